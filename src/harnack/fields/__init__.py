@@ -1,7 +1,7 @@
-"""Fields: what f is. One family a folder.
+"""Fields: the functions f whose level sets are drawn, with a folder for each family.
 
-This package exports what all fields share. The fields themselves are names of `harnack`, which
-`harnack/__init__.pyi` lists.
+This package exports the base classes and helpers of all fields. The fields themselves are names of
+`harnack`, which `harnack/__init__.pyi` lists.
 """
 
 from __future__ import annotations

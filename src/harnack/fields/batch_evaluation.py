@@ -1,4 +1,5 @@
-"""Runs Dr.Jit kernels at many NumPy points, in batches; the results are NumPy arrays."""
+"""Runs Dr.Jit kernels at large numbers of NumPy points, in batches; the results are NumPy
+arrays."""
 
 from __future__ import annotations
 
@@ -37,8 +38,8 @@ def evaluate_points(
     kernel: Callable[[Backend, Vec3], tuple[Any, ...]],
     precision: Precision | None,
 ) -> tuple[npt.NDArray[Any], ...]:
-    """The arrays that `kernel` gives at points (n, 3), in the order of the points; for a single
-    point (3,) without the first axis.
+    """The arrays that `kernel` returns for points (n, 3), in the order of the points; for a single
+    point (3,), without the first axis.
 
     precision: None for double precision if the points are an array of float64, else single.
 
@@ -46,20 +47,20 @@ def evaluate_points(
     same nodes of a tree, which halves the time.
 
     Raises:
-        TypeError, ValueError: points that are no (n, 3) array of finite numbers.
+        TypeError, ValueError: points that are not an (n, 3) array of finite numbers.
     """
     backend = choose_backend(precision or precision_of_input(points))
 
     def visit(x: Vec3) -> tuple[Any, ...]:
         order = morton_order(backend, x)
         results = kernel(backend, dr.gather(backend.Array3f, x, order))
-        return tuple(_restore_order(one, order, dr.width(x)) for one in results)
+        return tuple(_restore_order(array, order, dr.width(x)) for array in results)
 
     check_no_derivatives("what NumPy's arrays are given of", points)
-    given = np.asarray(points)
-    if given.shape == (3,):
-        return tuple(one[0] for one in map_batches(backend, visit, given[None]))
-    return map_batches(backend, visit, given)
+    vectors = np.asarray(points)
+    if vectors.shape == (3,):
+        return tuple(array[0] for array in map_batches(backend, visit, vectors[None]))
+    return map_batches(backend, visit, vectors)
 
 
 def accepts_numpy_points(hessian: Callable[[Any, Vec3], Any]) -> Callable[..., Any]:
@@ -95,7 +96,7 @@ def map_batches(
     at_once: the number of points of a batch.
 
     Raises:
-        TypeError, ValueError: points that are no (n, 3) array of finite numbers.
+        TypeError, ValueError: points that are not an (n, 3) array of finite numbers.
     """
     on_device = dr.is_array_v(cast("Any", type(points)))
     vectors = (
@@ -109,14 +110,14 @@ def map_batches(
         with dr.suspend_grad():
             results = compute(
                 *(
-                    _part(backend, one, start, lanes) if n else backend.Array3f(0)
-                    for one in (vectors, *others)
+                    _part(backend, array, start, lanes) if n else backend.Array3f(0)
+                    for array in (vectors, *others)
                 )
             )
             dr.eval(*results)
-        parts.append(tuple(_spread(to_numpy(one), max(lanes, 1)) for one in results))
+        parts.append(tuple(_spread(to_numpy(array), max(lanes, 1)) for array in results))
     if len(parts) == 1:
-        return tuple(one[:n] for one in parts[0])
+        return tuple(array[:n] for array in parts[0])
     return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
 
 
@@ -132,13 +133,14 @@ def _spread(values: npt.NDArray[Any], n: int) -> npt.NDArray[Any]:
 
 
 def _restore_order(values: Any, order: Any, n: int) -> Any:
-    """Values that belong to the points in visiting order, brought into the given order."""
+    """Values of the points in visiting order, brought back into the original order of the
+    points."""
     kind = cast("Any", type(values))
     if dr.depth_v(kind) == 1:
         out = dr.zeros(kind, n)
         dr.scatter(out, values, order)
         return out
-    return kind([_restore_order(one, order, n) for one in values])
+    return kind([_restore_order(component, order, n) for component in values])
 
 
 def morton_order(backend: Backend, x: Vec3, bits: int = _BITS) -> Any:
@@ -150,13 +152,13 @@ def morton_order(backend: Backend, x: Vec3, bits: int = _BITS) -> Any:
     n = dr.width(x)
     if n < 2:
         return dr.arange(index, n)
-    low = vector(*(dr.min(one) for one in x))
-    sides = [dr.max(x[k]) - low[k] for k in range(3)]
+    lower = vector(*(dr.min(coordinate) for coordinate in x))
+    sides = [dr.max(x[k]) - lower[k] for k in range(3)]
     size = dr.maximum(dr.maximum(sides[0], sides[1]), sides[2])
     scale = (2**bits - 1e-3) / dr.maximum(size, 1e-30)
     key = index(0)
     for axis in range(3):
-        cell = index((x[axis] - low[axis]) * scale)
+        cell = index((x[axis] - lower[axis]) * scale)
         for bit in range(bits):
             key |= (cell & (1 << bit)) << (2 * bit + axis)
     keys = to_numpy(key).astype(np.uint16 if 3 * bits <= 16 else np.uint32)

@@ -1,4 +1,5 @@
-"""Fields that can be evaluated at many points at once, and caches that live as long as a field.
+"""Fields that can be evaluated at large numbers of points at once, and caches that live as long as
+a field.
 
 - `BatchedField`: values, derivatives and error bounds at NumPy points, as NumPy arrays.
 - `FieldCache`, `cached_prepare`: caches for results that are computed or uploaded once per field.
@@ -96,8 +97,8 @@ class PointValues:
     def with_far_field_errors(self, x: Vec3, terms: int, weight: float) -> PointValues:
         """The same values with error bounds that hold at points far away too.
 
-        x: the points, in coordinates in which the field's data have a size of about one. terms: how
-        many terms were summed up. weight: of all dipoles together.
+        x: the points, in coordinates in which the field's data have a size of about 1. terms: the
+            number of terms summed up. weight: of all dipoles together.
 
         Two errors matter only far away. A term of a derivative is a product of a factor that falls
         like |x|^-5 and one that grows like |x|^2, and the first may underflow. And where dipoles
@@ -118,22 +119,23 @@ class PointValues:
     def rescaled(self, size: Real) -> PointValues:
         """The values of x -> f(x / size) at `size` times the points. Where a number has overflowed
         its error is infinite."""
-        gradient, hessian, share = self.gradient, self.hessian, 1 / size
+        gradient, hessian, inverse = self.gradient, self.hessian, 1 / size
         gradient_error, hessian_error = self.gradient_error, self.hessian_error
         if gradient is not None:
-            gradient = gradient * share
-            known = dr.isfinite(gradient.x) & dr.isfinite(gradient.y) & dr.isfinite(gradient.z)
-            gradient_error = dr.select(known, gradient_error * share, dr.inf)
+            gradient = gradient * inverse
+            is_finite = dr.isfinite(gradient.x) & dr.isfinite(gradient.y) & dr.isfinite(gradient.z)
+            gradient_error = dr.select(is_finite, gradient_error * inverse, dr.inf)
         if hessian is not None:
-            hessian = type(hessian)(*(share * share * one for one in hessian.components()))
-            known = dr.isfinite(sum(hessian.components()))
-            hessian_error = dr.select(known, hessian_error * (share * share), dr.inf)
+            hessian = type(hessian)(*(inverse * inverse * entry for entry in hessian.components()))
+            is_finite = dr.isfinite(sum(hessian.components()))
+            hessian_error = dr.select(is_finite, hessian_error * (inverse * inverse), dr.inf)
         error = dr.select(dr.isfinite(self.value), self.error, dr.inf)
         return PointValues(self.value, error, gradient, hessian, gradient_error, hessian_error)
 
 
 class BatchedField(Field):
-    """A field that gives values, derivatives and error bounds at many points at once.
+    """A field that evaluates values, derivatives and error bounds at large numbers of points at
+    once.
 
     Subclasses define `values_at`.
     """
@@ -238,12 +240,15 @@ class BatchedField(Field):
         points: Any,
         precision: Precision | None,
         derivatives: int,
-        wanted: Callable[[PointValues], tuple[Any, ...]],
+        choose: Callable[[PointValues], tuple[Any, ...]],
     ) -> tuple[FloatArray, ...]:
+        """The arrays that `choose` takes from the values at points, with this number of
+        derivatives."""
+
         def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
             del backend
             sharp = derivatives == 1
-            return wanted(self.sharp_values_at(x) if sharp else self.values_at(x, derivatives))
+            return choose(self.sharp_values_at(x) if sharp else self.values_at(x, derivatives))
 
         return evaluate_points(points, kernel, precision)
 
@@ -280,8 +285,8 @@ def sharpened(at: Callable[[Vec3, Real], PointValues], x: Vec3) -> PointValues:
     """Value and gradient at points x by a sum over a tree, the gradient with an error of about 1 %
     of its length.
 
-    at: gives values and gradients at points, with clusters taken as a whole beyond this multiple of
-        the usual distance.
+    at: evaluates values and gradients at points, with clusters expanded beyond this multiple of the
+        usual distance.
 
     Far terms may nearly cancel, as the triangles of a mesh with small holes do. Then the gradient
     is far smaller than the truncation error of its clusters. Bounds of the truncation error add up
@@ -357,12 +362,12 @@ def cached_prepare(prepare: Prepare) -> Prepare:
     Fields with parameters are uploaded at each call: a parameter may change in place, and its
     derivatives belong to a single trace.
     """
-    kept: defaultdict[Backend, FieldCache[Field]] = defaultdict(FieldCache)
+    caches: defaultdict[Backend, FieldCache[Field]] = defaultdict(FieldCache)
 
     @functools.wraps(prepare)
-    def once(self: Field, backend: Backend) -> Field:
+    def cached(self: Field, backend: Backend) -> Field:
         if self.parameters():
             return prepare(self, backend)
-        return kept[backend].get(self, None, lambda: prepare(self, backend))
+        return caches[backend].get(self, None, lambda: prepare(self, backend))
 
-    return cast("Prepare", once)
+    return cast("Prepare", cached)

@@ -93,7 +93,8 @@ def tight_extent(
 
 
 def _outside(held: ConvexHull, clearance: Clearance) -> Clearance:
-    """The clearance from what lies outside a polytope: inside, the distance to its faces."""
+    """The clearance from the outside of a polytope: for points inside, the distance to its
+    faces."""
 
     def beyond(points: FloatArray) -> FloatArray:
         depth = (held.offsets - points @ held.normals.T).min(axis=1)
@@ -108,7 +109,7 @@ def _outside(held: ConvexHull, clearance: Clearance) -> Clearance:
 def occupied_cells(
     field: Field, levels: tuple[float, ...], extent: Volume, cells_across: int
 ) -> OccupancyGrid:
-    """A grid over an extent, with about so many cells along its longest side."""
+    """A grid over an extent, with about this number of cells along its longest side."""
     return OccupancyGrid.from_clearance(
         *extent.bounds(), clearance_function(field, levels, "single"), cells_across
     )
@@ -117,19 +118,19 @@ def occupied_cells(
 def level_distance_lower_bound(
     backend: Backend, field: Field, levels: Levels, p: Vec3, sample: Sample
 ) -> Real:
-    """A proved lower bound of the distance from p to the nearest level; sample: the field at p.
+    """A proved lower bound of the distance from p to the nearest level. sample: of the field at p.
 
-    Proof. An enclosure holds f(p + tv) within [L(t, s), U(t, s)], s the slope along a unit
-    direction v, and steps to where that first meets a level. Neither end falls as s grows, as every
-    enclosure has to prove (`Enclosure`).
+    Proof. An enclosure holds f(p + tv) within [L(t, s), U(t, s)], with s the slope along a unit
+    direction v, and steps to the point where this interval first meets a level. Neither end falls
+    as s grows, as every enclosure has to prove (`Enclosure`).
 
-    All slopes lie in [-G, G], G = |grad f(p)| and its error: one enclosure with that interval of
-    slopes holds in every direction. The distances to the level above and to that below are proved
-    separately, each by the promise that gives the larger distance.
+    All slopes lie in [-G, G], with G = |grad f(p)| plus its error: an enclosure with that interval
+    of slopes holds in every direction. The distances to the level above and to the level below are
+    proved separately, each by the promise that proves the larger distance.
 
     As in the tracer, the level gaps are reduced by the rounding of value and position, and the
-    result is reduced by the rounding of p itself. If f jumps, the bound is about f continued
-    smoothly through all facets, which is f itself as far as the nearest facet.
+    result is reduced by the rounding of p itself. If f jumps, the bound is for f continued smoothly
+    through all facets, which equals f as far as the nearest facet.
     """
     steepest = safe_norm(sample.gradient) + sample.gradient_error
     size = max_norm(p)
@@ -143,10 +144,10 @@ def level_distance_lower_bound(
         sample.value_error,
         SlopeRange(-steepest, steepest),
     )
-    none = backend.Float(dr.inf)
-    above = longest_free_length(enclosures, LevelGaps(none, gaps.above))
-    below = longest_free_length(enclosures, LevelGaps(gaps.below, none))
-    distance = dr.select(gaps.nearest > 0, fmin(above, below), 0)
+    inf = backend.Float(dr.inf)
+    upward = longest_free_length(enclosures, LevelGaps(inf, gaps.above))
+    downward = longest_free_length(enclosures, LevelGaps(gaps.below, inf))
+    distance = dr.select(gaps.nearest > 0, fmin(upward, downward), 0)
     if field.has_jumps:
         distance = fmin(distance, field.distance_to_jumps(p))
     return fmax(backend.Float(distance) - 2 * epsilon * size, 0)
@@ -255,5 +256,5 @@ def frame_parameters(
 
 
 def coordinate_rounding(x: Vec3) -> Real:
-    """The rounding of a coordinate of x, or of a vertex of size about one."""
+    """The rounding of a coordinate of x, or of a vertex of size about 1."""
     return float(dr.epsilon(x)) * (1 + dr.max(dr.abs(x)))

@@ -36,7 +36,7 @@ _FUNCTIONS: Mapping[str, Callable[..., Any]] = MappingProxyType(
         "min": lambda *several: functools.reduce(arithmetic.minimum, several),
     }
 )  # fmt: skip
-# Functions with several arguments: the least and the largest number of them.
+# Functions of more than one argument: the least and the largest number of arguments.
 _ARGUMENT_COUNTS = {"max": (2, 99), "min": (2, 99), "norm": (2, 3), "atan2": (2, 2)}
 _OPERATORS: Mapping[type[ast.operator], Callable[[Any, Any], Any]] = MappingProxyType(
     {
@@ -53,7 +53,7 @@ _MAX_LENGTH, _MAX_DEPTH = 4000, 200
 
 @dataclass(frozen=True)
 class TextFormula:
-    """f(x, y, z) given as a text, called like any function of three coordinates.
+    """A formula f(x, y, z) as a text. It is called like any function of three coordinates.
 
     text: with + - * / ^ (or **), brackets, numbers, x, y, z, pi, e and the functions above. An
         equation "left = right" means left - right. It is parsed to a tree and never run as Python,
@@ -67,18 +67,18 @@ class TextFormula:
 
     @classmethod
     def parse(cls, text: str, parameters: Mapping[str, float] | None = None) -> TextFormula:
-        """The formula of a text.
+        """The formula that a text describes.
 
         Raises:
-            ValueError: the text is no formula, saying where and what is wrong; or a parameter is
-                not in it, or has a name that means something else.
+            ValueError: the text is not a formula (the message states the position and the mistake);
+                or a parameter is not in it, or has a name with another meaning.
         """
-        parameters = {name: as_finite(one, name) for name, one in (parameters or {}).items()}
+        parameters = {name: as_finite(number, name) for name, number in (parameters or {}).items()}
         if len(text) > _MAX_LENGTH:
             raise ValueError(f"a formula has at most {_MAX_LENGTH:,} characters, not {len(text):,}")
-        strange = re.search(r"[^A-Za-z0-9\s.,+*/^()=<>!-]|\b0[xob]", text, re.IGNORECASE)
-        if strange:
-            raise _formula_error(text, f"{strange[0]!r} has no meaning here")
+        unknown = re.search(r"[^A-Za-z0-9\s.,+*/^()=<>!-]|\b0[xob]", text, re.IGNORECASE)
+        if unknown:
+            raise _formula_error(text, f"{unknown[0]!r} has no meaning here")
         sides = [cls._side(text, side) for side in re.split(r"(?<![<>=!])=(?!=)", text)]
         if len(sides) > 2:
             raise _formula_error(text, "more than one = sign")
@@ -115,12 +115,13 @@ class TextFormula:
             raise _formula_error(self.text, "a number in it is too large, or not real") from None
 
     def __repr__(self) -> str:
-        numbers = "".join(f", {name} = {one:g}" for name, one in self.parameters.items())
+        numbers = "".join(f", {name} = {number:g}" for name, number in self.parameters.items())
         return self.text + numbers
 
 
 def looks_like_formula(text: str) -> bool:
-    """Whether a text looks like a formula: an equation, or with powers, products or functions."""
+    """Whether a text looks like a formula: it is an equation, or has powers, products or
+    functions."""
     return any(sign in text for sign in ("=", "^", "*", "("))
 
 
@@ -131,30 +132,31 @@ def _formula_error(text: str, why: str) -> ValueError:
     )
 
 
-def _check(text: str, node: ast.expr, own: Iterable[str], depth: int = 0) -> None:
-    """Raise ValueError for anything in a tree that is not allowed or not known."""
+def _check(text: str, node: ast.expr, parameters: Iterable[str], depth: int = 0) -> None:
+    """Raise ValueError for anything in a tree that is not allowed or not known. parameters: their
+    names."""
     if depth > _MAX_DEPTH:
         raise _formula_error(text, f"more than {_MAX_DEPTH} operations are within each other")
     if isinstance(node, ast.BinOp):
         if not isinstance(node.op, ast.Pow) and type(node.op) not in _OPERATORS:
             raise _formula_error(text, "the operators are + - * / ^")
-        _check(text, node.left, own, depth + 1)
-        _check(text, node.right, own, depth + 1)
+        _check(text, node.left, parameters, depth + 1)
+        _check(text, node.right, parameters, depth + 1)
     elif isinstance(node, ast.UnaryOp):
         if not isinstance(node.op, ast.USub | ast.UAdd):
             raise _formula_error(text, "the signs are + and -")
-        _check(text, node.operand, own, depth + 1)
+        _check(text, node.operand, parameters, depth + 1)
     elif isinstance(node, ast.Name):
-        known = (*_COORDINATES, *_CONSTANTS, *own)
+        names = (*_COORDINATES, *_CONSTANTS, *parameters)
         if node.id in _FUNCTIONS:
             raise _formula_error(
                 text, f"the argument of {node.id} stands in brackets, and a power behind them"
             )
-        if node.id not in known:
+        if node.id not in names:
             raise _formula_error(
                 text,
-                f"{node.id!r} is unknown, there are {', '.join(known)} and {', '.join(_FUNCTIONS)}"
-                f"{did_you_mean(node.id, (*known, *_FUNCTIONS))}; of a number of your own, give "
+                f"{node.id!r} is unknown, there are {', '.join(names)} and {', '.join(_FUNCTIONS)}"
+                f"{did_you_mean(node.id, (*names, *_FUNCTIONS))}; of a number of your own, give "
                 f'parameters={{"{node.id}": 1.0}}',
             )
     elif isinstance(node, ast.Constant):
@@ -164,7 +166,7 @@ def _check(text: str, node: ast.expr, own: Iterable[str], depth: int = 0) -> Non
         if not math.isfinite(_as_float(text, value)):
             raise _formula_error(text, "a number is too large")
     elif isinstance(node, ast.Call):
-        _check_call(text, node, own, depth + 1)
+        _check_call(text, node, parameters, depth + 1)
     elif isinstance(node, ast.Compare):
         raise _formula_error(text, "an equation has one = between its two sides")
     else:
@@ -178,21 +180,27 @@ def _as_float(text: str, value: float) -> float:
         raise _formula_error(text, "a number is too large") from None
 
 
-def _check_call(text: str, node: ast.Call, own: Iterable[str], depth: int) -> None:
+def _check_call(text: str, node: ast.Call, parameters: Iterable[str], depth: int) -> None:
+    """Raise ValueError for a call of an unknown function, with a wrong number of arguments, or with
+    arguments that are not allowed."""
     name = node.func.id if isinstance(node.func, ast.Name) else ast.unparse(node.func)
-    if name in (*_COORDINATES, *_CONSTANTS, *own) or not isinstance(node.func, ast.Name):
+    if name in (*_COORDINATES, *_CONSTANTS, *parameters) or not isinstance(node.func, ast.Name):
         raise _formula_error(text, f"is a * missing after {name!r}")
     if name not in _FUNCTIONS:
-        known = ", ".join(_FUNCTIONS)
+        names = ", ".join(_FUNCTIONS)
         hint = did_you_mean(name, _FUNCTIONS)
-        raise _formula_error(text, f"{name!r} is no known function, there are {known}{hint}")
-    least, most = _ARGUMENT_COUNTS.get(name, (1, 1))
-    if node.keywords or not least <= len(node.args) <= most:
-        count = f"{least} or {most}" if least < most < 9 else f"{least}{' or more' * (most > 9)}"
-        plural = "s" if most > 1 else ""
+        raise _formula_error(text, f"{name!r} is no known function, there are {names}{hint}")
+    fewest, largest = _ARGUMENT_COUNTS.get(name, (1, 1))
+    if node.keywords or not fewest <= len(node.args) <= largest:
+        count = (
+            f"{fewest} or {largest}"
+            if fewest < largest < 9
+            else f"{fewest}{' or more' * (largest > 9)}"
+        )
+        plural = "s" if largest > 1 else ""
         raise _formula_error(text, f"{name} takes {count} argument{plural}, not {len(node.args)}")
-    for one in node.args:
-        _check(text, one, own, depth)
+    for argument in node.args:
+        _check(text, argument, parameters, depth)
 
 
 def _value(node: ast.expr, names: Mapping[str, Any]) -> Any:
@@ -223,13 +231,14 @@ def _evaluate_node(node: ast.expr, names: Mapping[str, Any]) -> Any:
         case ast.Constant(value):
             return float(value)  # pyright: ignore
         case ast.Call(ast.Name(name), arguments):
-            return _FUNCTIONS[name](*(_value(one, names) for one in arguments))
+            return _FUNCTIONS[name](*(_value(argument, names) for argument in arguments))
         case _:
             raise AssertionError(f"{node} was checked")
 
 
 def _power(base: Any, exponent: Any) -> Any:
-    """base^exponent, with whole exponents as integers: negative numbers have such powers too."""
+    """base^exponent, where exponents without a fraction are integers: negative numbers have such
+    powers too."""
     if isinstance(exponent, float) and exponent.is_integer():
         exponent = int(exponent) if abs(exponent) < 2**31 else exponent
     if isinstance(base, float) and isinstance(exponent, int | float):
@@ -242,11 +251,12 @@ def _power(base: Any, exponent: Any) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Expression(Formula):
-    """f(x, y, z) given as a Python function, written with plain operators and `harnack.sin` etc.
+    """A field f(x, y, z) that is a Python function, written with plain operators and `harnack.sin`
+    etc.
 
     function: called with three coordinates while a kernel is being recorded; numbers in it are
         literals of that kernel.
-    domain: the volume it is drawn in; None for all of space.
+    domain: the volume in which f is drawn; None for all of space.
     """
 
     function: Callable[[Any, Any, Any], Any]
@@ -271,27 +281,28 @@ def expression(
     level: float = 0.0,
     is_convex: bool = False,
 ) -> Expression:
-    """The implicit surface f(x, y, z) = level of a formula of your own.
+    """The implicit surface f(x, y, z) = level of a user-defined formula.
 
     function: of three coordinates, written with + - * / **, abs, and the functions `harnack.sin`,
         `cos`, `tan`, `exp`, `log`, `sqrt`, `tanh`, `atan`, `atan2`, `asin`, `acos`, `sinh`, `cosh`,
-        `maximum`, `minimum`, `norm`; NumPy's of the same names do too. Or a text, such as
-        "x^2 + y^2 = 1 + sin(2*z)", with `max` and `min`; an equation means left - right.
-    parameters: numbers by their names in a text, as of "x^2 + y^2 = a" {"a": 2.0}.
-    domain: the volume to draw it in, such as `harnack.Ball()`; None for all of space.
-    level: the one drawn when none is asked for.
-    is_convex: a promise of yours that the function is convex, as quadrics and norms are: steps
-        towards it are longer then. `harnack.testing.check_field` samples it.
+        `maximum`, `minimum`, `norm`; NumPy's functions of the same names work too. Or a text, such
+        as "x^2 + y^2 = 1 + sin(2*z)", with `max` and `min`; an equation means left - right.
+    parameters: numbers by their names in a text, such as {"a": 2.0} for "x^2 + y^2 = a".
+    domain: the volume in which the surface is drawn, such as `harnack.Ball()`; None for all of
+        space.
+    level: the level drawn by default.
+    is_convex: your promise that the function is convex, as quadrics and norms are: then steps
+        towards the surface are longer. `harnack.testing.check_field` tests the promise at samples.
 
         torus = hk.expression(lambda x, y, z: (hk.norm(x, y) - 1) ** 2 + z**2 - 0.1)
 
-    Warns of a formula so long that the first trace takes more than some ten seconds to compile.
+    Warns of a formula so long that the first trace takes more than about ten seconds to compile.
 
     Raises:
-        TypeError: function cannot be called with three coordinates, or uses what has no proved
-            ranges; domain is no volume.
+        TypeError: function cannot be called with three coordinates, or uses operations without
+            proved ranges; domain is not a volume.
         NotImplementedError: function uses numbers with derivatives enabled.
-        ValueError: level is not finite; a text is no formula, or without such a parameter.
+        ValueError: level is not finite; a text is not a formula, or lacks a parameter.
     """
     if parameters is not None and not isinstance(cast("Any", parameters), Mapping):
         raise TypeError(f'parameters are numbers by name, such as {{"a": 2}}, not {parameters!r}')
@@ -307,15 +318,15 @@ def expression(
     _check_arguments(function)
     check_volume(domain, "domain")
     level, is_convex = as_finite(level, "level"), flag(is_convex, "is_convex")
-    made = Expression(function, domain, default_level=level, is_convex=is_convex)
+    field = Expression(function, domain, default_level=level, is_convex=is_convex)
     point = probe_jets()
-    check_no_derivatives("an expression", as_jet(made.formula(*point), point[0], "expression"))
-    warn_if_slow_to_compile(made)
-    return made
+    check_no_derivatives("an expression", as_jet(field.formula(*point), point[0], "expression"))
+    warn_if_slow_to_compile(field)
+    return field
 
 
 def _check_arguments(function: Callable[..., Any]) -> None:
-    """Raise TypeError for what does not take three coordinates."""
+    """Raise TypeError for a function that does not take three coordinates."""
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):  # of what is not written in Python nothing may be known

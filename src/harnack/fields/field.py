@@ -121,9 +121,9 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         super().__init_subclass__(**kwargs)
         if "__repr__" not in vars(cls):  # a dataclass would write out all numbers
             cls.__repr__ = Field.__repr__
-        for name, own in list(vars(cls).items()):
-            if isinstance(own, classmethod) and not name.startswith("_"):
-                checked_maker = no_derivatives(cast("Any", own).__func__)
+        for name, attribute in list(vars(cls).items()):
+            if isinstance(attribute, classmethod) and not name.startswith("_"):
+                checked_maker = no_derivatives(cast("Any", attribute).__func__)
                 setattr(cls, name, classmethod(checked_maker))
         if "evaluate" in vars(cls):
             checked: Any = validate_samples(cls.evaluate)
@@ -147,26 +147,26 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         make_read_only(state)
 
     def __repr__(self) -> str:
-        """The constructor call, with those arguments that the field still stores and that differ
-        from their defaults; arrays are written as their shapes."""
-        given = inspect.signature(type(self).__init__).parameters
-        own = {key.removeprefix("_"): value for key, value in vars(self).items()}
-        said = [
-            f"{key}={format_short(own[key])}"
-            for key, one in given.items()
-            if key in own and not is_same_or_equal(own[key], one.default)
+        """The constructor call, with the arguments that the field still stores and that differ from
+        their defaults; arrays are written as their shapes."""
+        parameters = inspect.signature(type(self).__init__).parameters
+        values = {key.removeprefix("_"): value for key, value in vars(self).items()}
+        arguments = [
+            f"{key}={format_short(values[key])}"
+            for key, parameter in parameters.items()
+            if key in values and not is_same_or_equal(values[key], parameter.default)
         ]
-        return f"{type(self).__name__}({', '.join(said)})"
+        return f"{type(self).__name__}({', '.join(arguments)})"
 
     def __getattr__(self, name: str) -> Any:
         """Raise AttributeError; for methods that only solids have, the message says how to make a
         solid of the field."""
-        own = f"{type(self).__name__!r} object has no attribute {name!r}"
+        message = f"{type(self).__name__!r} object has no attribute {name!r}"
         if name in _SOLID_METHODS:
-            own += ": make a solid of the field first, by harnack.solid(field, below=level)"
-        raise AttributeError(own)
+            message += ": make a solid of the field first, by harnack.solid(field, below=level)"
+        raise AttributeError(message)
 
-    def _is_no_number(self, *others: Any) -> Any:
+    def _is_no_number(self, *operands: Any) -> Any:
         """Arithmetic and comparisons are refused. `Solid` defines -, and all fields keep ==."""
         raise TypeError(
             f"a {type(self).__name__} is a function of space, which is not computed with as "
@@ -268,7 +268,7 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         ties of f's formula the derivative is the gradient of the sample, too. A field with
         parameters overrides this method if `evaluate` cannot be differentiated in both modes.
         """
-        if any(dr.grad_enabled(one) for one in self.parameters()):
+        if any(dr.grad_enabled(parameter) for parameter in self.parameters()):
             return self.evaluate(p).value
         self.refuse_hidden_parameters()
         at = dr.detach(p)
@@ -296,7 +296,7 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         """
         if dr.is_array_v(type(points)):
             self.refuse_hidden_parameters()
-            if any(dr.grad_enabled(one) for one in (points, *self.parameters())):
+            if any(dr.grad_enabled(array) for array in (points, *self.parameters())):
                 return self.differentiable_value(points)
             return self.evaluate(points).value
         return self._evaluate_points(points, precision, lambda sample: sample.value)
@@ -324,10 +324,12 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         return gradient + type(points)(*(dr.dot(row, moved) for row in rows))
 
     def _evaluate_points(
-        self, points: Any, precision: Precision | None, wanted: Callable[[Sample], Any]
+        self, points: Any, precision: Precision | None, choose: Callable[[Sample], Any]
     ) -> npt.NDArray[Any]:
+        """The array that `choose` takes from the samples at points."""
+
         def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
-            return (wanted(self.prepare(backend).evaluate(x)),)
+            return (choose(self.prepare(backend).evaluate(x)),)
 
         return evaluate_points(points, kernel, precision)[0]
 
@@ -354,7 +356,7 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         return sample.gradient_error, math.inf
 
     def describe(self) -> dict[str, Any]:
-        """Names and values of choices that the field made by itself, for users who want to know
+        """Names and values of the choices that the field made by itself, for users who need
         them."""
         return {}
 
@@ -372,7 +374,7 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
 
 
 class EvaluateOnly(Field):
-    """A field that is given by its `evaluate` alone, such as the result of `Field.at_accuracy`."""
+    """A field that has only its `evaluate`, such as the result of `Field.at_accuracy`."""
 
     def __init__(self, evaluate: Callable[[Vec3], Sample]) -> None:
         self._evaluate = evaluate
@@ -388,11 +390,11 @@ def validate_levels_in_range(
 
     what: the name of the function, for the message.
     """
-    low, high = value_range
+    lower, upper = value_range
     for level in levels:
-        if not low <= level <= high:
+        if not lower <= level <= upper:
             raise ValueError(
-                f"no surface has level {level:g}: {what} stays within [{low:.6g}, {high:.6g}]"
+                f"no surface has level {level:g}: {what} stays within [{lower:.6g}, {upper:.6g}]"
             )
 
 
@@ -406,13 +408,13 @@ def check_is_field(given: Any) -> None:
 
 
 def suggest_field(given: Any) -> str:
-    """Text for an error message: the kind of an object that is no field, and how to make a field of
-    it."""
+    """The text of an error message: the kind of an object that is not a field, and how to make a
+    field of it."""
     kind, name = type(given).__name__, getattr(given, "__name__", "")
     if isinstance(getattr(given, "field", None), Field):
         return f"a {kind}: take its .field, and what else this takes of it, such as its level"
     parts: list[Any] = [*given] if type(given) in (list, tuple) else []
-    if any(isinstance(one, Field) for one in parts):
+    if any(isinstance(part, Field) for part in parts):
         return f"a {kind} of fields: give one at a time, or to harnack.render one flat list"
     if inspect.isclass(given) and issubclass(given, Field):
         return f"the class {name} itself: make one of it, {name}(...)"

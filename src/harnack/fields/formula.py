@@ -1,11 +1,11 @@
-"""Fields that are given by a formula of the coordinates: everything else follows from it.
+"""Fields defined by a formula of the coordinates, from which everything else follows.
 
-A formula is evaluated in two ways. Given jets of the coordinates at a point, it returns value and
-gradient with bounds of their rounding; given jets along a piece of a path, it returns ranges of its
+A formula is evaluated in two ways. For jets of the coordinates at a point it returns value and
+gradient with bounds of their rounding. For jets along a piece of a path it returns ranges of its
 derivatives there, from which steps are proved.
 
 A formula's kernel is counted before it is compiled: LLVM's time grows faster than the number of
-operations, so that a warning comes before minutes of silence, and says what to do.
+operations, so that a warning comes before minutes of silence, with a remedy.
 """
 
 from __future__ import annotations
@@ -96,21 +96,23 @@ class Formula(Field):
 
     @property
     def tally(self) -> Tally:
-        """What the formula is made of; of a prepared one, while its numbers were known."""
+        """The operations of the formula, counted; for a prepared formula, counted before it was
+        prepared, while its numbers were known."""
         return tally_of(self.formula) if self._prepared_tally is None else self._prepared_tally
 
     @property
     def is_steep(self) -> bool:
-        """Whether the formula uses what may have a vertical tangent or a pole, or is as steep as
-        one for the rounding of coordinates."""
+        """Whether the formula uses an operation that may have a vertical tangent or a pole, or that
+        is as steep as a pole for the rounding of coordinates."""
         return self.tally.is_steep or self.is_abrupt
 
     @property
     def is_abrupt(self) -> bool:
-        """Whether f may change within the rounding of coordinates by far more than its slopes say.
+        """Whether f may change within the rounding of coordinates by far more than its slopes
+        allow.
 
-        Where a Lipschitz constant is stated, as the library's shapes do, which are about distances,
-        small numbers in a formula are lengths, and only large ones make it abrupt.
+        Where a Lipschitz constant is stated, as for the library's shapes, whose values are about
+        distances, small numbers in a formula are lengths, and only large numbers make it abrupt.
         """
         return self.tally.turns_within(1.0 if self.lipschitz is not None else self.tally.finest)
 
@@ -125,9 +127,9 @@ class Formula(Field):
 
         At a tie, such as max(x, 0) at x = 0, the jet gives a range of gradients. The range contains
         all gradients nearby, and others where terms of several ties are added, as on the faces of
-        `corner`. Its middle is the gradient at no point, though its direction mostly leads across
-        the tie. A second sample (`Dual`), a few roundings away in about this direction, decides
-        which side to use.
+        `orthogonal_intersection`. Its middle is the gradient at no point, though its direction
+        mostly leads across the tie. A second sample (`Dual`), a few roundings away in about this
+        direction, decides which side to use.
 
         Proof of the error. The gradient at p lies within `gradient_error` of the middle. A gradient
         that is farther from it does not come from a tie at p: the gradient of f changes that much
@@ -136,23 +138,27 @@ class Formula(Field):
         epsilon = float(dr.epsilon(type(p.x)))
         is_bounded = dr.isfinite(sample.gradient_error + dr.sum(sample.gradient))
         middle = dr.select(is_bounded, sample.gradient, 0)
-        doubt = dr.select(is_bounded, sample.gradient_error, dr.inf)
-        steep = safe_norm(middle)
-        way = dr.select(steep > 0, middle / steep, 0) + type(p)(*_TIE_DIRECTION)
+        error = dr.select(is_bounded, sample.gradient_error, dr.inf)
+        norm = safe_norm(middle)
+        direction = dr.select(norm > 0, middle / norm, 0) + type(p)(*_TIE_DIRECTION)
         size = max_norm(p) + dr.abs(sample.value)
         size = dr.select(size > 0, size, 1)
-        away = Dual.at_point(p + way * (_TIE_OFFSET * epsilon * size))
+        coordinates = Dual.at_point(p + direction * (_TIE_OFFSET * epsilon * size))
         try:
-            beside = away[0].coerce(self.formula(*away))
+            dual = coordinates[0].coerce(self.formula(*coordinates))
         except TypeError:  # a formula that accepts only ranges, as that of noise
             return sample
-        one_side = type(p)(*(0 * p.x + one for one in beside.first_derivatives))
-        off = safe_norm(one_side - middle)
-        is_tie = (doubt > _TIE_THRESHOLD * epsilon * steep) & (off <= 2 * doubt) & dr.isfinite(off)
+        gradient = type(p)(*(0 * p.x + component for component in dual.first_derivatives))
+        distance = safe_norm(gradient - middle)
+        is_tie = (
+            (error > _TIE_THRESHOLD * epsilon * norm)
+            & (distance <= 2 * error)
+            & dr.isfinite(distance)
+        )
         return dataclasses.replace(
             sample,
-            gradient=dr.select(is_tie, one_side, sample.gradient),
-            gradient_error=dr.select(is_tie, doubt + off, doubt),
+            gradient=dr.select(is_tie, gradient, sample.gradient),
+            gradient_error=dr.select(is_tie, error + distance, error),
         )
 
     def sample_without_alternatives(self, p: Vec3) -> Sample:
@@ -161,37 +167,40 @@ class Formula(Field):
         return self._sample_of(self._jet(Jet.at_point(p), p.x), p)
 
     def _sample_of(self, jet: Jet, p: Vec3) -> Sample:
+        """The sample at p from the jet of f there."""
         zero = 0 * p.x
-        gradient = type(p)(*(zero + one.midpoint for one in jet.first_derivatives))
-        doubt = zero
-        for one in jet.first_derivatives:
-            doubt = doubt + one.radius
-        known = self.promises(p)
+        gradient = type(p)(*(zero + derivative.midpoint for derivative in jet.first_derivatives))
+        gradient_error = zero
+        for derivative in jet.first_derivatives:
+            gradient_error = gradient_error + derivative.radius
+        promises = self.promises(p)
         value, error = zero + jet.value.midpoint, zero + jet.value.radius
-        return Sample(value, gradient, known, error, doubt)
+        return Sample(value, gradient, promises, error, gradient_error)
 
     def _local_lipschitz(self, p: Vec3, sample: Sample) -> tuple[Lipschitz, ...]:
         """Lipschitz constants on balls around p, each a bound of |grad f| on the box around the
         ball. The radii are the multiples `_RADII` of Newton's estimate of the distance to level
         0."""
         steps = dr.abs(sample.value) / safe_norm(sample.gradient)
-        made: list[Lipschitz] = []
+        promises: list[Lipschitz] = []
         for multiple in _RADII:
             radius = fmin(multiple * steps, _LARGEST_RADIUS)
             jet = self._jet(Jet.over_ball(p, radius), p.x)
-            slopes = (0 * p.x + one.max_abs for one in jet.first_derivatives)
+            slopes = (0 * p.x + derivative.max_abs for derivative in jet.first_derivatives)
             constant = safe_norm(type(p)(*slopes)) * (1 + 1e-5)
-            known = dr.isfinite(constant) & (radius > 0)
-            made.append(Lipschitz(dr.select(known, constant, dr.inf), dr.select(known, radius, 0)))
-        return tuple(made)
+            is_known = dr.isfinite(constant) & (radius > 0)
+            promises.append(
+                Lipschitz(dr.select(is_known, constant, dr.inf), dr.select(is_known, radius, 0))
+            )
+        return tuple(promises)
 
     def promises(self, p: Vec3) -> tuple[Promise, ...]:
-        """Promises that hold in every direction from p: the Lipschitz constant, if one is known."""
+        """Promises that hold in every direction from p: the Lipschitz constant, if it is known."""
         return () if self.lipschitz is None else (Lipschitz(0 * p.x + self.lipschitz),)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         jet = self._jet(Jet.at_point(p, order=2), p.x)
-        xx, xy, xz, yy, yz, zz = (0 * p.x + one.midpoint for one in jet.second_derivatives)
+        xx, xy, xz, yy, yz, zz = (0 * p.x + entry.midpoint for entry in jet.second_derivatives)
         vector = cast("Any", type(p))
         return vector(xx, xy, xz), vector(xy, yy, yz), vector(xz, yz, zz)
 
@@ -204,20 +213,21 @@ class Formula(Field):
         """The sample, with the enclosures ahead that the ranges of the formula prove, and with no
         enclosures behind. Without such enclosures, those of the sample's promises are used.
 
-        Proof that no jump of f is passed, given that ranges of f' are all numbers on a piece with a
-        jump. A march steps to t + s rounded, which may lie behind the s that was proved, and looks
-        on from a point that is rounded again: a jump between would be seen from neither. So where
-        f may jump, the piece begins before t, by more than the rounding of t, and is of all paths
-        that lead through the point up to its rounding (`FormulaOnRay.rounded`). The exact path up
-        to t + s then lies in such pieces altogether, and they have no jump.
+        Proof that no jump of f is passed, given that the range of f' on a piece with a jump is all
+        numbers. A march steps to t + s rounded, which may lie beyond the s that was proved, and
+        goes on from a point that is rounded again: a jump between the two would be missed from
+        both. So where f may jump, the piece begins before t, by more than the rounding of t, and
+        covers all paths that lead through the point up to its rounding (`FormulaOnRay.rounded`).
+        The exact path up to t + s then lies in such pieces altogether, and they have no jump.
 
-        Proof that no level is passed where f is abrupt (`is_abrupt`), as max(-1, min(1, 1e9
-        y)) is. At a rounded point f may be -1 with slope 0, and 1 at the point of the exact path.
-        So the slopes at the start, too, are those of all points that round to this one: they hold
-        for the exact path, and with the values there, which differ from f here by no more than
-        `tracer.steep.SteepPlace.error`, they prove what is said of it. (Bounds that are made of no
-        such pieces prove it of the path through the rounded point; the error does the rest, except
-        where a path passes the end of a surface that is thinner than rounding.)
+        Proof that no level is passed where f is abrupt (`is_abrupt`), as max(-1, min(1, 1e9 y)) is.
+        At a rounded point f may be -1 with slope 0, and 1 at the point of the exact path. So the
+        slopes at the start, too, are those of all points that round to this point. They hold for
+        the exact path. Its values differ from f at the rounded point by no more than
+        `tracer.steep.SteepPlace.error`, and together they prove the claim for the exact path.
+        (Enclosures without such pieces prove the claim for the path through the rounded point; the
+        error covers the difference, except where a path passes the end of a surface that is thinner
+        than rounding.)
         """
         del back
         p = path.point(t)
@@ -234,15 +244,15 @@ class Formula(Field):
         if not enclosures:
             return path.enclose(sample)
         if self.may_jump and not all(
-            isinstance(one, PiecewiseTaylorEnclosure) for one in enclosures
+            isinstance(entry, PiecewiseTaylorEnclosure) for entry in enclosures
         ):
             ahead = dr.select(function.is_continuous(ahead), ahead, 0)
             enclosures = path.proofs.from_restriction(function, slopes, ahead)
-        growth = max(one.reach_growth for one in enclosures)
+        growth = max(entry.reach_growth for entry in enclosures)
         if self.is_convex and ConvexityEnclosure in path.proofs.kinds:
             enclosures = (*enclosures, ConvexityEnclosure(slopes))
-        least = safe_norm(type(p)(*(0 * p.x + one.min_abs for one in jet.first_derivatives)))
-        return RaySample(sample, enclosures, (), slope, growth, slope_error, least)
+        min_norm = safe_norm(type(p)(*(0 * p.x + entry.min_abs for entry in jet.first_derivatives)))
+        return RaySample(sample, enclosures, (), slope, growth, slope_error, min_norm)
 
     def _slope(self, p: Vec3, direction: Vec3, *, is_rounded: bool = False) -> tuple[Real, Real]:
         """The derivative along a direction and its error: in a crease, where the gradient is a
@@ -281,14 +291,15 @@ class Formula(Field):
 
 
 def probe_jets() -> tuple[Jet, Jet, Jet]:
-    """Coordinates of some point, to try a formula on when it is made."""
+    """Jets of the coordinates of an arbitrary point, with which a new formula is tested."""
     return Jet.at_point(choose_backend("double").Array3f(0.1, 0.2, 0.3))
 
 
 def hessian_error(jet: Jet, like: Real) -> Real:
-    """A bound of the distance of a Hessian from the middles of its ranges at a point: the spectral
-    norm of a matrix is at most the sum of the sizes of its entries."""
-    xx, xy, xz, yy, yz, zz = (one.radius for one in jet.second_derivatives)
+    """A bound of the distance, in the spectral norm, of a Hessian at a point from the midpoints of
+    its ranges. Proof. The spectral norm of a matrix is at most the sum of the absolute values of
+    its entries."""
+    xx, xy, xz, yy, yz, zz = (entry.radius for entry in jet.second_derivatives)
     return 0 * like + xx + yy + zz + 2 * (xy + xz + yz)
 
 
@@ -323,10 +334,10 @@ def is_jet(x: Any, name: str) -> bool:
 
 
 def as_jet(value: Any, like: Jet, name: str) -> Jet:
-    """What a formula returned, as a jet; a constant is one too.
+    """The result of a formula as a jet; a constant becomes a constant jet.
 
     Raises:
-        TypeError: it returned anything else.
+        TypeError: the result is neither a jet nor a constant.
     """
     if isinstance(value, Jet):
         return value
@@ -342,8 +353,8 @@ def as_jet(value: Any, like: Jet, name: str) -> Jet:
 class FormulaOnRay:
     """A formula along the path p + s d.
 
-    before: how far before p its first piece begins. If that is not 0.0, its pieces are of all paths
-        that lead through p up to rounding.
+    before: the distance before p at which its first piece begins. If that is not 0.0, its pieces
+        cover all paths that lead through p up to rounding.
     """
 
     field: Formula
@@ -395,8 +406,8 @@ class FormulaOnRay:
 
 
 def with_device_numbers(field: Any, backend: Backend) -> Any:
-    """A copy of a dataclass whose numbers, and those of fields in it, are kernel parameters of the
-    backend."""
+    """A copy of a dataclass whose numbers, and the numbers of fields in it, are kernel parameters
+    of the backend."""
     other = copy.copy(field)
     for entry in dataclasses.fields(cast("Any", field)) if dataclasses.is_dataclass(field) else ():
         value = getattr(field, entry.name)
@@ -412,5 +423,5 @@ def prepare_value(value: Any, backend: Backend) -> Any:
         return dr.opaque(backend.Float, value)
     if isinstance(value, tuple):
         entries = cast("tuple[Any, ...]", value)
-        return tuple(prepare_value(one, backend) for one in entries)
+        return tuple(prepare_value(entry, backend) for entry in entries)
     return value.prepare(backend) if isinstance(value, Field) else value

@@ -41,9 +41,11 @@ class PatchBoxes(UnitFrame):
         The size is a power of two, so that positions along rays are scaled without rounding, and
         keep their order.
         """
-        low, high = lower.min(axis=0), upper.max(axis=0)
-        center = round_to_single(0.5 * (low + high))
-        size = 2.0 ** math.ceil(math.log2(np.abs(np.stack([low, high]) - center).max()))
+        min_corner, max_corner = lower.min(axis=0), upper.max(axis=0)
+        center = round_to_single(0.5 * (min_corner + max_corner))
+        size = 2.0 ** math.ceil(
+            math.log2(np.abs(np.stack([min_corner, max_corner]) - center).max())
+        )
         tree = BoxTree.from_corners(backend, (lower - center) / size, (upper - center) / size)
         return cls(*frame_parameters(backend, center, size), tree)
 

@@ -70,14 +70,16 @@ class Sample:
     def map_promises(self, change: Callable[[Promise], Promise], **numbers: Any) -> Sample:
         """This sample with `change` applied to each promise, the alternative ones included, and
         with the named attributes replaced. `ray_promises` stay as they are."""
-        known, weaker = (
+        promises, alternatives = (
             tuple(map(change, group)) for group in (self.promises, self.alternative_promises)
         )
-        return dataclasses.replace(self, promises=known, alternative_promises=weaker, **numbers)
+        return dataclasses.replace(
+            self, promises=promises, alternative_promises=alternatives, **numbers
+        )
 
     def shifted(self, offset: Real) -> Sample:
         """The sample of f + offset at the same point. The sum is taken to add no error."""
-        return self.map_promises(lambda one: one.shifted(offset), value=self.value + offset)
+        return self.map_promises(lambda promise: promise.shifted(offset), value=self.value + offset)
 
     def select(self, mask: Mask, other: Sample) -> Sample:
         """The other sample on the lanes of the mask, this sample on all others. The two must have
@@ -87,7 +89,7 @@ class Sample:
         groups: dict[str, Any] = {}
         for k in ("promises", "alternative_promises", "ray_promises"):
             pairs = zip(getattr(self, k), getattr(other, k), strict=True)
-            groups[k] = tuple(own.select(mask, one) for own, one in pairs)
+            groups[k] = tuple(ours.select(mask, theirs) for ours, theirs in pairs)
         return dataclasses.replace(self, shading_normal=None, **numbers, **groups)
 
 
@@ -116,19 +118,19 @@ def validate_samples(
             raise TypeError(
                 f"{name} returned {_describe_type(sample)}, not a Sample: {_SAMPLE_HELP}"
             )
-        given: Any
-        for place, given in (
+        group: Any
+        for place, group in (
             ("promises", sample.promises),
             ("alternative_promises", sample.alternative_promises),
         ):
-            if not isinstance(given, tuple):
+            if not isinstance(group, tuple):
                 raise TypeError(
-                    f"{name}: Sample.{place} is {_describe_type(given)}, not a tuple: "
+                    f"{name}: Sample.{place} is {_describe_type(group)}, not a tuple: "
                     f"{_SAMPLE_HELP}"
                 )
-            for one in cast("tuple[Any, ...]", given):
-                if not isinstance(one, Promise):
-                    wrong = f"Sample.{place} holds {_describe_type(one)}, no promise"
+            for promise in cast("tuple[Any, ...]", group):
+                if not isinstance(promise, Promise):
+                    wrong = f"Sample.{place} holds {_describe_type(promise)}, no promise"
                     raise TypeError(f"{name}: {wrong}: {_SAMPLE_HELP}")
         gradient: Any = sample.gradient
         if not dr.is_array_v(type(gradient)) or dr.size_v(type(gradient)) != 3:
@@ -146,7 +148,7 @@ def validate_samples(
 def _unbox_numpy(record: _R) -> _R:
     """The record with its NumPy scalars as Python numbers: Dr.Jit takes no NumPy scalars."""
     scalars: dict[str, Any] = {
-        key: one.item() for key, one in vars(record).items() if isinstance(one, np.generic)
+        key: value.item() for key, value in vars(record).items() if isinstance(value, np.generic)
     }
     return dataclasses.replace(record, **scalars) if scalars else record
 
@@ -162,10 +164,10 @@ def space_scaled(sample: Sample, size: Real) -> Sample:
     divided by it; bounds of second derivatives and of Laplacians are divided by its square.
     """
     return sample.map_promises(
-        lambda one: one.space_scaled(size),
+        lambda promise: promise.space_scaled(size),
         gradient=sample.gradient / size,
         gradient_error=sample.gradient_error / size,
-        ray_promises=tuple(one.space_scaled(size) for one in sample.ray_promises),
+        ray_promises=tuple(promise.space_scaled(size) for promise in sample.ray_promises),
     )
 
 
@@ -241,9 +243,9 @@ class Ray:
         """
         slope = dr.dot(sample.gradient, self.direction)
         slopes = SlopeRange.around(slope, sample.gradient_error)
-        given = sample.promises, sample.alternative_promises, sample.value, sample.value_error
+        arguments = sample.promises, sample.alternative_promises, sample.value, sample.value_error
         ahead, back = (
-            self.proofs.from_promises(*given, one, sample.ray_promises)
-            for one in (slopes, slopes.negated())
+            self.proofs.from_promises(*arguments, interval, sample.ray_promises)
+            for interval in (slopes, slopes.negated())
         )
         return RaySample(sample, ahead, back, slope)

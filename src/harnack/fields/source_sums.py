@@ -72,7 +72,7 @@ def dipole_rounding(area: Real, inverse: Real, unit: Real) -> Real:
 
 @dataclass(frozen=True)
 class SourceTerm:
-    """The term of one dipole, edge or far node in the sums of f and of its derivatives.
+    """The term of a dipole, edge or far node in the sums of f and of its derivatives.
 
     Derivatives that were not requested are None. The value of an edge is None, too: its angle is
     added later.
@@ -158,15 +158,15 @@ class SourceSums:
         return 0 if self.gradient is None else 1 if self.hessian is None else 2
 
     def add_term(self, terms: SourceTerm, active: Mask) -> SourceSums:
-        """The sums with terms added where active; what they do not have is 0.
+        """The sums with terms added on active lanes; derivatives that the terms lack count as 0.
 
-        Rounding of the value. Errors of n additions add up like n, if they are all of one sign, as
-        where small terms are lost in a large sum. But what s = fl(a + b) loses is a number of the
-        same precision, and found exactly (Knuth's TwoSum; Higham 2002, Section 4.3): with c = s - a
-        it is (a - (s - c)) + (b - c). It is at most u |s|, u half the distance from 1 to the next
-        number. These numbers are summed in turn, and that sum is off by at most n u times the sum
-        of their absolute values, hence by n u^2 times the sum of all |s|. Up to n = 2^20 terms n u
-        is at most 1/16, and twice that covers the rounding of the bound itself.
+        Rounding of the value. Errors of n additions add up like n, if they all have the same sign,
+        as where small terms are lost in a large sum. But the error of s = fl(a + b) is a number of
+        the same precision, and is computed exactly (Knuth's TwoSum; Higham 2002, Section 4.3): with
+        c = s - a it is (a - (s - c)) + (b - c). It is at most u |s|, u half the distance from 1 to
+        the next number. These numbers are summed in turn, and the error of that sum is at most n u
+        times the sum of their absolute values, hence by n u^2 times the sum of all |s|. Up to n =
+        2^20 terms n u is at most 1/16, and twice that covers the rounding of the bound itself.
         """
         gradient, hessian = self.gradient, self.hessian
         if gradient is not None and terms.gradient is not None:
@@ -251,26 +251,26 @@ class SourceSums:
     ) -> Sample:
         """`share` times f as a sample with promises.
 
-        unit: the rounding of a coordinate. rounding: of the value, from other sources. along: more
-        promises, for f along a line.
+        unit: the rounding of a coordinate. rounding: of the value, from other sources. along:
+            further promises, for f along a line.
 
         Proof of the promises. Along a line the k-th derivative of a dipole a at rho is at most
         (k+1)! a/rho^(k+2) (it is a mixed derivative of a/rho, whose tensor is symmetric and takes
         its largest value on equal vectors), so that Taylor's remainder after the linear term is at
-        most a ((rho-t)^-2 - rho^-2 - 2t rho^-3) = a t^2 rho^-4 phi(t/rho), phi(q) =
-        (3-2q)/(1-q)^2. That of a far node is at most that of a dipole of area A + K/r^2 in its
-        center, for t/r <= `max_step_fraction` (`multipole.remainder_constants`). phi is convex: on
-        [0, b] it lies below 3 + rise q, rise = (phi(b)-3)/b = (4-3b)/(1-b)^2. With t <= r = b
-        free_distance, |f(y) - f(x) - g.(y-x)| <= t^2 (3 s4 + rise r s5).
-        On the ball of that radius f changes by at most |g| r more, and is harmonic: dipoles of far
-        nodes are farther away than 1 - 1/rough times the center, and `max_step_fraction` is less.
+        most a ((rho-t)^-2 - rho^-2 - 2t rho^-3) = a t^2 rho^-4 phi(t/rho), phi(q) = (3-2q)/(1-q)^2.
+        The remainder of a far node is at most that of a dipole of area A + K/r^2 at its center, for
+        t/r <= `max_step_fraction` (`multipole.remainder_constants`). phi is convex: on [0, b] it
+        lies below 3 + rise q, rise = (phi(b)-3)/b = (4-3b)/(1-b)^2. With t <= r = b free_distance,
+        |f(y) - f(x) - g.(y-x)| <= t^2 (3 s4 + rise r s5). On the ball of that radius f changes by
+        at most |g| r more, and is harmonic: dipoles of far nodes are farther away than 1 - 1/rough
+        times the center, and `max_step_fraction` is less.
         """
         g = share * self.gradient
         slope_error = share * dr.fma(SLOPE_ROUNDINGS * unit, self.s4, self.gradient_truncation)
         distance = self.singularity_distance * (1 - SUM_MARGIN) - 4 * unit
         scale, radii = (2 + 2 * SUM_MARGIN) * share, [(b, b * distance) for b in _REACHES]
-        bends = [TaylorRemainder(scale * self.remainder(b, r), r) for b, r in radii]
-        slope, widest = dr.norm(g) + slope_error, bends[-1]
+        taylor = [TaylorRemainder(scale * self.remainder(b, r), r) for b, r in radii]
+        slope, widest = dr.norm(g) + slope_error, taylor[-1]
         r = widest.radius
         variation = (1 + SUM_MARGIN) * r * dr.fma(0.5 * r, widest.constant, slope)
         value = share * self.value
@@ -278,27 +278,27 @@ class SourceSums:
         # At a singular point f has all values: the sample has a gradient so steep that every level
         # is close to first order, and an error as large as the distance to such a level. Likewise
         # near a singular point, where rounding leaves nothing of the gradient.
-        reach, most = 16 * unit, share * 1.6e5 * math.pi
-        apart = (
+        reach, max_error = 16 * unit, share * 1.6e5 * math.pi
+        is_regular = (
             (self.singularity_distance > reach)
             & dr.isfinite(value)
             & dr.isfinite(dr.squared_norm(g))
         )
-        lost = ~(slope_error <= dr.norm(g)) & (
+        is_lost = ~(slope_error <= dr.norm(g)) & (
             self.singularity_distance <= _NEAR_SINGULARITY * unit
         )
-        apart, reach = apart & ~lost, fmax(self.singularity_distance, reach)
-        steep = type(g)(0, 0, most / reach)
+        is_regular, reach = is_regular & ~is_lost, fmax(self.singularity_distance, reach)
+        steep_gradient = type(g)(0, 0, max_error / reach)
         error = dr.fma(share, self.truncation + self.rounding, rounding)
-        along = tuple(one.scaled(share) for one in along)
+        along = tuple(promise.scaled(share) for promise in along)
         return Sample(
-            dr.select(apart, value, 0),
-            dr.select(apart, g, steep),
-            tuple(bends),
-            dr.select(apart, error, most),
-            dr.select(apart, slope_error, 0),
+            dr.select(is_regular, value, 0),
+            dr.select(is_regular, g, steep_gradient),
+            tuple(taylor),
+            dr.select(is_regular, error, max_error),
+            dr.select(is_regular, slope_error, 0),
             normal,
-            dr.select(apart, share * self.truncation, 0),
+            dr.select(is_regular, share * self.truncation, 0),
             (ball,),
             along,
         )
@@ -317,13 +317,13 @@ class SourceSums:
         slope = dr.fma(SLOPE_ROUNDINGS * unit, self.s4, slope)
         b = _REACHES[-1]
         r = b * (self.singularity_distance * (1 - SUM_MARGIN) - 4 * unit)
-        bend = self.remainder(b, dr.select(self.s5 > 0, r, 0))
+        remainder = self.remainder(b, dr.select(self.s5 > 0, r, 0))
         pairs = zip(lengths, rates, strict=True)
-        found = (
-            dr.select(active & (length <= r), rate + dr.fma(length, bend, slope), dr.inf)
+        sums = (
+            dr.select(active & (length <= r), rate + dr.fma(length, remainder, slope), dr.inf)
             for length, rate in pairs
         )
-        return tuple(found)
+        return tuple(sums)
 
     def remainder(self, b: float, r: Real) -> Real:
         """3 s4 + rise r s5 for r = b times the free distance, or less: see `sample`."""

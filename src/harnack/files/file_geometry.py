@@ -108,9 +108,9 @@ class FileGeometry:
 def ranks_in_lists(sizes: IntArray) -> IntArray:
     """The position of each entry within its list, for lists of these sizes stored one after the
     other: 0 to size - 1 for each list."""
-    found = np.arange(int(sizes.sum()), dtype=np.int64)
-    found -= np.repeat(np.cumsum(sizes) - sizes, sizes)
-    return found
+    ranks = np.arange(int(sizes.sum()), dtype=np.int64)
+    ranks -= np.repeat(np.cumsum(sizes) - sizes, sizes)
+    return ranks
 
 
 def triangles_as_polygons(path: Path, corners: IntArray) -> PolygonList:
@@ -255,10 +255,11 @@ def _remove(partial: Path) -> None:
 
 def _partial_name(target: Path) -> Path:
     # As long as the target's name if that is long, so that it is allowed where the target's is.
+    """A random name for a partial file beside the target."""
     token = f".{secrets.token_hex(4)}.partial"
     stem = os.fsencode(target.stem)
-    kept = os.fsdecode(stem[: max(0, len(stem) - len(token) - 1)])
-    return target.with_name(f".{kept}{token}{target.suffix}")
+    prefix = os.fsdecode(stem[: max(0, len(stem) - len(token) - 1)])
+    return target.with_name(f".{prefix}{token}{target.suffix}")
 
 
 _ADVICE = {

@@ -68,13 +68,13 @@ _LOOP_READERS: dict[str, Callable[[Path, bytes], FileGeometry]] = {
 def read_loops(path: str | os.PathLike[str], *, boundary: bool = False) -> list[FloatArray]:
     """The closed curves in an .obj, .ply or .loops file, as arrays (n, 3).
 
-    .obj: every `f` face is a loop, every `l` polyline that ends at its first vertex is one, and
-    all other `l` polylines are joined end to end. .ply: every face is a loop, edges are joined;
-    a file with vertices only is one loop in their order. .loops: one loop a line, x y z
-    repeated. Where edges are joined, equal positions count as one vertex.
+    .obj: every `f` face is a loop, every `l` polyline that ends at its first vertex is a loop, and
+    all other `l` polylines are joined end to end. .ply: every face is a loop, edges are joined; a
+    file with vertices only is one loop in their order. .loops: a loop on each line, x y z repeated.
+    Where edges are joined, equal positions count as the same vertex.
 
-    boundary: not the faces, but the boundary of the surface they form: the edges that do not
-    cancel between neighboring faces, equal positions counted as one vertex.
+    boundary: not the faces, but the boundary of the surface they form: the edges that do not cancel
+        between neighboring faces, where equal positions count as the same vertex.
 
     Raises:
         FileFormatError: unreadable, malformed or hostile; open polylines; a loop that
@@ -186,7 +186,7 @@ class LoadedMesh:
     summary: the contents of the file, and why they are read as a mesh.
     zero_area_faces: (k, 3) faces of zero area, left out of `faces`; they may close gaps without a
         width.
-    rounded: how many corners were joined with others from which rounding separated them.
+    rounded: the number of corners that were joined with others from which rounding separated them.
     """
 
     vertices: FloatArray
@@ -239,11 +239,11 @@ def read_geometry(path: str | os.PathLike[str], read_as: ReadAs | None = None) -
     """Read the surface, cloud, curves, blobs or molecule in a file: .obj, .ply, .stl, .off, .glb,
     .gltf, .3mf, .xyz, .loops, .blobs; molecules .pdb, .ent, .cif, .mmcif.
 
-    Faces make a mesh, except polygons of an .obj or .ply file of which some have more than four
-    corners and none share an edge: these are curves, as are polylines without faces. Points alone
-    make a cloud, with normals from nx ny nz (.ply), from as many `vn` as `v` (.obj) or from columns
-    4 to 6 (.xyz). Polygons are triangulated, the nodes of a scene are transformed to their
-    positions, and faces of zero area are left out.
+    Faces make a mesh, except polygons of an .obj or .ply file if a polygon has more than four
+    corners and no two share an edge: these are curves, as are polylines without faces. Points alone
+    make a cloud, with normals from nx ny nz (.ply), from the same number of `vn` as of `v` (.obj)
+    or from columns 4 to 6 (.xyz). Polygons are triangulated, the nodes of a scene are transformed
+    to their positions, and faces of zero area are left out.
 
     read_as: "winding": the faces, as a mesh. "dipole": the points; of a mesh the centers of its
         triangles, with their normals and areas. "loops": the result of `read_loops`; of a mesh its
@@ -299,7 +299,7 @@ def _read(path: Path, kind: str, read_as: ReadAs | None) -> LoadedGeometry:
 def _check_convertible(
     path: Path, read_as: ReadAs | None, possible: tuple[str, ...], held: str
 ) -> None:
-    """Raise unless `read_as` can be made of what the file holds."""
+    """Raise an error unless the contents of the file can be read as `read_as`."""
     needs = {
         "winding": "faces", "dipole": "points or faces", "loops": "polylines or faces",
         "polygons": "faces",
@@ -333,17 +333,20 @@ def _interpret_faces(
 
 
 def _polygons(contents: FileGeometry) -> LoadedPolygons:
+    """The polygons of a file with three corners or more, each to be spanned by a surface."""
     sizes = contents.faces.sizes
-    end, wide = np.cumsum(sizes), np.flatnonzero(sizes >= 3)
-    kept = [contents.faces.corners[end[k] - sizes[k] : end[k]] for k in wide]
-    few, many = min(map(len, kept)), max(map(len, kept))
-    corners = f"{few}" if few == many else f"{few} to {many}"
-    said = f"{len(kept):,} polygons of {corners} corners, each spanned by a surface, as asked"
-    return LoadedPolygons(contents.vertices, kept, said)
+    ends, indices = np.cumsum(sizes), np.flatnonzero(sizes >= 3)
+    polygons = [contents.faces.corners[ends[k] - sizes[k] : ends[k]] for k in indices]
+    min_corners, max_corners = min(map(len, polygons)), max(map(len, polygons))
+    corners = f"{min_corners}" if min_corners == max_corners else f"{min_corners} to {max_corners}"
+    summary = (
+        f"{len(polygons):,} polygons of {corners} corners, each spanned by a surface, as asked"
+    )
+    return LoadedPolygons(contents.vertices, polygons, summary)
 
 
 def _looks_like_curves(contents: FileGeometry) -> bool:
-    """Whether some polygon has more than four corners, and no two share an edge."""
+    """Whether a polygon has more than four corners, and no two polygons share an edge."""
     faces = contents.faces
     if faces.sizes.max() <= 4:
         return False
@@ -359,65 +362,79 @@ def _looks_like_curves(contents: FileGeometry) -> bool:
 
 
 def _mesh(contents: FileGeometry) -> LoadedMesh:
-    found = triangulate(contents.vertices, contents.faces.corners, contents.faces.sizes)
-    vertices, faces = without_zero_area_faces(contents.vertices, found)
-    flat = found[zero_area_faces(vertices, found)]
+    """The triangle mesh of a file's faces, with a summary of what was read.
+
+    Raises:
+        MeshError: the faces cancel each other.
+    """
+    triangles = triangulate(contents.vertices, contents.faces.corners, contents.faces.sizes)
+    vertices, faces = without_zero_area_faces(contents.vertices, triangles)
+    zero_area = triangles[zero_area_faces(vertices, triangles)]
     welded = Welded.of(vertices, faces)
     net, edges = welded.net, welded.edges
     if not len(net.faces):
         raise MeshError(f"its {len(faces):,} faces cancel each other: there is no surface")
     count = f"{len(faces):,} triangles"
     if len(edges) == 0:
-        said = f"{count} without singular edges: a closed mesh"
-        middle = vertices.mean(axis=0)
-        if np.linalg.det(vertices[faces] - middle).sum() < 0.0:
-            said += ", whose faces look inward (the winding number inside is negative)"
+        summary = f"{count} without singular edges: a closed mesh"
+        center = vertices.mean(axis=0)
+        if np.linalg.det(vertices[faces] - center).sum() < 0.0:
+            summary += ", whose faces look inward (the winding number inside is negative)"
     elif len(edges) >= len(faces):
-        said = f"{count}, {len(edges):,} singular edges: a triangle soup"
+        summary = f"{count}, {len(edges):,} singular edges: a triangle soup"
     else:
-        said = f"{count}, {len(edges):,} singular edges: a mesh with holes or faces turned round"
+        summary = f"{count}, {len(edges):,} singular edges: a mesh with holes or faces turned round"
     if welded.rounded:
         vertices = vertices[welded.index]
-        said += f"; {welded.rounded:,} corners joined with others that were apart by rounding"
-    if len(found) > len(faces):
-        said += f"; {len(found) - len(faces):,} of zero area left out"
+        summary += f"; {welded.rounded:,} corners joined with others that were apart by rounding"
+    if len(triangles) > len(faces):
+        summary += f"; {len(triangles) - len(faces):,} of zero area left out"
     if len(faces) > len(net.faces):
-        said += f"; {len(faces) - len(net.faces):,} are added to or canceled by others"
+        summary += f"; {len(faces) - len(net.faces):,} are added to or canceled by others"
     if len(contents.polylines):
-        said += "; polylines not used"
-    return LoadedMesh(vertices, faces, said, flat, welded.rounded)
+        summary += "; polylines not used"
+    return LoadedMesh(vertices, faces, summary, zero_area, welded.rounded)
 
 
 def _mesh_to_cloud(mesh: LoadedMesh) -> LoadedCloud:
+    """The triangles of a mesh as a cloud of points, with their normals and areas."""
     corners = mesh.vertices[mesh.faces]
     normal = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(normal, axis=1)
-    said = f"{len(area):,} triangles, each taken as a point with its normal and area, as asked"
-    return LoadedCloud(corners.mean(axis=1), normal / area[:, None], area, said)
+    summary = f"{len(area):,} triangles, each taken as a point with its normal and area, as asked"
+    return LoadedCloud(corners.mean(axis=1), normal / area[:, None], area, summary)
 
 
 def _mesh_to_boundary(path: Path, mesh: LoadedMesh) -> LoadedCurves:
+    """The boundary of a mesh's faces as loops.
+
+    Raises:
+        FileFormatError: the faces have no boundary, or it is not a valid curve.
+    """
     edges, weights = singular_edges(weld_vertices(mesh.vertices)[mesh.faces])
     if not len(edges):
         raise FileLocation(path).error(
             'its faces form a closed surface, which has no boundary: it cannot be taken as "loops"'
         )
     try:
-        joined = singular_loops(edges, weights)
-        loops = validate_loops([mesh.vertices[loop] for loop in joined])
+        closed = singular_loops(edges, weights)
+        loops = validate_loops([mesh.vertices[loop] for loop in closed])
     except CurveError as error:
         raise FileLocation(path).error(str(error)) from error
     noun = "loop" if len(loops) == 1 else "loops"
-    said = f"{len(loops):,} {noun} of {sum(weights):,} edges: the boundary of the faces, as asked"
-    return LoadedCurves(loops, said)
+    summary = (
+        f"{len(loops):,} {noun} of {sum(weights):,} edges: the boundary of the faces, as asked"
+    )
+    return LoadedCurves(loops, summary)
 
 
 def _cloud(contents: FileGeometry) -> LoadedCloud:
+    """The point cloud of a file without faces."""
     points = as_cloud_points(contents.vertices)
     count = f"{len(points):,} points"
     if contents.normals is None:
-        said = f"{count} without faces, and no normals read: a point cloud"
-        return LoadedCloud(points, None, None, said)
+        summary = f"{count} without faces, and no normals read: a point cloud"
+        return LoadedCloud(points, None, None, summary)
     normals = as_unit_normals(contents.normals, len(points))
     return LoadedCloud(points, normals, None, f"{count} with normals, no faces: a point cloud")
 

@@ -35,7 +35,7 @@ _UNSUPPORTED_EXTENSIONS = (
     "EXT_mesh_gpu_instancing", "KHR_mesh_quantization", "KHR_node_visibility",
     "EXT_meshopt_compression", "KHR_meshopt_compression",
 )  # fmt: skip
-# How triangles may be listed: one by one, or in strips.
+# The modes in which triangles may be listed: one by one, or in strips.
 _TRIANGLES, _FAN = (4, 5), 6
 # Extensions under which vertices and indices are stored as always.
 _IGNORED_EXTENSIONS = ("KHR_materials", "KHR_texture", "KHR_lights", "EXT_texture", "KHR_xmp")
@@ -125,36 +125,36 @@ def _check_header(place: FileLocation, header: dict[str, Any], size: int) -> Non
             raise place.error(f"it uses the extension {name}, which is not read: save it without")
     _check_no_animation(place, header)
     views, accessors = header.get("bufferViews", []), header.get("accessors", [])
-    asked = 0
+    total = 0
     for view in views:
         if _count(view, "byteLength") + _count(view, "byteOffset", 0) > size:
             raise place.error("a buffer view lies outside the file: it is truncated")
-        asked += view["byteLength"]
+        total += view["byteLength"]
     for accessor in accessors:
         item = _COMPONENT_BYTES[accessor["componentType"]] * _COMPONENTS[accessor["type"]]
-        asked += _count(accessor, "count") * item
+        total += _count(accessor, "count") * item
         _count(accessor, "byteOffset", 0)
-    if asked > 8 * max(size, 1 << 16):
+    if total > 8 * max(size, 1 << 16):
         raise place.error(
-            f"its header asks for {asked:,} bytes of data, many times those of the file ({size:,})"
+            f"its header asks for {total:,} bytes of data, many times those of the file ({size:,})"
         )
     _check_nodes(place, header, _corner_counts(place, header, accessors))
 
 
 def _check_no_animation(place: FileLocation, header: dict[str, Any]) -> None:
-    """Refuse scenes with features that are not read: vertices moved otherwise than by nodes, fans
-    of triangles, and points or lines beside triangles."""
+    """Refuse scenes with features that are not read: vertices moved by anything but nodes, fans of
+    triangles, and points or lines beside triangles."""
     nodes: list[Any] = header.get("nodes", [])
     meshes: list[Any] = header.get("meshes", [])
     if any("skin" in node for node in nodes):
         raise place.error("its vertices are moved by a skin: apply it, and save the mesh as it is")
-    primitives = [one for mesh in meshes for one in mesh["primitives"]]
-    weights = [w for one in (*nodes, *meshes) for w in one.get("weights", [])]
-    if any(weights) and any("targets" in one for one in primitives):
+    primitives = [entry for mesh in meshes for entry in mesh["primitives"]]
+    weights = [w for entry in (*nodes, *meshes) for w in entry.get("weights", [])]
+    if any(weights) and any("targets" in entry for entry in primitives):
         raise place.error(
             "its vertices are moved by morph targets: apply them, and save the mesh as it is"
         )
-    modes = {one.get("mode", _TRIANGLES[0]) for one in primitives}
+    modes = {entry.get("mode", _TRIANGLES[0]) for entry in primitives}
     if _FAN in modes:
         raise place.error("triangles in fans are not read: save them one by one")
     if modes & {*_TRIANGLES} and modes - {*_TRIANGLES}:
@@ -162,7 +162,7 @@ def _check_no_animation(place: FileLocation, header: dict[str, Any]) -> None:
 
 
 def _corner_counts(place: FileLocation, header: dict[str, Any], accessors: list[Any]) -> list[int]:
-    """How many corners each mesh draws."""
+    """The number of corners that each mesh draws."""
     drawn: list[int] = []
     for mesh in header.get("meshes", []):
         total = 0
@@ -179,20 +179,21 @@ def _corner_counts(place: FileLocation, header: dict[str, Any], accessors: list[
 
 
 def _check_nodes(place: FileLocation, header: dict[str, Any], drawn: list[int]) -> None:
-    """Refuses nodes that do not form trees of modest depth, or that together draw too much."""
+    """Refuse nodes that do not form trees of moderate depth, or that together draw too many
+    corners. drawn: the number of corners of each mesh."""
     nodes: list[Any] = header.get("nodes", [])
     children = {k: node.get("children", []) for k, node in enumerate(nodes)}
-    below = [child for found in children.values() for child in found]
+    descendants = [child for child_list in children.values() for child in child_list]
     roots = [root for scene in header.get("scenes", []) for root in set(scene.get("nodes", []))]
-    if len(below) != len(set(below)) or set(below) & set(roots):
+    if len(descendants) != len(set(descendants)) or set(descendants) & set(roots):
         raise place.error("a node of its scene hangs below two others")
     level, depth = set(roots), 0
     while level:
         level, depth = {child for node in level for child in children[node]}, depth + 1
         if depth > _MAX_NODE_DEPTH:
             raise place.error(f"its scene is nested more than {_MAX_NODE_DEPTH} nodes deep")
-    used: list[int] = [node["mesh"] for node in nodes if "mesh" in node]
-    total = sum(drawn[mesh] for mesh in used)
+    drawn_meshes: list[int] = [node["mesh"] for node in nodes if "mesh" in node]
+    total = sum(drawn[mesh] for mesh in drawn_meshes)
     if total > MAX_BYTES:
         raise place.error(f"its scene draws {total:,} corners: at most {MAX_BYTES:,} are read")
 
@@ -215,7 +216,7 @@ def _contents(place: FileLocation, scene: Any) -> FileGeometry:
         geometry = scene.geometry[name]
         placed = _placed(place, np.asarray(geometry.vertices), np.asarray(world_from_node))
         if not hasattr(geometry, "faces"):
-            # Lines have entities; what is left are points.
+            # Lines have entities; the other geometries are points.
             points += [] if hasattr(geometry, "entities") else [placed]
             continue
         corners = np.asarray(geometry.faces, dtype=np.int64)

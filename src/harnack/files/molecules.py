@@ -35,14 +35,14 @@ class Atoms:
 
 
 def read_molecule(path: str | os.PathLike[str]) -> Atoms:
-    """Read the atoms of a molecule (.pdb, .ent, .cif, .mmcif): those of the first model, without
-    alternatives, water and hydrogen.
+    """Read the atoms of a molecule (.pdb, .ent, .cif, .mmcif): the atoms of the first model,
+    without alternatives, water and hydrogen.
 
     Alternatives are atoms that the file marks as such (altLoc in .pdb, label_alt_id in .cif): of
-    each atom the first counts, and of several residues in the same place the first. Atoms without
-    the mark all count, whatever their names. Radii are gemmi's van der Waals radii of the elements
-    (C 1.7, N 1.55, O 1.52, S 1.8, H 1.2). `summary` tells what was left out: atoms of other models,
-    alternatives, unknown elements, and the text after the line END.
+    each atom the first alternative counts, and of residues at the same position the first. Atoms
+    without the mark all count, whatever their names. Radii are gemmi's van der Waals radii of the
+    elements (C 1.7, N 1.55, O 1.52, S 1.8, H 1.2). `summary` lists the parts left out: atoms of
+    other models, alternatives, unknown elements, and the text after the line END.
 
     Raises:
         FileFormatError: unreadable, malformed, another format, no atoms in it.
@@ -72,22 +72,24 @@ def parse_molecule(path: Path, data: bytes) -> Atoms:
         first = " ".join(str(error).split())
         raise place.error(f"the molecule cannot be read ({first})") from None
     sizes = [model.count_atom_sites() for model in structure]
-    found = _drop_alternate_locations(structure[0]) if sizes else []
-    known = [atom for atom in found if atom.element.atomic_number > 0]
-    if not known:
+    atoms = _drop_alternate_locations(structure[0]) if sizes else []
+    known_atoms = [atom for atom in atoms if atom.element.atomic_number > 0]
+    if not known_atoms:
         raise place.error(
             "it holds no atoms of known elements: a molecule's file has lines ATOM or HETATM "
             "(.pdb) or a table _atom_site (.cif)"
         )
-    positions = np.array([atom.pos.tolist() for atom in known], dtype=np.float64)
-    wrong = np.flatnonzero(~np.isfinite(positions).all(axis=1))
-    if wrong.size:
-        raise place.error(f"atom {known[wrong[0]].serial} has coordinates that are not finite")
-    radii = np.array([round(atom.element.vdw_r, 6) for atom in known], dtype=np.float64)
-    elements = tuple(atom.element.name for atom in known)
+    positions = np.array([atom.pos.tolist() for atom in known_atoms], dtype=np.float64)
+    invalid = np.flatnonzero(~np.isfinite(positions).all(axis=1))
+    if invalid.size:
+        raise place.error(
+            f"atom {known_atoms[invalid[0]].serial} has coordinates that are not finite"
+        )
+    radii = np.array([round(atom.element.vdw_r, 6) for atom in known_atoms], dtype=np.float64)
+    elements = tuple(atom.element.name for atom in known_atoms)
     left_out = {
-        "alternatives": sizes[0] - len(found),
-        "of unknown elements": len(found) - len(known),
+        "alternatives": sizes[0] - len(atoms),
+        "of unknown elements": len(atoms) - len(known_atoms),
         "behind the line END": 0 if is_cif else _atom_lines(text) - sum(sizes),
     }
     return Atoms(positions, radii, elements, _summarize(elements, left_out, len(structure)))
@@ -109,13 +111,13 @@ def _text(data: bytes, *, is_cif: bool) -> str:
 
 
 def _drop_alternate_locations(model: Any) -> list[Any]:
-    """The atoms of a model; of atoms that are marked as alternatives by different letters, the
-    first of each name in the first residue of each place. A line TER ends a chain: behind it the
-    same name and number are another place."""
+    """The atoms of a model; of atoms that are marked as alternatives by different letters, only the
+    first of each name in the first residue of each position. A line TER ends a chain: after it the
+    same name and number are another position."""
     residues: dict[tuple[int, str], tuple[str, str]] = {}
     marks: dict[tuple[int, str, str, str], str] = {}
-    found: list[Any] = []
-    for chain, residue in ((k, one) for k, part in enumerate(model) for one in part):
+    atoms: list[Any] = []
+    for chain, residue in ((k, entry) for k, part in enumerate(model) for entry in part):
         for atom in residue:
             if atom.has_altloc():
                 place = (chain, str(residue.seqid))
@@ -124,8 +126,8 @@ def _drop_alternate_locations(model: Any) -> list[Any]:
                 mark = marks.setdefault((*place, residue.name, atom.name), atom.altloc)
                 if is_other or mark != atom.altloc:
                     continue
-            found.append(atom)
-    return found
+            atoms.append(atom)
+    return atoms
 
 
 def _atom_lines(text: str) -> int:
@@ -163,10 +165,14 @@ def _check_coordinates(path: Path, text: str) -> None:
 
 
 def _summarize(elements: tuple[str, ...], left_out: dict[str, int], models: int) -> str:
+    """The summary of what was read: the number of atoms, the commonest elements, and the atoms left
+    out, by reason."""
     common = Counter(elements).most_common(_MAX_LISTED_ELEMENTS)
     names = ", ".join(f"{count:,} {name}" for name, count in common)
-    said = f"{len(elements):,} atoms ({names}{', ...' if len(set(elements)) > len(common) else ''})"
+    summary = (
+        f"{len(elements):,} atoms ({names}{', ...' if len(set(elements)) > len(common) else ''})"
+    )
     if models > 1:
-        said += f", the first of {models} models"
-    parts = [f"{number:,} {what}" for what, number in left_out.items() if number]
-    return f"{said}; {', '.join(parts)} left out" if parts else said
+        summary += f", the first of {models} models"
+    parts = [f"{number:,} {reason}" for reason, number in left_out.items() if number]
+    return f"{summary}; {', '.join(parts)} left out" if parts else summary

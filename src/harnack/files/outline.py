@@ -72,16 +72,17 @@ def text(
 ) -> Outline:
     """The outline of text, which starts at the origin and runs along x, y upwards.
 
-    words: a line or several lines, set by matplotlib (`pip install harnack[outlines]`).
-    size: of the font, in units of length: about from the lowest to the highest point of a line.
+    words: one or more lines, set by matplotlib (`pip install harnack[outlines]`).
+    size: of the font, in units of length: about the height from the lowest to the highest point of
+        a line.
     font: a file (.ttf, .otf), or the name of a family that is installed; None for DejaVu Sans,
         which matplotlib brings.
-    align: of lines to each other, and to the y axis.
+    align: the alignment of lines to each other, and to the y axis.
     tolerance: the largest distance between the polygons and the letters' curves; by default a
         thousandth of the size.
 
     Raises:
-        ValueError: text without a visible letter, or with letters that the font lacks; no such
+        ValueError: text without a visible letter, or with letters that the font lacks; an unknown
             font.
         ModuleNotFoundError: without matplotlib.
     """
@@ -95,20 +96,20 @@ def text(
         raise ValueError(f'align must be "left", "center" or "right", not {align!r}')
     loops: list[FloatArray] = []
     for number, line in enumerate(words.expandtabs(4).splitlines()):
-        made = _line(line, font, size, allowed)
-        if made:
-            x = np.concatenate(made)[:, 0]
+        line_loops = _line(line, font, size, allowed)
+        if line_loops:
+            x = np.concatenate(line_loops)[:, 0]
             left, right = float(x.min()), float(x.max())
             along = {"left": 0.0, "center": 0.5 * (left + right), "right": right}[align]
             shift = np.array([-along, -number * _LINE_HEIGHT * size])
-            loops += [one + shift for one in made]
+            loops += [loop + shift for loop in line_loops]
     if not loops:
         raise ValueError(f"there is nothing to see in the text {words!r:.60}")
     return make_outline(loops, "nonzero")
 
 
 def _line(line: str, font: Any, size: float, allowed: float) -> list[FloatArray]:
-    """Loops of one line of text."""
+    """The loops of a line of text."""
     manager = _import_optional("matplotlib.font_manager")
     if font is not None and Path(font).suffix.lower() in (".ttf", ".otf", ".ttc"):
         if not Path(font).is_file():
@@ -135,7 +136,7 @@ def _line(line: str, font: Any, size: float, allowed: float) -> list[FloatArray]
     points, codes = maker.get_text_path(about, line, ismath=False)
     scale = size / maker.FONT_SCALE
     rows = np.asarray(points, dtype=np.float64).reshape(-1, 2) * scale
-    return _path_to_loops(rows, [int(one) for one in codes], allowed)
+    return _path_to_loops(rows, [int(code) for code in codes], allowed)
 
 
 # Codes of matplotlib's paths, and how many points belong to each.
@@ -144,6 +145,7 @@ _POINTS = {2: 1, 3: 2, 4: 3}
 
 
 def _path_to_loops(points: FloatArray, codes: list[int], allowed: float) -> list[FloatArray]:
+    """The closed loops of a path of matplotlib, its curves flattened within `allowed`."""
     loops: list[list[FloatArray]] = []
     k = 0
     while k < len(codes):
@@ -157,18 +159,19 @@ def _path_to_loops(points: FloatArray, codes: list[int], allowed: float) -> list
         controls = np.concatenate([loops[-1][-1][-1:], points[k : k + count]])
         loops[-1].append(flatten_bezier(controls, allowed)[0] if count > 1 else controls[1:])
         k += count
-    return _drop_degenerate_loops([np.concatenate(one) for one in loops])
+    return _drop_degenerate_loops([np.concatenate(pieces) for pieces in loops])
 
 
 def _drop_degenerate_loops(loops: list[FloatArray]) -> list[FloatArray]:
     """The loops with at least three different points; other loops enclose nothing."""
-    return [one for one in loops if len(np.unique(one, axis=0)) > 2]
+    return [loop for loop in loops if len(np.unique(loop, axis=0)) > 2]
 
 
 # SVG.
 
 _MAX_SVG_BYTES, _MAX_SVG_ELEMENTS, _MAX_SVG_DEPTH = 32 * 2**20, 200_000, 200
-# What does not show, with all that is in it; and what shows in ways that are not read.
+# Elements that are not visible, with all elements in them; and elements that are visible in ways
+# that are not read.
 _HIDDEN = (
     "defs", "symbol", "clipPath", "mask", "marker", "pattern", "linearGradient", "radialGradient",
     "filter", "metadata", "title", "desc", "script", "namedview", "style",
@@ -249,39 +252,41 @@ def _parse_svg(data: bytes) -> Element:
 def _filled_shapes(
     element: Element, transform: FloatArray, inherited: dict[str, str]
 ) -> Iterator[tuple[str, FloatArray, FillingRule]]:
-    """Path data, transform (3, 3) and fill rule of each shape that is filled."""
+    """The path data, transform (3, 3) and fill rule of each filled shape of an element."""
     tag = element.tag
     if tag == "style" and _FILL_CHANGING_RULES.search("".join(element.itertext())):
         raise ValueError("its style sheet may change what is filled: save it with plain attributes")
     if tag in _HIDDEN:
         yield from ()
         return
-    own = {**inherited, **_styles(element)}
-    if own.get("display") == "none":
+    styles = {**inherited, **_styles(element)}
+    if styles.get("display") == "none":
         return
     if tag in _UNSUPPORTED_TAGS:
         raise ValueError(f"<{tag}> is not read: turn it into paths before the file is saved")
     for name in _CUTTING:
-        if own.pop(name, "none") != "none":
+        if styles.pop(name, "none") != "none":
             raise ValueError(f"{name} is not read: cut the shapes before the file is saved")
-    if own.get("transform", "none") != "none" or "transform-origin" in own:
+    if styles.get("transform", "none") != "none" or "transform-origin" in styles:
         raise ValueError("transforms in styles are not read, nor a transform-origin: apply them")
     if "transform" in element.attrib:
         parse_transform = _import_optional("svgpathtools.parser").parse_transform
-        more: FloatArray = parse_transform(element.attrib["transform"], strict=True)
-        transform = transform @ more
-    is_filled = own.get("fill") not in ("none", "transparent")
-    is_filled &= not _NO_OPACITY.fullmatch(own.get("fill-opacity", "1"))
-    if tag in _SHAPES and is_filled and own.get("visibility") != "hidden":
+        local_transform: FloatArray = parse_transform(element.attrib["transform"], strict=True)
+        transform = transform @ local_transform
+    is_filled = styles.get("fill") not in ("none", "transparent")
+    is_filled &= not _NO_OPACITY.fullmatch(styles.get("fill-opacity", "1"))
+    if tag in _SHAPES and is_filled and styles.get("visibility") != "hidden":
         yield (
             _path_data(element),
             transform,
-            "even-odd" if own.get("fill-rule") == "evenodd" else "nonzero",
+            "even-odd" if styles.get("fill-rule") == "evenodd" else "nonzero",
         )
-    for one in element:
-        if one.tag == "svg" and {"x", "y", "viewBox"} & one.attrib.keys():
+    for child in element:
+        if child.tag == "svg" and {"x", "y", "viewBox"} & child.attrib.keys():
             raise ValueError("an <svg> in another with a place of its own is not read: ungroup it")
-        yield from _filled_shapes(one, transform, {k: v for k, v in own.items() if k in _INHERITED})
+        yield from _filled_shapes(
+            child, transform, {k: v for k, v in styles.items() if k in _INHERITED}
+        )
 
 
 _INHERITED = ("fill", "fill-rule", "fill-opacity", "visibility", "display")
@@ -290,16 +295,16 @@ _CUTTING = ("clip-path", "mask")
 
 
 def _styles(element: Element) -> dict[str, str]:
-    """Properties of an element by their names, those of its style first. A transform is one of a
-    style."""
+    """The properties of an element by name; its style overrides its attributes. A transform is
+    included only if it is in the style."""
     names = (*_INHERITED, *_CUTTING, "transform-origin")
-    found = {name: element.attrib[name].strip() for name in names if name in element.attrib}
+    styles = {name: element.attrib[name].strip() for name in names if name in element.attrib}
     names = (*names, "transform")
     for entry in element.attrib.get("style", "").split(";"):
         name, _, value = entry.partition(":")
         if name.strip() in names:
-            found[name.strip()] = value.strip()
-    return found
+            styles[name.strip()] = value.strip()
+    return styles
 
 
 _LENGTHS = {"x", "y", "cx", "cy", "width", "height", "r", "rx", "ry"}
@@ -308,41 +313,42 @@ _LENGTHS = {"x", "y", "cx", "cy", "width", "height", "r", "rx", "ry"}
 def _path_data(element: Element) -> str:
     """The path data of a shape."""
     makers = _import_optional("svgpathtools.svg_to_paths")
-    about, kind = {k: v.removesuffix("px") for k, v in element.attrib.items()}, element.tag
+    values, kind = {k: v.removesuffix("px") for k, v in element.attrib.items()}, element.tag
     if kind == "path":
-        return about.get("d", "")
-    for name in _LENGTHS & about.keys():
-        if re.search(r"[%a-df-z]", about[name], re.IGNORECASE):
+        return values.get("d", "")
+    for name in _LENGTHS & values.keys():
+        if re.search(r"[%a-df-z]", values[name], re.IGNORECASE):
             raise ValueError(
-                f'{name}="{about[name]:.20}" of a <{kind}> has a unit: save the file with plain '
+                f'{name}="{values[name]:.20}" of a <{kind}> has a unit: save the file with plain '
                 "numbers"
             )
-    sizes = {name: float(about[name]) for name in ("width", "height", "r", "rx", "ry")
-             if name in about and kind != "polygon"}  # fmt: skip
-    if any(not 0 <= one < math.inf for one in sizes.values()):
+    sizes = {name: float(values[name]) for name in ("width", "height", "r", "rx", "ry")
+             if name in values and kind != "polygon"}  # fmt: skip
+    if any(not 0 <= size < math.inf for size in sizes.values()):
         raise ValueError(f"a <{kind}> in it has a size that is negative or not finite")
     if kind == "rect":
         # Corners are rounded by half of a side at the most.
         for name, other, side in (("rx", "ry", "width"), ("ry", "rx", "height")):
             if name in sizes or other in sizes:
                 radius = sizes.get(name, sizes.get(other, 0.0))
-                about = {**about, name: str(min(radius, 0.5 * sizes.get(side, 0.0)))}
-        return makers.rect2pathd(about)
+                values = {**values, name: str(min(radius, 0.5 * sizes.get(side, 0.0)))}
+        return makers.rect2pathd(values)
     if kind in ("circle", "ellipse"):
-        return makers.ellipse2pathd(about)
-    return makers.polygon2pathd(about, kind == "polygon")
+        return makers.ellipse2pathd(values)
+    return makers.polygon2pathd(values, kind == "polygon")
 
 
 def _outline_of(
     shapes: list[tuple[str, FloatArray, FillingRule]], scale: float, tolerance: float | None
 ) -> Outline:
+    """The outline of the union of filled shapes, y upwards."""
     paths: list[tuple[list[Any], FloatArray, FillingRule]] = [
         (_segments(data), matrix, rule) for data, matrix, rule in shapes
     ]
     if tolerance is None:
         ends = [
             matrix[:2, :2] @ _xy(end) + matrix[:2, 2]
-            for segments, matrix, _ in paths for one in segments for end in (one.start, one.end)
+            for segments, matrix, _ in paths for part in segments for end in (part.start, part.end)
         ]  # fmt: skip
         size = float(np.ptp(np.array(ends), axis=0).max()) if ends else 0.0
         if not size > 0:
@@ -351,55 +357,61 @@ def _outline_of(
     loops: list[FloatArray] = []
     flip = np.array([scale, -scale])
     for segments, matrix, rule in paths:
-        own = [one * flip for one in _loops(segments, matrix, tolerance)]
-        if own:
-            loops += make_outline(own, rule)
+        shape_loops = [part * flip for part in _loops(segments, matrix, tolerance)]
+        if shape_loops:
+            loops += make_outline(shape_loops, rule)
     if not loops:
         raise ValueError("it fills nothing: strokes have no outline; turn them into paths")
     return make_outline(loops, "nonzero")
 
 
 def _segments(data: str) -> list[Any]:
+    """The segments of path data.
+
+    Raises:
+        ValueError: malformed data, or a number that is not finite.
+    """
     parse_path = _import_optional("svgpathtools.parser").parse_path
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", "Replacing degenerate")  # an arc of radius 0 is a line
         try:
-            made: list[Any] = [*parse_path(data)]
+            segments: list[Any] = [*parse_path(data)]
         except AssertionError:
             raise ValueError(
                 f"in its path {data!r:.60} an arc ends where it begins: leave it out"
             ) from None
         except (Warning, ArithmeticError, LookupError, ValueError) as wrong:
             raise ValueError(f"its path {data!r:.60} is none: {wrong}") from None
-    if not all(np.isfinite([one.start, one.end]).all() for one in made):
+    if not all(np.isfinite([segment.start, segment.end]).all() for segment in segments):
         raise ValueError("a number in it is not finite")
-    return made
+    return segments
 
 
 def _loops(segments: list[Any], matrix: FloatArray, tolerance: float) -> list[FloatArray]:
-    """Closed loops of segments that follow on each other, under a transform."""
+    """The closed loops of consecutive segments, under a transform."""
     loops: list[list[FloatArray]] = []
     last: complex | None = None
-    for one in segments:
-        if last is None or one.start != last:
-            loops.append([_transform_points(matrix, [one.start])])
-        last = one.end
-        kind = type(one).__name__
+    for piece in segments:
+        if last is None or piece.start != last:
+            loops.append([_transform_points(matrix, [piece.start])])
+        last = piece.end
+        kind = type(piece).__name__
         if kind == "Arc":
-            loops[-1].append(_arc(one, matrix, tolerance))
+            loops[-1].append(_arc(piece, matrix, tolerance))
             continue
-        controls = _transform_points(matrix, [*one.bpoints()])
+        controls = _transform_points(matrix, [*piece.bpoints()])
         if not np.isfinite(controls).all():
             raise ValueError("a number in it is not finite")
         loops[-1].append(
             flatten_bezier(controls, tolerance)[0] if len(controls) > 2 else controls[1:]
         )
-    return _drop_degenerate_loops([np.concatenate(one) for one in loops])
+    return _drop_degenerate_loops([np.concatenate(piece) for piece in loops])
 
 
 def _arc(arc: Any, matrix: FloatArray, tolerance: float) -> FloatArray:
-    """Points of an elliptic arc: n chords are within r (angle/n)^2/8 of it, r the larger radius."""
+    """The points of an elliptic arc without its first point. n chords are within r (angle/n)^2/8 of
+    the arc, with r its larger radius."""
     angle = math.radians(abs(float(arc.delta)))
     largest = max(abs(arc.radius.real), abs(arc.radius.imag))
     largest *= float(np.linalg.norm(matrix[:2, :2], 2))
@@ -407,12 +419,13 @@ def _arc(arc: Any, matrix: FloatArray, tolerance: float) -> FloatArray:
     if not count <= _MOST_SIDES:
         raise ValueError("an arc in it has too many segments: allow a larger tolerance")
     t = np.linspace(0.0, 1.0, math.ceil(count) + 1)[1:]
-    points = [arc.point(float(one)) for one in t[:-1]]
+    points = [arc.point(float(parameter)) for parameter in t[:-1]]
     return _transform_points(matrix, [*points, arc.end])
 
 
 def _transform_points(matrix: FloatArray, points: list[complex]) -> FloatArray:
-    return np.array([_xy(one) for one in points]) @ matrix[:2, :2].T + matrix[:2, 2]
+    """The points (n, 2) of complex numbers under a transform."""
+    return np.array([_xy(point) for point in points]) @ matrix[:2, :2].T + matrix[:2, 2]
 
 
 def _xy(z: complex) -> FloatArray:

@@ -122,10 +122,10 @@ class TextValues:
         self.size = len(numbers)
 
     def read(self, where: IntArray, code: str) -> npt.NDArray[Any]:
-        found = self._numbers[np.clip(where, 0, self.size)]
-        if code in "fd" or (found != np.rint(found)).any():
-            return found
-        return np.clip(found, -(2.0**53), 2.0**53).astype(np.int64)
+        values = self._numbers[np.clip(where, 0, self.size)]
+        if code in "fd" or (values != np.rint(values)).any():
+            return values
+        return np.clip(values, -(2.0**53), 2.0**53).astype(np.int64)
 
     def width(self, code: str) -> int:
         return 1
@@ -179,7 +179,7 @@ class ElementTable:
 
     def list_column(self, name: str) -> tuple[npt.NDArray[Any], IntArray]:
         """A column of lists: the numbers of all lists, one list after the other, and the length of
-        each."""
+        each list."""
         column = self._column(name)
         if column.list_lengths is None:
             raise self._is_other_kind()
@@ -242,9 +242,9 @@ def _check_elements(path: Path, header: PlyHeader) -> None:
             raise FileLocation(path).error(f"its header has the element {name[:40]!r} twice")
 
 
-def _check_end(path: Path, left: bytes) -> None:
-    """Refuses data after the last row."""
-    if left.strip(_PADDING):
+def _check_end(path: Path, remainder: bytes) -> None:
+    """Refuse data after the last row."""
+    if remainder.strip(_PADDING):
         raise FileLocation(path).error(
             "more follows than the rows that its header promises: its counts are too small"
         )
@@ -253,15 +253,15 @@ def _check_end(path: Path, left: bytes) -> None:
 def _polygons(
     table: ElementTable, corners: npt.NDArray[Any], sizes: IntArray, count: int
 ) -> PolygonList:
-    """Polygons of these corners, which must be indices of `count` vertices."""
-    found = PolygonList(corners.astype(np.int64), sizes, table.places)
+    """The polygons of these corners, which must be indices of `count` vertices."""
+    polygons = PolygonList(corners.astype(np.int64), sizes, table.places)
     if corners.dtype.kind == "f" and corners.size:
         k = int(np.argmax(corners != np.rint(corners)))
-        raise found.location_of_corner(k).error(
+        raise polygons.location_of_corner(k).error(
             f"indices must be integers, not {float(corners[k])}"
         )
-    check_indices(found, count)
-    return found
+    check_indices(polygons, count)
+    return polygons
 
 
 def _columns(
@@ -279,7 +279,7 @@ def _columns(
         if lengths.dtype.kind == "f":
             k = int(np.argmax(lengths != np.rint(lengths)))
             raise places[k].error(f"the length of a list is no integer, but {lengths[k]}")
-        # What is impossible ends behind everything.
+        # Impossible lists end beyond the end of the file.
         sizes = np.where(lengths < 0, values.size + 1, lengths).astype(np.int64)
         sizes = np.minimum(sizes, values.size + 1)
         added += values.width(p.length_code)
@@ -311,20 +311,22 @@ def _text_tables(path: Path, data: bytes, header: PlyHeader) -> dict[str, Elemen
 
 
 def _binary_tables(path: Path, data: bytes, header: PlyHeader) -> dict[str, ElementTable]:
+    """The tables of the elements of a binary file, by name."""
     values = BinaryValues(data, header.byte_order)
     tables: dict[str, ElementTable] = {}
     begin = header.size
     for section in header.elements:
-        least = sum(values.width(p.length_code or p.code) for p in section.properties)
-        if section.count * least > values.size - begin:
+        min_stride = sum(values.width(p.length_code or p.code) for p in section.properties)
+        if section.count * min_stride > values.size - begin:
             raise _too_short(path, section)
         if not section.count:
             continue
         places = FileLocations(path, section.name, range(section.count))
         try:
-            # Most often the lists of all rows are as long as those of the first, and not empty.
+            # In most files the lists of all rows are as long as those of the first row, and not
+            # empty.
             stride = next(_row_ends(section, values, begin)) - begin
-            if stride == least and any(p.length_code for p in section.properties):
+            if stride == min_stride and any(p.length_code for p in section.properties):
                 check_element_count(FileLocation(path), header.declared_rows(len(data)))
             begins = begin + stride * np.arange(section.count, dtype=np.int64)
             columns, ends = _columns(section, values, begins, places)
@@ -372,7 +374,7 @@ def _too_short(path: Path, section: PlyElement) -> FileFormatError:
 
 
 def _header(path: Path, data: bytes) -> PlyHeader:
-    """What the header of a .ply file declares.
+    """The elements and properties that the header of a .ply file declares.
 
     Raises:
         FileFormatError: it is malformed, or not the header of a .ply file.

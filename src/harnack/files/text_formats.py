@@ -36,14 +36,14 @@ from harnack.geometry.boundary_edges import weld_vertices
 
 
 def read_xyz(path: Path, data: bytes) -> FileGeometry:
-    """Read an .xyz file, a point a line: positions from columns 1 to 3, and normals from columns 4
-    to 6 if there are six columns or more.
+    """Read an .xyz file, with a point on each line: positions from columns 1 to 3, and normals from
+    columns 4 to 6 if there are six columns or more.
 
     Further columns are ignored. `#` begins a comment.
 
     Raises:
         FileFormatError: lines with different numbers of columns or fewer than three, words, numbers
-            that are not finite; columns 4 to 6 that are no normals (lengths far from 1).
+            that are not finite; columns 4 to 6 that are not normals (lengths far from 1).
     """
     lines = split_content_lines(path, data)
     if not len(lines):
@@ -111,20 +111,18 @@ class Metaballs:
 
 
 def read_metaballs(path: Path, data: bytes) -> Metaballs:
-    """The blobs of a .blobs file: text that a person can write, a blob a line. `#` begins a
-    comment.
+    """The blobs of a .blobs file: text that a person can write, with a blob on each line. `#`
+    begins a comment.
 
-        # x y z radius [weight [group]]
-        0.0  0.0  0.0  1.0
-        1.2  0.0  0.0  0.8
-        0.6  0.5  0.0  0.4  -1     # carves
+        # x y z radius [weight [group]] 0.0  0.0  0.0  1.0 1.2  0.0  0.0  0.8 0.6  0.5  0.0  0.4  -1
+        # carves
 
-    The radius is that of the ball that the blob is by itself. Weights are 1 unless given. Blobs of
-    one group flow together, groups meet in creases; without groups all flow together. Lines may
-    have different numbers of columns. Either all lines name a group or none does.
+    The radius is that of the ball that the blob is by itself. The default weight is 1. Blobs of the
+    same group flow together, and groups meet in creases; without groups all blobs flow together.
+    Lines may have different numbers of columns. Either all lines name a group or none does.
 
     Raises:
-        FileFormatError: nothing in it; words, numbers that are not finite, fewer than four or more
+        FileFormatError: an empty file; words, numbers that are not finite, fewer than four or more
             than six columns, a radius that is not positive, a group that is no integer, groups on
             some lines only.
     """
@@ -132,36 +130,36 @@ def read_metaballs(path: Path, data: bytes) -> Metaballs:
     if not len(lines):
         raise FileLocation(path).error(f"it holds no blobs: write one a line, {_COLUMNS}")
     numbers, counts = read_floats(lines)
-    wrong = np.flatnonzero((counts < 4) | (counts > 6))
-    if wrong.size:
-        raise lines.locations[wrong[0]].error(
-            f"a blob has four to six numbers, {_COLUMNS}, not {counts[wrong[0]]}"
+    invalid = np.flatnonzero((counts < 4) | (counts > 6))
+    if invalid.size:
+        raise lines.locations[invalid[0]].error(
+            f"a blob has four to six numbers, {_COLUMNS}, not {counts[invalid[0]]}"
         )
     table = np.ones((len(counts), 6))
     table[np.arange(6) < counts[:, None]] = numbers
     radii, groups = table[:, 3], table[:, 5]
-    wrong = np.flatnonzero(~(radii > 0))
-    if wrong.size:
-        raise lines.locations[wrong[0]].error(
-            f"the radius of a blob must be positive, not {radii[wrong[0]]:g}; to carve, give a "
+    invalid = np.flatnonzero(~(radii > 0))
+    if invalid.size:
+        raise lines.locations[invalid[0]].error(
+            f"the radius of a blob must be positive, not {radii[invalid[0]]:g}; to carve, give a "
             "negative weight behind it"
         )
-    named = counts == 6
-    said = f"{len(table):,} blobs"
-    if not named.any():
-        return Metaballs(table[:, :3], radii, table[:, 4], None, f"{said}, one group")
-    if not named.all():
-        raise lines.locations[int(np.argmin(named))].error(
+    is_grouped = counts == 6
+    summary = f"{len(table):,} blobs"
+    if not is_grouped.any():
+        return Metaballs(table[:, :3], radii, table[:, 4], None, f"{summary}, one group")
+    if not is_grouped.all():
+        raise lines.locations[int(np.argmin(is_grouped))].error(
             "this line names no group and others do: write the sixth number in all lines or in none"
         )
-    wrong = np.flatnonzero((groups != np.rint(groups)) | (np.abs(groups) > 2**31))
-    if wrong.size:
-        raise lines.locations[wrong[0]].error(
-            f"a group must be an integer, not {groups[wrong[0]]:g}"
+    invalid = np.flatnonzero((groups != np.rint(groups)) | (np.abs(groups) > 2**31))
+    if invalid.size:
+        raise lines.locations[invalid[0]].error(
+            f"a group must be an integer, not {groups[invalid[0]]:g}"
         )
-    whole = groups.astype(np.int64)
-    said = f"{said} in {len(np.unique(whole))} groups"
-    return Metaballs(table[:, :3], radii, table[:, 4], whole, said)
+    group_numbers = groups.astype(np.int64)
+    summary = f"{summary} in {len(np.unique(group_numbers))} groups"
+    return Metaballs(table[:, :3], radii, table[:, 4], group_numbers, summary)
 
 
 # Wavefront .obj.
@@ -171,11 +169,11 @@ _UNSUPPORTED_OBJ_STATEMENTS = (b"curv", b"curv2", b"surf", b"bzp", b"bsp", b"fo"
 
 
 def read_obj(path: Path, data: bytes) -> FileGeometry:
-    """Vertices, faces (`f`) and polylines (`l`) of a Wavefront .obj file, normals of a cloud if
-    there is one a vertex.
+    """Vertices, faces (`f`) and polylines (`l`) of a Wavefront .obj file, and normals of a cloud if
+    there is one for each vertex.
 
-    Points `p` choose vertices, and the normals of theirs. Statements of groups, materials and
-    textures are ignored; those by which there is more of the surface are refused.
+    Points `p` choose vertices and their normals. Statements of groups, materials and textures are
+    ignored; statements that define further surface are refused.
 
     Indices may be negative (counted back from the last vertex so far) and carry texture and normal
     indices after slashes, which are not read.
@@ -186,14 +184,14 @@ def read_obj(path: Path, data: bytes) -> FileGeometry:
     lines = split_content_lines(path, data)
     if b"\\" in data:
         lines = _join_continued_lines(lines)
-    found: dict[bytes, tuple[list[bytes], list[int]]]
-    found = {keyword: ([], []) for keyword in (b"v", b"vn", b"f", b"l", b"p")}
+    statements: dict[bytes, tuple[list[bytes], list[int]]]
+    statements = {keyword: ([], []) for keyword in (b"v", b"vn", b"f", b"l", b"p")}
     for number, line in zip(lines.locations.numbers, lines.text, strict=True):
         keyword = line.split(None, 1)[0]
-        if listed := found.get(keyword):
-            listed[0].append(line[len(keyword) :])
-            listed[1].append(number)
-        elif keyword in _UNSUPPORTED_OBJ_STATEMENTS or keyword.lower() in found:
+        if statement := statements.get(keyword):
+            statement[0].append(line[len(keyword) :])
+            statement[1].append(number)
+        elif keyword in _UNSUPPORTED_OBJ_STATEMENTS or keyword.lower() in statements:
             raise FileLocation(path, f"line {number}").error(
                 f"the statement {excerpt(keyword)} is not read: save the surface as 'v' and 'f'"
             )
@@ -203,7 +201,7 @@ def read_obj(path: Path, data: bytes) -> FileGeometry:
             )
     rows = {
         k: TextLines(text, FileLocations(path, "line", numbers))
-        for k, (text, numbers) in found.items()
+        for k, (text, numbers) in statements.items()
     }
     vertices = read_table(rows[b"v"], 3, too_few_message="a vertex needs three coordinates, not {}")
     faces = _parse_obj_polygons(rows[b"f"], "'f' needs at least 3 vertices", 3, rows[b"v"])
@@ -223,20 +221,20 @@ def read_obj(path: Path, data: bytes) -> FileGeometry:
 def _parse_obj_points(
     path: Path, vertices: FloatArray, normals: FloatArray | None, rows: dict[bytes, TextLines]
 ) -> FileGeometry:
-    """The vertices that points name, with normals if all name one."""
-    listed = _parse_obj_polygons(rows[b"p"], "'p' needs a vertex", 1, rows[b"v"])
+    """The vertices that points name, with normals if all points name a normal."""
+    points = _parse_obj_polygons(rows[b"p"], "'p' needs a vertex", 1, rows[b"v"])
     words = [word.split(b"/") for line in rows[b"p"].text for word in line.split()]
     named = [word[2] for word in words if len(word) == 3 and word[2]]
     if normals is None or not named:
-        return FileGeometry(path, vertices[listed.corners])
-    own = [parse_vertex_index(word, rows[b"p"].locations[0]) for word in named]
-    if len(own) != len(words) or not all(1 <= k <= len(normals) for k in own):
+        return FileGeometry(path, vertices[points.corners])
+    normal_indices = [parse_vertex_index(word, rows[b"p"].locations[0]) for word in named]
+    if len(normal_indices) != len(words) or not all(1 <= k <= len(normals) for k in normal_indices):
         raise (
             rows[b"p"]
             .locations[0]
             .error(f"points need normals from 1 to {len(normals):,} each, or none of them one")
         )
-    return FileGeometry(path, vertices[listed.corners], normals[np.array(own) - 1])
+    return FileGeometry(path, vertices[points.corners], normals[np.array(normal_indices) - 1])
 
 
 def _join_continued_lines(lines: TextLines) -> TextLines:
@@ -257,23 +255,26 @@ def _join_continued_lines(lines: TextLines) -> TextLines:
     )
 
 
-def _parse_obj_polygons(lines: TextLines, few: str, least: int, vertices: TextLines) -> PolygonList:
-    """Faces or polylines, counted from 0. few: the error of one with fewer corners than `least`."""
+def _parse_obj_polygons(
+    lines: TextLines, too_few: str, min_corners: int, vertices: TextLines
+) -> PolygonList:
+    """The faces or polylines of statements, with vertices counted from 0. too_few: the error of a
+    statement with fewer corners than `min_corners`."""
     # Texture and normal indices stand behind slashes.
     text = [re.sub(rb"(?<=\S)/\S*", b"", line) if b"/" in line else line for line in lines.text]
     corners, sizes = read_integers(TextLines(text, lines.locations))
-    if (short := np.flatnonzero(sizes < least)).size:
-        raise lines.locations[short[0]].error(few)
-    listed = PolygonList(corners, sizes, lines.locations)
+    if (short := np.flatnonzero(sizes < min_corners)).size:
+        raise lines.locations[short[0]].error(too_few)
+    statements = PolygonList(corners, sizes, lines.locations)
     if (zero := np.flatnonzero(corners == 0)).size:
-        raise listed.location_of_corner(zero[0]).error(
+        raise statements.location_of_corner(zero[0]).error(
             "vertices are counted from 1, there is no vertex 0"
         )
-    # Negative ones are counted back from the statement.
+    # Negative indices are counted back from the statement.
     before = np.repeat(np.searchsorted(vertices.locations.numbers, lines.locations.numbers), sizes)
-    if (low := np.flatnonzero(corners < -before)).size:
-        raise listed.location_of_corner(low[0]).error(
-            f"vertex {corners[low[0]]} is out of range: {before[low[0]]} vertices precede it"
+    if (bad := np.flatnonzero(corners < -before)).size:
+        raise statements.location_of_corner(bad[0]).error(
+            f"vertex {corners[bad[0]]} is out of range: {before[bad[0]]} vertices precede it"
         )
     corners = np.where(corners > 0, corners - 1, corners + before)
     polygons = PolygonList(corners, sizes, lines.locations)
@@ -373,7 +374,7 @@ _KEYWORDS = (b"solid", b"facet", b"outer", b"vertex", b"endloop", b"endfacet", b
 
 
 def read_stl(path: Path, data: bytes) -> FileGeometry:
-    """The triangles of an .stl file, corners at the same position made one vertex.
+    """The triangles of an .stl file, where corners at the same position become the same vertex.
 
     Raises:
         FileFormatError: truncated, malformed, a coordinate that is not finite, no triangles.

@@ -34,7 +34,7 @@ _Number = TypeVar("_Number", int, float)
 
 @dataclass(frozen=True, eq=False)
 class TextLines:
-    """Lines of a text file, such as all that say something, and where they stand."""
+    """Lines of a text file, such as all lines with content, and their locations."""
 
     text: list[bytes]
     locations: FileLocations
@@ -81,10 +81,10 @@ def split_content_lines(
 
 
 def parse_finite(word: bytes, place: FileLocation) -> float:
-    """A finite number.
+    """The finite number that a word is.
 
     Raises:
-        FileFormatError: it is not one.
+        FileFormatError: the word is not a finite number.
     """
     try:
         value = float(b"" if b"_" in word else word)  # Python reads 1_0 as 10
@@ -99,7 +99,7 @@ def parse_vertex_index(word: bytes, place: FileLocation) -> int:
     """An integer that can be the index of a vertex.
 
     Raises:
-        FileFormatError: it is not one.
+        FileFormatError: the word is not such an integer.
     """
     try:
         value = int(b"" if b"_" in word else word)
@@ -134,14 +134,15 @@ def read_table(
 ) -> FloatArray:
     """The first numbers of each line, all finite: (n, columns). Further words are ignored.
 
-    too_few_message: the error of a line with fewer.
+    too_few_message: the error of a line with fewer numbers.
 
     Raises:
-        FileFormatError: naming the first line with too few, or with what is no finite number.
+        FileFormatError: naming the first line with too few numbers, or with a word that is not a
+            finite number.
     """
-    found = _parse_with_numpy(lines, range(columns))
-    if found is not None and np.isfinite(found).all():
-        return found
+    table = _parse_with_numpy(lines, range(columns))
+    if table is not None and np.isfinite(table).all():
+        return table
     numbers: list[float] = []
     for k, line in enumerate(lines.text):
         words, place = line.split()[:columns], lines.locations[k]
@@ -154,35 +155,35 @@ def read_table(
 def read_floats(
     lines: TextLines, *, convert: Callable[[bytes, FileLocation], float] = parse_finite
 ) -> tuple[FloatArray, IntArray]:
-    """The numbers of all lines, one after the other, and how many each line has: (n,).
+    """The numbers of all lines, one after the other, and the count (n,) of numbers of each line.
 
-    convert: makes numbers of the words where not all are finite numbers, or raises.
+    convert: converts a word to a number, or raises; used if not all words are finite numbers.
 
     Raises:
-        FileFormatError: what `convert` raises.
+        FileFormatError: as `convert` raises it.
     """
-    found = _parse_with_numpy(lines)
-    if found is not None and np.isfinite(found).all():
-        return found.ravel(), _equal(found)
+    table = _parse_with_numpy(lines)
+    if table is not None and np.isfinite(table).all():
+        return table.ravel(), _equal(table)
     return _parse_words(lines, float, convert)
 
 
 def read_integers(lines: TextLines) -> tuple[IntArray, IntArray]:
-    """The integers of all lines, one after the other, and how many each line has: (n,).
+    """The integers of all lines, one after the other, and the count (n,) of integers of each line.
 
     Raises:
-        FileFormatError: naming the line of the first word that is none.
+        FileFormatError: naming the line of the first word that is not an integer.
     """
-    found = _parse_with_numpy(lines)
-    if found is not None and (np.abs(found) < 2.0**53).all() and (found == np.rint(found)).all():
-        return found.astype(np.int64).ravel(), _equal(found)
+    table = _parse_with_numpy(lines)
+    if table is not None and (np.abs(table) < 2.0**53).all() and (table == np.rint(table)).all():
+        return table.astype(np.int64).ravel(), _equal(table)
     return _parse_words(lines, int, parse_vertex_index)
 
 
 def _parse_with_numpy(lines: TextLines, columns: Sequence[int] | None = None) -> FloatArray | None:
     """A table of numbers by NumPy, or None where it does not succeed.
 
-    columns: which to read. None: all, if there are as many in each line.
+    columns: the columns to read. None: all columns, if each line has the same number of them.
     """
     if not len(lines) or b"_" in b"\n".join(lines.text):
         return None
@@ -198,14 +199,15 @@ def _parse_with_numpy(lines: TextLines, columns: Sequence[int] | None = None) ->
 
 
 def _equal(table: FloatArray) -> IntArray:
-    """How many numbers each row of a table has."""
+    """The number of numbers of each row of a table."""
     return np.full(len(table), table.shape[1], dtype=np.int64)
 
 
 def _parse_words(
     lines: TextLines, kind: type[_Number], convert: Callable[[bytes, FileLocation], _Number]
 ) -> tuple[npt.NDArray[Any], IntArray]:
-    """The words of lines with different numbers of them, or with what is no number."""
+    """The numbers of all lines, and the count of numbers of each line, for lines of different
+    lengths or with words that are not numbers."""
 
     def converted() -> Iterator[_Number]:
         for k, line in enumerate(lines.text):
@@ -216,9 +218,9 @@ def _parse_words(
     counts = np.fromiter((len(line.split()) for line in lines.text), np.int64)
     try:
         words = chain.from_iterable(map(bytes.split, lines.text))
-        found = np.fromiter(map(kind, words), np.dtype(kind))
-        if np.isfinite(found).all():
-            return found, counts
+        numbers = np.fromiter(map(kind, words), np.dtype(kind))
+        if np.isfinite(numbers).all():
+            return numbers, counts
     except (ValueError, OverflowError):
         pass
     return np.fromiter(converted(), np.dtype(kind)), counts

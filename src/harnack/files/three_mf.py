@@ -35,12 +35,12 @@ _UNITS = {
 
 
 def read_3mf(path: Path, data: bytes) -> FileGeometry:
-    """All triangles of the parts that a file's build has, where it puts them, in millimeters.
-    Colors and settings are ignored, also that a part is not to be printed.
+    """All triangles of the parts in a file's build, at their positions in the build, in
+    millimeters. Colors and settings are ignored, also the setting that a part is not to be printed.
 
     Raises:
-        FileFormatError: no archive, too large when it is unpacked, malformed, without triangles; or
-            packages are missing.
+        FileFormatError: a file that is not an archive, is too large when unpacked, is malformed, or
+            has no triangles; or packages are missing.
     """
     import trimesh  # here, since it takes half a second
 
@@ -50,7 +50,7 @@ def read_3mf(path: Path, data: bytes) -> FileGeometry:
         raise place.error(f"3MF needs {' and '.join(missing)}: pip install 'harnack[3mf]'")
     try:
         with zipfile.ZipFile(BytesIO(data)) as archive:
-            size = sum(one.file_size for one in archive.infolist())
+            size = sum(entry.file_size for entry in archive.infolist())
     except zipfile.BadZipFile:
         raise place.error("this is no .3mf file: it is no zip archive") from None
     if size > MAX_BYTES:
@@ -77,8 +77,8 @@ def _contents(place: FileLocation, scene: Any) -> FileGeometry:
         matrix, name = scene.graph[node]
         part = scene.geometry[name]
         corners = np.asarray(part.faces, np.int64)
-        own = triangles_as_polygons(place.path, corners)
-        check_indices(own, len(part.vertices))
+        polygons = triangles_as_polygons(place.path, corners)
+        check_indices(polygons, len(part.vertices))
         x = np.asarray(part.vertices, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
         if np.linalg.det(matrix[:3, :3]) < 0:  # a mirror image
             corners = corners[:, ::-1]

@@ -54,8 +54,8 @@ Edge = tuple[int, int]
 
 
 class OpenChainError(ValueError):
-    """Edges that do not join to closed loops. vertex: where a chain of them ends, or where too many
-    meet."""
+    """Edges that do not join to closed loops. vertex: the vertex at which a chain of edges ends, or
+    at which too many edges meet."""
 
     def __init__(self, vertex: int, count: int) -> None:
         super().__init__(f"{count} edges meet at vertex {vertex}")
@@ -67,8 +67,8 @@ def boundary_edges(faces: Iterable[Sequence[int]]) -> list[Edge]:
     """The directed edges of faces that remain when each edge cancels against the same edge run the
     other way.
 
-    An edge is listed as often as it remains. At every vertex as many of them begin as end, because
-    that is so for each face.
+    An edge is listed as often as it remains. At every vertex the same number of them begins and
+    ends, because that holds for each face.
     """
     net: Counter[Edge] = Counter()
     for face in faces:
@@ -86,9 +86,9 @@ def boundary_edges(faces: Iterable[Sequence[int]]) -> list[Edge]:
 def join_edges(edges: Sequence[Edge]) -> list[list[int]]:
     """Join all edges to closed loops of vertex indices.
 
-    If as many edges begin as end at every vertex, their directions are kept, and a loop ends where
-    it first meets itself. Otherwise exactly two edges must meet at every vertex, and each loop runs
-    in the direction of its first edge.
+    If at every vertex the same number of edges begins and ends, their directions are kept, and a
+    loop ends where it first meets itself. Otherwise exactly two edges must meet at every vertex,
+    and each loop runs in the direction of its first edge.
 
     Raises:
         OpenChainError: neither is the case.
@@ -186,9 +186,10 @@ def weld_vertices(vertices: FloatArray) -> IntArray:
 def net_faces(faces: IntArray) -> NetFaces:
     """The faces (m, 3) with duplicates added up: same vertices +1, reversed -1.
 
-    A face that its reversed duplicates cancel vanishes, and so does one that uses a vertex twice,
-    since it has no area. Whichever corner a face begins with makes no difference. What remains
-    runs so that its multiplicity is positive, and keeps the order of the original faces.
+    A face that its reversed duplicates cancel vanishes, and so does a face that uses a vertex
+    twice, since it has no area. The corner with which a face begins makes no difference. The
+    remaining faces are oriented so that their multiplicity is positive, and keep the order of the
+    original faces.
     """
     a, b, c = faces.T
     proper = np.flatnonzero((a != b) & (b != c) & (c != a))
@@ -198,8 +199,8 @@ def net_faces(faces: IntArray) -> NetFaces:
     descents = (a > b).astype(np.int64) + (b > c) + (c > a)
     sign = np.where(descents == 1, 1, -1)
     if not len(proper):
-        none = np.zeros(0, dtype=np.int64)
-        return NetFaces(none.reshape(0, 3), none, none)
+        empty = np.zeros(0, dtype=np.int64)
+        return NetFaces(empty.reshape(0, 3), empty, empty)
     order, starts = _group_equal_rows(corners.view(np.uint64))
     net = np.add.reduceat(sign[order], starts)
     group_sign = np.repeat(np.sign(net), _lengths(starts, len(order)))
@@ -237,19 +238,19 @@ def net_edges(
     """
     if not len(begin):
         return np.zeros((0, 2), dtype=np.int64), np.zeros(0, dtype=np.int64)
-    low, high = np.minimum(begin, end), np.maximum(begin, end)
+    lower, upper = np.minimum(begin, end), np.maximum(begin, end)
     signed = np.where(begin < end, 1, -1) * np.asarray(weight, dtype=np.int64)
-    count = int(high.max()) + 1
-    keys = low * count + high  # below 2^63: there are at most 10^8 vertices
+    count = int(upper.max()) + 1
+    keys = lower * count + upper  # below 2^63: there are at most 10^8 vertices
     order = np.argsort(keys, kind="stable")
     keys = keys[order]
     starts = np.flatnonzero(np.append(True, keys[1:] != keys[:-1]))
     net = np.add.reduceat(signed[order], starts)
     keys = keys[starts]
-    low, high = keys // count, keys % count
-    singular = (net != 0) & (low != high)
-    low, high, net = low[singular], high[singular], net[singular]
-    begin, end = np.where(net > 0, low, high), np.where(net > 0, high, low)
+    lower, upper = keys // count, keys % count
+    remains = (net != 0) & (lower != upper)
+    lower, upper, net = lower[remains], upper[remains], net[remains]
+    begin, end = np.where(net > 0, lower, upper), np.where(net > 0, upper, lower)
     return np.column_stack([begin, end]), np.abs(net)
 
 
@@ -257,10 +258,11 @@ def singular_loops(edges: IntArray, weights: IntArray) -> list[list[int]]:
     """The closed loops of vertex indices that singular edges form.
 
     An edge of weight k occurs k times. A loop is listed without its first vertex at the end, and
-    ends where it first meets itself. One Python step an edge: for up to about a million.
+    ends where it first meets itself. The time is a Python step for each edge: for up to about a
+    million edges.
 
     Raises:
-        OpenChainError: the edges are not those of `singular_edges`: some loop does not close.
+        OpenChainError: the edges are not a result of `singular_edges`: a loop does not close.
     """
     repeated: list[list[int]] = np.repeat(edges, weights, axis=0).tolist()
     return join_edges([(begin, end) for begin, end in repeated])

@@ -394,7 +394,7 @@ class HalfSpace(Polytope):
 
 @dataclass(frozen=True)
 class VolumeIntersection(Volume):
-    """The intersection of several volumes (at least one)."""
+    """The intersection of one or more volumes."""
 
     volumes: tuple[Volume, ...]
 

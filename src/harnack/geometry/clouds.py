@@ -156,28 +156,30 @@ def estimate_areas(
     n = as_unit_normals(normals, len(x))
     check_neighbors(neighbors)
     welded = weld_vertices(x)
-    positions, where = np.unique(welded, return_inverse=True)
-    sharing = np.bincount(where)[where]
+    positions, position_of = np.unique(welded, return_inverse=True)
+    sharing = np.bincount(position_of)[position_of]
     tree = build_point_tree(x[positions])
     rank = np.empty(len(positions), np.int64)
     rank[tree.indices] = np.arange(len(positions))
-    order = np.argsort(rank[where])  # neighbors one after the other, which saves half of the time
+    order = np.argsort(
+        rank[position_of]
+    )  # neighbors one after the other, which saves half of the time
     nearest = np.empty((len(x), min(neighbors, tree.n - 1)), np.uint32)
     radii = np.empty(len(positions))
 
     def find(part: slice) -> None:
-        some = order[part]
-        nearest[some], distance = nearest_neighbors(tree, x[some], neighbors)
-        radii[where[some]] = 0.5 * distance[:, -1]
+        batch = order[part]
+        nearest[batch], distance = nearest_neighbors(tree, x[batch], neighbors)
+        radii[position_of[batch]] = 0.5 * distance[:, -1]
 
     parallel_over_slices(find, len(x))
     areas = np.empty(len(x))
     cells = TangentVoronoi.of(tree.data)
     for start in range(0, len(x), _POINTS_PER_BATCH):
-        some = order[start : start + _POINTS_PER_BATCH]
-        most = _MAX_RADIUS_RATIO * np.median(radii[nearest[some]], axis=1)
-        reach = np.minimum(radii[where[some]], most)
-        areas[some] = cells.areas(x[some], n[some], nearest[some], reach)
+        batch = order[start : start + _POINTS_PER_BATCH]
+        max_radius = _MAX_RADIUS_RATIO * np.median(radii[nearest[batch]], axis=1)
+        reach = np.minimum(radii[position_of[batch]], max_radius)
+        areas[batch] = cells.areas(x[batch], n[batch], nearest[batch], reach)
     return areas / sharing
 
 
@@ -255,9 +257,9 @@ _NEIGHBOR_COUNTS, _MAX_FLATNESS, _PROBES, _MIN_SUBSET, _FLATNESS_GAIN = (
     1000,
     0.9,
 )
-# How many of the nearest points that have a normal vote on the sign of a point's normal.
+# The number of the nearest points with a normal that vote on the sign of a point's normal.
 _VOTING_NEIGHBORS = 8
-# Where to look for extreme points: towards the faces, edges and corners of a cube.
+# The directions of extreme points: towards the faces, edges and corners of a cube.
 _DIRECTIONS = np.array([d for d in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
 
 
@@ -291,22 +293,22 @@ def estimate_normals(points: npt.ArrayLike, neighbors: int | None = None) -> Flo
     x = as_cloud_points(points)
     if neighbors is not None:
         check_neighbors(neighbors)
-    positions, where = np.unique(weld_vertices(x), return_inverse=True)
+    positions, position_of = np.unique(weld_vertices(x), return_inverse=True)
     x = x[positions]
     if len(x) < 4:
         raise CloudError(f"{len(x)} different points do not show a surface: give at least 4")
-    some = np.arange(len(x))
+    subset = np.arange(len(x))
     if neighbors is None:
-        neighbors, some = _choose_neighborhood(x)
-    tree = build_point_tree(x[some])
-    planes = _fit_tangent_planes(x[some], tree, neighbors)
+        neighbors, subset = _choose_neighborhood(x)
+    tree = build_point_tree(x[subset])
+    planes = _fit_tangent_planes(x[subset], tree, neighbors)
     piece, parent = _spanning_forest(planes)
     sign = _propagate_signs(planes, parent)
     normals = planes.normals * sign[:, None]
-    normals *= _outward_signs(x[some], normals, piece)[piece, None]
-    if len(some) < len(x):
+    normals *= _outward_signs(x[subset], normals, piece)[piece, None]
+    if len(subset) < len(x):
         normals = _transfer_normals(x, tree, normals, neighbors)
-    return normals[where]
+    return normals[position_of]
 
 
 def _choose_neighborhood(x: FloatArray) -> tuple[int, IntArray]:
@@ -314,32 +316,34 @@ def _choose_neighborhood(x: FloatArray) -> tuple[int, IntArray]:
     points among which the neighbors are sought."""
     rng = np.random.default_rng(0)
     probes = x[rng.choice(len(x), min(len(x), _PROBES), replace=False)]
-    some = np.arange(len(x))
-    best, found = np.inf, (_NEIGHBOR_COUNTS[0], some)
+    subset = np.arange(len(x))
+    min_flatness, choice = np.inf, (_NEIGHBOR_COUNTS[0], subset)
     counts = _NEIGHBOR_COUNTS
     while True:
-        tree = build_point_tree(x[some])
+        tree = build_point_tree(x[subset])
         for count in counts:
             index, _ = nearest_neighbors(tree, probes, count)
             spread = tree.data[index]
             spread = spread - spread.mean(axis=1, keepdims=True)
             widths = np.linalg.eigvalsh(np.einsum("mki,mkj->mij", spread, spread))
             flatness = np.median(np.sqrt(np.abs(widths[:, 0]) / np.maximum(widths[:, 1], 1e-300)))
-            if flatness < _FLATNESS_GAIN * best:
-                best, found = float(flatness), (count, some)
-            if best < _MAX_FLATNESS:
-                return found
-        if len(some) < _MIN_SUBSET:
-            return found
-        some, counts = (
-            np.sort(rng.choice(some, len(some) // 2, replace=False)),
+            if flatness < _FLATNESS_GAIN * min_flatness:
+                min_flatness, choice = float(flatness), (count, subset)
+            if min_flatness < _MAX_FLATNESS:
+                return choice
+        if len(subset) < _MIN_SUBSET:
+            return choice
+        subset, counts = (
+            np.sort(rng.choice(subset, len(subset) // 2, replace=False)),
             _NEIGHBOR_COUNTS[-1:],
         )
 
 
-def _transfer_normals(x: FloatArray, tree: Any, given: FloatArray, neighbors: int) -> FloatArray:
-    """Normals of points (n, 3) from the nearest points that have a normal, with the signs of
-    these."""
+def _transfer_normals(
+    x: FloatArray, tree: Any, known_normals: FloatArray, neighbors: int
+) -> FloatArray:
+    """Normals of points (n, 3) from the nearest points that have a normal, with the signs of these
+    normals. known_normals: of the points of the tree."""
     normals = np.empty_like(x)
 
     def fit(part: slice) -> None:
@@ -347,8 +351,8 @@ def _transfer_normals(x: FloatArray, tree: Any, given: FloatArray, neighbors: in
         spread = tree.data[index] - tree.data[index].mean(axis=1, keepdims=True)
         _, axes = np.linalg.eigh(np.einsum("mki,mkj->mij", spread, spread))
         line = axes[:, :, 0]
-        along = np.einsum("mki,mi->mk", given[index[:, :_VOTING_NEIGHBORS]], line)
-        normals[part] = line * np.where(along.sum(axis=1) < 0, -1.0, 1.0)[:, None]
+        projections = np.einsum("mki,mi->mk", known_normals[index[:, :_VOTING_NEIGHBORS]], line)
+        normals[part] = line * np.where(projections.sum(axis=1) < 0, -1.0, 1.0)[:, None]
 
     parallel_over_slices(fit, len(x))
     return normals
@@ -449,11 +453,11 @@ def _propagate_signs(planes: _TangentPlanes, parent: IntArray) -> FloatArray:
     agreement = _agreement(planes, np.arange(len(parent)), parent)
     sign = np.where(agreement < 0.0, -1.0, 1.0)
     while True:
-        above = parent[parent]
-        if np.array_equal(above, parent):
+        ancestor = parent[parent]
+        if np.array_equal(ancestor, parent):
             return sign
         sign *= sign[parent]
-        parent = above
+        parent = ancestor
 
 
 def _outward_signs(x: FloatArray, normals: FloatArray, piece: IntArray) -> FloatArray:

@@ -37,23 +37,23 @@ MIN_ANGLE = 1e-6  # so do edges that fold back at a smaller angle (radians)
 def is_convex_position(loops: tuple[FloatArray, ...]) -> bool:
     """Whether it is proved that the theorems apply to these (validated) loops.
 
-    True means: one loop; no edge is shorter than 1e-9 (all lengths relative to the curve's
-    size: one that short may be nothing but rounding, and has no direction to be trusted); edges
-    that share no vertex are at least 1e-9 apart, none folds back; and either all vertices lie
-    within 1e-12 of one plane (then P is on the boundary of its flat hull, a degenerate convex
-    set), or every edge has a plane through it that no vertex exceeds by more than 1e-12. False
-    means: no proof found, as for more than 2048 vertices; it says nothing about the curve.
+    True means: one loop; no edge is shorter than 1e-9 (all lengths relative to the curve's size; an
+    edge that short may be nothing but rounding, and has no reliable direction); edges that share no
+    vertex are at least 1e-9 apart, and no edge folds back; and either all vertices lie within 1e-12
+    of a common plane (then P is on the boundary of its flat hull, a degenerate convex set), or
+    every edge has a plane through it that no vertex exceeds by more than 1e-12. False means that
+    there is no proof, as for more than 2048 vertices; it implies nothing about the curve.
 
-    Stability. Where no vertex exceeds the plane of an edge, that edge lies on the boundary of
-    the hull H, and nothing is left to say. Otherwise let each point move along the normal of its
+    Stability. Where no vertex exceeds the plane of an edge, that edge lies on the boundary of the
+    hull H, and nothing remains to be proved. Otherwise let each point move along the normal of its
     edge until it leaves H: by at most delta = 1e-12. At a vertex the edges' normals n and n' may
-    send it to two places; both lie in the wedge { a n + b n', a, b >= 0 } at the vertex, where
-    n.x <= delta and n'.x <= delta leave |x| <= 2 delta / (1 + n.n'), and n.n' >= -0.9 is
-    required, so a path of that size on the boundary joins them. It cannot meet another edge
-    (1e-9 away); crossings with its neighbor, near the common vertex, are cut off as loops of
-    area below 1e-15. So the theorems hold for a curve within w = 2e-11 of P, and the two
-    solid angles differ by at most 2 w / r for each edge at distance r: at r = 1e-4 that is less
-    than the rounding of the solid angle itself in single precision.
+    send it to two positions; both lie in the wedge { a n + b n', a, b >= 0 } at the vertex, where
+    n.x <= delta and n'.x <= delta leave |x| <= 2 delta / (1 + n.n'), and n.n' >= -0.9 is required,
+    so a path of that size on the boundary joins them. It cannot meet another edge (1e-9 away);
+    crossings with its neighbor, near the common vertex, are cut off as loops of area below 1e-15.
+    So the theorems hold for a curve within w = 2e-11 of P, and the two solid angles differ by at
+    most 2 w / r for each edge at distance r: at r = 1e-4 that is less than the rounding of the
+    solid angle itself in single precision.
     """
     if len(loops) != 1 or not 3 <= len(loops[0]) <= MAX_EXAMINED_VERTICES:
         return False
@@ -98,9 +98,10 @@ def _supporting_planes(
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """For the edges from vertices `part`: a plane that contains the edge and supports all of x.
 
-    Projected along the edge, the vertices have to leave an angle of at least pi free; the
-    normal (k, 3) points to the middle of the largest free angle. Also by how far the vertices
-    exceed the plane (k,), and whether all but the edge's ends stay below it beyond rounding.
+    Projected along the edge, the vertices have to leave an angle of at least pi free; the normal
+    (k, 3) points to the middle of the largest free angle. Also returned are the distance by which
+    the vertices exceed the plane (k,), and whether all but the edge's ends stay below it beyond
+    rounding.
     """
     count = len(x)
     start = x[part]
@@ -139,20 +140,21 @@ def _widest_gap_direction(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def is_simple(x: FloatArray) -> bool:
-    """Whether edges without a common vertex are MIN_SEPARATION apart, and none folds back."""
+    """Whether edges without a common vertex are MIN_SEPARATION apart, and no edge folds back on its
+    neighbor."""
     count = len(x)
     ends = np.roll(x, -1, axis=0)
     direction = (ends - x) / _edge_lengths(x)[:, None]
     turned = direction + np.roll(direction, -1, axis=0)
     if not np.linalg.norm(turned, axis=1).min() >= MIN_ANGLE:
         return False
-    low, high = np.minimum(x, ends) - MIN_SEPARATION, np.maximum(x, ends)
-    near = np.triu(np.ones((count, count), dtype=np.bool_), k=2)
-    near[0, count - 1] = False
+    lower, upper = np.minimum(x, ends) - MIN_SEPARATION, np.maximum(x, ends)
+    is_near = np.triu(np.ones((count, count), dtype=np.bool_), k=2)
+    is_near[0, count - 1] = False
     for axis in range(3):
-        near &= low[:, None, axis] <= high[None, :, axis]
-        near &= low[None, :, axis] <= high[:, None, axis]
-    first, second = np.nonzero(near)
+        is_near &= lower[:, None, axis] <= upper[None, :, axis]
+        is_near &= lower[None, :, axis] <= upper[:, None, axis]
+    first, second = np.nonzero(is_near)
     for begin in range(0, len(first), 100_000):
         i, j = first[begin : begin + 100_000], second[begin : begin + 100_000]
         clearance = segment_distance_lower_bound(x[i], ends[i], x[j], ends[j])
@@ -312,23 +314,24 @@ def _facet_normals(x: FloatArray) -> FloatArray | None:
 def _order_by_spread(normals: FloatArray) -> FloatArray:
     """The same normals in another order, the first ones far from each other: most rays that miss
     the hull are recognized by a few planes."""
-    order, left = [0], np.full(len(normals), np.inf)
+    order, min_distances = [0], np.full(len(normals), np.inf)
     for _ in range(min(len(normals), _LEADING_PLANES) - 1):
-        left = np.minimum(left, 1.0 - normals @ normals[order[-1]])
-        order.append(int(np.argmax(left)))
-    rest = np.setdiff1d(np.arange(len(normals)), order)
-    return normals[np.concatenate([order, rest]).astype(np.intp)]
+        min_distances = np.minimum(min_distances, 1.0 - normals @ normals[order[-1]])
+        order.append(int(np.argmax(min_distances)))
+    remaining = np.setdiff1d(np.arange(len(normals)), order)
+    return normals[np.concatenate([order, remaining]).astype(np.intp)]
 
 
 def _distinct_normals(normals: FloatArray) -> FloatArray:
-    """One of each group of nearly equal normals, at most MAX_PLANES, and the six axes if cut."""
+    """A normal of each group of nearly equal normals, at most MAX_PLANES groups; with the six axes
+    if the groups are coarser than 9 digits."""
     digits = 9
     while True:
         _, first = np.unique(np.round(normals, digits), axis=0, return_index=True)
         if len(first) <= MAX_PLANES:
             break
         digits -= 1
-    kept = normals[np.sort(first)]
+    distinct = normals[np.sort(first)]
     if digits < 9:
-        kept = np.concatenate([np.eye(3), -np.eye(3), kept])
-    return kept / np.linalg.norm(kept, axis=1, keepdims=True)
+        distinct = np.concatenate([np.eye(3), -np.eye(3), distinct])
+    return distinct / np.linalg.norm(distinct, axis=1, keepdims=True)

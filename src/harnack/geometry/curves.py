@@ -125,8 +125,8 @@ class Circle:
 def _numbers(values: Any, name: str, shape: tuple[int, ...]) -> FloatArray:
     array = as_real_array(values, f"{name} of a circle", type_error=TypeError).astype(np.float64)
     if array.shape != shape:
-        wanted = "three numbers" if shape else "a number"
-        raise ValueError(f"{name} of a circle must be {wanted}, not an array {array.shape}")
+        expected = "three numbers" if shape else "a number"
+        raise ValueError(f"{name} of a circle must be {expected}, not an array {array.shape}")
     if not np.isfinite(array).all():
         raise ValueError(f"{name} of a circle must be finite, not {values!r}")
     return array
@@ -138,12 +138,12 @@ def cancel_opposite_circles(circles: Iterable[Circle]) -> tuple[Circle, ...]:
     Only circles with exactly the same center and radius and exactly opposite normals cancel.
     """
     surplus: Counter[Circle] = Counter()
-    for one in circles:
-        back = one.reversed()
-        if surplus[back] > 0:
-            surplus[back] -= 1
+    for circle in circles:
+        reverse = circle.reversed()
+        if surplus[reverse] > 0:
+            surplus[reverse] -= 1
         else:
-            surplus[one] += 1
+            surplus[circle] += 1
     return tuple(surplus.elements())
 
 
@@ -218,13 +218,13 @@ def validate_curves(curves: Any) -> tuple[Loops, tuple[Circle, ...]]:
     if isinstance(curves, Circle):
         return (), (curves,)
     parts = _as_parts(curves)
-    if not any(isinstance(one, Circle) for one in parts):
+    if not any(isinstance(part, Circle) for part in parts):
         return validate_loops(curves), ()
-    circles = tuple(one for one in parts if isinstance(one, Circle))
+    circles = tuple(part for part in parts if isinstance(part, Circle))
     loops = [
-        _validate_loop(one, f"loop {k}")
-        for k, one in enumerate(parts)
-        if not isinstance(one, Circle)
+        _validate_loop(part, f"loop {k}")
+        for k, part in enumerate(parts)
+        if not isinstance(part, Circle)
     ]
     total = sum(len(loop) for loop in loops)
     if total > MAX_VERTICES:
@@ -238,20 +238,21 @@ def _as_parts(curves: Any) -> list[Any]:
 
 
 def _as_list(loops: Any) -> list[tuple[int, Any]]:
-    """Numbered loops. A list is a list of loops if its entries' entries are points."""
+    """The numbered loops of an argument. A list is a list of loops if its entries are lists of
+    points."""
     try:
-        whole = np.asarray(loops)
+        array = np.asarray(loops)
     except ValueError:  # loops of different lengths, or points of different lengths
         if any(_is_point(part) for part in loops):
             raise CurveShapeError("every vertex needs three coordinates: some differ") from None
         return _numbered(loops)
-    if whole.ndim == 3:
-        return _numbered(whole)
-    if whole.dtype == object and whole.ndim == 1 and len(whole):  # so does older NumPy
-        return _numbered(whole)
-    if whole.ndim == 1 and whole.size == 0:
+    if array.ndim == 3:
+        return _numbered(array)
+    if array.dtype == object and array.ndim == 1 and len(array):  # so does older NumPy
+        return _numbered(array)
+    if array.ndim == 1 and array.size == 0:
         return []
-    return [(0, whole)]
+    return [(0, array)]
 
 
 def _is_point(part: Any) -> bool:
@@ -292,11 +293,11 @@ def _as_vertices(loop: Any, name: str) -> FloatArray:
 
 def _count_distinct(vertices: FloatArray) -> int:
     """Number of different vertices, counted up to 3."""
-    others = vertices
-    for found in range(3):
-        if len(others) == 0:
-            return found
-        others = others[(others != others[0]).any(axis=1)]
+    remaining = vertices
+    for count in range(3):
+        if len(remaining) == 0:
+            return count
+        remaining = remaining[(remaining != remaining[0]).any(axis=1)]
     return 3
 
 

@@ -88,8 +88,8 @@ class NoiseEstimate:
 
     def kept_fraction(self) -> float:
         """The fraction of the points that are worth moving, at most 1."""
-        share = _MAX_NOISE_PER_SPACING * self.spacing / max(self.deviation, 1e-300)
-        return min(max(share, _MIN_KEPT_FRACTION), 1.0)
+        fraction = _MAX_NOISE_PER_SPACING * self.spacing / max(self.deviation, 1e-300)
+        return min(max(fraction, _MIN_KEPT_FRACTION), 1.0)
 
 
 def outlier_indices(points: FloatArray, tree: Any) -> IntArray:
@@ -155,14 +155,16 @@ def _min_variance_axes(offsets: FloatArray, weights: FloatArray | None) -> Float
     return axes[:, :, 0]
 
 
-def _deviations_by_normals(offsets: FloatArray, own: FloatArray, theirs: FloatArray) -> FloatArray:
-    """Standard deviations (m,) of t_j among the neighbors whose normals are like those of the
-    points."""
-    like = np.einsum("mi,mki->mk", own, theirs) > _MIN_NORMAL_COSINE
-    said = np.einsum("mki,mki->mk", 0.5 * (own[:, None] + theirs), offsets)
-    count = np.maximum(like.sum(axis=1), 2)
-    mean = (said * like).sum(axis=1) / count
-    return np.sqrt(((said - mean[:, None]) ** 2 * like).sum(axis=1) / (count - 1))
+def _deviations_by_normals(
+    offsets: FloatArray, normals: FloatArray, theirs: FloatArray
+) -> FloatArray:
+    """Standard deviations (m,) of t_j among the neighbors whose normals are like the points'
+    normals."""
+    is_like = np.einsum("mi,mki->mk", normals, theirs) > _MIN_NORMAL_COSINE
+    heights = np.einsum("mki,mki->mk", 0.5 * (normals[:, None] + theirs), offsets)
+    count = np.maximum(is_like.sum(axis=1), 2)
+    mean = (heights * is_like).sum(axis=1) / count
+    return np.sqrt(((heights - mean[:, None]) ** 2 * is_like).sum(axis=1) / (count - 1))
 
 
 class CloudDenoiser:
@@ -178,13 +180,13 @@ class CloudDenoiser:
         self.tree = build_point_tree(points) if tree is None else tree
         self.selected = np.arange(len(points))
         if (part := noise.kept_fraction()) < 1:
-            some = np.random.default_rng(0).choice(
+            subset = np.random.default_rng(0).choice(
                 len(points), max(4, round(part * len(points))), replace=False
             )
             # In the order of the tree, so that neighbors of neighbors are looked up together.
-            place = np.empty(len(points), np.int64)
-            place[self.tree.indices] = self.selected
-            self.selected = some[np.argsort(place[some])]
+            rank = np.empty(len(points), np.int64)
+            rank[self.tree.indices] = self.selected
+            self.selected = subset[np.argsort(rank[subset])]
 
     @property
     def spacing(self) -> float:
@@ -194,18 +196,18 @@ class CloudDenoiser:
     def denoise_points(self, normals: FloatArray) -> FloatArray:
         """The selected points (m, 3), moved along their normals. normals: (n, 3), of all points;
         they are known and are not changed."""
-        some, own = self.points[self.selected], normals[self.selected]
-        if len(some) < len(self.points):
-            some = _move_along_normals(
-                some,
-                own,
-                _neighbors(build_point_tree(some), some, _INITIAL_NEIGHBORS),
-                some,
-                own,
+        points, own_normals = self.points[self.selected], normals[self.selected]
+        if len(points) < len(self.points):
+            points = _move_along_normals(
+                points,
+                own_normals,
+                _neighbors(build_point_tree(points), points, _INITIAL_NEIGHBORS),
+                points,
+                own_normals,
                 _NORMAL_CHORD,
             )
-        near = _neighbors(self.tree, some, self.noise.neighbor_count)
-        return _move_along_normals(some, own, near, self.points, normals, _NORMAL_CHORD)
+        near = _neighbors(self.tree, points, self.noise.neighbor_count)
+        return _move_along_normals(points, own_normals, near, self.points, normals, _NORMAL_CHORD)
 
     def denoise_points_and_normals(self, normals: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The selected points, moved, and their normals, improved in turn with the points: (k, 3)
@@ -216,23 +218,23 @@ class CloudDenoiser:
         start, chord = self.points[self.selected], _CHORD_OF_ESTIMATES
         if len(start) == len(self.points):
             nearest = self.selected
-            beside = _neighbors(self.tree, start, _PLANE_NEIGHBORS)
+            adjacent = _neighbors(self.tree, start, _PLANE_NEIGHBORS)
         else:
             tree = build_point_tree(start)
             nearest = _neighbors(tree, self.points, 1)[:, 0]
-            beside = _neighbors(tree, start, _INITIAL_NEIGHBORS)
-            start = _move_along_normals(start, normals, beside, start, normals, chord)
+            adjacent = _neighbors(tree, start, _INITIAL_NEIGHBORS)
+            start = _move_along_normals(start, normals, adjacent, start, normals, chord)
         near = _neighbors(self.tree, start, self.noise.neighbor_count)
         moved = _move_along_normals(start, normals, near, self.points, normals[nearest], chord)
         for _ in range(_NORMAL_ITERATIONS):
-            normals = _refit_normals(moved, normals, beside, chord)
+            normals = _refit_normals(moved, normals, adjacent, chord)
             moved = _move_along_normals(start, normals, near, self.points, normals[nearest], chord)
-        own = near == self.selected[:, None]
-        kept = (
-            _agreeing_weight(start, normals, near, own, self.points, normals[nearest], chord)
+        is_self = near == self.selected[:, None]
+        is_kept = (
+            _agreeing_weight(start, normals, near, is_self, self.points, normals[nearest], chord)
             >= _MIN_AGREEING_WEIGHT
         )
-        return moved[kept], normals[kept]
+        return moved[is_kept], normals[is_kept]
 
 
 def _neighbors(tree: Any, points: FloatArray, count: int) -> Indices:
@@ -250,32 +252,32 @@ def _neighbors(tree: Any, points: FloatArray, count: int) -> Indices:
 
 def _move_along_normals(
     start: FloatArray,
-    own: FloatArray,
+    own_normals: FloatArray,
     near: Indices,
     points: FloatArray,
     normals: FloatArray,
     chord: float,
 ) -> FloatArray:
-    """Points (m, 3), moved along their `own` normals (m, 3) to where the mean of t_j is 0.
+    """Points (m, 3), moved along their normals `own_normals` (m, 3) to where the mean of t_j is 0.
 
-    near: (m, k) their neighbors among points (n, 3) with normals (n, 3). Weights depend on the
-        distance along the plane of the point only: with the distance in space, neighbors on the
-        point's side of the surface would hold it there.
+    near: (m, k) the indices of their neighbors among points (n, 3) with normals (n, 3). Weights
+        depend on the distance along the plane of the point only: with the distance in space,
+        neighbors on the point's side of the surface would hold it there.
     """
     moved = np.empty_like(start)
 
     def move(part: slice) -> None:
-        n, index = own[part], near[part]
+        n, index = own_normals[part], near[part]
         theirs, offsets = normals[index], points[index] - start[part, None]
         height = np.einsum("mi,mki->mk", n, offsets)
         cosine = np.einsum("mi,mki->mk", n, theirs)
         weight = _weights(_squared_tangential(offsets, height), cosine, chord)
-        # n_j . (p_j - x) and n . (p_j - x); both are linear where x moves along n.
-        said = 0.5 * (np.einsum("mki,mki->mk", theirs, offsets) + height)
+        # The mean of n_j . (p_j - x) and n . (p_j - x); both are linear where x moves along n.
+        heights = 0.5 * (np.einsum("mki,mki->mk", theirs, offsets) + height)
         slope = 0.5 * (weight * (cosine + 1)).sum(axis=1)
-        # What all neighbors contradict stays.
-        along = np.where(slope > _MIN_SLOPE, (weight * said).sum(axis=1), 0.0)
-        moved[part] = start[part] + (along / np.maximum(slope, _MIN_SLOPE))[:, None] * n
+        # A point whose normal no neighbor supports stays.
+        mean = np.where(slope > _MIN_SLOPE, (weight * heights).sum(axis=1), 0.0)
+        moved[part] = start[part] + (mean / np.maximum(slope, _MIN_SLOPE))[:, None] * n
 
     parallel_over_slices(move, len(start))
     return moved
@@ -283,39 +285,39 @@ def _move_along_normals(
 
 def _agreeing_weight(
     start: FloatArray,
-    own: FloatArray,
+    own_normals: FloatArray,
     near: Indices,
     is_own: BoolArray,
     points: FloatArray,
     normals: FloatArray,
     chord: float,
 ) -> FloatArray:
-    """(m,) the fraction, by weight, of the neighbors of points that have a normal like theirs.
+    """(m,) the fraction, by weight, of the neighbors of points that have a normal like the point's.
 
-    is_own: (m, k) which of the neighbors are the points themselves, and do not count. The other
+    is_own: (m, k) whether a neighbor is the point itself, which does not count. The other
         arguments: as for `_move_along_normals`.
     """
-    alike = np.empty(len(start))
+    fraction = np.empty(len(start))
 
     def add(part: slice) -> None:
-        n, index = own[part], near[part]
+        n, index = own_normals[part], near[part]
         offsets = points[index] - start[part, None]
         height = np.einsum("mi,mki->mk", n, offsets)
-        near_by = (
+        weight = (
             np.exp(-_DISTANCE_DECAY * _relative(_squared_tangential(offsets, height)))
             * ~is_own[part]
         )
         cosine = np.einsum("mi,mki->mk", n, normals[index])
-        alike[part] = (near_by * _normal_weight(cosine, chord)).sum(axis=1) / near_by.sum(axis=1)
+        fraction[part] = (weight * _normal_weight(cosine, chord)).sum(axis=1) / weight.sum(axis=1)
 
     parallel_over_slices(add, len(start))
-    return alike
+    return fraction
 
 
 def _refit_normals(
     points: FloatArray, normals: FloatArray, near: Indices, chord: float
 ) -> FloatArray:
-    """Normals (m, 3) of points (m, 3), by the planes of those neighbors (m, k) that have such
+    """Normals (m, 3) of points (m, 3), from the planes of their neighbors (m, k) that have similar
     normals."""
     turned = np.empty_like(normals)
 
@@ -326,8 +328,8 @@ def _refit_normals(
         weight = _weights(_squares(offsets), cosine, chord)
         offsets -= np.einsum("mk,mki->mi", weight, offsets)[:, None]
         line = _min_variance_axes(offsets, weight)
-        back = np.einsum("mi,mi->m", line, normals[part]) < 0
-        turned[part] = np.where(back[:, None], -line, line)
+        is_reversed = np.einsum("mi,mi->m", line, normals[part]) < 0
+        turned[part] = np.where(is_reversed[:, None], -line, line)
 
     parallel_over_slices(turn, len(points))
     return turned

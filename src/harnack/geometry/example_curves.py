@@ -17,7 +17,7 @@ ReturnPath = Literal["outside", "axis"]
 
 
 def _check_whole(name: str, number: Any) -> None:
-    """Raise TypeError for what is no whole number."""
+    """Raise TypeError for an argument that is not an integer."""
     if not isinstance(number, int | np.integer):
         raise TypeError(f"{name} must be a whole number, not {number!r}")
 
@@ -26,7 +26,7 @@ def _angles(n: int, least: int) -> FloatArray:
     """n angles that divide the full turn.
 
     Raises:
-        ValueError: fewer than `least`. TypeError: no whole number.
+        ValueError: fewer than `least`. TypeError: n is not an integer.
     """
     _check_whole("the number of vertices of a curve", n)
     if n < least:
@@ -53,7 +53,7 @@ def torus_knot(
 
     Raises:
         ValueError: p and q have a common divisor, which would be a link.
-        TypeError: they are no whole numbers.
+        TypeError: p or q is not an integer.
     """
     _check_whole("p of a torus knot", p)
     _check_whole("q of a torus knot", q)
@@ -130,9 +130,10 @@ def square_with_holes(
         (0.1, 0.5, 0.3),
     ),
 ) -> list[FloatArray]:
-    """A square in the plane z = 0 with round holes of n vertices, which run the other way round.
+    """A square in the plane z = 0 with round holes of n vertices, which are oriented the opposite
+    way.
 
-    holes: x, y and radius of each. They are not checked to lie apart and within the square.
+    holes: x, y and radius of each hole. They are not checked to be disjoint and within the square.
     """
     corners = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
     loops: list[FloatArray] = [0.5 * side * corners]
@@ -147,7 +148,7 @@ def random_closed_curve(
 ) -> FloatArray:
     """n vertices of a random trigonometric polynomial, about 1 in size: often a knot.
 
-    harmonics: how many frequencies. decay: amplitudes fall like frequency^-decay.
+    harmonics: the number of frequencies. decay: amplitudes fall like frequency^-decay.
     """
     t = _angles(n, 3)
     if harmonics < 1:

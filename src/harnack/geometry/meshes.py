@@ -97,17 +97,17 @@ def without_zero_area_faces(
         MeshError: as `validate_mesh`; no face has an area.
     """
     x, triangles = _checked_arrays(vertices, faces)
-    flat, longest = _measure_faces(x, triangles)
-    if flat.all():
+    is_flat, longest = _measure_faces(x, triangles)
+    if is_flat.all():
         raise MeshError(
             f"all {len(triangles):,} faces have zero area: the vertices of each lie on a line; "
             "check which column of the faces is which, and that coordinates were not rounded away"
         )
     _check_size(longest)
-    kept = triangles[~flat]
+    proper_faces = triangles[~is_flat]
     x.setflags(write=False)
-    kept.setflags(write=False)
-    return x, kept
+    proper_faces.setflags(write=False)
+    return x, proper_faces
 
 
 def solid_angles(corners: FloatArray, point: FloatArray) -> FloatArray:
@@ -218,8 +218,9 @@ def _check_size(longest: FloatArray) -> None:
 
 
 def _zero_area_message(x: FloatArray, faces: IntArray, flat: IntArray) -> str:
+    """The text of an error message about faces of zero area, whose indices are `flat`."""
     a, b, c = (x[k] for k in faces[flat[0]])
-    corners = ", ".join(format_vector(one) for one in (a, b, c))
+    corners = ", ".join(format_vector(corner) for corner in (a, b, c))
     repeated = bool((a == b).all() or (b == c).all() or (c == a).all())
     why = "two of its vertices are equal" if repeated else "its vertices lie on a line"
     count = f"{flat.size:,} of {len(faces):,} faces have" if flat.size > 1 else "one face has"

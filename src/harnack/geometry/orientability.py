@@ -28,27 +28,27 @@ def orientation_components(faces: IntArray) -> IntArray:
     Neighbors with consistent orientation share a label. A face and its reverse have the same label
     if and only if their component is non-orientable.
     """
-    import scipy.sparse  # here: half a second that few need
+    import scipy.sparse  # imported here, as it takes half a second and few programs need it
     import scipy.sparse.csgraph as csgraph_module
 
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
     m = len(faces)
     pairs, index, uses = _edges(faces)
     order = np.argsort(index, kind="stable")
-    one, other = order[(uses == 2)[index[order]]].reshape(-1, 2).T
-    same = ((pairs[one] == pairs[other]).all(axis=1)).astype(np.int64)
-    one, other = one % m, other % m
-    # Each face as it is and turned over (m more); neighbors that agree are joined.
-    rows = np.concatenate([one, one + m])
-    columns = np.concatenate([other + m * same, other + m * (1 - same)])
+    first, second = order[(uses == 2)[index[order]]].reshape(-1, 2).T
+    is_reversed = ((pairs[first] == pairs[second]).all(axis=1)).astype(np.int64)
+    first, second = first % m, second % m
+    # Each face as it is, and reversed (m more); neighbors that agree are joined.
+    rows = np.concatenate([first, first + m])
+    columns = np.concatenate([second + m * is_reversed, second + m * (1 - is_reversed)])
     joined = sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(2 * m, 2 * m))
     return np.asarray(csgraph.connected_components(joined, directed=False)[1], np.int64)
 
 
 def _edges(faces: IntArray) -> tuple[IntArray, IntArray, IntArray]:
     """Edges (3m, 2) in the direction in which faces run them, the first edges of all faces first;
-    the index (3m,) of each as an undirected edge; and for each undirected edge how many faces run
-    it."""
+    the index (3m,) of each as an undirected edge; and for each undirected edge the number of faces
+    that run it."""
     pairs = np.concatenate([faces[:, [k, (k + 1) % 3]] for k in range(3)]).astype(np.int64)
     keys = pairs.min(axis=1) * (int(pairs.max(initial=0)) + 1) + pairs.max(axis=1)
     _, index, uses = np.unique(keys, return_inverse=True, return_counts=True)

@@ -31,14 +31,14 @@ _CLIPPER_SIZE = 2.0**17
 
 
 def make_outline(loops: Any, rule: FillingRule = "even-odd") -> Outline:
-    """The loops that bound the region inside of loops.
+    """The outline of the region inside of loops: the loops that bound it.
 
     loops: an array (n, 2) of the vertices of a closed loop, the last joined to the first, or
-        several such arrays of different lengths. Loops may be nested to any depth, and may run
-        either way.
+        several such arrays of different lengths. Loops may be nested to any depth, and may have
+        either orientation.
     rule: which points are inside. "even-odd": points around which an odd number of loops runs, so
-        that a loop in another is a hole, whichever way it runs. "nonzero": points around which
-        loops run more often one way than the other; the letters of fonts use this rule.
+        that a loop in another loop is a hole, whatever its orientation. "nonzero": points whose
+        winding number is not 0; the letters of fonts use this rule.
 
     Loops that neither touch nor cross keep their vertices exactly. Others are cut where they cross
     (by Clipper2, through manifold3d), with vertices rounded to about 1e-13 of the outline's size.
@@ -47,29 +47,35 @@ def make_outline(loops: Any, rule: FillingRule = "even-odd") -> Outline:
         ValueError: a loop is malformed or too large; there is no area inside.
         TypeError: not numbers.
     """
-    given = _checked_loops(loops)
-    points = np.concatenate(given)
+    checked = _checked_loops(loops)
+    points = np.concatenate(checked)
     size = float(np.ptp(points, axis=0).max())
     if not size > 0:
         raise ValueError("an outline encloses no area: all of its points are one")
     tolerance = _TOUCH_TOLERANCE * (size + float(np.abs(points).max()))
-    if rule == "even-odd" and not _self_intersects(given, tolerance):
-        return _orient_loops(given)
-    made = _resolve_crossings(given, rule)
-    if not made:
+    if rule == "even-odd" and not _self_intersects(checked, tolerance):
+        return _orient_loops(checked)
+    outline = _resolve_crossings(checked, rule)
+    if not outline:
         raise ValueError("an outline encloses no area")
-    return made
+    return outline
 
 
 def _checked_loops(loops: Any) -> list[FloatArray]:
-    several: list[Any] = [loops] if _is_one_loop(loops) else list(loops)
-    if not several:
+    """The loops as arrays (n, 2), without repeated points.
+
+    Raises:
+        ValueError: no loops, a wrong shape, numbers that are not finite or too large, too many
+            points, or fewer than three different points.
+    """
+    entries: list[Any] = [loops] if _is_one_loop(loops) else list(loops)
+    if not entries:
         raise ValueError("an outline needs a loop of points at least, and there is none")
-    made: list[FloatArray] = []
+    checked: list[FloatArray] = []
     total = 0
-    for k, one in enumerate(several):
+    for k, loop in enumerate(entries):
         name = f"loop {k} of an outline"
-        array = as_real_array(one, name)
+        array = as_real_array(loop, name)
         if array.ndim != 2 or array.shape[1] != 2:
             raise ValueError(f"{name} must have shape (n, 2), not {array.shape}")
         points = np.array(array, dtype=np.float64)
@@ -81,8 +87,8 @@ def _checked_loops(loops: Any) -> list[FloatArray]:
         points = points[np.any(points != np.roll(points, 1, axis=0), axis=1)]
         if len(points) < 3:
             raise ValueError(f"{name} needs three points or more that differ, not {len(points)}")
-        made.append(points)
-    return made
+        checked.append(points)
+    return checked
 
 
 def _is_one_loop(loops: Any) -> bool:
@@ -101,41 +107,43 @@ def _is_one_loop(loops: Any) -> bool:
 
 
 def _edges_and_successors(loops: list[FloatArray]) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Start, end (m, 2) of all edges, and the index of the edge that follows each."""
+    """The starts and ends (m, 2) of all edges, and for each edge the index of the next edge of its
+    loop."""
     start = np.concatenate(loops)
-    end = np.concatenate([np.roll(one, -1, axis=0) for one in loops])
-    after: IntArray = np.arange(1, len(start) + 1, dtype=np.int64)
-    last = np.array([len(one) for one in loops], dtype=np.int64).cumsum() - 1
-    after[last] = np.concatenate([[0], last[:-1] + 1])
-    return start, end, after
+    end = np.concatenate([np.roll(loop, -1, axis=0) for loop in loops])
+    successor: IntArray = np.arange(1, len(start) + 1, dtype=np.int64)
+    last = np.array([len(loop) for loop in loops], dtype=np.int64).cumsum() - 1
+    successor[last] = np.concatenate([[0], last[:-1] + 1])
+    return start, end, successor
 
 
 def _self_intersects(loops: list[FloatArray], tolerance: float) -> bool:
-    """Whether edges touch or cross that are no neighbors, or neighbors run back on each other."""
-    start, end, after = _edges_and_successors(loops)
-    back = end[after] - start[after]
-    along = end - start
-    turn = along[:, 0] * back[:, 1] - along[:, 1] * back[:, 0]
-    ahead = (along * back).sum(axis=1)
-    size = np.linalg.norm(along, axis=1) * np.linalg.norm(back, axis=1)
-    if ((np.abs(turn) <= 1e-9 * size) & (ahead < 0)).any():
+    """Whether two edges that are not neighbors touch or cross, or a neighbor runs back on an
+    edge."""
+    start, end, successor = _edges_and_successors(loops)
+    next_edge = end[successor] - start[successor]
+    edge = end - start
+    turn = edge[:, 0] * next_edge[:, 1] - edge[:, 1] * next_edge[:, 0]
+    dot = (edge * next_edge).sum(axis=1)
+    size = np.linalg.norm(edge, axis=1) * np.linalg.norm(next_edge, axis=1)
+    if ((np.abs(turn) <= 1e-9 * size) & (dot < 0)).any():
         return True
-    low, high = np.minimum(start, end) - tolerance, np.maximum(start, end) + tolerance
-    order = np.argsort(low[:, 0], kind="stable")
-    last = cast("IntArray", low[order, 0].searchsorted(high[order, 0], side="right"))
+    lower, upper = np.minimum(start, end) - tolerance, np.maximum(start, end) + tolerance
+    order = np.argsort(lower[:, 0], kind="stable")
+    last = cast("IntArray", lower[order, 0].searchsorted(upper[order, 0], side="right"))
     counts: IntArray = last - np.arange(1, len(order) + 1)
     if int(counts.sum()) > _MOST_PAIRS:
         return True
     begin = 0
     while begin < len(order):
         stop = begin + max(1, int(counts[begin:].cumsum().searchsorted(_CHUNK)))
-        some = counts[begin:stop]
-        rows = np.arange(begin, stop).repeat(some)
-        offset = np.arange(len(rows)) - (some.cumsum() - some).repeat(some)
+        batch = counts[begin:stop]
+        rows = np.arange(begin, stop).repeat(batch)
+        offset = np.arange(len(rows)) - (batch.cumsum() - batch).repeat(batch)
         i, j = order[rows], order[rows + 1 + offset]
-        near = (low[i, 1] <= high[j, 1]) & (low[j, 1] <= high[i, 1])
-        near &= (after[i] != j) & (after[j] != i)
-        i, j = i[near], j[near]
+        is_near = (lower[i, 1] <= upper[j, 1]) & (lower[j, 1] <= upper[i, 1])
+        is_near &= (successor[i] != j) & (successor[j] != i)
+        i, j = i[is_near], j[is_near]
         if _segments_touch(start[i], end[i], start[j], end[j], tolerance).any():
             return True
         begin = stop
@@ -159,26 +167,26 @@ def _segments_touch(
 
 def _distances(p: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
     """The distance of each point from its segment."""
-    along = b - a
-    share = ((p - a) * along).sum(axis=1) / (along * along).sum(axis=1)
-    return np.linalg.norm(p - a - np.clip(share, 0, 1)[:, None] * along, axis=1)
+    edge = b - a
+    t = ((p - a) * edge).sum(axis=1) / (edge * edge).sum(axis=1)
+    return np.linalg.norm(p - a - np.clip(t, 0, 1)[:, None] * edge, axis=1)
 
 
 def _orient_loops(loops: list[FloatArray]) -> Outline:
-    """Simple loops, with the region on the left of each. The region lies inside of a loop if an
-    even number of other loops runs around it, else outside."""
+    """Simple loops, oriented so that the region is on the left of each. The region lies inside of a
+    loop if an even number of other loops runs around it, else outside."""
     start, end, _ = _edges_and_successors(loops)
-    owner = np.repeat(np.arange(len(loops)), [len(one) for one in loops])
-    made: list[FloatArray] = []
+    loop_index = np.repeat(np.arange(len(loops)), [len(points) for points in loops])
+    oriented: list[FloatArray] = []
     for k, loop in enumerate(loops):
         x, y = loop[0]
         spans = (start[:, 1] > y) != (end[:, 1] > y)
-        spans &= owner != k
+        spans &= loop_index != k
         a, b = start[spans], end[spans]
-        at = a[:, 0] + (y - a[:, 1]) / (b[:, 1] - a[:, 1]) * (b[:, 0] - a[:, 0])
-        is_hole = np.count_nonzero(at > x) % 2 == 1
-        made.append(loop[::-1].copy() if (_area(loop) > 0) == is_hole else loop)
-    return _make_read_only(made)
+        crossing = a[:, 0] + (y - a[:, 1]) / (b[:, 1] - a[:, 1]) * (b[:, 0] - a[:, 0])
+        is_hole = np.count_nonzero(crossing > x) % 2 == 1
+        oriented.append(loop[::-1].copy() if (_area(loop) > 0) == is_hole else loop)
+    return _make_read_only(oriented)
 
 
 def _area(loop: FloatArray) -> float:
@@ -193,28 +201,31 @@ def _resolve_crossings(loops: list[FloatArray], rule: FillingRule) -> Outline:
 
     fill = FillRule.EvenOdd if rule == "even-odd" else FillRule.NonZero
     points = np.concatenate(loops)
-    low, high = points.min(axis=0), points.max(axis=0)
-    unit = 2.0 ** (math.frexp(float((high - low).max()))[1] - 10)
-    # A multiple of the unit, so that the rounded loops have the same one.
-    center: FloatArray = np.rint(0.5 * (low + high) / unit) * unit
-    scaled, scale = scale_for_clipper([one - center for one in loops])
-    found = cast("list[FloatArray]", CrossSection(scaled, fill).to_polygons())
-    made = [np.array(one, np.float64) for one in found]
-    # In an order of its own, so that the same region always has the same loops.
-    made = [np.roll(one, -int(np.lexsort(one.T)[0]), axis=0) for one in made if len(one) > 2]
-    made.sort(key=lambda one: (one[0].tolist(), one[1].tolist()))
-    return _make_read_only([one / scale + center for one in made])
+    lower, upper = points.min(axis=0), points.max(axis=0)
+    grid = 2.0 ** (math.frexp(float((upper - lower).max()))[1] - 10)
+    # A multiple of the grid width, so that the rounded loops have the same center.
+    center: FloatArray = np.rint(0.5 * (lower + upper) / grid) * grid
+    scaled, scale = scale_for_clipper([loop - center for loop in loops])
+    polygons = cast("list[FloatArray]", CrossSection(scaled, fill).to_polygons())
+    outline = [np.array(loop, np.float64) for loop in polygons]
+    # In a canonical order, so that the same region always has the same loops.
+    outline = [
+        np.roll(loop, -int(np.lexsort(loop.T)[0]), axis=0) for loop in outline if len(loop) > 2
+    ]
+    outline.sort(key=lambda loop: (loop[0].tolist(), loop[1].tolist()))
+    return _make_read_only([loop / scale + center for loop in outline])
 
 
 def _make_read_only(loops: list[FloatArray]) -> Outline:
-    for one in loops:
-        one.setflags(write=False)
+    """The loops, made read-only, as an outline."""
+    for loop in loops:
+        loop.setflags(write=False)
     return tuple(loops)
 
 
 def scale_for_clipper(outline: Sequence[FloatArray]) -> tuple[list[FloatArray], float]:
-    """The loops times a power of two, so large that Clipper2's rounding hardly matters; and that
-    factor."""
-    largest = max(float(np.abs(one).max()) for one in outline)
+    """The loops multiplied by a power of two, so large that Clipper2's rounding hardly matters; and
+    that factor."""
+    largest = max(float(np.abs(loop).max()) for loop in outline)
     scale = 2.0 ** (math.frexp(_CLIPPER_SIZE)[1] - math.frexp(largest)[1])
-    return [np.ascontiguousarray(one * scale) for one in outline], scale
+    return [np.ascontiguousarray(loop * scale) for loop in outline], scale

@@ -108,41 +108,40 @@ class PolygonFaces:
     def in_convex_position(self) -> BoolArray:
         """(m,) whether each face is a single loop without self-intersections that is proved to lie
         on the boundary of a convex set; False where there is no proof."""
-        found = self._projects_to_convex_polygon()
-        single = np.bincount(self.face_of_loop, minlength=self.face_count) == 1
-        rest = np.flatnonzero(single & ~found)[:_MAX_EXAMINED_FACES]
-        for k in rest:
-            found[k] = is_convex_position(tuple(self.loops(int(k))))
-        return found
+        is_convex = self._projects_to_convex_polygon()
+        is_single = np.bincount(self.face_of_loop, minlength=self.face_count) == 1
+        unproved = np.flatnonzero(is_single & ~is_convex)[:_MAX_EXAMINED_FACES]
+        for k in unproved:
+            is_convex[k] = is_convex_position(tuple(self.loops(int(k))))
+        return is_convex
 
     def _projects_to_convex_polygon(self) -> BoolArray:
         """(m,) whether each face is a single loop whose projection along its mean normal is a
         convex polygon, run around once.
 
         Such a loop has no self-intersection, for its projection has none, and it lies on the
-        boundary of a convex set, the cylinder over the projection. A turn counts only from a
-        millionth of the lengths of the edges on, far above rounding: a face that is called convex
-        is convex.
+        boundary of a convex set, the cylinder over the projection. A turn counts only if its sine
+        is more than a millionth, far above rounding: a face that is called convex is convex.
         """
         x = self.vertices[self.corners]
         face, first = self.face_of_corner, self.first_corners
-        middle = np.add.reduceat(x, first) / np.diff(np.append(first, len(x)))[:, None]
-        a = x - middle[face]
+        center = np.add.reduceat(x, first) / np.diff(np.append(first, len(x)))[:, None]
+        a = x - center[face]
         normal = np.add.reduceat(np.cross(a, a[self.next_corner]), first)
         length = np.linalg.norm(normal, axis=1)
         normal /= np.where(length > 0, length, 1)[:, None]
         edge = x[self.next_corner] - x
-        least = np.linalg.norm(edge, axis=1)
-        least *= _TURN * least[self.next_corner]
+        min_sine = np.linalg.norm(edge, axis=1)
+        min_sine *= _TURN * min_sine[self.next_corner]
         edge -= (edge * normal[face]).sum(axis=1)[:, None] * normal[face]
-        after = edge[self.next_corner]
-        sine = (np.cross(edge, after) * normal[face]).sum(axis=1)
-        cosine = (edge * after).sum(axis=1)
-        turns = np.logical_and.reduceat(sine > least, first)
-        turned = np.add.reduceat(np.arctan2(sine, cosine), first)
-        once = np.abs(turned - 2 * np.pi) < _REVOLUTION
-        single = np.bincount(self.face_of_loop, minlength=self.face_count) == 1
-        return turns & once & single & (length > 0)
+        next_edge = edge[self.next_corner]
+        sine = (np.cross(edge, next_edge) * normal[face]).sum(axis=1)
+        cosine = (edge * next_edge).sum(axis=1)
+        turns_left = np.logical_and.reduceat(sine > min_sine, first)
+        total_turn = np.add.reduceat(np.arctan2(sine, cosine), first)
+        is_once = np.abs(total_turn - 2 * np.pi) < _REVOLUTION
+        is_single = np.bincount(self.face_of_loop, minlength=self.face_count) == 1
+        return turns_left & is_once & is_single & (length > 0)
 
     @functools.cached_property
     def first_corners(self) -> IntArray:
@@ -163,24 +162,24 @@ def validate_polygons(vertices: Any, faces: Any) -> PolygonFaces:
     """
     x = _checked_vertices(vertices)
     corners, sizes, face_of_loop = _flatten_faces(faces)
-    out = np.flatnonzero((corners < 0) | (corners >= len(x)))
+    bad = np.flatnonzero((corners < 0) | (corners >= len(x)))
     face = np.repeat(face_of_loop, sizes)
-    if out.size:
-        index = int(corners[out[0]])
+    if bad.size:
+        index = int(corners[bad[0]])
         hint = ""
         if index == len(x) and int(corners.min()) == 1:
             hint = "; these indices seem to count from 1: subtract 1"
         raise MeshError(
-            f"face {face[out[0]]} has vertex {index}{others_suffix(out.size)}, which is out of "
+            f"face {face[bad[0]]} has vertex {index}{others_suffix(bad.size)}, which is out of "
             "range: "
             f"there are {len(x):,} vertices, counted from 0{hint}"
         )
-    found = PolygonFaces(x, corners, sizes, face_of_loop)
-    _check_edges(found)
-    _check_not_collinear(found)
+    polygons = PolygonFaces(x, corners, sizes, face_of_loop)
+    _check_edges(polygons)
+    _check_not_collinear(polygons)
     for array in (x, corners, sizes, face_of_loop):
         array.setflags(write=False)
-    return found
+    return polygons
 
 
 def _checked_vertices(vertices: Any) -> FloatArray:
@@ -198,7 +197,7 @@ def _checked_vertices(vertices: Any) -> FloatArray:
 
 
 def _flatten_faces(faces: Any) -> tuple[IntArray, IntArray, IntArray]:
-    """Corners of all loops, the size of each, and the face of each."""
+    """The corners of all loops, and the size and the face of each loop."""
     if not _is_list(faces):
         raise MeshError(f"the faces must be a list of lists of vertex indices, not {faces!r}")
     if len(faces) == 0:
@@ -229,11 +228,11 @@ def _loops_of(face: Any, k: int) -> list[Any]:
         )
     if len(face) == 0:
         raise MeshError(f"face {k} is empty: it needs three or more vertices; leave it out")
-    nested = [_is_list(one) for one in face]
-    if any(nested) and not all(nested):
+    is_nested = [_is_list(entry) for entry in face]
+    if any(is_nested) and not all(is_nested):
         raise MeshError(f"face {k} mixes indices and loops: give one kind or the other")
     loops: list[Any] = []
-    for loop in face if all(nested) else [face]:
+    for loop in face if all(is_nested) else [face]:
         try:
             array: npt.NDArray[Any] = np.asarray(loop)
         except (ValueError, OverflowError):
@@ -252,23 +251,25 @@ def _is_list(value: Any) -> bool:
     return is_array or (isinstance(value, Sequence) and not isinstance(value, str))
 
 
-def _check_edges(found: PolygonFaces) -> None:
-    n = len(found.vertices)
-    loop = np.repeat(np.arange(len(found.loop_sizes)), found.loop_sizes)
-    face = found.face_of_corner
-    first = _first_repeated_key(loop * n + found.corners)
+def _check_edges(mesh: PolygonFaces) -> None:
+    """Raise MeshError for a loop that visits a vertex twice, an edge of length zero, or an edge
+    that its face runs twice."""
+    n = len(mesh.vertices)
+    loop = np.repeat(np.arange(len(mesh.loop_sizes)), mesh.loop_sizes)
+    face = mesh.face_of_corner
+    first = _first_repeated_key(loop * n + mesh.corners)
     if first is not None:
         raise MeshError(
-            f"face {face[first]} visits vertex {found.corners[first]} twice: split it there into "
+            f"face {face[first]} visits vertex {mesh.corners[first]} twice: split it there into "
             "two loops of one face, or into two faces"
         )
-    begin, end = found.corners, found.corners[found.next_corner]
-    length = np.abs(found.vertices[begin] - found.vertices[end]).max(axis=1)
-    if (none := np.flatnonzero(length < 1e-100)).size:
-        k = none[0]
+    begin, end = mesh.corners, mesh.corners[mesh.next_corner]
+    length = np.abs(mesh.vertices[begin] - mesh.vertices[end]).max(axis=1)
+    if (degenerate := np.flatnonzero(length < 1e-100)).size:
+        k = degenerate[0]
         raise MeshError(
             f"face {face[k]} has an edge without a length, from vertex {begin[k]} to "
-            f"{end[k]}{others_suffix(none.size)}: join vertices at the same place"
+            f"{end[k]}{others_suffix(degenerate.size)}: join vertices at the same place"
         )
     _, edge = np.unique(np.minimum(begin, end) * n + np.maximum(begin, end), return_inverse=True)
     if (first := _first_repeated_key(face * len(edge) + edge.reshape(-1))) is not None:
@@ -286,27 +287,30 @@ def _first_repeated_key(keys: IntArray) -> int | None:
     return int(np.setdiff1d(np.arange(len(keys)), first)[0])
 
 
-def _check_not_collinear(found: PolygonFaces) -> None:
+def _check_not_collinear(mesh: PolygonFaces) -> None:
     """Raise MeshError for a face whose corners are collinear: all within 1e-9 of its size from the
     line that joins the corner farthest from the center of its box to the corner farthest from that
     corner."""
-    x, face = found.vertices[found.corners], found.face_of_corner
-    low, high = found.face_boxes()
-    a = x - (0.5 * (low + high))[face]
-    a /= np.abs(high - low).max(axis=1)[face][:, None]
-    # The direction of the longest row, and how far the others are from it.
+    x, face = mesh.vertices[mesh.corners], mesh.face_of_corner
+    lower, upper = mesh.face_boxes()
+    a = x - (0.5 * (lower + upper))[face]
+    a /= np.abs(upper - lower).max(axis=1)[face][:, None]
+    # The corner of each face that is farthest from the center, and the offsets of the others from
+    # it.
     square = (a * a).sum(axis=1)
     order = np.lexsort((square, face))
     last = np.append(np.flatnonzero(np.diff(face[order])), len(order) - 1)
     pole = a[order[last]]
-    off = a - pole[face]
+    offset = a - pole[face]
     # From the pole to the corner that is farthest from it.
-    far = (off * off).sum(axis=1)
-    order = np.lexsort((far, face))
-    line = off[order[last]]
+    square_distance = (offset * offset).sum(axis=1)
+    order = np.lexsort((square_distance, face))
+    line = offset[order[last]]
     line /= np.linalg.norm(line, axis=1, keepdims=True)
-    rest = np.linalg.norm(off - (off * line[face]).sum(axis=1)[:, None] * line[face], axis=1)
-    widest = np.maximum.reduceat(rest, found.first_corners)
+    distance = np.linalg.norm(
+        offset - (offset * line[face]).sum(axis=1)[:, None] * line[face], axis=1
+    )
+    widest = np.maximum.reduceat(distance, mesh.first_corners)
     if (flat := np.flatnonzero(widest < _COLLINEAR_TOLERANCE)).size:
         raise MeshError(
             f"the vertices of face {flat[0]}{others_suffix(flat.size)} lie on a line: it has no "
@@ -314,7 +318,7 @@ def _check_not_collinear(found: PolygonFaces) -> None:
         )
 
 
-# How much normals count beside places, in units of the mesh.
+# The weight of normals relative to positions, in units of the mesh.
 _NORMAL_WEIGHT = 0.25
 
 
@@ -327,16 +331,17 @@ def cluster_into_polygons(
     smoothing: int = 0,
     seed: int = 0,
 ) -> tuple[FloatArray, list[list[list[int]]]]:
-    """Cut a triangle mesh into about `count` clusters, whose boundaries are polygons with many
-    corners that are not planar. Returns vertices, and polygon faces, a list of loops each.
+    """Cut a triangle mesh into about `count` clusters, whose boundaries are polygons with a large
+    number of corners, not planar. Returns the vertices and the polygon faces, each a list of loops.
 
     For pictures and tests. Each triangle is a point (centroid, weight * normal) in six dimensions,
     and Lloyd's algorithm finds the clusters, so that they are compact and bend little
     (Cohen-Steiner, Alliez and Desbrun 2004 do so with planes).
 
     Corners of the polygons are vertices of the mesh; vertices inside of clusters are left out.
-    smoothing: how many times corners of just two edges are moved to the middle between their
-    position and the mean of their neighbors, since boundaries along triangles are zigzags.
+    smoothing: the number of times that corners of just two edges are moved to the middle between
+        their position and the mean of their neighbors, since boundaries along triangles are
+        zigzags.
 
     Raises:
         ValueError: fewer than two clusters, or more than triangles.
@@ -347,14 +352,16 @@ def cluster_into_polygons(
     order = np.argsort(patch, kind="stable")
     parts = np.split(faces[order], np.flatnonzero(np.diff(patch[order])) + 1)
     loops = [join_edges(boundary_edges(part.tolist())) for part in parts]
-    loops = [one for one in loops if one]
-    used = np.unique([corner for one in loops for loop in one for corner in loop])
+    loops = [cluster for cluster in loops if cluster]
+    used = np.unique([corner for cluster in loops for loop in cluster for corner in loop])
     number = np.full(len(vertices), -1)
     number[used] = np.arange(len(used))
-    numbered = [[[int(number[corner]) for corner in loop] for loop in one] for one in loops]
+    numbered = [[[int(number[corner]) for corner in loop] for loop in cluster] for cluster in loops]
     points = vertices[used]
     if smoothing:
-        ends = np.array([(a, b) for one in numbered for loop in one for a, b in _edges(loop)])
+        ends = np.array(
+            [(a, b) for cluster in numbered for loop in cluster for a, b in _edges(loop)]
+        )
         points = _smoothed(points, np.unique(np.sort(ends, axis=1), axis=0), smoothing)
     return points, numbered
 
@@ -364,7 +371,7 @@ def _edges(loop: list[int]) -> list[tuple[int, int]]:
 
 
 def _smoothed(points: FloatArray, edges: IntArray, times: int) -> FloatArray:
-    """The points, with those of exactly two edges (e, 2) smoothed along the polygon, `times`
+    """The points, where points of exactly two edges (e, 2) are smoothed along the polygon, `times`
     times."""
     both = np.concatenate([edges, edges[:, ::-1]])
     inner = np.bincount(both[:, 0], minlength=len(points)) == 2

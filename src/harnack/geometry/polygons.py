@@ -25,20 +25,20 @@ __all__ = ["cancel_opposite_edges", "remaining_edges", "triangulate"]
 def cancel_opposite_edges(loops: Loops) -> Loops:
     """Remove pairs of opposite edges from closed loops; the solid angle stays the same modulo 4 pi.
 
-    Seen from a point, an edge contributes minus what the reversed edge contributes, so both drop
+    Seen from a point, the contribution of an edge is minus that of the reversed edge, so both drop
     out of the sum. If they were kept, they would leave rounding errors, and would count in
     distances and in tests of convexity as a curve that is not there.
 
     Vertices at exactly the same position are the same. If edges run both ways between two vertices,
-    the surplus of one direction is left, as often as it counts. If no edges cancel, the loops are
-    returned as they are; if all cancel, no loop is returned. Edges are compared as wholes: of two
+    the surplus of a direction is left, with its multiplicity. If no edges cancel, the loops are
+    returned as they are; if all cancel, no loop is returned. Only entire edges are compared: of two
     edges that overlap in part and run opposite ways, both stay.
 
-    Proof that the rest is closed: in loops as many edges begin at a vertex as end there, and this
-    stays true when an edge and its reverse are removed. The gradient of the solid angle is the sum
-    of the edges' fields, which cancel (Biot and Savart), and the integral along closed paths is
-    still a multiple of 4 pi, so that values change by a constant at most; far away both vanish,
-    modulo 4 pi.
+    Proof that the remaining loops are closed: in loops the same number of edges begins and ends at
+    a vertex, and this stays true when an edge and its reverse are removed. The gradient of the
+    solid angle is the sum of the edges' fields, which cancel (Biot and Savart), and the integral
+    along closed paths is still a multiple of 4 pi, so that values change by a constant at most; far
+    away both vanish, modulo 4 pi.
     """
     points = np.concatenate(loops)
     begin, end = _welded(loops, points)
@@ -71,13 +71,13 @@ def _welded(loops: Loops, points: FloatArray) -> tuple[IntArray, IntArray]:
 
 # Triangles of polygons.
 
-# Corners squared, and this constant more a polygon, summed over those of which ears are cut: some
-# ten seconds of work at worst.
+# The square of the number of corners plus a constant, summed over the polygons of which ears are
+# cut: about ten seconds of work at worst.
 _MAX_EAR_WORK = 1_000_000_000
 _WORK_A_POLYGON = 1000
 # Twice the area of a triangle, in a polygon of size about 1, up to which it counts as flat.
 _FLAT = 1e-12
-# How much an edge with corners in its middle is bent: depth over the square of its length.
+# The curvature of an edge with corners in its middle: depth over the square of its length.
 _INWARD = 1e-6
 _CHUNK = 2_000_000
 
@@ -87,7 +87,8 @@ def triangulate(vertices: FloatArray, corners: IntArray, sizes: IntArray) -> Int
 
     vertices: (n, 3).
     corners: the vertex indices of all polygons, one polygon after the other.
-    sizes: (m,) the number of corners of each; polygons with fewer than three give no triangles.
+    sizes: (m,) the number of corners of each polygon; polygons with fewer than three yield no
+        triangles.
 
     A polygon need not be exactly planar: it is judged by its projection along its mean normal. If
     the fans around its first two corners are not valid triangulations, because the polygon is not
@@ -96,41 +97,46 @@ def triangulate(vertices: FloatArray, corners: IntArray, sizes: IntArray) -> Int
     number these still add up to the polygon.
 
     Raises:
-        MeshError: so many non-convex polygons with so many corners that it would take long.
+        MeshError: the triangulation would take too long, because of the number of non-convex
+            polygons and of their corners.
     """
     if (sizes == 3).all():
         return corners.reshape(-1, 3)
     begins = np.cumsum(sizes) - sizes
-    found = [np.zeros((0, 3), dtype=np.int64)]
+    triangles = [np.zeros((0, 3), dtype=np.int64)]
     owners = [np.zeros(0, dtype=np.int64)]
     work = 0
     for part in _group_by_size(sizes):
         k = int(sizes[part[0]])
         polygons = corners[begins[part][:, None] + np.arange(k)]
-        bent = np.zeros(len(part), dtype=bool)
+        is_concave = np.zeros(len(part), dtype=bool)
         if k > 3:
-            bent = _fan_is_invalid(vertices, polygons)
-            # The fan around the second corner is that around the first of the polygon turned on.
-            polygons[bent] = np.roll(polygons[bent], -1, axis=1)
+            is_concave = _fan_is_invalid(vertices, polygons)
+            # The fan around the second corner is the fan around the first corner of the rotated
+            # polygon.
+            polygons[is_concave] = np.roll(polygons[is_concave], -1, axis=1)
             # A quadrilateral can be cut in no other way.
-            bent[bent] = k > 4 and _fan_is_invalid(vertices, polygons[bent])
-        work += int(bent.sum()) * (k * k + _WORK_A_POLYGON)
+            is_concave[is_concave] = k > 4 and _fan_is_invalid(vertices, polygons[is_concave])
+        work += int(is_concave.sum()) * (k * k + _WORK_A_POLYGON)
         if work > _MAX_EAR_WORK:
             raise MeshError(
-                f"{bent.sum():,} polygons with dents and {k:,} corners each take too long to "
+                f"{is_concave.sum():,} polygons with dents and {k:,} corners each take too long to "
                 "triangulate: let the program that made the file triangulate them"
             )
-        found.append(_fans(polygons[~bent]))
-        owners.append(np.repeat(part[~bent], k - 2))
-        projections = _projections(vertices, polygons[bent])
-        for owner, polygon, projection in zip(part[bent], polygons[bent], projections, strict=True):
-            found.append(_clip_ears(polygon, projection))
-            owners.append(np.full(len(found[-1]), owner))
-    return np.concatenate(found)[np.argsort(np.concatenate(owners), kind="stable")]
+        triangles.append(_fans(polygons[~is_concave]))
+        owners.append(np.repeat(part[~is_concave], k - 2))
+        projections = _projections(vertices, polygons[is_concave])
+        for owner, polygon, projection in zip(
+            part[is_concave], polygons[is_concave], projections, strict=True
+        ):
+            triangles.append(_clip_ears(polygon, projection))
+            owners.append(np.full(len(triangles[-1]), owner))
+    return np.concatenate(triangles)[np.argsort(np.concatenate(owners), kind="stable")]
 
 
 def _group_by_size(sizes: IntArray) -> list[IntArray]:
-    """Numbers of polygons with equally many corners, three or more, not too many at a time."""
+    """The indices of polygons with the same number of corners, three or more, in groups of limited
+    size."""
     order = np.argsort(sizes, kind="stable")
     order = order[sizes[order] >= 3]
     distinct, first = np.unique(sizes[order], return_index=True)

@@ -66,8 +66,8 @@ def smooth_curve(
         raise TooManyVerticesError(
             f"{total:,} vertices are more than {MAX_VERTICES:,}: take fewer samples"
         )
-    made = [_spline(loop, samples_per_segment, closed, _POWERS[spacing]) for loop in loops]
-    return made if _is_list(points) else made[0]
+    curves = [_spline(loop, samples_per_segment, closed, _POWERS[spacing]) for loop in loops]
+    return curves if _is_list(points) else curves[0]
 
 
 def _count(samples: Any) -> int:
@@ -90,18 +90,23 @@ def _is_list(points: Any) -> bool:
 
 
 def _spline(x: FloatArray, samples: int, closed: bool, power: float) -> FloatArray:
+    """The vertices of the spline through the points of a loop, with `samples` from each point to
+    the next.
+
+    power: the parameter grows from point to point like this power of the distance.
+    """
     knots = np.concatenate([x, x[:1]]) if closed else x
-    apart = np.diff(knots, axis=0)
-    length = np.linalg.norm(apart / np.abs(apart).max(), axis=1)  # so that no square overflows
-    at = np.concatenate([[0.0], np.cumsum(length**power)])
-    if (np.diff(at) <= 0).any():
-        k = int(np.flatnonzero(np.diff(at) <= 0)[0])
+    chords = np.diff(knots, axis=0)
+    length = np.linalg.norm(chords / np.abs(chords).max(), axis=1)  # so that no square overflows
+    parameters = np.concatenate([[0.0], np.cumsum(length**power)])
+    if (np.diff(parameters) <= 0).any():
+        k = int(np.flatnonzero(np.diff(parameters) <= 0)[0])
         raise CurveScaleError(
             f"points {k} and {(k + 1) % len(x)} are nearer to each other than rounding, beside the "
             "length of the curve: remove one of them"
         )
-    spline = CubicSpline(at, knots, bc_type="periodic" if closed else "not-a-knot")
-    between = at[:-1, None] + np.diff(at)[:, None] * (np.arange(samples) / samples)
-    made = spline(between.ravel())
-    made[::samples] = knots[:-1]
-    return made if closed else np.concatenate([made, knots[-1:]])
+    spline = CubicSpline(parameters, knots, bc_type="periodic" if closed else "not-a-knot")
+    inner = parameters[:-1, None] + np.diff(parameters)[:, None] * (np.arange(samples) / samples)
+    vertices = spline(inner.ravel())
+    vertices[::samples] = knots[:-1]
+    return vertices if closed else np.concatenate([vertices, knots[-1:]])

@@ -55,7 +55,7 @@ class TangentVoronoi:
         """Upload the positions (n, 3) of all possible neighbors."""
         backend = choose_backend("double")
         columns = np.asarray(positions, np.float64).T
-        return cls(backend, tuple(upload_floats(backend, one) for one in columns))
+        return cls(backend, tuple(upload_floats(backend, column) for column in columns))
 
     def areas(
         self, points: FloatArray, normals: FloatArray, nearest: npt.NDArray[Any], radii: FloatArray
@@ -72,20 +72,21 @@ class TangentVoronoi:
         """
         areas, rim = self._cell_areas(points, normals, nearest, radii, mirrored=False)
         if rim.any():
-            some = points[rim], normals[rim], nearest[rim], radii[rim]
-            areas[rim], _ = self._cell_areas(*some, mirrored=True)
+            rim_points = points[rim], normals[rim], nearest[rim], radii[rim]
+            areas[rim], _ = self._cell_areas(*rim_points, mirrored=True)
         return areas * radii * radii
 
     def _cell_areas(
         self, points: FloatArray, normals: FloatArray, nearest: npt.NDArray[Any],
         radii: FloatArray, *, mirrored: bool,
     ) -> tuple[FloatArray, BoolArray]:  # fmt: skip
-        """Areas in units of the radii squared, and where all neighbors lie on one side.
+        """The areas (m,) of cells in units of the radii squared, and whether all neighbors lie on
+        one side.
 
-        On line j, at distance h_j from the center, the others and the circle leave an interval of
-        the position s along it. The region is star shaped, so its area is the sum of the triangles
-        between these intervals and the center, and of circular sectors in the directions that
-        remain. All neighbors lie on one side if none is to the left of one of them.
+        On line j, at distance h_j from the center, the other lines and the circle leave an interval
+        of the position s along it. The region is star shaped, so its area is the sum of the
+        triangles between these intervals and the center, and of circular sectors in the directions
+        that remain. All neighbors lie on one side if one of them has no other neighbor to its left.
         """
         backend, index = self.backend, self.backend.UInt32
         u, v = (upload_vectors(backend, axis) for axis in orthonormal_basis_rows(normals))
@@ -98,39 +99,44 @@ class TangentVoronoi:
 
         def line(i: Any, active: Mask) -> _BisectorLine:
             row = dr.select(i < rows, i, i - rows)
-            one = dr.gather(index, table, row * width + lane, active)
-            there = [dr.gather(backend.Float, part, one, active) for part in self.positions]
-            offset = (backend.Array3f(*there) - center) * scale
+            bisector = dr.gather(index, table, row * width + lane, active)
+            location = [dr.gather(backend.Float, part, bisector, active) for part in self.positions]
+            offset = (backend.Array3f(*location) - center) * scale
             sign = dr.select(i < rows, backend.Float(1), backend.Float(-1))
             # The plane that bisects the offset d meets the tangent plane in q . y = |d|^2/2.
             q = sign * dr.dot(offset, u), sign * dr.dot(offset, v)
             return _crossing(backend, q, 0.5 * dr.squared_norm(offset))
 
-        def others(j: Any, *state: Any) -> tuple[Any, ...]:
+        def step(j: Any, *state: Any) -> tuple[Any, ...]:
             numbers = [j + t for t in range(_LINES_PER_ITERATION)]
-            own = [line(number, number < lines) for number in numbers]
-            area, turned, is_rim = state
-            for number, one, found in zip(
-                numbers, own, _clip_bisectors(backend, numbers, own, line, lines), strict=True
+            bisectors = [line(number, number < lines) for number in numbers]
+            area, angle, is_rim = state
+            for number, bisector, interval in zip(
+                numbers,
+                bisectors,
+                _clip_bisectors(backend, numbers, bisectors, line, lines),
+                strict=True,
             ):
-                low, high, has_left = found
-                used, there = low < high, number < lines
-                low, high = dr.select(used, low, 0), dr.select(used, high, 0)
-                area = area + dr.select(there, 0.5 * one.h * (high - low), 0)
-                turn = dr.atan2(high, one.h) - dr.atan2(low, one.h)
-                turned = turned + dr.select(there, turn, 0)
+                lower, upper, has_left = interval
+                is_cut, location = lower < upper, number < lines
+                lower, upper = dr.select(is_cut, lower, 0), dr.select(is_cut, upper, 0)
+                area = area + dr.select(location, 0.5 * bisector.h * (upper - lower), 0)
+                turn = dr.atan2(upper, bisector.h) - dr.atan2(lower, bisector.h)
+                angle = angle + dr.select(location, turn, 0)
                 is_rim = is_rim | (
-                    there & ~has_left & ((one.neighbor[0] != 0) | (one.neighbor[1] != 0))
+                    location
+                    & ~has_left
+                    & ((bisector.neighbor[0] != 0) | (bisector.neighbor[1] != 0))
                 )
-            return j + _LINES_PER_ITERATION, area, turned, is_rim
+            return j + _LINES_PER_ITERATION, area, angle, is_rim
 
         zero = backend.Float(0) + 0 * scale
         start = index(0) + 0 * lane, zero, zero, zero > 1
-        more = _below(lines)
-        _, area, turned, is_rim = dr.while_loop(start, more, others, label="lines")
-        whole = area + 0.5 * fmax(2 * math.pi - turned, 0)
-        dr.eval(whole, is_rim)
-        return to_numpy(whole), to_numpy(is_rim)
+        condition = _below(lines)
+        _, area, angle, is_rim = dr.while_loop(start, condition, step, label="lines")
+        total = area + 0.5 * fmax(2 * math.pi - angle, 0)
+        dr.eval(total, is_rim)
+        return to_numpy(total), to_numpy(is_rim)
 
 
 def _below(count: Any) -> Callable[..., Mask]:
@@ -151,36 +157,37 @@ def _crossing(backend: Backend, q: tuple[Real, Real], b: Real) -> _BisectorLine:
 
 
 def _clip_bisectors(
-    backend: Backend, numbers: list[Any], own: list[_BisectorLine], line: Any, lines: Any
+    backend: Backend, numbers: list[Any], own_lines: list[_BisectorLine], line: Any, lines: Any
 ) -> list[tuple[Real, Real, Mask]]:
-    """The intervals of some lines that all other lines leave, and whether a neighbor is to the
-    left."""
+    """For each of these bisector lines, the interval of it that all other lines leave, and whether
+    a neighbor is to the left of its neighbor."""
     start: list[Any] = []
-    for one in own:
-        half_chord = dr.sqrt(fmax(1 - dr.square(one.h), 0))
+    for bisector in own_lines:
+        half_chord = dr.sqrt(fmax(1 - dr.square(bisector.h), 0))
         start += [-half_chord, half_chord, half_chord > dr.inf]
 
     def cut(i: Any, *state: Any) -> tuple[Any, ...]:
         other, new = line(i, i < lines), list[Any]()
-        for t, (number, one) in enumerate(zip(numbers, own, strict=True)):
-            low, high, has_left = state[3 * t : 3 * t + 3]
-            # How fast this line nears the other, going along it.
-            slope = other.y * one.x - other.x * one.y
-            room = other.h - one.h * (other.x * one.x + other.y * one.y)
+        for t, (number, bisector) in enumerate(zip(numbers, own_lines, strict=True)):
+            lower, upper, has_left = state[3 * t : 3 * t + 3]
+            # The rate at which this line nears the other line, along this line.
+            slope = other.y * bisector.x - other.x * bisector.y
+            distance = other.h - bisector.h * (other.x * bisector.x + other.y * bisector.y)
             is_parallel = dr.abs(slope) < _PARALLEL
-            bound = room / dr.select(is_parallel, 1, slope)
-            low = dr.select(slope < -_PARALLEL, fmax(low, bound), low)
-            high = dr.select(slope > _PARALLEL, fmin(high, bound), high)
-            # Of equal lines the first counts.
-            hidden = is_parallel & (room < dr.select(number > i, _PARALLEL, -_PARALLEL))
-            high = dr.select(hidden, -dr.inf, high)
+            bound = distance / dr.select(is_parallel, 1, slope)
+            lower = dr.select(slope < -_PARALLEL, fmax(lower, bound), lower)
+            upper = dr.select(slope > _PARALLEL, fmin(upper, bound), upper)
+            # Of equal lines only the first counts.
+            is_hidden = is_parallel & (distance < dr.select(number > i, _PARALLEL, -_PARALLEL))
+            upper = dr.select(is_hidden, -dr.inf, upper)
             has_left = has_left | (
-                one.neighbor[0] * other.neighbor[1] - one.neighbor[1] * other.neighbor[0] > 0
+                bisector.neighbor[0] * other.neighbor[1] - bisector.neighbor[1] * other.neighbor[0]
+                > 0
             )
-            new += [low, high, has_left]
+            new += [lower, upper, has_left]
         return i + 1, *new
 
     zero = backend.UInt32(0) + 0 * numbers[0]
-    found: tuple[Any, ...] = dr.while_loop((zero, *start), _below(lines), cut, label="other lines")
-    found = found[1:]
-    return [(found[k], found[k + 1], found[k + 2]) for k in range(0, len(found), 3)]
+    final: tuple[Any, ...] = dr.while_loop((zero, *start), _below(lines), cut, label="other lines")
+    final = final[1:]
+    return [(final[k], final[k + 1], final[k + 2]) for k in range(0, len(final), 3)]

@@ -19,9 +19,9 @@ from harnack.geometry.meshes import zero_area_faces
 
 __all__ = ["Welded", "connected_groups", "pairs_within", "rounding_of"]
 
-# How many units in the last place of the largest coordinate rounding explains.
+# The distance, in units in the last place of the largest coordinate, that rounding explains.
 _UNITS = 4
-# It explains no distance that is more than this part of the shortest edge there.
+# Rounding explains no distance that is more than this fraction of the shortest edge there.
 _OF_EDGES = 1e-3
 
 
@@ -39,10 +39,11 @@ class Welded:
     """A mesh after welding.
 
     index: (n,) the vertex that each vertex was joined to: the first at exactly its position, or the
-        first of those that rounding separates.
+        first of the positions that rounding separates.
     net: the faces between these vertices, duplicates added up (`net_faces`).
-    edges, weights: at which these faces do not cancel (`singular_edges`).
-    rounded: how many positions were joined with others from which rounding separates them.
+    edges, weights: the edges at which these faces do not cancel (`singular_edges`).
+    rounded: the number of positions that were joined with others from which rounding separates
+        them.
     """
 
     index: IntArray
@@ -58,9 +59,9 @@ class Welded:
         Corners are joined if they are nearer to each other than `rounding_of` and than a thousandth
         of the edges there, if edges at them do not cancel, and if joining leaves fewer such edges.
         No face loses its area, or two of its corners to the same position: where a face would, the
-        corners that it touches stay apart. So there are as many faces as before, but for those that
-        cancel; and a wider gap stays, as two corners are joined only if they are as near as two
-        results of one computation.
+        corners that it touches stay apart. So the number of faces is the same as before, except for
+        faces that cancel; and a wider gap stays, as two corners are joined only if they are as near
+        as two results of the same computation.
         """
         welded = cls._by(weld_vertices(vertices), vertices, faces, 0)
         if not len(welded.edges):
@@ -79,7 +80,8 @@ class Welded:
 
 
 def _joined_by_rounding(x: FloatArray, faces: IntArray, places: IntArray) -> IntArray:
-    """(n,) the vertex that stands for each, of those at some places, all different."""
+    """(n,) the vertex that stands for each vertex. Only vertices in `places`, all at different
+    positions, are joined."""
     stands = np.arange(len(x))
     pairs = places[pairs_within(x[places], rounding_of(x[faces]))]
     distance = np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1)

@@ -1,18 +1,20 @@
-"""Sums of blobs: at a point, along a path with ranges of both derivatives on its pieces, as jets.
+"""Sums of blobs: at a point; along a path, with ranges of both derivatives on its pieces; and as
+jets.
 
-One loop over the blobs. Positions are relative to each blob and in units of its own support, so
-that the same bounds hold for blobs of every size. Jets let blobs be deformed and blended.
+Each is one loop over the blobs. Positions are relative to each blob and in units of its own
+support, so that the same bounds hold for blobs of every size. Jets allow blobs to be deformed and
+blended.
 
 Rounding. Let u be the unit roundoff, v the vector from the point to a center in units of the
-support, t = v.d. Centers are stored as the sum of two numbers, so that v is right within 4u|v|;
-then so are t, the distance h of the line from the center (as a length), and the positions
-x = s - t, within 8u(2 + |t|) where they matter: that is a displacement of the blob relative to the
-path, which also covers that |d| is 1 only up to 2u. A displacement by e changes f' by at most
-`KernelLipschitz.slope` times e, and f'' by `KernelLipschitz.bend` times e (its jumps at the end of
-the support are searched for within a margin), or by `BlobKernel.lipschitz_fraction` of that. A sum
-of n terms adds n u times the sum of their largest absolute values. Both are added to the ranges,
-outwards. The value at the point is right within 8u |dk/dq|, by the rounding of q, and (16 + n)u m,
-with m as in `BlobKernel.profile`.
+support, t = v.d. Centers are stored as the sum of two numbers, so that the error of v is at most
+4u|v|. Then the errors of t, of the distance h of the line from the center (as a length) and of the
+positions x = s - t are at most 8u(2 + |t|) where they matter. That is a displacement of the blob
+relative to the path, which also covers that |d| is 1 only up to 2u. A displacement by e changes f'
+by at most `KernelLipschitz.slope` times e, and f'' by `KernelLipschitz.bend` times e (its jumps at
+the end of the support are tested for within a margin), or by `BlobKernel.lipschitz_fraction` of
+these bounds. A sum of n terms adds n u times the sum of their largest absolute values. Both are
+added to the ranges, outwards. The error of the value at the point is at most 8u |dk/dq|, by the
+rounding of q, plus (16 + n)u m, with m as in `BlobKernel.profile`.
 """
 
 from __future__ import annotations
@@ -35,15 +37,15 @@ if TYPE_CHECKING:
     from harnack.fields.blobs.kernels import BlobKernel, ChordProfile
 
 State: TypeAlias = "tuple[Any, ...]"
-# From the record of a blob and a state: the state with that blob added.
+# A function of the record of a blob and of a state: the state with that blob added.
 EachBlob: TypeAlias = "Callable[[list[Real], State], State]"
-# Applies that to all blobs that matter, beginning with a state.
+# A function that applies an `EachBlob` to all blobs that matter, from an initial state.
 ForEach: TypeAlias = "Callable[[EachBlob, State], State]"
 
 
 @dataclass(frozen=True)
 class SumValue:
-    """A sum at points: value and gradient, and bounds of their rounding."""
+    """A sum of blobs at points: its value and gradient, and bounds of their rounding errors."""
 
     value: Real
     gradient: Vec3
@@ -51,14 +53,15 @@ class SumValue:
     gradient_error: Real
 
 
-# The number of pieces of a path that takes the least time, for sums over all blobs, and for those
-# over the blobs of a cell, where lengths are short. Finding the blobs costs more than ranges.
+# The fastest number of pieces of a path, for sums over all blobs, and for sums over the blobs of a
+# cell, where lengths are short. Finding the blobs costs more than ranges.
 PIECES, PIECES_IN_CELL = 4, 3
 
 
 @dataclass(frozen=True)
 class SumOnRay:
-    """A sum along the path from p: its value at p, and ranges on pieces (a `PathRestriction`)."""
+    """A sum along the path from p: its value at p, and ranges of its derivatives on pieces (a
+    `PathRestriction`)."""
 
     start: SumValue
     parts: tuple[PathPiece, ...]
@@ -69,13 +72,13 @@ class SumOnRay:
         return len(self.parts)
 
     def derivative_ranges(self, knots: Sequence[Real]) -> tuple[PathPiece, ...]:
-        """The ranges, for the same knots that they were computed with."""
+        """The ranges, for the same knots for which they were computed."""
         assert len(knots) == len(self.parts) + 1
         return self.parts
 
 
 class KnotRecorder:
-    """A stand-in for a `PathRestriction` that records which knots a proof asks for."""
+    """A stand-in for a `PathRestriction` that records the knots that a proof asks for."""
 
     def __init__(self, piece_count: int = PIECES) -> None:
         self.piece_count = piece_count
@@ -111,10 +114,13 @@ def sum_along(
     *,
     signed: bool = True,
 ) -> SumOnRay:
-    """The sum along p + s d. signed: whether amplitudes may be negative."""
+    """The sum along p + s d, with ranges of its derivatives on the pieces between knots.
+
+    signed: whether amplitudes may be negative.
+    """
     real = backend.Float
     count = len(knots) - 1
-    unit = 0.5 * backend.machine_epsilon
+    u = 0.5 * backend.machine_epsilon
     jumps = kernel.second_derivative_jumps
 
     def body(row: list[Real], state: State) -> State:
@@ -123,71 +129,80 @@ def sum_along(
         v = _from(p, row) * inverse
         start = _add_value(kernel, v, inverse, amplitude, start)
 
-        along = dr.dot(v, d)
-        beside = v - along * d
-        squared = dr.dot(beside, beside)
+        t = dr.dot(v, d)
+        across = v - t * d
+        squared = dr.dot(across, across)
         height = fmin(squared, 1)
         inside = 1 - height
         chord = kernel.chord(height, inside)
-        size = 1 + dr.abs(along)
-        margin = (64 * unit) * size
-        places = [dr.fma(knot, inverse, -along) for knot in knots]
-        near = (squared < 1 + margin) & (places[0] < 1 + margin) & (places[-1] > -1 - margin)
+        size = 1 + dr.abs(t)
+        margin = (64 * u) * size
+        positions = [dr.fma(knot, inverse, -t) for knot in knots]
+        is_near = (
+            (squared < 1 + margin) & (positions[0] < 1 + margin) & (positions[-1] > -1 - margin)
+        )
         slope_scale = amplitude * inverse
         bend_scale = slope_scale * inverse
 
-        a = clamp(places[0], -chord.half_length, chord.half_length)
+        a = clamp(positions[0], -chord.half_length, chord.half_length)
         first_a, second_a = kernel.derivatives(height, inside, a)
         for k in range(count):
-            b = clamp(places[k + 1], -chord.half_length, chord.half_length)
+            b = clamp(positions[k + 1], -chord.half_length, chord.half_length)
             first_b, second_b = kernel.derivatives(height, inside, b)
             slopes = _slopes(chord, a, b, first_a, first_b)
             bends = _bends(chord, a, b, second_a, second_b)
             if jumps:
-                bends = _with_jumps(bends, inside, margin, places[k], places[k + 1])
-            for at, (low, high), scale in ((0, slopes, slope_scale), (2, bends, bend_scale)):
+                bends = _with_jumps(bends, inside, margin, positions[k], positions[k + 1])
+            for index, (lower, upper), scale in ((0, slopes, slope_scale), (2, bends, bend_scale)):
                 if signed:
-                    up = scale > 0
-                    low, high = dr.select(up, low, high), dr.select(up, high, low)
-                sums[4 * k + at] = dr.fma(low, scale, sums[4 * k + at])
-                sums[4 * k + at + 1] = dr.fma(high, scale, sums[4 * k + at + 1])
+                    positive = scale > 0
+                    lower, upper = (
+                        dr.select(positive, lower, upper),
+                        dr.select(positive, upper, lower),
+                    )
+                sums[4 * k + index] = dr.fma(lower, scale, sums[4 * k + index])
+                sums[4 * k + index + 1] = dr.fma(upper, scale, sums[4 * k + index + 1])
             a, first_a, second_a = b, first_b, second_b
 
-        nearest = fmax(fmax(places[0], -places[-1]), 0)
+        nearest = fmax(fmax(positions[0], -positions[-1]), 0)
         share = kernel.lipschitz_fraction(inside, nearest * nearest)
-        weight = dr.select(near, (size + 1) * share, 0)
+        weight = dr.select(is_near, (size + 1) * share, 0)
         sums[-3] = dr.fma(dr.abs(slope_scale), weight, sums[-3])
         sums[-2] = dr.fma(dr.abs(bend_scale), weight, sums[-2])
-        sums[-1] = sums[-1] + dr.select(near, real(1), 0)
+        sums[-1] = sums[-1] + dr.select(is_near, real(1), 0)
         return (*start, *sums)
 
     state = for_each(body, tuple(real(0) for _ in range(_VALUE_STATE_SIZE + 4 * count + 3)))
     steepness = kernel.steepness
     slope_size, bend_size, terms = state[-3:]
-    rounding = unit * (16 + terms)
+    rounding = u * (16 + terms)
     slope_error = rounding * steepness.slope * slope_size
     bend_error = rounding * steepness.bend * bend_size
-    parts: list[PathPiece] = []
+    pieces: list[PathPiece] = []
     for k, (begin, end) in enumerate(itertools.pairwise(knots)):
-        low, high, least, most = state[_VALUE_STATE_SIZE + 4 * k : _VALUE_STATE_SIZE + 4 * k + 4]
-        slopes = SlopeRange(low - slope_error, high + slope_error)
-        parts.append(PathPiece(end - begin, slopes, least - bend_error, most + bend_error))
-    return SumOnRay(_value(kernel, backend, state[:_VALUE_STATE_SIZE]), tuple(parts))
+        lower, upper, min_second, max_second = state[
+            _VALUE_STATE_SIZE + 4 * k : _VALUE_STATE_SIZE + 4 * k + 4
+        ]
+        slopes = SlopeRange(lower - slope_error, upper + slope_error)
+        pieces.append(
+            PathPiece(end - begin, slopes, min_second - bend_error, max_second + bend_error)
+        )
+    return SumOnRay(_value(kernel, backend, state[:_VALUE_STATE_SIZE]), tuple(pieces))
 
 
 def hessian_at(kernel: BlobKernel, backend: Backend, p: Vec3, for_each: ForEach) -> State:
-    """The second derivatives of the sum at points p: rows of the upper triangle."""
+    """The second derivatives (6,) of the sum at points p: the upper triangle row by row."""
 
     def body(row: list[Real], state: State) -> State:
         inverse, amplitude = row[6], row[7]
         v = _from(p, row) * inverse
         q = dr.dot(v, v)
         scale = amplitude * inverse * inverse
-        even = 2 * scale * kernel.profile(q)[1]
-        bend = 4 * scale * kernel.second_derivative(q)
+        diagonal = 2 * scale * kernel.profile(q)[1]
+        mixed = 4 * scale * kernel.second_derivative(q)
         pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
         return tuple(
-            total + dr.select(q < 1, bend * v[i] * v[j] + (even if i == j else 0), 0)
+            total + dr.select(q < 1, mixed * v[i] * v[j] + (diagonal if i == j else 0), 0)
             for total, (i, j) in zip(state, pairs, strict=True)
         )
 
@@ -200,30 +215,35 @@ _VALUE_STATE_SIZE = 8
 
 
 def _add_value(kernel: BlobKernel, v: Vec3, inverse: Real, amplitude: Real, state: State) -> State:
-    value, x, y, z, moved, noise, slope_size, terms = state
+    """The state, of `_VALUE_STATE_SIZE` numbers, with another blob added.
+
+    v: the vector from p to its center, in units of its support. inverse: of the support's radius.
+    """
+    value, x, y, z, slopes, scales, gradient_size, terms = state
     q = dr.dot(v, v)
-    k, slope, scale = kernel.profile(q)
-    steep = amplitude * slope
-    pull = -2 * steep * inverse
-    here = q < 1.001
+    k, dk, scale = kernel.profile(q)
+    slope = amplitude * dk
+    radial = -2 * slope * inverse
+    is_inside = q < 1.001
     size = dr.abs(amplitude)
     return (
         dr.fma(amplitude, k, value),
-        dr.fma(pull, v.x, x),
-        dr.fma(pull, v.y, y),
-        dr.fma(pull, v.z, z),
-        moved + dr.abs(steep),
-        dr.fma(size, scale, noise),
-        slope_size + dr.select(here, size * inverse * kernel.lipschitz_fraction(1.0, q), 0),
-        terms + dr.select(here, type(q)(1), 0),
+        dr.fma(radial, v.x, x),
+        dr.fma(radial, v.y, y),
+        dr.fma(radial, v.z, z),
+        slopes + dr.abs(slope),
+        dr.fma(size, scale, scales),
+        gradient_size + dr.select(is_inside, size * inverse * kernel.lipschitz_fraction(1.0, q), 0),
+        terms + dr.select(is_inside, type(q)(1), 0),
     )
 
 
 def _value(kernel: BlobKernel, backend: Backend, state: State) -> SumValue:
-    value, x, y, z, moved, noise, slope_size, terms = state
-    unit = 0.5 * backend.machine_epsilon
-    error = unit * dr.fma(16 + terms, noise, 8 * moved)
-    gradient_error = unit * (32 + terms) * kernel.steepness.slope * slope_size
+    """The sum and its errors, from the state of the loop."""
+    value, x, y, z, slopes, scales, gradient_size, terms = state
+    roundoff = 0.5 * backend.machine_epsilon
+    error = roundoff * dr.fma(16 + terms, scales, 8 * slopes)
+    gradient_error = roundoff * (32 + terms) * kernel.steepness.slope * gradient_size
     return SumValue(value, backend.Array3f(x, y, z), error, gradient_error)
 
 
@@ -236,8 +256,8 @@ def _slopes(chord: ChordProfile, a: Real, b: Real, at_a: Real, at_b: Real) -> tu
     """The range of the first derivative between a and b."""
     falls = (a <= chord.steepest_position) & (b >= chord.steepest_position)
     rises = (a <= -chord.steepest_position) & (b >= -chord.steepest_position)
-    low = dr.select(falls, -chord.steepest, fmin(at_a, at_b))
-    return low, dr.select(rises, chord.steepest, fmax(at_a, at_b))
+    lower = dr.select(falls, -chord.steepest, fmin(at_a, at_b))
+    return lower, dr.select(rises, chord.steepest, fmax(at_a, at_b))
 
 
 def _bends(chord: ChordProfile, a: Real, b: Real, at_a: Real, at_b: Real) -> tuple[Real, Real]:
@@ -245,21 +265,21 @@ def _bends(chord: ChordProfile, a: Real, b: Real, at_a: Real, at_b: Real) -> tup
     center = (a <= 0) & (b >= 0)
     right = (a <= chord.max_curvature_position) & (b >= chord.max_curvature_position)
     left = (a <= -chord.max_curvature_position) & (b >= -chord.max_curvature_position)
-    low = dr.select(center, chord.min_second, fmin(at_a, at_b))
-    return low, dr.select(left | right, chord.max_second, fmax(at_a, at_b))
+    lower = dr.select(center, chord.min_second, fmin(at_a, at_b))
+    return lower, dr.select(left | right, chord.max_second, fmax(at_a, at_b))
 
 
 def _with_jumps(
     bends: tuple[Real, Real], inside: Real, margin: Real, begin: Real, end: Real
 ) -> tuple[Real, Real]:
-    """The range, with 0 included where the piece leaves the support, and 0 alone where it does not
-    meet the support."""
+    """The range of the second derivative, with 0 included where the piece leaves the support, and 0
+    alone where it does not meet the support."""
     low, high = bends
     nearest = fmax(fmax(begin, -end), 0)
     meets = nearest * nearest < inside + margin
     farthest = fmax(dr.abs(begin), dr.abs(end))
     leaves: Mask = ~(farthest * farthest <= inside - margin)
-    low, high = dr.select(leaves, fmin(low, 0), low), dr.select(leaves, fmax(high, 0), high)
+    low, high = (dr.select(leaves, fmin(low, 0), low), dr.select(leaves, fmax(high, 0), high))
     return dr.select(meets, low, 0), dr.select(meets, high, 0)
 
 
@@ -280,10 +300,10 @@ def for_each_listed(records: RecordTable, entries: Any, begin: Any, end: Any) ->
         def step(i: Any, *state: Any) -> State:
             return i + 1, *body(records.read_record(dr.gather(kind, entries, i)), state)
 
-        def more(i: Any, *_: Any) -> Mask:
+        def has_more(i: Any, *_: Any) -> Mask:
             return i < end
 
-        return dr.while_loop((kind(begin), *state), more, step, label="blobs of a cell")[1:]
+        return dr.while_loop((kind(begin), *state), has_more, step, label="blobs of a cell")[1:]
 
     return for_each
 
@@ -307,28 +327,29 @@ def sum_jets(term: Term, like: Jet, zero: Real, for_each: ForEach) -> Jet:
 
 
 def blob_term(kernel: BlobKernel, coordinates: Coordinates) -> Term:
-    """The jet of one blob at jets of the coordinates."""
+    """The function of a record that returns the jet of its blob, at jets of the coordinates."""
     function = kernel.function()
 
     def term(row: list[Real]) -> Jet:
         inverse, amplitude = row[6], row[7]
-        x, y, z = (((one - row[k]) - row[3 + k]) * inverse for k, one in enumerate(coordinates))
+        x, y, z = (((axis - row[k]) - row[3 + k]) * inverse for k, axis in enumerate(coordinates))
         return (x**2 + y**2 + z**2).apply(function) * amplitude
 
     return term
 
 
 def jet_bounds(jet: Jet, zero: Real) -> Iterator[Any]:
-    """The ends of all intervals of a jet, as numbers of the backend."""
-    for one in (jet.value, *jet.first_derivatives, *jet.second_derivatives):
-        yield zero + one.lower
-        yield zero + one.upper
+    """The bounds of all intervals of a jet, as numbers of the backend."""
+    for interval in (jet.value, *jet.first_derivatives, *jet.second_derivatives):
+        yield zero + interval.lower
+        yield zero + interval.upper
     if jet.jet_at_start is not None:
         yield from jet_bounds(jet.jet_at_start, zero)
 
 
 def jet_from_bounds(like: Jet, ends: Iterator[Any]) -> Jet:
-    """A jet of the same variables as another one, with these ends."""
+    """The jet with these bounds, of the same variables as another jet: the inverse of
+    `jet_bounds`."""
     value = Interval(next(ends), next(ends))
     first = tuple(Interval(next(ends), next(ends)) for _ in like.first_derivatives)
     second = tuple(Interval(next(ends), next(ends)) for _ in like.second_derivatives)

@@ -1,6 +1,6 @@
 """Blobs: metaballs, soft objects and densities of molecules, as level sets of sums of kernels.
 
-`Blobs` is the field, `Molecule` that of a molecule's atoms, by their van der Waals radii.
+`Blobs` is the field; `Molecule` is the field of a molecule's atoms, with their van der Waals radii.
 """
 
 from __future__ import annotations
@@ -59,12 +59,12 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
     from harnack.geometry import Volume
 
-# From so many blobs on, a grid is faster than a sum over all, by experiment.
+# For at least this number of blobs a grid is faster than a sum over all blobs, by experiment.
 _MIN_BLOBS_FOR_GRID = 64
 
 
 class BlobError(ValueError):
-    """Blobs that cannot be; the message says which and why."""
+    """Arguments that are not valid blobs; the message states which blob, and why."""
 
 
 class Blobs(Formula):
@@ -75,16 +75,17 @@ class Blobs(Formula):
 
     centers: (n, 3).
     radii: (n,) or one number, > 0.
-    weights: (n,), or None for 1; negative ones carve.
+    weights: (n,), or None for 1; negative weights carve.
     kernel: "compact" (a polynomial of the sixth degree), "gaussian", or the soft objects "cubic"
         and "sextic"; or one with other parameters, such as `GaussianKernel(sharpness=2.0)`. Each
-        ends at `BlobKernel.support` times the radius.
-    groups: (n,) integers: f is then the largest of the sums of each group, so that groups meet in
-        creases; None for one sum.
+        kernel ends at `BlobKernel.support` times the radius.
+    groups: (n,) integers: f is then the largest of the sums of the groups, so that groups meet in
+        creases; None for a single sum.
 
-    Many blobs are kept in a uniform grid of lists, so that a sample takes only those nearby.
+    Large numbers of blobs are kept in a uniform grid of lists, so that a sample reads only the
+    blobs nearby.
 
-    Raises BlobError (a ValueError) for numbers that are no blobs.
+    Raises BlobError (a ValueError) for numbers that are not valid blobs.
     """
 
     is_cheap = False
@@ -111,18 +112,20 @@ class Blobs(Formula):
 
     @property
     def _supports(self) -> FloatArray:
+        """(n,) The radii of the blobs' supports."""
         return self.radii * self.kernel.support
 
     @functools.cached_property
     def cell_lists(self) -> CellLists | None:
-        """The lists of blobs near each cell of a grid; None for few blobs."""
+        """The lists of blobs near each cell of a grid; None for a small number of blobs."""
         return (
             CellLists.of(self.centers, self._supports) if len(self) >= _MIN_BLOBS_FOR_GRID else None
         )
 
     @cached_prepare
     def prepare(self, backend: Backend) -> Blobs:
-        """The blobs as records of the backend; other blobs compile no other kernel."""
+        """The same field with its blobs as records of the backend. Other blobs need no other
+        kernel."""
         prepared = copy.copy(self)
         prepared._on = _BlobDeviceData.upload(backend, self)
         prepared.kernel = self.kernel.prepare(backend)
@@ -130,13 +133,13 @@ class Blobs(Formula):
         return prepared
 
     def largest_gradient(self) -> float:
-        """A bound of |grad f|: the largest sum of the largest gradients of overlapping blobs."""
-        steep = np.abs(self.weights) * (self.kernel.amplitude * self.kernel.steepness.slope)
-        steep /= self._supports
+        """A bound of |grad f|: the largest sum of the gradient bounds of overlapping blobs."""
+        gradients = np.abs(self.weights) * (self.kernel.amplitude * self.kernel.steepness.slope)
+        gradients /= self._supports
         lists = self.cell_lists
         if lists is None:
-            return float(steep.sum())
-        ends = np.concatenate([[0.0], np.cumsum(steep[lists.entries])])
+            return float(gradients.sum())
+        ends = np.concatenate([[0.0], np.cumsum(gradients[lists.entries])])
         return float((ends[lists.starts[1:]] - ends[lists.starts[:-1]]).max()) * (1 + 1e-6)
 
     def extent(self, levels: tuple[float, ...]) -> Volume:
@@ -154,84 +157,89 @@ class Blobs(Formula):
                 )
 
     def evaluate(self, p: Vec3) -> Sample:
-        on = self._prepared(p)
-        return self._sample(on.value_at(self.kernel, p))
+        data = self._prepared(p)
+        return self._sample(data.value_at(self.kernel, p))
 
-    def _sample(self, found: SumValue) -> Sample:
-        known = () if self.lipschitz is None else (Lipschitz(0 * found.value + self.lipschitz),)
-        return Sample(found.value, found.gradient, known, found.error, found.gradient_error)
+    def _sample(self, sums: SumValue) -> Sample:
+        """The sample from the sum at points."""
+        promises = () if self.lipschitz is None else (Lipschitz(0 * sums.value + self.lipschitz),)
+        return Sample(sums.value, sums.gradient, promises, sums.error, sums.gradient_error)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """Value and ranges by one loop over the blobs nearby; looking back nothing is proved.
+        """The ray sample, by one loop over the blobs nearby. It has no enclosure looking back.
 
         In a grid, enclosures reach to the end of the point's cell. From an empty cell, f is 0 until
-        the path comes to the first cell that is not empty: steps from there are proved from that
-        cell's list.
+        the path comes to the first cell that is not empty; enclosures from there are proved from
+        that cell's list.
         """
         del back
         p, d = path.point(t), path.direction
-        on = self._prepared(p)
-        count = PIECES if on.grid is None else PIECES_IN_CELL
-        asked = KnotRecorder(count)
-        nothing = SlopeRange(0.0, 0.0)
-        path.proofs.from_restriction(asked, nothing, ahead)
-        if asked.knots is None:
+        data = self._prepared(p)
+        count = PIECES if data.grid is None else PIECES_IN_CELL
+        probe = KnotRecorder(count)
+        no_slope = SlopeRange(0.0, 0.0)
+        path.proofs.from_restriction(probe, no_slope, ahead)
+        if probe.knots is None:
             return path.enclose(self.evaluate(p))
-        on = self._prepared(p)
-        run: Real | None = None
-        there, length = p, fmin(ahead, on.max_path_length)
-        if on.grid is not None:
-            run = empty = on.grid.empty_run(p, d, ahead)
-            there = dr.fma(type(p)(empty), d, p)
-            reach = on.grid.cell(there).exit_distance(d)
-            length = fmin(dr.select(empty > 0, reach, fmin(ahead, reach)), on.max_path_length)
-        path.proofs.from_restriction(asked, nothing, length)
+        data = self._prepared(p)
+        empty_length: Real | None = None
+        q, length = p, fmin(ahead, data.max_path_length)
+        if data.grid is not None:
+            empty_length = skipped = data.grid.empty_run(p, d, ahead)
+            q = dr.fma(type(p)(skipped), d, p)
+            reach = data.grid.cell(q).exit_distance(d)
+            length = fmin(dr.select(skipped > 0, reach, fmin(ahead, reach)), data.max_path_length)
+        path.proofs.from_restriction(probe, no_slope, length)
         enclosures: tuple[Enclosure, ...]
-        if on.groups is None:
-            found = sum_along(
+        if data.groups is None:
+            sums = sum_along(
                 self.kernel,
-                on.backend,
-                there,
+                data.backend,
+                q,
                 d,
-                asked.knots,
-                on.near(there),
-                signed=on.has_negative_weights,
+                probe.knots,
+                data.near(q),
+                signed=data.has_negative_weights,
             )
-            start = found.start if run is None else _zero_where(run > 0, found.start)
+            start = (
+                sums.start if empty_length is None else _zero_where(empty_length > 0, sums.start)
+            )
             slope = dr.dot(start.gradient, d)
             slopes = SlopeRange.around(slope, start.gradient_error)
-            enclosures = path.proofs.from_restriction(found, slopes, length)
+            enclosures = path.proofs.from_restriction(sums, slopes, length)
         else:
-            start = on.value_at(self.kernel, p)
+            start = data.value_at(self.kernel, p)
             slope = dr.dot(start.gradient, d)
             enclosures = (
                 GroupMaximumEnclosure(
-                    self.kernel, on.grouped(there), path, there, start.value, asked.knots, length,
-                    on.has_negative_weights,
+                    self.kernel, data.grouped(q), path, q, start.value, probe.knots, length,
+                    data.has_negative_weights,
                 ),
             )  # fmt: skip
-        if run is not None:
-            enclosures = tuple(DelayedEnclosure(run, one) for one in enclosures)
+        if empty_length is not None:
+            enclosures = tuple(
+                DelayedEnclosure(empty_length, enclosure) for enclosure in enclosures
+            )
         return RaySample(self._sample(start), enclosures, (), slope, float(count))
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         """f of jets of the coordinates, or of Dr.Jit numbers: a sum over all blobs."""
         if not is_jet(x, type(self).__name__):
             return self.differentiable_value(backend_of(x).Array3f(x, y, z))
-        on = self._prepared_for(backend_of(_backend_number(x, y, z)))
-        zero = on.backend.Float(0)
+        data = self._prepared_for(backend_of(_backend_number(x, y, z)))
+        zero = data.backend.Float(0)
         term = blob_term(self.kernel, (x, y, z))
-        if on.groups is None:
-            return sum_jets(term, x, zero, for_each_record(on.records))
-        return group_maximum_jet(term, x, zero, on.grouped(None))
+        if data.groups is None:
+            return sum_jets(term, x, zero, for_each_record(data.records))
+        return group_maximum_jet(term, x, zero, data.grouped(None))
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """Rows of the Hessian of the sum, or of the largest sum."""
-        on = self._prepared(p)
-        if on.groups is not None:
+        """The rows of the Hessian of the sum, or of the largest sum."""
+        data = self._prepared(p)
+        if data.groups is not None:
             return super().hessian(p)
-        xx, xy, xz, yy, yz, zz = hessian_at(self.kernel, on.backend, p, on.near(p))
-        vector = on.backend.Array3f
+        xx, xy, xz, yy, yz, zz = hessian_at(self.kernel, data.backend, p, data.near(p))
+        vector = data.backend.Array3f
         return vector(xx, xy, xz), vector(xy, yy, yz), vector(xz, yz, zz)
 
     def _prepared(self, p: Vec3) -> _BlobDeviceData:
@@ -255,9 +263,9 @@ class Blobs(Formula):
 class _BlobDeviceData:
     """The data of blobs on a backend.
 
-    groups: the group of each blob, and the number of groups; None if all are one sum.
+    groups: the group of each blob, and the number of groups; None if all blobs are one sum.
     has_negative_weights: whether amplitudes may be negative.
-    max_path_length: longer than any path through all supports.
+    max_path_length: a length greater than that of any path through all supports.
     """
 
     backend: Backend
@@ -275,24 +283,25 @@ class _BlobDeviceData:
         if blobs.groups is not None:
             count = dr.opaque(backend.UInt32, int(blobs.groups.max()) + 1)
             groups = upload_integers(backend, blobs.groups), count
-        low, high = blobs.extent(()).bounds()
+        lower, upper = blobs.extent(()).bounds()
         return cls(
             backend,
             RecordTable.upload(backend, _rows(backend, blobs)),
             None if lists is None else BlobGrid.upload(backend, lists),
             groups,
             bool((blobs.weights < 0).any()),
-            dr.opaque(backend.Float, 2 * float(np.linalg.norm(high - low))),
+            dr.opaque(backend.Float, 2 * float(np.linalg.norm(upper - lower))),
         )
 
     def near(self, p: Vec3) -> ForEach:
-        """The blobs whose supports may contain p: those of its cell."""
+        """A loop over the blobs whose supports may contain p: those of its cell, or all without a
+        grid."""
         if self.grid is None:
             return for_each_record(self.records)
         return for_each_listed(self.records, self.grid.entries, *self.grid.list_at(p))
 
     def grouped(self, p: Vec3 | None) -> GroupedList:
-        """The same, by groups; all blobs if p is None."""
+        """The blobs whose supports may contain p, by groups; all blobs if p is None."""
         assert self.groups is not None
         of, count = self.groups
         if self.grid is None or p is None:
@@ -309,20 +318,23 @@ class _BlobDeviceData:
 
 
 def _rows(backend: Backend, blobs: Blobs) -> FloatArray:
-    """Records (n, 8): the center, rounded; the rest of the center; 1/R; and the amplitude."""
+    """The records (n, 8) of blobs: the center, rounded; the rest of the center; the inverse of the
+    support's radius; and the amplitude."""
     supports = blobs.radii * blobs.kernel.support
     info = np.finfo(backend.dtype)
     largest, smallest = float(info.max), float(info.smallest_normal)
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
         amplitude = blobs.weights * blobs.kernel.amplitude
-        near = blobs.centers.astype(backend.dtype).astype(np.float64)
-        strong = np.abs(amplitude) * max(1.0, blobs.kernel.steepness.bend)
+        rounded = blobs.centers.astype(backend.dtype).astype(np.float64)
+        size = np.abs(amplitude) * max(1.0, blobs.kernel.steepness.bend)
         inverse = 1 / supports
-        bend = strong * inverse * inverse
-    outside = ~((np.abs(blobs.centers) <= largest) & (supports[:, None] * smallest < 1)).all(axis=1)
-    outside |= ~((inverse < 1e30) & (strong <= largest) & (bend <= largest))
-    if outside.any():
-        worst = int(np.argmax(outside))
+        second = size * inverse * inverse
+    is_invalid = ~((np.abs(blobs.centers) <= largest) & (supports[:, None] * smallest < 1)).all(
+        axis=1
+    )
+    is_invalid |= ~((inverse < 1e30) & (size <= largest) & (second <= largest))
+    if is_invalid.any():
+        worst = int(np.argmax(is_invalid))
         precision = "single" if backend.dtype == np.float32 else "double"
         help_ = 'use precision="double" or ' if precision == "single" else ""
         raise BlobError(
@@ -331,13 +343,14 @@ def _rows(backend: Backend, blobs: Blobs) -> FloatArray:
             f"too small, too large or too far away for {precision} precision: "
             f"{help_}choose units nearer to 1"
         )
-    rest = blobs.centers - near
-    return np.column_stack([near, rest, 1 / supports, amplitude])
+    remainder = blobs.centers - rounded
+    return np.column_stack([rounded, remainder, 1 / supports, amplitude])
 
 
 @dataclass(frozen=True)
 class DelayedEnclosure(Enclosure):
-    """F = 0 for 0 <= s <= run; from there on the path is that of another enclosure."""
+    """An enclosure of a function F along a path: F = 0 for 0 <= s <= run, and from there on `then`
+    holds."""
 
     run: Real
     then: Enclosure
@@ -346,38 +359,38 @@ class DelayedEnclosure(Enclosure):
         return self.run + self.then.free_length(gaps)
 
 
-def _zero_where(mask: Any, found: SumValue) -> SumValue:
+def _zero_where(mask: Any, sums: SumValue) -> SumValue:
     """The sum, replaced by 0 where the mask holds."""
-    zero = 0 * found.value
+    zero = 0 * sums.value
     return SumValue(
-        dr.select(mask, zero, found.value),
-        dr.select(mask, type(found.gradient)(0), found.gradient),
-        dr.select(mask, zero, found.error),
-        dr.select(mask, zero, found.gradient_error),
+        dr.select(mask, zero, sums.value),
+        dr.select(mask, type(sums.gradient)(0), sums.gradient),
+        dr.select(mask, zero, sums.error),
+        dr.select(mask, zero, sums.gradient_error),
     )
 
 
 def _backend_number(*jets: Jet) -> Any:
-    """Some number of the backend from the ranges of jets.
+    """A number of the backend among the bounds of jets.
 
     Raises:
-        TypeError: they are all constants.
+        TypeError: all bounds are constants.
     """
     for jet in jets:
-        for one in (jet.value, *jet.first_derivatives):
-            for end in (one.lower, one.upper):
-                if dr.is_array_v(cast("Any", type(end))):
-                    return end
+        for interval in (jet.value, *jet.first_derivatives):
+            for bound in (interval.lower, interval.upper):
+                if dr.is_array_v(cast("Any", type(bound))):
+                    return bound
     raise TypeError("blobs need a point of the backend: the coordinates are constants")
 
 
 def _checked(
     centers: Any, radii: Any, weights: Any, groups: Any
 ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray | None]:
-    """The arguments as arrays, sorted by groups.
+    """The centers, radii, weights and groups as arrays, sorted by groups.
 
     Raises:
-        BlobError: wrong shapes, or numbers that no blob can have.
+        BlobError: wrong shapes, or numbers that are not valid for a blob.
     """
     c = as_real_array(centers, "centers", BlobError).astype(np.float64)
     check_vectors(c, "centers", BlobError)
@@ -403,6 +416,11 @@ def _checked(
 
 
 def _numbers(values: Any, name: str, count: int) -> FloatArray:
+    """The finite numbers (count,), from a number or an array.
+
+    Raises:
+        BlobError: a wrong shape, or a number that is not finite.
+    """
     array = as_real_array(values, name, BlobError).astype(np.float64)
     if array.ndim == 0:
         array = np.full(count, float(array))
@@ -419,19 +437,19 @@ def _numbers(values: Any, name: str, count: int) -> FloatArray:
 
 class Molecule(Blobs):
     """The surface of a molecule: the level 1 of a sum of A exp(-s (d/r)^2) over its atoms, each
-    less a tangent that makes it end (see `GaussianKernel`); r is the van der Waals radius of the
-    atom.
+    minus a tangent, so that its support is bounded (see `GaussianKernel`); r is the van der Waals
+    radius of the atom.
 
     source: a .pdb, .ent, .cif or .mmcif file, or `Atoms`.
-    sharpness: s; the larger, the closer the surface follows the single atoms.
+    sharpness: s; the larger it is, the closer the surface follows the single atoms.
     tail: an atom ends where its Gaussian is this fraction of its value at the radius. With 1/32
         about ten atoms reach a point, with 1/1000 about twenty.
 
-    The usual viewers cut Gaussians off at 1/32: then f jumps by that, and the surface has seams.
-    Here the tangent is subtracted, so that atoms end smoothly and ranges of f along a ray are
-    exact; a single atom is still a ball of its radius.
+    The usual viewers cut Gaussians off at 1/32: then f jumps by this value, and the surface has
+    seams. Here a tangent is subtracted, so that f is smooth where atoms end, and ranges of f along
+    a ray are exact; a single atom is still a ball of its radius.
 
-    Raises FileFormatError for what is no file of a molecule.
+    Raises FileFormatError for a file that is not of a molecule.
     """
 
     def __init__(

@@ -1,8 +1,9 @@
-"""A uniform grid with a list of blobs in each cell, so that a sample takes only those nearby.
+"""A uniform grid with a list of blobs for each cell, so that a sample reads only the blobs nearby.
 
 A cell's list holds every blob whose support meets the cell, enlarged by a margin on all sides: the
-function is that of the list until a path has left the enlarged cell. For cells with an empty list
-it is stored how many cells around them are empty too, so that a path passes them in few jumps.
+function is that of the list until a path has left the enlarged cell. For a cell with an empty list,
+the grid stores the distance to the nearest cell whose list is not empty, so that a path passes
+empty cells in few jumps.
 """
 
 from __future__ import annotations
@@ -26,18 +27,19 @@ if TYPE_CHECKING:
 
 # The margin, in cells, within which a cell's list is valid.
 _MARGIN = 1 / 4
-# Pairs of a sphere and a cell that are compared at once.
+# The number of pairs of a ball and a cell that are compared at once.
 _AT_ONCE = 4_000_000
-# The most cells, and the most entries of all lists for each blob; beyond that, cells become larger.
+# The maximal number of cells, and of entries of all lists for each blob; beyond these, cells become
+# larger.
 _MOST_CELLS, _MOST_ENTRIES = 1 << 24, 200.0
 
 
 @dataclass(frozen=True)
 class CellLists(GridData):
-    """A grid in NumPy, in which a cell is empty if its list is.
+    """A grid of lists of blobs in NumPy, in which a cell is empty if its list is.
 
-    starts: (cells + 1,) where each cell's list begins among `entries`.
-    entries: blobs, by their index, in order within each list.
+    starts: (cells + 1,) the index in `entries` at which each cell's list begins.
+    entries: the indices of blobs, in order within each list.
     """
 
     starts: IntArray
@@ -45,21 +47,21 @@ class CellLists(GridData):
 
     @classmethod
     def of(cls, centers: FloatArray, supports: FloatArray, cell: float | None = None) -> CellLists:
-        """The lists of balls with centers (n, 3) and radii (n,).
+        """The lists of balls with centers (n, 3) and radii (n,), the supports of blobs.
 
-        cell: about the size of a cell; None for 3/5 of the median radius.
+        cell: the approximate size of a cell; None for 3/5 of the median radius.
         """
         size = float(np.median(supports)) * 0.6 if cell is None else cell
-        low, high = (centers - supports[:, None]).min(0), (centers + supports[:, None]).max(0)
+        lower, upper = (centers - supports[:, None]).min(0), (centers + supports[:, None]).max(0)
         while True:
             size = round_to_short_float(size)
             margin = _MARGIN * size
-            origin = np.nextafter((low - 2 * margin).astype(np.float32), np.float32(-np.inf))
+            origin = np.nextafter((lower - 2 * margin).astype(np.float32), np.float32(-np.inf))
             origin = origin.astype(np.float64)
-            counts = np.ceil((high + 2 * margin - origin) / size)
+            counts = np.ceil((upper + 2 * margin - origin) / size)
             entries = float(((2 * supports / size + 1.1) ** 3).sum())
-            many = counts.prod() > _MOST_CELLS or entries > _MOST_ENTRIES * len(supports)
-            if not many or counts.max() == 1:
+            too_large = counts.prod() > _MOST_CELLS or entries > _MOST_ENTRIES * len(supports)
+            if not too_large or counts.max() == 1:
                 break
             size *= 1.25
         shape = (int(counts[0]), int(counts[1]), int(counts[2]))
@@ -68,8 +70,8 @@ class CellLists(GridData):
         total = shape[0] * shape[1] * shape[2]
         starts = np.zeros(total + 1, dtype=np.int64)
         starts[1:] = np.cumsum(np.bincount(cells, minlength=total))
-        empty = (np.diff(starts) == 0).reshape(shape[::-1])
-        return cls(origin, size, shape, distance_to_occupied(empty), starts, blobs[order])
+        is_empty = (np.diff(starts) == 0).reshape(shape[::-1])
+        return cls(origin, size, shape, distance_to_occupied(is_empty), starts, blobs[order])
 
 
 def _pairs(
@@ -79,37 +81,38 @@ def _pairs(
     size: float,
     shape: tuple[int, int, int],
 ) -> tuple[IntArray, IntArray]:
-    """Pairs of a cell, enlarged by the margin, and a ball that meets it, sorted by balls."""
-    wide = radii * (1 + 1e-6)
-    first = np.floor((centers - wide[:, None] - origin) / size - _MARGIN).astype(np.int64)
-    last = np.floor((centers + wide[:, None] - origin) / size + _MARGIN).astype(np.int64)
+    """The pairs of a cell, enlarged by the margin, and a ball that meets it: the indices of the
+    cells and of the balls, sorted by balls."""
+    padded = radii * (1 + 1e-6)
+    first = np.floor((centers - padded[:, None] - origin) / size - _MARGIN).astype(np.int64)
+    last = np.floor((centers + padded[:, None] - origin) / size + _MARGIN).astype(np.int64)
     spans = (last - first).max(axis=1) + 1
     cells: list[IntArray] = []
     blobs: list[IntArray] = []
     for span in cast("list[int]", np.unique(spans).tolist()):
-        alike = np.flatnonzero(spans == span)
-        for part in np.array_split(alike, max(1, len(alike) * span**3 // _AT_ONCE)):
-            places = first[part, :, None] + np.arange(span)  # (m, 3, span)
-            lower = origin[:, None] + (places - _MARGIN) * size
-            upper = origin[:, None] + (places + 1 + _MARGIN) * size
-            c = centers[part, :, None]
+        same_span = np.flatnonzero(spans == span)
+        for group in np.array_split(same_span, max(1, len(same_span) * span**3 // _AT_ONCE)):
+            indices = first[group, :, None] + np.arange(span)  # (m, 3, span)
+            lower = origin[:, None] + (indices - _MARGIN) * size
+            upper = origin[:, None] + (indices + 1 + _MARGIN) * size
+            c = centers[group, :, None]
             squares = np.maximum(np.maximum(lower - c, c - upper), 0) ** 2
-            inside = (places >= 0) & (places < np.array(shape)[:, None])
-            squares[~inside] = np.inf
+            is_inside = (indices >= 0) & (indices < np.array(shape)[:, None])
+            squares[~is_inside] = np.inf
             x, y, z = squares[:, 0], squares[:, 1], squares[:, 2]
-            total = z[:, :, None, None] + y[:, None, :, None] + x[:, None, None, :]
-            ball, k, j, i = np.nonzero(total <= (wide[part] ** 2)[:, None, None, None])
-            px, py, pz = (places[ball, axis, n] for axis, n in enumerate((i, j, k)))
+            distances = z[:, :, None, None] + y[:, None, :, None] + x[:, None, None, :]
+            ball, k, j, i = np.nonzero(distances <= (padded[group] ** 2)[:, None, None, None])
+            px, py, pz = (indices[ball, axis, n] for axis, n in enumerate((i, j, k)))
             cells.append(px + shape[0] * (py + shape[1] * pz))
-            blobs.append(part[ball])
-    found, which = np.concatenate(cells), np.concatenate(blobs)
-    order = np.argsort(which, kind="stable")
-    return found[order], which[order]
+            blobs.append(group[ball])
+    all_cells, all_blobs = np.concatenate(cells), np.concatenate(blobs)
+    order = np.argsort(all_blobs, kind="stable")
+    return all_cells[order], all_blobs[order]
 
 
 @dataclass(frozen=True)
 class BlobGrid(EmptySpaceGrid):
-    """Cell lists on a backend."""
+    """The cell lists of blobs on a backend."""
 
     starts: Any
     entries: Any
@@ -125,7 +128,7 @@ class BlobGrid(EmptySpaceGrid):
         )
 
     def list_at(self, p: Vec3) -> tuple[Any, Any]:
-        """Where the list of the cell of p begins and ends. Outside of the grid that of the nearest
-        cell is valid too, since no support reaches beyond the grid."""
+        """The indices at which the list of the cell of p begins and ends. Outside of the grid the
+        list of the nearest cell is valid too, since no support reaches beyond the grid."""
         kind, index = self.backend.UInt32, self.cell(p).index
         return dr.gather(kind, self.starts, index), dr.gather(kind, self.starts, index + 1)

@@ -2,13 +2,13 @@
 
 Lengths are in units of the support: a kernel is a function k(q) of the squared distance q, falling
 from the center to 0 at q = 1, where it ends with k' = 0. Along a line that passes the center at the
-distance h, x from the nearest point, it is k(h^2 + x^2): a function of x on the chord |x| <= S,
-S^2 = 1 - h^2. Its derivatives in x all have the same shape, and that is what proofs rest on:
+distance h, x from the nearest point, it is k(h^2 + x^2): a function of x on the chord |x| <= S, S^2
+= 1 - h^2. Its derivatives in x all have the same shape, on which the proofs rest:
 
-- the first is odd and, for x > 0, falls to one minimum at x = c1, then rises to 0 at S;
-- the second is even and rises from a minimum at 0 to one maximum at c2, then falls until S.
+- the first is odd and, for x > 0, falls to a single minimum at x = c1, then rises to 0 at S;
+- the second is even and rises from a minimum at 0 to a single maximum at c2, then falls until S.
 
-So their ranges on any piece of the line are found among the values at its two ends and three
+So the ends of their ranges on any piece of the line are among the values at its two ends and three
 numbers of the chord. At S the second derivative of some kernels jumps to 0
 (`second_derivative_jumps`).
 """
@@ -35,11 +35,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ChordProfile:
-    """A kernel along a line.
+    """The extrema of a kernel's derivatives along a line.
 
     half_length: S, half the length of the chord; 0 where the line misses the support.
     steepest_position: c1.
-    steepest: the first derivative at -c1, its largest.
+    steepest: the first derivative at -c1, which is its largest value.
     max_curvature_position: c2.
     max_second, min_second: the second derivative at c2 and at 0.
     """
@@ -65,8 +65,8 @@ class KernelLipschitz:
 
 
 class BlobKernel(abc.ABC):
-    """A kernel. Amplitudes are chosen so that a single blob of weight 1 has the value 1 at its
-    radius."""
+    """A kernel of blobs. Amplitudes are chosen so that a single blob of weight 1 has the value 1 at
+    its radius."""
 
     name: ClassVar[str]
     second_derivative_jumps: ClassVar[bool] = True
@@ -80,7 +80,7 @@ class BlobKernel(abc.ABC):
     @property
     @abc.abstractmethod
     def steepness(self) -> KernelLipschitz:
-        """See `KernelLipschitz`."""
+        """The Lipschitz constants of the kernel: see `KernelLipschitz`."""
 
     @abc.abstractmethod
     def height(self, q: FloatArray) -> FloatArray:
@@ -88,7 +88,8 @@ class BlobKernel(abc.ABC):
 
     @abc.abstractmethod
     def profile(self, q: Real) -> tuple[Real, Real, Real]:
-        """k, dk/dq, and a number m with which k is right within 16 roundings of m and of dk/dq."""
+        """k, dk/dq, and a number m such that the error of k is at most 16 roundings of m and of
+        dk/dq."""
 
     @abc.abstractmethod
     def second_derivative(self, q: Real) -> Real:
@@ -100,11 +101,11 @@ class BlobKernel(abc.ABC):
 
     @abc.abstractmethod
     def derivatives(self, height: Real, inside: Real, x: Real) -> tuple[Real, Real]:
-        """The first two derivatives along such lines at |x| <= S."""
+        """The first two derivatives along the lines of `chord`, at |x| <= S."""
 
     def lipschitz_fraction(self, inside: Real, nearest: Real) -> Real:
-        """The fraction of `steepness` that is enough on lines with S^2 = `inside`, for
-        x^2 >= `nearest`."""
+        """The fraction of `steepness` that is still a bound on lines with S^2 = `inside`, for x^2
+        >= `nearest`."""
         del inside, nearest
         return 1.0
 
@@ -113,7 +114,7 @@ class BlobKernel(abc.ABC):
         """Ranges of k and of its first two derivatives in q, on an interval of q >= 0."""
 
     def prepare(self, backend: Backend) -> BlobKernel:
-        """The same with its numbers as kernel parameters of the backend."""
+        """The same kernel with its numbers as kernel parameters of the backend."""
         del backend
         return self
 
@@ -131,11 +132,11 @@ class BlobKernel(abc.ABC):
 
 @dataclass(frozen=True)
 class CompactKernel(BlobKernel):
-    """(1 - q)^3: polynomial, with a continuous second derivative (Aydinlilar and Zanni 2023, eq. 7
-    with n = 6).
+    """The compact polynomial kernel (1 - q)^3, with a continuous second derivative (Aydinlilar and
+    Zanni 2023, eq. 7 with n = 6).
 
-    Along a line w = S^2 - x^2 and f' = -6 x w^2, f'' = 6 w (4 x^2 - w), f''' = 24 x (3w - 2x^2).
-    So f'' = 0 at x^2 = S^2/5 and f''' = 0 at x = 0 and x^2 = 3 S^2/5.
+    Along a line w = S^2 - x^2 and f' = -6 x w^2, f'' = 6 w (4 x^2 - w), f''' = 24 x (3w - 2x^2). So
+    f'' = 0 at x^2 = S^2/5 and f''' = 0 at x = 0 and x^2 = 3 S^2/5.
     """
 
     support: float = 1.6  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -175,23 +176,23 @@ class CompactKernel(BlobKernel):
 
     def derivative_ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
         w = _one_minus(q)
-        unit = machine_epsilon(w.lower)
+        epsilon = machine_epsilon(w.lower)
         return (
-            _rising(w.lower * w.lower * w.lower, w.upper * w.upper * w.upper, 4 * unit),
-            _rising(-3 * w.upper * w.upper, -3 * w.lower * w.lower, 4 * unit),
-            _rising(6 * w.lower, 6 * w.upper, 2 * unit),
+            _rising(w.lower * w.lower * w.lower, w.upper * w.upper * w.upper, 4 * epsilon),
+            _rising(-3 * w.upper * w.upper, -3 * w.lower * w.lower, 4 * epsilon),
+            _rising(6 * w.lower, 6 * w.upper, 2 * epsilon),
         )
 
 
 @dataclass(frozen=True)
 class SexticKernel(BlobKernel):
-    """1 - 22/9 q + 17/9 q^2 - 4/9 q^3 = w^2 (5 + 4w)/9 with w = 1 - q: soft objects (Wyvill,
-    McPheeters and Wyvill 1986; Hart 1996, appendix D).
+    """The sextic kernel of soft objects, 1 - 22/9 q + 17/9 q^2 - 4/9 q^3 = w^2 (5 + 4w)/9 with w =
+    1 - q (Wyvill, McPheeters and Wyvill 1986; Hart 1996, appendix D).
 
-    Along a line f' = -4/9 x w (5 + 6w), f'' = -4/9 w (5 + 6w) + 8/9 x^2 (5 + 12w) and f''' =
-    4/9 x (15 + 36w - 24x^2), which is 0 at 0 and at x^2 = 1/4 + 3/5 S^2. f'' = 0 is a quadratic
-    equation in x^2, with sum of roots 1/2 + 6/5 S^2 and product S^2 (5 + 6 S^2)/30; the larger root
-    lies outside the chord. Where the maximum of f'' would too, f'' rises until S.
+    Along a line f' = -4/9 x w (5 + 6w), f'' = -4/9 w (5 + 6w) + 8/9 x^2 (5 + 12w) and f''' = 4/9 x
+    (15 + 36w - 24x^2), which is 0 at 0 and at x^2 = 1/4 + 3/5 S^2. f'' = 0 is a quadratic equation
+    in x^2, with sum of roots 1/2 + 6/5 S^2 and product S^2 (5 + 6 S^2)/30; the larger root lies
+    outside the chord. Where the maximum of f'' would lie outside as well, f'' rises until S.
     """
 
     support: float = 2.0  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -220,11 +221,11 @@ class SexticKernel(BlobKernel):
         total = dr.fma(1.2, inside, 0.5)
         product = inside * dr.fma(0.2, inside, 1 / 6)
         turn = dr.sqrt(2 * product / (total + dr.sqrt(fmax(total * total - 4 * product, 0))))
-        bend = dr.sqrt(fmin(dr.fma(0.6, inside, 0.25), inside))
+        peak = dr.sqrt(fmin(dr.fma(0.6, inside, 0.25), inside))
         first, _ = self.derivatives(height, inside, turn)
-        _, most = self.derivatives(height, inside, bend)
+        _, largest = self.derivatives(height, inside, peak)
         return ChordProfile(
-            dr.sqrt(inside), turn, -first, bend, most, -inside * dr.fma(8 / 3, inside, 20 / 9)
+            dr.sqrt(inside), turn, -first, peak, largest, -inside * dr.fma(8 / 3, inside, 20 / 9)
         )
 
     def derivatives(self, height: Real, inside: Real, x: Real) -> tuple[Real, Real]:
@@ -235,7 +236,7 @@ class SexticKernel(BlobKernel):
 
     def derivative_ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
         w = _one_minus(q)
-        unit = machine_epsilon(w.lower)
+        epsilon = machine_epsilon(w.lower)
 
         def k(w: Real) -> Real:
             return w * w * (4 / 9 * w + 5 / 9)
@@ -243,21 +244,22 @@ class SexticKernel(BlobKernel):
         def slope(w: Real) -> Real:
             return -w * (4 / 3 * w + 10 / 9)
 
-        bend = _rising(8 / 3 * w.lower + 10 / 9, 8 / 3 * w.upper + 10 / 9, 4 * unit)
+        second = _rising(8 / 3 * w.lower + 10 / 9, 8 / 3 * w.upper + 10 / 9, 4 * epsilon)
         return (
-            _rising(k(w.lower), k(w.upper), 6 * unit),
-            _rising(slope(w.upper), slope(w.lower), 6 * unit),
-            _zero_outside(bend, q),
+            _rising(k(w.lower), k(w.upper), 6 * epsilon),
+            _rising(slope(w.upper), slope(w.lower), 6 * epsilon),
+            _zero_outside(second, q),
         )
 
 
 @dataclass(frozen=True)
 class CubicKernel(BlobKernel):
-    """1 - 3 r^2 + 2 r^3 = (1 - r)^2 (1 + 2r) with r^2 = q: soft objects (Hart 1996, eq. 36).
+    """The cubic kernel of soft objects, 1 - 3 r^2 + 2 r^3 = (1 - r)^2 (1 + 2r) with r^2 = q (Hart
+    1996, eq. 36).
 
-    Along a line r^2 = h^2 + x^2 and f' = -6 x (1 - r), f'' = -6 (1 - r - x^2/r), f''' =
-    6 x/r (3 - x^2/r^2), so f'' rises until S. f'' = 0 where r + x^2/r = 1: a quadratic equation,
-    x^2 = (1 - 4h^2 + sqrt(1 + 8h^2))/8.
+    Along a line r^2 = h^2 + x^2 and f' = -6 x (1 - r), f'' = -6 (1 - r - x^2/r), f''' = 6 x/r (3 -
+    x^2/r^2), so f'' rises until S. f'' = 0 where r + x^2/r = 1: a quadratic equation, x^2 = (1 -
+    4h^2 + sqrt(1 + 8h^2))/8.
     """
 
     support: float = 2.0  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -297,16 +299,16 @@ class CubicKernel(BlobKernel):
 
     def derivative_ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
         low, high = dr.sqrt(fmin(fmax(q.lower, 0), 1)), dr.sqrt(fmin(q.upper, 1))
-        unit = machine_epsilon(low)
+        epsilon = machine_epsilon(low)
 
         def k(r: Real) -> Real:
             return (1 - r) * (1 - r) * (1 + 2 * r)
 
-        # Absolute errors: of r half a unit, of 1 - r as much and less.
-        slope = Interval(-3 * (1 - low) - 8 * unit, fmin(-3 * (1 - high) + 8 * unit, 0))
-        value = Interval(fmax(k(high) - 8 * unit, 0), k(low) + 8 * unit)
-        bend = Interval(1.5 / high, dr.select(low > 0, 1.5 / low, dr.inf)).widened(8 * unit)
-        return value, slope, _zero_outside(bend, q)
+        # Absolute errors: of r half an epsilon, of 1 - r at most as much.
+        slope = Interval(-3 * (1 - low) - 8 * epsilon, fmin(-3 * (1 - high) + 8 * epsilon, 0))
+        value = Interval(fmax(k(high) - 8 * epsilon, 0), k(low) + 8 * epsilon)
+        second = Interval(1.5 / high, dr.select(low > 0, 1.5 / low, dr.inf)).widened(8 * epsilon)
+        return value, slope, _zero_outside(second, q)
 
 
 # A polynomial P with y = (1 - u) P(u), e^-y (1 - 2y) = u, within 3e-5 for 0 <= u <= 1.
@@ -318,20 +320,20 @@ _TURN = (
 
 @dataclass(frozen=True)
 class GaussianKernel(BlobKernel):
-    """exp(z) - 1 - z with z = b (1 - q): a Gaussian, less its tangent in q where the blob ends
-    (Aydinlilar and Zanni 2023, eq. 6, has no end).
+    """The Gaussian kernel exp(z) - 1 - z with z = b (1 - q): a Gaussian minus its tangent in q
+    where the blob ends (Aydinlilar and Zanni 2023, eq. 6, has no end).
 
-    A Gaussian that is only cut off jumps, and no step across the jump could be proved. Less its
-    tangent it ends as smoothly as the other kernels, differs from the Gaussian by a parabola that
-    is small if the tail is, and its ranges are exact.
+    A Gaussian that is only cut off jumps, and no step across the jump could be proved. Minus its
+    tangent it ends as smoothly as the other kernels, and its ranges are exact. It differs from the
+    Gaussian by a parabola that is small if the tail is.
 
     sharpness: s of exp(-s d^2/radius^2).
-    tail: what is left of the Gaussian where the blob ends, in parts of what it is at the radius.
+    tail: the value of the Gaussian where the blob ends, as a fraction of its value at the radius.
 
-    Along a line z = b (S^2 - x^2), y = b x^2 and f' = -2 b x (e^z - 1), f'' =
-    2b (e^z (2y - 1) + 1), f''' = 4 b^2 x e^z (3 - 2y): the maximum of f'' is at y = 3/2, or at S if
-    that is nearer. f'' = 0 where e^-y (1 - 2y) = e^-z at x = 0: a function of one number, taken
-    from a polynomial. Its error e changes the extreme value of f' by the order of e^2.
+    Along a line z = b (S^2 - x^2), y = b x^2 and f' = -2 b x (e^z - 1), f'' = 2b (e^z (2y - 1) +
+    1), f''' = 4 b^2 x e^z (3 - 2y): the maximum of f'' is at y = 3/2, or at S if S is nearer. f'' =
+    0 where e^-y (1 - 2y) = e^-z at x = 0: a function of a single number, approximated by a
+    polynomial. Its error e changes the extreme value of f' by the order of e^2.
     """
 
     sharpness: float = 1.0
@@ -387,18 +389,20 @@ class GaussianKernel(BlobKernel):
         top = dr.exp(z)
         u = 1 / top
         polynomial: Any = _TURN[-1]
-        for one in reversed(_TURN[:-1]):
-            polynomial = dr.fma(polynomial, u, one)
+        for coefficient in reversed(_TURN[:-1]):
+            polynomial = dr.fma(polynomial, u, coefficient)
         y = fmax((1 - u) * polynomial, 0)
         turn = dr.sqrt(y / b)
-        late = z < 1.5
-        most = 2 * b * (2 * dr.select(late, z, top * math.exp(-1.5)) + dr.select(late, 0, 1))
+        is_at_end = z < 1.5
+        largest = (
+            2 * b * (2 * dr.select(is_at_end, z, top * math.exp(-1.5)) + dr.select(is_at_end, 0, 1))
+        )
         return ChordProfile(
             dr.sqrt(inside),
             turn,
             2 * b * turn * (dr.exp(z - y) - 1),
             dr.sqrt(fmin(1.5, z) / b),
-            most,
+            largest,
             -2 * b * (top - 1),
         )
 
@@ -414,20 +418,24 @@ class GaussianKernel(BlobKernel):
         power = dr.fma(b / 32, nearest, 1)
         for _ in range(5):
             power = power * power
-        most = 1.01 if isinstance(inside, float) else 1.01 * dr.exp(b * (inside - 1))
-        return fmin(most / power, 1)
+        largest = 1.01 if isinstance(inside, float) else 1.01 * dr.exp(b * (inside - 1))
+        return fmin(largest / power, 1)
 
     def derivative_ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
         w = _one_minus(q)
-        b, unit = self._rate, machine_epsilon(w.lower)
-        # The product with b is off by half a unit, the exponential by eight.
-        off = 16 * unit
-        z = Interval(b * w.lower, b * w.upper).widened(2 * unit)
+        b, epsilon = self._rate, machine_epsilon(w.lower)
+        # The error of the product with b is half an epsilon, that of the exponential eight.
+        error = 16 * epsilon
+        z = Interval(b * w.lower, b * w.upper).widened(2 * epsilon)
         low, high = dr.exp(z.lower), dr.exp(z.upper)
-        value = Interval(fmax(low - 1 - z.lower - off * low, 0), high - 1 - z.upper + off * high)
-        slope = Interval(-b * (high - 1) - off * b * high, fmin(-b * (low - 1) + off * b * low, 0))
-        bend = Interval(b * b * low, b * b * high).widened(off)
-        return value, slope, _zero_outside(bend, q)
+        value = Interval(
+            fmax(low - 1 - z.lower - error * low, 0), high - 1 - z.upper + error * high
+        )
+        slope = Interval(
+            -b * (high - 1) - error * b * high, fmin(-b * (low - 1) + error * b * low, 0)
+        )
+        second = Interval(b * b * low, b * b * high).widened(error)
+        return value, slope, _zero_outside(second, q)
 
 
 KERNELS: dict[str, type[BlobKernel]] = {
@@ -439,9 +447,10 @@ KERNELS: dict[str, type[BlobKernel]] = {
 
 
 def choose_kernel(kernel: str | BlobKernel) -> BlobKernel:
-    """A kernel by its name, with its default parameters, or as it is given.
+    """The kernel of this name, with its default parameters; a kernel is returned as it is.
 
-    Raises ValueError for another name, TypeError for what is neither.
+    Raises ValueError for an unknown name, TypeError for an argument that is neither a name nor a
+    kernel.
     """
     if isinstance(kernel, BlobKernel):
         return kernel
@@ -456,6 +465,7 @@ def choose_kernel(kernel: str | BlobKernel) -> BlobKernel:
 
 
 def _check_support(support: float) -> None:
+    """Raise ValueError for a support that is not between 1 and 100."""
     if not 1.0 < as_real(support, "support") <= 100.0:
         raise ValueError(
             f"support must lie between 1 and 100, not {support!r}: it is where a blob ends, in "
@@ -464,17 +474,18 @@ def _check_support(support: float) -> None:
 
 
 def _one_minus(q: Interval) -> Interval:
-    """1 - q where it is not negative."""
+    """The range of max(1 - q, 0)."""
     w = Interval(1.0, 1.0) - q
     return Interval(fmax(w.lower, 0), fmax(w.upper, 0))
 
 
-def _rising(low: Real, high: Real, unit: float) -> Interval:
-    return Interval(low, high).widened(unit)
+def _rising(lower: Real, upper: Real, margin: float) -> Interval:
+    """The interval between the bounds, widened by a relative margin."""
+    return Interval(lower, upper).widened(margin)
 
 
-def _zero_outside(bend: Interval, q: Interval) -> Interval:
-    """The range of a positive second derivative on an interval, 0 beyond the support."""
+def _zero_outside(second: Interval, q: Interval) -> Interval:
+    """The range of a positive second derivative on an interval; it is 0 beyond the support."""
     return Interval(
-        dr.select(q.upper < 1, fmax(bend.lower, 0), 0), dr.select(q.lower <= 1, bend.upper, 0)
+        dr.select(q.upper < 1, fmax(second.lower, 0), 0), dr.select(q.lower <= 1, second.upper, 0)
     )

@@ -28,22 +28,28 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
     from harnack.geometry import Volume
 
-# Other parts are used to narrow the range of the value if that shifts it by more than this fraction
+# The other operands narrow the range of the value only if that shifts it by more than this fraction
 # of its error; at creases the shift is nearly always smaller.
 _MIN_SHIFT = 0.25
 
 
 def union(*solids: Solid) -> Solid:
-    """All points of any of the solids. Raises ValueError for none, TypeError for no solids."""
+    """The union of the solids: all points that are in at least one of them.
+
+    Raises:
+        ValueError: no solids.
+        TypeError: an argument is not a solid.
+    """
     return BooleanSolid(_flatten_operands(solids, is_union=True), is_union=True)
 
 
 def intersection(*solids: Solid) -> Solid:
-    """The points that are in all of the solids. Raises as `union`."""
+    """The intersection of the solids: all points that are in each of them. Raises as `union`."""
     return BooleanSolid(_flatten_operands(solids, is_union=False), is_union=False)
 
 
 def _flatten_operands(solids: tuple[Solid, ...], *, is_union: bool) -> tuple[Solid, ...]:
+    """The operands, with those of nested unions (or intersections) in place of these."""
     if not solids:
         raise ValueError("give at least one solid")
     flat: list[Solid] = []
@@ -70,44 +76,46 @@ class BooleanSolid(Solid):
     is_union: bool
 
     def __post_init__(self) -> None:
-        domains = list(dict.fromkeys(one.domain for one in self.parts if one.domain is not None))
+        domains = list(dict.fromkeys(part.domain for part in self.parts if part.domain is not None))
         domain = None
         if domains:
             domain = domains[0] if len(domains) == 1 else VolumeIntersection(domains)
         object.__setattr__(self, "domain", domain)
         object.__setattr__(
-            self, "has_variable_accuracy", any(one.has_variable_accuracy for one in self.parts)
+            self, "has_variable_accuracy", any(part.has_variable_accuracy for part in self.parts)
         )
-        coarsest = min((one.coarsest_accuracy for one in self.parts), default=1.0)
+        coarsest = min((part.coarsest_accuracy for part in self.parts), default=1.0)
         object.__setattr__(self, "coarsest_accuracy", coarsest)
-        # A part that proves nothing looking back would refuse all longer steps.
-        object.__setattr__(self, "over_relaxation", min(one.over_relaxation for one in self.parts))
+        # An operand that proves nothing looking back would refuse all longer steps.
+        object.__setattr__(
+            self, "over_relaxation", min(part.over_relaxation for part in self.parts)
+        )
         object.__setattr__(self, "min_wavelength", min_wavelength(self.parts))
-        constants = [one.lipschitz for one in self.parts]
-        known = all(one is not None for one in constants)
-        object.__setattr__(self, "lipschitz", max(constants) if known else None)
+        constants = [part.lipschitz for part in self.parts]
+        all_known = all(part is not None for part in constants)
+        object.__setattr__(self, "lipschitz", max(constants) if all_known else None)
 
     def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
-        return BooleanSolid(tuple(one.map_operands(change) for one in self.parts), self.is_union)
+        return BooleanSolid(tuple(part.map_operands(change) for part in self.parts), self.is_union)
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
-        hulls = [one.sublevel_extent(level, above=above) for one in self.parts]
-        known = [one for one in hulls if one is not None]
+        extents = [part.sublevel_extent(level, above=above) for part in self.parts]
+        bounded = [part for part in extents if part is not None]
         if self.is_union == above:
-            return VolumeIntersection(known) if len(known) > 1 else next(iter(known), None)
-        if len(known) < len(hulls):
+            return VolumeIntersection(bounded) if len(bounded) > 1 else next(iter(bounded), None)
+        if len(bounded) < len(extents):
             return None
-        return _around(known)
+        return _around(bounded)
 
     @property
     def is_steep(self) -> bool:
         return any(part.is_steep for part in self.parts)
 
     def prepare(self, backend: Backend) -> Solid:
-        return self._of([one.prepare(backend) for one in self.parts])
+        return self._of([part.prepare(backend) for part in self.parts])
 
     def at_accuracy(self, detail: Real) -> Field:
-        return self._of([one.at_accuracy(detail) for one in self.parts])
+        return self._of([part.at_accuracy(detail) for part in self.parts])
 
     def for_ray_count(self, count: int) -> Field:
         def make(parts: list[Any]) -> Solid:
@@ -117,78 +125,81 @@ class BooleanSolid(Solid):
 
     def _of(self, parts: list[Field]) -> Solid:
         """The same combination of other operands, which need not be solids."""
-        other = copy.copy(self)
-        object.__setattr__(other, "parts", tuple(parts))
-        return other
+        combination = copy.copy(self)
+        object.__setattr__(combination, "parts", tuple(parts))
+        return combination
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        values = [one.formula(x, y, z) for one in self.parts]
+        values = [part.formula(x, y, z) for part in self.parts]
         if len(values) == 1:
             return values[0]
         return minimum(*values) if self.is_union else maximum(*values)
 
     def evaluate(self, p: Vec3) -> Sample:
-        samples = [one.evaluate(p) for one in self.parts]
+        samples = [part.evaluate(p) for part in self.parts]
         return self._combine_samples(samples, max_norm(p))[0]
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        best: Any = None
+        extreme: Any = None
         rows: Any = None
-        for one in self.parts:
-            value, own = one.evaluate(p).value, one.hessian(p)
+        for part in self.parts:
+            value, part_rows = part.evaluate(p).value, part.hessian(p)
             if rows is None:
-                best, rows = value, own
+                extreme, rows = value, part_rows
                 continue
-            chosen = (value < best) if self.is_union else (value > best)
-            rows = tuple(dr.select(chosen, a, b) for a, b in zip(own, rows, strict=True))
-            best = dr.select(chosen, value, best)
+            is_chosen = (value < extreme) if self.is_union else (value > extreme)
+            rows = tuple(dr.select(is_chosen, a, b) for a, b in zip(part_rows, rows, strict=True))
+            extreme = dr.select(is_chosen, value, extreme)
         return rows
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """The largest derivative errors of the operands that may be the extreme one. Infinite where
-        rounding leaves open which one is, since derivatives jump there."""
+        """The largest derivative errors of the operands that may be the extreme one. They are
+        infinite where rounding leaves open which operand is extreme, since derivatives jump
+        there."""
         size = max_norm(p)
         sign = -1.0 if self.is_union else 1.0
-        whole = value_error_bound(sample, safe_norm(sample.gradient), size)
-        near, slopes, bends = 0 * p.x, 0 * p.x, 0 * p.x
-        for one in self.parts:
-            own = one.evaluate(p)
-            doubt = value_error_bound(own, safe_norm(own.gradient), size)
-            is_open = ~(sign * (sample.value - own.value) > doubt + whole)
-            near = near + dr.select(is_open, 1.0, 0.0)
-            slope, bend = one.derivative_errors(p, own)
+        total_error = value_error_bound(sample, safe_norm(sample.gradient), size)
+        count, max_first, max_second = 0 * p.x, 0 * p.x, 0 * p.x
+        for part in self.parts:
+            operand = part.evaluate(p)
+            error = value_error_bound(operand, safe_norm(operand.gradient), size)
+            is_open = ~(sign * (sample.value - operand.value) > error + total_error)
+            count = count + dr.select(is_open, 1.0, 0.0)
+            first, second = part.derivative_errors(p, operand)
             # NaN is kept, as it bounds nothing.
-            slopes = dr.select(is_open & ~(slope <= slopes), slope, slopes)
-            bends = dr.select(is_open & ~(bend <= bends), bend, bends)
-        is_one = near <= 1
-        return dr.select(is_one, slopes, dr.inf), dr.select(is_one, bends, dr.inf)
+            max_first = dr.select(is_open & ~(first <= max_first), first, max_first)
+            max_second = dr.select(is_open & ~(second <= max_second), second, max_second)
+        is_single = count <= 1
+        return dr.select(is_single, max_first, dr.inf), dr.select(is_single, max_second, dr.inf)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         """The ray sample of the combination, from those of all operands, by `MaximumEnclosure`."""
-        looks = [one.sample_ray(path, t, ahead, back) for one in self.parts]
+        looks = [operand.sample_ray(path, t, ahead, back) for operand in self.parts]
         size = max_norm(path.origin) + t
-        sample, below, extreme = self._combine_samples([one.sample for one in looks], size)
+        sample, below, extreme = self._combine_samples([operand.sample for operand in looks], size)
         slope, slope_error = looks[-1].slope, looks[-1].slope_error_bound
         for look in looks[:-1]:
             is_chosen = look.sample.value == extreme
             slope = dr.select(is_chosen, look.slope, slope)
             slope_error = dr.select(is_chosen, look.slope_error_bound, slope_error)
-        front = self._enclosures([one.forward for one in looks], below)
-        behind = self._enclosures([one.backward for one in looks], below)
-        growth = max(one.reach_growth for one in looks)
+        front = self._enclosures([operand.forward for operand in looks], below)
+        behind = self._enclosures([operand.backward for operand in looks], below)
+        growth = max(operand.reach_growth for operand in looks)
         return RaySample(sample, front, behind, slope, growth, slope_error)
 
     def _enclosures(
-        self, parts: list[tuple[Enclosure, ...]], below: list[tuple[Real, Real]]
+        self, operands: list[tuple[Enclosure, ...]], below: list[tuple[Real, Real]]
     ) -> tuple[Enclosure, ...]:
-        if not all(parts):
+        """The enclosures of the combination from those of its operands; () if an operand has none.
+
+        below: for each operand, bounds of the difference by which it is below the greatest operand.
+        """
+        if not all(operands):
             return ()
         if self.is_union:
-            parts = [tuple(NegatedEnclosure(one) for one in part) for part in parts]
+            operands = [tuple(NegatedEnclosure(kind) for kind in kinds) for kinds in operands]
         greatest = MaximumEnclosure(
-            tuple(
-                MaximumOperand(*lengths, part) for lengths, part in zip(below, parts, strict=True)
-            )
+            tuple(MaximumOperand(*gaps, kinds) for gaps, kinds in zip(below, operands, strict=True))
         )
         return (NegatedEnclosure(greatest),) if self.is_union else (greatest,)
 
@@ -208,93 +219,97 @@ class BooleanSolid(Solid):
         subtracted from the difference by which the operand is below.
         """
         sign = -1.0 if self.is_union else 1.0
-        values = [sign * one.value for one in samples]
+        values = [sign * operand.value for operand in samples]
         greatest = values[0]
-        for one in values[1:]:
-            greatest = fmax(one, greatest)
-        chosen = samples[-1]
-        value, gradient, slope_error = chosen.value, chosen.gradient, chosen.gradient_error
+        for operand in values[1:]:
+            greatest = fmax(operand, greatest)
+        last = samples[-1]
+        value, gradient, slope_error = last.value, last.gradient, last.gradient_error
         value, slope_error = 0 * greatest + value, 0 * greatest + slope_error
-        for sample, own in zip(samples[:-1], values[:-1], strict=True):
-            is_greatest = own >= greatest
+        for sample, operand_value in zip(samples[:-1], values[:-1], strict=True):
+            is_greatest = operand_value >= greatest
             value = dr.select(is_greatest, sample.value, value)
             gradient = dr.select(is_greatest, sample.gradient, gradient)
             slope_error = dr.select(is_greatest, sample.gradient_error, slope_error)
-        errors = [value_error_bound(one, safe_norm(one.gradient), size) for one in samples]
+        errors = [
+            value_error_bound(operand, safe_norm(operand.gradient), size) for operand in samples
+        ]
         error, truncation = 0 * greatest, 0 * greatest
-        for sample, own, off in zip(samples, values, errors, strict=True):
-            gap = greatest - own
-            error = fmax(fmax(off - gap, sample.value_error - gap), error)
+        for sample, operand_value, value_error in zip(samples, values, errors, strict=True):
+            gap = greatest - operand_value
+            error = fmax(fmax(value_error - gap, sample.value_error - gap), error)
             truncation = fmax(sample.truncation_error - gap, truncation)
-        least = values[0] - errors[0]
-        for own, off in zip(values[1:], errors[1:], strict=True):
-            least = fmax(own - off, least)
-        shift = 0.5 * (least - (greatest - error))
+        lower_bound = values[0] - errors[0]
+        for operand_value, value_error in zip(values[1:], errors[1:], strict=True):
+            lower_bound = fmax(operand_value - value_error, lower_bound)
+        shift = 0.5 * (lower_bound - (greatest - error))
         shift = dr.select(shift > _MIN_SHIFT * error, shift, 0)
         extreme, value = value, value + sign * shift
         greatest, error = greatest + shift, error - shift
         # `Sample.value_error` leaves out the rounding that follows from value and gradient.
-        plain = Sample(value, gradient, ())
-        stated = value_error_bound(plain, safe_norm(gradient), size)
+        unstated = Sample(value, gradient, ())
+        stated = value_error_bound(unstated, safe_norm(gradient), size)
         joined = Sample(
             value, gradient, self._common_lipschitz(samples), fmax(error - stated, 0), slope_error,
             truncation_error=truncation,
         )  # fmt: skip
-        whole = value_error_bound(joined, safe_norm(gradient), size)
+        stated_error = value_error_bound(joined, safe_norm(gradient), size)
         return (
             joined,
             [
                 (
-                    fmax(greatest - own - fmax(off - whole, 0), 0),
-                    greatest - own + fmax(off - whole, 0),
+                    fmax(greatest - operand_value - fmax(value_error - stated_error, 0), 0),
+                    greatest - operand_value + fmax(value_error - stated_error, 0),
                 )
-                for own, off in zip(values, errors, strict=True)
+                for operand_value, value_error in zip(values, errors, strict=True)
             ],
             extreme,
         )
 
     def _common_lipschitz(self, samples: list[Sample]) -> tuple[Lipschitz, ...]:
-        """The largest of the Lipschitz constants of the parts, which is one of the combination."""
+        """The largest of the operands' Lipschitz constants, which is a constant of the combination;
+        () if an operand promises none."""
         constant: Any = 0.0
         radius: Any = math.inf
         for sample in samples:
-            own = lipschitz_of(sample)
-            if own is None:
+            promise = lipschitz_of(sample)
+            if promise is None:
                 return ()
-            constant = fmax(0 * sample.value + own.constant, constant)
-            radius = fmin(0 * sample.value + own.radius, radius)
+            constant = fmax(0 * sample.value + promise.constant, constant)
+            radius = fmin(0 * sample.value + promise.radius, radius)
         return (Lipschitz(constant, radius),)
 
 
 def min_wavelength(parts: Iterable[Solid]) -> float | None:
-    """The smallest `Field.min_wavelength` of several fields."""
+    """The smallest `Field.min_wavelength` of any of the fields; None if no field has it."""
     return min(
-        (one.min_wavelength for one in parts if one.min_wavelength is not None), default=None
+        (part.min_wavelength for part in parts if part.min_wavelength is not None), default=None
     )
 
 
 def lipschitz_of(sample: Sample) -> Lipschitz | None:
-    """A Lipschitz constant that a sample promises, or one that follows from another promise."""
-    found = [one.implied_lipschitz(sample.value) for one in sample.all_promises]
-    stated = (one for one in sample.all_promises if isinstance(one, Lipschitz))
-    return next(stated, None) or next((one for one in found if one is not None), None)
+    """The Lipschitz constant that a sample promises, or one that follows from another of its
+    promises; None if there is neither."""
+    implied = [promise.implied_lipschitz(sample.value) for promise in sample.all_promises]
+    stated = (promise for promise in sample.all_promises if isinstance(promise, Lipschitz))
+    return next(stated, None) or next((promise for promise in implied if promise is not None), None)
 
 
 def _around(volumes: list[Volume]) -> Volume | None:
-    """A box around volumes; None if they have no bounds."""
-    corners = [one.bounds() for one in volumes]
-    low = np.min([one for one, _ in corners], axis=0)
-    high = np.max([one for _, one in corners], axis=0)
-    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+    """A box around volumes; a volume itself if it is alone; None if they are unbounded."""
+    corners = [volume.bounds() for volume in volumes]
+    lower = np.min([volume for volume, _ in corners], axis=0)
+    upper = np.max([volume for _, volume in corners], axis=0)
+    if not (np.isfinite(lower).all() and np.isfinite(upper).all()):
         return None
     if len(volumes) == 1:
         return volumes[0]
-    return Box(tuple(low), tuple(high))
+    return Box(tuple(lower), tuple(upper))
 
 
 @dataclass(frozen=True, eq=False)
 class Complement(SolidOfField):
-    """All points that are not inside a solid: -f."""
+    """The complement of a solid: all points that are not inside it. Its function is -f."""
 
     field: Solid
 
@@ -328,8 +343,8 @@ def negated_look(look: RaySample) -> RaySample:
     """The ray sample of -f from that of f."""
     return RaySample(
         negated_sample(look.sample),
-        tuple(NegatedEnclosure(one) for one in look.forward),
-        tuple(NegatedEnclosure(one) for one in look.backward),
+        tuple(NegatedEnclosure(enclosure) for enclosure in look.forward),
+        tuple(NegatedEnclosure(enclosure) for enclosure in look.backward),
         -look.slope,
         look.reach_growth,
         look.slope_error,
@@ -339,7 +354,7 @@ def negated_look(look: RaySample) -> RaySample:
 def negated_sample(sample: Sample) -> Sample:
     """The sample of -f from that of f."""
     return sample.map_promises(
-        lambda one: one.negated(),
+        lambda promise: promise.negated(),
         value=-sample.value,
         gradient=-sample.gradient,
         shading_normal=None if sample.shading_normal is None else -sample.shading_normal,
@@ -348,7 +363,7 @@ def negated_sample(sample: Sample) -> Sample:
 
 @dataclass(frozen=True, eq=False)
 class OffsetSolid(SolidOfField):
-    """The points where f <= distance.
+    """An offset of a solid: the points where f <= distance.
 
     Proof. f - distance has the enclosures of f, and its Lipschitz constant.
     """
@@ -364,9 +379,9 @@ class OffsetSolid(SolidOfField):
         return self.field.sublevel_extent(level + self.distance, above=above)
 
     def prepare(self, backend: Backend) -> Solid:
-        other = super().prepare(backend)
-        object.__setattr__(other, "distance", prepare_value(self.distance, backend))
-        return other
+        prepared = super().prepare(backend)
+        object.__setattr__(prepared, "distance", prepare_value(self.distance, backend))
+        return prepared
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         return self.field.formula(x, y, z) - self.distance
@@ -378,7 +393,7 @@ class OffsetSolid(SolidOfField):
         """The sample of f - distance, with the rounding of the difference."""
         size = dr.abs(sample.value) + abs(self.distance)
         return sample.map_promises(
-            lambda one: one.shifted(-self.distance),
+            lambda promise: promise.shifted(-self.distance),
             value=sample.value - self.distance,
             value_error=sample.value_error + 8 * float(dr.epsilon(type(sample.value))) * size,
         )
@@ -408,55 +423,55 @@ class BlendedSolid(FormulaSolid):
 
     def __post_init__(self) -> None:
         for name, least, value in (("radius", 0.0, self.radius), ("power", 1.0, self.power)):
-            good = isinstance(value, numbers.Real) and least <= float(value) < math.inf
-            if not good or value == 0:
+            is_valid = isinstance(value, numbers.Real) and least <= float(value) < math.inf
+            if not is_valid or value == 0:
                 bound = "above 0" if least == 0.0 else f"of at least {least:g}"
                 raise ValueError(f"{name} must be a number {bound}, not {value!r}")
             object.__setattr__(self, name, float(value))
-        for one in self.parts:
-            if not isinstance(one, Solid):  # pyright: ignore[reportUnnecessaryIsInstance]
-                raise TypeError(not_a_solid(one))
-            one.formula(*probe_jets())  # raises TypeError for a solid without a formula
-        constants = [one.lipschitz for one in self.parts]
-        known = all(one is not None for one in constants)
-        lipschitz = 2 ** (1 / self.power) * max(constants) * (1 + 1e-6) if known else None
+        for part in self.parts:
+            if not isinstance(part, Solid):  # pyright: ignore[reportUnnecessaryIsInstance]
+                raise TypeError(not_a_solid(part))
+            part.formula(*probe_jets())  # raises TypeError for a solid without a formula
+        constants = [part.lipschitz for part in self.parts]
+        all_known = all(part is not None for part in constants)
+        lipschitz = 2 ** (1 / self.power) * max(constants) * (1 + 1e-6) if all_known else None
         object.__setattr__(self, "lipschitz", lipschitz)
         object.__setattr__(self, "min_wavelength", min_wavelength(self.parts))
         object.__setattr__(self, "domain", union(*self.parts).domain)
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
-        whole = union(*self.parts) if self.is_union else self.parts[0] & self.parts[1]
+        sharp = union(*self.parts) if self.is_union else self.parts[0] & self.parts[1]
         if self.is_union:
             return (
-                whole.sublevel_extent(level, above=True)
+                sharp.sublevel_extent(level, above=True)
                 if above
-                else whole.sublevel_extent(self._min_operand_bound(level))
+                else sharp.sublevel_extent(self._min_operand_bound(level))
             )
         return (
-            whole.sublevel_extent(-self._min_operand_bound(-level), above=True)
+            sharp.sublevel_extent(-self._min_operand_bound(-level), above=True)
             if above
-            else whole.sublevel_extent(level)
+            else sharp.sublevel_extent(level)
         )
 
     def _min_operand_bound(self, level: float) -> float:
         """A bound of the smaller of both functions where their blended union is at most `level`.
 
-        Proof. The blend grows with both, so it is at least that of the lesser value m taken twice:
-        r - 2^(1/p) (r - m) for m < r, and m beyond.
+        Proof. The blend grows with both functions, so it is at least the blend of the smaller value
+        m with itself: r - 2^(1/p) (r - m) for m < r, and m for larger m.
         """
         if level >= self.radius:
             return level
         return self.radius - (self.radius - level) / 2 ** (1 / self.power) * (1 - 1e-9)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        a, b = (one.formula(x, y, z) for one in self.parts)
+        a, b = (part.formula(x, y, z) for part in self.parts)
         blend = blend_union if self.is_union else blend_intersection
         return blend(a, b, self.radius, self.power)
 
     def prepare(self, backend: Backend) -> Solid:
-        other = copy.copy(self)
-        parts = tuple(one.prepare(backend) for one in self.parts)
-        object.__setattr__(other, "parts", parts)
+        prepared = copy.copy(self)
+        parts = tuple(part.prepare(backend) for part in self.parts)
+        object.__setattr__(prepared, "parts", parts)
         # The power stays a literal: the ranges of x^p depend on the kind of number that p is.
-        object.__setattr__(other, "radius", prepare_value(self.radius, backend))
-        return other
+        object.__setattr__(prepared, "radius", prepare_value(self.radius, backend))
+        return prepared

@@ -1,4 +1,4 @@
-"""Twisted and tapered solids: images of solids under maps that bend lines."""
+"""Twisted and tapered solids: images of solids under maps that do not keep lines straight."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from harnack.fields.solids.solid import AXES, SpaceMap, axis_index
 
 
 class Deformation(SpaceMap):
-    """A map that does not keep lines straight, for solids with a formula.
+    """A map of space that does not keep lines straight, for solids with a formula.
 
-    axis: the coordinate along which it changes.
+    axis: the coordinate on which the map depends.
     """
 
     def apply(self, solid: Solid) -> Solid:
@@ -40,9 +40,9 @@ class Deformation(SpaceMap):
 
     @property
     def min_scale(self) -> float:
-        """The smallest factor by which the map multiplies lengths, and so wavelengths. 1 if it
-        depends on the point, as for a twist, which compresses waves more the farther they are from
-        its axis."""
+        """The smallest factor by which the map multiplies lengths, and so wavelengths. It is 1 for
+        a map whose factor depends on the point, such as a twist, which compresses waves more the
+        farther they are from its axis."""
         return 1.0
 
     @abc.abstractmethod
@@ -51,20 +51,20 @@ class Deformation(SpaceMap):
 
     @abc.abstractmethod
     def volume(self, volume: Volume | None) -> Volume | None:
-        """A volume that contains the image of another one; None if none is known."""
+        """A volume that contains the image of another volume; None if no such volume is known."""
 
     @abc.abstractmethod
     def preimage_lipschitz(self, p: Vec3) -> tuple[Real, Real]:
-        """A Lipschitz constant of `preimage` on a ball about p, and its radius."""
+        """A Lipschitz constant of `preimage` on a ball about p, and the radius of that ball."""
 
     @abc.abstractmethod
     def prepare(self, backend: Backend) -> Deformation:
-        """The same with its numbers as kernel parameters of the backend."""
+        """The same map with its numbers as kernel parameters of the backend."""
 
 
 @dataclass(frozen=True, eq=False)
 class DeformedSolid(FormulaSolid):
-    """A solid under a map that bends lines: its formula at the points that are mapped to p.
+    """The image of a solid under a deformation: its formula at the preimage of p.
 
     No Lipschitz constant of the map is needed for a step: ranges of the local coordinates and of
     their derivatives along the ray are passed on to the formula.
@@ -77,23 +77,24 @@ class DeformedSolid(FormulaSolid):
         if self.inner.domain is not None:
             domain = self.map.volume(self.inner.domain)
             object.__setattr__(self, "domain", domain)
-        waves = self.inner.min_wavelength
+        wavelength = self.inner.min_wavelength
         object.__setattr__(
-            self, "min_wavelength", None if waves is None else waves * self.map.min_scale
+            self, "min_wavelength", None if wavelength is None else wavelength * self.map.min_scale
         )
 
     @property
     def may_jump(self) -> bool:
-        """Whether the solid's formula may jump: the map itself is continuous."""
+        """Whether the inner solid's formula may jump: the map itself is continuous."""
         return tally_of(self.inner.formula).may_jump
 
     def promises(self, p: Vec3) -> tuple[Promise, ...]:
-        """The Lipschitz constant of the solid times that of the map on a ball about p."""
-        inner = self.inner.lipschitz
-        if inner is None:
+        """The Lipschitz constant of the inner solid times that of the inverse map on a ball about
+        p."""
+        constant = self.inner.lipschitz
+        if constant is None:
             return ()
         stretch, radius = self.map.preimage_lipschitz(p)
-        return (Lipschitz(inner * stretch, radius),)
+        return (Lipschitz(constant * stretch, radius),)
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         return self.map.volume(self.inner.sublevel_extent(level, above=above))
@@ -102,11 +103,11 @@ class DeformedSolid(FormulaSolid):
         return self.inner.formula(*self.map.preimage(x, y, z))
 
     def prepare(self, backend: Backend) -> Field:
-        other = copy.copy(self)
-        object.__setattr__(other, "inner", self.inner.prepare(backend))
-        object.__setattr__(other, "map", self.map.prepare(backend))
-        object.__setattr__(other, "_prepared_tally", self.tally)
-        return other
+        prepared = copy.copy(self)
+        object.__setattr__(prepared, "inner", self.inner.prepare(backend))
+        object.__setattr__(prepared, "map", self.map.prepare(backend))
+        object.__setattr__(prepared, "_prepared_tally", self.tally)
+        return prepared
 
 
 @dataclass(frozen=True)
@@ -115,8 +116,9 @@ class Twist(Deformation):
     equation 50).
 
     Proof of `preimage_lipschitz`. The derivative of the inverse is a rotation times [[1, 0, -y a],
-    [0, 1, x a], [0, 0, 1]], whose largest singular value is (m + sqrt(m^2 + 4))/2, m = |a| times
-    the distance from the axis. (Hart's equation 51 is too small where a is large.)
+    [0, 1, x a], [0, 0, 1]], whose largest singular value is (m + sqrt(m^2 + 4))/2, with m = |a|
+    times the distance from the axis, a the rate. (Hart's equation 51 is too small where a is
+    large.)
     """
 
     rate: Any
@@ -134,8 +136,8 @@ class Twist(Deformation):
         return _turned_back((u * c + v * s, v * c - u * s, w), self.axis)
 
     def volume(self, volume: Volume | None) -> Volume | None:
-        found = _cylinder(volume, self.axis)
-        return None if found is None else _box(found[0], found[1], self.axis)
+        cylinder = _cylinder(volume, self.axis)
+        return None if cylinder is None else _box(cylinder[0], cylinder[1], self.axis)
 
     def preimage_lipschitz(self, p: Vec3) -> tuple[Real, Real]:
         rate = dr.abs(0 * p.x + self.rate)
@@ -143,7 +145,7 @@ class Twist(Deformation):
         radius = 0.25 * rho + 0.25 / rate
         m = (rho + radius) * rate
         constant = 0.5 * (m + dr.sqrt(m * m + 4)) * (1 + 1e-5)
-        # Without a twist m is NaN.
+        # At the rate 0, m is NaN.
         return dr.select(rate > 0, constant, 1), dr.select(rate > 0, radius, dr.inf)
 
     def prepare(self, backend: Backend) -> Twist:
@@ -152,7 +154,8 @@ class Twist(Deformation):
 
 @dataclass(frozen=True)
 class Taper(Deformation):
-    """Scales cross sections by r, linear along an axis between two positions and constant beyond.
+    """Scales cross sections by a factor r that is linear along an axis between two positions and
+    constant beyond them.
 
     Proof of `preimage_lipschitz`. The derivative of the inverse acts on the radial and the axial
     direction as [[k, m], [0, 1]], k = 1/r, m = rho |r'|/r^2 at the distance rho from the axis, and
@@ -168,22 +171,22 @@ class Taper(Deformation):
     def __post_init__(self) -> None:
         axis_index(self.axis)
         try:
-            given = (*self.start, *self.end)
+            ends = (*self.start, *self.end)
         except TypeError:
-            given = ()
-        if len(given) != 4:
+            ends = ()
+        if len(ends) != 4:
             raise ValueError(
                 "start and end must be (coordinate, scale), two numbers each, "
                 f"not {self.start!r} and {self.end!r}"
             )
-        if not all(isinstance(one, numbers.Real) and math.isfinite(one) for one in given):
+        if not all(isinstance(number, numbers.Real) and math.isfinite(number) for number in ends):
             raise ValueError("start and end must be (coordinate, scale), finite numbers")
         if not self.start[0] < self.end[0]:
             raise ValueError(f"start must lie before end: {self.start[0]} < {self.end[0]} is wrong")
         if not (self.start[1] > 0 and self.end[1] > 0):
             raise ValueError(f"scales must be positive, not {self.start[1]}, {self.end[1]}")
         for name in ("start", "end"):
-            object.__setattr__(self, name, tuple(float(one) for one in getattr(self, name)))
+            object.__setattr__(self, name, tuple(float(number) for number in getattr(self, name)))
 
     @property
     def min_scale(self) -> float:
@@ -192,15 +195,15 @@ class Taper(Deformation):
     def preimage(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
         u, v, w = _axis_last((x, y, z), self.axis)
         (a, r), (b, s) = self.start, self.end
-        inside = minimum(maximum((w - a) * (1.0 / (b - a)), 0.0), 1.0)
-        shrink = 1.0 / (inside * (s - r) + r)
-        return _turned_back((u * shrink, v * shrink, w), self.axis)
+        fraction = minimum(maximum((w - a) * (1.0 / (b - a)), 0.0), 1.0)
+        inverse = 1.0 / (fraction * (s - r) + r)
+        return _turned_back((u * inverse, v * inverse, w), self.axis)
 
     def volume(self, volume: Volume | None) -> Volume | None:
-        found = _cylinder(volume, self.axis)
-        if found is None:
+        cylinder = _cylinder(volume, self.axis)
+        if cylinder is None:
             return None
-        return _box(found[0] * max(self.start[1], self.end[1]), found[1], self.axis)
+        return _box(cylinder[0] * max(self.start[1], self.end[1]), cylinder[1], self.axis)
 
     def preimage_lipschitz(self, p: Vec3) -> tuple[Real, Real]:
         (a, r), (b, s) = ((0 * p.x + u, 0 * p.x + v) for u, v in (self.start, self.end))
@@ -217,6 +220,7 @@ class Taper(Deformation):
 
 
 def _from_axis(p: Vec3, axis: str) -> Real:
+    """The distance of p from the axis."""
     u, v, _ = _axis_last((p.x, p.y, p.z), axis)
     return dr.sqrt(u * u + v * v)
 
@@ -228,30 +232,33 @@ def _axis_last(p: tuple[Any, Any, Any], axis: str) -> tuple[Any, Any, Any]:
 
 
 def _turned_back(p: tuple[Any, Any, Any], axis: str) -> tuple[Any, Any, Any]:
+    """The coordinates in the order x, y, z, from `_axis_last`'s order."""
     k = AXES[axis]
     x, y, z = (p[(i - k - 1) % 3] for i in range(3))
     return x, y, z
 
 
 def _cylinder(volume: Volume | None, axis: str) -> tuple[float, tuple[float, float]] | None:
-    """The radius about an axis, and the range along it, of a cylinder around a volume."""
+    """A cylinder around a volume: its radius about an axis, and its range along the axis; None for
+    a volume without bounds."""
     if volume is None:
         return None
-    low, high = volume.bounds()
-    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+    lower, upper = volume.bounds()
+    if not (np.isfinite(lower).all() and np.isfinite(upper).all()):
         return None
     k = AXES[axis]
-    most = np.maximum(np.abs(low), np.abs(high))
-    radius = float(np.hypot(most[(k + 1) % 3], most[(k + 2) % 3])) * (1 + 1e-12)
+    max_abs = np.maximum(np.abs(lower), np.abs(upper))
+    radius = float(np.hypot(max_abs[(k + 1) % 3], max_abs[(k + 2) % 3])) * (1 + 1e-12)
     if isinstance(volume, Ball):
         center = np.asarray(volume.center, dtype=float)
         radius = float(np.hypot(center[(k + 1) % 3], center[(k + 2) % 3]) + volume.radius)
         radius *= 1 + 1e-12
-    return radius, (float(low[k]), float(high[k]))
+    return radius, (float(lower[k]), float(upper[k]))
 
 
 def _box(radius: float, span: tuple[float, float], axis: str) -> Box:
-    low = [-radius] * 3
-    high = [radius] * 3
-    low[AXES[axis]], high[AXES[axis]] = span
-    return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+    """The box around a cylinder about an axis."""
+    lower = [-radius] * 3
+    upper = [radius] * 3
+    lower[AXES[axis]], upper[AXES[axis]] = span
+    return Box((lower[0], lower[1], lower[2]), (upper[0], upper[1], upper[2]))

@@ -1,6 +1,6 @@
-"""Noise and fractal noise as fields, and shapes that are displaced by them.
+"""Gradient noise and fractal noise as fields, and solids that are displaced by them.
 
-`NoiseConstants` has the proved bounds of noise from gradients at the points of a lattice.
+`NoiseConstants` holds the proved bounds of gradient noise on a lattice.
 """
 
 from __future__ import annotations
@@ -34,28 +34,28 @@ CORNERS = tuple(itertools.product((0, 1), repeat=3))
 
 @dataclass(frozen=True)
 class NoiseConstants:
-    """Bounds of noise on a lattice of unit length, with any unit vectors at its points.
+    """Bounds of gradient noise on a lattice of spacing 1, for any unit vectors at its points.
 
     max_abs: of |noise|.
     max_gradient: of |grad noise|.
     max_second_derivative: of all second derivatives.
 
     Proof. With weights w_c of the corners c of a cell and r_c = x - c, noise is sum w_c g_c.r_c.
-    |noise| <= sum w_c |r_c| <= sqrt(sum w_c |r_c|^2), which is the root of three terms of at most
-    1/4: s(t) lies below the line (1 + 2t)/4 up to its middle, for it is convex there. sqrt(3)/2 is
-    attained in the middle.
+    |noise| <= sum w_c |r_c| <= sqrt(sum w_c |r_c|^2), the root of a sum of three terms of at most
+    1/4: s(t) lies below the line (1 + 2t)/4 on the first half, for it is convex there. sqrt(3)/2 is
+    attained at the cell's center.
 
     The derivative along v is sum g_c.(A_c v) with A_c = w_c I + r_c grad w_c^T, at most sum |A_c v|
     <= sqrt(v^T (sum A_c^T A_c / o_c) v) for weights o_c > 0 with the sum 1 (Cauchy and Schwarz).
     With the spectral norms of the A_c as weights the root of the largest eigenvalue is at most
     2.183 for the cubic and sqrt(499)/8 = 2.7923 for the quintic fade on a grid of the cell, and
-    changes slowly between its points: 2.2 and 2.82 leave room for that. In the middle sqrt(19)/2 =
+    changes slowly between its points: 2.2 and 2.82 leave room for that. At the center sqrt(19)/2 =
     2.1794 and sqrt(499)/8 are attained. Hart's 3 (1996, appendix F) is a bound, but his argument
     (3/2 of the fade times 2 of the vectors) does not prove it: values of a table have no Lipschitz
     constant.
 
     A second derivative d_ij is, in the same way along the other axes, at most a sum over the
-    corners of one or two axes; the largest sum of a row of these bounds is one of the spectral norm
+    corners of one or two axes; the largest row sum of these bounds is a bound of the spectral norm
     of the Hessian: 17.64 and 24.35 on a grid.
     """
 
@@ -71,7 +71,7 @@ CONSTANTS: dict[Fade, NoiseConstants] = {
 
 
 def fade(kind: Fade, t: Any) -> tuple[Any, Any, Any]:
-    """The weight of the farther end, 0 to 1, and its first two derivatives."""
+    """The weight of the far end of an edge at t, 0 to 1, and its first two derivatives."""
     if kind == "cubic":
         return t * t * (3 - 2 * t), 6 * t * (1 - t), 6 - 12 * t
     rest = 1 - t
@@ -83,14 +83,14 @@ def fade(kind: Fade, t: Any) -> tuple[Any, Any, Any]:
 
 
 def cell_noise(kind: Fade, t: Any, vectors: Any) -> tuple[Any, list[Any], list[Any]]:
-    """Noise in a cell: value, gradient (3,) and Hessian (6,), rows of the upper triangle.
+    """Noise in a cell: its value, gradient (3,) and Hessian (6,), the upper triangle row by row.
 
     t: (3,) the position in the cell, 0 to 1. vectors: (8,) unit vectors (3,) at the corners, in the
-    order of `CORNERS`.
+        order of `CORNERS`.
     """
     weights: list[tuple[tuple[Any, Any], ...]] = []
-    for one in t:
-        s, ds, dds = fade(kind, one)
+    for fraction in t:
+        s, ds, dds = fade(kind, fraction)
         weights.append(((1 - s, s), (-ds, ds), (-dds, dds)))
     value: Any = 0.0
     gradient: list[Any] = [0.0] * 3
@@ -104,45 +104,46 @@ def cell_noise(kind: Fade, t: Any, vectors: Any) -> tuple[Any, list[Any], list[A
         )
 
     for corner, g in zip(CORNERS, vectors, strict=True):
-        inner = sum(g[k] * (t[k] - corner[k]) for k in range(3))
+        dot = sum(g[k] * (t[k] - corner[k]) for k in range(3))
         w = weight(corner, [0, 0, 0])
-        value = value + w * inner
+        value = value + w * dot
         dw = [weight(corner, [int(i == k) for i in range(3)]) for k in range(3)]
         for k in range(3):
-            gradient[k] = gradient[k] + (w * g[k] + dw[k] * inner)
+            gradient[k] = gradient[k] + (w * g[k] + dw[k] * dot)
         for m, (i, j) in enumerate(itertools.combinations_with_replacement(range(3), 2)):
             orders = [int(i == k) + int(j == k) for k in range(3)]
-            hessian[m] = hessian[m] + (dw[i] * g[j] + dw[j] * g[i] + weight(corner, orders) * inner)
+            hessian[m] = hessian[m] + (dw[i] * g[j] + dw[j] * g[i] + weight(corner, orders) * dot)
     return value, gradient, hessian
 
 
 def lattice_vector(x: Any, y: Any, z: Any, seed: Any, like: Real) -> list[Any]:
-    """A pseudo-random unit vector for integers (Dr.Jit, 32 bits, unsigned)."""
+    """A pseudo-random unit vector for a lattice point, from unsigned integers of 32 bits of
+    Dr.Jit."""
     h = x * 0x8DA6B343 + y * 0xD8163841 + z * 0xCB1AB31F + seed * 0x9E3779B1
     for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B)):
         h = (h ^ (h >> shift)) * factor
     h = h ^ (h >> 16)
-    # Odd numbers below 1024 in size: exact, and none is 0.
+    # Odd numbers of absolute value below 1024: exact, and never 0.
     real = cast("Any", type(like))
     parts = [real((h >> (10 * k)) & 1023) * 2 - 1023 for k in range(3)]
     scale = 1 / dr.sqrt(parts[0] * parts[0] + parts[1] * parts[1] + parts[2] * parts[2])
-    return [one * scale for one in parts]
+    return [part * scale for part in parts]
 
 
 @dataclass(frozen=True)
 class FractalNoise(FormulaSolid):
-    """The sum of a_i noise(2^i k p), a_i = amplitude 2^(-beta i), over a number of octaves.
+    """Fractal noise: the sum of a_i noise(2^i k p), a_i = amplitude 2^(-beta i), over octaves i.
 
-    octaves: their number.
+    octaves: the number of octaves.
     beta: how fast amplitudes fall: 0 for white noise, 1 for 1/f noise, 2 for Brownian motion.
-    frequency: k, points of the lattice in a unit of length.
-    amplitude: that of the first octave.
+    frequency: k, the number of lattice points per unit of length.
+    amplitude: of the first octave.
     seed: an integer of 32 bits that chooses the noise.
     fade: "quintic", with a continuous second derivative, or "cubic", which is Hart's.
 
-    Hart 1996, equations 52 to 55. Its Lipschitz constant is at most the sum of those of the
-    octaves; amplitudes 2^(-beta i) have the Hurst exponent beta, so that the graph has the fractal
-    dimension 3 - beta, where Hart's equation after 53 has 2 + (3 - beta)/2.
+    Hart 1996, equations 52 to 55. Its Lipschitz constant is at most the sum of the octaves'
+    constants; amplitudes 2^(-beta i) have the Hurst exponent beta, so that the graph has the
+    fractal dimension 3 - beta, where Hart's equation after 53 has 2 + (3 - beta)/2.
     """
 
     octaves: int = 6
@@ -182,24 +183,25 @@ class FractalNoise(FormulaSolid):
         return self._sum(2.0) * CONSTANTS[self.fade].max_second_derivative
 
     def prepare(self, backend: Backend) -> Field:
-        made = with_device_numbers(self, backend)
+        prepared = with_device_numbers(self, backend)
         constants = (self._sum(1.0) * CONSTANTS[self.fade].max_gradient, self.max_second_derivative)
         numbers = {
-            "_constants": tuple(dr.opaque(backend.Float, one) for one in constants),
+            "_constants": tuple(dr.opaque(backend.Float, constant) for constant in constants),
             "_falls": dr.opaque(backend.Float, 2.0**-self.beta),
             "_seed": dr.opaque(backend.UInt32, self.seed),
         }
         for name, value in numbers.items():
-            object.__setattr__(made, name, value)
-        return made
+            object.__setattr__(prepared, name, value)
+        return prepared
 
     def promises(self, p: Vec3) -> tuple[Promise, ...]:
-        slope, bend = self._data(p.x)["_constants"]
-        return Lipschitz(0 * p.x + slope), TaylorRemainder(0 * p.x + bend)
+        first, second = self._data(p.x)["_constants"]
+        return Lipschitz(0 * p.x + first), TaylorRemainder(0 * p.x + second)
 
     def _data(self, like: Real) -> dict[str, Any]:
-        made = self if hasattr(self, "_falls") else self.prepare(backend_of(like))
-        return vars(made)
+        """The attributes of the noise, prepared for the backend of a number."""
+        prepared = self if hasattr(self, "_falls") else self.prepare(backend_of(like))
+        return vars(prepared)
 
     @property
     def may_jump(self) -> bool:
@@ -211,24 +213,26 @@ class FractalNoise(FormulaSolid):
         return None
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        jets = [one for one in (x, y, z) if is_jet(one, type(self).__name__)]
+        jets = [axis for axis in (x, y, z) if is_jet(axis, type(self).__name__)]
         if jets:
-            made = [one if isinstance(one, Jet) else jets[0].coerce(one) for one in (x, y, z)]
-            return self._ranges(made)
+            coordinates = [
+                axis if isinstance(axis, Jet) else jets[0].coerce(axis) for axis in (x, y, z)
+            ]
+            return self._ranges(coordinates)
         return self._octaves([x, y, z])[0][0]
 
     def _octaves(self, q: list[Real], *, each: bool = False) -> list[tuple[Any, Any, Any]]:
-        """Value, gradient and Hessian of the sum, or of each octave."""
+        """Value, gradient and Hessian of the sum; or, if `each`, of each octave."""
         data = self._data(q[0])
         scale, amplitude = data["frequency"], data["amplitude"]
-        found: list[tuple[Any, list[Any], list[Any]]] = []
+        octaves: list[tuple[Any, list[Any], list[Any]]] = []
         for octave in range(self.octaves):
-            place = [one * scale for one in q]
-            whole = [dr.floor(dr.detach(one)) for one in place]
-            t = [a - b for a, b in zip(place, whole, strict=True)]
+            position = [entry * scale for entry in q]
+            floors = [dr.floor(dr.detach(entry)) for entry in position]
+            t = [a - b for a, b in zip(position, floors, strict=True)]
             integer = dr.int32_array_t(cast("Any", type(q[0])))
             natural = dr.uint32_array_t(cast("Any", type(q[0])))
-            base = [natural(integer(one)) for one in whole]
+            base = [natural(integer(entry)) for entry in floors]
             seed = data["_seed"] + octave
             vectors: list[Any] = []
             for corner in CORNERS:
@@ -236,41 +240,44 @@ class FractalNoise(FormulaSolid):
                 vectors.append(lattice_vector(i, j, k, seed, q[0]))
             value, gradient, hessian = cell_noise(self.fade, t, vectors)
             slope = amplitude * scale
-            found.append(
+            octaves.append(
                 (
                     amplitude * value,
-                    [slope * one for one in gradient],
-                    [slope * scale * one for one in hessian],
+                    [slope * entry for entry in gradient],
+                    [slope * scale * entry for entry in hessian],
                 )
             )
             amplitude, scale = amplitude * data["_falls"], 2 * scale
         if each:
-            return found
-        total = found[0]
-        for one in found[1:]:
+            return octaves
+        total = octaves[0]
+        for entry in octaves[1:]:
             total = (
-                total[0] + one[0],
-                [a + b for a, b in zip(total[1], one[1], strict=True)],
-                [a + b for a, b in zip(total[2], one[2], strict=True)],
+                total[0] + entry[0],
+                [a + b for a, b in zip(total[1], entry[1], strict=True)],
+                [a + b for a, b in zip(total[2], entry[2], strict=True)],
             )
         return [total]
 
     def _ranges(self, coordinates: list[Jet]) -> Jet:
-        """The jet of the sum for jets of the coordinates: the sum of the octaves' jets."""
+        """The jet of the sum from jets of the coordinates: the sum of the octaves' jets."""
         like = coordinates[0].backend_number()
         like = like if coordinates[0].jet_at_start is None else coordinates[0].piece_length
-        starts = [one if one.jet_at_start is None else one.jet_at_start for one in coordinates]
-        at = [0 * like + one.value_on_backend(like).midpoint for one in starts]
-        off = [0 * like + one.value_on_backend(like).radius for one in starts]
+        starts = [
+            start if start.jet_at_start is None else start.jet_at_start for start in coordinates
+        ]
+        at = [0 * like + start.value_on_backend(like).midpoint for start in starts]
+        radii = [0 * like + start.value_on_backend(like).radius for start in starts]
         data, constants = self._data(at[0]), CONSTANTS[self.fade]
-        unit = 2 * float(dr.epsilon(cast("Any", type(at[0]))))
+        epsilon = 2 * float(dr.epsilon(cast("Any", type(at[0]))))
         scale, amplitude = data["frequency"], data["amplitude"]
         total: Jet | None = None
         for value, gradient, hessian in self._octaves(at, each=True):
-            # Thirty operations for each corner. The position in the cell is off by a rounding of
-            # the coordinate, and nothing is known where the lattice is finer than the numbers are.
-            place = fmax(fmax(dr.abs(at[0]), dr.abs(at[1])), dr.abs(at[2])) * scale
-            lost = dr.select(place < 2.0**30, unit * place, dr.inf)
+            # Thirty operations for each corner. The position in the cell has the rounding error of
+            # the coordinate, so that there is no bound where the lattice is finer than the spacing
+            # of numbers.
+            size = fmax(fmax(dr.abs(at[0]), dr.abs(at[1])), dr.abs(at[2])) * scale
+            lost = dr.select(size < 2.0**30, epsilon * size, dr.inf)
             octave = _Octave(
                 at=at,
                 value=value,
@@ -278,19 +285,20 @@ class FractalNoise(FormulaSolid):
                 hessian=hessian,
                 slope=amplitude * scale * constants.max_gradient * (1 + 1e-5),
                 bend=amplitude * scale * scale * constants.max_second_derivative * (1 + 1e-5),
-                error=amplitude * (32 * unit + constants.max_gradient * 2 * lost),
+                error=amplitude * (32 * epsilon + constants.max_gradient * 2 * lost),
                 slope_error=amplitude
                 * scale
-                * (64 * unit + constants.max_second_derivative * 2 * lost),
+                * (64 * epsilon + constants.max_second_derivative * 2 * lost),
             )
-            jet = octave.jet(coordinates, starts, _length(off))
+            jet = octave.jet(coordinates, starts, _length(radii))
             total = jet if total is None else total + jet
             amplitude, scale = amplitude * data["_falls"], 2 * scale
         return cast("Jet", total)
 
 
 class Noise(FractalNoise):
-    """One octave: lattice noise of random unit vectors (Perlin 1985; Hart 1996, equation 52)."""
+    """Gradient noise of a single octave: lattice noise with random unit vectors (Perlin 1985; Hart
+    1996, equation 52)."""
 
     def __init__(
         self,
@@ -305,9 +313,10 @@ class Noise(FractalNoise):
 
 @dataclass(frozen=True)
 class DisplacedSolid(FormulaSolid):
-    """A shape with noise added to its function (Hart 1996, appendix F): f + noise <= 0.
+    """A displaced solid: noise is added to its function (Hart 1996, appendix F): f + noise <= 0.
 
-    Its Lipschitz constant is the sum of both; its surface is where f is within `max_abs` of 0.
+    Its Lipschitz constant is the sum of both constants; its surface lies where the solid's f is
+    within `max_abs` of 0.
     """
 
     solid: Formula
@@ -323,12 +332,12 @@ class DisplacedSolid(FormulaSolid):
 
     @property
     def lipschitz(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
-        one, two = self.solid.lipschitz, self.noise.lipschitz
-        return None if one is None else one + two
+        constant, noise_constant = self.solid.lipschitz, self.noise.lipschitz
+        return None if constant is None else constant + noise_constant
 
     @property
     def may_jump(self) -> bool:
-        """Whether the shape's function may: noise is continuous."""
+        """Whether the solid's function may jump: noise is continuous."""
         return self.solid.may_jump
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
@@ -343,10 +352,10 @@ class DisplacedSolid(FormulaSolid):
 
 @dataclass(frozen=True)
 class _Octave:
-    """One octave around a point.
+    """An octave of noise about a point.
 
     at: the point.
-    value, gradient, hessian: there.
+    value, gradient, hessian: of the octave at the point.
     slope, bend: bounds of the first and second derivatives everywhere.
     error, slope_error: bounds of the errors of value and gradient.
     """
@@ -368,56 +377,58 @@ class _Octave:
         (mean value theorem), and derivatives along a path follow by the chain rule. The value is
         that at the start plus the integral of the slope.
         """
-        wide = self.error + self.slope * off * (1 + 1e-5)
-        value = Interval(self.value - wide, self.value + wide)
+        error = self.error + self.slope * off * (1 + 1e-5)
+        value = Interval(self.value - error, self.value + error)
         if coordinates[0].jet_at_start is None:
-            # At points of space, not on pieces of length 0: the Hessian is known.
+            # At points of space, not on pieces of length 0, the Hessian is known.
             is_point = len(coordinates[0].first_derivatives) > 1
             return self._derivatives(coordinates, off, value, is_point=is_point)
         start = self._derivatives(starts, off, value, is_point=False)
-        far = [
-            fmax(dr.abs(one.value.upper - q), dr.abs(one.value.lower - q))
-            for one, q in zip(coordinates, self.at, strict=True)
+        distances = [
+            fmax(dr.abs(coordinate.value.upper - q), dr.abs(coordinate.value.lower - q))
+            for coordinate, q in zip(coordinates, self.at, strict=True)
         ]
-        distance = _length(far) * (1 + 1e-5)
-        wide = wide + self.slope * distance
-        wider = Interval(self.value - wide, self.value + wide)
-        piece = self._derivatives(coordinates, distance, wider, is_point=False)
+        distance = _length(distances) * (1 + 1e-5)
+        error = error + self.slope * distance
+        piece_value = Interval(self.value - error, self.value + error)
+        piece = self._derivatives(coordinates, distance, piece_value, is_point=False)
         return piece.narrowed_from_start(start, coordinates[0].piece_length)
 
     def _derivatives(self, jets: list[Jet], reach: Real, value: Interval, *, is_point: bool) -> Jet:
+        """The jet from jets of the coordinates, which are within `reach` of the point, and from the
+        value's range. If `is_point`, second derivatives are those of the Hessian."""
         change = self.bend * reach + self.slope_error
-        parts = [
+        slopes = [
             Interval(fmax(g - change, -self.slope), -fmax(-g - change, -self.slope))
             for g in self.gradient
         ]
         first: list[Interval] = []
         speeds: list[Real] = []
         for i in range(len(jets[0].first_derivatives)):
-            rates = [one.first_derivatives[i] for one in jets]
+            rates = [jet.first_derivatives[i] for jet in jets]
             speed = _length([0 * self.value + r.max_abs for r in rates]) * (1 + 1e-5)
-            along = _sum([g * r for g, r in zip(parts, rates, strict=True)])
-            most = self.slope * speed
-            first.append(Interval(fmax(along.lower, -most), -fmax(-along.upper, -most)))
+            rate = _sum([g * r for g, r in zip(slopes, rates, strict=True)])
+            limit = self.slope * speed
+            first.append(Interval(fmax(rate.lower, -limit), -fmax(-rate.upper, -limit)))
             speeds.append(speed)
-        rounded = 64 * 2 * float(dr.epsilon(cast("Any", type(self.value)))) * self.bend
+        rounding = 64 * 2 * float(dr.epsilon(cast("Any", type(self.value)))) * self.bend
         second: list[Interval] = []
         for k, (i, j) in enumerate(jets[0].hessian_indices()):
-            bent = self.bend * speeds[i] * speeds[j]
-            own = Interval(-bent, bent)
+            bound = self.bend * speeds[i] * speeds[j]
+            quadratic = Interval(-bound, bound)
             if is_point:
-                own = _quadratic(
-                    [Interval(h - rounded, h + rounded) for h in self.hessian], jets, i, j
+                quadratic = _quadratic(
+                    [Interval(h - rounding, h + rounding) for h in self.hessian], jets, i, j
                 )
-            along = [g * one.second_derivatives[k] for g, one in zip(parts, jets, strict=True)]
-            second.append(_sum([own, *along]))
+            rate = [g * jet.second_derivatives[k] for g, jet in zip(slopes, jets, strict=True)]
+            second.append(_sum([quadratic, *rate]))
         return Jet(value, tuple(first), tuple(second))
 
 
 def _sum(parts: list[Interval]) -> Interval:
     total = parts[0]
-    for one in parts[1:]:
-        total = total + one
+    for part in parts[1:]:
+        total = total + part
     return total
 
 

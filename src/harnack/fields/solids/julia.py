@@ -1,4 +1,4 @@
-"""Quaternion Julia sets, with proved empty balls around points outside of them."""
+"""Quaternion Julia sets, with a proved empty ball about each point outside."""
 
 from __future__ import annotations
 
@@ -24,18 +24,20 @@ Quaternion = tuple[float, float, float, float]
 
 # Radii of the balls, as fractions of the longest possible step.
 _RADII = (0.8, 0.6, 0.45, 0.3, 0.15)
-# Iterates beyond this absolute value have escaped; from there on only their logarithms are
-# computed.
+# Iterates beyond this absolute value have escaped; from there on only the logarithms of later
+# iterates are computed.
 _FAR = {"single": 1e4, "double": 1e8}
 
 
 @dataclass(frozen=True)
 class Julia(Solid):
-    """The points whose orbit under q -> q^2 + c stays small for a number of iterations.
+    """A quaternion Julia set: the points whose orbit under q -> q^2 + c stays small for a number of
+    iterations.
 
     c: the constant, four numbers; the real part comes first.
-    iterations: N. More of them show finer parts, and the solid shrinks to the Julia set.
-    fourth_coordinate: the fourth coordinate; points of space are q = x + y i + z j + slice k.
+    iterations: N. More iterations show finer details, and the solid shrinks to the Julia set.
+    fourth_coordinate: that of the slice shown; points of space are q = x + y i + z j +
+        fourth_coordinate k.
 
     f = 2^-N max(log(|q_N|/B), -1), with B = (1 + sqrt(1 + 4 |c|))/2: from |q| > B on an orbit
     escapes, for |q|^2 - |c| > |q| there. So f <= 0 on the filled Julia set, for any N.
@@ -45,16 +47,16 @@ class Julia(Solid):
     in any direction is at most d_n, with d_0 = 1 and d_(n+1) = 2 (|q_n| + e_n) d_n. So d_n/(|q_n| -
     e_n) is a bound g_n of the derivative of log|q_n| there. Besides, |q_n| >= m_n implies |q_(n+1)|
     >= m_n^2 - |c|, and g_(n+1) <= 2 g_n/(1 - |c|/m_n^2), for |q q' + q' q| <= 2 |q| |q'|; the
-    better one is used. 2^-N g_N is a Lipschitz constant of f in the ball, and so is 2^-N d_N e/B,
-    as f is cut off at |q| = B/e; one is promised for each of a few radii. The rounding of an
-    iterate is one more such change: e_n with r = 0 bounds the error of q_n. A ball with |q_n| - e_n
-    > B for some n <= N contains nothing of the solid. The usual |z| log|z| / (2 |z'|) is no bound
-    of the distance.
+    smaller bound is used. 2^-N g_N is a Lipschitz constant of f in the ball, and so is 2^-N d_N
+    e/B, as f is cut off at |q| = B/e; a constant is promised for each of a few radii. The rounding
+    of an iterate is another such change: e_n with r = 0 bounds the error of q_n. A ball with |q_n|
+    - e_n > B for an n <= N contains no point of the solid. The usual |z| log|z| / (2 |z'|) is not a
+    bound of the distance.
 
     Where |q_n| > R (a large number) at n < N, f = 2^-n log|q_n| - 2^-N log B within 2^-n 2
     |c|/|q_n|^2: each later iterate adds 2^-(j+1) log|1 + c/q_j^2|, and these fall. If m_n >= 2 B
-    there, later m_j at least double, and all factors 1/(1 - |c|/m_j^2) together are at most
-    exp(4 |c|/m_n^2).
+    there, later m_j at least double, and all factors 1/(1 - |c|/m_j^2) together are at most exp(4
+    |c|/m_n^2).
     """
 
     c: Quaternion = (-0.2, 0.8, 0.0, 0.0)
@@ -68,7 +70,7 @@ class Julia(Solid):
             numbers = ()
         if len(numbers) != 4:
             raise ValueError(f"c of a Julia set must be four numbers, not {self.c!r}")
-        c = tuple(as_finite(one, "each part of c of a Julia set") for one in numbers)
+        c = tuple(as_finite(part, "each part of c of a Julia set") for part in numbers)
         if not math.hypot(*c) <= 10.0:
             raise ValueError(f"c of a Julia set must be no longer than 10, not {self.c!r}")
         object.__setattr__(self, "c", c)
@@ -80,15 +82,15 @@ class Julia(Solid):
 
     @property
     def escape_radius(self) -> float:
-        """B: an orbit that has left this radius never returns."""
+        """B: an orbit that has left the ball of this radius never returns."""
         return 0.5 + math.sqrt(0.25 + math.hypot(*self.c))
 
     def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
         return change(self)
 
     def prepare(self, backend: Backend) -> Julia:
-        """The same with its numbers as kernel parameters of the backend."""
-        made = copy.copy(self)
+        """The same set with its numbers as kernel parameters of the backend."""
+        prepared = copy.copy(self)
         size = math.hypot(*self.c)
         for name, value in (
             ("_c", self.c),
@@ -96,19 +98,19 @@ class Julia(Solid):
             ("_size", size),
             ("_b", self.escape_radius),
         ):
-            object.__setattr__(made, name, _data(backend, value))
-        return made
+            object.__setattr__(prepared, name, _data(backend, value))
+        return prepared
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
-        """Proof. Where |q_0| = B (1 + t), t > 0, |q_n| >= B (1 + (2B)^n t) by induction, for B^2 -
-        |c| = B; so f <= level needs (2B)^N t <= exp(2^N level) - 1."""
+        """A ball about the origin. Proof. Where |q_0| = B (1 + t), t > 0, |q_n| >= B (1 + (2B)^n t)
+        by induction, for B^2 - |c| = B; so f <= level needs (2B)^N t <= exp(2^N level) - 1."""
         b, scaled = self.escape_radius, 2.0**self.iterations * level
         if above or scaled > 600.0:
             return None
-        beyond = math.expm1(max(scaled, 0.0)) / (2.0 * b) ** self.iterations
-        reach = b * (1.0 + beyond)
-        across = reach * reach - self.fourth_coordinate * self.fourth_coordinate
-        return ball_around((0.0, 0.0, 0.0), math.sqrt(max(across, 0.0)))
+        excess = math.expm1(max(scaled, 0.0)) / (2.0 * b) ** self.iterations
+        reach = b * (1.0 + excess)
+        square = reach * reach - self.fourth_coordinate * self.fourth_coordinate
+        return ball_around((0.0, 0.0, 0.0), math.sqrt(max(square, 0.0)))
 
     def evaluate(self, p: Vec3) -> Sample:
         if not hasattr(self, "_c"):
@@ -117,108 +119,113 @@ class Julia(Solid):
             return self.prepare(backend_of(p)).evaluate(p)
         zero = 0 * p.x
         value, gradient, error, (steepest,) = self._orbit(p, (zero,))
-        # No step is longer than this, as the constant of a ball is at least that at its center.
+        # No step is longer than this, as the Lipschitz constant on a ball is at least that at its
+        # center.
         longest = dr.abs(value) / steepest
         longest = clamp(dr.select(dr.isfinite(longest), longest, 1), 1e-6, self._parameter("_b"))
-        radii = tuple(longest * one for one in _RADII)
+        radii = tuple(longest * fraction for fraction in _RADII)
         constants = self._orbit(p, radii)[3]
-        known: list[Lipschitz] = []
-        for radius, most in zip(radii, constants, strict=True):
-            proved = (most >= 0) & (most < dr.inf)
-            known.append(Lipschitz(dr.select(proved, most, 0), dr.select(proved, radius, 0)))
-        return Sample(value, gradient, tuple(known), error)
+        promises: list[Lipschitz] = []
+        for radius, constant in zip(radii, constants, strict=True):
+            is_proved = (constant >= 0) & (constant < dr.inf)
+            promises.append(
+                Lipschitz(dr.select(is_proved, constant, 0), dr.select(is_proved, radius, 0))
+            )
+        return Sample(value, gradient, tuple(promises), error)
 
     def _parameter(self, name: str) -> Any:
         return getattr(self, name)
 
     def _orbit(self, p: Vec3, radii: tuple[Real, ...]) -> tuple[Any, ...]:
-        """f, its gradient, how far f is off, and bounds of |grad f| in balls; for the error
-        to be that of rounding alone, the first radius is 0."""
+        """f, its gradient, a bound of the error of f, and bounds of |grad f| on the balls of these
+        radii. The first radius must be 0 for the error to be that of rounding alone."""
         c, size, b = self._parameter("_c"), self._parameter("_size"), self._parameter("_b")
         real = cast("Any", type(p.x))
-        single = dr.type_v(real) == dr.VarType.Float32
-        far = _FAR["single" if single else "double"]
-        unit = 2 * float(dr.epsilon(real))
-        zero, one = 0 * p.x, 0 * p.x + 1
+        is_single = dr.type_v(real) == dr.VarType.Float32
+        escape = _FAR["single" if is_single else "double"]
+        epsilon = 2 * float(dr.epsilon(real))
+        zero, ones = 0 * p.x, 0 * p.x + 1
         q = [p.x, p.y, p.z, zero + self._parameter("_slice")]
-        slopes = [one, zero, zero, zero, one, zero, zero, zero, one, zero, zero, zero]
-        moved = [zero + r for r in radii]
-        steep = [one for _ in radii]
+        jac = [ones, zero, zero, zero, ones, zero, zero, zero, ones, zero, zero, zero]
+        change = [zero + r for r in radii]
+        slopes = [ones for _ in radii]
         start = dr.sqrt(_squared_norm(q))
-        least = [fmax(start * (1 - 4 * unit) - r, 0) for r in moved]
-        rates = [1 / low for low in least]
+        min_q = [fmax(start * (1 - 4 * epsilon) - r, 0) for r in change]
+        rates = [1 / m for m in min_q]
 
         def body(n: Any, *state: Any) -> tuple[Any, ...]:
-            q, slopes = list(state[:4]), state[4:16]
-            moved, steep, least, rates = _split_in_four(state[16:])
-            bent: list[Any] = [None] * 12
+            q, jac = list(state[:4]), state[4:16]
+            change, slopes, min_q, rates = _split_in_four(state[16:])
+            next_jac: list[Any] = [None] * 12
             for k in range(3):
-                a, *v = (slopes[3 * i + k] for i in range(4))
-                bent[k] = 2 * (q[0] * a - (q[1] * v[0] + q[2] * v[1] + q[3] * v[2]))
+                a, *v = (jac[3 * i + k] for i in range(4))
+                next_jac[k] = 2 * (q[0] * a - (q[1] * v[0] + q[2] * v[1] + q[3] * v[2]))
                 for i in range(3):
-                    bent[3 * (i + 1) + k] = 2 * (q[0] * v[i] + q[i + 1] * a)
+                    next_jac[3 * (i + 1) + k] = 2 * (q[0] * v[i] + q[i + 1] * a)
             square = _squared_norm(q)
-            norm = dr.sqrt(square) * (1 + 4 * unit)
-            # Each part of q^2 + c is off by a few roundings of |q|^2 + |c|.
-            rounded = 8 * unit * (square + size)
+            norm = dr.sqrt(square) * (1 + 4 * epsilon)
+            # The error of each component of q^2 + c is a few roundings of |q|^2 + |c|.
+            rounded = 8 * epsilon * (square + size)
             across = q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
-            new = [q[0] * q[0] - across + c[0], *(2 * q[0] * q[i] + c[i] for i in (1, 2, 3))]
-            farther = [(2 * norm * e + e * e) * (1 + 8 * unit) + rounded for e in moved]
-            steeper = [
-                2 * (norm + e) * d * (1 + 8 * unit) for e, d in zip(moved, steep, strict=True)
+            next_q = [q[0] * q[0] - across + c[0], *(2 * q[0] * q[i] + c[i] for i in (1, 2, 3))]
+            next_change = [(2 * norm * e + e * e) * (1 + 8 * epsilon) + rounded for e in change]
+            next_slopes = [
+                2 * (norm + e) * d * (1 + 8 * epsilon) for e, d in zip(change, slopes, strict=True)
             ]
-            after = dr.sqrt(_squared_norm(new)) * (1 - 4 * unit)
-            lows: list[Real] = []
-            slower: list[Real] = []
-            for e, d, low, rate in zip(farther, steeper, least, rates, strict=True):
-                next_low = low * low * (1 - 4 * unit) - size
-                share = 1 - size / (low * low) * (1 + 4 * unit)
-                by_rate = dr.select(share > 0, 2 * rate / share * (1 + 4 * unit), dr.inf)
-                lows.append(fmax(fmax(after - e, 0), next_low))
-                slower.append(fmin(by_rate, d / fmax(after - e, 0) * (1 + unit)))
-            return n + 1, *new, *bent, *farther, *steeper, *lows, *slower
+            next_norm = dr.sqrt(_squared_norm(next_q)) * (1 - 4 * epsilon)
+            next_min_q: list[Real] = []
+            next_rates: list[Real] = []
+            for e, d, m, rate in zip(next_change, next_slopes, min_q, rates, strict=True):
+                next_m = m * m * (1 - 4 * epsilon) - size
+                factor = 1 - size / (m * m) * (1 + 4 * epsilon)
+                by_rate = dr.select(factor > 0, 2 * rate / factor * (1 + 4 * epsilon), dr.inf)
+                next_min_q.append(fmax(fmax(next_norm - e, 0), next_m))
+                next_rates.append(fmin(by_rate, d / fmax(next_norm - e, 0) * (1 + epsilon)))
+            return n + 1, *next_q, *next_jac, *next_change, *next_slopes, *next_min_q, *next_rates
 
-        def goes_on(n: Any, *state: Any) -> Any:
-            return (n < self.iterations) & (_squared_norm(state[:4]) <= far * far)
+        def is_active(n: Any, *state: Any) -> Any:
+            return (n < self.iterations) & (_squared_norm(state[:4]) <= escape * escape)
 
         index = dr.uint32_array_t(real)
-        begin = (dr.zeros(index, dr.width(p)), *q, *slopes, *moved, *steep, *least, *rates)
-        n, *state = dr.while_loop(begin, goes_on, body, label="quaternion Julia set")
-        q, slopes = state[:4], state[4:16]
-        moved, steep, least, rates = _split_in_four(state[16:])
+        begin = (dr.zeros(index, dr.width(p)), *q, *jac, *change, *slopes, *min_q, *rates)
+        n, *state = dr.while_loop(begin, is_active, body, label="quaternion Julia set")
+        q, jac = state[:4], state[4:16]
+        change, slopes, min_q, rates = _split_in_four(state[16:])
         square = _squared_norm(q)
         norm = dr.sqrt(square)
-        share = dr.exp2(-real(n)) * (1 + 4 * unit)
-        all_made = n >= self.iterations
+        factor = dr.exp2(-real(n)) * (1 + 4 * epsilon)
+        is_complete = n >= self.iterations
         last = 2.0**-self.iterations
         offset = last * dr.log(b)
         is_floor = norm <= b * math.exp(-1.0)
-        value = dr.select(is_floor, -last, share * dr.log(norm) - offset)
-        scale = dr.select(is_floor, 0, share / square)
+        value = dr.select(is_floor, -last, factor * dr.log(norm) - offset)
+        scale = dr.select(is_floor, 0, factor / square)
         gradient = type(p)(
-            *(scale * sum(q[i] * slopes[3 * i + k] for i in range(4)) for k in range(3))
+            *(scale * sum(q[i] * jac[3 * i + k] for i in range(4)) for k in range(3))
         )
         cut = b * (math.exp(-1.0) * (1 - 1e-6))  # f is constant where |q_N| is smaller
         constants: list[Real] = []
-        for e, d, low, rate in zip(moved, steep, least, rates, strict=True):
-            at_end = fmin(rate, d / fmax(norm * (1 - 4 * unit) - e, cut))
-            later = dr.select(low >= 2 * b, rate * dr.exp(4 * size / (low * low)), dr.inf)
-            constants.append(share * dr.select(all_made, at_end, later) * (1 + 8 * unit))
-        # Logarithms are off by a few units of their size, or of 1.
-        spread = 16 * unit * (share * (dr.abs(dr.log(norm)) + 1) + dr.abs(offset))
-        spread += dr.select(all_made, 0, share * 2 * size / square)
-        off = share * moved[0] / fmax(norm - moved[0], cut)
-        return value, gradient, off + spread, constants
+        for e, d, m, rate in zip(change, slopes, min_q, rates, strict=True):
+            at_end = fmin(rate, d / fmax(norm * (1 - 4 * epsilon) - e, cut))
+            escaped = dr.select(m >= 2 * b, rate * dr.exp(4 * size / (m * m)), dr.inf)
+            constants.append(factor * dr.select(is_complete, at_end, escaped) * (1 + 8 * epsilon))
+        # The error of logarithms is a few roundings of their size, or of 1.
+        rounding = 16 * epsilon * (factor * (dr.abs(dr.log(norm)) + 1) + dr.abs(offset))
+        rounding += dr.select(is_complete, 0, factor * 2 * size / square)
+        error = factor * change[0] / fmax(norm - change[0], cut)
+        return value, gradient, error + rounding, constants
 
 
 def _split_in_four(state: Any) -> tuple[Any, Any, Any, Any]:
+    """The four equal parts of a sequence."""
     k = len(state) // 4
     return state[:k], state[k : 2 * k], state[2 * k : 3 * k], state[3 * k :]
 
 
 def _data(backend: Backend, value: Any) -> Any:
+    """Numbers, or nested tuples of them, as kernel parameters of a backend."""
     if isinstance(value, tuple):
-        return tuple(_data(backend, one) for one in cast("tuple[Any, ...]", value))
+        return tuple(_data(backend, part) for part in cast("tuple[Any, ...]", value))
     return dr.opaque(backend.Float, float(value))
 
 

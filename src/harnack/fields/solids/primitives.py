@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Plane(FormulaSolid):
-    """The half-space n.x <= distance, n the normal made a unit vector.
+    """The half-space n.x <= distance, where n is the unit vector along the normal.
 
     The signed distance (Hart, equation 23): its gradient is n, so that its Lipschitz constant is 1.
     """
@@ -84,8 +84,9 @@ class Sphere(FormulaSolid):
 
 
 def _box_of_radii(radii: tuple[float, float, float], level: float) -> Volume:
-    """Around the points where m (g - 1) <= level, for the least radius m and a norm g that is 1
-    on a surface which reaches these radii along the axes, and lies in the box of them."""
+    """The box around the points where m (g - 1) <= level, with m the least radius and g a norm that
+    is 1 on a surface which reaches the radii along the axes, and lies in the box of half sides
+    `radii`."""
     a, b, c = radii
     size = 1.0 + level / min(radii)
     return box_around((size * a, size * b, size * c))
@@ -95,9 +96,9 @@ def _box_of_radii(radii: tuple[float, float, float], level: float) -> Volume:
 class Ellipsoid(FormulaSolid):
     """The points with |(x/a, y/b, z/c)| <= 1, radii = (a, b, c).
 
-    f = m (|(x/a, y/b, z/c)| - 1) with m the least radius. Proof of the constant 1: the norm has the
-    constant 1 and the stretched coordinates 1/m; it is attained along the shortest axis. So f is no
-    larger than the distance, which no formula in closed form gives.
+    f = m (|(x/a, y/b, z/c)| - 1) with m the least radius. Proof of the Lipschitz constant 1: the
+    norm has the constant 1, and the stretched coordinates have 1/m. It is attained along the
+    shortest axis. So f is no larger than the distance, which has no closed form.
     """
 
     is_convex = True
@@ -120,11 +121,11 @@ class Ellipsoid(FormulaSolid):
 
 @dataclass(frozen=True)
 class Cylinder(FormulaSolid):
-    """The points within `radius` of the z axis, and of |z| <= half_height if that is given.
+    """The points within `radius` of the z axis, and with |z| <= half_height unless that is None.
 
-    Without ends the signed distance |(x, y)| - r (Hart, equation 25). With ends the distances to
-    the side and to the ends have gradients at right angles, so that `corner` gives the signed
-    distance; its Lipschitz constant is 1.
+    Without ends f is the signed distance |(x, y)| - r (Hart, equation 25). With ends the distances
+    to the side and to the ends have gradients at right angles, so that `orthogonal_intersection` is
+    the signed distance; its Lipschitz constant is 1.
     """
 
     is_convex = True
@@ -153,17 +154,17 @@ class Cylinder(FormulaSolid):
             return None
         if self.half_height is None:
             return None
-        r, most = self.radius, level
-        return box_around((r + most, r + most, self.half_height + most))
+        r, margin = self.radius, level
+        return box_around((r + margin, r + margin, self.half_height + margin))
 
 
 @dataclass(frozen=True)
 class DoubleCone(FormulaSolid):
     """The double cone around the z axis whose sides make an angle with it, in radians.
 
-    f = |(x, y)| cos(angle) - |z| sin(angle) (Hart, equation 26). Its gradient is a unit vector off
-    the axis and the plane z = 0: the constant is 1. It is the signed distance where the nearest
-    point of a side is not beyond the apex, and smaller elsewhere.
+    f = |(x, y)| cos(angle) - |z| sin(angle) (Hart, equation 26). Off the axis and the plane z = 0
+    its gradient is a unit vector, so that its Lipschitz constant is 1. It is the signed distance
+    where the nearest point of a side is not beyond the apex, and smaller elsewhere.
     """
 
     angle: float = math.pi / 6
@@ -191,8 +192,9 @@ class DoubleCone(FormulaSolid):
 class Capsule(FormulaSolid):
     """The points within `radius` of the segment from start to end.
 
-    The signed distance |q - max(0, min(1, t)) (end - start)| - r, q = x - start, t the parameter of
-    the nearest point of the line. As a distance of a set it has the constant 1.
+    f is the signed distance |q - max(0, min(1, t)) (end - start)| - r, with q = x - start and t the
+    parameter of the nearest point of the line. As the distance from a set it has the Lipschitz
+    constant 1.
     """
 
     is_convex = True
@@ -229,16 +231,16 @@ class Capsule(FormulaSolid):
         r = self.radius + level
         pairs = list(zip(self.start, self.end, strict=True))
         half = [abs(b - a) / 2 + r for a, b in pairs]
-        middle = tuple((a + b) / 2 for a, b in pairs)
-        return box_around((half[0], half[1], half[2]), middle)
+        center = tuple((a + b) / 2 for a, b in pairs)
+        return box_around((half[0], half[1], half[2]), center)
 
 
 @dataclass(frozen=True)
 class Torus(FormulaSolid):
     """The points within `minor` of the circle of radius `major` around the z axis.
 
-    The signed distance | (|(x, y)| - R, z) | - r (Hart, equation 27); a distance of a set, so its
-    constant is 1. With minor > major (a spindle) it is a bound inside.
+    f is the signed distance | (|(x, y)| - R, z) | - r (Hart, equation 27); the distance from a set,
+    so its Lipschitz constant is 1. With minor > major (a spindle torus) it is only a bound inside.
     """
 
     major: float = 1.0
@@ -262,9 +264,10 @@ class Torus(FormulaSolid):
 
 @dataclass(frozen=True)
 class Cuboid(FormulaSolid):
-    """The box |x| <= a, |y| <= b, |z| <= c of half sides (a, b, c), its edges rounded by `radius`.
+    """The box |x| <= a, |y| <= b, |z| <= c of half sides (a, b, c), with edges rounded by `radius`.
 
-    The signed distance: that of the box smaller by the radius (`corner`), less the radius.
+    f is the signed distance: that of the box smaller by the radius (`orthogonal_intersection`),
+    less the radius.
     """
 
     is_convex = True
@@ -294,20 +297,20 @@ class Cuboid(FormulaSolid):
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         if above:
             return None
-        a, b, c = (one + level for one in self.half_sides)
+        a, b, c = (side + level for side in self.half_sides)
         return box_around((a, b, c))
 
 
 def lipschitz_of_norms(p: float, q: float) -> float:
     """The Lipschitz constant of | (|(x, y)|_p, z) |_q, p, q >= 1.
 
-    Hart (1996, equation 31) prints one that is right only for p = q < 2 or p, q >= 2. Proof. The
-    gradient has the parts u^(q-1) grad |(x, y)|_p and v^(q-1), where (u, v) has the q-norm 1. The
-    gradient of the p-norm has the dual norm 1, so its length is at most c = 2^max(0, 1/p - 1/2).
-    So the square of the length is at most c^2 u^(2q-2) + v^(2q-2). For q >= 2 both powers are at
-    most u^q and v^q, whose sum is 1: it is at most c^2, for c >= 1. For q < 2, Hoelder's inequality
-    with the exponents q/(2q-2) and q/(2-q) gives (c^m + 1)^(2/m) with m = 2q/(2-q). All are
-    attained.
+    Hart's constant (1996, equation 31) is right only for p = q < 2 or p, q >= 2. Proof. The
+    gradient has the components u^(q-1) grad |(x, y)|_p and v^(q-1), where (u, v) has the q-norm 1.
+    The gradient of the p-norm has the dual norm 1, so its length is at most c = 2^max(0, 1/p -
+    1/2). So the square of the length is at most c^2 u^(2q-2) + v^(2q-2). For q >= 2 both powers are
+    at most u^q and v^q, whose sum is 1: it is at most c^2, for c >= 1. For q < 2, Hoelder's
+    inequality with the exponents q/(2q-2) and q/(2-q) gives (c^m + 1)^(2/m) with m = 2q/(2-q). All
+    are attained.
     """
     c = 2.0 ** max(0.0, 1.0 / p - 0.5)
     if q >= 2.0:
@@ -317,8 +320,13 @@ def lipschitz_of_norms(p: float, q: float) -> float:
 
 
 def _checked_powers(powers: Any, name: str) -> tuple[float, float]:
+    """The two powers as numbers.
+
+    Raises:
+        ValueError: not two numbers, or a power below 1.
+    """
     try:
-        p, q = (float(one) for one in powers)
+        p, q = (float(power) for power in powers)
     except (TypeError, ValueError):
         raise ValueError(f"the powers of a {name} must be two numbers, not {powers!r}") from None
     if not (p >= 1.0 and q >= 1.0):
@@ -330,22 +338,23 @@ def _checked_powers(powers: Any, name: str) -> tuple[float, float]:
 
 
 class _Powered(FormulaSolid):
-    """A shape with powers, which are literals of its kernel and no kernel parameters."""
+    """A shape with powers, which are literals of its kernel and not kernel parameters."""
 
     powers: tuple[float, float]
 
     def prepare(self, backend: Backend) -> Field:
-        made = with_device_numbers(self, backend)
-        set_frozen(made, "powers", self.powers)
-        return made
+        prepared = with_device_numbers(self, backend)
+        set_frozen(prepared, "powers", self.powers)
+        return prepared
 
 
 @dataclass(frozen=True)
 class Superellipsoid(_Powered):
     """The points with | (|(x/a, y/b)|_p, z/c) |_q <= 1, powers = (p, q), radii = (a, b, c).
 
-    f = m (that norm - 1) with m the least radius (Hart, equations 28 to 30), whose constant is that
-    of the norm for equal radii, and no larger for others: see `lipschitz_of_norms`.
+    f = m (that norm - 1) with m the least radius (Hart, equations 28 to 30), whose Lipschitz
+    constant is that of the norm for equal radii, and no larger for other radii: see
+    `lipschitz_of_norms`.
     """
 
     is_convex = True
@@ -374,7 +383,8 @@ class Superellipsoid(_Powered):
 class Supertorus(_Powered):
     """The points with | (|(x, y)|_p - R, z) |_q <= r, powers = (p, q).
 
-    Its constant is that of the norms (`lipschitz_of_norms`): subtracting R changes no gradient.
+    Its Lipschitz constant is that of the norms (`lipschitz_of_norms`): subtracting R changes no
+    gradient.
     """
 
     powers: tuple[float, float] = (4.0, 4.0)

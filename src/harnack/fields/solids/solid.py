@@ -34,7 +34,7 @@ Point = tuple[float, float, float]
 
 
 def box_around(half: tuple[float, float, float], center: Any = (0.0, 0.0, 0.0)) -> Volume:
-    """The box with these half sides, which count as 0 if they are negative."""
+    """The box with these half sides about a center. Negative half sides count as 0."""
     sizes = [
         max(h, 0.0) + _EXTENT_MARGIN * (abs(h) + abs(c)) for h, c in zip(half, center, strict=True)
     ]
@@ -44,13 +44,13 @@ def box_around(half: tuple[float, float, float], center: Any = (0.0, 0.0, 0.0)) 
 
 
 def ball_around(center: tuple[float, float, float], radius: float) -> Volume:
-    """The ball with this radius, which counts as 0 if it is negative."""
+    """The ball about a center. A negative radius counts as 0."""
     slack = _EXTENT_MARGIN * (abs(radius) + sum(abs(c) for c in center)) + 1e-30
     return Ball(center, max(radius, 0.0) + slack)
 
 
 def set_frozen(shape: Any, name: str, value: Any) -> None:
-    """Set an attribute of a frozen shape to a value that was checked."""
+    """Set an attribute of a frozen shape to a checked value."""
     object.__setattr__(shape, name, value)
 
 
@@ -58,21 +58,22 @@ AXES = {"x": 0, "y": 1, "z": 2}
 
 
 class SpaceMap(abc.ABC):
-    """A map of space, one to one."""
+    """A one-to-one map of space."""
 
     @abc.abstractmethod
     def apply(self, solid: Solid) -> Solid:
-        """The image of a solid that is no combination of others."""
+        """The image of a solid that is not a combination of other solids."""
 
 
 def axis_index(axis: str) -> int:
+    """The index, 0 to 2, of an axis. Raises ValueError for a name that is not "x", "y" or "z"."""
     if axis not in AXES:
         raise ValueError(f'axis must be "x", "y" or "z", not {axis!r}')
     return AXES[axis]
 
 
 def not_a_solid(other: Any) -> str:
-    """Text for an error message: how to make a solid of an object that is no solid."""
+    """The text of an error message: how to make a solid of an object that is not a solid."""
     kind = type(other).__name__
     if isinstance(other, Field):
         return (
@@ -83,6 +84,8 @@ def not_a_solid(other: Any) -> str:
 
 
 def _with_source(prepare: Callable[[Any, Backend], Field]) -> Callable[[Any, Backend], Field]:
+    """Wrap `prepare` so that a prepared solid keeps a reference to the original."""
+
     @functools.wraps(prepare)
     def remembering(self: Any, backend: Backend) -> Field:
         prepared = prepare(self, backend)
@@ -94,14 +97,14 @@ def _with_source(prepare: Callable[[Any, Backend], Field]) -> Callable[[Any, Bac
 
 
 class Solid(Field):
-    """The points where f <= 0; its boundary is the level 0.
+    """A solid: the points where f <= 0. Its boundary is the level 0.
 
     Solids are combined by operators, `a | b` (union), `a & b` (intersection), `a - b` (difference),
     `~a` (complement), and are moved and deformed by methods. Every step is proved from enclosures
-    of the operands, never from a distance, as f of a combination is no distance.
+    of the operands, never from a distance, as f of a combination is not a distance.
 
     lipschitz: a proved bound of |grad f| everywhere, so that outside f/lipschitz is a lower bound
-        of the distance (Hart 1996, definition 3); None if none is known.
+        of the distance (Hart 1996, definition 3); None if no such bound is known.
     """
 
     over_relaxation = 1.0
@@ -109,14 +112,16 @@ class Solid(Field):
     lipschitz: Any = None
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
-        """A volume proved to hold all points where f <= level, or f >= level if `above`; None where
-        none is known."""
+        """A volume proved to hold all points where f <= level, or f >= level if `above`; None if no
+        such volume is known."""
         del level, above
         return self.domain
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        own: Solid = vars(self).get("_source", self)
-        return own.sublevel_extent(max(levels)) or own.sublevel_extent(min(levels), above=True)
+        original: Solid = vars(self).get("_source", self)
+        return original.sublevel_extent(max(levels)) or original.sublevel_extent(
+            min(levels), above=True
+        )
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         """Wrap `prepare`: a prepared solid, whose numbers lie on a backend, keeps a reference to
@@ -126,7 +131,7 @@ class Solid(Field):
             cls.prepare = _with_source(cls.prepare)  # type: ignore[method-assign]
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        """f of coordinates that are jets; see `Formula`.
+        """f of jets of the coordinates; see `Formula`.
 
         Raises:
             TypeError: f has no formula.
@@ -139,9 +144,10 @@ class Solid(Field):
 
     @abc.abstractmethod
     def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
-        """The same combination with a change of each operand, such as a map of space."""
+        """The same combination, with each operand replaced by its image under `change`, such as a
+        map of space."""
 
-    # Combinations. Operands that are no solids are refused.
+    # Combinations. Operands that are not solids are refused.
 
     def __or__(self, other: Any) -> Solid:
         from harnack.fields.solids.booleans import union
@@ -175,15 +181,16 @@ class Solid(Field):
         """The union with another solid, with a fillet where the surfaces meet (or, with
         intersect=True, the intersection with a rounded edge).
 
-        The fillet fills where both surfaces are near, whatever the angle between them: where faces
-        are flush, as of a plate and a rib of the same height, the blend bulges by
-        radius (1 - 2^(-1/power)), 0.29 radius for a circle. Cut it off by a slab as high as these,
+        The fillet fills the space where both surfaces are near, whatever the angle between them.
+        Where faces are flush, as of a plate and a rib of the same height, the blend bulges by
+        radius (1 - 2^(-1/power)), 0.29 radius for a circle. Cut it off by a slab of the same
+        height,
 
             plate.blended(rib, 2.0) & hk.Cuboid((30.0, 30.0, 5.0))
 
-        with 5 half the height, or let one of them end a radius below the other's face.
+        with 5 half the height, or let one of the solids end a radius below the other's face.
 
-        radius: how far the fillet reaches along both surfaces, where f is a distance.
+        radius: the distance that the fillet reaches along both surfaces, where f is a distance.
         power: the exponent of the superellipse that the fillet is a part of: 2 for a circle, larger
             for a sharper corner (Hart 1996, appendix D.3, corrected).
 
@@ -196,16 +203,16 @@ class Solid(Field):
 
     @no_derivatives
     def offset(self, distance: float) -> Solid:
-        """The points where f <= distance: larger by that length, or smaller if it is negative,
-        where f is a distance."""
+        """The points where f <= distance. Where f is a distance, the solid grows by that length, or
+        shrinks if it is negative."""
         from harnack.fields.solids.booleans import OffsetSolid
 
         return OffsetSolid(self, distance)
 
     @no_derivatives
     def shell(self, thickness: float) -> Solid:
-        """The solid, hollow: the points where -thickness <= f <= 0, a wall of that thickness inside
-        of the surface where f is a distance, as of a mesh, a sphere or an outline.
+        """The hollow solid: the points where -thickness <= f <= 0. Where f is a distance, as for a
+        mesh, a sphere or an outline, this is a wall of that thickness inside of the surface.
 
         Raises:
             ValueError: a thickness that is not positive.
@@ -215,7 +222,7 @@ class Solid(Field):
         half = 0.5 * as_positive(thickness, "the thickness of a shell")
         return BandSolid(self, -half, half)
 
-    # Maps of space. Those that bend lines need a formula.
+    # Maps of space. Maps that do not keep lines straight need a formula.
 
     @no_derivatives
     def translated(self, offset: Sequence[float]) -> Solid:
@@ -226,10 +233,11 @@ class Solid(Field):
 
     @no_derivatives
     def rotated(self, degrees: float, axis: str | Sequence[float] = "z") -> Solid:
-        """The solid, rotated by so many degrees about an axis through the origin, counter-clockwise
-        as seen from the end of the axis.
+        """The solid, rotated by an angle in degrees about an axis through the origin,
+        counter-clockwise as seen from the end of the axis.
 
-        axis: "x", "y", "z" or a vector (3,)."""
+        axis: "x", "y", "z" or a vector (3,).
+        """
         from harnack.fields.solids.transforms import AffineMap
 
         return self._apply_map(AffineMap.rotation(degrees, axis))
@@ -241,22 +249,23 @@ class Solid(Field):
     def _for_rays(
         self, parts: Sequence[Field], count: int, make: Callable[[list[Field]], Solid]
     ) -> Field:
-        """This solid, or the same one made of its parts as they are for so many rays: once, so that
-        nothing is prepared twice. `Field.for_ray_count` of solids that have parts."""
-        others = [one.for_ray_count(count) for one in parts]
-        key = tuple(map(id, others))  # of objects that the solid holds
+        """This solid, or the same combination of its parts as they are for this number of rays
+        (`Field.for_ray_count`). The combination is cached, so that nothing is prepared twice."""
+        variants = [part.for_ray_count(count) for part in parts]
+        key = tuple(map(id, variants))  # of objects that the solid keeps alive
         if key == tuple(map(id, parts)):
             return self
         if key not in self._ray_count_variants:
-            self._ray_count_variants[key] = make(others)
+            self._ray_count_variants[key] = make(variants)
         return self._ray_count_variants[key]
 
     @no_derivatives
     def scaled(self, factors: float | Sequence[float]) -> Solid:
-        """The solid, scaled about the origin, by one factor or by one for each axis.
+        """The solid, scaled about the origin, by a factor, or by a factor for each axis.
 
-        If all factors are equal f is multiplied by them, so that a distance stays a distance; else
-        it is left as it is."""
+        If all factors are equal, f is multiplied by them, so that a distance stays a distance; else
+        f is not multiplied.
+        """
         from harnack.fields.solids.transforms import AffineMap
 
         return self._apply_map(AffineMap.scaling(factors))
@@ -292,12 +301,13 @@ class Solid(Field):
 
 
 class SolidOfField(Solid):
-    """A solid made of another field, `field`, whose settings for the tracer it takes over."""
+    """A solid whose function derives from another field, `field`. It takes over the field's
+    settings for the tracer."""
 
     field: Any
 
     def _copy_settings(self, *names: str) -> None:
-        """Copy the inner field's settings for the tracer, and these attributes."""
+        """Copy the inner field's settings for the tracer, and the attributes of these names."""
         settings = (
             "has_variable_accuracy",
             "coarsest_accuracy",
@@ -322,9 +332,10 @@ class SolidOfField(Solid):
         return self._with_inner(self.field.at_accuracy(detail))
 
     def _with_inner(self, inner: Field) -> Solid:
-        other = copy.copy(self)
-        object.__setattr__(other, "field", inner)
-        return other
+        """The same solid of another field."""
+        solid = copy.copy(self)
+        object.__setattr__(solid, "field", inner)
+        return solid
 
     def for_ray_count(self, count: int) -> Field:
         def make(parts: list[Field]) -> Solid:
@@ -339,7 +350,7 @@ class SolidOfField(Solid):
 
 
 class FormulaSolid(Formula, Solid):
-    """A solid given by a formula of the coordinates."""
+    """A solid whose function is a formula of the coordinates."""
 
     def prepare(self, backend: Backend) -> Field:
         return super().prepare(backend)

@@ -1,4 +1,4 @@
-"""Screw threads: `Thread`, any profile wound along a helix; `metric_thread`, the metric ones of
+"""Screw threads: `Thread`, a profile wound along a helix; `metric_thread`, the metric threads of
 ISO."""
 
 from __future__ import annotations
@@ -42,28 +42,28 @@ _MOST_STARTS = 32
 
 @dataclass(frozen=True, eq=False)
 class Thread(Solid):
-    """An endless screw along the z axis: the points nearer to the axis than a profile that moves by
-    `starts` pitches along it in each turn.
+    """An endless screw along the z axis: the points nearer to the axis than a profile that moves
+    along the axis by `starts` pitches in each turn.
 
     profile: (n, 2) points (z, r) of a polyline, r positive; z begins within half a pitch of 0 and
-        rises by less than a pitch. Behind the last point it goes on to the first, one pitch
-        further. At most 32 points.
+        rises by less than a pitch. After the last point the polyline goes on to the first, one
+        pitch further. At most 32 points.
     pitch: the period of the profile along the axis.
-    starts: how many grooves there are side by side.
-    left_handed: whether it turns clockwise as it rises.
+    starts: the number of parallel grooves.
+    left_handed: whether the screw turns clockwise as it rises.
 
-    With (r, angle, z) the cylindrical coordinates of p, f is the signed distance d of (r, u),
-    u = z - starts pitch angle/(2 pi), from the periodic polyline in the plane; but it is at least
-    -m/2, with m the least r of the profile. The surface is exact; f is no distance, but close to
-    one where the pitch is small beside the radius.
+    With (r, angle, z) the cylindrical coordinates of p, f is the signed distance d of (r, u), u = z
+    - starts pitch angle/(2 pi), from the periodic polyline in the plane; but f is at least -m/2,
+    with m the least r of the profile. The surface is exact; f is not a distance, but close to one
+    where the pitch is small compared to the radius.
 
-    Proof of the constant. |grad r| = 1, and grad u has the part 1 along the axis and starts pitch/
-    (2 pi r) around it, at right angles to grad r. So where r >= m/2, |grad f| is at most
-    sqrt(1 + (starts pitch/(pi m))^2). Where r < m/2, d < -m/2, so that f is constant. u jumps by
-    multiples of the pitch, which do not change f.
+    Proof of the Lipschitz constant. |grad r| = 1, and grad u has the components 1 along the axis
+    and starts pitch/(2 pi r) around it, at right angles to grad r. So where r >= m/2, |grad f| is
+    at most sqrt(1 + (starts pitch/(pi m))^2). Where r < m/2, d < -m/2, so that f is constant. u
+    jumps by multiples of the pitch, which do not change f.
 
     Raises:
-        ValueError: another profile.
+        ValueError: a profile that is not of this kind.
     """
 
     profile: Any
@@ -100,18 +100,18 @@ class Thread(Solid):
         rows = tuple((float(a), float(b)) for a, b in points)
         set_frozen(self, "profile", rows)
         # Three periods: a nearest point is at most half a period away along the axis, and these
-        # reach so far beyond the one from 0 to the pitch.
+        # periods reach that far beyond the period from 0 to the pitch.
         shifted = [(a + k * self.pitch, b) for k in (-1, 0, 1) for a, b in rows]
         shifted.append((rows[0][0] + 2 * self.pitch, rows[0][1]))
         set_frozen(self, "_points", tuple(shifted))
         lead = self.starts * self.pitch * (-1 if self.left_handed else 1)
         set_frozen(self, "_lead", lead / (2 * math.pi))
-        least = min(b for _, b in rows)
-        set_frozen(self, "_least", 0.5 * least)
-        most = max(b for _, b in rows)
-        set_frozen(self, "_most", most)
-        set_frozen(self, "_size", most + 2 * self.pitch * self.starts)
-        slope = self.starts * self.pitch / (math.pi * least)
+        min_radius = min(b for _, b in rows)
+        set_frozen(self, "_least", 0.5 * min_radius)
+        max_radius = max(b for _, b in rows)
+        set_frozen(self, "_most", max_radius)
+        set_frozen(self, "_size", max_radius + 2 * self.pitch * self.starts)
+        slope = self.starts * self.pitch / (math.pi * min_radius)
         set_frozen(self, "lipschitz", math.hypot(1.0, slope) * (1 + 1e-6))
 
     def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
@@ -122,37 +122,37 @@ class Thread(Solid):
         return None
 
     def prepare(self, backend: Backend) -> Thread:
-        made = with_device_numbers(self, backend)
+        prepared = with_device_numbers(self, backend)
         numbers: Any = cast("Any", self)
         points = tuple(
-            tuple(dr.opaque(backend.Float, one) for one in row) for row in numbers._points
+            tuple(dr.opaque(backend.Float, number) for number in row) for row in numbers._points
         )
-        set_frozen(made, "_points", points)
+        set_frozen(prepared, "_points", points)
         for name in ("_lead", "_least", "_most", "_size", "lipschitz"):
-            set_frozen(made, name, dr.opaque(backend.Float, getattr(self, name)))
-        return made
+            set_frozen(prepared, name, dr.opaque(backend.Float, getattr(self, name)))
+        return prepared
 
     def evaluate(self, p: Vec3) -> Sample:
-        real, on = cast("Any", type(p.x)), cast("Any", self)
-        unit = 2 * float(dr.epsilon(real))
+        real, data = cast("Any", type(p.x)), cast("Any", self)
+        epsilon = 2 * float(dr.epsilon(real))
         r = dr.sqrt(dr.fma(p.x, p.x, p.y * p.y))
-        along = p.z - dr.atan2(p.y, p.x) * on._lead
-        along = along - dr.floor(along / self.pitch) * self.pitch
-        error = 8 * unit * (dr.abs(p.z) + r + on._size)
-        outside = r >= self._height(along)
-        sign = dr.select(outside, real(1), real(-1))
-        distance, by_r, by_z, doubt = self._nearest(r, along, sign, error)
+        axial = p.z - dr.atan2(p.y, p.x) * data._lead
+        axial = axial - dr.floor(axial / self.pitch) * self.pitch
+        error = 8 * epsilon * (dr.abs(p.z) + r + data._size)
+        is_outside = r >= self._height(axial)
+        sign = dr.select(is_outside, real(1), real(-1))
+        distance, d_r, d_z, slope_error = self._nearest(r, axial, sign, error)
         value = sign * distance
-        is_core = value <= -on._least
-        value = dr.select(is_core, -on._least, value)
-        by_r, by_z = (dr.select(is_core, 0, one) for one in (by_r, by_z))
-        safe = dr.select(r > 0, r, 1)
-        x, y = p.x / safe, p.y / safe
-        around = -by_z * on._lead / safe
-        gradient = cast("Any", type(p))(by_r * x - around * y, by_r * y + around * x, by_z)
+        is_core = value <= -data._least
+        value = dr.select(is_core, -data._least, value)
+        d_r, d_z = (dr.select(is_core, 0, derivative) for derivative in (d_r, d_z))
+        divisor = dr.select(r > 0, r, 1)
+        x, y = p.x / divisor, p.y / divisor
+        tangential = -d_z * data._lead / divisor
+        gradient = cast("Any", type(p))(d_r * x - tangential * y, d_r * y + tangential * x, d_z)
         constant = 0 * p.x + self.lipschitz
-        doubt = dr.select(is_core, 0, doubt * constant + 16 * unit)
-        return Sample(value, gradient, (Lipschitz(constant),), error, doubt)
+        slope_error = dr.select(is_core, 0, slope_error * constant + 16 * epsilon)
+        return Sample(value, gradient, (Lipschitz(constant),), error, slope_error)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         del ahead, back
@@ -161,63 +161,67 @@ class Thread(Solid):
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return look
         numbers = cast("Any", self)
-        beside = OutsideCylinderEnclosure(
+        cylinder = OutsideCylinderEnclosure(
             look.sample.value, look.sample.value_error, dr.sqrt(dr.fma(p.x, p.x, p.y * p.y)),
             dr.fma(p.x, d.x, p.y * d.y), dr.fma(d.x, d.x, d.y * d.y), 0 * p.x + numbers._most,
             0 * p.x + self.lipschitz,
         )  # fmt: skip
-        return replace(look, forward=(*look.forward, beside))
+        return replace(look, forward=(*look.forward, cylinder))
 
     def _height(self, z: Real) -> Real:
         """The polyline's r at z."""
         height = 0 * z
         for (a, s), (b, t) in itertools.pairwise(self._corners()):
-            there = s + (z - a) / (b - a) * (t - s)
-            height = dr.select((z >= a) & (z <= b), there, height)
+            r = s + (z - a) / (b - a) * (t - s)
+            height = dr.select((z >= a) & (z <= b), r, height)
         return height
 
     def _corners(self) -> tuple[tuple[Real, Real], ...]:
+        """The corners (z, r) of three periods of the profile."""
         return cast("Any", self)._points
 
     def _nearest(self, r: Real, z: Real, sign: Real, error: Real) -> tuple[Real, Real, Real, Real]:
-        """The distance of (r, z) from the polyline; the gradient of the signed distance by r and by
-        z, along the normal of an edge or away from a vertex; and a bound of its error."""
+        """The distance of (r, z) from the polyline; the derivatives of the signed distance by r and
+        by z, along the normal of an edge or away from a vertex; and a bound of the error of this
+        gradient."""
         zero = 0 * r
-        best, by_r, by_z, doubt = zero + dr.inf, zero, zero, zero
-        unit = 2 * float(dr.epsilon(cast("Any", type(r))))
+        nearest, d_r, d_z, gradient_error = zero + dr.inf, zero, zero, zero
+        epsilon = 2 * float(dr.epsilon(cast("Any", type(r))))
         for (a, s), (b, t) in itertools.pairwise(self._corners()):
-            side_z, side_r = zero + (b - a), zero + (t - s)
-            over = dr.rsqrt(side_z * side_z + side_r * side_r)
+            edge_z, edge_r = zero + (b - a), zero + (t - s)
+            inverse_length = dr.rsqrt(edge_z * edge_z + edge_r * edge_r)
             from_z, from_r = z - a, r - s
-            share = (from_z * side_z + from_r * side_r) * over * over
-            back = -clamp(share, 0, 1)
-            to_z, to_r = dr.fma(side_z, back, from_z), dr.fma(side_r, back, from_r)
-            across = dr.abs(from_r * side_z - from_z * side_r) * over
-            inner = (share > 0) & (share < 1)
-            distance = dr.select(inner, across, dr.sqrt(to_z * to_z + to_r * to_r))
-            nearer = distance < best
-            plain, way = inner | (distance <= error), sign / distance
-            for_r = dr.select(plain, side_z * over, to_r * way)
-            for_z = dr.select(plain, -side_r * over, to_z * way)
-            by_r, by_z = dr.select(nearer, for_r, by_r), dr.select(nearer, for_z, by_z)
-            off = dr.select(inner, 8 * unit, fmin(2 * error / distance, 2))
-            doubt = dr.select(nearer, off, doubt)
-            best = dr.select(nearer, distance, best)
-        return best, by_r, by_z, doubt
+            fraction = (from_z * edge_z + from_r * edge_r) * inverse_length * inverse_length
+            minus_t = -clamp(fraction, 0, 1)
+            to_z, to_r = dr.fma(edge_z, minus_t, from_z), dr.fma(edge_r, minus_t, from_r)
+            line_distance = dr.abs(from_r * edge_z - from_z * edge_r) * inverse_length
+            is_inner = (fraction > 0) & (fraction < 1)
+            distance = dr.select(is_inner, line_distance, dr.sqrt(to_z * to_z + to_r * to_r))
+            is_nearer = distance < nearest
+            by_normal, scale = is_inner | (distance <= error), sign / distance
+            for_r = dr.select(by_normal, edge_z * inverse_length, to_r * scale)
+            for_z = dr.select(by_normal, -edge_r * inverse_length, to_z * scale)
+            d_r, d_z = dr.select(is_nearer, for_r, d_r), dr.select(is_nearer, for_z, d_z)
+            edge_error = dr.select(is_inner, 8 * epsilon, fmin(2 * error / distance, 2))
+            gradient_error = dr.select(is_nearer, edge_error, gradient_error)
+            nearest = dr.select(is_nearer, distance, nearest)
+        return nearest, d_r, d_z, gradient_error
 
 
 @dataclass(frozen=True)
 class OutsideCylinderEnclosure(Enclosure):
-    """A function f, along a path, that is at least the distance from an endless cylinder outside of
-    it.
+    """An enclosure, along a path, of a function f that is at least the distance from an endless
+    cylinder, outside of it.
 
-    value, error: of f. r, slope, square: the distance from the axis is that of r(s)^2 = r^2 +
-    2 slope s + square s^2. radius: of the cylinder. constant: a Lipschitz constant of f.
+    value, error: of f. r, radial_slope, square: the distance from the axis is r(s), with r(s)^2 =
+        r^2 + 2 radial_slope s + square s^2. radius: of the cylinder. constant: a Lipschitz constant
+        of f.
 
-    Proof. f stays above a level L >= 0 as long as r(s) > R + L, R the radius: up to the smaller
-    root of the quadratic, which is computed as for a slightly larger discriminant, so that it is
-    not rounded upwards and no root is missed. A thread lies within the largest r of its profile, so
-    that (r, u) is at least r - R from it. And f rises no faster than its constant allows.
+    Proof. f stays above a level L >= 0 as long as r(s) > R + L, with R the radius: up to the
+    smaller root of the quadratic. The root is computed for a slightly larger discriminant, so that
+    it is not rounded upwards and no root is missed. A thread lies within the largest r of its
+    profile, so that (r, u) is at least r - R from it. And f rises no faster than its constant
+    allows.
     """
 
     value: Real
@@ -231,15 +235,17 @@ class OutsideCylinderEnclosure(Enclosure):
     def free_length(self, gaps: LevelGaps) -> Real:
         level = self.value - gaps.below + self.error
         target = self.radius + level
-        left = (self.r - target) * (self.r + target)
-        squared, product = self.radial_slope * self.radial_slope, self.square * left
-        room = squared - product + 1e-5 * (squared + dr.abs(product))
-        root = left / (dr.sqrt(fmax(room, 0)) - self.radial_slope)
-        free = dr.select((self.radial_slope >= 0) | (room < 0), dr.inf, root)
-        known = (gaps.below <= self.value) & (left > 1e-5 * target * target) & (gaps.above >= 0)
-        known &= (free >= 0) & dr.isfinite(left + squared + product)
-        free = dr.select(gaps.below == dr.inf, dr.inf, dr.select(known, free, 0))
-        return fmax(fmin(free, gaps.above / self.constant), 0) * (1 - 1e-5)
+        excess = (self.r - target) * (self.r + target)
+        squared, product = self.radial_slope * self.radial_slope, self.square * excess
+        discriminant = squared - product + 1e-5 * (squared + dr.abs(product))
+        root = excess / (dr.sqrt(fmax(discriminant, 0)) - self.radial_slope)
+        length = dr.select((self.radial_slope >= 0) | (discriminant < 0), dr.inf, root)
+        is_known = (
+            (gaps.below <= self.value) & (excess > 1e-5 * target * target) & (gaps.above >= 0)
+        )
+        is_known &= (length >= 0) & dr.isfinite(excess + squared + product)
+        length = dr.select(gaps.below == dr.inf, dr.inf, dr.select(is_known, length, 0))
+        return fmax(fmin(length, gaps.above / self.constant), 0) * (1 - 1e-5)
 
 
 # ISO 261 and 262: nominal diameters and coarse pitches, in millimeters.
@@ -254,7 +260,7 @@ COARSE_PITCHES: Mapping[str, float] = MappingProxyType(
     }
 )  # fmt: skip
 _NAME = re.compile(r"M(\d{1,4}(?:\.\d{1,3})?)(?:\s*[xX]\s*(\d{1,3}(?:\.\d{1,3})?))?")
-# Of the pitch. More would leave next to nothing of the crests.
+# As a fraction of the pitch. A larger clearance would leave next to nothing of the crests.
 _MOST_CLEARANCE = 0.1
 
 
@@ -267,27 +273,28 @@ def metric_thread(
     clearance: float = 0.0,
     left_handed: bool = False,
 ) -> Solid:
-    """A metric screw thread of ISO about the z axis, in millimeters.
+    """A metric screw thread of ISO about the z axis. Lengths are in millimeters.
 
-    name: "M8" for a coarse one (ISO 261, from M1 to M68), "M8x1" for one of any other pitch.
-    length: an external thread reaches from z = 0 to there, both ends beveled by 45 degrees down to
-        its root. An internal one is what is cut out of a nut, `nut - thread("M8", 20,
+    name: "M8" for a coarse thread (ISO 261, from M1 to M68), "M8x1" for a thread of any other
+        pitch.
+    length: an external thread reaches from z = 0 to z = length, both ends beveled by 45 degrees
+        down to its root. An internal thread is to be cut out of a nut, `nut - thread("M8", 20,
         internal=True)`: it begins one pitch below z = 0, so that it opens a face there, with a
-        bevel, and ends at z = length; let it reach a pitch beyond the other face, if the hole is to
+        bevel, and ends at z = length. Let it reach a pitch beyond the other face, if the hole is to
         go through.
-    internal: whether it is for a nut.
-    clearance: by which the surface lies inside of the basic profile, or outside for an internal
-        thread, across both flanks, crests and roots, up to a tenth of the pitch. Printed threads
-        that are to fit want 0.05 to 0.1 on either side. Grooves stay in the middle, so that the gap
-        between a bolt and its nut is the sum of their clearances on both flanks.
+    internal: whether the thread is for a nut.
+    clearance: the distance by which the surface lies inside of the basic profile, or outside for an
+        internal thread, across both flanks, crests and roots; up to a tenth of the pitch. Printed
+        threads that are to fit want 0.05 to 0.1 on either side. Grooves stay in the middle, so that
+        the gap between a bolt and its nut is the sum of their clearances on both flanks.
 
     The profile is the basic one of ISO 68-1, for bolt and nut: flanks at 60 degrees to each other,
     a crest of an eighth and a root of a quarter of the pitch P, and between their radii a depth of
-    5/8 H, H = sqrt(3)/2 P. Tolerances of ISO 965 and rounded roots are not in it.
+    5/8 H, H = sqrt(3)/2 P. It has no tolerances of ISO 965 and no rounded roots.
 
     Raises:
-        ValueError: no such thread, a length that leaves nothing between the bevels, or another
-            clearance.
+        ValueError: an unknown thread, a length that leaves nothing between the bevels, or a
+            clearance out of range.
     """
     diameter, pitch = _sizes(name)
     length = as_positive(length, "the length of a thread")
@@ -303,31 +310,31 @@ def metric_thread(
     sign = 1.0 if internal else -1.0
     crest, root = 0.5 * diameter + sign * clearance, 0.5 * diameter - depth + sign * clearance
     # Edges moved across themselves by c meet c tan(30 degrees) farther along, at both ends.
-    moved = sign * clearance * math.tan(math.radians(30.0))
-    flat, flank, bottom = pitch / 8 + 2 * moved, 5 * pitch / 16, pitch / 4 - 2 * moved
-    z = np.cumsum([-moved, flat, flank, bottom])
-    made = Thread(np.column_stack([z, [crest, crest, root, root]]), pitch, 1, left_handed)
-    over = crest + 0.25 * depth  # beyond the crests, so that no faces coincide
-    bevel = over - root
+    shift = sign * clearance * math.tan(math.radians(30.0))
+    flat, flank, bottom = pitch / 8 + 2 * shift, 5 * pitch / 16, pitch / 4 - 2 * shift
+    z = np.cumsum([-shift, flat, flank, bottom])
+    thread = Thread(np.column_stack([z, [crest, crest, root, root]]), pitch, 1, left_handed)
+    outer = crest + 0.25 * depth  # beyond the crests, so that no faces coincide
+    bevel = outer - root
     if internal:
-        opening = [(over, -pitch), (over, 0.0), (root, bevel)]
-        around = SolidOfRevolution([(0.0, -pitch), (over, -pitch), (over, length), (0.0, length)])
-        return (made & around) | SolidOfRevolution([(0.0, -pitch), *opening, (0.0, bevel)])
+        opening = [(outer, -pitch), (outer, 0.0), (root, bevel)]
+        extent = SolidOfRevolution([(0.0, -pitch), (outer, -pitch), (outer, length), (0.0, length)])
+        return (thread & extent) | SolidOfRevolution([(0.0, -pitch), *opening, (0.0, bevel)])
     if not length > 2 * bevel:
         raise ValueError(
             f"a thread {name} must be longer than {2 * bevel:.3g}, for its bevels, not {length:g}"
         )
-    ends = [(root, 0.0), (over, bevel), (over, length - bevel), (root, length)]
-    return made & SolidOfRevolution([(0.0, 0.0), *ends, (0.0, length)])
+    ends = [(root, 0.0), (outer, bevel), (outer, length - bevel), (root, length)]
+    return thread & SolidOfRevolution([(0.0, 0.0), *ends, (0.0, length)])
 
 
 def _sizes(name: Any) -> tuple[float, float]:
-    """Diameter and pitch of a thread by its name."""
-    found = _NAME.fullmatch(name.strip()) if isinstance(name, str) else None
-    if found is None:
+    """The diameter and the pitch of a thread, by its name."""
+    match = _NAME.fullmatch(name.strip()) if isinstance(name, str) else None
+    if match is None:
         raise ValueError(f'a thread is named as "M8" or "M8x1", not {name!r:.40}')
-    diameter = float(found[1])
-    if found[2] is None:
+    diameter = float(match[1])
+    if match[2] is None:
         key = f"M{diameter:g}"
         if key not in COARSE_PITCHES:
             raise ValueError(
@@ -336,8 +343,8 @@ def _sizes(name: Any) -> tuple[float, float]:
                 f"in {key}x1"
             )
         return diameter, COARSE_PITCHES[key]
-    pitch = float(found[2])
-    # Four depths, so that a core is left.
+    pitch = float(match[2])
+    # The diameter is more than four depths, so that a core remains.
     if not (pitch > 0 and diameter > 4 * pitch * math.sqrt(0.75) * 0.625):
         raise ValueError(f"a thread {name} leaves no core: its pitch is too large for it")
     return diameter, pitch

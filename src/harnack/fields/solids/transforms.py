@@ -1,4 +1,4 @@
-"""Solids moved, rotated, scaled and sheared."""
+"""Solids that are moved, rotated, scaled and sheared: affine maps of solids."""
 
 from __future__ import annotations
 
@@ -29,12 +29,13 @@ from harnack.fields.solids.solid import SpaceMap, axis_index
 
 @dataclass(frozen=True)
 class AffineMap(SpaceMap):
-    """u -> matrix u + offset, in double precision.
+    """The affine map u -> matrix u + translation_vector, in double precision.
 
-    matrix: (3, 3), rows, not singular.
+    matrix: (3, 3), row by row, not singular.
     translation_vector: (3,).
-    value_factor: f is multiplied by it. For a similarity it is the factor by which lengths grow,
-        for other maps 1; for several maps in turn it is the product of theirs.
+    value_factor: the factor by which f is multiplied. For a similarity it is the factor by which
+        lengths grow, for other maps 1; for a composition of maps it is the product of their
+        factors.
     """
 
     matrix: tuple[tuple[float, ...], ...]
@@ -43,7 +44,11 @@ class AffineMap(SpaceMap):
 
     @classmethod
     def of_arrays(cls, matrix: npt.ArrayLike, offset: npt.ArrayLike = (0.0, 0.0, 0.0)) -> AffineMap:
-        """Raises ValueError for other shapes, what is not finite, and a singular matrix."""
+        """The map of these arrays.
+
+        Raises:
+            ValueError: arrays of other shapes, numbers that are not finite, or a singular matrix.
+        """
         m, b = np.asarray(matrix, dtype=np.float64), np.asarray(offset, dtype=np.float64)
         if m.shape != (3, 3) or b.shape != (3,):
             raise ValueError(
@@ -57,12 +62,13 @@ class AffineMap(SpaceMap):
                 f"the matrix is singular (singular values {sizes[0]:g} to {sizes[-1]:g}): it would "
                 "flatten the solid"
             )
-        rows = tuple(tuple(float(v) for v in row) for row in m)
-        return cls(rows, tuple(float(v) for v in b), _similarity(m) or 1.0)
+        rows = tuple(tuple(float(number) for number in row) for row in m)
+        return cls(rows, tuple(float(number) for number in b), _similarity(m) or 1.0)
 
     @classmethod
     def of_matrix(cls, matrix: npt.ArrayLike) -> AffineMap:
-        """A linear map (3, 3), or an affine one (3, 4) or (4, 4) whose last row is (0, 0, 0, 1)."""
+        """A linear map from a matrix (3, 3), or an affine map from a matrix (3, 4), or (4, 4) whose
+        last row is (0, 0, 0, 1)."""
         m = np.asarray(matrix, dtype=np.float64)
         if m.shape == (4, 4):
             if not np.array_equal(m[3], (0.0, 0.0, 0.0, 1.0)):
@@ -74,7 +80,7 @@ class AffineMap(SpaceMap):
 
     @classmethod
     def translation(cls, offset: Sequence[float]) -> AffineMap:
-        """u -> u + offset."""
+        """The translation u -> u + offset."""
         if np.shape(offset) != (3,):
             raise ValueError(f"offset (3,): give a vector (x, y, z), not {offset!r}")
         return cls.of_arrays(np.eye(3), np.asarray(offset, dtype=np.float64))
@@ -100,7 +106,7 @@ class AffineMap(SpaceMap):
 
     @classmethod
     def scaling(cls, factors: float | Sequence[float]) -> AffineMap:
-        """u -> factors u."""
+        """The scaling u -> factors u, by one factor or by one for each axis."""
         sizes = np.asarray(factors, dtype=np.float64)
         sizes = np.broadcast_to(sizes if sizes.shape in ((), (3,)) else np.nan, (3,))
         if not (np.isfinite(sizes).all() and (sizes > 0).all()):
@@ -126,11 +132,11 @@ class AffineMap(SpaceMap):
 
     @property
     def similarity(self) -> float | None:
-        """The factor by which all lengths grow; None if it is no similarity."""
+        """The factor by which all lengths grow; None if the map is not a similarity."""
         return _similarity(np.array(self.matrix))
 
     def volume(self, volume: Volume | None) -> Volume | None:
-        """A volume that contains the image of another one; None if that has no bounds."""
+        """A volume that contains the image of another volume; None for a volume without bounds."""
         if volume is None:
             return None
         m, b = np.array(self.matrix), np.array(self.translation_vector)
@@ -141,29 +147,29 @@ class AffineMap(SpaceMap):
             return Ball(
                 (float(center[0]), float(center[1]), float(center[2])), factor * volume.radius + pad
             )
-        low, high = volume.bounds()
-        if not (np.isfinite(low).all() and np.isfinite(high).all()):
+        lower, upper = volume.bounds()
+        if not (np.isfinite(lower).all() and np.isfinite(upper).all()):
             return None
-        corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3)
+        corners = np.stack(np.meshgrid(*zip(lower, upper, strict=True)), axis=-1).reshape(-1, 3)
         image = corners @ m.T + b
         return ConvexHull.from_points(image).padded(1e-12 * float(np.abs(image).max()))
 
 
 def _similarity(m: FloatArray) -> float | None:
-    """The factor by which a matrix makes all lengths grow; None if it is no similarity."""
+    """The factor by which a matrix multiplies all lengths; None if it is not a similarity."""
     factor = abs(float(np.linalg.det(m))) ** (1 / 3)
-    grown = np.abs(m.T @ m - factor**2 * np.eye(3)).max()
-    return factor if grown <= 1e-14 * factor**2 else None
+    deviation = np.abs(m.T @ m - factor**2 * np.eye(3)).max()
+    return factor if deviation <= 1e-14 * factor**2 else None
 
 
 @dataclass(frozen=True, eq=False)
 class TransformedSolid(SolidOfField):
-    """A solid under an affine map.
+    """The image of a solid under an affine map.
 
     Proof. A ray o + t d is the image of the straight path M^-1 (o - b) + t M^-1 d, along which the
-    solid is sampled; lengths on it are |M^-1 d| times as large (`ScaledEnclosure`). The rounding of
-    coordinates there is a few units of the sum of the sizes of their terms, which enters the error
-    of the value. f is multiplied by the factor of the map.
+    solid is sampled. Lengths on that path are |M^-1 d| times as large (`ScaledEnclosure`). The
+    rounding of coordinates there is a few units of the sum of the sizes of their terms, which
+    enters the error of the value. f is multiplied by the factor of the map.
     """
 
     field: Solid
@@ -180,11 +186,13 @@ class TransformedSolid(SolidOfField):
         object.__setattr__(self, "domain", domain)
         numbers = _InverseMap.of(self.map)
         object.__setattr__(self, "_numbers", numbers)
-        inner = self.field.lipschitz
-        lipschitz = None if inner is None else inner * numbers.stretch * numbers.factor
+        constant = self.field.lipschitz
+        lipschitz = None if constant is None else constant * numbers.stretch * numbers.factor
         object.__setattr__(self, "lipschitz", lipschitz)
-        own = self.field.min_wavelength
-        object.__setattr__(self, "min_wavelength", None if own is None else own / numbers.stretch)
+        wavelength = self.field.min_wavelength
+        object.__setattr__(
+            self, "min_wavelength", None if wavelength is None else wavelength / numbers.stretch
+        )
 
     @property
     def numbers(self) -> _InverseMap:
@@ -192,13 +200,13 @@ class TransformedSolid(SolidOfField):
         return cast("Any", self)._numbers
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
-        own = level / self.map.value_factor
-        return self.map.volume(self.field.sublevel_extent(own, above=above))
+        inner_level = level / self.map.value_factor
+        return self.map.volume(self.field.sublevel_extent(inner_level, above=above))
 
     def prepare(self, backend: Backend) -> Solid:
-        other = super().prepare(backend)
-        object.__setattr__(other, "_numbers", self.numbers.prepare(backend))
-        return other
+        prepared = super().prepare(backend)
+        object.__setattr__(prepared, "_numbers", self.numbers.prepare(backend))
+        return prepared
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         return self.field.formula(*self.numbers.local(x, y, z)) * self.numbers.factor
@@ -211,37 +219,40 @@ class TransformedSolid(SolidOfField):
         numbers = self.numbers
         rows = self.field.hessian(type(p)(*numbers.local(p.x, p.y, p.z)))
         columns = [numbers.pull_back(row) for row in rows]  # H M^-1
-        own = [numbers.pull_back(type(p)(*(columns[j][k] for j in range(3)))) for k in range(3)]
-        x, y, z = (one * numbers.factor for one in own)
+        product = [numbers.pull_back(type(p)(*(columns[j][k] for j in range(3)))) for k in range(3)]
+        x, y, z = (vector * numbers.factor for vector in product)
         return x, y, z
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """For a formula, by its ranges. For another field, its own errors at the local coordinates,
-        without the effect of the rounding of these coordinates, which is not known."""
+        """The errors of a formula follow from its ranges. For another field they are its errors at
+        the local coordinates, without the effect of the rounding of these coordinates, which is not
+        known."""
         del sample
         numbers = self.numbers
         local = type(p)(*numbers.local(p.x, p.y, p.z))
-        slope, bend = self.field.derivative_errors(local, self.field.evaluate(local))
-        slope = slope * numbers.stretch * numbers.factor
+        first, second = self.field.derivative_errors(local, self.field.evaluate(local))
+        first = first * numbers.stretch * numbers.factor
         if not isinstance(self.field, FormulaSolid):
-            return slope, bend * numbers.stretch * numbers.stretch * numbers.factor
+            return first, second * numbers.stretch * numbers.stretch * numbers.factor
         coordinates = Jet.at_point(p, order=2)
         jet = as_jet(self.formula(*coordinates), coordinates[0], type(self.field).__name__)
         # The gradient need not be the middle of its range (`Formula._with_one_sided_gradient`):
-        # both are added.
-        return slope + sum(one.radius for one in jet.first_derivatives), hessian_error(jet, p.x)
+        # both errors are added.
+        return first + sum(rate.radius for rate in jet.first_derivatives), hessian_error(jet, p.x)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         numbers, vector = self.numbers, cast("Any", type(path.origin))
         o, d = path.origin, path.direction
         direction = vector(*numbers.local_direction(d.x, d.y, d.z))
         speed = safe_norm(direction)
-        own = Ray(vector(*numbers.local(o.x, o.y, o.z)), direction / speed, path.proofs)
-        look = self.field.sample_ray(own, t * speed, ahead * speed, back * speed)
+        inner_ray = Ray(vector(*numbers.local(o.x, o.y, o.z)), direction / speed, path.proofs)
+        look = self.field.sample_ray(inner_ray, t * speed, ahead * speed, back * speed)
         sample = self._image(look.sample, self._size(o, t))
 
         def stretched(enclosures: tuple[Any, ...]) -> tuple[Any, ...]:
-            return tuple(ScaledEnclosure(one, speed, numbers.factor) for one in enclosures)
+            return tuple(
+                ScaledEnclosure(enclosure, speed, numbers.factor) for enclosure in enclosures
+            )
 
         slope = look.slope * speed * numbers.factor
         ahead_, back_ = stretched(look.forward), stretched(look.backward)
@@ -249,26 +260,30 @@ class TransformedSolid(SolidOfField):
         return RaySample(sample, ahead_, back_, slope, look.reach_growth, error)
 
     def _size(self, p: Vec3, t: Real) -> Real:
-        """A bound of the terms that the local coordinates of p + t d are sums of."""
+        """A bound of the terms in the sums that are the local coordinates of p + t d."""
         numbers = self.numbers
         return numbers.stretch * (max_norm(p) + numbers.offset_size + t) * math.sqrt(3)
 
     def _image(self, sample: Sample, size: Real) -> Sample:
+        """The sample of the image from that of the inner solid.
+
+        size: a bound of the terms of the local coordinates (`_size`).
+        """
         numbers = self.numbers
-        unit = 2 * float(dr.epsilon(type(sample.value)))
-        moved = 8 * unit * size * safe_norm(sample.gradient)
+        epsilon = 2 * float(dr.epsilon(type(sample.value)))
+        rounding = 8 * epsilon * size * safe_norm(sample.gradient)
         factor, stretch = numbers.factor, numbers.stretch
 
-        def image(one: Promise) -> Promise:
+        def image(promise: Promise) -> Promise:
             if self.map.similarity is None:
-                one = one.weakened_for_linear_maps(sample.value)
-            return one.scaled(factor).linearly_mapped(stretch)
+                promise = promise.weakened_for_linear_maps(sample.value)
+            return promise.scaled(factor).linearly_mapped(stretch)
 
         return sample.map_promises(
             image,
             value=sample.value * factor,
             gradient=numbers.pull_back(sample.gradient) * factor,
-            value_error=(sample.value_error + moved) * factor,
+            value_error=(sample.value_error + rounding) * factor,
             gradient_error=sample.gradient_error * factor * stretch,
             shading_normal=None,
             truncation_error=sample.truncation_error * factor,
@@ -278,12 +293,12 @@ class TransformedSolid(SolidOfField):
 
 @dataclass(frozen=True)
 class _InverseMap:
-    """The inverse of an affine map as a kernel uses it.
+    """The inverse of an affine map u -> M u + b, as kernels use it.
 
     rows: of M^-1.
     translation_vector: b.
     stretch: the largest singular value of M^-1.
-    factor: that of f.
+    factor: the factor by which f is multiplied.
     offset_size: the largest component of b.
     """
 
@@ -298,7 +313,7 @@ class _InverseMap:
         inverse = change.inverse
         stretch = float(np.linalg.svd(inverse, compute_uv=False)[0]) * (1 + 1e-6)
         return cls(
-            tuple(tuple(float(v) for v in row) for row in inverse),
+            tuple(tuple(float(number) for number in row) for row in inverse),
             change.translation_vector,
             stretch,
             change.value_factor,
@@ -319,34 +334,35 @@ class _InverseMap:
         return replace(prepared, rows=rows[:3], translation_vector=rows[3])
 
     def local(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
-        """M^-1 (p - b), for coordinates of any kind."""
+        """The preimage M^-1 (p - b) of p, for coordinates of any kind."""
         a, b, c = (
-            one if _is(shift, 0.0) else one - shift
-            for one, shift in zip((x, y, z), self.translation_vector, strict=True)
+            coordinate if _is(shift, 0.0) else coordinate - shift
+            for coordinate, shift in zip((x, y, z), self.translation_vector, strict=True)
         )
         return self.local_direction(a, b, c)
 
     def local_direction(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
-        """M^-1 d."""
+        """The preimage M^-1 d of a direction."""
         u, v, w = (_combined(row, (x, y, z)) for row in self.rows)
         return u, v, w
 
     def pull_back(self, g: Vec3) -> Vec3:
-        """M^-T g, the gradient of f(M^-1 p) if g is that of f."""
+        """M^-T g: the gradient of f(M^-1 p), if g is the gradient of f."""
         columns = (tuple(row[i] for row in self.rows) for i in range(3))
         return type(g)(*(_combined(column, (g.x, g.y, g.z)) for column in columns))
 
 
 def _combined(weights: tuple[Any, ...], terms: tuple[Any, ...]) -> Any:
-    """The weighted sum, without terms of weight 0."""
+    """The weighted sum, without the terms of weight 0."""
     total: Any = None
     for weight, term in zip(weights, terms, strict=True):
         if _is(weight, 0.0):
             continue
-        one = term if _is(weight, 1.0) else term * weight
-        total = one if total is None else total + one
+        product = term if _is(weight, 1.0) else term * weight
+        total = product if total is None else total + product
     return total
 
 
 def _is(x: Any, number: float) -> bool:
+    """Whether x is a Python float that equals a number."""
     return isinstance(x, float) and x == number

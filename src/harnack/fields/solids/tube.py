@@ -1,5 +1,5 @@
-"""Tubes: `Tube` around polylines and cubic Bezier curves, `TubeNetwork` around many separate
-segments."""
+"""Tubes: `Tube` around polylines and cubic Bezier curves, `TubeNetwork` around a large number of
+separate segments."""
 
 from __future__ import annotations
 
@@ -46,22 +46,22 @@ _MOST_SEGMENTS = 1_000_000
 _GROUP, _MANY = 8, 64
 # The inner knots of the piecewise linear bound, as fractions of the length asked for.
 _KNOTS = (0.125, 0.25, 0.5)
-# For a ray without an end, that length is so many times the size of the tube and of coordinates.
+# That length for a ray without an end, in multiples of the size of the tube and of coordinates.
 _FAR = 8.0
 
 
 @dataclass(frozen=True, eq=False)
 class Tube(Solid):
-    """The points within `radius` of a polyline.
+    """A tube: the points within `radius` of a polyline.
 
-    points: (n, 3) its vertices, one after the other; repeat the first to close it.
-    starts: indices of vertices at which another polyline starts, not joined to the one before: see
-        `from_polylines`.
+    points: (n, 3) the vertices of the polyline in order; repeat the first to close it.
+    starts: indices of vertices at which another polyline starts, not joined to the polyline before:
+        see `from_polylines`.
     flattening_error: a bound of the distance of the polyline from the curve that it stands for, and
         so of the distance between the surfaces: see `bezier`.
 
     f is the signed distance, whose Lipschitz constant is 1 (Hart 1996, equations 32 to 35, for
-    cubic Bezier curves). Along a path more is proved: see `TangentEnclosure`.
+    cubic Bezier curves). Along a path a stronger bound is proved: see `TangentEnclosure`.
     """
 
     points: FloatArray
@@ -92,42 +92,45 @@ class Tube(Solid):
             parts.append(part)
         points = np.concatenate(parts)
         ends = np.cumsum([len(part) for part in parts])[:-1]
-        object.__setattr__(self, "starts", tuple(int(one) for one in ends))
+        object.__setattr__(self, "starts", tuple(int(end) for end in ends))
         points.setflags(write=False)
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "radius", as_positive(self.radius, "the radius of a tube"))
 
     @classmethod
     def from_polylines(cls, polylines: Iterable[npt.ArrayLike], radius: float) -> Tube:
-        """The points within `radius` of any of several polylines (n_i, 3): one distance for all.
+        """The points within `radius` of any of the polylines (n_i, 3), as a single tube with one
+        distance function.
 
         Raises:
-            ValueError: there is none, or one is no polyline; TypeError: not numbers.
+            ValueError: no polylines, or an array that is not a polyline.
+            TypeError: arrays that are not of numbers.
         """
-        parts: list[FloatArray] = []
-        for k, one in enumerate(polylines):
-            array = as_real_array(one, f"polyline {k} of a tube")
+        arrays: list[FloatArray] = []
+        for k, entry in enumerate(polylines):
+            array = as_real_array(entry, f"polyline {k} of a tube")
             check_vectors(array, f"polyline {k} of a tube")
-            parts.append(np.array(array, dtype=np.float64))
-        if not parts:
+            arrays.append(np.array(array, dtype=np.float64))
+        if not arrays:
             raise ValueError("a tube needs a polyline, and there are none")
-        ends = np.cumsum([len(part) for part in parts])[:-1]
-        return cls(np.concatenate(parts), radius, starts=tuple(int(one) for one in ends))
+        ends = np.cumsum([len(part) for part in arrays])[:-1]
+        return cls(np.concatenate(arrays), radius, starts=tuple(int(entry) for entry in ends))
 
     @classmethod
     def bezier(
         cls, controls: npt.ArrayLike, radius: float, *, tolerance: float | None = None
     ) -> Tube:
-        """The tube around a chain of cubic Bezier curves, which end where the next one starts.
+        """The tube around a chain of cubic Bezier curves, each of which ends where the next starts.
 
-        controls: (3 n + 1, 3) control points of n curves; every third one is where two curves meet.
-        tolerance: how far the surface may be from the exact one, in units of length; by default a
-            thousandth of the radius. The number of segments grows like its square root.
+        controls: (3 n + 1, 3) control points of n curves; two curves meet at every third point.
+        tolerance: the largest distance between the surface and the exact surface, in units of
+            length; by default a thousandth of the radius. The number of segments grows like its
+            square root.
 
         Proof: `harnack.geometry.beziers.flatten_bezier`.
 
         Raises:
-            ValueError: another number of points, or numbers that are not finite.
+            ValueError: a number of points that is not 3 n + 1, or numbers that are not finite.
         """
         array = as_real_array(controls, "the control points")
         check_vectors(array, "the control points")
@@ -140,13 +143,13 @@ class Tube(Solid):
         check_finite(points, "control point {}", ValueError)
         radius = as_positive(radius, "the radius of a tube")
         allowed = 1e-3 * radius if tolerance is None else as_positive(tolerance, "the tolerance")
-        made = [points[:1]]
-        off = 0.0
+        pieces = [points[:1]]
+        max_error = 0.0
         for start in range(0, len(points) - 1, 3):
-            more, error = flatten_bezier(points[start : start + 4], allowed)
-            made.append(more)
-            off = max(off, error)
-        return cls(np.concatenate(made), radius, flattening_error=off)
+            vertices, error = flatten_bezier(points[start : start + 4], allowed)
+            pieces.append(vertices)
+            max_error = max(max_error, error)
+        return cls(np.concatenate(pieces), radius, flattening_error=max_error)
 
     @classmethod
     def helix(
@@ -156,13 +159,14 @@ class Tube(Solid):
         """A coil of round wire about the z axis, from (radius, 0, 0) to z = pitch turns; its ends
         are round.
 
-        radius: of the helix that is the middle of the wire. pitch: along the axis, of one turn.
-        wire: its radius. left_handed: whether it turns clockwise as it rises.
-        tolerance: how far the surface may be from the exact one, in units of length; by default a
-            thousandth of the radius of the wire.
+        radius: of the helix that is the middle of the wire. pitch: the rise along the axis in each
+            turn.
+        wire: the radius of the wire. left_handed: whether the helix turns clockwise as it rises.
+        tolerance: the largest distance between the surface and the exact surface, in units of
+            length; by default a thousandth of the radius of the wire.
 
-        Proof. A chord between two angles h apart is within h^2/8 max |c''| of the helix c, taken at
-        equal angles, and |c''| is the radius.
+        Proof. A chord between two angles h apart is within h^2/8 max |c''| of the helix c, which is
+        parametrized by the angle, and |c''| is the radius.
 
         Raises:
             ValueError: numbers that are not positive, or more than a million segments.
@@ -177,8 +181,8 @@ class Tube(Solid):
         t = np.linspace(0.0, angle, math.ceil(count) + 1)
         y = np.sin(t) * (-radius if left_handed else radius)
         points = np.column_stack([radius * np.cos(t), y, pitch * t / (2 * math.pi)])
-        off = radius * (angle / math.ceil(count)) ** 2 / 8.0
-        return cls(points, wire, flattening_error=off)
+        error = radius * (angle / math.ceil(count)) ** 2 / 8.0
+        return cls(points, wire, flattening_error=error)
 
     def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
         return change(self)
@@ -190,28 +194,28 @@ class Tube(Solid):
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         if above:
             return None
-        low, high = self.points.min(axis=0), self.points.max(axis=0)
+        lower, upper = self.points.min(axis=0), self.points.max(axis=0)
         reach = self.radius + level
-        x, y, z = (float(v) for v in 0.5 * (high - low) + reach)
-        return box_around((x, y, z), tuple(float(v) for v in 0.5 * (low + high)))
+        x, y, z = (float(v) for v in 0.5 * (upper - lower) + reach)
+        return box_around((x, y, z), tuple(float(v) for v in 0.5 * (lower + upper)))
 
     @cached_prepare
     def prepare(self, backend: Backend) -> Tube:
-        made = copy.copy(self)
-        joined = np.ones(len(self.points) - 1, dtype=np.bool_)
-        joined[[one - 1 for one in self.starts]] = False
-        start, side = self.points[:-1][joined], np.diff(self.points, axis=0)[joined]
+        prepared = copy.copy(self)
+        is_segment = np.ones(len(self.points) - 1, dtype=np.bool_)
+        is_segment[[vertex - 1 for vertex in self.starts]] = False
+        start, side = self.points[:-1][is_segment], np.diff(self.points, axis=0)[is_segment]
         rows = np.column_stack([start, side, 1.0 / np.sum(side * side, axis=1)])
         groups = None
         if len(rows) >= _MANY:
             rows, balls = _grouped(rows)
             groups = RecordTable.upload(backend, balls)
-        object.__setattr__(made, "_records", RecordTable.upload(backend, rows))
-        object.__setattr__(made, "_groups", groups)
-        object.__setattr__(made, "_radius", dr.opaque(backend.Float, self.radius))
+        object.__setattr__(prepared, "_records", RecordTable.upload(backend, rows))
+        object.__setattr__(prepared, "_groups", groups)
+        object.__setattr__(prepared, "_radius", dr.opaque(backend.Float, self.radius))
         size = float(np.abs(self.points).max()) + self.radius
-        object.__setattr__(made, "_size", dr.opaque(backend.Float, size))
-        return made
+        object.__setattr__(prepared, "_size", dr.opaque(backend.Float, size))
+        return prepared
 
     def evaluate(self, p: Vec3) -> Sample:
         return self._sample_with_bounds(p, None, ())[0]
@@ -225,68 +229,71 @@ class Tube(Solid):
             return self.prepare(backend_of(p)).sample_ray(path, t, ahead, ahead)
         far = _FAR * (max_norm(p) + self._parameter("_size"))
         length = dr.select(dr.isfinite(ahead), ahead, far)
-        knots = (*(one * length for one in _KNOTS), ahead)
-        sample, distance, lows = self._sample_with_bounds(p, path.direction, knots)
+        knots = (*(fraction * length for fraction in _KNOTS), ahead)
+        sample, distance, bounds = self._sample_with_bounds(p, path.direction, knots)
         slope = dr.dot(sample.gradient, path.direction)
-        most = fmin(slope + sample.gradient_error, 1.0)
-        return RaySample(sample, (TangentEnclosure(distance, most, knots, lows),), (), slope, 4.0)
+        max_slope = fmin(slope + sample.gradient_error, 1.0)
+        return RaySample(
+            sample, (TangentEnclosure(distance, max_slope, knots, bounds),), (), slope, 4.0
+        )
 
     def _sample_with_bounds(
         self, p: Vec3, direction: Vec3 | None, knots: tuple[Real, ...]
     ) -> tuple[Sample, Real, tuple[Real, ...]]:
-        """The sample, the distance from the polyline, and bounds of the movement at the knots."""
+        """The sample; the distance from the polyline; and at each knot of the ray, a lower bound of
+        the change of the distance."""
         if not hasattr(self, "_records"):
             return self.prepare(backend_of(p))._sample_with_bounds(p, direction, knots)
         real, vector = cast("Any", type(p.x)), cast("Any", type(p))
-        unit = 2 * float(dr.epsilon(real))
+        epsilon = 2 * float(dr.epsilon(real))
         records: RecordTable = cast("Any", self)._records
 
         def body(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            nearest, x, y, z, size, *lows = state
+            nearest, x, y, z, size, *bounds = state
             from_start, side = p - vector(*row[:3]), vector(*row[3:6])
             t = clamp(dr.dot(from_start, side) * row[6], 0, 1)
             away = dr.fma(side, -t, from_start)
             distance = dr.norm(away)
             # The error of the vector is a few roundings of its terms.
-            off = 8 * unit * (dr.norm(from_start) + dr.norm(side))
+            rounding = 8 * epsilon * (dr.norm(from_start) + dr.norm(side))
             if direction is not None:
-                slope = dr.dot(away, direction) / distance - off / distance * 2
-                lows = min_with_tangent(
-                    lows, knots, distance - off, slope, 4 * unit * distance, unit
+                slope = dr.dot(away, direction) / distance - rounding / distance * 2
+                bounds = min_with_tangent(
+                    bounds, knots, distance - rounding, slope, 4 * epsilon * distance, epsilon
                 )
-            nearer = distance < nearest
+            is_nearer = distance < nearest
             return (
-                dr.select(nearer, distance, nearest),
-                *(dr.select(nearer, a, b) for a, b in zip(away, (x, y, z), strict=True)),
-                fmax(off, size),
-                *lows,
+                dr.select(is_nearer, distance, nearest),
+                *(dr.select(is_nearer, a, b) for a, b in zip(away, (x, y, z), strict=True)),
+                fmax(rounding, size),
+                *bounds,
             )
 
         zero = 0 * p.x
         start = (zero + dr.inf, zero, zero, zero, zero, *(zero + dr.inf for _ in knots))
         groups: RecordTable | None = cast("Any", self)._groups
         if groups is None:
-            found = records.for_each(body, start, "tube")
+            final = records.for_each(body, start, "tube")
         else:
-            found = _visit_by_groups(p, direction, knots, records, groups, body, start)
-        distance, error = found[0], found[4]
-        away = vector(*found[1:4])
+            final = _visit_by_groups(p, direction, knots, records, groups, body, start)
+        distance, error = final[0], final[4]
+        away = vector(*final[1:4])
         gradient = dr.select(distance > 0, away / distance, vector(0))
         value = distance - self._parameter("_radius")
-        error = error + 4 * unit * (distance + self._parameter("_radius"))
-        doubt = dr.select(distance > 0, fmin(4 * error / distance, 2), 2)
-        sample = Sample(value, gradient, (Lipschitz(zero + 1),), error, doubt)
-        return sample, distance, tuple(low - distance - error for low in found[5:])
+        error = error + 4 * epsilon * (distance + self._parameter("_radius"))
+        gradient_error = dr.select(distance > 0, fmin(4 * error / distance, 2), 2)
+        sample = Sample(value, gradient, (Lipschitz(zero + 1),), error, gradient_error)
+        return sample, distance, tuple(bound - distance - error for bound in final[5:])
 
     def _parameter(self, name: str) -> Any:
         return getattr(self, name)
 
 
 def _grouped(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Records of segments in groups of `_GROUP`, the last padded with copies, and a ball (center,
-    radius) around each group."""
-    missing = -len(rows) % _GROUP
-    rows = np.concatenate([rows, np.repeat(rows[-1:], missing, axis=0)])
+    """The records of segments in groups of `_GROUP`, the last group padded with copies, and a
+    record of a ball (center, radius) around each group."""
+    padding = -len(rows) % _GROUP
+    rows = np.concatenate([rows, np.repeat(rows[-1:], padding, axis=0)])
     ends = np.concatenate([rows[:, :3], rows[:, :3] + rows[:, 3:6]], axis=1)
     points = ends.reshape(-1, 2 * _GROUP, 3)
     centers = 0.5 * (points.min(axis=1) + points.max(axis=1))
@@ -306,46 +313,48 @@ def _visit_by_groups(
     """The state after `body` for all segments, where the ball of a far group replaces its segments.
 
     Proof. A segment in a ball of radius r about c is at least |p - c| - r and at most |p - c| + r
-    away. So the nearest segment is in no group whose ball begins farther away than another one
-    ends. The distance from the ball, which bounds that of all its segments, is convex along the
-    ray as well, and lies above its own tangent.
+    away. So the nearest segment is in no group whose ball begins farther away than another ball
+    ends. The distance from the ball is a lower bound of that from each of its segments. It is
+    convex along the ray as well, and lies above its own tangent.
     """
     real, vector = cast("Any", type(p.x)), cast("Any", type(p))
-    unit = 2 * float(dr.epsilon(real))
+    epsilon = 2 * float(dr.epsilon(real))
 
-    def bound(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        return (fmin(dr.norm(p - vector(*row[:3])) + row[3], state[0]),)
+    def bound(ball: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+        return (fmin(dr.norm(p - vector(*ball[:3])) + ball[3], state[0]),)
 
-    (most,) = groups.for_each(bound, (real(dr.inf),), "tube groups")
-    limit = most * (1 + 16 * unit) + 16 * unit * dr.norm(p)
+    (min_end,) = groups.for_each(bound, (real(dr.inf),), "tube groups")
+    limit = min_end * (1 + 16 * epsilon) + 16 * epsilon * dr.norm(p)
 
     def visit(i: Any, *state: Any) -> tuple[Any, ...]:
-        row = groups.read_record(i)
-        away = p - vector(*row[:3])
+        ball = groups.read_record(i)
+        away = p - vector(*ball[:3])
         distance = dr.norm(away)
-        is_near = distance - row[3] <= limit
-        found = list(state)
+        is_near = distance - ball[3] <= limit
+        updated = list(state)
         if direction is not None:
-            off = 8 * unit * (dr.norm(p) + distance + row[3])
-            slope = dr.dot(away, direction) / distance - 2 * off / distance
-            start = dr.select(is_near, dr.inf, distance - row[3] - off)
-            found[5:] = min_with_tangent(found[5:], knots, start, slope, 4 * unit * distance, unit)
+            rounding = 8 * epsilon * (dr.norm(p) + distance + ball[3])
+            slope = dr.dot(away, direction) / distance - 2 * rounding / distance
+            start = dr.select(is_near, dr.inf, distance - ball[3] - rounding)
+            updated[5:] = min_with_tangent(
+                updated[5:], knots, start, slope, 4 * epsilon * distance, epsilon
+            )
 
         def each(j: Any, *inner: Any) -> tuple[Any, ...]:
             return j + 1, *body(records.read_record(i * _GROUP + j), inner)
 
-        def more(j: Any, *_: Any) -> Any:
+        def has_more(j: Any, *_: Any) -> Any:
             return j < last
 
         last = dr.select(is_near, type(i)(_GROUP), type(i)(0))
-        inside = dr.while_loop((type(i)(0), *found), more, each, label="tube")
-        return i + 1, *inside[1:]
+        visited = dr.while_loop((type(i)(0), *updated), has_more, each, label="tube")
+        return i + 1, *visited[1:]
 
-    def more_groups(i: Any, *_: Any) -> Any:
+    def has_groups(i: Any, *_: Any) -> Any:
         return i < groups.iteration_count
 
     index = groups.backend.UInt32(0)
-    return dr.while_loop((index, *start), more_groups, visit, label="tube by groups")[1:]
+    return dr.while_loop((index, *start), has_groups, visit, label="tube by groups")[1:]
 
 
 def min_with_tangent(
@@ -356,14 +365,15 @@ def min_with_tangent(
     rounding: Real,
     unit: float,
 ) -> list[Real]:
-    """The smaller of `lower_bounds` and of the values of a tangent at the knots, the last of which
+    """At each knot, the smaller of the bound `lows` and of the value of a tangent. The last knot
     may be infinite.
 
-    start: the tangent's value at 0, known up to `rounding`.
+    start: the tangent's value at 0, with an error of up to `rounding`.
     slope: of the tangent, at least -1; NaN, as on the segment itself, counts as -1.
 
-    The slope is lowered by four roundings, for that of the product with a knot. It is never 0, so
-    that at infinity the tangent is infinite, with the slope's sign, and never 0 times infinity.
+    The slope is lowered by four roundings, for the rounding of the product with a knot. It is never
+    0, so that at infinity the tangent is infinite, with the slope's sign, and never 0 times
+    infinity.
     """
     slope = fmax(slope, -1) - 4 * unit
     slope = dr.select(slope == 0, -unit, slope)
@@ -373,23 +383,25 @@ def min_with_tangent(
 
 @dataclass(frozen=True)
 class TangentEnclosure(Enclosure):
-    """The distance from a set of segments along a path.
+    """An enclosure of the distance F from a set of segments along a path.
 
     distance: from the nearest segment.
-    slope: a bound of the rate at which that grows.
+    slope: an upper bound of the rate at which that distance grows.
     knots: increasing lengths s.
-    lower_bounds: lower bounds of F at these, by the tangents of the distances.
+    lower_bounds: lower bounds of F at the knots, less its value at 0, by the tangents of the
+        distances from all segments.
 
-    Proof. The distance from one segment is a convex function of s, so it lies above its tangent at
-    s = 0 (Hart 1996, theorem 4). The smallest of all tangents is a concave function, which lies
-    above the chord between two of its points: so F lies above the piecewise linear function through
-    0 and the lows at the knots. The last knot may be infinite: if the low there is -inf, nothing is
-    known beyond the knot before; if it is +inf, no tangent falls, and F never falls below the low
-    before.
+    Proof. The distance from a segment is a convex function of s, so it lies above its tangent at s
+    = 0 (Hart 1996, theorem 4). The smallest of all tangents is a concave function, which lies above
+    the chord between two of its points: so F lies above the piecewise linear function through 0 and
+    the lower bounds at the knots. The last knot may be infinite: if the bound there is -inf, F has
+    no bound beyond the knot before; if it is +inf, no tangent falls, and F never falls below the
+    bound at the knot before.
 
-    From above, the distance from the polyline is at most that from the nearest point c,
-    sqrt(D^2 + 2 D m s + s^2), with D the distance and m its slope; so F does not reach g before
-    s^2 + 2 D m s = g^2 + 2 D g. Where these squares overflow: a distance does not before s = g.
+    From above, the distance from the polyline is at most that from the nearest point c, sqrt(D^2 +
+    2 D m s + s^2), with D the distance and m its slope; so F does not reach g before s^2 + 2 D m s
+    = g^2 + 2 D g. Where these squares overflow, F does not reach g before s = g, as it is a
+    distance.
     """
 
     distance: Real
@@ -398,23 +410,23 @@ class TangentEnclosure(Enclosure):
     lower_bounds: tuple[Real, ...]
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        across = self.distance * self.slope
-        right = gaps.above * (gaps.above + 2 * self.distance)
-        root = dr.sqrt(fmax(dr.fma(across, across, right), 0))
-        up = dr.select(across > 0, right / (across + root), root - across)
-        # Squares of large numbers overflow: a distance rises by 1 per unit of length at most.
-        up = dr.select(dr.isfinite(right) & dr.isfinite(root), up, gaps.above)
-        total, start, low = 0 * self.distance, 0 * self.distance, 0 * self.distance
-        free = gaps.below >= 0  # and not NaN
-        for knot, next_low in zip(self.knots, self.lower_bounds, strict=True):
-            is_clear = next_low >= -gaps.below
-            part = fmax((gaps.below + low) / (low - next_low) * (knot - start), 0)
-            reached = dr.select(is_clear, knot, fmin(start + part, knot))
-            total = dr.select(free, reached, total)
-            free &= is_clear
-            start, low = knot, next_low
-        known = (total >= 0) & (up >= 0)
-        return dr.select(known, fmin(total, up) * (1 - 1e-6), 0)
+        half_slope = self.distance * self.slope
+        product = gaps.above * (gaps.above + 2 * self.distance)
+        root = dr.sqrt(fmax(dr.fma(half_slope, half_slope, product), 0))
+        up = dr.select(half_slope > 0, product / (half_slope + root), root - half_slope)
+        # Squares of large numbers overflow: a distance rises at most as fast as the length.
+        up = dr.select(dr.isfinite(product) & dr.isfinite(root), up, gaps.above)
+        total, start, bound = 0 * self.distance, 0 * self.distance, 0 * self.distance
+        is_free = gaps.below >= 0  # and not NaN
+        for knot, next_bound in zip(self.knots, self.lower_bounds, strict=True):
+            is_clear = next_bound >= -gaps.below
+            part = fmax((gaps.below + bound) / (bound - next_bound) * (knot - start), 0)
+            length = dr.select(is_clear, knot, fmin(start + part, knot))
+            total = dr.select(is_free, length, total)
+            is_free &= is_clear
+            start, bound = knot, next_bound
+        is_valid = (total >= 0) & (up >= 0)
+        return dr.select(is_valid, fmin(total, up) * (1 - 1e-6), 0)
 
 
 # Boxes are wider than the tubes by this fraction of their size.
@@ -424,19 +436,20 @@ _REACH = 0.5
 
 
 class TubeNetwork(PatchField["_TubeBuffers"]):
-    """The surfaces at distance `radius` from many segments: edges of meshes, wires, struts.
+    """The surfaces at distance `radius` from a set of segments: edges of meshes, wires, struts.
 
     points: (n, 3).
     segments: (m, 2) indices of points, counted from 0.
     radius: a number, or (m,).
 
-    Each segment is a part with rounded ends (`harnack.fields.capabilities`): a ray pays only for
-    those whose boxes it enters, so that thousands cost little more than one, and
-    `Hits.primitive_index` is the index of the segment. `level` makes all tubes thicker by so much.
-    For one polyline, and for combinations with other solids, there is `Tube`.
+    Each segment is a patch, a tube with rounded ends (`harnack.fields.capabilities`). A ray
+    evaluates only the patches whose boxes it enters, so that thousands of segments cost little more
+    than a single segment, and `Hits.primitive_index` is the index of the segment. A level is added
+    to the radius of all tubes. For a single polyline, and for combinations with other solids, there
+    is `Tube`.
 
-    Raises ValueError for arrays of other shapes, numbers that are not finite, an index without a
-    point, a segment without a length, a radius that is not positive.
+    Raises ValueError for arrays of other shapes, numbers that are not finite, an index that is out
+    of range, a segment without a length, or a radius that is not positive.
     """
 
     default_level: float = 0.0
@@ -456,12 +469,13 @@ class TubeNetwork(PatchField["_TubeBuffers"]):
         level = max(self.levels if levels is None else levels)
         ends = self.points[self.segments]
         reach = (self.radius + level)[:, None]
-        low, high = ends.min(axis=1) - reach, ends.max(axis=1) + reach
-        slack = _SLACK * (high - low).max(axis=1)[:, None]
-        return low - slack, high + slack
+        lower, upper = ends.min(axis=1) - reach, ends.max(axis=1) + reach
+        slack = _SLACK * (upper - lower).max(axis=1)[:, None]
+        return lower - slack, upper + slack
 
     def evaluate(self, p: Vec3) -> NoReturn:
-        """Raises TypeError: there is a function for each segment, and none for all together."""
+        """Raises TypeError: each segment has a function of its own, and there is none for all
+        segments together."""
         del p
         raise TypeError(
             "tubes are no level set of one function, but of one for each segment: take "
@@ -478,15 +492,15 @@ class TubeNetwork(PatchField["_TubeBuffers"]):
         return _TubeBuffers(boxes, RecordTable.upload(backend, rows))
 
     def patch(self, index: Any) -> Field:
-        on = self._require_data()
-        return _Segment(on.boxes, on.segments.read_record(index))
+        data = self._require_data()
+        return _Segment(data.boxes, data.segments.read_record(index))
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
-        least = float(self.radius.min())
+        min_radius = float(self.radius.min())
         for level in levels:
-            if not level > -least:
+            if not level > -min_radius:
                 raise ValueError(
-                    f"level {level:g} leaves nothing of the thinnest tube, of radius {least:g}"
+                    f"level {level:g} leaves nothing of the thinnest tube, of radius {min_radius:g}"
                 )
 
     def describe(self) -> dict[str, Any]:
@@ -495,19 +509,20 @@ class TubeNetwork(PatchField["_TubeBuffers"]):
 
 @dataclass(frozen=True)
 class _TubeBuffers:
-    """The tubes' boxes and segments on a backend; segments relative to the center of the boxes."""
+    """The tubes' boxes and records of segments on a backend. Segments are relative to the center of
+    the boxes."""
 
     boxes: PatchBoxes
     segments: RecordTable
 
 
 class _Segment(Field):
-    """The distance from a segment, in each lane another, less its radius.
+    """The distance from a segment less its radius; each lane may have another segment.
 
-    It is convex, as the distance from a convex set is, with the Lipschitz constant 1. Its second
-    derivative along a line is at most 1/D at distance D (Hart 1996): the distance from a point or a
-    line has that across the gradient, and that from a segment is one or the other. So it is at most
-    1/(D - r) within r.
+    The distance is convex, as the distance from a convex set, with the Lipschitz constant 1. Its
+    second derivative along a line is at most 1/D at the distance D (Hart 1996): this is the second
+    derivative, across the gradient, of the distance from a point or from a line, and the distance
+    from a segment is always one of these. So it is at most 1/(D - r) within r.
     """
 
     def __init__(self, boxes: PatchBoxes, row: list[Real]) -> None:
@@ -515,23 +530,31 @@ class _Segment(Field):
 
     def evaluate(self, p: Vec3) -> Sample:
         backend, row = self._boxes.backend, self._row
-        vector, unit = backend.Array3f, 2 * backend.machine_epsilon
+        vector, epsilon = backend.Array3f, 2 * backend.machine_epsilon
         from_start = vector(p) - self._boxes.center - vector(*row[:3])
         side = vector(*row[4:7])
-        along = clamp(dr.dot(from_start, side) * row[7], 0, 1)
-        away = dr.fma(side, vector(-along), from_start)
+        t = clamp(dr.dot(from_start, side) * row[7], 0, 1)
+        away = dr.fma(side, vector(-t), from_start)
         distance = dr.norm(away)
         # The error of the vector is a few roundings of its terms.
-        off = 8 * unit * (dr.norm(from_start) + dr.norm(side) + dr.norm(vector(*row[:3])))
-        error = off + 4 * unit * (distance + row[3])
+        vector_error = (
+            8 * epsilon * (dr.norm(from_start) + dr.norm(side) + dr.norm(vector(*row[:3])))
+        )
+        error = vector_error + 4 * epsilon * (distance + row[3])
         gradient = dr.select(distance > 0, away / distance, vector(0))
         doubt = dr.select(distance > 0, dr.minimum(4 * error / distance, 2), 2)
         r = _REACH * fmax(distance - error, 0)
-        known: tuple[Promise, ...] = (Lipschitz(backend.Float(1)), TaylorRemainder(1 / r, r))
-        return Sample(distance - row[3], gradient, known, error, doubt)
+        promises: tuple[Promise, ...] = (Lipschitz(backend.Float(1)), TaylorRemainder(1 / r, r))
+        return Sample(distance - row[3], gradient, promises, error, doubt)
 
 
 def _checked_segments(segments: Any, points: FloatArray) -> IntArray:
+    """The segments as indices (m, 2).
+
+    Raises:
+        ValueError: a wrong shape or type, too many segments, an index out of range, or a segment
+            without a length.
+    """
     array = as_real_array(segments, "the segments of tubes")
     if array.ndim != 2 or array.shape[1] != 2 or not len(array):
         raise ValueError(f"the segments of tubes must have shape (m, 2), not {array.shape}")
@@ -540,19 +563,24 @@ def _checked_segments(segments: Any, points: FloatArray) -> IntArray:
     if len(array) >= MAX_BOXES:
         raise ValueError(f"{len(array):,} segments are too many: at most {MAX_BOXES:,}")
     pairs = np.array(array, dtype=np.int64)
-    if (out := np.flatnonzero(((pairs < 0) | (pairs >= len(points))).any(axis=1))).size:
+    if (bad := np.flatnonzero(((pairs < 0) | (pairs >= len(points))).any(axis=1))).size:
         raise ValueError(
-            f"segment {out[0]} joins points {pairs[out[0], 0]} and {pairs[out[0], 1]}: there are "
+            f"segment {bad[0]} joins points {pairs[bad[0], 0]} and {pairs[bad[0], 1]}: there are "
             f"{len(points):,} points, counted from 0"
         )
     ends = points[pairs]
-    if (none := np.flatnonzero(np.abs(ends[:, 0] - ends[:, 1]).max(axis=1) < 1e-100)).size:
-        raise ValueError(f"segment {none[0]} has no length: leave it out")
+    if (empty := np.flatnonzero(np.abs(ends[:, 0] - ends[:, 1]).max(axis=1) < 1e-100)).size:
+        raise ValueError(f"segment {empty[0]} has no length: leave it out")
     pairs.setflags(write=False)
     return pairs
 
 
 def _checked_radius(radius: Any, count: int) -> FloatArray:
+    """The radii (count,) of the segments, from a number or an array.
+
+    Raises:
+        ValueError: a wrong shape, or a radius that is not positive.
+    """
     array = as_real_array(radius, "the radius of tubes")
     if array.ndim == 0:
         return np.full(count, as_positive(radius, "the radius of tubes"))
@@ -560,6 +588,6 @@ def _checked_radius(radius: Any, count: int) -> FloatArray:
         raise ValueError(
             f"the radius of tubes is a number or has shape ({count},), not {array.shape}"
         )
-    for one in (array.min(), array.max()):
-        as_positive(float(one), "the radius of tubes")
+    for radius_ in (array.min(), array.max()):
+        as_positive(float(radius_), "the radius of tubes")
     return np.array(array, dtype=np.float64)
