@@ -70,7 +70,7 @@ def _many_rays(surfaces: list[hk.Surface], material: str, camera: Camera) -> np.
 
 def _error(image: np.ndarray, reference: np.ndarray) -> float:
     """Root mean square over all pixels and colors, of 255 steps of the picture that is shown."""
-    shown = (tone_map(one.astype(np.float32)).astype(float) for one in (image, reference))
+    shown = (tone_map(pixels.astype(np.float32)).astype(float) for pixels in (image, reference))
     first, second = shown
     return float(np.sqrt(np.mean((first - second) ** 2)))
 
@@ -104,10 +104,10 @@ def antialiasing() -> str:
                 start = time.perf_counter()
                 image = render(surfaces, **settings)
                 seconds.append(time.perf_counter() - start)
-            taken = min(seconds)
-            base = taken if spp == 1 else base
+            fastest = min(seconds)
+            base = fastest if spp == 1 else base
             lines.append(
                 f"| {name} | {antialias if spp > 1 else ''} | {spp} "
-                f"| {_error(image, reference):.2f} | {taken:.2f} | {taken / base:.2f} x |"
+                f"| {_error(image, reference):.2f} | {fastest:.2f} | {fastest / base:.2f} x |"
             )
     return "\n".join(lines) + "\n"

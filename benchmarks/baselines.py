@@ -87,21 +87,21 @@ def fixed_steps(step: float) -> Method:
 
     def method(rays: Rays) -> Array:
         n = len(rays.counts)
-        found, active = np.full(n, np.inf), np.arange(n)
+        crossings, active = np.full(n, np.inf), np.arange(n)
         t, before = np.zeros(n), rays.above(np.zeros(n), np.arange(n))
         half = math.inf if rays.field.period is None else 0.5 * rays.field.period
         for _ in range(min(MOST, math.ceil(FAR / step))):
             if not len(active):
                 break
-            now = rays.above(t[active] + step, active)
+            value = rays.above(t[active] + step, active)
             last = before[active]
-            hit = (last * now <= 0) & (np.abs(last - now) < half)
-            share = last / np.where(last == now, 1, last - now)
-            found[active[hit]] = (t[active] + step * share)[hit]
+            hit = (last * value <= 0) & (np.abs(last - value) < half)
+            fraction = last / np.where(last == value, 1, last - value)
+            crossings[active[hit]] = (t[active] + step * fraction)[hit]
             t[active] += step
-            before[active] = now
+            before[active] = value
             active = active[~hit]
-        return found
+        return crossings
 
     return method
 
@@ -111,16 +111,16 @@ def sphere_tracing(constant: float) -> Method:
 
     def method(rays: Rays) -> Array:
         n = len(rays.counts)
-        found, t, active = np.full(n, np.inf), np.zeros(n), np.arange(n)
+        crossings, t, active = np.full(n, np.inf), np.zeros(n), np.arange(n)
         for _ in range(MOST):
             if not len(active):
                 break
             gap = np.abs(rays.above(t[active], active))
             hit = gap < EPS
-            found[active[hit]] = t[active[hit]]
+            crossings[active[hit]] = t[active[hit]]
             t[active] += gap / constant
             active = active[~hit & (t[active] <= FAR)]
-        return found
+        return crossings
 
     return method
 
@@ -132,8 +132,8 @@ def newton(rays: Rays) -> Array:
     for _ in range(8):
         value, slope = rays.above(t, rows), rays.slope(t, rows)
         t = t - np.clip(value / np.where(slope == 0, 1e-30, slope), -2, 2)
-    good = (np.abs(rays.above(t, rows)) < EPS) & (t >= 0) & (t <= FAR)
-    return np.where(good, t, np.inf)
+    is_root = (np.abs(rays.above(t, rows)) < EPS) & (t >= 0) & (t <= FAR)
+    return np.where(is_root, t, np.inf)
 
 
 def bisection(rays: Rays) -> Array:
@@ -143,27 +143,27 @@ def bisection(rays: Rays) -> Array:
     """
     n = len(rays.counts)
     rows = np.arange(n)
-    low, high = np.zeros(n), np.full(n, 0.125)
-    start = rays.above(low, rows)
-    end, found = start.copy(), np.full(n, np.inf)
+    lower, upper = np.zeros(n), np.full(n, 0.125)
+    start = rays.above(lower, rows)
+    end, crossings = start.copy(), np.full(n, np.inf)
     active = rows
     for _ in range(10):
-        end[active] = rays.above(high[active], active)
+        end[active] = rays.above(upper[active], active)
         active = active[start[active] * end[active] > 0]
-        high[active] *= 2
+        upper[active] *= 2
     active = rows[start * end <= 0]
     for _ in range(100):
         if not len(active):
             break
-        middle = 0.5 * (low[active] + high[active])
+        middle = 0.5 * (lower[active] + upper[active])
         value = rays.above(middle, active)
-        hit = (np.abs(value) < EPS) | (high[active] - low[active] < 1e-8)
-        found[active[hit]] = middle[hit]
-        before = value * start[active] > 0
-        low[active] = np.where(before, middle, low[active])
-        high[active] = np.where(before, high[active], middle)
+        hit = (np.abs(value) < EPS) | (upper[active] - lower[active] < 1e-8)
+        crossings[active[hit]] = middle[hit]
+        is_before = value * start[active] > 0
+        lower[active] = np.where(is_before, middle, lower[active])
+        upper[active] = np.where(is_before, upper[active], middle)
         active = active[~hit]
-    return np.where(found <= FAR, found, np.inf)
+    return np.where(crossings <= FAR, crossings, np.inf)
 
 
 def interval_analysis(rays: Rays) -> Array:
@@ -174,7 +174,7 @@ def interval_analysis(rays: Rays) -> Array:
     """
     n = len(rays.counts)
     bound = _fan_bounds if isinstance(rays.field, hk.SolidAngle) else _gyroid_bounds
-    found, depth = np.full(n, np.inf), 14
+    crossings, depth = np.full(n, np.inf), 14
     low = np.zeros((n, depth + 2))
     high = np.full((n, depth + 2), FAR)
     top = np.ones(n, np.int64)
@@ -187,17 +187,17 @@ def interval_analysis(rays: Rays) -> Array:
         rays.counts[active] += 1
         straddles = (lower <= rays.level) & (upper >= rays.level)
         if rays.field.period is not None:  # any of the levels
-            turns = np.ceil((lower - rays.level) / rays.field.period)
-            straddles = rays.level + turns * rays.field.period <= upper
+            periods = np.ceil((lower - rays.level) / rays.field.period)
+            straddles = rays.level + periods * rays.field.period <= upper
         leaf = b - a < max(2 * EPS, 1.5 * FAR / 2**depth)
-        hit, split = straddles & leaf, straddles & ~leaf
-        found[active[hit]] = 0.5 * (a + b)[hit]
-        rows, middle, k = active[split], 0.5 * (a + b)[split], k[split]
-        low[rows, k], high[rows, k] = middle, b[split]
-        low[rows, k + 1], high[rows, k + 1] = a[split], middle
+        is_hit, is_split = straddles & leaf, straddles & ~leaf
+        crossings[active[is_hit]] = 0.5 * (a + b)[is_hit]
+        rows, middle, k = active[is_split], 0.5 * (a + b)[is_split], k[is_split]
+        low[rows, k], high[rows, k] = middle, b[is_split]
+        low[rows, k + 1], high[rows, k + 1] = a[is_split], middle
         top[rows] = k + 2
-        active = active[~hit & (top[active] > 0)]
-    return found
+        active = active[~is_hit & (top[active] > 0)]
+    return crossings
 
 
 Interval = tuple[Array, Array]
@@ -221,11 +221,11 @@ def _less(x: Interval, y: Interval) -> Interval:
 
 
 def _length(x: list[Interval]) -> Interval:
-    low, high = 0.0, 0.0
+    lower, upper = 0.0, 0.0
     for a, b in x:
-        least = np.where((a <= 0) & (b >= 0), 0, np.minimum(np.abs(a), np.abs(b)))
-        low, high = low + least**2, high + np.maximum(np.abs(a), np.abs(b)) ** 2
-    return np.sqrt(low), np.sqrt(high)
+        min_abs = np.where((a <= 0) & (b >= 0), 0, np.minimum(np.abs(a), np.abs(b)))
+        lower, upper = lower + min_abs**2, upper + np.maximum(np.abs(a), np.abs(b)) ** 2
+    return np.sqrt(lower), np.sqrt(upper)
 
 
 def _fan_bounds(
@@ -236,7 +236,7 @@ def _fan_bounds(
     assert isinstance(field, hk.SolidAngle)
     p, q = rays.points(start, rows), rays.points(end, rows)
     box = np.minimum(p, q), np.maximum(p, q)
-    low, high = np.zeros(len(rows)), np.zeros(len(rows))
+    lower, upper = np.zeros(len(rows)), np.zeros(len(rows))
     for loop in field.loops:
         middle = loop.mean(axis=0)
         for first, second in zip(loop, np.roll(loop, -1, axis=0), strict=True):
@@ -254,11 +254,11 @@ def _fan_bounds(
                 _product(_product(la, lb), lc), _product(_dot(a, b), lc),
                 _product(_dot(b, c), la), _product(_dot(c, a), lb),
             )  # fmt: skip
-            cut = (x[0] <= 0) & (y[0] <= 0) & (y[1] >= 0)
+            at_cut = (x[0] <= 0) & (y[0] <= 0) & (y[1] >= 0)
             angles = np.stack([np.arctan2(v, u) for u in x for v in y])
-            low += np.where(cut, -2 * np.pi, 2 * angles.min(axis=0))
-            high += np.where(cut, 2 * np.pi, 2 * angles.max(axis=0))
-    return low, high
+            lower += np.where(at_cut, -2 * np.pi, 2 * angles.min(axis=0))
+            upper += np.where(at_cut, 2 * np.pi, 2 * angles.max(axis=0))
+    return lower, upper
 
 
 def _gyroid_bounds(
@@ -267,18 +267,18 @@ def _gyroid_bounds(
     """Bounds of sin x cos y + sin y cos z + sin z cos x between two lengths."""
     field = rays.field
     assert isinstance(field, hk.Gyroid)
-    unit = 2 * np.pi / field.cell
-    p, q = unit * rays.points(start, rows), unit * rays.points(end, rows)
+    frequency = 2 * np.pi / field.cell
+    p, q = frequency * rays.points(start, rows), frequency * rays.points(end, rows)
     box = np.minimum(p, q), np.maximum(p, q)
     sines = [_sine(box[0][:, k], box[1][:, k]) for k in range(3)]
     cosines = [_sine(box[0][:, k] + np.pi / 2, box[1][:, k] + np.pi / 2) for k in range(3)]
     return _sum(*(_product(sines[k], cosines[(k + 1) % 3]) for k in range(3)))
 
 
-def _sine(low: Array, high: Array) -> Interval:
-    ends = np.sin(low), np.sin(high)
-    top = np.floor((high - np.pi / 2) / (2 * np.pi)) > np.floor((low - np.pi / 2) / (2 * np.pi))
-    foot = np.floor((high + np.pi / 2) / (2 * np.pi)) > np.floor((low + np.pi / 2) / (2 * np.pi))
+def _sine(lower: Array, upper: Array) -> Interval:
+    ends = np.sin(lower), np.sin(upper)
+    top = np.floor((upper - np.pi / 2) / (2 * np.pi)) > np.floor((lower - np.pi / 2) / (2 * np.pi))
+    foot = np.floor((upper + np.pi / 2) / (2 * np.pi)) > np.floor((lower + np.pi / 2) / (2 * np.pi))
     return np.where(foot, -1, np.minimum(*ends)), np.where(top, 1, np.maximum(*ends))
 
 
@@ -297,27 +297,27 @@ METHODS: tuple[tuple[str, Method], ...] = (
 def oracle(rays: Rays) -> Array:
     """First crossings by samples 1/2000 apart."""
     n = len(rays.counts)
-    found = np.full(n, np.inf)
+    crossings = np.full(n, np.inf)
     middle = -(rays.origins * rays.directions).sum(axis=1)
     start, end = np.maximum(middle - 1.5, 0), np.minimum(middle + 1.5, rays.far)
     half = math.inf if rays.field.period is None else 0.5 * rays.field.period
     rows = np.flatnonzero(end > start)
     before = rays.above(start[rows], rows)
-    for shares in np.array_split(np.arange(1, SAMPLES) / (SAMPLES - 1), SAMPLES // _AT_ONCE):
+    for fractions in np.array_split(np.arange(1, SAMPLES) / (SAMPLES - 1), SAMPLES // _AT_ONCE):
         if not len(rows):
             break
-        t = start[rows] + (end - start)[rows] * shares[:, None]
-        many = np.broadcast_to(rows, t.shape)
-        value = rays.above(t.ravel(), many.ravel()).reshape(t.shape)
+        t = start[rows] + (end - start)[rows] * fractions[:, None]
+        ray_ids = np.broadcast_to(rows, t.shape)
+        value = rays.above(t.ravel(), ray_ids.ravel()).reshape(t.shape)
         last = np.concatenate([before[None], value[:-1]])
         crosses = (last * value <= 0) & (np.abs(last - value) < half)
         hit, first = crosses.any(axis=0), crosses.argmax(axis=0)
         at = first[hit], np.flatnonzero(hit)
-        share = last[at] / np.where(last[at] == value[at], 1, last[at] - value[at])
+        fraction = last[at] / np.where(last[at] == value[at], 1, last[at] - value[at])
         step = (end - start)[rows[hit]] / (SAMPLES - 1)
-        found[rows[hit]] = t[at] + (share - 1) * step
+        crossings[rows[hit]] = t[at] + (fraction - 1) * step
         rows, before = rows[~hit], value[-1, ~hit]
-    return found
+    return crossings
 
 
 @dataclass(frozen=True)
@@ -396,9 +396,9 @@ def baselines() -> str:
     for scene, field, level in scenes:
         results, truth = compare(field, level)
         hits = int(np.isfinite(truth).sum())
-        for one in results:
+        for result in results:
             lines.append(
-                f"| {scene} ({hits} hits) | {one.name} | {one.missed} | {one.false} "
-                f"| {one.evaluations:.1f} |"
+                f"| {scene} ({hits} hits) | {result.name} | {result.missed} | {result.false} "
+                f"| {result.evaluations:.1f} |"
             )
     return "\n".join(lines) + "\n"

@@ -82,14 +82,14 @@ def _queries(folder: Path, workers: int, chunks: int) -> tuple[float, float]:
     field = _mesh()
     with _client(workers) as client:
         for k in range(2 * workers):  # each compiles
-            few = points[k * CHUNK : k * CHUNK + CHUNK // 10]
-            client.compute(field.value(few)).result()
-        begun = time.perf_counter()
+            block = points[k * CHUNK : k * CHUNK + CHUNK // 10]
+            client.compute(field.value(block)).result()
+        start = time.perf_counter()
         values = field.value(points[: chunks * CHUNK])
         hk.to_zarr(values, folder / f"{workers}.zarr", client=client, progress=workers == 2)
-        seconds = time.perf_counter() - begun
-        most = max(client.run(_peak).values())
-    return chunks * CHUNK / seconds, most
+        seconds = time.perf_counter() - start
+        peak = max(client.run(_peak).values())
+    return chunks * CHUNK / seconds, peak
 
 
 def _peak() -> int:
@@ -103,7 +103,7 @@ def _tiles(workers: int) -> float:
     seconds = 0.0
     with _client(workers) as client:
         for seed in range(2):
-            begun = time.perf_counter()
+            start = time.perf_counter()
             hk.render(field, client=client, seed=seed, **_PICTURE)
-            seconds = time.perf_counter() - begun
+            seconds = time.perf_counter() - start
     return seconds

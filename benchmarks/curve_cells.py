@@ -100,13 +100,13 @@ def _row(name: str, make: Callable[..., Any], count: _Rays, unit: float = 1e9) -
     entries: list[str] = []
     for o, d in (_camera(count.width), _chords(count.count), _bounces(plain, count)):
         rays = to_vector3(backend, o), to_vector3(backend, d)
-        for one in (plain, field):
-            work = functools.partial(_trace, one, rays)
+        for variant in (plain, field):
+            work = functools.partial(_trace, variant, rays)
             work()
             best = min(_seconds(work) for _ in range(count.repeats))
             entries.append(f"{best / len(o) * unit:,.{0 if unit > 1e6 else 1}f}")
-    on = field.prepare(backend)._device
-    size = (on.built if isinstance(field, hk.WindingNumber) else on.cells).size
+    device_data = field.prepare(backend)._device
+    size = (device_data.built if isinstance(field, hk.WindingNumber) else device_data.cells).size
     return f"| {name} | " + " | ".join(entries) + f" | {built:.2f} s | {size / 1e6:.1f} |"
 
 

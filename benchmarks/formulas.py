@@ -123,15 +123,15 @@ def measured() -> tuple[dict[str, Array], dict[str, Array]]:
         f"differences, {_DIFFERENCE:g} apart": lambda: differences(loop, x),
         "harnack": lambda: ours.gradient(x, precision="single"),
     }
-    size = _length(gradient)
+    norm = _length(gradient)
 
-    def off(given: Array) -> Array:
-        d = given.astype(fine) - value
+    def error(computed: Array) -> Array:
+        d = computed.astype(fine) - value
         return np.abs(d - 4 * fine(np.pi) * np.round(d / (4 * fine(np.pi))))
 
     with np.errstate(all="ignore"):
-        of_values = {name: off(f()) for name, f in values.items()}
-        of_gradients = {name: _length(f() - gradient) / size for name, f in gradients.items()}
+        of_values = {name: error(f()) for name, f in values.items()}
+        of_gradients = {name: _length(f() - gradient) / norm for name, f in gradients.items()}
     return of_values, of_gradients
 
 
@@ -149,10 +149,10 @@ def formulas() -> str:
     ]
     for kind, errors in zip(("value", "gradient"), measured(), strict=True):
         for name, error in errors.items():
-            known = np.asarray(error[np.isfinite(error)], np.float64)
-            middle, most = np.quantile(known, [0.5, 0.999])
+            finite = np.asarray(error[np.isfinite(error)], np.float64)
+            median, quantile = np.quantile(finite, [0.5, 0.999])
             lines.append(
-                f"| {kind} | {name} | {middle:.1e} | {most:.1e} | {known.max():.1e} "
-                f"| {len(error) - len(known)} |"
+                f"| {kind} | {name} | {median:.1e} | {quantile:.1e} | {finite.max():.1e} "
+                f"| {len(error) - len(finite)} |"
             )
     return "\n".join(lines) + "\n"

@@ -84,17 +84,17 @@ def bumpy_cloud(n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 def at_points(series: str, vertices: FloatArray, faces: Any, method: Any) -> AtPoints:
     """`WindingNumber.value` on NumPy arrays."""
-    points, made = cube_points(POINTS), []
+    points, fields = cube_points(POINTS), []
 
     def make() -> None:
         field = WindingNumber(vertices, faces, method=method)
         field.value(points[:10])
-        made.append(field)
+        fields.append(field)
 
     seconds = seconds_of(make)
-    made[0].value(points)  # compiles
-    taken = [seconds_of(lambda: made[0].value(points)) for _ in range(REPEATS)]
-    return AtPoints(series, len(faces), seconds, float(np.median(taken)) / POINTS * 1e6)
+    fields[0].value(points)  # compiles
+    times = [seconds_of(lambda: fields[0].value(points)) for _ in range(REPEATS)]
+    return AtPoints(series, len(faces), seconds, float(np.median(times)) / POINTS * 1e6)
 
 
 def along_rays(series: str, elements: int, field: hk.Field) -> AlongRays:
@@ -103,15 +103,15 @@ def along_rays(series: str, elements: int, field: hk.Field) -> AlongRays:
     eye, directions = camera(WIDTH)
     o, d = to_vector3(backend, eye[None]), to_vector3(backend, directions)
     surface = hk.level_set(field.prepare(backend))
-    kept: list[hk.Hits] = []
+    hits: list[hk.Hits] = []
 
     def call() -> None:
-        kept[:] = [hk.trace(surface, o, d, t_max=10.0)]
+        hits[:] = [hk.trace(surface, o, d, t_max=10.0)]
         dr.sync_thread()
 
     call()  # compiles
     seconds = float(np.median([seconds_of(call) for _ in range(REPEATS)]))
-    n, status = kept[0].evaluations.numpy(), kept[0].status.numpy()
+    n, status = hits[0].evaluations.numpy(), hits[0].status.numpy()
     return AlongRays(
         series, elements, float((status == int(hk.RayStatus.HIT)).mean()), float(n.mean()),
         int(n.max()), int((status == int(hk.RayStatus.OUT_OF_STEPS)).sum()), seconds / n.size * 1e6,
@@ -185,9 +185,9 @@ def plot(path: Path, points: list[AtPoints], rays: list[AlongRays]) -> None:
     ]
     for axis, (rows, quantity, label) in zip(axes, panels, strict=True):
         for series in dict.fromkeys(row.series for row in rows):
-            some = [row for row in rows if row.series == series]
-            y = [getattr(row, quantity) for row in some]
-            axis.plot([row.elements for row in some], y, "o-", label=series)
+            selected = [row for row in rows if row.series == series]
+            y = [getattr(row, quantity) for row in selected]
+            axis.plot([row.elements for row in selected], y, "o-", label=series)
         axis.set(xscale="log", xlabel="triangles or points", ylabel=label)
         axis.legend(loc="center right")
     # Clouds take tens of times as long as meshes: only a logarithm shows both.

@@ -192,7 +192,7 @@ def coherent(solids: list[Solid]) -> Count:
     blocks = blocks.reshape(side * side, -1, 3)
     axis = blocks.mean(1)
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-    wide = np.linalg.norm(blocks - axis[:, None], axis=2).max(1)
+    width = np.linalg.norm(blocks - axis[:, None], axis=2).max(1)
     t, evaluations = np.zeros(len(axis)), 0
     active = np.ones(len(axis), bool)
     for _ in range(_MOST):
@@ -202,13 +202,13 @@ def coherent(solids: list[Solid]) -> Count:
         p = eye + t[rows, None] * axis[rows]
         f = np.min([solid.distance(p) for solid in solids], axis=0)
         evaluations += rows.size * len(solids)
-        step = (f - t[rows] * wide[rows]) / (1 + wide[rows])
-        stops = step < 0.05 * t[rows] * wide[rows] + _NEAR
+        step = (f - t[rows] * width[rows]) / (1 + width[rows])
+        stops = step < 0.05 * t[rows] * width[rows] + _NEAR
         t[rows[~stops]] += step[~stops]
         active[rows[stops | (t[rows] > _FAR)]] = False
     start = np.broadcast_to(t[:, None], blocks.shape[:2]).reshape(side, side, _BLOCK, _BLOCK)
-    made = trace(solids, start=start.transpose(0, 2, 1, 3).reshape(-1).copy())
-    return Count(made.evaluations + evaluations / len(d), made.steps, 0.0, made.lengths, made.t)
+    count = trace(solids, start=start.transpose(0, 2, 1, 3).reshape(-1).copy())
+    return Count(count.evaluations + evaluations / len(d), count.steps, 0.0, count.lengths, count.t)
 
 
 _ENHANCED: tuple[tuple[str, dict[str, bool]], ...] = (
@@ -267,23 +267,23 @@ def hart() -> str:
     histograms: dict[str, np.ndarray] = {}
     for scene, solids in scenes().items():
         plain = trace(solids)
-        rows = [(name, trace(solids, **asked)) for name, asked in _ENHANCED]
+        rows = [(name, trace(solids, **options)) for name, options in _ENHANCED]
         rows.append((f"image coherence, blocks of {_BLOCK}", coherent(solids)))
-        for name, made in rows:
+        for name, count in rows:
             if scene == "14 tori" and name in ("convexity", "both"):
                 continue  # tori are not convex
-            seen = np.isfinite(plain.t)
-            assert (seen == np.isfinite(made.t)).mean() > 0.999
-            both = seen & np.isfinite(made.t)
-            assert np.abs(plain.t - made.t)[both].max() < 0.1
+            is_hit = np.isfinite(plain.t)
+            assert (is_hit == np.isfinite(count.t)).mean() > 0.999
+            are_hits = is_hit & np.isfinite(count.t)
+            assert np.abs(plain.t - count.t)[are_hits].max() < 0.1
             printed = _PRINTED.get((scene, name), "")
             lines.append(
-                f"| {scene} | {name} | {made.evaluations:.2f} "
-                f"| {100 * made.evaluations / plain.evaluations:.0f} | {printed} "
-                f"| {made.steps:.2f} | {made.bounds:.2f} |"
+                f"| {scene} | {name} | {count.evaluations:.2f} "
+                f"| {100 * count.evaluations / plain.evaluations:.0f} | {printed} "
+                f"| {count.steps:.2f} | {count.bounds:.2f} |"
             )
             if scene == "one ball" and name in ("none", "convexity"):
-                histograms[name] = made.lengths
+                histograms[name] = count.lengths
     lines += ["", *_histogram_lines(histograms), "", *_on_our_tracer()]
     return "\n".join(lines) + "\n"
 
@@ -299,7 +299,7 @@ def _histogram_lines(histograms: dict[str, np.ndarray]) -> list[str]:
     ]
     for name, lengths in histograms.items():
         counts = np.histogram(lengths, edges)[0] * 1000 / _WIDTH**2
-        lines.append(f"| {name} | " + " | ".join(f"{one:.0f}" for one in counts) + " |")
+        lines.append(f"| {name} | " + " | ".join(f"{number:.0f}" for number in counts) + " |")
     return lines
 
 

@@ -68,7 +68,7 @@ def hollow(folder: Path) -> str:
             if isinstance(row, str):
                 lines.append(f"| {path.stem} | | | | refused: {row} | | | |")
                 continue
-            walls = " | ".join(f"{one:.2f}" for one in row.walls)
+            walls = " | ".join(f"{thickness:.2f}" for thickness in row.walls)
             closed = "yes" if row.is_closed else "no"
             lines.append(
                 f"| {path.stem} | {row.seconds:.0f} | {row.attempts} | {row.triangles:,} "
@@ -79,20 +79,20 @@ def hollow(folder: Path) -> str:
 
 def _measured(path: Path) -> _Row | str:
     """Of a file, in a process that has just been started; or why the part cannot be made."""
-    given: Any = trimesh.load(path)
-    whole = hk.repair(given)
+    loaded: Any = trimesh.load(path)
+    whole = hk.repair(loaded)
     whole.apply_scale(_SIZE / whole.extents[1])
     part, gyroid = hk.solid(whole), hk.Gyroid(_CELL)
     lattice = hk.solid(gyroid, between=gyroid.levels_of_thickness(0.8))
-    made = part.shell(_WALL) | (part & lattice)
+    body = part.shell(_WALL) | (part & lattice)
     (x, _, z), vent = whole.bounds.mean(axis=0), hk.Cylinder(_VENT, 6.0).rotated(90, "x")
     axes = [np.array((x + side, whole.bounds[0, 1], z)) for side in (-15.0, 5.0)]
-    for place in axes:
-        made = made - vent.translated(tuple(place))
-    said: list[str] = []
+    for position in axes:
+        body = body - vent.translated(tuple(position))
+    stages: list[str] = []
     with tempfile.TemporaryDirectory() as folder:
         try:
-            hk.mesh(made, tolerance=_TOLERANCE, progress=said.append).export(f"{folder}/part.stl")
+            hk.mesh(body, tolerance=_TOLERANCE, progress=stages.append).export(f"{folder}/part.stl")
         except MeshingError as error:
             return str(error)
         seconds = time.process_time()
@@ -101,7 +101,7 @@ def _measured(path: Path) -> _Row | str:
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     is_closed = is_closed and not len(intersecting_faces(vertices, faces))
     walls = _walls(whole, vertices[faces], axes)
-    return _Row(seconds, said.count(_TOGETHER), len(faces), is_closed, walls)
+    return _Row(seconds, stages.count(_TOGETHER), len(faces), is_closed, walls)
 
 
 # Walls.
@@ -116,11 +116,11 @@ def _walls(
     size = float(whole.extents.max())
     # A face lies on the mesh if its corners and points of its edges do.
     middle = 0.5 * (corner + np.roll(corner, 1, axis=1))
-    on_it = np.concatenate([corner, middle, corner.mean(axis=1)[:, None]], axis=1)
+    samples = np.concatenate([corner, middle, corner.mean(axis=1)[:, None]], axis=1)
     is_inner = np.zeros(len(corner), np.bool_)
-    for k in range(on_it.shape[1]):
+    for k in range(samples.shape[1]):
         rows = np.flatnonzero(~is_inner)
-        is_inner[rows] = outside.distance(on_it[rows, k], _OUTSIDE * size) > _OUTSIDE * size
+        is_inner[rows] = outside.distance(samples[rows, k], _OUTSIDE * size) > _OUTSIDE * size
     is_inner &= ~_beside_vents(corner.mean(axis=1), axes, 0.5)
     points, _ = trimesh.sample.sample_surface(whole, _SAMPLES, seed=5)
     points = np.asarray(points)[~_beside_vents(points, axes, _AWAY)]
@@ -130,11 +130,11 @@ def _walls(
 
 def _beside_vents(points: FloatArray, axes: list[FloatArray], room: float) -> npt.NDArray[np.bool_]:
     """(n,) whether points are within a vent, along y, or not farther from it than that."""
-    found = np.zeros(len(points), np.bool_)
+    is_beside = np.zeros(len(points), np.bool_)
     for axis in axes:
-        across = np.hypot(points[:, 0] - axis[0], points[:, 2] - axis[2])
-        found |= (across < _VENT + room) & (np.abs(points[:, 1] - axis[1]) < 6.0 + room)
-    return found
+        distance = np.hypot(points[:, 0] - axis[0], points[:, 2] - axis[2])
+        is_beside |= (distance < _VENT + room) & (np.abs(points[:, 1] - axis[1]) < 6.0 + room)
+    return is_beside
 
 
 class Triangles:
@@ -149,7 +149,7 @@ class Triangles:
         group = np.ceil(np.log2(np.maximum(radius, 1e-9))).astype(np.int64)
         self._groups = [
             (float(radius[rows].max()), corner[rows], scipy.spatial.cKDTree(center[rows]))
-            for rows in (np.flatnonzero(group == one) for one in np.unique(group))
+            for rows in (np.flatnonzero(group == size) for size in np.unique(group))
         ]
 
     def distance(self, points: FloatArray, enough: float = np.inf) -> FloatArray:
@@ -160,31 +160,31 @@ class Triangles:
         )
 
     def _of_some(self, points: FloatArray, enough: float) -> FloatArray:
-        least = self._vertices.query(points)[0]
+        distances = self._vertices.query(points)[0]
         for radius, corner, centers in self._groups:
-            reach = np.minimum(least, 1.01 * enough) + radius
+            reach = np.minimum(distances, 1.01 * enough) + radius
             near = centers.query_ball_point(points, reach)
-            count = np.array([len(one) for one in near])
+            count = np.array([len(ids) for ids in near])
             if not count.sum():
                 continue
             rows = np.repeat(np.arange(len(points)), count)
-            some = corner[np.concatenate([np.asarray(one, np.int64) for one in near if one])]
-            np.minimum.at(least, rows, distance_to_triangles(points[rows], some))
-        return least
+            triangles = corner[np.concatenate([np.asarray(ids, np.int64) for ids in near if ids])]
+            np.minimum.at(distances, rows, distance_to_triangles(points[rows], triangles))
+        return distances
 
 
 def distance_to_triangles(p: FloatArray, corner: FloatArray) -> FloatArray:
     """(n,) from each point (n, 3) to its triangle (n, 3, 3): to the plane if the foot is inside,
     else to the nearest edge."""
-    least = np.full(len(p), np.inf)
+    best = np.full(len(p), np.inf)
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     is_inside = np.ones(len(p), np.bool_)
     for k in range(3):
-        start, way = corner[:, k], corner[:, (k + 1) % 3] - corner[:, k]
-        length = np.maximum((way * way).sum(axis=1), 1e-300)
-        share = np.clip(((p - start) * way).sum(axis=1) / length, 0, 1)
-        least = np.minimum(least, np.linalg.norm(p - start - share[:, None] * way, axis=1))
-        is_inside &= (np.cross(way, p - start) * normal).sum(axis=1) >= 0
+        start, edge = corner[:, k], corner[:, (k + 1) % 3] - corner[:, k]
+        length = np.maximum((edge * edge).sum(axis=1), 1e-300)
+        fraction = np.clip(((p - start) * edge).sum(axis=1) / length, 0, 1)
+        best = np.minimum(best, np.linalg.norm(p - start - fraction[:, None] * edge, axis=1))
+        is_inside &= (np.cross(edge, p - start) * normal).sum(axis=1) >= 0
     size = np.linalg.norm(normal, axis=1)
     height = np.abs(((p - corner[:, 0]) * normal).sum(axis=1)) / np.maximum(size, 1e-300)
-    return np.where(is_inside & (size > 0), np.minimum(least, height), least)
+    return np.where(is_inside & (size > 0), np.minimum(best, height), best)

@@ -122,11 +122,11 @@ def measured(choice: str) -> tuple[float, float, float, float]:
         page.rest()
         page.do(_DRAG, [1.0, EVENTS])  # compiles what is left to be compiled
         page.rest()
-        found: dict[str, Any] = page.do(_DRAG, [SECONDS, EVENTS])
+        timings: dict[str, Any] = page.do(_DRAG, [SECONDS, EVENTS])
         page.close()
-    events, pictures = np.array(found["events"]), np.array(found["pictures"])
-    moving = (pictures[:, 0] >= events[0]) & (pictures[:, 0] <= found["last"])
+    events, pictures = np.array(timings["events"]), np.array(timings["pictures"])
+    moving = (pictures[:, 0] >= events[0]) & (pictures[:, 0] <= timings["last"])
     shown = [pictures[pictures[:, 1] >= k, 0].min() - t for k, t in enumerate(events)]
-    rate = float(moving.sum() / (found["last"] - events[0]) * 1000)
-    whole = float(found["whole"] - found["last"])
+    rate = float(moving.sum() / (timings["last"] - events[0]) * 1000)
+    whole = float(timings["whole"] - timings["last"])
     return rate, float(np.median(shown)), float(np.quantile(shown, 0.9)), whole

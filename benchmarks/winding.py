@@ -71,23 +71,23 @@ def seconds_of(call: Callable[[], Any]) -> float:
 
 def kernel_seconds(call: Callable[[], Any]) -> float:
     """What Dr.Jit's kernels take of one call: the median of three."""
-    found: list[float] = []
+    seconds: list[float] = []
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         for _ in range(3):
             dr.kernel_history_clear()
             call()
             history = dr.kernel_history((dr.KernelType.JIT,))
-            found.append(1e-3 * sum(float(entry["execution_time"]) for entry in history))
-    return float(np.median(found))
+            seconds.append(1e-3 * sum(float(entry["execution_time"]) for entry in history))
+    return float(np.median(seconds))
 
 
 def compare(mesh: MeshArrays, points: FloatArray, method: Any) -> list[Row]:
     """libigl, then `value` and `value_and_gradient` of harnack: in turn, medians of REPEATS."""
     vertices, faces = mesh
-    how: Any = {"cells": _MEGABYTES} if method == "cells" else {"method": method}
+    options: Any = {"cells": _MEGABYTES} if method == "cells" else {"method": method}
     if method == "tree":  # without it, gradients are looked at more closely
-        how["accuracy"] = 2.0
-    field = WindingNumber(vertices, faces, **how)
+        options["accuracy"] = 2.0
+    field = WindingNumber(vertices, faces, **options)
     calls: dict[str, Callable[[], Any]] = {
         LIBIGL: lambda: libigl(vertices, faces, points),
         f"{method}, value": lambda: field.value(points),
@@ -97,18 +97,18 @@ def compare(mesh: MeshArrays, points: FloatArray, method: Any) -> list[Row]:
     truth = exact.value(points[:CHECKED], precision="double")
     # The first calls compile, and show the errors.
     errors = {name: np.abs(call()[:CHECKED] - truth) for name, call in calls.items()}
-    taken: dict[str, list[float]] = {name: [] for name in calls}
+    times: dict[str, list[float]] = {name: [] for name in calls}
     builds: list[float] = []
     for _ in range(REPEATS):
         # libigl builds its tree in every call.
         builds.append(seconds_of(lambda: libigl(vertices, faces, points[:10])))
         for name, call in calls.items():
-            taken[name].append(seconds_of(call))
-    taken[LIBIGL] = [total - float(np.median(builds)) for total in taken[LIBIGL]]
+            times[name].append(seconds_of(call))
+    times[LIBIGL] = [total - float(np.median(builds)) for total in times[LIBIGL]]
     return [
         Row(
             name,
-            float(np.median(taken[name])),
+            float(np.median(times[name])),
             float("nan") if name == LIBIGL else kernel_seconds(call),
             float(np.median(errors[name])),
             float(errors[name].max()),

@@ -104,13 +104,13 @@ def _waist(vertices: Array) -> float:
 def _last_film() -> tuple[float, float]:
     """The largest distance, in steps of 0.01, with a film, and its waist."""
     film = _film(0.5)
-    found = (0.5, film.neck or 0.0)
+    last_film = (0.5, film.neck or 0.0)
     for k in range(51, 71):
         film = _film(0.01 * k, film)
         if film.neck is None:
             break
-        found = (0.01 * k, film.neck)
-    return found
+        last_film = (0.01 * k, film.neck)
+    return last_film
 
 
 def _tube(distance: float) -> tuple[Array, Array]:

@@ -59,16 +59,16 @@ class _Contest:
         normal = np.zeros((len(self.inside), 3))
         normal[self.inside] = gradient / np.maximum(size, 1e-30)
         picture = self.view.shade(normal, self._all(hit))
-        for where, color in ((result.early, FALSE), (result.late, MISSED)):
-            picture = marked(picture, self._all(where), color)
+        for is_marked, color in ((result.early, FALSE), (result.late, MISSED)):
+            picture = marked(picture, self._all(is_marked), color)
         return picture
 
     def told(self, results: list[Result]) -> str:
         """Counts of methods; of ours also how near to the surface its false hits are."""
         text = "; ".join(
-            f"{one.name}: {one.missed:,} missed and {one.false:,} false at {one.evaluations:.1f} "
+            f"{row.name}: {row.missed:,} missed and {row.false:,} false at {row.evaluations:.1f} "
             "evaluations a ray"
-            for one in results
+            for row in results
         )
         rows = np.flatnonzero(self.ours.early)
         if not len(rows):
@@ -85,11 +85,11 @@ class _Contest:
         text = f"{result.evaluations:.0f} looks, {result.missed} missed, {result.false} false"
         return Panel(doubled(self.drawn(result)), f"{result.name}: {text}")
 
-    def _all(self, some: Array) -> Array:
+    def _all(self, values: Array) -> Array:
         """Of all pixels, from those with a ray."""
-        whole = np.zeros(len(self.inside), bool)
-        whole[self.inside] = some
-        return whole
+        pixels = np.zeros(len(self.inside), bool)
+        pixels[self.inside] = values
+        return pixels
 
 
 @functools.cache
@@ -132,7 +132,7 @@ def figure_25(width: int) -> Report:
         "The paper's polygon and steps are not stated; its pictures are 1423 x 800. Ours refuses "
         "changes of sign by more than half a period, without which every jump would be a hit."
     )
-    panels = [contest.panel(one) for one in results]
+    panels = [contest.panel(result) for result in results]
     return Report(montage(panels[:2], panels[2:]), caption, differs)
 
 
@@ -146,7 +146,7 @@ def figure_26(width: int) -> Report:
             for constant in (5.0, 50.0, 500.0)
         ]
         results.append(contest.ours)
-        panels = [contest.panel(one) for one in results]
+        panels = [contest.panel(result) for result in results]
         rows += [panels[:2], panels[2:]]
         texts.append(
             f"{label}, {len(contest.truth):,} rays with {contest.hits:,} hits: "
@@ -175,8 +175,8 @@ def figure_27(width: int) -> Report:
         ]  # fmt: skip
         if name != "trefoil":  # whose 48 edges take a minute in interval arithmetic
             methods.append(("intervals", baselines.interval_analysis))
-        results = [*(contest.measure(*one) for one in methods), contest.ours]
-        panels = [contest.panel(one) for one in results]
+        results = [*(contest.measure(*method) for method in methods), contest.ours]
+        panels = [contest.panel(method) for method in results]
         rows += [panels[:2], panels[2:]]
         texts.append(
             f"{label}, {len(contest.truth):,} rays with {contest.hits:,} hits: "

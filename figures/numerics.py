@@ -54,15 +54,15 @@ def figure_12(width: int) -> Report:
         missed = truth.is_hit & (t > real + APART) & ~lost
         false = np.isfinite(t) & (t < real - APART)
         shown = view.shade(truth.normal, truth.is_hit)
-        for where, color in ((missed, MISSED), (false, FALSE)):
-            shown = marked(shown, where, color)
+        for is_marked, color in ((missed, MISSED), (false, FALSE)):
+            shown = marked(shown, is_marked, color)
         first.append(Panel(doubled(shown), name))
         texts.append(
             f"{name} {int(missed.sum()):,} missed, {int(false.sum()):,} false, "
             f"{int(lost.sum()):,} out of {MOST} steps"
         )
     ours = view.trace(field)
-    gone = truth.is_hit & ~(ours.t < truth.t + APART) | ours.is_hit & ~truth.is_hit
+    unequal = truth.is_hit & ~(ours.t < truth.t + APART) | ours.is_hit & ~truth.is_hit
     wrong: list[str] = []
     gradients: tuple[tuple[str, Callable[[Array, Array], Array]], ...] = (
         ("Biot-Savart", formulas.biot_savart), ("Adiels", formulas.adiels),
@@ -71,24 +71,24 @@ def figure_12(width: int) -> Report:
     at = truth.position[truth.is_hit].astype(np.float32)
     for name, gradient in gradients:
         with np.errstate(all="ignore"):
-            found = gradient(loop, at).astype(np.float64)
-            found /= np.linalg.norm(found, axis=1, keepdims=True)
+            directions = gradient(loop, at).astype(np.float64)
+            directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         angle = np.degrees(
-            np.arccos(np.clip((found * truth.normal[truth.is_hit]).sum(axis=1), -1, 1))
+            np.arccos(np.clip((directions * truth.normal[truth.is_hit]).sum(axis=1), -1, 1))
         )
         normal = np.zeros_like(truth.normal)
-        normal[truth.is_hit] = np.nan_to_num(found)
-        off = np.zeros(len(near), bool)
-        off[truth.is_hit] = ~(angle < _OFF)
-        shown = marked(view.shade(normal, truth.is_hit), off, MISSED)
+        normal[truth.is_hit] = np.nan_to_num(directions)
+        is_off = np.zeros(len(near), bool)
+        is_off[truth.is_hit] = ~(angle < _OFF)
+        shown = marked(view.shade(normal, truth.is_hit), is_off, MISSED)
         second.append(Panel(doubled(shown), name))
-        wrong.append(f"{name} {int(off.sum()):,} (median {np.nanmedian(angle):.1e} degrees)")
+        wrong.append(f"{name} {int(is_off.sum()):,} (median {np.nanmedian(angle):.1e} degrees)")
     caption = (
         "Top (unproved): first hits by the published algorithm in single precision with three "
         f"formulas of the solid angle of 8 vertices, of {int(truth.is_hit.sum()):,} hits; missed "
         f"ones are magenta, hits where nothing is or more than {APART} before the surface green: "
         f"{'; '.join(texts)}. `hk.trace` in single precision differs from the reference on "
-        f"{int(gone.sum())} rays. Bottom: normals at the same hits by three formulas of the "
+        f"{int(unequal.sum())} rays. Bottom: normals at the same hits by three formulas of the "
         f"gradient; off by more than {_OFF:g} degree in magenta: "
         f"{'; '.join(wrong)}. The errors "
         "at random points are in [benchmarks](benchmarks.md)."

@@ -58,13 +58,13 @@ def scene(name: str, width: int, *, share: float = 0.75, **settings: Any) -> tup
     """A picture of a scene of the gallery, and what its first hits took."""
     from harnack.gallery import SCENES
 
-    chosen = SCENES[name]
-    given = {"show": "shaded", "material": list(chosen.materials), **settings}
-    given.setdefault("camera", chosen.camera)
-    surfaces = chosen.surfaces()
-    if len(given["material"]) == 1:
-        given["material"] *= len(surfaces)
-    return drawn(surfaces, fitting(width, share), **given)
+    entry = SCENES[name]
+    options = {"show": "shaded", "material": list(entry.materials), **settings}
+    options.setdefault("camera", entry.camera)
+    surfaces = entry.surfaces()
+    if len(options["material"]) == 1:
+        options["material"] *= len(surfaces)
+    return drawn(surfaces, fitting(width, share), **options)
 
 
 def drawn(what: Any, size: tuple[int, int], **settings: Any) -> tuple[Pixels, Counts]:

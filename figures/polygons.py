@@ -75,10 +75,10 @@ def _with_balls(view: View, picture: Pixels, t: Array, centers: Array, radii: Ar
         middle = d @ away
         rows = np.flatnonzero(away @ away - middle**2 < radii[k] ** 2)
         half = np.sqrt(radii[k] ** 2 - (away @ away - middle[rows] ** 2))
-        seen = middle[rows] - half < t[rows]
+        is_visible = middle[rows] - half < t[rows]
         rim = 1 - half / radii[k]
-        share = np.where(seen, 0.10 + 0.55 * rim**3, 0.0)[:, None]
-        colors[rows] = (1 - share) * colors[rows] + share * np.array([0.25, 0.45, 0.75])
+        opacity = np.where(is_visible, 0.10 + 0.55 * rim**3, 0.0)[:, None]
+        colors[rows] = (1 - opacity) * colors[rows] + opacity * np.array([0.25, 0.45, 0.75])
     return view.pixels(colors)
 
 
@@ -87,17 +87,17 @@ def _steps(
 ) -> Array:
     """Where a ray (n + 1, 3) is looked at on its way to the surface."""
     d = towards / np.linalg.norm(towards)
-    at = [0.0]
-    for most in range(1, 400):
+    lengths = [0.0]
+    for max_steps in range(1, 400):
         hits = hk.trace(
-            field, start[None], d[None], max_steps=most, bound=bound, overstep=overstep,
+            field, start[None], d[None], max_steps=max_steps, bound=bound, overstep=overstep,
             precision="double",
         )  # fmt: skip
-        if hits.t[0] > at[-1]:
-            at.append(float(hits.t[0]))
+        if hits.t[0] > lengths[-1]:
+            lengths.append(float(hits.t[0]))
         if hits.status[0] != hk.RayStatus.OUT_OF_STEPS:
             break
-    return start + np.array(at)[:, None] * d
+    return start + np.array(lengths)[:, None] * d
 
 
 def _isolines(field: hk.SolidAngle) -> tuple[Array, list[tuple[int, int]]]:
@@ -184,10 +184,10 @@ def figure_9(width: int) -> Report:
             Panel(halved(patch), f"{name}: bilinear patch"),
             Panel(halved(ours), f"{name}: level set"),
         ])  # fmt: skip
-        most, times = _crossings(field, vertices, faces)
+        max_crossings, max_times = _crossings(field, vertices, faces)
         texts.append(
             f"{name}: {100 * folded.mean():.0f} % of the patch's parameters are turned over, and "
-            f"a vertical line meets it up to {times} times, the level set up to {most}"
+            f"a vertical line meets it up to {max_times} times, the level set up to {max_crossings}"
         )
     caption = (
         "A quadrilateral with a reflex corner, in a plane and out of it. Left: the bilinear "
@@ -201,11 +201,11 @@ def figure_9(width: int) -> Report:
 def _drawn_patch(view: View, vertices: Array, faces: Array, folded: Array) -> Pixels:
     """A patch, pink where a part that is turned over is in front or lies on another."""
     d = view.directions()
-    one, other = (mesh_hits(vertices, faces[some], view.eye, d) for some in (~folded, folded))
-    over = (other.t <= one.t + 1e-3) & other.is_hit
-    normal = np.where(over[:, None], other.normal, one.normal)
-    color = np.where(over[:, None], (0.9, 0.2, 0.6), FRONT)
-    return view.shade(normal, one.is_hit | other.is_hit, color, color)
+    up, down = (mesh_hits(vertices, faces[part], view.eye, d) for part in (~folded, folded))
+    is_over = (down.t <= up.t + 1e-3) & down.is_hit
+    normal = np.where(is_over[:, None], down.normal, up.normal)
+    color = np.where(is_over[:, None], (0.9, 0.2, 0.6), FRONT)
+    return view.shade(normal, up.is_hit | down.is_hit, color, color)
 
 
 def _bilinear(quad: Array, n: int) -> tuple[Array, Array, Array]:
@@ -216,8 +216,8 @@ def _bilinear(quad: Array, n: int) -> tuple[Array, Array, Array]:
     a, b, c, d = quad
     vertices = (1 - u) * (1 - v) * a + u * (1 - v) * b + u * v * c + (1 - u) * v * d
     k = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
-    one, other = np.column_stack([k, k + n + 1, k + n + 2]), np.column_stack([k, k + n + 2, k + 1])
-    faces = np.concatenate([one, other])
+    abc, acd = np.column_stack([k, k + n + 1, k + n + 2]), np.column_stack([k, k + n + 2, k + 1])
+    faces = np.concatenate([abc, acd])
     p, q, r = (vertices[faces[:, i], :2] for i in range(3))
     e, f = q - p, r - p
     area = e[:, 0] * f[:, 1] - e[:, 1] * f[:, 0]

@@ -57,7 +57,7 @@ def published(
 ) -> Ends:
     """First hits without over-stepping. stop: at |f - level| <= eps |grad f|, or at <= eps."""
     t, kind = start.astype(directions.dtype), directions.dtype
-    found = np.full(len(t), np.inf, kind)
+    t_hit = np.full(len(t), np.inf, kind)
     count = np.zeros(len(t), np.int64)
     rows = np.flatnonzero(t < end)
     for _ in range(most):
@@ -78,10 +78,10 @@ def published(
         for gap, level in zip(gaps, levels, strict=True):
             if (v := level - claim.lower) > 0:
                 step = np.minimum(step, 2 * r * gap / (u + 2 * v + np.sqrt(u * (u + 8 * v))))
-        found[rows[hit]] = t[rows[hit]]
+        t_hit[rows[hit]] = t[rows[hit]]
         t[rows] += step
         rows = rows[~hit & (t[rows] < end[rows])]
-    return Ends(found, count)
+    return Ends(t_hit, count)
 
 
 def claimed_angle(field: hk.SolidAngle) -> Claim:
@@ -92,7 +92,9 @@ def claimed_angle(field: hk.SolidAngle) -> Claim:
 
     def look(p: Array) -> tuple[Array, Array, Array]:
         sample = ready.evaluate(to_vector3(backend, p))
-        (ball,) = [one for one in sample.all_promises if isinstance(one, hk.HarmonicBall)]
+        (ball,) = [
+            promise for promise in sample.all_promises if isinstance(promise, hk.HarmonicBall)
+        ]
         return to_numpy(sample.value), to_numpy(sample.gradient), to_numpy(ball.radius)
 
     return Claim(look, -4 * math.pi, field.default_level, 4 * math.pi)
@@ -104,11 +106,11 @@ def distance_to_loop(loop: Array) -> Callable[[Array], Array]:
     b = np.roll(loop, -1, axis=0) - loop
 
     def distance(p: Array) -> Array:
-        least = np.full(len(p), np.inf, p.dtype)
-        for start, along in zip(a.astype(p.dtype), b.astype(p.dtype), strict=True):
-            away = p - start
-            share = np.clip(away @ along / (along @ along), 0, 1)
-            least = np.minimum(least, ((away - share[:, None] * along) ** 2).sum(axis=1))
-        return np.sqrt(least)
+        nearest = np.full(len(p), np.inf, p.dtype)
+        for start, edge in zip(a.astype(p.dtype), b.astype(p.dtype), strict=True):
+            offset = p - start
+            fraction = np.clip(offset @ edge / (edge @ edge), 0, 1)
+            nearest = np.minimum(nearest, ((offset - fraction[:, None] * edge) ** 2).sum(axis=1))
+        return np.sqrt(nearest)
 
     return distance

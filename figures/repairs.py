@@ -36,18 +36,18 @@ def figure_14(width: int) -> Report:
         for loop in corners
     ])  # fmt: skip
     view = View.of(mesh.vertices, (2 * size[0], 2 * size[1]), chosen.camera)
-    met = mesh_hits(
+    hits = mesh_hits(
         fans.reshape(-1, 3), np.arange(3 * len(fans)).reshape(-1, 3), view.eye, view.directions()
     )
-    triangles = view.shade(met.normal, met.is_hit, (0.72, 0.30, 0.22), (0.85, 0.80, 0.72))
-    _, many = scene("patches", width)
+    triangles = view.shade(hits.normal, hits.is_hit, (0.72, 0.30, 0.22), (0.85, 0.80, 0.72))
+    _, patch_counts = scene("patches", width)
     patches = SCENES["patches"].surfaces()[0].field.describe()["faces"]
     caption = (
         f"A net of curves on a wavy torus, {faces} polygons with {len(mesh.edges)} edges (left); "
         "a level set for each polygon (middle); and a simple triangulation of the polygons by "
         f"fans (right). The middle takes {counts}, for all polygons that a ray enters; the "
         f"picture with tubes, {seconds:.1f} s, compilation and counting included. A bumpy sphere "
-        f"of {patches:,} such polygons (gallery scene `patches`): {many}."
+        f"of {patches:,} such polygons (gallery scene `patches`): {patch_counts}."
     )
     differs = (
         "The exoskeleton of de Goes et al. (2011) is not public; ours is made by clustering a "

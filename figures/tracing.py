@@ -34,8 +34,8 @@ def figure_4(width: int) -> Report:
     ]
     panels: list[list[Panel]] = [[], []]
     texts: list[str] = []
-    for share in (1.0, 0.1, 0.05, 0.01):
-        claim = Claim(lambda p: _polynomial(p, outer), share * lower, level)
+    for fraction in (1.0, 0.1, 0.05, 0.01):
+        claim = Claim(lambda p: _polynomial(p, outer), fraction * lower, level)
         below, above = [0, 0], [0, 0]
         for row, view in zip(panels, views, strict=True):
             d = view.directions()
@@ -44,17 +44,17 @@ def figure_4(width: int) -> Report:
             ends = published(claim, view.eye, d, start, end)
             missed = truth.is_hit & ~(ends.t < truth.t + 0.01) & (ends.evaluations < MOST)
             rising = (truth.normal * d).sum(axis=1) > 0
-            for kind, some in ((below, rising), (above, ~rising)):
-                kind[0] += int((missed & some).sum())
-                kind[1] += int((truth.is_hit & some).sum())
+            for kind, selected in ((below, rising), (above, ~rising)):
+                kind[0] += int((missed & selected).sum())
+                kind[1] += int((truth.is_hit & selected).sum())
             hit = np.isfinite(ends.t)
             p = view.eye + np.where(hit, ends.t, 0)[:, None] * d
             normal = claim.look(p)[1]
             normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
             shown = marked(view.shade(normal, hit), missed, MISSED)
-            row.append(Panel(shown, f"c = {share * lower:.4f}"))
+            row.append(Panel(shown, f"c = {fraction * lower:.4f}"))
         texts.append(
-            f"c = {share * lower:.4f}: {below[0]:,} of {below[1]:,} from below and {above[0]:,} "
+            f"c = {fraction * lower:.4f}: {below[0]:,} of {below[1]:,} from below and {above[0]:,} "
             f"of {above[1]:,} from above"
         )
     caption = (
@@ -199,23 +199,23 @@ def figure_23(width: int) -> Report:
     loop = np.array([[1.0, 1.0, s], [-1.0, 1.0, -s], [-1.0, -1.0, s], [1.0, -1.0, -s]])
     across = max(8, 8 * round(width / 40))
     rules = (("classic", 1.75), ("caps", 1.4))
-    found = errors(loop, across=across, steps=60, rules=rules)
+    error_sets = errors(loop, across=across, steps=60, rules=rules)
     names = {"classic": "published rule, over-stepping 1.75", "caps": "harnack, caps"}
     figure, axes = pyplot.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
     rays, texts = 0, []
-    for name, parts in found.items():
-        for axis, error in zip(axes, parts, strict=True):
+    for name, measures in error_sets.items():
+        for axis, error in zip(axes, measures, strict=True):
             rays = error.shape[1]
             error = np.maximum(error, 1e-13)
             steps = np.arange(len(error))
             axis.semilogy(steps, error.mean(axis=1), label=names.get(name, name))
             low, high = np.percentile(error, [0.5, 99.5], axis=1)
             axis.fill_between(steps, low, high, alpha=0.2)
-        within = parts[1] < 1e-4
+        within = measures[1] < 1e-4
         count = np.where(within.any(axis=0), within.argmax(axis=0), np.inf)
         median = float(np.median(count))
-        told = f"{median:.0f}" if math.isfinite(median) else "more than 60"
-        texts.append(f"{names.get(name, name)} {told}")
+        steps_text = f"{median:.0f}" if math.isfinite(median) else "more than 60"
+        texts.append(f"{names.get(name, name)} {steps_text}")
     for axis, name in zip(axes, ("|f - level|", "|t - t*|"), strict=True):
         axis.set(xlabel="evaluations", ylabel=name, ylim=(1e-8, 20), xlim=(0, 60))
     axes[0].legend(fontsize=8)
