@@ -33,9 +33,10 @@ CHECKED = 2_000
 SAMPLES = 384
 DAMAGE = ("none", "holes", "flips", "duplicates", "self-intersections")
 METHODS: tuple[tuple[Any, int], ...] = (("exact", 2), ("tree", 0), ("tree", 1), ("tree", 2))
-# Of the size of the mesh: tolerance of the trace, and how far a hit may be from the surface.
+# Of the size of the mesh: tolerance of the trace, and the largest distance of a hit from the
+# surface.
 TOLERANCE, REACH = 2e-5, 3e-4
-# Faces that are damaged at most: each makes three boundary edges, which the oracle pays for.
+# The largest number of damaged faces: each makes three boundary edges, which the oracle pays for.
 _MOST = 300
 
 FloatArray = npt.NDArray[np.float64]
@@ -125,13 +126,13 @@ def at_points(name: str, mesh: MeshArrays) -> Iterator[PointRow]:
     expected = winding_sum(vertices[faces])(x)
     for method, order in METHODS:
         field = WindingNumber(vertices, faces, method=method, order=order)
-        off = np.abs(field.value(x) - expected)
+        error = np.abs(field.value(x) - expected)
         bound = field.error_bound(x)
         yield PointRow(
             name, len(faces), len(field.mesh.singular_edges),
             method if method == "exact" else f"{method}, order {order}",
-            int((off > bound).sum()), float(np.median(off)), float(off.max()),
-            float((off / bound).max()),
+            int((error > bound).sum()), float(np.median(error)), float(error.max()),
+            float((error / bound).max()),
         )  # fmt: skip
 
 
@@ -193,7 +194,7 @@ def _explained(
 
 
 def _rounded(v: FloatArray) -> FloatArray:
-    """To single precision, so that all methods are asked about the same mesh and points."""
+    """The values in single precision, so that all methods get the same mesh and points."""
     return v.astype(np.float32).astype(np.float64)
 
 
@@ -212,7 +213,7 @@ def agreement(folder: Path) -> str:
         for point_row in at_points(path.stem, mesh):
             points.append(point_row)
             print(point_row, flush=True)
-        # Of a flat mesh w stays below 1/2 and comes near it only at the mesh: a level in between.
+        # For a flat mesh w stays below 1/2 and comes near it only at the mesh: a level in between.
         level = 0.25 if np.ptp(mesh[0], axis=0).min() == 0 else 0.5
         for seed, kind in enumerate(DAMAGE):
             for ray_row in along_rays(path.stem, damaged(mesh, kind, seed), kind, seed, level):

@@ -1,4 +1,4 @@
-"""How close shaded pictures come to many rays a pixel, and in what time, by the pixels chosen."""
+"""Error of shaded pictures against many rays a pixel, and their time, by the pixels chosen."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ Surfaces = Callable[[], "list[hk.Surface]"]
 
 def _wires() -> list[hk.Surface]:
     """Three rings, each a tenth to a fifth of a pixel wide."""
-    turn = np.linspace(0, 2 * math.pi, 61)
+    angle = np.linspace(0, 2 * math.pi, 61)
     rings = [
         hk.Tube(
-            radius * np.column_stack([np.cos(turn), tilt * np.sin(turn),
-                                      math.sqrt(1 - tilt**2) * np.sin(turn)]),
+            radius * np.column_stack([np.cos(angle), tilt * np.sin(angle),
+                                      math.sqrt(1 - tilt**2) * np.sin(angle)]),
             1e-3,
         )
         for radius, tilt in ((1.0, 0.2), (0.8, -0.5), (0.9, 0.8))
@@ -56,7 +56,7 @@ def _scenes() -> dict[str, tuple[Surfaces, str, Camera]]:
 
 
 def _many_rays(surfaces: list[hk.Surface], material: str, camera: Camera) -> np.ndarray:
-    """The picture with the same rays in every pixel, without choosing any.
+    """The picture with the same rays in every pixel, without a choice of pixels.
 
     A picture that is `side` times as wide and high has them all, each in the middle of a pixel.
     """
@@ -69,7 +69,7 @@ def _many_rays(surfaces: list[hk.Surface], material: str, camera: Camera) -> np.
 
 
 def _error(image: np.ndarray, reference: np.ndarray) -> float:
-    """Root mean square over all pixels and colors, of 255 steps of the picture that is shown."""
+    """Root mean square error over all pixels and colors, in 255 steps of the displayed picture."""
     shown = (tone_map(pixels.astype(np.float32)).astype(float) for pixels in (image, reference))
     first, second = shown
     return float(np.sqrt(np.mean((first - second) ** 2)))

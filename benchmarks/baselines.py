@@ -1,4 +1,4 @@
-"""What is commonly used to trace such surfaces, and how many first hits it misses.
+"""Methods in common use for tracing such surfaces, and the number of first hits that they miss.
 
 None of these methods proves anything about singular or angle-valued functions: they are here for
 comparison alone (the paper's Figs. 25 to 27). Rays are followed for 0 <= t <= 10 with at most 2500
@@ -22,16 +22,16 @@ from .scenes import camera, unit
 Array = npt.NDArray[np.float64]
 
 FAR, EPS, MOST = 10.0, 1e-3, 2500
-# A hit that is farther from the oracle's than this is another one.
+# A hit that is farther from the oracle's than this counts as another hit.
 APART = 0.02
 ACROSS, SAMPLES = 64, 6000
-# Samples of a ray that are evaluated together.
+# Number of samples of a ray that are evaluated together.
 _AT_ONCE = 50
 
 
 @dataclass(frozen=True)
 class Rays:
-    """Values of a field along rays, counted: n rays, of which `far` (n,) is looked at."""
+    """Values of a field along n rays, with counts of evaluations; rays end at `far` (n,)."""
 
     field: hk.Field
     level: float
@@ -42,7 +42,7 @@ class Rays:
 
     @classmethod
     def of(cls, field: hk.Field, level: float, across: int) -> Rays:
-        """Of the camera of all benchmarks."""
+        """The rays of the camera of all benchmarks."""
         eye, d = camera(across)
         return cls.along(field, level, eye, d)[0]
 
@@ -50,16 +50,16 @@ class Rays:
     def along(
         cls, field: hk.Field, level: float, eye: Array, d: Array
     ) -> tuple[Rays, npt.NDArray[np.bool_]]:
-        """Of one origin (3,) and unit directions (m, 3), from where they enter the field's domain;
-        and which (m,) of them do."""
+        """Rays of one origin (3,) and unit directions (m, 3), from the points where they enter the
+        field's domain; and which (m,) of them enter it."""
         o, far = np.tile(eye, (len(d), 1)), np.full(len(d), FAR)
-        meets = np.ones(len(d), bool)
+        is_hit = np.ones(len(d), bool)
         if isinstance(field.domain, hk.Ball):
             middle = -(o * d).sum(axis=1)
             half = field.domain.radius**2 - (o**2).sum(axis=1) + middle**2
-            meets, half = half > 0, np.sqrt(np.maximum(half, 0))
-            o, d, far = (o + (middle - half)[:, None] * d)[meets], d[meets], 2 * half[meets]
-        return cls(field, level, o, d, far, np.zeros(len(d), np.int64)), meets
+            is_hit, half = half > 0, np.sqrt(np.maximum(half, 0))
+            o, d, far = (o + (middle - half)[:, None] * d)[is_hit], d[is_hit], 2 * half[is_hit]
+        return cls(field, level, o, d, far, np.zeros(len(d), np.int64)), is_hit
 
     def points(self, t: Array, rows: npt.NDArray[np.int64]) -> Array:
         """(n, 3) the points at t of some rays."""
@@ -107,7 +107,7 @@ def fixed_steps(step: float) -> Method:
 
 
 def sphere_tracing(constant: float) -> Method:
-    """Steps of |f - level|/L with a constant that is claimed and does not hold."""
+    """Steps of |f - level|/L with a claimed constant that does not hold."""
 
     def method(rays: Rays) -> Array:
         n = len(rays.counts)
@@ -169,7 +169,10 @@ def bisection(rays: Rays) -> Array:
 def interval_analysis(rays: Rays) -> Array:
     """The first interval of a bisection of [0, 10], 14 times, in which f may take the level.
 
-    Of a curve: the fan of triangles in interval arithmetic. An arctangent whose arguments may lie
+
+
+    For a curve: the fan of triangles in interval arithmetic. An arctangent whose arguments may lie
+
     on the cut is anything between -pi and pi.
     """
     n = len(rays.counts)
@@ -295,7 +298,7 @@ METHODS: tuple[tuple[str, Method], ...] = (
 
 
 def oracle(rays: Rays) -> Array:
-    """First crossings by samples 1/2000 apart."""
+    """First crossings, from samples 1/2000 apart."""
     n = len(rays.counts)
     crossings = np.full(n, np.inf)
     middle = -(rays.origins * rays.directions).sum(axis=1)
@@ -322,8 +325,8 @@ def oracle(rays: Rays) -> Array:
 
 @dataclass(frozen=True)
 class Result:
-    """Of one method on n rays. late (n,): first crossings that it passed. early (n,): hits where
-    there is none, or before the first."""
+    """The result of a method on n rays. late (n,): first crossings that it passed. early (n,): hits
+    where there is none, or before the first."""
 
     name: str
     late: npt.NDArray[np.bool_]
@@ -364,7 +367,7 @@ def measure_ours(rays: Rays, truth: Array) -> Result:
 
 
 def compare(field: hk.Field, level: float, across: int = ACROSS) -> tuple[list[Result], Array]:
-    """All methods on one field, ours last, and the oracle's first crossings."""
+    """All methods on one field, harnack last, and the oracle's first crossings."""
     rays = Rays.of(field, level, across)
     truth = oracle(rays)
     results = [measure(rays, name, method, truth) for name, method in METHODS]

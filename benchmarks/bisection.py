@@ -1,9 +1,9 @@
 """Bisection of rays with interval pruning, the baseline of the published tables.
 
-An interval of the ray is looked at as a whole. Where the enclosure proves it free, the next one
-follows; where not, what it proves free at the front (and, of bands, at the end) is cut off and the
-rest halved. The ends of intervals still to come are on a stack, each with how far the ray is free
-behind it.
+An interval of the ray is examined as a whole. Where the enclosure proves it free, the next interval
+follows; where not, the part that is proved free at the front (and, of bands, at the end) is cut off
+and the rest halved. The ends of pending intervals are on a stack, each with the length to which the
+ray is free behind it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _DEPTH, _MOST = 48, 2000
 def bisect(
     backend: Backend, field: Any, kind: type[Enclosure], rays: tuple[Any, Any, Any], width: float
 ) -> tuple[Any, Any, float]:
-    """Where rays hit f = 0 (infinite where they do not), looks, and core seconds.
+    """Lengths at which rays hit f = 0 (infinite where they do not), evaluations, and core seconds.
 
     rays: origins, unit directions and lengths. width: an interval this short that is not proved
         free is a hit.
@@ -34,7 +34,8 @@ def bisect(
     real, count = backend.Float, backend.UInt32
 
     def free_ends(start: Any, stop: Any) -> tuple[Any, Any]:
-        """Where the interval is free from its start on, and from where to its end."""
+        """The length to which the interval is free from its start, and that from which it is free
+        to its end."""
         p = dr.fma(backend.Array3f(start), d, o)
         sample = prepared.evaluate(p)
         length = stop - start
@@ -46,7 +47,7 @@ def bisect(
         front = bounds.free_length(gaps)
         back = length
         if isinstance(bounds, BandEnclosure):
-            # Lines that fall into the gap at the end: from where on they are inside.
+            # Lines that fall into the gap at the end: the lengths from which they are inside.
             up = (gaps.above - bounds.offsets.upper) / bounds.slopes.upper
             down = -(gaps.below + bounds.offsets.lower) / bounds.slopes.lower
             above = (bounds.offsets.upper >= gaps.above) & (bounds.slopes.upper < 0) & (up < length)

@@ -1,4 +1,4 @@
-"""Compact blobs as a formula of records: what the published methods are compared on.
+"""Compact blobs as a formula of records: the field of comparisons with published methods.
 
 f = sum of a max(1 - |p - c|^2/R^2, 0)^3 - T over the blobs. The formula itself goes through every
 arithmetic; ranges of derivatives in closed form, and those published for segment tracing, are given
@@ -89,7 +89,7 @@ class Scene:
         return sums.max(0)
 
     def crossings(self, rays: tuple[np.ndarray, ...], groups: int, samples: int) -> np.ndarray:
-        """How often f changes sign between so many points of each ray."""
+        """The number of sign changes of f between `samples` + 1 points of each ray."""
         o, d, length = rays
         previous, count = None, np.zeros(len(o), int)
         for k in range(samples + 1):
@@ -99,13 +99,13 @@ class Scene:
         return count
 
     def field(self, groups: int = 1) -> hk.Blobs:
-        """The same field plus its threshold, as the library has it."""
+        """The same field plus its threshold, in the library's form."""
         grouped = None if groups == 1 else np.arange(len(self.centers)) % groups
         kernel = CompactKernel(support=self.width)
         return hk.Blobs(self.centers, self.reaches / self.width, kernel=kernel, groups=grouped)
 
     def first_inside(self, rays: tuple[np.ndarray, ...], samples: int) -> np.ndarray:
-        """Where f is first seen to be positive, at so many points of each ray; else infinity."""
+        """The first of `samples` + 1 points of each ray at which f is positive; else infinity."""
         o, d, length = rays
         entries = np.full(len(o), np.inf)
         for k in range(samples + 1):
@@ -122,7 +122,7 @@ class BlobFormula(Formula):
     exact: whether ranges of the first derivative are exact, for each blob; else products of the
         ranges of the kernel's and the distance's derivative, as in segment tracing (Galin et al.
         2020; Aydinlilar and Zanni 2023, equation 21).
-    groups: as in `Scene.values`; with several, ranges of derivatives are not to be asked for.
+    groups: as in `Scene.values`; ranges of derivatives are not supported for several.
     """
 
     scene: Scene
@@ -215,8 +215,8 @@ class BlobsAlong(FormulaOnRay):
 def _extrema(
     function: Callable[[Any], Any], x: Any, y: Any, half: Any, places: tuple[Any, ...]
 ) -> tuple[Any, Any]:
-    """Least and largest value on [x, y] of a function that is 0 outside [-half, half] and has no
-    extrema but at the places."""
+    """The smallest and the largest value on [x, y] of a function that is 0 outside [-half, half]
+    and has no extrema but at the places."""
     a, b = clamp(x, -half, half), clamp(y, -half, half)
     lower = upper = function(a)
     for point in (b, *(clamp(place, a, b) for place in places)):
@@ -225,11 +225,11 @@ def _extrema(
     return lower, upper
 
 
-def _product(away: Any, rate: Any, height: Any, x: Any, y: Any) -> tuple[Any, Any]:
+def _product(square: Any, rate: Any, height: Any, x: Any, y: Any) -> tuple[Any, Any]:
     """The range of k'(d) times the range of d', with d the distance from the center."""
-    first, last = dr.sqrt(away + x * x), dr.sqrt(away + y * y)
+    first, last = dr.sqrt(square + x * x), dr.sqrt(square + y * y)
     ratios = [factor / fmax(d, 1e-20) for factor, d in ((x, first), (y, last))]
-    nearest = dr.select((x < 0) & (y > 0), dr.sqrt(away), fmin(first, last))
+    nearest = dr.select((x < 0) & (y > 0), dr.sqrt(square), fmin(first, last))
     farthest = fmax(first, last)
 
     def kernel(d: Any) -> Any:

@@ -29,14 +29,14 @@ Make = Callable[[FloatArray, "FloatArray | None"], tuple[Any, Any]]
 _COUNTS, _NOISE = (20_000, 200_000), 0.005
 # The depth of the octree of Poisson reconstruction: the default of both programs.
 _DEPTH, _SAMPLES = 8, 100_000
-# The largest distance is looked for again so often, on the triangles of so many farthest points.
+# The largest distance is searched again _ROUNDS times, on the triangles of the _FARTHEST points.
 _ROUNDS, _FARTHEST = 2, 500
 _NAMES = ("spot", "stanford-bunny", "fandisk")
 
 
 @dataclass(frozen=True)
 class _Row:
-    """What a program made. distance, mean: Hausdorff's and the mean one, parts of the diagonal."""
+    """The result of a program. distance, mean: Hausdorff's and mean distance, over the diagonal."""
 
     seconds: float
     faces: int
@@ -75,7 +75,7 @@ def clouds(folder: Path | None) -> str:
 
 
 def _lines(programs: dict[str, Make], folder: Path | None) -> Iterator[str]:
-    """The rows of the table, each when it is measured."""
+    """The rows of the table, each as soon as it is measured."""
     for name, mesh in _meshes(folder).items():
         for count, has_normals in itertools.product(_COUNTS, (True, False)):
             points, normals = _cloud(mesh, count)
@@ -118,8 +118,8 @@ def _cloud(arrays: Arrays, count: int) -> tuple[FloatArray, FloatArray]:
     return np.asarray(noisy), np.array(mesh.face_normals[faces])
 
 
-def _diagonal(whole: Arrays) -> float:
-    return float(np.linalg.norm(np.ptp(whole[0], axis=0)))
+def _diagonal(arrays: Arrays) -> float:
+    return float(np.linalg.norm(np.ptp(arrays[0], axis=0)))
 
 
 def _ours(points: FloatArray, normals: FloatArray | None) -> tuple[Any, Any]:
@@ -173,7 +173,7 @@ def _peers() -> dict[str, Make]:
 def _measured(
     make: Make, points: FloatArray, normals: FloatArray | None, max_triangles: int
 ) -> tuple[float, Arrays]:
-    """Seconds, and a mesh of at most so many triangles; 0 for as many as there are."""
+    """Seconds, and a mesh of at most `max_triangles` triangles; 0 for no limit."""
     start = time.process_time()
     try:
         vertices, faces = make(points, normals)
@@ -191,12 +191,12 @@ def _measured(
     return seconds, (np.array(vertices, np.float64), np.array(faces, np.int64))
 
 
-def _compared(seconds: float, result: Arrays, whole: Arrays) -> _Row:
+def _compared(seconds: float, result: Arrays, reference: Arrays) -> _Row:
     if not len(result[1]):
         return _Row(seconds, 0, False, math.nan, math.nan)
     mesh = trimesh.Trimesh(*result, process=False)
-    distances = [_away(result, whole, 1), _away(whole, result, 2)]
-    size, mean = _diagonal(whole), float(np.mean([sampled.distance for sampled in distances]))
+    distances = [_away(result, reference, 1), _away(reference, result, 2)]
+    size, mean = _diagonal(reference), float(np.mean([sampled.distance for sampled in distances]))
     farthest = max(sampled.farthest for sampled in distances)
     closed = bool(mesh.is_watertight and mesh.is_winding_consistent)
     return _Row(seconds, len(result[1]), closed, farthest / size, mean / size)
@@ -204,27 +204,28 @@ def _compared(seconds: float, result: Arrays, whole: Arrays) -> _Row:
 
 @dataclass(frozen=True)
 class _Away:
-    """Distances (n,) of points chosen by chance on a mesh from another, and about the largest."""
+    """Distances (n,) of random points of a mesh from another mesh, and about the largest
+    distance."""
 
     distance: FloatArray
     farthest: float
 
 
 def _away(arrays: Arrays, other: Arrays, seed: int) -> _Away:
-    """How far points of a mesh are from the triangles of another."""
+    """Distances of points of a mesh from the triangles of another."""
     vertices, faces = arrays
-    distance, chosen = _sampled((vertices, faces), other, seed)
+    distance, face_ids = _sampled((vertices, faces), other, seed)
     farthest = float(distance.max())
     for k in range(_ROUNDS):
-        faces = faces[chosen]
-        distances, chosen = _sampled((vertices, faces), other, seed + 2 * k + 2)
+        faces = faces[face_ids]
+        distances, face_ids = _sampled((vertices, faces), other, seed + 2 * k + 2)
         farthest = max(farthest, float(distances.max()))
     return _Away(distance, farthest)
 
 
 def _sampled(arrays: Arrays, other: Arrays, seed: int) -> tuple[FloatArray, npt.NDArray[np.int64]]:
-    """Distances of points chosen by chance on a mesh from the triangles of another, and the faces,
-    by index, of those that are farthest."""
+    """Distances of random points of a mesh from the triangles of another, and the indices of the
+    faces of the farthest points."""
     mesh = trimesh.Trimesh(*arrays, process=False)
     points, face_ids = trimesh.sample.sample_surface(mesh, _SAMPLES, seed=seed)
     vertices, faces = other

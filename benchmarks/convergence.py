@@ -1,7 +1,7 @@
-"""How fast each rule approaches the surface, against sphere tracing with an exact distance.
+"""The speed at which rules approach the surface, against sphere tracing with an exact distance.
 
 The paper's Fig. 23: the 2 pi level set is meshed finely, and sphere tracing walks by the exact
-distance to that mesh (libigl's closest-point query), the best case there is for it.
+distance to that mesh (libigl's closest-point query), which is its best case.
 """
 
 from __future__ import annotations

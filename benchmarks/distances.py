@@ -1,4 +1,4 @@
-"""Distances to surfaces: how long a point takes, against trimesh's nearest points and scipy's."""
+"""Distances to surfaces: time of a point, against trimesh's nearest points and scipy's."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ def _around(field: hk.Field, n: int) -> FloatArray:
 
 def _cloud(n: int) -> hk.DipolePotential:
     k = np.arange(n) + 0.5
-    z, turn = 1 - 2 * k / n, np.pi * (1 + np.sqrt(5)) * k
+    z, angle = 1 - 2 * k / n, np.pi * (1 + np.sqrt(5)) * k
     flat = np.sqrt(1 - z * z)
-    p = np.column_stack([flat * np.cos(turn), flat * np.sin(turn), z])
+    p = np.column_stack([flat * np.cos(angle), flat * np.sin(angle), z])
     return hk.DipolePotential(p, p, np.full(n, 4 * np.pi / n))
 
 

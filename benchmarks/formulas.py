@@ -1,4 +1,4 @@
-"""Formulas for the solid angle of a polygon and for its gradient: which of them stay accurate.
+"""Formulas for the solid angle of a polygon and for its gradient, and their accuracy.
 
 The paper's Fig. 12, with numbers: each formula in single precision against the fan in 80-bit
 floats, at points of a camera's rays. All are equal in exact arithmetic, modulo 4 pi.
@@ -75,8 +75,8 @@ def adiels(loop: Array, x: Array) -> Array:
     for p, q in zip(loop, np.roll(loop, -1, axis=0), strict=True):
         a, b = p - x, q - x
         la, lb = _length(a), _length(b)
-        share = (1 / la + 1 / lb) / (la * lb + _dot(a, b))
-        total += share[:, None] * np.cross(a, b)
+        fraction = (1 / la + 1 / lb) / (la * lb + _dot(a, b))
+        total += fraction[:, None] * np.cross(a, b)
     return total
 
 
@@ -102,7 +102,7 @@ def _unit(a: Array) -> Array:
 
 
 def measured() -> tuple[dict[str, Array], dict[str, Array]]:
-    """Errors of values in radians, and of gradients as a part of their length."""
+    """Errors of values in radians, and of gradients relative to their length."""
     loop = np.asarray(example_curves.wavy_polygon(12), np.float32)
     x = np.random.default_rng(0).uniform(-1.2, 1.2, (POINTS, 3)).astype(np.float32)
     fine = np.longdouble

@@ -1,4 +1,4 @@
-"""How the cost of winding numbers and of point clouds grows with their number of elements."""
+"""Growth of the cost of winding numbers and of point clouds with their number of elements."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ FloatArray = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class AtPoints:
-    """Microseconds for one of many points; seconds to make the field from arrays."""
+    """Microseconds a point, of many points; seconds to construct the field from arrays."""
 
     series: str
     elements: int
@@ -57,7 +57,7 @@ class AlongRays:
 
 
 def one_hole(vertices: FloatArray, faces: Any, fraction: float = 0.01) -> Any:
-    """The faces without the fraction of them that lies nearest to the camera."""
+    """The faces without the given fraction that lies nearest to the camera."""
     towards = vertices[faces].mean(axis=1) @ (EYE / np.linalg.norm(EYE))
     return faces[np.sort(np.argsort(towards)[: len(faces) - round(fraction * len(faces))])]
 
@@ -69,8 +69,8 @@ def bumpy_cloud(n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     u - grad r/r with grad r tangential, and each point holds 4 pi/n r^2/(normal . u).
     """
     k = np.arange(n) + 0.5
-    z, turn = 1 - 2 * k / n, np.pi * (1 + np.sqrt(5)) * k
-    u = np.column_stack([np.cos(turn), np.sin(turn), z])
+    z, angle = 1 - 2 * k / n, np.pi * (1 + np.sqrt(5)) * k
+    u = np.column_stack([np.cos(angle), np.sin(angle), z])
     u[:, :2] *= np.sqrt(1 - z * z)[:, None]
     s, c = np.sin(5 * u), np.cos(5 * u)
     r = 1 + 0.15 * s.prod(axis=1)

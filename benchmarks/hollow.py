@@ -23,21 +23,22 @@ from .repair import is_solid
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
-# Millimeters: what parts are scaled to, walls, and the radius of vents; and the tolerance.
+# In millimeters: the size to which parts are scaled, walls, cells, and the radius of vents; and the
+# tolerance.
 _SIZE, _WALL, _CELL, _VENT = 80.0, 2.0, 8.0, 2.0
 _TOLERANCE = 1.2e-3
 _NAMES = ("stanford-bunny", "spot", "cow", "homer")
-# How many meshes are done at once; and what is said at each attempt.
+# Number of meshes that are processed at once; and the message at each attempt.
 _AT_ONCE, _TOGETHER = 4, "putting the parts together"
-# Sampled points of the outer side; how near to it faces count as parts of it, and how far from the
-# axes of vents, in millimeters, points and faces are looked at.
+# Number of sampled points of the outer side; the distance from it within which faces count as parts
+# of it; and the distance from the axes of vents, in millimeters, beyond which points are used.
 _SAMPLES, _OUTSIDE, _AWAY = 20_000, 1e-5, 3.0
 
 
 @dataclass(frozen=True)
 class _Row:
-    """What was made of a mesh. attempts: how often parts were put together. walls: the thinnest,
-    the median, and what 99.9 % are thinner than."""
+    """The part that was made of a mesh. attempts: the number of times that its parts were put
+    together. walls: the thinnest, the median, and the thickness that 99.9 % are below."""
 
     seconds: float
     attempts: int
@@ -47,7 +48,7 @@ class _Row:
 
 
 def hollow(folder: Path) -> str:
-    """Measure, and return the section of the page. folder: of the meshes."""
+    """Measure, and return the section of the page. folder: the folder of the meshes."""
     lines = [
         "## Hollow parts\n",
         f"Meshes repaired, scaled to {_SIZE:g} mm of height, hollowed by {_WALL:g} mm, with walls "
@@ -78,15 +79,15 @@ def hollow(folder: Path) -> str:
 
 
 def _measured(path: Path) -> _Row | str:
-    """Of a file, in a process that has just been started; or why the part cannot be made."""
+    """The row of a file, in a new process; or the reason why the part cannot be made."""
     loaded: Any = trimesh.load(path)
-    whole = hk.repair(loaded)
-    whole.apply_scale(_SIZE / whole.extents[1])
-    part, gyroid = hk.solid(whole), hk.Gyroid(_CELL)
+    repaired = hk.repair(loaded)
+    repaired.apply_scale(_SIZE / repaired.extents[1])
+    outer, gyroid = hk.solid(repaired), hk.Gyroid(_CELL)
     lattice = hk.solid(gyroid, between=gyroid.levels_of_thickness(0.8))
-    body = part.shell(_WALL) | (part & lattice)
-    (x, _, z), vent = whole.bounds.mean(axis=0), hk.Cylinder(_VENT, 6.0).rotated(90, "x")
-    axes = [np.array((x + side, whole.bounds[0, 1], z)) for side in (-15.0, 5.0)]
+    body = outer.shell(_WALL) | (outer & lattice)
+    (x, _, z), vent = repaired.bounds.mean(axis=0), hk.Cylinder(_VENT, 6.0).rotated(90, "x")
+    axes = [np.array((x + side, repaired.bounds[0, 1], z)) for side in (-15.0, 5.0)]
     for position in axes:
         body = body - vent.translated(tuple(position))
     stages: list[str] = []
@@ -100,7 +101,7 @@ def _measured(path: Path) -> _Row | str:
     is_closed = bool(mesh.is_watertight and mesh.is_winding_consistent) and is_solid(mesh)
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     is_closed = is_closed and not len(intersecting_faces(vertices, faces))
-    walls = _walls(whole, vertices[faces], axes)
+    walls = _walls(repaired, vertices[faces], axes)
     return _Row(seconds, stages.count(_TOGETHER), len(faces), is_closed, walls)
 
 
@@ -108,12 +109,12 @@ def _measured(path: Path) -> _Row | str:
 
 
 def _walls(
-    whole: trimesh.Trimesh, corner: FloatArray, axes: list[FloatArray]
+    mesh: trimesh.Trimesh, corner: FloatArray, axes: list[FloatArray]
 ) -> tuple[float, float, float]:
-    """The thinnest wall, the median and what 99.9 % are thinner than, of the triangles (m, 3, 3) of
-    a part whose outer side is that of a mesh."""
-    outside = Triangles(np.asarray(whole.triangles, np.float64))
-    size = float(whole.extents.max())
+    """The thinnest wall, the median and the thickness that 99.9 % are below, of the triangles (m,
+    3, 3) of a part whose outer side is that of a mesh."""
+    outside = Triangles(np.asarray(mesh.triangles, np.float64))
+    size = float(mesh.extents.max())
     # A face lies on the mesh if its corners and points of its edges do.
     middle = 0.5 * (corner + np.roll(corner, 1, axis=1))
     samples = np.concatenate([corner, middle, corner.mean(axis=1)[:, None]], axis=1)
@@ -122,14 +123,14 @@ def _walls(
         rows = np.flatnonzero(~is_inner)
         is_inner[rows] = outside.distance(samples[rows, k], _OUTSIDE * size) > _OUTSIDE * size
     is_inner &= ~_beside_vents(corner.mean(axis=1), axes, 0.5)
-    points, _ = trimesh.sample.sample_surface(whole, _SAMPLES, seed=5)
+    points, _ = trimesh.sample.sample_surface(mesh, _SAMPLES, seed=5)
     points = np.asarray(points)[~_beside_vents(points, axes, _AWAY)]
     wall = Triangles(corner[is_inner]).distance(points)
     return float(wall.min()), float(np.median(wall)), float(np.quantile(wall, 0.999))
 
 
 def _beside_vents(points: FloatArray, axes: list[FloatArray], room: float) -> npt.NDArray[np.bool_]:
-    """(n,) whether points are within a vent, along y, or not farther from it than that."""
+    """(n,) whether points are within a vent, along y, or at most `room` away from it."""
     is_beside = np.zeros(len(points), np.bool_)
     for axis in axes:
         distance = np.hypot(points[:, 0] - axis[0], points[:, 2] - axis[2])
@@ -138,8 +139,8 @@ def _beside_vents(points: FloatArray, axes: list[FloatArray], room: float) -> np
 
 
 class Triangles:
-    """Triangles (m, 3, 3), to which distances are asked for: those whose centers are near enough
-    are compared one by one."""
+    """Triangles (m, 3, 3), for distances from them: triangles whose centers are near enough are
+    compared one by one."""
 
     def __init__(self, corner: FloatArray) -> None:
         center = corner.mean(axis=1)
@@ -153,7 +154,8 @@ class Triangles:
         ]
 
     def distance(self, points: FloatArray, enough: float = np.inf) -> FloatArray:
-        """(n,) of points (n, 3); exact where it is at most `enough`, elsewhere at least that."""
+        """(n,) distances of points (n, 3); exact where at most `enough`, elsewhere at least
+        `enough`."""
         return np.concatenate(
             [self._of_some(points[i : i + 2000], enough) for i in range(0, len(points), 2000)]
             or [np.zeros(0)]
@@ -174,8 +176,8 @@ class Triangles:
 
 
 def distance_to_triangles(p: FloatArray, corner: FloatArray) -> FloatArray:
-    """(n,) from each point (n, 3) to its triangle (n, 3, 3): to the plane if the foot is inside,
-    else to the nearest edge."""
+    """(n,) distances from each point (n, 3) to its triangle (n, 3, 3): to the plane if the
+    projection is inside, else to the nearest edge."""
     best = np.full(len(p), np.inf)
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     is_inside = np.ones(len(p), np.bool_)

@@ -42,7 +42,8 @@ _BISECTED: dict[str | None, type[Enclosure]] = {
 
 @dataclass(frozen=True)
 class Row:
-    """One method: looks a ray, over all rays and those that hit; core time a ray; hits missed."""
+    """One method: evaluations a ray, over all rays and hitting rays; core time a ray; hits
+    missed."""
 
     name: str
     published: float | None
@@ -113,8 +114,9 @@ def _row(
     )  # fmt: skip
 
 
-# Of tables 3 and 4: name, bound, whether of the benchmark's own formula, what the paper has for the
-# largest of sums and for one sum. Ranges of that formula in closed form are of one sum alone.
+# Rows of tables 3 and 4: name, bound, whether the benchmark's own formula is used, the paper's
+# numbers for the largest of sums and for one sum. Ranges of that formula in closed form are of one
+# sum alone.
 _ALL_ROOTS: tuple[tuple[str, str | None, bool, float | None, float | None], ...] = (
     ("segment tracing", "segment", False, 39.36, 40.97),
     ("bottom-up linear", "bottom-up-linear", True, None, 28.95),

@@ -1,4 +1,4 @@
-"""What a bounded Laplacian is worth: the gyroid with ever more known of it."""
+"""The worth of a bounded Laplacian: the gyroid with more and more promises."""
 
 from __future__ import annotations
 

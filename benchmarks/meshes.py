@@ -24,15 +24,15 @@ _PERIOD = 4 * math.pi
 # Half of a gyroid's wall, as a value of the function; its cell is 1 and the box two cells wide.
 _WALL = 0.3
 _CELL = 2 * math.pi
-# What lies in the wall, by the values on lattices of up to 800^3 points, to 5e-5.
+# The volume of the wall, by the values on lattices of up to 800^3 points, to 5e-5.
 _VOLUME = 1.54755
 
 
 @dataclass(frozen=True)
 class _Row:
-    """One mesh. far: the largest distance of a point of the mesh from the surface, rms: its root
-    mean square; missed: the largest of a point of the surface from the mesh, None where it was not
-    measured; all as parts of the size."""
+    """One mesh. far: the largest distance of a point of the mesh from the surface; rms: the root
+    mean square; missed: the largest distance of a point of the surface from the mesh, None where it
+    was not measured; all relative to the size."""
 
     name: str
     seconds: float
@@ -92,7 +92,7 @@ def _line(surface: str, row: _Row, rim: int | None) -> str:
 
 
 def _peer() -> str:
-    """Which microgen takes part."""
+    """The version of microgen that takes part."""
     try:
         return f"microgen is {importlib.metadata.version('microgen')}."
     except importlib.metadata.PackageNotFoundError:
@@ -112,13 +112,14 @@ def _ours(loop: FloatArray, tolerance: float) -> _Row:
 
 
 def _curve_errors(loop: FloatArray, mesh: trimesh.Trimesh) -> tuple[float, float, float]:
-    """Largest and rms error, and how far hits are from the mesh at most, as parts of the size."""
+    """Largest and rms error, and the largest distance of hits from the mesh, relative to the
+    size."""
     size, rng = float(np.ptp(loop, axis=0).max()), np.random.default_rng(0)
     points: FloatArray = np.asarray(mesh.sample(_SAMPLES, seed=0))
     exact = CurveOracle([loop])(points)
     gap = exact.value - 2 * math.pi
     gap -= _PERIOD * np.round(gap / _PERIOD)
-    # Where the slope leads past the curve, the curve, which ends every level, is what is near.
+    # Where the slope leads past the curve, the curve, which ends every level, is the nearest.
     error = np.minimum(np.abs(gap) / np.linalg.norm(exact.gradient, axis=1), exact.smooth) / size
     direction = rng.normal(size=(8 * _HITS, 3))
     origin = 4 * direction / np.linalg.norm(direction, axis=1)[:, None]
@@ -128,8 +129,8 @@ def _curve_errors(loop: FloatArray, mesh: trimesh.Trimesh) -> tuple[float, float
 
 
 def _distances(mesh: trimesh.Trimesh, points: FloatArray) -> FloatArray:
-    """(n,) to the nearest of those triangles of which a center or a middle of an edge is among the
-    32 nearest: hardly too large."""
+    """(n,) distances to the nearest of the triangles of which a center or a midpoint of an edge is
+    among the 32 nearest: hardly too large."""
     from scipy.spatial import cKDTree
 
     corner = np.asarray(mesh.triangles)
@@ -144,7 +145,7 @@ def _distances(mesh: trimesh.Trimesh, points: FloatArray) -> FloatArray:
 
 
 def _cubes(loop: FloatArray, step: float) -> list[_Row]:
-    """Marching cubes over the same box, as it is and cleaned."""
+    """Marching cubes over the same box, as they are and cleaned."""
     from skimage.measure import marching_cubes
 
     field, evaluations = hk.SolidAngle(loop), 0

@@ -1,4 +1,4 @@
-"""What a path-traced picture costs, beside Mitsuba's own path tracer on a mesh of the surface."""
+"""Cost of a path-traced picture, beside Mitsuba's own path tracer on a mesh of the surface."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def _radiance(mi: Any, scene: Any, clamp: float | None = None) -> Callable[[], n
 
 
 def _timed(draw: Callable[[], np.ndarray]) -> tuple[float, float, np.ndarray]:
-    """Least CPU and wall time, and the picture."""
+    """The smallest CPU and wall time, and the picture."""
     image = draw()  # compiles
     cpu, wall = [], []
     for _ in range(_ROUNDS):

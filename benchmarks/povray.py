@@ -27,10 +27,10 @@ from .blobs import Scene
 from .scenes import EYE, FIELD_OF_VIEW
 
 WIDTH, TOLERANCE, SAMPLES = 256, 1e-4, 1500
-# Every so many pixels a row and column are compared with the oracle.
+# Every _CHECKED-th pixel of a row and of a column is compared with the oracle.
 _CHECKED = 2
-# A pixel is wrong where one sees a surface and the other does not, or this much later; or farther
-# from the surface than so many tolerances.
+# A pixel is wrong where one sees a surface and the other does not, or sees it this much later; or
+# where the hit is farther from the surface than this many tolerances.
 _APART, _NEAR = 2e-3, 3.0
 # Positions are written to pictures as <0.1, 0.9> for coordinates in [-_SIZE, _SIZE].
 _SIZE = 2.0
@@ -38,7 +38,7 @@ _SIZE = 2.0
 
 @dataclass(frozen=True)
 class Drawn:
-    """A surface that all of them draw.
+    """A surface that all programs draw.
 
     field, level: f, or f plus a constant, and the level that is the surface.
     formula: f of x, y, z, arrays of any kind, positive inside. values: of points (n, 3) in NumPy.
@@ -78,7 +78,7 @@ class Oracle:
     doubtful: np.ndarray
 
     def wrong(self, drawn: Drawn, d: np.ndarray, t: np.ndarray) -> tuple[int, int]:
-        """How many of these distances are wrong, without and with the doubtful pixels.
+        """The number of wrong distances, without and with the doubtful pixels.
 
         A hit before the root is right if it is near the surface: within `_NEAR` tolerances of it,
         to first order.
@@ -173,10 +173,10 @@ def _blobs() -> Drawn:
         for c, reach, height in zip(scene.centers, scene.reaches, scene.heights, strict=True)
     ]
     points = np.random.default_rng(0).uniform(low, high, (400_000, 3))
-    steepest = float(np.linalg.norm(gradients(points), axis=1).max())
+    max_slope = float(np.linalg.norm(gradients(points), axis=1).max())
     return Drawn(
         "40 blobs", scene.field(), scene.threshold, box, formula, scene.values, gradients,
-        intervals, f"{scene.threshold:.12f}-({'+'.join(terms)})", steepest,
+        intervals, f"{scene.threshold:.12f}-({'+'.join(terms)})", max_slope,
     )  # fmt: skip
 
 
@@ -197,7 +197,7 @@ def _axes() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def spans(drawn: Drawn, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where rays enter and leave the container; far < near where they miss it."""
+    """Lengths at which rays enter and leave the container; far < near where they miss it."""
     if isinstance(drawn.domain, hk.Ball):
         middle = -(d @ EYE)
         square = EYE @ EYE - middle**2
@@ -212,17 +212,17 @@ def oracle(drawn: Drawn, d: np.ndarray) -> Oracle:
     the tracer."""
     backend = choose_backend("double")
     count, real = backend.UInt32, backend.Float
-    near, far = (real(length) for length in spans(drawn, d))
+    start_t, far = (real(length) for length in spans(drawn, d))
     directions = to_vector3(backend, d)
-    crosses = far > near
+    crosses = far > start_t
 
     def value(t: Any) -> Any:
         return drawn.formula(*(float(EYE[k]) + t * directions[k] for k in range(3)))
 
-    start = value(near)
+    start = value(start_t)
 
     def first(k: Any, index: Any, before: Any) -> tuple[Any, ...]:
-        current = value(near + (far - near) * (real(k) / SAMPLES))
+        current = value(start_t + (far - start_t) * (real(k) / SAMPLES))
         is_first = (index == 0) & ((current > 0) != (before > 0))
         return k + 1, dr.select(is_first, k, index), current
 
@@ -232,8 +232,8 @@ def oracle(drawn: Drawn, d: np.ndarray) -> Oracle:
         first,
     )[1]
     has_root = index > 0
-    a = near + (far - near) * (real(index) - 1) / SAMPLES
-    b = near + (far - near) * real(index) / SAMPLES
+    a = start_t + (far - start_t) * (real(index) - 1) / SAMPLES
+    b = start_t + (far - start_t) * real(index) / SAMPLES
     for _ in range(40):
         middle = 0.5 * (a + b)
         same = (value(middle) > 0) == (start > 0)
@@ -241,16 +241,16 @@ def oracle(drawn: Drawn, d: np.ndarray) -> Oracle:
     # Nearly touched well before the first root, or a root right at the container.
     last = dr.select(has_root, dr.maximum(index, 4) - 4, SAMPLES)
 
-    def touched(k: Any, least: Any) -> tuple[Any, ...]:
-        t = near + (far - near) * (real(k) / SAMPLES)
-        return k + 1, dr.minimum(least, dr.abs(value(t)))
+    def touched(k: Any, min_value: Any) -> tuple[Any, ...]:
+        t = start_t + (far - start_t) * (real(k) / SAMPLES)
+        return k + 1, dr.minimum(min_value, dr.abs(value(t)))
 
     def behind_root(k: Any, most: Any) -> tuple[Any, ...]:
-        current = value(near + (far - near) * (real(k) / SAMPLES))
+        current = value(start_t + (far - start_t) * (real(k) / SAMPLES))
         behind = (current > 0) != (start > 0)
         return k + 1, dr.select(behind, dr.maximum(most, dr.abs(current)), most), behind
 
-    least = dr.while_loop(
+    min_value = dr.while_loop(
         (dr.zeros(count, len(d)), dr.full(real, dr.inf, len(d))),
         lambda k, _: crosses & (k <= last),
         touched,
@@ -263,7 +263,7 @@ def oracle(drawn: Drawn, d: np.ndarray) -> Oracle:
     )
     shallow = has_root & ~beyond[2] & (beyond[1] < 1.1 * TOLERANCE * drawn.steepest)
     edge = has_root & ((index <= 3) | (index + 3 >= SAMPLES))
-    doubtful = (least < 1.1 * TOLERANCE * drawn.steepest) | edge | shallow
+    doubtful = (min_value < 1.1 * TOLERANCE * drawn.steepest) | edge | shallow
     t = dr.select(has_root, b, dr.inf)
     dr.eval(t, doubtful)
     return Oracle(t.numpy(), doubtful.numpy())
@@ -298,7 +298,7 @@ def by_harnack(
 def by_povray(
     drawn: Drawn, d: np.ndarray, threads: int, *, positions: bool
 ) -> tuple[np.ndarray | None, float, float]:
-    """Distances if positions are asked for, and core and wall time of tracing as POV-Ray tells
+    """Distances if positions are requested, and core and wall time of tracing as POV-Ray reports
     them."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scene.pov"
@@ -316,12 +316,12 @@ def pov_scene(drawn: Drawn, *, positions: bool) -> str:
     wide = 2 * math.tan(FIELD_OF_VIEW / 2)
     flat = "pigment { rgb <1,1,1> }"
     if positions:
-        parts = [
+        maps = [
             f"[1 function {{ 0.5+{axis}*{0.4 / _SIZE:.12f} }} color_map {{ [0 rgb 0] "
             f"[1 rgb {_vector(3 * np.eye(3)[k])}] }}]"
             for k, axis in enumerate("xyz")
         ]
-        flat = f"pigment {{ average pigment_map {{ {' '.join(parts)} }} }}"
+        flat = f"pigment {{ average pigment_map {{ {' '.join(maps)} }} }}"
     return (
         "#version 3.7;\nglobal_settings { assumed_gamma 1.0 }\nbackground { rgb 0 }\n"
         f"camera {{ perspective location {_vector(EYE)} direction {_vector(forward)} "
@@ -337,7 +337,7 @@ def _vector(v: np.ndarray) -> str:
 
 
 def _run_povray(path: Path, threads: int, out: Path | None) -> tuple[float, float]:
-    """Core and wall seconds of tracing: neither of starting nor of reading the scene."""
+    """Core and wall seconds of tracing, without starting and reading the scene."""
     writing = [f"+O{out}", "+FN16", "File_Gamma=1.0"] if out else ["Output_to_File=false"]
     command = [
         "povray", f"+I{path}", f"+W{WIDTH}", f"+H{WIDTH}", "-D", "-A", f"+WT{threads}",
@@ -355,7 +355,7 @@ def _run_povray(path: Path, threads: int, out: Path | None) -> tuple[float, floa
 
 
 def _distances(path: Path, d: np.ndarray) -> np.ndarray:
-    """t of the positions that a picture's colors are; infinite where it shows the background."""
+    """t of the positions that the colors of a picture encode; infinite at the background."""
     from mitsuba import Bitmap
 
     pixels = np.array(Bitmap(str(path)), dtype=np.float64).reshape(-1, 3)[: len(d)] / 65535

@@ -30,24 +30,24 @@ Damage = tuple[str, float]
 Close = Callable[[FloatArray, IntArray], tuple[Any, Any, str]]
 
 _SHARES = (0.02, 0.05, 0.10)
-# Of other damage than patches only this share is measured.
+# Damage other than patches is measured for this share only.
 _USUAL_SHARE = 0.05
 _SAMPLES = 100_000
-# How many meshes are done at once.
+# Number of meshes that are processed at once.
 _AT_ONCE = 3
-# What takes long is asked for this damage only.
+# Slow programs are run for this damage only.
 _SLOW, _OF_SLOW = ("alpha wrap", "screened Poisson"), ("patches", 0.05)
-# Larger meshes are not asked of others: the time of all together counts.
+# Larger meshes are left out: the total time counts.
 _MOST_FACES = 30_000
-# Within this of the best a distance counts as one of the best, and so does one below the least that
-# sampling tells apart, as a part of the diagonal.
+# A distance counts as among the best within this factor of the best, and also below the smallest
+# distance that sampling resolves, relative to the diagonal.
 _NEARLY, _FLOOR = 1.10, 1e-3
 
 
 @dataclass(frozen=True)
 class _Row:
-    """What a program made. distance: Hausdorff's, as a part of the diagonal, sampled; infinite if
-    there is no mesh."""
+    """The result of a program. distance: Hausdorff's, relative to the diagonal, sampled; infinite
+    if there is no mesh."""
 
     seconds: float
     is_closed: bool
@@ -56,7 +56,8 @@ class _Row:
 
 
 def repair(folder: Path | None) -> str:
-    """Measure, and return the section of the page. folder: of more meshes; None for made ones."""
+    """Measure, and return the section of the page. folder: of further meshes; None for generated
+    meshes."""
     meshes = _meshes(folder)
     rows: dict[Damage, list[dict[str, _Row]]] = defaultdict(list)
     largest_first = sorted(meshes.items(), key=lambda entry: -len(entry[1][1]))
@@ -72,7 +73,7 @@ def _programs() -> dict[str, Close]:
 
 
 def _of_mesh(entry: tuple[str, Arrays]) -> dict[Damage, dict[str, _Row]]:
-    """What each program makes of one mesh, by kind and share of damage."""
+    """The results of each program for one mesh, by kind and share of damage."""
     name, whole = entry
     rows: dict[Damage, dict[str, _Row]] = {}
     for kind, fraction in itertools.product(_KINDS, _SHARES):
@@ -159,11 +160,11 @@ def _counts(names: Iterable[str]) -> str:
     return ", ".join(f"{name} {count}" for name, count in sorted(counts.items()))
 
 
-# Meshes, and what is done to them.
+# Meshes, and their damage.
 
 
 def _meshes(folder: Path | None) -> dict[str, Arrays]:
-    """Closed meshes of files and made ones."""
+    """Closed meshes of files, and generated meshes."""
     meshes: dict[str, Arrays] = {
         "torus": torus_mesh(1.0, 0.4, 96, 48),
         "sphere": _arrays(trimesh.creation.icosphere(4)),
@@ -249,18 +250,18 @@ def damaged(vertices: FloatArray, faces: IntArray, kind: str, share: float, seed
     diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     center = vertices[faces].mean(axis=1)
     lost = np.zeros(len(faces), np.bool_)
-    for place in rng.choice(len(faces), 6, replace=False):
-        near = np.argsort(np.linalg.norm(center - center[place], axis=1))
+    for face in rng.choice(len(faces), 6, replace=False):
+        near = np.argsort(np.linalg.norm(center - center[face], axis=1))
         lost[near[: max(1, int(share * len(faces) / 6))]] = True
     rest = faces[~lost]
-    chosen = rng.choice(len(rest), max(1, int(share * len(rest))), replace=False)
+    subset = rng.choice(len(rest), max(1, int(share * len(rest))), replace=False)
     if kind == "faces":
         return vertices, faces[rng.random(len(faces)) > share]
     if kind == "flips":
         rest = rest.copy()
-        rest[chosen] = rest[chosen, ::-1]
+        rest[subset] = rest[subset, ::-1]
     if kind == "doubles":
-        rest = np.concatenate([rest, rest[chosen]])
+        rest = np.concatenate([rest, rest[subset]])
     if kind == "noise":
         return vertices + rng.normal(0, 2e-3 * diagonal, vertices.shape), rest
     if kind == "cracks":
@@ -305,8 +306,8 @@ def _peers() -> dict[str, Close]:
         return mesh.vertex_matrix(), mesh.face_matrix(), ""
 
     def by_poisson(vertices: FloatArray, faces: IntArray) -> tuple[Any, Any, str]:
-        """Of vertices with the normals of their faces; those without a face have none, by which the
-        filter fails."""
+        """The reconstruction from vertices with the normals of their faces; vertices without a face
+        have no normal, so that the filter fails."""
         meshes = lab.MeshSet()
         meshes.add_mesh(lab.Mesh(vertices, faces))
         meshes.apply_filter("meshing_remove_unreferenced_vertices")
@@ -323,7 +324,7 @@ def _peers() -> dict[str, Close]:
     return programs
 
 
-def _measured(close: Close, damaged_mesh: Arrays, whole: Arrays) -> _Row:
+def _measured(close: Close, damaged_mesh: Arrays, reference: Arrays) -> _Row:
     start = time.process_time()
     try:
         vertices, faces, stage = close(*damaged_mesh)
@@ -336,7 +337,7 @@ def _measured(close: Close, damaged_mesh: Arrays, whole: Arrays) -> _Row:
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     is_closed = bool(mesh.is_watertight and mesh.is_winding_consistent) and is_solid(mesh)
     is_closed = is_closed and not len(intersecting_faces(vertices, faces))
-    return _Row(seconds, is_closed, _hausdorff((vertices, faces), whole), stage)
+    return _Row(seconds, is_closed, _hausdorff((vertices, faces), reference), stage)
 
 
 def is_solid(mesh: trimesh.Trimesh) -> bool:
@@ -348,8 +349,8 @@ def is_solid(mesh: trimesh.Trimesh) -> bool:
 
 
 def _hausdorff(first: Arrays, second: Arrays) -> float:
-    """Between two meshes, from points of each to triangles of the other, over the diagonal of the
-    second; by MeshLab."""
+    """The distance between two meshes, from points of each to triangles of the other, over the
+    diagonal of the second; by MeshLab."""
     import pymeshlab
 
     lab: Any = pymeshlab

@@ -24,12 +24,12 @@ from .growth import bumpy_cloud, one_hole
 from .scenes import camera, others, polygons
 
 WIDTH = 256
-# Turns that versions take, and runs of a scene in a turn, of which the fastest counts.
+# Number of turns of the versions, and of runs of a scene in a turn, of which the fastest counts.
 TURNS, REPEATS = 3, 3
 
 
 def fields() -> dict[str, hk.Field]:
-    """What is traced, at the default level and tolerance."""
+    """The traced fields, at the default level and tolerance."""
     v, f = bumpy_sphere(6)
     damaged = remove_faces(f, 0.1, 0)
     points, normals, areas = bumpy_cloud(4000)

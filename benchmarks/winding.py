@@ -1,4 +1,4 @@
-"""Winding numbers at points: how fast and how exact, against libigl's fast winding number."""
+"""Winding numbers at points: speed and accuracy, against libigl's fast winding number."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ FloatArray = npt.NDArray[np.float64]
 class Row:
     """One way to compute winding numbers. Seconds are medians, for all points.
 
-    kernel: what of `seconds` is computing, without sorting and transfers; NaN if not known.
+    kernel: the part of `seconds` for computing, without sorting and transfers; NaN if not known.
     """
 
     method: str
@@ -53,8 +53,8 @@ def libigl(vertices: FloatArray, faces: Any, points: FloatArray) -> FloatArray:
 def query_points(vertices: FloatArray, n: int = POINTS) -> FloatArray:
     """(n, 3) points, uniform in the bounding box made half as large again about its center."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
-    unit = np.random.default_rng(1).uniform(-0.75, 0.75, (n, 3))
-    return 0.5 * (low + high) + unit * (high - low)
+    offsets = np.random.default_rng(1).uniform(-0.75, 0.75, (n, 3))
+    return 0.5 * (low + high) + offsets * (high - low)
 
 
 def cube_points(n: int = POINTS) -> FloatArray:
@@ -70,7 +70,7 @@ def seconds_of(call: Callable[[], Any]) -> float:
 
 
 def kernel_seconds(call: Callable[[], Any]) -> float:
-    """What Dr.Jit's kernels take of one call: the median of three."""
+    """Seconds of Dr.Jit's kernels in a call: the median of three calls."""
     seconds: list[float] = []
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         for _ in range(3):
@@ -131,7 +131,7 @@ def throughput(surface: Path | None = None) -> str:
         ("soup", soup, cube, "cells"),
     ]
     if surface is not None:
-        # Here: `versions` runs this file with earlier versions of the package.
+        # Imported here: `versions` runs this file with earlier versions of the package.
         from harnack.files import read_geometry
 
         read: Any = read_geometry(surface, "winding")
@@ -162,7 +162,7 @@ def throughput(surface: Path | None = None) -> str:
 
 
 def _sorting(points: FloatArray) -> float:
-    # Here: `versions` runs this file with earlier versions of the package.
+    # Imported here: `versions` runs this file with earlier versions of the package.
     from harnack.fields.batch_evaluation import morton_order
 
     backend = choose_backend("single")

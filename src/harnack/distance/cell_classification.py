@@ -74,7 +74,7 @@ class ClipCurveDescent:
         x = vector(x)
 
         def body(
-            y: Vec3, best: Vec3, nearest: Real, w: Real, tangent: Vec3, bend: Vec3, normal: Vec3,
+            y: Vec3, best: Vec3, nearest: Real, w: Real, tangent: Vec3, ddy: Vec3, normal: Vec3,
             wall: Vec3, wall_height: Real, corner: Any, factor: Real, tries: Any, k: Any,
             active: Mask,
         ) -> tuple[Any, ...]:  # fmt: skip
@@ -100,7 +100,7 @@ class ClipCurveDescent:
             w = dr.select(accepted, clamp(step, -distance, distance), w)
             best, nearest = dr.select(accepted, y, best), dr.select(accepted, distance, nearest)
             tangent = dr.select(accepted, trial.tangent, tangent)
-            bend = dr.select(accepted, trial.second_derivative, bend)
+            ddy = dr.select(accepted, trial.second_derivative, ddy)
             changes_face = accepted & new_face
             wall = dr.select(crosses, trial.normal, dr.select(changes_face, 0, wall))
             wall_height = dr.select(crosses, dr.dot(trial.normal, y) + trial.depth, wall_height)
@@ -110,11 +110,11 @@ class ClipCurveDescent:
             # The wall is met where rate |s| + s^2/2 wall.bend is the gap.
             s, gap = factor * w, fmax(wall_height - dr.dot(wall, best), 0)
             rate = dr.sign(w) * dr.dot(wall, tangent)
-            root = rate + dr.sqrt(rate * rate + 2 * gap * dr.dot(wall, bend))
+            root = rate + dr.sqrt(rate * rate + 2 * gap * dr.dot(wall, ddy))
             limit = dr.select(root > 0, _BEFORE * 2 * gap / root, dr.inf)
             is_limited = ~(is_free & ~crosses) & (limit < dr.abs(s))
             s = dr.select(is_limited, clamp(s, -limit, limit), s)
-            target = dr.fma(vector(s), tangent, best) + vector(0.5 * s * s) * bend
+            target = dr.fma(vector(s), tangent, best) + vector(0.5 * s * s) * ddy
             min_step = dr.select(is_limited, 0, _LEAST_STEP * nearest)
             is_short = dr.abs(s) <= fmax(min_step, trial.near)
             corner = dr.select((corner == _TURNING) & ~corrects, _TURNED, corner)
@@ -128,7 +128,7 @@ class ClipCurveDescent:
                 dr.select(corrects, tries + 1, 0),
             )
             return (
-                y, best, nearest, w, tangent, bend, normal, wall, wall_height, corner, factor,
+                y, best, nearest, w, tangent, ddy, normal, wall, wall_height, corner, factor,
                 tries, k + 1, active,
             )  # fmt: skip
 
@@ -283,10 +283,10 @@ class CellClassifier:
         distance = np.full(len(cells), np.inf)
         if self._volume is not None:
             distance, start = self._at(self._pulled_inside, cells.center)
-        foot, normal, spread, curvature = self._at(
+        surface_point, normal, spread, curvature = self._at(
             self._surface_point_and_plane, start, radius, cells.normal
         )
-        self._outside(foot)
+        self._outside(surface_point)
         clip_point, clip_curvature = cells.clip_point.copy(), cells.clip_curvature.copy()
         if self._rim is not None:
             ids = np.flatnonzero(np.abs(distance) <= radius)
@@ -294,7 +294,7 @@ class CellClassifier:
             self._outside(clip_point)
         return dataclasses.replace(
             cells,
-            surface_point=foot,
+            surface_point=surface_point,
             normal=normal,
             plane_radius=spread,
             curvature=curvature,
@@ -359,9 +359,9 @@ class CellClassifier:
         radius, unknown = radii.x, self._backend.Float(FAR_SENTINEL)
         if self.surface.field.has_jumps:
             return self._nearest_ray_hit(p, radius), normal, self._backend.Float(0), unknown
-        foot = self._newton_point(p, radius)
-        is_found = foot.x < 0.5 * FAR_SENTINEL
-        y = dr.select(is_found, foot, p)
+        point = self._newton_point(p, radius)
+        is_found = point.x < 0.5 * FAR_SENTINEL
+        y = dr.select(is_found, point, p)
         gradient = self._field.evaluate(y).gradient
         n = gradient / safe_norm(gradient)
         is_plane = is_found & ~(dr.squared_norm(normal) > 0) & dr.isfinite(dr.squared_norm(n))
@@ -373,7 +373,7 @@ class CellClassifier:
             uu, vv, uv = TangentPlane.of(gradient).restrict_hessian(self._field.hessian(y))
             bound = dr.sqrt(dr.fma(uu, uu, dr.fma(vv, vv, 2 * uv * uv))) / safe_norm(gradient)
             curvature = dr.select(bound < FAR_SENTINEL, bound, unknown)
-        return foot, dr.select(is_plane, n, normal), dr.select(is_found, spread, 0), curvature
+        return point, dr.select(is_plane, n, normal), dr.select(is_found, spread, 0), curvature
 
     def _on_rim(self, p: Vec3, radii: Vec3) -> tuple[Vec3, Real]:
         """A point of the clip curve near p, and the curvature of the curve."""
@@ -418,7 +418,7 @@ class CellClassifier:
         """The hit nearest to the center of rays through the cell, of a field that jumps."""
         real, vector, count = self._backend.Float, self._backend.Array3f, self._backend.UInt32
 
-        def body(foot: Vec3, best: Real, k: Any) -> tuple[Any, ...]:
+        def body(point: Vec3, best: Real, k: Any) -> tuple[Any, ...]:
             d = vector(*_DIAGONALS[0]) / 3**0.5
             for number, diagonal in enumerate(_DIAGONALS[1:], 1):
                 d = dr.select(k == number, vector(*diagonal) / 3**0.5, d)
@@ -429,10 +429,10 @@ class CellClassifier:
             square = dr.squared_norm(y - p)
             nearer = is_hit & (square < best)
             nearer &= is_on_surface(self._prepared, y, ray_hit, nearer)
-            return dr.select(nearer, y, foot), dr.select(nearer, square, best), k + 1
+            return dr.select(nearer, y, point), dr.select(nearer, square, best), k + 1
 
-        def is_active(foot: Vec3, best: Real, k: Any) -> Mask:
-            del foot, best
+        def is_active(point: Vec3, best: Real, k: Any) -> Mask:
+            del point, best
             return k < len(_DIAGONALS)
 
         start = (vector(FAR_SENTINEL), real(dr.inf), count(0))

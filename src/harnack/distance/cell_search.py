@@ -319,8 +319,8 @@ class _CellSearch:
             count = int(is_split.sum())
             if not count or not len(ids) or len(self.cells) + 4 * count > self.max_cells:
                 break
-            parts = self.proofs.with_surface_points(_subdivide(self.proofs, self.cells, is_split))
-            self.cells = SurfaceCells.concatenate([self.cells.select(~is_split), parts])
+            octants = self.proofs.with_surface_points(_subdivide(self.proofs, self.cells, is_split))
+            self.cells = SurfaceCells.concatenate([self.cells.select(~is_split), octants])
             progress(f"distances: {len(self.cells):,} cells for {len(ids):,} points")
             tree, tried = CellTree.of(self.backend, self.cells), self.feet
             marks = dr.zeros(self.backend.Bool, len(self.cells))
@@ -329,32 +329,33 @@ class _CellSearch:
         self, coarse: CellTree, tree: CellTree, marks: Any
     ) -> tuple[IntArray, FloatArray]:
         """`_descend_from_best_start`, and a first `_improve`: in one kernel, where Newton's method
-        ends.
+        converges.
 
-        Returns the rows at which there is more to try, and the feet that were tried (n, 3).
+        Returns the indices of the queries that have more to try, and the surface points that were
+        tried (n, 3).
         """
         backend = self.backend
         tolerance = dr.opaque(backend.Float, self.tolerance)
 
-        def compute(x: Vec3, known: Vec3) -> tuple[Real | Vec3, ...]:
+        def compute(x: Vec3, guess: Vec3) -> tuple[Real | Vec3, ...]:
             real, missing = backend.Float, backend.Array3f(FAR_SENTINEL)
-            limit = safe_norm(known - x)
+            limit = safe_norm(guess - x)
             limit = dr.select(dr.isfinite(limit), limit, FAR_SENTINEL)
             start = coarse.best_start(x, limit)
             y, free, unresolved = self.descents.newton_in_kernel(x, start, limit)
             has_start, gap = start.x < 0.5 * FAR_SENTINEL, safe_norm(y - x)
             unresolved &= has_start
             is_nearer = has_start & ~unresolved & (gap < limit)
-            foot = dr.select(is_nearer, y, dr.select(limit < 0.5 * FAR_SENTINEL, known, missing))
+            point = dr.select(is_nearer, y, dr.select(limit < 0.5 * FAR_SENTINEL, guess, missing))
             distance = dr.select(is_nearer, gap, limit)
             best = BestCandidate(
-                foot, dr.select(unresolved, 0, distance), dr.select(is_nearer, free, 0),
+                point, dr.select(unresolved, 0, distance), dr.select(is_nearer, free, 0),
                 dr.select(is_nearer, 1, real(_APART_FROM_BOUNDARY)),
             )  # fmt: skip
             lower, feet = tree.closer_candidates(x, best, (start,), tolerance, marks)
-            foot = dr.select(distance < 0.5 * FAR_SENTINEL, foot, dr.nan)
+            point = dr.select(distance < 0.5 * FAR_SENTINEL, point, dr.nan)
             return (
-                foot,
+                point,
                 best.exclusion_radius,
                 lower,
                 start,
@@ -385,16 +386,16 @@ class _CellSearch:
         return self.lower < self._distance(slice(None)) - self.tolerance
 
     def _distance(self, rows: IntArray | slice) -> FloatArray:
-        """Of the best feet so far; FAR where there is none."""
+        """Distances of the best points so far; FAR where there is none."""
         distances = np.linalg.norm(self.points[rows] - self.feet[rows], axis=1)
         return np.where(np.isnan(distances), FAR_SENTINEL, distances)
 
     def _is_boundary(self, rows: IntArray | slice) -> BoolArray:
-        """Whether the best is what was known on the boundary."""
+        """Whether the best point is the initial guess, on the boundary."""
         return self.known.on_boundary & (self.feet[rows] == self.known.feet[rows]).all(axis=1)
 
     def _descend_from_best_start(self, tree: CellTree) -> FloatArray:
-        """Descend from the feet that seem nearest, which are returned (n, 3)."""
+        """Descend from the surface points that seem nearest, which are returned (n, 3)."""
         limit = upload_floats(self.backend, self._distance(slice(None)))
         start = to_numpy(tree.best_start(upload_vectors(self.backend, self.points), limit))
         ids = np.flatnonzero(start[:, 0] < 0.5 * FAR_SENTINEL)
@@ -425,7 +426,8 @@ class _CellSearch:
             rows, tried = rows[active], [feet[active] for feet in (*tried[-1:], *starts)]
 
     def _descend_from_candidates(self, rows: IntArray, starts: Sequence[FloatArray]) -> IntArray:
-        """Descend from feet (k, 3), FAR for none; returns the rows where that led nearer."""
+        """Descend from surface points (k, 3), FAR for none; returns the rows where that led
+        nearer."""
         old_distance = self._distance(rows)
         start_index, selected = np.nonzero([start[:, 0] < 0.5 * FAR_SENTINEL for start in starts])
         self._descend(rows[selected], np.stack(starts)[start_index, selected])
@@ -451,8 +453,8 @@ class _CellSearch:
         return [to_numpy(candidate) for candidate in candidates]
 
     def _leave_boundary(self) -> IntArray:
-        """Descend from the boundary of the surface, where the best point is on it; returns the rows
-        where that led nearer."""
+        """Descend from the boundary of the surface, where the best point is on it; returns the
+        queries where that led nearer."""
         ids = np.flatnonzero(self._is_boundary(slice(None)))
         distance = self._distance(ids)
         ids, distance = ids[distance > 0], distance[distance > 0]
@@ -462,7 +464,7 @@ class _CellSearch:
         return ids[self._distance(ids) < distance]
 
     def _descend(self, ids: IntArray, start: FloatArray) -> None:
-        """Descend from places (k, 3), points of the surface or the points themselves."""
+        """Descend from points (k, 3): points of the surface, or the query points themselves."""
         if not len(ids):
             return
         x = self.points[ids]
@@ -471,8 +473,8 @@ class _CellSearch:
         self._update_best(ids, *self.descents.descend(x, start, self._distance(ids)))
 
     def _update_best(self, rows: IntArray, feet: FloatArray, free: FloatArray) -> None:
-        """Take points of the surface (k, 3) or NaN, and their radii, where they are nearer; rows
-        may come several times."""
+        """Replace the best points by points of the surface (k, 3) or NaN, and their radii, where
+        these are nearer; rows may occur several times."""
         distances = np.linalg.norm(self.points[rows] - feet, axis=1)
         improved = np.flatnonzero(distances < self._distance(rows))
         improved = improved[np.argsort(-distances[improved])]  # the last one stays

@@ -2,7 +2,7 @@
 distance.
 
 For each cell the surface in it is either unknown or proved to lie in a slab (two parallel planes).
-Some cells also have a known point of the surface, their *foot*.
+Some cells also have a known point of the surface.
 """
 
 from __future__ import annotations
@@ -165,11 +165,11 @@ class CellTree:
         vector = self.tree.backend.Array3f
 
         def visit_cell(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-            best, foot = state
+            best, point = state
             cell = _CellRecord.of(vector, row)
             estimate = cell.estimate(x)
             is_best = active & (estimate < best)
-            return dr.select(is_best, estimate, best), dr.select(is_best, cell.foot, foot)
+            return dr.select(is_best, estimate, best), dr.select(is_best, cell.foot, point)
 
         upper_bound = (1 + 1e-9) * dr.sqrt(squared_distance_in_nearby_leaf(self.tree, x, 4))
         start = fmin(upper_bound, limit), vector(FAR_SENTINEL)
@@ -212,14 +212,14 @@ class CellTree:
         def with_candidate(cell: _CellRecord, estimate: Real, state: LoopValues) -> LoopValues:
             # The list is sorted: a nearer candidate takes the place of a listed one, which moves on
             # to the next place, unless both lead to the same closest point.
-            listed, foot = [*state], cell.foot
+            listed, point = [*state], cell.foot
             for k in range(0, len(listed), 2):
                 old, y = listed[k], listed[k + 1]
                 is_nearer, is_apart = estimate < old, cell.is_separated(y, 1.0)
                 listed[k] = dr.select(is_nearer, estimate, old)
-                listed[k + 1] = dr.select(is_nearer, foot, y)
+                listed[k + 1] = dr.select(is_nearer, point, y)
                 estimate = dr.select(is_apart, dr.select(is_nearer, old, estimate), dr.inf)
-                foot = dr.select(is_nearer, y, foot)
+                point = dr.select(is_nearer, y, point)
             return tuple(listed)
 
         def may_contain(low: Vec3, high: Vec3) -> Mask:

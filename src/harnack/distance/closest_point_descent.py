@@ -160,13 +160,13 @@ class ClosestPointDescent:
         step = -residual / slope
         exact = dataclasses.replace(sample, value_error=0.0, gradient_error=0.0)
         arrives = taylor_remainder(exact, dr.abs(step)) <= slope * at_y.level_uncertainty
-        foot, is_short = self._step_to_level(x, residual, at_y)
+        end, is_short = self._step_to_level(x, residual, at_y)
         arrives &= is_short
         is_found = is_minimum & (
             self._is_on_level(residual, at_y) | (self._is_level_resolved(at_y) & arrives)
         )
         radius = exclusion_radius(exact, rows, x, y)
-        return foot, is_found, dr.select(is_found, radius, 0)
+        return end, is_found, dr.select(is_found, radius, 0)
 
     def descend(self, x: Vec3, start: Vec3) -> tuple[Vec3, Mask, Mask]:
         """The closest point y to x that is found from `start`; whether it is a closest point (see
@@ -236,17 +236,17 @@ class ClosestPointDescent:
         """y moved onto the level, where y is closest to x except for a step as short as in
         `finish`; NaN elsewhere."""
         residual, at_y = self._evaluate(y)
-        foot, is_short = self._step_to_level(x, residual, at_y)
-        return dr.select(is_short & self._is_level_resolved(at_y), foot, dr.nan)
+        end, is_short = self._step_to_level(x, residual, at_y)
+        return dr.select(is_short & self._is_level_resolved(at_y), end, dr.nan)
 
     def _step_to_level(self, x: Vec3, residual: Real, at_y: _DescentState) -> tuple[Vec3, Mask]:
         """The end of Newton's step along the gradient, and whether the step is so short that the
         point stays the closest to x, to rounding."""
         slope = lengths.safe_norm(at_y.gradient)
         step = -residual / slope
-        foot = dr.fma(self.backend.Array3f(step / slope), at_y.gradient, at_y.y)
+        end = dr.fma(self.backend.Array3f(step / slope), at_y.gradient, at_y.y)
         limit = self.backend.machine_epsilon**0.5 * dr.norm(x - at_y.y) + at_y.level_uncertainty
-        return foot, dr.abs(step) <= limit
+        return end, dr.abs(step) <= limit
 
     def _evaluate(self, y: Vec3) -> tuple[Real, _DescentState]:
         """f - level at y, and the state at y."""

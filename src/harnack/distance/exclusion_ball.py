@@ -79,10 +79,10 @@ class _HessianBounds:
     def of(cls, sample: Sample, rows: Rows, way: Vec3) -> _HessianBounds:
         plane = TangentPlane.of(sample.gradient)
         eigen = SymmetricEigen2.of(*plane.restrict_hessian(rows))
-        least = dr.select(dr.dot(way, plane.n) > 0, eigen.smallest, -eigen.largest)
+        smallest = dr.select(dr.dot(way, plane.n) > 0, eigen.smallest, -eigen.largest)
         hn = matvec(rows, plane.n)
         squares = dr.squared_norm(rows[0]) + dr.squared_norm(rows[1]) + dr.squared_norm(rows[2])
         return cls(
-            fmin(least, 0), safe_norm(dr.cross(hn, plane.n)), dr.abs(dr.dot(hn, plane.n)),
+            fmin(smallest, 0), safe_norm(dr.cross(hn, plane.n)), dr.abs(dr.dot(hn, plane.n)),
             0.5 * dr.sqrt(squares),
         )  # fmt: skip

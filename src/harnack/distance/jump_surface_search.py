@@ -87,7 +87,7 @@ class JumpSurfaceSearch:
 
         def body(*state: Any) -> tuple[Any, ...]:
             last = NearestFacet(*state[:5])
-            probe, foot, nearest, n, active = state[5:]
+            probe, best, nearest, n, active = state[5:]
             is_first = active & (probe == 0)
             candidate = next_facet((last.sort_key, last.facet), limit, is_first)
             facet = _select(is_first, candidate, last)
@@ -97,12 +97,12 @@ class JumpSurfaceSearch:
             start, end = _probe(vector, probe, facet.normal)
             is_hit, hit_facet, hit_point = self._probe_hits(y, length, start, end, active)
             hit_point = dr.select((hit_facet == facet.facet) & (probe == 0), y, hit_point)
-            foot = dr.select(is_hit, hit_point, foot)
+            best = dr.select(is_hit, hit_point, best)
             n = n + dr.select(is_first, index(1), 0)
             last_probe = facet.is_inner | (probe == len(_EDGES))
             active &= ~is_hit & ~(last_probe & (n >= max_count))
             probe = dr.select(last_probe, index(0), probe + 1)
-            return *_parts(facet), probe, foot, nearest, n, active
+            return *_parts(facet), probe, best, nearest, n, active
 
         def is_active(*state: Any) -> Mask:
             return state[-1]
@@ -111,8 +111,8 @@ class JumpSurfaceSearch:
             *_parts(no_facet), index(0), vector(dr.nan), vector(dr.inf), index(0),
             backend.Bool(True),
         )  # fmt: skip
-        *_, foot, nearest, _, _ = dr.while_loop(start, is_active, body, label="sheets in turn")
-        return foot, nearest
+        *_, best, nearest, _, _ = dr.while_loop(start, is_active, body, label="sheets in turn")
+        return best, nearest
 
     def _probe_hits(
         self, y: Vec3, unit: Real, start: Vec3, end: Vec3, active: Mask
@@ -189,8 +189,8 @@ def straddles_level(surface: SurfaceTracer, y: Vec3, radius: Real, active: Mask)
     return (lower < upper) & (surface.levels.gaps(lower).above < upper - lower)
 
 
-def _parts(near: NearestFacet) -> tuple[Any, ...]:
-    return near.sort_key, near.facet, near.offset, near.normal, near.is_inner
+def _parts(facet: NearestFacet) -> tuple[Any, ...]:
+    return facet.sort_key, facet.facet, facet.offset, facet.normal, facet.is_inner
 
 
 def _select(mask: Mask, first: NearestFacet, second: NearestFacet) -> NearestFacet:
@@ -305,9 +305,9 @@ class _HitPlanes:
     def parts(self) -> tuple[Any, ...]:
         """Normals and offsets in turn, as the state of a loop."""
         return tuple(
-            part
+            number
             for plane in (self.first, self.second, self.third)
-            for part in (plane.normal, plane.offset)
+            for number in (plane.normal, plane.offset)
         )
 
     def updated(self, plane: _HitPlane, seen: Mask, best: Mask) -> _HitPlanes:
