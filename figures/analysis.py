@@ -54,13 +54,13 @@ def figure_7(width: int) -> Report:
 def _sphere() -> np.ndarray:
     """Points (n, 3), evenly spread over the unit sphere."""
     k = np.arange(4000) + 0.5
-    z, turn = 1 - 2 * k / 4000, np.pi * (1 + math.sqrt(5)) * k
+    z, angle = 1 - 2 * k / 4000, np.pi * (1 + math.sqrt(5)) * k
     across = np.sqrt(1 - z * z)
-    return np.column_stack([across * np.cos(turn), across * np.sin(turn), z])
+    return np.column_stack([across * np.cos(angle), across * np.sin(angle), z])
 
 
 def figure_19(width: int) -> Report:
-    """Riemann surfaces, cut to a ball and not."""
+    """Riemann surfaces, with and without a cut to a ball."""
     names = (
         ("riemann-log", "log"), ("riemann-sqrt", "square root"), ("riemann-cbrt", "cube root"),
         ("riemann-asin", "arc sine, real part"),

@@ -16,7 +16,7 @@ from .panels import Panel, doubled, fitting, montage
 from .published import MOST, Claim, distance_to_loop, published
 from .view import FALSE, MISSED, Array, View, marked
 
-# Normals that are farther off than this many degrees are marked.
+# Normals with a larger error than this, in degrees, are marked.
 _OFF = 1.0
 # A ball around the origin that holds the surface.
 _REACH = 1.3
@@ -28,8 +28,8 @@ def figure_12(width: int) -> Report:
     field = hk.SolidAngle(loop)
     view = View.of(loop, fitting(width // 2))  # these formulas take a minute in NumPy
     truth = view.trace(field, tolerance=1e-7, precision="double")
-    near = view.eye @ view.eye - (view.directions() @ view.eye) ** 2 < _REACH**2
-    d = view.directions()[near].astype(np.float32)
+    is_near = view.eye @ view.eye - (view.directions() @ view.eye) ** 2 < _REACH**2
+    d = view.directions()[is_near].astype(np.float32)
     middle = -(d @ view.eye.astype(np.float32))
     distance = distance_to_loop(loop)
     first, second, texts = [], [], []
@@ -46,11 +46,11 @@ def figure_12(width: int) -> Report:
         claim = Claim(look, -4 * np.pi, 2 * np.pi, 4 * np.pi)
         with np.errstate(all="ignore"):
             ends = published(claim, view.eye, d, middle - _REACH, middle + _REACH)
-        t = np.full(len(near), np.inf)
-        t[near] = ends.t
+        t = np.full(len(is_near), np.inf)
+        t[is_near] = ends.t
         real = np.where(truth.is_hit, truth.t, np.inf)
-        lost = np.zeros(len(near), bool)
-        lost[near] = ~np.isfinite(ends.t) & (ends.evaluations >= MOST)
+        lost = np.zeros(len(is_near), bool)
+        lost[is_near] = ~np.isfinite(ends.t) & (ends.evaluations >= MOST)
         missed = truth.is_hit & (t > real + APART) & ~lost
         false = np.isfinite(t) & (t < real - APART)
         shown = view.shade(truth.normal, truth.is_hit)
@@ -78,7 +78,7 @@ def figure_12(width: int) -> Report:
         )
         normal = np.zeros_like(truth.normal)
         normal[truth.is_hit] = np.nan_to_num(directions)
-        is_off = np.zeros(len(near), bool)
+        is_off = np.zeros(len(is_near), bool)
         is_off[truth.is_hit] = ~(angle < _OFF)
         shown = marked(view.shade(normal, truth.is_hit), is_off, MISSED)
         second.append(Panel(doubled(shown), name))

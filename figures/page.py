@@ -34,7 +34,7 @@ def picture_name(figure: Figure, *, is_plot: bool) -> str:
 
 
 def sections(page: Path) -> dict[int, str]:
-    """The sections of a page by number; none of a page that is not there."""
+    """The sections of a page by number; none if the page does not exist."""
     if not page.exists():
         return {}
     matches = _SECTION.findall(page.read_text(encoding="utf-8"))
@@ -42,7 +42,7 @@ def sections(page: Path) -> dict[int, str]:
 
 
 def write(page: Path, figure: Figure, report: Report, *, seconds: float, width: int) -> None:
-    """Write a figure's picture, and its section in place of the one that is there.
+    """Write a figure's picture, and its section in place of the existing section.
 
     Both are written to temporary names, and renamed."""
     folder = page.parent / "images" / "figures"
@@ -61,9 +61,9 @@ def write(page: Path, figure: Figure, report: Report, *, seconds: float, width: 
         f"in {seconds:.0f} s, harnack {hk.__version__}, {today}, panels of {width} pixels.*\n"
     )
     texts = {**sections(page), figure.number: text}
-    parts = [
+    blocks = [
         f"<!-- figure {number} -->\n{texts[number]}\n<!-- end of figure {number} -->\n"
         for number in sorted(texts)
     ]
     with write_atomically(page) as partial:
-        partial.write_text("\n".join([_HEADING, *parts]), encoding="utf-8")
+        partial.write_text("\n".join([_HEADING, *blocks]), encoding="utf-8")

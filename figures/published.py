@@ -1,7 +1,7 @@
-"""The published algorithms (paper, Alg. 1 and 2) as printed, in NumPy: what ours is compared with.
+"""The published algorithms (paper, Alg. 1 and 2) as printed, in NumPy, for comparison with ours.
 
-They prove as much as what is claimed to them: a lower bound that does not hold, or a value that is
-wrong by rounding, makes rays pass the surface. So they are unproved here.
+They prove as much as the claims that they are given: a lower bound that does not hold, or a value
+that is wrong by rounding, makes rays pass the surface. So they are unproved here.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ MOST = 1000
 
 @dataclass(frozen=True)
 class Claim:
-    """What the algorithm is told of a function f.
+    """The claims about a function f that the algorithm is given.
 
     look: from points (n, 3) to values (n,), gradients (n, 3), and radii (n,) of balls on which f >
-    lower. Of an angle f - level is reduced to [0, period) first, and lower is below that.
+    lower. For an angle f - level is reduced to [0, period) first, and lower is below that.
     """
 
     look: Callable[[Array], tuple[Array, Array, Array]]
@@ -37,8 +37,8 @@ class Claim:
 
 @dataclass(frozen=True)
 class Ends:
-    """Of n rays: t, inf where there is no hit, and evaluations, at most so many for rays that ran
-    out of steps."""
+    """The ends of n rays: t, inf where there is no hit, and the number of evaluations, at most
+    `most` for rays that ran out of steps."""
 
     t: Array
     evaluations: Array
