@@ -212,8 +212,8 @@ _PRECISIONS: dict[Any, Precision] = {
 def to_vector3(backend: Backend, vectors: Any, name: str = "vectors") -> Vec3:
     """Vectors as backend.Array3f, from an array-like of shape (n, 3) or a Dr.Jit 3-vector.
 
-    Values of an array-like must be finite. A Dr.Jit vector is passed on (its precision is
-    changed if need be) and its values are not looked at, which would end its recording.
+    Values of an array-like must be finite. A Dr.Jit vector is passed on (its precision is changed
+    if necessary) and its values are not checked, which would end its recording.
 
     Raises:
         TypeError: not numbers; a Dr.Jit array that is no 3-vector or of another backend.

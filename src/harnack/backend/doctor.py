@@ -30,7 +30,7 @@ class Finding:
     subject: the thing that was examined.
     detail: the result.
     ok: False if harnack cannot work like this.
-    advice: what to do about it; empty if nothing.
+    advice: what to do about a problem; empty if there is none.
     """
 
     subject: str

@@ -43,7 +43,7 @@ class LLVMLibrary:
     """A shared LLVM library on this machine.
 
     path: its path, with links not resolved.
-    major: its major version, None if it could not be told without loading it.
+    major: its major version, None if it cannot be determined without loading the library.
     """
 
     path: Path
@@ -67,10 +67,11 @@ def rejection_reason(major: int | None) -> str | None:
 
 
 def library_version(path: Path) -> int | None:
-    """Major version of the LLVM library at `path`, told without loading it; None if unknown.
+    """Major version of the LLVM library at `path`, determined without loading it; None if unknown.
 
-    The file name says it (libLLVM-15.so.1, libLLVM.so.19.1), or the name that the links end at,
-    or the library's own SONAME, or a folder on the way (Homebrew: Cellar/llvm/21.1.0/lib).
+    The version is in the file name (libLLVM-15.so.1, libLLVM.so.19.1), in the name that the links
+    end at, in the library's own SONAME, or in a folder of the path (Homebrew:
+    Cellar/llvm/21.1.0/lib).
     """
     real = Path(os.path.realpath(path))
     for name in (path.name, real.name):

@@ -101,7 +101,7 @@ def _entries(record: Any) -> list[Any]:
 Lanes = TypeVar("Lanes")
 Result = TypeVar("Result")
 
-# Lanes that share a queue: their number for each thread of a processor, and in all on a GPU.
+# Number of lanes that share a queue: for each thread of a processor, and in all on a GPU.
 _LANES_PER_THREAD, _LANES_ON_GPU = 1024, 1 << 17
 
 

@@ -105,15 +105,15 @@ def accepts_tensors(method: Method) -> Method:
 def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
     """A function of Dr.Jit tensors as one of PyTorch tensors, with derivatives.
 
-    As `drjit.wrap(source="torch", target="drjit")`, but nothing is dropped without a word: a result
-    that depends on the arguments by nothing that has a derivative, such as whether rays hit
-    (`hits.is_hit`), raises where its derivative is asked for; and a second backward pass
+    As `drjit.wrap(source="torch", target="drjit")`, but nothing is dropped silently: a result that
+    depends on the arguments only through quantities without a derivative, such as whether rays hit
+    (`hits.is_hit`), raises where its derivative is requested; and a second backward pass
     (`retain_graph=True`) is right, and calls `function` again.
 
     function: must be pure. It is called with a Dr.Jit tensor for each PyTorch tensor among its
         arguments, of the same shape and precision, and returns a Dr.Jit array or tensor, or several
-        in a tuple, list or dictionary; 3-vectors become tensors (n, 3). All else that it is given
-        it is given as it is; tensors in lists and the like are not looked for.
+        in a tuple, list or dictionary; 3-vectors become tensors (n, 3). All other arguments are
+        passed unchanged; tensors in lists and the like are not converted.
 
     Raises ImportError where PyTorch is not installed.
     """
@@ -220,20 +220,20 @@ def wrap_for_jax(
 ) -> Callable[..., Any]:
     """A function of Dr.Jit tensors as one of JAX arrays, with derivatives for `jax.grad`.
 
-    What `drjit.wrap(source="torch", target="drjit")` is for PyTorch; Dr.Jit has nothing for JAX.
+    The counterpart for JAX of `drjit.wrap(source="torch", target="drjit")`; Dr.Jit has none.
 
     function: must be pure. It is called with a Dr.Jit tensor for each array or number among its
         arguments, of the shape and precision that it has in JAX, and returns Dr.Jit arrays or
-        tensors, in tuples, lists and dictionaries if it likes; 3-vectors become arrays (n, 3).
+        tensors, possibly in tuples, lists and dictionaries; 3-vectors become arrays (n, 3).
     result_like: only for use inside `jax.jit`: a JAX function of the same arguments whose result
-        has the shapes and types of `function`'s. Only these are looked at.
+        has the shapes and types of `function`'s. Only these are used.
 
-    A result that depends on the arguments by nothing that has a derivative, such as whether rays
-    hit (`hits.is_hit`), raises where its derivative is asked for.
+    A result that depends on the arguments only through quantities without a derivative, such as
+    whether rays hit (`hits.is_hit`), raises where its derivative is requested.
 
     Derivatives are those of reverse mode (`jax.grad`, `jax.vjp`, `jax.jacrev`). A derivative calls
-    `function` a second time: JAX may keep what a forward pass leaves, and Dr.Jit's graph is none
-    of what it can keep.
+    `function` a second time: JAX may keep the values of a forward pass, but it cannot keep Dr.Jit's
+    graph.
 
     Raises ImportError where JAX is not installed.
     """

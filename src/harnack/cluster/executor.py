@@ -134,10 +134,10 @@ class Executor:
         """Call the method named `step` of a job with the arguments of each part, and yield the
         results in the order of the parts.
 
-        job: what `SerializedObject.serialize` takes. It is sent to each worker once, and opened
-            there once.
+        job: an object that `SerializedObject.serialize` accepts. It is sent to each worker once,
+            and opened there once.
 
-        Raises what the method raises.
+        Raises the errors of the method.
         """
         if self.client is None and self.checkpoint is None:
             method: TaskFunction = getattr(job, step)

@@ -413,7 +413,7 @@ def _hashing_pickler(base: Any) -> Callable[..., Any]:
             if not isinstance(reduced, tuple) or len(cast("tuple[Any, ...]", reduced)) < 3:
                 return cast("Any", reduced)
             constructor, arguments, state, *rest = cast("tuple[Any, ...]", reduced)
-            if isinstance(obj, ModuleType):  # what is left out says nothing
+            if isinstance(obj, ModuleType):  # attributes that are left out have no effect
                 state, _ = state
             state = _with_keys_apart(state)
             if is_code:

@@ -162,7 +162,7 @@ def _imports(code: CodeType) -> Iterator[tuple[int, str]]:
         if instruction.opname != "EXTENDED_ARG"
     ]
     for k, step in enumerate(instructions):
-        if step.opname == "IMPORT_NAME":  # after its level and what is taken from the module
+        if step.opname == "IMPORT_NAME":  # after its level and the names imported from the module
             yield int(instructions[k - 2].argval), str(step.argval)
 
 

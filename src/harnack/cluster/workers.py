@@ -1,4 +1,4 @@
-"""The workers of a Dask cluster: whether they can work, told before anything is sent to them."""
+"""The workers of a Dask cluster, and checks that they can work before anything is sent to them."""
 
 from __future__ import annotations
 

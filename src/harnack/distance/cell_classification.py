@@ -41,10 +41,10 @@ _DOMAIN_INSET, _MISS, _NEAR = 64.0, 48.0, 256.0
 _BEFORE = 0.999
 # States of a search at a corner of the domain: it turns into the other face, or has turned.
 _TURNING, _TURNED = 1, 2
-_LEAST_SHARE = 1e-9  # of a step: shorter ones are given up
-_LEAST_SLOPE = 0.05  # of (x - y) . t along the curve: steps are no longer than 20 times that
+_LEAST_SHARE = 1e-9  # of a step: shorter steps are given up
+_LEAST_SLOPE = 0.05  # of (x - y) . t along the curve: steps are at most 20 times that product
 _SAME = 1e-6  # cosines of angles between normals of one face differ from one by less
-_LEAST_STEP = 1e-8  # of the distance: what is left is half its square
+_LEAST_STEP = 1e-8  # of the distance: the relative error that remains is half its square
 
 
 @dataclass(frozen=True)

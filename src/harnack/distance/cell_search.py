@@ -79,8 +79,8 @@ class DescentMethods(Protocol):
         self, points: FloatArray, boundary: FloatArray, aside: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Iterate from points `boundary` (n, 3) of the curve at which the surface ends, along the
-        surface where it begins in the direction of x. aside: (n,) how far from the curve the
-        surface is looked for."""
+        surface where it begins in the direction of x. aside: (n,) the distance from the curve at
+        which the surface is searched."""
         ...
 
 
@@ -104,7 +104,7 @@ class InitialGuess:
 
 @dataclass(frozen=True)
 class StoppingRule:
-    """When a search ends.
+    """The condition under which a search ends.
 
     length: an improvement of the distance by less than this length is not pursued.
     prove: whether cells are subdivided until none of them may hold a point that is nearer than the
@@ -373,7 +373,7 @@ class _CellSearch:
 
     @staticmethod
     def _rounded(lower: FloatArray, points: FloatArray) -> FloatArray:
-        """Lower bounds (n,), less what rounding may have done to them."""
+        """Lower bounds (n,), less a bound of their rounding errors."""
         return lower * (1 - 1e-12) - 1e-15 * np.abs(points).max(axis=1)
 
     @property

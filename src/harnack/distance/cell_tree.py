@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 __all__ = ["FAR_SENTINEL", "BestCandidate", "CellTree", "SurfaceCells"]
 
 FAR_SENTINEL = 1e150
-"""Coordinates of missing feet, and the thickness of slabs that bound nothing."""
+"""Coordinates of missing surface points, and the thickness of slabs that bound nothing."""
 # Visits of nodes take a tenth of the time of visits of cells.
 _LEAF_SIZE = 1
 # Number of surface points of other parts of the surface that a walk finds.
@@ -89,7 +89,7 @@ class SurfaceCells:
 
     @property
     def is_single_piece(self) -> BoolArray:
-        """(n,) whether the surface in a cell is in one piece, as far as its slab tells."""
+        """(n,) whether the slab of a cell shows that the surface in it is in one piece."""
         return self.thickness < _SINGLE_PIECE_THICKNESS * self.half
 
     @classmethod

@@ -1,7 +1,7 @@
 """The level sets of a closed mesh's winding number as triangles, of which a tree finds the nearest.
 
-Off its triangles the winding number of a closed mesh is a whole number; so its level sets consist
-of triangles. A triangle belongs to a level as a whole unless others pass through it: then it is cut
+Off its triangles the winding number of a closed mesh is an integer, so its level sets consist of
+triangles. A triangle belongs to a level entirely, unless others pass through it: then it is cut
 along these first.
 """
 

@@ -163,7 +163,7 @@ class Enclosure(abc.ABC):
         """The enclosure that this class proves from ranges of the derivatives of f along the path;
         None if it does not use ranges.
 
-        length: the reach that is asked for.
+        length: the requested reach.
         slopes: of f along the path, at its start.
         """
         del function, slopes, length

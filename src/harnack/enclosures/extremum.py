@@ -221,8 +221,8 @@ class BranchPointEnclosure(Enclosure):
 
     distance_to_limit: y.
     max_fall_rate: v.
-    closest_parameter, closest_distance: how far ahead the path is closest to the branch line, and
-        its distance from the line there; both are lengths in the plane.
+    closest_parameter, closest_distance: the length at which the path is closest to the branch line,
+        and its distance from the line there; both are lengths in the plane.
     speed: of the path in the plane.
     exponent, constant: alpha and C.
     max_radius: the largest r that may be used, R less rounding.

@@ -51,7 +51,7 @@ def _check_branch_point(
     )
     angle = rng.uniform(-math.pi, math.pi, _PLACES)
     x, y = point.location.real + radii * np.cos(angle), point.location.imag + radii * np.sin(angle)
-    radii = np.hypot(x - point.location.real, y - point.location.imag)  # of the places as rounded
+    radii = np.hypot(x - point.location.real, y - point.location.imag)  # of the rounded points
     branches: Any = field.branches.prepare(backend)
     imaginary = field.part == "imag"
     period: float | None = branches.period(imaginary)

@@ -112,7 +112,7 @@ def proved_free_lengths(
     """The free lengths (n,) that a field's enclosures prove from points (n, 3) along unit
     directions.
 
-    ahead: (n,) the reach that is asked of the enclosures.
+    ahead: (n,) the reach that is requested of the enclosures.
     gaps: (n, 2) the differences in value to the levels below and above.
     forwards: False for the enclosures that look back from points on paths along `directions`.
     """
@@ -142,23 +142,24 @@ def check_field(
 ) -> None:
     """Test what a field promises by sampling it in double precision.
 
-    points: (n, 3) where to look, those outside the field's domain left out; by default `count`
-        random ones in its domain or, if it has none, around its default surface.
-    levels: whose `extent` to test; by default the default level.
-    directions: how many ways to walk from each point within each promise.
+    points: (n, 3) the points of the test, without the points outside the field's domain; by default
+        `count` random points in its domain or, if it has none, around its default surface.
+    levels: the levels whose `extent` is tested; by default the default level.
+    directions: the number of paths from each point within each promise.
 
     Checked: values and gradients are numbers, alike in both precisions within `Sample.value_error`;
-    the gradient is that of the value; f is harmonic where a ball of dimension 2 or 3 says so;
+    the gradient is that of the value; f is harmonic where a ball of dimension 2 or 3 promises it;
     `differentiable_value` is the value and has this gradient; `hessian`, where there is one, is
     symmetric, the derivative of the gradient and, of a harmonic f, without trace; the lift of f
-    keeps each promise (`HarmonicBall`, `Lipschitz`, `TaylorRemainder`) on the way to random points
-    of its ball, or for the last two to where that leaves the domain, and where a search for the
-    worst points and places in these balls ends (`search_violations`: some 14,000 places for each
-    promise); enclosures along paths, of a field that gives its own (`check_ray_samples`), hold;
-    some step is possible at most points; no level set leaves its `extent`. Jumps across sheets
-    are taken out on the way, and values may move between neighboring points by `Sample.value_error`
-    besides, as they do where a tree takes other clusters as wholes. Near the branch points of a
-    Riemann surface all branches are within what these say.
+    keeps each promise (`HarmonicBall`, `Lipschitz`, `TaylorRemainder`) on the path to random points
+    of its ball, or for the last two to the point where the path leaves the domain, and at the end
+    of a search for the worst pairs of points in these balls (`search_violations`: about 14,000
+    pairs for each promise); enclosures along paths, of a field that gives its own
+    (`check_ray_samples`), hold; a step is possible at most points; no level set leaves its
+    `extent`. Jumps across facets are taken out along the path, and values may in addition move
+    between neighboring points by `Sample.value_error`, as they do where a tree approximates other
+    clusters as wholes. Near the branch points of a Riemann surface all branches are within the
+    bounds of these points.
 
     The default takes one to three seconds for most fields, on two cores; for meshes about ten, for
     a `Morph` half a minute. It is a search and no proof: a promise that is wrong where nothing
@@ -166,7 +167,7 @@ def check_field(
 
     Raises:
         BrokenPromiseError: naming the promise and the point where it is broken.
-        ValueError: none of the points given lies in the field's domain.
+        ValueError: none of the points lies in the field's domain.
         TypeError: `evaluate` returns something else than a `Sample`.
     """
     check_is_field(field)

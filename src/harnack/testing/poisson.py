@@ -165,7 +165,7 @@ class GreenPotentials:
         return (density * value).sum(axis=1), (density * slope).sum(axis=1)
 
     def movement(self, q: FloatArray, density: FloatArray) -> FloatArray:
-        """w(q) - w(0) at places q (rows, m) on the axis, 0 <= q < 1: (rows, m)."""
+        """w(q) - w(0) at points q (rows, m) on the axis, 0 <= q < 1: (rows, m)."""
         total = np.zeros_like(q)
         for j in range(self.centers.shape[1]):
             y, size = self.centers[:, j, None], self.sizes[:, j, None]

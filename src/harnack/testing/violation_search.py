@@ -299,7 +299,7 @@ def search_violations(
     """Search for points that violate a promise, the one with index `number` in
     `Sample.all_promises`.
 
-    A promise that is wrong by a few percent is violated only in special places: beside a
+    A promise that is wrong by a few percent is violated only at special points: beside a
     singularity that lies just inside of the ball, or in the one direction in which a range is
     attained. Random points miss these. So this is a random local search over pairs: a point p,
     where the promise is made, and a point y in its ball, where it is tested. Both are moved at
@@ -307,8 +307,8 @@ def search_violations(
     and shrinks after failure.
 
     points: (n, 3), and `look` the samples of the field there. The search starts from the points
-        with the smallest radius and from others chosen at random, with y towards the border of the
-        ball: along the gradient, against it, and in random directions.
+        with the smallest radius and from random points, with y towards the border of the ball:
+        along the gradient, against it, and in random directions.
 
     Raises:
         BrokenPromiseError: naming both points of the worst pair.

@@ -200,14 +200,14 @@ class _LLVMParser:
     def __init__(self) -> None:
         self.statements: list[Statement] = []
         self.labels: dict[int, str] = {}
-        self._tables: dict[str, int] = {}  # which parameter a result was read from
+        self._tables: dict[str, int] = {}  # the parameter that a result was read from
         self._current_block = self.statements
         self._loops: list[Loop] = []
         self._aliases: dict[str, Operand] = {}  # names for other values
         self._addresses: dict[str, _Address] = {}
-        self._records: dict[str, _Address] = {}  # of results that are several numbers
+        self._records: dict[str, _Address] = {}  # of results that consist of several numbers
         self._label: str | None = None
-        self._labeled = ""  # the variable that it is of
+        self._labeled = ""  # the variable that has this label
         self._block = ""
         self._patterns = {
             word: [(re.compile(pattern), action) for pattern, action in rules]
@@ -452,7 +452,7 @@ class _LLVMParser:
     def _convert(self, result: str, name: str, source_type: str, a: str, target_type: str) -> None:
         kind, source = self._kind(target_type), self._kind(source_type)
         value = self._value(a, source)
-        if name == "bitcast" and isinstance(value, str):  # of what was read from a table
+        if name == "bitcast" and isinstance(value, str):  # of a value that was read from a table
             if value in self._tables:
                 self._label_parameter(self._tables[value])
             if kind == source:

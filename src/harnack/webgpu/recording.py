@@ -154,7 +154,7 @@ class _ArrayLabels:
 
     def _name_parts(self, gathered: Any, source: Any) -> None:
         for _, leaf in labeled_leaves("", gathered):
-            if leaf.state == dr.VarState.Evaluated:  # at a place that is known already
+            if leaf.state == dr.VarState.Evaluated:  # gathered at known indices
                 self.label_array(leaf)
             elif source.state == dr.VarState.Evaluated:
                 dr.set_label(leaf, self._table(source))
