@@ -33,9 +33,10 @@ CHECKED = 2_000
 SAMPLES = 384
 DAMAGE = ("none", "holes", "flips", "duplicates", "self-intersections")
 METHODS: tuple[tuple[Any, int], ...] = (("exact", 2), ("tree", 0), ("tree", 1), ("tree", 2))
-# Of the size of the mesh: tolerance of the trace, and how far a hit may be from the surface.
+# Of the size of the mesh: tolerance of the trace, and the largest distance of a hit from the
+# surface.
 TOLERANCE, REACH = 2e-5, 3e-4
-# Faces that are damaged at most: each makes three boundary edges, which the oracle pays for.
+# The largest number of damaged faces: each makes three boundary edges, which the oracle pays for.
 _MOST = 300
 
 FloatArray = npt.NDArray[np.float64]
@@ -86,30 +87,32 @@ def read(path: Path) -> MeshArrays:
     """Vertices and faces of a surface file, moved and scaled to a largest coordinate of one."""
     surface: Any = read_geometry(path, "winding")
     vertices = np.asarray(surface.vertices, np.float64)
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    vertices = (vertices - 0.5 * (low + high)) / (0.5 * float((high - low).max()))
+    lower, upper = vertices.min(axis=0), vertices.max(axis=0)
+    vertices = (vertices - 0.5 * (lower + upper)) / (0.5 * float((upper - lower).max()))
     return _rounded(vertices), np.asarray(surface.faces, np.int64)
 
 
 def damaged(mesh: MeshArrays, kind: str, seed: int) -> MeshArrays:
     """The mesh after one kind of damage."""
     vertices, faces = mesh
-    share = min(0.05, _MOST / len(faces))
+    fraction = min(0.05, _MOST / len(faces))
     if kind == "holes":  # four large ones and many small ones
         center = vertices[faces].mean(axis=1)
         rng = np.random.default_rng(seed)
-        for seen in center[rng.integers(len(faces), size=4)]:
-            nearest = np.argsort(((vertices[faces].mean(axis=1) - seen) ** 2).sum(axis=1))
+        for point in center[rng.integers(len(faces), size=4)]:
+            nearest = np.argsort(((vertices[faces].mean(axis=1) - point) ** 2).sum(axis=1))
             faces = np.delete(faces, nearest[: len(center) // 200], axis=0)
-        faces = remove_faces(faces, share, seed)
+        faces = remove_faces(faces, fraction, seed)
     elif kind == "flips":
-        faces = flip_faces(faces, share, seed)
+        faces = flip_faces(faces, fraction, seed)
     elif kind == "duplicates":
-        faces = duplicate_faces(faces, share, seed)
-        faces = duplicate_faces(faces, 0.5 * share, seed + 1, flipped=True)
+        faces = duplicate_faces(faces, fraction, seed)
+        faces = duplicate_faces(faces, 0.5 * fraction, seed + 1, flipped=True)
     elif kind == "self-intersections":
-        ball, more = icosphere(3)
-        faces = np.concatenate([remove_faces(faces, 0.5 * share, seed), more + len(vertices)])
+        ball, ball_faces = icosphere(3)
+        faces = np.concatenate(
+            [remove_faces(faces, 0.5 * fraction, seed), ball_faces + len(vertices)]
+        )
         vertices = np.concatenate([vertices, _rounded(0.35 * ball + [0.2, 0.1, 0.05])])
     elif kind != "none":
         raise ValueError(f"unknown damage {kind!r}")
@@ -123,13 +126,13 @@ def at_points(name: str, mesh: MeshArrays) -> Iterator[PointRow]:
     expected = winding_sum(vertices[faces])(x)
     for method, order in METHODS:
         field = WindingNumber(vertices, faces, method=method, order=order)
-        off = np.abs(field.value(x) - expected)
+        error = np.abs(field.value(x) - expected)
         bound = field.error_bound(x)
         yield PointRow(
             name, len(faces), len(field.mesh.singular_edges),
             method if method == "exact" else f"{method}, order {order}",
-            int((off > bound).sum()), float(np.median(off)), float(off.max()),
-            float((off / bound).max()),
+            int((error > bound).sum()), float(np.median(error)), float(error.max()),
+            float((error / bound).max()),
         )  # fmt: skip
 
 
@@ -138,34 +141,34 @@ def along_rays(
 ) -> Iterator[RayRow]:
     """First hits by both methods. Raises AssertionError if the oracle is not the direct sum."""
     vertices, faces = mesh
-    low, high = vertices.min(axis=0) - 0.05, vertices.max(axis=0) + 0.05
-    o, d = mesh_rays(vertices, faces, RAYS, seed, low, high)
+    lower, upper = vertices.min(axis=0) - 0.05, vertices.max(axis=0) + 0.05
+    o, d = mesh_rays(vertices, faces, RAYS, seed, lower, upper)
     oracle = WindingNumber(vertices, faces, method="exact")
     edges = oracle.mesh.vertices[oracle.mesh.singular_edges]
 
     def exact(x: FloatArray) -> FloatArray:
         return oracle.value(x, precision="double")
 
-    some = o + np.random.default_rng(seed).uniform(0, 3, (RAYS, 1)) * d
-    assert np.abs(exact(some) - winding_sum(vertices[faces])(some)).max() < 1e-9
-    far = 6.0
-    truth = first_side_changes(exact, o, d, 0.0, far, level=level, samples=SAMPLES)
+    points = o + np.random.default_rng(seed).uniform(0, 3, (RAYS, 1)) * d
+    assert np.abs(exact(points) - winding_sum(vertices[faces])(points)).max() < 1e-9
+    t_max = 6.0
+    truth = first_side_changes(exact, o, d, 0.0, t_max, level=level, samples=SAMPLES)
     plain = None if len(edges) else PlainHits.of(mesh, exact, o, d, TOLERANCE)
     for method in ("exact", "tree"):
         field: Any = WindingNumber(vertices, faces, method=method)
-        hits = hk.trace(field, o, d, level=level, t_max=far, tolerance=TOLERANCE)
+        hits = hk.trace(field, o, d, level=level, t_max=t_max, tolerance=TOLERANCE)
         t = np.where(hits.is_hit, hits.t, np.inf).astype(np.float64)
         verdict = judge(
-            t, exact, o, d, 0.0, far,
+            t, exact, o, d, 0.0, t_max,
             level=level, reach=REACH, edges=edges, truth=truth, samples=SAMPLES,
         )  # fmt: skip
         early = verdict.early
-        at = o[early] + t[early, None] * d[early]
+        early_points = o[early] + t[early, None] * d[early]
         yield RayRow(
             name, damage, level, len(edges), method,
             verdict.hits, int((hits.is_hit & (hits.primitive_index < 0)).sum()),
             len(verdict.missed), len(early),
-            int(_explained(field, exact, level, at, d[early]).sum()),
+            int(_explained(field, exact, level, early_points, d[early]).sum()),
             int((hits.status == hk.RayStatus.OUT_OF_STEPS).sum()),
             0 if plain is None else int(plain.clear.sum()),
             0 if plain is None else plain.others(t),
@@ -178,20 +181,20 @@ def _explained(
 ) -> npt.NDArray[np.bool_]:  # fmt: skip
     """Whether w just before or just behind points of rays is within its bound of the level.
 
-    A trace takes a point for a hit within twice the bound of the field it traces.
+    A trace accepts a point as a hit within twice the bound of the field that it traces.
     """
     traced = WindingNumber(
         field.mesh.vertices, field.mesh.triangles, method=field.method, accuracy=4.0
     )
-    near = np.zeros(len(x), np.bool_)
-    for aside in (-TOLERANCE, TOLERANCE) if len(x) else ():
-        there = x + aside * d
-        near |= np.abs(exact(there) - level) <= 2 * traced.error_bound(there) + TOLERANCE
-    return near
+    is_near = np.zeros(len(x), np.bool_)
+    for offset in (-TOLERANCE, TOLERANCE) if len(x) else ():
+        points = x + offset * d
+        is_near |= np.abs(exact(points) - level) <= 2 * traced.error_bound(points) + TOLERANCE
+    return is_near
 
 
 def _rounded(v: FloatArray) -> FloatArray:
-    """To single precision, so that all methods are asked about the same mesh and points."""
+    """The values in single precision, so that all methods get the same mesh and points."""
     return v.astype(np.float32).astype(np.float64)
 
 
@@ -210,7 +213,7 @@ def agreement(folder: Path) -> str:
         for point_row in at_points(path.stem, mesh):
             points.append(point_row)
             print(point_row, flush=True)
-        # Of a flat mesh w stays below 1/2 and comes near it only at the mesh: a level in between.
+        # For a flat mesh w stays below 1/2 and comes near it only at the mesh: a level in between.
         level = 0.25 if np.ptp(mesh[0], axis=0).min() == 0 else 0.5
         for seed, kind in enumerate(DAMAGE):
             for ray_row in along_rays(path.stem, damaged(mesh, kind, seed), kind, seed, level):

@@ -1,4 +1,4 @@
-"""How close shaded pictures come to many rays a pixel, and in what time, by the pixels chosen."""
+"""Error of shaded pictures against many rays a pixel, and their time, by the pixels chosen."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ Surfaces = Callable[[], "list[hk.Surface]"]
 
 def _wires() -> list[hk.Surface]:
     """Three rings, each a tenth to a fifth of a pixel wide."""
-    turn = np.linspace(0, 2 * math.pi, 61)
+    angle = np.linspace(0, 2 * math.pi, 61)
     rings = [
         hk.Tube(
-            radius * np.column_stack([np.cos(turn), tilt * np.sin(turn),
-                                      math.sqrt(1 - tilt**2) * np.sin(turn)]),
+            radius * np.column_stack([np.cos(angle), tilt * np.sin(angle),
+                                      math.sqrt(1 - tilt**2) * np.sin(angle)]),
             1e-3,
         )
         for radius, tilt in ((1.0, 0.2), (0.8, -0.5), (0.9, 0.8))
@@ -56,7 +56,7 @@ def _scenes() -> dict[str, tuple[Surfaces, str, Camera]]:
 
 
 def _many_rays(surfaces: list[hk.Surface], material: str, camera: Camera) -> np.ndarray:
-    """The picture with the same rays in every pixel, without choosing any.
+    """The picture with the same rays in every pixel, without a choice of pixels.
 
     A picture that is `side` times as wide and high has them all, each in the middle of a pixel.
     """
@@ -69,8 +69,8 @@ def _many_rays(surfaces: list[hk.Surface], material: str, camera: Camera) -> np.
 
 
 def _error(image: np.ndarray, reference: np.ndarray) -> float:
-    """Root mean square over all pixels and colors, of 255 steps of the picture that is shown."""
-    shown = (tone_map(one.astype(np.float32)).astype(float) for one in (image, reference))
+    """Root mean square error over all pixels and colors, in 255 steps of the displayed picture."""
+    shown = (tone_map(pixels.astype(np.float32)).astype(float) for pixels in (image, reference))
     first, second = shown
     return float(np.sqrt(np.mean((first - second) ** 2)))
 
@@ -104,10 +104,10 @@ def antialiasing() -> str:
                 start = time.perf_counter()
                 image = render(surfaces, **settings)
                 seconds.append(time.perf_counter() - start)
-            taken = min(seconds)
-            base = taken if spp == 1 else base
+            fastest = min(seconds)
+            base = fastest if spp == 1 else base
             lines.append(
                 f"| {name} | {antialias if spp > 1 else ''} | {spp} "
-                f"| {_error(image, reference):.2f} | {taken:.2f} | {taken / base:.2f} x |"
+                f"| {_error(image, reference):.2f} | {fastest:.2f} | {fastest / base:.2f} x |"
             )
     return "\n".join(lines) + "\n"

@@ -1,4 +1,4 @@
-"""What is commonly used to trace such surfaces, and how many first hits it misses.
+"""Methods in common use for tracing such surfaces, and the number of first hits that they miss.
 
 None of these methods proves anything about singular or angle-valued functions: they are here for
 comparison alone (the paper's Figs. 25 to 27). Rays are followed for 0 <= t <= 10 with at most 2500
@@ -22,16 +22,16 @@ from .scenes import camera, unit
 Array = npt.NDArray[np.float64]
 
 FAR, EPS, MOST = 10.0, 1e-3, 2500
-# A hit that is farther from the oracle's than this is another one.
+# A hit that is farther from the oracle's than this counts as another hit.
 APART = 0.02
 ACROSS, SAMPLES = 64, 6000
-# Samples of a ray that are evaluated together.
+# Number of samples of a ray that are evaluated together.
 _AT_ONCE = 50
 
 
 @dataclass(frozen=True)
 class Rays:
-    """Values of a field along rays, counted: n rays, of which `far` (n,) is looked at."""
+    """Values of a field along n rays, with counts of evaluations; rays end at `far` (n,)."""
 
     field: hk.Field
     level: float
@@ -42,7 +42,7 @@ class Rays:
 
     @classmethod
     def of(cls, field: hk.Field, level: float, across: int) -> Rays:
-        """Of the camera of all benchmarks."""
+        """The rays of the camera of all benchmarks."""
         eye, d = camera(across)
         return cls.along(field, level, eye, d)[0]
 
@@ -50,16 +50,16 @@ class Rays:
     def along(
         cls, field: hk.Field, level: float, eye: Array, d: Array
     ) -> tuple[Rays, npt.NDArray[np.bool_]]:
-        """Of one origin (3,) and unit directions (m, 3), from where they enter the field's domain;
-        and which (m,) of them do."""
+        """Rays of one origin (3,) and unit directions (m, 3), from the points where they enter the
+        field's domain; and which (m,) of them enter it."""
         o, far = np.tile(eye, (len(d), 1)), np.full(len(d), FAR)
-        meets = np.ones(len(d), bool)
+        is_hit = np.ones(len(d), bool)
         if isinstance(field.domain, hk.Ball):
             middle = -(o * d).sum(axis=1)
             half = field.domain.radius**2 - (o**2).sum(axis=1) + middle**2
-            meets, half = half > 0, np.sqrt(np.maximum(half, 0))
-            o, d, far = (o + (middle - half)[:, None] * d)[meets], d[meets], 2 * half[meets]
-        return cls(field, level, o, d, far, np.zeros(len(d), np.int64)), meets
+            is_hit, half = half > 0, np.sqrt(np.maximum(half, 0))
+            o, d, far = (o + (middle - half)[:, None] * d)[is_hit], d[is_hit], 2 * half[is_hit]
+        return cls(field, level, o, d, far, np.zeros(len(d), np.int64)), is_hit
 
     def points(self, t: Array, rows: npt.NDArray[np.int64]) -> Array:
         """(n, 3) the points at t of some rays."""
@@ -87,40 +87,40 @@ def fixed_steps(step: float) -> Method:
 
     def method(rays: Rays) -> Array:
         n = len(rays.counts)
-        found, active = np.full(n, np.inf), np.arange(n)
+        crossings, active = np.full(n, np.inf), np.arange(n)
         t, before = np.zeros(n), rays.above(np.zeros(n), np.arange(n))
         half = math.inf if rays.field.period is None else 0.5 * rays.field.period
         for _ in range(min(MOST, math.ceil(FAR / step))):
             if not len(active):
                 break
-            now = rays.above(t[active] + step, active)
+            value = rays.above(t[active] + step, active)
             last = before[active]
-            hit = (last * now <= 0) & (np.abs(last - now) < half)
-            share = last / np.where(last == now, 1, last - now)
-            found[active[hit]] = (t[active] + step * share)[hit]
+            hit = (last * value <= 0) & (np.abs(last - value) < half)
+            fraction = last / np.where(last == value, 1, last - value)
+            crossings[active[hit]] = (t[active] + step * fraction)[hit]
             t[active] += step
-            before[active] = now
+            before[active] = value
             active = active[~hit]
-        return found
+        return crossings
 
     return method
 
 
 def sphere_tracing(constant: float) -> Method:
-    """Steps of |f - level|/L with a constant that is claimed and does not hold."""
+    """Steps of |f - level|/L with a claimed constant that does not hold."""
 
     def method(rays: Rays) -> Array:
         n = len(rays.counts)
-        found, t, active = np.full(n, np.inf), np.zeros(n), np.arange(n)
+        crossings, t, active = np.full(n, np.inf), np.zeros(n), np.arange(n)
         for _ in range(MOST):
             if not len(active):
                 break
             gap = np.abs(rays.above(t[active], active))
             hit = gap < EPS
-            found[active[hit]] = t[active[hit]]
+            crossings[active[hit]] = t[active[hit]]
             t[active] += gap / constant
             active = active[~hit & (t[active] <= FAR)]
-        return found
+        return crossings
 
     return method
 
@@ -132,8 +132,8 @@ def newton(rays: Rays) -> Array:
     for _ in range(8):
         value, slope = rays.above(t, rows), rays.slope(t, rows)
         t = t - np.clip(value / np.where(slope == 0, 1e-30, slope), -2, 2)
-    good = (np.abs(rays.above(t, rows)) < EPS) & (t >= 0) & (t <= FAR)
-    return np.where(good, t, np.inf)
+    is_root = (np.abs(rays.above(t, rows)) < EPS) & (t >= 0) & (t <= FAR)
+    return np.where(is_root, t, np.inf)
 
 
 def bisection(rays: Rays) -> Array:
@@ -143,38 +143,41 @@ def bisection(rays: Rays) -> Array:
     """
     n = len(rays.counts)
     rows = np.arange(n)
-    low, high = np.zeros(n), np.full(n, 0.125)
-    start = rays.above(low, rows)
-    end, found = start.copy(), np.full(n, np.inf)
+    lower, upper = np.zeros(n), np.full(n, 0.125)
+    start = rays.above(lower, rows)
+    end, crossings = start.copy(), np.full(n, np.inf)
     active = rows
     for _ in range(10):
-        end[active] = rays.above(high[active], active)
+        end[active] = rays.above(upper[active], active)
         active = active[start[active] * end[active] > 0]
-        high[active] *= 2
+        upper[active] *= 2
     active = rows[start * end <= 0]
     for _ in range(100):
         if not len(active):
             break
-        middle = 0.5 * (low[active] + high[active])
+        middle = 0.5 * (lower[active] + upper[active])
         value = rays.above(middle, active)
-        hit = (np.abs(value) < EPS) | (high[active] - low[active] < 1e-8)
-        found[active[hit]] = middle[hit]
-        before = value * start[active] > 0
-        low[active] = np.where(before, middle, low[active])
-        high[active] = np.where(before, high[active], middle)
+        hit = (np.abs(value) < EPS) | (upper[active] - lower[active] < 1e-8)
+        crossings[active[hit]] = middle[hit]
+        is_before = value * start[active] > 0
+        lower[active] = np.where(is_before, middle, lower[active])
+        upper[active] = np.where(is_before, upper[active], middle)
         active = active[~hit]
-    return np.where(found <= FAR, found, np.inf)
+    return np.where(crossings <= FAR, crossings, np.inf)
 
 
 def interval_analysis(rays: Rays) -> Array:
     """The first interval of a bisection of [0, 10], 14 times, in which f may take the level.
 
-    Of a curve: the fan of triangles in interval arithmetic. An arctangent whose arguments may lie
+
+
+    For a curve: the fan of triangles in interval arithmetic. An arctangent whose arguments may lie
+
     on the cut is anything between -pi and pi.
     """
     n = len(rays.counts)
     bound = _fan_bounds if isinstance(rays.field, hk.SolidAngle) else _gyroid_bounds
-    found, depth = np.full(n, np.inf), 14
+    crossings, depth = np.full(n, np.inf), 14
     low = np.zeros((n, depth + 2))
     high = np.full((n, depth + 2), FAR)
     top = np.ones(n, np.int64)
@@ -187,17 +190,17 @@ def interval_analysis(rays: Rays) -> Array:
         rays.counts[active] += 1
         straddles = (lower <= rays.level) & (upper >= rays.level)
         if rays.field.period is not None:  # any of the levels
-            turns = np.ceil((lower - rays.level) / rays.field.period)
-            straddles = rays.level + turns * rays.field.period <= upper
+            periods = np.ceil((lower - rays.level) / rays.field.period)
+            straddles = rays.level + periods * rays.field.period <= upper
         leaf = b - a < max(2 * EPS, 1.5 * FAR / 2**depth)
-        hit, split = straddles & leaf, straddles & ~leaf
-        found[active[hit]] = 0.5 * (a + b)[hit]
-        rows, middle, k = active[split], 0.5 * (a + b)[split], k[split]
-        low[rows, k], high[rows, k] = middle, b[split]
-        low[rows, k + 1], high[rows, k + 1] = a[split], middle
+        is_hit, is_split = straddles & leaf, straddles & ~leaf
+        crossings[active[is_hit]] = 0.5 * (a + b)[is_hit]
+        rows, middle, k = active[is_split], 0.5 * (a + b)[is_split], k[is_split]
+        low[rows, k], high[rows, k] = middle, b[is_split]
+        low[rows, k + 1], high[rows, k + 1] = a[is_split], middle
         top[rows] = k + 2
-        active = active[~hit & (top[active] > 0)]
-    return found
+        active = active[~is_hit & (top[active] > 0)]
+    return crossings
 
 
 Interval = tuple[Array, Array]
@@ -221,11 +224,11 @@ def _less(x: Interval, y: Interval) -> Interval:
 
 
 def _length(x: list[Interval]) -> Interval:
-    low, high = 0.0, 0.0
+    lower, upper = 0.0, 0.0
     for a, b in x:
-        least = np.where((a <= 0) & (b >= 0), 0, np.minimum(np.abs(a), np.abs(b)))
-        low, high = low + least**2, high + np.maximum(np.abs(a), np.abs(b)) ** 2
-    return np.sqrt(low), np.sqrt(high)
+        min_abs = np.where((a <= 0) & (b >= 0), 0, np.minimum(np.abs(a), np.abs(b)))
+        lower, upper = lower + min_abs**2, upper + np.maximum(np.abs(a), np.abs(b)) ** 2
+    return np.sqrt(lower), np.sqrt(upper)
 
 
 def _fan_bounds(
@@ -236,7 +239,7 @@ def _fan_bounds(
     assert isinstance(field, hk.SolidAngle)
     p, q = rays.points(start, rows), rays.points(end, rows)
     box = np.minimum(p, q), np.maximum(p, q)
-    low, high = np.zeros(len(rows)), np.zeros(len(rows))
+    lower, upper = np.zeros(len(rows)), np.zeros(len(rows))
     for loop in field.loops:
         middle = loop.mean(axis=0)
         for first, second in zip(loop, np.roll(loop, -1, axis=0), strict=True):
@@ -254,11 +257,11 @@ def _fan_bounds(
                 _product(_product(la, lb), lc), _product(_dot(a, b), lc),
                 _product(_dot(b, c), la), _product(_dot(c, a), lb),
             )  # fmt: skip
-            cut = (x[0] <= 0) & (y[0] <= 0) & (y[1] >= 0)
+            at_cut = (x[0] <= 0) & (y[0] <= 0) & (y[1] >= 0)
             angles = np.stack([np.arctan2(v, u) for u in x for v in y])
-            low += np.where(cut, -2 * np.pi, 2 * angles.min(axis=0))
-            high += np.where(cut, 2 * np.pi, 2 * angles.max(axis=0))
-    return low, high
+            lower += np.where(at_cut, -2 * np.pi, 2 * angles.min(axis=0))
+            upper += np.where(at_cut, 2 * np.pi, 2 * angles.max(axis=0))
+    return lower, upper
 
 
 def _gyroid_bounds(
@@ -267,18 +270,18 @@ def _gyroid_bounds(
     """Bounds of sin x cos y + sin y cos z + sin z cos x between two lengths."""
     field = rays.field
     assert isinstance(field, hk.Gyroid)
-    unit = 2 * np.pi / field.cell
-    p, q = unit * rays.points(start, rows), unit * rays.points(end, rows)
+    frequency = 2 * np.pi / field.cell
+    p, q = frequency * rays.points(start, rows), frequency * rays.points(end, rows)
     box = np.minimum(p, q), np.maximum(p, q)
     sines = [_sine(box[0][:, k], box[1][:, k]) for k in range(3)]
     cosines = [_sine(box[0][:, k] + np.pi / 2, box[1][:, k] + np.pi / 2) for k in range(3)]
     return _sum(*(_product(sines[k], cosines[(k + 1) % 3]) for k in range(3)))
 
 
-def _sine(low: Array, high: Array) -> Interval:
-    ends = np.sin(low), np.sin(high)
-    top = np.floor((high - np.pi / 2) / (2 * np.pi)) > np.floor((low - np.pi / 2) / (2 * np.pi))
-    foot = np.floor((high + np.pi / 2) / (2 * np.pi)) > np.floor((low + np.pi / 2) / (2 * np.pi))
+def _sine(lower: Array, upper: Array) -> Interval:
+    ends = np.sin(lower), np.sin(upper)
+    top = np.floor((upper - np.pi / 2) / (2 * np.pi)) > np.floor((lower - np.pi / 2) / (2 * np.pi))
+    foot = np.floor((upper + np.pi / 2) / (2 * np.pi)) > np.floor((lower + np.pi / 2) / (2 * np.pi))
     return np.where(foot, -1, np.minimum(*ends)), np.where(top, 1, np.maximum(*ends))
 
 
@@ -295,35 +298,35 @@ METHODS: tuple[tuple[str, Method], ...] = (
 
 
 def oracle(rays: Rays) -> Array:
-    """First crossings by samples 1/2000 apart."""
+    """First crossings, from samples 1/2000 apart."""
     n = len(rays.counts)
-    found = np.full(n, np.inf)
+    crossings = np.full(n, np.inf)
     middle = -(rays.origins * rays.directions).sum(axis=1)
     start, end = np.maximum(middle - 1.5, 0), np.minimum(middle + 1.5, rays.far)
     half = math.inf if rays.field.period is None else 0.5 * rays.field.period
     rows = np.flatnonzero(end > start)
     before = rays.above(start[rows], rows)
-    for shares in np.array_split(np.arange(1, SAMPLES) / (SAMPLES - 1), SAMPLES // _AT_ONCE):
+    for fractions in np.array_split(np.arange(1, SAMPLES) / (SAMPLES - 1), SAMPLES // _AT_ONCE):
         if not len(rows):
             break
-        t = start[rows] + (end - start)[rows] * shares[:, None]
-        many = np.broadcast_to(rows, t.shape)
-        value = rays.above(t.ravel(), many.ravel()).reshape(t.shape)
+        t = start[rows] + (end - start)[rows] * fractions[:, None]
+        ray_ids = np.broadcast_to(rows, t.shape)
+        value = rays.above(t.ravel(), ray_ids.ravel()).reshape(t.shape)
         last = np.concatenate([before[None], value[:-1]])
         crosses = (last * value <= 0) & (np.abs(last - value) < half)
         hit, first = crosses.any(axis=0), crosses.argmax(axis=0)
         at = first[hit], np.flatnonzero(hit)
-        share = last[at] / np.where(last[at] == value[at], 1, last[at] - value[at])
+        fraction = last[at] / np.where(last[at] == value[at], 1, last[at] - value[at])
         step = (end - start)[rows[hit]] / (SAMPLES - 1)
-        found[rows[hit]] = t[at] + (share - 1) * step
+        crossings[rows[hit]] = t[at] + (fraction - 1) * step
         rows, before = rows[~hit], value[-1, ~hit]
-    return found
+    return crossings
 
 
 @dataclass(frozen=True)
 class Result:
-    """Of one method on n rays. late (n,): first crossings that it passed. early (n,): hits where
-    there is none, or before the first."""
+    """The result of a method on n rays. late (n,): first crossings that it passed. early (n,): hits
+    where there is none, or before the first."""
 
     name: str
     late: npt.NDArray[np.bool_]
@@ -364,7 +367,7 @@ def measure_ours(rays: Rays, truth: Array) -> Result:
 
 
 def compare(field: hk.Field, level: float, across: int = ACROSS) -> tuple[list[Result], Array]:
-    """All methods on one field, ours last, and the oracle's first crossings."""
+    """All methods on one field, harnack last, and the oracle's first crossings."""
     rays = Rays.of(field, level, across)
     truth = oracle(rays)
     results = [measure(rays, name, method, truth) for name, method in METHODS]
@@ -396,9 +399,9 @@ def baselines() -> str:
     for scene, field, level in scenes:
         results, truth = compare(field, level)
         hits = int(np.isfinite(truth).sum())
-        for one in results:
+        for result in results:
             lines.append(
-                f"| {scene} ({hits} hits) | {one.name} | {one.missed} | {one.false} "
-                f"| {one.evaluations:.1f} |"
+                f"| {scene} ({hits} hits) | {result.name} | {result.missed} | {result.false} "
+                f"| {result.evaluations:.1f} |"
             )
     return "\n".join(lines) + "\n"

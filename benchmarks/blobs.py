@@ -1,4 +1,4 @@
-"""Compact blobs as a formula of records: what the published methods are compared on.
+"""Compact blobs as a formula of records: the field of comparisons with published methods.
 
 f = sum of a max(1 - |p - c|^2/R^2, 0)^3 - T over the blobs. The formula itself goes through every
 arithmetic; ranges of derivatives in closed form, and those published for segment tracing, are given
@@ -63,21 +63,21 @@ class Scene:
     def rays(self, count: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Origins, unit directions and lengths of rays between random points of the box's faces."""
         generator = np.random.default_rng(seed)
-        low, high = self.box
-        size = high - low
+        lower, upper = self.box
+        size = upper - lower
         areas = np.array([size[1] * size[2], size[0] * size[2], size[0] * size[1]])
 
         def points() -> np.ndarray:
             axis = generator.choice(3, count, p=areas / areas.sum())
             side = generator.integers(0, 2, count)
-            p = low + generator.random((count, 3)) * size
-            p[np.arange(count), axis] = np.where(side, high[axis], low[axis])
+            p = lower + generator.random((count, 3)) * size
+            p[np.arange(count), axis] = np.where(side, upper[axis], lower[axis])
             return p
 
         a, b = points(), points()
         length = np.linalg.norm(b - a, axis=1)
-        kept = length > 1e-6
-        return a[kept], ((b - a) / length[:, None])[kept], length[kept]
+        is_long = length > 1e-6
+        return a[is_long], ((b - a) / length[:, None])[is_long], length[is_long]
 
     def values(self, points: np.ndarray, groups: int = 1) -> np.ndarray:
         """f in double precision, at points (n, 3): of several groups the largest sum, where blob k
@@ -89,30 +89,30 @@ class Scene:
         return sums.max(0)
 
     def crossings(self, rays: tuple[np.ndarray, ...], groups: int, samples: int) -> np.ndarray:
-        """How often f changes sign between so many points of each ray."""
+        """The number of sign changes of f between `samples` + 1 points of each ray."""
         o, d, length = rays
-        before, count = None, np.zeros(len(o), int)
+        previous, count = None, np.zeros(len(o), int)
         for k in range(samples + 1):
-            inside = self.values(o + (length * k / samples)[:, None] * d, groups) >= 0
-            count += 0 if before is None else inside != before
-            before = inside
+            is_inside = self.values(o + (length * k / samples)[:, None] * d, groups) >= 0
+            count += 0 if previous is None else is_inside != previous
+            previous = is_inside
         return count
 
     def field(self, groups: int = 1) -> hk.Blobs:
-        """The same field plus its threshold, as the library has it."""
+        """The same field plus its threshold, in the library's form."""
         grouped = None if groups == 1 else np.arange(len(self.centers)) % groups
         kernel = CompactKernel(support=self.width)
         return hk.Blobs(self.centers, self.reaches / self.width, kernel=kernel, groups=grouped)
 
     def first_inside(self, rays: tuple[np.ndarray, ...], samples: int) -> np.ndarray:
-        """Where f is first seen to be positive, at so many points of each ray; else infinity."""
+        """The first of `samples` + 1 points of each ray at which f is positive; else infinity."""
         o, d, length = rays
-        found = np.full(len(o), np.inf)
+        entries = np.full(len(o), np.inf)
         for k in range(samples + 1):
             t = length * k / samples
-            inside = self.values(o + t[:, None] * d) >= 0
-            found = np.where(inside & np.isinf(found), t, found)
-        return found
+            is_inside = self.values(o + t[:, None] * d) >= 0
+            entries = np.where(is_inside & np.isinf(entries), t, entries)
+        return entries
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +122,7 @@ class BlobFormula(Formula):
     exact: whether ranges of the first derivative are exact, for each blob; else products of the
         ranges of the kernel's and the distance's derivative, as in segment tracing (Galin et al.
         2020; Aydinlilar and Zanni 2023, equation 21).
-    groups: as in `Scene.values`; with several, ranges of derivatives are not to be asked for.
+    groups: as in `Scene.values`; ranges of derivatives are not supported for several.
     """
 
     scene: Scene
@@ -134,8 +134,8 @@ class BlobFormula(Formula):
     def prepare(self, backend: Any) -> BlobFormula:
         scene = self.scene
         table = np.column_stack([scene.centers, scene.reaches**-2.0, scene.heights])
-        parts = [RecordTable.upload(backend, table[k :: self.groups]) for k in range(self.groups)]
-        return dataclasses.replace(self, records=tuple(parts))
+        tables = [RecordTable.upload(backend, table[k :: self.groups]) for k in range(self.groups)]
+        return dataclasses.replace(self, records=tuple(tables))
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         assert self.records, "call prepare"
@@ -145,9 +145,9 @@ class BlobFormula(Formula):
             u, v, w = x - row[0], y - row[1], z - row[2]
             return kernel(1.0 - (u * u + v * v + w * w) * row[3]) * row[4]
 
-        sums = [summed(one, blob) for one in self.records]
-        for one in sums[1:]:
-            sums[0] = hk.maximum(sums[0], one)
+        sums = [summed(group, blob) for group in self.records]
+        for group in sums[1:]:
+            sums[0] = hk.maximum(sums[0], group)
         return sums[0] - self.scene.threshold
 
     def restrict(self, p: Any, direction: Any) -> BlobsAlong:
@@ -169,14 +169,14 @@ class BlobsAlong(FormulaOnRay):
             center, rate, height = row[:3], row[3], row[4]
             v = [center[k] - self.p[k] for k in range(3)]
             middle = sum((v[k] * self.direction[k] for k in range(1, 3)), v[0] * self.direction[0])
-            aside = [v[k] - middle * self.direction[k] for k in range(3)]
-            away = aside[0] * aside[0] + aside[1] * aside[1] + aside[2] * aside[2]
-            top = 1 - away * rate
+            offset = [v[k] - middle * self.direction[k] for k in range(3)]
+            squared_distance = offset[0] * offset[0] + offset[1] * offset[1] + offset[2] * offset[2]
+            top = 1 - squared_distance * rate
             half = dr.sqrt(fmax(top, 0) / rate)
-            unit = _ROUNDINGS * float(dr.epsilon(type(top)))
-            there = half > 0
-            slack = dr.select(there, unit * 6 * height * dr.sqrt(rate), 0)
-            bent = dr.select(there, unit * 30 * height * rate, 0)
+            rounding = _ROUNDINGS * float(dr.epsilon(type(top)))
+            is_inside = half > 0
+            slope_error = dr.select(is_inside, rounding * 6 * height * dr.sqrt(rate), 0)
+            second_error = dr.select(is_inside, rounding * 30 * height * rate, 0)
 
             def first(x: Any) -> Any:
                 w = fmax(top - rate * x * x, 0)
@@ -193,13 +193,13 @@ class BlobsAlong(FormulaOnRay):
                     near = math.sqrt(0.2) * half
                     low, high = _extrema(first, x, y, half, (near, -near))
                 else:
-                    low, high = _product(away, rate, height, x, y)
+                    low, high = _product(squared_distance, rate, height, x, y)
                 far = math.sqrt(0.6) * half
-                least, most = _extrema(second, x, y, half, (far, -far, 0 * far))
+                min_second, max_second = _extrema(second, x, y, half, (far, -far, 0 * far))
                 old = state[4 * k : 4 * k + 4]
                 new += [
-                    old[0] + (low - slack), old[1] + (high + slack),
-                    old[2] + (least - bent), old[3] + (most + bent),
+                    old[0] + (low - slope_error), old[1] + (high + slope_error),
+                    old[2] + (min_second - second_error), old[3] + (max_second + second_error),
                 ]  # fmt: skip
             return tuple(new)
 
@@ -215,35 +215,35 @@ class BlobsAlong(FormulaOnRay):
 def _extrema(
     function: Callable[[Any], Any], x: Any, y: Any, half: Any, places: tuple[Any, ...]
 ) -> tuple[Any, Any]:
-    """Least and largest value on [x, y] of a function that is 0 outside [-half, half] and has no
-    extrema but at the places."""
+    """The smallest and the largest value on [x, y] of a function that is 0 outside [-half, half]
+    and has no extrema but at the places."""
     a, b = clamp(x, -half, half), clamp(y, -half, half)
-    low = high = function(a)
-    for place in (b, *(clamp(one, a, b) for one in places)):
-        value = function(place)
-        low, high = fmin(low, value), fmax(high, value)
-    return low, high
+    lower = upper = function(a)
+    for point in (b, *(clamp(place, a, b) for place in places)):
+        value = function(point)
+        lower, upper = fmin(lower, value), fmax(upper, value)
+    return lower, upper
 
 
-def _product(away: Any, rate: Any, height: Any, x: Any, y: Any) -> tuple[Any, Any]:
+def _product(square: Any, rate: Any, height: Any, x: Any, y: Any) -> tuple[Any, Any]:
     """The range of k'(d) times the range of d', with d the distance from the center."""
-    first, last = dr.sqrt(away + x * x), dr.sqrt(away + y * y)
-    ratios = [one / fmax(d, 1e-20) for one, d in ((x, first), (y, last))]
-    nearest = dr.select((x < 0) & (y > 0), dr.sqrt(away), fmin(first, last))
+    first, last = dr.sqrt(square + x * x), dr.sqrt(square + y * y)
+    ratios = [factor / fmax(d, 1e-20) for factor, d in ((x, first), (y, last))]
+    nearest = dr.select((x < 0) & (y > 0), dr.sqrt(square), fmin(first, last))
     farthest = fmax(first, last)
 
     def kernel(d: Any) -> Any:
         w = fmax(1 - rate * d * d, 0)
         return -6 * height * rate * d * w * w
 
-    steepest = clamp(dr.sqrt(0.2 / rate), nearest, farthest)
+    peak = clamp(dr.sqrt(0.2 / rate), nearest, farthest)
     ends = kernel(nearest), kernel(farthest)
-    low, high = fmin(fmin(*ends), kernel(steepest)), fmax(*ends)
+    low, high = fmin(fmin(*ends), kernel(peak)), fmax(*ends)
     products = [k * ratio for k in (low, high) for ratio in ratios]
-    least = most = products[0]
-    for one in products[1:]:
-        least, most = fmin(least, one), fmax(most, one)
-    return least, most
+    lower = upper = products[0]
+    for factor in products[1:]:
+        lower, upper = fmin(lower, factor), fmax(upper, factor)
+    return lower, upper
 
 
 def summed(records: RecordTable, term: Callable[[list[Any]], Any]) -> Any:
@@ -253,9 +253,9 @@ def summed(records: RecordTable, term: Callable[[list[Any]], Any]) -> Any:
 
     def body(i: Any, *state: Any) -> tuple[Any, ...]:
         total = _rebuilt(start, iter(state)) + term(records.read_record(i))
-        return i + 1, *(zero + one for one in _numbers(total))
+        return i + 1, *(zero + number for number in _numbers(total))
 
-    first = (records.backend.UInt32(1), *(zero + one for one in _numbers(start)))
+    first = (records.backend.UInt32(1), *(zero + number for number in _numbers(start)))
     state = dr.while_loop(first, lambda i, *_: i < records.iteration_count, body, label="blobs")
     return _rebuilt(start, iter(state[1:]))
 
@@ -266,8 +266,8 @@ def _numbers(x: Any) -> Iterator[Any]:
         for entry in dataclasses.fields(x):
             yield from _numbers(getattr(x, entry.name))
     elif isinstance(x, tuple):
-        for one in x:
-            yield from _numbers(one)
+        for element in x:
+            yield from _numbers(element)
     elif x is not None and not isinstance(x, int):
         yield x
 
@@ -280,5 +280,5 @@ def _rebuilt(like: Any, numbers: Iterator[Any]) -> Any:
         }
         return type(like)(**values)
     if isinstance(like, tuple):
-        return tuple(_rebuilt(one, numbers) for one in like)
+        return tuple(_rebuilt(element, numbers) for element in like)
     return like if like is None or isinstance(like, int) else next(numbers)

@@ -29,14 +29,14 @@ Make = Callable[[FloatArray, "FloatArray | None"], tuple[Any, Any]]
 _COUNTS, _NOISE = (20_000, 200_000), 0.005
 # The depth of the octree of Poisson reconstruction: the default of both programs.
 _DEPTH, _SAMPLES = 8, 100_000
-# The largest distance is looked for again so often, on the triangles of so many farthest points.
+# The largest distance is searched again _ROUNDS times, on the triangles of the _FARTHEST points.
 _ROUNDS, _FARTHEST = 2, 500
 _NAMES = ("spot", "stanford-bunny", "fandisk")
 
 
 @dataclass(frozen=True)
 class _Row:
-    """What a program made. distance, mean: Hausdorff's and the mean one, parts of the diagonal."""
+    """The result of a program. distance, mean: Hausdorff's and mean distance, over the diagonal."""
 
     seconds: float
     faces: int
@@ -75,19 +75,19 @@ def clouds(folder: Path | None) -> str:
 
 
 def _lines(programs: dict[str, Make], folder: Path | None) -> Iterator[str]:
-    """The rows of the table, each when it is measured."""
-    for name, whole in _meshes(folder).items():
-        for count, given in itertools.product(_COUNTS, (True, False)):
-            points, normals = _cloud(whole, count)
+    """The rows of the table, each as soon as it is measured."""
+    for name, mesh in _meshes(folder).items():
+        for count, has_normals in itertools.product(_COUNTS, (True, False)):
+            points, normals = _cloud(mesh, count)
             rows: dict[str, _Row] = {}
-            most = 0
+            max_triangles = 0
             for program, make in programs.items():
-                made = _measured(make, points, normals if given else None, most)
-                rows[program] = _compared(*made, whole)
-                most = most or len(made[1][1])
+                measured = _measured(make, points, normals if has_normals else None, max_triangles)
+                rows[program] = _compared(*measured, mesh)
+                max_triangles = max_triangles or len(measured[1][1])
             entries = " | ".join(_entry(rows.get(program)) for program in programs)
-            said = "given" if given else "none"
-            yield f"| {name} | {count:,} | {said} | {most:,} | {entries} |"
+            normals_text = "given" if has_normals else "none"
+            yield f"| {name} | {count:,} | {normals_text} | {max_triangles:,} | {entries} |"
 
 
 def _entry(row: _Row | None) -> str:
@@ -100,41 +100,41 @@ def _entry(row: _Row | None) -> str:
 
 
 def _meshes(folder: Path | None) -> dict[str, Arrays]:
-    found: dict[str, Arrays] = {}
+    meshes: dict[str, Arrays] = {}
     for name in _NAMES if folder else ():
         mesh: Any = read_geometry(Path(folder or "") / f"{name}.obj", "winding")
         joined = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
         joined.merge_vertices(merge_tex=True, merge_norm=True)
-        found[name] = np.array(joined.vertices), np.array(joined.faces)
-    return {**found, "torus": torus_mesh(1.0, 0.4, 192, 96), "bumpy sphere": bumpy_sphere(5)}
+        meshes[name] = np.array(joined.vertices), np.array(joined.faces)
+    return {**meshes, "torus": torus_mesh(1.0, 0.4, 192, 96), "bumpy sphere": bumpy_sphere(5)}
 
 
-def _cloud(whole: Arrays, count: int) -> tuple[FloatArray, FloatArray]:
+def _cloud(arrays: Arrays, count: int) -> tuple[FloatArray, FloatArray]:
     """Points with noise, and normals."""
-    mesh = trimesh.Trimesh(*whole, process=False)
+    mesh = trimesh.Trimesh(*arrays, process=False)
     points, faces = trimesh.sample.sample_surface(mesh, count, seed=0)
-    noise = _NOISE * _diagonal(whole)
-    moved = points + np.random.default_rng(0).normal(0, noise, points.shape)
-    return np.asarray(moved), np.array(mesh.face_normals[faces])
+    noise = _NOISE * _diagonal(arrays)
+    noisy = points + np.random.default_rng(0).normal(0, noise, points.shape)
+    return np.asarray(noisy), np.array(mesh.face_normals[faces])
 
 
-def _diagonal(whole: Arrays) -> float:
-    return float(np.linalg.norm(np.ptp(whole[0], axis=0)))
+def _diagonal(arrays: Arrays) -> float:
+    return float(np.linalg.norm(np.ptp(arrays[0], axis=0)))
 
 
 def _ours(points: FloatArray, normals: FloatArray | None) -> tuple[Any, Any]:
-    given = "estimate" if normals is None else normals
-    made = hk.mesh(hk.DipolePotential(points, given, smoothing="auto"))
-    return made.vertices, made.faces
+    directions = "estimate" if normals is None else normals
+    surface = hk.mesh(hk.DipolePotential(points, directions, smoothing="auto"))
+    return surface.vertices, surface.faces
 
 
 def _peers() -> dict[str, Make]:
     """Other programs that are installed."""
-    found: dict[str, Make] = {}
+    programs: dict[str, Make] = {}
     try:
         import open3d
     except ImportError:
-        return found
+        return programs
 
     def poisson(points: FloatArray, normals: FloatArray | None) -> tuple[Any, Any]:
         cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
@@ -147,11 +147,11 @@ def _peers() -> dict[str, Make]:
         mesh, _ = make(cloud, depth=_DEPTH, n_threads=1)
         return np.asarray(mesh.vertices), np.asarray(mesh.triangles)
 
-    found[f"Open3D {open3d.__version__}"] = poisson
+    programs[f"Open3D {open3d.__version__}"] = poisson
     try:
         import pymeshlab
     except ImportError:
-        return found
+        return programs
 
     def recon(points: FloatArray, normals: FloatArray | None) -> tuple[Any, Any]:
         meshes = pymeshlab.MeshSet()
@@ -166,14 +166,14 @@ def _peers() -> dict[str, Make]:
         return mesh.vertex_matrix(), mesh.face_matrix()
 
     version = importlib.metadata.version("pymeshlab")
-    found[f"PoissonRecon (pymeshlab {version})"] = recon
-    return found
+    programs[f"PoissonRecon (pymeshlab {version})"] = recon
+    return programs
 
 
 def _measured(
-    make: Make, points: FloatArray, normals: FloatArray | None, most: int
+    make: Make, points: FloatArray, normals: FloatArray | None, max_triangles: int
 ) -> tuple[float, Arrays]:
-    """Seconds, and a mesh of at most so many triangles; 0 for as many as there are."""
+    """Seconds, and a mesh of at most `max_triangles` triangles; 0 for no limit."""
     start = time.process_time()
     try:
         vertices, faces = make(points, normals)
@@ -181,57 +181,58 @@ def _measured(
         print(f"{type(error).__name__}: {error}", flush=True)
         vertices, faces = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
     seconds = time.process_time() - start
-    if most and len(faces) > most:
+    if max_triangles and len(faces) > max_triangles:
         import open3d
 
         mesh = open3d.geometry.TriangleMesh(
             open3d.utility.Vector3dVector(vertices), open3d.utility.Vector3iVector(faces)
-        ).simplify_quadric_decimation(most)
+        ).simplify_quadric_decimation(max_triangles)
         vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.triangles)
     return seconds, (np.array(vertices, np.float64), np.array(faces, np.int64))
 
 
-def _compared(seconds: float, made: Arrays, whole: Arrays) -> _Row:
-    if not len(made[1]):
+def _compared(seconds: float, result: Arrays, reference: Arrays) -> _Row:
+    if not len(result[1]):
         return _Row(seconds, 0, False, math.nan, math.nan)
-    mesh = trimesh.Trimesh(*made, process=False)
-    ways = [_away(made, whole, 1), _away(whole, made, 2)]
-    size, mean = _diagonal(whole), float(np.mean([one.distance for one in ways]))
-    far = max(one.farthest for one in ways)
+    mesh = trimesh.Trimesh(*result, process=False)
+    distances = [_away(result, reference, 1), _away(reference, result, 2)]
+    size, mean = _diagonal(reference), float(np.mean([sampled.distance for sampled in distances]))
+    farthest = max(sampled.farthest for sampled in distances)
     closed = bool(mesh.is_watertight and mesh.is_winding_consistent)
-    return _Row(seconds, len(made[1]), closed, far / size, mean / size)
+    return _Row(seconds, len(result[1]), closed, farthest / size, mean / size)
 
 
 @dataclass(frozen=True)
 class _Away:
-    """Distances (n,) of points chosen by chance on a mesh from another, and about the largest."""
+    """Distances (n,) of random points of a mesh from another mesh, and about the largest
+    distance."""
 
     distance: FloatArray
     farthest: float
 
 
-def _away(made: Arrays, other: Arrays, seed: int) -> _Away:
-    """How far points of a mesh are from the triangles of another."""
-    vertices, faces = made
-    distance, chosen = _sampled((vertices, faces), other, seed)
+def _away(arrays: Arrays, other: Arrays, seed: int) -> _Away:
+    """Distances of points of a mesh from the triangles of another."""
+    vertices, faces = arrays
+    distance, face_ids = _sampled((vertices, faces), other, seed)
     farthest = float(distance.max())
     for k in range(_ROUNDS):
-        faces = faces[chosen]
-        far, chosen = _sampled((vertices, faces), other, seed + 2 * k + 2)
-        farthest = max(farthest, float(far.max()))
+        faces = faces[face_ids]
+        distances, face_ids = _sampled((vertices, faces), other, seed + 2 * k + 2)
+        farthest = max(farthest, float(distances.max()))
     return _Away(distance, farthest)
 
 
-def _sampled(made: Arrays, other: Arrays, seed: int) -> tuple[FloatArray, npt.NDArray[np.int64]]:
-    """Distances of points chosen by chance on a mesh from the triangles of another, and the faces,
-    by index, of those that are farthest."""
-    mesh = trimesh.Trimesh(*made, process=False)
-    points, place = trimesh.sample.sample_surface(mesh, _SAMPLES, seed=seed)
+def _sampled(arrays: Arrays, other: Arrays, seed: int) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+    """Distances of random points of a mesh from the triangles of another, and the indices of the
+    faces of the farthest points."""
+    mesh = trimesh.Trimesh(*arrays, process=False)
+    points, face_ids = trimesh.sample.sample_surface(mesh, _SAMPLES, seed=seed)
     vertices, faces = other
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    center, size = 0.5 * (low + high), float((high - low).max())
+    lower, upper = vertices.min(axis=0), vertices.max(axis=0)
+    center, size = 0.5 * (lower + upper), float((upper - lower).max())
     backend = choose_backend("double")
     surface = LevelTriangles((vertices[faces] - center) / size, center, size, True)
-    way = surface.upload(backend)(to_vector3(backend, np.asarray(points)))
-    distance = np.linalg.norm(to_numpy(way), axis=1)
-    return distance, np.unique(place[np.argsort(distance)[-_FARTHEST:]])
+    offsets = surface.upload(backend)(to_vector3(backend, np.asarray(points)))
+    distance = np.linalg.norm(to_numpy(offsets), axis=1)
+    return distance, np.unique(face_ids[np.argsort(distance)[-_FARTHEST:]])

@@ -16,7 +16,7 @@ import harnack as hk
 from harnack.geometry import example_curves, example_meshes
 
 POINTS, CHUNK, MEMORY = 100_000_000, 1_000_000, "1GB"
-# Chunks that one worker alone is measured with.
+# Number of chunks with which one worker alone is measured.
 _FEW = 20
 _PICTURE: dict[str, Any] = {"size": (640, 480), "spp": 16, "show": "path", "progress": False}
 
@@ -75,35 +75,35 @@ def _write_points(path: Path) -> None:
 
 
 def _queries(folder: Path, workers: int, chunks: int) -> tuple[float, float]:
-    """Queries a second, and the most bytes that a worker used."""
+    """Queries a second, and the largest number of bytes that a worker used."""
     import dask.array as da
 
     points = da.from_zarr(str(folder / "points.zarr"))
     field = _mesh()
     with _client(workers) as client:
         for k in range(2 * workers):  # each compiles
-            few = points[k * CHUNK : k * CHUNK + CHUNK // 10]
-            client.compute(field.value(few)).result()
-        begun = time.perf_counter()
+            block = points[k * CHUNK : k * CHUNK + CHUNK // 10]
+            client.compute(field.value(block)).result()
+        start = time.perf_counter()
         values = field.value(points[: chunks * CHUNK])
         hk.to_zarr(values, folder / f"{workers}.zarr", client=client, progress=workers == 2)
-        seconds = time.perf_counter() - begun
-        most = max(client.run(_peak).values())
-    return chunks * CHUNK / seconds, most
+        seconds = time.perf_counter() - start
+        peak = max(client.run(_peak).values())
+    return chunks * CHUNK / seconds, peak
 
 
 def _peak() -> int:
-    """The most bytes that this process has used."""
+    """The largest number of bytes that this process has used."""
     return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 def _tiles(workers: int) -> float:
-    """Seconds for a picture, the second one."""
+    """Seconds for the second of two pictures."""
     field = hk.SolidAngle(example_curves.wavy_polygon(64))
     seconds = 0.0
     with _client(workers) as client:
         for seed in range(2):
-            begun = time.perf_counter()
+            start = time.perf_counter()
             hk.render(field, client=client, seed=seed, **_PICTURE)
-            seconds = time.perf_counter() - begun
+            seconds = time.perf_counter() - start
     return seconds

@@ -1,7 +1,7 @@
-"""How fast each rule approaches the surface, against sphere tracing with an exact distance.
+"""The speed at which rules approach the surface, against sphere tracing with an exact distance.
 
 The paper's Fig. 23: the 2 pi level set is meshed finely, and sphere tracing walks by the exact
-distance to that mesh (libigl's closest-point query), the best case there is for it.
+distance to that mesh (libigl's closest-point query), which is its best case.
 """
 
 from __future__ import annotations
@@ -62,28 +62,28 @@ def errors(
     field = hk.SolidAngle(loop)
     eye, d = camera(across)
     exact = hk.trace(field, eye[None], d, precision="double", tolerance=1e-10)
-    d, star = d[exact.status == hk.RayStatus.HIT], exact.t[exact.status == hk.RayStatus.HIT]
+    d, t_exact = d[exact.status == hk.RayStatus.HIT], exact.t[exact.status == hk.RayStatus.HIT]
     start, _ = _clip(field, eye, d)
-    found: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    results: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     for bound, overstep in rules:
-        at = [start]
+        lengths = [start]
         for k in range(1, steps + 1):
             hits = hk.trace(
                 field, eye[None], d, precision="double", tolerance=1e-12,
                 max_steps=k, bound=bound, overstep=overstep,
             )  # fmt: skip
-            at.append(hits.t)
-        found[bound] = _measure(field, eye, d, np.array(at), star)
+            lengths.append(hits.t)
+        results[bound] = _measure(field, eye, d, np.array(lengths), t_exact)
     vertices, faces = meshed(loop)
     tree = igl.AABB()
     tree.init(vertices, faces)
-    t, at = start.copy(), [start]
+    t, lengths = start.copy(), [start]
     for _ in range(steps):
         distance = np.sqrt(tree.squared_distance(vertices, faces, eye + t[:, None] * d)[0])
         t = t + np.where(distance < ARRIVED, 0, distance)  # a ray that has arrived stays
-        at.append(t)
-    found["sphere tracing, exact distance"] = _measure(field, eye, d, np.array(at), star)
-    return found
+        lengths.append(t)
+    results["sphere tracing, exact distance"] = _measure(field, eye, d, np.array(lengths), t_exact)
+    return results
 
 
 def _clip(field: hk.SolidAngle, eye: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -99,7 +99,7 @@ def _clip(field: hk.SolidAngle, eye: np.ndarray, d: np.ndarray) -> tuple[np.ndar
 
 
 def _measure(
-    field: hk.SolidAngle, eye: np.ndarray, d: np.ndarray, t: np.ndarray, star: np.ndarray
+    field: hk.SolidAngle, eye: np.ndarray, d: np.ndarray, t: np.ndarray, t_exact: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     from harnack.backend import choose_backend, to_numpy, to_vector3
 
@@ -107,7 +107,7 @@ def _measure(
     points = (eye + t[..., None] * d).reshape(-1, 3)
     f = to_numpy(field.evaluate(to_vector3(backend, points)).value).reshape(t.shape)
     gap = np.abs((f - field.default_level + 2 * np.pi) % (4 * np.pi) - 2 * np.pi)
-    return gap, np.abs(t - star)
+    return gap, np.abs(t - t_exact)
 
 
 def plot(path: Path) -> dict[str, tuple[float, ...]]:
@@ -117,10 +117,10 @@ def plot(path: Path) -> dict[str, tuple[float, ...]]:
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    found = errors(example_curves.wavy_polygon(64))
+    rule_errors = errors(example_curves.wavy_polygon(64))
     figure, axes = pyplot.subplots(1, 2, figsize=(10, 4), layout="constrained")
     summary: dict[str, tuple[float, ...]] = {}
-    for name, (gap, along) in found.items():
+    for name, (gap, along) in rule_errors.items():
         for axis, error in zip(axes, (gap, along), strict=True):
             mean = np.exp(np.log(np.maximum(error, 1e-13)).mean(axis=1))
             axis.semilogy(mean[:SHOWN], label=name)

@@ -28,7 +28,7 @@ _SUBDIVISIONS, _WIDTH_OF_MESHES, _RAYS_OF_MESHES, _REPEATS_OF_MESHES = (4, 5), 1
 
 @dataclass(frozen=True)
 class _Rays:
-    """How many: the camera's along each side, chords and bounces; and how often."""
+    """Numbers of rays: the camera's along each side, chords and bounces; and of repetitions."""
 
     width: int
     count: int
@@ -90,7 +90,7 @@ def broken_mesh(subdivisions: int, kind: str) -> tuple[FloatArray, Any]:
 
 
 def _row(name: str, make: Callable[..., Any], count: _Rays, unit: float = 1e9) -> str:
-    """unit: how many of a unit of time make a second."""
+    """A row of the table. unit: the number of units of time in a second."""
     plain, built = make(cells=False), 0.0
     backend = choose_backend("single")
     for _ in range(2):  # the first time compiles kernels
@@ -100,13 +100,13 @@ def _row(name: str, make: Callable[..., Any], count: _Rays, unit: float = 1e9) -
     entries: list[str] = []
     for o, d in (_camera(count.width), _chords(count.count), _bounces(plain, count)):
         rays = to_vector3(backend, o), to_vector3(backend, d)
-        for one in (plain, field):
-            work = functools.partial(_trace, one, rays)
+        for variant in (plain, field):
+            work = functools.partial(_trace, variant, rays)
             work()
             best = min(_seconds(work) for _ in range(count.repeats))
             entries.append(f"{best / len(o) * unit:,.{0 if unit > 1e6 else 1}f}")
-    on = field.prepare(backend)._device
-    size = (on.built if isinstance(field, hk.WindingNumber) else on.cells).size
+    device_data = field.prepare(backend)._device
+    size = (device_data.built if isinstance(field, hk.WindingNumber) else device_data.cells).size
     return f"| {name} | " + " | ".join(entries) + f" | {built:.2f} s | {size / 1e6:.1f} |"
 
 

@@ -1,4 +1,4 @@
-"""Distances to surfaces: how long a point takes, against trimesh's nearest points and scipy's."""
+"""Distances to surfaces: time of a point, against trimesh's nearest points and scipy's."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ def _around(field: hk.Field, n: int) -> FloatArray:
 
 def _cloud(n: int) -> hk.DipolePotential:
     k = np.arange(n) + 0.5
-    z, turn = 1 - 2 * k / n, np.pi * (1 + np.sqrt(5)) * k
+    z, angle = 1 - 2 * k / n, np.pi * (1 + np.sqrt(5)) * k
     flat = np.sqrt(1 - z * z)
-    p = np.column_stack([flat * np.cos(turn), flat * np.sin(turn), z])
+    p = np.column_stack([flat * np.cos(angle), flat * np.sin(angle), z])
     return hk.DipolePotential(p, p, np.full(n, 4 * np.pi / n))
 
 
@@ -63,23 +63,23 @@ def distances(n: int = POINTS) -> str:
         x = _around(field, count)
         hk.signed_distance(field, x[:200])
         seconds = _cpu(lambda field=field, x=x: hk.signed_distance(field, x))
-        found = hk.distance_bounds(field, x[: min(count, 20_000)])
-        gap = (found.upper - found.lower) / np.ptp(x, axis=0).max()
-        middle, high = np.quantile(gap, [0.5, 0.9])
+        bounds = hk.distance_bounds(field, x[: min(count, 20_000)])
+        gap = (bounds.upper - bounds.lower) / np.ptp(x, axis=0).max()
+        median, upper = np.quantile(gap, [0.5, 0.9])
         rows.append(
-            f"| {name} | {count:,} | {1e6 * seconds / count:.1f} | {middle:.1g} | {high:.1g} |"
+            f"| {name} | {count:,} | {1e6 * seconds / count:.1f} | {median:.1g} | {upper:.1g} |"
         )
     vertices, faces = example_meshes.bumpy_sphere(6)
     x = _around(fields["closed mesh, 81,920 faces"][0], FEW)
     nearest = _cpu(lambda: cKDTree(vertices).query(x))
-    others = [f"scipy's k-d tree, to the nearest vertex alone: {1e6 * nearest / FEW:.1f} us"]
+    peers = [f"scipy's k-d tree, to the nearest vertex alone: {1e6 * nearest / FEW:.1f} us"]
     try:
         import trimesh
 
         mesh = trimesh.Trimesh(vertices, faces, process=False)
         mesh.nearest.on_surface(x[:10])  # pyright: ignore
         seconds = _cpu(lambda: mesh.nearest.on_surface(x))  # pyright: ignore
-        others.append(
+        peers.append(
             f"trimesh's `nearest.on_surface`, without a sign: {1e6 * seconds / FEW:.0f} us"
         )
     except ImportError:
@@ -94,6 +94,6 @@ def distances(n: int = POINTS) -> str:
         "",
         *rows,
         "",
-        f"To the same mesh, {FEW:,} points: " + "; ".join(others) + ".",
+        f"To the same mesh, {FEW:,} points: " + "; ".join(peers) + ".",
         "",
     ])  # fmt: skip

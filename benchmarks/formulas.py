@@ -1,4 +1,4 @@
-"""Formulas for the solid angle of a polygon and for its gradient: which of them stay accurate.
+"""Formulas for the solid angle of a polygon and for its gradient, and their accuracy.
 
 The paper's Fig. 12, with numbers: each formula in single precision against the fan in 80-bit
 floats, at points of a camera's rays. All are equal in exact arithmetic, modulo 4 pi.
@@ -75,8 +75,8 @@ def adiels(loop: Array, x: Array) -> Array:
     for p, q in zip(loop, np.roll(loop, -1, axis=0), strict=True):
         a, b = p - x, q - x
         la, lb = _length(a), _length(b)
-        share = (1 / la + 1 / lb) / (la * lb + _dot(a, b))
-        total += share[:, None] * np.cross(a, b)
+        fraction = (1 / la + 1 / lb) / (la * lb + _dot(a, b))
+        total += fraction[:, None] * np.cross(a, b)
     return total
 
 
@@ -102,7 +102,7 @@ def _unit(a: Array) -> Array:
 
 
 def measured() -> tuple[dict[str, Array], dict[str, Array]]:
-    """Errors of values in radians, and of gradients as a part of their length."""
+    """Errors of values in radians, and of gradients relative to their length."""
     loop = np.asarray(example_curves.wavy_polygon(12), np.float32)
     x = np.random.default_rng(0).uniform(-1.2, 1.2, (POINTS, 3)).astype(np.float32)
     fine = np.longdouble
@@ -123,15 +123,15 @@ def measured() -> tuple[dict[str, Array], dict[str, Array]]:
         f"differences, {_DIFFERENCE:g} apart": lambda: differences(loop, x),
         "harnack": lambda: ours.gradient(x, precision="single"),
     }
-    size = _length(gradient)
+    norm = _length(gradient)
 
-    def off(given: Array) -> Array:
-        d = given.astype(fine) - value
+    def error(computed: Array) -> Array:
+        d = computed.astype(fine) - value
         return np.abs(d - 4 * fine(np.pi) * np.round(d / (4 * fine(np.pi))))
 
     with np.errstate(all="ignore"):
-        of_values = {name: off(f()) for name, f in values.items()}
-        of_gradients = {name: _length(f() - gradient) / size for name, f in gradients.items()}
+        of_values = {name: error(f()) for name, f in values.items()}
+        of_gradients = {name: _length(f() - gradient) / norm for name, f in gradients.items()}
     return of_values, of_gradients
 
 
@@ -149,10 +149,10 @@ def formulas() -> str:
     ]
     for kind, errors in zip(("value", "gradient"), measured(), strict=True):
         for name, error in errors.items():
-            known = np.asarray(error[np.isfinite(error)], np.float64)
-            middle, most = np.quantile(known, [0.5, 0.999])
+            finite = np.asarray(error[np.isfinite(error)], np.float64)
+            median, quantile = np.quantile(finite, [0.5, 0.999])
             lines.append(
-                f"| {kind} | {name} | {middle:.1e} | {most:.1e} | {known.max():.1e} "
-                f"| {len(error) - len(known)} |"
+                f"| {kind} | {name} | {median:.1e} | {quantile:.1e} | {finite.max():.1e} "
+                f"| {len(error) - len(finite)} |"
             )
     return "\n".join(lines) + "\n"

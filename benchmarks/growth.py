@@ -1,4 +1,4 @@
-"""How the cost of winding numbers and of point clouds grows with their number of elements."""
+"""Growth of the cost of winding numbers and of point clouds with their number of elements."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ FloatArray = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class AtPoints:
-    """Microseconds for one of many points; seconds to make the field from arrays."""
+    """Microseconds a point, of many points; seconds to construct the field from arrays."""
 
     series: str
     elements: int
@@ -57,7 +57,7 @@ class AlongRays:
 
 
 def one_hole(vertices: FloatArray, faces: Any, fraction: float = 0.01) -> Any:
-    """The faces without the fraction of them that lies nearest to the camera."""
+    """The faces without the given fraction that lies nearest to the camera."""
     towards = vertices[faces].mean(axis=1) @ (EYE / np.linalg.norm(EYE))
     return faces[np.sort(np.argsort(towards)[: len(faces) - round(fraction * len(faces))])]
 
@@ -69,8 +69,8 @@ def bumpy_cloud(n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     u - grad r/r with grad r tangential, and each point holds 4 pi/n r^2/(normal . u).
     """
     k = np.arange(n) + 0.5
-    z, turn = 1 - 2 * k / n, np.pi * (1 + np.sqrt(5)) * k
-    u = np.column_stack([np.cos(turn), np.sin(turn), z])
+    z, angle = 1 - 2 * k / n, np.pi * (1 + np.sqrt(5)) * k
+    u = np.column_stack([np.cos(angle), np.sin(angle), z])
     u[:, :2] *= np.sqrt(1 - z * z)[:, None]
     s, c = np.sin(5 * u), np.cos(5 * u)
     r = 1 + 0.15 * s.prod(axis=1)
@@ -84,17 +84,17 @@ def bumpy_cloud(n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 def at_points(series: str, vertices: FloatArray, faces: Any, method: Any) -> AtPoints:
     """`WindingNumber.value` on NumPy arrays."""
-    points, made = cube_points(POINTS), []
+    points, fields = cube_points(POINTS), []
 
     def make() -> None:
         field = WindingNumber(vertices, faces, method=method)
         field.value(points[:10])
-        made.append(field)
+        fields.append(field)
 
     seconds = seconds_of(make)
-    made[0].value(points)  # compiles
-    taken = [seconds_of(lambda: made[0].value(points)) for _ in range(REPEATS)]
-    return AtPoints(series, len(faces), seconds, float(np.median(taken)) / POINTS * 1e6)
+    fields[0].value(points)  # compiles
+    times = [seconds_of(lambda: fields[0].value(points)) for _ in range(REPEATS)]
+    return AtPoints(series, len(faces), seconds, float(np.median(times)) / POINTS * 1e6)
 
 
 def along_rays(series: str, elements: int, field: hk.Field) -> AlongRays:
@@ -103,15 +103,15 @@ def along_rays(series: str, elements: int, field: hk.Field) -> AlongRays:
     eye, directions = camera(WIDTH)
     o, d = to_vector3(backend, eye[None]), to_vector3(backend, directions)
     surface = hk.level_set(field.prepare(backend))
-    kept: list[hk.Hits] = []
+    hits: list[hk.Hits] = []
 
     def call() -> None:
-        kept[:] = [hk.trace(surface, o, d, t_max=10.0)]
+        hits[:] = [hk.trace(surface, o, d, t_max=10.0)]
         dr.sync_thread()
 
     call()  # compiles
     seconds = float(np.median([seconds_of(call) for _ in range(REPEATS)]))
-    n, status = kept[0].evaluations.numpy(), kept[0].status.numpy()
+    n, status = hits[0].evaluations.numpy(), hits[0].status.numpy()
     return AlongRays(
         series, elements, float((status == int(hk.RayStatus.HIT)).mean()), float(n.mean()),
         int(n.max()), int((status == int(hk.RayStatus.OUT_OF_STEPS)).sum()), seconds / n.size * 1e6,
@@ -185,9 +185,9 @@ def plot(path: Path, points: list[AtPoints], rays: list[AlongRays]) -> None:
     ]
     for axis, (rows, quantity, label) in zip(axes, panels, strict=True):
         for series in dict.fromkeys(row.series for row in rows):
-            some = [row for row in rows if row.series == series]
-            y = [getattr(row, quantity) for row in some]
-            axis.plot([row.elements for row in some], y, "o-", label=series)
+            selected = [row for row in rows if row.series == series]
+            y = [getattr(row, quantity) for row in selected]
+            axis.plot([row.elements for row in selected], y, "o-", label=series)
         axis.set(xscale="log", xlabel="triangles or points", ylabel=label)
         axis.legend(loc="center right")
     # Clouds take tens of times as long as meshes: only a logarithm shows both.

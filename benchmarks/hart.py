@@ -111,10 +111,10 @@ def trace(
     solids: list[Solid], *, convexity: bool = False, triangle: bool = False,
     bounding: bool = False, start: np.ndarray | None = None,
 ) -> Count:  # fmt: skip
-    """Sphere tracing with what is asked for.
+    """Sphere tracing with the enhancements that are chosen.
 
     Each solid has a parameter `free`, up to which the ray is known not to meet it. Proof of the
-    enhancements: |f(x + t v) - f(x)| <= t keeps what a distance told before, less the travel since
+    enhancements: |f(x + t v) - f(x)| <= t keeps an earlier distance valid, less the travel since
     (triangle inequality); a convex f lies above its tangent, f + t v.grad f, so that a ray that
     leaves a convex solid never meets it; and a ray is as far from a solid as from a ball around it.
     """
@@ -133,46 +133,46 @@ def trace(
         p = eye + t[rows, None] * d[rows]
         steps += rows.size
         nearest = np.full(rows.size, np.inf)
-        known = free[rows] if triangle or convexity else np.zeros((rows.size, m))
+        limits = free[rows] if triangle or convexity else np.zeros((rows.size, m))
         if bounding:
-            # Balls first, from the nearest on: a heap does the same one by one.
+            # Balls first, nearest first: a heap would do the same one by one.
             for k, solid in enumerate(solids):
                 if solid.ball is not None:
                     center, radius = solid.ball
-                    ask = np.isfinite(known[:, k])
-                    away = np.linalg.norm(p - center, axis=1) - radius
-                    known[ask, k] = np.maximum(known[ask, k], t[rows][ask] + away[ask])
-                    bounds += int(ask.sum())
-        order = np.argsort(known, axis=1) if bounding or triangle else None
+                    is_due = np.isfinite(limits[:, k])
+                    gap = np.linalg.norm(p - center, axis=1) - radius
+                    limits[is_due, k] = np.maximum(limits[is_due, k], t[rows][is_due] + gap[is_due])
+                    bounds += int(is_due.sum())
+        order = np.argsort(limits, axis=1) if bounding or triangle else None
         touching = np.zeros(rows.size, bool)
-        for place in range(m):
-            which = np.full(rows.size, place) if order is None else order[:, place]
-            told = known[np.arange(rows.size), which]
-            ask = np.isfinite(told)
+        for rank in range(m):
+            solid_ids = np.full(rows.size, rank) if order is None else order[:, rank]
+            bound = limits[np.arange(rows.size), solid_ids]
+            is_due = np.isfinite(bound)
             if triangle or bounding:
-                ask &= told < nearest
-                nearest = np.where(~ask, np.minimum(nearest, told), nearest)
-            for k in np.unique(which[ask]):
-                part = np.flatnonzero(ask & (which == k))
+                is_due &= bound < nearest
+                nearest = np.where(~is_due, np.minimum(nearest, bound), nearest)
+            for k in np.unique(solid_ids[is_due]):
+                subset = np.flatnonzero(is_due & (solid_ids == k))
                 solid = solids[k]
-                f = solid.distance(p[part])
-                evaluations += part.size
+                f = solid.distance(p[subset])
+                evaluations += subset.size
                 reach = f
                 if convexity and solid.gradient is not None:
-                    rate = (solid.gradient(p[part]) * d[rows[part]]).sum(1)
-                    away = np.where(rate < 0, f / np.maximum(-rate, 1e-300), np.inf)
-                    reach = np.maximum(f, away)
-                told_now = t[rows[part]] + reach
-                free[rows[part], k] = told_now
-                nearest[part] = np.minimum(nearest[part], told_now)
-                touching[part] |= f < _NEAR
+                    rate = (solid.gradient(p[subset]) * d[rows[subset]]).sum(1)
+                    gap = np.where(rate < 0, f / np.maximum(-rate, 1e-300), np.inf)
+                    reach = np.maximum(f, gap)
+                new_bound = t[rows[subset]] + reach
+                free[rows[subset], k] = new_bound
+                nearest[subset] = np.minimum(nearest[subset], new_bound)
+                touching[subset] |= f < _NEAR
         step = nearest - t[rows]
         lengths.append(step[(step > 0) & np.isfinite(step)])
         hit[rows[touching]] = True
-        gone = ~touching & ~(nearest < _FAR)
-        moving = ~touching & ~gone
+        escaped = ~touching & ~(nearest < _FAR)
+        moving = ~touching & ~escaped
         t[rows[moving]] = nearest[moving]
-        active[rows[touching | gone]] = False
+        active[rows[touching | escaped]] = False
     return Count(
         evaluations / n, steps / n, bounds / n, np.concatenate(lengths), np.where(hit, t, np.inf)
     )
@@ -192,7 +192,7 @@ def coherent(solids: list[Solid]) -> Count:
     blocks = blocks.reshape(side * side, -1, 3)
     axis = blocks.mean(1)
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-    wide = np.linalg.norm(blocks - axis[:, None], axis=2).max(1)
+    width = np.linalg.norm(blocks - axis[:, None], axis=2).max(1)
     t, evaluations = np.zeros(len(axis)), 0
     active = np.ones(len(axis), bool)
     for _ in range(_MOST):
@@ -202,13 +202,13 @@ def coherent(solids: list[Solid]) -> Count:
         p = eye + t[rows, None] * axis[rows]
         f = np.min([solid.distance(p) for solid in solids], axis=0)
         evaluations += rows.size * len(solids)
-        step = (f - t[rows] * wide[rows]) / (1 + wide[rows])
-        stops = step < 0.05 * t[rows] * wide[rows] + _NEAR
+        step = (f - t[rows] * width[rows]) / (1 + width[rows])
+        stops = step < 0.05 * t[rows] * width[rows] + _NEAR
         t[rows[~stops]] += step[~stops]
         active[rows[stops | (t[rows] > _FAR)]] = False
     start = np.broadcast_to(t[:, None], blocks.shape[:2]).reshape(side, side, _BLOCK, _BLOCK)
-    made = trace(solids, start=start.transpose(0, 2, 1, 3).reshape(-1).copy())
-    return Count(made.evaluations + evaluations / len(d), made.steps, 0.0, made.lengths, made.t)
+    count = trace(solids, start=start.transpose(0, 2, 1, 3).reshape(-1).copy())
+    return Count(count.evaluations + evaluations / len(d), count.steps, 0.0, count.lengths, count.t)
 
 
 _ENHANCED: tuple[tuple[str, dict[str, bool]], ...] = (
@@ -219,7 +219,7 @@ _ENHANCED: tuple[tuple[str, dict[str, bool]], ...] = (
     ("bounding balls", {"bounding": True}),
     ("bounding balls, triangle inequality", {"bounding": True, "triangle": True}),
 )
-# What the paper prints, in percent of the time without.
+# The printed results of the paper, in percent of the time without enhancement.
 _PRINTED = {
     ("one ball", "convexity"): 69,
     ("nine balls and a plane", "convexity"): 59,
@@ -231,7 +231,7 @@ _PRINTED = {
 
 
 class _Ellipsoid(Formula):
-    """A convex f of which the march can be asked with and without its convexity."""
+    """A convex f that can be marched with and without its convexity."""
 
     lipschitz = 1.0
     domain = hk.Ball(radius=3.0)
@@ -241,8 +241,8 @@ class _Ellipsoid(Formula):
 
 
 class _Tangent(ParabolaEnclosure):
-    """Of a convex f with a Lipschitz constant K: slope s <= F(s) <= K s (Hart's Theorem 4, asked of
-    f itself)."""
+    """The enclosure of a convex f with a Lipschitz constant K: slope s <= F(s) <= K s (Hart's
+    Theorem 4, for f itself)."""
 
     @classmethod
     def from_promise(
@@ -267,29 +267,29 @@ def hart() -> str:
     histograms: dict[str, np.ndarray] = {}
     for scene, solids in scenes().items():
         plain = trace(solids)
-        rows = [(name, trace(solids, **asked)) for name, asked in _ENHANCED]
+        rows = [(name, trace(solids, **options)) for name, options in _ENHANCED]
         rows.append((f"image coherence, blocks of {_BLOCK}", coherent(solids)))
-        for name, made in rows:
+        for name, count in rows:
             if scene == "14 tori" and name in ("convexity", "both"):
                 continue  # tori are not convex
-            seen = np.isfinite(plain.t)
-            assert (seen == np.isfinite(made.t)).mean() > 0.999
-            both = seen & np.isfinite(made.t)
-            assert np.abs(plain.t - made.t)[both].max() < 0.1
+            is_hit = np.isfinite(plain.t)
+            assert (is_hit == np.isfinite(count.t)).mean() > 0.999
+            are_hits = is_hit & np.isfinite(count.t)
+            assert np.abs(plain.t - count.t)[are_hits].max() < 0.1
             printed = _PRINTED.get((scene, name), "")
             lines.append(
-                f"| {scene} | {name} | {made.evaluations:.2f} "
-                f"| {100 * made.evaluations / plain.evaluations:.0f} | {printed} "
-                f"| {made.steps:.2f} | {made.bounds:.2f} |"
+                f"| {scene} | {name} | {count.evaluations:.2f} "
+                f"| {100 * count.evaluations / plain.evaluations:.0f} | {printed} "
+                f"| {count.steps:.2f} | {count.bounds:.2f} |"
             )
             if scene == "one ball" and name in ("none", "convexity"):
-                histograms[name] = made.lengths
+                histograms[name] = count.lengths
     lines += ["", *_histogram_lines(histograms), "", *_on_our_tracer()]
     return "\n".join(lines) + "\n"
 
 
 def _histogram_lines(histograms: dict[str, np.ndarray]) -> list[str]:
-    """Of steps towards one ball, by powers of four (the paper's Figure 12)."""
+    """The histogram of steps towards one ball, by powers of four (the paper's Figure 12)."""
     edges = [0.0, *(4.0**k for k in range(-7, 2)), math.inf]
     names = [f"< {edge:.1e}" for edge in edges[1:-1]] + ["longer"]
     lines = [
@@ -299,12 +299,13 @@ def _histogram_lines(histograms: dict[str, np.ndarray]) -> list[str]:
     ]
     for name, lengths in histograms.items():
         counts = np.histogram(lengths, edges)[0] * 1000 / _WIDTH**2
-        lines.append(f"| {name} | " + " | ".join(f"{one:.0f}" for one in counts) + " |")
+        lines.append(f"| {name} | " + " | ".join(f"{number:.0f}" for number in counts) + " |")
     return lines
 
 
 def _on_our_tracer() -> list[str]:
-    """Looks at a convex f with its Lipschitz constant, and with ranges that know its convexity."""
+    """Evaluations of a convex f with its Lipschitz constant, and with ranges that use its
+    convexity."""
     backend = choose_backend("double")
     eye, d = rays()
     o, directions = to_vector3(backend, eye[None]), to_vector3(backend, d)

@@ -23,21 +23,22 @@ from .repair import is_solid
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
-# Millimeters: what parts are scaled to, walls, and the radius of vents; and the tolerance.
+# In millimeters: the size to which parts are scaled, walls, cells, and the radius of vents; and the
+# tolerance.
 _SIZE, _WALL, _CELL, _VENT = 80.0, 2.0, 8.0, 2.0
 _TOLERANCE = 1.2e-3
 _NAMES = ("stanford-bunny", "spot", "cow", "homer")
-# How many meshes are done at once; and what is said at each attempt.
+# Number of meshes that are processed at once; and the message at each attempt.
 _AT_ONCE, _TOGETHER = 4, "putting the parts together"
-# Sampled points of the outer side; how near to it faces count as parts of it, and how far from the
-# axes of vents, in millimeters, points and faces are looked at.
+# Number of sampled points of the outer side; the distance from it within which faces count as parts
+# of it; and the distance from the axes of vents, in millimeters, beyond which points are used.
 _SAMPLES, _OUTSIDE, _AWAY = 20_000, 1e-5, 3.0
 
 
 @dataclass(frozen=True)
 class _Row:
-    """What was made of a mesh. attempts: how often parts were put together. walls: the thinnest,
-    the median, and what 99.9 % are thinner than."""
+    """The part that was made of a mesh. attempts: the number of times that its parts were put
+    together. walls: the thinnest, the median, and the thickness that 99.9 % are below."""
 
     seconds: float
     attempts: int
@@ -47,7 +48,7 @@ class _Row:
 
 
 def hollow(folder: Path) -> str:
-    """Measure, and return the section of the page. folder: of the meshes."""
+    """Measure, and return the section of the page. folder: the folder of the meshes."""
     lines = [
         "## Hollow parts\n",
         f"Meshes repaired, scaled to {_SIZE:g} mm of height, hollowed by {_WALL:g} mm, with walls "
@@ -68,7 +69,7 @@ def hollow(folder: Path) -> str:
             if isinstance(row, str):
                 lines.append(f"| {path.stem} | | | | refused: {row} | | | |")
                 continue
-            walls = " | ".join(f"{one:.2f}" for one in row.walls)
+            walls = " | ".join(f"{thickness:.2f}" for thickness in row.walls)
             closed = "yes" if row.is_closed else "no"
             lines.append(
                 f"| {path.stem} | {row.seconds:.0f} | {row.attempts} | {row.triangles:,} "
@@ -78,21 +79,21 @@ def hollow(folder: Path) -> str:
 
 
 def _measured(path: Path) -> _Row | str:
-    """Of a file, in a process that has just been started; or why the part cannot be made."""
-    given: Any = trimesh.load(path)
-    whole = hk.repair(given)
-    whole.apply_scale(_SIZE / whole.extents[1])
-    part, gyroid = hk.solid(whole), hk.Gyroid(_CELL)
+    """The row of a file, in a new process; or the reason why the part cannot be made."""
+    loaded: Any = trimesh.load(path)
+    repaired = hk.repair(loaded)
+    repaired.apply_scale(_SIZE / repaired.extents[1])
+    outer, gyroid = hk.solid(repaired), hk.Gyroid(_CELL)
     lattice = hk.solid(gyroid, between=gyroid.levels_of_thickness(0.8))
-    made = part.shell(_WALL) | (part & lattice)
-    (x, _, z), vent = whole.bounds.mean(axis=0), hk.Cylinder(_VENT, 6.0).rotated(90, "x")
-    axes = [np.array((x + side, whole.bounds[0, 1], z)) for side in (-15.0, 5.0)]
-    for place in axes:
-        made = made - vent.translated(tuple(place))
-    said: list[str] = []
+    body = outer.shell(_WALL) | (outer & lattice)
+    (x, _, z), vent = repaired.bounds.mean(axis=0), hk.Cylinder(_VENT, 6.0).rotated(90, "x")
+    axes = [np.array((x + side, repaired.bounds[0, 1], z)) for side in (-15.0, 5.0)]
+    for position in axes:
+        body = body - vent.translated(tuple(position))
+    stages: list[str] = []
     with tempfile.TemporaryDirectory() as folder:
         try:
-            hk.mesh(made, tolerance=_TOLERANCE, progress=said.append).export(f"{folder}/part.stl")
+            hk.mesh(body, tolerance=_TOLERANCE, progress=stages.append).export(f"{folder}/part.stl")
         except MeshingError as error:
             return str(error)
         seconds = time.process_time()
@@ -100,46 +101,46 @@ def _measured(path: Path) -> _Row | str:
     is_closed = bool(mesh.is_watertight and mesh.is_winding_consistent) and is_solid(mesh)
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     is_closed = is_closed and not len(intersecting_faces(vertices, faces))
-    walls = _walls(whole, vertices[faces], axes)
-    return _Row(seconds, said.count(_TOGETHER), len(faces), is_closed, walls)
+    walls = _walls(repaired, vertices[faces], axes)
+    return _Row(seconds, stages.count(_TOGETHER), len(faces), is_closed, walls)
 
 
 # Walls.
 
 
 def _walls(
-    whole: trimesh.Trimesh, corner: FloatArray, axes: list[FloatArray]
+    mesh: trimesh.Trimesh, corner: FloatArray, axes: list[FloatArray]
 ) -> tuple[float, float, float]:
-    """The thinnest wall, the median and what 99.9 % are thinner than, of the triangles (m, 3, 3) of
-    a part whose outer side is that of a mesh."""
-    outside = Triangles(np.asarray(whole.triangles, np.float64))
-    size = float(whole.extents.max())
+    """The thinnest wall, the median and the thickness that 99.9 % are below, of the triangles (m,
+    3, 3) of a part whose outer side is that of a mesh."""
+    outside = Triangles(np.asarray(mesh.triangles, np.float64))
+    size = float(mesh.extents.max())
     # A face lies on the mesh if its corners and points of its edges do.
     middle = 0.5 * (corner + np.roll(corner, 1, axis=1))
-    on_it = np.concatenate([corner, middle, corner.mean(axis=1)[:, None]], axis=1)
+    samples = np.concatenate([corner, middle, corner.mean(axis=1)[:, None]], axis=1)
     is_inner = np.zeros(len(corner), np.bool_)
-    for k in range(on_it.shape[1]):
+    for k in range(samples.shape[1]):
         rows = np.flatnonzero(~is_inner)
-        is_inner[rows] = outside.distance(on_it[rows, k], _OUTSIDE * size) > _OUTSIDE * size
+        is_inner[rows] = outside.distance(samples[rows, k], _OUTSIDE * size) > _OUTSIDE * size
     is_inner &= ~_beside_vents(corner.mean(axis=1), axes, 0.5)
-    points, _ = trimesh.sample.sample_surface(whole, _SAMPLES, seed=5)
+    points, _ = trimesh.sample.sample_surface(mesh, _SAMPLES, seed=5)
     points = np.asarray(points)[~_beside_vents(points, axes, _AWAY)]
     wall = Triangles(corner[is_inner]).distance(points)
     return float(wall.min()), float(np.median(wall)), float(np.quantile(wall, 0.999))
 
 
 def _beside_vents(points: FloatArray, axes: list[FloatArray], room: float) -> npt.NDArray[np.bool_]:
-    """(n,) whether points are within a vent, along y, or not farther from it than that."""
-    found = np.zeros(len(points), np.bool_)
+    """(n,) whether points are within a vent, along y, or at most `room` away from it."""
+    is_beside = np.zeros(len(points), np.bool_)
     for axis in axes:
-        across = np.hypot(points[:, 0] - axis[0], points[:, 2] - axis[2])
-        found |= (across < _VENT + room) & (np.abs(points[:, 1] - axis[1]) < 6.0 + room)
-    return found
+        distance = np.hypot(points[:, 0] - axis[0], points[:, 2] - axis[2])
+        is_beside |= (distance < _VENT + room) & (np.abs(points[:, 1] - axis[1]) < 6.0 + room)
+    return is_beside
 
 
 class Triangles:
-    """Triangles (m, 3, 3), to which distances are asked for: those whose centers are near enough
-    are compared one by one."""
+    """Triangles (m, 3, 3), for distances from them: triangles whose centers are near enough are
+    compared one by one."""
 
     def __init__(self, corner: FloatArray) -> None:
         center = corner.mean(axis=1)
@@ -149,42 +150,43 @@ class Triangles:
         group = np.ceil(np.log2(np.maximum(radius, 1e-9))).astype(np.int64)
         self._groups = [
             (float(radius[rows].max()), corner[rows], scipy.spatial.cKDTree(center[rows]))
-            for rows in (np.flatnonzero(group == one) for one in np.unique(group))
+            for rows in (np.flatnonzero(group == size) for size in np.unique(group))
         ]
 
     def distance(self, points: FloatArray, enough: float = np.inf) -> FloatArray:
-        """(n,) of points (n, 3); exact where it is at most `enough`, elsewhere at least that."""
+        """(n,) distances of points (n, 3); exact where at most `enough`, elsewhere at least
+        `enough`."""
         return np.concatenate(
             [self._of_some(points[i : i + 2000], enough) for i in range(0, len(points), 2000)]
             or [np.zeros(0)]
         )
 
     def _of_some(self, points: FloatArray, enough: float) -> FloatArray:
-        least = self._vertices.query(points)[0]
+        distances = self._vertices.query(points)[0]
         for radius, corner, centers in self._groups:
-            reach = np.minimum(least, 1.01 * enough) + radius
+            reach = np.minimum(distances, 1.01 * enough) + radius
             near = centers.query_ball_point(points, reach)
-            count = np.array([len(one) for one in near])
+            count = np.array([len(ids) for ids in near])
             if not count.sum():
                 continue
             rows = np.repeat(np.arange(len(points)), count)
-            some = corner[np.concatenate([np.asarray(one, np.int64) for one in near if one])]
-            np.minimum.at(least, rows, distance_to_triangles(points[rows], some))
-        return least
+            triangles = corner[np.concatenate([np.asarray(ids, np.int64) for ids in near if ids])]
+            np.minimum.at(distances, rows, distance_to_triangles(points[rows], triangles))
+        return distances
 
 
 def distance_to_triangles(p: FloatArray, corner: FloatArray) -> FloatArray:
-    """(n,) from each point (n, 3) to its triangle (n, 3, 3): to the plane if the foot is inside,
-    else to the nearest edge."""
-    least = np.full(len(p), np.inf)
+    """(n,) distances from each point (n, 3) to its triangle (n, 3, 3): to the plane if the
+    projection is inside, else to the nearest edge."""
+    best = np.full(len(p), np.inf)
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     is_inside = np.ones(len(p), np.bool_)
     for k in range(3):
-        start, way = corner[:, k], corner[:, (k + 1) % 3] - corner[:, k]
-        length = np.maximum((way * way).sum(axis=1), 1e-300)
-        share = np.clip(((p - start) * way).sum(axis=1) / length, 0, 1)
-        least = np.minimum(least, np.linalg.norm(p - start - share[:, None] * way, axis=1))
-        is_inside &= (np.cross(way, p - start) * normal).sum(axis=1) >= 0
+        start, edge = corner[:, k], corner[:, (k + 1) % 3] - corner[:, k]
+        length = np.maximum((edge * edge).sum(axis=1), 1e-300)
+        fraction = np.clip(((p - start) * edge).sum(axis=1) / length, 0, 1)
+        best = np.minimum(best, np.linalg.norm(p - start - fraction[:, None] * edge, axis=1))
+        is_inside &= (np.cross(edge, p - start) * normal).sum(axis=1) >= 0
     size = np.linalg.norm(normal, axis=1)
     height = np.abs(((p - corner[:, 0]) * normal).sum(axis=1)) / np.maximum(size, 1e-300)
-    return np.where(is_inside & (size > 0), np.minimum(least, height), least)
+    return np.where(is_inside & (size > 0), np.minimum(best, height), best)

@@ -42,7 +42,8 @@ _BISECTED: dict[str | None, type[Enclosure]] = {
 
 @dataclass(frozen=True)
 class Row:
-    """One method: looks a ray, over all rays and those that hit; core time a ray; hits missed."""
+    """One method: evaluations a ray, over all rays and hitting rays; core time a ray; hits
+    missed."""
 
     name: str
     published: float | None
@@ -113,8 +114,9 @@ def _row(
     )  # fmt: skip
 
 
-# Of tables 3 and 4: name, bound, whether of the benchmark's own formula, what the paper has for the
-# largest of sums and for one sum. Ranges of that formula in closed form are of one sum alone.
+# Rows of tables 3 and 4: name, bound, whether the benchmark's own formula is used, the paper's
+# numbers for the largest of sums and for one sum. Ranges of that formula in closed form are of one
+# sum alone.
 _ALL_ROOTS: tuple[tuple[str, str | None, bool, float | None, float | None], ...] = (
     ("segment tracing", "segment", False, 39.36, 40.97),
     ("bottom-up linear", "bottom-up-linear", True, None, 28.95),
@@ -131,7 +133,7 @@ def all_roots(count: int = 10_000, checked: int = 1_000) -> list[str]:
     scene = Scene.random(80, 4.0, (0.6, 1.3), 1.8, seed=5)
     rays = scene.rays(count, seed=2)
     backend = choose_backend()
-    origins, directions = (to_vector3(backend, one) for one in rays[:2])
+    origins, directions = (to_vector3(backend, array) for array in rays[:2])
     end = to_float(backend, rays[2])
     lines = [
         f"All crossings of {count:,} rays through 80 blobs (`all_hits=24`), which is what "
@@ -142,20 +144,20 @@ def all_roots(count: int = 10_000, checked: int = 1_000) -> list[str]:
         "|---|---|---:|---:|---:|---:|---:|",
     ]
     for groups, name in ((5, "largest of sums"), (1, "sum")):
-        reference = scene.crossings(tuple(one[:checked] for one in rays), groups, 1500)
-        for method, bound, own, *published in _ALL_ROOTS:
-            if own and bound is None and groups > 1:
+        reference = scene.crossings(tuple(array[:checked] for array in rays), groups, 1500)
+        for method, bound, uses_formula, *published in _ALL_ROOTS:
+            if uses_formula and bound is None and groups > 1:
                 continue
-            field = BlobFormula(scene, groups=groups) if own else scene.field(groups)
-            level = 0.0 if own else scene.threshold
+            field = BlobFormula(scene, groups=groups) if uses_formula else scene.field(groups)
+            level = 0.0 if uses_formula else scene.threshold
             surface = hk.level_set(field, level, bound=bound, tolerance=1e-3, overstep=1.0)
             seconds: list[float] = []
             for _ in range(2):
                 core = time.process_time()
-                found = hk.trace(surface, origins, directions, t_max=end, all_hits=24)
+                hits = hk.trace(surface, origins, directions, t_max=end, all_hits=24)
                 dr.sync_thread()
                 seconds.append(time.process_time() - core)
-            looks, crossings = found.evaluations.numpy(), found.count.numpy()
+            looks, crossings = hits.evaluations.numpy(), hits.count.numpy()
             other = int((crossings[:checked] != reference).sum())
             printed = published[groups == 1]
             lines.append(
@@ -169,7 +171,7 @@ def all_roots(count: int = 10_000, checked: int = 1_000) -> list[str]:
 def inclusion() -> str:
     """The section of the page."""
     scene = table1_scene()
-    reference = scene.first_inside(tuple(one[:CHECKED] for one in scene.rays(RAYS)), SAMPLES)
+    reference = scene.first_inside(tuple(array[:CHECKED] for array in scene.rays(RAYS)), SAMPLES)
     rows = [measure(scene, method, reference=reference) for method in METHODS]
     lines = [
         "## Forward inclusion functions\n",

@@ -1,4 +1,4 @@
-"""What a bounded Laplacian is worth: the gyroid with ever more known of it."""
+"""The worth of a bounded Laplacian: the gyroid with more and more promises."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ class GyroidByLaplacian(hk.Field):
 
     def evaluate(self, p: Any) -> hk.Sample:
         k = self.scale
-        (sx, cx), (sy, cy), (sz, cz) = (dr.sincos(k * one) for one in (p.x, p.y, p.z))
+        (sx, cx), (sy, cy), (sz, cz) = (dr.sincos(k * coordinate) for coordinate in (p.x, p.y, p.z))
         value = sx * cy + sy * cz + sz * cx
         gradient = k * type(p)(cx * cy - sz * sx, cy * cz - sx * sy, cz * cx - sy * sz)
         if self.share is None:
             return hk.Sample(value, gradient, (hk.Lipschitz(k * _STEEPEST * (1 + 1e-6)),))
-        reach = _STEEPEST * self.share + 1e-5
-        lower = fmax(value - reach, -_LARGEST - 1e-5)
-        upper = fmin(value + reach, _LARGEST + 1e-5)
+        movement = _STEEPEST * self.share + 1e-5
+        lower = fmax(value - movement, -_LARGEST - 1e-5)
+        upper = fmin(value + movement, _LARGEST + 1e-5)
         ends = -2 * k * k * upper, -2 * k * k * lower
         radius = type(value)(self.share / k)
         return hk.Sample(value, gradient, (hk.BoundedLaplacian(radius, lower, upper, *ends),))

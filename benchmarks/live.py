@@ -11,10 +11,10 @@ from harnack.geometry import example_curves
 from tests.view.browsers import Page, chromium
 
 VERTICES, SIZE, SECONDS, EVENTS = 64, 512, 4.0, 60
-# What has the panel let Python draw, or not.
+# What makes the panel let Python draw, or not.
 DRAWN_BY = {"the browser, SwiftShader": "", "Python, LLVM": "panel.let_python_draw('')"}
-# Drags a vertex along a circle. Of each event the time is kept, and of each picture the time and
-# the last event that it shows.
+# Drags a vertex along a circle. The time of each event is recorded, and of each picture the time
+# and the last event that it shows.
 _DRAG = """async ([seconds, rate]) => {
   const target = panel.is_remote ? panel.remote_canvas : panel.drawing.canvas;
   const events = [], pictures = [];
@@ -88,7 +88,7 @@ _DRAG = """async ([seconds, rate]) => {
 
 
 def live() -> str:
-    """A table of both ways to draw."""
+    """A table of the two ways to draw."""
     lines = [
         f"A vertex of a trefoil of {VERTICES} vertices is dragged in Chromium, in a "
         "window of "
@@ -122,11 +122,11 @@ def measured(choice: str) -> tuple[float, float, float, float]:
         page.rest()
         page.do(_DRAG, [1.0, EVENTS])  # compiles what is left to be compiled
         page.rest()
-        found: dict[str, Any] = page.do(_DRAG, [SECONDS, EVENTS])
+        timings: dict[str, Any] = page.do(_DRAG, [SECONDS, EVENTS])
         page.close()
-    events, pictures = np.array(found["events"]), np.array(found["pictures"])
-    moving = (pictures[:, 0] >= events[0]) & (pictures[:, 0] <= found["last"])
+    events, pictures = np.array(timings["events"]), np.array(timings["pictures"])
+    moving = (pictures[:, 0] >= events[0]) & (pictures[:, 0] <= timings["last"])
     shown = [pictures[pictures[:, 1] >= k, 0].min() - t for k, t in enumerate(events)]
-    rate = float(moving.sum() / (found["last"] - events[0]) * 1000)
-    whole = float(found["whole"] - found["last"])
-    return rate, float(np.median(shown)), float(np.quantile(shown, 0.9)), whole
+    rate = float(moving.sum() / (timings["last"] - events[0]) * 1000)
+    full_picture = float(timings["whole"] - timings["last"])
+    return rate, float(np.median(shown)), float(np.quantile(shown, 0.9)), full_picture

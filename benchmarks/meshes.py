@@ -24,15 +24,15 @@ _PERIOD = 4 * math.pi
 # Half of a gyroid's wall, as a value of the function; its cell is 1 and the box two cells wide.
 _WALL = 0.3
 _CELL = 2 * math.pi
-# What lies in the wall, by the values on lattices of up to 800^3 points, to 5e-5.
+# The volume of the wall, by the values on lattices of up to 800^3 points, to 5e-5.
 _VOLUME = 1.54755
 
 
 @dataclass(frozen=True)
 class _Row:
-    """One mesh. far: the largest distance of a point of the mesh from the surface, rms: its root
-    mean square; missed: the largest of a point of the surface from the mesh, None where it was not
-    measured; all as parts of the size."""
+    """One mesh. far: the largest distance of a point of the mesh from the surface; rms: the root
+    mean square; missed: the largest distance of a point of the surface from the mesh, None where it
+    was not measured; all relative to the size."""
 
     name: str
     seconds: float
@@ -92,7 +92,7 @@ def _line(surface: str, row: _Row, rim: int | None) -> str:
 
 
 def _peer() -> str:
-    """Which microgen takes part."""
+    """The version of microgen that takes part."""
     try:
         return f"microgen is {importlib.metadata.version('microgen')}."
     except importlib.metadata.PackageNotFoundError:
@@ -105,46 +105,47 @@ def _timed(make: Callable[[], Any]) -> tuple[Any, float]:
 
 
 def _ours(loop: FloatArray, tolerance: float) -> _Row:
-    made, seconds = _timed(lambda: hk.mesh(hk.SolidAngle(loop), tolerance=tolerance))
-    evaluations = made.metadata["harnack"]["evaluations"]
+    mesh, seconds = _timed(lambda: hk.mesh(hk.SolidAngle(loop), tolerance=tolerance))
+    evaluations = mesh.metadata["harnack"]["evaluations"]
     name = f"harnack, tolerance {tolerance:g}"
-    return _Row(name, seconds, made, evaluations, *_curve_errors(loop, made))
+    return _Row(name, seconds, mesh, evaluations, *_curve_errors(loop, mesh))
 
 
-def _curve_errors(loop: FloatArray, made: trimesh.Trimesh) -> tuple[float, float, float]:
-    """Largest and rms error, and how far hits are from the mesh at most, as parts of the size."""
+def _curve_errors(loop: FloatArray, mesh: trimesh.Trimesh) -> tuple[float, float, float]:
+    """Largest and rms error, and the largest distance of hits from the mesh, relative to the
+    size."""
     size, rng = float(np.ptp(loop, axis=0).max()), np.random.default_rng(0)
-    points: FloatArray = np.asarray(made.sample(_SAMPLES, seed=0))
-    seen = CurveOracle([loop])(points)
-    off = seen.value - 2 * math.pi
-    off -= _PERIOD * np.round(off / _PERIOD)
-    # Where the slope leads past the curve, the curve, which ends every level, is what is near.
-    error = np.minimum(np.abs(off) / np.linalg.norm(seen.gradient, axis=1), seen.smooth) / size
+    points: FloatArray = np.asarray(mesh.sample(_SAMPLES, seed=0))
+    exact = CurveOracle([loop])(points)
+    gap = exact.value - 2 * math.pi
+    gap -= _PERIOD * np.round(gap / _PERIOD)
+    # Where the slope leads past the curve, the curve, which ends every level, is the nearest.
+    error = np.minimum(np.abs(gap) / np.linalg.norm(exact.gradient, axis=1), exact.smooth) / size
     direction = rng.normal(size=(8 * _HITS, 3))
     origin = 4 * direction / np.linalg.norm(direction, axis=1)[:, None]
     hits = hk.trace(hk.SolidAngle(loop), origin, rng.uniform(-1, 1, origin.shape) - origin)
-    missed = _distances(made, np.asarray(hits.position[hits.is_hit])[:_HITS]).max() / size
+    missed = _distances(mesh, np.asarray(hits.position[hits.is_hit])[:_HITS]).max() / size
     return float(error.max()), float(np.sqrt((error**2).mean())), float(missed)
 
 
-def _distances(made: trimesh.Trimesh, points: FloatArray) -> FloatArray:
-    """(n,) to the nearest of those triangles of which a center or a middle of an edge is among the
-    32 nearest: hardly too large."""
+def _distances(mesh: trimesh.Trimesh, points: FloatArray) -> FloatArray:
+    """(n,) distances to the nearest of the triangles of which a center or a midpoint of an edge is
+    among the 32 nearest: hardly too large."""
     from scipy.spatial import cKDTree
 
-    corner = np.asarray(made.triangles)
+    corner = np.asarray(mesh.triangles)
     middles = 0.5 * (corner + np.roll(corner, 1, axis=1))
-    places = np.concatenate([corner.mean(axis=1)[:, None], middles], axis=1).reshape(-1, 3)
-    near = cKDTree(places).query(points, k=32)[1] // 4
-    best = np.full(len(points), np.inf)
-    for owner in near.T:
+    samples = np.concatenate([corner.mean(axis=1)[:, None], middles], axis=1).reshape(-1, 3)
+    triangle_ids = cKDTree(samples).query(points, k=32)[1] // 4
+    distances = np.full(len(points), np.inf)
+    for owner in triangle_ids.T:
         foot = trimesh.triangles.closest_point(corner[owner], points)
-        best = np.minimum(best, np.linalg.norm(foot - points, axis=1))
-    return best
+        distances = np.minimum(distances, np.linalg.norm(foot - points, axis=1))
+    return distances
 
 
 def _cubes(loop: FloatArray, step: float) -> list[_Row]:
-    """Marching cubes over the same box, as it is and cleaned."""
+    """Marching cubes over the same box, as they are and cleaned."""
     from skimage.measure import marching_cubes
 
     field, evaluations = hk.SolidAngle(loop), 0
@@ -154,8 +155,8 @@ def _cubes(loop: FloatArray, step: float) -> list[_Row]:
     def wrapped(points: FloatArray) -> FloatArray:
         nonlocal evaluations
         evaluations += len(points)
-        off = field.value(points, precision="double") - 2 * math.pi
-        return off - _PERIOD * np.round(off / _PERIOD)
+        residual = field.value(points, precision="double") - 2 * math.pi
+        return residual - _PERIOD * np.round(residual / _PERIOD)
 
     def make() -> tuple[FloatArray, Any, Any]:
         axes = [lower[k] + step * (np.arange(counts[k]) - 1) for k in range(3)]
@@ -167,11 +168,11 @@ def _cubes(loop: FloatArray, step: float) -> list[_Row]:
 
     (vertices, faces, cleaned), seconds = _timed(make)
     rows: list[_Row] = []
-    for name, some in (("", faces), (", cleaned", cleaned)):
-        made = trimesh.Trimesh(vertices, some, process=False)
-        made.remove_unreferenced_vertices()
+    for name, subset in (("", faces), (", cleaned", cleaned)):
+        mesh = trimesh.Trimesh(vertices, subset, process=False)
+        mesh.remove_unreferenced_vertices()
         label = f"marching cubes, step {step:g}{name}"
-        rows.append(_Row(label, seconds, made, evaluations, *_curve_errors(loop, made)))
+        rows.append(_Row(label, seconds, mesh, evaluations, *_curve_errors(loop, mesh)))
     return rows
 
 
@@ -190,16 +191,16 @@ def _walls() -> list[_Row]:
         box = hk.Box((-1, -1, -1), (1, 1, 1))
         return hk.mesh(hk.Gyroid(cell=1.0), solid=(-_WALL, _WALL), clip=box, tolerance=2e-3)
 
-    made, seconds = _timed(ours)
-    evaluations = made.metadata["harnack"]["evaluations"]
-    rows = [_Row("harnack, tolerance 0.002", seconds, made, evaluations, *_wall_errors(made))]
+    mesh, seconds = _timed(ours)
+    evaluations = mesh.metadata["harnack"]["evaluations"]
+    rows = [_Row("harnack, tolerance 0.002", seconds, mesh, evaluations, *_wall_errors(mesh))]
     rows += [_cubes_wall(step) for step in (0.05, 0.025)]
     rows += [row for row in (_manifold_wall(0.05), _microgen_wall(10), _microgen_wall(40)) if row]
     return rows
 
 
-def _wall_errors(made: trimesh.Trimesh) -> tuple[float, float, None]:
-    points: FloatArray = np.asarray(made.sample(_SAMPLES, seed=0))
+def _wall_errors(mesh: trimesh.Trimesh) -> tuple[float, float, None]:
+    points: FloatArray = np.asarray(mesh.sample(_SAMPLES, seed=0))
     value, slope = _gyroid(points)
     error = np.abs(np.abs(value) - _WALL) / np.maximum(np.linalg.norm(slope, axis=1), 1e-9)
     error = np.minimum(error, np.abs(np.abs(points).max(axis=1) - 1)) / 2  # or on the box
@@ -221,9 +222,9 @@ def _cubes_wall(step: float) -> _Row:
         )
         return trimesh.Trimesh(vertices + axis[0], faces, process=False)
 
-    made, seconds = _timed(make)
+    mesh, seconds = _timed(make)
     name = f"marching cubes of the wall, step {step:g}"
-    return _Row(name, seconds, made, len(axis) ** 3, *_wall_errors(made))
+    return _Row(name, seconds, mesh, len(axis) ** 3, *_wall_errors(mesh))
 
 
 def _manifold_wall(step: float) -> _Row | None:
@@ -243,26 +244,26 @@ def _manifold_wall(step: float) -> _Row | None:
 
         manifold3d.Manifold.level_set(record, ends, step)
         wall = _WALL - np.abs(_gyroid(np.array(recorded))[0])
-        known = dict(zip(recorded, wall.tolist(), strict=True))
+        values = dict(zip(recorded, wall.tolist(), strict=True))
 
         def replay(x: float, y: float, z: float) -> float:
-            value = known.get((x, y, z))
+            value = values.get((x, y, z))
             if value is None:  # points of its root finding, one by one
                 value = _WALL - abs(float(_gyroid(np.array([[x, y, z]]))[0][0]))
-                known[x, y, z] = value
+                values[x, y, z] = value
             return value
 
         solid = manifold3d.Manifold.level_set(replay, ends, step, 0.0, 1e-4)
         solid = solid ^ manifold3d.Manifold.cube([2, 2, 2], True)
-        found = solid.to_mesh()
-        recorded[:] = list(known)
+        arrays = solid.to_mesh()
+        recorded[:] = list(values)
         return trimesh.Trimesh(
-            np.asarray(found.vert_properties)[:, :3], np.asarray(found.tri_verts), process=False
+            np.asarray(arrays.vert_properties)[:, :3], np.asarray(arrays.tri_verts), process=False
         )
 
-    made, seconds = _timed(make)
+    mesh, seconds = _timed(make)
     name = f"manifold3d level_set of the wall, edge {step:g}"
-    return _Row(name, seconds, made, len(recorded), *_wall_errors(made))
+    return _Row(name, seconds, mesh, len(recorded), *_wall_errors(mesh))
 
 
 def _microgen_wall(resolution: int) -> _Row | None:
@@ -283,7 +284,7 @@ def _microgen_wall(resolution: int) -> _Row | None:
             np.asarray(sheet.points, float), sheet.faces.reshape(-1, 4)[:, 1:], process=False
         )
 
-    made, seconds = _timed(make)
+    mesh, seconds = _timed(make)
     count = (2 * resolution) ** 3
     name = f"microgen, resolution {resolution}"
-    return _Row(name, seconds, made, count, *_wall_errors(made))
+    return _Row(name, seconds, mesh, count, *_wall_errors(mesh))

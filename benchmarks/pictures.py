@@ -1,4 +1,4 @@
-"""What a path-traced picture costs, beside Mitsuba's own path tracer on a mesh of the surface."""
+"""Cost of a path-traced picture, beside Mitsuba's own path tracer on a mesh of the surface."""
 
 from __future__ import annotations
 
@@ -90,26 +90,26 @@ def _radiance(mi: Any, scene: Any, clamp: float | None = None) -> Callable[[], n
 
 
 def _timed(draw: Callable[[], np.ndarray]) -> tuple[float, float, np.ndarray]:
-    """Least CPU and wall time, and the picture."""
+    """The smallest CPU and wall time, and the picture."""
     image = draw()  # compiles
     cpu, wall = [], []
     for _ in range(_ROUNDS):
         dr.sync_thread()
-        began = time.process_time(), time.perf_counter()
+        start = time.process_time(), time.perf_counter()
         image = draw()
         dr.sync_thread()
-        cpu.append(time.process_time() - began[0])
-        wall.append(time.perf_counter() - began[1])
+        cpu.append(time.process_time() - start[0])
+        wall.append(time.perf_counter() - start[1])
     return min(cpu), min(wall), image
 
 
-def _as_mesh(mi: Any, made: Any) -> tuple[Any, int]:
+def _as_mesh(mi: Any, studio: Any) -> tuple[Any, int]:
     """The surface, whose polygon is a graph over a disc, as a mesh of Mitsuba's in the studio."""
-    carrier = made.scene["surface0"]
+    carrier = studio.scene["surface0"]
     r = np.linspace(0, 1, _RINGS)[1:]
-    turn = np.linspace(0, 2 * np.pi, _RINGS, endpoint=False)
-    r, turn = (part.ravel() for part in np.meshgrid(r, turn, indexing="ij"))
-    flat = 0.9995 * r[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
+    angle = np.linspace(0, 2 * np.pi, _RINGS, endpoint=False)
+    r, angle = (grid.ravel() for grid in np.meshgrid(r, angle, indexing="ij"))
+    flat = 0.9995 * r[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
     o = np.column_stack([np.vstack([[0, 0], flat]), np.full(len(flat) + 1, 2.0)])
     fine = replace(carrier.surface, tolerance=hk.HitTolerance(1e-5))
     hits = hk.trace(fine, o, [[0, 0, -1.0]])

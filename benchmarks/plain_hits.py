@@ -43,18 +43,18 @@ class PlainHits:
             if not (clear[k] and len(crossings)):
                 continue
             ends = np.concatenate([[0], crossings, [crossings[-1] + 1]])
-            above = exact(o[k] + 0.5 * (ends[1:] + ends[:-1])[:, None] * d[k]) > 0.5
-            changes = np.flatnonzero(above[1:] != above[:-1])
+            is_above = exact(o[k] + 0.5 * (ends[1:] + ends[:-1])[:, None] * d[k]) > 0.5
+            changes = np.flatnonzero(is_above[1:] != is_above[:-1])
             if len(changes):
                 first[k] = crossings[changes[0]]
                 allowed[k] = tolerance + 1e-6 / max(lean[changes[0]], 1e-9)
         return cls(first, allowed, clear)
 
     def others(self, t: FloatArray) -> int:
-        """How many clear rays are hit elsewhere."""
+        """The number of clear rays that are hit elsewhere."""
         with np.errstate(invalid="ignore"):
-            same = (t == self.t) | (np.abs(t - self.t) <= self.allowed)
-        return int((self.clear & ~same).sum())
+            is_same = (t == self.t) | (np.abs(t - self.t) <= self.allowed)
+        return int((self.clear & ~is_same).sum())
 
 
 def _crossings(
@@ -71,9 +71,9 @@ def _crossings(
         u, v, t = (s * h).sum(axis=1), g @ d, (f * g).sum(axis=1)
         u, v, t = u / volume, v / volume, t / volume
         margin = np.minimum(np.minimum(u, v), 1 - u - v)
-    beside = np.abs(margin) * np.sqrt(double_area) < _BESIDE
+    near_edge = np.abs(margin) * np.sqrt(double_area) < _BESIDE
     ahead = t > -_BESIDE
-    clear = not bool((ahead & (beside | ~np.isfinite(margin) | (np.abs(t) < _BESIDE))).any())
-    met = np.flatnonzero((margin >= 0) & ahead)
-    met = met[np.argsort(t[met])]
-    return t[met], np.abs(volume[met]) / double_area[met], clear
+    clear = not bool((ahead & (near_edge | ~np.isfinite(margin) | (np.abs(t) < _BESIDE))).any())
+    crossed = np.flatnonzero((margin >= 0) & ahead)
+    crossed = crossed[np.argsort(t[crossed])]
+    return t[crossed], np.abs(volume[crossed]) / double_area[crossed], clear

@@ -27,10 +27,10 @@ from .blobs import Scene
 from .scenes import EYE, FIELD_OF_VIEW
 
 WIDTH, TOLERANCE, SAMPLES = 256, 1e-4, 1500
-# Every so many pixels a row and column are compared with the oracle.
+# Every _CHECKED-th pixel of a row and of a column is compared with the oracle.
 _CHECKED = 2
-# A pixel is wrong where one sees a surface and the other does not, or this much later; or farther
-# from the surface than so many tolerances.
+# A pixel is wrong where one sees a surface and the other does not, or sees it this much later; or
+# where the hit is farther from the surface than this many tolerances.
 _APART, _NEAR = 2e-3, 3.0
 # Positions are written to pictures as <0.1, 0.9> for coordinates in [-_SIZE, _SIZE].
 _SIZE = 2.0
@@ -38,7 +38,7 @@ _SIZE = 2.0
 
 @dataclass(frozen=True)
 class Drawn:
-    """A surface that all of them draw.
+    """A surface that all programs draw.
 
     field, level: f, or f plus a constant, and the level that is the surface.
     formula: f of x, y, z, arrays of any kind, positive inside. values: of points (n, 3) in NumPy.
@@ -62,8 +62,8 @@ class Drawn:
     def container(self) -> str:
         if isinstance(self.domain, hk.Ball):
             return f"sphere {{ <0,0,0>, {self.domain.radius:.9f} }}"
-        low, high = (np.asarray(one) for one in (self.domain.lower, self.domain.upper))
-        return f"box {{ {_vector(low)}, {_vector(high)} }}"
+        lower, upper = (np.asarray(corner) for corner in (self.domain.lower, self.domain.upper))
+        return f"box {{ {_vector(lower)}, {_vector(upper)} }}"
 
 
 @dataclass(frozen=True)
@@ -78,19 +78,19 @@ class Oracle:
     doubtful: np.ndarray
 
     def wrong(self, drawn: Drawn, d: np.ndarray, t: np.ndarray) -> tuple[int, int]:
-        """How many of these distances are wrong, without and with the doubtful pixels.
+        """The number of wrong distances, without and with the doubtful pixels.
 
         A hit before the root is right if it is near the surface: within `_NEAR` tolerances of it,
         to first order.
         """
-        seen, there = np.isfinite(t), np.isfinite(self.t)
-        p = EYE + np.where(seen, t, 0.0)[:, None] * d
+        is_hit, has_root = np.isfinite(t), np.isfinite(self.t)
+        p = EYE + np.where(is_hit, t, 0.0)[:, None] * d
         with np.errstate(invalid="ignore"):
-            far = np.abs(drawn.values(p)) > _NEAR * TOLERANCE * np.linalg.norm(
+            is_far = np.abs(drawn.values(p)) > _NEAR * TOLERANCE * np.linalg.norm(
                 drawn.gradients(p), axis=1
             )
-            off = (seen != there) | (seen & there & ((t > self.t + _APART) | far))
-        return int((off & ~self.doubtful).sum()), int(off.sum())
+            is_wrong = (is_hit != has_root) | (is_hit & has_root & ((t > self.t + _APART) | is_far))
+        return int((is_wrong & ~self.doubtful).sum()), int(is_wrong.sum())
 
 
 def has_povray() -> bool:
@@ -107,7 +107,7 @@ def _gyroid() -> Drawn:
     k = 3 * math.pi
 
     def formula(x: Any, y: Any, z: Any) -> Any:
-        s, c = [hk.sin(k * one) for one in (x, y, z)], [hk.cos(k * one) for one in (x, y, z)]
+        s, c = [hk.sin(k * axis) for axis in (x, y, z)], [hk.cos(k * axis) for axis in (x, y, z)]
         return -(s[0] * c[1] + s[1] * c[2] + s[2] * c[0])
 
     def values(p: np.ndarray) -> np.ndarray:
@@ -123,9 +123,9 @@ def _gyroid() -> Drawn:
         from isoray.arithmetic.interval import ia_cos, ia_mul, ia_sin
 
         axes = [(k * ends[2 * i], k * ends[2 * i + 1]) for i in range(3)]
-        s, c = [ia_sin(*one) for one in axes], [ia_cos(*one) for one in axes]
+        s, c = [ia_sin(*axis) for axis in axes], [ia_cos(*axis) for axis in axes]
         products = [ia_mul(*s[i], *c[(i + 1) % 3]) for i in range(3)]
-        return -sum(one[1] for one in products), -sum(one[0] for one in products)
+        return -sum(axis[1] for axis in products), -sum(axis[0] for axis in products)
 
     text = "+".join(f"sin({k:.12f}*{a})*cos({k:.12f}*{b})" for a, b in ("xy", "yz", "zx"))
     ball = hk.Ball(radius=1.0)
@@ -154,9 +154,9 @@ def _blobs() -> Drawn:
         low, high = np.full(len(ends[0]), -scene.threshold), np.full(len(ends[0]), -scene.threshold)
         for c, reach, height in zip(scene.centers, scene.reaches, scene.heights, strict=True):
             squares = [ia_sqr(ends[2 * i] - c[i], ends[2 * i + 1] - c[i]) for i in range(3)]
-            least, most = (sum(one[side] for one in squares) for side in (0, 1))
-            low += height * np.maximum(1 - most / reach**2, 0) ** 3
-            high += height * np.maximum(1 - least / reach**2, 0) ** 3
+            nearest, farthest = (sum(square[side] for square in squares) for side in (0, 1))
+            low += height * np.maximum(1 - farthest / reach**2, 0) ** 3
+            high += height * np.maximum(1 - nearest / reach**2, 0) ** 3
         return low, high
 
     def formula(x: Any, y: Any, z: Any) -> Any:
@@ -173,10 +173,10 @@ def _blobs() -> Drawn:
         for c, reach, height in zip(scene.centers, scene.reaches, scene.heights, strict=True)
     ]
     points = np.random.default_rng(0).uniform(low, high, (400_000, 3))
-    steepest = float(np.linalg.norm(gradients(points), axis=1).max())
+    max_slope = float(np.linalg.norm(gradients(points), axis=1).max())
     return Drawn(
         "40 blobs", scene.field(), scene.threshold, box, formula, scene.values, gradients,
-        intervals, f"{scene.threshold:.12f}-({'+'.join(terms)})", steepest,
+        intervals, f"{scene.threshold:.12f}-({'+'.join(terms)})", max_slope,
     )  # fmt: skip
 
 
@@ -197,13 +197,13 @@ def _axes() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def spans(drawn: Drawn, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where rays enter and leave the container; far < near where they miss it."""
+    """Lengths at which rays enter and leave the container; far < near where they miss it."""
     if isinstance(drawn.domain, hk.Ball):
         middle = -(d @ EYE)
-        away = EYE @ EYE - middle**2
-        half = np.sqrt(np.maximum(drawn.domain.radius**2 - away, 0))
-        return middle - half, np.where(away < drawn.domain.radius**2, middle + half, -1.0)
-    ends = [(np.asarray(one) - EYE) / d for one in (drawn.domain.lower, drawn.domain.upper)]
+        square = EYE @ EYE - middle**2
+        half = np.sqrt(np.maximum(drawn.domain.radius**2 - square, 0))
+        return middle - half, np.where(square < drawn.domain.radius**2, middle + half, -1.0)
+    ends = [(np.asarray(corner) - EYE) / d for corner in (drawn.domain.lower, drawn.domain.upper)]
     return np.minimum(*ends).max(1), np.maximum(*ends).min(1)
 
 
@@ -212,58 +212,58 @@ def oracle(drawn: Drawn, d: np.ndarray) -> Oracle:
     the tracer."""
     backend = choose_backend("double")
     count, real = backend.UInt32, backend.Float
-    near, far = (real(one) for one in spans(drawn, d))
+    start_t, far = (real(length) for length in spans(drawn, d))
     directions = to_vector3(backend, d)
-    crosses = far > near
+    crosses = far > start_t
 
     def value(t: Any) -> Any:
         return drawn.formula(*(float(EYE[k]) + t * directions[k] for k in range(3)))
 
-    start = value(near)
+    start = value(start_t)
 
-    def first(k: Any, found: Any, before: Any) -> tuple[Any, ...]:
-        now = value(near + (far - near) * (real(k) / SAMPLES))
-        new = (found == 0) & ((now > 0) != (before > 0))
-        return k + 1, dr.select(new, k, found), now
+    def first(k: Any, index: Any, before: Any) -> tuple[Any, ...]:
+        current = value(start_t + (far - start_t) * (real(k) / SAMPLES))
+        is_first = (index == 0) & ((current > 0) != (before > 0))
+        return k + 1, dr.select(is_first, k, index), current
 
-    found = dr.while_loop(
+    index = dr.while_loop(
         (count(1) + dr.zeros(count, len(d)), dr.zeros(count, len(d)), start),
-        lambda k, found, _: crosses & (k <= SAMPLES) & (found == 0),
+        lambda k, index, _: crosses & (k <= SAMPLES) & (index == 0),
         first,
     )[1]
-    has_root = found > 0
-    a = near + (far - near) * (real(found) - 1) / SAMPLES
-    b = near + (far - near) * real(found) / SAMPLES
+    has_root = index > 0
+    a = start_t + (far - start_t) * (real(index) - 1) / SAMPLES
+    b = start_t + (far - start_t) * real(index) / SAMPLES
     for _ in range(40):
         middle = 0.5 * (a + b)
         same = (value(middle) > 0) == (start > 0)
         a, b = dr.select(same, middle, a), dr.select(same, b, middle)
     # Nearly touched well before the first root, or a root right at the container.
-    last = dr.select(has_root, dr.maximum(found, 4) - 4, SAMPLES)
+    last = dr.select(has_root, dr.maximum(index, 4) - 4, SAMPLES)
 
-    def touched(k: Any, least: Any) -> tuple[Any, ...]:
-        t = near + (far - near) * (real(k) / SAMPLES)
-        return k + 1, dr.minimum(least, dr.abs(value(t)))
+    def touched(k: Any, min_value: Any) -> tuple[Any, ...]:
+        t = start_t + (far - start_t) * (real(k) / SAMPLES)
+        return k + 1, dr.minimum(min_value, dr.abs(value(t)))
 
     def behind_root(k: Any, most: Any) -> tuple[Any, ...]:
-        now = value(near + (far - near) * (real(k) / SAMPLES))
-        behind = (now > 0) != (start > 0)
-        return k + 1, dr.select(behind, dr.maximum(most, dr.abs(now)), most), behind
+        current = value(start_t + (far - start_t) * (real(k) / SAMPLES))
+        behind = (current > 0) != (start > 0)
+        return k + 1, dr.select(behind, dr.maximum(most, dr.abs(current)), most), behind
 
-    least = dr.while_loop(
+    min_value = dr.while_loop(
         (dr.zeros(count, len(d)), dr.full(real, dr.inf, len(d))),
         lambda k, _: crosses & (k <= last),
         touched,
     )[1]
     # Or behind it for so short that it is within the tolerance of the surface all the time.
     beyond = dr.while_loop(
-        (count(found), dr.zeros(real, len(d)), dr.full(backend.Bool, True, len(d))),
+        (count(index), dr.zeros(real, len(d)), dr.full(backend.Bool, True, len(d))),
         lambda k, most, behind: has_root & behind & (k <= SAMPLES),
         lambda k, most, behind: behind_root(k, most),
     )
     shallow = has_root & ~beyond[2] & (beyond[1] < 1.1 * TOLERANCE * drawn.steepest)
-    edge = has_root & ((found <= 3) | (found + 3 >= SAMPLES))
-    doubtful = (least < 1.1 * TOLERANCE * drawn.steepest) | edge | shallow
+    edge = has_root & ((index <= 3) | (index + 3 >= SAMPLES))
+    doubtful = (min_value < 1.1 * TOLERANCE * drawn.steepest) | edge | shallow
     t = dr.select(has_root, b, dr.inf)
     dr.eval(t, doubtful)
     return Oracle(t.numpy(), doubtful.numpy())
@@ -298,7 +298,7 @@ def by_harnack(
 def by_povray(
     drawn: Drawn, d: np.ndarray, threads: int, *, positions: bool
 ) -> tuple[np.ndarray | None, float, float]:
-    """Distances if positions are asked for, and core and wall time of tracing as POV-Ray tells
+    """Distances if positions are requested, and core and wall time of tracing as POV-Ray reports
     them."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scene.pov"
@@ -316,12 +316,12 @@ def pov_scene(drawn: Drawn, *, positions: bool) -> str:
     wide = 2 * math.tan(FIELD_OF_VIEW / 2)
     flat = "pigment { rgb <1,1,1> }"
     if positions:
-        parts = [
+        maps = [
             f"[1 function {{ 0.5+{axis}*{0.4 / _SIZE:.12f} }} color_map {{ [0 rgb 0] "
             f"[1 rgb {_vector(3 * np.eye(3)[k])}] }}]"
             for k, axis in enumerate("xyz")
         ]
-        flat = f"pigment {{ average pigment_map {{ {' '.join(parts)} }} }}"
+        flat = f"pigment {{ average pigment_map {{ {' '.join(maps)} }} }}"
     return (
         "#version 3.7;\nglobal_settings { assumed_gamma 1.0 }\nbackground { rgb 0 }\n"
         f"camera {{ perspective location {_vector(EYE)} direction {_vector(forward)} "
@@ -333,29 +333,29 @@ def pov_scene(drawn: Drawn, *, positions: bool) -> str:
 
 
 def _vector(v: np.ndarray) -> str:
-    return "<" + ",".join(f"{float(one):.12f}" for one in v) + ">"
+    return "<" + ",".join(f"{float(number):.12f}" for number in v) + ">"
 
 
 def _run_povray(path: Path, threads: int, out: Path | None) -> tuple[float, float]:
-    """Core and wall seconds of tracing: neither of starting nor of reading the scene."""
+    """Core and wall seconds of tracing, without starting and reading the scene."""
     writing = [f"+O{out}", "+FN16", "File_Gamma=1.0"] if out else ["Output_to_File=false"]
     command = [
         "povray", f"+I{path}", f"+W{WIDTH}", f"+H{WIDTH}", "-D", "-A", f"+WT{threads}",
         *writing,
     ]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    told = re.search(
+    process = subprocess.run(command, capture_output=True, text=True, check=False)
+    times = re.search(
         r"Trace Time:.*?\(([\d.]+) seconds\)\s*using \d+ thread\(s\) with ([\d.]+) CPU-seconds",
-        done.stderr,
+        process.stderr,
         re.DOTALL,
     )
-    if done.returncode or told is None:
-        raise RuntimeError(f"povray failed:\n{done.stderr[-2000:]}")
-    return float(told[2]), float(told[1])
+    if process.returncode or times is None:
+        raise RuntimeError(f"povray failed:\n{process.stderr[-2000:]}")
+    return float(times[2]), float(times[1])
 
 
 def _distances(path: Path, d: np.ndarray) -> np.ndarray:
-    """t of the positions that a picture's colors are; infinite where it shows the background."""
+    """t of the positions that the colors of a picture encode; infinite at the background."""
     from mitsuba import Bitmap
 
     pixels = np.array(Bitmap(str(path)), dtype=np.float64).reshape(-1, 3)[: len(d)] / 65535
@@ -374,16 +374,16 @@ def by_isoray(drawn: Drawn, d: np.ndarray) -> tuple[np.ndarray, float]:
     def function(p: np.ndarray) -> tuple[np.ndarray, None]:
         return drawn.values(p), None
 
-    def recipe(*given: Any) -> tuple[np.ndarray, np.ndarray]:
-        return drawn.intervals(*given[:6])
+    def recipe(*bounds: Any) -> tuple[np.ndarray, np.ndarray]:
+        return drawn.intervals(*bounds[:6])
 
     near, far = spans(drawn, d)
     core = time.process_time()
-    made = bisect_trace(
+    result = bisect_trace(
         np.broadcast_to(EYE, d.shape), d, near, far, far > near,
         NaturalIntervalInclusion(recipe), function, threshold=TOLERANCE,
     )  # fmt: skip
-    return np.where(made.is_hit, made.t, np.inf), time.process_time() - core
+    return np.where(result.is_hit, result.t, np.inf), time.process_time() - core
 
 
 @contextlib.contextmanager

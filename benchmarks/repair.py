@@ -30,24 +30,24 @@ Damage = tuple[str, float]
 Close = Callable[[FloatArray, IntArray], tuple[Any, Any, str]]
 
 _SHARES = (0.02, 0.05, 0.10)
-# Of other damage than patches only this share is measured.
+# Damage other than patches is measured for this share only.
 _USUAL_SHARE = 0.05
 _SAMPLES = 100_000
-# How many meshes are done at once.
+# Number of meshes that are processed at once.
 _AT_ONCE = 3
-# What takes long is asked for this damage only.
+# Slow programs are run for this damage only.
 _SLOW, _OF_SLOW = ("alpha wrap", "screened Poisson"), ("patches", 0.05)
-# Larger meshes are not asked of others: the time of all together counts.
+# Larger meshes are left out: the total time counts.
 _MOST_FACES = 30_000
-# Within this of the best a distance counts as one of the best, and so does one below the least that
-# sampling tells apart, as a part of the diagonal.
+# A distance counts as among the best within this factor of the best, and also below the smallest
+# distance that sampling resolves, relative to the diagonal.
 _NEARLY, _FLOOR = 1.10, 1e-3
 
 
 @dataclass(frozen=True)
 class _Row:
-    """What a program made. distance: Hausdorff's, as a part of the diagonal, sampled; infinite if
-    there is no mesh."""
+    """The result of a program. distance: Hausdorff's, relative to the diagonal, sampled; infinite
+    if there is no mesh."""
 
     seconds: float
     is_closed: bool
@@ -56,13 +56,14 @@ class _Row:
 
 
 def repair(folder: Path | None) -> str:
-    """Measure, and return the section of the page. folder: of more meshes; None for made ones."""
+    """Measure, and return the section of the page. folder: of further meshes; None for generated
+    meshes."""
     meshes = _meshes(folder)
     rows: dict[Damage, list[dict[str, _Row]]] = defaultdict(list)
-    largest_first = sorted(meshes.items(), key=lambda named: -len(named[1][1]))
+    largest_first = sorted(meshes.items(), key=lambda entry: -len(entry[1][1]))
     with ProcessPoolExecutor(_AT_ONCE, mp_context=get_context("spawn")) as pool:
-        for found in pool.map(_of_mesh, largest_first):
-            for damage, row in found.items():
+        for results in pool.map(_of_mesh, largest_first):
+            for damage, row in results.items():
                 rows[damage].append(row)
     return "\n".join(_page(meshes, rows, list(_programs())))
 
@@ -71,27 +72,27 @@ def _programs() -> dict[str, Close]:
     return {"harnack": _ours, **_peers()}
 
 
-def _of_mesh(named: tuple[str, Arrays]) -> dict[Damage, dict[str, _Row]]:
-    """What each program makes of one mesh, by kind and share of damage."""
-    name, whole = named
+def _of_mesh(entry: tuple[str, Arrays]) -> dict[Damage, dict[str, _Row]]:
+    """The results of each program for one mesh, by kind and share of damage."""
+    name, whole = entry
     rows: dict[Damage, dict[str, _Row]] = {}
-    for kind, share in itertools.product(_KINDS, _SHARES):
-        if kind != "patches" and share != _USUAL_SHARE:
+    for kind, fraction in itertools.product(_KINDS, _SHARES):
+        if kind != "patches" and fraction != _USUAL_SHARE:
             continue
-        given = damaged(*whole, kind, share, seed=11)
-        is_few = (kind, share) == _OF_SLOW
-        found = {
-            label: _measured(close, given, whole)
+        mesh = damaged(*whole, kind, fraction, seed=11)
+        is_few = (kind, fraction) == _OF_SLOW
+        results = {
+            label: _measured(close, mesh, whole)
             for label, close in _programs().items()
             if is_few or not label.startswith(_SLOW)
         }
-        rows[kind, share] = found
-        said = "; ".join(
+        rows[kind, fraction] = results
+        summary = "; ".join(
             f"{label} {row.stage} {'closed' if row.is_closed else 'open'} "
             f"{100 * row.distance:.2f} {row.seconds:.1f} s"
-            for label, row in found.items()
+            for label, row in results.items()
         )
-        print(f"{name} {kind} {share:.0%}: {said}", flush=True)
+        print(f"{name} {kind} {fraction:.0%}: {summary}", flush=True)
     return rows
 
 
@@ -101,7 +102,7 @@ def _page(
     programs: list[str],
 ) -> list[str]:
     """The lines of the section."""
-    every = [found for some in rows.values() for found in some]
+    every = [results for group in rows.values() for results in group]
     sizes = sorted(len(faces) for _, faces in meshes.values())
     lines = [
         "## Repair\n",
@@ -117,16 +118,16 @@ def _page(
         "meshes; a program is *among the best* if it is closed and within 10 % of the nearest "
         "closed result, or within 0.1 %. Seconds are of CPU time, median and largest; alpha wrap "
         "and Poisson were asked for patches of 5 % only. By harnack's "
-        f"stages {_counts(found['harnack'].stage for found in every)}.\n",
+        f"stages {_counts(results['harnack'].stage for results in every)}.\n",
         "| damage | program | closed | distance | among the best | seconds |",
         "|---|---|---:|---:|---:|---:|",
     ]
-    for (kind, share), some in rows.items():
+    for (kind, share), group in rows.items():
         lines += [
-            f"| {kind} {share:.0%} | {label} | {_summary(some, label)} |" for label in some[0]
+            f"| {kind} {share:.0%} | {label} | {_summary(group, label)} |" for label in group[0]
         ]
     lines += [
-        f"| all | {label} | {_summary([f for f in every if label in f], label)} |"
+        f"| all | {label} | {_summary([result for result in every if label in result], label)} |"
         for label in programs
     ]
     return [*lines, ""]
@@ -134,19 +135,20 @@ def _page(
 
 def _summary(rows: list[dict[str, _Row]], label: str) -> str:
     """The cells of a line of the table."""
-    own = [found[label] for found in rows]
+    series = [results[label] for results in rows]
     best = [
-        min(row.distance if row.is_closed else math.inf for row in found.values()) for found in rows
+        min(row.distance if row.is_closed else math.inf for row in results.values())
+        for results in rows
     ]
     among = [
         row.is_closed and row.distance <= max(_NEARLY * least, _FLOOR)
-        for row, least in zip(own, best, strict=True)
+        for row, least in zip(series, best, strict=True)
     ]
-    seconds = sorted(row.seconds for row in own)
-    distance = float(np.median([row.distance for row in own]))
+    seconds = sorted(row.seconds for row in series)
+    distance = float(np.median([row.distance for row in series]))
     near = "none" if math.isinf(distance) else f"{100 * distance:.2f}"
     return (
-        f"{sum(row.is_closed for row in own)} of {len(own)} | {near} | {np.mean(among):.0%} "
+        f"{sum(row.is_closed for row in series)} of {len(series)} | {near} | {np.mean(among):.0%} "
         f"| {float(np.median(seconds)):.1f}, {seconds[-1]:.1f}"
     )
 
@@ -158,12 +160,12 @@ def _counts(names: Iterable[str]) -> str:
     return ", ".join(f"{name} {count}" for name, count in sorted(counts.items()))
 
 
-# Meshes, and what is done to them.
+# Meshes, and their damage.
 
 
 def _meshes(folder: Path | None) -> dict[str, Arrays]:
-    """Closed meshes of files and made ones."""
-    found: dict[str, Arrays] = {
+    """Closed meshes of files, and generated meshes."""
+    meshes: dict[str, Arrays] = {
         "torus": torus_mesh(1.0, 0.4, 96, 48),
         "sphere": _arrays(trimesh.creation.icosphere(4)),
         "box": _arrays(trimesh.creation.box((1.0, 0.7, 0.4)).subdivide_to_size(0.04)),
@@ -192,8 +194,8 @@ def _meshes(folder: Path | None) -> dict[str, Arrays]:
         joined = trimesh.Trimesh(vertices, faces, process=False)
         joined.merge_vertices(merge_tex=True, merge_norm=True)
         if joined.is_watertight and len(faces) <= _MOST_FACES:
-            found[path.stem] = np.array(joined.vertices), np.array(joined.faces)
-    return found
+            meshes[path.stem] = np.array(joined.vertices), np.array(joined.faces)
+    return meshes
 
 
 def _arrays(mesh: trimesh.Trimesh) -> Arrays:
@@ -209,11 +211,11 @@ def _knot() -> Arrays:
     )
     along = np.roll(line, -1, axis=0) - np.roll(line, 1, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
-    one = np.cross(along, line - [0, 0, 3.0])  # nowhere along the curve
-    one /= np.linalg.norm(one, axis=1, keepdims=True)
-    other = np.cross(along, one)
+    u = np.cross(along, line - [0, 0, 3.0])  # nowhere along the curve
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    v = np.cross(along, u)
     angle = np.arange(sides)[:, None] * (2 * np.pi / sides)
-    rings = line[:, None] + radius * (np.cos(angle) * one[:, None] + np.sin(angle) * other[:, None])
+    rings = line[:, None] + radius * (np.cos(angle) * u[:, None] + np.sin(angle) * v[:, None])
     i, j = (k.ravel() for k in np.mgrid[:count, :sides])
     a, b = i * sides + j, i * sides + (j + 1) % sides
     c, d = (a + sides) % (count * sides), (b + sides) % (count * sides)
@@ -248,18 +250,18 @@ def damaged(vertices: FloatArray, faces: IntArray, kind: str, share: float, seed
     diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     center = vertices[faces].mean(axis=1)
     lost = np.zeros(len(faces), np.bool_)
-    for place in rng.choice(len(faces), 6, replace=False):
-        near = np.argsort(np.linalg.norm(center - center[place], axis=1))
+    for face in rng.choice(len(faces), 6, replace=False):
+        near = np.argsort(np.linalg.norm(center - center[face], axis=1))
         lost[near[: max(1, int(share * len(faces) / 6))]] = True
     rest = faces[~lost]
-    some = rng.choice(len(rest), max(1, int(share * len(rest))), replace=False)
+    subset = rng.choice(len(rest), max(1, int(share * len(rest))), replace=False)
     if kind == "faces":
         return vertices, faces[rng.random(len(faces)) > share]
     if kind == "flips":
         rest = rest.copy()
-        rest[some] = rest[some, ::-1]
+        rest[subset] = rest[subset, ::-1]
     if kind == "doubles":
-        rest = np.concatenate([rest, rest[some]])
+        rest = np.concatenate([rest, rest[subset]])
     if kind == "noise":
         return vertices + rng.normal(0, 2e-3 * diagonal, vertices.shape), rest
     if kind == "cracks":
@@ -275,13 +277,13 @@ def damaged(vertices: FloatArray, faces: IntArray, kind: str, share: float, seed
 
 
 def _ours(vertices: FloatArray, faces: IntArray) -> tuple[Any, Any, str]:
-    made = hk.repair(trimesh.Trimesh(vertices, faces, process=False))
-    return made.vertices, made.faces, made.metadata["harnack"]["stage"]
+    mesh = hk.repair(trimesh.Trimesh(vertices, faces, process=False))
+    return mesh.vertices, mesh.faces, mesh.metadata["harnack"]["stage"]
 
 
 def _peers() -> dict[str, Close]:
     """Other programs that are installed."""
-    found: dict[str, Close] = {}
+    programs: dict[str, Close] = {}
     try:
         import pymeshfix
     except ImportError:
@@ -291,7 +293,7 @@ def _peers() -> dict[str, Close]:
         def fixed(vertices: FloatArray, faces: IntArray) -> tuple[Any, Any, str]:
             return (*pymeshfix.clean_from_arrays(vertices, faces), "")
 
-        found[f"pymeshfix {importlib.metadata.version('pymeshfix')}"] = fixed
+        programs[f"pymeshfix {importlib.metadata.version('pymeshfix')}"] = fixed
     import pymeshlab
 
     lab: Any = pymeshlab
@@ -304,8 +306,8 @@ def _peers() -> dict[str, Close]:
         return mesh.vertex_matrix(), mesh.face_matrix(), ""
 
     def by_poisson(vertices: FloatArray, faces: IntArray) -> tuple[Any, Any, str]:
-        """Of vertices with the normals of their faces; those without a face have none, by which the
-        filter fails."""
+        """The reconstruction from vertices with the normals of their faces; vertices without a face
+        have no normal, so that the filter fails."""
         meshes = lab.MeshSet()
         meshes.add_mesh(lab.Mesh(vertices, faces))
         meshes.apply_filter("meshing_remove_unreferenced_vertices")
@@ -317,15 +319,15 @@ def _peers() -> dict[str, Close]:
         return mesh.vertex_matrix(), mesh.face_matrix(), ""
 
     version = importlib.metadata.version("pymeshlab")
-    found[f"alpha wrap (pymeshlab {version})"] = alpha_wrapped
-    found[f"screened Poisson (pymeshlab {version})"] = by_poisson
-    return found
+    programs[f"alpha wrap (pymeshlab {version})"] = alpha_wrapped
+    programs[f"screened Poisson (pymeshlab {version})"] = by_poisson
+    return programs
 
 
-def _measured(close: Close, given: Arrays, whole: Arrays) -> _Row:
+def _measured(close: Close, damaged_mesh: Arrays, reference: Arrays) -> _Row:
     start = time.process_time()
     try:
-        vertices, faces, stage = close(*given)
+        vertices, faces, stage = close(*damaged_mesh)
     except Exception as error:
         return _Row(time.process_time() - start, False, math.inf, type(error).__name__)
     seconds = time.process_time() - start
@@ -335,7 +337,7 @@ def _measured(close: Close, given: Arrays, whole: Arrays) -> _Row:
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     is_closed = bool(mesh.is_watertight and mesh.is_winding_consistent) and is_solid(mesh)
     is_closed = is_closed and not len(intersecting_faces(vertices, faces))
-    return _Row(seconds, is_closed, _hausdorff((vertices, faces), whole), stage)
+    return _Row(seconds, is_closed, _hausdorff((vertices, faces), reference), stage)
 
 
 def is_solid(mesh: trimesh.Trimesh) -> bool:
@@ -346,14 +348,14 @@ def is_solid(mesh: trimesh.Trimesh) -> bool:
     return Manifold(Mesh64(vertices, faces)).status() == Error.NoError
 
 
-def _hausdorff(one: Arrays, other: Arrays) -> float:
-    """Between two meshes, from points of each to triangles of the other, over the diagonal of the
-    second; by MeshLab."""
+def _hausdorff(first: Arrays, second: Arrays) -> float:
+    """The distance between two meshes, from points of each to triangles of the other, over the
+    diagonal of the second; by MeshLab."""
     import pymeshlab
 
     lab: Any = pymeshlab
     meshes = lab.MeshSet()
-    for vertices, faces in (one, other):
+    for vertices, faces in (first, second):
         meshes.add_mesh(lab.Mesh(vertices, faces))
     far = max(
         meshes.get_hausdorff_distance(
@@ -362,4 +364,4 @@ def _hausdorff(one: Arrays, other: Arrays) -> float:
         )["max"]
         for k in (0, 1)
     )  # fmt: skip
-    return float(far) / float(np.linalg.norm(np.ptp(other[0], axis=0)))
+    return float(far) / float(np.linalg.norm(np.ptp(second[0], axis=0)))

@@ -1,4 +1,4 @@
-"""What is measured: fields, and the camera of all measurements."""
+"""The measured fields, and the camera of all measurements."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FIELD_OF_VIEW = math.radians(40.0)
 
 @dataclass(frozen=True)
 class Scene:
-    """A field of about unit size, made when asked for, and its number of vertices (0: no curve)."""
+    """A field of about unit size, made on demand, and its number of vertices (0: no curve)."""
 
     name: str
     make: Callable[[], hk.Field]
@@ -25,8 +25,8 @@ class Scene:
 
 
 class WithoutExtent(hk.SolidAngle):
-    """A curve that does not say how far its surface reaches: rays are clipped at t_max alone,
-    as in the published code."""
+    """A curve without a bound of its surface's extent: rays are clipped at t_max alone, as in the
+    published code."""
 
     def extent(self, levels):  # type: ignore[no-untyped-def]
         return None

@@ -24,12 +24,12 @@ from .growth import bumpy_cloud, one_hole
 from .scenes import camera, others, polygons
 
 WIDTH = 256
-# Turns that versions take, and runs of a scene in a turn, of which the fastest counts.
+# Number of turns of the versions, and of runs of a scene in a turn, of which the fastest counts.
 TURNS, REPEATS = 3, 3
 
 
 def fields() -> dict[str, hk.Field]:
-    """What is traced, at the default level and tolerance."""
+    """The traced fields, at the default level and tolerance."""
     v, f = bumpy_sphere(6)
     damaged = remove_faces(f, 0.1, 0)
     points, normals, areas = bumpy_cloud(4000)
@@ -73,12 +73,12 @@ def beside(before: Path) -> str:
     source = before.resolve() / "src"
     if not (source / "harnack").is_dir():
         raise SystemExit(f"{before} is no checkout of harnack: it has no folder src/harnack")
-    here = Path(hk.__file__).resolve().parent.parent
-    found: dict[Path, list[dict[str, list[float]]]] = {source: [], here: []}
+    current = Path(hk.__file__).resolve().parent.parent
+    rows_by_folder: dict[Path, list[dict[str, list[float]]]] = {source: [], current: []}
     for _ in range(TURNS):
-        for folder, rows in found.items():
+        for folder, rows in rows_by_folder.items():
             rows.append(_in_a_process_of_its_own(folder))
-    old, new = (_medians(found[folder]) for folder in (source, here))
+    old, new = (_medians(rows_by_folder[folder]) for folder in (source, current))
     commit = subprocess.run(
         ["git", "-C", str(before), "rev-parse", "--short", "HEAD"],
         capture_output=True, text=True, check=True,

@@ -1,4 +1,4 @@
-"""Winding numbers at points: how fast and how exact, against libigl's fast winding number."""
+"""Winding numbers at points: speed and accuracy, against libigl's fast winding number."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ FloatArray = npt.NDArray[np.float64]
 class Row:
     """One way to compute winding numbers. Seconds are medians, for all points.
 
-    kernel: what of `seconds` is computing, without sorting and transfers; NaN if not known.
+    kernel: the part of `seconds` for computing, without sorting and transfers; NaN if not known.
     """
 
     method: str
@@ -53,8 +53,8 @@ def libigl(vertices: FloatArray, faces: Any, points: FloatArray) -> FloatArray:
 def query_points(vertices: FloatArray, n: int = POINTS) -> FloatArray:
     """(n, 3) points, uniform in the bounding box made half as large again about its center."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
-    unit = np.random.default_rng(1).uniform(-0.75, 0.75, (n, 3))
-    return 0.5 * (low + high) + unit * (high - low)
+    offsets = np.random.default_rng(1).uniform(-0.75, 0.75, (n, 3))
+    return 0.5 * (low + high) + offsets * (high - low)
 
 
 def cube_points(n: int = POINTS) -> FloatArray:
@@ -70,24 +70,24 @@ def seconds_of(call: Callable[[], Any]) -> float:
 
 
 def kernel_seconds(call: Callable[[], Any]) -> float:
-    """What Dr.Jit's kernels take of one call: the median of three."""
-    found: list[float] = []
+    """Seconds of Dr.Jit's kernels in a call: the median of three calls."""
+    seconds: list[float] = []
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         for _ in range(3):
             dr.kernel_history_clear()
             call()
             history = dr.kernel_history((dr.KernelType.JIT,))
-            found.append(1e-3 * sum(float(entry["execution_time"]) for entry in history))
-    return float(np.median(found))
+            seconds.append(1e-3 * sum(float(entry["execution_time"]) for entry in history))
+    return float(np.median(seconds))
 
 
 def compare(mesh: MeshArrays, points: FloatArray, method: Any) -> list[Row]:
     """libigl, then `value` and `value_and_gradient` of harnack: in turn, medians of REPEATS."""
     vertices, faces = mesh
-    how: Any = {"cells": _MEGABYTES} if method == "cells" else {"method": method}
+    options: Any = {"cells": _MEGABYTES} if method == "cells" else {"method": method}
     if method == "tree":  # without it, gradients are looked at more closely
-        how["accuracy"] = 2.0
-    field = WindingNumber(vertices, faces, **how)
+        options["accuracy"] = 2.0
+    field = WindingNumber(vertices, faces, **options)
     calls: dict[str, Callable[[], Any]] = {
         LIBIGL: lambda: libigl(vertices, faces, points),
         f"{method}, value": lambda: field.value(points),
@@ -97,18 +97,18 @@ def compare(mesh: MeshArrays, points: FloatArray, method: Any) -> list[Row]:
     truth = exact.value(points[:CHECKED], precision="double")
     # The first calls compile, and show the errors.
     errors = {name: np.abs(call()[:CHECKED] - truth) for name, call in calls.items()}
-    taken: dict[str, list[float]] = {name: [] for name in calls}
+    times: dict[str, list[float]] = {name: [] for name in calls}
     builds: list[float] = []
     for _ in range(REPEATS):
         # libigl builds its tree in every call.
         builds.append(seconds_of(lambda: libigl(vertices, faces, points[:10])))
         for name, call in calls.items():
-            taken[name].append(seconds_of(call))
-    taken[LIBIGL] = [total - float(np.median(builds)) for total in taken[LIBIGL]]
+            times[name].append(seconds_of(call))
+    times[LIBIGL] = [total - float(np.median(builds)) for total in times[LIBIGL]]
     return [
         Row(
             name,
-            float(np.median(taken[name])),
+            float(np.median(times[name])),
             float("nan") if name == LIBIGL else kernel_seconds(call),
             float(np.median(errors[name])),
             float(errors[name].max()),
@@ -131,7 +131,7 @@ def throughput(surface: Path | None = None) -> str:
         ("soup", soup, cube, "cells"),
     ]
     if surface is not None:
-        # Here: `versions` runs this file with earlier versions of the package.
+        # Imported here: `versions` runs this file with earlier versions of the package.
         from harnack.files import read_geometry
 
         read: Any = read_geometry(surface, "winding")
@@ -162,7 +162,7 @@ def throughput(surface: Path | None = None) -> str:
 
 
 def _sorting(points: FloatArray) -> float:
-    # Here: `versions` runs this file with earlier versions of the package.
+    # Imported here: `versions` runs this file with earlier versions of the package.
     from harnack.fields.batch_evaluation import morton_order
 
     backend = choose_backend("single")

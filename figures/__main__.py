@@ -33,15 +33,15 @@ def main() -> int:
     arguments = parser.parse_args()
     if arguments.size < LEAST:
         parser.error(f"--size must be at least {LEAST} pixels, not {arguments.size}")
-    chosen = arguments.only or sorted(FIGURES)
+    selected = arguments.only or sorted(FIGURES)
     columns = (
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     )  # fmt: skip
     with track_interrupts() as interrupts:
         try:
             with Progress(*columns) as progress:
-                task = progress.add_task("figures", total=len(chosen))
-                for number in chosen:
+                task = progress.add_task("figures", total=len(selected))
+                for number in selected:
                     figure = FIGURES[number]
                     progress.update(task, description=f"Fig. {number}: {figure.title}")
                     start = time.perf_counter()

@@ -27,16 +27,16 @@ def figure_7(width: int) -> Report:
         for order in range(degree + 1):
             field = hk.SphericalHarmonic(degree, order)
             values = field.value(_sphere())
-            low, high = float(values.min()), float(values.max())
-            levels = [0.5 * low, 0.15 * low, 0.15 * high, 0.5 * high]
-            found = view.trace(field, level=levels, clip=ball)
-            counts = Counts.of(found.status, found.evaluations)
+            lower, upper = float(values.min()), float(values.max())
+            levels = [0.5 * lower, 0.15 * lower, 0.15 * upper, 0.5 * upper]
+            hits = view.trace(field, level=levels, clip=ball)
+            counts = Counts.of(hits.status, hits.evaluations)
             totals.append(counts.evaluations)
             hits_of.append(counts.evaluations_hitting)
             most, lost = max(most, counts.most), lost + counts.out_of_steps
-            positive = (found.value > 0)[:, None]
+            positive = (hits.value > 0)[:, None]
             color = np.where(positive, FRONT, BACK)
-            row.append(Panel(halved(view.shade(found.normal, found.is_hit, color, 0.8 * color)),
+            row.append(Panel(halved(view.shade(hits.normal, hits.is_hit, color, 0.8 * color)),
                              f"l = {degree}, m = {order}"))  # fmt: skip
         rows.append(row)
     caption = (
@@ -54,13 +54,13 @@ def figure_7(width: int) -> Report:
 def _sphere() -> np.ndarray:
     """Points (n, 3), evenly spread over the unit sphere."""
     k = np.arange(4000) + 0.5
-    z, turn = 1 - 2 * k / 4000, np.pi * (1 + math.sqrt(5)) * k
+    z, angle = 1 - 2 * k / 4000, np.pi * (1 + math.sqrt(5)) * k
     across = np.sqrt(1 - z * z)
-    return np.column_stack([across * np.cos(turn), across * np.sin(turn), z])
+    return np.column_stack([across * np.cos(angle), across * np.sin(angle), z])
 
 
 def figure_19(width: int) -> Report:
-    """Riemann surfaces, cut to a ball and not."""
+    """Riemann surfaces, with and without a cut to a ball."""
     names = (
         ("riemann-log", "log"), ("riemann-sqrt", "square root"), ("riemann-cbrt", "cube root"),
         ("riemann-asin", "arc sine, real part"),
@@ -155,8 +155,8 @@ def figure_21(width: int) -> Report:
         ("with the slope", "slope", 1.4),
         ("all proofs", None, None),
     ):
-        found = view.trace(field, level=0.5, bound=bound, overstep=overstep)
-        rows.append(f"{name}: {Counts.of(found.status, found.evaluations)}")
+        hits = view.trace(field, level=0.5, bound=bound, overstep=overstep)
+        rows.append(f"{name}: {Counts.of(hits.status, hits.evaluations)}")
     caption = (
         "The 1/2 level of sin 6x sin 6y sin 6z + sin 2x sin 2y sin 2z, as a solid in a cube of "
         f"side π: {counts}. The open surface in the same cube, by the proofs used: "

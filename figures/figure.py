@@ -1,4 +1,4 @@
-"""A figure: what the paper shows, and how our counterpart is made and measured."""
+"""A figure: the content of the paper's figure, and the counterpart with its measurements."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ import harnack as hk
 
 @dataclass(frozen=True)
 class Report:
-    """A figure as it was made.
+    """The result of making a figure.
 
-    picture: all panels in one picture. caption: what is seen, with what was measured.
-    differs: where it is not what the paper's figure is. is_plot: a drawing, kept without loss.
+    picture: all panels in one picture. caption: a description of the picture, with measurements.
+    differs: the differences from the paper's figure. is_plot: a drawing, stored without loss.
     """
 
     picture: Image.Image
@@ -30,8 +30,8 @@ class Report:
 class Figure:
     """A figure of the paper and its counterpart.
 
-    paper: what the paper's figure shows, in our words. make: from the width of one panel in
-    pixels to the report; smaller ones are measured on fewer rays.
+    paper: the content of the paper's figure, in our words. make: from the width of one panel in
+    pixels to the report; smaller panels are measured on fewer rays.
     """
 
     number: int
@@ -42,7 +42,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class Counts:
-    """What n rays took, one for each pixel."""
+    """Counts of the evaluations and results of n rays, one for each pixel."""
 
     rays: int
     hits: int
@@ -53,7 +53,7 @@ class Counts:
 
     @classmethod
     def of(cls, status: npt.NDArray[np.int64], evaluations: npt.NDArray[np.int64]) -> Counts:
-        """Of the status and the number of evaluations of each ray, in arrays of one shape."""
+        """From the status and the number of evaluations of each ray, in arrays of one shape."""
         hit = status == int(hk.RayStatus.HIT)
         lost = status == int(hk.RayStatus.OUT_OF_STEPS)
         hitting = float(evaluations[hit].mean()) if hit.any() else 0.0

@@ -61,7 +61,7 @@ def _square(height: float) -> Array:
 
 
 def _neck(field: hk.SolidAngle) -> float | None:
-    """Distance of the level set from the axis at z = 0, along x; None if it is not met."""
+    """Distance of the level set from the axis at z = 0, along x; None if the ray hits nothing."""
     hits = hk.trace(field, [[0, 0, 0]], [[1, 0, 0]], precision="double", t_max=3.0)
     return float(hits.t[0]) if hits.is_hit[0] else None
 
@@ -77,7 +77,7 @@ class _Film:
 
 
 def _film(distance: float, start: _Film | None = None) -> _Film:
-    """By relaxation of a tube, or of a film at another distance."""
+    """The film, by relaxation of a tube, or of a film at another distance."""
     vertices, faces = _tube(distance)
     if start is not None:
         vertices = start.vertices * [1, 1, distance / start.vertices[:, 2].max()]
@@ -104,21 +104,21 @@ def _waist(vertices: Array) -> float:
 def _last_film() -> tuple[float, float]:
     """The largest distance, in steps of 0.01, with a film, and its waist."""
     film = _film(0.5)
-    found = (0.5, film.neck or 0.0)
+    last_film = (0.5, film.neck or 0.0)
     for k in range(51, 71):
         film = _film(0.01 * k, film)
         if film.neck is None:
             break
-        found = (0.01 * k, film.neck)
-    return found
+        last_film = (0.01 * k, film.neck)
+    return last_film
 
 
 def _tube(distance: float) -> tuple[Array, Array]:
     """Vertices and triangles of the straight tube between the squares."""
-    turn = np.arange(_AROUND) / _AROUND * 4
-    k = turn.astype(int)
+    parameter = np.arange(_AROUND) / _AROUND * 4
+    k = parameter.astype(int)
     ring = _square(0.0)
-    ring = (1 - (turn - k))[:, None] * ring[k] + (turn - k)[:, None] * ring[(k + 1) % 4]
+    ring = (1 - (parameter - k))[:, None] * ring[k] + (parameter - k)[:, None] * ring[(k + 1) % 4]
     heights = np.linspace(distance, -distance, _ALONG + 1)
     vertices = np.concatenate([ring + np.array([0, 0, height]) for height in heights])
     i, j = np.meshgrid(np.arange(_ALONG), np.arange(_AROUND), indexing="ij")

@@ -23,10 +23,10 @@ _FALSE_SHEET = (0.85, 0.25, 0.55)
 
 @dataclass(frozen=True)
 class _Contest:
-    """One surface seen by several methods along the same rays.
+    """A surface traced by several methods along the same rays.
 
-    inside: which pixels have a ray, where the field has a domain. truth: the oracle's first hits of
-    these rays.
+    inside: (pixels,) whether a pixel has a ray, where the field has a domain. truth: the oracle's
+    first hits of these rays.
     """
 
     view: View
@@ -49,7 +49,7 @@ class _Contest:
         return baselines.measure(self.rays, name, method, self.truth)
 
     def drawn(self, result: Result) -> Pixels:
-        """What a method sees: missed first hits magenta, false ones green."""
+        """The picture by a method: missed first hits magenta, false hits green."""
         hit = np.isfinite(result.t)
         t = np.where(hit, result.t, 0)
         points = self.rays.origins + t[:, None] * self.rays.directions
@@ -59,16 +59,16 @@ class _Contest:
         normal = np.zeros((len(self.inside), 3))
         normal[self.inside] = gradient / np.maximum(size, 1e-30)
         picture = self.view.shade(normal, self._all(hit))
-        for where, color in ((result.early, FALSE), (result.late, MISSED)):
-            picture = marked(picture, self._all(where), color)
+        for is_marked, color in ((result.early, FALSE), (result.late, MISSED)):
+            picture = marked(picture, self._all(is_marked), color)
         return picture
 
     def told(self, results: list[Result]) -> str:
-        """Counts of methods; of ours also how near to the surface its false hits are."""
+        """Counts of methods; for harnack also the distance of its false hits from the surface."""
         text = "; ".join(
-            f"{one.name}: {one.missed:,} missed and {one.false:,} false at {one.evaluations:.1f} "
+            f"{row.name}: {row.missed:,} missed and {row.false:,} false at {row.evaluations:.1f} "
             "evaluations a ray"
-            for one in results
+            for row in results
         )
         rows = np.flatnonzero(self.ours.early)
         if not len(rows):
@@ -85,16 +85,16 @@ class _Contest:
         text = f"{result.evaluations:.0f} looks, {result.missed} missed, {result.false} false"
         return Panel(doubled(self.drawn(result)), f"{result.name}: {text}")
 
-    def _all(self, some: Array) -> Array:
-        """Of all pixels, from those with a ray."""
-        whole = np.zeros(len(self.inside), bool)
-        whole[self.inside] = some
-        return whole
+    def _all(self, values: Array) -> Array:
+        """Values of all pixels, from values of the pixels with a ray."""
+        pixels = np.zeros(len(self.inside), bool)
+        pixels[self.inside] = values
+        return pixels
 
 
 @functools.cache
 def _contest(name: str, width: int) -> _Contest:
-    """The same for Figs. 25, 26 and 27, whose oracle takes most of the time."""
+    """The contest of Figs. 25, 26 and 27, cached, as its oracle takes most of the time."""
     size = fitting(max(16, 2 * width // 3))  # drawn at twice this size
     camera = Camera(azimuth=-60, elevation=24, zoom=0.95)
     if name == "gyroid":
@@ -132,7 +132,7 @@ def figure_25(width: int) -> Report:
         "The paper's polygon and steps are not stated; its pictures are 1423 x 800. Ours refuses "
         "changes of sign by more than half a period, without which every jump would be a hit."
     )
-    panels = [contest.panel(one) for one in results]
+    panels = [contest.panel(result) for result in results]
     return Report(montage(panels[:2], panels[2:]), caption, differs)
 
 
@@ -146,7 +146,7 @@ def figure_26(width: int) -> Report:
             for constant in (5.0, 50.0, 500.0)
         ]
         results.append(contest.ours)
-        panels = [contest.panel(one) for one in results]
+        panels = [contest.panel(result) for result in results]
         rows += [panels[:2], panels[2:]]
         texts.append(
             f"{label}, {len(contest.truth):,} rays with {contest.hits:,} hits: "
@@ -175,8 +175,8 @@ def figure_27(width: int) -> Report:
         ]  # fmt: skip
         if name != "trefoil":  # whose 48 edges take a minute in interval arithmetic
             methods.append(("intervals", baselines.interval_analysis))
-        results = [*(contest.measure(*one) for one in methods), contest.ours]
-        panels = [contest.panel(one) for one in results]
+        results = [*(contest.measure(*method) for method in methods), contest.ours]
+        panels = [contest.panel(method) for method in results]
         rows += [panels[:2], panels[2:]]
         texts.append(
             f"{label}, {len(contest.truth):,} rays with {contest.hits:,} hits: "
@@ -207,29 +207,29 @@ def figure_24(width: int) -> Report:
     for cells, keep in ((48, False), (144, False), (48, True), (144, True)):
         vertices, faces, close = _marching_cubes(field, cells)
         faces, close = (faces[close], close[close]) if keep else (faces, close)
-        met = mesh_hits(vertices, faces, view.eye, view.directions())
-        face = np.where(met.is_hit, met.face, 0)
+        hits = mesh_hits(vertices, faces, view.eye, view.directions())
+        face = np.where(hits.is_hit, hits.face, 0)
         front, back = (np.where(close[face][:, None], c, _FALSE_SHEET) for c in (FRONT, BACK))
-        shown = view.shade(met.normal, met.is_hit, front, back)
-        lost = truth.is_hit & ~met.is_hit
+        shown = view.shade(hits.normal, hits.is_hit, front, back)
+        lost = truth.is_hit & ~hits.is_hit
         shown = marked(shown, lost, MISSED)
-        wrong = met.is_hit & ~((met.t < real + APART) & (met.t > real - APART))
+        is_wrong = hits.is_hit & ~((hits.t < real + APART) & (hits.t > real - APART))
         name = f"{cells}^3 cells, filtered" if keep else f"{cells}^3 cells"
         panels.append(Panel(halved(shown), name))
         texts.append(
             f"{name}: {len(faces):,} triangles, {100 * (~close).mean():.0f} % of them far from "
             f"the level; of {int(truth.is_hit.sum()):,} hits {int(lost.sum()):,} are lost, and "
-            f"{int(wrong.sum()):,} rays end more than {APART} from the surface"
+            f"{int(is_wrong.sum()):,} rays end more than {APART} from the surface"
         )
     ours = view.trace(field)
-    off = ours.is_hit != truth.is_hit
+    unequal = ours.is_hit != truth.is_hit
     panels.append(Panel(halved(view.shade(ours.normal, ours.is_hit)), "harnack"))
     caption = (
         "Marching cubes (scikit-image; unproved) of the solid angle of 12 vertices modulo 4π, "
         "level 2π, on grids of [-1.3, 1.3]³. Triangles whose middle is farther than π/2 from the "
         "level are pink: the sheet on which the angle jumps. Filtered are those without them; "
         f"what is then lost of the true surface is magenta. {'; '.join(texts)}. harnack along the "
-        f"same rays: {ours.evaluations.mean():.1f} evaluations a ray, {int(off.sum())} rays "
+        f"same rays: {ours.evaluations.mean():.1f} evaluations a ray, {int(unequal.sum())} rays "
         "differ in whether they hit from the reference, whose tolerance is a thousandth of its."
     )
     differs = (
@@ -241,7 +241,7 @@ def figure_24(width: int) -> Report:
 
 def _marching_cubes(field: hk.SolidAngle, cells: int) -> tuple[Array, Array, Array]:
     """Vertices and triangles of the 2 pi level of the angle in [0, 4 pi), and which of them have
-    middles at which it is within pi/2 of that."""
+    centers at which the angle is within pi/2 of that level."""
     from skimage.measure import marching_cubes
 
     u = np.linspace(-1.3, 1.3, cells + 1)

@@ -34,15 +34,15 @@ def picture_name(figure: Figure, *, is_plot: bool) -> str:
 
 
 def sections(page: Path) -> dict[int, str]:
-    """The sections of a page by number; none of a page that is not there."""
+    """The sections of a page by number; none if the page does not exist."""
     if not page.exists():
         return {}
-    found = _SECTION.findall(page.read_text(encoding="utf-8"))
-    return {int(number): text for number, text in found}
+    matches = _SECTION.findall(page.read_text(encoding="utf-8"))
+    return {int(number): text for number, text in matches}
 
 
 def write(page: Path, figure: Figure, report: Report, *, seconds: float, width: int) -> None:
-    """Write a figure's picture, and its section in place of the one that is there.
+    """Write a figure's picture, and its section in place of the existing section.
 
     Both are written to temporary names, and renamed."""
     folder = page.parent / "images" / "figures"
@@ -60,10 +60,10 @@ def write(page: Path, figure: Figure, report: Report, *, seconds: float, width: 
         f"{figure.paper}\n\n**Here:** {report.caption}\n\n**Differs:** {report.differs}\n\n*Made "
         f"in {seconds:.0f} s, harnack {hk.__version__}, {today}, panels of {width} pixels.*\n"
     )
-    all_of_them = {**sections(page), figure.number: text}
-    parts = [
-        f"<!-- figure {number} -->\n{all_of_them[number]}\n<!-- end of figure {number} -->\n"
-        for number in sorted(all_of_them)
+    texts = {**sections(page), figure.number: text}
+    blocks = [
+        f"<!-- figure {number} -->\n{texts[number]}\n<!-- end of figure {number} -->\n"
+        for number in sorted(texts)
     ]
     with write_atomically(page) as partial:
-        partial.write_text("\n".join([_HEADING, *parts]), encoding="utf-8")
+        partial.write_text("\n".join([_HEADING, *blocks]), encoding="utf-8")

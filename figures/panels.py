@@ -40,48 +40,48 @@ def montage(*rows: Sequence[Panel]) -> Image.Image:
     sheet = Image.new("RGB", (max(w for w, _ in sizes), height), _PAPER)
     draw, top = ImageDraw.Draw(sheet), 0
     for row, (_, tall) in zip(rows, sizes, strict=True):
-        left = 0
+        x = 0
         for panel in row:
-            sheet.paste(Image.fromarray(panel.pixels), (left, top))
-            draw.text((left + 2, top + tall + 1), panel.label, _INK, font)
-            left += panel.pixels.shape[1] + _GAP
+            sheet.paste(Image.fromarray(panel.pixels), (x, top))
+            draw.text((x + 2, top + tall + 1), panel.label, _INK, font)
+            x += panel.pixels.shape[1] + _GAP
         top += tall + strip
     return sheet
 
 
 def fitting(width: int, share: float = 0.75) -> tuple[int, int]:
-    """The size of a panel of some width."""
+    """The size of a panel of a width."""
     return width, round(share * width)
 
 
 def scene(name: str, width: int, *, share: float = 0.75, **settings: Any) -> tuple[Pixels, Counts]:
-    """A picture of a scene of the gallery, and what its first hits took."""
+    """A picture of a scene of the gallery, and the counts of its first hits."""
     from harnack.gallery import SCENES
 
-    chosen = SCENES[name]
-    given = {"show": "shaded", "material": list(chosen.materials), **settings}
-    given.setdefault("camera", chosen.camera)
-    surfaces = chosen.surfaces()
-    if len(given["material"]) == 1:
-        given["material"] *= len(surfaces)
-    return drawn(surfaces, fitting(width, share), **given)
+    entry = SCENES[name]
+    options = {"show": "shaded", "material": list(entry.materials), **settings}
+    options.setdefault("camera", entry.camera)
+    surfaces = entry.surfaces()
+    if len(options["material"]) == 1:
+        options["material"] *= len(surfaces)
+    return drawn(surfaces, fitting(width, share), **options)
 
 
 def drawn(what: Any, size: tuple[int, int], **settings: Any) -> tuple[Pixels, Counts]:
-    """A picture by `hk.render`, shaded if nothing else is asked for, and what its first hits took:
-    one ray through the middle of each pixel."""
+    """A picture by `hk.render`, shaded by default, and the counts of its first hits: one ray
+    through the middle of each pixel."""
     settings = {"show": "shaded", **settings}
     image = tone_map(hk.render(what, size=size, progress=False, **settings))
-    only = {k: v for k, v in settings.items() if k not in ("show", "spp", "seed", "antialias")}
+    options = {k: v for k, v in settings.items() if k not in ("show", "spp", "seed", "antialias")}
     status, evaluations = (
-        hk.render(what, size=size, show=show, progress=False, **only)
+        hk.render(what, size=size, show=show, progress=False, **options)
         for show in ("status", "evaluations")
     )
     return image, Counts.of(status, evaluations)
 
 
 def heat(numbers: Any, top: float, size: tuple[int, int]) -> Pixels:
-    """Numbers (n,), row by row, as colors: 0 is dark blue; `top`, and all above, yellow."""
+    """Numbers (n,), row by row, as colors: 0 is dark blue; `top` and larger numbers are yellow."""
     colors = viridis(np.asarray(numbers, np.float64) / top)
     return (colors * 255 + 0.5).astype(np.uint8).reshape(*size[::-1], 3)
 
@@ -92,5 +92,5 @@ def halved(pixels: Pixels) -> Pixels:
 
 
 def doubled(pixels: Pixels) -> Pixels:
-    """A picture with four pixels for each of one."""
+    """A picture with four pixels for each pixel."""
     return pixels.repeat(2, axis=0).repeat(2, axis=1)

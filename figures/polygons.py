@@ -24,7 +24,7 @@ def figure_1(width: int) -> Report:
     field = hk.SolidAngle(loop)
     start, towards = np.array([-1.75, 0.0, 1.0]), np.array([1.95, 0.0, -0.97])
     published = WithoutExtent(loop, lift_bound="convex")
-    places = _steps(published, start, towards, "classic", 1.0)
+    samples = _steps(published, start, towards, "classic", 1.0)
     ours = _steps(field, start, towards, None, None)
     size = fitting(4 * width)  # four samples a pixel
     view = View.of([*loop, start], size, Camera(azimuth=-68, elevation=24, zoom=1.05))
@@ -34,15 +34,15 @@ def figure_1(width: int) -> Report:
     t = np.where(hits.is_hit, hits.t, np.inf)
     for lines, color in (
         (hk.TubeNetwork(points, segments, 0.006), (0.25, 0.25, 0.25)),
-        (hk.TubeNetwork(places[[0, -1]], [(0, 1)], 0.012), (0.75, 0.55, 0.1)),
+        (hk.TubeNetwork(samples[[0, -1]], [(0, 1)], 0.012), (0.75, 0.55, 0.1)),
     ):
-        met = view.trace(lines)
-        nearer = met.is_hit & (met.t < t)
-        drawn_lines = view.shade(met.normal, met.is_hit, color, color).reshape(-1, 3)
+        line_hits = view.trace(lines)
+        nearer = line_hits.is_hit & (line_hits.t < t)
+        drawn_lines = view.shade(line_hits.normal, line_hits.is_hit, color, color).reshape(-1, 3)
         picture.reshape(-1, 3)[nearer] = drawn_lines[nearer]
-        t = np.where(nearer, met.t, t)
-    radii = np.linalg.norm(np.diff(places, axis=0), axis=1)
-    shown = _with_balls(view, picture, t, places[:-1], radii)
+        t = np.where(nearer, line_hits.t, t)
+    radii = np.linalg.norm(np.diff(samples, axis=0), axis=1)
+    shown = _with_balls(view, picture, t, samples[:-1], radii)
     d = view.directions()
     mirrored = d - 2 * (d * hits.normal).sum(axis=1, keepdims=True) * hits.normal
     light = np.sin(16 * np.arcsin(np.clip(mirrored[:, 2], -1, 1))) > 0
@@ -51,7 +51,7 @@ def figure_1(width: int) -> Report:
     caption = (
         f"The 2π level of the solid angle of a polygon of {len(loop)} vertices, isolines of a "
         "slice every π/2, a ray, and the balls that the published rule proves empty along it: "
-        f"{len(places) - 1} steps without over-stepping to a tolerance of 1e-4 (the bound of the "
+        f"{len(samples) - 1} steps without over-stepping to a tolerance of 1e-4 (the bound of the "
         f"surface's extent left out), where our proofs along the ray take {len(ours) - 1}. Right: "
         "reflection of striped surroundings by the normals of the hits. All pixels: "
         f"{Counts.of(hits.status, hits.evaluations)}."
@@ -61,43 +61,43 @@ def figure_1(width: int) -> Report:
         "3t), lit by a formula. Our own steps are not drawn as balls, since they are proved "
         "along the ray only."
     )
-    left = Panel(halved(shown), "level set, isolines of a slice, balls of the published rule")
-    return Report(montage((left, Panel(halved(stripes), "reflection lines"))), caption, differs)
+    panel = Panel(halved(shown), "level set, isolines of a slice, balls of the published rule")
+    return Report(montage((panel, Panel(halved(stripes), "reflection lines"))), caption, differs)
 
 
 def _with_balls(view: View, picture: Pixels, t: Array, centers: Array, radii: Array) -> Pixels:
-    """A picture with clear balls over what is met at t (n,); the farthest first."""
+    """A picture with transparent balls over the surface at t (n,); the farthest first."""
     d, colors = view.directions(), picture.reshape(-1, 3) / 255.0
     for k in np.argsort(-np.linalg.norm(centers - view.eye, axis=1)):
         if radii[k] < 0.004:  # less than a pixel
             continue
-        away = centers[k] - view.eye
-        middle = d @ away
-        rows = np.flatnonzero(away @ away - middle**2 < radii[k] ** 2)
-        half = np.sqrt(radii[k] ** 2 - (away @ away - middle[rows] ** 2))
-        seen = middle[rows] - half < t[rows]
+        to_center = centers[k] - view.eye
+        middle = d @ to_center
+        rows = np.flatnonzero(to_center @ to_center - middle**2 < radii[k] ** 2)
+        half = np.sqrt(radii[k] ** 2 - (to_center @ to_center - middle[rows] ** 2))
+        is_visible = middle[rows] - half < t[rows]
         rim = 1 - half / radii[k]
-        share = np.where(seen, 0.10 + 0.55 * rim**3, 0.0)[:, None]
-        colors[rows] = (1 - share) * colors[rows] + share * np.array([0.25, 0.45, 0.75])
+        opacity = np.where(is_visible, 0.10 + 0.55 * rim**3, 0.0)[:, None]
+        colors[rows] = (1 - opacity) * colors[rows] + opacity * np.array([0.25, 0.45, 0.75])
     return view.pixels(colors)
 
 
 def _steps(
     field: hk.Field, start: Array, towards: Array, bound: str | None, overstep: float | None
 ) -> Array:
-    """Where a ray (n + 1, 3) is looked at on its way to the surface."""
+    """The points (n + 1, 3) at which a ray is evaluated on its way to the surface."""
     d = towards / np.linalg.norm(towards)
-    at = [0.0]
-    for most in range(1, 400):
+    lengths = [0.0]
+    for max_steps in range(1, 400):
         hits = hk.trace(
-            field, start[None], d[None], max_steps=most, bound=bound, overstep=overstep,
+            field, start[None], d[None], max_steps=max_steps, bound=bound, overstep=overstep,
             precision="double",
         )  # fmt: skip
-        if hits.t[0] > at[-1]:
-            at.append(float(hits.t[0]))
+        if hits.t[0] > lengths[-1]:
+            lengths.append(float(hits.t[0]))
         if hits.status[0] != hk.RayStatus.OUT_OF_STEPS:
             break
-    return start + np.array(at)[:, None] * d
+    return start + np.array(lengths)[:, None] * d
 
 
 def _isolines(field: hk.SolidAngle) -> tuple[Array, list[tuple[int, int]]]:
@@ -118,8 +118,8 @@ def _isolines(field: hk.SolidAngle) -> tuple[Array, list[tuple[int, int]]]:
                 continue
             first = sum(map(len, points))
             segments += [(first + k, first + k + 1) for k in range(len(line) - 1)]
-            place = line / (n - 1) * 2 - 1
-            points.append(np.column_stack([place[:, 0] * x, 0 * place[:, 0], place[:, 1] * z]))
+            unit = line / (n - 1) * 2 - 1
+            points.append(np.column_stack([unit[:, 0] * x, 0 * unit[:, 0], unit[:, 1] * z]))
     return np.concatenate(points), segments
 
 
@@ -153,7 +153,7 @@ def figure_8(width: int) -> Report:
 
 
 def _motion() -> float:
-    """How far first hits of vertical rays move with the boundary."""
+    """The largest movement of first hits of vertical rays with the boundary."""
     u = np.linspace(-0.6, 0.6, 30)
     grid = np.stack(np.meshgrid(u, u, [2.0], indexing="ij"), axis=-1).reshape(-1, 3)
     heights = [
@@ -184,10 +184,10 @@ def figure_9(width: int) -> Report:
             Panel(halved(patch), f"{name}: bilinear patch"),
             Panel(halved(ours), f"{name}: level set"),
         ])  # fmt: skip
-        most, times = _crossings(field, vertices, faces)
+        max_crossings, max_times = _crossings(field, vertices, faces)
         texts.append(
             f"{name}: {100 * folded.mean():.0f} % of the patch's parameters are turned over, and "
-            f"a vertical line meets it up to {times} times, the level set up to {most}"
+            f"a vertical line meets it up to {max_times} times, the level set up to {max_crossings}"
         )
     caption = (
         "A quadrilateral with a reflex corner, in a plane and out of it. Left: the bilinear "
@@ -199,25 +199,25 @@ def figure_9(width: int) -> Report:
 
 
 def _drawn_patch(view: View, vertices: Array, faces: Array, folded: Array) -> Pixels:
-    """A patch, pink where a part that is turned over is in front or lies on another."""
+    """A patch, pink where a folded part is in front or lies on another."""
     d = view.directions()
-    one, other = (mesh_hits(vertices, faces[some], view.eye, d) for some in (~folded, folded))
-    over = (other.t <= one.t + 1e-3) & other.is_hit
-    normal = np.where(over[:, None], other.normal, one.normal)
-    color = np.where(over[:, None], (0.9, 0.2, 0.6), FRONT)
-    return view.shade(normal, one.is_hit | other.is_hit, color, color)
+    up, down = (mesh_hits(vertices, faces[mask], view.eye, d) for mask in (~folded, folded))
+    is_over = (down.t <= up.t + 1e-3) & down.is_hit
+    normal = np.where(is_over[:, None], down.normal, up.normal)
+    color = np.where(is_over[:, None], (0.9, 0.2, 0.6), FRONT)
+    return view.shade(normal, up.is_hit | down.is_hit, color, color)
 
 
 def _bilinear(quad: Array, n: int) -> tuple[Array, Array, Array]:
-    """Vertices and triangles of a bilinear patch, and which of them are turned over as seen
-    from +z."""
+    """Vertices and triangles of a bilinear patch, and which of them are turned over as seen from
+    +z."""
     u, v = np.meshgrid(np.linspace(0, 1, n + 1), np.linspace(0, 1, n + 1), indexing="ij")
     u, v = u.ravel()[:, None], v.ravel()[:, None]
     a, b, c, d = quad
     vertices = (1 - u) * (1 - v) * a + u * (1 - v) * b + u * v * c + (1 - u) * v * d
     k = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
-    one, other = np.column_stack([k, k + n + 1, k + n + 2]), np.column_stack([k, k + n + 2, k + 1])
-    faces = np.concatenate([one, other])
+    abc, acd = np.column_stack([k, k + n + 1, k + n + 2]), np.column_stack([k, k + n + 2, k + 1])
+    faces = np.concatenate([abc, acd])
     p, q, r = (vertices[faces[:, i], :2] for i in range(3))
     e, f = q - p, r - p
     area = e[:, 0] * f[:, 1] - e[:, 1] * f[:, 0]
@@ -225,7 +225,8 @@ def _bilinear(quad: Array, n: int) -> tuple[Array, Array, Array]:
 
 
 def _crossings(field: hk.SolidAngle, vertices: Array, faces: Array) -> tuple[int, int]:
-    """The most crossings of a vertical line with the level set, and with triangles."""
+    """The largest numbers of crossings of a vertical line with the level set, and with
+    triangles."""
     u = np.linspace(-0.97, 0.97, 50) + 1.234e-3
     grid = np.stack(np.meshgrid(u, u, [2.0], indexing="ij"), axis=-1).reshape(-1, 3)
     level = hk.trace(field, grid, [[0, 0, -1.0]], all_hits=6, precision="double", t_max=4.0)
@@ -233,8 +234,8 @@ def _crossings(field: hk.SolidAngle, vertices: Array, faces: Array) -> tuple[int
     sides = []
     for k in range(3):
         edge = corners[:, (k + 1) % 3] - corners[:, k]
-        away = grid[:, None, :2] - corners[None, :, k]
-        sides.append(edge[:, 0] * away[..., 1] > edge[:, 1] * away[..., 0])
+        offset = grid[:, None, :2] - corners[None, :, k]
+        sides.append(edge[:, 0] * offset[..., 1] > edge[:, 1] * offset[..., 0])
     inside = (sides[0] == sides[1]) & (sides[1] == sides[2])
     return int(level.count.max()), int(inside.sum(axis=1).max())
 

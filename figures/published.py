@@ -1,7 +1,7 @@
-"""The published algorithms (paper, Alg. 1 and 2) as printed, in NumPy: what ours is compared with.
+"""The published algorithms (paper, Alg. 1 and 2) as printed, in NumPy, for comparison with ours.
 
-They prove as much as what is claimed to them: a lower bound that does not hold, or a value that is
-wrong by rounding, makes rays pass the surface. So they are unproved here.
+They prove as much as the claims that they are given: a lower bound that does not hold, or a value
+that is wrong by rounding, makes rays pass the surface. So they are unproved here.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ MOST = 1000
 
 @dataclass(frozen=True)
 class Claim:
-    """What the algorithm is told of a function f.
+    """The claims about a function f that the algorithm is given.
 
     look: from points (n, 3) to values (n,), gradients (n, 3), and radii (n,) of balls on which f >
-    lower. Of an angle f - level is reduced to [0, period) first, and lower is below that.
+    lower. For an angle f - level is reduced to [0, period) first, and lower is below that.
     """
 
     look: Callable[[Array], tuple[Array, Array, Array]]
@@ -37,8 +37,8 @@ class Claim:
 
 @dataclass(frozen=True)
 class Ends:
-    """Of n rays: t, inf where there is no hit, and evaluations, at most so many for rays that ran
-    out of steps."""
+    """The ends of n rays: t, inf where there is no hit, and the number of evaluations, at most
+    `most` for rays that ran out of steps."""
 
     t: Array
     evaluations: Array
@@ -57,7 +57,7 @@ def published(
 ) -> Ends:
     """First hits without over-stepping. stop: at |f - level| <= eps |grad f|, or at <= eps."""
     t, kind = start.astype(directions.dtype), directions.dtype
-    found = np.full(len(t), np.inf, kind)
+    t_hit = np.full(len(t), np.inf, kind)
     count = np.zeros(len(t), np.int64)
     rows = np.flatnonzero(t < end)
     for _ in range(most):
@@ -78,10 +78,10 @@ def published(
         for gap, level in zip(gaps, levels, strict=True):
             if (v := level - claim.lower) > 0:
                 step = np.minimum(step, 2 * r * gap / (u + 2 * v + np.sqrt(u * (u + 8 * v))))
-        found[rows[hit]] = t[rows[hit]]
+        t_hit[rows[hit]] = t[rows[hit]]
         t[rows] += step
         rows = rows[~hit & (t[rows] < end[rows])]
-    return Ends(found, count)
+    return Ends(t_hit, count)
 
 
 def claimed_angle(field: hk.SolidAngle) -> Claim:
@@ -92,7 +92,9 @@ def claimed_angle(field: hk.SolidAngle) -> Claim:
 
     def look(p: Array) -> tuple[Array, Array, Array]:
         sample = ready.evaluate(to_vector3(backend, p))
-        (ball,) = [one for one in sample.all_promises if isinstance(one, hk.HarmonicBall)]
+        (ball,) = [
+            promise for promise in sample.all_promises if isinstance(promise, hk.HarmonicBall)
+        ]
         return to_numpy(sample.value), to_numpy(sample.gradient), to_numpy(ball.radius)
 
     return Claim(look, -4 * math.pi, field.default_level, 4 * math.pi)
@@ -104,11 +106,11 @@ def distance_to_loop(loop: Array) -> Callable[[Array], Array]:
     b = np.roll(loop, -1, axis=0) - loop
 
     def distance(p: Array) -> Array:
-        least = np.full(len(p), np.inf, p.dtype)
-        for start, along in zip(a.astype(p.dtype), b.astype(p.dtype), strict=True):
-            away = p - start
-            share = np.clip(away @ along / (along @ along), 0, 1)
-            least = np.minimum(least, ((away - share[:, None] * along) ** 2).sum(axis=1))
-        return np.sqrt(least)
+        nearest = np.full(len(p), np.inf, p.dtype)
+        for start, edge in zip(a.astype(p.dtype), b.astype(p.dtype), strict=True):
+            offset = p - start
+            fraction = np.clip(offset @ edge / (edge @ edge), 0, 1)
+            nearest = np.minimum(nearest, ((offset - fraction[:, None] * edge) ** 2).sum(axis=1))
+        return np.sqrt(nearest)
 
     return distance

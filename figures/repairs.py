@@ -18,15 +18,15 @@ from .view import BACK, FRONT, Pixels, View, mesh_hits
 
 def figure_14(width: int) -> Report:
     """A net of curves, and the surface through it."""
-    chosen = SCENES["exoskeleton"]
-    surface, tubes = chosen.surfaces()
+    entry = SCENES["exoskeleton"]
+    surface, tubes = entry.surfaces()
     mesh = surface.field
     assert isinstance(mesh, hk.PolygonMesh)
     size = fitting(width)
-    settings = {"camera": chosen.camera}
+    settings = {"camera": entry.camera}
     net, _ = drawn(tubes, size, material="gold", **settings)
     start = time.perf_counter()
-    whole, _ = drawn([surface, tubes], size, material=["eggshell", "gold"], **settings)
+    both, _ = drawn([surface, tubes], size, material=["eggshell", "gold"], **settings)
     seconds = time.perf_counter() - start
     _, counts = drawn(surface, size, material="eggshell", **settings)
     faces = mesh.describe()["faces"]
@@ -35,26 +35,26 @@ def figure_14(width: int) -> Report:
         np.stack([np.broadcast_to(loop[0], loop[1:-1].shape), loop[1:-1], loop[2:]], axis=1)
         for loop in corners
     ])  # fmt: skip
-    view = View.of(mesh.vertices, (2 * size[0], 2 * size[1]), chosen.camera)
-    met = mesh_hits(
+    view = View.of(mesh.vertices, (2 * size[0], 2 * size[1]), entry.camera)
+    hits = mesh_hits(
         fans.reshape(-1, 3), np.arange(3 * len(fans)).reshape(-1, 3), view.eye, view.directions()
     )
-    triangles = view.shade(met.normal, met.is_hit, (0.72, 0.30, 0.22), (0.85, 0.80, 0.72))
-    _, many = scene("patches", width)
+    triangles = view.shade(hits.normal, hits.is_hit, (0.72, 0.30, 0.22), (0.85, 0.80, 0.72))
+    _, patch_counts = scene("patches", width)
     patches = SCENES["patches"].surfaces()[0].field.describe()["faces"]
     caption = (
         f"A net of curves on a wavy torus, {faces} polygons with {len(mesh.edges)} edges (left); "
         "a level set for each polygon (middle); and a simple triangulation of the polygons by "
         f"fans (right). The middle takes {counts}, for all polygons that a ray enters; the "
         f"picture with tubes, {seconds:.1f} s, compilation and counting included. A bumpy sphere "
-        f"of {patches:,} such polygons (gallery scene `patches`): {many}."
+        f"of {patches:,} such polygons (gallery scene `patches`): {patch_counts}."
     )
     differs = (
         "The exoskeleton of de Goes et al. (2011) is not public; ours is made by clustering a "
         "mesh. The paper compares with a mesh viewer's picture."
     )
     labels = ("the net", "a level set for each polygon", "fans of triangles")
-    pictures = (net, whole, halved(triangles))
+    pictures = (net, both, halved(triangles))
     panels = [Panel(p, label) for p, label in zip(pictures, labels, strict=True)]
     return Report(montage(panels), caption, differs)
 
@@ -63,15 +63,15 @@ def figure_15(width: int) -> Report:
     """Points with normals, and the surface through them."""
     rows, texts = [], []
     for name in ("cloud", "knot-cloud"):
-        chosen = SCENES[name]
-        field = chosen.surfaces()[0].field
+        entry = SCENES[name]
+        field = entry.surfaces()[0].field
         assert isinstance(field, hk.DipolePotential)
         size = fitting(width)
         start = time.perf_counter()
         picture, counts = scene(name, width)
         seconds = time.perf_counter() - start
         rows.append([
-            Panel(_points(field, size, chosen.camera), f"{len(field.points):,} points"),
+            Panel(_points(field, size, entry.camera), f"{len(field.points):,} points"),
             Panel(picture, "the surface"),
         ])  # fmt: skip
         texts.append(f"{len(field.points):,} points: {counts}; {seconds:.1f} s with compilation")
@@ -90,7 +90,7 @@ def figure_15(width: int) -> Report:
 
 
 def _points(field: hk.DipolePotential, size: tuple[int, int], camera: Camera) -> Pixels:
-    """Squares for points, near ones over far ones."""
+    """Squares for points, near squares over far squares."""
     view = View.of(field.points, (2 * size[0], 2 * size[1]), camera)
     pixels, depth = view.project(field.points)
     facing = (field.normals * (view.eye - field.points)).sum(axis=1) > 0
@@ -110,23 +110,23 @@ def figure_16(width: int) -> Report:
     """Meshes with holes, and their repair by winding numbers."""
     rows, texts = [], []
     for name, label in (("cut-mesh", "round holes"), ("soup", "loose triangles")):
-        chosen = SCENES[name]
-        surface = chosen.surfaces()[0]
+        entry = SCENES[name]
+        surface = entry.surfaces()[0]
         field = surface.field
         assert isinstance(field, hk.WindingNumber)
         size = fitting(width)
         vertices, faces = field.mesh.vertices, field.mesh.input_faces
-        view = View.of(vertices, (2 * size[0], 2 * size[1]), chosen.camera)
-        met = mesh_hits(vertices, faces, view.eye, view.directions())
-        before = view.shade(met.normal, met.is_hit)
+        view = View.of(vertices, (2 * size[0], 2 * size[1]), entry.camera)
+        mesh_hit = mesh_hits(vertices, faces, view.eye, view.directions())
+        before = view.shade(mesh_hit.normal, mesh_hit.is_hit)
         start = time.perf_counter()
         picture, counts = scene(name, width)
         seconds = time.perf_counter() - start
         same = replace(view, size=size)  # a quarter of the rays
         hits = same.trace(surface)
         spans = hits.is_hit & (hits.primitive_index < 0)
-        met = mesh_hits(vertices, faces, same.eye, same.directions())
-        through = met.is_hit & ((met.normal * same.directions()).sum(axis=1) > 0)
+        mesh_hit = mesh_hits(vertices, faces, same.eye, same.directions())
+        through = mesh_hit.is_hit & ((mesh_hit.normal * same.directions()).sum(axis=1) > 0)
         rows.append(
             [Panel(halved(before), f"{len(faces):,} triangles"), Panel(picture, "repaired")]
         )

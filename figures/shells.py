@@ -19,9 +19,9 @@ def figure_17(width: int) -> Report:
     size = fitting(2 * width)
     panels, texts = [], []
     for name in ("shell-ring", "shell-court", "shell-columns"):
-        chosen = SCENES[name]
-        surfaces = chosen.surfaces()
-        settings = {"camera": chosen.camera, "material": list(chosen.materials)}
+        entry = SCENES[name]
+        surfaces = entry.surfaces()
+        settings = {"camera": entry.camera, "material": list(entry.materials)}
         hk.render(surfaces, show="shaded", size=(32, 24), spp=4, progress=False, **settings)
         start = time.perf_counter()
         image = hk.render(
@@ -29,7 +29,7 @@ def figure_17(width: int) -> Report:
         )
         seconds = time.perf_counter() - start
         shell = surfaces[0]
-        _, counts = drawn(shell, fitting(width), camera=chosen.camera)
+        _, counts = drawn(shell, fitting(width), camera=entry.camera)
         outline, holes = shell.field.loops[0], shell.field.circles
         panels.append(Panel(halved(tone_map(image)), name))
         texts.append(

@@ -34,8 +34,8 @@ def figure_4(width: int) -> Report:
     ]
     panels: list[list[Panel]] = [[], []]
     texts: list[str] = []
-    for share in (1.0, 0.1, 0.05, 0.01):
-        claim = Claim(lambda p: _polynomial(p, outer), share * lower, level)
+    for fraction in (1.0, 0.1, 0.05, 0.01):
+        claim = Claim(lambda p: _polynomial(p, outer), fraction * lower, level)
         below, above = [0, 0], [0, 0]
         for row, view in zip(panels, views, strict=True):
             d = view.directions()
@@ -44,17 +44,17 @@ def figure_4(width: int) -> Report:
             ends = published(claim, view.eye, d, start, end)
             missed = truth.is_hit & ~(ends.t < truth.t + 0.01) & (ends.evaluations < MOST)
             rising = (truth.normal * d).sum(axis=1) > 0
-            for kind, some in ((below, rising), (above, ~rising)):
-                kind[0] += int((missed & some).sum())
-                kind[1] += int((truth.is_hit & some).sum())
+            for kind, selected in ((below, rising), (above, ~rising)):
+                kind[0] += int((missed & selected).sum())
+                kind[1] += int((truth.is_hit & selected).sum())
             hit = np.isfinite(ends.t)
             p = view.eye + np.where(hit, ends.t, 0)[:, None] * d
             normal = claim.look(p)[1]
             normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
             shown = marked(view.shade(normal, hit), missed, MISSED)
-            row.append(Panel(shown, f"c = {share * lower:.4f}"))
+            row.append(Panel(shown, f"c = {fraction * lower:.4f}"))
         texts.append(
-            f"c = {share * lower:.4f}: {below[0]:,} of {below[1]:,} from below and {above[0]:,} "
+            f"c = {fraction * lower:.4f}: {below[0]:,} of {below[1]:,} from below and {above[0]:,} "
             f"of {above[1]:,} from above"
         )
     caption = (
@@ -79,7 +79,8 @@ def _polynomial(p: Array, outer: float) -> tuple[Array, Array, Array]:
 
 
 def _in_ball(eye: Array, d: Array) -> tuple[Array, Array]:
-    """Where rays are in the unit ball; an end before the start where they are not."""
+    """Lengths at which rays enter and leave the unit ball; an end before the start where they miss
+    it."""
     middle = -(d @ eye)
     half = 1 - (eye @ eye - middle**2)
     root = np.sqrt(np.maximum(half, 0))
@@ -87,7 +88,7 @@ def _in_ball(eye: Array, d: Array) -> tuple[Array, Array]:
 
 
 def figure_5(width: int) -> Report:
-    """Where rays end: by value, and by value over slope."""
+    """Ends of rays: by value, and by value over slope."""
     field = hk.SolidAngle(example_curves.wavy_polygon(48))
     size = fitting(width, 0.6)
     by_value, by_slope = 0.35, 0.05
@@ -98,12 +99,12 @@ def figure_5(width: int) -> Report:
         grid = np.stack(np.meshgrid(u, [0.0], w, indexing="xy"), axis=-1)
         points = grid.transpose(2, 1, 0, 3).reshape(-1, 3)
         gap, slope = _gap_and_slope(field, points)
-        for near, name in (
+        for is_near, name in (
             (np.abs(gap) < by_value, "|f - level| < eps"),
             (np.abs(gap) < by_slope * slope, "|f - level| < eps |grad f|"),
         ):
             shades = np.where((np.floor(gap / (math.pi / 4)) % 2 == 0)[:, None], 0.97, 0.90)
-            colors = np.where(near[:, None], (0.85, 0.35, 0.2), shades * np.ones(3))
+            colors = np.where(is_near[:, None], (0.85, 0.35, 0.2), shades * np.ones(3))
             pixels = (colors * 255).astype(np.uint8).reshape(2 * size[1], 2 * size[0], 3)
             row.append(Panel(np.asarray(Image.fromarray(pixels).reduce(2)), name))
     thin = _thickness(field, by_value, by_slope)
@@ -131,7 +132,8 @@ def _gap_and_slope(field: hk.SolidAngle, points: Array) -> tuple[Array, Array]:
 
 
 def _thickness(field: hk.SolidAngle, by_value: float, by_slope: float) -> tuple[Array, Array, int]:
-    """Where both conditions end along normals of the surface: their 1st and 99th percentiles."""
+    """The lengths at which both conditions end along normals of the surface: their 1st and 99th
+    percentiles."""
     u = np.linspace(-1, 1, 60)
     grid = np.stack(np.meshgrid(u, u, [2.0], indexing="ij"), axis=-1).reshape(-1, 3)
     hits = hk.trace(field, grid, [[0, 0, -1.0]], precision="double", tolerance=1e-9)
@@ -197,25 +199,25 @@ def figure_23(width: int) -> Report:
     # The paper's saddle with a square as its shadow, here over the plane of x and y.
     s = 0.5
     loop = np.array([[1.0, 1.0, s], [-1.0, 1.0, -s], [-1.0, -1.0, s], [1.0, -1.0, -s]])
-    across = max(8, 8 * round(width / 40))
+    ray_count = max(8, 8 * round(width / 40))
     rules = (("classic", 1.75), ("caps", 1.4))
-    found = errors(loop, across=across, steps=60, rules=rules)
+    error_sets = errors(loop, across=ray_count, steps=60, rules=rules)
     names = {"classic": "published rule, over-stepping 1.75", "caps": "harnack, caps"}
     figure, axes = pyplot.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
     rays, texts = 0, []
-    for name, parts in found.items():
-        for axis, error in zip(axes, parts, strict=True):
+    for name, measures in error_sets.items():
+        for axis, error in zip(axes, measures, strict=True):
             rays = error.shape[1]
             error = np.maximum(error, 1e-13)
             steps = np.arange(len(error))
             axis.semilogy(steps, error.mean(axis=1), label=names.get(name, name))
             low, high = np.percentile(error, [0.5, 99.5], axis=1)
             axis.fill_between(steps, low, high, alpha=0.2)
-        within = parts[1] < 1e-4
+        within = measures[1] < 1e-4
         count = np.where(within.any(axis=0), within.argmax(axis=0), np.inf)
         median = float(np.median(count))
-        told = f"{median:.0f}" if math.isfinite(median) else "more than 60"
-        texts.append(f"{names.get(name, name)} {told}")
+        steps_text = f"{median:.0f}" if math.isfinite(median) else "more than 60"
+        texts.append(f"{names.get(name, name)} {steps_text}")
     for axis, name in zip(axes, ("|f - level|", "|t - t*|"), strict=True):
         axis.set(xlabel="evaluations", ylabel=name, ylim=(1e-8, 20), xlim=(0, 60))
     axes[0].legend(fontsize=8)

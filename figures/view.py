@@ -1,4 +1,4 @@
-"""Pinhole views: rays of all pixels, and pictures of what they met.
+"""Pinhole views: rays of all pixels, and pictures of their hits.
 
 Comparisons need the same rays for every method, and pictures of meshes beside those of level
 sets; so they are drawn here, one ray a pixel and lit by a formula, and not by `harnack.render`.
@@ -39,7 +39,7 @@ class View:
 
     @classmethod
     def of(cls, points: Any, size: tuple[int, int], camera: Camera | None = None) -> View:
-        """That frames points (n, 3), as the studio's camera does."""
+        """The view that frames points (n, 3), as the studio's camera does."""
         camera = Camera() if camera is None else camera
         eye, _ = camera.frame_points(np.asarray(points, np.float64), size)
         return cls(eye, np.stack(camera.axes()), camera.fov_or_default, size)
@@ -97,7 +97,7 @@ class View:
 
 
 def marked(picture: Pixels, where: npt.NDArray[np.bool_], color: Color) -> Pixels:
-    """The picture with some of its pixels, row by row, in a color."""
+    """The picture with the selected pixels, row by row, in a color."""
     picture = picture.copy()
     picture.reshape(-1, 3)[where] = np.round(np.array(color) * 255).astype(np.uint8)
     return picture
@@ -126,7 +126,7 @@ def mesh_hits(vertices: Any, faces: Any, eye: Array, directions: Array) -> MeshH
     inside.update()
     scene = mi.load_dict({"type": "scene", "mesh": mesh})
     ray = mi.Ray3f(mi.Point3f(*eye.tolist()), mi.Vector3f(*directions.T.astype(np.float32)))
-    met = scene.ray_intersect(ray)
-    t = np.asarray(met.t.numpy(), np.float64)
-    normal = np.where(np.isfinite(t)[:, None], np.asarray(met.n.numpy(), np.float64).T, 0.0)
-    return MeshHits(t, normal, np.asarray(met.prim_index.numpy(), np.int64))
+    hits = scene.ray_intersect(ray)
+    t = np.asarray(hits.t.numpy(), np.float64)
+    normal = np.where(np.isfinite(t)[:, None], np.asarray(hits.n.numpy(), np.float64).T, 0.0)
+    return MeshHits(t, normal, np.asarray(hits.prim_index.numpy(), np.int64))

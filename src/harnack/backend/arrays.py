@@ -19,8 +19,8 @@ from harnack.backend.llvm import ensure_llvm
 from harnack.backend.validation import FloatArray, as_real_array, check_vectors
 from harnack.name_suggestions import is_one_of
 
-# Dr.Jit creates its array types at run time, one family a backend and precision, so no static
-# type describes "a Float of whichever backend". These names say what is meant.
+# Dr.Jit creates its array types at run time, one family per backend and precision, so no static
+# type describes "a Float of any backend". These names stand for such types.
 Real: TypeAlias = Any  #: Dr.Jit floating-point array, one number a lane (a Python float may do)
 Vec3: TypeAlias = Any  #: Dr.Jit 3-vector, one a lane
 Index: TypeAlias = Any  #: Dr.Jit integer array
@@ -104,24 +104,25 @@ def _check_ieee_arithmetic(backend: Backend) -> None:
     Raises:
         RuntimeError: a result differs from NumPy's.
     """
-    given = np.array([1, 3, 0, -0.0, 1e-30, 8e37, np.inf, np.nan, 0.1, 16777216], np.float32)
-    x, one = upload_floats(backend, given), dr.opaque(backend.Float, 1)
-    unit = np.float32(1)
+    values = np.array([1, 3, 0, -0.0, 1e-30, 8e37, np.inf, np.nan, 0.1, 16777216], np.float32)
+    x, one = upload_floats(backend, values), dr.opaque(backend.Float, 1)
+    np_one = np.float32(1)
     with np.errstate(all="ignore"):
-        # A quotient and a root may be two units off: bounds take more into account.
+        # A quotient and a root may have an error of two units in the last place: bounds allow for
+        # more.
         cases: dict[str, tuple[Any, Any, int]] = {
-            "1 / x": (one / x, unit / given, 2), "sqrt(x)": (dr.sqrt(x), np.sqrt(given), 2),
-            "x - x": (x - x, given - given, 0), "x + 1": (x + one, given + unit, 0),
-            "2 x": (2 * one * x, 2 * given, 0), "x x": (x * x, given * given, 0),
-            "x == x": (dr.select(x == x, one, 0), (given == given).astype(np.float32), 0),
+            "1 / x": (one / x, np_one / values, 2), "sqrt(x)": (dr.sqrt(x), np.sqrt(values), 2),
+            "x - x": (x - x, values - values, 0), "x + 1": (x + one, values + np_one, 0),
+            "2 x": (2 * one * x, 2 * values, 0), "x x": (x * x, values * values, 0),
+            "x == x": (dr.select(x == x, one, 0), (values == values).astype(np.float32), 0),
         }  # fmt: skip
-        for what, (computed, right, units) in cases.items():
-            found = to_numpy(computed)
-            near = np.abs(found - right) <= units * np.spacing(np.abs(right))
-            same = (found == right) | (np.isnan(found) & np.isnan(right))
-            if not (near | same).all():
+        for name, (computed, expected, ulps) in cases.items():
+            result = to_numpy(computed)
+            is_near = np.abs(result - expected) <= ulps * np.spacing(np.abs(expected))
+            is_same = (result == expected) | (np.isnan(result) & np.isnan(expected))
+            if not (is_near | is_same).all():
                 raise RuntimeError(
-                    f"Dr.Jit's {backend.name} device does not compute {what} as IEEE 754 says, on "
+                    f"Dr.Jit's {backend.name} device does not compute {name} as IEEE 754 says, on "
                     f"which proofs rest: set {BACKEND_VARIABLE}=llvm to compute on the CPU"
                 )
 
@@ -201,7 +202,7 @@ def _type_of(value: object) -> Any:
     return type(value)
 
 
-# Devices in the order in which they are taken, and what to do where there is none.
+# Devices in the order in which they are chosen, and advice if there is none.
 _DEVICES: dict[BackendName, tuple[Any, str]] = {
     "cuda": (dr.JitBackend.CUDA, "check that nvidia-smi lists one"),
     "metal": (dr.JitBackend.Metal, "it is for Macs with macOS 14 or later"),
@@ -218,8 +219,8 @@ _PRECISIONS: dict[Any, Precision] = {
 def to_vector3(backend: Backend, vectors: Any, name: str = "vectors") -> Vec3:
     """Vectors as backend.Array3f, from an array-like of shape (n, 3) or a Dr.Jit 3-vector.
 
-    Values of an array-like must be finite. A Dr.Jit vector is passed on (its precision is
-    changed if need be) and its values are not looked at, which would end its recording.
+    Values of an array-like must be finite. A Dr.Jit vector is passed on (its precision is changed
+    if necessary) and its values are not checked, which would end its recording.
 
     Raises:
         TypeError: not numbers; a Dr.Jit array that is no 3-vector or of another backend.
@@ -242,16 +243,18 @@ def as_finite_vectors(vectors: Any, name: str) -> FloatArray:
     """
     values = as_real_array(vectors, name, type_error=TypeError).astype(np.float64, copy=False)
     check_vectors(values, name)
-    finite = np.isfinite(values)
-    if not finite.all():
-        _check_rows(~finite.all(axis=1), "NaN or infinite", name)
+    is_finite = np.isfinite(values)
+    if not is_finite.all():
+        _check_rows(~is_finite.all(axis=1), "NaN or infinite", name)
     return values
 
 
 def upload_vectors(backend: Backend, rows: npt.NDArray[Any], name: str = "vectors") -> Vec3:
     """An array (n, 3) as backend.Array3f, each column uploaded by `upload_floats`. Infinite values
     and NaN are allowed."""
-    return backend.Array3f(*(upload_floats(backend, one) for one in _cast(backend, rows, name).T))
+    return backend.Array3f(
+        *(upload_floats(backend, column) for column in _cast(backend, rows, name).T)
+    )
 
 
 def to_float(backend: Backend, values: Any, name: str = "values") -> Real:
@@ -285,8 +288,8 @@ def gather_vectors(backend: Backend, vectors: Vec3, index: Index) -> Vec3:
     write the derivatives of such a gather beyond the end of the array."""
     return backend.Array3f(
         *(
-            one if dr.width(one) == 1 else dr.gather(backend.Float, one, index)
-            for one in backend.Array3f(vectors)
+            component if dr.width(component) == 1 else dr.gather(backend.Float, component, index)
+            for component in backend.Array3f(vectors)
         )
     )
 
@@ -306,18 +309,20 @@ def as_kernel_parameters(array: Any) -> Any:
 
 def _check_same_backend(backend: Backend, array: Any, name: str) -> None:
     try:
-        own = backend_of(array)
+        array_backend = backend_of(array)
     except TypeError as error:
         raise TypeError(f"{name}: {error}") from None
-    if own.name != backend.name:
-        raise TypeError(f"{name} lives on {own.name}, but the computation runs on {backend.name}")
+    if array_backend.name != backend.name:
+        raise TypeError(
+            f"{name} lives on {array_backend.name}, but the computation runs on {backend.name}"
+        )
 
 
-def _check_rows(is_bad: Any, what: str, name: str) -> None:
-    bad = np.flatnonzero(is_bad)
-    if bad.size:
-        rest = f" and {bad.size - 1} more" if bad.size > 1 else ""
-        raise ValueError(f"{name} has {what} values: entry {bad[0]}{rest}")
+def _check_rows(is_bad: Any, kind: str, name: str) -> None:
+    indices = np.flatnonzero(is_bad)
+    if indices.size:
+        others = f" and {indices.size - 1} more" if indices.size > 1 else ""
+        raise ValueError(f"{name} has {kind} values: entry {indices[0]}{others}")
 
 
 def _cast(backend: Backend, values: npt.NDArray[Any], name: str) -> npt.NDArray[Any]:

@@ -30,7 +30,7 @@ class Finding:
     subject: the thing that was examined.
     detail: the result.
     ok: False if harnack cannot work like this.
-    advice: what to do about it; empty if nothing.
+    advice: what to do about a problem; empty if there is none.
     """
 
     subject: str
@@ -71,11 +71,11 @@ def _device(name: str, kind: Any) -> Finding:
 
 
 def _llvm() -> list[Finding]:
-    """The LLVM that Dr.Jit loaded, then every one on this machine, best first."""
+    """The LLVM that Dr.Jit loaded, then every LLVM on this machine, best first."""
     loaded = loaded_library()
     requested = os.environ.get(PATH_VARIABLE)
-    how = f" ({PATH_VARIABLE})" if requested else ""
-    text = f"{loaded.path}, version {loaded.major}{how}" if loaded else "none loaded"
+    source = f" ({PATH_VARIABLE})" if requested else ""
+    text = f"{loaded.path}, version {loaded.major}{source}" if loaded else "none loaded"
     findings = [Finding("LLVM", text)]
     for library in find_libraries():
         version = "unknown" if library.major is None else library.major
@@ -87,15 +87,15 @@ def _llvm() -> list[Finding]:
 
 def _backend() -> Finding:
     forced = os.environ.get(BACKEND_VARIABLE)
-    how = f", forced by {BACKEND_VARIABLE}" if forced else ""
+    source = f", forced by {BACKEND_VARIABLE}" if forced else ""
     try:
         backend = choose_backend()
     except LLVMNotFoundError as error:
         return Finding("backend", "none", ok=False, advice=str(error))
     except (RuntimeError, ValueError) as error:
-        return Finding("backend", f"none{how}", ok=False, advice=str(error))
+        return Finding("backend", f"none{source}", ok=False, advice=str(error))
     threads = f" on {dr.thread_count()} threads" if backend.name == "llvm" else ""
-    return Finding("backend", f"{backend.name}{threads}, {backend.precision} precision{how}")
+    return Finding("backend", f"{backend.name}{threads}, {backend.precision} precision{source}")
 
 
 def _kernel(precision: str) -> Finding:
@@ -104,7 +104,7 @@ def _kernel(precision: str) -> Finding:
     subject = f"kernel, {precision} precision"
     code = f"import harnack.backend.doctor as d; d.try_kernel({precision!r})"
     try:
-        done = subprocess.run(
+        process = subprocess.run(
             [sys.executable, "-c", code],
             capture_output=True,
             text=True,
@@ -113,11 +113,11 @@ def _kernel(precision: str) -> Finding:
         )
     except subprocess.TimeoutExpired:
         return Finding(subject, f"no answer in {_KERNEL_SECONDS} s", ok=False)
-    if done.returncode == 0:
+    if process.returncode == 0:
         return Finding(subject, "runs")
-    lines = done.stderr.strip().splitlines() or ["no message"]
+    lines = process.stderr.strip().splitlines() or ["no message"]
     detail = (
-        f"fails with exit status {done.returncode}: {lines[0] if len(lines) > 3 else lines[-1]}"
+        f"fails with exit status {process.returncode}: {lines[0] if len(lines) > 3 else lines[-1]}"
     )
     return Finding(
         subject, detail, ok=False, advice=f"choose another LLVM: set {PATH_VARIABLE} to its file"
@@ -136,14 +136,14 @@ def try_kernel(precision: str) -> None:
     dr.eval(table)
     x = dr.linspace(backend.Float, 0, 1, 64)
 
-    def more(i: Index, total: Real) -> Mask:
+    def is_active(i: Index, total: Real) -> Mask:
         return i < 8
 
     def add(i: Index, total: Real) -> tuple[Index, Real]:
         term = dr.gather(backend.Float, table, i)
         return i + 1, total + dr.minimum(term, 4) * dr.sqrt(x)
 
-    _, total = dr.while_loop((backend.UInt32(0), dr.zeros(backend.Float, 64)), more, add)
+    _, total = dr.while_loop((backend.UInt32(0), dr.zeros(backend.Float, 64)), is_active, add)
     if abs(float(to_numpy(total)[-1]) - 26.0) > 1e-4:
         raise RuntimeError(f"the kernel gave {total[-1]} instead of 26")
 

@@ -6,7 +6,7 @@ comparison and a select become a single `minps`. With a NaN in either place the 
 returned: put the safe value there.
 
 `safe_norm` is right for vectors whose squares would overflow or vanish. `sincos` is as accurate on
-every backend as what is promised of sums of waves assumes.
+every backend as the promises of sums of waves assume.
 """
 
 from __future__ import annotations
@@ -53,18 +53,18 @@ def safe_norm(v: Vec3) -> Real:
     largest = max_norm(v)
     real = cast("Any", type(largest))
     (low, up), (high, down) = _norm_scaling_exponents(largest)
-    short, long = largest < 2.0**low, largest > 2.0**high
-    scale = dr.select(short, real(2.0**up), dr.select(long, real(2.0**down), real(1)))
-    back = dr.select(short, real(2.0**-up), dr.select(long, real(2.0**-down), real(1)))
-    return dr.norm(v * scale) * back
+    is_short, is_long = largest < 2.0**low, largest > 2.0**high
+    scale = dr.select(is_short, real(2.0**up), dr.select(is_long, real(2.0**down), real(1)))
+    inverse = dr.select(is_short, real(2.0**-up), dr.select(is_long, real(2.0**-down), real(1)))
+    return dr.norm(v * scale) * inverse
 
 
 def safe_normalize(v: Vec3) -> Vec3:
     """v/|v|, right for every vector whose largest component is a normal number."""
     largest = dr.detach(max_norm(v))
     (low, _), (high, _) = _norm_scaling_exponents(largest)
-    ordinary = (largest >= 2.0**low) & (largest <= 2.0**high)
-    scaled = v / dr.select(ordinary, 1, largest)
+    is_ordinary = (largest >= 2.0**low) & (largest <= 2.0**high)
+    scaled = v / dr.select(is_ordinary, 1, largest)
     return scaled / dr.norm(scaled)
 
 
@@ -84,7 +84,7 @@ def _norm_scaling_exponents(x: Real) -> tuple[tuple[int, int], tuple[int, int]]:
 # pi/2 in three parts, the first two so short that their products with integers below 2^11 are exact
 # (Cody and Waite 1980), and the minimax polynomials of Cephes (Moshier) on [-pi/4, pi/4].
 _HALF_PI = (1.5703125, 4.837512969970703125e-4, 7.54978995489188216e-8)
-# And in two, with fused products: the second is what double precision leaves over.
+# And in two, with fused products: the second is the remainder in double precision.
 _HALF_PI_DOUBLE = (1.5707963267948966, 6.123233995736766e-17)
 _SINE = (-1.9515295891e-4, 8.3321608736e-3, -1.6666654611e-1)
 _COSINE = (2.443315711809948e-5, -1.388731625493765e-3, 4.166664568298827e-2)
@@ -95,27 +95,27 @@ def sincos(x: Any) -> tuple[Any, Any]:
     beyond it they are not numbers.
 
     In single precision by arithmetic alone. Dr.Jit's own functions are one instruction on CUDA,
-    off by 2^-20.5 = 11u and by 600u for an angle of 300 (PTX ISA, sin.approx), and on LLVM they
-    lose accuracy from 8192 on: 16u at 10^5, everything at 10^6. In double precision they are right
-    within 1.6u up to some 10^9, so that angles are reduced here: x - k pi/2 is rounded once, and
-    once more for the part of pi/2 that double precision leaves over, as products are fused.
+    with an error of 2^-20.5 = 11u and of 600u for an angle of 300 (PTX ISA, sin.approx), and on
+    LLVM they lose accuracy from 8192 on: 16u at 10^5, everything at 10^6. In double precision they
+    are right within 1.6u up to about 10^9, so that angles are reduced here: x - k pi/2 is rounded
+    once, and once more for the remainder of pi/2 in double precision, as products are fused.
     """
     is_double = dr.type_v(type(x)) == dr.VarType.Float64
-    quarter = dr.round(x * 0.6366197723675814)
-    rest = dr.select(dr.abs(x) <= max_sincos_argument(type(x)), x, dr.nan)
+    k = dr.round(x * 0.6366197723675814)
+    reduced = dr.select(dr.abs(x) <= max_sincos_argument(type(x)), x, dr.nan)
     for part in _HALF_PI_DOUBLE if is_double else _HALF_PI:
-        rest = dr.fma(quarter, -part, rest)
+        reduced = dr.fma(k, -part, reduced)
     if is_double:
-        sine, cosine = dr.sincos(rest)
+        sine, cosine = dr.sincos(reduced)
     else:
-        square = rest * rest
+        square = reduced * reduced
         sine, cosine = _polynomial(_SINE, square), _polynomial(_COSINE, square)
-        sine = dr.fma(sine * square, rest, rest)
+        sine = dr.fma(sine * square, reduced, reduced)
         cosine = dr.fma(cosine * square, square, dr.fma(square, -0.5, 1))
-    # quarter modulo 4 is 0, 1, 2, 3 for (s, c), (c, -s), (-s, -c), (-c, s).
-    half = 0.5 * quarter
-    whole = dr.floor(half)
-    is_odd, is_late = whole != half, dr.floor(0.5 * whole) != 0.5 * whole
+    # k modulo 4 is 0, 1, 2, 3 for (s, c), (c, -s), (-s, -c), (-c, s).
+    half = 0.5 * k
+    floor = dr.floor(half)
+    is_odd, is_late = floor != half, dr.floor(0.5 * floor) != 0.5 * floor
     s, c = dr.select(is_odd, cosine, sine), dr.select(is_odd, sine, cosine)
     return dr.select(is_late, -s, s), dr.select(is_late ^ is_odd, -c, c)
 
@@ -128,8 +128,8 @@ def max_sincos_argument(real: Any) -> float:
 
 def _polynomial(coefficients: tuple[float, ...], x: Any) -> Any:
     total = coefficients[0]
-    for one in coefficients[1:]:
-        total = dr.fma(total, x, one)
+    for coefficient in coefficients[1:]:
+        total = dr.fma(total, x, coefficient)
     return total
 
 

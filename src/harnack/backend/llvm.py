@@ -43,7 +43,7 @@ class LLVMLibrary:
     """A shared LLVM library on this machine.
 
     path: its path, with links not resolved.
-    major: its major version, None if it could not be told without loading it.
+    major: its major version, None if it cannot be determined without loading the library.
     """
 
     path: Path
@@ -67,23 +67,24 @@ def rejection_reason(major: int | None) -> str | None:
 
 
 def library_version(path: Path) -> int | None:
-    """Major version of the LLVM library at `path`, told without loading it; None if unknown.
+    """Major version of the LLVM library at `path`, determined without loading it; None if unknown.
 
-    The file name says it (libLLVM-15.so.1, libLLVM.so.19.1), or the name that the links end at,
-    or the library's own SONAME, or a folder on the way (Homebrew: Cellar/llvm/21.1.0/lib).
+    The version is in the file name (libLLVM-15.so.1, libLLVM.so.19.1), in the name that the links
+    end at, in the library's own SONAME, or in a folder of the path (Homebrew:
+    Cellar/llvm/21.1.0/lib).
     """
     real = Path(os.path.realpath(path))
     for name in (path.name, real.name):
-        found = re.match(r"libLLVM(?:-|\.so\.|\.)(\d+)", name)
-        if found:
-            return int(found[1])
+        match = re.match(r"libLLVM(?:-|\.so\.|\.)(\d+)", name)
+        if match:
+            return int(match[1])
     major = _version_from_soname(real)
     if major is not None:
         return major
     for folder in reversed(real.parts[:-1]):
-        found = re.fullmatch(r"(?:llvm[-@]?)?(\d\d)(?:\.\d+){0,2}(?:_\d+)?", folder)
-        if found and "llvm" in str(real.parent).lower():
-            return int(found[1])
+        match = re.fullmatch(r"(?:llvm[-@]?)?(\d\d)(?:\.\d+){0,2}(?:_\d+)?", folder)
+        if match and "llvm" in str(real.parent).lower():
+            return int(match[1])
     return None
 
 
@@ -91,14 +92,14 @@ def _version_from_soname(path: Path) -> int | None:
     """Major version from the SONAME stored in the library's string table."""
     try:
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-            found = re.search(rb"\0libLLVM(?:-(\d+)[.\d]*\.so|\.so\.(\d+))[.\d]*\0", data)
-            return int(found[1] or found[2]) if found else None
+            match = re.search(rb"\0libLLVM(?:-(\d+)[.\d]*\.so|\.so\.(\d+))[.\d]*\0", data)
+            return int(match[1] or match[2]) if match else None
     except (OSError, ValueError):  # unreadable, or empty
         return None
 
 
 def _search_folders() -> Iterator[Path]:
-    """Folders that may hold LLVM, those nearest to this Python first."""
+    """Folders that may hold LLVM, the folders nearest to this Python first."""
     yield Path(sys.prefix) / "lib" / "native"  # where `make setup` may have unpacked one
     yield Path(sys.prefix) / "lib"
     if "CONDA_PREFIX" in os.environ:
@@ -120,28 +121,28 @@ def find_libraries(folders: Iterable[Path] | None = None) -> tuple[LLVMLibrary, 
 
     Each file is listed once, however many links lead to it. Nothing is loaded.
     """
-    found: dict[str, LLVMLibrary] = {}
+    libraries: dict[str, LLVMLibrary] = {}
     for folder in _search_folders() if folders is None else folders:
         for pattern in ("libLLVM.so*", "libLLVM-*.so*", "libLLVM.dylib", "libLLVM-*.dylib"):
             for path in sorted(folder.glob(pattern)):
                 real = os.path.realpath(path)
-                if real not in found and os.path.isfile(real):
-                    found[real] = LLVMLibrary(path, library_version(path))
+                if real not in libraries and os.path.isfile(real):
+                    libraries[real] = LLVMLibrary(path, library_version(path))
     # The sort is stable, so among equals the order of the folders decides.
     best_first = sorted(
-        found.values(), key=lambda library: preference_key(library.major), reverse=True
+        libraries.values(), key=lambda library: preference_key(library.major), reverse=True
     )
     return tuple(best_first)
 
 
 def preference_key(major: int | None) -> tuple[bool, bool, bool, int]:
     """Sort key of LLVM versions: the greatest is the one to use."""
-    known = major or 0
+    version = major or 0
     return (
         rejection_reason(major) is None,
-        known == PREFERRED_MAJOR,
-        known <= NEWEST_TRIED_MAJOR,
-        known,
+        version == PREFERRED_MAJOR,
+        version <= NEWEST_TRIED_MAJOR,
+        version,
     )
 
 
@@ -184,7 +185,8 @@ def loaded_library() -> LLVMLibrary | None:
     for path in _mapped_libraries():
         if library_version(path) == major:
             return LLVMLibrary(path, major)
-    # No memory map to read (macOS), or an unusual name: what Dr.Jit was told, or would take.
+    # No memory map to read (macOS), or an unusual name: the path that Dr.Jit was given, or its
+    # default.
     return LLVMLibrary(Path(os.environ.get(PATH_VARIABLE) or "libLLVM"), major)
 
 
@@ -228,7 +230,7 @@ def ensure_llvm() -> int:
 
 
 def _load_failure_message() -> str:
-    """What kept Dr.Jit from loading LLVM, and what to do."""
+    """The reason why Dr.Jit did not load LLVM, and advice."""
     requested = os.environ.get(PATH_VARIABLE)
     if requested:
         reason = rejection_reason(library_version(Path(requested)))
@@ -236,12 +238,12 @@ def _load_failure_message() -> str:
             reason = "there is no such file"
         reason = reason or "Dr.Jit cannot load it"
         return f"{PATH_VARIABLE} names {requested}: {reason}. {repair_advice()}"
-    found = find_libraries()
-    if found and found[0].rejection_reason is None:
-        return f"Dr.Jit did not load {found[0].path}. {repair_advice()}"
-    listing = "; ".join(f"{library.path} ({library.rejection_reason})" for library in found)
-    only = f" Found only {listing}." if found else ""
-    return f"The CPU backend needs LLVM {MINIMUM_MAJOR} or newer.{only} {repair_advice()}"
+    libraries = find_libraries()
+    if libraries and libraries[0].rejection_reason is None:
+        return f"Dr.Jit did not load {libraries[0].path}. {repair_advice()}"
+    listing = "; ".join(f"{library.path} ({library.rejection_reason})" for library in libraries)
+    listed = f" Found only {listing}." if libraries else ""
+    return f"The CPU backend needs LLVM {MINIMUM_MAJOR} or newer.{listed} {repair_advice()}"
 
 
 def repair_advice() -> str:

@@ -40,14 +40,14 @@ def loop_while_active(state: State, body: Callable[[State], State], label: str) 
     Errors that the body raises while it is recorded are raised unchanged.
     """
 
-    def running(*leaves: Any) -> Mask:
+    def is_active(*leaves: Any) -> Mask:
         return rebuild_record(state, iter(leaves)).active
 
-    def step(*leaves: Any) -> tuple[Any, ...]:
+    def run_body(*leaves: Any) -> tuple[Any, ...]:
         return tuple(array_leaves(body(rebuild_record(state, iter(leaves)))))
 
     try:
-        leaves = dr.while_loop(tuple(array_leaves(state)), running, step, label=label)
+        leaves = dr.while_loop(tuple(array_leaves(state)), is_active, run_body, label=label)
     except RuntimeError as error:  # Dr.Jit wraps what the body raises
         raise (error.__cause__ or error) from None
     return rebuild_record(state, iter(leaves))
@@ -61,17 +61,17 @@ def update_where_active(
     that a packet without active lanes skips the work."""
     index = dr.uint32_array_t(active)
 
-    def step(trip: Any, *state: Any) -> tuple[Any, ...]:
-        return trip + 1, *change(state)
+    def run_once(iteration: Any, *state: Any) -> tuple[Any, ...]:
+        return iteration + 1, *change(state)
 
-    def is_first(trip: Any, *_: Any) -> Mask:
-        return active & (trip < 1)
+    def is_first(iteration: Any, *_: Any) -> Mask:
+        return active & (iteration < 1)
 
-    return dr.while_loop((index(0), *state), is_first, step, label=label)[1:]
+    return dr.while_loop((index(0), *state), is_first, run_once, label=label)[1:]
 
 
 def array_leaves(record: Any) -> Iterator[Any]:
-    """The arrays of a record, those of nested records included, in order; None is left out."""
+    """The arrays of a record and of its nested records, in order; None is left out."""
     for value in _entries(record):
         if dataclasses.is_dataclass(value):
             yield from array_leaves(value)
@@ -101,7 +101,7 @@ def _entries(record: Any) -> list[Any]:
 Lanes = TypeVar("Lanes")
 Result = TypeVar("Result")
 
-# Lanes that share a queue: their number for each thread of a processor, and in all on a GPU.
+# Number of lanes that share a queue: for each thread of a processor, and in all on a GPU.
 _LANES_PER_THREAD, _LANES_ON_GPU = 1024, 1 << 17
 
 
@@ -131,10 +131,10 @@ def gather_record(record: Lanes, rows: Any) -> Lanes:
     """The lanes of a record at the indices `rows`. A value that all lanes share stays an array of
     width 1."""
 
-    def some(leaf: Any) -> Any:
+    def gather(leaf: Any) -> Any:
         return leaf if dr.width(leaf) == 1 else dr.gather(type(leaf), leaf, rows)
 
-    return rebuild_record(record, map(some, array_leaves(record)))
+    return rebuild_record(record, map(gather, array_leaves(record)))
 
 
 def compute_on_active(
@@ -180,17 +180,17 @@ def loop_with_queue(
     width = max(dr.width(leaf) for leaf in array_leaves(start))
     active = dr.full(type(start.active), True, width) & start.active
     rows, count = active_lanes(active)
-    done = broadcast_copy(result(start), width, type(rows))
+    results = broadcast_copy(result(start), width, type(rows))
     if count:
-        _run_queue(start, body, result, rows, count, [*array_leaves(done)], label)
+        _run_queue(start, body, result, rows, count, [*array_leaves(results)], label)
     _begin_new_scope(rows)
-    return done
+    return results
 
 
 @dataclass(frozen=True)
 class _QueueLane:
-    """A lane that follows rays from the queue. queue_index: of the ray that it follows now. state:
-    the state of that ray."""
+    """A lane that follows rays from the queue. queue_index: the index of the ray that it follows
+    now. state: the state of that ray."""
 
     queue_index: Any
     state: Any
@@ -202,39 +202,37 @@ class _QueueLane:
 
 def _run_queue(
     start: Any, body: Callable[[Any], Any], result: Callable[[Any], Any],
-    rows: Any, total: int, done: list[Any], label: str,
+    rows: Any, total: int, results: list[Any], label: str,
 ) -> None:  # fmt: skip
     """Run the loop of `loop_with_queue`. rows: indices in `start` of the `total` rays to be run.
-    done: arrays into which their results are written."""
+    results: arrays into which their results are written."""
     index = cast("Any", type(rows))
     count = dr.opaque(index, total)
     threads = dr.thread_count() if dr.backend_v(rows) == dr.JitBackend.LLVM else 0
-    at_once = min(len(rows), _LANES_PER_THREAD * threads or _LANES_ON_GPU)
-    taken, first = _evaluate_unshared(
-        lambda: [dr.full(index, at_once, 1), dr.arange(index, at_once)]
-    )
+    width = min(len(rows), _LANES_PER_THREAD * threads or _LANES_ON_GPU)
+    counter, first = _evaluate_unshared(lambda: [dr.full(index, width, 1), dr.arange(index, width)])
 
-    def fetched(row: Any, wanted: Mask) -> Any:
-        which = dr.gather(index, rows, row, wanted)
+    def fetch(slot: Any, mask: Mask) -> Any:
+        ids = dr.gather(index, rows, slot, mask)
 
-        def of_ray(leaf: Any) -> Any:
-            return leaf if dr.width(leaf) == 1 else dr.gather(type(leaf), leaf, which, wanted)
+        def gather(leaf: Any) -> Any:
+            return leaf if dr.width(leaf) == 1 else dr.gather(type(leaf), leaf, ids, mask)
 
-        return rebuild_record(start, map(of_ray, array_leaves(start)))
+        return rebuild_record(start, map(gather, array_leaves(start)))
 
-    def one_step(lane: _QueueLane) -> _QueueLane:
-        now = body(lane.state)
-        ended = lane.active & ~now.active
-        which = dr.gather(index, rows, lane.queue_index, ended)
-        for target, value in zip(done, array_leaves(result(now)), strict=True):
-            dr.scatter(target, value, which, ended)
-        row = dr.select(ended, dr.scatter_inc(taken, index(0), ended), lane.queue_index)
-        again = ended & (row < count)
-        both = zip(array_leaves(fetched(row, again)), array_leaves(now), strict=True)
-        return _QueueLane(row, rebuild_record(now, (dr.select(again, *pair) for pair in both)))
+    def step(lane: _QueueLane) -> _QueueLane:
+        new = body(lane.state)
+        ended = lane.active & ~new.active
+        ids = dr.gather(index, rows, lane.queue_index, ended)
+        for target, value in zip(results, array_leaves(result(new)), strict=True):
+            dr.scatter(target, value, ids, ended)
+        slot = dr.select(ended, dr.scatter_inc(counter, index(0), ended), lane.queue_index)
+        fetches = ended & (slot < count)
+        pairs = zip(array_leaves(fetch(slot, fetches)), array_leaves(new), strict=True)
+        return _QueueLane(slot, rebuild_record(new, (dr.select(fetches, *pair) for pair in pairs)))
 
-    loop_while_active(_QueueLane(first, fetched(first, first < count)), one_step, label)
-    dr.eval(done)
+    loop_while_active(_QueueLane(first, fetch(first, first < count)), step, label)
+    dr.eval(results)
 
 
 def _begin_new_scope(array: Any) -> None:
@@ -251,9 +249,9 @@ def _evaluate_unshared(make: Callable[[], Any]) -> Any:
     an accidental match, such as two arrays of the same length, would compile another kernel.
     """
     with dr.scoped_set_flag(dr.JitFlag.ValueNumbering, False):
-        made = make()
-        dr.make_opaque(made)
-    return made
+        arrays = make()
+        dr.make_opaque(arrays)
+    return arrays
 
 
 def _broadcast(leaf: Any, width: int, index: Any) -> Any:

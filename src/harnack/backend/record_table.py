@@ -32,8 +32,8 @@ class RecordTable:
     """A table on a backend, each row (record) padded with zeros to a multiple of eight numbers
     (packets).
 
-    packets_per_record: how many packets a record has.
-    records_per_iteration: how many records an iteration of `for_each` reads.
+    packets_per_record: the number of packets of a record.
+    records_per_iteration: the number of records that an iteration of `for_each` reads.
     iteration_count: the number of iterations of that loop.
     first_record: the index, per lane, of the record to start at; None for the first of the table.
     """
@@ -54,15 +54,15 @@ class RecordTable:
 
         padding_row: (c,) a row without effect, repeated until `at_once` divides the number of rows.
             Needed only if it does not.
-        at_once: how many records an iteration of `for_each` reads.
+        at_once: the number of records that an iteration of `for_each` reads.
 
         Rows are padded with zeros by Dr.Jit, on many threads and without another copy in NumPy.
 
         Raises:
             ValueError: padding_row is needed and is None.
         """
-        trips = -(-len(table) // at_once)
-        missing = trips * at_once - len(table)
+        iterations = -(-len(table) // at_once)
+        missing = iterations * at_once - len(table)
         if missing and padding_row is None:
             raise ValueError(
                 f"{len(table)} records make no whole trips of {at_once}: give `filling`"
@@ -70,13 +70,15 @@ class RecordTable:
         if padding_row is not None:
             table = np.concatenate([table, np.tile(padding_row, (missing, 1))])
         rows, width = table.shape
-        padded = -(-width // PACKET) * PACKET
+        padded_width = -(-width // PACKET) * PACKET
         mapped = upload_floats(backend, np.ascontiguousarray(table).ravel())
-        lane = dr.arange(backend.UInt32, rows * padded)
-        row, column = lane // padded, lane % padded
+        lane = dr.arange(backend.UInt32, rows * padded_width)
+        row, column = lane // padded_width, lane % padded_width
         copy = dr.gather(backend.Float, mapped, row * width + column, column < width)
         dr.eval(copy)
-        return cls(backend, copy, padded // PACKET, at_once, dr.opaque(backend.UInt32, trips))
+        return cls(
+            backend, copy, padded_width // PACKET, at_once, dr.opaque(backend.UInt32, iterations)
+        )
 
     def view(self, first: Any, trips: Any) -> RecordTable:
         """A view of `trips` consecutive records that begins at record `first`; both may differ
@@ -96,9 +98,9 @@ class RecordTable:
         numbers: list[Real] = []
         i = i if self.first_record is None else i + self.first_record
         for k in range(self.packets_per_record):
-            place = i * self.packets_per_record + k
-            eight = dr.gather(self.backend.ArrayXf, self.buffer, place, active, shape=(PACKET, 1))
-            numbers += [eight[j] for j in range(PACKET)]
+            index = i * self.packets_per_record + k
+            packet = dr.gather(self.backend.ArrayXf, self.buffer, index, active, shape=(PACKET, 1))
+            numbers += [packet[j] for j in range(PACKET)]
         return numbers
 
     def for_each(
@@ -108,7 +110,7 @@ class RecordTable:
 
         Inactive lanes cost nothing where all lanes of their packet are inactive.
         """
-        trips = (
+        iterations = (
             self.iteration_count if active is True else dr.select(active, self.iteration_count, 0)
         )
 
@@ -117,8 +119,8 @@ class RecordTable:
                 state = body(self.read_record(i * self.records_per_iteration + j), state)
             return i + 1, *state
 
-        def more(i: Any, *_: Any) -> Mask:
-            return i < trips
+        def is_active(i: Any, *_: Any) -> Mask:
+            return i < iterations
 
         start = (self.backend.UInt32(0), *state)
-        return dr.while_loop(start, more, step, label=label)[1:]
+        return dr.while_loop(start, is_active, step, label=label)[1:]

@@ -50,8 +50,8 @@ def tensor_to_vectors(
     numbers = tensor_to_array(tensor, name)
     backend = backend_of(numbers)
     count = 3 * tensor.shape[0]
-    places = (dr.arange(backend.UInt32, k, count, 3) for k in range(3 if count else 0))
-    rows = [dr.gather(backend.Float, numbers, place) for place in places]
+    indices = (dr.arange(backend.UInt32, k, count, 3) for k in range(3 if count else 0))
+    rows = [dr.gather(backend.Float, numbers, index) for index in indices]
     return backend.Array3f(*rows) if rows else dr.zeros(backend.Array3f, 0)
 
 
@@ -87,7 +87,7 @@ def accepts_tensors(method: Method) -> Method:
     """Extend a method of points: it also takes a tensor of points, and then returns tensors."""
 
     @functools.wraps(method)
-    def general(self: Any, points: Any, **settings: Any) -> Any:
+    def wrapper(self: Any, points: Any, **settings: Any) -> Any:
         if not is_tensor(points):
             return method(self, points, **settings)
         *shape, _ = points.shape or (0,)
@@ -96,7 +96,7 @@ def accepts_tensors(method: Method) -> Method:
             method(self, tensor_to_vectors(rows, "points"), **settings), tuple(shape)
         )
 
-    return cast("Method", general)
+    return cast("Method", wrapper)
 
 
 # PyTorch.
@@ -105,22 +105,23 @@ def accepts_tensors(method: Method) -> Method:
 def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
     """A function of Dr.Jit tensors as one of PyTorch tensors, with derivatives.
 
-    As `drjit.wrap(source="torch", target="drjit")`, but nothing is dropped without a word: a result
-    that depends on the arguments by nothing that has a derivative, such as whether rays hit
-    (`hits.is_hit`), raises where its derivative is asked for; and a second backward pass
+    As `drjit.wrap(source="torch", target="drjit")`, but nothing is dropped silently: a result that
+    depends on the arguments only through quantities without a derivative, such as whether rays hit
+    (`hits.is_hit`), raises where its derivative is requested; and a second backward pass
     (`retain_graph=True`) is right, and calls `function` again.
 
     function: must be pure. It is called with a Dr.Jit tensor for each PyTorch tensor among its
         arguments, of the same shape and precision, and returns a Dr.Jit array or tensor, or several
-        in a tuple, list or dictionary; 3-vectors become tensors (n, 3). All else that it is given
-        it is given as it is; tensors in lists and the like are not looked for.
+        in a tuple, list or dictionary; 3-vectors become tensors (n, 3). All other arguments are
+        passed unchanged; tensors in lists and the like are not converted.
 
     Raises ImportError where PyTorch is not installed.
     """
     torch: Any = importlib.import_module("torch")
 
     def run(arguments: list[Any], tensors: tuple[Any, ...]) -> tuple[list[Any], Any]:
-        """The inputs, and what `function` returns; arguments: of it, None for tensors."""
+        """The inputs, and the result of `function`; arguments: its arguments, with None for
+        tensors."""
         inputs = [_differentiable_tensor(tensor.detach()) for tensor in tensors]
         remaining = iter(inputs)
         filled = (next(remaining) if value is None else value for value in arguments)
@@ -134,8 +135,8 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
             ctx.save_for_backward(*tensors)
             ctx.arguments, ctx.graph = arguments, (inputs, _results(outputs))
             results = tuple(dr.detach(_as_tensor(value)).torch() for value in ctx.graph[1])
-            whole = (result for result in results if not result.is_floating_point())
-            ctx.mark_non_differentiable(*whole)
+            integral = (result for result in results if not result.is_floating_point())
+            ctx.mark_non_differentiable(*integral)
             return results
 
         @staticmethod
@@ -164,7 +165,7 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _results(outputs: Any) -> list[Any]:
-    """What a function returned, as a list."""
+    """The results of a function, as a list."""
     if isinstance(outputs, dict):
         return list(cast("dict[Any, Any]", outputs).values())
     return list(cast("list[Any]", outputs)) if isinstance(outputs, (tuple, list)) else [outputs]
@@ -179,8 +180,8 @@ def _like(shape: list[Any], results: Any) -> Any:
 
 
 def _gradients(inputs: list[Any], outputs: list[Any], cotangents: list[Any]) -> list[Any]:
-    """Gradients, as tensors, with respect to those inputs that are floats, given those of outputs
-    (None for none).
+    """Gradients, as tensors, with respect to the inputs that are floats, from gradients with
+    respect to outputs (None for none).
 
     Raises:
         NotImplementedError: an output that is asked for has no derivative at all.
@@ -219,20 +220,20 @@ def wrap_for_jax(
 ) -> Callable[..., Any]:
     """A function of Dr.Jit tensors as one of JAX arrays, with derivatives for `jax.grad`.
 
-    What `drjit.wrap(source="torch", target="drjit")` is for PyTorch; Dr.Jit has nothing for JAX.
+    The counterpart for JAX of `drjit.wrap(source="torch", target="drjit")`; Dr.Jit has none.
 
     function: must be pure. It is called with a Dr.Jit tensor for each array or number among its
         arguments, of the shape and precision that it has in JAX, and returns Dr.Jit arrays or
-        tensors, in tuples, lists and dictionaries if it likes; 3-vectors become arrays (n, 3).
+        tensors, possibly in tuples, lists and dictionaries; 3-vectors become arrays (n, 3).
     result_like: only for use inside `jax.jit`: a JAX function of the same arguments whose result
-        has the shapes and types of `function`'s. Only these are looked at.
+        has the shapes and types of `function`'s. Only these are used.
 
-    A result that depends on the arguments by nothing that has a derivative, such as whether rays
-    hit (`hits.is_hit`), raises where its derivative is asked for.
+    A result that depends on the arguments only through quantities without a derivative, such as
+    whether rays hit (`hits.is_hit`), raises where its derivative is requested.
 
     Derivatives are those of reverse mode (`jax.grad`, `jax.vjp`, `jax.jacrev`). A derivative calls
-    `function` a second time: JAX may keep what a forward pass leaves, and Dr.Jit's graph is none
-    of what it can keep.
+    `function` a second time: JAX may keep the values of a forward pass, but it cannot keep Dr.Jit's
+    graph.
 
     Raises ImportError where JAX is not installed.
     """
@@ -254,15 +255,19 @@ def wrap_for_jax(
         leaves: list[Any] = jax.tree.leaves(args)
         if _is_traced(jax, (args, cotangents)):
             shapes = [
-                jax.ShapeDtypeStruct(one.shape, one.dtype) for one in leaves if _is_float(jax, one)
+                jax.ShapeDtypeStruct(leaf.shape, leaf.dtype)
+                for leaf in leaves
+                if _is_float(jax, leaf)
             ]
-            found = iter(_pure_callback(jax, pull_back, shapes, args, cotangents))
+            derivatives = iter(_pure_callback(jax, pull_back, shapes, args, cotangents))
         else:
-            found = iter(pull_back(args, cotangents))
+            derivatives = iter(pull_back(args, cotangents))
         # JAX has a type of its own for derivatives with respect to integers.
         gradients = [
-            next(found) if _is_float(jax, one) else np.zeros(np.shape(one), jax.dtypes.float0)
-            for one in leaves
+            next(derivatives)
+            if _is_float(jax, leaf)
+            else np.zeros(np.shape(leaf), jax.dtypes.float0)
+            for leaf in leaves
         ]
         return jax.tree.unflatten(jax.tree.structure(args), gradients)
 
@@ -284,7 +289,8 @@ def _run(jax: Any, function: Callable[..., Any], *args: Any) -> Any:
 
 
 def _pull_back(jax: Any, function: Callable[..., Any], args: Any, cotangents: Any) -> list[Any]:
-    """Gradients with respect to those arguments that are floats, given those of the result."""
+    """Gradients with respect to the arguments that are floats, from gradients with respect to the
+    result."""
     inputs = jax.tree.map(_differentiable_tensor, args)
     outputs = jax.tree.leaves(function(*inputs))
     gradients = _gradients(jax.tree.leaves(inputs), outputs, jax.tree.leaves(cotangents))
@@ -292,12 +298,12 @@ def _pull_back(jax: Any, function: Callable[..., Any], args: Any, cotangents: An
 
 
 def _is_traced(jax: Any, values: Any) -> bool:
-    """Whether JAX is transforming or compiling, so that values are not there yet."""
+    """Whether JAX is transforming or compiling, so that values do not exist yet."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
 
 
 def _pure_callback(jax: Any, compute: Callable[..., Any], shapes: Any, *args: Any) -> Any:
-    """What `compute` gives, called while a program that JAX has compiled runs."""
+    """The result of `compute`, called while a program that JAX has compiled runs."""
 
     def on_host(*values: Any) -> Any:
         # As NumPy arrays: a callback must not wait for work that is JAX's own to do.
@@ -316,7 +322,7 @@ def _tensor(array: Any) -> Any:
 
 
 def _differentiable_tensor(array: Any) -> Any:
-    """Likewise, with derivatives enabled if it holds floats."""
+    """A Dr.Jit tensor as `_tensor` gives it, with derivatives enabled if it holds floats."""
     tensor = _tensor(array)
     if dr.is_float_v(tensor):
         dr.enable_grad(tensor)

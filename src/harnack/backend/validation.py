@@ -27,7 +27,7 @@ BoolArray: TypeAlias = npt.NDArray[np.bool_]
 TRANSPOSE_ADVICE = "; transpose it"
 """Advice of `check_vectors` where an array (3, n) surely holds n vectors."""
 
-# Entries of a list, and letters of a value, that `format_short` writes.
+# Number of entries of a list, and of letters of a value, that `format_short` writes.
 _MOST_SHOWN, _MAX_TEXT_LENGTH = 4, 60
 
 MAX_COORDINATE = 1e100
@@ -86,10 +86,10 @@ def check_finite(
 ) -> None:
     """Check that all numbers of an array (n, k) are finite. name: the name of a row, with {} for
     its index."""
-    bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
-    if bad.size:
+    ids = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+    if ids.size:
         raise error(
-            f"{name.format(bad[0])} is {format_vector(rows[bad[0]])}{others_suffix(bad.size)}: "
+            f"{name.format(ids[0])} is {format_vector(rows[ids[0]])}{others_suffix(ids.size)}: "
             f"{advice}"
         )
 
@@ -106,7 +106,7 @@ def format_vector(row: FloatArray) -> str:
 
 
 def others_suffix(count: int) -> str:
-    """The end of a message about the first of `count` entries: how many others there are."""
+    """The end of a message about the first of `count` entries: the number of other entries."""
     return f" (and {count - 1:,} more)" if count > 1 else ""
 
 
@@ -130,33 +130,33 @@ def no_derivatives(function: Function) -> Function:
     that carry them (`check_no_derivatives`)."""
 
     @functools.wraps(function)
-    def checked(*given: Any, **named: Any) -> Any:
-        check_no_derivatives(function.__qualname__, given, named)
-        return function(*given, **named)
+    def wrapper(*args: Any, **kwargs: Any) -> Any:
+        check_no_derivatives(function.__qualname__, args, kwargs)
+        return function(*args, **kwargs)
 
-    return cast("Function", checked)
+    return cast("Function", wrapper)
 
 
 def has_derivatives(value: Any) -> bool:
     """Whether a value is, or contains, a Dr.Jit or PyTorch array with derivatives enabled.
     Containers are searched, objects that functions refer to, and attributes of fields, of callables
     and of dataclasses."""
-    seen: set[int] = set()
-    left: list[Any] = [value]
-    for one in left:  # which grows
-        kind = cast("Any", type(one))
+    visited: set[int] = set()
+    pending: list[Any] = [value]
+    for node in pending:  # which grows
+        kind = cast("Any", type(node))
         if kind is tuple:  # most of what fields hold
-            left += [entry for entry in one if type(entry) not in _PLAIN_TYPES]
+            pending += [entry for entry in node if type(entry) not in _PLAIN_TYPES]
         elif kind in _PLAIN_TYPES:
             continue
         elif dr.is_array_v(kind):
-            if dr.is_diff_v(kind) and dr.grad_enabled(one):
+            if dr.is_diff_v(kind) and dr.grad_enabled(node):
                 return True
-        elif getattr(one, "requires_grad", False) is True:
+        elif getattr(node, "requires_grad", False) is True:
             return True
-        elif id(one) not in seen and not isinstance(one, type):
-            seen.add(id(one))
-            left += _contained_values(one)
+        elif id(node) not in visited and not isinstance(node, type):
+            visited.add(id(node))
+            pending += _contained_values(node)
     return False
 
 
@@ -164,17 +164,17 @@ def is_plain_data(value: Any) -> bool:
     """Whether a value is plain data: Python's and NumPy's numbers, strings and arrays, in tuples,
     dictionaries and dataclasses of this package. Plain data can never carry derivatives; Dr.Jit
     arrays and functions can."""
-    left: list[Any] = [value]
-    for one in left:  # which grows
-        kind = cast("Any", type(one))
+    pending: list[Any] = [value]
+    for node in pending:  # which grows
+        kind = cast("Any", type(node))
         if kind in _PLAIN_TYPES:
             continue
         if kind is tuple:
-            left += one
+            pending += node
         elif kind is dict:
-            left += one.values()
-        elif dataclasses.is_dataclass(one) and kind.__module__.startswith("harnack."):
-            left += vars(one).values()
+            pending += node.values()
+        elif dataclasses.is_dataclass(node) and kind.__module__.startswith("harnack."):
+            pending += vars(node).values()
         else:
             return False
     return True
@@ -203,17 +203,17 @@ _KNOWN_PACKAGES = frozenset(("harnack", "drjit", "numpy", "math"))
 
 
 def _contained_values(value: Any) -> list[Any]:
-    """What a value holds, as far as it is looked into."""
+    """The values that a value refers to, as far as they are searched."""
     if isinstance(value, _CONTAINER_TYPES):
-        return [one for one in cast("Any", value) if type(one) not in _PLAIN_TYPES]
+        return [entry for entry in cast("Any", value) if type(entry) not in _PLAIN_TYPES]
     if isinstance(value, dict):
         return list(cast("Any", value).values())
     if inspect.isfunction(value):
         if str(value.__module__).partition(".")[0] in _KNOWN_PACKAGES and not value.__closure__:
             return []
-        found, named = inspect.getclosurevars(value), value.__kwdefaults__ or {}
-        others = found.globals.values(), named.values(), value.__defaults__ or ()
-        return [*found.nonlocals.values(), *(one for group in others for one in group)]
+        closure, defaults = inspect.getclosurevars(value), value.__kwdefaults__ or {}
+        groups = closure.globals.values(), defaults.values(), value.__defaults__ or ()
+        return [*closure.nonlocals.values(), *(entry for group in groups for entry in group)]
     if inspect.ismethod(value):
         return [value.__func__, value.__self__]
     is_known = dataclasses.is_dataclass(value) or callable(value) or hasattr(value, "parameters")
@@ -336,5 +336,5 @@ def as_triple(value: Any, name: str, *, all_positive: bool = False) -> tuple[flo
     if len(entries) != 3:
         raise ValueError(f"{name} must be three numbers, not {len(entries)}: {value!r}")
     check = as_positive if all_positive else as_finite
-    x, y, z = (check(one, f"each of {name}") for one in entries)
+    x, y, z = (check(entry, f"each of {name}") for entry in entries)
     return x, y, z

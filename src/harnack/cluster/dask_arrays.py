@@ -53,70 +53,74 @@ def accepts_dask_arrays(*names: str) -> Callable[[Function], Function]:
 
 def _map_blocks(call: Callable[..., Any], names: tuple[str, ...], arguments: dict[str, Any]) -> Any:
     """The Dask arrays that result from `call` for arguments that contain Dask arrays."""
-    what = "Dask arrays"
-    delayed = import_optional("dask", what).delayed
-    array = import_optional("dask.array", what)
-    lazy = {name: one for name, one in arguments.items() if is_dask_array(one)}
+    purpose = "Dask arrays"
+    delayed = import_optional("dask", purpose).delayed
+    dask_array = import_optional("dask.array", purpose)
+    lazy = {name: array for name, array in arguments.items() if is_dask_array(array)}
     for name in lazy.keys() - set(names):
         raise TypeError(f"{name} cannot be a Dask array: call its method compute() first")
     lazy = _align_blocks(
-        array, lazy, {name: arguments[name] for name in names if name in arguments}
+        dask_array, lazy, {name: arguments[name] for name in names if name in arguments}
     )
-    fixed = {name: one for name, one in arguments.items() if name not in lazy}
-    for name, one in lazy.items():
-        if one.dtype.kind not in "iuf":
-            raise TypeError(f"{name} must hold real numbers, not {one.dtype}")
-    call = functools.partial(call, **fixed)
-    # What there is to be expected, told by no points; wrong settings are told here as well.
-    result = call(**{name: np.zeros((0, *one.shape[1:]), one.dtype) for name, one in lazy.items()})
+    constants = {name: array for name, array in arguments.items() if name not in lazy}
+    for name, array in lazy.items():
+        if array.dtype.kind not in "iuf":
+            raise TypeError(f"{name} must hold real numbers, not {array.dtype}")
+    call = functools.partial(call, **constants)
+    # The kind of the result, from a call with no points; wrong settings raise here as well.
+    result = call(
+        **{name: np.zeros((0, *array.shape[1:]), array.dtype) for name, array in lazy.items()}
+    )
     empty = _arrays_of(result)
-    packed = SerializedObject.serialize(call, what)
+    packed = SerializedObject.serialize(call, purpose)
     token = content_hash(
-        (packed.content_hash, [(name, one.name) for name, one in lazy.items()]), what
+        (packed.content_hash, [(name, array.name) for name, array in lazy.items()]), purpose
     )
-    sent = delayed(packed, name=f"harnack-{packed.content_hash}", traverse=False)
-    run = delayed(_run, pure=False)
-    columns = [one.to_delayed().reshape(-1).tolist() for one in lazy.values()]
+    task = delayed(packed, name=f"harnack-{packed.content_hash}", traverse=False)
+    run_block = delayed(_run, pure=False)
+    block_lists = [array.to_delayed().reshape(-1).tolist() for array in lazy.values()]
     lengths: tuple[int, ...] = next(iter(lazy.values())).chunks[0]
-    found: dict[str, list[Any]] = {name: [] for name in empty}
-    for k, blocks in enumerate(zip(*columns, strict=True)):
-        given = dict(zip(lazy, blocks, strict=True))
-        block = run(sent, given, sum(lengths[:k]), dask_key_name=f"harnack-{token}-{k}")
-        for name, one in empty.items():
-            shape = (lengths[k], *one.shape[1:])
-            found[name].append(array.from_delayed(block[name], shape, one.dtype))
-    results = {name: array.concatenate(parts) for name, parts in found.items()}
+    outputs: dict[str, list[Any]] = {name: [] for name in empty}
+    for k, blocks in enumerate(zip(*block_lists, strict=True)):
+        inputs = dict(zip(lazy, blocks, strict=True))
+        output = run_block(task, inputs, sum(lengths[:k]), dask_key_name=f"harnack-{token}-{k}")
+        for name, array in empty.items():
+            shape = (lengths[k], *array.shape[1:])
+            outputs[name].append(dask_array.from_delayed(output[name], shape, array.dtype))
+    results = {name: dask_array.concatenate(pieces) for name, pieces in outputs.items()}
     return type(result)(**results) if is_dataclass(result) else results[""]
 
 
-def _align_blocks(array: Any, lazy: dict[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
+def _align_blocks(
+    dask_array: Any, lazy: dict[str, Any], others: Mapping[str, Any]
+) -> dict[str, Any]:
     """Dask arrays, and other arrays with an entry for each of their rows, cut into the same blocks
     of rows.
 
     Raises:
         ValueError: their lengths differ or are not known.
     """
-    first, main = next(iter(lazy.items()))
-    if main.ndim == 0:
-        raise ValueError(f"{first} must have shape (n, 3) or (n,), not ()")
-    if any(np.isnan(one) for one in main.chunks[0]):
+    first_name, reference = next(iter(lazy.items()))
+    if reference.ndim == 0:
+        raise ValueError(f"{first_name} must have shape (n, 3) or (n,), not ()")
+    if any(np.isnan(array) for array in reference.chunks[0]):
         raise ValueError(
-            f"{first}: the lengths of its blocks are not known; call its method "
+            f"{first_name}: the lengths of its blocks are not known; call its method "
             "compute_chunk_sizes() first"
         )
-    count = main.shape[0]
-    rows = dict(lazy)
-    for name, one in others.items():
-        shape = np.shape(one)
+    count = reference.shape[0]
+    aligned = dict(lazy)
+    for name, array in others.items():
+        shape = np.shape(array)
         if name not in lazy and shape not in ((), (3,)) and shape[0] == count:
-            rows[name] = array.from_array(np.asarray(one), chunks=-1)
-    for name, one in rows.items():
-        if one.ndim not in (1, 2) or (one.ndim == 2 and one.shape[1] != 3):
-            raise ValueError(f"{name} must have shape (n, 3) or (n,), not {one.shape}")
-        if one.shape[0] != count:
-            raise ValueError(f"{name} has {one.shape[0]} entries, and {first} has {count}")
-    chunks = main.chunks[0]
-    return {name: one.rechunk((chunks, -1)[: one.ndim]) for name, one in rows.items()}
+            aligned[name] = dask_array.from_array(np.asarray(array), chunks=-1)
+    for name, array in aligned.items():
+        if array.ndim not in (1, 2) or (array.ndim == 2 and array.shape[1] != 3):
+            raise ValueError(f"{name} must have shape (n, 3) or (n,), not {array.shape}")
+        if array.shape[0] != count:
+            raise ValueError(f"{name} has {array.shape[0]} entries, and {first_name} has {count}")
+    chunks = reference.chunks[0]
+    return {name: array.rechunk((chunks, -1)[: array.ndim]) for name, array in aligned.items()}
 
 
 def _arrays_of(result: Any) -> dict[str, np.ndarray[Any, Any]]:

@@ -85,8 +85,8 @@ class CheckpointFolder:
         if not path.exists():
             return None
         try:
-            with np.load(path, allow_pickle=False) as found:
-                return {name: found[name] for name in found.files}
+            with np.load(path, allow_pickle=False) as archive:
+                return {name: archive[name] for name in archive.files}
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise ValueError(
                 f"{path} is damaged ({error}): delete it, and it is made anew"
@@ -134,27 +134,27 @@ class Executor:
         """Call the method named `step` of a job with the arguments of each part, and yield the
         results in the order of the parts.
 
-        job: what `SerializedObject.serialize` takes. It is sent to each worker once, and opened
-            there once.
+        job: an object that `SerializedObject.serialize` accepts. It is sent to each worker once,
+            and opened there once.
 
-        Raises what the method raises.
+        Raises the errors of the method.
         """
         if self.client is None and self.checkpoint is None:
-            do: TaskFunction = getattr(job, step)
+            method: TaskFunction = getattr(job, step)
             for part in parts:
-                yield do(*part)
+                yield method(*part)
             return
         packed = SerializedObject.serialize(job, "checkpoint" if self.client is None else "client")
         names = [f"{packed.content_hash}-{step}-{content_hash(part, 'a part')}" for part in parts]
-        doing = (
+        runner = (
             _LocalTasks(packed, step)
             if self.client is None
             else _DaskTasks(self.client, packed, step)
         )
         try:
-            yield from _ordered_results(names, parts, self.checkpoint, doing, self._max_pending)
+            yield from _ordered_results(names, parts, self.checkpoint, runner, self._max_pending)
         finally:
-            for name, arrays in doing.cancel():
+            for name, arrays in runner.cancel():
                 if self.checkpoint is not None:
                     self.checkpoint.save(name, arrays)
 
@@ -181,8 +181,8 @@ def open_executor(
     if checkpoint is not None:
         import_optional("cloudpickle", "checkpoint")
         folder = CheckpointFolder.open(checkpoint)
-    with connect_client(client) as one:
-        yield Executor(one, folder, tiles)
+    with connect_client(client) as dask_client:
+        yield Executor(dask_client, folder, tiles)
 
 
 class _LocalTasks:
@@ -258,84 +258,84 @@ class _DaskTasks:
         return name, arrays
 
     def _wait(self) -> None:
-        """Wait until a task is finished. Warns if there is no worker to run any."""
-        alone_since, warned = None, False
-        look_again = time.monotonic() + 1
+        """Wait until a task is finished. Warns if there is no worker to run a task."""
+        idle_since, warned = None, False
+        next_check = time.monotonic() + 1
         while not self.completed.has_ready():
             time.sleep(_POLL_SECONDS)
             now = time.monotonic()
-            if now < look_again:
+            if now < next_check:
                 continue
-            look_again = now + 1
+            next_check = now + 1
             if worker_threads(self.client):
-                alone_since = None
+                idle_since = None
                 continue
-            alone_since = alone_since or now
-            if now - alone_since > _NO_WORKER_SECONDS and not warned:
+            idle_since = idle_since or now
+            if now - idle_since > _NO_WORKER_SECONDS and not warned:
                 warned = True
                 warnings.warn("the cluster has no worker: this waits for one", stacklevel=2)
 
     def cancel(self) -> list[tuple[str, TaskResult]]:
         """Cancel unfinished tasks, and return (name, result) of tasks that are finished but were
         not fetched."""
-        ready = [one for one in self.names if one.status == "finished"]
-        found: list[tuple[str, TaskResult]] = []
+        finished = [future for future in self.names if future.status == "finished"]
+        results: list[tuple[str, TaskResult]] = []
         # Without a scheduler there are no results to fetch; the error that is raised says so.
         with suppress(OSError, TimeoutError, asyncio.CancelledError, self.scheduler_lost):
-            self.client.cancel([one for one in self.names if one.status != "finished"])
-            for one in ready:
-                found.append((self.names[one], one.result(timeout=_NO_WORKER_SECONDS)[0]))
+            self.client.cancel([future for future in self.names if future.status != "finished"])
+            for future in finished:
+                results.append((self.names[future], future.result(timeout=_NO_WORKER_SECONDS)[0]))
         self.names.clear()
         self.packed.release()
-        return found
+        return results
 
 
 def _ordered_results(
     names: list[str],
-    parts: Sequence[tuple[Any, ...]],
+    arguments: Sequence[tuple[Any, ...]],
     folder: CheckpointFolder | None,
-    doing: _LocalTasks | _DaskTasks,
-    ahead: Callable[[], int],
+    runner: _LocalTasks | _DaskTasks,
+    max_pending: Callable[[], int],
 ) -> Iterator[TaskResult]:
-    """The results of tasks in their order, while several of them run at the same time.
+    """The results of tasks in their order, while several tasks run at the same time.
 
-    A task that occurs several times is run once. ahead: gives the largest number of tasks that may
-    be submitted or waiting to be yielded.
+    A task that occurs several times is run once. max_pending: gives the largest number of tasks
+    that may be submitted or waiting to be yielded.
     """
-    found: dict[str, TaskResult] = {}
-    waiting: set[str] = set()
-    uses, begun = Counter(names), 0
+    results: dict[str, TaskResult] = {}
+    pending: set[str] = set()
+    uses, next_index = Counter(names), 0
 
-    def begin(index: int) -> None:
-        doing.submit(names[index], parts[index])
-        waiting.add(names[index])
+    def submit(index: int) -> None:
+        runner.submit(names[index], arguments[index])
+        pending.add(names[index])
 
     for index, name in enumerate(names):
-        kept = None if folder is None or name in found else folder.load(name)
-        if kept is not None:
-            yield kept
+        stored = None if folder is None or name in results else folder.load(name)
+        if stored is not None:
+            yield stored
             continue
-        if name not in found and name not in waiting:
-            begin(index)
-        begun = max(begun, index + 1)
-        while name not in found:
-            most = ahead()
-            while begun < len(names) and len(waiting) + len(found) < most:
-                other = names[begun]
+        if name not in results and name not in pending:
+            submit(index)
+        next_index = max(next_index, index + 1)
+        while name not in results:
+            limit = max_pending()
+            while next_index < len(names) and len(pending) + len(results) < limit:
+                next_name = names[next_index]
                 if (
-                    other not in waiting
-                    and other not in found
-                    and not (folder and folder.has(other))
+                    next_name not in pending
+                    and next_name not in results
+                    and not (folder and folder.has(next_name))
                 ):
-                    begin(begun)
-                begun += 1
-            done, arrays = doing.next_completed()
-            waiting.remove(done)
-            found[done] = arrays
+                    submit(next_index)
+                next_index += 1
+            finished, arrays = runner.next_completed()
+            pending.remove(finished)
+            results[finished] = arrays
             if folder is not None:
-                folder.save(done, arrays)
+                folder.save(finished, arrays)
         uses[name] -= 1
-        yield found[name] if uses[name] else found.pop(name)
+        yield results[name] if uses[name] else results.pop(name)
 
 
 def _identity(packed: SerializedObject) -> SerializedObject:
@@ -343,10 +343,10 @@ def _identity(packed: SerializedObject) -> SerializedObject:
 
 
 def _run_task(
-    packed: SerializedObject, step: str, part: tuple[Any, ...]
+    packed: SerializedObject, step: str, arguments: tuple[Any, ...]
 ) -> tuple[TaskResult, str, str]:
     """Run a task on this worker. Returns its result, the worker's address, and its
     `rounding_fingerprint`."""
     with exclusive_compute() as address:
-        do: TaskFunction = getattr(packed.deserialize(), step)
-        return do(*part), address, rounding_fingerprint()
+        method: TaskFunction = getattr(packed.deserialize(), step)
+        return method(*arguments), address, rounding_fingerprint()

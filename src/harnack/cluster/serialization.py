@@ -1,8 +1,8 @@
 """Objects as bytes to be sent, and digests of their contents.
 
 Cached values are left out: they would be sent for nothing, and would make equal objects differ.
-These are the values of `functools.cached_property` and of a `TransientCache`, and private fields of
-dataclasses that are not compared.
+The cached values are those of `functools.cached_property` and of a `TransientCache`, and private
+fields of dataclasses that are not compared.
 
 Functions and classes of Python and of installed packages are sent by name. Those of users are sent
 by value, with the attributes of users' modules that they use (`users_code.py`). Their digest
@@ -47,7 +47,7 @@ from harnack.cluster.users_code import (
 
 Key = TypeVar("Key")
 Value = TypeVar("Value")
-# In the place of an attribute: none.
+# Stands for an attribute that is left out.
 _OMIT = object()
 # The newest protocol of the oldest Python that is supported.
 _PROTOCOL = 5
@@ -80,8 +80,8 @@ def import_optional(name: str, what: str) -> Any:
 @functools.cache
 def package_versions() -> str:
     """Versions of this library and of those on which the bits of its results depend."""
-    others = (f"{name} {importlib.metadata.version(name)}" for name in _PACKAGES)
-    return ", ".join((f"harnack {__version__}", *others))
+    versions = (f"{name} {importlib.metadata.version(name)}" for name in _PACKAGES)
+    return ", ".join((f"harnack {__version__}", *versions))
 
 
 class TransientCache(dict[Key, Value]):
@@ -118,9 +118,9 @@ class SerializedObject:
             ModuleNotFoundError: the extra `cluster` is not installed.
             TypeError: the object cannot be pickled. The messages begin with `what`.
         """
-        name, naming = _hash_and_files(thing, what)
+        name, pickler = _hash_and_files(thing, what)
         data = _written(_cacheless_pickler, thing, what).file.getvalue()
-        files, others = sorted(naming.files.items()), sorted(naming.others.items())
+        files, others = sorted(pickler.files.items()), sorted(pickler.others.items())
         return cls(name, data, tuple(files), package_versions(), tuple(others))
 
     def deserialize(self) -> Any:
@@ -139,16 +139,19 @@ class SerializedObject:
 
 @functools.lru_cache(maxsize=4)
 def _deserialize_cached(packed: SerializedObject) -> Any:
-    there = [packed.package_versions, *(f"{name} {version}" for name, version in packed.others)]
-    here = [package_versions(), *(f"{name} {installed_version(name)}" for name, _ in packed.others)]
-    if there != here:
+    sent = [packed.package_versions, *(f"{name} {version}" for name, version in packed.others)]
+    local = [
+        package_versions(),
+        *(f"{name} {installed_version(name)}" for name, _ in packed.others),
+    ]
+    if sent != local:
         raise RuntimeError(
-            f"this was sent by {', '.join(there)}, and here is {', '.join(here)}: install the same "
+            f"this was sent by {', '.join(sent)}, and here is {', '.join(local)}: install the same "
             "on all machines"
         )
-    for name, contents in packed.file_digests:
-        here_in_it = _file_digest(name)
-        if here_in_it != contents and not (here_in_it is None and name.isidentifier()):
+    for name, expected in packed.file_digests:
+        digest = _file_digest(name)
+        if digest != expected and not (digest is None and name.isidentifier()):
             raise ValueError(
                 f"the file {name} is not here, or not as it was where it was named: put it on all "
                 "machines under the same name, with the whole path"
@@ -169,13 +172,13 @@ def content_hash(thing: Any, what: str) -> str:
     return _hash_and_files(thing, what)[0]
 
 
-def _hash_and_files(thing: Any, what: str, words: frozenset[str] = frozenset()) -> tuple[str, Any]:
+def _hash_and_files(value: Any, what: str, words: frozenset[str] = frozenset()) -> tuple[str, Any]:
     """The content hash of an object, and the pickler that wrote it, which has noted files and
     packages."""
     try:
-        pickler = _written(_hashing_pickler, thing, what, words, fast=True)
+        pickler = _written(_hashing_pickler, value, what, words, fast=True)
     except (RecursionError, TypeError, ValueError):  # an object that holds itself
-        pickler = _written(_hashing_pickler, thing, what, words)
+        pickler = _written(_hashing_pickler, value, what, words)
     data = (
         f"{package_versions()} {sorted(pickler.others.items())}".encode() + pickler.file.getvalue()
     )
@@ -183,20 +186,21 @@ def _hash_and_files(thing: Any, what: str, words: frozenset[str] = frozenset()) 
 
 
 def _written(
-    kind: Callable[[Any], Any], thing: Any, what: str, words: frozenset[str] = frozenset(), *,
+    make_class: Callable[[Any], Any], value: Any, what: str, words: frozenset[str] = frozenset(), *,
     fast: bool = False,
 ) -> Any:  # fmt: skip
-    """A pickler of a kind, after it has written an object into its `file`.
+    """A pickler of the class that `make_class` returns, after it has written an object into its
+    `file`.
 
     Which attributes of modules are needed is known only when all code was written. So the object is
     written again until no name is missing; this ends, since the code has finitely many names.
     """
     cloudpickle = import_optional("cloudpickle", what)
     while True:
-        pickler = kind(cloudpickle.Pickler)(what, words)
+        pickler = make_class(cloudpickle.Pickler)(what, words)
         pickler.fast = fast
         try:
-            pickler.dump(thing)
+            pickler.dump(value)
         except (pickle.PicklingError, TypeError, AttributeError) as error:
             raise TypeError(
                 f"{what}: it cannot be sent to another process or written down ({error}); make it "
@@ -208,25 +212,25 @@ def _written(
             return pickler
 
 
-def _by_value(obj: Any, reduce: Callable[[Any], Any]) -> Any:
-    """What cloudpickle's `reduce` makes of a function, class or type variable, which is what it is
-    made of, and not its name, if it is of a user's module."""
-    module = sys.modules.get(str(getattr(obj, "__module__", None)))
+def _by_value(definition: Any, reduce: Callable[[Any], Any]) -> Any:
+    """The result of cloudpickle's `reduce` for a function, class or type variable: its contents,
+    and not its name, if it is of a user's module."""
+    module = sys.modules.get(str(getattr(definition, "__module__", None)))
     if module is None or not is_sent_itself(module):
-        return reduce(obj)
+        return reduce(definition)
     with _REGISTRY_LOCK:
         cloudpickle = import_optional("cloudpickle", "to send code")
-        was_there = module.__name__ in cloudpickle.list_registry_pickle_by_value()
+        was_listed = module.__name__ in cloudpickle.list_registry_pickle_by_value()
         cloudpickle.register_pickle_by_value(module)
         try:
-            return reduce(obj)
+            return reduce(definition)
         finally:
-            if not was_there:
+            if not was_listed:
                 cloudpickle.unregister_pickle_by_value(module)
 
 
 def _file_digest(name: str) -> str | None:
-    """A digest of what is in a file; None where there is none."""
+    """A digest of the contents of a file; None if there is no such file."""
     try:
         if not Path(name).is_file():  # pipes never end
             return None
@@ -240,9 +244,9 @@ def _file_digest(name: str) -> str | None:
 
 
 def _cached_property(function: Callable[..., Any], name: str) -> functools.cached_property[Any]:
-    made = functools.cached_property(function)
-    made.__set_name__(object, name)
-    return made
+    cached = functools.cached_property(function)
+    cached.__set_name__(object, name)
+    return cached
 
 
 def _cached_function(function: Callable[..., Any], settings: dict[str, Any]) -> Any:
@@ -263,10 +267,10 @@ def _cacheless_pickler(base: Any) -> Callable[..., Any]:
     """
 
     class Lean(base):
-        def __init__(self, what: str, words: frozenset[str]) -> None:
+        def __init__(self, context: str, words: frozenset[str]) -> None:
             self.file = io.BytesIO()
             super().__init__(self.file, protocol=_PROTOCOL)
-            self.what = what
+            self.what = context
             self.words = set(words)
             self.modules: list[tuple[ModuleType, frozenset[str]]] = []
             self.spaces: dict[int, Namespace] = {}
@@ -283,16 +287,16 @@ def _cacheless_pickler(base: Any) -> Callable[..., Any]:
                 return _without_number(_by_value(obj, reduce))
             if isinstance(obj, FunctionType):
                 return self.of_function(obj, _by_value(obj, reduce))
-            kind: type = obj.__class__
-            remembered = _transient_attributes(kind)
-            if not remembered:
+            obj_type: type = obj.__class__
+            transient = _transient_attributes(obj_type)
+            if not transient:
                 return _not_by_name(obj)
-            make, arguments, state, *rest = (*obj.__reduce_ex__(_PROTOCOL), None)[:6]
+            constructor, arguments, state, *rest = (*obj.__reduce_ex__(_PROTOCOL), None)[:6]
             if isinstance(state, dict):
-                given = cast("dict[str, Any]", state)
-                state = {key: remembered.get(key, one) for key, one in given.items()}
-                state = {key: one for key, one in state.items() if one is not _OMIT}
-            return make, arguments, state, *rest[:3]
+                attributes2 = cast("dict[str, Any]", state)
+                state = {key: transient.get(key, value) for key, value in attributes2.items()}
+                state = {key: value for key, value in state.items() if value is not _OMIT}
+            return constructor, arguments, state, *rest[:3]
 
         def of_module(self, module: ModuleType) -> Any:
             if not is_sent_itself(module):
@@ -322,20 +326,20 @@ def _without_number(reduced: Any) -> Any:
     it would replace the methods of that class."""
     if not isinstance(reduced, tuple):
         return reduced
-    make, arguments, *rest = cast("tuple[Any, ...]", reduced)
+    constructor, arguments, *rest = cast("tuple[Any, ...]", reduced)
     return (
-        make,
+        constructor,
         tuple(None if _is_generated_id(argument) else argument for argument in arguments),
         *rest,
     )
 
 
 def _not_by_name(obj: Any) -> Any:
-    """`NotImplemented`, where an object does not stand for a name in a module of a user; else what
-    it is made of.
+    """`NotImplemented`, where an object does not stand for a name in a module of a user; else its
+    contents.
 
     Raises:
-        TypeError: that cannot be told.
+        TypeError: its contents cannot be determined.
     """
     module = sys.modules.get(str(getattr(obj, "__module__", None)))
     if module is None or not hasattr(obj, "__qualname__") or not is_sent_itself(module):
@@ -359,29 +363,29 @@ def _hashing_pickler(base: Any) -> Callable[..., Any]:
     Attributes of its objects: files, the digest of each file. others: the versions of the installed
     packages that are used.
     """
-    lean: Any = _cacheless_pickler(base)
+    base_pickler: Any = _cacheless_pickler(base)
 
-    class Naming(lean):
-        def __init__(self, what: str, words: frozenset[str]) -> None:
-            super().__init__(what, words)
+    class Naming(base_pickler):
+        def __init__(self, context: str, words: frozenset[str]) -> None:
+            super().__init__(context, words)
             self.files: dict[str, str] = {}
             self.others: dict[str, str] = {}
             self.begun: dict[int, tuple[Any, int]] = {}
 
         def persistent_id(self, obj: Any) -> Any:
-            kind = cast("type[Any]", type(obj))
+            obj_type = cast("type[Any]", type(obj))
             if id(obj) in self.begun:  # classes, functions and modules may name themselves
                 return f"number {self.begun[id(obj)][1]}"
-            if kind is set or kind is frozenset:  # whose order differs
+            if obj_type is set or obj_type is frozenset:  # whose order differs
                 members = cast("set[Any] | frozenset[Any]", obj)
                 words = frozenset(cast("set[str]", self.words))
-                named = [_hash_and_files(member, self.what, words) for member in members]
-                for _, other in named:
-                    self.words |= other.words
-                    self.modules += other.modules
-                    self.files |= other.files
-                    self.others |= other.others
-                return kind.__name__, sorted(name for name, _ in named)
+                hashed = [_hash_and_files(member, self.what, words) for member in members]
+                for _, pickler in hashed:
+                    self.words |= pickler.words
+                    self.modules += pickler.modules
+                    self.files |= pickler.files
+                    self.others |= pickler.others
+                return obj_type.__name__, sorted(name for name, _ in hashed)
             return self.of_file(obj) if isinstance(obj, str | os.PathLike) else None
 
         def of_file(self, obj: Any) -> str | None:
@@ -395,27 +399,27 @@ def _hashing_pickler(base: Any) -> Callable[..., Any]:
             if obj is tuple:  # in which all else is written
                 return NotImplemented
             if isinstance(obj, CodeType):
-                said = [getattr(obj, one, None) for one in _CODE_ATTRIBUTES]
-                return tuple, ([obj.co_consts, repr(said).encode()],)
+                values = [getattr(obj, attribute, None) for attribute in _CODE_ATTRIBUTES]
+                return tuple, ([obj.co_consts, repr(values).encode()],)
             if isinstance(obj, functools.cached_property):
                 return tuple, ([obj.func],)
             self.say_where_from(obj)
-            found = lean.reducer_override(self, obj)
+            reduced = base_pickler.reducer_override(self, obj)
             is_code = isinstance(obj, type | FunctionType | ModuleType)
-            if found is NotImplemented and type(obj) not in base.dispatch_table:
-                found = obj.__qualname__ if is_code else obj.__reduce_ex__(_PROTOCOL)
-            if isinstance(found, str):
-                return tuple, ([str(getattr(obj, "__module__", None)).encode(), found.encode()],)
-            if not isinstance(found, tuple) or len(cast("tuple[Any, ...]", found)) < 3:
-                return cast("Any", found)
-            make, arguments, state, *rest = cast("tuple[Any, ...]", found)
-            if isinstance(obj, ModuleType):  # what is left out says nothing
+            if reduced is NotImplemented and type(obj) not in base.dispatch_table:
+                reduced = obj.__qualname__ if is_code else obj.__reduce_ex__(_PROTOCOL)
+            if isinstance(reduced, str):
+                return tuple, ([str(getattr(obj, "__module__", None)).encode(), reduced.encode()],)
+            if not isinstance(reduced, tuple) or len(cast("tuple[Any, ...]", reduced)) < 3:
+                return cast("Any", reduced)
+            constructor, arguments, state, *rest = cast("tuple[Any, ...]", reduced)
+            if isinstance(obj, ModuleType):  # attributes that are left out have no effect
                 state, _ = state
             state = _with_keys_apart(state)
             if is_code:
                 self.begun[id(obj)] = (obj, len(self.begun))
                 return tuple, ([*map(_apart, arguments), state],)
-            return make, arguments, state, *rest
+            return constructor, arguments, state, *rest
 
         def say_where_from(self, obj: Any) -> None:
             """Note the package or the compiled file that the code of an object is in."""
@@ -435,14 +439,14 @@ def _hashing_pickler(base: Any) -> Callable[..., Any]:
     return Naming
 
 
-# Attributes whose values are names as well, or say something of names.
+# Attributes whose values are names as well, or contain names.
 _SAY_NAMES = ("__name__", "__qualname__", "__module__", "__annotations__")
 _HAVE_NAMES = ("__globals__", "__kwdefaults__")
 
 
 def _with_keys_apart(state: Any) -> Any:
-    """What objects are made of, with names of attributes that are no strings: there may be files
-    that are called so."""
+    """The contents of an object, with names of attributes that are no strings: there may be files
+    of the same names."""
     if isinstance(state, tuple):
         return tuple(map(_with_keys_apart, cast("tuple[Any, ...]", state)))
     if not isinstance(state, dict):
@@ -456,7 +460,7 @@ def _with_keys_apart(state: Any) -> Any:
 
 
 def _apart(names: Any) -> Any:
-    """Strings, and those in a dictionary, as bytes."""
+    """Strings, and the strings in a dictionary, as bytes."""
     if isinstance(names, dict):
         mapping = cast("dict[Any, Any]", names)
         return [(_apart(key), _apart(value)) for key, value in mapping.items()]
@@ -475,16 +479,16 @@ def _is_generated_id(argument: Any) -> bool:
 
 @functools.lru_cache(maxsize=1024)
 def _transient_attributes(kind: type) -> dict[str, Any]:
-    """What to put in the place of attributes that objects of a class compute and remember."""
-    found: dict[str, Any] = {
+    """The values that replace attributes in which objects of a class store computed values."""
+    replacements: dict[str, Any] = {
         name: _OMIT
-        for one in kind.__mro__
-        for name, value in vars(one).items()
+        for definition in kind.__mro__
+        for name, value in vars(definition).items()
         if isinstance(value, functools.cached_property)
     }
     if dataclasses.is_dataclass(kind):
-        for one in dataclasses.fields(kind):
-            private = one.name.startswith("_")
-            if private and not one.compare and one.default is not dataclasses.MISSING:
-                found[one.name] = one.default
-    return found
+        for definition in dataclasses.fields(kind):
+            private = definition.name.startswith("_")
+            if private and not definition.compare and definition.default is not dataclasses.MISSING:
+                replacements[definition.name] = definition.default
+    return replacements

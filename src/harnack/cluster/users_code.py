@@ -25,15 +25,15 @@ from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any, cast
 
-# Of these suffixes a module can be sent; others are compiled, and are files to be compared.
+# Suffixes of modules that can be sent; other modules are compiled, and are files to be compared.
 _SOURCES = (*importlib.machinery.SOURCE_SUFFIXES, *importlib.machinery.BYTECODE_SUFFIXES)
 # Functions that see all attributes of a module at once.
 _FINDERS = frozenset(("vars", "dir", "__dict__", "getmembers"))
-# Functions that find modules whose names are in no import.
+# Functions that find modules whose names are not in an import statement.
 _IMPORTERS = frozenset(("import_module", "__import__"))
-# What a function knows of its module without naming it.
+# Attributes that a function may use of its module without naming it.
 _OF_EACH = ("__package__", "__name__", "__path__", "__file__")
-# What belongs to the process that imported a module.
+# Attributes that belong to the process that imported a module.
 _OF_IMPORT = frozenset(("__builtins__", "__spec__", "__loader__", "__cached__"))
 # The attribute of a sent module that lists the names of the attributes that were not sent.
 _LEFT_OUT = "__left_out__"
@@ -73,7 +73,7 @@ class Namespace:
 
 
 def sent_module(known: Mapping[str, Any]) -> SentModule:
-    """A module with nothing but what is `known` of it."""
+    """A module with only the attributes in `known`."""
     module = SentModule(str(known.get("__name__", "")))
     vars(module).update(known)
     return module
@@ -85,7 +85,7 @@ def itself(module: SentModule) -> SentModule:
 
 
 def fill(module: SentModule, contents: tuple[Mapping[str, Any], frozenset[str]]) -> None:
-    """Give a module its attributes, and the names of those that are left out."""
+    """Give a module its attributes, and the names of the attributes that are left out."""
     attributes, left_out = contents
     vars(module).update(attributes, **{_LEFT_OUT: left_out - _OF_IMPORT})
 
@@ -97,16 +97,16 @@ def function_in(module: SentModule, code: CodeType, closure: Any) -> FunctionTyp
 
 def attributes_named(module: ModuleType, words: frozenset[str] | set[str]) -> dict[str, Any]:
     """The attributes of a module that code with these words may use, in the order of names."""
-    every = bool(words & _FINDERS)
+    uses_all = bool(words & _FINDERS)
     return {
         name: value
         for name, value in sorted(vars(module).items())
-        if (every or name in words or name == "__getattr__") and name not in _OF_IMPORT
+        if (uses_all or name in words or name == "__getattr__") and name not in _OF_IMPORT
     }
 
 
 def codes_within(code: CodeType) -> Iterator[CodeType]:
-    """A code and those of the functions and classes that it defines."""
+    """A code object, and the code objects of the functions and classes that it defines."""
     yield code
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
@@ -132,15 +132,15 @@ def _texts(constants: Iterable[Any]) -> Iterator[str]:
 
 
 def refuse_imports_within(function: FunctionType) -> None:
-    """Refuse a function that imports users' modules when it is called: it cannot be told which
-    these will be, and which of their attributes are used.
+    """Refuse a function that imports users' modules when it is called: it cannot be determined
+    which modules these will be, and which of their attributes are used.
 
     Raises:
-        TypeError: the function does.
+        TypeError: the function imports such a module.
     """
     package = function.__globals__.get("__package__") or ""
     for code in codes_within(function.__code__):
-        names = [_imported(steps, package) for steps in _imports(code)]
+        names = [_imported(statement, package) for statement in _imports(code)]
         if _IMPORTERS.intersection(code.co_names):
             names += [
                 text for text in _texts(code.co_consts) if text.replace(".", "_").isidentifier()
@@ -155,19 +155,19 @@ def refuse_imports_within(function: FunctionType) -> None:
 
 
 def _imports(code: CodeType) -> Iterator[tuple[int, str]]:
-    """(level, name) of each import: how many packages up, and what from there."""
-    steps = [
+    """(level, name) of each import: the number of packages up, and the name relative to there."""
+    instructions = [
         instruction
         for instruction in dis.get_instructions(code)
         if instruction.opname != "EXTENDED_ARG"
     ]
-    for k, step in enumerate(steps):
-        if step.opname == "IMPORT_NAME":  # after its level and what is taken from the module
-            yield int(steps[k - 2].argval), str(step.argval)
+    for k, step in enumerate(instructions):
+        if step.opname == "IMPORT_NAME":  # after its level and the names imported from the module
+            yield int(instructions[k - 2].argval), str(step.argval)
 
 
-def _imported(step: tuple[int, str], package: str) -> str:
-    level, name = step
+def _imported(statement: tuple[int, str], package: str) -> str:
+    level, name = statement
     with suppress(ImportError):  # which the function will meet itself
         return importlib.util.resolve_name("." * level + name, package)
     return name
@@ -182,8 +182,8 @@ def _is_a_users_root(root: str) -> bool:
         spec = importlib.util.find_spec(root)
     if spec is None or spec.origin in ("built-in", "frozen"):
         return False
-    place = spec.origin or next(iter(spec.submodule_search_locations or ()), None)
-    return place is not None and _is_users_place(root, place)
+    location = spec.origin or next(iter(spec.submodule_search_locations or ()), None)
+    return location is not None and _is_users_place(root, location)
 
 
 def is_users(module: ModuleType) -> bool:
@@ -192,45 +192,45 @@ def is_users(module: ModuleType) -> bool:
     root = name.partition(".")[0]
     if name == "__main__" or sys.modules.get(name) is not module:
         return True
-    place = _place(module)
-    if place is None and root != name and (top := sys.modules.get(root)) is not None:
+    location = _place(module)
+    if location is None and root != name and (top := sys.modules.get(root)) is not None:
         return is_users(top)
-    if place is None:  # one that is built in has a specification
+    if location is None:  # one that is built in has a specification
         return getattr(module, "__spec__", None) is None
-    return _is_users_place(root, place)
+    return _is_users_place(root, location)
 
 
 def is_sent_itself(module: ModuleType) -> bool:
     """Whether a module is a user's and not a compiled one."""
-    place = _place(module)
+    location = _place(module)
     return is_users(module) and (
-        place is None or place.endswith(_SOURCES) or not Path(place).suffix
+        location is None or location.endswith(_SOURCES) or not Path(location).suffix
     )
 
 
 def compiled_file(module: ModuleType) -> str | None:
     """The file of a compiled module of a user; None for another module."""
-    place = _place(module)
-    return place if place is not None and is_users(module) and not is_sent_itself(module) else None
+    path = _place(module)
+    return path if path is not None and is_users(module) and not is_sent_itself(module) else None
 
 
 def _place(module: ModuleType) -> str | None:
     """The file or, of a package without one, the folder of a module."""
-    names = vars(module)
-    place = names.get("__file__") or next(iter(names.get("__path__", ())), None)
-    return place if isinstance(place, str) else None
+    attributes = vars(module)
+    location = attributes.get("__file__") or next(iter(attributes.get("__path__", ())), None)
+    return location if isinstance(location, str) else None
 
 
 @functools.cache
-def _is_users_place(root: str, place: str) -> bool:
+def _is_users_place(root: str, location: str) -> bool:
     if root == "harnack":
         return False
-    path = Path(place).resolve()
+    path = Path(location).resolve()
     if {"site-packages", "dist-packages"} & set(path.parts):
         return False
-    places = sysconfig.get_paths()
+    paths = sysconfig.get_paths()
     return not any(
-        path.is_relative_to(Path(places[name]).resolve())
+        path.is_relative_to(Path(paths[name]).resolve())
         for name in ("stdlib", "platstdlib", "purelib", "platlib")
     )
 

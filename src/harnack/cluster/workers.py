@@ -1,4 +1,4 @@
-"""The workers of a Dask cluster: whether they can work, told before anything is sent to them."""
+"""The workers of a Dask cluster, and checks that they can work before anything is sent to them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import numpy as np
 from harnack.backend import choose_backend, to_numpy
 from harnack.cluster.serialization import import_optional, package_versions
 
-# How long to wait for a scheduler.
+# The time to wait for a scheduler.
 _CONNECT_TIMEOUT = "10s"
 SCHEDULER_LOST = "the scheduler was lost, or somebody cancelled what this task waits for"
 _INSTALL = "install the same there as here, such as by pip install 'harnack[cluster]=={version}'"
@@ -98,22 +98,22 @@ def worker_threads(client: Any) -> dict[str, int]:
         RuntimeError: the scheduler is gone.
     """
     try:
-        found: dict[str, int] = client.nthreads()
+        threads: dict[str, int] = client.nthreads()
     except OSError:
         raise RuntimeError(SCHEDULER_LOST) from None
-    return found
+    return threads
 
 
 def _check_workers(client: Any) -> None:
-    # A function of Python's own library, which workers have whatever else they lack.
+    # A function of Python's own library, which every worker has.
     versions = client.run(importlib.metadata.version, "harnack", on_error="return")
-    here = importlib.metadata.version("harnack")
+    local_version = importlib.metadata.version("harnack")
     for address, version in versions.items():
-        if version != here:
-            found = f"harnack {version}" if isinstance(version, str) else "no harnack"
+        if version != local_version:
+            remote = f"harnack {version}" if isinstance(version, str) else "no harnack"
             raise RuntimeError(
-                f"worker {address} has {found}, and here it is {here}: "
-                f"{_INSTALL.format(version=here)}"
+                f"worker {address} has {remote}, and here it is {local_version}: "
+                f"{_INSTALL.format(version=local_version)}"
             )
     states = client.run(_worker_state, on_error="return")
     for address, state in states.items():
@@ -122,11 +122,11 @@ def _check_workers(client: Any) -> None:
         if state[0] != package_versions():
             raise RuntimeError(
                 f"worker {address} has {state[0]}, and here it is {package_versions()}: "
-                f"{_INSTALL.format(version=here)}"
+                f"{_INSTALL.format(version=local_version)}"
             )
-    strange = [address for address, state in states.items() if state[1] != rounding_fingerprint()]
-    if strange:
-        warn_rounding_differs(strange)
+    differing = [address for address, state in states.items() if state[1] != rounding_fingerprint()]
+    if differing:
+        warn_rounding_differs(differing)
 
 
 def warn_rounding_differs(workers: Iterable[str]) -> None:
@@ -170,5 +170,5 @@ def _rounding(_name: str) -> str:
     s, c = dr.sincos(x)
     results = (dr.rcp(x), dr.rsqrt(x), s, c, dr.exp(-x), dr.log(x), dr.fma(s, c, x), dr.sqrt(x),
                dr.atan2(s, x), x / c)  # fmt: skip
-    numbers = np.concatenate([to_numpy(one) for one in results])
+    numbers = np.concatenate([to_numpy(result) for result in results])
     return hashlib.blake2b(numbers.tobytes(), digest_size=8).hexdigest()

@@ -15,7 +15,7 @@ from harnack.cluster.serialization import import_optional
 from harnack.cluster.workers import connect_client
 from harnack.progress import Advance, progress_bar
 
-# The attribute of a Zarr array that says what it holds.
+# The attribute of a Zarr array that holds the name of the Dask array.
 _NAME_ATTRIBUTE = "harnack"
 
 
@@ -79,7 +79,7 @@ def to_zarr(
 
 
 def _compute_tasks(client: Any, tasks: list[Any]) -> Iterator[None]:
-    """Computes tasks, all at once by a client, else one by one, and yields after each."""
+    """Compute tasks, all at once by a client, else one by one, and yield after each."""
     if client is None:
         for task in tasks:
             task.compute()
@@ -97,7 +97,7 @@ def _compute_tasks(client: Any, tasks: list[Any]) -> Iterator[None]:
 
 
 def _open_or_create(zarr: Any, array: Any, target: Path) -> Any:
-    """The Zarr array of a Dask array, made if it is not there."""
+    """The Zarr array of a Dask array, created if it does not exist."""
     if not target.parent.is_dir():
         raise FileNotFoundError(f"cannot write {target}: create the folder {target.parent} first")
     chunks = tuple(max(1, lengths[0]) for lengths in array.chunks)
@@ -110,8 +110,8 @@ def _open_or_create(zarr: Any, array: Any, target: Path) -> Any:
         file = zarr.open_array(str(target), mode="r+")
     except Exception as error:  # of many kinds
         raise ValueError(f"{target} is no Zarr array ({error}): name another folder") from None
-    same = file.shape == array.shape and file.chunks == chunks and file.dtype == array.dtype
-    if not same or file.attrs.get(_NAME_ATTRIBUTE) != array.name:
+    is_same = file.shape == array.shape and file.chunks == chunks and file.dtype == array.dtype
+    if not is_same or file.attrs.get(_NAME_ATTRIBUTE) != array.name:
         raise ValueError(
             f"{target} holds another array, or the same one made of other numbers: delete it, or "
             "name another folder"
@@ -130,8 +130,8 @@ def _chunk_slices(array: Any, index: tuple[int, ...]) -> tuple[slice, ...]:
     return tuple(slice(a, b) for a, b in zip(starts, ends, strict=True))
 
 
-def _write(path: str, places: tuple[slice, ...], block: Any) -> None:
+def _write(path: str, slices: tuple[slice, ...], block: Any) -> None:
     zarr = import_optional("zarr", "to_zarr")
     # Chunks of zeros would be left out, and computed again.
     with zarr.config.set({"array.write_empty_chunks": True}):
-        zarr.open_array(path, mode="r+")[places] = block
+        zarr.open_array(path, mode="r+")[slices] = block

@@ -22,22 +22,23 @@ if TYPE_CHECKING:
 
 __all__ = ["DescentMethods", "InitialGuess", "SearchResult", "StoppingRule", "search"]
 
-# The number of cells before points are looked up in them: for each point, at least, and for fields
-# with sheets, which are searched in turn as well.
+# The number of cells before points are looked up in them: per point; at least; and for fields with
+# jump surfaces, which are searched in turn as well.
 _CELLS_PER_POINT, _EACH_TO_PROVE, _MIN_CELLS, _FEWEST_ON_SHEETS = 0.16, 0.25, 10_000, 1500
-# Cells at most, and which share of that where evaluations are as expensive as sums of many terms.
+# The largest number of cells, and the fraction of it where evaluations are as expensive as sums of
+# many terms.
 _MAX_CELLS, _MOST_TO_PROVE, _MOST_ON_SHEETS, _EXPENSIVE_FIELD_FACTOR = 60_000, 150_000, 20_000, 0.25
 _MAX_SUBDIVISIONS = 40
-# Cells, at least, in which the search for a point begins.
+# The smallest number of cells in which the search for a point begins.
 _COARSE = 300
-# Cells along an edge of the cube to begin with.
+# Number of cells along an edge of the first cube.
 _ACROSS = 8
-# Times that feet of other parts of the surface are tried, from the same cells.
+# Number of times that surface points of other parts of the surface are tried, from the same cells.
 _MAX_CANDIDATE_ROUNDS = 4
-# In tolerances: how far to the side of its boundary the surface is looked for.
+# In tolerances: the distance from the boundary curve at which the surface is looked for.
 _BOUNDARY_OFFSET = 100.0
-# Beside the boundary the surface was looked for already: if the best point is on it, other feet are
-# tried only if they are this many times farther from it.
+# Beside the boundary the surface was looked for already: if the best point is on it, other surface
+# points are tried only if they are this many times farther from it.
 _APART_FROM_BOUNDARY = 2.0
 # Descents begin at points that seem nearer to the surface than this many times the best.
 _MIN_GAIN = 0.9
@@ -78,8 +79,8 @@ class DescentMethods(Protocol):
         self, points: FloatArray, boundary: FloatArray, aside: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Iterate from points `boundary` (n, 3) of the curve at which the surface ends, along the
-        surface where it begins in the direction of x. aside: (n,) how far from the curve the
-        surface is looked for."""
+        surface where it begins in the direction of x. aside: (n,) the distance from the curve at
+        which the surface is searched."""
         ...
 
 
@@ -103,7 +104,7 @@ class InitialGuess:
 
 @dataclass(frozen=True)
 class StoppingRule:
-    """When a search ends.
+    """The condition under which a search ends.
 
     length: an improvement of the distance by less than this length is not pursued.
     prove: whether cells are subdivided until none of them may hold a point that is nearer than the
@@ -123,7 +124,7 @@ class _Cube:
 
     @classmethod
     def around(cls, lower: FloatArray, upper: FloatArray) -> _Cube:
-        """The smallest around a box, and a little more."""
+        """The smallest cube around a box, slightly enlarged."""
         half = 0.5 * float((upper - lower).max()) * (1 + 1e-6)
         half += 1e-12 * float(np.abs([lower, upper]).max())
         return cls(0.5 * (lower + upper), max(half, 1e-30))
@@ -149,15 +150,15 @@ def search(
             break
         x = points[rows]
         root = _Cube.around(x.min(axis=0), x.max(axis=0))
-        away = np.linalg.norm(x - feet[rows], axis=1)
-        half = max(4 * half, 1.0 + 4 * root.half, 1.1 * float(np.nanmax(away, initial=0.0)))
+        distances = np.linalg.norm(x - feet[rows], axis=1)
+        half = max(4 * half, 1.0 + 4 * root.half, 1.1 * float(np.nanmax(distances, initial=0.0)))
         root = _Cube(root.center, root.half + half)
-        so_far = replace(known.some(rows), feet=feet[rows])
-        found = _search_in_batches(surface, root, x, so_far, descents, tolerance, progress)
-        # Beyond the cube there may be more.
-        to_walls = root.half - np.abs(x - root.center).max(axis=1)
-        feet[rows], lower[rows] = found.closest, np.minimum(found.lower_bounds, to_walls)
-        distance = np.linalg.norm(x - found.closest, axis=1)
+        start = replace(known.some(rows), feet=feet[rows])
+        result = _search_in_batches(surface, root, x, start, descents, tolerance, progress)
+        # Beyond the cube there may be more of the surface.
+        wall_distances = root.half - np.abs(x - root.center).max(axis=1)
+        feet[rows], lower[rows] = result.closest, np.minimum(result.lower_bounds, wall_distances)
+        distance = np.linalg.norm(x - result.closest, axis=1)
         rows = rows[~(distance <= half)]
     return SearchResult(feet, lower)
 
@@ -174,77 +175,78 @@ def _search_in_batches(
     surface: TracedSurface,
     root: _Cube,
     points: FloatArray,
-    known: InitialGuess,
+    guess: InitialGuess,
     descents: DescentMethods,
     tolerance: StoppingRule,
     progress: Callable[[str], None],
 ) -> SearchResult:
-    """The nearest points in a cube, for some of the points at a time."""
+    """The nearest points in a cube, for a batch of the points at a time."""
     proofs = CellClassifier(surface)
-    most = _max_cells(surface, len(points), tolerance.prove)
-    each = _EACH_TO_PROVE if tolerance.prove else _CELLS_PER_POINT
-    enough = min(max(_MIN_CELLS, int(each * len(points))), _MAX_CELLS, most)
+    max_cells = _max_cells(surface, len(points), tolerance.prove)
+    cells_per_point = _EACH_TO_PROVE if tolerance.prove else _CELLS_PER_POINT
+    min_cells = min(max(_MIN_CELLS, int(cells_per_point * len(points))), _MAX_CELLS, max_cells)
     if surface.field.has_jumps:
-        enough = _FEWEST_ON_SHEETS
-    coarse, cells = _split(proofs, root, enough, progress)
+        min_cells = _FEWEST_ON_SHEETS
+    coarse, cells = _split(proofs, root, min_cells, progress)
     backend, trees = choose_backend("double"), None
     if len(cells):
         trees = CellTree.of(backend, coarse), CellTree.of(backend, cells)
-    parts: list[SearchResult] = []
-    for first in range(0, max(len(points), 1), _BATCH_SIZE):
-        rows = slice(first, first + _BATCH_SIZE)
-        at_most = most if tolerance.prove else 0
-        job = _CellSearch(
+    results: list[SearchResult] = []
+    for start in range(0, max(len(points), 1), _BATCH_SIZE):
+        rows = slice(start, start + _BATCH_SIZE)
+        limit = max_cells if tolerance.prove else 0
+        cell_search = _CellSearch(
             proofs,
             cells,
             trees,
             points[rows],
-            known.some(rows),
+            guess.some(rows),
             descents,
             tolerance.length,
-            at_most,
+            limit,
         )
-        parts.append(job.run(progress))
+        results.append(cell_search.run(progress))
     return SearchResult(
-        *(np.concatenate([getattr(p, k) for p in parts]) for k in ("closest", "lower_bounds"))
+        *(np.concatenate([getattr(r, k) for r in results]) for k in ("closest", "lower_bounds"))
     )
 
 
-def _max_cells(surface: TracedSurface, points: int, is_proved: bool) -> int:
-    """How many cells there may be."""
+def _max_cells(surface: TracedSurface, count: int, is_proved: bool) -> int:
+    """The largest number of cells."""
     if surface.field.has_jumps:
         return _MOST_ON_SHEETS
-    most = min(max(_MAX_CELLS, points // 2), _MOST_TO_PROVE) if is_proved else _MAX_CELLS
-    return int(most * (_EXPENSIVE_FIELD_FACTOR if surface.field.has_variable_accuracy else 1.0))
+    limit = min(max(_MAX_CELLS, count // 2), _MOST_TO_PROVE) if is_proved else _MAX_CELLS
+    return int(limit * (_EXPENSIVE_FIELD_FACTOR if surface.field.has_variable_accuracy else 1.0))
 
 
 def _split(
-    proofs: CellClassifier, root: _Cube, enough: int, progress: Callable[[str], None]
+    proofs: CellClassifier, root: _Cube, min_cells: int, progress: Callable[[str], None]
 ) -> tuple[SurfaceCells, SurfaceCells]:
-    """Cells of the root, split until there are enough: in each round the larger half of those where
-    the surface may be in several pieces, and the others by how much it may bend. Before these, the
-    few cells that they are parts of."""
+    """Cells of the root, split until there are at least `min_cells`: in each iteration the larger
+    half. The size of a cell in which the surface is in one piece is a quarter of the thickness of
+    its slab, by which the surface may bend. Returned first are the few coarse cells that contain
+    these."""
     half = root.half / _ACROSS
     steps = (2 * np.indices((_ACROSS,) * 3).reshape(3, -1).T + 1 - _ACROSS) * half
     cells = proofs.nonempty_cells(root.center + steps, np.full(len(steps), half))
     coarse = cells
     for _ in range(_MAX_SUBDIVISIONS):
-        if not 0 < len(cells) < enough:
+        if not 0 < len(cells) < min_cells:
             break
         if len(coarse) < _COARSE:
             coarse = cells
-        size = np.where(cells.is_single_piece, 0.25 * cells.thickness, cells.half)
-        which = size >= np.median(size)
-        parts = _subdivide(proofs, cells, which)
-        cells = SurfaceCells.concatenate([cells.select(~which), parts])
+        sizes = np.where(cells.is_single_piece, 0.25 * cells.thickness, cells.half)
+        is_split = sizes >= np.median(sizes)
+        children = _subdivide(proofs, cells, is_split)
+        cells = SurfaceCells.concatenate([cells.select(~is_split), children])
         progress(f"distances: {len(cells):,} cells")
     return proofs.with_surface_points(coarse), proofs.with_surface_points(cells)
 
 
-def _subdivide(proofs: CellClassifier, cells: SurfaceCells, which: BoolArray) -> SurfaceCells:
-    """What is left of the cells of a mask (n,), each cut in eight."""
-    half = 0.5 * cells.half[which]
-    center = cells.center[which, None] + half[:, None, None] * _CORNERS
+def _subdivide(proofs: CellClassifier, cells: SurfaceCells, is_split: BoolArray) -> SurfaceCells:
+    """The nonempty children of the cells of a mask (n,), each of which is cut in eight."""
+    half = 0.5 * cells.half[is_split]
+    center = cells.center[is_split, None] + half[:, None, None] * _CORNERS
     return proofs.nonempty_cells(center.reshape(-1, 3), np.repeat(half, 8))
 
 
@@ -281,45 +283,45 @@ class _CellSearch:
         """The closest points and the lower bounds of the distances."""
         if not len(self.points):
             return SearchResult(self.feet, self.lower)
-        has_sheets = self.proofs.surface.field.has_jumps
+        has_jumps = self.proofs.surface.field.has_jumps
         if self.trees is not None:
-            self._search_cells(*self.trees, has_sheets, progress)
+            self._search_cells(*self.trees, has_jumps, progress)
         else:
             self.lower[:] = np.inf
-        if not has_sheets:
+        if not has_jumps:
             # Where two parts of the surface meet or cross within a cell, descents may not have
             # begun on both of them; and a promise that does not hold may have left out cells.
-            rows = np.flatnonzero(self._is_unproved() | np.isnan(self.feet[:, 0]))
-            rows = rows[self.known.estimate[rows] < _MIN_GAIN * self._distance(rows)]
-            self._descend(rows, self.points[rows])
+            ids = np.flatnonzero(self._is_unproved() | np.isnan(self.feet[:, 0]))
+            ids = ids[self.known.estimate[ids] < _MIN_GAIN * self._distance(ids)]
+            self._descend(ids, self.points[ids])
         return SearchResult(self.feet, self.lower)
 
     def _search_cells(
-        self, coarse: CellTree, tree: CellTree, has_sheets: bool, progress: Callable[[str], None]
+        self, coarse: CellTree, tree: CellTree, has_jumps: bool, progress: Callable[[str], None]
     ) -> None:
-        """Descend first from the foot of the coarse cell where the surface seems nearest, then from
-        those of other parts that may be nearer. If some may still be, and there are not too many
-        cells, those cells are split, and so on."""
+        """Descend first from the surface point of the coarse cell where the surface seems nearest,
+        then from those of other parts that may be nearer. If cells remain that may hold a nearer
+        point, and there are not too many cells, those cells are split, and so on."""
         marks = dr.zeros(self.backend.Bool, len(self.cells)) if self.max_cells else None
-        if has_sheets or self._is_expensive:
-            tried, rows = self._descend_from_best_start(tree), np.arange(len(self.points))
-            if not has_sheets:
+        if has_jumps or self._is_expensive:
+            tried, ids = self._descend_from_best_start(tree), np.arange(len(self.points))
+            if not has_jumps:
                 self._leave_boundary()
         else:
-            rows, tried = self._first_round(coarse, tree, marks)
-            rows = np.union1d(rows, self._leave_boundary())
+            ids, tried = self._first_round(coarse, tree, marks)
+            ids = np.union1d(ids, self._leave_boundary())
         for _ in range(_MAX_SUBDIVISIONS):
-            self._improve(tree, rows, [tried[rows]], marks)
+            self._improve(tree, ids, [tried[ids]], marks)
             if marks is None:
                 break
-            rows = np.flatnonzero(self._is_unproved())
-            split = to_numpy(marks)
-            count = int(split.sum())
-            if not count or not len(rows) or len(self.cells) + 4 * count > self.max_cells:
+            ids = np.flatnonzero(self._is_unproved())
+            is_split = to_numpy(marks)
+            count = int(is_split.sum())
+            if not count or not len(ids) or len(self.cells) + 4 * count > self.max_cells:
                 break
-            parts = self.proofs.with_surface_points(_subdivide(self.proofs, self.cells, split))
-            self.cells = SurfaceCells.concatenate([self.cells.select(~split), parts])
-            progress(f"distances: {len(self.cells):,} cells for {len(rows):,} points")
+            octants = self.proofs.with_surface_points(_subdivide(self.proofs, self.cells, is_split))
+            self.cells = SurfaceCells.concatenate([self.cells.select(~is_split), octants])
+            progress(f"distances: {len(self.cells):,} cells for {len(ids):,} points")
             tree, tried = CellTree.of(self.backend, self.cells), self.feet
             marks = dr.zeros(self.backend.Bool, len(self.cells))
 
@@ -327,50 +329,51 @@ class _CellSearch:
         self, coarse: CellTree, tree: CellTree, marks: Any
     ) -> tuple[IntArray, FloatArray]:
         """`_descend_from_best_start`, and a first `_improve`: in one kernel, where Newton's method
-        ends.
+        converges.
 
-        Returns the rows at which there is more to try, and the feet that were tried (n, 3).
+        Returns the indices of the queries that have more to try, and the surface points that were
+        tried (n, 3).
         """
         backend = self.backend
         tolerance = dr.opaque(backend.Float, self.tolerance)
 
-        def compute(x: Vec3, known: Vec3) -> tuple[Real | Vec3, ...]:
-            real, none = backend.Float, backend.Array3f(FAR_SENTINEL)
-            limit = safe_norm(known - x)
+        def compute(x: Vec3, guess: Vec3) -> tuple[Real | Vec3, ...]:
+            real, missing = backend.Float, backend.Array3f(FAR_SENTINEL)
+            limit = safe_norm(guess - x)
             limit = dr.select(dr.isfinite(limit), limit, FAR_SENTINEL)
             start = coarse.best_start(x, limit)
-            y, free, unknown = self.descents.newton_in_kernel(x, start, limit)
-            begins, away = start.x < 0.5 * FAR_SENTINEL, safe_norm(y - x)
-            unknown &= begins
-            is_nearer = begins & ~unknown & (away < limit)
-            foot = dr.select(is_nearer, y, dr.select(limit < 0.5 * FAR_SENTINEL, known, none))
-            distance = dr.select(is_nearer, away, limit)
+            y, free, unresolved = self.descents.newton_in_kernel(x, start, limit)
+            has_start, gap = start.x < 0.5 * FAR_SENTINEL, safe_norm(y - x)
+            unresolved &= has_start
+            is_nearer = has_start & ~unresolved & (gap < limit)
+            point = dr.select(is_nearer, y, dr.select(limit < 0.5 * FAR_SENTINEL, guess, missing))
+            distance = dr.select(is_nearer, gap, limit)
             best = BestCandidate(
-                foot, dr.select(unknown, 0, distance), dr.select(is_nearer, free, 0),
+                point, dr.select(unresolved, 0, distance), dr.select(is_nearer, free, 0),
                 dr.select(is_nearer, 1, real(_APART_FROM_BOUNDARY)),
             )  # fmt: skip
-            lower, others = tree.closer_candidates(x, best, (start,), tolerance, marks)
-            foot = dr.select(distance < 0.5 * FAR_SENTINEL, foot, dr.nan)
+            lower, feet = tree.closer_candidates(x, best, (start,), tolerance, marks)
+            point = dr.select(distance < 0.5 * FAR_SENTINEL, point, dr.nan)
             return (
-                foot,
+                point,
                 best.exclusion_radius,
                 lower,
                 start,
-                *others,
-                dr.select(unknown, real(1), 0),
+                *feet,
+                dr.select(unresolved, real(1), 0),
             )
 
-        self.feet, self.free, lower, start, *others, unknown = in_batches(
+        self.feet, self.free, lower, start, *feet, unresolved = in_batches(
             backend, compute, self.points, self.known.feet
         )
         self.lower = self._rounded(lower, self.points)
-        rows = np.flatnonzero(unknown)
-        self._descend(rows, start[rows])
-        return np.union1d(rows, self._descend_from_candidates(np.arange(len(start)), others)), start
+        ids = np.flatnonzero(unresolved)
+        self._descend(ids, start[ids])
+        return np.union1d(ids, self._descend_from_candidates(np.arange(len(start)), feet)), start
 
     @staticmethod
     def _rounded(lower: FloatArray, points: FloatArray) -> FloatArray:
-        """Lower bounds (n,), less what rounding may have done to them."""
+        """Lower bounds (n,), less a bound of their rounding errors."""
         return lower * (1 - 1e-12) - 1e-15 * np.abs(points).max(axis=1)
 
     @property
@@ -383,20 +386,20 @@ class _CellSearch:
         return self.lower < self._distance(slice(None)) - self.tolerance
 
     def _distance(self, rows: IntArray | slice) -> FloatArray:
-        """Of the best feet so far; FAR where there is none."""
-        away = np.linalg.norm(self.points[rows] - self.feet[rows], axis=1)
-        return np.where(np.isnan(away), FAR_SENTINEL, away)
+        """Distances of the best points so far; FAR where there is none."""
+        distances = np.linalg.norm(self.points[rows] - self.feet[rows], axis=1)
+        return np.where(np.isnan(distances), FAR_SENTINEL, distances)
 
     def _is_boundary(self, rows: IntArray | slice) -> BoolArray:
-        """Whether the best is what was known on the boundary."""
+        """Whether the best point is the initial guess, on the boundary."""
         return self.known.on_boundary & (self.feet[rows] == self.known.feet[rows]).all(axis=1)
 
     def _descend_from_best_start(self, tree: CellTree) -> FloatArray:
-        """Descend from the feet that seem nearest, which are returned (n, 3)."""
+        """Descend from the surface points that seem nearest, which are returned (n, 3)."""
         limit = upload_floats(self.backend, self._distance(slice(None)))
         start = to_numpy(tree.best_start(upload_vectors(self.backend, self.points), limit))
-        rows = np.flatnonzero(start[:, 0] < 0.5 * FAR_SENTINEL)
-        self._descend(rows, start[rows])
+        ids = np.flatnonzero(start[:, 0] < 0.5 * FAR_SENTINEL)
+        self._descend(ids, start[ids])
         return start
 
     def _improve(
@@ -416,21 +419,22 @@ class _CellSearch:
             starts = self._closer_candidates(tree, rows, tried, marks)
             if self._is_expensive:
                 starts = starts[:1]
-            nearer = self._descend_from_candidates(rows, starts)
-            some = np.isin(rows, nearer)
+            improved_ids = self._descend_from_candidates(rows, starts)
+            active = np.isin(rows, improved_ids)
             if self._is_expensive or self.proofs.surface.field.has_jumps:
-                some |= starts[0][:, 0] < 0.5 * FAR_SENTINEL
-            rows, tried = rows[some], [one[some] for one in (*tried[-1:], *starts)]
+                active |= starts[0][:, 0] < 0.5 * FAR_SENTINEL
+            rows, tried = rows[active], [feet[active] for feet in (*tried[-1:], *starts)]
 
     def _descend_from_candidates(self, rows: IntArray, starts: Sequence[FloatArray]) -> IntArray:
-        """Descend from feet (k, 3), FAR for none; returns the rows where that led nearer."""
-        before = self._distance(rows)
-        number, some = np.nonzero([start[:, 0] < 0.5 * FAR_SENTINEL for start in starts])
-        self._descend(rows[some], np.stack(starts)[number, some])
-        return rows[self._distance(rows) < before]
+        """Descend from surface points (k, 3), FAR for none; returns the rows where that led
+        nearer."""
+        old_distance = self._distance(rows)
+        start_index, selected = np.nonzero([start[:, 0] < 0.5 * FAR_SENTINEL for start in starts])
+        self._descend(rows[selected], np.stack(starts)[start_index, selected])
+        return rows[self._distance(rows) < old_distance]
 
     def _closer_candidates(
-        self, tree: CellTree, rows: IntArray, tried: Sequence[FloatArray], marks: Any
+        self, tree: CellTree, rows: IntArray, skipped: Sequence[FloatArray], marks: Any
     ) -> list[FloatArray]:
         """`CellTree.closer_candidates` for some points; raises their lower bounds."""
         backend, feet = self.backend, self.feet[rows]
@@ -440,38 +444,38 @@ class _CellSearch:
             upload_floats(backend, np.where(self._is_boundary(rows), _APART_FROM_BOUNDARY, 1.0)),
         )  # fmt: skip
         x = upload_vectors(backend, self.points[rows])
-        tried_already = tuple(upload_vectors(backend, one) for one in tried)
+        tried_already = tuple(upload_vectors(backend, candidate) for candidate in skipped)
         tolerance = dr.opaque(backend.Float, self.tolerance)
-        lower, others = tree.closer_candidates(x, best, tried_already, tolerance, marks)
-        dr.eval(lower, *others)
+        lower, candidates = tree.closer_candidates(x, best, tried_already, tolerance, marks)
+        dr.eval(lower, *candidates)
         proved = self._rounded(to_numpy(lower), self.points[rows])
         self.lower[rows] = np.maximum(proved, self.lower[rows])
-        return [to_numpy(one) for one in others]
+        return [to_numpy(candidate) for candidate in candidates]
 
     def _leave_boundary(self) -> IntArray:
-        """Descend from the boundary of the surface, where the best point is on it; returns the rows
-        where that led nearer."""
-        rows = np.flatnonzero(self._is_boundary(slice(None)))
-        distance = self._distance(rows)
-        rows, distance = rows[distance > 0], distance[distance > 0]
-        aside = np.minimum(0.25 * distance, _BOUNDARY_OFFSET * self.tolerance)
-        x = self.points[rows]
-        self._update_best(rows, *self.descents.descend_from_boundary(x, self.feet[rows], aside))
-        return rows[self._distance(rows) < distance]
+        """Descend from the boundary of the surface, where the best point is on it; returns the
+        queries where that led nearer."""
+        ids = np.flatnonzero(self._is_boundary(slice(None)))
+        distance = self._distance(ids)
+        ids, distance = ids[distance > 0], distance[distance > 0]
+        offset = np.minimum(0.25 * distance, _BOUNDARY_OFFSET * self.tolerance)
+        x = self.points[ids]
+        self._update_best(ids, *self.descents.descend_from_boundary(x, self.feet[ids], offset))
+        return ids[self._distance(ids) < distance]
 
-    def _descend(self, rows: IntArray, start: FloatArray) -> None:
-        """Descend from places (k, 3), points of the surface or the points themselves."""
-        if not len(rows):
+    def _descend(self, ids: IntArray, start: FloatArray) -> None:
+        """Descend from points (k, 3): points of the surface, or the query points themselves."""
+        if not len(ids):
             return
-        x = self.points[rows]
+        x = self.points[ids]
         on_surface = (start != x).any(axis=1, keepdims=True)
-        self._update_best(rows, np.where(on_surface, start, np.nan), np.zeros(len(rows)))
-        self._update_best(rows, *self.descents.descend(x, start, self._distance(rows)))
+        self._update_best(ids, np.where(on_surface, start, np.nan), np.zeros(len(ids)))
+        self._update_best(ids, *self.descents.descend(x, start, self._distance(ids)))
 
     def _update_best(self, rows: IntArray, feet: FloatArray, free: FloatArray) -> None:
-        """Take points of the surface (k, 3) or NaN, and their radii, where they are nearer; rows
-        may come several times."""
-        away = np.linalg.norm(self.points[rows] - feet, axis=1)
-        nearer = np.flatnonzero(away < self._distance(rows))
-        nearer = nearer[np.argsort(-away[nearer])]  # the last one stays
-        self.feet[rows[nearer]], self.free[rows[nearer]] = feet[nearer], free[nearer]
+        """Replace the best points by points of the surface (k, 3) or NaN, and their radii, where
+        these are nearer; rows may occur several times."""
+        distances = np.linalg.norm(self.points[rows] - feet, axis=1)
+        improved = np.flatnonzero(distances < self._distance(rows))
+        improved = improved[np.argsort(-distances[improved])]  # the last one stays
+        self.feet[rows[improved]], self.free[rows[improved]] = feet[improved], free[improved]

@@ -2,7 +2,7 @@
 distance.
 
 For each cell the surface in it is either unknown or proved to lie in a slab (two parallel planes).
-Some cells also have a known point of the surface, their *foot*.
+Some cells also have a known point of the surface.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ if TYPE_CHECKING:
 __all__ = ["FAR_SENTINEL", "BestCandidate", "CellTree", "SurfaceCells"]
 
 FAR_SENTINEL = 1e150
-"""Coordinates of missing feet, and the thickness of slabs that bound nothing."""
-# Visits of nodes take a tenth of what visits of cells do.
+"""Coordinates of missing surface points, and the thickness of slabs that bound nothing."""
+# Visits of nodes take a tenth of the time of visits of cells.
 _LEAF_SIZE = 1
-# Feet of other parts of the surface that one walk finds.
+# Number of surface points of other parts of the surface that a walk finds.
 _CANDIDATES_PER_WALK = 4
-# Feet closer to one another than this many half cells lead to the same place: where the surface in
-# a cell is in one piece and does not end, and elsewhere.
+# Surface points closer to each other than this many half cells lead to the same closest point:
+# where the surface in a cell is in one piece and does not end, and elsewhere.
 _SEPARATION, _SEPARATION_IN_PIECES = 4.0, 3.0
 # In half cells: the surface is in one piece in a slab that is thinner.
 _SINGLE_PIECE_THICKNESS = 0.5
@@ -53,8 +53,8 @@ class SurfaceCells:
     normal: (n, 3), offset, thickness: (n,) the surface within the ball around the cell has |normal
         . (y - center) - offset| <= thickness, which is FAR where nothing is known. The normal is
         zero where no plane is known that is nearly the surface.
-    plane_radius: (n,) within this radius about its foot the surface is nearly that plane.
-    curvature: (n,) how much it is curved there, at most; FAR where that is not known.
+    plane_radius: (n,) within this radius about its surface point the surface is nearly that plane.
+    curvature: (n,) an upper bound of its curvature there; FAR where none is known.
     clip_point: (n, 3) a point of the clip curve, at which a domain cuts the surface, or FAR.
     clip_curvature: (n,) of the clip curve there.
     """
@@ -85,11 +85,11 @@ class SurfaceCells:
 
     def select(self, which: BoolArray) -> SurfaceCells:
         """The cells that a mask (n,) selects."""
-        return SurfaceCells(*(part[which] for part in vars(self).values()))
+        return SurfaceCells(*(column[which] for column in vars(self).values()))
 
     @property
     def is_single_piece(self) -> BoolArray:
-        """(n,) whether the surface in a cell is in one piece, as far as its slab tells."""
+        """(n,) whether the slab of a cell shows that the surface in it is in one piece."""
         return self.thickness < _SINGLE_PIECE_THICKNESS * self.half
 
     @classmethod
@@ -124,12 +124,12 @@ class CellTree:
     @classmethod
     def of(cls, backend: Backend, cells: SurfaceCells) -> CellTree:
         # Points of the clip curve are surface points of cells of their own.
-        cut = np.flatnonzero(cells.clip_point[:, 0] < FAR_SENTINEL)
-        n, both = len(cells), np.concatenate([np.arange(len(cells)), cut])
+        cut_ids = np.flatnonzero(cells.clip_point[:, 0] < FAR_SENTINEL)
+        n, ids = len(cells), np.concatenate([np.arange(len(cells)), cut_ids])
         is_plain = cells.is_single_piece & (cells.clip_point[:, 0] == FAR_SENTINEL)
-        apart = np.where(is_plain, _SEPARATION, _SEPARATION_IN_PIECES) * cells.half
+        separation = np.where(is_plain, _SEPARATION, _SEPARATION_IN_PIECES) * cells.half
         bulge = 0.15 * cells.curvature * np.square(cells.plane_radius)
-        doubt = np.where(cells.is_single_piece, np.minimum(cells.thickness, bulge), 0.0)
+        slack = np.where(cells.is_single_piece, np.minimum(cells.thickness, bulge), 0.0)
         records = np.column_stack(
             [
                 cells.center,
@@ -140,40 +140,40 @@ class CellTree:
                 cells.offset,
                 np.arange(n, dtype=np.float64),
                 cells.plane_radius,
-                doubt,
-                apart,
+                slack,
+                separation,
             ]
-        )[both]
-        reach = _CLIP_CURVE_RADIUS * cells.half[cut]
-        bulge = reach * np.minimum(0.25, cells.clip_curvature[cut] * reach)
-        records[n:, 4:7] = cells.clip_point[cut]
+        )[ids]
+        radius = _CLIP_CURVE_RADIUS * cells.half[cut_ids]
+        bulge = radius * np.minimum(0.25, cells.clip_curvature[cut_ids] * radius)
+        records[n:, 4:7] = cells.clip_point[cut_ids]
         records[n:, 12:] = np.column_stack([
-            np.full(len(cut), -1), reach, bulge, _SEPARATION_IN_PIECES * cells.half[cut],
+            np.full(len(cut_ids), -1), radius, bulge, _SEPARATION_IN_PIECES * cells.half[cut_ids],
         ])  # fmt: skip
-        center, half = cells.center[both], cells.half[both, None]
+        center, half = cells.center[ids], cells.half[ids, None]
         hierarchy = build_balanced_tree(center, leaf_size=_LEAF_SIZE)
-        placed = hierarchy.values_in_slots(records)
-        placed[hierarchy.leaf_slots < 0] = (
+        slot_records = hierarchy.values_in_slots(records)
+        slot_records[hierarchy.leaf_slots < 0] = (
             [FAR_SENTINEL] * 3 + [0] + [FAR_SENTINEL] * 4 + [0, 0, 0, 0, -1, 0, 0, 0]
         )
         levels = node_boxes(hierarchy, center - half, center + half)
-        return cls(pack_tree(backend, hierarchy, levels, placed))
+        return cls(pack_tree(backend, hierarchy, levels, slot_records))
 
     def best_start(self, x: Vec3, limit: Real) -> Vec3:
         """The surface point of the cell in which the surface has the smallest estimated distance
         from x (`_CellRecord.estimate`); `FAR_SENTINEL` where no estimate is below `limit`."""
         vector = self.tree.backend.Array3f
 
-        def each(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-            best, foot = state
+        def visit_cell(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
+            best, point = state
             cell = _CellRecord.of(vector, row)
-            near = cell.estimate(x)
-            taken = active & (near < best)
-            return dr.select(taken, near, best), dr.select(taken, cell.foot, foot)
+            estimate = cell.estimate(x)
+            is_best = active & (estimate < best)
+            return dr.select(is_best, estimate, best), dr.select(is_best, cell.foot, point)
 
-        some = (1 + 1e-9) * dr.sqrt(squared_distance_in_nearby_leaf(self.tree, x, 4))
-        start = fmin(some, limit), vector(FAR_SENTINEL)
-        return self._walk(x, each, start, lambda state: dr.square(state[0]))[1]
+        upper_bound = (1 + 1e-9) * dr.sqrt(squared_distance_in_nearby_leaf(self.tree, x, 4))
+        start = fmin(upper_bound, limit), vector(FAR_SENTINEL)
+        return self._walk(x, visit_cell, start, lambda state: dr.square(state[0]))[1]
 
     def closer_candidates(
         self, x: Vec3, best: BestCandidate, others: tuple[Vec3, ...], tolerance: Real, marks: Any
@@ -190,77 +190,80 @@ class CellTree:
         backend = self.tree.backend
         vector, index = backend.Array3f, backend.UInt32
 
-        def each(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
+        def visit_cell(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
             lower, *listed = state
             cell = _CellRecord.of(vector, row)
-            counts = active & ~cell.is_within(best.point, best.exclusion_radius)
-            here = cell.lower_bound(x)
-            wanted = counts & (here < best.distance - tolerance)
+            is_relevant = active & ~cell.is_within(best.point, best.exclusion_radius)
+            cell_bound = cell.lower_bound(x)
+            is_open_cell = is_relevant & (cell_bound < best.distance - tolerance)
             if marks is not None:
-                number = index(fmax(cell.number, 0))
-                dr.scatter(marks, backend.Bool(True), number, wanted & cell.is_cell)
-            lower = dr.select(counts & cell.is_cell, fmin(lower, here), lower)
-            near = cell.estimate(x)
-            taken = wanted & (near < best.distance + cell.estimate_slack)
-            taken &= cell.is_separated(best.point, best.separation_factor)
+                cell_index = index(fmax(cell.number, 0))
+                dr.scatter(marks, backend.Bool(True), cell_index, is_open_cell & cell.is_cell)
+            lower = dr.select(is_relevant & cell.is_cell, fmin(lower, cell_bound), lower)
+            estimate = cell.estimate(x)
+            is_listed = is_open_cell & (estimate < best.distance + cell.estimate_slack)
+            is_listed &= cell.is_separated(best.point, best.separation_factor)
             for other in others:
-                taken &= cell.is_separated(other, 1.0)
-            near = dr.select(taken, near, dr.inf)
-            add = functools.partial(listed_with, cell, near)
-            return lower, *update_where_active(taken, add, (*listed,), "listed cells")
+                is_listed &= cell.is_separated(other, 1.0)
+            estimate = dr.select(is_listed, estimate, dr.inf)
+            insert = functools.partial(with_candidate, cell, estimate)
+            return lower, *update_where_active(is_listed, insert, (*listed,), "listed cells")
 
-        def listed_with(cell: _CellRecord, near: Real, state: LoopValues) -> LoopValues:
-            # The list is sorted: what is nearer takes a place, and what was there goes on to the
-            # next, unless both lead to the same place.
-            listed, foot = [*state], cell.foot
+        def with_candidate(cell: _CellRecord, estimate: Real, state: LoopValues) -> LoopValues:
+            # The list is sorted: a nearer candidate takes the place of a listed one, which moves on
+            # to the next place, unless both lead to the same closest point.
+            listed, point = [*state], cell.foot
             for k in range(0, len(listed), 2):
-                there, y = listed[k], listed[k + 1]
-                is_nearer, is_apart = near < there, cell.is_separated(y, 1.0)
-                listed[k] = dr.select(is_nearer, near, there)
-                listed[k + 1] = dr.select(is_nearer, foot, y)
-                near = dr.select(is_apart, dr.select(is_nearer, there, near), dr.inf)
-                foot = dr.select(is_nearer, y, foot)
+                old, y = listed[k], listed[k + 1]
+                is_nearer, is_apart = estimate < old, cell.is_separated(y, 1.0)
+                listed[k] = dr.select(is_nearer, estimate, old)
+                listed[k + 1] = dr.select(is_nearer, point, y)
+                estimate = dr.select(is_apart, dr.select(is_nearer, old, estimate), dr.inf)
+                point = dr.select(is_nearer, y, point)
             return tuple(listed)
 
-        def is_open(low: Vec3, high: Vec3) -> Mask:
+        def may_contain(low: Vec3, high: Vec3) -> Mask:
             y = best.point
             corner = vector(*(fmax(high[k] - y[k], y[k] - low[k]) for k in range(3)))
             return dr.squared_norm(corner) >= best.exclusion_radius * best.exclusion_radius
 
         limit = backend.Float(best.distance)
-        empty = (
-            one
+        empty_list = (
+            entry
             for _ in range(_CANDIDATES_PER_WALK)
-            for one in (backend.Float(dr.inf), vector(FAR_SENTINEL))
+            for entry in (backend.Float(dr.inf), vector(FAR_SENTINEL))
         )
-        start = limit, *empty
-        lower, *listed = self._walk(x, each, start, lambda state: limit * limit, is_open)
+        start = limit, *empty_list
+        lower, *listed = self._walk(x, visit_cell, start, lambda state: limit * limit, may_contain)
         return lower, listed[1::2]
 
     def _walk(
-        self, x: Vec3, each: Any, start: LoopValues, limit: Callable[[LoopValues], Real],
+        self, x: Vec3, visit_cell: Any, start: LoopValues, limit: Callable[[LoopValues], Real],
         is_open: Callable[[Vec3, Vec3], Mask] = lambda low, high: low.x <= high.x,
     ) -> LoopValues:  # fmt: skip
-        """limit: the squared distance, given the state, beyond which boxes are left out, and so are
-        those that are not `is_open`."""
+        """Traverse the tree.
+
+        limit: gives the squared distance, by the state, beyond which boxes are left out. Boxes that
+        are not `is_open` are left out too.
+        """
         vector = self.tree.backend.Array3f
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
             low, high = vector(*node.head[:3]), vector(*node.head[3:6])
-            away = dr.select(x < low, low - x, dr.select(x > high, x - high, 0))
-            close = (dr.squared_norm(away) < limit(state)) & is_open(low, high)
-            return close, for_each_primitive(node, close & node.is_leaf, each, state)
+            offset = dr.select(x < low, low - x, dr.select(x > high, x - high, 0))
+            is_near = (dr.squared_norm(offset) < limit(state)) & is_open(low, high)
+            return is_near, for_each_primitive(node, is_near & node.is_leaf, visit_cell, state)
 
         return traverse(self.tree, visit, start)
 
 
 @dataclass(frozen=True)
 class _CellRecord:
-    """What the tree holds of a cell, or of a point of the rim in a cell (number < 0): the columns
-    of `SurfaceCells`, and
+    """The record of a cell in the tree, or of a point of the clip curve in a cell (number < 0): the
+    columns of `SurfaceCells`, and
 
-    estimate_slack: by how much the surface may be nearer than it seems.
-    apart: feet that are closer to this one than that lead to the same place.
+    estimate_slack: an upper bound of (estimate - distance) of the surface.
+    apart: surface points that are closer than this to `foot` lead to the same closest point.
     """
 
     center: Vec3
@@ -287,35 +290,37 @@ class _CellRecord:
         return self.number >= 0
 
     def lower_bound(self, x: Vec3) -> Real:
-        """A length that the surface in the cell is no nearer than: of its box, and of its slab."""
+        """A lower bound of the distance from x to the surface in the cell: the larger of those by
+        the cell's box and by its slab."""
         vector = cast("Any", type(x))
-        away = x - self.center
-        box = dr.norm(vector(*(fmax(dr.abs(away[k]) - self.half, 0) for k in range(3))))
-        height = dr.dot(away, self.normal)
-        across = dr.norm(dr.fma(vector(-height), self.normal, away))
-        off = fmax(dr.abs(height - self.offset) - self.thickness, 0)
-        beside = fmax(across - 1.7321 * self.half, 0)
-        return fmax(box, dr.norm(vector(off, beside, 0)))
+        offset = x - self.center
+        box = dr.norm(vector(*(fmax(dr.abs(offset[k]) - self.half, 0) for k in range(3))))
+        height = dr.dot(offset, self.normal)
+        across = dr.norm(dr.fma(vector(-height), self.normal, offset))
+        normal_gap = fmax(dr.abs(height - self.offset) - self.thickness, 0)
+        lateral_gap = fmax(across - 1.7321 * self.half, 0)
+        return fmax(box, dr.norm(vector(normal_gap, lateral_gap, 0)))
 
     def estimate(self, x: Vec3) -> Real:
-        """How near the surface in the cell seems to come to x, not nearer than is proved; infinite
-        without a foot.
+        """An estimate of the distance from x to the surface in the cell, not below the proved
+        bound; infinite without a surface point.
 
-        Within the spread about the foot the surface is taken for a plane, the rim for a line: the
-        way to its nearest point is at right angles to that from there to the foot.
+        Within the spread about its point the surface is taken for a plane, the clip curve for a
+        line: the path to its nearest point is at right angles to the path from there to the surface
+        point.
         """
-        away = x - self.foot
-        height = dr.select(self.is_cell, dr.dot(away, self.normal), 0)
-        square = dr.squared_norm(away) - height * height - self.spread * self.spread
+        offset = x - self.foot
+        height = dr.select(self.is_cell, dr.dot(offset, self.normal), 0)
+        square = dr.squared_norm(offset) - height * height - self.spread * self.spread
         near = dr.sqrt(dr.fma(height, height, fmax(square, 0)))
         return dr.select(self.foot.x < 0.5 * FAR_SENTINEL, fmax(near, self.lower_bound(x)), dr.inf)
 
     def is_separated(self, y: Vec3, times: Real) -> Mask:
-        """Whether the foot is apart from y (`_SEPARATION`), so many times as far as it has to
-        be."""
+        """Whether the surface point is separated from y (`_SEPARATION`), at `times` the distance
+        that is required."""
         return dr.squared_norm(self.foot - y) >= dr.square(times * self.apart)
 
     def is_within(self, y: Vec3, radius: Real) -> Mask:
         """Whether the whole cell is within a radius of y."""
-        away = dr.abs(y - self.center) + self.half
-        return dr.squared_norm(away) < radius * radius
+        farthest = dr.abs(y - self.center) + self.half
+        return dr.squared_norm(farthest) < radius * radius

@@ -72,9 +72,9 @@ def signed_distance(
             mesh, and for the boundary of the solid of a closed mesh, it is exact to rounding. NaN,
             with a RuntimeWarning that counts these points, where no surface is found: there is
             none, or it was found only within a radius that the field promises to be free.
-        "lower_bound": never longer in size than the true distance, with proof: no level lies in the
-            ball of that radius about the point, not even outside the field's domain. Of first
-            order too: the nearer the surface, the smaller the share that it falls short by.
+        "lower_bound": never longer than the true distance, with proof: no level lies in the ball of
+            that radius about the point, not even outside the field's domain. Of first order too:
+            the nearer the surface, the smaller the relative error.
         For a field that jumps across facets, "first_order" and "second_order" see the smooth part
         of the surface, and the nearest facet if that is nearer and the surface lies there.
     progress: told what is being done.
@@ -91,9 +91,9 @@ def signed_distance(
         NotImplementedError: "second_order" with a field that has no second derivatives.
     """
     if not is_one_of(method, get_args(Method)):
-        known = ", ".join(f'"{one}"' for one in get_args(Method))
+        names = ", ".join(f'"{name}"' for name in get_args(Method))
         hint = did_you_mean(method, get_args(Method))
-        raise ValueError(f"unknown method {method!r}; choose one of {known}{hint}")
+        raise ValueError(f"unknown method {method!r}; choose one of {names}{hint}")
     traced, backend = _surface("signed_distance", surface, options, keywords)
     field = traced.field
     if method == "closest_point":
@@ -104,10 +104,10 @@ def signed_distance(
     levels, prepared = traced.target_levels(backend), traced.evaluator(backend)
     compute = _COMPUTE[method]
 
-    def of_points(p: Vec3) -> tuple[Real | Vec3, ...]:
+    def estimate(p: Vec3) -> tuple[Real | Vec3, ...]:
         return p, compute(backend, prepared, levels, p)
 
-    x, result = in_batches(backend, of_points, points)
+    x, result = in_batches(backend, estimate, points)
     if method == "lower_bound":
         _check_domain(field, x)
     if field.has_jumps and method != "lower_bound":
@@ -247,21 +247,21 @@ def _surface(
     )
 
 
-def _warn(name: str, found: ClosestPoints) -> None:
-    """Of points without an answer, and of answers that a promise of the field contradicts."""
-    n = len(found.closest)
-    unresolved = int(np.isnan(found.closest[:, 0]).sum())
+def _warn(name: str, result: ClosestPoints) -> None:
+    """Warn of points without an answer, and of answers that a promise of the field contradicts."""
+    count = len(result.closest)
+    unresolved = int(np.isnan(result.closest[:, 0]).sum())
     if unresolved:
         warnings.warn(
-            f"{name}: no closest point was found for {unresolved} of {n} points (NaN): no cell "
+            f"{name}: no closest point was found for {unresolved} of {count} points (NaN): no cell "
             "that may hold the surface, and no descent from the points, led to a point of it",
             RuntimeWarning,
             stacklevel=4,
         )
-    refused = int(found.violates_promises.sum())
+    refused = int(result.violates_promises.sum())
     if refused:
         warnings.warn(
-            f"{name}: for {refused} of {n} points, points of the surface were found within the "
+            f"{name}: for {refused} of {count} points, points of the surface were found within the "
             "radius that the field's own promises prove to be free of it, and left out: the "
             "promises in `Sample.promises` do not hold (harnack.testing.check_field tests them)",
             RuntimeWarning,
@@ -274,9 +274,9 @@ def _check_domain(field: Field, points: FloatArray) -> None:
         return
     outside = np.flatnonzero(~field.domain.contains_points(points))
     if outside.size:
-        rest = f" and {outside.size - 1} more" if outside.size > 1 else ""
+        more = f" and {outside.size - 1} more" if outside.size > 1 else ""
         raise ValueError(
-            f"points: entry {outside[0]}{rest} outside the domain of {type(field).__name__}, where "
+            f"points: entry {outside[0]}{more} outside the domain of {type(field).__name__}, where "
             "it promises nothing; leave such points out, or give the field a larger domain"
         )
 
@@ -295,8 +295,8 @@ def _second(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
 
 def _lower(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
     sample = field.evaluate(p)
-    above = -levels.offset_to_nearest(sample.value)
-    return dr.copysign(level_distance_lower_bound(backend, field, levels, p, sample), above)
+    residual = -levels.offset_to_nearest(sample.value)
+    return dr.copysign(level_distance_lower_bound(backend, field, levels, p, sample), residual)
 
 
 _COMPUTE: dict[str, Callable[[Backend, Field, Levels, Vec3], Real]] = {

@@ -3,7 +3,8 @@ and by rays.
 
 A *jump surface* consists of facets across which the field jumps, such as the triangles of a mesh. A
 point of it is part of the level set where f passes a level from one side to the other. A short ray
-through the point decides that, in the same arithmetic in which rays meet the surface anywhere else.
+through the point decides whether it does, in the same arithmetic in which rays meet the surface
+anywhere else.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ _CORNERS = (
 _EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (0, 2), (1, 3))
 # In these lengths: the distance from y at which f is evaluated, where rounding of y hardly counts.
 _SIGN_TEST_SCALE = 64.0
-# Before a facet f is evaluated at this part of the way to it.
+# Before a facet f is evaluated at this fraction of the distance to it.
 _BEFORE = 0.98
 
 NextJump: TypeAlias = "Callable[[tuple[Any, Any], Any, Any], NearestFacet]"
@@ -49,7 +50,8 @@ NextJump: TypeAlias = "Callable[[tuple[Any, Any], Any, Any], NearestFacet]"
 class JumpSurfaceSearch:
     """Search for the closest point of a prepared surface that lies on a jump surface.
 
-    scale: at least the coordinates that the field computes with, for bounds of rounding errors.
+    scale: an upper bound of the coordinates that the field computes with, for bounds of rounding
+        errors.
     most: the largest number of facets that are examined for each point.
     """
 
@@ -73,85 +75,85 @@ class JumpSurfaceSearch:
         """
         backend = self.surface.backend
         real, index, vector = backend.Float, backend.UInt32, backend.Array3f
-        following = self._next_jump(x)
-        most = dr.opaque(index, self.most)
-        short = (
+        next_facet = self._next_jump(x)
+        max_count = dr.opaque(index, self.most)
+        length = (
             _PROBE_HALF_LENGTH * backend.machine_epsilon * fmax(real(self.scale), dr.max(dr.abs(x)))
         )
         limit = real(limit)
-        nothing = NearestFacet(
+        no_facet = NearestFacet(
             real(-1), index(NO_FACET), vector(dr.inf), vector(0), backend.Bool(False)
         )
 
         def body(*state: Any) -> tuple[Any, ...]:
             last = NearestFacet(*state[:5])
-            probe, foot, nearest, n, active = state[5:]
-            fresh = active & (probe == 0)
-            found = following((last.sort_key, last.facet), limit, fresh)
-            near = _select(fresh, found, last)
-            active &= near.facet != NO_FACET
-            nearest = dr.select(active & fresh & (n == 0), near.offset, nearest)
-            y = x + near.offset
-            start, end = _probe(vector, probe, near.normal)
-            met, sheet, at = self._probe_hits(y, short, start, end, active)
-            at = dr.select((sheet == near.facet) & (probe == 0), y, at)
-            foot = dr.select(met, at, foot)
-            n = n + dr.select(fresh, index(1), 0)
-            last_probe = near.is_inner | (probe == len(_EDGES))
-            active &= ~met & ~(last_probe & (n >= most))
+            probe, best, nearest, n, active = state[5:]
+            is_first = active & (probe == 0)
+            candidate = next_facet((last.sort_key, last.facet), limit, is_first)
+            facet = _select(is_first, candidate, last)
+            active &= facet.facet != NO_FACET
+            nearest = dr.select(active & is_first & (n == 0), facet.offset, nearest)
+            y = x + facet.offset
+            start, end = _probe(vector, probe, facet.normal)
+            is_hit, hit_facet, hit_point = self._probe_hits(y, length, start, end, active)
+            hit_point = dr.select((hit_facet == facet.facet) & (probe == 0), y, hit_point)
+            best = dr.select(is_hit, hit_point, best)
+            n = n + dr.select(is_first, index(1), 0)
+            last_probe = facet.is_inner | (probe == len(_EDGES))
+            active &= ~is_hit & ~(last_probe & (n >= max_count))
             probe = dr.select(last_probe, index(0), probe + 1)
-            return *_parts(near), probe, foot, nearest, n, active
+            return *_parts(facet), probe, best, nearest, n, active
 
-        def more(*state: Any) -> Mask:
+        def is_active(*state: Any) -> Mask:
             return state[-1]
 
         start = (
-            *_parts(nothing), index(0), vector(dr.nan), vector(dr.inf), index(0),
+            *_parts(no_facet), index(0), vector(dr.nan), vector(dr.inf), index(0),
             backend.Bool(True),
         )  # fmt: skip
-        *_, foot, nearest, _, _ = dr.while_loop(start, more, body, label="sheets in turn")
-        return foot, nearest
+        *_, best, nearest, _, _ = dr.while_loop(start, is_active, body, label="sheets in turn")
+        return best, nearest
 
     def _probe_hits(
-        self, y: Vec3, short: Real, start: Vec3, end: Vec3, active: Mask
+        self, y: Vec3, unit: Real, start: Vec3, end: Vec3, active: Mask
     ) -> tuple[Mask, Any, Vec3]:
-        """Whether the segment between two points about y, in units of `short`, meets the surface;
-        the facet that it meets, and where."""
+        """Whether the segment between two points about y, in units of `unit`, meets the surface;
+        the facet that it meets, and the point where it does."""
         backend = self.surface.backend
         real, vector = backend.Float, backend.Array3f
-        o = dr.fma(vector(short), start, y)
-        way, length = (end - start) / dr.norm(end - start), dr.norm(end - start)
-        seen = self.surface.first_hit(o, way, real(0), short * length, active)
-        met = active & (seen.status == int(RayStatus.HIT))
+        o = dr.fma(vector(unit), start, y)
+        direction, length = (end - start) / dr.norm(end - start), dr.norm(end - start)
+        hit = self.surface.first_hit(o, direction, real(0), unit * length, active)
+        is_hit = active & (hit.status == int(RayStatus.HIT))
         # To first order any level is near where the gradient has no bound, as at the facet's edge.
-        met &= straddles_level(self.surface, y, _SIGN_TEST_SCALE * short, met)
-        return met, seen.facet, dr.fma(vector(seen.t), way, o)
+        is_hit &= straddles_level(self.surface, y, _SIGN_TEST_SCALE * unit, is_hit)
+        return is_hit, hit.facet, dr.fma(vector(hit.t), direction, o)
 
     def _next_jump(self, x: Vec3) -> NextJump:
-        """The facets of the field in turn; for a field that does not list them, the nearest facet
-        only."""
+        """A function that gives the facets of the field in the order of their distance; for a field
+        that does not list them, the nearest facet only."""
         field, backend = self.surface.field, self.surface.backend
         real, index = backend.Float, backend.UInt32
         probe = field.nearest_facet(x, (real(-1), index(NO_FACET)), real(0), backend.Bool(False))
         if probe is None:
-            only = _nearest_jump_by_differences(backend, field, x)
+            facet = _nearest_jump_by_differences(backend, field, x)
 
-            def once(after: tuple[Real, Any], limit: Real, active: Mask) -> NearestFacet:
+            def single_facet(after: tuple[Real, Any], limit: Real, active: Mask) -> NearestFacet:
                 del active
-                fresh = (after[0] < 0) & (only.sort_key < limit)
-                order = dr.select(fresh, only.sort_key, dr.inf)
-                sheet = dr.select(fresh, only.facet, index(NO_FACET))
-                return NearestFacet(order, sheet, only.offset, only.normal, only.is_inner)
+                is_first = (after[0] < 0) & (facet.sort_key < limit)
+                sort_key = dr.select(is_first, facet.sort_key, dr.inf)
+                facet_id = dr.select(is_first, facet.facet, index(NO_FACET))
+                return NearestFacet(sort_key, facet_id, facet.offset, facet.normal, facet.is_inner)
 
-            return once
+            return single_facet
 
-        def told(after: tuple[Real, Any], limit: Real, active: Mask) -> NearestFacet:
-            found = field.nearest_facet(x, after, limit, active)
-            if found is None:
+        def listed_facet(after: tuple[Real, Any], limit: Real, active: Mask) -> NearestFacet:
+            nearest = field.nearest_facet(x, after, limit, active)
+            if nearest is None:
                 raise RuntimeError("nearest_sheet tells sheets at some times and not at others")
-            return found
+            return nearest
 
-        return told
+        return listed_facet
 
 
 def straddles_level(surface: SurfaceTracer, y: Vec3, radius: Real, active: Mask) -> Mask:
@@ -164,77 +166,78 @@ def straddles_level(surface: SurfaceTracer, y: Vec3, radius: Real, active: Mask)
     """
     backend, field = surface.backend, surface.field.exact(surface.backend)
     real, index, vector = backend.Float, backend.UInt32, backend.Array3f
-    nowhere = vector(0)
+    zero = vector(0)
 
-    def body(k: Any, low: Real, high: Real, active: Mask) -> tuple[Any, ...]:
-        start, end = _probe(vector, k + 1, nowhere)
+    def body(k: Any, lower: Real, upper: Real, active: Mask) -> tuple[Any, ...]:
+        start, end = _probe(vector, k + 1, zero)
         o = dr.fma(vector(radius), start, y)
         length = dr.norm(end - start)
-        way, reach = (end - start) / length, radius * length
-        behind = JumpCrossing(real(0), index(NO_FACET), real(0), nowhere)
-        t = real(field.next_jump(o, way, behind, reach, active).t)
-        inside = dr.select(t < reach, t, 0.5 * reach)
-        for share in (real(0), _BEFORE * inside):
-            value = real(field.evaluate(dr.fma(vector(share), way, o)).value)
-            low, high = fmin(low, value), fmax(high, value)
-        return k + 1, low, high, active & (k + 1 < len(_EDGES))
+        direction, reach = (end - start) / length, radius * length
+        start_crossing = JumpCrossing(real(0), index(NO_FACET), real(0), zero)
+        t = real(field.next_jump(o, direction, start_crossing, reach, active).t)
+        before_jump = dr.select(t < reach, t, 0.5 * reach)
+        for distance in (real(0), _BEFORE * before_jump):
+            value = real(field.evaluate(dr.fma(vector(distance), direction, o)).value)
+            lower, upper = fmin(lower, value), fmax(upper, value)
+        return k + 1, lower, upper, active & (k + 1 < len(_EDGES))
 
-    def more(*state: Any) -> Mask:
+    def is_active(*state: Any) -> Mask:
         return state[-1]
 
     start = index(0), real(dr.inf), real(-dr.inf), backend.Bool(active)
-    _, low, high, _ = dr.while_loop(start, more, body, label="sides of a level")
-    return (low < high) & (surface.levels.gaps(low).above < high - low)
+    _, lower, upper, _ = dr.while_loop(start, is_active, body, label="sides of a level")
+    return (lower < upper) & (surface.levels.gaps(lower).above < upper - lower)
 
 
-def _parts(near: NearestFacet) -> tuple[Any, ...]:
-    return near.sort_key, near.facet, near.offset, near.normal, near.is_inner
+def _parts(facet: NearestFacet) -> tuple[Any, ...]:
+    return facet.sort_key, facet.facet, facet.offset, facet.normal, facet.is_inner
 
 
-def _select(mask: Mask, one: NearestFacet, other: NearestFacet) -> NearestFacet:
-    pairs = zip(_parts(one), _parts(other), strict=True)
+def _select(mask: Mask, first: NearestFacet, second: NearestFacet) -> NearestFacet:
+    pairs = zip(_parts(first), _parts(second), strict=True)
     return NearestFacet(*(dr.select(mask, a, b) for a, b in pairs))
 
 
-def _probe(vector: Any, number: Any, normal: Vec3) -> tuple[Vec3, Vec3]:
+def _probe(vector: Any, index: Any, normal: Vec3) -> tuple[Vec3, Vec3]:
     """Both ends of a probe about the origin: along the normal, then the tetrahedron's edges."""
     start, end = -normal, normal
     for k, (i, j) in enumerate(_EDGES):
-        start = dr.select(number == k + 1, vector(*_CORNERS[i]), start)
-        end = dr.select(number == k + 1, vector(*_CORNERS[j]), end)
+        start = dr.select(index == k + 1, vector(*_CORNERS[i]), start)
+        end = dr.select(index == k + 1, vector(*_CORNERS[j]), end)
     return start, end
 
 
 def _nearest_jump_by_differences(backend: Backend, field: Field, x: Vec3) -> NearestFacet:
-    """The nearest sheet to x, from its distance d alone: along the way on which d falls.
+    """The nearest facet to x, from its distance d alone: in the direction in which d falls.
 
-    Central differences over h = r d are off by r^2, and by epsilon s/(r d) as rounding moves d by
-    epsilon s, s the size of coordinates: with r = (epsilon s/d)^(1/3) both are small down to
-    distances of a few roundings. There any direction serves: y = x is on the sheet to rounding.
+    Central differences over h = r d have an error of r^2, and of epsilon s/(r d) as rounding moves
+    d by epsilon s, where s is the size of coordinates: with r = (epsilon s/d)^(1/3) both are small
+    down to distances of a few rounding errors. At smaller distances any direction serves: y = x is
+    on the facet to rounding.
     """
     real, vector = backend.Float, backend.Array3f
     d = real(field.distance_to_jumps(x))
     size = fmax(dr.max(dr.abs(x)), d)
     h = d * fmin(dr.cbrt(backend.machine_epsilon * size / d), 0.5)
-    rate: list[Real] = []
+    differences: list[Real] = []
     for axis in range(3):
-        move = vector(*(h if k == axis else 0 for k in range(3)))
-        ahead, back = (field.distance_to_jumps(q) for q in (x + move, x - move))
-        rate.append(back - ahead)
-    fall = vector(*rate)
-    gradient_norm = dr.norm(fall)
+        shift = vector(*(h if k == axis else 0 for k in range(3)))
+        ahead, behind = (field.distance_to_jumps(q) for q in (x + shift, x - shift))
+        differences.append(behind - ahead)
+    descent = vector(*differences)
+    gradient_norm = dr.norm(descent)
     has_direction = (gradient_norm > 0.2 * h) & (d > 64 * backend.machine_epsilon * size)
-    way = dr.select(has_direction, fall / gradient_norm, vector(1 / math.sqrt(3)))
-    offset = dr.select(has_direction, d * way, 0)
-    return NearestFacet(d, backend.UInt32(0), offset, way, backend.Bool(False))
+    direction = dr.select(has_direction, descent / gradient_norm, vector(1 / math.sqrt(3)))
+    offset = dr.select(has_direction, d * direction, 0)
+    return NearestFacet(d, backend.UInt32(0), offset, direction, backend.Bool(False))
 
 
 # Nearer points by rays.
 
 _MOST_RAYS = 600
-# Rays of a turn, which all have to fail before the next turn is narrower: those to where planes
-# meet, then those near the best direction, about 137.5 degrees apart, so that however many there
-# are they are spread evenly, and no turn repeats the one before.
+# Rays of a turn, which all have to fail before the next turn is narrower: rays to the intersections
+# of planes, then rays near the best direction, about 137.5 degrees apart, so that any number of
+# them is spread evenly, and no turn repeats the one before.
 _PLANE_TRIALS, _TILTED, _GOLDEN = 4, 8, 2.399963229728653
 # Steps are tangents of angles.
 _INITIAL_STEP, _STEP_REDUCTION = 1.0, 0.25
@@ -242,7 +245,8 @@ _INITIAL_STEP, _STEP_REDUCTION = 1.0, 0.25
 _SPHERE_RAYS = 128
 # Planes whose normals are closer than this, as the sine of an angle, count as the same.
 _APART = 1e-3
-# In epsilons, of coordinates: so far from a hit f is evaluated on both sides of the level.
+# In epsilons, of coordinates: the distance from a hit at which f is evaluated on both sides of the
+# level.
 _HIT_TEST_RADIUS = 1024.0
 
 
@@ -255,7 +259,7 @@ class _HitPlane:
 
     @classmethod
     def where(cls, mask: Mask, one: _HitPlane, other: _HitPlane) -> _HitPlane:
-        """One plane in some lanes, another elsewhere."""
+        """The plane `one` in lanes of the mask, `other` elsewhere."""
         normal = dr.select(mask, one.normal, other.normal)
         return cls(normal, dr.select(mask, one.offset, other.offset))
 
@@ -264,28 +268,30 @@ class _HitPlane:
         return dr.squared_norm(dr.cross(self.normal, other.normal)) > _APART * _APART
 
     def nearest_on_line(self, other: _HitPlane) -> Vec3:
-        """The shortest way to where both are; not finite if they are parallel."""
+        """The shortest vector to the intersection of both planes; not finite if they are
+        parallel."""
         vector = cast("Any", type(self.normal))
         cosine = dr.dot(self.normal, other.normal)
-        ours = vector(self.offset - cosine * other.offset) * self.normal
-        return (ours + vector(other.offset - cosine * self.offset) * other.normal) / (
+        own_part = vector(self.offset - cosine * other.offset) * self.normal
+        return (own_part + vector(other.offset - cosine * self.offset) * other.normal) / (
             1 - cosine * cosine
         )
 
     def intersection_point(self, second: _HitPlane, third: _HitPlane) -> Vec3:
-        """The way to where all three are; not finite if they are parallel to a line."""
+        """The vector to the intersection of all three; not finite if they are parallel to a
+        line."""
         vector = cast("Any", type(self.normal))
         a, b, c = self.normal, second.normal, third.normal
-        ways = (dr.cross(b, c), dr.cross(c, a), dr.cross(a, b))
+        normals = (dr.cross(b, c), dr.cross(c, a), dr.cross(a, b))
         offsets = (self.offset, second.offset, third.offset)
-        total = sum((vector(o) * w for o, w in zip(offsets, ways, strict=True)), vector(0))
-        return total / dr.dot(a, ways[0])
+        total = sum((vector(o) * n for o, n in zip(offsets, normals, strict=True)), vector(0))
+        return total / dr.dot(a, normals[0])
 
 
 @dataclass(frozen=True)
 class _HitPlanes:
-    """Three planes that touch the surface: where the best point is, then the two last seen that are
-    parallel neither to it nor to one another."""
+    """Three planes that touch the surface: at the best point, then at the last two hits whose
+    planes are parallel neither to it nor to each other."""
 
     first: _HitPlane
     second: _HitPlane
@@ -293,42 +299,44 @@ class _HitPlanes:
 
     @classmethod
     def of(cls, parts: tuple[Any, ...]) -> _HitPlanes:
-        """From `parts`."""
+        """The planes, from their normals and offsets as `parts` gives them."""
         return cls(*(_HitPlane(parts[k], parts[k + 1]) for k in (0, 2, 4)))
 
     def parts(self) -> tuple[Any, ...]:
-        """Normals and offsets, as loops want them."""
+        """Normals and offsets in turn, as the state of a loop."""
         return tuple(
-            part
+            number
             for plane in (self.first, self.second, self.third)
-            for part in (plane.normal, plane.offset)
+            for number in (plane.normal, plane.offset)
         )
 
     def updated(self, plane: _HitPlane, seen: Mask, best: Mask) -> _HitPlanes:
-        """With one more, where `seen`; that of the best point, where `best`."""
+        """The planes with another one added, where `seen`; as the plane of the best point, where
+        `best`."""
         first, second, third = self.first, self.second, self.third
-        parts = _HitPlane.where
-        stays = first.is_apart(plane)
-        ours = _HitPlanes(
+        select = _HitPlane.where
+        is_apart = first.is_apart(plane)
+        if_best = _HitPlanes(
             plane,
-            parts(stays, first, second),
-            parts(stays & second.is_apart(plane), second, third),
+            select(is_apart, first, second),
+            select(is_apart & second.is_apart(plane), second, third),
         )
-        is_new = seen & ~best & stays
-        theirs = _HitPlanes(
+        is_new = seen & ~best & is_apart
+        otherwise = _HitPlanes(
             first,
-            parts(is_new, plane, second),
-            parts(is_new & second.is_apart(plane), second, third),
+            select(is_new, plane, second),
+            select(is_new & second.is_apart(plane), second, third),
         )
         return _HitPlanes(
-            parts(best, ours.first, theirs.first),
-            parts(best, ours.second, theirs.second),
-            parts(best, ours.third, theirs.third),
+            select(best, if_best.first, otherwise.first),
+            select(best, if_best.second, otherwise.second),
+            select(best, if_best.third, otherwise.third),
         )
 
     def meeting(self, number: Any) -> Vec3:
-        """The shortest way to where planes meet: all three (0), the first and the second (1), the
-        first and the third (2), or to the first alone (3); not finite where they do not."""
+        """The shortest vector to the intersection of planes: of all three (0), of the first and the
+        second (1), of the first and the third (2), or to the first alone (3); not finite where
+        there is no intersection."""
         first, second, third = self.first, self.second, self.third
         vector = cast("Any", type(first.normal))
         pairs = dr.select(number == 1, first.nearest_on_line(second), first.nearest_on_line(third))
@@ -359,45 +367,45 @@ def compass_search(surface: SurfaceTracer, x: Vec3, foot: Vec3) -> Vec3:
 
     def body(
         d: Vec3, t: Real, foot: Vec3, step: Real, angle: Real, failed: Any, n: Any, active: Mask,
-        *parts: Any,
+        *values: Any,
     ) -> tuple[Any, ...]:  # fmt: skip
-        planes, around = _HitPlanes.of(parts), n < _SPHERE_RAYS
-        meets = ~around & (failed < _PLANE_TRIALS)
-        way = dr.select(
-            meets, dr.normalize(planes.meeting(failed)), _tilt_direction(d, step, angle)
+        planes, is_global = _HitPlanes.of(values), n < _SPHERE_RAYS
+        to_planes = ~is_global & (failed < _PLANE_TRIALS)
+        direction = dr.select(
+            to_planes, dr.normalize(planes.meeting(failed)), _tilt_direction(d, step, angle)
         )
-        way = dr.select(around, _spiral_direction(vector, real(n)), way)
-        usable = active & dr.isfinite(dr.squared_norm(way))
+        direction = dr.select(is_global, _spiral_direction(vector, real(n)), direction)
+        is_valid = active & dr.isfinite(dr.squared_norm(direction))
         # Beyond t as well, for planes.
-        end = dr.select(around, t, t * (1 + fmin(step, 0.5)))
-        seen = surface.first_hit(x, dr.select(usable, way, d), real(0), end, usable)
-        hit = usable & (seen.status == int(RayStatus.HIT))
-        nearer = hit & (seen.t < t * (1 - 8 * backend.machine_epsilon))
-        there = dr.fma(vector(seen.t), way, x)
-        nearer &= is_on_surface(surface, there, seen, nearer)
-        normal = dr.normalize(seen.gradient)
-        touches = hit & dr.isfinite(dr.squared_norm(normal))
-        touching = _HitPlane(normal, dr.dot(normal, way) * seen.t)
-        planes = planes.updated(touching, touches, touches & nearer)
-        d, t = dr.select(nearer, way, d), dr.select(nearer, seen.t, t)
-        foot = dr.select(nearer, there, foot)
-        failed = dr.select(nearer | around, count(0), failed + 1)
-        spent = failed == _PLANE_TRIALS + _TILTED
-        narrower = dr.select(spent, _STEP_REDUCTION * step, step)
-        step = dr.select(nearer & ~around & ~meets, fmin(2 * step, _INITIAL_STEP), narrower)
-        angle = dr.select(nearer | meets | around, angle, angle + _GOLDEN)
-        failed = dr.select(spent, count(0), failed)
+        end = dr.select(is_global, t, t * (1 + fmin(step, 0.5)))
+        hit = surface.first_hit(x, dr.select(is_valid, direction, d), real(0), end, is_valid)
+        is_hit = is_valid & (hit.status == int(RayStatus.HIT))
+        nearer = is_hit & (hit.t < t * (1 - 8 * backend.machine_epsilon))
+        point = dr.fma(vector(hit.t), direction, x)
+        nearer &= is_on_surface(surface, point, hit, nearer)
+        normal = dr.normalize(hit.gradient)
+        has_plane = is_hit & dr.isfinite(dr.squared_norm(normal))
+        plane = _HitPlane(normal, dr.dot(normal, direction) * hit.t)
+        planes = planes.updated(plane, has_plane, has_plane & nearer)
+        d, t = dr.select(nearer, direction, d), dr.select(nearer, hit.t, t)
+        foot = dr.select(nearer, point, foot)
+        failed = dr.select(nearer | is_global, count(0), failed + 1)
+        is_spent = failed == _PLANE_TRIALS + _TILTED
+        new_step = dr.select(is_spent, _STEP_REDUCTION * step, step)
+        step = dr.select(nearer & ~is_global & ~to_planes, fmin(2 * step, _INITIAL_STEP), new_step)
+        angle = dr.select(nearer | to_planes | is_global, angle, angle + _GOLDEN)
+        failed = dr.select(is_spent, count(0), failed)
         active &= (step > backend.machine_epsilon**0.5) & (n + 1 < _MOST_RAYS)
         return d, t, foot, step, angle, failed, n + 1, active, *planes.parts()
 
-    def more(*state: Any) -> Mask:
+    def is_active(*state: Any) -> Mask:
         return state[7]
 
     start = (
         d, t, vector(foot), real(_INITIAL_STEP), real(0), count(0), count(0), active,
         *3 * (vector(0), real(0)),
     )  # fmt: skip
-    return dr.while_loop(start, more, body, label="closing in")[2]
+    return dr.while_loop(start, is_active, body, label="closing in")[2]
 
 
 def is_on_surface(surface: SurfaceTracer, y: Vec3, hit: MarchResult, active: Mask) -> Mask:
@@ -419,6 +427,6 @@ def _tilt_direction(d: Vec3, step: Real, angle: Real) -> Vec3:
 def _spiral_direction(vector: Any, n: Real) -> Vec3:
     """Evenly spread directions, one for each n < `_SPHERE_RAYS`."""
     z = 1 - (2 * n + 1) / _SPHERE_RAYS
-    flat = dr.sqrt(1 - z * z)
+    radius = dr.sqrt(1 - z * z)
     sine, cosine = dr.sincos(_GOLDEN * n)
-    return vector(flat * cosine, flat * sine, z)
+    return vector(radius * cosine, radius * sine, z)

@@ -1,7 +1,7 @@
 """The level sets of a closed mesh's winding number as triangles, of which a tree finds the nearest.
 
-Off its triangles the winding number of a closed mesh is a whole number; so its level sets consist
-of triangles. A triangle belongs to a level as a whole unless others pass through it: then it is cut
+Off its triangles the winding number of a closed mesh is an integer, so its level sets consist of
+triangles. A triangle belongs to a level entirely, unless others pass through it: then it is cut
 along these first.
 """
 
@@ -40,8 +40,8 @@ _BESIDE = 1e-9
 class LevelTriangles:
     """The triangles of a level set, scaled.
 
-    corners: (k, 3, 3) in coordinates of at most about 1; the real ones are center + size times
-        these.
+    corners: (k, 3, 3) in coordinates of at most about 1; the unscaled corners are center + size
+        times these.
     is_complete: whether the surface consists of these triangles only.
     """
 
@@ -59,26 +59,26 @@ class LevelTriangles:
         if isinstance(surface.field, MeshSolid) and surface.clip_volume is None:
             if surface.field.domain is not None or any(surface.level_values):
                 return None
-            closed = surface.field.surface
-            return cls(closed.corners, closed.center, closed.size, True)
+            solid = surface.field.surface
+            return cls(solid.corners, solid.center, solid.size, True)
         mesh = surface.field.jump_mesh()
         if mesh is None or surface.clip_volume is not None or surface.field.domain is not None:
             return None
         vertices, faces, is_all = mesh
-        only_sheets = surface.field.is_of_sheets_alone(surface.level_values)
-        low, high = vertices[faces].min(axis=(0, 1)), vertices[faces].max(axis=(0, 1))
-        size = float(2.0 ** np.ceil(np.log2(0.5 * (high - low).max())))
-        center = round_to_single(0.5 * (low + high))
-        unit = (vertices - center) / size
-        if only_sheets:
-            return cls(unit[faces], center, size, True)
-        rays = _tree(choose_backend("double"), unit, faces)
-        pieces, _ = split_intersecting_faces(rays, unit, faces)
+        is_jumps_only = surface.field.is_of_sheets_alone(surface.level_values)
+        lower, upper = vertices[faces].min(axis=(0, 1)), vertices[faces].max(axis=(0, 1))
+        size = float(2.0 ** np.ceil(np.log2(0.5 * (upper - lower).max())))
+        center = round_to_single(0.5 * (lower + upper))
+        scaled = (vertices - center) / size
+        if is_jumps_only:
+            return cls(scaled[faces], center, size, True)
+        tree = _tree(choose_backend("double"), scaled, faces)
+        pieces, _ = split_intersecting_faces(tree, scaled, faces)
         if is_all:
-            on = separates_levels(rays, pieces, surface.level_values)
+            on_level = separates_levels(tree, pieces, surface.level_values)
         else:
-            on = _proved_on_level(surface, center + size * pieces, size)
-        return cls(pieces[on], center, size, is_all)
+            on_level = _proved_on_level(surface, center + size * pieces, size)
+        return cls(pieces[on_level], center, size, is_all)
 
     def upload(self, backend: Backend) -> Callable[[Vec3], Vec3]:
         """Upload the triangles. Returns a function of points that gives the vector from each to the
@@ -88,15 +88,15 @@ class LevelTriangles:
             return lambda p: vector(dr.nan) + 0 * p
         corners = self.corners
         faces = np.arange(3 * len(corners)).reshape(-1, 3)
-        rays = _tree(backend, corners.reshape(-1, 3), faces, slabs=True)
-        on, center, size = frame_parameters(backend, self.center, self.size)
-        del on
+        tree = _tree(backend, corners.reshape(-1, 3), faces, slabs=True)
+        _frame, center, size = frame_parameters(backend, self.center, self.size)
+        del _frame
 
         def nearest(p: Vec3) -> Vec3:
             x: Any = (vector(p) - center) / size
-            limit = initial_squared_distance(rays, x)
-            after = real(-1), backend.UInt32(NO_TRIANGLE)
-            return next_closest_triangle(rays, x, after, limit, backend.Bool(True)).offset * size
+            limit = initial_squared_distance(tree, x)
+            start = real(-1), backend.UInt32(NO_TRIANGLE)
+            return next_closest_triangle(tree, x, start, limit, backend.Bool(True)).offset * size
 
         return nearest
 
@@ -109,28 +109,28 @@ def _tree(
 
 
 def _proved_on_level(surface: TracedSurface, corners: FloatArray, size: float) -> BoolArray:
-    """(k,) whether all of a triangle, which none passes through, belongs to a level.
+    """(k,) whether all of a triangle, through which no other one passes, belongs to a level.
 
-    Proof. With its jumps, whole numbers, removed, f is smooth about the triangle's center, and
-    takes no level mod 1 within the radius that `level_distance_lower_bound` proves. If that holds
-    the triangle, f on either side of it stays on the same side of the level as just beside the
-    center.
+    Proof. With its jumps, which are whole numbers, removed, f is smooth about the triangle's
+    center, and takes no level mod 1 within the radius that `level_distance_lower_bound` proves. If
+    a ball of that radius contains the triangle, f on either side of it stays on the same side of
+    the level as just beside the center.
     """
     backend, field = choose_backend("double"), surface.field
     prepared = surface.evaluator(backend)
     smooth = EvaluateOnly(prepared.evaluate)
-    targets = Levels(tuple(dr.opaque(backend.Float, v) for v in surface.level_values), 1.0)
+    levels = Levels(tuple(dr.opaque(backend.Float, level) for level in surface.level_values), 1.0)
 
     def clearance(p: Vec3) -> tuple[Any]:
-        return (level_distance_lower_bound(backend, smooth, targets, p, prepared.evaluate(p)),)
+        return (level_distance_lower_bound(backend, smooth, levels, p, prepared.evaluate(p)),)
 
     center = corners.mean(axis=1)
-    (free,) = in_batches(backend, clearance, center)
+    (clearances,) = in_batches(backend, clearance, center)
     radius = np.linalg.norm(corners - center[:, None], axis=2).max(axis=1)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normal, axis=1, keepdims=True)
-    way = _BESIDE * size * normal / np.maximum(length, 1e-300)
-    sides = [field.value(center + sign * way, precision="double") for sign in (1, -1)]
-    low, high = np.minimum(*sides), np.maximum(*sides)
-    between = np.any([(low < v) & (v < high) for v in surface.level_values], axis=0)
-    return between & (free > radius + 2 * _BESIDE * size) & (length[:, 0] > 0)
+    offset = _BESIDE * size * normal / np.maximum(length, 1e-300)
+    sides = [field.value(center + sign * offset, precision="double") for sign in (1, -1)]
+    lower, upper = np.minimum(*sides), np.maximum(*sides)
+    between = np.any([(lower < level) & (level < upper) for level in surface.level_values], axis=0)
+    return between & (clearances > radius + 2 * _BESIDE * size) & (length[:, 0] > 0)

@@ -142,7 +142,7 @@ def second_order_distance(above: Real, gradient: Vec3, rows: tuple[Vec3, Vec3, V
     return dr.select(dr.isfinite(first) & (first != 0), quotient, first)
 
 
-# What searches compute at points, in batches: NumPy on both ends, in double precision.
+# Computations at points, for searches, in batches: NumPy on both ends, in double precision.
 
 # Bounds memory, and the time until an interrupt is noticed.
 _AT_ONCE = 1 << 18
@@ -156,8 +156,8 @@ def in_batches(
 ) -> tuple[Any, ...]:
     """The results of `compute` for points of shape (n, 3), as float64 arrays (n,) or (n, 3).
 
-    others: more vectors of the same shape that `compute` is given, one a lane; their values are
-        not checked.
+    others: further vectors of the same shape, passed to `compute` with the points, one for each
+        lane; their values are not checked.
 
     Raises:
         TypeError, ValueError: points that are not an (n, 3) array of finite numbers of at most
@@ -165,9 +165,9 @@ def in_batches(
     """
     _check_size(points)
     with np.errstate(over="ignore"):
-        rounded = (one.astype(backend.dtype, copy=False) for one in others)
+        rounded = (values.astype(backend.dtype, copy=False) for values in others)
         results = field_points.map_batches(backend, compute, points, *rounded, at_once=_AT_ONCE)
-    return tuple(one.astype(np.float64, copy=False) for one in results)
+    return tuple(values.astype(np.float64, copy=False) for values in results)
 
 
 def _check_size(points: Any) -> None:

@@ -1,4 +1,4 @@
-"""Enclosures: proofs of how far f moves along a path. None of them depends on a kind of field.
+"""Enclosures: proofs of bounds of the movement of f along a path, for fields of any kind.
 
 This package exports the parts that all proofs share. The proofs themselves are names of `harnack`,
 which `harnack/__init__.pyi` lists.

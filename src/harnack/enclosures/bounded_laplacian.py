@@ -66,8 +66,8 @@ class BoundedLaplacianEnclosure(Enclosure):
     bound, w (A-1) + (f_v/3) B + l kappa + m q^2/6, is convex in q, since A'' >= |B''| and kappa''
     >= 0.1907 B'' (checked in the same place), and it is 0 at q = 0.
 
-    Neither end falls as the slope grows: it enters the upper end as +f_v B/3 with B >= 0, and the
-    lower end, that of -f negated, in the same way.
+    Neither end falls as the slope grows: the slope enters the upper end as +f_v B/3 with B >= 0,
+    and the lower end, which is the upper end of -f negated, in the same way.
     """
 
     radius: Real
@@ -86,11 +86,11 @@ class BoundedLaplacianEnclosure(Enclosure):
     ) -> Self | None:
         if not isinstance(promise, BoundedLaplacian):
             return None
-        radius, below, above = allowed_movement(promise, value, error)
-        if below is None or above is None:
+        radius, max_fall, max_rise = allowed_movement(promise, value, error)
+        if max_fall is None or max_rise is None:
             return None
         ends = promise.laplacian_lower, promise.laplacian_upper
-        return cls.from_ranges(radius, (below, above), ends, slopes)
+        return cls.from_ranges(radius, (max_fall, max_rise), ends, slopes)
 
     @classmethod
     def from_ranges(
@@ -103,59 +103,59 @@ class BoundedLaplacianEnclosure(Enclosure):
         """The enclosure of a function that may fall and rise by the two `ranges` in the ball, with
         these bounds (lower, upper) of its Laplacian."""
         half = 0.5 * radius * radius
-        low, high = half * laplacian[0], half * laplacian[1]
-        mean, spread = low + high, high - low
+        lower, upper = half * laplacian[0], half * laplacian[1]
+        mean, spread = lower + upper, upper - lower
         # [mean - spread, mean + spread] contains both ends, whatever the roundings.
-        slack = 4 * float(dr.epsilon(type(spread))) if dr.is_array_v(spread) else 0.0
-        spread = dr.select(spread >= 0, spread + slack * (spread + dr.abs(mean)), dr.nan)
+        rounding = 4 * float(dr.epsilon(type(spread))) if dr.is_array_v(spread) else 0.0
+        spread = dr.select(spread >= 0, spread + rounding * (spread + dr.abs(mean)), dr.nan)
         return cls(radius, *ranges, mean, spread, slopes)
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        up, down = self._conditions(gaps)
+        above, below = self._conditions(gaps)
         q = fmin(
-            largest_free_fraction(up, self.solver_iterations),
-            largest_free_fraction(down, self.solver_iterations),
+            largest_free_fraction(above, self.solver_iterations),
+            largest_free_fraction(below, self.solver_iterations),
         )
         return dr.select(self._is_known(gaps), q * self.radius, 0)
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
-        up, down = self._conditions(gaps)
+        above, below = self._conditions(gaps)
         q = length / self.radius
-        inside = (q <= 1) & self._is_known(gaps)
+        is_inside = (q <= 1) & self._is_known(gaps)
         q = clamp(q, 0, 1)
-        return (length <= 0) | (inside & is_free_fraction(up, q) & is_free_fraction(down, q))
+        return (length <= 0) | (is_inside & is_free_fraction(above, q) & is_free_fraction(below, q))
 
     def _is_known(self, gaps: LevelGaps) -> Mask:
         """Whether ranges, Laplacian and gaps are numbers, and not too large or small."""
-        known = (gaps.below >= 0) & (gaps.above >= 0) & dr.isfinite(self.laplacian_mean)
-        for side in (self.max_fall + self.max_rise, self.laplacian_spread):
-            known = known & ((side == 0) | (dr.isfinite(1 / side) & dr.isfinite(4 * side)))
-        return known
+        is_valid = (gaps.below >= 0) & (gaps.above >= 0) & dr.isfinite(self.laplacian_mean)
+        for x in (self.max_fall + self.max_rise, self.laplacian_spread):
+            is_valid = is_valid & ((x == 0) | (dr.isfinite(1 / x) & dr.isfinite(4 * x)))
+        return is_valid
 
     def _conditions(self, gaps: LevelGaps) -> tuple[_GreenCondition, _GreenCondition]:
         """The conditions for f not to reach the level above, and the level below."""
-        below, above, slopes = self.max_fall, self.max_rise, self.slopes
+        fall, rise, slopes = self.max_fall, self.max_rise, self.slopes
         return (
-            self._growth(gaps.above, below, above, self.laplacian_mean, slopes.upper),
-            self._growth(gaps.below, above, below, -self.laplacian_mean, slopes.negated().upper),
+            self._growth(gaps.above, fall, rise, self.laplacian_mean, slopes.upper),
+            self._growth(gaps.below, rise, fall, -self.laplacian_mean, slopes.negated().upper),
         )
 
-    def _growth(self, gap: Real, u: Real, most: Real, mean: Real, slope: Real) -> _GreenCondition:
-        """The condition in units of w + l; u, most: how far f is above c, and may rise."""
+    def _growth(self, gap: Real, u: Real, rise: Real, mean: Real, slope: Real) -> _GreenCondition:
+        """The condition in units of w + l. u: f - c at p. rise: the largest rise of f."""
         w = fmax(dr.fma(mean, 1 / 6, u), 0)
         scale = w + self.laplacian_spread
-        share = dr.select(scale > 0, 1 / scale, 0)
-        w, spread = w * share, self.laplacian_spread * share
-        steepest = dr.fma(GREEN_SLOPE_BOUND, spread, w)
-        slack = condition_rounding(type(gap))
+        inverse = dr.select(scale > 0, 1 / scale, 0)
+        w, spread = w * inverse, self.laplacian_spread * inverse
+        max_slope = dr.fma(GREEN_SLOPE_BOUND, spread, w)
+        rounding = condition_rounding(type(gap))
         # A slope that is not a number counts as the steepest.
-        slope = fmin(slope * (self.radius / 3 * share) + slack, steepest)
-        slope = fmax(slope, slack - steepest)
+        slope = fmin(slope * (self.radius / 3 * inverse) + rounding, max_slope)
+        slope = fmax(slope, rounding - max_slope)
         # A level outside of the range is never met, and a constant function meets none.
-        is_met = (gap <= most) & (scale > 0)
-        gap = dr.select(is_met, fmin(gap * share, _UNREACHABLE_GAP), _UNREACHABLE_GAP)
+        is_reachable = (gap <= rise) & (scale > 0)
+        gap = dr.select(is_reachable, fmin(gap * inverse, _UNREACHABLE_GAP), _UNREACHABLE_GAP)
         return _GreenCondition(
-            gap / (dr.sqrt(1 + gap) + 1), w, slope, spread, fmax(mean * share, 0)
+            gap / (dr.sqrt(1 + gap) + 1), w, slope, spread, fmax(mean * inverse, 0)
         )
 
 
@@ -177,16 +177,16 @@ class _GreenCondition:
         # The logarithm, taken at about the root for slope 0.
         log = clamp(-0.5 * dr.log(fmax(self.gap, 1e-12)), 0, 14)
         first = 3 * self.slope
-        bend = dr.fma(GREEN_KERNEL_BOUND * self.spread, 2 + log, 5 * self.weight - 2 * first)
-        second = 0.5 * (1 + bend + self.mean / 6) - 0.125 * (first - 2) * (first - 2)
+        quadratic = dr.fma(GREEN_KERNEL_BOUND * self.spread, 2 + log, 5 * self.weight - 2 * first)
+        second = 0.5 * (1 + quadratic + self.mean / 6) - 0.125 * (first - 2) * (first - 2)
         return self.gap + 0.5 * first, second
 
     def __call__(self, q: Real) -> Real:
-        s, r, back = q * q, 1 / (1 + q), 1 - q
+        s, r, p = q * q, 1 / (1 + q), 1 - q
         log = 2 - dr.log(fmax(q, 1e-30))
         inner = q * dr.fma(self.weight, 5 - s, GREEN_KERNEL_BOUND * self.spread * log)
         inner = dr.fma(self.slope, 3 + s, inner)
-        c = dr.fma(inner, r * r, q * dr.fma(self.mean * (1 / 6) * back, back, 1))  # (S-1)/q + 2
+        c = dr.fma(inner, r * r, q * dr.fma(self.mean * (1 / 6) * p, p, 1))  # (S-1)/q + 2
         root = dr.sqrt(fmax(dr.fma(q, c - 2, 1), 0))
-        share = 1 / (root + 1)
-        return self.gap + share * (c + q * (c - 2) * share)
+        inverse = 1 / (root + 1)
+        return self.gap + inverse * (c + q * (c - 2) * inverse)

@@ -94,8 +94,8 @@ class LevelGaps:
 
     def reduced_by(self, error: Real) -> LevelGaps:
         """The gaps that remain at least if the value may be wrong by `error`."""
-        down, up = fmax(self.below - error, 0), fmax(self.above - error, 0)
-        return LevelGaps(down, up, self.is_one_sided)
+        below, above = fmax(self.below - error, 0), fmax(self.above - error, 0)
+        return LevelGaps(below, above, self.is_one_sided)
 
     def swapped(self) -> LevelGaps:
         """The gaps of -f."""
@@ -163,7 +163,7 @@ class Enclosure(abc.ABC):
         """The enclosure that this class proves from ranges of the derivatives of f along the path;
         None if it does not use ranges.
 
-        length: the reach that is asked for.
+        length: the requested reach.
         slopes: of f along the path, at its start.
         """
         del function, slopes, length
@@ -205,22 +205,22 @@ class Levels:
         and with a period the gap on the other is at most the period. Where f is NaN, the gaps are
         NaN.
         """
-        down: Real = math.inf
-        up: Real = math.inf
+        below: Real = math.inf
+        above: Real = math.inf
         for level in self.values:
-            above = f - level  # > 0: the level lies below f
+            offset = f - level  # > 0: the level lies below f
             if self.period is not None:
                 # Within half a period of 0, where rounding cannot confuse the sides of a level.
-                reduced = above - self.period * dr.round(above / self.period)
+                reduced = offset - self.period * dr.round(offset / self.period)
                 is_above = reduced >= 0
                 below_gap = dr.select(is_above, reduced, self.period + reduced)
                 above_gap = dr.select(is_above, self.period - reduced, -reduced)
             else:
                 # Compared in this order, NaN gives NaN, which proves nothing.
-                below_gap = dr.select(above < 0, math.inf, above)
-                above_gap = dr.select(above > 0, math.inf, -above)
-            down, up = fmin(down, below_gap), fmin(up, above_gap)
-        return LevelGaps(down, up, len(self.values) == 1 and self.period is None)
+                below_gap = dr.select(offset < 0, math.inf, offset)
+                above_gap = dr.select(offset > 0, math.inf, -offset)
+            below, above = fmin(below, below_gap), fmin(above, above_gap)
+        return LevelGaps(below, above, len(self.values) == 1 and self.period is None)
 
     def offset_to_nearest(self, f: Real) -> Real:
         """level - f for the level nearest to f."""

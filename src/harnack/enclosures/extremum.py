@@ -1,4 +1,4 @@
-"""Enclosures of functions that are the greatest or the nearest of several, and of maps of others.
+"""Enclosures of maxima and of nearest branches of several functions, and of mapped functions.
 
 - `MaximumEnclosure`, with `NegatedEnclosure` and `ScaledEnclosure`: unions, intersections and
   differences of solids, and solids that were moved and scaled.
@@ -49,42 +49,42 @@ class MaximumEnclosure(Enclosure):
     operands: tuple[MaximumOperand, ...]
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        none = type(gaps.above)(dr.inf)
-        up, down = none, type(gaps.above)(0)
-        for part in self.operands:
-            rise, fall = self._gaps(gaps, part)
-            up = fmin(longest_free_length(part.enclosures, rise), up)
-            fallen = longest_free_length(part.enclosures, fall)
-            # A part that may lie below the level already proves nothing, whatever its slope.
-            down = fmax(dr.select(fall.below > 0, fallen, 0), down)
-        up = dr.select(gaps.above == dr.inf, none, up)
-        down = dr.select(gaps.below == dr.inf, none, down)
-        reach = fmin(up, down)
-        return dr.select(reach == dr.inf, self._reach(none), reach)
+        inf = type(gaps.above)(dr.inf)
+        rise_length, fall_length = inf, type(gaps.above)(0)
+        for operand in self.operands:
+            rise, fall = self._gaps(gaps, operand)
+            rise_length = fmin(longest_free_length(operand.enclosures, rise), rise_length)
+            length = longest_free_length(operand.enclosures, fall)
+            # An operand that may lie below the level already proves nothing, whatever its slope.
+            fall_length = fmax(dr.select(fall.below > 0, length, 0), fall_length)
+        rise_length = dr.select(gaps.above == dr.inf, inf, rise_length)
+        fall_length = dr.select(gaps.below == dr.inf, inf, fall_length)
+        reach = fmin(rise_length, fall_length)
+        return dr.select(reach == dr.inf, self._reach(inf), reach)
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
-        up, down = gaps.above == gaps.above, gaps.below == dr.inf
-        for part in self.operands:
-            rise, fall = self._gaps(gaps, part)
-            up &= any_is_free(part.enclosures, rise, length)
-            down |= (fall.below > 0) & any_is_free(part.enclosures, fall, length)
-        return (up | (gaps.above == dr.inf)) & down
+        free_above, free_below = gaps.above == gaps.above, gaps.below == dr.inf
+        for operand in self.operands:
+            rise, fall = self._gaps(gaps, operand)
+            free_above &= any_is_free(operand.enclosures, rise, length)
+            free_below |= (fall.below > 0) & any_is_free(operand.enclosures, fall, length)
+        return (free_above | (gaps.above == dr.inf)) & free_below
 
-    def _reach(self, none: Real) -> Real:
+    def _reach(self, inf: Real) -> Real:
         """The reach of the enclosures of all operands, if there is no level."""
-        reach = none
-        for part in self.operands:
-            reach = fmin(longest_free_length(part.enclosures, LevelGaps(none, none)), reach)
+        reach = inf
+        for operand in self.operands:
+            reach = fmin(longest_free_length(operand.enclosures, LevelGaps(inf, inf)), reach)
         return reach
 
     @staticmethod
-    def _gaps(gaps: LevelGaps, part: MaximumOperand) -> tuple[LevelGaps, LevelGaps]:
-        """How far an operand must rise, and how far it must fall, for the maximum to meet a
+    def _gaps(gaps: LevelGaps, operand: MaximumOperand) -> tuple[LevelGaps, LevelGaps]:
+        """The gaps by which an operand must rise, and must fall, for the maximum to meet a
         level."""
-        none = type(gaps.above)(dr.inf)
+        inf = type(gaps.above)(dr.inf)
         return (
-            LevelGaps(none, gaps.above + part.min_deficit, is_one_sided=True),
-            LevelGaps(fmax(gaps.below - part.max_deficit, 0), none, is_one_sided=True),
+            LevelGaps(inf, gaps.above + operand.min_deficit, is_one_sided=True),
+            LevelGaps(fmax(gaps.below - operand.max_deficit, 0), inf, is_one_sided=True),
         )
 
 
@@ -121,15 +121,15 @@ class ScaledEnclosure(Enclosure):
         return self.inner.is_free(self._gaps(gaps), length * self.speed / STEP_SAFETY)
 
     def _gaps(self, gaps: LevelGaps) -> LevelGaps:
-        share = STEP_SAFETY / self.value_factor
-        down, up = _scaled(gaps.below, share), _scaled(gaps.above, share)
-        return LevelGaps(down, up, gaps.is_one_sided)
+        factor = STEP_SAFETY / self.value_factor
+        below, above = _scaled(gaps.below, factor), _scaled(gaps.above, factor)
+        return LevelGaps(below, above, gaps.is_one_sided)
 
 
-def _scaled(gap: Real, share: Real) -> Real:
+def _scaled(gap: Real, factor: Real) -> Real:
     """The gap times a positive number; a finite gap stays finite, also if the product overflows."""
     largest = type(gap)(dr.largest(type(gap)))
-    return dr.select(gap == dr.inf, gap, fmin(largest, gap * share))
+    return dr.select(gap == dr.inf, gap, fmin(largest, gap * factor))
 
 
 @dataclass(frozen=True)
@@ -188,14 +188,14 @@ class NearestBranchEnclosure(Enclosure):
             ),
             length,
         )
-        known = (length >= 0) & (self.distance >= 0)
-        for sheet in self.branches:
-            gap = fmax(towards + sheet.excess, 0)
-            one = first_reach(gap, -sheet.slopes.lower, self.second_derivative_bound)
-            known &= one >= 0
-            length = fmin(length, one)
-        known &= (self.second_derivative_bound >= 0) & (self.reach > 0)
-        return fmax(dr.select(known, fmin(length, self.reach), 0) * STEP_SAFETY, 0)
+        is_valid = (length >= 0) & (self.distance >= 0)
+        for branch in self.branches:
+            gap = fmax(towards + branch.excess, 0)
+            branch_length = first_reach(gap, -branch.slopes.lower, self.second_derivative_bound)
+            is_valid &= branch_length >= 0
+            length = fmin(length, branch_length)
+        is_valid &= (self.second_derivative_bound >= 0) & (self.reach > 0)
+        return fmax(dr.select(is_valid, fmin(length, self.reach), 0) * STEP_SAFETY, 0)
 
 
 # Powers may have larger rounding errors than `STEP_SAFETY` covers.
@@ -221,8 +221,8 @@ class BranchPointEnclosure(Enclosure):
 
     distance_to_limit: y.
     max_fall_rate: v.
-    closest_parameter, closest_distance: how far ahead the path is closest to the branch line, and
-        its distance from the line there; both are lengths in the plane.
+    closest_parameter, closest_distance: the length at which the path is closest to the branch line,
+        and its distance from the line there; both are lengths in the plane.
     speed: of the path in the plane.
     exponent, constant: alpha and C.
     max_radius: the largest r that may be used, R less rounding.
@@ -244,26 +244,24 @@ class BranchPointEnclosure(Enclosure):
     def free_length(self, gaps: LevelGaps) -> Real:
         towards = dr.select(self.is_positive, gaps.below, gaps.above)
         away = dr.select(self.is_positive, gaps.above, gaps.below)
-        room = self.distance_to_limit - fmax(self.distance - towards, 0)
-        together = room + self.distance + towards + self.max_fall_rate + self.speed
-        room = dr.select(together == together, room, 0)  # NaN proves nothing
+        w = self.distance_to_limit - fmax(self.distance - towards, 0)
+        total = w + self.distance + towards + self.max_fall_rate + self.speed
+        w = dr.select(total == total, w, 0)  # NaN proves nothing
         best = 0 * self.distance_to_limit
-        for part in _TRIED_FRACTIONS:
-            share = fmax(part * room / self.constant, 0)
-            radius = dr.power(share, 1 / self.exponent) * _POWER_SAFETY
-            radius = dr.select(dr.isfinite(share) & (radius >= 0), fmin(radius, self.max_radius), 0)
+        for q in _TRIED_FRACTIONS:
+            power = fmax(q * w / self.constant, 0)
+            radius = dr.power(power, 1 / self.exponent) * _POWER_SAFETY
+            radius = dr.select(dr.isfinite(power) & (radius >= 0), fmin(radius, self.max_radius), 0)
             chord = (radius - self.closest_distance) * (radius + self.closest_distance)
-            leaves = self.closest_parameter + dr.sqrt(fmax(chord, 0))
-            leaves = dr.select(self.speed > 0, leaves / self.speed, dr.inf)
-            length = dr.select(
-                self.max_fall_rate > 0, (1 - part) * room / self.max_fall_rate, dr.inf
-            )
-            length = fmin(leaves, length)
-            start = (
+            exit_length = self.closest_parameter + dr.sqrt(fmax(chord, 0))
+            exit_length = dr.select(self.speed > 0, exit_length / self.speed, dr.inf)
+            length = dr.select(self.max_fall_rate > 0, (1 - q) * w / self.max_fall_rate, dr.inf)
+            length = fmin(exit_length, length)
+            inside = (
                 self.closest_distance * self.closest_distance
                 + self.closest_parameter * self.closest_parameter
                 < radius * radius
             )
-            known = start & (room > 0) & (chord > 0) & dr.isfinite(chord)  # squares may overflow
-            best = fmax(dr.select(known, length, 0), best)
+            valid = inside & (w > 0) & (chord > 0) & dr.isfinite(chord)  # squares may overflow
+            best = fmax(dr.select(valid, length, 0), best)
         return dr.select(away == dr.inf, best * _POWER_SAFETY, 0)

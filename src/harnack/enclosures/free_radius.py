@@ -36,8 +36,8 @@ _ROUNDINGS = 16.0
 
 
 class FreeRadiusCondition(Protocol):
-    """A condition q k(q) <= gap which proves that all of [0, q] is free of levels, q a fraction of
-    the radius. q k(q) crosses the gap upwards at most once on [0, 1]."""
+    """A condition q k(q) <= gap which proves that all of [0, q] is free of levels, where q is a
+    fraction of the radius. q k(q) crosses the gap upwards at most once on [0, 1]."""
 
     @property
     def gap(self) -> Real: ...
@@ -58,14 +58,14 @@ def condition_rounding(real: Any) -> float:
 
 def is_free_fraction(condition: FreeRadiusCondition, q: Real) -> Mask:
     """Whether all of [0, q] is proved free, for 0 <= q <= 1."""
-    slack = condition_rounding(type(q))
-    return q * (condition(q) + slack) <= condition.gap * CONDITION_SAFETY
+    rounding = condition_rounding(type(q))
+    return q * (condition(q) + rounding) <= condition.gap * CONDITION_SAFETY
 
 
 def largest_free_fraction(condition: FreeRadiusCondition, rounds: int) -> Real:
     """The largest q in [0, 1) that is proved free, approached from below.
 
-    Four rounds come within 1e-5 of it for four balls in five, and within a few percent wherever
+    Four iterations come within 1e-5 of it for four balls in five, and within a few percent wherever
     the extremal measure is not concentrated in 1e-3 of the sphere; twelve come within 1e-5.
 
     Why it is safe: only a q at which q k(q) <= gap was *evaluated* is returned; by the single
@@ -76,29 +76,29 @@ def largest_free_fraction(condition: FreeRadiusCondition, rounds: int) -> Real:
     is covered if q k(q) is convex.
     """
     real = cast("Any", type(condition.gap))
-    gap, slack = condition.gap, condition_rounding(real)
+    gap, rounding = condition.gap, condition_rounding(real)
     previous_q = real(0)
-    previous_k, bend = condition.expansion_at_zero()
-    q = clamp(_root(gap, previous_k, bend), 0, 1)
-    safe, below = real(0), -gap  # q k(q) - gap at the ends of the bracket
-    unsafe, above = real(1), real(dr.inf)
+    previous_k, slope = condition.expansion_at_zero()
+    q = clamp(_root(gap, previous_k, slope), 0, 1)
+    safe, low_excess = real(0), -gap  # q k(q) - gap at the ends of the bracket
+    unsafe, high_excess = real(1), real(dr.inf)
     for i in range(rounds):
         if i == rounds - 1:
-            part = dr.select(dr.isfinite(above), below / (below - above), 1)
-            q = fmax(safe, dr.select(dr.isfinite(above), dr.fma(part, unsafe - safe, safe), q))
+            t = dr.select(dr.isfinite(high_excess), low_excess / (low_excess - high_excess), 1)
+            q = fmax(safe, dr.select(dr.isfinite(high_excess), dr.fma(t, unsafe - safe, safe), q))
             q = q * CONDITION_SAFETY
         # Candidates aim at twice the slack, so that rounding does not fail them.
-        k = condition(q) + 2 * slack
-        excess = dr.fma(q, k - slack, -gap)
-        good: Mask = excess <= 0
-        better = good & (q >= safe)
-        safe, below = dr.select(better, q, safe), dr.select(better, excess, below)
-        worse = ~good & (q <= unsafe)
-        unsafe, above = dr.select(worse, q, unsafe), dr.select(worse, excess, above)
-        run = q - previous_q
-        bend = dr.select(run == 0, 0, (k - previous_k) / run)
+        k = condition(q) + 2 * rounding
+        excess = dr.fma(q, k - rounding, -gap)
+        is_free: Mask = excess <= 0
+        better = is_free & (q >= safe)
+        safe, low_excess = dr.select(better, q, safe), dr.select(better, excess, low_excess)
+        worse = ~is_free & (q <= unsafe)
+        unsafe, high_excess = dr.select(worse, q, unsafe), dr.select(worse, excess, high_excess)
+        step = q - previous_q
+        slope = dr.select(step == 0, 0, (k - previous_k) / step)
         previous_q, previous_k = q, k
-        q = clamp(_root(gap, dr.fma(-bend, q, k), bend), safe, unsafe)
+        q = clamp(_root(gap, dr.fma(-slope, q, k), slope), safe, unsafe)
     return safe * CONDITION_SAFETY
 
 
@@ -106,11 +106,11 @@ def _root(gap: Real, constant: Real, slope: Real) -> Real:
     """The positive root of x (constant + slope x) = gap, or 1 if there is none."""
     root = dr.sqrt(fmax(dr.fma(constant, constant, 4 * slope * gap), 0))
     # Two forms of the same root, each used where the other one cancels.
-    rises = constant > 0
-    above = dr.select(rises, 2 * gap, root - constant)
-    below = dr.select(rises, constant + root, 2 * slope)
-    candidate = above / below
-    return dr.select((below > 0) & dr.isfinite(candidate), candidate, 1)
+    is_rising = constant > 0
+    numerator = dr.select(is_rising, 2 * gap, root - constant)
+    denominator = dr.select(is_rising, constant + root, 2 * slope)
+    candidate = numerator / denominator
+    return dr.select((denominator > 0) & dr.isfinite(candidate), candidate, 1)
 
 
 # A radius is multiplied by this, as distances carry a few roundings of float32.
@@ -138,18 +138,18 @@ class HarmonicBallEnclosure(Enclosure):
     ) -> Self | None:
         if not isinstance(promise, HarmonicBall):
             return None
-        radius, below, above = allowed_movement(promise, value, error)
-        if not cls.applies_to(promise.dimension, below is not None, above is not None):
+        radius, max_fall, max_rise = allowed_movement(promise, value, error)
+        if not cls.applies_to(promise.dimension, max_fall is not None, max_rise is not None):
             return None
-        return cls(radius, below, above, promise.dimension, slopes)
+        return cls(radius, max_fall, max_rise, promise.dimension, slopes)
 
     def is_valid(self, gaps: LevelGaps) -> Mask:
         """Whether ranges and gaps are numbers, and large enough to divide by."""
-        known = (gaps.below >= 0) & (gaps.above >= 0)
-        for one in (self.max_fall, self.max_rise):
-            if one is not None:
-                known &= (one == 0) | (dr.isfinite(1 / one) & dr.isfinite(2 * one))
-        return known
+        valid = (gaps.below >= 0) & (gaps.above >= 0)
+        for movement in (self.max_fall, self.max_rise):
+            if movement is not None:
+                valid &= (movement == 0) | (dr.isfinite(1 / movement) & dr.isfinite(2 * movement))
+        return valid
 
     @classmethod
     def applies_to(cls, dimension: int, is_bounded_below: bool, is_bounded_above: bool) -> bool:
@@ -161,24 +161,24 @@ class HarmonicBallEnclosure(Enclosure):
 def allowed_movement(
     promise: HarmonicBall | BoundedLaplacian, value: Real, error: Real
 ) -> tuple[Real, Real | None, Real | None]:
-    """The radius of a promise, and how far it lets f fall and rise (None: that side is not
-    bounded).
+    """The radius of a promise, and bounds of the fall and of the rise of f that it implies (None:
+    that side is not bounded).
 
     The ends of the promise are moved outwards by the error and by eight units in the last place of
     f: if the two ends are equal up to rounding, the promise would otherwise prove f constant. A
     radius that is not a positive number, or a NaN anywhere, proves nothing (radius 0).
     """
-    unit = 2 * float(dr.epsilon(type(value)))  # Dr.Jit's is half the distance to the next number
-    total_error = dr.fma(8 * unit, dr.abs(value), error)
-    known = promise.radius > 0
+    epsilon = 2 * float(dr.epsilon(type(value)))  # Dr.Jit's is half the distance to the next number
+    total_error = dr.fma(8 * epsilon, dr.abs(value), error)
+    is_valid = promise.radius > 0
 
     def movement(end: Real, sign: float) -> Real | None:
-        nonlocal known
+        nonlocal is_valid
         if isinstance(end, float) and math.isinf(end):
             return None
         distance = sign * (end - value)
-        known = known & (distance == distance)  # not NaN
+        is_valid = is_valid & (distance == distance)  # not NaN
         return fmax(distance, 0) + total_error
 
-    below, above = movement(promise.lower, -1.0), movement(promise.upper, 1.0)
-    return dr.select(known, promise.radius * _RADIUS_SAFETY, 0), below, above
+    fall, rise = movement(promise.lower, -1.0), movement(promise.upper, 1.0)
+    return dr.select(is_valid, promise.radius * _RADIUS_SAFETY, 0), fall, rise

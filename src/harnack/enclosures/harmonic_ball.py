@@ -54,17 +54,17 @@ class HarnackEnclosure(HarmonicBallEnclosure):
         return dr.select(self.is_valid(gaps), self.radius * self._fraction(gaps), 0)
 
     def _fraction(self, gaps: LevelGaps) -> Real:
-        """The step divided by the radius, from whichever sides are bounded."""
-        below = above = None
+        """The step divided by the radius, from the sides that are bounded."""
+        lower = upper = None
         if self.max_fall is not None:
-            below = _fraction_from_one_side(self.max_fall, gaps.above, gaps.below, self.dimension)
+            lower = _fraction_from_one_side(self.max_fall, gaps.above, gaps.below, self.dimension)
         if self.max_rise is not None:  # the same for upper - f, positive and harmonic
-            above = _fraction_from_one_side(self.max_rise, gaps.below, gaps.above, self.dimension)
-        if below is None or above is None:
-            one = below if above is None else above
-            assert one is not None
-            return one
-        return fmax(below, above)
+            upper = _fraction_from_one_side(self.max_rise, gaps.below, gaps.above, self.dimension)
+        if lower is None or upper is None:
+            fraction = lower if upper is None else upper
+            assert fraction is not None
+            return fraction
+        return fmax(lower, upper)
 
 
 def _fraction_from_one_side(u: Real, gap_away: Real, gap_toward: Real, dimension: int) -> Real:
@@ -161,21 +161,21 @@ class HarnackSlopeEnclosure(HarmonicBallEnclosure):
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
         q = length / self.radius
-        covered = q <= 1
+        is_covered = q <= 1
         q = clamp(q, 0, 1)
         for alternatives in self._conditions(gaps):
-            free = None
+            side_free = None
             for condition in alternatives:
                 proved = is_free_fraction(condition, q)
-                free = proved if free is None else free | proved
-            covered = covered & free
-        return (length <= 0) | (covered & self.is_valid(gaps))
+                side_free = proved if side_free is None else side_free | proved
+            is_covered = is_covered & side_free
+        return (length <= 0) | (is_covered & self.is_valid(gaps))
 
     def _conditions(
         self, gaps: LevelGaps
     ) -> tuple[list[FreeRadiusCondition], list[FreeRadiusCondition]]:
-        """The conditions for f not to reach the level above, and the level below; on each side one
-        of them is enough."""
+        """The conditions for f not to reach the level above, and the level below; on each side it
+        is enough that one holds."""
         up: list[FreeRadiusCondition] = []
         down: list[FreeRadiusCondition] = []
         rising = self.slopes
@@ -186,17 +186,17 @@ class HarnackSlopeEnclosure(HarmonicBallEnclosure):
             if u is None:
                 continue
             # u = 0 forces u to vanish identically: no level is ever reached.
-            share = dr.select(u > 0, 1 / u, dr.inf)
-            scale = self.radius * share / self.dimension
-            most = dr.select(u > 0, slopes.upper * scale, 0)
-            least = dr.select(u > 0, slopes.lower * scale, 0)
+            inv_u = dr.select(u > 0, 1 / u, dr.inf)
+            scale = self.radius * inv_u / self.dimension
+            upper = dr.select(u > 0, slopes.upper * scale, 0)
+            lower = dr.select(u > 0, slopes.lower * scale, 0)
             slack = condition_rounding(type(gaps.above))
             # NaN for a slope counts as the worst one, on both sides.
-            steep, flat = fmax(fmin(most + slack, 1), -1), clamp(least - slack, -1, 1)
+            m_max, m_min = fmax(fmin(upper + slack, 1), -1), clamp(lower - slack, -1, 1)
             away.append(
-                _ChordCondition.of(fmin(gap_away * share, _UNREACHABLE_GAP), steep, self.dimension)
+                _ChordCondition.of(fmin(gap_away * inv_u, _UNREACHABLE_GAP), m_max, self.dimension)
             )
-            toward.append(_JensenCondition(fmin(gap_toward * share, 1), flat, self.dimension))
+            toward.append(_JensenCondition(fmin(gap_toward * inv_u, 1), m_min, self.dimension))
         return up, down
 
 
@@ -235,13 +235,13 @@ class _ChordCondition:
         if self.dimension == 3:
             c = dr.fma(q * (5 - s) + m * (3 + s), r * r, q)  # (B - 1)/q + 2
             root = dr.sqrt(fmax(dr.fma(q, c - 2, 1), 0))
-            share = 1 / (root + 1)
-            return self.gap + share * (c + q * (c - 2) * share)
+            inverse = 1 / (root + 1)
+            return self.gap + inverse * (c + q * (c - 2) * inverse)
         a = q * (9 + s * (s - 2)) + 4 * m * (1 + s)
         c = dr.fma(a, r * r * r, q * (3 - q))  # (B - 1)/q + 3
         root = dr.cbrt(fmax(dr.fma(q, c - 3, 1), 0))
-        share = 1 / dr.fma(root, root + 1, 1)
-        return self.gap + share * (c + q * (c - 3) * share * (root + 2))
+        inverse = 1 / dr.fma(root, root + 1, 1)
+        return self.gap + inverse * (c + q * (c - 3) * inverse * (root + 2))
 
 
 @dataclass(frozen=True)
@@ -257,9 +257,9 @@ class _JensenCondition:
     dimension: int
 
     def expansion_at_zero(self) -> tuple[Real, Real]:
-        n, m, rest = self.dimension, self.mean, 1 - self.gap
+        n, m, weight = self.dimension, self.mean, 1 - self.gap
         second = 1 + 0.5 * n * (1 + (n - 2) * m * m)
-        return -rest * n * m, dr.fma(rest, second, self.gap)
+        return -weight * n * m, dr.fma(weight, second, self.gap)
 
     def __call__(self, q: Real) -> Real:
         e = q - 2 * self.mean
@@ -324,31 +324,31 @@ class SphericalCapEnclosure(HarmonicBallEnclosure):
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
         up, down = self._conditions(gaps)
         q = length / self.radius
-        inside = (q <= 1) & self.is_valid(gaps)
+        is_inside = (q <= 1) & self.is_valid(gaps)
         q = clamp(q, 0, 1)
-        return (length <= 0) | (inside & is_free_fraction(up, q) & is_free_fraction(down, q))
+        return (length <= 0) | (is_inside & is_free_fraction(up, q) & is_free_fraction(down, q))
 
     def _conditions(self, gaps: LevelGaps) -> tuple[_CapCondition, _CapCondition]:
         """The conditions for f not to reach the level above, and the level below."""
-        below, above = self.max_fall, self.max_rise
-        assert below is not None
-        assert above is not None
-        share = 1 / (below + above)
-        p, rest = below * share, above * share
-        moment = self.radius * share / 3
+        fall, rise = self.max_fall, self.max_rise
+        assert fall is not None
+        assert rise is not None
+        inverse = 1 / (fall + rise)
+        p, rest = fall * inverse, rise * inverse
+        moment = self.radius * inverse / 3
         rising, falling = moment * self.slopes.upper, -moment * self.slopes.lower
         return (
-            _two_caps(gaps.above, above, p, rest, rising),
-            _two_caps(gaps.below, below, rest, p, falling),
+            _two_caps(gaps.above, rise, p, rest, rising),
+            _two_caps(gaps.below, fall, rest, p, falling),
         )
 
 
-def _two_caps(gap: Real, most: Real, p: Real, rest: Real, mu: Real) -> _CapCondition:
+def _two_caps(gap: Real, max_rise: Real, p: Real, rest: Real, mu: Real) -> _CapCondition:
     # Without a range f is constant: no level is ever reached.
     slack = condition_rounding(type(gap)) * p
     shift = dr.select(rest > 0, mu / rest, 0) + slack
     shift = fmax(fmin(shift, p), -p)  # the worst one, p, if the slope is not a number
-    return _CapCondition(dr.select(gap < most, gap / most, 1), p, rest, shift)
+    return _CapCondition(dr.select(gap < max_rise, gap / max_rise, 1), p, rest, shift)
 
 
 @dataclass(frozen=True)
@@ -371,10 +371,10 @@ class _CapCondition:
     def __call__(self, q: Real) -> Real:
         # s = 1 + q x with x = e/(s+1), as s^2 = 1 + q e.
         e1, e2 = q - 2 * (self.rest - self.shift), q + 2 * (self.rest + self.shift)
-        back, on = 1 - q, 1 + q
-        s1 = dr.sqrt(dr.fma(back, back, 2 * q * (self.p + self.shift)))
-        s2 = dr.sqrt(dr.fma(on, on, -2 * q * (self.p - self.shift)))
-        both = 1 / ((s1 + 1) * (s2 + 1))
-        total = dr.fma(e1, s2 + 1, e2 * (s1 + 1)) * both  # x1 + x2
-        rise = q * dr.fma(e1 * e2, both, 1) + total * dr.fma(0.5 * s1, s2, 1)
+        one_minus_q, one_plus_q = 1 - q, 1 + q
+        s1 = dr.sqrt(dr.fma(one_minus_q, one_minus_q, 2 * q * (self.p + self.shift)))
+        s2 = dr.sqrt(dr.fma(one_plus_q, one_plus_q, -2 * q * (self.p - self.shift)))
+        inverse = 1 / ((s1 + 1) * (s2 + 1))
+        total = dr.fma(e1, s2 + 1, e2 * (s1 + 1)) * inverse  # x1 + x2
+        rise = q * dr.fma(e1 * e2, inverse, 1) + total * dr.fma(0.5 * s1, s2, 1)
         return dr.fma(1 - self.gap, rise, self.gap * q)

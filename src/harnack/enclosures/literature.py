@@ -48,20 +48,20 @@ class BottomUpQuadraticEnclosure(ParabolaEnclosure):
     ) -> Self | None:
         if not isinstance(function, EvaluableRestriction):
             return None
-        made = _parabolas(function, length, cls.degree)
-        (a, b), (c, d) = made.bounds
+        parabolas = _parabolas(function, length, cls.degree)
+        (a, b), (c, d) = parabolas.bounds
         return cls(SlopeRange(a, c), 2 * b, 2 * d, length)
 
     def free_length(self, gaps: LevelGaps) -> Real:
         # All of the length, not shortened for rounding: else a ray that misses needs one more
         # sample.
-        nearer = LevelGaps(gaps.below * STEP_SAFETY, gaps.above * STEP_SAFETY)
-        known = dr.isfinite(self.slopes.lower + self.slopes.upper)
-        known &= dr.isfinite(self.min_second_derivative + self.max_second_derivative) & (
+        smaller_gaps = LevelGaps(gaps.below * STEP_SAFETY, gaps.above * STEP_SAFETY)
+        is_finite = dr.isfinite(self.slopes.lower + self.slopes.upper)
+        is_finite &= dr.isfinite(self.min_second_derivative + self.max_second_derivative) & (
             self.reach > 0
         )
-        free = known & self.is_free(nearer, self.reach)
-        return dr.select(free, self.reach, super().free_length(gaps))
+        is_free = is_finite & self.is_free(smaller_gaps, self.reach)
+        return dr.select(is_free, self.reach, super().free_length(gaps))
 
 
 class BottomUpLinearEnclosure(BottomUpQuadraticEnclosure):
@@ -91,14 +91,14 @@ class LongestOfEnclosure(Enclosure):
     def from_restriction(
         cls, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> Self | None:
-        made = [kind.from_restriction(function, slopes, length) for kind in cls.kinds]
-        several = tuple(one for one in made if one is not None)
-        return cls(several) if several else None
+        candidates = [kind.from_restriction(function, slopes, length) for kind in cls.kinds]
+        enclosures = tuple(enclosure for enclosure in candidates if enclosure is not None)
+        return cls(enclosures) if enclosures else None
 
     def free_length(self, gaps: LevelGaps) -> Real:
         longest: Real = type(gaps.above)(0)
-        for one in self.enclosures:
-            longest = fmax(one.free_length(gaps), longest)
+        for enclosure in self.enclosures:
+            longest = fmax(enclosure.free_length(gaps), longest)
         return fmax(longest, 0)
 
 
@@ -121,11 +121,11 @@ class BandEnclosure(Enclosure):
         return fmax(fmin(up, down), 0)
 
     def _free(self, gap: Real, offset: Real, slope: Real) -> Real:
-        none = gap == dr.inf
-        left = gap - offset
-        reach = dr.select(slope > 0, left / slope * STEP_SAFETY, self.reach)
-        known = (left > 0) & dr.isfinite(slope)  # and not NaN
-        return dr.select(none, self.reach, dr.select(known, fmin(reach, self.reach), 0))
+        no_level = gap == dr.inf
+        remaining = gap - offset
+        reach = dr.select(slope > 0, remaining / slope * STEP_SAFETY, self.reach)
+        is_valid = (remaining > 0) & dr.isfinite(slope)  # and not NaN
+        return dr.select(no_level, self.reach, dr.select(is_valid, fmin(reach, self.reach), 0))
 
 
 class AffineEnclosure(BandEnclosure):
@@ -162,9 +162,9 @@ class IntervalEnclosure(BandEnclosure):
     ) -> Self | None:
         if not isinstance(function, EvaluableRestriction):
             return None
-        made = function.evaluate_with(lambda p, d: Jet.along_ray(p, d, 0.0, length, anchored=False))
+        jet = function.evaluate_with(lambda p, d: Jet.along_ray(p, d, 0.0, length, anchored=False))
         zero = 0 * length
-        return cls(made.value - _value(function), SlopeRange(zero, zero), length)
+        return cls(jet.value - _value(function), SlopeRange(zero, zero), length)
 
 
 def _parabolas(function: EvaluableRestriction, length: Real, degree: int) -> ParabolaBounds:
@@ -176,8 +176,8 @@ def _parabolas(function: EvaluableRestriction, length: Real, degree: int) -> Par
 def _value(function: EvaluableRestriction) -> Interval:
     """f at the start of the path."""
 
-    def here(p: Vec3, direction: Vec3) -> tuple[Jet, Jet, Jet]:
+    def at_start(p: Vec3, direction: Vec3) -> tuple[Jet, Jet, Jet]:
         del direction
         return Jet.at_point(p)
 
-    return function.evaluate_with(here).value
+    return function.evaluate_with(at_start).value

@@ -50,8 +50,8 @@ class ParabolaEnclosure(Enclosure):
     def free_length(self, gaps: LevelGaps) -> Real:
         up = first_reach(gaps.above, self.slopes.upper, self.max_second_derivative)
         down = first_reach(gaps.below, -self.slopes.lower, -self.min_second_derivative)
-        known = (up >= 0) & (down >= 0) & (self.reach > 0)  # and not NaN
-        return fmax(dr.select(known, fmin(fmin(up, down), self.reach), 0) * STEP_SAFETY, 0)
+        is_valid = (up >= 0) & (down >= 0) & (self.reach > 0)  # and not NaN
+        return fmax(dr.select(is_valid, fmin(fmin(up, down), self.reach), 0) * STEP_SAFETY, 0)
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
         free = _stays_below(gaps.above, self.slopes.upper, self.max_second_derivative, length)
@@ -80,12 +80,12 @@ class LipschitzEnclosure(ParabolaEnclosure):
 
     def free_length(self, gaps: LevelGaps) -> Real:
         length = gaps.nearest / self.slopes.upper
-        known = (gaps.below > 0) & (gaps.above > 0) & (self.slopes.upper >= 0) & (self.reach > 0)
-        return dr.select(known, fmin(length, self.reach), 0) * STEP_SAFETY
+        is_valid = (gaps.below > 0) & (gaps.above > 0) & (self.slopes.upper >= 0) & (self.reach > 0)
+        return dr.select(is_valid, fmin(length, self.reach), 0) * STEP_SAFETY
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
-        moved = self.slopes.upper * length
-        free = (length <= self.reach) & (moved <= gaps.below) & (moved <= gaps.above)
+        movement = self.slopes.upper * length
+        free = (length <= self.reach) & (movement <= gaps.below) & (movement <= gaps.above)
         return (length <= 0) | free
 
 
@@ -113,32 +113,33 @@ def _nan_if_negative(constant: Real) -> Real:
 
 
 def first_reach(gap: Real, slope: Real, curvature: Real) -> Real:
-    """The first s > 0 at which slope s + curvature s^2/2 reaches the gap; infinite if none does.
+    """The first s > 0 at which slope s + curvature s^2/2 reaches the gap; infinite if there is
+    none.
 
     In a form whose squares neither overflow nor underflow: near a zero of high order, slope,
     curvature and gap are all far below the square root of the smallest number.
     """
-    none = gap == dr.inf  # there is no level on this side
-    turns = curvature < 0
-    gap = _rounded_down_where(turns, dr.select(none, 0, gap))
-    steep, bent = dr.abs(slope), _max_turning_slope(gap, curvature)
-    longer, shorter = fmax(steep, bent), fmin(steep, bent)
-    ratio = dr.select(longer > 0, shorter / longer, 0)
-    root = longer * dr.sqrt(dr.fma(dr.select(turns, -ratio, ratio), ratio, 1))
-    away = dr.select(slope <= 0, dr.select(gap > 0, dr.inf, 0), dr.nan)
-    falling = dr.select(curvature <= 0, away, (root - slope) / curvature)
-    found = dr.select(slope > 0, gap / (0.5 * slope + 0.5 * root), falling)
-    return dr.select(none | (turns & (steep < bent)), dr.inf, found)
+    no_level = gap == dr.inf  # there is no level on this side
+    turns_away = curvature < 0
+    gap = _rounded_down_where(turns_away, dr.select(no_level, 0, gap))
+    start_slope, turn_slope = dr.abs(slope), _max_turning_slope(gap, curvature)
+    larger, smaller = fmax(start_slope, turn_slope), fmin(start_slope, turn_slope)
+    ratio = dr.select(larger > 0, smaller / larger, 0)
+    root = larger * dr.sqrt(dr.fma(dr.select(turns_away, -ratio, ratio), ratio, 1))
+    straight = dr.select(slope <= 0, dr.select(gap > 0, dr.inf, 0), dr.nan)
+    from_root = dr.select(curvature <= 0, straight, (root - slope) / curvature)
+    result = dr.select(slope > 0, gap / (0.5 * slope + 0.5 * root), from_root)
+    return dr.select(no_level | (turns_away & (start_slope < turn_slope)), dr.inf, result)
 
 
 def _stays_below(gap: Real, slope: Real, curvature: Real, length: Real) -> Mask:
     """Whether slope s + curvature s^2/2 <= gap for 0 <= s <= length.
 
     The largest value is at an end, or at the vertex of a parabola that rises and then falls."""
-    bend = 0.5 * curvature * length
-    turned = (slope > 0) & (slope + 2 * bend < 0)
-    steepest = _max_turning_slope(_rounded_down_where(turned, gap), curvature)
-    return dr.select(turned, slope <= steepest, (bend + slope) * length <= gap)
+    half_change = 0.5 * curvature * length
+    turns_back = (slope > 0) & (slope + 2 * half_change < 0)
+    max_slope = _max_turning_slope(_rounded_down_where(turns_back, gap), curvature)
+    return dr.select(turns_back, slope <= max_slope, (half_change + slope) * length <= gap)
 
 
 def _max_turning_slope(gap: Real, curvature: Real) -> Real:
@@ -165,10 +166,10 @@ class ConvexityEnclosure(Enclosure):
     slopes: SlopeRange
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        falls = -self.slopes.lower
-        down = dr.select(falls > 0, gaps.below / falls, dr.select(falls <= 0, dr.inf, 0))
-        down = dr.select(gaps.below > 0, down * STEP_SAFETY, 0)
-        return dr.select(gaps.above == dr.inf, fmax(down, 0), 0)
+        rate = -self.slopes.lower
+        length = dr.select(rate > 0, gaps.below / rate, dr.select(rate <= 0, dr.inf, 0))
+        length = dr.select(gaps.below > 0, length * STEP_SAFETY, 0)
+        return dr.select(gaps.above == dr.inf, fmax(length, 0), 0)
 
 
 # Covers the roundings, in single precision, of the angle and of the length that it becomes.
@@ -218,13 +219,13 @@ class SphereArcEnclosure(Enclosure):
         up = first_reach(gaps.above, self.slopes.upper * rate, self.curvature)
         down = first_reach(gaps.below, -self.slopes.lower * rate, self.curvature)
         half = 0.5 * _ARC_SAFETY * fmin(up, down)
-        known = (up >= 0) & (down >= 0) & (self.curvature >= 0)  # and not NaN
-        known &= dr.isfinite(total)  # its square does not overflow
-        ends = half >= _PI_BELOW  # once around the circle
-        s, k = sincos(dr.select(ends, 0, half))
-        left = dr.fma(c, k, -self.offset * s)
-        length = dr.select((left > 0) & ~ends, total * s / left * _ARC_SAFETY, dr.inf)
-        return dr.select(known, fmax(length, 0), 0)
+        is_valid = (up >= 0) & (down >= 0) & (self.curvature >= 0)  # and not NaN
+        is_valid &= dr.isfinite(total)  # its square does not overflow
+        is_full_turn = half >= _PI_BELOW  # once around the circle
+        s, k = sincos(dr.select(is_full_turn, 0, half))
+        divisor = dr.fma(c, k, -self.offset * s)
+        length = dr.select((divisor > 0) & ~is_full_turn, total * s / divisor * _ARC_SAFETY, dr.inf)
+        return dr.select(is_valid, fmax(length, 0), 0)
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
         return (length <= 0) | (length <= self.free_length(gaps))

@@ -28,10 +28,10 @@ class PiecewiseTaylorEnclosure(Enclosure):
 
     Proof of the step. Let F <= A at the start of a piece, with F' <= D there, and F' <= k, F'' <= c
     on the piece. Then F <= A + min(k s, D s + c s^2/2) on it. The next piece starts with at most
-    the value of that at its end, and with a slope of at most min(D + c w, k), w the length of the
-    piece. The first s at which that reaches the gap is the root of a line or of a parabola. For the
-    level below the same holds of -F. With exact ranges the bound converges to F with the third
-    power of the length of the pieces, so that one sample may prove much of a ray.
+    the value of this bound at its end, and with a slope of at most min(D + c w, k), where w is the
+    length of the piece. The first s at which the bound reaches the gap is the root of a line or of
+    a parabola. For the level below the same holds of -F. With exact ranges the bound converges to F
+    with the third power of the length of the pieces, so that one sample may prove much of a ray.
 
     Source: new in harnack; one piece is the linear and the quadratic Taylor form together
     (Aydinlilar and Zanni 2023, section 6.1).
@@ -80,45 +80,47 @@ class PiecewiseTaylorEnclosure(Enclosure):
         return falls | (first.slope_range.lower * reach >= gaps.above)
 
     def _free_on_pieces(self, gap: Real, rises: Mask | bool) -> tuple[Real, Mask]:
-        """The first s at which F, or -F, may reach the gap, or the whole length if it is proved not
-        to; and whether it is proved not to."""
+        """The first s at which F, or -F, may reach the gap, or the whole length if it is proved
+        that there is no such s; and whether that is proved."""
 
-        def chosen(upper: Real, lower: Real) -> Real:
+        def one_sided(upper: Real, lower: Real) -> Real:
             return dr.select(rises, upper, -lower)
 
-        slope = chosen(self.slopes.upper, self.slopes.lower)
-        none = gap == dr.inf
-        left = dr.select(none, 0, gap)  # the rest of the gap at the start of the piece
+        slope = one_sided(self.slopes.upper, self.slopes.lower)
+        no_level = gap == dr.inf
+        remaining = dr.select(no_level, 0, gap)  # the rest of the gap at the start of the piece
         total = type(gap)(0)
-        free = gap >= 0  # and not NaN
-        for part in self.pieces:
-            most = chosen(part.slope_range.upper, part.slope_range.lower)
-            bend = chosen(part.max_second_derivative, part.min_second_derivative)
-            slope, reach, left = self._advance_piece(left, slope, most, bend, part.length)
-            reach = dr.select(none, part.length, reach)
-            total = dr.select(free, total + reach, total)
-            free &= reach >= part.length
-        return total, free
+        is_free = gap >= 0  # and not NaN
+        for piece in self.pieces:
+            max_slope = one_sided(piece.slope_range.upper, piece.slope_range.lower)
+            curvature = one_sided(piece.max_second_derivative, piece.min_second_derivative)
+            slope, reach, remaining = self._advance_piece(
+                remaining, slope, max_slope, curvature, piece.length
+            )
+            reach = dr.select(no_level, piece.length, reach)
+            total = dr.select(is_free, total + reach, total)
+            is_free &= reach >= piece.length
+        return total, is_free
 
     @classmethod
     def _advance_piece(
-        cls, left: Real, slope: Real, most: Real, bend: Real, length: Real
+        cls, gap: Real, slope: Real, max_slope: Real, curvature: Real, length: Real
     ) -> tuple[Real, Real, Real]:
         """The slope at the end of a piece, the length of the piece that is proved free, and the gap
         that remains at its end."""
-        # A range that is NaN is not known.
-        slope = dr.select((slope <= most) | dr.isnan(most), slope, most)
-        by_line = dr.select(most > 0, left / most, dr.select(most <= 0, dr.inf, 0))
-        by_line = dr.select(left > 0, by_line, 0)
-        by_parabola = first_reach(left, slope, bend)
+        # A range that is NaN is unknown.
+        slope = dr.select((slope <= max_slope) | dr.isnan(max_slope), slope, max_slope)
+        by_line = dr.select(max_slope > 0, gap / max_slope, dr.select(max_slope <= 0, dr.inf, 0))
+        by_line = dr.select(gap > 0, by_line, 0)
+        by_parabola = first_reach(gap, slope, curvature)
         reach = fmin(fmax(by_parabola, by_line) * STEP_SAFETY, length)
-        # Both terms may cancel: the rounding is that of each, not that of their sum.
-        unit = 4 * float(dr.epsilon(type(left)))
-        bent, straight = 0.5 * length * length * bend, slope * length
-        by_parabola = (bent + straight) + unit * (dr.abs(bent) + dr.abs(straight))
-        risen = fmin(by_parabola, most * length + unit * dr.abs(most * length))
-        slope = dr.fma(bend, length, slope)
-        return dr.fma(0.25 * unit, dr.abs(slope), slope), reach, left - risen
+        # Both terms may cancel: the rounding error is that of each term, not that of their sum.
+        epsilon = 4 * float(dr.epsilon(type(gap)))
+        curved, linear = 0.5 * length * length * curvature, slope * length
+        by_parabola = (curved + linear) + epsilon * (dr.abs(curved) + dr.abs(linear))
+        rise = fmin(by_parabola, max_slope * length + epsilon * dr.abs(max_slope * length))
+        slope = dr.fma(curvature, length, slope)
+        return dr.fma(0.25 * epsilon, dr.abs(slope), slope), reach, gap - rise
 
 
 class SinglePieceEnclosure(PiecewiseTaylorEnclosure, abc.ABC):
@@ -139,10 +141,10 @@ class QuadraticTaylorEnclosure(SinglePieceEnclosure):
 
     @classmethod
     def _advance_piece(
-        cls, left: Real, slope: Real, most: Real, bend: Real, length: Real
+        cls, gap: Real, slope: Real, max_slope: Real, curvature: Real, length: Real
     ) -> tuple[Real, Real, Real]:
-        del most
-        return super()._advance_piece(left, slope, type(left)(dr.inf), bend, length)
+        del max_slope
+        return super()._advance_piece(gap, slope, type(gap)(dr.inf), curvature, length)
 
 
 class LinearTaylorEnclosure(SinglePieceEnclosure):
@@ -154,10 +156,10 @@ class LinearTaylorEnclosure(SinglePieceEnclosure):
 
     @classmethod
     def _advance_piece(
-        cls, left: Real, slope: Real, most: Real, bend: Real, length: Real
+        cls, gap: Real, slope: Real, max_slope: Real, curvature: Real, length: Real
     ) -> tuple[Real, Real, Real]:
-        del slope, bend
-        return super()._advance_piece(left, most, most, type(left)(0), length)
+        del slope, curvature
+        return super()._advance_piece(gap, max_slope, max_slope, type(gap)(0), length)
 
 
 class SegmentTracingEnclosure(SinglePieceEnclosure):
@@ -171,7 +173,7 @@ class SegmentTracingEnclosure(SinglePieceEnclosure):
     def from_restriction(
         cls, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> Self | None:
-        (part,) = function.derivative_ranges([0.0, length])
-        most = fmax(part.slope_range.upper, -part.slope_range.lower)
-        both = SlopeRange(-most, most)
-        return cls(both, (PathPiece(part.length, both, 0.0, 0.0),))
+        (piece,) = function.derivative_ranges([0.0, length])
+        max_slope = fmax(piece.slope_range.upper, -piece.slope_range.lower)
+        interval = SlopeRange(-max_slope, max_slope)
+        return cls(interval, (PathPiece(piece.length, interval, 0.0, 0.0),))

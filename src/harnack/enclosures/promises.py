@@ -111,34 +111,34 @@ class Promise(abc.ABC):
     def negated(self) -> Self:
         """The promise of -f."""
         numbers = {
-            name: -getattr(self, other)
-            for low, high in self.interval_pairs
-            for name, other in ((low, high), (high, low))
+            name: -getattr(self, opposite)
+            for lower, upper in self.interval_pairs
+            for name, opposite in ((lower, upper), (upper, lower))
         }
         return dataclasses.replace(self, **numbers)
 
     def space_scaled(self, size: Real) -> Self:
         """The promise of x -> f(x / size), at size * p."""
 
-        def longer(number: Real, power: int) -> Real:
+        def rescaled(number: Real, power: int) -> Real:
             if power == 0:
                 return number
             return number * size if power > 0 else number / _power(size, -power)
 
-        return self.map_numbers(lambda number, _, power: longer(number, power))
+        return self.map_numbers(lambda number, _, power: rescaled(number, power))
 
     def linearly_mapped(self, stretch: Real) -> Self:
         """The promise of x -> f(A x) for a linear map A that stretches no length by more than the
         factor `stretch`."""
 
-        def shorter(number: Real, power: int) -> Real:
+        def rescaled(number: Real, power: int) -> Real:
             if power > 0:
                 return number / stretch
             for _ in range(-power):
                 number = number * stretch
             return number
 
-        return self.map_numbers(lambda number, _, power: shorter(number, power))
+        return self.map_numbers(lambda number, _, power: rescaled(number, power))
 
     def map_numbers(self, change: Callable[[Any, int, int], Any]) -> Self:
         """The promise with other numbers. change: a function of a number and the powers of its
@@ -151,9 +151,9 @@ class Promise(abc.ABC):
         elsewhere."""
         numbers: dict[str, Any] = {}
         for name, *_ in self.units:
-            one, own = getattr(other, name), getattr(self, name)
-            is_same = isinstance(one, float) and isinstance(own, float) and one == own
-            numbers[name] = own if is_same else dr.select(mask, one, own)
+            new, old = getattr(other, name), getattr(self, name)
+            is_same = isinstance(new, float) and isinstance(old, float) and new == old
+            numbers[name] = old if is_same else dr.select(mask, new, old)
         return dataclasses.replace(self, **numbers)
 
 
@@ -192,7 +192,7 @@ class HarmonicBall(Promise):
         """
         mass = fmin(value - self.lower, self.upper - value)
         q = length / self.radius
-        rest = {
+        remainder = {
             (2, 1): 2 * q * q / (1 - q),
             (3, 1): q * q * (5 - 3 * q) / dr.square(1 - q),
             (4, 1): q * q * (9 - q * (11 - 4 * q)) / (dr.square(1 - q) * (1 - q)),
@@ -200,7 +200,7 @@ class HarmonicBall(Promise):
             (3, 2): q * q * q * (7 - 5 * q) / dr.square(1 - q),
             (4, 2): q * q * q * (16 - q * (23 - 9 * q)) / (dr.square(1 - q) * (1 - q)),
         }[self.dimension, degree]
-        return dr.select((q < 1) & (mass < dr.inf), mass * rest, dr.inf)
+        return dr.select((q < 1) & (mass < dr.inf), mass * remainder, dr.inf)
 
     def implied_lipschitz(self, value: Real) -> Lipschitz | None:
         """On half the ball. Proof. Let f be within M of a constant on a ball of radius r in R^n. At
@@ -239,8 +239,8 @@ class HarmonicBall(Promise):
         if _is_infinite(self.lower) or _is_infinite(self.upper):
             return None
         half = 0.5 * self.radius
-        most = _SECOND_DERIVATIVE_BOUND_4D if self.dimension == 4 else _SECOND_DERIVATIVE_BOUND
-        return 1.0001 * most * self._span(value) / (half * half), half
+        constant = _SECOND_DERIVATIVE_BOUND_4D if self.dimension == 4 else _SECOND_DERIVATIVE_BOUND
+        return 1.0001 * constant * self._span(value) / (half * half), half
 
     def _span(self, value: Real) -> Real:
         """upper - lower, as the sum of the distances of both from the value."""
@@ -281,9 +281,9 @@ class BoundedLaplacian(Promise):
         |d_v G| is 3 r/8.
         """
         half = 0.5 * self.radius
-        most = fmax(dr.abs(self.laplacian_lower), dr.abs(self.laplacian_upper))
-        steepest = 0.75 * (self.upper - self.lower) / half + 0.375 * half * most
-        return Lipschitz(1.0001 * steepest, half)
+        max_laplacian = fmax(dr.abs(self.laplacian_lower), dr.abs(self.laplacian_upper))
+        max_slope = 0.75 * (self.upper - self.lower) / half + 0.375 * half * max_laplacian
+        return Lipschitz(1.0001 * max_slope, half)
 
     def weakened_for_linear_maps(self, value: Real) -> Promise:
         return self.implied_lipschitz(value)
@@ -292,9 +292,9 @@ class BoundedLaplacian(Promise):
         """For a similarity A: the Laplacian of f(A x) is that of f times the square of the factor
         by which A stretches lengths, which is `stretch` up to some roundings."""
         slack = 5e-6 * (dr.abs(self.laplacian_lower) + dr.abs(self.laplacian_upper))
-        low, high = self.laplacian_lower - slack, self.laplacian_upper + slack
-        wider = dataclasses.replace(self, laplacian_lower=low, laplacian_upper=high)
-        return super(BoundedLaplacian, wider).linearly_mapped(stretch)
+        lower, upper = self.laplacian_lower - slack, self.laplacian_upper + slack
+        widened = dataclasses.replace(self, laplacian_lower=lower, laplacian_upper=upper)
+        return super(BoundedLaplacian, widened).linearly_mapped(stretch)
 
 
 @dataclass(frozen=True)
@@ -312,8 +312,8 @@ class Lipschitz(Promise):
     implies_smooth = False
 
     def movement_bounds(self, value: Any, slopes: SlopeRange, length: Any) -> tuple[Any, Any]:
-        most = self.constant * length
-        return -most, most
+        movement = self.constant * length
+        return -movement, movement
 
     def implied_lipschitz(self, value: Real) -> Lipschitz:
         return self
@@ -323,8 +323,8 @@ class Lipschitz(Promise):
 class TaylorRemainder(Promise):
     """|f(y) - f(p) - grad f(p).(y-p)| <= constant |y-p|^2/2 for every y with |y-p| < radius.
 
-    For a field with a domain: for every such y in it. There too, what Taylor's polynomial of second
-    degree leaves out is at most change |y-p|^3/6, if that is known.
+    For a field with a domain: for every such y in it. There too, the remainder of Taylor's
+    polynomial of second degree is at most cubic_constant |y-p|^3/6, if that constant is known.
     """
 
     constant: Real
@@ -334,8 +334,8 @@ class TaylorRemainder(Promise):
     units = (("constant", 1, -2), ("radius", 0, 1), ("cubic_constant", 1, -3))
 
     def movement_bounds(self, value: Any, slopes: SlopeRange, length: Any) -> tuple[Any, Any]:
-        bend = 0.5 * self.constant * length * length
-        return slopes.lower * length - bend, slopes.upper * length + bend
+        curved = 0.5 * self.constant * length * length
+        return slopes.lower * length - curved, slopes.upper * length + curved
 
     def implied_second_derivative_bound(self, value: Real) -> tuple[Real, Real] | None:
         """By definition, at every point that promises it; without a radius all do."""
@@ -345,8 +345,8 @@ class TaylorRemainder(Promise):
     def taylor_remainder_bound(self, value: Real, length: Real, degree: int = 1) -> Real:
         if degree == 2 and _is_infinite(self.cubic_constant):
             return dr.inf
-        rest = 0.5 * self.constant if degree == 1 else self.cubic_constant * length / 6
-        return dr.select(length < self.radius, rest * length * length, dr.inf)
+        factor = 0.5 * self.constant if degree == 1 else self.cubic_constant * length / 6
+        return dr.select(length < self.radius, factor * length * length, dr.inf)
 
 
 def _is_infinite(end: Any) -> bool:

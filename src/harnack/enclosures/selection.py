@@ -38,8 +38,8 @@ if TYPE_CHECKING:
     from harnack.enclosures.enclosure import PathRestriction
     from harnack.enclosures.promises import Lipschitz
 
-# Of promises: from the sharpest proof to the one that all fall back on. `trace` takes `_CURVATURE`
-# unasked, and so do clearances.
+# Enclosures from promises, from the sharpest proof to the fallback of all. `trace` takes
+# `_CURVATURE` by default, and so do clearances.
 _FALLBACK = (LipschitzEnclosure,)
 _SLOPE = (HarnackSlopeEnclosure, BoundedLaplacianEnclosure, *_FALLBACK)
 _CURVATURE = (TaylorEnclosure, SphericalCapEnclosure, *_SLOPE)
@@ -61,7 +61,7 @@ _KINDS_BY_NAME: dict[str, tuple[type[Enclosure], ...]] = {
     "lipschitz": _FALLBACK,
 }
 ENCLOSURE_NAMES = tuple(sorted(_KINDS_BY_NAME))
-# Those that need no promise: they are made of ranges of a formula.
+# Names of enclosures that need no promise: they are derived from ranges of a formula.
 _NAMES_USING_RANGES = [
     f'"{name}"' for name, (sharpest, *_) in _KINDS_BY_NAME.items()
     if sharpest.from_restriction.__func__ is not Enclosure.from_restriction.__func__
@@ -109,12 +109,14 @@ class EnclosureKinds:
             ValueError: no class of enclosures applies to a promise.
         """
         promises = promises + alternative_promises if self.uses_alternative_promises else promises
-        made = [self._enclosure(one, value, error, slopes) for one in (*promises, *ray_promises)]
-        if all(one is None for one in made[: len(promises)]):
+        enclosures = [
+            self._enclosure(entry, value, error, slopes) for entry in (*promises, *ray_promises)
+        ]
+        if all(entry is None for entry in enclosures[: len(promises)]):
             raise ValueError(
                 self._nothing_applies_message(promises + alternative_promises, value, error, slopes)
             )
-        return tuple(one for one in made if one is not None)
+        return tuple(entry for entry in enclosures if entry is not None)
 
     def _enclosure(
         self, promise: Promise, value: Real, error: Real, slopes: SlopeRange
@@ -128,39 +130,42 @@ class EnclosureKinds:
     def _nothing_applies_message(
         self, promises: tuple[Promise, ...], value: Real, error: Real, slopes: SlopeRange
     ) -> str:
-        """Why no proof applies, and which would."""
-        asked = ", ".join(kind.__name__ for kind in self.kinds)
+        """The reason why no proof applies, and the names of proofs that would."""
+        requested = ", ".join(kind.__name__ for kind in self.kinds)
         if not promises:
             kinds = ", ".join(kind.__name__ for kind in Promise.__subclasses__())
             return (
-                f"the bounds asked for ({asked}) need a promise and the field makes none: "
+                f"the bounds asked for ({requested}) need a promise and the field makes none: "
                 f"Sample.promises is empty, return one of these in it: {kinds}. Formulas are "
                 "bounded by ranges: leave bound out, or choose one of "
                 f"{', '.join(_NAMES_USING_RANGES)}"
             )
-        made = " and ".join(sorted({type(one).__name__ for one in promises}))
+        promised = " and ".join(sorted({type(promise).__name__ for promise in promises}))
         usable = [
             f'"{name}"'
             for name, (sharpest, *_) in _KINDS_BY_NAME.items()
-            if any(sharpest.from_promise(one, value, error, slopes) is not None for one in promises)
+            if any(
+                sharpest.from_promise(promise, value, error, slopes) is not None
+                for promise in promises
+            )
         ]
         if not usable:
             return (
-                f"no bound applies to what the field promises, {made}: a HarmonicBall needs at "
+                f"no bound applies to what the field promises, {promised}: a HarmonicBall needs at "
                 "least one limit that is not infinite, lower or upper, a BoundedLaplacian both"
             )
-        others = (
+        hint = (
             ""
             if not self.uses_alternative_promises
             else ", or leave bound=None for the sharpest there is"
         )
         return (
-            f"no bound applies: the field promises {made}, which the bounds asked for "
-            f"({asked}) cannot use; choose {' or '.join(usable)}{others}"
+            f"no bound applies: the field promises {promised}, which the bounds asked for "
+            f"({requested}) cannot use; choose {' or '.join(usable)}{hint}"
         )
 
 
-# A bound as users ask for it.
+# The argument `bound` of functions.
 EnclosureChoice: TypeAlias = (
     str | type[Enclosure] | Iterable[type[Enclosure]] | EnclosureKinds | None
 )
@@ -193,9 +198,9 @@ def choose_enclosures(bound: EnclosureChoice = None) -> EnclosureKinds:
                 f"{did_you_mean(bound, _KINDS_BY_NAME)}"
             )
         return EnclosureKinds(_KINDS_BY_NAME[bound])
-    several = cast("Any", bound) if isinstance(bound, Iterable) else (bound,)
-    kinds: tuple[Any, ...] = tuple(several)
-    if not kinds or not all(_is_proof(one) for one in kinds):
+    classes = cast("Any", bound) if isinstance(bound, Iterable) else (bound,)
+    kinds: tuple[Any, ...] = tuple(classes)
+    if not kinds or not all(_is_proof(kind) for kind in kinds):
         raise TypeError(
             "bound must be a name, or classes of enclosures such as harnack.SphericalCapEnclosure "
             "or (harnack.SphericalCapEnclosure, harnack.LipschitzEnclosure), "
@@ -205,25 +210,25 @@ def choose_enclosures(bound: EnclosureChoice = None) -> EnclosureKinds:
 
 
 def _is_proof(kind: Any) -> bool:
-    """Whether this is a class of enclosures that can be made."""
+    """Whether this is a class of enclosures that can be instantiated."""
     return isinstance(kind, type) and issubclass(kind, Enclosure) and not inspect.isabstract(kind)
 
 
 def longest_free_length(enclosures: tuple[Enclosure, ...], gaps: LevelGaps) -> Real:
-    """The longest length that any of the enclosures proves free. Each is proved, so their maximum
-    is.
+    """The longest length that any of the enclosures proves free. Each length is proved, so their
+    maximum is.
 
     It is at least 0, also where an enclosure gives NaN.
     """
     best: Real = type(gaps.above)(0)
-    for one in enclosures:
-        best = fmax(one.free_length(gaps), best)
+    for enclosure in enclosures:
+        best = fmax(enclosure.free_length(gaps), best)
     return best
 
 
 def any_is_free(enclosures: tuple[Enclosure, ...], gaps: LevelGaps, length: Real) -> Mask:
     """Whether any of the enclosures proves the length free."""
-    free = length <= 0
-    for one in enclosures:
-        free |= one.is_free(gaps, length)
-    return free
+    is_free = length <= 0
+    for enclosure in enclosures:
+        is_free |= enclosure.is_free(gaps, length)
+    return is_free

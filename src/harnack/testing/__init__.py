@@ -1,4 +1,4 @@
-"""Tests of fields and enclosures, for those of the library and for those that users write.
+"""Tests of fields and enclosures, of the library and of users.
 
 `check_field(MyField())` samples every promise of a field; `check_enclosure(MyEnclosure)` tries an
 enclosure on random functions of every kind, among them the extremal ones. Both raise

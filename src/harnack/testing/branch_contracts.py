@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 __all__ = ["check_branch_points"]
 
-# Places about each branch point, and the least of their distances, in sizes.
+# Number of points about each branch point, and the smallest of their distances, in radii.
 _PLACES, _NEAREST = 4000, 1e-6
-# More than the rounding of branches and of their power.
+# An upper bound of the rounding errors of branches and of their power.
 _SLACK = 1e-6
 
 
@@ -43,35 +43,35 @@ def _check_branch_point(
 ) -> None:
     backend = choose_backend("double")
     assert point.power is not None
-    # As many near the point as near the circle, where the power's share of g is least.
-    away = radius * np.where(
+    # As many near the point as near the circle, where the power's part of g is smallest.
+    radii = radius * np.where(
         rng.random(_PLACES) < 0.5,
         _NEAREST ** rng.random(_PLACES),
         np.sqrt(rng.random(_PLACES)) * (1 - 1e-9),
     )
     angle = rng.uniform(-math.pi, math.pi, _PLACES)
-    x, y = point.location.real + away * np.cos(angle), point.location.imag + away * np.sin(angle)
-    away = np.hypot(x - point.location.real, y - point.location.imag)  # of the places as rounded
+    x, y = point.location.real + radii * np.cos(angle), point.location.imag + radii * np.sin(angle)
+    radii = np.hypot(x - point.location.real, y - point.location.imag)  # of the rounded points
     branches: Any = field.branches.prepare(backend)
     imaginary = field.part == "imag"
     period: float | None = branches.period(imaginary)
     value = point.value.imag if imaginary else point.value.real
-    allowed = point.constant * away**point.power
-    worst = np.zeros(_PLACES)
+    bound = point.constant * radii**point.power
+    errors = np.zeros(_PLACES)
     for branch in branches.evaluate(complex_type(backend)(backend.Float(x), backend.Float(y))):
-        part = branch.value.imag if imaginary else branch.value.real
-        off: FloatArray = to_numpy(part) - value
+        component = branch.value.imag if imaginary else branch.value.real
+        error: FloatArray = to_numpy(component) - value
         if period is not None:
-            off = off - period * np.round(off / period)
-        worst = np.fmax(worst, np.abs(off))
-    rounding = _SLACK * (allowed + 1e-6 * abs(value)) + 2.0**-48 * (
+            error = error - period * np.round(error / period)
+        errors = np.fmax(errors, np.abs(error))
+    rounding = _SLACK * (bound + 1e-6 * abs(value)) + 2.0**-48 * (
         abs(value) + np.abs(point.location)
     )
     require(
-        worst <= allowed + rounding,
+        errors <= bound + rounding,
         f"BranchPoint({point.location}): a branch is farther from the value {point.value} than "
         f"{point.constant:g} |z - at|^{point.power:g}: the constant must be at least "
-        f"{(worst / away**point.power).max():.6g}",
+        f"{(errors / radii**point.power).max():.6g}",
         np.column_stack([x, y, np.full(_PLACES, field.height * value)]),
-        worst - allowed,
+        errors - bound,
     )

@@ -54,26 +54,26 @@ def check_derivatives(field: Field, points: FloatArray, look: FieldSamples) -> N
     Raises:
         BrokenPromiseError: naming the point where they do not agree.
     """
-    h, fits = _spacing_within(field, points, _spacing(points, look))
-    if not fits.any():
+    h, inside = _spacing_within(field, points, _spacing(points, look))
+    if not inside.any():
         return
-    points, look, h = points[fits], look.subset(fits), h[fits]
+    points, look, h = points[inside], look.subset(inside), h[inside]
     has_ball = any(isinstance(one, HarmonicBall) for one in look.promises)
     trials = [
         list(_stencil_samples(field, points, look, q * h))
         for q in (_SPACING_FACTORS[:1] if has_ball else _SPACING_FACTORS)
     ]
-    limits = [np.add(*_limits(field, points, look, nearby)) for nearby in trials]
-    nearby = _pick_spacing(trials, np.argmin(limits, axis=0))
-    _check_gradient(field, points, look, nearby)
+    limits = [np.add(*_limits(field, points, look, stencil)) for stencil in trials]
+    stencil = _pick_spacing(trials, np.argmin(limits, axis=0))
+    _check_gradient(field, points, look, stencil)
     _check_laplacian(points, look, trials)
     try:
         _check_hessian(field, points, look, trials)
     except BrokenPromiseError:
         if not field.has_variable_accuracy:
             raise
-        closely = [_without_truncation(field, points, one) for one in trials]
-        _check_hessian(field, points, look, closely)
+        exact_trials = [_without_truncation(field, points, one) for one in trials]
+        _check_hessian(field, points, look, exact_trials)
 
 
 def _spacing_within(
@@ -81,18 +81,20 @@ def _spacing_within(
 ) -> tuple[FloatArray, BoolArray]:
     """Spacings such that all nodes lie in the domain, and at which points there is such a
     spacing."""
-    fits = np.ones(len(points), dtype=np.bool_)
+    inside = np.ones(len(points), dtype=np.bool_)
     if field.domain is None:
-        return h, fits
+        return h, inside
     for _ in range(24):
-        fits[:] = True
+        inside[:] = True
         for axis in range(3):
             for node in (_NODES[0], _NODES[-1]):
-                fits &= field.domain.contains_points(points + (node * h)[:, None] * np.eye(3)[axis])
-        if fits.all():
+                inside &= field.domain.contains_points(
+                    points + (node * h)[:, None] * np.eye(3)[axis]
+                )
+        if inside.all():
             break
-        h = np.where(fits, h, 0.5 * h)
-    return h, fits
+        h = np.where(inside, h, 0.5 * h)
+    return h, inside
 
 
 @dataclass(frozen=True)
@@ -100,8 +102,8 @@ class _StencilSample:
     """The samples of the field at points + node h along an axis, for a node of the differences.
 
     h: (n,) the spacing.
-    weight: (n,) of the node, divided by h; wide: the same with twice the spacing.
-    move: (n,) the difference of the value to that at the points, without jumps and periods.
+    weight: (n,) the weight of the node, divided by h; wide: the same with twice the spacing.
+    move: (n,) the difference of the value to the value at the points, without jumps and periods.
     error: (n,) a bound of the errors of both values in it, gradient_error likewise.
     """
 
@@ -117,38 +119,38 @@ class _StencilSample:
 
 
 def _stencil_samples(
-    field: Field, points: FloatArray, look: FieldSamples, h: FloatArray
+    field: Field, points: FloatArray, samples: FieldSamples, h: FloatArray
 ) -> Iterator[_StencilSample]:
     for axis in range(3):
         for node, weight, wide in zip(_NODES, _WEIGHTS, _WIDE_WEIGHTS, strict=True):
-            way = np.sign(node) * np.eye(3)[axis] + 0 * points
+            direction = np.sign(node) * np.eye(3)[axis] + 0 * points
             length = np.abs(node) * h
-            other = sample_field(field, points + length[:, None] * way)
-            move = other.value - look.value
+            node_samples = sample_field(field, points + length[:, None] * direction)
+            change = node_samples.value - samples.value
             if field.period is not None:
-                move -= field.period * np.round(move / field.period)
+                change -= field.period * np.round(change / field.period)
             ends = np.column_stack([0 * length, length])
-            move -= accumulated_jumps(field, points, way, ends)[:, 1]
-            error = look.error + other.error
+            change -= accumulated_jumps(field, points, direction, ends)[:, 1]
+            error = samples.error + node_samples.error
             yield _StencilSample(
-                axis, node, h, weight / h, wide / h, move, other.gradient, error,
-                look.gradient_error + other.gradient_error,
+                axis, node, h, weight / h, wide / h, change, node_samples.gradient, error,
+                samples.gradient_error + node_samples.gradient_error,
             )  # fmt: skip
 
 
 def _without_truncation(
-    field: Field, points: FloatArray, nearby: list[_StencilSample]
+    field: Field, points: FloatArray, stencil: list[_StencilSample]
 ) -> list[_StencilSample]:
-    """The same places with gradients without truncation (`Field.exact`), whose
-    derivative the Hessian of a field with a choice of detail may be as well."""
+    """The same points with gradients without truncation error (`Field.exact`), whose derivative the
+    Hessian of a field with variable accuracy may be as well."""
     error = sample_field(field, points, closely=True).gradient_error
-    found: list[_StencilSample] = []
-    for neighbor in nearby:
-        there = points + (neighbor.node * neighbor.h)[:, None] * np.eye(3)[neighbor.axis]
-        look = sample_field(field, there, closely=True)
-        errors = error + look.gradient_error
-        found.append(dataclasses.replace(neighbor, gradient=look.gradient, gradient_error=errors))
-    return found
+    exact: list[_StencilSample] = []
+    for neighbor in stencil:
+        nodes = points + (neighbor.node * neighbor.h)[:, None] * np.eye(3)[neighbor.axis]
+        sample = sample_field(field, nodes, closely=True)
+        errors = error + sample.gradient_error
+        exact.append(dataclasses.replace(neighbor, gradient=sample.gradient, gradient_error=errors))
+    return exact
 
 
 def _pick_spacing(
@@ -161,7 +163,7 @@ def _pick_spacing(
 
     def pick(nodes: tuple[_StencilSample, ...]) -> _StencilSample:
         arrays: dict[str, Any] = {
-            name: np.stack([getattr(one, name) for one in nodes])[choice, rows]
+            name: np.stack([getattr(sample, name) for sample in nodes])[choice, rows]
             for name in ("h", "weight", "wide", "move", "gradient", "error", "gradient_error")
         }
         return dataclasses.replace(nodes[0], **arrays)
@@ -169,15 +171,15 @@ def _pick_spacing(
     return [pick(nodes) for nodes in zip(*trials, strict=True)]
 
 
-def _spacing(points: FloatArray, look: FieldSamples) -> FloatArray:
-    return 2e-3 * _scale(points, look)
+def _spacing(points: FloatArray, samples: FieldSamples) -> FloatArray:
+    return 2e-3 * _scale(points, samples)
 
 
-def _scale(points: FloatArray, look: FieldSamples) -> FloatArray:
+def _scale(points: FloatArray, samples: FieldSamples) -> FloatArray:
     """A length (n,) over which the field is smooth: the smallest radius of its `HarmonicBall`
     promises, at most the extent of the points."""
     size = float(np.ptp(points, axis=0).max()) or 1.0
-    radii = [known.radius for known in look.promises if isinstance(known, HarmonicBall)]
+    radii = [promise.radius for promise in samples.promises if isinstance(promise, HarmonicBall)]
     smooth = np.min([np.full(len(points), size), *radii], axis=0)
     return np.maximum(smooth, 1e-9 * size)
 
@@ -187,122 +189,125 @@ def _size(points: FloatArray) -> FloatArray:
 
 
 def _check_gradient(
-    field: Field, points: FloatArray, look: FieldSamples, nearby: list[_StencilSample]
+    field: Field, points: FloatArray, samples: FieldSamples, stencil: list[_StencilSample]
 ) -> None:
-    """By central differences of the value."""
-    tolerance, allowance = _limits(field, points, look, nearby)
-    off = np.linalg.norm(_difference(nearby)[0] - look.gradient, axis=1)
+    """Compare the gradient with central differences of the value."""
+    tolerance, allowance = _limits(field, points, samples, stencil)
+    error = np.linalg.norm(_difference(stencil)[0] - samples.gradient, axis=1)
     message = "the gradient is not that of the value"
-    _require_agreement(off, tolerance, allowance, message, points, has_creases=field.has_creases)
+    _require_agreement(error, tolerance, allowance, message, points, has_creases=field.has_creases)
 
 
-def _difference(nearby: list[_StencilSample]) -> tuple[FloatArray, FloatArray]:
+def _difference(stencil: list[_StencilSample]) -> tuple[FloatArray, FloatArray]:
     """The gradient (n, 3) by differences of the value, with both spacings."""
-    fine, wide = (np.zeros((len(nearby[0].h), 3)) for _ in range(2))
-    for neighbor in nearby:
+    fine, wide = (np.zeros((len(stencil[0].h), 3)) for _ in range(2))
+    for neighbor in stencil:
         fine[:, neighbor.axis] += neighbor.weight * neighbor.move
         wide[:, neighbor.axis] += neighbor.wide * neighbor.move
     return fine, wide
 
 
 def _limits(
-    field: Field, points: FloatArray, look: FieldSamples, nearby: list[_StencilSample]
+    field: Field, points: FloatArray, samples: FieldSamples, nodes: list[_StencilSample]
 ) -> tuple[FloatArray, FloatArray]:
     """Two bounds (n,) of the difference between differences of the value and the gradient: their
     truncation and rounding error, and the errors of value and gradient."""
-    h = nearby[0].h
-    allowance = look.gradient_error.copy()
-    for neighbor in nearby:
+    h = nodes[0].h
+    allowance = samples.gradient_error.copy()
+    for neighbor in nodes:
         allowance += np.abs(neighbor.weight) * neighbor.error
-    length = np.linalg.norm(look.gradient, axis=1)
-    magnitude = np.abs(look.value) + (field.period or 0)
+    length = np.linalg.norm(samples.gradient, axis=1)
+    magnitude = np.abs(samples.value) + (field.period or 0)
     tolerance = 1e-6 * length + (1e-12 * magnitude + 1e-12 * length * _size(points)) / h
-    fine, wide = _difference(nearby)
+    fine, wide = _difference(nodes)
     tolerance += _RICHARDSON_SHARE * np.linalg.norm(fine - wide, axis=1)
-    if not any(one.implies_smooth for one in look.promises):
-        # There may be a kink between the points: as much as the gradient changes there.
-        changes = [np.linalg.norm(neighbor.gradient - look.gradient, axis=1) for neighbor in nearby]
+    if not any(promise.implies_smooth for promise in samples.promises):
+        # There may be a kink between the points: the error is then as large as the gradient
+        # changes.
+        changes = [
+            np.linalg.norm(neighbor.gradient - samples.gradient, axis=1) for neighbor in nodes
+        ]
         tolerance += 2 * np.max(changes, axis=0)
     else:
-        tolerance += 1e-6 * _second_derivatives(nearby) * h
+        tolerance += 1e-6 * _second_derivatives(nodes) * h
     return tolerance, allowance
 
 
-def _second_derivatives(nearby: list[_StencilSample]) -> FloatArray:
-    """(n,) sums of the sizes of the second derivatives along the axes."""
+def _second_derivatives(stencil: list[_StencilSample]) -> FloatArray:
+    """(n,) sums of the absolute second derivatives along the axes."""
     return np.sum(
-        [np.abs(neighbor.weight * neighbor.gradient[:, neighbor.axis]) for neighbor in nearby],
+        [np.abs(neighbor.weight * neighbor.gradient[:, neighbor.axis]) for neighbor in stencil],
         axis=0,
     )
 
 
 def _check_laplacian(
-    points: FloatArray, look: FieldSamples, trials: list[list[_StencilSample]]
+    points: FloatArray, samples: FieldSamples, trials: list[list[_StencilSample]]
 ) -> None:
-    """By central differences of the gradient."""
-    bounds = [one for one in look.promises if isinstance(one, BoundedLaplacian)]
-    if not _is_harmonic(look) and not bounds:
+    """Compare the Laplacian with central differences of the gradient."""
+    bounds = [promise for promise in samples.promises if isinstance(promise, BoundedLaplacian)]
+    if not _is_harmonic(samples) and not bounds:
         return
-    length = np.linalg.norm(look.gradient, axis=1)
+    length = np.linalg.norm(samples.gradient, axis=1)
 
-    def differences(nearby: list[_StencilSample]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        h = nearby[0].h
+    def differences(stencil: list[_StencilSample]) -> tuple[FloatArray, FloatArray, FloatArray]:
+        h = stencil[0].h
         laplacian = np.sum(
-            [neighbor.weight * neighbor.gradient[:, neighbor.axis] for neighbor in nearby], axis=0
+            [neighbor.weight * neighbor.gradient[:, neighbor.axis] for neighbor in stencil], axis=0
         )
         allowance = np.sum(
-            [np.abs(neighbor.weight) * neighbor.gradient_error for neighbor in nearby], axis=0
+            [np.abs(neighbor.weight) * neighbor.gradient_error for neighbor in stencil], axis=0
         )
         wide = np.sum(
-            [neighbor.wide * neighbor.gradient[:, neighbor.axis] for neighbor in nearby], axis=0
+            [neighbor.wide * neighbor.gradient[:, neighbor.axis] for neighbor in stencil], axis=0
         )
-        tolerance = 1e-6 * _second_derivatives(nearby) + _RICHARDSON_SHARE * np.abs(
+        tolerance = 1e-6 * _second_derivatives(stencil) + _RICHARDSON_SHARE * np.abs(
             laplacian - wide
         )
         tolerance += 1e-11 * length * (1 + _size(points) / h) / h
         return laplacian, tolerance, allowance
 
-    tried = [differences(nearby) for nearby in trials]
-    if _is_harmonic(look):
+    tests = [differences(stencil) for stencil in trials]
+    if _is_harmonic(samples):
         message = "HarmonicBall: f is not harmonic, its Laplacian is not 0"
         _require_agreement(
-            *_likeliest([(np.abs(laplacian), *rest) for laplacian, *rest in tried]), message, points
+            *_likeliest([(np.abs(laplacian), *rest) for laplacian, *rest in tests]), message, points
         )
     for bound in bounds:
-        low, high = bound.laplacian_lower, bound.laplacian_upper
-        beyond = [
-            (np.maximum(np.maximum(low - laplacian, laplacian - high), 0), *rest)
-            for laplacian, *rest in tried
+        lower, upper = bound.laplacian_lower, bound.laplacian_upper
+        excesses = [
+            (np.maximum(np.maximum(lower - laplacian, laplacian - upper), 0), *rest)
+            for laplacian, *rest in tests
         ]
         message = "BoundedLaplacian: the Laplacian is not between its ends"
-        _require_agreement(*_likeliest(beyond), message, points)
+        _require_agreement(*_likeliest(excesses), message, points)
 
 
 def _likeliest(
-    tried: list[tuple[FloatArray, ...]],
+    results: list[tuple[FloatArray, ...]],
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """At each point, of the two spacings with the smallest bounds, the spacing at which they agree
     better: the difference, the tolerance and the allowance, (n,) each.
 
     Differences across a crease may be close at one spacing by accident, and wrong.
     """
-    off, tolerance, allowance = (np.stack(rows) for rows in zip(*tried, strict=True))
+    error, tolerance, allowance = (np.stack(values) for values in zip(*results, strict=True))
     limit = tolerance + allowance
     best = np.argsort(limit, axis=0)[:2]
-    over = np.take_along_axis(off - limit, best, axis=0)
-    chosen = np.take_along_axis(best, over.argmin(axis=0)[None], axis=0)
-    off, tolerance, allowance = (
-        np.take_along_axis(rows, chosen, axis=0)[0] for rows in (off, tolerance, allowance)
+    excess = np.take_along_axis(error - limit, best, axis=0)
+    chosen = np.take_along_axis(best, excess.argmin(axis=0)[None], axis=0)
+    error, tolerance, allowance = (
+        np.take_along_axis(values, chosen, axis=0)[0] for values in (error, tolerance, allowance)
     )
-    return off, tolerance, allowance
+    return error, tolerance, allowance
 
 
-def _is_harmonic(look: FieldSamples) -> bool:
-    return any(isinstance(one, HarmonicBall) and one.dimension < 4 for one in look.promises)
+def _is_harmonic(samples: FieldSamples) -> bool:
+    return any(isinstance(ball, HarmonicBall) and ball.dimension < 4 for ball in samples.promises)
 
 
 def _require_agreement(
-    off: FloatArray,
+    error: FloatArray,
     tolerance: FloatArray,
     allowance: FloatArray,
     message: str,
@@ -315,20 +320,20 @@ def _require_agreement(
 
     has_creases: differences may cross one, at few points.
     """
-    good = off <= tolerance + allowance
-    if has_creases and good.mean() >= _MIN_FRACTION_OFF_CREASES:
+    agrees = error <= tolerance + allowance
+    if has_creases and agrees.mean() >= _MIN_FRACTION_OFF_CREASES:
         return
-    require(good, message, points, off)
-    if np.mean(off <= tolerance) < _MIN_SMOOTH_FRACTION:
+    require(agrees, message, points, error)
+    if np.mean(error <= tolerance) < _MIN_SMOOTH_FRACTION:
         raise BrokenPromiseError(f"{message} at more than half of the {len(points)} points")
 
 
 def _check_hessian(
-    field: Field, points: FloatArray, look: FieldSamples, trials: list[list[_StencilSample]]
+    field: Field, points: FloatArray, samples: FieldSamples, trials: list[list[_StencilSample]]
 ) -> None:
-    """By central differences of the gradient, of two orders: they tell how far to trust them. The
-    spacing at which the gradient is compared with values is far too small for that where f may have
-    creases: so each quantity has its own."""
+    """Compare the Hessian with central differences of the gradient, of two orders, whose difference
+    tells how far to trust them. The spacing at which the gradient is compared with values is far
+    too small for that where f may have creases: so each quantity has its own spacing."""
     backend = choose_backend("double")
     try:
         rows = field.prepare(backend).hessian(to_vector3(backend, points, "points"))
@@ -337,32 +342,32 @@ def _check_hessian(
     n = len(points)
     hessian = np.stack([np.broadcast_to(to_numpy(row), (n, 3)) for row in rows], axis=1)
     require(np.isfinite(hessian).all(axis=(1, 2)), "the Hessian is not finite", points)
-    scale = _scale(points, look)
-    length = np.linalg.norm(look.gradient, axis=1)
+    scale = _scale(points, samples)
+    length = np.linalg.norm(samples.gradient, axis=1)
     size = np.abs(hessian).max(axis=(1, 2)) + length / scale
     skew = np.abs(hessian - hessian.transpose(0, 2, 1)).max(axis=(1, 2))
     require(skew <= 1e-9 * size, "the Hessian is not symmetric", points, skew)
-    if _is_harmonic(look):
+    if _is_harmonic(samples):
         trace = np.abs(np.trace(hessian, axis1=1, axis2=2))
         require(trace <= 1e-9 * size, "f is harmonic, but its Hessian has a trace", points, trace)
-    own = 0.0  # what it leaves out need not be what the gradient does
+    hessian_error = 0.0  # what it leaves out need not be what the gradient does
     if isinstance(field, BatchedField):
-        own = field.hessian_error_bound(points, precision="double")
+        hessian_error = field.hessian_error_bound(points, precision="double")
 
-    def differences(nearby: list[_StencilSample]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        h = nearby[0].h
+    def differences(stencil: list[_StencilSample]) -> tuple[FloatArray, FloatArray, FloatArray]:
+        h = stencil[0].h
         fine, coarse = np.zeros_like(hessian), np.zeros_like(hessian)
-        for neighbor in nearby:
+        for neighbor in stencil:
             fine[:, :, neighbor.axis] += neighbor.weight[:, None] * neighbor.gradient
             half = 0.5 * neighbor.node if abs(neighbor.node) == 1 else 0.0
             coarse[:, :, neighbor.axis] += half * neighbor.gradient / h[:, None]
-        tolerance = 1e-7 * size + 0.1 * np.abs(fine - coarse).max(axis=(1, 2)) + own
+        tolerance = 1e-7 * size + 0.1 * np.abs(fine - coarse).max(axis=(1, 2)) + hessian_error
         tolerance += 1e-11 * length * (1 + _size(points) / h) / h
         allowance = np.sum(
-            [np.abs(neighbor.weight) * neighbor.gradient_error for neighbor in nearby], axis=0
+            [np.abs(neighbor.weight) * neighbor.gradient_error for neighbor in stencil], axis=0
         )
         return np.abs(fine - hessian).max(axis=(1, 2)), tolerance, allowance
 
-    likeliest = _likeliest([differences(nearby) for nearby in trials])
+    likeliest = _likeliest([differences(stencil) for stencil in trials])
     message = "the Hessian is not the derivative of the gradient"
     _require_agreement(*likeliest, message, points, has_creases=field.has_creases)

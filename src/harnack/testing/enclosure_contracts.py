@@ -61,7 +61,7 @@ class PromiseCase:
     def enclosure(self, kind: type[Enclosure], slopes: SlopeRange) -> Enclosure | None:
         """The enclosure of a class for this promise; None if the class does not apply."""
         promise: Any = self.promise
-        # Without what `of` takes off for rounding, so that steps can be compared exactly.
+        # Without the allowance of `of` for rounding, so that steps can be compared exactly.
         if isinstance(promise, HarmonicBall) and issubclass(kind, HarmonicBallEnclosure):
             ends = -promise.lower, promise.upper
             below, above = (None if _is_open(end) else end for end in ends)
@@ -76,13 +76,13 @@ class PromiseCase:
 
     def accepts(self, kind: type[Enclosure]) -> bool:
         """Whether a class of enclosures applies to this promise."""
-        lows = [low for low, _ in self.promise.interval_pairs]
-        plain = {
-            name: -1.0 if name in lows else 1.0
+        lower_names = [lower for lower, _ in self.promise.interval_pairs]
+        values = {
+            name: -1.0 if name in lower_names else 1.0
             for name, *_ in self.promise.units
             if not _is_open(getattr(self.promise, name))
         }
-        case = PromiseCase(dataclasses.replace(self.promise, **plain), 1.0, 1.0)
+        case = PromiseCase(dataclasses.replace(self.promise, **values), 1.0, 1.0)
         return case.enclosure(kind, SlopeRange(0.0, 0.0)) is not None
 
     def step(self, kind: type[Enclosure], slope: Real, error: Real = 0.0) -> Real:
@@ -99,7 +99,7 @@ class PromiseCase:
 
 
 def _is_open(end: Any) -> bool:
-    """Whether this is no limit at all."""
+    """Whether this end is infinite, that is, no limit."""
     return isinstance(end, float) and math.isinf(end)
 
 
@@ -159,8 +159,8 @@ def check_enclosure(
 
 
 def random_functions(rng: np.random.Generator, rows: int) -> Iterator[RandomFunctions]:
-    """One trial of each kind: harmonic in 2, 3, 4 dimensions, of bounded Laplacian, Lipschitz,
-    of bounded curvature."""
+    """A set of functions of each kind: harmonic in 2, 3, 4 dimensions, of bounded Laplacian,
+    Lipschitz, of bounded curvature."""
     with np.errstate(all="ignore"):
         for dimension in (2, 3, 4):
             yield _positive(rng, rows, dimension, mirrored=False)
@@ -175,17 +175,17 @@ def random_functions(rng: np.random.Generator, rows: int) -> Iterator[RandomFunc
 def _positive(rng: np.random.Generator, rows: int, n: int, *, mirrored: bool) -> RandomFunctions:
     """f - lower (mirrored: upper - f) is the Poisson integral of one, two or three rings."""
     radius, mass = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
-    places = rng.uniform(-1, 1, (rows, 3))
-    close = rng.choice([-1.0, 1.0], (rows, 3)) * (1 - 10 ** rng.uniform(-8, 0, (rows, 3)))
-    places = np.where(rng.random((rows, 3)) < 0.3, close, places)
-    shares = rng.dirichlet([0.7] * 3, rows)
+    latitudes = rng.uniform(-1, 1, (rows, 3))
+    near_poles = rng.choice([-1.0, 1.0], (rows, 3)) * (1 - 10 ** rng.uniform(-8, 0, (rows, 3)))
+    latitudes = np.where(rng.random((rows, 3)) < 0.3, near_poles, latitudes)
+    weights = rng.dirichlet([0.7] * 3, rows)
     kind = rng.integers(0, 3, rows)
-    shares[kind == 0] = (1, 0, 0)  # equality in Jensen's inequality
-    poles = kind == 1  # equality in the chord's
-    places[poles, :2] = (1, -1)
-    shares[poles, 2] = 0
-    shares /= shares.sum(axis=1, keepdims=True)
-    u = AxialFunctions("points", places, shares * mass[:, None], radius, n)
+    weights[kind == 0] = (1, 0, 0)  # equality in Jensen's inequality
+    at_poles = kind == 1  # equality in the chord's
+    latitudes[at_poles, :2] = (1, -1)
+    weights[at_poles, 2] = 0
+    weights /= weights.sum(axis=1, keepdims=True)
+    u = AxialFunctions("points", latitudes, weights * mass[:, None], radius, n)
     sign = -1.0 if mirrored else 1.0
     ends = (-math.inf, mass) if mirrored else (-mass, math.inf)
     return _with_gaps(
@@ -203,8 +203,8 @@ def _bounded(rng: np.random.Generator, rows: int, n: int) -> RandomFunctions:
     """Boundary values in [lower, upper]: steps at random heights, among them two caps."""
     radius, span = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
     heights = np.sort(rng.uniform(0, 2, (rows, 3)), axis=1)
-    thin = rng.random(rows) < 0.2
-    heights[thin] *= 10 ** rng.uniform(-4, 0, thin.sum())[:, None]
+    is_thin = rng.random(rows) < 0.2
+    heights[is_thin] *= 10 ** rng.uniform(-4, 0, is_thin.sum())[:, None]
     values = rng.uniform(0, 1, (rows, 4))  # from the cap ahead to what lies behind the third
     kind = rng.integers(0, 3, rows)
     values[kind == 0] = (1, 0, 0, 1)  # equality in the upper cap bound
@@ -212,15 +212,15 @@ def _bounded(rng: np.random.Generator, rows: int, n: int) -> RandomFunctions:
     weights = values[:, :3] - values[:, 1:]
     u = AxialFunctions("caps", heights, weights * span[:, None], radius, n)
     mean = values[:, 3] + (weights * cap_mass(heights, n)).sum(axis=1)
-    below, above = span * mean, span * (1 - mean)
+    gap_below, gap_above = span * mean, span * (1 - mean)
     return _with_gaps(
         rng,
         f"bounded harmonic, n = {n}",
-        np.minimum(below, above),
+        np.minimum(gap_below, gap_above),
         radius,
         u.slope,
         u.movement,
-        HarmonicBall(radius, -below, above, n),
+        HarmonicBall(radius, -gap_below, gap_above, n),
     )
 
 
@@ -232,47 +232,47 @@ def _sourced(rng: np.random.Generator, rows: int, *, mirrored: bool) -> RandomFu
     one density everywhere, not negative, and mass at the poles alone, the bound is attained.
     """
     radius, mass = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
-    places, shares = rng.uniform(-1, 1, (rows, 3)), rng.dirichlet([0.7] * 3, rows)
+    latitudes, weights = rng.uniform(-1, 1, (rows, 3)), rng.dirichlet([0.7] * 3, rows)
     # As h - c >= mass (1-q^2)/8, f stays above c if its Laplacian stays below 0.75 of the mass: a
     # potential is at most (1-q^2)/6 times the largest density.
     centers = rng.uniform(-0.9, 0.9, (rows, 2))
     sizes = (1 - np.abs(centers)) * rng.uniform(0.1, 1, (rows, 2))
     density = rng.uniform(-0.18, 0.18, (rows, 4)) * 10 ** rng.uniform(-3, 0, (rows, 1))
     kind = rng.integers(0, 4, rows)
-    places[kind < 2, :2], shares[kind < 2, 2], density[kind < 2, 1:3] = (1, -1), 0, 0
+    latitudes[kind < 2, :2], weights[kind < 2, 2], density[kind < 2, 1:3] = (1, -1), 0, 0
     density[kind == 0, 0], density[kind == 0, 3] = np.abs(density[kind == 0, 0]), 0
     density[kind == 1, 0] = 0
     density[kind == 1, 3] = rng.choice([-0.7, 0.7], rows)[kind == 1]
-    shares /= shares.sum(axis=1, keepdims=True)
+    weights /= weights.sum(axis=1, keepdims=True)
     density *= mass[:, None]
     balls = GreenPotentials(
         np.column_stack([np.zeros(rows), centers]), np.column_stack([np.ones(rows), sizes])
     )
     even, wave = density[:, :3], density[:, 3]
-    u = AxialFunctions("points", places, shares * mass[:, None], radius, 3)
+    u = AxialFunctions("points", latitudes, weights * mass[:, None], radius, 3)
     potential, slope = balls.at_center(even)
-    turns = np.stack([-0.5 * wave, wave])  # P_2 is between -1/2 and 1
-    least = density[:, 0] + np.minimum(even[:, 1:], 0).sum(axis=1) + turns.min(axis=0)
-    most = density[:, 0] + np.maximum(even[:, 1:], 0).sum(axis=1) + turns.max(axis=0)
+    wave_sources = np.stack([-0.5 * wave, wave])  # P_2 is between -1/2 and 1
+    min_density = density[:, 0] + np.minimum(even[:, 1:], 0).sum(axis=1) + wave_sources.min(axis=0)
+    max_density = density[:, 0] + np.maximum(even[:, 1:], 0).sum(axis=1) + wave_sources.max(axis=0)
     sign = -1.0 if mirrored else 1.0
 
     def movement(t: FloatArray) -> FloatArray:
         q = t / radius[:, None]
-        turned = wave[:, None] / 5 * q * q * np.log(np.maximum(q, 1e-300))
-        return sign * (u.movement(t) - balls.movement(q, even) + turned)
+        wave_part = wave[:, None] / 5 * q * q * np.log(np.maximum(q, 1e-300))
+        return sign * (u.movement(t) - balls.movement(q, even) + wave_part)
 
     # The ball is taken a little smaller, on which even point masses are bounded.
-    near, far = mass - potential, 1e18 * mass
-    below, above = (far, near) if mirrored else (near, far)
-    low, high = np.sort(sign * np.stack([least, most]) / radius**2, axis=0)
+    near_end, far_end = mass - potential, 1e18 * mass
+    below, above = (far_end, near_end) if mirrored else (near_end, far_end)
+    lower, upper = np.sort(sign * np.stack([min_density, max_density]) / radius**2, axis=0)
     return _with_gaps(
         rng,
         f"bounded Laplacian, {'upper' if mirrored else 'lower'} end near",
-        near,
+        near_end,
         radius,
         sign * (u.slope - slope / radius),
         movement,
-        BoundedLaplacian(radius * (1 - 1e-9), -below, above, low, high),
+        BoundedLaplacian(radius * (1 - 1e-9), -below, above, lower, upper),
     )
 
 
@@ -281,12 +281,12 @@ def _lipschitz(rng: np.random.Generator, rows: int) -> RandomFunctions:
     radius, constant = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
     knots = np.sort(rng.uniform(0, 1, (rows, 2)), axis=1) * radius[:, None]
     slopes = rng.uniform(-1, 1, (rows, 3)) * constant[:, None]
-    straight = rng.random(rows) < 0.4
-    slopes[straight] = (rng.choice([-1.0, 1.0], rows) * constant)[straight, None]
+    is_straight = rng.random(rows) < 0.4
+    slopes[is_straight] = (rng.choice([-1.0, 1.0], rows) * constant)[is_straight, None]
 
     def movement(t: FloatArray) -> FloatArray:
-        bends = np.maximum(t[:, :, None] - knots[:, None, :], 0)
-        return slopes[:, :1] * t + (bends * np.diff(slopes, axis=1)[:, None, :]).sum(axis=2)
+        late = np.maximum(t[:, :, None] - knots[:, None, :], 0)
+        return slopes[:, :1] * t + (late * np.diff(slopes, axis=1)[:, None, :]).sum(axis=2)
 
     return _with_gaps(
         rng,
@@ -300,18 +300,18 @@ def _lipschitz(rng: np.random.Generator, rows: int) -> RandomFunctions:
 
 
 def _curved(rng: np.random.Generator, rows: int) -> RandomFunctions:
-    """Parabolas whose second derivative jumps once, at most the constant in size."""
+    """Parabolas whose second derivative, at most the constant in absolute value, jumps once."""
     radius, constant = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
-    bends = rng.uniform(-1, 1, (rows, 2)) * constant[:, None]
+    curvatures = rng.uniform(-1, 1, (rows, 2)) * constant[:, None]
     extremal = rng.random(rows) < 0.5
-    bends[extremal] = (rng.choice([-1.0, 1.0], rows) * constant)[extremal, None]
+    curvatures[extremal] = (rng.choice([-1.0, 1.0], rows) * constant)[extremal, None]
     knot = rng.uniform(0, 1, rows) * radius
     slope = constant * radius * rng.choice([-1.0, 1.0], rows) * 10 ** rng.uniform(-4, 1, rows)
 
     def movement(t: FloatArray) -> FloatArray:
         late = np.maximum(t - knot[:, None], 0)
-        turn = (bends[:, 1] - bends[:, 0])[:, None]
-        return slope[:, None] * t + 0.5 * bends[:, :1] * t * t + 0.5 * turn * late * late
+        change = (curvatures[:, 1] - curvatures[:, 0])[:, None]
+        return slope[:, None] * t + 0.5 * curvatures[:, :1] * t * t + 0.5 * change * late * late
 
     return _with_gaps(
         rng,
@@ -333,29 +333,29 @@ def _with_gaps(
     movement: Callable[[FloatArray], FloatArray],
     promise: Promise,
 ) -> RandomFunctions:
-    """Levels where the function is at a random place, and others at random."""
+    """Levels that the function reaches at a random point, and other levels at random."""
     rows = len(scale)
-    down, up = scale * _log_uniform(rng, rows, -9, 2), scale * _log_uniform(rng, rows, -9, 2)
-    place = np.where(rng.random(rows) < 0.5, rng.random(rows), _log_uniform(rng, rows, -8, 0))
-    met = movement((place * reach)[:, None])[:, 0]
-    is_met = (rng.random(rows) < 0.8) & (met != 0) & np.isfinite(met)
-    up = np.where(is_met & (met > 0), met, up)
-    down = np.where(is_met & (met < 0), -met, down)
-    far = rng.random(rows) < 0.5  # else the other level is often met first
-    up = np.where(is_met & far & (met < 0), np.inf, up)
-    down = np.where(is_met & far & (met > 0), np.inf, down)
-    return RandomFunctions(name, PromiseCase(promise, down, up), slope, reach, movement)
+    below, above = scale * _log_uniform(rng, rows, -9, 2), scale * _log_uniform(rng, rows, -9, 2)
+    fraction = np.where(rng.random(rows) < 0.5, rng.random(rows), _log_uniform(rng, rows, -8, 0))
+    value = movement((fraction * reach)[:, None])[:, 0]
+    is_reached = (rng.random(rows) < 0.8) & (value != 0) & np.isfinite(value)
+    above = np.where(is_reached & (value > 0), value, above)
+    below = np.where(is_reached & (value < 0), -value, below)
+    is_single = rng.random(rows) < 0.5  # else the other level is often met first
+    above = np.where(is_reached & is_single & (value < 0), np.inf, above)
+    below = np.where(is_reached & is_single & (value > 0), np.inf, below)
+    return RandomFunctions(name, PromiseCase(promise, below, above), slope, reach, movement)
 
 
-def _log_uniform(rng: np.random.Generator, rows: int, low: float, high: float) -> FloatArray:
-    return 10 ** rng.uniform(low, high, rows)
+def _log_uniform(rng: np.random.Generator, rows: int, lower: float, upper: float) -> FloatArray:
+    return 10 ** rng.uniform(lower, upper, rows)
 
 
 def _upload(trial: RandomFunctions, precision: Precision) -> tuple[PromiseCase, Any]:
     """The cases and slopes as Dr.Jit arrays."""
     real = choose_backend(precision).Float
-    upload = trial.case.map_numbers(lambda one: real(one) if isinstance(one, np.ndarray) else one)
-    return upload, real(trial.slope)
+    case = trial.case.map_numbers(lambda n: real(n) if isinstance(n, np.ndarray) else n)
+    return case, real(trial.slope)
 
 
 def _check_trial(
@@ -369,43 +369,43 @@ def _check_trial(
     rows = len(trial.slope)
     real = cast("Any", type(slope))
     step = to_numpy(case.step(kind, slope)).astype(np.float64)
-    met = _meets_level(trial, np.minimum(step, trial.reach), precision)
-    _require(trial, ~met, kind, "a level is met within the step {length}", step)
-    good = (step >= 0) & (step <= trial.reach * (1 + 1e-6))
-    beyond = "the step {length} is no length up to {reach}, where the promise ends"
-    _require(trial, good, kind, beyond, step)
+    is_met = _meets_level(trial, np.minimum(step, trial.reach), precision)
+    _require(trial, ~is_met, kind, "a level is met within the step {length}", step)
+    is_valid = (step >= 0) & (step <= trial.reach * (1 + 1e-6))
+    message = "the step {length} is no length up to {reach}, where the promise ends"
+    _require(trial, is_valid, kind, message, step)
     # In single precision both are rounded, each on its safe side.
-    shares = [1 - 1e-5 if precision == "double" else 0.98, *rng.uniform(0.01, 0.98, 2)]
-    for share in shares:
-        length = step * share
-        free = to_numpy(case.covers(kind, slope, real(length)))
-        _require(trial, free, kind, "{length} is not covered, but lies within the step", length)
+    fractions = [1 - 1e-5 if precision == "double" else 0.98, *rng.uniform(0.01, 0.98, 2)]
+    for fraction in fractions:
+        length = step * fraction
+        is_free = to_numpy(case.covers(kind, slope, real(length)))
+        _require(trial, is_free, kind, "{length} is not covered, but lies within the step", length)
     lengths = [step * (1 + 10 ** rng.uniform(-4, 0, rows)), trial.reach * rng.random(rows)]
     for length in lengths:
-        covered = to_numpy(case.covers(kind, slope, real(length)))
-        inside = np.minimum(length, trial.reach)
-        wrong = covered & (
-            _meets_level(trial, inside, precision) | (length > trial.reach * (1 + 1e-6))
+        is_covered = to_numpy(case.covers(kind, slope, real(length)))
+        tested = np.minimum(length, trial.reach)
+        is_wrong = is_covered & (
+            _meets_level(trial, tested, precision) | (length > trial.reach * (1 + 1e-6))
         )
-        _require(trial, ~wrong, kind, "a level is met within {length}, which is covered", length)
+        _require(trial, ~is_wrong, kind, "a level is met within {length}, which is covered", length)
 
 
 def _meets_level(trial: RandomFunctions, length: FloatArray, precision: Precision) -> BoolArray:
     """Whether the functions are seen to meet a level strictly within the length, (rows,)."""
     tolerance = 1e-9 if precision == "double" else 1e-5
-    shares = np.concatenate([np.linspace(0, 1, _SAMPLES // 2), 1 - np.geomspace(1e-7, 0.5, 24)])
-    t = (1 - tolerance) * length[:, None] * shares
+    fractions = np.concatenate([np.linspace(0, 1, _SAMPLES // 2), 1 - np.geomspace(1e-7, 0.5, 24)])
+    t = (1 - tolerance) * length[:, None] * fractions
     with np.errstate(all="ignore"):
-        moved = trial.movement(t)
-        # Rounding of the inputs moves a function by so much at most.
+        movement = trial.movement(t)
+        # An upper bound of the movement of a function by rounding of its inputs.
         q = np.minimum(t / trial.reach[:, None], 1 - 1e-12)
         growth = kernel_difference(q, 1.0, 4) + 1
-    slack = 0.0
+    rounding = 0.0
     if precision == "single":
-        slack = 2e-6 * _size(trial)[:, None] * growth
+        rounding = 2e-6 * _size(trial)[:, None] * growth
     c = trial.case
-    over = moved > c.gap_above[:, None] * (1 + tolerance) + slack
-    under = -moved > c.gap_below[:, None] * (1 + tolerance) + slack
+    over = movement > c.gap_above[:, None] * (1 + tolerance) + rounding
+    under = -movement > c.gap_below[:, None] * (1 + tolerance) + rounding
     return (over | under).any(axis=1)
 
 
@@ -417,16 +417,16 @@ def _size(trial: RandomFunctions) -> FloatArray:
 
 
 def _require(
-    trial: RandomFunctions, good: Any, kind: type[Enclosure], promise: str, length: FloatArray
+    trial: RandomFunctions, holds: Any, kind: type[Enclosure], promise: str, length: FloatArray
 ) -> None:
-    bad = np.flatnonzero(~good)
-    if not bad.size:
+    failures = np.flatnonzero(~holds)
+    if not failures.size:
         return
-    row = bad[0]
-    numbers = trial.case.map_numbers(lambda one: float(one[row]) if np.ndim(one) else one)
-    what = promise.format(reach=float(trial.reach[row]), length=float(length[row]))
+    row = failures[0]
+    numbers = trial.case.map_numbers(lambda n: float(n[row]) if np.ndim(n) else n)
+    message = promise.format(reach=float(trial.reach[row]), length=float(length[row]))
     raise BrokenPromiseError(
-        f"{kind.__name__} does not keep its promise ({trial.name}): {what}. Wrong in "
-        f"{bad.size} of {len(good)} trials; the first: {numbers}, "
+        f"{kind.__name__} does not keep its promise ({trial.name}): {message}. Wrong in "
+        f"{failures.size} of {len(holds)} trials; the first: {numbers}, "
         f"slope = {float(trial.slope[row])!r}"
     )

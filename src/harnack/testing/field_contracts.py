@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 __all__ = ["check_field", "check_ray_samples", "proved_free_lengths"]
 
-# Places at which the movement along a step is sampled.
+# Number of points at which the movement along a step is sampled.
 _SAMPLES = 33
 
 
@@ -72,28 +72,30 @@ def check_ray_samples(
     n = len(points)
     directions = random_directions(generator, n)
     size = float(np.ptp(points, axis=0).max()) or 1.0
-    ahead = size * 2.0 ** generator.uniform(-10, 1, n)
-    rough = lift_along_rays(field, points, directions, ahead[:, None] * np.linspace(0, 1, 9))
-    scale = np.abs(rough.moved).max(axis=1) + 1e-6
+    reach = size * 2.0 ** generator.uniform(-10, 1, n)
+    coarse = lift_along_rays(field, points, directions, reach[:, None] * np.linspace(0, 1, 9))
+    scale = np.abs(coarse.moved).max(axis=1) + 1e-6
     for forwards in (True, False):
         gaps = scale[:, None] * 10.0 ** generator.uniform(-3, 0.5, (n, 2))
-        without = generator.integers(0, 3, n)  # a level below, above, or on both sides
-        gaps[without < 2, without[without < 2]] = np.inf
+        no_level = generator.integers(0, 3, n)  # a level below, above, or on both sides
+        gaps[no_level < 2, no_level[no_level < 2]] = np.inf
         steps = proved_free_lengths(
-            field, points, directions if forwards else -directions, ahead, gaps,
+            field, points, directions if forwards else -directions, reach, gaps,
             enclosures=enclosures, precision=precision, forwards=forwards,
         )  # fmt: skip
-        lengths = np.minimum(steps, 2 * ahead)[:, None] * np.linspace(0, 1, _SAMPLES)
+        lengths = np.minimum(steps, 2 * reach)[:, None] * np.linspace(0, 1, _SAMPLES)
         path = lift_along_rays(field, points, directions, lengths)
-        # What rounding leaves of the values compared, and of the points in this precision.
-        unit = 2.0**-52 if precision == "double" else 2.0**-23
-        position = unit * (np.abs(points).max(axis=1)[:, None] + lengths) * path.gradient_norm
+        # The rounding error of the compared values, and of the points in this precision.
+        epsilon = 2.0**-52 if precision == "double" else 2.0**-23
+        position = epsilon * (np.abs(points).max(axis=1)[:, None] + lengths) * path.gradient_norm
         allowed = path.error + path.error[:, :1] + 8 * position + 1e-12 * scale[:, None]
-        over = np.maximum(path.moved - gaps[:, 1:], -path.moved - gaps[:, :1]) - allowed
-        worst = over.max(axis=1)
-        where = points + np.take_along_axis(lengths, over.argmax(axis=1)[:, None], 1) * directions
+        excess = np.maximum(path.moved - gaps[:, 1:], -path.moved - gaps[:, :1]) - allowed
+        worst = excess.max(axis=1)
+        places = (
+            points + np.take_along_axis(lengths, excess.argmax(axis=1)[:, None], 1) * directions
+        )
         side = "ahead" if forwards else "back"
-        require(worst <= 0, f"an enclosure looking {side} is left", points, worst, where)
+        require(worst <= 0, f"an enclosure looking {side} is left", points, worst, places)
 
 
 def proved_free_lengths(
@@ -110,19 +112,19 @@ def proved_free_lengths(
     """The free lengths (n,) that a field's enclosures prove from points (n, 3) along unit
     directions.
 
-    ahead: (n,) the reach that is asked of the enclosures.
+    ahead: (n,) the reach that is requested of the enclosures.
     gaps: (n, 2) the differences in value to the levels below and above.
     forwards: False for the enclosures that look back from points on paths along `directions`.
     """
     backend = choose_backend(precision)
-    path = Ray(
+    ray = Ray(
         to_vector3(backend, points), to_vector3(backend, directions), choose_enclosures(enclosures)
     )
     length = backend.Float(np.ascontiguousarray(ahead))
-    down, up = (backend.Float(np.ascontiguousarray(gaps[:, k])) for k in (0, 1))
-    look = field.prepare(backend).sample_ray(path, backend.Float(0), length, length)
-    proofs = look.forward if forwards else look.backward
-    steps = to_numpy(longest_free_length(proofs, LevelGaps(down, up)) + 0 * down)
+    below, above = (backend.Float(np.ascontiguousarray(gaps[:, k])) for k in (0, 1))
+    sample = field.prepare(backend).sample_ray(ray, backend.Float(0), length, length)
+    enclosures = sample.forward if forwards else sample.backward
+    steps = to_numpy(longest_free_length(enclosures, LevelGaps(below, above)) + 0 * below)
     return np.broadcast_to(steps, len(points)).astype(np.float64)
 
 
@@ -140,23 +142,24 @@ def check_field(
 ) -> None:
     """Test what a field promises by sampling it in double precision.
 
-    points: (n, 3) where to look, those outside the field's domain left out; by default `count`
-        random ones in its domain or, if it has none, around its default surface.
-    levels: whose `extent` to test; by default the default level.
-    directions: how many ways to walk from each point within each promise.
+    points: (n, 3) the points of the test, without the points outside the field's domain; by default
+        `count` random points in its domain or, if it has none, around its default surface.
+    levels: the levels whose `extent` is tested; by default the default level.
+    directions: the number of paths from each point within each promise.
 
     Checked: values and gradients are numbers, alike in both precisions within `Sample.value_error`;
-    the gradient is that of the value; f is harmonic where a ball of dimension 2 or 3 says so;
+    the gradient is that of the value; f is harmonic where a ball of dimension 2 or 3 promises it;
     `differentiable_value` is the value and has this gradient; `hessian`, where there is one, is
     symmetric, the derivative of the gradient and, of a harmonic f, without trace; the lift of f
-    keeps each promise (`HarmonicBall`, `Lipschitz`, `TaylorRemainder`) on the way to random points
-    of its ball, or for the last two to where that leaves the domain, and where a search for the
-    worst points and places in these balls ends (`search_violations`: some 14,000 places for each
-    promise); enclosures along paths, of a field that gives its own (`check_ray_samples`), hold;
-    some step is possible at most points; no level set leaves its `extent`. Jumps across sheets
-    are taken out on the way, and values may move between neighboring points by `Sample.value_error`
-    besides, as they do where a tree takes other clusters as wholes. Near the branch points of a
-    Riemann surface all branches are within what these say.
+    keeps each promise (`HarmonicBall`, `Lipschitz`, `TaylorRemainder`) on the path to random points
+    of its ball, or for the last two to the point where the path leaves the domain, and at the end
+    of a search for the worst pairs of points in these balls (`search_violations`: about 14,000
+    pairs for each promise); enclosures along paths, of a field that gives its own
+    (`check_ray_samples`), hold; a step is possible at most points; no level set leaves its
+    `extent`. Jumps across facets are taken out along the path, and values may in addition move
+    between neighboring points by `Sample.value_error`, as they do where a tree approximates other
+    clusters as wholes. Near the branch points of a Riemann surface all branches are within the
+    bounds of these points.
 
     The default takes one to three seconds for most fields, on two cores; for meshes about ten, for
     a `Morph` half a minute. It is a search and no proof: a promise that is wrong where nothing
@@ -164,7 +167,7 @@ def check_field(
 
     Raises:
         BrokenPromiseError: naming the promise and the point where it is broken.
-        ValueError: none of the points given lies in the field's domain.
+        ValueError: none of the points lies in the field's domain.
         TypeError: `evaluate` returns something else than a `Sample`.
     """
     check_is_field(field)
@@ -177,25 +180,25 @@ def check_field(
     if points is None:
         points = random_points(field, generator, count)
     elif field.domain is not None:
-        inside = field.domain.contains_points(points)
-        if not inside.any():
+        is_inside = field.domain.contains_points(points)
+        if not is_inside.any():
             raise ValueError(
                 f"points: all {len(points)} lie outside the domain {field.domain} of the field, "
                 "where it promises nothing; give points inside"
             )
-        points = points[inside]
-    several = levels if isinstance(levels, Sequence | np.ndarray) else (levels,)
+        points = points[is_inside]
+    level_list = levels if isinstance(levels, Sequence | np.ndarray) else (levels,)
     levels = [
-        as_real(field.default_level if level is None else level, "levels") for level in several
+        as_real(field.default_level if level is None else level, "levels") for level in level_list
     ]
-    look = sample_field(field, points)
-    _check_numbers(field, points, look)
-    check_derivatives(field, points, look)
+    samples = sample_field(field, points)
+    _check_numbers(field, points, samples)
+    check_derivatives(field, points, samples)
     _check_rounding(field, points)
-    _check_differentiable_value(field, points, look)
-    for number, known in enumerate(look.promises):
-        _check_promise(field, points, look, known, generator, directions)
-        search_violations(field, points, look, number, generator)
+    _check_differentiable_value(field, points, samples)
+    for number, promise in enumerate(samples.promises):
+        _check_promise(field, points, samples, promise, generator, directions)
+        search_violations(field, points, samples, number, generator)
     if isinstance(field, RiemannSurface):
         check_branch_points(field, float(np.ptp(points, axis=0).max()), generator)
     if _overrides_sample_ray(field):
@@ -210,67 +213,69 @@ def _overrides_sample_ray(field: Field) -> bool:
     return type(field).sample_ray is not Field.sample_ray and not field.has_jumps
 
 
-def _check_numbers(field: Field, points: FloatArray, look: FieldSamples) -> None:
+def _check_numbers(field: Field, points: FloatArray, samples: FieldSamples) -> None:
     if field.period is not None and not 0 < field.period < np.inf:
         raise BrokenPromiseError(f"period must be None or a positive number, not {field.period!r}")
-    require(np.isfinite(look.value), "the value is not a finite number", points)
-    require(np.isfinite(look.gradient).all(axis=1), "the gradient is not finite", points)
-    if not look.promises:
+    require(np.isfinite(samples.value), "the value is not a finite number", points)
+    require(np.isfinite(samples.gradient).all(axis=1), "the gradient is not finite", points)
+    if not samples.promises:
         if _overrides_sample_ray(field):
             return
         raise BrokenPromiseError("nothing is known: without a promise no step is possible")
-    for known in look.promises:
-        numbers = [vars(known)[name] for name, *_ in known.units]
-        name = type(known).__name__
+    for promise in samples.promises:
+        numbers = [vars(promise)[name] for name, *_ in promise.units]
+        name = type(promise).__name__
         require(~np.isnan(numbers).any(axis=0), f"{name} has a NaN", points)
-        for low, high in known.interval_pairs[:1]:
-            inside = (vars(known)[low] <= look.value) & (look.value <= vars(known)[high])
-            require(inside, f"{name}: the value is not within [{low}, {high}]", points)
-        for low, high in known.interval_pairs:
-            ordered = vars(known)[low] <= vars(known)[high]
-            require(ordered, f"{name}: {low} exceeds {high}", points)
-        if "constant" in vars(known):
-            require(vars(known)["constant"] >= 0, f"{name}: the constant is negative", points)
-        if isinstance(known, TaylorRemainder) and np.isinf(known.radius).all():
-            varies = np.ptp(known.constant) > 1e-6 * np.max(known.constant)
+        for lower, upper in promise.interval_pairs[:1]:
+            is_inside = (vars(promise)[lower] <= samples.value) & (
+                samples.value <= vars(promise)[upper]
+            )
+            require(is_inside, f"{name}: the value is not within [{lower}, {upper}]", points)
+        for lower, upper in promise.interval_pairs:
+            is_ordered = vars(promise)[lower] <= vars(promise)[upper]
+            require(is_ordered, f"{name}: {lower} exceeds {upper}", points)
+        if "constant" in vars(promise):
+            require(vars(promise)["constant"] >= 0, f"{name}: the constant is negative", points)
+        if isinstance(promise, TaylorRemainder) and np.isinf(promise.radius).all():
+            varies = np.ptp(promise.constant) > 1e-6 * np.max(promise.constant)
             message = "a TaylorRemainder without a radius has the same constant at every point"
             require(np.full(len(points), not varies), message, points)
-        if isinstance(known, HarmonicBall):
-            if known.dimension not in (2, 3, 4):
-                raise BrokenPromiseError(f"HarmonicBall has dimension {known.dimension!r}")
-            bounded = np.isfinite(known.lower) | np.isfinite(known.upper)
-            require(bounded, "HarmonicBall: both ends are infinite", points)
-    usable = np.any([known.radius > 0 for known in look.promises], axis=0)
-    if usable.mean() < 0.5:
+        if isinstance(promise, HarmonicBall):
+            if promise.dimension not in (2, 3, 4):
+                raise BrokenPromiseError(f"HarmonicBall has dimension {promise.dimension!r}")
+            is_bounded = np.isfinite(promise.lower) | np.isfinite(promise.upper)
+            require(is_bounded, "HarmonicBall: both ends are infinite", points)
+    is_usable = np.any([promise.radius > 0 for promise in samples.promises], axis=0)
+    if is_usable.mean() < 0.5:
         raise BrokenPromiseError(
             "the radius of every promise is 0 at most points: no step is possible there"
         )
 
 
 def _check_rounding(field: Field, points: FloatArray) -> None:
-    """Check that in single precision the value is off by at most `error`, eight units in its last
-    place, and the effect of rounding the point."""
+    """Check that in single precision the error of the value is at most `error`, eight units in its
+    last place, and the effect of rounding the point."""
     single = points.astype(np.float32).astype(np.float64)
     if field.domain is not None:
         single = single[field.domain.contains_points(single)]
     if not len(single):
         return
     exact, rounded = sample_field(field, single), sample_field(field, single, "single")
-    off = rounded.value - exact.value
+    error = rounded.value - exact.value
     if field.period is not None:
-        off -= field.period * np.round(off / field.period)
-    unit = 2.0**-24
+        error -= field.period * np.round(error / field.period)
+    roundoff = 2.0**-24
     length = np.linalg.norm(exact.gradient, axis=1)
     size = np.abs(single).max(axis=1)
-    allowed = rounded.error + exact.error + 8 * unit * (np.abs(exact.value) + length * size)
+    allowed = rounded.error + exact.error + 8 * roundoff * (np.abs(exact.value) + length * size)
     allowed += 8 * 2.0**-126  # numbers below the smallest normal one are lost
-    radii = [one.radius for one in exact.promises] or [np.full(len(single), np.inf)]
+    radii = [promise.radius for promise in exact.promises] or [np.full(len(single), np.inf)]
     singular = np.min(radii, axis=0) < 1e-4 * np.ptp(points)
-    good = (np.abs(off) <= allowed) | singular
-    require(good, "Sample.error: in single precision the value is off by more", single, off)
+    is_right = (np.abs(error) <= allowed) | singular
+    require(is_right, "Sample.error: in single precision the value is off by more", single, error)
 
 
-def _check_differentiable_value(field: Field, points: FloatArray, look: FieldSamples) -> None:
+def _check_differentiable_value(field: Field, points: FloatArray, samples: FieldSamples) -> None:
     backend = choose_backend("double")
     prepared = field.prepare(backend)
     x = to_vector3(backend, points, "points")
@@ -278,27 +283,27 @@ def _check_differentiable_value(field: Field, points: FloatArray, look: FieldSam
     value = prepared.differentiable_value(x)
     dr.backward(dr.sum(value), dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
     dr.eval(value, x.grad)
-    off = np.abs(to_numpy(value) - look.value)
+    error = np.abs(to_numpy(value) - samples.value)
     if field.period is not None:
-        off = np.abs(off - field.period * np.round(off / field.period))
-    own, own_slope = 0.0, 0.0  # what values at points leave out, which samples may not
+        error = np.abs(error - field.period * np.round(error / field.period))
+    value_error, gradient_error = 0.0, 0.0  # what values at points leave out, which samples may not
     if isinstance(field, BatchedField):
-        own = field.error_bound(points, precision="double")
-        own_slope = field.gradient_error_bound(points, precision="double")
-    good = off <= 1e-9 * (1 + np.abs(look.value)) + 2 * look.error + own
-    require(good, "differentiable_value is not the value", points, off)
-    off = np.linalg.norm(to_numpy(x.grad) - look.gradient, axis=1)
-    size = np.linalg.norm(look.gradient, axis=1)
-    good = off <= 1e-6 * size + 2 * look.gradient_error + own_slope
+        value_error = field.error_bound(points, precision="double")
+        gradient_error = field.gradient_error_bound(points, precision="double")
+    is_right = error <= 1e-9 * (1 + np.abs(samples.value)) + 2 * samples.error + value_error
+    require(is_right, "differentiable_value is not the value", points, error)
+    error = np.linalg.norm(to_numpy(x.grad) - samples.gradient, axis=1)
+    size = np.linalg.norm(samples.gradient, axis=1)
+    is_right = error <= 1e-6 * size + 2 * samples.gradient_error + gradient_error
     message = "differentiable_value does not have the gradient as its derivative, in reverse mode"
-    require(good, message, points, off)
+    require(is_right, message, points, error)
 
 
 def _check_promise(
     field: Field,
     points: FloatArray,
-    look: FieldSamples,
-    known: Promise,
+    samples: FieldSamples,
+    promise: Promise,
     rng: np.random.Generator,
     directions: int,
 ) -> None:
@@ -307,38 +312,38 @@ def _check_promise(
 
     Promises of all space, such as harmonic balls, are tested outside of the field's domain as well.
     """
-    name = type(known).__name__
-    reach = np.minimum(known.radius, 2 * float(np.ptp(points, axis=0).max()) + 1e-300)
+    name = type(promise).__name__
+    radius = np.minimum(promise.radius, 2 * float(np.ptp(points, axis=0).max()) + 1e-300)
     # Denser towards the border, where singularities may lie.
-    share = 1 - np.linspace(1, 0.03, 80) ** 2
-    gradient_norm = np.linalg.norm(look.gradient, axis=1, keepdims=True)
-    steepest = look.gradient / np.maximum(gradient_norm, 1e-300)
+    fractions = 1 - np.linspace(1, 0.03, 80) ** 2
+    gradient_norm = np.linalg.norm(samples.gradient, axis=1, keepdims=True)
+    steepest = samples.gradient / np.maximum(gradient_norm, 1e-300)
     steepest[gradient_norm[:, 0] == 0] = (1.0, 0.0, 0.0)
     for k in range(directions):
         # Singularities tend to lie along the gradient.
-        ways = (steepest, -steepest, random_directions(rng, len(points)))
-        d = ways[min(k, 2)]
-        t = reach[:, None] * share
-        if not known.holds_outside_domain:
-            t = np.minimum(reach, _distance_to_exit(field, points, d))[:, None] * share
-        walk = lift_along_rays(field, points, d, t)
-        moved = walk.moved
-        rounding = 1e-9 * (np.abs(look.value)[:, None] + (field.period or 0) + np.abs(moved))
-        rounding += look.error[:, None] + walk.error  # of both ends, also of approximations
-        slope = np.einsum("nk,nk->n", look.gradient, d)
-        slopes = SlopeRange(*((slope + sign * look.gradient_error)[:, None] for sign in (-1, 1)))
-        each = known.map_numbers(lambda number, _, __: number[:, None])
+        choices = (steepest, -steepest, random_directions(rng, len(points)))
+        d = choices[min(k, 2)]
+        t = radius[:, None] * fractions
+        if not promise.holds_outside_domain:
+            t = np.minimum(radius, _distance_to_exit(field, points, d))[:, None] * fractions
+        lift = lift_along_rays(field, points, d, t)
+        movement = lift.moved
+        rounding = 1e-9 * (np.abs(samples.value)[:, None] + (field.period or 0) + np.abs(movement))
+        rounding += samples.error[:, None] + lift.error  # of both ends, also of approximations
+        slope = np.einsum("nk,nk->n", samples.gradient, d)
+        slopes = SlopeRange(*((slope + sign * samples.gradient_error)[:, None] for sign in (-1, 1)))
+        per_row = promise.map_numbers(lambda number, _, __: number[:, None])
         with np.errstate(invalid="ignore"):  # 0 * inf, at the point itself
-            low, high = each.movement_bounds(look.value[:, None], slopes, t)
-            excess = np.maximum(moved - high, low - moved)
-        if isinstance(known, HarmonicBall):
-            excess = np.fmax(excess, _harnack_excess(known, look.value, moved, share))
+            lower, upper = per_row.movement_bounds(samples.value[:, None], slopes, t)
+            excess = np.maximum(movement - upper, lower - movement)
+        if isinstance(promise, HarmonicBall):
+            excess = np.fmax(excess, _harnack_excess(promise, samples.value, movement, fractions))
         excess = np.where(t > 0, excess, 0.0) - rounding
         worst = excess.argmax(axis=1)
         rows = np.arange(len(points))
-        there = points + t[rows, worst, None] * d
+        worst_points = points + t[rows, worst, None] * d
         message = f"{name}: f leaves what is promised here by more than rounding"
-        require(excess.max(axis=1) <= 0, message, points, excess.max(axis=1), there)
+        require(excess.max(axis=1) <= 0, message, points, excess.max(axis=1), worst_points)
 
 
 def _distance_to_exit(field: Field, points: FloatArray, d: FloatArray) -> FloatArray:
@@ -346,26 +351,26 @@ def _distance_to_exit(field: Field, points: FloatArray, d: FloatArray) -> FloatA
     if field.domain is None:
         return np.full(len(points), np.inf)
     backend = choose_backend("double")
-    o, way = to_vector3(backend, points, "points"), to_vector3(backend, d, "d")
-    ends = field.domain.prepare(backend).clip(o, way, backend.Float(0), backend.Float(np.inf))
+    o, direction = to_vector3(backend, points, "points"), to_vector3(backend, d, "d")
+    ends = field.domain.prepare(backend).clip(o, direction, backend.Float(0), backend.Float(np.inf))
     end = np.broadcast_to(to_numpy(ends[1]), (len(points),))
     return np.maximum(end * (1 - 1e-9) - 1e-12 * np.abs(points).max(axis=1), 0)
 
 
 def _harnack_excess(
-    ball: HarmonicBall, value: FloatArray, moved: FloatArray, share: FloatArray
+    ball: HarmonicBall, value: FloatArray, movement: FloatArray, fraction: FloatArray
 ) -> FloatArray:
-    """By how much f is outside [lower, upper], or moves by more than Harnack's inequality allows
-    a positive harmonic function: then it is not harmonic on the ball."""
+    """The excess of f over [lower, upper], or of its movement over the one that Harnack's
+    inequality allows a positive harmonic function: if positive, f is not harmonic on the ball."""
     n = ball.dimension
-    up = (1 + share) / (1 - share) ** (n - 1) - 1
-    down = 1 - (1 - share) / (1 + share) ** (n - 1)
-    below, above = (value - ball.lower)[:, None], (ball.upper - value)[:, None]
+    growth = (1 + fraction) / (1 - fraction) ** (n - 1) - 1
+    decay = 1 - (1 - fraction) / (1 + fraction) ** (n - 1)
+    gap_below, gap_above = (value - ball.lower)[:, None], (ball.upper - value)[:, None]
     with np.errstate(invalid="ignore"):  # 0 * inf, where nothing is known
-        rise = np.fmin(np.fmin(below * up, above), above * down)
-        fall = np.fmin(np.fmin(above * up, below), below * down)
+        rise = np.fmin(np.fmin(gap_below * growth, gap_above), gap_above * decay)
+        fall = np.fmin(np.fmin(gap_above * growth, gap_below), gap_below * decay)
     # A radius cut short only makes the comparison weaker for q <= 1.
-    return np.maximum(moved - rise * (1 + 1e-9), -moved - fall * (1 + 1e-9))
+    return np.maximum(movement - rise * (1 + 1e-9), -movement - fall * (1 + 1e-9))
 
 
 def _check_extent(field: Field, level: float, rng: np.random.Generator, count: int) -> None:
@@ -384,39 +389,39 @@ def _check_extent(field: Field, level: float, rng: np.random.Generator, count: i
     d = random_directions(rng, len(start))
     length = np.minimum(3 * float(half.max()), _distance_to_exit(field, start, d))
     t = np.linspace(0, 1, 160) * length[:, None]
-    walk = lift_along_rays(field, start, d, t)
-    above = sample_field(field, start).value[:, None] + walk.moved + walk.jumped - level
-    # To first order, farther from the level than a thousandth of the extent: no grazing.
-    clear = (
-        _distance_to_level(field, above)
-        > 1e-3 * float(half.max()) * walk.gradient_norm + walk.error
+    lift = lift_along_rays(field, start, d, t)
+    offsets = sample_field(field, start).value[:, None] + lift.moved + lift.jumped - level
+    # To first order, farther from the level than a thousandth of the extent: f does not graze it.
+    is_clear = (
+        _distance_to_level(field, offsets)
+        > 1e-3 * float(half.max()) * lift.gradient_norm + lift.error
     )
-    crossed = (
-        _level_interval(field, above[:, 1:]) != _level_interval(field, above[:, :-1])
-    ) & clear[:, 1:]
-    row, column = np.nonzero(crossed & clear[:, :-1])
+    is_crossed = (
+        _level_interval(field, offsets[:, 1:]) != _level_interval(field, offsets[:, :-1])
+    ) & is_clear[:, 1:]
+    row, column = np.nonzero(is_crossed & is_clear[:, :-1])
     if not row.size:
         return
-    low, high, offset = t[row, column], t[row, column + 1], above[row, column]
+    before, after, offset = t[row, column], t[row, column + 1], offsets[row, column]
     for _ in range(4):  # to 1e-6 of the interval
-        part = low[:, None] + (high - low)[:, None] * np.linspace(0, 1, 33)
-        walk = lift_along_rays(field, start[row], d[row], part)
-        there = offset[:, None] + walk.moved + walk.jumped
-        first = (_level_interval(field, there) != _level_interval(field, there[:, :1])).argmax(
+        lengths = before[:, None] + (after - before)[:, None] * np.linspace(0, 1, 33)
+        lift = lift_along_rays(field, start[row], d[row], lengths)
+        values = offset[:, None] + lift.moved + lift.jumped
+        first = (_level_interval(field, values) != _level_interval(field, values[:, :1])).argmax(
             axis=1
         )
-        some = np.arange(len(row))
-        low, high = part[some, first - 1], part[some, first]
-        offset = there[some, first - 1]
-    at = start[row] + high[:, None] * d[row]
-    inside = volume.contains_points(at)
-    require(inside, f"extent: the surface of level {level:g} leaves {volume} here", at)
+        ids = np.arange(len(row))
+        before, after = lengths[ids, first - 1], lengths[ids, first]
+        offset = values[ids, first - 1]
+    crossings = start[row] + after[:, None] * d[row]
+    is_inside = volume.contains_points(crossings)
+    require(is_inside, f"extent: the surface of level {level:g} leaves {volume} here", crossings)
 
 
-def _level_interval(field: Field, above: FloatArray) -> FloatArray:
-    return np.sign(above) if field.period is None else np.floor(above / field.period)
+def _level_interval(field: Field, offset: FloatArray) -> FloatArray:
+    return np.sign(offset) if field.period is None else np.floor(offset / field.period)
 
 
-def _distance_to_level(field: Field, above: FloatArray) -> FloatArray:
-    whole = 0.0 if field.period is None else field.period * np.round(above / field.period)
-    return np.abs(above - whole)
+def _distance_to_level(field: Field, offset: FloatArray) -> FloatArray:
+    nearest = 0.0 if field.period is None else field.period * np.round(offset / field.period)
+    return np.abs(offset - nearest)

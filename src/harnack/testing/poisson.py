@@ -24,8 +24,8 @@ _TERMS = 30
 def kernel_difference(q: npt.ArrayLike, s: npt.ArrayLike, dimension: int) -> FloatArray:
     """P(q, s) - 1 with P = (1-q^2)/(1+q^2-2qs)^(n/2), for 0 <= q < 1 and -1 <= s <= 1."""
     q, s = np.asarray(q, np.float64), np.asarray(s, np.float64)
-    near = (1 - q) ** 2 + 2 * q * (1 - s)  # accurate where q and s are near 1
-    log = np.where(q < 0.5, np.log1p(np.maximum(q * (q - 2 * s), -0.99)), np.log(near))
+    squared_distance = (1 - q) ** 2 + 2 * q * (1 - s)  # accurate where q and s are near 1
+    log = np.where(q < 0.5, np.log1p(np.maximum(q * (q - 2 * s), -0.99)), np.log(squared_distance))
     return np.expm1(np.log1p(-q * q) - 0.5 * dimension * log)
 
 
@@ -100,9 +100,9 @@ def _cap_closed(q: FloatArray, b: FloatArray, dimension: int) -> FloatArray:
         return 2 / math.pi * np.arctan2((1 + q) * np.sin(angle / 2), (1 - q) * np.cos(angle / 2))
     # n = 4: the sums over j of q^j sin(j angle) and of q^j sin(j angle)/j.
     along, across = q * np.cos(angle), q * np.sin(angle)
-    plain = across / ((1 - along) ** 2 + across**2)
+    plain_sum = across / ((1 - along) ** 2 + across**2)
     over_j = np.arctan2(across, 1 - along)
-    return (angle + plain + over_j - (plain - over_j) / (q * q)) / math.pi
+    return (angle + plain_sum + over_j - (plain_sum - over_j) / (q * q)) / math.pi
 
 
 @dataclass(frozen=True)
@@ -125,19 +125,19 @@ class AxialFunctions:
     def slope(self) -> FloatArray:
         """(rows,) derivative along the axis at the center."""
         if self.measure == "points":
-            each = self.dimension * self.latitudes_or_heights
+            slopes = self.dimension * self.latitudes_or_heights
         else:
-            each = cap_slope(self.latitudes_or_heights, self.dimension)
-        return (self.weights * each).sum(axis=1) / self.radius
+            slopes = cap_slope(self.latitudes_or_heights, self.dimension)
+        return (self.weights * slopes).sum(axis=1) / self.radius
 
     def movement(self, t: FloatArray) -> FloatArray:
         """u(t) - u(0) at distances t (rows, m) along the axis, 0 <= t < radius: (rows, m)."""
         q = t / self.radius[:, None]
         total = np.zeros_like(q)
         for j in range(self.latitudes_or_heights.shape[1]):
-            place, weight = self.latitudes_or_heights[:, j, None], self.weights[:, j, None]
-            each = kernel_difference if self.measure == "points" else cap_movement
-            total += weight * each(q, place, self.dimension)
+            position, weight = self.latitudes_or_heights[:, j, None], self.weights[:, j, None]
+            function = kernel_difference if self.measure == "points" else cap_movement
+            total += weight * function(q, position, self.dimension)
         return total
 
 
@@ -165,7 +165,7 @@ class GreenPotentials:
         return (density * value).sum(axis=1), (density * slope).sum(axis=1)
 
     def movement(self, q: FloatArray, density: FloatArray) -> FloatArray:
-        """w(q) - w(0) at places q (rows, m) on the axis, 0 <= q < 1: (rows, m)."""
+        """w(q) - w(0) at points q (rows, m) on the axis, 0 <= q < 1: (rows, m)."""
         total = np.zeros_like(q)
         for j in range(self.centers.shape[1]):
             y, size = self.centers[:, j, None], self.sizes[:, j, None]
@@ -175,10 +175,10 @@ class GreenPotentials:
 
 def _newton(q: FloatArray, y: FloatArray, size: FloatArray) -> FloatArray:
     """Newton's potential of a ball of density 1 at q, minus that at 0."""
-    near, far = np.abs(y), np.abs(q - y)
-    ends: list[FloatArray] = []
+    distance0, distance = np.abs(y), np.abs(q - y)
+    values: list[FloatArray] = []
     with np.errstate(divide="ignore", invalid="ignore"):
-        for d in (far, near):
-            ends.append(np.where(d > size, size**3 / (3 * d), 0.5 * size**2 - d * d / 6))
-        both = q * (2 * y - q) / 6  # free of cancellation where both are inside
-        return np.where((near <= size) & (far <= size), both, ends[0] - ends[1])
+        for d in (distance, distance0):
+            values.append(np.where(d > size, size**3 / (3 * d), 0.5 * size**2 - d * d / 6))
+        difference = q * (2 * y - q) / 6  # free of cancellation where both are inside
+        return np.where((distance0 <= size) & (distance <= size), difference, values[0] - values[1])

@@ -51,15 +51,15 @@ def require(
     amount: (n,) the size of the violation.
     there: (n, 3) the points where it shows, if not at the points themselves.
     """
-    broken: BoolArray = ~np.asarray(good, dtype=np.bool_)
-    bad = np.flatnonzero(broken)
-    if not bad.size:
+    is_broken: BoolArray = ~np.asarray(good, dtype=np.bool_)
+    ids = np.flatnonzero(is_broken)
+    if not ids.size:
         return
-    worst = bad[0] if amount is None else bad[np.abs(amount[bad]).argmax()]
-    by = "" if amount is None else f" (by {amount[worst]:.3g})"
-    where = "" if there is None else f", at {there[worst].tolist()}"
+    worst = ids[0] if amount is None else ids[np.abs(amount[ids]).argmax()]
+    size = "" if amount is None else f" (by {amount[worst]:.3g})"
+    at = "" if there is None else f", at {there[worst].tolist()}"
     raise BrokenPromiseError(
-        f"{message}{by}: point {points[worst].tolist()}{where}; {bad.size} of {len(points)} points"
+        f"{message}{size}: point {points[worst].tolist()}{at}; {ids.size} of {len(points)} points"
     )
 
 
@@ -67,19 +67,19 @@ def mutated_enclosure(kind: type[Enclosure], factor: float, *, covers: float | N
     """A class of enclosures that is wrong on purpose, to test that the tests detect it: every free
     length is multiplied by `factor`, and every length that `is_free` accepts by `covers` (None: by
     the same factor)."""
-    loose = factor if covers is None else covers
+    covers_factor = factor if covers is None else covers
     base: Any = kind
 
     class Scaled(base):
         original = kind
 
         def free_length(self, gaps: LevelGaps) -> Real:
-            inner: Any = super()
-            return factor * inner.free_length(gaps)
+            parent: Any = super()
+            return factor * parent.free_length(gaps)
 
         def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
-            inner: Any = super()
-            return inner.is_free(gaps, length / loose)
+            parent: Any = super()
+            return parent.is_free(gaps, length / covers_factor)
 
     Scaled.__name__ = f"Scaled{kind.__name__}"
     return Scaled
@@ -111,7 +111,9 @@ class FieldSamples:
             self.gradient[rows],
             self.error[rows],
             self.gradient_error[rows],
-            tuple(one.map_numbers(lambda number, _, __: number[rows]) for one in self.promises),
+            tuple(
+                promise.map_numbers(lambda number, _, __: number[rows]) for promise in self.promises
+            ),
         )
 
 
@@ -124,19 +126,20 @@ def sample_field(
     """
     n = len(points)
     sample = _sample(field, points, precision, closely)
-    numbers_known = [list(vars(one).values()) for one in sample.all_promises]
+    numbers = [list(vars(promise).values()) for promise in sample.all_promises]
     # At once, or each would be computed by a kernel of its own.
-    dr.eval(sample.value, sample.gradient, sample.value_error, sample.gradient_error, numbers_known)
+    dr.eval(sample.value, sample.gradient, sample.value_error, sample.gradient_error, numbers)
 
-    known = tuple(
-        one.map_numbers(lambda number, _, __: _spread(number, n)) for one in sample.all_promises
+    promises = tuple(
+        promise.map_numbers(lambda number, _, __: _spread(number, n))
+        for promise in sample.all_promises
     )
     return FieldSamples(
         _spread(sample.value, n),
         np.broadcast_to(to_numpy(sample.gradient), (n, 3)).astype(np.float64),
         _spread(sample.value_error, n),
         _spread(sample.gradient_error, n),
-        known,
+        promises,
     )
 
 
@@ -168,20 +171,20 @@ def lift_along_rays(
     """
     n, m = lengths.shape
     points = start[:, None] + lengths[..., None] * direction[:, None]
-    look = sample_field(field, points.reshape(-1, 3))
-    value, gradient = look.value.reshape(n, m), look.gradient.reshape(n, m, 3)
+    samples = sample_field(field, points.reshape(-1, 3))
+    value, gradient = samples.value.reshape(n, m), samples.gradient.reshape(n, m, 3)
     slope = np.einsum("nmk,nk->nm", gradient, direction)
-    move = np.diff(value, axis=1)
+    changes = np.diff(value, axis=1)
     if field.period is not None:
         expected = 0.5 * (slope[:, 1:] + slope[:, :-1]) * np.diff(lengths, axis=1)
         expected = np.where(np.isfinite(expected), expected, 0)
         # A gradient may grow without limit at a curve; there the lift still moves little.
         expected = np.clip(expected, -0.5 * field.period, 0.5 * field.period)
-        move -= field.period * np.round((move - expected) / field.period)
-    total = np.concatenate([np.zeros((n, 1)), np.cumsum(move, axis=1)], axis=1)
+        changes -= field.period * np.round((changes - expected) / field.period)
+    total = np.concatenate([np.zeros((n, 1)), np.cumsum(changes, axis=1)], axis=1)
     jumped = accumulated_jumps(field, start, direction, lengths)
     return RayLift(
-        total - jumped, jumped, np.linalg.norm(gradient, axis=2), look.error.reshape(n, m)
+        total - jumped, jumped, np.linalg.norm(gradient, axis=2), samples.error.reshape(n, m)
     )
 
 
@@ -196,16 +199,16 @@ def accumulated_jumps(
     backend = choose_backend("double")
     prepared = field.prepare(backend)
     o, d = to_vector3(backend, start), to_vector3(backend, direction)
-    first, far = (backend.Float(np.ascontiguousarray(lengths[:, k])) for k in (0, -1))
-    behind = JumpCrossing(first, backend.UInt32(NO_FACET), backend.Float(0), d)
+    first, last = (backend.Float(np.ascontiguousarray(lengths[:, k])) for k in (0, -1))
+    crossing = JumpCrossing(first, backend.UInt32(NO_FACET), backend.Float(0), d)
     while True:
-        behind = prepared.next_jump(o, d, behind, far, backend.Bool(True))
-        t, jump = (_spread(one, len(start)) for one in (behind.t, behind.jump))
-        ahead = np.isfinite(t)
-        if not ahead.any():
+        crossing = prepared.next_jump(o, d, crossing, last, backend.Bool(True))
+        t, jump = (_spread(values, len(start)) for values in (crossing.t, crossing.jump))
+        is_ahead = np.isfinite(t)
+        if not is_ahead.any():
             return total
-        passed = ahead[:, None] & (lengths >= t[:, None])
-        total += np.where(passed, np.where(ahead, jump, 0)[:, None], 0)
+        is_passed = is_ahead[:, None] & (lengths >= t[:, None])
+        total += np.where(is_passed, np.where(is_ahead, jump, 0)[:, None], 0)
 
 
 def random_points(field: Field, rng: np.random.Generator, n: int) -> FloatArray:
@@ -215,13 +218,13 @@ def random_points(field: Field, rng: np.random.Generator, n: int) -> FloatArray:
         return 3 * random_directions(rng, n) * rng.random((n, 1))
     lower, upper = volume.bounds()
     lower, upper = np.where(np.isfinite(lower), lower, -3), np.where(np.isfinite(upper), upper, 3)
-    found = np.zeros((0, 3))
-    while len(found) < n:
+    accepted = np.zeros((0, 3))
+    while len(accepted) < n:
         points = rng.uniform(lower, upper, (4 * n, 3))
         if field.domain is not None:
             points = points[field.domain.contains_points(points)]
-        found = np.concatenate([found, points])
-    return found[:n]
+        accepted = np.concatenate([accepted, points])
+    return accepted[:n]
 
 
 def random_directions(rng: np.random.Generator, n: int) -> FloatArray:
@@ -233,8 +236,8 @@ def random_directions(rng: np.random.Generator, n: int) -> FloatArray:
 def _sample(field: Field, points: FloatArray, precision: Precision, closely: bool) -> Sample:
     backend = choose_backend(precision)
     prepared = field.prepare(backend)
-    seen = prepared.exact(backend) if closely else prepared
-    return seen.evaluate(to_vector3(backend, points, "points"))
+    evaluator = prepared.exact(backend) if closely else prepared
+    return evaluator.evaluate(to_vector3(backend, points, "points"))
 
 
 def _spread(value: object, n: int) -> FloatArray:
@@ -242,21 +245,23 @@ def _spread(value: object, n: int) -> FloatArray:
     return np.broadcast_to(array, (n,)).astype(np.float64)
 
 
-# The search for the worst places.
+# The search for the worst points.
 
-# Pairs that climb: at most, and of the points given; how many moves each tries in a round, and
-# rounds. Where f is known along a path only, which costs one evaluation a sample, fewer.
+# The number of pairs that climb: the largest, and as a fraction of the points; the number of moves
+# that each pair tries in an iteration, and of iterations. Where f is known along a path only, which
+# costs an evaluation a sample, fewer.
 _MOST_PAIRS, _PAIRS_OF_POINTS = 48, 0.25
 _MOVES, _ROUNDS, _PATH_COST_DIVISOR = 8, 36, 2
-# Of the radius: how near places come to the border of the ball.
+# Fraction of the radius within which points stay, away from the border of the ball.
 _BORDER = 1 - 1e-6
-# Sizes of moves, in radii: the first, the least, and what success and failure make of them.
+# Lengths of moves, in radii: the first, the smallest, and the factors after success and failure.
 _FIRST_STEP, _MIN_STEP, _STEP_GROWTH, _STEP_SHRINKAGE = 0.25, 1e-9, 1.6, 0.6
-# Of the coordinates: radii below this are left out, for rounding moves places in them.
+# Of the coordinates: smaller radii are left out, for rounding moves points in such balls.
 _SMALLEST = 1e-6
-# Samples on the path to a place, where f is known along it only: searching, and to be sure.
+# Number of samples on the path to a point, where f is known along it only: in the search, and at
+# last.
 _PATH_SAMPLES, _FINAL_PATH_SAMPLES = 24, 600
-# What a ratio may be above one for rounding, and rounding of the values.
+# The allowance of a ratio above 1 for rounding, and the rounding error of the values.
 _ALLOWED, _ROUNDING = 1e-6, 1e-9
 # Of the radius: the spacing of differences of gradients.
 _SPACING = 1e-3
@@ -277,15 +282,15 @@ class _Candidates:
         whether that is another."""
         n = len(self.p)
         m = len(others.p) // n
-        which = np.arange(n) * m + others.violation_ratio.reshape(n, m).argmax(axis=1)
-        better = others.violation_ratio[which] > self.violation_ratio
-        rows = better[:, None]
+        best = np.arange(n) * m + others.violation_ratio.reshape(n, m).argmax(axis=1)
+        is_better = others.violation_ratio[best] > self.violation_ratio
+        mask = is_better[:, None]
         return _Candidates(
-            np.where(rows, others.p[which], self.p),
-            np.where(rows, others.w[which], self.w),
-            np.where(better, others.reach[which], self.reach),
-            np.where(better, others.violation_ratio[which], self.violation_ratio),
-        ), better
+            np.where(mask, others.p[best], self.p),
+            np.where(mask, others.w[best], self.w),
+            np.where(is_better, others.reach[best], self.reach),
+            np.where(is_better, others.violation_ratio[best], self.violation_ratio),
+        ), is_better
 
 
 def search_violations(
@@ -294,7 +299,7 @@ def search_violations(
     """Search for points that violate a promise, the one with index `number` in
     `Sample.all_promises`.
 
-    A promise that is wrong by a few percent is violated only in special places: beside a
+    A promise that is wrong by a few percent is violated only at special points: beside a
     singularity that lies just inside of the ball, or in the one direction in which a range is
     attained. Random points miss these. So this is a random local search over pairs: a point p,
     where the promise is made, and a point y in its ball, where it is tested. Both are moved at
@@ -302,53 +307,53 @@ def search_violations(
     and shrinks after failure.
 
     points: (n, 3), and `look` the samples of the field there. The search starts from the points
-        with the smallest radius and from others chosen at random, with y towards the border of the
-        ball: along the gradient, against it, and in random directions.
+        with the smallest radius and from random points, with y towards the border of the ball:
+        along the gradient, against it, and in random directions.
 
     Raises:
         BrokenPromiseError: naming both points of the worst pair.
     """
     search = _ViolationSearch(field, number, 2 * float(np.ptp(points, axis=0).max()) + 1e-300)
-    part = _PATH_COST_DIVISOR if search.needs_path else 1
-    pairs = min(max(int(_PAIRS_OF_POINTS * len(points)), 6), _MOST_PAIRS) // part
-    moves_each = _MOVES // part
+    divisor = _PATH_COST_DIVISOR if search.needs_path else 1
+    count = min(max(int(_PAIRS_OF_POINTS * len(points)), 6), _MOST_PAIRS) // divisor
+    moves_each = _MOVES // divisor
     order = np.argsort(np.broadcast_to(look.promises[number].radius, len(points)), kind="stable")
-    rows = np.concatenate([order[: pairs // 3], rng.choice(len(points), pairs)])[:pairs]
+    rows = np.concatenate([order[: count // 3], rng.choice(len(points), count)])[:count]
     steepest = look.gradient[rows]
     length = np.linalg.norm(steepest, axis=1, keepdims=True)
     steepest = np.where(length > 0, steepest / np.maximum(length, 1e-300), [1.0, 0.0, 0.0])
-    turn = np.arange(pairs)[:, None] % 3
-    along = np.where(turn == 1, -1, 1) * steepest
-    ways = np.where(turn == 2, random_directions(rng, pairs), along)
-    found = search.pairs(points[rows], ways * rng.uniform(0.3, 1, (pairs, 1)))
-    size = np.full(pairs, _FIRST_STEP)
-    for _ in range(_ROUNDS // part):
-        step = np.repeat(size, moves_each)[:, None]
-        p, w = (np.repeat(one, moves_each, axis=0) for one in (found.p, found.w))
-        reach = np.repeat(found.reach, moves_each)[:, None]
-        # Half of the moves keep the point, a quarter of them the place.
+    start_kind = np.arange(count)[:, None] % 3
+    along = np.where(start_kind == 1, -1, 1) * steepest
+    directions = np.where(start_kind == 2, random_directions(rng, count), along)
+    best = search.pairs(points[rows], directions * rng.uniform(0.3, 1, (count, 1)))
+    steps = np.full(count, _FIRST_STEP)
+    for _ in range(_ROUNDS // divisor):
+        step = np.repeat(steps, moves_each)[:, None]
+        p, w = (np.repeat(array, moves_each, axis=0) for array in (best.p, best.w))
+        reach = np.repeat(best.reach, moves_each)[:, None]
+        # Half of the moves keep p, a quarter of them y.
         kind = np.arange(len(p))[:, None] % 4
-        moves = kind >= 2
-        way = rng.normal(size=p.shape) * step * 10 ** rng.uniform(-1, 0, (len(p), 1))
-        shift = np.where(moves, rng.normal(size=p.shape) * step, 0)
-        near = w - np.where(kind == 3, shift, 0) + np.where(kind == 3, 0, way)
-        # A promise of slopes or second derivatives is broken most between neighbors: a way that is
-        # turned and made shorter or longer, by a share of its length.
+        moves_point = kind >= 2
+        change = rng.normal(size=p.shape) * step * 10 ** rng.uniform(-1, 0, (len(p), 1))
+        shift = np.where(moves_point, rng.normal(size=p.shape) * step, 0)
+        new_w = w - np.where(kind == 3, shift, 0) + np.where(kind == 3, 0, change)
+        # A promise of slopes or second derivatives is broken most between neighbors: an offset that
+        # is turned and made shorter or longer, by a fraction of its length.
         length = np.linalg.norm(w, axis=1, keepdims=True)
-        turned = (w + length * way) * 10 ** rng.uniform(-1, 0.5, (len(p), 1))
-        near = np.where(np.arange(len(p))[:, None] % 8 == 1, turned, near)
-        near = np.where(np.arange(len(p))[:, None] % 8 == 2, w + length * way, near)
-        found, better = found.best_of(search.pairs(p + reach * shift, near))
-        size = np.where(better, np.minimum(_STEP_GROWTH * size, 1), _STEP_SHRINKAGE * size)
-        size = np.where(size < _MIN_STEP, _FIRST_STEP, size)
-    worst = found.violation_ratio > 1 + _ALLOWED
-    if worst.any():
-        found = search.pairs(found.p[worst], found.w[worst], samples=_FINAL_PATH_SAMPLES)
-        there = found.p + found.reach[:, None] * found.w
-        good = ~(found.violation_ratio > 1 + _ALLOWED)
+        rotated = (w + length * change) * 10 ** rng.uniform(-1, 0.5, (len(p), 1))
+        new_w = np.where(np.arange(len(p))[:, None] % 8 == 1, rotated, new_w)
+        new_w = np.where(np.arange(len(p))[:, None] % 8 == 2, w + length * change, new_w)
+        best, is_better = best.best_of(search.pairs(p + reach * shift, new_w))
+        steps = np.where(is_better, np.minimum(_STEP_GROWTH * steps, 1), _STEP_SHRINKAGE * steps)
+        steps = np.where(steps < _MIN_STEP, _FIRST_STEP, steps)
+    is_violated = best.violation_ratio > 1 + _ALLOWED
+    if is_violated.any():
+        best = search.pairs(best.p[is_violated], best.w[is_violated], samples=_FINAL_PATH_SAMPLES)
+        y = best.p + best.reach[:, None] * best.w
+        holds = ~(best.violation_ratio > 1 + _ALLOWED)
         name = type(look.promises[number]).__name__
         message = f"{name}: f leaves what is promised here, by this factor"
-        require(good, message, found.p, found.violation_ratio, there)
+        require(holds, message, best.p, best.violation_ratio, y)
 
 
 @dataclass(frozen=True)
@@ -374,88 +379,89 @@ class _ViolationSearch:
         shortened to stay in the ball."""
         length = np.linalg.norm(w, axis=1, keepdims=True)
         w = w * np.minimum(1, _BORDER / np.maximum(length, 1e-300))
-        ratio, reach = np.full(len(p), -np.inf), np.full(len(p), 1.0)
+        ratios, radii = np.full(len(p), -np.inf), np.full(len(p), 1.0)
         rows = np.flatnonzero(self._within(p))
         if len(rows):
-            look = sample_field(self.field, p[rows])
-            known = look.promises[self.promise_index]
-            reach[rows] = np.minimum(known.radius, self.longest)
-            y = p + reach[:, None] * w
-            usable = reach[rows] > _SMALLEST * np.abs(p[rows]).max(axis=1)
-            if not known.holds_outside_domain:
-                usable &= self._within(y[rows])
-            rows, look = rows[usable], look.subset(usable)
+            samples2 = sample_field(self.field, p[rows])
+            promise = samples2.promises[self.promise_index]
+            radii[rows] = np.minimum(promise.radius, self.longest)
+            y = p + radii[:, None] * w
+            is_usable = radii[rows] > _SMALLEST * np.abs(p[rows]).max(axis=1)
+            if not promise.holds_outside_domain:
+                is_usable &= self._within(y[rows])
+            rows, samples2 = rows[is_usable], samples2.subset(is_usable)
             if len(rows):
-                ratio[rows] = self._ratio(look, p[rows], w[rows], reach[rows], samples)
-        return _Candidates(p, w, reach, np.where(np.isnan(ratio), -np.inf, ratio))
+                ratios[rows] = self._ratio(samples2, p[rows], w[rows], radii[rows], samples)
+        return _Candidates(p, w, radii, np.where(np.isnan(ratios), -np.inf, ratios))
 
     def _within(self, p: FloatArray) -> BoolArray:
-        inside = np.asarray(np.isfinite(p).all(axis=1))
+        is_inside = np.asarray(np.isfinite(p).all(axis=1))
         if self.field.domain is not None:
-            inside &= self.field.domain.contains_points(np.nan_to_num(p))
-        return inside
+            is_inside &= self.field.domain.contains_points(np.nan_to_num(p))
+        return is_inside
 
     def _ratio(
-        self, look: FieldSamples, p: FloatArray, w: FloatArray, reach: FloatArray, samples: int
+        self, at_p: FieldSamples, p: FloatArray, w: FloatArray, reach: FloatArray, samples: int
     ) -> FloatArray:
-        known, y = look.promises[self.promise_index], p + reach[:, None] * w
-        there = sample_field(self.field, y)
-        moved = there.value - look.value
+        promise, y = at_p.promises[self.promise_index], p + reach[:, None] * w
+        at_y = sample_field(self.field, y)
+        moved = at_y.value - at_p.value
         if self.needs_path:
             moved = self._lift(p, y, samples)
-        error = look.error + there.error
-        error = error + _ROUNDING * (np.abs(look.value) + (self.field.period or 0) + np.abs(moved))
+        error = at_p.error + at_y.error
+        error = error + _ROUNDING * (np.abs(at_p.value) + (self.field.period or 0) + np.abs(moved))
         distance = reach * np.linalg.norm(w, axis=1)
         with np.errstate(all="ignore"):
-            slope = np.einsum("nk,nk->n", look.gradient, y - p) / distance
-            low, high = known.movement_bounds(look.value, SlopeRange(slope, slope), distance)
-            if not known.holds_outside_domain:
-                middle, half = 0.5 * (low + high), 0.5 * (high - low)
-                error = error + look.gradient_error * distance * (middle != 0)
+            slope = np.einsum("nk,nk->n", at_p.gradient, y - p) / distance
+            lower, upper = promise.movement_bounds(at_p.value, SlopeRange(slope, slope), distance)
+            if not promise.holds_outside_domain:
+                middle, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
+                error = error + at_p.gradient_error * distance * (middle != 0)
                 return (np.abs(moved - middle) - error) / half
-            below, above = error - low, error + high
-            ratio, free = np.maximum(moved / above, -moved / below), reach - distance
-            if isinstance(known, HarmonicBall):
-                gap = np.minimum(below + moved, above - moved)
-                ratio = np.fmax(ratio, _slope_ratio(known, there, free, gap))
-            if isinstance(known, BoundedLaplacian):
-                spacing = _SPACING * free
-                ratio = np.fmax(ratio, self._laplacian_ratio(known, y, there, spacing))
+            max_fall, max_rise = error - lower, error + upper
+            ratio, margin = np.maximum(moved / max_rise, -moved / max_fall), reach - distance
+            if isinstance(promise, HarmonicBall):
+                gap = np.minimum(max_fall + moved, max_rise - moved)
+                ratio = np.fmax(ratio, _slope_ratio(promise, at_y, margin, gap))
+            if isinstance(promise, BoundedLaplacian):
+                spacing = _SPACING * margin
+                ratio = np.fmax(ratio, self._laplacian_ratio(promise, y, at_y, spacing))
             return ratio
 
     def _lift(self, p: FloatArray, y: FloatArray, samples: int) -> FloatArray:
-        """How far the continuous lift moves from p to y (n,)."""
-        way = y - p
-        length = np.linalg.norm(way, axis=1)
-        d = way / np.maximum(length, 1e-300)[:, None]
+        """The movement (n,) of the continuous lift from p to y."""
+        offset = y - p
+        length = np.linalg.norm(offset, axis=1)
+        d = offset / np.maximum(length, 1e-300)[:, None]
         # Denser towards the border, where singularities may lie.
-        share = 1 - np.linspace(1, 0, samples) ** 2
-        return lift_along_rays(self.field, p, d, length[:, None] * share).moved[:, -1]
+        fractions = 1 - np.linspace(1, 0, samples) ** 2
+        return lift_along_rays(self.field, p, d, length[:, None] * fractions).moved[:, -1]
 
     def _laplacian_ratio(
-        self, known: BoundedLaplacian, y: FloatArray, there: FieldSamples, h: FloatArray
+        self, bound: BoundedLaplacian, y: FloatArray, at_y: FieldSamples, h: FloatArray
     ) -> FloatArray:
-        """One more than by how much the Laplacian at y (n, 3) leaves its ends, in their size."""
+        """1 plus the amount by which the Laplacian at y (n, 3) leaves its bounds, relative to their
+        size."""
         fine, wide = np.zeros(len(y)), np.zeros(len(y))
-        rounding = 4 * there.gradient_error / h
+        rounding = 4 * at_y.gradient_error / h
         for axis in range(3):
             for node, weight, wider in ((1, 1.0, 0.0), (2, 0.0, 0.5)):
-                way = (node * h)[:, None] * np.eye(3)[axis]
+                shift = (node * h)[:, None] * np.eye(3)[axis]
                 rate = (
-                    sample_field(self.field, y + way).gradient
-                    - sample_field(self.field, y - way).gradient
+                    sample_field(self.field, y + shift).gradient
+                    - sample_field(self.field, y - shift).gradient
                 )
                 fine += weight * rate[:, axis] / (2 * h)
                 wide += wider * rate[:, axis] / (2 * h)
-        size = np.linalg.norm(there.gradient, axis=1)
-        rounding += 1e-11 * size * (1 + np.abs(y).max(axis=1) / h) / h + np.abs(fine - wide)
-        off = np.maximum(known.laplacian_lower - fine, fine - known.laplacian_upper) - rounding
-        scale = np.abs(known.laplacian_lower) + np.abs(known.laplacian_upper) + 1e-300
-        return 1 + off / scale
+        slope = np.linalg.norm(at_y.gradient, axis=1)
+        rounding += 1e-11 * slope * (1 + np.abs(y).max(axis=1) / h) / h + np.abs(fine - wide)
+        excess = np.maximum(bound.laplacian_lower - fine, fine - bound.laplacian_upper) - rounding
+        scale = np.abs(bound.laplacian_lower) + np.abs(bound.laplacian_upper) + 1e-300
+        return 1 + excess / scale
 
 
 def _slope_ratio(
-    known: HarmonicBall, there: FieldSamples, free: FloatArray, gap: FloatArray
+    promise: HarmonicBall, at_y: FieldSamples, margin: FloatArray, gap: FloatArray
 ) -> FloatArray:
     """The ratio of |grad f|, at points of a ball, to the largest gradient of a harmonic function
     whose value there is `gap` away from the nearer end of its range.
@@ -464,5 +470,5 @@ def _slope_ratio(
     by Harnack's inequality |grad f(y)| <= n (f(y) - lower)/free; likewise upper - f. Where a
     singularity lies in the ball, the left side grows faster than the right one beside it.
     """
-    slope = np.maximum(np.linalg.norm(there.gradient, axis=1) - there.gradient_error, 0)
-    return np.where(gap > 0, slope * free / (known.dimension * gap), -np.inf)
+    slope = np.maximum(np.linalg.norm(at_y.gradient, axis=1) - at_y.gradient_error, 0)
+    return np.where(gap > 0, slope * margin / (promise.dimension * gap), -np.inf)

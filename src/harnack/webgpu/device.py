@@ -34,12 +34,12 @@ __all__ = [
 ]
 
 Words = npt.NDArray[np.uint32]
-# Seconds that one dispatch should take: a system kills what keeps its display waiting.
+# Seconds that a dispatch should take: a system kills a program that keeps its display waiting.
 _MIN_DISPATCH_SECONDS, _MAX_DISPATCH_SECONDS = 0.1, 0.4
 _INITIAL_BATCH, _MAX_BATCH = 1 << 15, 1 << 21
-# Workgroups along an axis, at most, on every device.
+# The largest number of workgroups along an axis, on every device.
 _MAX_WORKGROUPS_PER_AXIS = 65535
-# Shaders that stay compiled.
+# Number of shaders that stay compiled.
 _SHADER_CACHE_SIZE = 64
 
 
@@ -79,10 +79,10 @@ def find_device() -> Device:
         ) from None
     try:
         adapter: Any = wgpu.gpu.request_adapter_sync(power_preference="high-performance")
-    except RuntimeError as wrong:
-        raise NoDeviceError(f"no device for WebGPU was found: {wrong}") from None
-    wanted = ("max-storage-buffer-binding-size", "max-buffer-size")
-    limits = {name: adapter.limits[name] for name in wanted}
+    except RuntimeError as error:
+        raise NoDeviceError(f"no device for WebGPU was found: {error}") from None
+    names = ("max-storage-buffer-binding-size", "max-buffer-size")
+    limits = {name: adapter.limits[name] for name in names}
     info = adapter.info
     name = f"{info['device']} ({info['backend_type']})"
     return Device(adapter.request_device_sync(required_limits=limits), name)
@@ -104,20 +104,20 @@ class CompiledShader:
         data: by label, the numbers and tables that the shader reads.
         lanes: by label, arrays (count,).
         """
-        made = pack_shader_data(self.shader, data)
-        given = np.stack([as_words(lanes[label]) for label in self.shader.lanes])
+        packed = pack_shader_data(self.shader, data)
+        lane_bits = np.stack([as_words(lanes[label]) for label in self.shader.lanes])
         results = np.empty((len(self.shader.results), count), np.uint32)
-        first, size = 0, _INITIAL_BATCH
-        while first < count:
-            last = min(first + size, count)
-            start = time.perf_counter()
-            results[:, first:last] = self._dispatch(made, given[:, first:last])
-            took = time.perf_counter() - start
-            if took < _MIN_DISPATCH_SECONDS and size < _MAX_BATCH:
+        start, size = 0, _INITIAL_BATCH
+        while start < count:
+            end = min(start + size, count)
+            start_time = time.perf_counter()
+            results[:, start:end] = self._dispatch(packed, lane_bits[:, start:end])
+            elapsed = time.perf_counter() - start_time
+            if elapsed < _MIN_DISPATCH_SECONDS and size < _MAX_BATCH:
                 size *= 2
-            elif took > _MAX_DISPATCH_SECONDS and size > WORKGROUP:
+            elif elapsed > _MAX_DISPATCH_SECONDS and size > WORKGROUP:
                 size //= 2
-            first = last
+            start = end
         return dict(zip(self.shader.results, results, strict=True))
 
     def _dispatch(self, data: Words, lanes: Words) -> Words:
@@ -133,21 +133,23 @@ class CompiledShader:
             handle.create_buffer_with_data(data=np.ascontiguousarray(lanes), usage=usage.STORAGE),
             handle.create_buffer(size=size, usage=usage.STORAGE | usage.COPY_SRC),
         ]
-        entries = [{"binding": k, "resource": {"buffer": one}} for k, one in enumerate(buffers)]
+        entries = [
+            {"binding": k, "resource": {"buffer": buffer}} for k, buffer in enumerate(buffers)
+        ]
         layout = self.pipeline.get_bind_group_layout(0)
         encoder = handle.create_command_encoder()
-        work = encoder.begin_compute_pass()
-        work.set_pipeline(self.pipeline)
-        work.set_bind_group(0, handle.create_bind_group(layout=layout, entries=entries))
+        compute_pass = encoder.begin_compute_pass()
+        compute_pass.set_pipeline(self.pipeline)
+        compute_pass.set_bind_group(0, handle.create_bind_group(layout=layout, entries=entries))
         groups = -(-count // WORKGROUP)
-        across = min(groups, _MAX_WORKGROUPS_PER_AXIS)
-        work.dispatch_workgroups(across, -(-groups // across))
-        work.end()
+        width = min(groups, _MAX_WORKGROUPS_PER_AXIS)
+        compute_pass.dispatch_workgroups(width, -(-groups // width))
+        compute_pass.end()
         handle.queue.submit([encoder.finish()])
-        found: Words = np.frombuffer(handle.queue.read_buffer(buffers[2]), dtype=np.uint32)
-        for one in buffers:
-            one.destroy()
-        return found.reshape(-1, count)
+        words: Words = np.frombuffer(handle.queue.read_buffer(buffers[2]), dtype=np.uint32)
+        for buffer in buffers:
+            buffer.destroy()
+        return words.reshape(-1, count)
 
 
 def pack_shader_data(shader: Shader, data: Mapping[str, Any]) -> Words:
@@ -155,10 +157,10 @@ def pack_shader_data(shader: Shader, data: Mapping[str, Any]) -> Words:
     to 0."""
     tables = [as_words(data[label]) for label in shader.tables]
     numbers = [as_words(data[label])[:1] for label in shader.numbers]
-    begin = 2 + len(tables) + len(numbers)
-    places = begin + np.cumsum([0, *map(len, tables)])[:-1].astype(np.uint32)
-    head = np.zeros(2, np.uint32)
-    return np.concatenate([head, places, *numbers, *tables]).astype(np.uint32)
+    table_start = 2 + len(tables) + len(numbers)
+    starts = table_start + np.cumsum([0, *map(len, tables)])[:-1].astype(np.uint32)
+    header = np.zeros(2, np.uint32)
+    return np.concatenate([header, starts, *numbers, *tables]).astype(np.uint32)
 
 
 def as_words(array: Any) -> Words:
@@ -174,7 +176,7 @@ def as_words(array: Any) -> Words:
 # Whole computations.
 
 Arrays: TypeAlias = "dict[str, npt.NDArray[Any]]"
-# Lanes that Dr.Jit computes as well: spread evenly over all.
+# Number of lanes that Dr.Jit computes as well, spread evenly over all lanes.
 _CHECKED_LANES = 4096
 
 
@@ -200,47 +202,47 @@ def evaluate_on_device(
         UntranslatableError: the kernel contains an unknown operation.
         DeviceMismatchError: the results differ.
     """
-    count = max(dr.width(one) for one in lanes.values())
-    # Two at least: a single lane would be a number.
-    some = max(2, min(count, _CHECKED_LANES))
-    rows: IntArray = np.arange(some) * (count - 1) // (some - 1)
+    count = max(dr.width(array) for array in lanes.values())
+    # At least two: a single lane would be a number.
+    sample_count = max(2, min(count, _CHECKED_LANES))
+    rows: IntArray = np.arange(sample_count) * (count - 1) // (sample_count - 1)
     recording = record_kernel(
-        compute, {name: _gather_lanes(one, rows) for name, one in lanes.items()}, data
+        compute, {name: _gather_lanes(array, rows) for name, array in lanes.items()}, data
     )
     program = device.compile(recording.shader)
-    given = {label: to_numpy(one) for label, one in labeled_leaves("lane", dict(lanes))}
-    bits = program.run(recording.data, given, count)
+    lane_arrays = {label: to_numpy(array) for label, array in labeled_leaves("lane", dict(lanes))}
+    bits = program.run(recording.data, lane_arrays, count)
     expected: Arrays = {}
-    found: Arrays = {}
-    for label, one in recording.results.items():
-        expected[label] = to_numpy(one)
-        found[label] = bits[label].view(expected[label].dtype)
-    for label, one in recording.constants.items():
-        expected[label] = np.full(len(rows), to_numpy(one)[0])
-        found[label] = np.full(count, to_numpy(one)[0])
-    sample = {label: one[rows] for label, one in found.items()}
-    wrong = find_mismatch(rows, _columns_to_arrays(expected), _columns_to_arrays(sample))
-    if wrong:
+    results: Arrays = {}
+    for label, array in recording.results.items():
+        expected[label] = to_numpy(array)
+        results[label] = bits[label].view(expected[label].dtype)
+    for label, array in recording.constants.items():
+        expected[label] = np.full(len(rows), to_numpy(array)[0])
+        results[label] = np.full(count, to_numpy(array)[0])
+    sample = {label: array[rows] for label, array in results.items()}
+    mismatch = find_mismatch(rows, _columns_to_arrays(expected), _columns_to_arrays(sample))
+    if mismatch:
         raise DeviceMismatchError(
-            f"{device.name} does not compute what Dr.Jit does: {wrong}. Nothing that it says is "
+            f"{device.name} does not compute what Dr.Jit does: {mismatch}. Nothing that it says is "
             "used: leave out backend"
         )
-    return _columns_to_arrays(found)
+    return _columns_to_arrays(results)
 
 
 def _gather_lanes(array: Any, rows: npt.NDArray[np.int64]) -> Any:
     index = upload_integers(backend_of(array), rows.astype(np.uint32))
-    some = dr.gather(type(array), array, index)
-    dr.make_opaque(some)
-    return some
+    gathered = dr.gather(type(array), array, index)
+    dr.make_opaque(gathered)
+    return gathered
 
 
 def _columns_to_arrays(columns: Arrays) -> Arrays:
     """Columns "result name" and "result name k" as arrays (n,) and (n, 3) by name."""
-    parts: dict[str, list[npt.NDArray[Any]]] = {}
+    groups: dict[str, list[npt.NDArray[Any]]] = {}
     for label, column in columns.items():
-        parts.setdefault(label.split()[1], []).append(column)
+        groups.setdefault(label.split()[1], []).append(column)
     return {
-        name: several[0] if len(several) == 1 else np.column_stack(several)
-        for name, several in parts.items()
+        name: group[0] if len(group) == 1 else np.column_stack(group)
+        for name, group in groups.items()
     }

@@ -117,13 +117,13 @@ class ComputeKernel:
     labels: dict[int, str]
 
     def walk(self) -> Iterator[Statement]:
-        """All statements, those in loops included."""
-        waiting = list(self.statements)
-        while waiting:
-            one = waiting.pop()
-            yield one
-            if isinstance(one, Loop):
-                waiting += [*one.test, *one.body]
+        """All statements, including the statements in loops."""
+        pending = list(self.statements)
+        while pending:
+            statement = pending.pop()
+            yield statement
+            if isinstance(statement, Loop):
+                pending += [*statement.test, *statement.body]
 
 
 def parse(text: str) -> ComputeKernel:
@@ -200,44 +200,45 @@ class _LLVMParser:
     def __init__(self) -> None:
         self.statements: list[Statement] = []
         self.labels: dict[int, str] = {}
-        self._tables: dict[str, int] = {}  # which parameter a result was read from
+        self._tables: dict[str, int] = {}  # the parameter that a result was read from
         self._current_block = self.statements
         self._loops: list[Loop] = []
         self._aliases: dict[str, Operand] = {}  # names for other values
         self._addresses: dict[str, _Address] = {}
-        self._records: dict[str, _Address] = {}  # of results that are several numbers
+        self._records: dict[str, _Address] = {}  # of results that consist of several numbers
         self._label: str | None = None
-        self._labeled = ""  # the variable that it is of
+        self._labeled = ""  # the variable that has this label
         self._block = ""
         self._patterns = {
-            word: [(re.compile(pattern), action) for pattern, action in several]
-            for word, several in self._grammar().items()
+            word: [(re.compile(pattern), action) for pattern, action in rules]
+            for word, rules in self._grammar().items()
         }
 
     def parse_line(self, line: str) -> None:
-        """One line more."""
+        """Read the next line."""
         text = line.partition(", !")[0].strip()
         if text.startswith(";"):
             self._label, self._labeled = text[1:].strip(), ""
         elif text.endswith(":"):
             self._enter_block(text[:-1])
         elif text:
-            result, _, said = text.rpartition(" = ")
+            result, _, instruction = text.rpartition(" = ")
             variable = result.partition("_")[0]
             self._labeled = self._labeled or variable
             if variable != self._labeled:
                 self._label = None
-            said = _FLAGS.sub("", said.partition(", align ")[0])
-            for pattern, action in self._patterns.get(said.partition(" ")[0], ()):
-                if (found := pattern.fullmatch(said)) is not None:
-                    action(*((result,) if result else ()), *found.groups())
+            instruction = _FLAGS.sub("", instruction.partition(", align ")[0])
+            for pattern, action in self._patterns.get(instruction.partition(" ")[0], ()):
+                if (match := pattern.fullmatch(instruction)) is not None:
+                    action(*((result,) if result else ()), *match.groups())
                     return
             raise UntranslatableError(
                 f"a kernel of this field holds what is not translated for other GPUs: {text[:160]}"
             )
 
     def _enter_block(self, block: str) -> None:
-        """A block of the kernel: of a loop, what is before it, its test, its body, its end."""
+        """Enter a block of the kernel: of a loop, the part before it, its test, its body, or its
+        end."""
         self._block = block
         if re.fullmatch(r"l_\d+_cond", block):
             loop = Loop()
@@ -249,7 +250,7 @@ class _LLVMParser:
         elif re.fullmatch(r"l_\d+_done", block):
             loop = self._loops.pop()
             loop.variables = [
-                replace(one, after=self._value(str(one.after), one.kind)) for one in loop.variables
+                replace(var, after=self._value(str(var.after), var.kind)) for var in loop.variables
             ]
             outer = self._loops[-1] if self._loops else None
             self._current_block = outer.body if outer else self.statements
@@ -262,8 +263,8 @@ class _LLVMParser:
             return Constant(kind, 0)
         if text == "true":
             return Constant(kind, 1)
-        if (several := re.match(r"<\w+ (\S+?)(?:,|>)", text)) is not None:
-            text = several.group(1)
+        if (match := re.match(r"<\w+ (\S+?)(?:,|>)", text)) is not None:
+            text = match.group(1)
         if kind == "f32":
             double = (
                 struct.unpack(">d", bytes.fromhex(text[2:].zfill(16)))[0]
@@ -281,8 +282,8 @@ class _LLVMParser:
             self.labels.setdefault(parameter, self._label)
 
     def _grammar(self) -> dict[str, list[tuple[str, Callable[..., None]]]]:
-        """By the word for what is done: what lines look like, and what is to do for each."""
-        place = rf"ptr ({_NAME}), <\d+ x i32> (\S+)"
+        """By the first word of an instruction: patterns of lines, and the action for each."""
+        entry = rf"ptr ({_NAME}), <\d+ x i32> (\S+)"
         binary: list[tuple[str, Callable[..., None]]]
         binary = [(rf"(\w+) {_VECTOR} {_OPERAND}, {_OPERAND}", self._arithmetic)]
         convert: list[tuple[str, Callable[..., None]]]
@@ -309,8 +310,8 @@ class _LLVMParser:
                 (r"getelementptr inbounds ptr, ptr %params, i32 (\d+)", self._parameter),
                 (rf"getelementptr inbounds \w+, ptr ({_NAME}), i64 %index", self._pointer),
                 (r"getelementptr \[\d+ x \w+\], ptr @\w+, .*", _ignore),  # zeros
-                (rf"getelementptr (?:inbounds )?\[(\d+) x \w+\], {place}", self._record),
-                (rf"getelementptr (?:inbounds )?(?:float|i32|i8), {place}", self._entry),
+                (rf"getelementptr (?:inbounds )?\[(\d+) x \w+\], {entry}", self._record),
+                (rf"getelementptr (?:inbounds )?(?:float|i32|i8), {entry}", self._entry),
             ],
             "load": [
                 (rf"load ptr, ptr ({_NAME})", self._pointer),
@@ -372,8 +373,8 @@ class _LLVMParser:
         if element != "ptr":
             self._aliases[result] = self._value(value, self._kind(element))
 
-    def _lane(self, result: str, which: str) -> None:
-        self._aliases[result] = "lane" if which == "index" else "count"
+    def _lane(self, result: str, name: str) -> None:
+        self._aliases[result] = "lane" if name == "index" else "count"
 
     def _parameter(self, result: str, number: str) -> None:
         self._addresses[result] = _Address(int(number))
@@ -383,12 +384,12 @@ class _LLVMParser:
         self._addresses[result] = self._addresses[pointer]
 
     def _load_number(self, result: str, element: str, pointer: str) -> None:
-        at = self._addresses[pointer]
-        self._current_block.append(Load(result, self._kind(element), "number", at.parameter))
+        source = self._addresses[pointer]
+        self._current_block.append(Load(result, self._kind(element), "number", source.parameter))
 
     def _load_lane(self, result: str, element: str, pointer: str) -> None:
-        at = self._addresses[pointer]
-        self._current_block.append(Load(result, self._kind(element), "lane", at.parameter))
+        source = self._addresses[pointer]
+        self._current_block.append(Load(result, self._kind(element), "lane", source.parameter))
 
     def _store(self, element: str, value: str, pointer: str) -> None:
         kind = self._kind(element)
@@ -397,13 +398,13 @@ class _LLVMParser:
         )
 
     def _record(self, result: str, stride: str, pointer: str, index: str) -> None:
-        at = self._addresses[pointer]
-        self._addresses[result] = _Address(at.parameter, self._value(index, "u32"), int(stride))
+        source = self._addresses[pointer]
+        self._addresses[result] = _Address(source.parameter, self._value(index, "u32"), int(stride))
 
     def _set_address_mask(self, result: str, mask: str, pointer: str) -> None:
-        at = self._addresses[pointer]
+        source = self._addresses[pointer]
         self._addresses[result] = _Address(
-            at.parameter, at.index, at.stride, self._value(mask, "bool")
+            source.parameter, source.index, source.stride, self._value(mask, "bool")
         )
 
     def _entry(self, result: str, pointer: str, index: str) -> None:
@@ -413,21 +414,23 @@ class _LLVMParser:
         self._records[result] = self._addresses[pointer]
 
     def _extract(self, result: str, element: str, record: str, entry: str) -> None:
-        at = self._records[record]
-        self._read_table(result, element, at, int(entry), at.mask)
+        source = self._records[record]
+        self._read_table(result, element, source, int(entry), source.mask)
 
     def _gather(self, result: str, element: str, pointer: str, mask: str) -> None:
-        at = self._addresses[pointer]
-        self._read_table(result, element, at, 0, self._value(mask, "bool"))
-        self._label_parameter(at.parameter)
+        source = self._addresses[pointer]
+        self._read_table(result, element, source, 0, self._value(mask, "bool"))
+        self._label_parameter(source.parameter)
 
     def _read_table(
-        self, result: str, element: str, at: _Address, entry: int, mask: Operand | None
+        self, result: str, element: str, source: _Address, entry: int, mask: Operand | None
     ) -> None:
         kind = self._kind(element)
-        load = Load(result, kind, "table", at.parameter, at.index, at.stride, entry, mask)
+        load = Load(
+            result, kind, "table", source.parameter, source.index, source.stride, entry, mask
+        )
         self._current_block.append(load)
-        self._tables[result] = at.parameter
+        self._tables[result] = source.parameter
 
     def _arithmetic(self, result: str, name: str, element: str, a: str, b: str) -> None:
         kind = self._kind(element)
@@ -446,28 +449,28 @@ class _LLVMParser:
         values = self._value(mask, "bool"), self._value(a, kind), self._value(b, kind)
         self._emit(result, kind, "select", *values)
 
-    def _convert(self, result: str, name: str, given: str, a: str, wanted: str) -> None:
-        kind, own = self._kind(wanted), self._kind(given)
-        value = self._value(a, own)
-        if name == "bitcast" and isinstance(value, str):  # of what was read from a table
+    def _convert(self, result: str, name: str, source_type: str, a: str, target_type: str) -> None:
+        kind, source = self._kind(target_type), self._kind(source_type)
+        value = self._value(a, source)
+        if name == "bitcast" and isinstance(value, str):  # of a value that was read from a table
             if value in self._tables:
                 self._label_parameter(self._tables[value])
-            if kind == own:
+            if kind == source:
                 self._aliases[result] = value
                 return
-        self._emit(result, kind, f"{name} {own}", value)
+        self._emit(result, kind, f"{name} {source}", value)
 
     def _class(self, result: str, name: str, element: str, value: str, mask: str) -> None:
         self._emit(result, "bool", f"{name} {mask}", self._value(value, self._kind(element)))
 
     def _call(self, result: str, element: str, function: str, arguments: str) -> None:
         kind = self._kind(element)
-        given = re.findall(r"<\d+ x \w+> (<[^>]*>|[^,\s]+)", arguments)
+        operands = re.findall(r"<\d+ x \w+> (<[^>]*>|[^,\s]+)", arguments)
         stem = re.sub(r"\.(?:v\d+\w*|ps|f32|i32|ss)\b.*", "", function)
         if stem in _UNARY_CALLS:
-            self._emit(result, kind, _UNARY_CALLS[stem], self._value(given[0], kind))
-        elif len(given) == _CALLS.get(stem, -1):
-            self._emit(result, kind, stem, *(self._value(one, kind) for one in given))
+            self._emit(result, kind, _UNARY_CALLS[stem], self._value(operands[0], kind))
+        elif len(operands) == _CALLS.get(stem, -1):
+            self._emit(result, kind, stem, *(self._value(operand, kind) for operand in operands))
         else:
             raise UntranslatableError(
                 f"a kernel of this field calls {function}, which is not translated for other GPUs"

@@ -1,4 +1,4 @@
-"""The kernel that Dr.Jit records for a computation, and which of its parameters is which array.
+"""The kernel that Dr.Jit records for a computation, and the array of each of its parameters.
 
 A kernel distinguishes its arrays only by the positions of their pointers. Labels come with it as
 comments: `drjit.set_label` labels a variable, and `JitFlag.PrintIR` prints labels. An array that a
@@ -24,7 +24,7 @@ from harnack.webgpu.wgsl import Shader, to_shader
 
 __all__ = ["RecordedKernel", "labeled_leaves", "record_kernel"]
 
-# A flag of Dr.Jit and its function `gather` are changed for all threads while one records.
+# A flag of Dr.Jit and its function `gather` are changed for all threads while a kernel is recorded.
 _RECORDING_LOCK = threading.Lock()
 
 
@@ -58,20 +58,20 @@ def record_kernel(
         RuntimeError: the computation is more than one kernel.
     """
     with _RECORDING_LOCK:
-        naming = _ArrayLabels()
+        labels = _ArrayLabels()
         for label, array in labeled_leaves("lane", dict(lanes)):
             dr.set_label(array, label)
         for array in _find_arrays(data):
-            naming.label_array(array)
-        with dr.suspend_grad(), naming.label_gathers():
-            given = compute(**lanes)
-        results = dict(labeled_leaves("result", dict(given)))
-        computed = {k: one for k, one in results.items() if not _is_constant(one)}
+            labels.label_array(array)
+        with dr.suspend_grad(), labels.label_gathers():
+            outputs = compute(**lanes)
+        results = dict(labeled_leaves("result", dict(outputs)))
+        computed = {k: value for k, value in results.items() if not _is_constant(value)}
         for label, array in computed.items():
             dr.set_label(array, label)
         text = _evaluate_and_get_ir(list(computed.values()))
-    constants = {label: one for label, one in results.items() if label not in computed}
-    return RecordedKernel(_shader(text), naming.labeled_arrays, computed, constants)
+    constants = {label: value for label, value in results.items() if label not in computed}
+    return RecordedKernel(_shader(text), labels.labeled_arrays, computed, constants)
 
 
 @functools.lru_cache(maxsize=64)
@@ -84,7 +84,7 @@ def _is_constant(array: Any) -> bool:
 
 
 def _evaluate_and_get_ir(arrays: list[Any]) -> str:
-    """Evaluates arrays, and gives the text of the kernel."""
+    """Evaluate arrays, and return the text of the kernel."""
     with (
         _garbage_collection_paused(),
         dr.scoped_set_flag(dr.JitFlag.KernelHistory, True),
@@ -93,7 +93,7 @@ def _evaluate_and_get_ir(arrays: list[Any]) -> str:
     ):
         dr.kernel_history_clear()
         dr.eval(arrays)
-        kernels = [one for one in dr.kernel_history() if one.get("ir") is not None]
+        kernels = [kernel for kernel in dr.kernel_history() if kernel.get("ir") is not None]
     if len(kernels) != 1:
         raise RuntimeError(f"this computation is {len(kernels)} kernels, and not one")
     return kernels[0]["ir"].getvalue()
@@ -140,11 +140,11 @@ class _ArrayLabels:
         module = cast("Any", dr)
         original = module.gather
 
-        def gather(dtype: Any, source: Any, index: Any, *rest: Any, **named: Any) -> Any:
-            found = original(dtype, source, index, *rest, **named)
+        def gather(dtype: Any, source: Any, index: Any, *args: Any, **kwargs: Any) -> Any:
+            gathered = original(dtype, source, index, *args, **kwargs)
             if dr.is_array_v(type(source)) and dr.depth_v(type(source)) == 1:
-                self._name_parts(found, source)
-            return found
+                self._name_parts(gathered, source)
+            return gathered
 
         module.gather = gather
         try:
@@ -152,12 +152,12 @@ class _ArrayLabels:
         finally:
             module.gather = original
 
-    def _name_parts(self, found: Any, source: Any) -> None:
-        for _, part in labeled_leaves("", found):
-            if part.state == dr.VarState.Evaluated:  # at a place that is known already
-                self.label_array(part)
+    def _name_parts(self, gathered: Any, source: Any) -> None:
+        for _, leaf in labeled_leaves("", gathered):
+            if leaf.state == dr.VarState.Evaluated:  # gathered at known indices
+                self.label_array(leaf)
             elif source.state == dr.VarState.Evaluated:
-                dr.set_label(part, self._table(source))
+                dr.set_label(leaf, self._table(source))
 
     def _table(self, source: Any) -> str:
         if source.index not in self._tables:
@@ -181,25 +181,27 @@ def labeled_leaves(name: str, value: Any) -> list[tuple[str, Any]]:
         return [leaf for k in range(len(value)) for leaf in labeled_leaves(f"{name} {k}", value[k])]
     if isinstance(value, dict):
         items = cast("dict[str, Any]", value).items()
-        return [leaf for key, one in items for leaf in labeled_leaves(f"{name} {key}", one)]
+        return [leaf for key, entry in items for leaf in labeled_leaves(f"{name} {key}", entry)]
     return []
 
 
 def _find_arrays(data: Any) -> Iterator[Any]:
-    """The flat arrays that an object holds, once each, in a fixed order."""
-    seen: set[int] = set()
-    waiting: list[Any] = [data]
-    while waiting:
-        one = waiting.pop(0)
-        if id(one) in seen or isinstance(one, type | str | bytes | int | float | None.__class__):
+    """The flat arrays that an object holds, each once, in a fixed order."""
+    visited: set[int] = set()
+    pending: list[Any] = [data]
+    while pending:
+        node = pending.pop(0)
+        if id(node) in visited or isinstance(
+            node, type | str | bytes | int | float | None.__class__
+        ):
             continue
-        seen.add(id(one))
-        if dr.is_array_v(type(one)):
-            for _, leaf in labeled_leaves("", one):
+        visited.add(id(node))
+        if dr.is_array_v(type(node)):
+            for _, leaf in labeled_leaves("", node):
                 yield leaf
-        elif isinstance(one, dict):
-            waiting += one.values()
-        elif isinstance(one, list | tuple):
-            waiting += one
-        elif dataclasses.is_dataclass(one) or hasattr(one, "__dict__"):
-            waiting += vars(one).values()
+        elif isinstance(node, dict):
+            pending += node.values()
+        elif isinstance(node, list | tuple):
+            pending += node
+        elif dataclasses.is_dataclass(node) or hasattr(node, "__dict__"):
+            pending += vars(node).values()

@@ -54,7 +54,7 @@ _INFIX = {
     "fadd": "+", "fsub": "-", "fmul": "*", "fdiv": "/", "add": "+", "sub": "-", "mul": "*",
     "udiv": "/", "urem": "%",
 }  # fmt: skip
-# Of truth values as of bits: "&&" would be a branch.
+# Operators of bits, and of truth values: "&&" would be a branch.
 _BITS = {"and": ("&", "&"), "or": ("|", "|"), "xor": ("^", "!=")}
 _FUNCTIONS = {
     "sqrt": "sqrt", "abs": "abs", "floor": "floor", "ceil": "ceil", "trunc": "trunc",
@@ -95,26 +95,26 @@ def to_shader(kernel: ComputeKernel) -> Shader:
 class _WGSLWriter:
     def __init__(self, kernel: ComputeKernel) -> None:
         self._kernel = kernel
-        places: dict[str, list[int]] = {"number": [], "table": [], "lane": []}
+        slots: dict[str, list[int]] = {"number": [], "table": [], "lane": []}
         self._stores: list[Store] = []
-        for one in kernel.walk():
-            if isinstance(one, Load) and one.parameter not in places[one.source]:
-                places[one.source].append(one.parameter)
-            elif isinstance(one, Store):
-                self._stores.append(one)
-        self._buffer_slots = {source: sorted(found) for source, found in places.items()}
-        self._stores.sort(key=lambda one: one.parameter)
+        for statement in kernel.walk():
+            if isinstance(statement, Load) and statement.parameter not in slots[statement.source]:
+                slots[statement.source].append(statement.parameter)
+            elif isinstance(statement, Store):
+                self._stores.append(statement)
+        self._buffer_slots = {source: sorted(parameters) for source, parameters in slots.items()}
+        self._stores.sort(key=lambda statement: statement.parameter)
         self._lines: list[str] = []
         self._depth = 1
 
     def shader(self) -> Shader:
-        for one in self._kernel.statements:
-            self._write(one)
+        for statement in self._kernel.statements:
+            self._write(statement)
         names = {
-            source: tuple(self._label(parameter) for parameter in found)
-            for source, found in self._buffer_slots.items()
+            source: tuple(self._label(parameter) for parameter in parameters)
+            for source, parameters in self._buffer_slots.items()
         }
-        results = tuple(self._label(one.parameter) for one in self._stores)
+        results = tuple(self._label(statement.parameter) for statement in self._stores)
         code = "\n".join(
             [
                 _PRELUDE,
@@ -143,61 +143,61 @@ class _WGSLWriter:
     def _emit(self, line: str) -> None:
         self._lines.append("  " * self._depth + line)
 
-    def _write(self, one: Statement) -> None:
-        if isinstance(one, Loop):
-            self._loop(one)
-        elif isinstance(one, Store):
-            place = self._stores.index(one)
-            value = self._text(one.value)
-            bits = value if one.kind == "u32" else f"bitcast<u32>({value})"
-            self._emit(f"results[{place}u * count + lane] = {bits};")
-        elif isinstance(one, Load):
-            self._emit(f"let {_name(one.result)} = {self._load(one)};")
+    def _write(self, statement: Statement) -> None:
+        if isinstance(statement, Loop):
+            self._loop(statement)
+        elif isinstance(statement, Store):
+            slot = self._stores.index(statement)
+            value = self._text(statement.value)
+            bits = value if statement.kind == "u32" else f"bitcast<u32>({value})"
+            self._emit(f"results[{slot}u * count + lane] = {bits};")
+        elif isinstance(statement, Load):
+            self._emit(f"let {_name(statement.result)} = {self._load(statement)};")
         else:
-            self._emit(f"let {_name(one.result)} = {self._operation(one)};")
+            self._emit(f"let {_name(statement.result)} = {self._operation(statement)};")
 
     def _loop(self, loop: Loop) -> None:
-        for one in loop.variables:
-            self._emit(f"var {_name(one.name)}: {one.kind} = {self._text(one.before)};")
+        for node in loop.variables:
+            self._emit(f"var {_name(node.name)}: {node.kind} = {self._text(node.before)};")
         self._emit("loop {")
         self._depth += 1
-        for one in loop.test:
-            self._write(one)
+        for node in loop.test:
+            self._write(node)
         self._emit(f"if (!{self._text(loop.condition)}) {{ break; }}")
-        for one in loop.body:
-            self._write(one)
-        changed = [one for one in loop.variables if one.after != one.name]
-        # At once: what one becomes may be what another was.
-        for one in changed:
-            self._emit(f"let next_{_name(one.name)} = {self._text(one.after)};")
-        for one in changed:
-            self._emit(f"{_name(one.name)} = next_{_name(one.name)};")
+        for node in loop.body:
+            self._write(node)
+        changed = [node for node in loop.variables if node.after != node.name]
+        # All at the same time: the new value of a variable may be the old value of another.
+        for node in changed:
+            self._emit(f"let next_{_name(node.name)} = {self._text(node.after)};")
+        for node in changed:
+            self._emit(f"{_name(node.name)} = next_{_name(node.name)};")
         self._depth -= 1
         self._emit("}")
 
     def _load(self, load: Load) -> str:
-        place = self._buffer_slots[load.source].index(load.parameter)
+        slot = self._buffer_slots[load.source].index(load.parameter)
         if load.source == "lane":
-            bits = f"lanes[{place}u * count + lane]"
+            bits = f"lanes[{slot}u * count + lane]"
         elif load.source == "number":
-            bits = f"data[{2 + len(self._buffer_slots['table']) + place}]"
+            bits = f"data[{2 + len(self._buffer_slots['table']) + slot}]"
         else:
             assert load.index is not None
             index = self._text(load.index)
             if load.stride > 1:
                 index = f"{index} * {load.stride}u + {load.offset}u"
-            bits = f"data[data[{2 + place}] + {index}]"
+            bits = f"data[data[{2 + slot}] + {index}]"
             if load.mask is not None and not (isinstance(load.mask, Constant) and load.mask.bits):
                 bits = f"select(0u, {bits}, {self._text(load.mask)})"
         return bits if load.kind == "u32" else f"bitcast<f32>({bits})"
 
-    def _operation(self, one: Operation) -> str:
-        a = [self._text(value) for value in one.operands]
-        name, _, how = one.name.partition(" ")
+    def _operation(self, operation: Operation) -> str:
+        a = [self._text(value) for value in operation.operands]
+        name, _, variant = operation.name.partition(" ")
         if name in _INFIX:
             return f"{a[0]} {_INFIX[name]} {a[1]}"
         if name in _BITS:
-            return f"{a[0]} {_BITS[name][one.kind == 'bool']} {a[1]}"
+            return f"{a[0]} {_BITS[name][operation.kind == 'bool']} {a[1]}"
         if name in _FUNCTIONS:
             return f"{_FUNCTIONS[name]}({', '.join(a)})"
         match name:
@@ -226,16 +226,16 @@ class _WGSLWriter:
             case "select":
                 return f"select({a[2]}, {a[1]}, {a[0]})"
             case "fpclass":
-                return _float_class_test(int(how), a[0])
+                return _float_class_test(int(variant), a[0])
             case "fcmp":
-                return _float_comparison(how, a[0], a[1])
+                return _float_comparison(variant, a[0], a[1])
             case "icmp":
-                if how in ("eq", "ne"):
-                    return f"{a[0]} {_ORDER[how]} {a[1]}"
-                x, y = (_signed(v) for v in a) if how[0] == "s" else a
-                return f"{x} {_ORDER[how[1:]]} {y}"
+                if variant in ("eq", "ne"):
+                    return f"{a[0]} {_ORDER[variant]} {a[1]}"
+                x, y = (_signed(v) for v in a) if variant[0] == "s" else a
+                return f"{x} {_ORDER[variant[1:]]} {y}"
             case _:
-                return _conversion(one, name, how, a[0])
+                return _conversion(operation, name, variant, a[0])
 
     def _text(self, value: Operand) -> str:
         if isinstance(value, str):
@@ -261,19 +261,19 @@ def _signed(text: str) -> str:
     return f"bitcast<i32>({text})"
 
 
-def _float_comparison(how: str, x: str, y: str) -> str:
-    """Of numbers; "o.." are false of NaN, "u.." true."""
-    if how in ("ord", "uno"):
-        either = f"is_nan({x}) | is_nan({y})"
-        return either if how == "uno" else f"!({either})"
-    if x == y and how in ("oeq", "une"):
-        return f"is_nan({x})" if how == "une" else f"!is_nan({x})"
-    family, order = how[0], how[1:]
-    if how == "ueq":
+def _float_comparison(predicate: str, x: str, y: str) -> str:
+    """A comparison of numbers; predicates "o.." are false for NaN, "u.." true."""
+    if predicate in ("ord", "uno"):
+        any_nan = f"is_nan({x}) | is_nan({y})"
+        return any_nan if predicate == "uno" else f"!({any_nan})"
+    if x == y and predicate in ("oeq", "une"):
+        return f"is_nan({x})" if predicate == "une" else f"!is_nan({x})"
+    family, order = predicate[0], predicate[1:]
+    if predicate == "ueq":
         return f"({x} == {y}) | is_nan({x}) | is_nan({y})"
-    if how == "one":
+    if predicate == "one":
         return f"({x} != {y}) & !is_nan({x}) & !is_nan({y})"
-    if how == "une":
+    if predicate == "une":
         return f"({x} != {y}) | is_nan({x}) | is_nan({y})"
     if family == "o":
         return f"{x} {_ORDER[order]} {y}"
@@ -296,10 +296,10 @@ def _float_class_test(classes: int, x: str) -> str:
     return " | ".join(test for mask, test in tests.items() if classes & mask)
 
 
-def _conversion(one: Operation, name: str, own: str, x: str) -> str:
-    match name, own, one.kind:
+def _conversion(op: Operation, name: str, source: str, x: str) -> str:
+    match name, source, op.kind:
         case "bitcast", _, kind:
-            return x if own == kind else f"bitcast<{kind}>({x})"
+            return x if source == kind else f"bitcast<{kind}>({x})"
         case "sitofp", "u32", _:
             return f"f32({_signed(x)})"
         case "uitofp", "u32" | "bool", _:
@@ -317,4 +317,4 @@ def _conversion(one: Operation, name: str, own: str, x: str) -> str:
         case "zext" | "trunc", "u32", "u32":
             return x
         case _:
-            raise UntranslatableError(f"{one.name} to {one.kind} is not translated for other GPUs")
+            raise UntranslatableError(f"{op.name} to {op.kind} is not translated for other GPUs")
