@@ -115,7 +115,7 @@ def _default_up_axis(path: Path, *, is_curve: bool) -> tuple[Axis, str]:
         return "y", "the standard of the format"
     if kind in _Y_UP_BY_CONVENTION and not is_curve:
         return "y", "as in most .obj files"
-    return "z", "for want of a standard (up= turns it)"
+    return "z", "for want of a standard (the option up turns it)"
 
 
 def _read(path: Path, read_as: ReadAs | None, boundary: bool) -> LoadedGeometry:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from harnack.cli.arguments import parse, parse_level, parse_size
+from harnack.cli.arguments import parse
 from harnack.cli.commands import COMMANDS
 from harnack.cli.messages import error_line, print_warnings, track_interrupts
 
-__all__ = ["main", "parse_level", "parse_size"]
+__all__ = ["main"]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

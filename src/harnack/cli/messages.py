@@ -18,7 +18,7 @@ from types import FrameType
 from typing import Any
 
 from harnack.rendering import UnboundedSurfaceError
-from harnack.rendering.render_options import OPTION_NAMES
+from harnack.rendering.option_table import BY_NAME
 
 # Ctrl-C.
 
@@ -78,40 +78,11 @@ def print_warnings() -> Generator[None]:
         yield
 
 
-# Arguments of Python that are options of the command line.
-_DIFFERENT_CLI_NAMES = (
-    "backdrop", "boundary", "camera", "isolines", "max_depth", "progress", "value_range",
-)  # fmt: skip
-OPTIONS = (
-    *(name for name in OPTION_NAMES if name not in _DIFFERENT_CLI_NAMES),
-    "bound", "cell_size", "confirm", "keep", "largest", "level", "max_triangles", "normals",
-    "read_as", "simplify", "smoothing", "take_boundary", "tolerance",
-)  # fmt: skip
+# An option with a value, as messages of the library write it, that is not inside of a call.
+_ARGUMENT = re.compile(
+    rf'(?<![(\w.])({"|".join(BY_NAME)})=("[^"]*"|True\b|\([^()]*\)|[\w.-]+(?:\.\w+)*)'
+)
 _PARAMETER = re.compile(r'parameters=\{"(\w+)": 1\.0\}')
-# One of them with a value, as messages write it, that is not inside of a call.
-_ARGUMENT = re.compile(rf'(?<![(\w])({"|".join(OPTIONS)})=("[^"]*"|True\b|[\w.-]+)')
-# What is written otherwise. Longer phrases come before their parts.
-_CLI_PHRASES = {
-    "with a client or a checkpoint": "with --scheduler or --checkpoint",
-    "(tiles=)": "(--tiles)",
-    "clip=harnack.Ball((0, 0, 0), 1)": "--ball 0,0,0,1",
-    "clip=harnack.Box(lower, upper)": "--box X,Y,Z,X,Y,Z",
-    "or harnack.Ball(center, radius)": "or --ball X,Y,Z,RADIUS",
-    "section=harnack.HalfSpace(normal, offset)": "--section X,Y,Z,OFFSET",
-    "target=(x, y, z)": "--target X,Y,Z",
-    "boundary=0.03": "--boundary-tube 0.03",
-    "harnack.Slider(low, high, step=...)": "--slider NAME=LOW:HIGH:STEP",
-    "`harnack.repair`": "`harnack repair`",
-    "solid=True": "--solid",
-    "solid=(-math.inf, level)": "--solid :LEVEL",
-    "solid=(-math.inf, 0.0)": "--solid :0",
-    "solid=(low, high)": "--solid LOW:HIGH",
-    "solid=(0.5, math.inf)": "--solid 0.5:",
-    'backdrop="white"': "--backdrop white",
-    "up= ": "--up ",
-    "max_triangles": "--max-triangles",
-    " (apply_translation), or scale it (apply_scale)": ", or scale it (--scale)",
-}
 
 
 def error_line(error: Exception) -> str:
@@ -130,24 +101,23 @@ def _explanation(error: Exception) -> str:
             return (
                 f"{error.reason}; choose another --level, such as {level_text(error.bounded_level)}"
             )
-        return f"{error.reason}; cut it, such as by --ball 0,0,0,2"
+        return f"{error.reason}; cut it, such as by --clip ball:0,0,0,2"
     if isinstance(error, MemoryError):
         return f"there is not enough memory: choose a smaller --size ({error})"
     return python_to_cli_terms(str(error))
 
 
 def python_to_cli_terms(text: str) -> str:
-    """A message of the library, reworded: options of the command line in place of arguments of
-    Python."""
-    for written, option in _CLI_PHRASES.items():
-        text = text.replace(written, option)
-    text = _PARAMETER.sub(r"--set \1=1", text)
-    return _ARGUMENT.sub(lambda found: _option(*found.groups()), text)
+    """A message of the library, with options of the command line in place of keywords of Python."""
+    text = _PARAMETER.sub(r"--parameter \1=1", text)
+    return _ARGUMENT.sub(lambda match: _option(*match.groups()), text)
 
 
 def _option(name: str, value: str) -> str:
-    option = f"--{name.rstrip('_').replace('_', '-')}"
-    return option if value == "True" else f"{option} {value.strip(chr(34))}"
+    flag = BY_NAME[name].flag
+    if value == "True":
+        return flag
+    return f"{flag} {value.strip(chr(34)).strip('()').replace(' ', '')}"
 
 
 def level_text(level: float | None) -> str:

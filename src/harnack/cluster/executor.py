@@ -245,7 +245,7 @@ class _DaskTasks:
         except self.worker_lost as error:
             raise RuntimeError(
                 f"several workers were lost while they did one part ({error}): it may need more "
-                "memory than they have. Cut the task into more parts (tiles=), or give them more"
+                "memory than they have. Divide the task into more parts (chunks), or give them more"
             ) from None
         except (asyncio.CancelledError, self.scheduler_lost):
             raise RuntimeError(SCHEDULER_LOST) from None

@@ -324,7 +324,7 @@ def curvature_lines(
             length that is not positive; an unknown family.
     """
     target, backend = _field_and_backend("curvature_lines", surface, options, keywords)
-    field, levels = target.field, target.level_values
+    field, levels = target.field, list(target.level_values)
     if len(levels) > 1:
         raise ValueError(f"lines of curvature are of one level, not of {len(levels)}")
     if not is_one_of(family, get_args(Family)):

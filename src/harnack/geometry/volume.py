@@ -136,8 +136,8 @@ def check_volume(given: object, name: str) -> None:
     """Raise TypeError for a value that is neither a volume nor None."""
     if given is not None and not isinstance(given, Volume):
         raise TypeError(
-            f"{name} must be a volume, such as harnack.Ball((0, 0, 0), 1), harnack.Box(lower, "
-            f"upper) or harnack.HalfSpace(normal, offset), not {given!r}"
+            f"{name} must be a volume: a harnack.Ball, harnack.Box or harnack.HalfSpace, or an "
+            f"intersection of these, not {given!r}"
         )
 
 

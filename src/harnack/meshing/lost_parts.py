@@ -223,7 +223,7 @@ def _advice(field: Field) -> str:
     """The remedy where cells miss parts, in words."""
     advice = "choose a smaller `cell_size`"
     if isinstance(field, WindingNumber):
-        advice += "; `harnack.repair` keeps thin parts where their triangles are sound"
+        advice += "; repairing the mesh keeps thin parts where their triangles are sound"
     if isinstance(field, DipolePotential) and not field.smoothing:
         advice += ', or smoothing="auto" if the points have noise'
     return advice

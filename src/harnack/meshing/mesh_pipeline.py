@@ -416,8 +416,7 @@ def _check_has_thickness(
         low, high = (f"{one:g}" for one in ends)
         raise MeshingError(
             f"the part between the levels {low} and {high} of this {type(field).__name__} has no "
-            f"thickness: it jumps across both at its triangles; for what is inside give "
-            f"solid=(0.5, math.inf)"
+            f'thickness: it jumps across both at its triangles; for the inside give side="above"'
         )
 
 
@@ -704,12 +703,12 @@ def _box(field: Field, levels: tuple[float, ...], volume: Volume | None) -> _Mes
     if volume is None and extent is None and isinstance(field, SolidAngle):
         raise MeshingError(
             f"level {level:g} is a multiple of 4 pi: the surface of a curve has no end there; "
-            "choose a level between them, such as 2 pi, or give clip=harnack.Box(lower, upper)"
+            "choose a level between them, such as 2 pi, or give a clip, such as a box"
         )
     if volume is None and extent is None:
         raise MeshingError(
-            f"{type(field).__name__} does not say where its level {level:g} ends: give "
-            "clip=harnack.Box(lower, upper) or harnack.Ball(center, radius)"
+            f"{type(field).__name__} does not say where its level {level:g} ends: give a "
+            "clip, such as a box (harnack.Box)"
         )
     if isinstance(field, SolidAngle):
         return _around_curve(field, extent, volume)
@@ -726,7 +725,7 @@ def _box(field: Field, levels: tuple[float, ...], volume: Volume | None) -> _Mes
     if not (np.isfinite(lower).all() and np.isfinite(upper).all()):
         raise MeshingError(
             f"the clip {volume} has no bounds, and {type(field).__name__} does not say where its "
-            f"level {level:g} ends: give clip=harnack.Box(lower, upper)"
+            f"level {level:g} ends: give a clip with bounds"
         )
     if not (lower < upper).all():
         raise MeshingError("the level set is empty: it lies outside of the clip")
@@ -743,7 +742,7 @@ def _around_curve(field: SolidAngle, extent: Volume | None, volume: Volume | Non
     low, high = _bounds_of(volume)
     lower, upper = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
     if not np.isfinite(upper - lower).all():
-        raise MeshingError("the clip has no bounds: give clip=harnack.Box(lower, upper)")
+        raise MeshingError("the clip has no bounds: give a box or a ball")
     pad = _ROOM * (upper - lower).max()
     return _MeshingBox(lower - pad, upper + pad, True)
 

@@ -146,7 +146,7 @@ class Camera:
             if not length > 0:
                 raise ValueError(
                     f"position {self.position} is in the middle of what is seen: say where to look "
-                    "with target=(x, y, z)"
+                    "with a target (x, y, z)"
                 )
             azimuth = math.degrees(math.atan2(away[1], away[0]))
             elevation = math.degrees(math.asin(max(-1.0, min(1.0, away[2] / length))))

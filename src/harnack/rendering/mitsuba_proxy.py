@@ -140,8 +140,7 @@ def from_properties(
     """
     if tint is not None and surface.solid_range is None:
         raise ValueError(
-            "tint needs a solid, which light goes through: give solid=(low, high), for instance "
-            "solid=(-math.inf, level)"
+            'tint needs a solid, which light goes through: give side="below" or side="above"'
         )
     placement = Placement.identity()
     if "to_world" in props:

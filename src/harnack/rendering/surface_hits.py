@@ -248,7 +248,7 @@ class CappedSolid:
     def of(cls, surface: TracedSurface, prepared: SurfaceTracer) -> CappedSolid:
         """The solid that `surface.side` describes."""
         if surface.solid_range is None:
-            raise ValueError("this level set is not a solid: make it with solid=(low, high)")
+            raise ValueError("this surface is not the boundary of a solid: give it a side")
         finite = iter(prepared.levels.values)
         low, high = (next(finite) if math.isfinite(end) else end for end in surface.solid_range)
         return cls(prepared, low, high)

@@ -123,8 +123,8 @@ def proved_free_lengths(
     length = backend.Float(np.ascontiguousarray(ahead))
     below, above = (backend.Float(np.ascontiguousarray(gaps[:, k])) for k in (0, 1))
     sample = field.prepare(backend).sample_ray(ray, backend.Float(0), length, length)
-    enclosures = sample.forward if forwards else sample.backward
-    steps = to_numpy(longest_free_length(enclosures, LevelGaps(below, above)) + 0 * below)
+    proofs = sample.forward if forwards else sample.backward
+    steps = to_numpy(longest_free_length(proofs, LevelGaps(below, above)) + 0 * below)
     return np.broadcast_to(steps, len(points)).astype(np.float64)
 
 

@@ -280,7 +280,8 @@ def trace_crossings(
     backend, o, d = rays.backend, rays.origin, rays.direction
     prepared = surface.prepare(backend, crosses=True)
     with dr.suspend_grad():
-        found = find_crossings(prepared, *(dr.detach(array) for array in rays.arrays), k)
+        o0, d0, near, far = (dr.detach(array) for array in rays.arrays)
+        found = find_crossings(prepared, o0, d0, near, far, k)
         is_found = dr.isfinite(found.t)
         length = norm(found.gradient)
         normal = dr.select(length > 0, found.gradient / length, 0)

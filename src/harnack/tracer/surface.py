@@ -108,7 +108,8 @@ class Surface:
 
     def replace(self, **changes: Any) -> Surface:
         """This surface with other arguments, by their names in the constructor."""
-        arguments = {"field": self.field, "level": self.levels, **self.keywords} | changes
+        arguments: dict[str, Any] = {"field": self.field, "level": self.levels, **self.keywords}
+        arguments |= changes
         return Surface(**arguments)
 
     @property
@@ -170,7 +171,7 @@ def _check_side(side: Any, levels: Sequence[Any]) -> Side | None:
     if side is not None and not is_one_of(side, SIDES):
         names = ", ".join(f'"{name}"' for name in SIDES)
         raise ValueError(f"side must be one of {names}, not {side!r}{did_you_mean(side, SIDES)}")
-    count = {"below": 1, "above": 1, "between": 2}.get(side, len(levels))
+    count = 2 if side == "between" else 1 if side in ("below", "above") else len(levels)
     if len(levels) != count:
         raise ValueError(
             f'side="{side}" is the solid '

@@ -100,6 +100,14 @@ class TracedSurface:
             largest=self.largest,
         )  # fmt: skip
 
+    @property
+    def options(self) -> TraceOptions:
+        """The options without the surface."""
+        return TraceOptions(
+            tolerance=self.tolerance, enclosures=self.enclosures, max_steps=self.max_steps,
+            over_relaxation=self.over_relaxation, require_crossing=self.require_crossing,
+        )  # fmt: skip
+
     def validate_crossings(self, option: str) -> None:
         """Raise an error if crossings of this surface cannot be traced.
 

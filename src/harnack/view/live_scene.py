@@ -509,7 +509,7 @@ def color_index(met: SurfaceHit) -> Any:
 
 def placed_tolerance(one: StudioObject, placed: PlacedSurface) -> float:
     """The tolerance as a length of the stage."""
-    return one.surface.tolerance.distance * float(placed.scale[0])
+    return one.surface.hit_tolerance.distance * float(placed.scale[0])
 
 
 def _place(made: RecordedKernel, label: str) -> int:

@@ -228,12 +228,13 @@ class Session:
         origin = _points([question.get("origin")], "origin")
         direction = _points([question.get("direction")], "direction")
         surfaces = [one.surface for one in self.live.surfaces_at(controls)]
-        every = [trace(one, origin, direction) for one in surfaces]
+        every = [trace(one.surface, origin, direction, options=one.options) for one in surfaces]
         nearest = min(range(len(every)), key=lambda k: float(every[k].t[0]))
         hits, surface = every[nearest], surfaces[nearest]
         steps = [0.0]
         for most in range(1, min(int(hits.evaluations[0]), _MOST_STEPS)):
-            reached = trace(replace(surface, max_steps=most), origin, direction).t[0]
+            options = surface.options.replace(max_steps=most)
+            reached = trace(surface.surface, origin, direction, options=options).t[0]
             if steps[-1] < reached < hits.t[0]:
                 steps.append(float(reached))
         there: JsonDict = {

@@ -56,7 +56,7 @@ class Lobes(Field):
     and the origin belongs to the surface. To tell signs by color, draw both parts:
 
         lobes, signs = hk.Lobes(3, 2), ["plastic", "porcelain"]
-        hk.render([lobes.positive, lobes.negative], material=signs, solid=(-math.inf, 0))
+        hk.render([lobes.positive, lobes.negative], material=signs, side="below")
 
     l, m: degree 0 <= l <= 12 and order -l <= m <= l.
     scale: more than 0, the length of a lobe in which Y reaches 1.
