@@ -413,10 +413,12 @@ class RiemannSurface(Field):
         enclosures: list[Enclosure] = []
         speed = abs(projection)
         for point, offset, y in self._ends_of_branches(local):
-            along = -(offset.real * projection.real + offset.imag * projection.imag) / speed
-            along = dr.select(speed > 0, along, 0)
-            across = dr.abs(offset.real * projection.imag - offset.imag * projection.real) / speed
-            across = dr.select(speed > 0, across, abs(offset)) + local.rounding
+            t_closest = -(offset.real * projection.real + offset.imag * projection.imag) / speed
+            t_closest = dr.select(speed > 0, t_closest, 0)
+            offset_norm = (
+                dr.abs(offset.real * projection.imag - offset.imag * projection.real) / speed
+            )
+            offset_norm = dr.select(speed > 0, offset_norm, abs(offset)) + local.rounding
             fall = dr.abs(d.z)
             if self._shift is None:
                 fall = fmax(-dr.mulsign(d.z, y), 0)
@@ -426,7 +428,7 @@ class RiemannSurface(Field):
             distance = dr.abs(local.nearest.phi)
             enclosures.append(
                 BranchPointEnclosure(
-                    gap, fall, along, across, speed, *cone, distance, local.value >= 0
+                    gap, fall, t_closest, offset_norm, speed, *cone, distance, local.value >= 0
                 )
             )
         return enclosures

@@ -236,27 +236,27 @@ class WaveRounding:
     def of(cls, terms: Sequence[Term]) -> WaveRounding:
         """The rounding of the operations of `evaluate_terms`."""
         common = [_common(terms, axis) for axis in range(3)]
-        value, gradient, whole, second = ([0.0] * 4 for _ in range(4))
+        value, gradient, total_slopes, second = ([0.0] * 4 for _ in range(4))
         sizes, slopes, seconds = 0.0, 0.0, 0.0
         for n, term in enumerate(terms):
             size, vector = abs(term.amplitude), _vector(term)
-            steep = math.sqrt(sum(k * k for k in vector))
-            second_size = size * steep * steep
-            sizes, slopes, seconds = sizes + size, slopes + size * steep, seconds + second_size
+            norm = math.sqrt(sum(k * k for k in vector))
+            second_size = size * norm * norm
+            sizes, slopes, seconds = sizes + size, slopes + size * norm, seconds + second_size
             angle, per_axis, operations = _of_term(term, common)
             _, all_per_axis, _ = _of_term(term, (None, None, None))
             partial = (sizes, slopes, seconds) if n else (0.0, 0.0, 0.0)  # the first sum is exact
             value[0] += size * (angle + operations) + partial[0]
-            gradient[0] += size * steep * (angle + operations + 2) + partial[1]
+            gradient[0] += size * norm * (angle + operations + 2) + partial[1]
             second[0] += second_size * (angle + operations + 6) + partial[2]
             for axis in range(3):
                 value[axis + 1] += size * per_axis[axis]
-                gradient[axis + 1] += size * steep * per_axis[axis]
-                whole[axis + 1] += size * steep * all_per_axis[axis]
+                gradient[axis + 1] += size * norm * per_axis[axis]
+                total_slopes[axis + 1] += size * norm * all_per_axis[axis]
                 second[axis + 1] += second_size * all_per_axis[axis]
-        whole[0] = gradient[0]
+        total_slopes[0] = gradient[0]
         moves = [0.0 if k is None else _rounded(k) for k in common]
-        a, b, c, d = ((s[0], s[1], s[2], s[3]) for s in (value, gradient, whole, second))
+        a, b, c, d = ((s[0], s[1], s[2], s[3]) for s in (value, gradient, total_slopes, second))
         return cls((moves[0], moves[1], moves[2]), a, b, c, d)
 
     def errors(self, p: Vec3, gradient: Vec3) -> tuple[Real, Real]:

@@ -138,20 +138,20 @@ class BoundaryCells:
         x.
         """
         backend, real = self.cells.backend, self.cells.backend.Float
-        found, inside = self.cells.sums(x, active)
-        displacement = x - found.center
+        local, inside = self.cells.sums(x, active)
+        displacement = x - local.center
         distance = dr.norm(displacement)
         inside &= distance > _TRIANGLE_ROUNDINGS * unit
         direction = dr.select(inside, displacement / distance, backend.Array3f(0, 0, 1))
-        frame = RayFrame.along(backend, found.center, direction)
-        change, is_certain = self.cells.change_from_center(found, frame, x, unit, inside)
+        frame = RayFrame.along(backend, local.center, direction)
+        change, is_certain = self.cells.change_from_center(local, frame, x, unit, inside)
         turns, is_clear = self.rays.signed_crossings_between(frame, distance, unit, inside)
         on_triangle = jump_sum_within(self.rays, x, _TRIANGLE_ROUNDINGS * unit, inside)
-        estimate = dr.gather(real, self.center_values, found.cell, inside) - turns + _SHARE * change
-        value = _SHARE * found.sums.angle
+        estimate = dr.gather(real, self.center_values, local.cell, inside) - turns + _SHARE * change
+        value = _SHARE * local.sums.angle
         offset = estimate - value
         branch = dr.round(offset)
-        error = found.error + found.rounding
+        error = local.error + local.rounding
         is_valid = inside & is_certain & is_clear & (on_triangle == 0)
         is_valid &= (dr.abs(offset - branch) < _MAX_BRANCH_ERROR) & (
             _SHARE * error < _MAX_BRANCH_ERROR

@@ -343,10 +343,10 @@ class CircleSet:
             length = dr.norm(relative.outward)
             perpendicular = dr.normalize(_across(vector, relative.normal))
             radial = dr.select(length > 0, relative.outward / length, perpendicular)
-            foot = dr.fma(vector(relative.a), radial, vector(*row[:3]))
-            square = dr.squared_norm(x - foot)
+            point = dr.fma(vector(relative.a), radial, vector(*row[:3]))
+            square = dr.squared_norm(x - point)
             closer = square < nearest
-            return dr.select(closer, foot, best), dr.select(closer, square, nearest)
+            return dr.select(closer, point, best), dr.select(closer, square, nearest)
 
         return self.records.for_each(add, (vector(0), real(dr.inf)), "nearest circle")
 

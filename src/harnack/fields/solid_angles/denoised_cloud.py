@@ -86,9 +86,12 @@ class DenoisedCloud:
             )
         cloud = CloudDenoiser(x, estimate_noise(x, known_normals, tree), tree)
         if known_normals is None:
-            moved, new_normals = cloud.denoise_points_and_normals(_normals(cloud, gradients))
+            new_points, new_normals = cloud.denoise_points_and_normals(_normals(cloud, gradients))
         else:
-            moved, new_normals = cloud.denoise_points(known_normals), known_normals[cloud.selected]
+            new_points, new_normals = (
+                cloud.denoise_points(known_normals),
+                known_normals[cloud.selected],
+            )
         noise, spacing = cloud.noise.deviation, cloud.spacing
         smoothing = min(_SMOOTHING, _SMOOTHING_OF_ROOT * (noise / spacing) ** 0.5)
         report = {
@@ -100,7 +103,7 @@ class DenoisedCloud:
         }
         if smoothing < _NO_NOISE:
             return cls(x[cloud.selected], new_normals, 0.0, report)
-        return cls(moved, new_normals, smoothing * spacing, report)
+        return cls(new_points, new_normals, smoothing * spacing, report)
 
 
 def _normals(cloud: CloudDenoiser, gradients: Gradients) -> FloatArray:

@@ -35,7 +35,8 @@ if TYPE_CHECKING:
     from harnack.tree.balanced_tree import FloatArray, IntArray
     from harnack.tree.triangle_tree import RayFrame
 
-# Edges in a trip of the loop; those that pad the last one have no length and no direction.
+# The number of edges in a trip of the loop; edges that pad the last trip have length and direction
+# 0.
 _EDGES_PER_TRIP = 4
 # The size of the imaginary part of a factor where it would be zero.
 _TINY = 1e-36

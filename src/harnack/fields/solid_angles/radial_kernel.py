@@ -134,13 +134,13 @@ class RadialSums:
         nearest, old = fmin(tail.distance, sums.singularity_distance), sums.hessian_truncation
         # Dr.Jit's epsilon is half the distance from 1 to the next number; the epsilon of the bounds
         # is the whole distance.
-        moved = 6 * 2 * float(dr.epsilon(q2_d3))
+        shift = 6 * 2 * float(dr.epsilon(q2_d3))
         sums = dataclasses.replace(
             sums,
             truncation=sums.truncation + error,
             gradient_truncation=sums.gradient_truncation + slope,
             hessian_truncation=None if old is None else old + second,
-            rounding=dr.fma(q2_d3, dr.fma(rounding, tail.distance, moved), sums.rounding),
+            rounding=dr.fma(q2_d3, dr.fma(rounding, tail.distance, shift), sums.rounding),
             singularity_distance=dr.select(active, nearest, sums.singularity_distance),
             s4=sums.s4 + q3_d4,
             s5=sums.s5 + q3_d5,

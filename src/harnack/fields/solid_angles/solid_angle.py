@@ -520,8 +520,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
             in_hull and self.has_variable_accuracy
         ):  # some half-spaces of the hull: all of it lies in them
             hull = ConvexHull.from_points(points).padded(1e-4 * self._size)
-            kept = slice(_MAX_PLANES)
-            return ConvexHull(hull.normals[kept], hull.offsets[kept], hull.lower, hull.upper)
+            planes = slice(_MAX_PLANES)
+            return ConvexHull(hull.normals[planes], hull.offsets[planes], hull.lower, hull.upper)
         if in_hull and not self._differentiable_loops:
             return ConvexHull.from_points(points).padded(1e-4 * self._size)
         length = sum(circle.length for circle in self._net_circles)
