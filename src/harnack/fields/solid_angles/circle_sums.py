@@ -259,7 +259,8 @@ class CircleSet:
             scale = dr.rcp(a * a)
             length = dr.norm(e)
             radial = dr.select(length > 0, e / length, 0)
-            # f_tt (I - n n - out out) + f_rr out out + f_zz n n + f_rz (n out + out n)
+            # With u = radial:
+            # f_tt (I - n n - u u) + f_rr u u + f_zz n n + f_rz (n u + u n).
             total = SymmetricMatrix(*state)
             total = total.add_outer_product(n, ((axial - tangential) * scale) * n)
             total = total.add_outer_product(radial, ((-axial - 2 * tangential) * scale) * radial)
@@ -306,7 +307,7 @@ class CircleSet:
             axial += 4 * float(dr.epsilon(line.x))
             height = dr.abs(relative.circle.z) * relative.a + slack
             # The line projected along the axis: at s its distance from the axis is
-            # |outward + s along|.
+            # |outward + s across_v|.
             across_v = dr.fma(vector(-dr.dot(relative.normal, line.v)), relative.normal, line.v)
             square = dr.squared_norm(across_v)
             t = dr.select(square > 0, -dr.dot(relative.outward, across_v) / square, 0)

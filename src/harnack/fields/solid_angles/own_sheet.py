@@ -81,7 +81,7 @@ def lies_on_own_level(mesh: WindingMesh, level: float) -> bool:
     _, far = _offsets(edges, corners.mean(axis=1), level)
     if np.mean(far < _FLAT * longest) < _NEARLY_ALL:
         return False
-    # The mean of w on both sides, which are the level and one more or less than it.
+    # The mean of w on both sides, where w is the level, and the level plus or minus 1.
     mean = np.array([_mean_winding(mesh.corners, point) for point in _some(points, _COUNTED)])
     return any(bool((np.abs(mean - level - side) < _SAME).all()) for side in (-0.5, 0.5))
 
