@@ -1,4 +1,4 @@
-"""Functions of a complex variable with all their branches: what Riemann surfaces are made of."""
+"""Functions of a complex variable with all their branches, for Riemann surfaces."""
 
 from __future__ import annotations
 
@@ -19,22 +19,23 @@ if TYPE_CHECKING:
 
     from harnack.backend import Backend, Real
 
-# A Dr.Jit complex number, one in each lane.
+# A Dr.Jit complex number, whose value may differ from lane to lane.
 Complex = Any
 
 # Points nearer than this to a singular point are moved away from it: squares of such distances do
 # not underflow.
 _MIN_DISTANCE = 1e-12
-# About the least number whose square, and the inverse of that, exist in single precision.
+# About the smallest number whose square, and the inverse of that, exist in single precision.
 _LEAST_SQUARED = 1e-18
 # The distance to the nearest singular point, if there is none.
 _NO_POINT = 2.0
-# Bounds of second derivatives are multiplied by this, for the rounding of logarithms and powers.
+# Bounds of second derivatives are multiplied by this factor, for the rounding of logarithms and
+# powers.
 _BOUND_MARGIN = 1 + 2e-4
 
 
 def complex_type(backend: Backend) -> Any:
-    """The complex numbers of a backend."""
+    """The type of complex numbers of a backend."""
     suffix = "64" if backend.precision == "double" else ""
     return getattr(importlib.import_module(f"drjit.{backend.name}.ad"), f"Complex2f{suffix}")
 
@@ -45,7 +46,8 @@ def complex_of(x: Real, y: Real) -> Complex:
 
 
 def derivatives(number: Complex, part: str) -> tuple[Real, Real]:
-    """d/dx and d/dy of the part, "imag" or "real", of an analytic function with this derivative."""
+    """d/dx and d/dy of the part, "imag" or "real", of an analytic function whose derivative is
+    `number`."""
     if part == "imag":
         return number.imag, number.real
     return number.real, -number.imag
@@ -57,8 +59,8 @@ class BranchPoint:
 
     location: the point.
     power, constant, radius, value: within the radius of the point, all branches g have |g - value|
-        <= constant |z - at|^power, with a power > 0 (up to the period of the part that is drawn).
-        The power is None where no such bound is known, as at poles and logarithms.
+        <= constant |z - location|^power, with a power > 0 (up to the period of the part that is
+        drawn). The power is None if no such bound is known, as at poles and logarithms.
     """
 
     location: complex
@@ -94,16 +96,18 @@ class PreparedBranchPoint:
     def of(
         cls, point: BranchPoint, number: Callable[[float], Real], made: Any
     ) -> PreparedBranchPoint:
-        """number: makes a number of the backend. made: makes a complex one of two."""
-        at, value = (
-            made(number(one.real), number(one.imag)) for one in (point.location, point.value)
-        )
+        """The point on a backend.
+
+        number: makes a number of the backend.
+        made: makes a complex number of the backend from its two parts.
+        """
+        at, value = (made(number(z.real), number(z.imag)) for z in (point.location, point.value))
         return cls(at, point.power, number(point.constant), number(point.radius), value)
 
 
 @dataclass(frozen=True)
 class Branch:
-    """One branch at z: its value, derivative and, if it is known, second derivative."""
+    """A branch at z: its value, derivative and, if it is known, second derivative."""
 
     value: Complex
     first: Complex
@@ -120,14 +124,14 @@ class PlaneRegion(abc.ABC):
 
     @abc.abstractmethod
     def disk(self) -> tuple[Complex, Real]:
-        """Center and radius of a disk that contains it."""
+        """Center and radius of a disk that contains the region."""
 
 
 @dataclass(frozen=True)
 class PlaneSegment(PlaneRegion):
     """The segment from z to z + length w, w a Dr.Jit complex number.
 
-    rounding: of z.
+    rounding: a bound of the rounding of z.
     """
 
     z: Complex
@@ -136,15 +140,15 @@ class PlaneSegment(PlaneRegion):
     rounding: Real
 
     def distances(self, at: Complex) -> tuple[Real, Real]:
-        """The smallest is that of the foot of the perpendicular, or of the end nearer to it; the
-        largest is that of an end, as distances are convex."""
+        """The smallest distance is that of the foot of the perpendicular, or of the end nearer to
+        it; the largest is that of an end, as distances are convex."""
         x, y = self.z.real - at.real, self.z.imag - at.imag
         speed = dr.square(self.w.real) + dr.square(self.w.imag)
-        foot = -(x * self.w.real + y * self.w.imag) / speed
-        foot = dr.select(speed > 0, fmin(fmax(foot, 0), self.length), 0)
+        closest = -(x * self.w.real + y * self.w.imag) / speed
+        closest = dr.select(speed > 0, fmin(fmax(closest, 0), self.length), 0)
         start, middle, end = (
             dr.sqrt(dr.square(x + s * self.w.real) + dr.square(y + s * self.w.imag))
-            for s in (0.0, foot, self.length)
+            for s in (0.0, closest, self.length)
         )
         slack = self.rounding + 1e-6 * start
         return fmax(fmin(middle, start) - slack, 0), fmax(end, start) * (1 + 1e-6) + slack
@@ -156,7 +160,7 @@ class PlaneSegment(PlaneRegion):
 
 @dataclass(frozen=True)
 class Disk(PlaneRegion):
-    """The disk of a radius about z; rounding: of z."""
+    """The disk of a radius about z; rounding: a bound of the rounding of z."""
 
     z: Complex
     radius: Real
@@ -173,7 +177,7 @@ class Disk(PlaneRegion):
 
 @dataclass(frozen=True)
 class Branches(abc.ABC):
-    """All branches of an analytic function, with what is proved about them."""
+    """All branches of an analytic function, with proved bounds."""
 
     _prepared: tuple[PreparedBranchPoint, ...] = field(
         default=(), kw_only=True, repr=False, compare=False
@@ -182,11 +186,12 @@ class Branches(abc.ABC):
     @property
     @abc.abstractmethod
     def branch_points(self) -> tuple[BranchPoint, ...]:
-        """The points where branches are not analytic; everywhere else each can be continued."""
+        """The points where branches are not analytic; everywhere else each branch can be
+        continued."""
 
     def period(self, imaginary: bool) -> float | None:
-        """A number by which each branch may be shifted, in the part that is drawn, to give a branch
-        again; None for none."""
+        """A number by which the drawn part of each branch may be shifted to give a branch again;
+        None if there is no such number."""
         del imaginary
         return None
 
@@ -196,25 +201,27 @@ class Branches(abc.ABC):
         return 1
 
     def prepare(self, backend: Backend) -> Branches:
-        """The same with its numbers as kernel parameters of the backend."""
+        """The same branches with their numbers as kernel parameters of the backend."""
 
         def number(value: float) -> Real:
             return dr.opaque(backend.Float, value)
 
-        made = complex_type(backend)
+        make_complex = complex_type(backend)
         return replace(
             self,
             _prepared=tuple(
-                PreparedBranchPoint.of(one, number, made) for one in self.branch_points
+                PreparedBranchPoint.of(point, number, make_complex) for point in self.branch_points
             ),
         )
 
     def points_on(self, z: Complex) -> tuple[PreparedBranchPoint, ...]:
-        """The points as numbers of the type of z."""
+        """The branch points as numbers of the type of z."""
         if self._prepared:
             return self._prepared
-        real, made = cast("Any", type(z.real)), cast("Any", type(z))
-        return tuple(PreparedBranchPoint.of(one, real, made) for one in self.branch_points)
+        real, make_complex = cast("Any", type(z.real)), cast("Any", type(z))
+        return tuple(
+            PreparedBranchPoint.of(point, real, make_complex) for point in self.branch_points
+        )
 
     @abc.abstractmethod
     def evaluate(self, z: Complex) -> tuple[Branch, ...]:
@@ -222,14 +229,14 @@ class Branches(abc.ABC):
 
     @abc.abstractmethod
     def second_derivative_bound(self, part: PlaneRegion) -> Real:
-        """A bound of |g''| for all branches on a region of the plane."""
+        """A bound of |g''| for all branches on the region `part` of the plane."""
 
     def move_off_singularities(self, z: Complex, rounding: Real) -> Complex:
         """z, moved by its rounding away from singular points, where derivatives are NaN."""
-        least = rounding + _MIN_DISTANCE
+        min_distance = rounding + _MIN_DISTANCE
         for point in self.points_on(z):
-            beside = type(z)(point.at.real + least, point.at.imag)
-            z = dr.select(abs(z - point.at) < least, beside, z)
+            moved = type(z)(point.at.real + min_distance, point.at.imag)
+            z = dr.select(abs(z - point.at) < min_distance, moved, z)
         return z
 
     def clearance(self, z: Complex) -> Real:
@@ -240,7 +247,8 @@ class Branches(abc.ABC):
         return nearest
 
     def max_abs(self, middle: complex, reach: float) -> float:
-        """A bound of |g| on the disk of that radius about a point; inf where none is known."""
+        """A bound of |g| on the disk of radius `reach` about a point; infinite if no bound is
+        known."""
         del middle, reach
         return math.inf
 
@@ -248,10 +256,10 @@ class Branches(abc.ABC):
         """A bound of the rounding of values, in units (2^-23 in single precision) of the number
         1."""
         del z
-        most: Real = 0.0
-        for one in branches:
-            most = fmax(8 * abs(one.value), most)
-        return most
+        largest: Real = 0.0
+        for branch in branches:
+            largest = fmax(8 * abs(branch.value), largest)
+        return largest
 
 
 @dataclass(frozen=True)
@@ -259,8 +267,8 @@ class PowerProduct(Branches):
     """The product of (z - a_i)^alpha_i, with rational exponents: q branches, q the least common
     denominator.
 
-    A full turn around a_i multiplies g by exp(2 pi i alpha_i): these generate the q-th roots of
-    unity.
+    A full turn around a_i multiplies g by exp(2 pi i alpha_i): these factors generate the q-th
+    roots of unity.
 
     Bound of g'': with e_i = alpha_i/(z - a_i), g'' = g ((sum e_i)^2 - sum alpha_i/(z - a_i)^2), so
 
@@ -282,22 +290,22 @@ class PowerProduct(Branches):
 
     @property
     def branch_points(self) -> tuple[BranchPoint, ...]:
-        made: list[BranchPoint] = []
+        points: list[BranchPoint] = []
         for i, (a, alpha) in enumerate(zip(self.centers, self.exponents, strict=True)):
             if alpha > 0 and alpha.is_integer():
                 continue
             if alpha < 0:
-                made.append(BranchPoint(a))
+                points.append(BranchPoint(a))
                 continue
-            others = [
+            factors = [
                 (abs(a - b), beta)
                 for j, (b, beta) in enumerate(zip(self.centers, self.exponents, strict=True))
                 if j != i
             ]
-            radius = 0.5 * min((d for d, _ in others), default=math.inf)
-            constant = math.prod((d + math.copysign(radius, beta)) ** beta for d, beta in others)
-            made.append(BranchPoint(a, alpha, constant * (1 + 1e-6), radius))
-        return tuple(made)
+            radius = 0.5 * min((d for d, _ in factors), default=math.inf)
+            constant = math.prod((d + math.copysign(radius, beta)) ** beta for d, beta in factors)
+            points.append(BranchPoint(a, alpha, constant * (1 + 1e-6), radius))
+        return tuple(points)
 
     def prepare(self, backend: Backend) -> Branches:
         return replace(super().prepare(backend), _on=_uploaded(self.centers, backend))
@@ -311,32 +319,32 @@ class PowerProduct(Branches):
         unit = 4 * float(dr.epsilon(z.real))
         for a, alpha in zip(self._centers(z), self.exponents, strict=True):
             if alpha > 0 and alpha.is_integer():
-                least = _LEAST_SQUARED + unit * fmax(dr.abs(a.real), dr.abs(a.imag))
-                beside = type(z)(a.real + least, a.imag)
-                z = dr.select(abs(z - a) < least, beside, z)
+                min_distance = _LEAST_SQUARED + unit * fmax(dr.abs(a.real), dr.abs(a.imag))
+                moved = type(z)(a.real + min_distance, a.imag)
+                z = dr.select(abs(z - a) < min_distance, moved, z)
         return z
 
     def evaluate(self, z: Complex) -> tuple[Branch, ...]:
         scale, angle = 0 * z.real, 0 * z.real
-        slope = type(z)(scale, scale)
-        other = slope
+        ratio = type(z)(scale, scale)
+        squares = ratio
         for a, alpha in zip(self._centers(z), self.exponents, strict=True):
-            away = z - a
-            scale = scale + alpha * dr.log(abs(away))
-            angle = angle + alpha * dr.atan2(away.imag, away.real)
-            inverse = dr.rcp(away)
-            slope = slope + alpha * inverse
-            other = other + alpha * (inverse * inverse)
+            offset = z - a
+            scale = scale + alpha * dr.log(abs(offset))
+            angle = angle + alpha * dr.atan2(offset.imag, offset.real)
+            inverse = dr.rcp(offset)
+            ratio = ratio + alpha * inverse
+            squares = squares + alpha * (inverse * inverse)
         size = dr.exp(scale)
         sine, cosine = sincos(angle)
         g = type(z)(size * cosine, size * sine)
-        bent = slope * slope - other
-        made: list[Branch] = []
+        second_ratio = ratio * ratio - squares
+        branches: list[Branch] = []
         for k in range(self.denominator):
-            turn = 2 * math.pi * k / self.denominator
-            value = g * type(z)(math.cos(turn), math.sin(turn)) if k else g
-            made.append(Branch(value, value * slope, value * bent))
-        return tuple(made)
+            rotation = 2 * math.pi * k / self.denominator
+            value = g * type(z)(math.cos(rotation), math.sin(rotation)) if k else g
+            branches.append(Branch(value, value * ratio, value * second_ratio))
+        return tuple(branches)
 
     def second_derivative_bound(self, part: PlaneRegion) -> Real:
         nearest: list[Real] = []
@@ -346,9 +354,9 @@ class PowerProduct(Branches):
             nearest.append(dr.log(low))
             farthest.append(dr.log(high))
         alphas, total = self.exponents, 0 * part.disk()[1]
-        for i, one in enumerate(alphas):
-            for j, other in enumerate(alphas[: i + 1]):
-                factor = abs(one * (one - 1)) if i == j else 2 * abs(one * other)
+        for i, alpha_i in enumerate(alphas):
+            for j, alpha_j in enumerate(alphas[: i + 1]):
+                factor = abs(alpha_i * (alpha_i - 1)) if i == j else 2 * abs(alpha_i * alpha_j)
                 if factor == 0:
                     continue
                 powers = [alpha - (k == i) - (k == j) for k, alpha in enumerate(alphas)]
@@ -361,26 +369,26 @@ class PowerProduct(Branches):
         return total * _BOUND_MARGIN
 
     def max_abs(self, middle: complex, reach: float) -> float:
-        most = 1.0
+        bound = 1.0
         for a, alpha in zip(self.centers, self.exponents, strict=True):
-            away = abs(a - middle)
-            if alpha < 0 and away <= reach:
+            distance = abs(a - middle)
+            if alpha < 0 and distance <= reach:
                 return math.inf
-            most *= (away + math.copysign(reach, alpha)) ** alpha
-        return most
+            bound *= (distance + math.copysign(reach, alpha)) ** alpha
+        return bound
 
     def value_rounding(self, z: Complex, branches: tuple[Branch, ...]) -> Real:
-        """That of exp and of the angle: a few units of their arguments."""
-        most = 12 + 4 * math.pi * sum(abs(alpha) for alpha in self.exponents)
+        """The rounding of exp and of the angle: a few units of their arguments."""
+        roundings = 12 + 4 * math.pi * sum(abs(alpha) for alpha in self.exponents)
         for a, alpha in zip(self._centers(z), self.exponents, strict=True):
-            most = most + 4 * abs(alpha) * dr.abs(dr.log(abs(z - a)))
-        return most * abs(branches[0].value)
+            roundings = roundings + 4 * abs(alpha) * dr.abs(dr.log(abs(z - a)))
+        return roundings * abs(branches[0].value)
 
 
 @dataclass(frozen=True)
 class Logarithm(Branches):
-    """sum n_i log(z - a_i), the logarithm of a product of integer powers: its imaginary part is
-    known up to 2 pi.
+    """sum n_i log(z - a_i), the logarithm of a product of integer powers, whose imaginary part is
+    determined up to 2 pi.
 
     |g''| = |sum n_i/(z - a_i)^2| <= sum |n_i|/d_i^2, with the smallest distances of the region.
     """
@@ -406,9 +414,9 @@ class Logarithm(Branches):
         zero = type(z)(0 * z.real, 0 * z.real)
         value, first, second = zero, zero, zero
         for a, n in zip(self._centers(z), self.multiplicities, strict=True):
-            away = z - a
-            inverse = dr.rcp(away)
-            value = value + n * type(z)(dr.log(abs(away)), dr.atan2(away.imag, away.real))
+            offset = z - a
+            inverse = dr.rcp(offset)
+            value = value + n * type(z)(dr.log(abs(offset)), dr.atan2(offset.imag, offset.real))
             first = first + n * inverse
             second = second - n * (inverse * inverse)
         return (Branch(value, first, second),)
@@ -421,18 +429,18 @@ class Logarithm(Branches):
 
     def value_rounding(self, z: Complex, branches: tuple[Branch, ...]) -> Real:
         del branches
-        most = 0 * z.real
+        roundings = 0 * z.real
         for a, n in zip(self._centers(z), self.multiplicities, strict=True):
-            most = most + abs(n) * (8 * math.pi + 4 * dr.abs(dr.log(abs(z - a))))
-        return most
+            roundings = roundings + abs(n) * (8 * math.pi + 4 * dr.abs(dr.log(abs(z - a))))
+        return roundings
 
 
 @dataclass(frozen=True)
 class ArcSine(Branches):
-    """asin: its branches are g and pi - g modulo 2 pi, with g the principal one.
+    """asin: its branches are g and pi - g modulo 2 pi, with g the principal branch.
 
     g' = (1 - z^2)^(-1/2) and g'' = z g'^3, so |g''| <= |z|/(d_1 d_2)^(3/2), d_i the distances from
-    1 and -1. At either, asin(1 - w) = pi/2 - 2 asin sqrt(w/2), whose series has positive
+    1 and -1. At both points, asin(1 - w) = pi/2 - 2 asin sqrt(w/2), whose series has positive
     coefficients: |g - pi/2| <= 2 asin sqrt(|w|/2), and for |w| <= 1/2 at most (pi/3)/sqrt(1/2)
     sqrt|w|, as asin is convex.
     """
@@ -451,11 +459,11 @@ class ArcSine(Branches):
         return None if imaginary else 2 * math.pi
 
     def evaluate(self, z: Complex) -> tuple[Branch, ...]:
-        """By Kahan's formulas (1987), in which nothing cancels."""
-        below, above = dr.sqrt(1 - z), dr.sqrt(1 + z)
-        product = below * above
+        """The branches by Kahan's formulas (1987), in which nothing cancels."""
+        root_minus, root_plus = dr.sqrt(1 - z), dr.sqrt(1 + z)
+        product = root_minus * root_plus
         real = dr.atan2(z.real, product.real)
-        imaginary = dr.asinh(below.real * above.imag - below.imag * above.real)
+        imaginary = dr.asinh(root_minus.real * root_plus.imag - root_minus.imag * root_plus.real)
         g, first = type(z)(real, imaginary), dr.rcp(product)
         second = z * (first * first * first)
         return Branch(g, first, second), Branch(math.pi - g, -first, -second)
@@ -464,14 +472,14 @@ class ArcSine(Branches):
         complex_number = cast("Any", type(part.disk()[0]))
         low1, _ = part.distances(complex_number(1, 0))
         low2, _ = part.distances(complex_number(-1, 0))
-        _, most = part.distances(complex_number(0, 0))
+        _, largest = part.distances(complex_number(0, 0))
         inverse = 1 / (low1 * low2)
-        return most * inverse * dr.sqrt(inverse) * _BOUND_MARGIN
+        return largest * inverse * dr.sqrt(inverse) * _BOUND_MARGIN
 
 
 @dataclass(frozen=True)
 class UserBranches(Branches):
-    """Branches that a user gives: see `RiemannSurface`.
+    """Branches of a user's function: see `RiemannSurface`.
 
     On a region g'' is bounded by the user's bound on a disk around it, if no singular point lies in
     that disk; around a segment, the smallest disk.
@@ -496,28 +504,30 @@ class UserBranches(Branches):
         return self.shift
 
     def evaluate(self, z: Complex) -> tuple[Branch, ...]:
-        made: list[Branch] = []
-        for one in self.function(z):
-            given = [part if dr.is_array_v(type(part)) else type(z)(part) for part in one]
-            made.append(Branch(*given))
-        return tuple(made)
+        branches: list[Branch] = []
+        for numbers in self.function(z):
+            parts = [part if dr.is_array_v(type(part)) else type(z)(part) for part in numbers]
+            branches.append(Branch(*parts))
+        return tuple(branches)
 
     def second_derivative_bound(self, part: PlaneRegion) -> Real:
         middle, radius = part.disk()
-        free = radius == radius
+        is_free = radius == radius
         for point in self.points_on(middle):
-            free = free & (abs(middle - point.at) > radius)
+            is_free = is_free & (abs(middle - point.at) > radius)
         bound = 0 * radius + self.second_bound(middle, radius)
-        return dr.select(free & (bound >= 0), bound, dr.inf)
+        return dr.select(is_free & (bound >= 0), bound, dr.inf)
 
 
-def _uploaded(places: tuple[complex, ...], backend: Backend) -> tuple[Complex, ...]:
-    made = complex_type(backend)
+def _uploaded(points: tuple[complex, ...], backend: Backend) -> tuple[Complex, ...]:
+    """Points of the plane as kernel parameters of a backend."""
+    make_complex = complex_type(backend)
     real = backend.Float
-    return tuple(made(dr.opaque(real, a.real), dr.opaque(real, a.imag)) for a in places)
+    return tuple(make_complex(dr.opaque(real, a.real), dr.opaque(real, a.imag)) for a in points)
 
 
 def _finite(value: Any, name: str) -> complex:
+    """A finite complex number. Raises TypeError or ValueError, with this name, for other values."""
     try:
         number = complex(value)
     except (TypeError, ValueError):

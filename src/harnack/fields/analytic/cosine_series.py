@@ -26,13 +26,13 @@ if TYPE_CHECKING:
 
 __all__ = ["CellBounds", "CosineBounds", "evaluate_on_grid", "fit_cosines", "midpoints"]
 
-# Nodes for each half wave of the highest frequency: at least the first number, at most the last,
-# and between them as many as make about the second number along an axis.
+# Nodes for each half wave of the highest frequency: at least `_MIN_NODES`, at most `_FINEST`, and
+# between these limits so many that an axis has about `_ALONG_AXIS` nodes.
 _MIN_NODES, _ALONG_AXIS, _FINEST = 8, 112, 32
 # Sides, in cells, of the grids of local bounds. A grid is used if its bounds are on average below
-# this fraction of the global one, so that they are worth the time of a lookup.
+# `_MAX_RATIO` times the global bound, so that they are worth the time of a lookup.
 _CELLS, _MAX_RATIO = (16, 8, 4), 0.9
-# Cells along a side of the grid by which the extent of a level is bounded.
+# The number of cells along a side of the grid by which the extent of a level is bounded.
 _EXTENT_CELLS = 32
 # Bounds are moved outwards by this fraction for the rounding of double precision.
 _ROUNDING = 1e-9
@@ -50,26 +50,27 @@ def midpoints(lower: FloatArray, upper: FloatArray, shape: tuple[int, ...]) -> F
 def fit_cosines(grid: FloatArray, terms: tuple[int, int, int]) -> FloatArray:
     """The first coefficients of the series through values at the midpoints of cells.
 
-    The discrete cosine transform of type 2: the whole series passes through all values, and its
-    part of the first terms is the best fit to them in mean square, since the cosines are orthogonal
-    on the midpoints.
+    They come from the discrete cosine transform of type 2: the whole series passes through all
+    values, and its first terms are the best fit to the values in mean square, since the cosines are
+    orthogonal on the midpoints.
     """
-    from scipy import fft  # here: time that few need
+    from scipy import fft  # imported here, as it takes time and is rarely needed
 
-    whole = np.asarray(cast("Any", fft).dctn(grid, type=2), dtype=np.float64) / grid.size
-    kept = whole[: terms[0], : terms[1], : terms[2]].copy()
+    transform = np.asarray(cast("Any", fft).dctn(grid, type=2), dtype=np.float64) / grid.size
+    coefficients = transform[: terms[0], : terms[1], : terms[2]].copy()
     for axis in range(3):
         first = [slice(None)] * 3
         first[axis] = slice(0, 1)
-        kept[tuple(first)] *= 0.5
-    return kept
+        coefficients[tuple(first)] *= 0.5
+    return coefficients
 
 
 def evaluate_on_grid(
     coefficients: FloatArray, angles: tuple[FloatArray, FloatArray, FloatArray],
     orders: tuple[int, int, int] = (0, 0, 0),
 ) -> FloatArray:  # fmt: skip
-    """Derivatives of these orders in the angles on the grid of angles (n_x, n_y, n_z)."""
+    """Derivatives of these orders with respect to the angles, on the grid of angles (n_x, n_y,
+    n_z)."""
     values = coefficients
     for angle, order in zip(angles, orders, strict=True):
         k: FloatArray = np.arange(values.shape[0], dtype=np.float64)
@@ -84,7 +85,7 @@ class CellBounds:
     """Bounds of all second derivatives around each cell of a grid of n^3 cells over the box.
 
     count: n.
-    bounds: (n^3,), x fastest: on the cell and all its neighbors.
+    bounds: (n^3,), x fastest: a bound on the cell and all its neighbors.
     """
 
     count: int
@@ -95,18 +96,18 @@ class CellBounds:
 class CosineBounds:
     """Proved bounds of a cosine series.
 
-    low, high: f stays within them.
+    low, high: f stays between them.
     curvature: |v.H v| for unit v never exceeds it, H the Hessian.
     cells: local bounds of |v.H v|, finest grid first; only grids that are worth a lookup.
     cell_low, cell_high: (32, 32, 32) ranges of f on the cells of the box.
 
     Proof. Along each axis f is a trigonometric polynomial of the angle of degree n = K - 1, and so
-    is v.H v for any fixed v. On a grid of N = 2 n m > 2 n angles to the full turn, of which those
-    from 0 to pi do by symmetry (f is even in each angle, and v.H v becomes v'.H v' with other signs
-    in v), Ehlich and Zeller (1964): |T| <= max over the grid / cos(pi n/N), one axis after the
-    other. With G that bound, Bernstein gives |T_uu| <= n^2 G, and linear interpolation between
-    nodes h = pi/(n m) apart is off by at most h^2/8 n^2 G = pi^2 G/(8 m^2) along each axis: a bound
-    at the nodes of a cell, plus these, is one on the cell.
+    is v.H v for any fixed v. Take a grid of N = 2 n m > 2 n angles per full turn, of which the
+    angles from 0 to pi suffice by symmetry (f is even in each angle, and v.H v becomes v'.H v' with
+    other signs in v). Then by Ehlich and Zeller (1964) |T| <= max over the grid / cos(pi n/N), one
+    axis after the other. With G that bound, Bernstein gives |T_uu| <= n^2 G, and linear
+    interpolation between nodes h = pi/(n m) apart is off by at most h^2/8 n^2 G = pi^2 G/(8 m^2)
+    along each axis: a bound at the nodes of a cell, plus these errors, is a bound on the cell.
     """
 
     low: float
@@ -118,35 +119,35 @@ class CosineBounds:
 
     @classmethod
     def of(cls, coefficients: FloatArray, size: FloatArray) -> CosineBounds:
-        """size: (3,) of the box."""
+        """The bounds of the series with these coefficients; size: (3,) of the box."""
         degrees: list[int] = [n - 1 for n in coefficients.shape]
-        fine = [min(max(_MIN_NODES, _ALONG_AXIS // max(n, 1)), _FINEST) for n in degrees]
+        densities = [min(max(_MIN_NODES, _ALONG_AXIS // max(n, 1)), _FINEST) for n in degrees]
         angles: list[FloatArray] = [
             math.pi * np.arange(n * m + 1) / max(n * m, 1) if n else np.zeros(1)
-            for n, m in zip(degrees, fine, strict=True)
+            for n, m in zip(degrees, densities, strict=True)
         ]
         factor = math.prod(
             1 / math.cos(0.5 * math.pi / m) if n else 1.0
-            for n, m in zip(degrees, fine, strict=True)
+            for n, m in zip(degrees, densities, strict=True)
         )
-        off = sum(
-            math.pi**2 / (8 * m * m) if n else 0.0 for n, m in zip(degrees, fine, strict=True)
+        error = sum(
+            math.pi**2 / (8 * m * m) if n else 0.0 for n, m in zip(degrees, densities, strict=True)
         )
         nodes = angles[0], angles[1], angles[2]
         values = evaluate_on_grid(coefficients, nodes)
         middle = 0.5 * float(values.min() + values.max())
         half = 0.5 * float(values.max() - values.min()) * factor * (1 + _ROUNDING)
         half += _ROUNDING * abs(middle)
-        bent = _spectral_norms(coefficients, nodes, math.pi / size)
-        curvature = float(bent.max()) * factor * (1 + _ROUNDING)
+        norms = _spectral_norms(coefficients, nodes, math.pi / size)
+        curvature = float(norms.max()) * factor * (1 + _ROUNDING)
         cells: list[CellBounds] = []
         for count in _CELLS:
-            local = _cell_extremes(bent, angles, count, 1, np.maximum) + off * curvature
+            local = _cell_extremes(norms, angles, count, 1, np.maximum) + error * curvature
             local = np.minimum(local * (1 + _ROUNDING), curvature)
             if float(local.mean()) <= _MAX_RATIO * curvature:
                 # x is the first index in `_cell_extremes` and runs fastest on the device.
                 cells.append(CellBounds(count, np.ascontiguousarray(local.T).ravel()))
-        margin = off * half + _ROUNDING * (abs(middle) + half)
+        margin = error * half + _ROUNDING * (abs(middle) + half)
         return cls(
             middle - half,
             middle + half,
@@ -157,18 +158,18 @@ class CosineBounds:
         )
 
     def extent(self, levels: tuple[float, ...]) -> tuple[FloatArray, FloatArray] | None:
-        """Corners, as fractions of the box, of a box that holds the level sets; None if there are
-        none."""
-        met = np.zeros(self.cell_low.shape, dtype=bool)
+        """Corners, as fractions of the box, of a box that contains the level sets; None if there
+        are no level sets."""
+        is_met = np.zeros(self.cell_low.shape, dtype=bool)
         for level in levels:
-            met |= (self.cell_low <= level) & (level <= self.cell_high)
-        if not met.any():
+            is_met |= (self.cell_low <= level) & (level <= self.cell_high)
+        if not is_met.any():
             return None
         low, high = np.zeros(3), np.ones(3)
         for axis in range(3):
-            rest = tuple(a for a in range(3) if a != axis)
-            some = np.flatnonzero(met.any(axis=rest))
-            low[axis], high[axis] = some[0] / len(met), (some[-1] + 1) / len(met)
+            other_axes = tuple(a for a in range(3) if a != axis)
+            indices = np.flatnonzero(is_met.any(axis=other_axes))
+            low[axis], high[axis] = indices[0] / len(is_met), (indices[-1] + 1) / len(is_met)
         return low, high
 
 
@@ -179,51 +180,53 @@ def _spectral_norms(
 ) -> FloatArray:
     """The largest |eigenvalue| of the Hessian at each node, a slab at a time; rates: angles per
     length. Eigenvalues of symmetric 3x3 matrices by Smith's formula (1961)."""
-    norms = np.empty(tuple(len(one) for one in nodes))
+    norms = np.empty(tuple(len(values) for values in nodes))
     slab = max(1, 400_000 // (norms.shape[1] * norms.shape[2]))
     for start in range(0, len(nodes[0]), slab):
-        part = nodes[0][start : start + slab], nodes[1], nodes[2]
+        slab_nodes = nodes[0][start : start + slab], nodes[1], nodes[2]
         second: dict[tuple[int, int], FloatArray] = {}
         for a, b in itertools.combinations_with_replacement(range(3), 2):
             orders = [0, 0, 0]
             orders[a] += 1
             orders[b] += 1
-            here = evaluate_on_grid(coefficients, part, (orders[0], orders[1], orders[2]))
-            second[a, b] = rates[a] * rates[b] * here
+            derivative = evaluate_on_grid(
+                coefficients, slab_nodes, (orders[0], orders[1], orders[2])
+            )
+            second[a, b] = rates[a] * rates[b] * derivative
         xx, yy, zz = second[0, 0], second[1, 1], second[2, 2]
         xy, xz, yz = second[0, 1], second[0, 2], second[1, 2]
         mean = (xx + yy + zz) / 3
         x, y, z = xx - mean, yy - mean, zz - mean
         spread = np.sqrt((x * x + y * y + z * z + 2 * (xy * xy + xz * xz + yz * yz)) / 6)
-        safe = np.where(spread > 0, spread, 1.0)
-        x, y, z, xy, xz, yz = (one / safe for one in (x, y, z, xy, xz, yz))
+        divisor = np.where(spread > 0, spread, 1.0)
+        x, y, z, xy, xz, yz = (values / divisor for values in (x, y, z, xy, xz, yz))
         half = 0.5 * (x * (y * z - yz * yz) - xy * (xy * z - yz * xz) + xz * (xy * yz - y * xz))
         angle = np.arccos(np.clip(half, -1, 1)) / 3
         top = mean + 2 * spread * np.cos(angle)
         bottom = mean + 2 * spread * np.cos(angle + 2 * math.pi / 3)
-        # Near 1, the error of the arccosine is the square root of that of its argument.
+        # Near 1, the error of the arccosine is the square root of the error of its argument.
         norms[start : start + slab] = np.maximum(np.abs(top), np.abs(bottom)) + 1e-7 * spread
     return norms
 
 
 def _cell_extremes(
-    values: FloatArray, angles: list[FloatArray], count: int, around: int, best: Any
+    values: FloatArray, angles: list[FloatArray], count: int, margin: int, ufunc: Any
 ) -> FloatArray:
-    """The extremes over the nodes on and next to each of count^3 cells, with `around` neighbors
-    on each side."""
+    """The extremes over the nodes on and next to each of count^3 cells, with `margin` neighbors on
+    each side; ufunc: np.minimum or np.maximum."""
     for axis in range(3):
         intervals = len(angles[axis]) - 1
         columns: list[FloatArray] = []
         for cell in range(count):
-            first = max(cell - around, 0) * intervals // count
-            last = -(-min(cell + 1 + around, count) * intervals // count)
+            first = max(cell - margin, 0) * intervals // count
+            last = -(-min(cell + 1 + margin, count) * intervals // count)
             part = np.moveaxis(values, axis, 0)[first : last + 1]
-            columns.append(best.reduce(part, axis=0))
+            columns.append(ufunc.reduce(part, axis=0))
         values = np.stack(columns, axis=axis)
     return values
 
 
-# Constants are moved up, and radii down, by this fraction for the roundings of float32.
+# Constants are increased, and radii decreased, by this fraction for the roundings of float32.
 _KERNEL_ROUNDING = 1e-5
 
 
@@ -231,16 +234,17 @@ _KERNEL_ROUNDING = 1e-5
 class CosineSums:
     """The coefficients and local bounds of a series on a backend.
 
-    The sum over k is made for each i and j, that over j for each i, that over i last (sum
-    factorization): about 2 K^3 products in all where a sum of terms would need 7 K^3. i runs in a
-    recorded loop over rows of a table, j and k are unrolled, so that the coefficients are kernel
+    Sums over k are computed for each i and j, sums over j for each i, and the sum over i last (sum
+    factorization): about 2 K^3 products in all, whereas a sum of terms would need 7 K^3. i runs in
+    a recorded loop over rows of a table, j and k are unrolled, so that the coefficients are kernel
     parameters: another function fitted by as many terms compiles no other kernel. Each sum begins
     with the highest frequency, so that the large terms, of low frequency, take part in the fewest
     roundings.
 
-    lower: corner of the box.
+    lower: the lower corner of the box.
     rate: pi over its size, angles per length.
-    rounding: of value and gradient, in units of u, without that which moves the point.
+    rounding: the rounding of value and gradient, in units of u, without the rounding that moves the
+        point.
     """
 
     backend: Backend
@@ -274,7 +278,7 @@ class CosineSums:
             RecordTable.upload(backend, table),
             (dr.opaque(backend.Float, rounding[0]), dr.opaque(backend.Float, rounding[1])),
             dr.opaque(backend.Float, bounds.curvature * (1 + _KERNEL_ROUNDING)),
-            tuple(_CellCurvatures.upload(backend, one, size) for one in bounds.cells),
+            tuple(_CellCurvatures.upload(backend, cells, size) for cells in bounds.cells),
         )
 
     def angles(self, p: Vec3) -> Vec3:
@@ -282,7 +286,7 @@ class CosineSums:
         return (self.backend.Array3f(p) - self.lower) * self.rate
 
     def value(self, p: Vec3) -> tuple[Real, Vec3]:
-        """Value and gradient."""
+        """Value and gradient at points."""
         angles = self.angles(p)
         y, z = _waves(angles.y, self.shape[1]), _waves(angles.z, self.shape[2])
 
@@ -311,7 +315,7 @@ class CosineSums:
             s, c = sincos(row[0] * angles.x)
             d, e = -row[0] * s, -row[0] * row[0] * c
             parts = (b * e, byy * c, bzz * c, by * d, bz * d, byz * c)
-            return tuple(one + part for one, part in zip(state, parts, strict=True))
+            return tuple(total + part for total, part in zip(state, parts, strict=True))
 
         real, vector, r = self.backend.Float, self.backend.Array3f, self.rate
         start = tuple(real(0) for _ in range(6))
@@ -323,18 +327,18 @@ class CosineSums:
         )
 
     def curvatures(self, p: Vec3) -> tuple[TaylorRemainder, ...]:
-        """Bounds of second derivatives around p, that on the smallest ball first; the last one
-        holds everywhere."""
+        """Bounds of second derivatives around p, the bound on the smallest ball first; the last
+        bound holds everywhere."""
         everywhere = TaylorRemainder(self.curvature + 0 * p.x, dr.inf)
         if not self.cells:
             return (everywhere,)
-        share = self.angles(p) * float(1 / np.pi)
-        return (*(one.curvature(share) for one in self.cells), everywhere)
+        fraction = self.angles(p) * float(1 / np.pi)
+        return (*(cells.curvature(fraction) for cells in self.cells), everywhere)
 
 
 @dataclass(frozen=True)
 class _CellCurvatures:
-    """Local bounds of second derivatives on a backend; sides: those of a cell."""
+    """Local bounds of second derivatives on a backend; sides: the sides of a cell."""
 
     backend: Backend
     count: int
@@ -347,20 +351,22 @@ class _CellCurvatures:
         return cls(backend, cells.count, _vector_parameters(backend, size / cells.count), bounds)
 
     def curvature(self, share: Vec3) -> TaylorRemainder:
-        """The bound of the cell in which a point lies, on a ball within the cell's neighbors."""
-        place, index = share * float(self.count), self.backend.UInt32(0)
-        free: Real = dr.inf
+        """The bound of the cell in which a point lies, on a ball within the cell's neighbors;
+        share: the point as fractions of the box."""
+        position, index = share * float(self.count), self.backend.UInt32(0)
+        radius: Real = dr.inf
         for axis in (2, 1, 0):
-            cell = clamp(dr.floor(place[axis]), 0, self.count - 1)
+            cell = clamp(dr.floor(position[axis]), 0, self.count - 1)
             index = index * self.count + self.backend.UInt32(cell)
-            rest = place[axis] - cell
-            free = fmin((1 + fmin(rest, 1 - rest)) * self.sides[axis], free)
+            offset = position[axis] - cell
+            radius = fmin((1 + fmin(offset, 1 - offset)) * self.sides[axis], radius)
         constant = dr.gather(self.backend.Float, self.bounds, index)
-        return TaylorRemainder(constant, free * (1 - _KERNEL_ROUNDING * self.count))
+        return TaylorRemainder(constant, radius * (1 - _KERNEL_ROUNDING * self.count))
 
 
 def _vector_parameters(backend: Backend, numbers: FloatArray) -> Vec3:
-    return backend.Array3f(*(dr.opaque(backend.Float, float(one)) for one in numbers))
+    """Three numbers as kernel parameters."""
+    return backend.Array3f(*(dr.opaque(backend.Float, float(number)) for number in numbers))
 
 
 def _waves(angle: Real, count: int) -> tuple[list[Real], list[Real]]:
@@ -380,18 +386,18 @@ def _sum_plane(
     *,
     second: bool = False,
 ) -> tuple[Any, ...]:
-    """The sum over j and k for one i, its derivatives by y and z, and with `second` those by y
-    twice, by y and z, and by z twice."""
+    """The sum over j and k for one i, its derivatives by y and z, and with `second` its derivatives
+    by y twice, by y and z, and by z twice."""
     (cos_y, slope_y), (cos_z, slope_z) = y, z
-    many = len(cos_z)
+    count = len(cos_z)
     sums: list[Any] = [0 * cos_y[0]] * (6 if second else 3)
     for j in reversed(range(len(cos_y))):
         a, b, c = 0 * cos_y[0], 0 * cos_y[0], 0 * cos_y[0]
-        for k in reversed(range(many)):
-            one = row[1 + j * many + k]
-            a, b = dr.fma(one, cos_z[k], a), dr.fma(one, slope_z[k], b)
+        for k in reversed(range(count)):
+            coefficient = row[1 + j * count + k]
+            a, b = dr.fma(coefficient, cos_z[k], a), dr.fma(coefficient, slope_z[k], b)
             if second and k:
-                c = dr.fma(one * float(-k * k), cos_z[k], c)
+                c = dr.fma(coefficient * float(-k * k), cos_z[k], c)
         sums[0] = dr.fma(a, cos_y[j], sums[0])
         sums[1] = dr.fma(a, slope_y[j], sums[1])
         sums[2] = dr.fma(b, cos_y[j], sums[2])

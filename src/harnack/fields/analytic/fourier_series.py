@@ -1,4 +1,4 @@
-"""Any function on a box, as a cosine series that is fitted to it (paper, section 4.7.1)."""
+"""Any function on a box, as a cosine series fitted to it (paper, section 4.7.1)."""
 
 from __future__ import annotations
 
@@ -29,24 +29,26 @@ if TYPE_CHECKING:
 __all__ = ["FourierSeries", "SurfaceDisplacement"]
 
 _MOST_TERMS = 24
-# Samples along a side by default: for each term, and at least; and the most samples in all.
+# The default number of samples along a side for each term, and its minimum; the largest number of
+# samples in all.
 _SAMPLES, _LEAST_SAMPLES, _MOST_SAMPLES = 4, 64, 1 << 25
-# Points at which the error of a fit is measured; the Newton steps that bring them to the surface,
-# and the tolerance of these.
+# The number of points at which the error of a fit is measured; the number of Newton steps that move
+# them to the surface, and their tolerance.
 _CHECK_POINTS, _NEWTON_STEPS, _CONVERGED = 20_000, 12, 1e-9
-# Coefficients that are so small against the values fitted are rounding.
+# Coefficients below this fraction of the fitted values are rounding errors.
 _MIN_COEFFICIENT = 1e-13
-# Covers terms of second order in the unit roundoff.
+# A factor that covers terms of second order in the unit roundoff.
 _SECOND_ORDER = 1.05
 
-# f of points (n, 3): (n,).
+# A function of points (n, 3) with values (n,).
 Function: TypeAlias = Callable[["FloatArray"], Any]
 
 
 @dataclass(frozen=True)
 class SurfaceDisplacement:
-    """The distance of the surface of a series from that of the function it was fitted to: sampled,
-    and to first order, |function - level|/|gradient of the series| at points of its surface.
+    """The distance between the surface of a series and the surface of the function it was fitted
+    to: sampled, and to first order, |function - level|/|gradient of the series| at points of its
+    surface.
 
     mean, largest: lengths.
     count: the number of points.
@@ -60,23 +62,25 @@ class SurfaceDisplacement:
 class FourierSeries(Field):
     """sum a_ijk cos(i u) cos(j v) cos(k w) on a box, u, v, w from 0 to pi along its sides.
 
-    Made by `fit` from any function or grid of values. **What is proved is about the series**, not
-    about the function that it was fitted to: `fit_error` says how far their values differ and
-    `displacement` how far their surfaces do, both by sampling. The series continues the function by
-    reflection at the walls of the box. It converges quickly where the function is smooth and
-    has no slope across the walls; kinks, such as those of distances, cost accuracy, and so do
-    functions that are very steep far from the surface: compress those first, say by tanh.
+    `fit` computes the series of any function or grid of values. **All proofs are about the
+    series**, not about the function that it was fitted to: `fit_error` is the difference of their
+    values and `displacement` the distance of their surfaces, both by sampling. The series continues
+    the function by reflection at the walls of the box. It converges quickly if the function is
+    smooth and has no slope across the walls; kinks, such as those of distances, cost accuracy, and
+    so do functions that are very steep far from the surface: compress such functions first, for
+    example by tanh.
 
     coefficients: (K_x, K_y, K_z), at most 24 each.
     box: a finite `Box`.
 
     Promises: bounds of the second derivatives (`CosineBounds` has the proof), on the whole box and,
-    where those are smaller, on balls around the cells of grids over it. Rounding, in units of u: an
-    angle k u is off by 3 roundings of u, which move the point, and one of the product, k pi at
-    most; a sine or cosine by 2; a coefficient by 1; a term takes part in i + j + k + 3 sums.
+    if local bounds are smaller, on balls around the cells of grids over it. Rounding, in units of
+    u: an angle k u is off by 3 roundings of u, which move the point, and a rounding of the product,
+    k pi at most; a sine or cosine by 2; a coefficient by 1; a term takes part in i + j + k + 3
+    sums.
 
     Raises:
-        ValueError: coefficients of another shape, not finite, or all zero but the first; a box
+        ValueError: coefficients of another shape, not finite, or all zero except the first; a box
             without size.
     """
 
@@ -118,14 +122,16 @@ class FourierSeries(Field):
         """The series of `terms` cosines along each axis that is closest to a function.
 
         function: a callable that takes points (n, 3) and gives values (n,); or a grid (n_x, n_y,
-            n_z) of values at the middles of that many cells of the box.
-        box: a finite `Box`, or its two corners. terms: 1 to 24, along each axis.
-        samples: cells a side, of a function; by default 4 for each term, at least 64.
+            n_z) of values at the midpoints of that many cells of the box.
+        box: a finite `Box`, or its two corners.
+        terms: 1 to 24, along each axis.
+        samples: the number of cells per side on which a function is sampled; by default 4 for each
+            term, at least 64.
 
         Raises:
             ValueError: values that are NaN or infinite, or of another shape; more terms than 24 or
                 than samples; a function that is constant; a box without size.
-            TypeError: neither a function nor numbers; terms that are no whole numbers.
+            TypeError: neither a function nor numbers; terms that are no integers.
         """
         numbers = _as_triple(terms, "terms")
         _check_terms(numbers)
@@ -146,10 +152,10 @@ class FourierSeries(Field):
                 raise ValueError(f"a grid must have shape (n_x, n_y, n_z), not {grid.shape}")
             _check_samples(numbers, cast("tuple[int, int, int]", grid.shape))
             if not np.isfinite(grid).all():
-                bad = np.argwhere(~np.isfinite(grid))
+                invalid = np.argwhere(~np.isfinite(grid))
                 raise ValueError(
-                    f"the grid has {len(bad)} values that are NaN or infinite, the first at "
-                    f"{tuple(bad[0].tolist())}: replace them by numbers"
+                    f"the grid has {len(invalid)} values that are NaN or infinite, the first at "
+                    f"{tuple(invalid[0].tolist())}: replace them by numbers"
                 )
         if float(np.ptp(grid)) == 0.0:
             raise ValueError("the function is constant: it has no level sets")
@@ -159,14 +165,14 @@ class FourierSeries(Field):
                 f"the series of {numbers} terms is constant, though the function is not: take more "
                 "terms"
             )
-        made = cls(fitted, space)
-        made._source = cast("Any", function) if callable(function) else grid
-        made.fit_error = made._largest_difference()
-        return made
+        series = cls(fitted, space)
+        series._source = cast("Any", function) if callable(function) else grid
+        series.fit_error = series._largest_difference()
+        return series
 
     @property
     def value_range(self) -> tuple[float, float]:
-        """Proved: the values of the series stay within it."""
+        """Proved: the values of the series stay within this interval."""
         return self._bounds.low, self._bounds.high
 
     @property
@@ -175,13 +181,14 @@ class FourierSeries(Field):
         return self._bounds.curvature
 
     def displacement(self, level: float | None = None, *, rng: int = 0) -> SurfaceDisplacement:
-        """An estimate of the distance of the surface at a level from that of the function fitted.
+        """An estimate of the distance between the surfaces of the series and of the fitted
+        function, at a level.
 
         For a function, at random points of the surface; for a grid, at its points next to the
         surface.
 
         Raises:
-            ValueError: the series was not made by `fit`, or no point of the level was found.
+            ValueError: the series was not computed by `fit`, or no point of the level was found.
         """
         if self._source is None:
             raise ValueError("the series was made from coefficients: there is no function to miss")
@@ -190,43 +197,44 @@ class FourierSeries(Field):
         if not len(points):
             raise ValueError(f"no point with level {chosen:g} was found in the box")
         slope = np.linalg.norm(self.gradient(points, precision="double"), axis=1)
-        away = np.abs(values) / np.maximum(slope, 1e-300)
-        return SurfaceDisplacement(float(away.mean()), float(away.max()), len(points))
+        distances = np.abs(values) / np.maximum(slope, 1e-300)
+        return SurfaceDisplacement(float(distances.mean()), float(distances.max()), len(points))
 
     def _near(self, level: float, rng: int) -> tuple[FloatArray, FloatArray]:
-        """Points of the surface, or next to it, and the function less the series there."""
+        """Points of the surface, or next to it, and the function minus the series at these
+        points."""
         if not callable(self._source):
             grid = cast("FloatArray", self._source)
             points = midpoints(self._lower, self._lower + self._size, grid.shape)
             value = self.value(points, precision="double")
             slope = np.linalg.norm(self.gradient(points, precision="double"), axis=1)
             cell = float((self._size / grid.shape).max())
-            near = np.abs(value - level) <= slope * cell
-            return points[near], (grid.ravel() - value)[near]
+            is_near = np.abs(value - level) <= slope * cell
+            return points[is_near], (grid.ravel() - value)[is_near]
         x = self._lower + self._size * np.random.default_rng(rng).random((_CHECK_POINTS, 3))
         for _ in range(_NEWTON_STEPS):
             gradient = self.gradient(x, precision="double")
             square = np.maximum((gradient**2).sum(axis=1), 1e-300)
-            off = (self.value(x, precision="double") - level) / square
-            step = off[:, None] * gradient
+            difference = (self.value(x, precision="double") - level) / square
+            step = difference[:, None] * gradient
             length = np.linalg.norm(step, axis=1, keepdims=True)
             x = x - step * np.minimum(1, 0.1 * self._size.min() / np.maximum(length, 1e-300))
             x = np.clip(x, self._lower, self._lower + self._size)
         slope = np.linalg.norm(self.gradient(x, precision="double"), axis=1)
-        off = np.abs(self.value(x, precision="double") - level)
-        x = x[off <= _CONVERGED * float(self._size.max()) * slope]
+        difference = np.abs(self.value(x, precision="double") - level)
+        x = x[difference <= _CONVERGED * float(self._size.max()) * slope]
         return x, (_values(self._source, x) if len(x) else np.zeros(0)) - level
 
     def _largest_difference(self) -> float:
         """The largest difference between series and function at random points, or all of a grid."""
         if callable(self._source):
             x = self._lower + self._size * np.random.default_rng(0).random((_CHECK_POINTS, 3))
-            given = _values(self._source, x)
+            values = _values(self._source, x)
         else:
             grid = cast("FloatArray", self._source)
             x = midpoints(self._lower, self._lower + self._size, grid.shape)
-            given = grid.ravel()
-        return float(np.abs(self.value(x, precision="double") - given).max())
+            values = grid.ravel()
+        return float(np.abs(self.value(x, precision="double") - values).max())
 
     @cached_prepare
     def prepare(self, backend: Backend) -> Self:
@@ -242,30 +250,31 @@ class FourierSeries(Field):
         )
 
     def _on(self, p: Vec3) -> CosineSums:
+        """The series on the backend of p."""
         return self._upload(backend_of(p)) if self._device is None else self._device
 
     def evaluate(self, p: Vec3) -> Sample:
-        on = self._on(p)
-        value, gradient = on.value(p)
+        sums = self._on(p)
+        value, gradient = sums.value(p)
         unit = float(dr.epsilon(type(value))) * _SECOND_ORDER
         # The rounding of p - lower, times pi/size, moves the point.
-        moved = [dr.fma(3.0, dr.abs(p[k] - on.lower[k]), dr.abs(on.lower[k])) for k in range(3)]
-        error = sum((moved[k] * dr.abs(gradient[k]) for k in range(3)), 0 * p.x)
-        error = unit * (error + on.rounding[0])
-        length = dr.norm(on.backend.Array3f(*moved))
-        slope_error = unit * dr.fma(on.curvature, length, on.rounding[1])
-        return Sample(value, gradient, on.curvatures(p), error, slope_error)
+        moves = [dr.fma(3.0, dr.abs(p[k] - sums.lower[k]), dr.abs(sums.lower[k])) for k in range(3)]
+        error = sum((moves[k] * dr.abs(gradient[k]) for k in range(3)), 0 * p.x)
+        error = unit * (error + sums.rounding[0])
+        length = dr.norm(sums.backend.Array3f(*moves))
+        slope_error = unit * dr.fma(sums.curvature, length, sums.rounding[1])
+        return Sample(value, gradient, sums.curvatures(p), error, slope_error)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """Rows of the Hessian of the series."""
         return self._on(p).hessian(p)
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """The part of the box in whose cells the series is not proved to stay off the levels."""
-        shares = self._bounds.extent(levels)
-        if shares is None:
+        """The part of the box with the cells in which the series may take a level."""
+        fractions = self._bounds.extent(levels)
+        if fractions is None:
             return self.domain
-        low, high = shares
+        low, high = fractions
         corners = self._lower + low * self._size, self._lower + high * self._size
         return Box(cast("Any", tuple(corners[0].tolist())), cast("Any", tuple(corners[1].tolist())))
 
@@ -277,25 +286,26 @@ class FourierSeries(Field):
             "terms": self.coefficients.shape,
             "range": self.value_range,
             "second derivatives": self.curvature,
-            "grids of local bounds": tuple(one.count for one in self._bounds.cells),
+            "grids of local bounds": tuple(cells.count for cells in self._bounds.cells),
             "error of the fit": self.fit_error,
         }
 
 
 def _as_triple(numbers: Any, name: str) -> tuple[int, int, int]:
+    """Three integers, from one integer or three."""
     try:
-        one = operator.index(numbers)
+        number = operator.index(numbers)
     except TypeError:
         try:
-            several = tuple(operator.index(n) for n in numbers)
+            triple = tuple(operator.index(n) for n in numbers)
         except TypeError as error:
             raise TypeError(
                 f"{name} must be whole numbers, one or three, not {numbers!r} ({error})"
             ) from None
-        if len(several) != 3:
-            raise ValueError(f"{name} must be one number or three, not {len(several)}") from None
-        return several[0], several[1], several[2]
-    return one, one, one
+        if len(triple) != 3:
+            raise ValueError(f"{name} must be one number or three, not {len(triple)}") from None
+        return triple[0], triple[1], triple[2]
+    return number, number, number
 
 
 def _check_terms(terms: tuple[int, ...]) -> None:
@@ -315,14 +325,15 @@ def _check_samples(terms: tuple[int, int, int], shape: tuple[int, int, int]) -> 
 
 
 def _finite_box(box: Any) -> Box:
+    """A box with finite sides longer than 0, from a `Box` or two corners."""
     try:
-        made = box if isinstance(box, Box) else Box(*box)
+        volume = box if isinstance(box, Box) else Box(*box)
     except TypeError:
         raise TypeError(f"box must be a harnack.Box or two corners, not {box!r}") from None
-    lower, upper = made.bounds()
+    lower, upper = volume.bounds()
     if not (np.isfinite(lower).all() and np.isfinite(upper).all() and (lower < upper).all()):
-        raise ValueError(f"the box of a series needs finite sides longer than 0, not {made}")
-    return made
+        raise ValueError(f"the box of a series needs finite sides longer than 0, not {volume}")
+    return volume
 
 
 def _values(function: Function, points: FloatArray) -> FloatArray:
@@ -333,23 +344,23 @@ def _values(function: Function, points: FloatArray) -> FloatArray:
             f"the function must give one value for each point (n, 3): for {len(points)} points it "
             f"gave an array of shape {values.shape}"
         )
-    bad = np.flatnonzero(~np.isfinite(values))
-    if bad.size:
+    ids = np.flatnonzero(~np.isfinite(values))
+    if ids.size:
         raise ValueError(
-            f"the function is {values[bad[0]]} at {points[bad[0]].tolist()}, and NaN or infinite "
-            f"at {bad.size} of {len(points)} points: bound it first"
+            f"the function is {values[ids[0]]} at {points[ids[0]].tolist()}, and NaN or infinite "
+            f"at {ids.size} of {len(points)} points: bound it first"
         )
     return values.astype(np.float64)
 
 
 def _rounding(a: FloatArray, size: FloatArray) -> tuple[float, float]:
-    """The rounding of value and gradient, in units of u, without that which moves the point: see
-    `FourierSeries`."""
+    """The rounding of value and gradient, in units of u, without the rounding that moves the point:
+    see `FourierSeries`."""
     i, j, k = np.indices(a.shape)
-    each = (i + j + k) * (math.pi + 1) + 10
+    roundings = (i + j + k) * (math.pi + 1) + 10
     sizes = np.abs(a)
     slopes = [
-        math.pi / size[axis] * float((sizes * n * (each + 4)).sum())
+        math.pi / size[axis] * float((sizes * n * (roundings + 4)).sum())
         for axis, n in enumerate((i, j, k))
     ]
-    return float((sizes * each).sum()), math.hypot(*slopes)
+    return float((sizes * roundings).sum()), math.hypot(*slopes)

@@ -43,23 +43,23 @@ if TYPE_CHECKING:
 
 __all__ = ["HypersphericalHarmonic"]
 
-# Constants are moved up by this fraction for the roundings of float32.
+# Constants are increased by this fraction for the roundings of float32.
 _ROUNDING = 1e-5
 # Radii of the balls on which the Hessian is bounded, in units of sqrt(1 + |p|^2).
 _SHARES = _NEAR, _WIDE = 0.2, 0.6
 # Near zeros of high order: the chord of the ball on the sphere, in units of the distance to the
-# zero over (order - 2); the largest radius, in the units above; and the radius of a ball in space
-# whose image lies within a chord, in units of the chord times 1 + |p|^2.
+# zero over (order - 2); the largest radius, in units of sqrt(1 + |p|^2); and the radius of a ball
+# in space whose image lies within a chord, in units of the chord times 1 + |p|^2.
 _BESIDE, _MOST_BESIDE, _OF_CHORD = 0.5, 0.3, 0.349
-# Covers terms of second order in the unit roundoff, and the rounding of the bounds themselves.
+# A factor that covers terms of second order in the unit roundoff, and the rounding of the bounds.
 _SECOND_ORDER = 1.05
-# Roundings, in units of u: the relative one of 1/(1 + |p|^2), and that of w.
+# Roundings, in units of u: the relative rounding of 1/(1 + |p|^2), and the rounding of w.
 _OF_SCALE, _OF_HEIGHT = 6.0, 13.0
 
 
 @dataclass(frozen=True)
 class _OrderTerm:
-    """The terms of one j: a sum of solid harmonics times C_n^k(w), with bounds of both."""
+    """The terms of one j: a sum of solid harmonics S(y) times C_n^k(w), with bounds of both."""
 
     j: int
     n: int
@@ -77,11 +77,11 @@ class _OrderTerm:
         return cls(j, l - j, j + 1, weights, *bounds, rounding)
 
     def largest(self, rho: Real, r: Real) -> tuple[Real, Real]:
-        """Bounds of first and second derivatives of S(y) C(w) in R^4, where y is within rho of
-        the third axis and r of 0: C and its derivatives are largest at w = 1."""
-        c, first, second = (float(one) for one in self.axial(1.0))
-        value, slope, bent = self.value(rho, r), self.gradient(rho, r), self.hessian(rho, r)
-        return slope * c + value * first, bent * c + slope * first + value * second
+        """Bounds of first and second derivatives of S(y) C(w) in R^4, for y within rho of the third
+        axis and r of 0: C and its derivatives are largest at w = 1."""
+        c, first, second = (float(number) for number in self.axial(1.0))
+        value, slope, curvature = self.value(rho, r), self.gradient(rho, r), self.hessian(rho, r)
+        return slope * c + value * first, curvature * c + slope * first + value * second
 
     def axial(self, w: Real) -> tuple[Real, Real, Real]:
         """C_n^k(w) and its first two derivatives."""
@@ -91,7 +91,7 @@ class _OrderTerm:
 
 
 class HypersphericalHarmonic(Field):
-    """A harmonic function of the sphere S^3 at the point (2p, |p|^2 - 1)/(1 + |p|^2) of it.
+    """A harmonic function of the sphere S^3 at its point (2p, |p|^2 - 1)/(1 + |p|^2).
 
     P_ljm(X) = N S_jm(y) |X|^(l-j) C_(l-j)^(j+1)(w/|X|) with X = (y, w): S_jm the solid harmonic of
     `SphericalHarmonic`, C a Gegenbauer polynomial, the integral of P^2 over S^3 being 1. The origin
@@ -99,9 +99,10 @@ class HypersphericalHarmonic(Field):
     for j > 0. No level set needs to be clipped: rays that leave are proved to meet nothing.
 
     l, j, m: degree 0 <= l <= 6, and 0 <= j <= l, -j <= m <= j: (l+1)^2 functions for each l.
-        For more general ones see `from_polynomial`.
-    domain: a volume to draw it in; None for all of space. Surfaces of the level that f tends to far
-        away (0 for j > 0) may have no end, nor have rays along them: those need one, or a t_max.
+        For more general functions see `from_polynomial`.
+    domain: the volume in which f is drawn; None for all of space. Surfaces of the level to which f
+        tends far away (0 for j > 0) may be unbounded, and so may rays along them: they need a
+        domain, or a t_max.
 
     Proofs. Let P be of degree l with |P| <= M and half of its range A on S^3 (`HypersphereRange`).
     P is harmonic and homogeneous, so |grad P| <= l M there and |v.H v| <= l (l-1) M for unit
@@ -109,21 +110,22 @@ class HypersphericalHarmonic(Field):
 
     - `TaylorRemainder`. A line runs on S^3 at speed 2/S, and its second derivative in t has the
       length 4/S^1.5 (`SphereArcEnclosure` has the circle: it is sqrt(c^2 + t^2) 4/S^2). By the
-      chain rule |f''| <= M l (4 (l-1)/S^2 + 4/S^1.5) with the least S on the ball, and |grad f| <=
-      2 l A/S (Bernstein on the great circle along the line).
+      chain rule |f''| <= M l (4 (l-1)/S^2 + 4/S^1.5) with the smallest S on the ball, and
+      |grad f| <= 2 l A/S (Bernstein on the great circle along the line).
     - Where f vanishes to an order above 2, at y = 0 or for |m| > 2 on the circle y_1 = y_2 = 0,
       another `TaylorRemainder`, on a ball whose radius is a fraction of the distance to that zero.
       With bounds of S_jm, its gradient and its Hessian at such distances (`AxialBound`), and 2ab <=
-      1 for the components (a, b) of unit vectors, it is the same chain rule for S_jm(y) C(w). The
-      ball: R <= 0.3 sqrt(S) leaves 1 + |q|^2 >= 0.49 S at q, so that on the sphere it is within the
-      chord 2R/(0.7 S).
+      1 for the components (a, b) of unit vectors, it follows by the same chain rule for
+      S_jm(y) C(w). The ball: for R <= 0.3 sqrt(S), 1 + |q|^2 >= 0.49 S at its points q, so that on
+      the sphere it is within the chord 2R/(0.7 S).
     - Along a ray: `SphereArcEnclosure`. On the circle of radius 1/c, in its angle, the first
-      derivative of the point has length 1/c and the second too, so |f_aa| <= M l ((l-1)/c^2 + 1/c);
-      and f is a trigonometric polynomial of degree l of the angle, so |f_aa| <= l^2 A (Bernstein).
+      derivative of the point has length 1/c and so has the second, so |f_aa| <=
+      M l ((l-1)/c^2 + 1/c); and f is a trigonometric polynomial of degree l of the angle, so
+      |f_aa| <= l^2 A (Bernstein).
 
     Raises:
         ValueError: l, j or m outside these ranges.
-        TypeError: l, j or m is no whole number.
+        TypeError: l, j or m is no integer.
     """
 
     is_cheap = True
@@ -145,18 +147,18 @@ class HypersphericalHarmonic(Field):
     def from_polynomial(
         cls, coefficients: Monomials, *, domain: Volume | None = None
     ) -> HypersphericalHarmonic:
-        """The function of a homogeneous harmonic polynomial of R^4, by its coefficients.
+        """The function of a homogeneous harmonic polynomial of R^4, from its coefficients.
 
-        coefficients: (a, b, c, d) -> that of x^a y^b z^c w^d, a + b + c + d = l for all, l <= 6;
-            x, y, z are 2p/(1 + |p|^2) and w = (|p|^2 - 1)/(1 + |p|^2).
+        coefficients: (a, b, c, d) -> coefficient of x^a y^b z^c w^d, a + b + c + d = l for all, l
+            <= 6; x, y, z are 2p/(1 + |p|^2) and w = (|p|^2 - 1)/(1 + |p|^2).
 
         Raises:
             ValueError: not homogeneous, of a degree above 6, zero, not finite, or not harmonic.
-            TypeError: a key is not four whole numbers.
+            TypeError: a key is not four integers.
         """
         terms: dict[tuple[int, int, int, int], float] = {}
         for key, value in coefficients.items():
-            powers = tuple(operator.index(one) for one in key)
+            powers = tuple(operator.index(power) for power in key)
             if len(powers) != 4 or min(powers) < 0:
                 raise TypeError(
                     f"a monomial of R^4 is four powers >= 0, of x, y, z and w, not {key!r}"
@@ -165,9 +167,9 @@ class HypersphericalHarmonic(Field):
                 raise ValueError(f"the coefficient of {key} is {value!r}, not a finite number")
             a, b, c, d = powers
             terms[a, b, c, d] = terms.get((a, b, c, d), 0.0) + float(value)
-        made = cls.__new__(cls)
-        made._initialize(*from_monomials(terms), domain)
-        return made
+        field = cls.__new__(cls)
+        field._initialize(*from_monomials(terms), domain)
+        return field
 
     def _initialize(self, l: int, weights: SphereWeights, domain: Volume | None) -> None:  # noqa: E741
         self.domain = domain
@@ -179,17 +181,17 @@ class HypersphericalHarmonic(Field):
 
     @property
     def value_range(self) -> tuple[float, float]:
-        """Proved: the values of f stay within it."""
+        """Proved: the values of f stay within this interval."""
         return self._known.low, self._known.high
 
     def evaluate(self, p: Vec3) -> Sample:
         square = dr.squared_norm(p)
         value, gradient, error, gradient_error = self._values(p, 1 + square)
-        known = (*self._remainder_near_zero(p, square), *self._curvatures(square))
-        steep = self.degree * (self._known.high - self._known.low) * (1 + _ROUNDING)
-        lipschitz = Lipschitz(steep / self._min_square(square, _WIDE), self._reach(square, _WIDE))
+        promises = (*self._remainder_near_zero(p, square), *self._curvatures(square))
+        slope = self.degree * (self._known.high - self._known.low) * (1 + _ROUNDING)
+        lipschitz = Lipschitz(slope / self._min_square(square, _WIDE), self._reach(square, _WIDE))
         return Sample(
-            value, gradient, known, error, gradient_error, alternative_promises=(lipschitz,)
+            value, gradient, promises, error, gradient_error, alternative_promises=(lipschitz,)
         )
 
     def _values(self, p: Vec3, total: Real) -> tuple[Real, Vec3, Real, Real]:
@@ -198,7 +200,7 @@ class HypersphericalHarmonic(Field):
         With s = 1/total, y = 2 s p, w = 1 - 2 s, f = sum of S(y) C(w): since S is homogeneous of
         degree j, grad f = 2 s (sum of C grad S + p S (2 s C' - j C)). To first order in u: y is off
         by `_OF_SCALE` of its size, all coordinates alike, and by two roundings of each coordinate
-        (`is_divided`); w by `_OF_HEIGHT`; S, grad S and C as their recurrences say.
+        (`is_divided`); w by `_OF_HEIGHT`; S, grad S and C by the errors of their recurrences.
         """
         s = 1 / total
         y, w, size = 2 * s * p, 1 - 2 * s, dr.norm(p)
@@ -206,55 +208,62 @@ class HypersphericalHarmonic(Field):
         zero = 0 * p.x
         value, inner, outer = zero, type(p)(0), zero
         error, slope = zero, zero
-        many = len(self._orders) + 8.0
-        for one in self._orders:
-            c, first, second = one.axial(w)
-            at, (x1, x2, x3) = evaluate(one.weights, y.x, y.y, y.z)
-            value = value + c * at
+        roundings = len(self._orders) + 8.0
+        for term in self._orders:
+            c, first, second = term.axial(w)
+            harmonic, (x1, x2, x3) = evaluate(term.weights, y.x, y.y, y.z)
+            value = value + c * harmonic
             inner = inner + c * type(p)(zero + x1, zero + x2, zero + x3)
-            radial = 2 * s * first - one.j * c
-            outer = outer + at * radial
+            radial = 2 * s * first - term.j * c
+            outer = outer + harmonic * radial
             # Rounding.
-            most, steep = one.value(rho, r), one.gradient(rho, r)
-            off = one.rounding.value(rho, r) + _OF_SCALE * one.j * most
-            tilt = one.rounding.gradient(rho, r) + (_OF_SCALE * max(one.j - 1, 0) + many) * steep
-            c_off = dr.fma(_OF_HEIGHT, dr.abs(first), gegenbauer_rounding(one.n, one.k))
-            next_off = 2 * one.k * gegenbauer_rounding(one.n - 1, one.k + 1)
+            upper, slope_max = term.value(rho, r), term.gradient(rho, r)
+            value_off = term.rounding.value(rho, r) + _OF_SCALE * term.j * upper
+            slope_off = (
+                term.rounding.gradient(rho, r)
+                + (_OF_SCALE * max(term.j - 1, 0) + roundings) * slope_max
+            )
+            c_off = dr.fma(_OF_HEIGHT, dr.abs(first), gegenbauer_rounding(term.n, term.k))
+            next_off = 2 * term.k * gegenbauer_rounding(term.n - 1, term.k + 1)
             first_off = dr.fma(_OF_HEIGHT, dr.abs(second), next_off)
             radial_off = 2 * s * dr.fma(8.0, dr.abs(first), first_off)
-            radial_off = radial_off + one.j * (c_off + 3 * dr.abs(c))
+            radial_off = radial_off + term.j * (c_off + 3 * dr.abs(c))
             c = dr.abs(c)
-            error = error + c * (off + many * most) + most * c_off
-            slope = slope + c * tilt + steep * c_off
-            slope = slope + size * (dr.abs(radial) * (off + many * most) + most * radial_off)
+            error = error + c * (value_off + roundings * upper) + upper * c_off
+            slope = slope + c * slope_off + slope_max * c_off
+            slope = slope + size * (
+                dr.abs(radial) * (value_off + roundings * upper) + upper * radial_off
+            )
         unit = float(dr.epsilon(type(zero))) * _SECOND_ORDER
         gradient = 2 * s * (inner + p * outer)
-        lost = 64 * float(dr.smallest(type(zero)))
-        return value, gradient, dr.fma(error, unit, lost), 2 * s * unit * slope
+        underflow = 64 * float(dr.smallest(type(zero)))
+        return value, gradient, dr.fma(error, unit, underflow), 2 * s * unit * slope
 
-    def _min_square(self, square: Real, share: float) -> Real:
-        """A lower bound of 1 + |y|^2 on the ball of radius share sqrt(1 + |p|^2) about p."""
-        inner = fmax(dr.sqrt(square) - share * dr.sqrt(1 + square), 0)
+    def _min_square(self, square: Real, fraction: float) -> Real:
+        """A lower bound of 1 + |y|^2 on the ball of radius fraction sqrt(1 + |p|^2) about p;
+        square: |p|^2."""
+        inner = fmax(dr.sqrt(square) - fraction * dr.sqrt(1 + square), 0)
         return dr.fma(inner, inner, 1) * (1 - _ROUNDING)
 
-    def _reach(self, square: Real, share: float) -> Real:
-        return share * dr.sqrt(1 + square)
+    def _reach(self, square: Real, fraction: float) -> Real:
+        """The radius fraction sqrt(1 + |p|^2); square: |p|^2."""
+        return fraction * dr.sqrt(1 + square)
 
     def _curvatures(self, square: Real) -> list[TaylorRemainder]:
-        """Bounds of the Hessian on three balls, the last one all of space."""
+        """Bounds of the Hessian on three balls, the last of which is all of space."""
         l = self.degree  # noqa: E741
         size = l * self._known.largest * (1 + _ROUNDING)
-        made: list[TaylorRemainder] = []
-        for share in _SHARES:
-            least = self._min_square(square, share)
-            bent = (4 * (l - 1) / least + 4 / dr.sqrt(least)) / least
-            made.append(TaylorRemainder(fmax(size * bent, 0), self._reach(square, share)))
-        return [*made, TaylorRemainder(0 * square + max(size * 4.0 * l, 0.0), dr.inf)]
+        promises: list[TaylorRemainder] = []
+        for fraction in _SHARES:
+            lower = self._min_square(square, fraction)
+            second = (4 * (l - 1) / lower + 4 / dr.sqrt(lower)) / lower
+            promises.append(TaylorRemainder(fmax(size * second, 0), self._reach(square, fraction)))
+        return [*promises, TaylorRemainder(0 * square + max(size * 4.0 * l, 0.0), dr.inf)]
 
     def _remainder_near_zero(self, p: Vec3, square: Real) -> tuple[TaylorRemainder, ...]:
         """The bound of the Hessian near a zero of high order; empty if there is no such zero."""
-        by_axis = min(abs(m) for one in self._orders for _, m in one.weights)
-        by_center = min(one.j for one in self._orders)
+        by_axis = min(abs(m) for term in self._orders for _, m in term.weights)
+        by_center = min(term.j for term in self._orders)
         if by_center < 3:
             return ()
         y = (2 / (1 + square)) * p
@@ -262,17 +271,17 @@ class HypersphericalHarmonic(Field):
         chord = _BESIDE / (by_center - 2) * r
         if by_axis > 2:
             chord = fmin(chord, _BESIDE / (by_axis - 2) * rho)
-        least = self._min_square(square, _MOST_BESIDE)
-        root = dr.rcp(dr.sqrt(least))
-        bent = 0 * square
-        for one in self._orders:
-            first, second = one.largest(rho + chord, r + chord)
-            bent = bent + 4 * root * root * root * dr.fma(root, second, first)
+        lower = self._min_square(square, _MOST_BESIDE)
+        root = dr.rcp(dr.sqrt(lower))
+        second_max = 0 * square
+        for term in self._orders:
+            first, second = term.largest(rho + chord, r + chord)
+            second_max = second_max + 4 * root * root * root * dr.fma(root, second, first)
         radius = fmin(_OF_CHORD * chord * (1 + square), _MOST_BESIDE * dr.sqrt(1 + square))
-        return (TaylorRemainder(bent * (1 + _ROUNDING), radius),)
+        return (TaylorRemainder(second_max * (1 + _ROUNDING), radius),)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The sample, with `SphereArcEnclosure` enclosures if the sharpest proofs are asked for."""
+        """The sample, with `SphereArcEnclosure` enclosures if the ray uses the sharpest proofs."""
         del ahead, back
         p = path.point(t)
         sample = self.evaluate(p)
@@ -283,56 +292,59 @@ class HypersphericalHarmonic(Field):
         # The point of the line closest to the origin, from one end or the other without
         # cancellation: the origin of the ray may be far away.
         start = dr.dot(path.origin, path.direction)
-        foot = path.origin - start * path.direction
-        square = 1 + dr.squared_norm(foot)
-        along = dr.dot(p, path.direction)
+        closest = path.origin - start * path.direction
+        square = 1 + dr.squared_norm(closest)
+        position = dr.dot(p, path.direction)
         l, c = self.degree, dr.sqrt(square)  # noqa: E741
-        known = self._known
-        most = l * l * 0.5 * (known.high - known.low)
-        bent = fmin(known.largest * l * ((l - 1) / square + 1 / c), most) * (1 + _ROUNDING)
-        forward = SphereArcEnclosure(slopes, bent, along, square)
-        backward = SphereArcEnclosure(slopes.negated(), bent, -along, square)
-        curvatures = [one for one in sample.promises if isinstance(one, TaylorRemainder)]
-        beside = curvatures[: -len(_SHARES) - 1]
-        around = [
-            ParabolaEnclosure(slopes, -one.constant, one.constant, one.radius) for one in beside
+        bounds = self._known
+        limit = l * l * 0.5 * (bounds.high - bounds.low)
+        second = fmin(bounds.largest * l * ((l - 1) / square + 1 / c), limit) * (1 + _ROUNDING)
+        forward = SphereArcEnclosure(slopes, second, position, square)
+        backward = SphereArcEnclosure(slopes.negated(), second, -position, square)
+        curvatures = [
+            promise for promise in sample.promises if isinstance(promise, TaylorRemainder)
         ]
-        behind = [
-            ParabolaEnclosure(slopes.negated(), -one.constant, one.constant, one.radius)
-            for one in beside
+        near_zero = curvatures[: -len(_SHARES) - 1]
+        ahead_near = [
+            ParabolaEnclosure(slopes, -promise.constant, promise.constant, promise.radius)
+            for promise in near_zero
         ]
-        return RaySample(sample, (forward, *around), (backward, *behind), slope)
+        back_near = [
+            ParabolaEnclosure(slopes.negated(), -promise.constant, promise.constant, promise.radius)
+            for promise in near_zero
+        ]
+        return RaySample(sample, (forward, *ahead_near), (backward, *back_near), slope)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """Rows of the Hessian, whose trace is not 0: f is harmonic on S^3 and not in space.
 
-        By the chain rule with dy_i/dx_k = 2s (d_ik - 2s x_i x_k), dw/dx_k = 4 s^2 x_k, and
-        second derivatives 4 s^2 (4s x_i x_k x_m - x_m d_ik - x_k d_im - x_i d_km) of y_i and
-        4 s^2 (d_km - 4s x_k x_m) of w.
+        By the chain rule with dy_i/dx_k = 2s (d_ik - 2s x_i x_k), dw/dx_k = 4 s^2 x_k, and second
+        derivatives 4 s^2 (4s x_i x_k x_m - x_m d_ik - x_k d_im - x_i d_km) of y_i and 4 s^2 (d_km -
+        4s x_k x_m) of w.
         """
         vector = cast("Any", type(p))
         s = 1 / (1 + dr.squared_norm(p))
         y, w, zero = 2 * s * p, 1 - 2 * s, 0 * p.x
         rows = [[zero] * 4 for _ in range(4)]
         slopes = [zero] * 4
-        for one in self._orders:
-            c, first, second = one.axial(w)
-            at, gradient = evaluate(one.weights, y.x, y.y, y.z)
-            xx, yy, zz, xy, xz, yz = hessian(one.weights, y.x, y.y, y.z)
+        for term in self._orders:
+            c, first, second = term.axial(w)
+            harmonic, gradient = evaluate(term.weights, y.x, y.y, y.z)
+            xx, yy, zz, xy, xz, yz = hessian(term.weights, y.x, y.y, y.z)
             matrix = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
             for i in range(3):
                 for k in range(3):
                     rows[i][k] = rows[i][k] + c * matrix[i][k]
                 rows[i][3] = rows[i][3] + first * gradient[i]
                 slopes[i] = slopes[i] + c * gradient[i]
-            rows[3][3] = rows[3][3] + second * at
-            slopes[3] = slopes[3] + first * at
+            rows[3][3] = rows[3][3] + second * harmonic
+            slopes[3] = slopes[3] + first * harmonic
         x = (p.x, p.y, p.z)
         # Columns of the derivative of (y, w), four by three.
-        along = [[2 * s * ((i == k) - 2 * s * x[i] * x[k]) for k in range(3)] for i in range(3)]
-        along.append([4 * s * s * x[k] for k in range(3)])
+        jacobian = [[2 * s * ((i == k) - 2 * s * x[i] * x[k]) for k in range(3)] for i in range(3)]
+        jacobian.append([4 * s * s * x[k] for k in range(3)])
         radial = x[0] * slopes[0] + x[1] * slopes[1] + x[2] * slopes[2]
-        out: list[Vec3] = []
+        result: list[Vec3] = []
         for k in range(3):
             row: list[Real] = []
             for m in range(3):
@@ -340,14 +352,14 @@ class HypersphericalHarmonic(Field):
                 for i in range(4):
                     for n in range(4):
                         entry = rows[min(i, n)][max(i, n)]
-                        total = total + along[i][k] * entry * along[n][m]
-                bent = 4 * s * x[k] * x[m] * (radial - slopes[3])
-                bent = bent - x[m] * slopes[k] - x[k] * slopes[m]
+                        total = total + jacobian[i][k] * entry * jacobian[n][m]
+                curved = 4 * s * x[k] * x[m] * (radial - slopes[3])
+                curved = curved - x[m] * slopes[k] - x[k] * slopes[m]
                 if k == m:
-                    bent = bent + slopes[3] - radial
-                row.append(total + 4 * s * s * bent)
-            out.append(vector(*row))
-        return out[0], out[1], out[2]
+                    curved = curved + slopes[3] - radial
+                row.append(total + 4 * s * s * curved)
+            result.append(vector(*row))
+        return result[0], result[1], result[2]
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """A ball about the origin; None for levels whose surface may reach to infinity."""
@@ -366,7 +378,7 @@ class HypersphericalHarmonic(Field):
     def describe(self) -> dict[str, Any]:
         return {
             "degree": self.degree,
-            "harmonics": sum(len(one.weights) for one in self._orders),
+            "harmonics": sum(len(term.weights) for term in self._orders),
             "range": self.value_range,
             "value far away": self._known.pole,
         }

@@ -1,16 +1,17 @@
-"""Harmonic functions on the sphere S^3: the (l+1)^2 of degree l, their sums and their ranges.
+"""Harmonic functions on the sphere S^3: the (l+1)^2 functions of degree l, their sums and their
+ranges.
 
 With X = (y, w), y in R^3, the homogeneous harmonic polynomials of degree l of R^4 are spanned by
 
     P_ljm(X) = N_lj S_jm(y) |X|^(l-j) C_(l-j)^(j+1)(w/|X|),   0 <= j <= l, -j <= m <= j,
 
-S_jm = |y|^j Y_jm the solid harmonics of `solid_harmonics`, C_n^k Gegenbauer polynomials (which obey
-n C_n = 2 (n+k-1) w C_(n-1) - (n+2k-2) C_(n-2)) and N_lj such that the integral of P^2 over S^3
-is 1: with n = l-j, k = j+1 (DLMF 18.3),
+S_jm = |y|^j Y_jm the solid harmonics of `solid_harmonics`, C_n^k Gegenbauer polynomials (with n C_n
+= 2 (n+k-1) w C_(n-1) - (n+2k-2) C_(n-2)) and N_lj such that the integral of P^2 over S^3 is 1: with
+n = l-j, k = j+1 (DLMF 18.3),
 
     N^-2 = integral of sin(a)^(2k) C_n^k(cos a)^2 = pi 2^(1-2k) (n+2k-1)!/(n! (n+k) ((k-1)!)^2).
 
-On the sphere |X| = 1, which is all that is needed here.
+All functions here are evaluated on the sphere |X| = 1.
 """
 
 from __future__ import annotations
@@ -43,9 +44,9 @@ LARGEST_DEGREE = 6
 SphereWeights: TypeAlias = Mapping[tuple[int, int], float]  #: (j, m) -> coefficient of P_ljm
 Monomials: TypeAlias = Mapping[tuple[int, int, int, int], float]  #: of x^a y^b z^c w^d
 
-# Spheres |y| = const of S^3 on which ranges are proved.
+# The number of spheres |y| = const of S^3 on which ranges are proved.
 _SLICES = 256
-# The product of degree and grid spacing on each.
+# The product of degree and grid spacing on each of these spheres.
 _RESOLUTION = 0.1
 
 
@@ -58,27 +59,28 @@ def norm(l: int, j: int) -> float:  # noqa: E741
 
 
 def gegenbauer(n: int, k: int, w: Any) -> Any:
-    """C_n^k(w), of NumPy or Dr.Jit numbers; 0 for n < 0."""
+    """C_n^k(w), for NumPy or Dr.Jit numbers; 0 for n < 0."""
     if n < 0:
         return 0.0 * w
-    below, value = 0.0 * w, 0.0 * w + 1.0
+    previous, value = 0.0 * w, 0.0 * w + 1.0
     for i in range(1, n + 1):
         a, b = _coefficients(i, k)
-        below, value = value, a * (w * value) - b * below
+        previous, value = value, a * (w * value) - b * previous
     return value
 
 
 def _coefficients(i: int, k: int) -> tuple[float, float]:
-    """Of the recurrence to C_i^k."""
+    """The two coefficients of the recurrence to C_i^k."""
     return 2 * (i + k - 1) / i, (i + 2 * k - 2) / i
 
 
 @functools.cache
 def gegenbauer_rounding(n: int, k: int) -> float:
-    """How far rounding moves `gegenbauer` of a number in [-1, 1], in units of u, to first order.
+    """A bound, to first order, of the rounding of `gegenbauer` for a number in [-1, 1], in units of
+    u.
 
-    A step commits 4u |a w C_(i-1)| + 3u |b C_(i-2)| and passes on what earlier ones did by the same
-    recurrence; the sum of the sizes is sampled, and moves little between samples (1.03).
+    A step commits 4u |a w C_(i-1)| + 3u |b C_(i-2)| and propagates the errors of earlier steps by
+    the same recurrence; the sum of the sizes is sampled, and changes little between samples (1.03).
     """
     w = np.cos(np.linspace(0, math.pi, 4001))
     total = np.zeros_like(w)
@@ -86,28 +88,29 @@ def gegenbauer_rounding(n: int, k: int) -> float:
         a, b = _coefficients(start, k)
         committed = 4 * np.abs(a * w * gegenbauer(start - 1, k, w))
         committed += 3 * np.abs(b * gegenbauer(start - 2, k, w))
-        below, value = np.zeros_like(w), np.ones_like(w)
+        previous, value = np.zeros_like(w), np.ones_like(w)
         for i in range(start + 1, n + 1):
             a, b = _coefficients(i, k)
-            below, value = value, a * w * value - b * below
+            previous, value = value, a * w * value - b * previous
         total += np.abs(value) * committed
     return 1.03 * float(total.max())
 
 
 def weights_by_order(l: int, weights: SphereWeights) -> dict[int, dict[tuple[int, int], float]]:  # noqa: E741
-    """j -> the solid harmonics (j, m) of the factor of C_(l-j)^(j+1), N_lj included."""
-    found: dict[int, dict[tuple[int, int], float]] = {}
+    """For each j, the weights of the solid harmonics (j, m) in the factor of C_(l-j)^(j+1), N_lj
+    included."""
+    orders: dict[int, dict[tuple[int, int], float]] = {}
     for (j, m), weight in sorted(weights.items()):
-        found.setdefault(j, {})[j, m] = norm(l, j) * weight
-    return found
+        orders.setdefault(j, {})[j, m] = norm(l, j) * weight
+    return orders
 
 
 def from_monomials(coefficients: Monomials) -> tuple[int, dict[tuple[int, int], float]]:
     """The degree and the weights of a homogeneous harmonic polynomial of R^4.
 
     The weights are integrals over S^3 of products of degree 2l <= 12, exact by quadrature: Gauss
-    and Chebyshev's rule in w, Gauss and Legendre's on S^2, even steps around. A polynomial that is
-    not harmonic is more than the sum of these projections.
+    and Chebyshev's rule in w, Gauss and Legendre's on S^2, even steps in longitude. A polynomial
+    that is not harmonic differs from the sum of these projections.
 
     Raises:
         ValueError: not homogeneous, of a degree above 6, zero, or not harmonic.
@@ -125,45 +128,49 @@ def from_monomials(coefficients: Monomials) -> tuple[int, dict[tuple[int, int], 
         raise ValueError(f"the degree must be 0 to {LARGEST_DEGREE}, not {l}")
     a = math.pi * np.arange(1, 9) / 9
     c, legendre = np.polynomial.legendre.leggauss(8)
-    turn = 2 * math.pi * np.arange(16) / 16
-    angle, cosine, around = (one.ravel() for one in np.meshgrid(a, c, turn, indexing="ij"))
+    longitudes = 2 * math.pi * np.arange(16) / 16
+    angle, cosine, longitude = (
+        entry.ravel() for entry in np.meshgrid(a, c, longitudes, indexing="ij")
+    )
     sine = np.sqrt(1 - cosine**2)
     weight = (np.sin(a) ** 2 * math.pi / 9)[:, None, None] * legendre[:, None] * (math.pi / 8)
     weight = np.broadcast_to(weight, (8, 8, 16)).ravel()
-    unit = np.stack([sine * np.cos(around), sine * np.sin(around), cosine])
-    y, w = np.sin(angle) * unit, np.cos(angle)
+    direction = np.stack([sine * np.cos(longitude), sine * np.sin(longitude), cosine])
+    y, w = np.sin(angle) * direction, np.cos(angle)
     values = sum(
-        one * y[0] ** i * y[1] ** j * y[2] ** k * w**n for (i, j, k, n), one in coefficients.items()
+        entry * y[0] ** i * y[1] ** j * y[2] ** k * w**n
+        for (i, j, k, n), entry in coefficients.items()
     )
     weights: dict[tuple[int, int], float] = {}
-    rest = np.array(values, dtype=np.float64)
+    misfit = np.array(values, dtype=np.float64)
     for j in range(l + 1):
         axial = norm(l, j) * gegenbauer(l - j, j + 1, w)
         for m in range(-j, j + 1):
             basis = axial * (evaluate({(j, m): 1.0}, *y)[0] + 0.0 * w)
             weights[j, m] = float(weight @ (values * basis))
-            rest -= weights[j, m] * basis
+            misfit -= weights[j, m] * basis
     size = float(np.abs(values).max())
-    if float(np.abs(rest).max()) > 1e-9 * size:
+    if float(np.abs(misfit).max()) > 1e-9 * size:
         raise ValueError(
             "the polynomial is not harmonic in R^4: its second derivatives in x, y, z and w do not "
-            f"add up to zero (on the unit sphere {float(np.abs(rest).max()):.3g} is left of it)"
+            f"add up to zero (on the unit sphere {float(np.abs(misfit).max()):.3g} is left of it)"
         )
-    largest = max(abs(one) for one in weights.values())
-    return l, {key: one for key, one in weights.items() if abs(one) > 1e-13 * largest}
+    largest = max(abs(entry) for entry in weights.values())
+    return l, {key: entry for key, entry in weights.items() if abs(entry) > 1e-13 * largest}
 
 
 @dataclass(frozen=True)
 class HypersphereRange:
     """Proved ranges of a sum of degree l on S^3, and on the spheres of angle a from the pole w = 1.
 
-    low, high: on all of S^3. lower, upper: (n,) for angles from i pi/n to (i+1) pi/n.
+    low, high: the range on all of S^3.
+    lower, upper: (n,) the ranges for angles from i pi/n to (i+1) pi/n.
     pole: the value at w = 1, to which f tends far away.
 
     Proof. On the sphere in the middle of each pair of angles P is a polynomial of degree l on S^2,
     and on S^3 all points are within `covering` + half a step of a sample: `proved_range`, whose
-    proof is along great circles. Between spheres P moves by l A pi/(2n) at most (Bernstein), A half
-    the range on S^3.
+    proof is along great circles. Between spheres P changes by l A pi/(2n) at most (Bernstein), A
+    half the range on S^3.
     """
 
     degree: int
@@ -183,15 +190,15 @@ class HypersphereRange:
         values = np.zeros((_SLICES, unit.shape[1]))
         pole = 0.0
         for j, sums in weights_by_order(l, weights).items():
-            at = evaluate(sums, *unit)[0] + 0.0 * unit[0]
-            values += (np.sin(a) ** j * gegenbauer(l - j, j + 1, np.cos(a)))[:, None] * at
+            harmonic = evaluate(sums, *unit)[0] + 0.0 * unit[0]
+            values += (np.sin(a) ** j * gegenbauer(l - j, j + 1, np.cos(a)))[:, None] * harmonic
             if j == 0:
-                pole += float(at[0]) * float(gegenbauer(l, 1, np.ones(1))[0])
+                pole += float(harmonic[0]) * float(gegenbauer(l, 1, np.ones(1))[0])
         lower, upper = values.min(axis=1), values.max(axis=1)
         low, high = float(lower.min()), float(upper.max())
         low, high = proved_range(low, high, l, covering + 0.5 * h)
-        rest = 0.5 * (l * covering) ** 2
-        margin = 0.5 * (upper - lower) * rest / (1 - rest)
+        e = 0.5 * (l * covering) ** 2
+        margin = 0.5 * (upper - lower) * e / (1 - e)
         margin = margin + 0.5 * (high - low) * (0.5 * h * l) + 1e-11 * (high - low)
         return cls(l, low, high, lower - margin, upper + margin, pole)
 
@@ -201,21 +208,20 @@ class HypersphereRange:
         return max(-self.low, self.high)
 
     def radius(self, level: float) -> float:
-        """The radius of a ball about the origin that contains all points with this level; inf if
-        there is none.
+        """The radius of a ball about the origin that contains all points with this level; infinite
+        if there is no such ball.
 
-        An angle a from the pole is a distance cot(a/2) from the origin. Where the first sphere is
-        not free of the level, write P = A cos(b) along a great circle from the pole, A >= |P|: b
-        changes at a rate of at most l (Szego), so the level is at least |b(level) - b(pole)|/l
-        away.
+        An angle a from the pole is a distance cot(a/2) from the origin. If the level may occur on
+        the first sphere, write P = A cos(b) along a great circle from the pole, A >= |P|: b changes
+        at a rate of at most l (Szego), so the level is at least |b(level) - b(pole)|/l away.
         """
-        met = np.flatnonzero((self.lower <= level) & (level <= self.upper))
-        if met.size and met[0] > 0:
-            angle = math.pi / len(self.lower) * float(met[0])
-        elif met.size == 0:
+        slices = np.flatnonzero((self.lower <= level) & (level <= self.upper))
+        if slices.size and slices[0] > 0:
+            angle = math.pi / len(self.lower) * float(slices[0])
+        elif slices.size == 0:
             return 0.0
         else:
-            most, l = self.largest, max(1, self.degree)  # noqa: E741
-            b, start = (math.acos(max(-1.0, min(1.0, one / most))) for one in (level, self.pole))
+            bound, l = self.largest, max(1, self.degree)  # noqa: E741
+            b, start = (math.acos(max(-1.0, min(1.0, f / bound))) for f in (level, self.pole))
             angle = abs(b - start) / l - 1e-9
         return 1 / math.tan(0.5 * angle) * (1 + 1e-9) if angle > 0 else math.inf

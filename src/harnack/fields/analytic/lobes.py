@@ -1,4 +1,4 @@
-"""The lobes r = |Y| of spherical harmonics, as they are drawn for orbitals of atoms."""
+"""The lobes r = |Y| of spherical harmonics, as in pictures of atomic orbitals."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ __all__ = ["Lobes"]
 
 LobeSign = Literal["both", "positive", "negative"]
 _PARTS: tuple[LobeSign, ...] = ("both", "positive", "negative")
-# Promised ends are moved outwards by this fraction for the roundings of float32.
+# Ends of promised ranges are moved outwards by this fraction for the roundings of float32.
 _ROUNDING = 1e-5
-# Fourth powers of scales and harmonics from 1/this to this stay in the range of a precision.
+# Scales and harmonics between 1/limit and limit have fourth powers within the range of a precision.
 _REACH = {"single": 1e6, "double": 1e60}
-# The least bound of second derivatives, so that it is not 0.
+# The smallest bound of second derivatives, so that it is not 0.
 _SMALLEST = 1e-20
 
 
@@ -51,15 +51,16 @@ class Lobes(Field):
 
         f = r^2 (r^2 - Y(u)^2)   for both signs,   f = r^2 (r - Y(u)) or r^2 (r + Y(u))
 
-    for the lobes where Y is positive or negative; the lobes are where f <= 0. The factor r^2 makes
-    second derivatives bounded at the origin, where all lobes meet: f and its gradient vanish there,
-    and the origin belongs to the surface. To tell signs by color, draw both parts:
+    for the lobes where Y is positive or negative; the lobes are the points with f <= 0. The factor
+    r^2 makes second derivatives bounded at the origin, where all lobes meet: f and its gradient
+    vanish there, and the origin belongs to the surface. To distinguish signs by color, draw both
+    parts:
 
         lobes, signs = hk.Lobes(3, 2), ["plastic", "porcelain"]
         hk.render([lobes.positive, lobes.negative], material=signs, side="below")
 
     l, m: degree 0 <= l <= 12 and order -l <= m <= l.
-    scale: more than 0, the length of a lobe in which Y reaches 1.
+    scale: a positive number, the length of a lobe in which Y reaches 1.
     sign: "both", "positive" or "negative".
 
     Second derivatives. The sum of the harmonics is W = Y^2, Y or -Y, and f = r^4 - r^2 W or
@@ -70,14 +71,14 @@ class Lobes(Field):
 
         2 W + 2 c q T' + q^2 T",   and   |2 c q T' + q^2 T"| <= q N A sqrt(4 c^2 + q^2 N^2)
 
-    (Cauchy and Schwarz), at most N^2 A for N >= 2 and 2 A/sqrt(3) for N = 1. Those of r^3 are in
-    [0, 6 r], those of r^4 in [0, 12 r^2]. So those of f along a segment are bounded on both sides
-    by how far its ends are from the origin. The gradient is continuous, 0 at the origin, so that
-    this holds of segments through it as well.
+    (Cauchy and Schwarz), at most N^2 A for N >= 2 and 2 A/sqrt(3) for N = 1. The second derivatives
+    of r^3 are in [0, 6 r], those of r^4 in [0, 12 r^2]. So those of f along a segment are bounded
+    on both sides by the distances of its ends from the origin. The gradient is continuous, 0 at the
+    origin, so that this holds for segments through it as well.
 
     Raises:
-        ValueError: l, m, scale or part out of range; no direction with that sign.
-        TypeError: l or m is no whole number.
+        ValueError: l, m, scale or sign out of range; no direction with that sign.
+        TypeError: l or m is no integer.
     """
 
     over_relaxation = 1.6
@@ -93,10 +94,11 @@ class Lobes(Field):
         scale: float = 1.0,
         sign: LobeSign = "both",
     ) -> Lobes:
-        """The lobes of a sum of real spherical harmonics, {(l, m): c} for the sum of c Y_lm."""
-        made = cls.__new__(cls)
-        made._initialize(weights, scale, sign)
-        return made
+        """The lobes of a sum of real spherical harmonics; weights: {(l, m): c} for the sum of c
+        Y_lm."""
+        field = cls.__new__(cls)
+        field._initialize(weights, scale, sign)
+        return field
 
     def _initialize(self, weights: Any, scale: Any, sign: LobeSign) -> None:
         self.weights = _checked(weights)
@@ -107,12 +109,12 @@ class Lobes(Field):
         self._size: Any = self.scale
         (first, *others) = self.weights
         if others:
-            ends = BallRange.of(self.weights).with_spheres(self.weights, 1.0).on_ball(1.0)
+            bounds = BallRange.of(self.weights).with_spheres(self.weights, 1.0).on_ball(1.0)
         else:
             weight = self.weights[first]
             low, high = (weight * end for end in range_of_harmonic(*first))
-            ends = min(low, high), max(low, high)
-        self.value_range = ends
+            bounds = min(low, high), max(low, high)
+        self.value_range = bounds
         self._rounding = HarmonicRounding.of(self.weights, is_divided=False)
         if self.extent_radius() <= 0:
             raise ValueError(f"there is no direction in which the function is {sign}")
@@ -136,27 +138,31 @@ class Lobes(Field):
         return max(l for l, _ in self.weights)  # noqa: E741
 
     def extent_radius(self) -> float:
-        """The length of the longest lobe, proved from above; not positive if there is none."""
+        """A proved upper bound of the length of the longest lobe; not positive if there is no
+        lobe."""
         low, high = self.value_range
         ends = {"both": max(-low, high), "positive": high, "negative": -low}
         return self.scale * ends[self.part]
 
     def prepare(self, backend: Backend) -> Field:
-        reach, most = _REACH[backend.precision], max(map(abs, self.value_range))
-        if not (1 / reach <= self.scale <= reach and 1 / reach <= most <= reach):
+        limit, largest = _REACH[backend.precision], max(map(abs, self.value_range))
+        if not (1 / limit <= self.scale <= limit and 1 / limit <= largest <= limit):
             raise ValueError(
                 f"lobes in {backend.precision} precision need a scale and a largest |Y| from "
-                f"{1 / reach:.0e} to {reach:.0e}, not {self.scale:.3g} and {most:.3g}: choose "
+                f"{1 / limit:.0e} to {limit:.0e}, not {self.scale:.3g} and {largest:.3g}: choose "
                 "another unit of length"
             )
-        other = copy.copy(self)
-        other._size = dr.opaque(backend.Float, self.scale)
-        return other
+        field = copy.copy(self)
+        field._size = dr.opaque(backend.Float, self.scale)
+        return field
 
     def extent(self, levels: tuple[float, ...]) -> Volume:
-        """With a the length of the longest lobe and scale 1, f > c beyond a + c^(1/4) or, of one
+        """A ball about the origin.
+
+        With a the length of the longest lobe and scale 1, f > c beyond a + c^(1/4) or, for a single
         sign, a + c^(1/3), for c > 0: there r^2 - W >= (r - a)^2 or r - W >= r - a, and r^2 is at
-        least (r - a)^2. Levels c <= 0 are within a."""
+        least (r - a)^2. Levels c <= 0 are within a.
+        """
         beyond = max(*levels, 0.0) ** (1 / 4 if self.part == "both" else 1 / 3)
         return Ball(radius=(self.extent_radius() + self.scale * beyond) * (1 + 1e-6))
 
@@ -166,110 +172,110 @@ class Lobes(Field):
     def _unscaled(self, x: Vec3) -> Sample:
         """The sample at a point of lobes of scale 1."""
         r = safe_norm(x)
-        at_origin = r <= float(dr.smallest(type(r))) ** 0.25  # f is 0 to rounding
+        at_origin = r <= float(dr.smallest(type(r))) ** 0.25  # f is 0 up to rounding
         u = dr.select(at_origin, type(x)(0, 0, 1), x / dr.select(at_origin, 1, r))
         r = dr.select(at_origin, 0, r)
         y, slope = evaluate(self.weights, u.x, u.y, u.z)
-        across = type(x)(*slope)
-        across -= dr.dot(across, u) * u  # the gradient of Y(x/r), times r
+        tangential = type(x)(*slope)
+        tangential -= dr.dot(tangential, u) * u  # the gradient of Y(x/r), times r
         if self.part == "both":
             value = r * r * ((r - y) * (r + y))
-            gradient = r * ((4 * r * r - 2 * y * y) * u - (2 * y) * across)
+            gradient = r * ((4 * r * r - 2 * y * y) * u - (2 * y) * tangential)
         else:
-            y, across = (y, across) if self.part == "positive" else (-y, -across)
+            y, tangential = (y, tangential) if self.part == "positive" else (-y, -tangential)
             value = r * r * (r - y)
-            gradient = r * ((3 * r - 2 * y) * u - across)
-        steep = safe_norm(across)
-        error, gradient_error = self._errors(r, y, steep, dr.sqrt(u.x * u.x + u.y * u.y))
-        least, most = self._second_derivatives(1.5 * r + 0.5)
-        known = [TaylorRemainder(fmax(-least, most), 0.5 * (r + 1))]
+            gradient = r * ((3 * r - 2 * y) * u - tangential)
+        slope_norm = safe_norm(tangential)
+        error, gradient_error = self._errors(r, y, slope_norm, dr.sqrt(u.x * u.x + u.y * u.y))
+        lower, upper = self._second_derivatives(1.5 * r + 0.5)
+        promises = [TaylorRemainder(fmax(-lower, upper), 0.5 * (r + 1))]
         if self.part == "both" and self.degree > 0:
-            known.append(self._local_remainder(r, y, steep))
-        return Sample(value, gradient, tuple(known), error, gradient_error)
+            promises.append(self._local_remainder(r, y, slope_norm))
+        return Sample(value, gradient, tuple(promises), error, gradient_error)
 
     def _local_remainder(self, r: Real, y: Real, slope: Real) -> TaylorRemainder:
         """A bound of second derivatives on a small ball, on which Y and its slope may be far
         smaller than elsewhere: between lobes that come close to each other.
 
         Proof, for B(x, q r) with q <= 1/4, whose directions from the origin are within the angle
-        1.05 q of u. With M and L as for Y itself, second derivatives along the sphere are at most
-        L^2 M, so slopes are at most G = |slope| + 1.05 q L^2 M there, and |Y| <= H = |Y(u)| +
-        1.05 q G. Second derivatives of r^2 Y^2 are 2 Y^2 + 2 Y (2 c q Y' + q^2 Y") + 2 q^2 Y'^2
-        with the c and q of `Lobes`, so at most 2 H^2 + 2 H b + 2 G^2, b being N^2 A of Y. Those of
-        r^4 are at most 12 r^2.
+        1.05 q of u. With M and L the largest size and the degree of Y, second derivatives along the
+        sphere are at most L^2 M, so slopes are at most G = |slope| + 1.05 q L^2 M there, and |Y| <=
+        H = |Y(u)| + 1.05 q G. Second derivatives of r^2 Y^2 are 2 Y^2 + 2 Y (2 c q Y' + q^2 Y") + 2
+        q^2 Y'^2 with the c and q of `Lobes`, so at most 2 H^2 + 2 H b + 2 G^2, b being N^2 A of Y.
+        The second derivatives of r^4 are at most 12 r^2.
         """
-        most, degree = max(map(abs, self.value_range)), self.degree
-        q = fmin(0.8 * dr.sqrt(r / most), 0.25) / degree
-        bend = degree**2 * most
-        steepest = slope + (1.05 * bend) * q
-        highest = dr.abs(y) + 1.05 * q * steepest
-        turned = bend if degree > 1 else 2 / math.sqrt(3) * most
-        constant = 2 * (highest * (highest + turned) + steepest * steepest)
-        constant = fmax(constant, 12 * dr.square(r * (1 + q)) + 2 * highest * turned)
+        max_value, degree = max(map(abs, self.value_range)), self.degree
+        q = fmin(0.8 * dr.sqrt(r / max_value), 0.25) / degree
+        second_max = degree**2 * max_value
+        max_slope = slope + (1.05 * second_max) * q
+        max_abs = dr.abs(y) + 1.05 * q * max_slope
+        swing = second_max if degree > 1 else 2 / math.sqrt(3) * max_value
+        constant = 2 * (max_abs * (max_abs + swing) + max_slope * max_slope)
+        constant = fmax(constant, 12 * dr.square(r * (1 + q)) + 2 * max_abs * swing)
         return TaylorRemainder(constant * (1 + _ROUNDING) + _SMALLEST, q * r)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The sample, with parabolas from ranges of second derivatives as far as is asked."""
+        """The sample, with parabolas from ranges of second derivatives on the lengths `ahead` and
+        `back`."""
         p = path.point(t)
         sample = self.evaluate(p)
-        look = path.enclose(sample)
-        slopes = SlopeRange.around(look.slope, sample.gradient_error)
+        base = path.enclose(sample)
+        slopes = SlopeRange.around(base.slope, sample.gradient_error)
 
         def enclosure(reach: Real, sign: int, along: SlopeRange) -> ParabolaEnclosure:
             reach = dr.select(dr.isfinite(reach), reach, 4 * (safe_norm(p) + self._size))
             end = dr.fma(type(p)(sign * reach), path.direction, p)
             farthest = fmax(safe_norm(p), safe_norm(end)) * ((1 + _ROUNDING) / self._size)
-            share = 1 / dr.square(self._size)
-            least, most = self._second_derivatives(farthest)
-            return ParabolaEnclosure(along, share * least, share * most, reach)
+            scale = 1 / dr.square(self._size)
+            lower, upper = self._second_derivatives(farthest)
+            return ParabolaEnclosure(along, scale * lower, scale * upper, reach)
 
         forward, backward = enclosure(ahead, 1, slopes), enclosure(back, -1, slopes.negated())
-        return RaySample(sample, (*look.forward, forward), (*look.backward, backward), look.slope)
+        return RaySample(sample, (*base.forward, forward), (*base.backward, backward), base.slope)
 
     def _second_derivatives(self, farthest: Real) -> tuple[Real, Real]:
-        """The least and the largest second derivative along any line within r <= farthest, for
+        """The smallest and the largest second derivative along any line within r <= farthest, for
         scale 1: see `Lobes`."""
         low, high = self.value_range
         if self.part == "both":
-            most, degree = max(low * low, high * high), 2 * self.degree
-            low, high = 0.0, most
+            upper, degree = max(low * low, high * high), 2 * self.degree
+            low, high = 0.0, upper
             power = 12 * farthest * farthest
         else:
             low, high = (low, high) if self.part == "positive" else (-high, -low)
             degree, power = self.degree, 6 * farthest
         swing = 0.5 * (high - low) * (degree**2 if degree != 1 else 2 / math.sqrt(3))
-        least, most = -(2 * high + swing), power - (2 * low - swing)
-        room = _ROUNDING * (abs(least) + dr.abs(most))
-        return least - room, most + room
+        lower, upper = -(2 * high + swing), power - (2 * low - swing)
+        margin = _ROUNDING * (abs(lower) + dr.abs(upper))
+        return lower - margin, upper + margin
 
-    def _errors(self, r: Real, y: Real, steep: Real, rho: Real) -> tuple[Real, Real]:
+    def _errors(self, r: Real, y: Real, slope_norm: Real, rho: Real) -> tuple[Real, Real]:
         """Bounds of the rounding of value and gradient, to first order in the unit roundoff e.
 
         The unit vector is off by 4 e of itself: that changes Y by at most 4 e L M, M = max |Y|, its
-        radial continuation by as much, and its gradient by 4 e L^2 M each. Y itself is evaluated
-        with an error of `HarmonicRounding`. After that there are products, with a few roundings
-        each.
+        radial continuation by as much, and its gradient by 4 e L^2 M each. `HarmonicRounding`
+        bounds the error of the evaluation of Y. The products after that have a few roundings each.
         """
         unit = float(dr.epsilon(type(r)))
-        most, degree = max(map(abs, self.value_range)), self.degree
-        off = unit * (self._rounding.value(rho, 1.0) + (8 * degree + 4) * most)
+        max_value, degree = max(map(abs, self.value_range)), self.degree
+        error = unit * (self._rounding.value(rho, 1.0) + (8 * degree + 4) * max_value)
         slope = unit * (
-            2 * self._rounding.gradient(rho, 1.0) + (8 * degree**2 + 16 * degree + 16) * most
+            2 * self._rounding.gradient(rho, 1.0) + (8 * degree**2 + 16 * degree + 16) * max_value
         )
         if self.part == "both":
-            high = dr.abs(y) + off
-            off, slope = 2 * high * off, 2 * (high * slope + steep * off)
-            return r * r * (off + 8 * unit * r * r), r * (slope + 4 * off + 32 * unit * r * r)
-        return r * r * (off + 8 * unit * r), r * (slope + 2 * off + 24 * unit * r)
+            high = dr.abs(y) + error
+            error, slope = 2 * high * error, 2 * (high * slope + slope_norm * error)
+            return r * r * (error + 8 * unit * r * r), r * (slope + 4 * error + 32 * unit * r * r)
+        return r * r * (error + 8 * unit * r), r * (slope + 2 * error + 24 * unit * r)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """Rows of the Hessian of f; see `_of_power`. At the origin its limit depends on the
-        direction of approach: it is that along z."""
+        direction of approach: the result is the limit along z."""
         distance = safe_norm(p)
         at_origin = distance == 0
         u = dr.select(at_origin, type(p)(0, 0, 1), p / dr.select(at_origin, 1, distance))
         r = distance / self._size
-        sign, share = (
+        sign, scale = (
             -1.0 if self.part == "negative" else 1.0,
             1 / dr.square(self._size),
         )
@@ -277,8 +283,8 @@ class Lobes(Field):
         if self.part == "both":
             y, slope, second = self._of_power(u, 1)  # r^2 Y^2 is the square of r Y
             for k in range(3):
-                bend = 2 * (slope[k] * slope + y * second[k])
-                row = r * r * (8 * u[k] * u) - bend
+                curved = 2 * (slope[k] * slope + y * second[k])
+                row = r * r * (8 * u[k] * u) - curved
                 row[k] += 4 * r * r
                 rows.append(row)
         else:
@@ -287,13 +293,14 @@ class Lobes(Field):
                 row = 3 * r * u[k] * u - sign * second[k]
                 row[k] += 3 * r
                 rows.append(row)
-        return share * rows[0], share * rows[1], share * rows[2]
+        return scale * rows[0], scale * rows[1], scale * rows[2]
 
     def _of_power(self, u: Vec3, n: int) -> tuple[Real, Vec3, tuple[Vec3, Vec3, Vec3]]:
         """Value, gradient and Hessian at unit vectors of r^n Y(x/r), a sum of r^(n-l) P_l with P_l
-        solid harmonics. With k = n - l, that of r^k P is, where r = 1,
+        solid harmonics. With k = n - l, the Hessian of r^k P is, at r = 1,
 
-            H + k (x g^T + g x^T) + k P (I + (k-2) x x^T),   H and g of P."""
+            H + k (x g^T + g x^T) + k P (I + (k-2) x x^T),   H and g of P.
+        """
         vector = cast("Any", type(u))
         value, gradient = 0 * u.x, 0 * u
         rows = [0 * u, 0 * u, 0 * u]
@@ -303,9 +310,9 @@ class Lobes(Field):
             g, (xx, yy, zz, xy, xz, yz) = vector(*slope), hessian(part, u.x, u.y, u.z)
             value, gradient = value + y, gradient + g + (k * y) * u
             for i, row in enumerate(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))):
-                turned = vector(*row) + k * (u[i] * g + g[i] * u) + (k * (k - 2) * y * u[i]) * u
-                turned[i] += k * y
-                rows[i] = rows[i] + turned
+                new_row = vector(*row) + k * (u[i] * g + g[i] * u) + (k * (k - 2) * y * u[i]) * u
+                new_row[i] += k * y
+                rows[i] = rows[i] + new_row
         return value, gradient, (rows[0], rows[1], rows[2])
 
     def describe(self) -> dict[str, Any]:
@@ -316,12 +323,12 @@ def _checked(weights: Any) -> dict[tuple[int, int], float]:
     """The coefficients that are not zero.
 
     Raises:
-        TypeError: a key is no pair of whole numbers, or a coefficient no number.
-        ValueError: there is no coefficient, or one of no harmonic.
+        TypeError: a key is no pair of integers, or a coefficient no number.
+        ValueError: there is no coefficient, or a key names no harmonic.
     """
     if not isinstance(weights, Mapping):
         raise TypeError(f"weights must be {{(l, m): coefficient}}, not {weights!r}")
-    kept: dict[tuple[int, int], float] = {}
+    checked: dict[tuple[int, int], float] = {}
     for key, weight in cast("Mapping[Any, Any]", weights).items():
         l, m = degree_and_order(key)  # noqa: E741
         if not 0 <= l <= LARGEST_DEGREE:
@@ -330,7 +337,7 @@ def _checked(weights: Any) -> dict[tuple[int, int], float]:
             raise ValueError(f"the order m must be -l to l, here -{l} to {l}, not {m}")
         number = as_finite(weight, f"the coefficient of Y_{l},{m}")
         if number != 0:
-            kept[l, m] = number
-    if not kept:
+            checked[l, m] = number
+    if not checked:
         raise ValueError("lobes need a coefficient that is not zero")
-    return kept
+    return checked

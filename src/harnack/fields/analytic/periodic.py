@@ -1,7 +1,8 @@
 """Sums of Laplacian eigenfunctions, periodic minimal surfaces among them (paper, section 4.7).
 
-`EigenfunctionSum` is the field; `ExtensionBounds` bounds the harmonic extension of such a sum to
-four dimensions (paper, section 4.7.1).
+- `EigenfunctionSum`: the field.
+- `ExtensionBounds`: bounds of the harmonic extension of such a sum to four dimensions (paper,
+  section 4.7.1).
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ __all__ = [
     "sine_factor",
 ]
 
-# Promised ends are moved outwards by this fraction for the roundings of float32.
+# Ends of promised ranges are moved outwards by this fraction for the roundings of float32.
 _ROUNDING_EXTENSION = 1e-5
 
 
@@ -73,11 +74,11 @@ class ExtensionBounds:
 
         -F <= h(x) = (1 + alpha (1-x^2)) (Dx - f) + (1-x^2) E,
 
-    a cubic that on x >= 0 is largest at its one critical point
+    a cubic that on x >= 0 is largest at its only critical point
     x* = D(1+alpha) / (sqrt((alpha f - E)^2 + 3 alpha (1+alpha) D^2) - (alpha f - E)) or, if that
-    is beyond it, at x = 1. The upper end is the same with -f. Neither end need exceed
-    cosh(kappa R) sup|f| + E. A constant term, which is its own extension, is left out of
-    all this and added in the end.
+    is beyond 1, at x = 1. The upper end is the same with -f. Neither end need exceed
+    cosh(kappa R) sup|f| + E. A constant term, which is its own extension, is excluded from all this
+    and added in the end.
     """
 
     radius: float
@@ -90,12 +91,13 @@ class ExtensionBounds:
 
     @classmethod
     def with_best_radius(cls, waves: WaveBounds) -> ExtensionBounds:
-        """The radius that is best where it matters, near level 0 at a gradient of mean size.
+        """The bounds for the radius that gives the longest steps near level 0 at a gradient of mean
+        size.
 
-        There a step loses to the second-order term of the bound, which is proportional to
-        (f - lower)/R^2. For the gyroid (cell 2 pi) R = 1.1, in the middle of the best: with the
-        slope bound, 0.8 to 1.4 took 11.5 to 11.9 evaluations a ray, the paper's exp with the
-        range +-3/2 at its best radius 21.4.
+        There a step is shortened by the second-order term of the bound, which is proportional to (f
+        - lower)/R^2. For the gyroid (cell 2 pi) the result is R = 1.1, in the middle of the best
+        radii: with the slope bound, 0.8 to 1.4 took 11.5 to 11.9 evaluations per ray, the paper's
+        exp with the range +-3/2 at its best radius 21.4.
         """
         k, a = np.array(waves.wavenumbers), np.array(waves.amplitudes)
         typical = math.sqrt(0.5 * float(a**2 @ k**2))
@@ -107,7 +109,7 @@ class ExtensionBounds:
 
     @classmethod
     def at(cls, waves: WaveBounds, radius: float) -> ExtensionBounds:
-        """The numbers of one radius; kappa is the weighted median, which makes E smallest."""
+        """The bounds for a radius; kappa is the weighted median, which makes E smallest."""
         growth: npt.NDArray[np.float64] = np.cosh(radius * np.array(waves.wavenumbers))
         amplitudes = np.array(waves.amplitudes)
         order = np.argsort(growth)
@@ -137,7 +139,7 @@ class ExtensionBounds:
         return HarmonicBall(real(r), lower, upper, dimension=4)
 
     def _lower_bound(self, f: Real, rise: Real) -> Real:
-        """A bound of -F on the ball where |f(y) - f| <= rise |y-p|/R."""
+        """A bound of -F on the ball, if |f(y) - f| <= rise |y-p|/R."""
         alpha, e = self.alpha, self.spread
         b = alpha * f - e
         root = dr.sqrt(b * b + 3 * alpha * (1 + alpha) * rise * rise)
@@ -150,7 +152,7 @@ class ExtensionBounds:
         return fmin(fmax(falling, level - f), self.largest)
 
     def _below_host(self, slope: float) -> float:
-        """The same at f = 0 in Python floats, for choosing the radius."""
+        """The bound of -F at f = 0 in Python floats, for choosing the radius."""
         r, alpha, e = self.radius, self.alpha, self.spread
         rise = min(self.largest_gradient * r, slope * r + 0.5 * self.curvature * r * r)
         x = np.linspace(0.0, 1.0, 101)
@@ -158,9 +160,9 @@ class ExtensionBounds:
         return min(float(falling.max()), self.largest)
 
 
-# Constants are moved up by this fraction for the roundings of float32.
+# Constants are increased by this fraction for the roundings of float32.
 _ROUNDING = 1e-5
-# The bound of the Hessian is moved up by this fraction more for the rounding of the gradient.
+# The bound of the Hessian is increased by this further fraction for the rounding of the gradient.
 _SLOPE_SHARE = 1e-5
 
 
@@ -168,7 +170,7 @@ class EigenfunctionSum(Field):
     """A sum of products of sines and cosines, and of plane waves: any truncated Fourier series.
 
     terms: `WaveProduct` and `PlaneWave` terms; frequencies in radians per unit length.
-    domain: the volume it is drawn in; by default the ball about the origin whose radius is the
+    domain: the volume in which f is drawn; by default the ball about the origin whose radius is the
         longest wavelength.
 
     Each term is an eigenfunction of the Laplacian, so cosh(kappa w) f with kappa^2 = -eigenvalue
@@ -183,9 +185,9 @@ class EigenfunctionSum(Field):
         E t <= E^2/(2 h H) + h H t^2/2   (2 a b <= a^2 + b^2):
 
     the larger H and E^2/(2 h H) cover the error of Taylor's formula with a rounded gradient. On the
-    harmonic ball of radius R it is E R, of which `enclosures.free_radius.condition_rounding` covers
-    16 u of the mean 4 (f - lower)/R in units of which the slope enters, f - lower being about H
-    R^2/2 or more; only the rest is added.
+    harmonic ball of radius R this error is E R, of which
+    `enclosures.free_radius.condition_rounding` covers 16 u of the mean 4 (f - lower)/R in units of
+    which the slope enters, f - lower being about H R^2/2 or more; only the rest is added.
 
     Raises:
         ValueError: terms that are not finite, or a sum that is constant.
@@ -212,9 +214,9 @@ class EigenfunctionSum(Field):
 
     @property
     def value_range(self) -> tuple[float, float]:
-        """Proved: the values of f stay within it."""
-        middle, most = self.waves.constant, self.waves.largest_value
-        return middle - most, middle + most
+        """Proved: the values of f stay within this interval."""
+        middle, largest = self.waves.constant, self.waves.largest_value
+        return middle - largest, middle + largest
 
     @property
     def max_gradient(self) -> float:
@@ -232,20 +234,20 @@ class EigenfunctionSum(Field):
         epsilon = float(dr.epsilon(type(value)))
         error, slope_error = self._rounding.errors(p, gradient)
         slope = dr.norm(gradient) + slope_error
-        reach = 0.9 * self.max_gradient / self.curvature  # the best by experiment, gyroid and P
-        local = (slope + 0.5 * self.curvature * reach) * (1 + _ROUNDING)
-        lipschitz = Lipschitz(fmin(local, self.max_gradient * (1 + _ROUNDING)), reach)
+        radius = 0.9 * self.max_gradient / self.curvature  # the best by experiment, gyroid and P
+        local = (slope + 0.5 * self.curvature * radius) * (1 + _ROUNDING)
+        lipschitz = Lipschitz(fmin(local, self.max_gradient * (1 + _ROUNDING)), radius)
         change = self.waves.max_third_derivative * (1 + _ROUNDING)
-        known = (
+        promises = (
             TaylorRemainder(self.curvature * (1 + _ROUNDING + _SLOPE_SHARE), cubic_constant=change),
         )
-        weaker = (self._extension.ball(value, slope), lipschitz)
+        alternatives = (self._extension.ball(value, slope), lipschitz)
         error += slope_error * (slope_error * (0.5 / (_SLOPE_SHARE * self.curvature)))
         error += fmax(slope_error * self._extension.radius - self._rounding_bound * epsilon, 0)
-        return Sample(value, gradient, known, error, alternative_promises=weaker)
+        return Sample(value, gradient, promises, error, alternative_promises=alternatives)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """Rows of the Hessian; its trace is that of the sum's Laplacian, not zero."""
+        """Rows of the Hessian; its trace is the Laplacian of the sum, which is not zero."""
         x, y, z = (type(p)(*row) for row in hessian_of_terms(self.terms, p))
         return x, y, z
 
@@ -261,20 +263,20 @@ class EigenfunctionSum(Field):
         validate_levels_in_range(levels, self.value_range)
 
     def wall_levels(self, half_width: float, *, level: float | None = None) -> tuple[float, float]:
-        """The two levels of the wall |f - level| <= half_width, to be given as `solid=`.
+        """The two levels of the wall |f - level| <= half_width, for the argument `solid=`.
 
-        half_width is a difference of values of f, not a length: see `levels_of_thickness`.
+        half_width: a difference of values of f, not a length: see `levels_of_thickness`.
         level: the middle of the wall, by default `default_level`.
         """
         middle = self.default_level if level is None else float(level)
         if not 0 < half_width < math.inf:
             raise ValueError(f"the half width of a wall must be positive, not {half_width!r}")
         low, high = middle - half_width, middle + half_width
-        least, most = self.value_range
-        if low < least or high > most:
+        lower, upper = self.value_range
+        if low < lower or high > upper:
             raise ValueError(
                 f"a wall from {low:g} to {high:g} has a side without surface: the function stays "
-                f"within [{least:g}, {most:g}]; take a smaller half width or thickness"
+                f"within [{lower:g}, {upper:g}]; take a smaller half width or thickness"
             )
         return low, high
 
@@ -283,7 +285,7 @@ class EigenfunctionSum(Field):
     ) -> tuple[float, float]:
         """The two levels of a wall about `level` that is proved to be at least this thick.
 
-        thickness is a length. The wall holds every point within thickness/2 of the middle
+        thickness is a length. The wall contains every point within thickness/2 of the middle
         surface, since there |f - level| <= `max_gradient` * thickness/2; where f is less steep than
         at its steepest the wall is thicker.
         """
@@ -299,6 +301,7 @@ class EigenfunctionSum(Field):
 
 
 def _wavenumber(cell: Any) -> float:
+    """The wavenumber 2 pi/cell of a cell with this edge length."""
     if not isinstance(cell, numbers.Real):
         raise TypeError(f"the edge length of the cell must be a number, not {cell!r}")
     edge = float(cell)
@@ -329,8 +332,8 @@ class _CubicSurface(EigenfunctionSum):
 class Gyroid(_CubicSurface):
     """sin X cos Y + sin Y cos Z + sin Z cos X with (X, Y, Z) = 2 pi p/cell (paper, Eq. 18).
 
-    cell: edge length of the cubic cell that it repeats in, 2 pi by default (so X = x).
-    domain: the volume it is drawn in, by default the ball of radius `cell` about the origin.
+    cell: the edge length of the cubic cell of periodicity, 2 pi by default (so X = x).
+    domain: the volume in which f is drawn, by default the ball of radius `cell` about the origin.
 
     |f| <= 3/2: 2 sin a cos b <= sin^2 a + cos^2 b, and the three right sides add up to 3.
     |grad f| <= sqrt 3 (2 pi/cell): f_X = cos X cos Y - sin Z sin X has, by Cauchy-Schwarz,

@@ -1,6 +1,6 @@
 """Functions of the plane: level curves of analytic functions, height fields, and functions by name.
 
-- `make_branches`: the `Branches` that a name, a mapping or a user's function stands for.
+- `make_branches`: the `Branches` of a name, a mapping or a user's function.
 - `LevelCurves`: level curves of harmonic functions of the plane, extended to walls: Harnack tracing
   in two dimensions.
 - `HeightField`: the graph of a formula over the plane.
@@ -51,11 +51,12 @@ if TYPE_CHECKING:
 __all__ = ["make_branches", "power_product"]
 
 _NAMES = ("log", "sqrt", "cbrt", "power", "asin")
-# The largest denominator of an exponent, which is the number of sheets: more cannot be told apart.
+# The largest denominator of an exponent, which is the number of sheets: more sheets cannot be
+# distinguished.
 _MAX_BRANCHES = 24
 # The largest exponent.
 _MAX_EXPONENT = 6
-# A point at which a user's function is tried.
+# A point at which a user's function is evaluated as a test.
 _PROBE = 0.31, 0.17
 
 
@@ -68,16 +69,17 @@ def make_branches(
     second_bound: Callable[[Any, Any], Any] | None = None,
     period: float | None = None,
 ) -> Branches:
-    """The branches of what a user names: see `RiemannSurface`.
+    """The branches of a function by its name, a mapping, or a user's function: see
+    `RiemannSurface`.
 
     Raises:
-        TypeError, ValueError: settings that do not belong together, or that are no such function.
+        TypeError, ValueError: settings that do not belong together, or an invalid function.
     """
-    own = {"singular": singular_points, "second": second_bound, "period": period}
+    user_settings = {"singular": singular_points, "second": second_bound, "period": period}
     if callable(function):
         _refuse_settings("a function of your own", exponent=exponent, argument=argument)
         return _user_branches(function, singular_points, second_bound, period)
-    _refuse_settings("a function that is named; only one of your own has them", **own)
+    _refuse_settings("a function that is named; only one of your own has them", **user_settings)
     if isinstance(function, Mapping):
         _refuse_settings("a mapping of exponents", exponent=exponent, argument=argument)
         return power_product(cast("Mapping[complex, Any]", function))
@@ -113,15 +115,15 @@ def power_product(exponents: Mapping[complex, Any]) -> PowerProduct:
     """The product of (z - a)^alpha for a mapping {a: alpha}.
 
     Raises:
-        TypeError, ValueError: no such mapping.
+        TypeError, ValueError: the mapping is invalid.
     """
     chosen: dict[complex, Fraction] = {}
     for a, alpha in exponents.items():
-        place, power = complex(a), _fraction(alpha)
-        if not (math.isfinite(place.real) and math.isfinite(place.imag)):
+        point, power = complex(a), _fraction(alpha)
+        if not (math.isfinite(point.real) and math.isfinite(point.imag)):
             raise ValueError(f"each zero or branch point must be finite, not {a!r}")
         if power != 0:
-            chosen[place] = power
+            chosen[point] = power
     if not chosen:
         raise ValueError("a product of powers needs at least one exponent other than 0")
     count = math.lcm(*(power.denominator for power in chosen.values()))
@@ -138,25 +140,26 @@ def _fraction(value: Any) -> Fraction:
     """A number as a fraction with a small denominator.
 
     Raises:
-        TypeError, ValueError: it is none.
+        TypeError, ValueError: it is no such fraction.
     """
     try:
         exact = Fraction(value)
     except (TypeError, ValueError, OverflowError):
         raise TypeError(f"an exponent must be a rational number, not {value!r}") from None
-    near = exact.limit_denominator(_MAX_BRANCHES)
-    if abs(near - exact) > Fraction(1, 10**12):
+    fraction = exact.limit_denominator(_MAX_BRANCHES)
+    if abs(fraction - exact) > Fraction(1, 10**12):
         raise ValueError(
             f"the exponent {value!r} is no fraction with a denominator up to {_MAX_BRANCHES}: its "
             "function has too many sheets to be drawn, infinitely many if it is irrational; write "
             "Fraction(2, 3) for two thirds"
         )
-    if not abs(near) <= _MAX_EXPONENT:
+    if not abs(fraction) <= _MAX_EXPONENT:
         raise ValueError(f"exponents must be at most {_MAX_EXPONENT} in size, not {value!r}")
-    return near
+    return fraction
 
 
 def _whole(value: Any) -> int:
+    """A nonzero integer. Raises TypeError or ValueError for other values."""
     number = _fraction(value)
     if number.denominator != 1 or number == 0:
         raise ValueError(
@@ -168,6 +171,8 @@ def _whole(value: Any) -> int:
 def _user_branches(
     function: Any, singular_points: Any, second_bound: Any, period: Any
 ) -> UserBranches:
+    """The branches of a user's function, evaluated once as a test. Raises TypeError or
+    ValueError."""
     if singular_points is None or second_bound is None:
         raise ValueError(
             "a function of your own needs singular_points=, where it is not analytic, such as [0], "
@@ -177,7 +182,8 @@ def _user_branches(
         raise TypeError(f"second_bound must be a function of z and a radius, not {second_bound!r}")
     try:
         points = tuple(
-            one if isinstance(one, BranchPoint) else BranchPoint(one) for one in singular_points
+            entry if isinstance(entry, BranchPoint) else BranchPoint(entry)
+            for entry in singular_points
         )
     except TypeError:
         raise TypeError(
@@ -188,17 +194,19 @@ def _user_branches(
     ):
         raise ValueError(f"period must be a positive number, not {period!r}")
     backend = choose_backend("double")
-    z = complex_type(backend)(*(backend.Float(one) for one in _PROBE))
-    wrong = "the function must return its branches, each as (g, g') or (g, g', g''), not"
+    z = complex_type(backend)(*(backend.Float(entry) for entry in _PROBE))
+    message = "the function must return its branches, each as (g, g') or (g, g', g''), not"
     try:
-        branches = [tuple(one) for one in function(z)]
+        branches = [tuple(entry) for entry in function(z)]
     except TypeError as error:
-        raise TypeError(f"{wrong} what it does ({error})") from None
-    if not branches or any(len(one) not in (2, 3) for one in branches):
-        raise ValueError(f"{wrong} {branches!r}")
-    for one in (number for branch in branches for number in branch):
-        if not isinstance(one, type(z) | backend.Float | int | float | complex):
-            raise TypeError(f"{wrong} with {one!r}: use operators, drjit.sqrt, drjit.log and so on")
+        raise TypeError(f"{message} what it does ({error})") from None
+    if not branches or any(len(entry) not in (2, 3) for entry in branches):
+        raise ValueError(f"{message} {branches!r}")
+    for entry in (number for branch in branches for number in branch):
+        if not isinstance(entry, type(z) | backend.Float | int | float | complex):
+            raise TypeError(
+                f"{message} with {entry!r}: use operators, drjit.sqrt, drjit.log and so on"
+            )
     if period is not None and len(branches) > 1:
         raise ValueError(
             "a function with a period must have one branch up to it: of several, no side of the "
@@ -210,12 +218,13 @@ def _user_branches(
             f"second_bound must return a real number, the bound of |g''|, not {bound!r}"
         )
     shift = None if period is None else float(period)
-    made = UserBranches(function, points, second_bound, len(branches), shift)
-    made.evaluate(z)
-    return made
+    branches_of_user = UserBranches(function, points, second_bound, len(branches), shift)
+    branches_of_user.evaluate(z)
+    return branches_of_user
 
 
 def _try_bound(second_bound: Callable[[Any, Any], Any], z: Any, radius: Any) -> Any:
+    """The user's bound at a point. Raises TypeError if it does not take z and a radius."""
     try:
         return second_bound(z, radius)
     except TypeError as error:
@@ -224,14 +233,15 @@ def _try_bound(second_bound: Callable[[Any, Any], Any], z: Any, radius: Any) -> 
         ) from error
 
 
-def _refuse_settings(what: str, **settings: Any) -> None:
-    given = [name for name, value in settings.items() if value is not None]
-    if given:
-        raise ValueError(f"{' and '.join(given)} cannot be given for {what}")
+def _refuse_settings(context: str, **settings: Any) -> None:
+    """Raise ValueError if any of the settings is not None."""
+    names = [name for name, value in settings.items() if value is not None]
+    if names:
+        raise ValueError(f"{' and '.join(names)} cannot be given for {context}")
 
 
 # Radii of the disks on which the function is bounded, as fractions of the distance to the nearest
-# singular point, and the longest of them.
+# singular point, and the largest radius.
 _DISK_FRACTIONS = (0.4, 0.8)
 _LONGEST = 1e6
 
@@ -244,16 +254,16 @@ class LevelCurves(Field):
         a single branch, up to a period, as for `RiemannSurface`: {a_i: n_i} with integers n_i for a
         rational function, "log" with argument={a_i: n_i} for charges n_i at a_i.
     part: "real" or "imag".
-    level: the level that is drawn if the user names none.
+    level: the default level.
     domain: the volume in which f is drawn; by default the box |x|, |y| <= 2, |z| <= 1/4.
 
     Re g is harmonic in the plane: Harnack's inequality of dimension 2 holds in disks up to the
     nearest singular point, and as |g''| is bounded there (`Branches.second_derivative_bound`) f
-    changes by at most |g'| r + |g''| r^2/2 on a disk of radius r. The promises are that, as a ball
-    of dimension 2, and the bound of second derivatives.
+    changes by at most |g'| r + |g''| r^2/2 on a disk of radius r. The promises are this range, as a
+    ball of dimension 2, and the bound of second derivatives.
 
     Raises:
-        TypeError, ValueError: no such function, or one with several branches.
+        TypeError, ValueError: an invalid function, or a function with several branches.
     """
 
     is_global = True
@@ -293,9 +303,9 @@ class LevelCurves(Field):
         self.period = shift  # pyright: ignore[reportAttributeAccessIssue]
 
     def prepare(self, backend: Backend) -> LevelCurves:
-        made = copy.copy(self)
-        made.branches = self.branches.prepare(backend)
-        return made
+        field = copy.copy(self)
+        field.branches = self.branches.prepare(backend)
+        return field
 
     def evaluate(self, p: Vec3) -> Sample:
         rounding, z, branch = self._at(p)
@@ -303,24 +313,24 @@ class LevelCurves(Field):
         vector = cast("Any", type(p))
         gradient = vector(x, y, 0 * x)
         slope, error = dr.norm(gradient), self.branches.value_rounding(z, (branch,))
-        reach = self.branches.clearance(z)
-        known: list[TaylorRemainder | HarmonicBall] = []
+        clearance = self.branches.clearance(z)
+        promises: list[TaylorRemainder | HarmonicBall] = []
         value = branch.value.imag if self.part == "imag" else branch.value.real
-        for part in _DISK_FRACTIONS:
-            radius = part * dr.minimum(reach, _LONGEST)
-            bend = self.branches.second_derivative_bound(Disk(z, radius, rounding)) * (1 + 1e-4)
-            moves = (slope * radius + 0.5 * bend * radius * radius) * (1 + 1e-5)
-            known += [
-                TaylorRemainder(bend, radius),
-                HarmonicBall(radius, value - moves, value + moves, 2),
+        for fraction in _DISK_FRACTIONS:
+            radius = fraction * dr.minimum(clearance, _LONGEST)
+            second = self.branches.second_derivative_bound(Disk(z, radius, rounding)) * (1 + 1e-4)
+            change = (slope * radius + 0.5 * second * radius * radius) * (1 + 1e-5)
+            promises += [
+                TaylorRemainder(second, radius),
+                HarmonicBall(radius, value - change, value + change, 2),
             ]
-        return Sample(value, gradient, tuple(known), backend_of(p).machine_epsilon * error)
+        return Sample(value, gradient, tuple(promises), backend_of(p).machine_epsilon * error)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """Rows of the Hessian, free of trace.
 
         Raises:
-            NotImplementedError: a function of your own comes without its second derivative.
+            NotImplementedError: the user's function does not return its second derivative.
         """
         _, _, branch = self._at(p)
         if branch.second is None:
@@ -332,13 +342,13 @@ class LevelCurves(Field):
         return vector(xx, xy, zero), vector(xy, -xx, zero), vector(zero, zero, zero)
 
     def _at(self, p: Vec3) -> tuple[Real, Complex, Branch]:
-        """The rounding of the point, the point in the plane, and the function there."""
+        """The rounding of the point, the point in the plane, and the branch at that point."""
         rounding = 4 * backend_of(p).machine_epsilon * max_norm(p)
         z = self.branches.move_off_singularities(complex_of(p.x, p.y), rounding)
         return rounding, z, self.branches.evaluate(z)[0]
 
 
-# Cells along a side of the grid on which the heights over the domain are bounded.
+# The number of cells along a side of the grid on which the heights over the domain are bounded.
 _CELLS = 32
 
 
@@ -350,17 +360,20 @@ def _around_the_origin() -> Volume:
 class HeightField(Formula):
     """The surface z = u(x, y): the level 0 of f = z - u, which is negative below it.
 
-    function: u, written with plain operators and `harnack.sin` and its like (see `expression`);
-        called while a kernel is being recorded, its numbers are literals of that kernel.
-    domain: the volume it is drawn in, by default the box of all points with coordinates up to 1.
+    function: u, written with plain operators and functions such as `harnack.sin` (see
+        `expression`); called while a kernel is being recorded, its numbers are literals of that
+        kernel.
+    domain: the volume in which the surface is drawn, by default the box of all points with
+        coordinates up to 1.
 
-    Along a ray f'' is that of u alone, and steps are proved from its ranges. Rays are clipped to
+    Along a ray f'' depends on u only, and steps are proved from its ranges. Rays are clipped to
     the range of heights that u has over the domain, which is proved on a grid of cells.
 
         hk.HeightField(lambda x, y: 0.3 * hk.sin(3 * x) * hk.cos(3 * y))
 
     Raises:
-        TypeError: function cannot be called with two coordinates, or uses what has no ranges.
+        TypeError: function cannot be called with two coordinates, or uses operations without
+            ranges.
     """
 
     function: Callable[[Any, Any], Any]
@@ -398,8 +411,8 @@ class HeightField(Formula):
         bottom, top = max(low, lower[2] - slack), min(high, upper[2] + slack)
         if bottom >= top:
             return self.domain
-        x, y = (float(one) for one in lower[:2])
-        far_x, far_y = (float(one) for one in upper[:2])
+        x, y = (float(coordinate) for coordinate in lower[:2])
+        far_x, far_y = (float(coordinate) for coordinate in upper[:2])
         slab = Box((x - slack, y - slack, bottom), (far_x + slack, far_y + slack, top))
         return VolumeIntersection((self.domain, slab))
 

@@ -1,7 +1,7 @@
 """Harmonic polynomials and spherical harmonics, clipped to a ball (paper, section 4.1).
 
-`SphericalHarmonic` and `HarmonicPolynomial` are sums of solid harmonics; `HarmonicPromises` are
-what such a sum promises near a point.
+- `SphericalHarmonic`, `HarmonicPolynomial`: sums of solid harmonics, as fields.
+- `HarmonicPromises`: the promises of such a sum near a point.
 """
 
 from __future__ import annotations
@@ -46,14 +46,15 @@ if TYPE_CHECKING:
 
 __all__ = ["HarmonicPolynomial", "SphericalHarmonic"]
 
-# Promised ends are moved outwards by this fraction for the roundings of float32.
+# Ends of promised ranges are moved outwards by this fraction for the roundings of float32.
 _ROUNDING = 1e-5
 # Bounds of the Hessian are larger by this fraction, which covers the rounding of the gradient.
 _SLOPE_SHARE = 1e-5
 # Radii of harmonic balls that are tried, in units of the radius of the ball about the domain.
 _RADII = np.geomspace(0.1, 8.0, 200)
-# Radii of the balls on which the Hessian is bounded, by experiment: a smaller and a larger one in
-# units of |p|/(l-2), and the least value of the larger; near an axis of high order m, in rho/(m-2).
+# Radii of the balls on which the Hessian is bounded, by experiment: a smaller and a larger radius
+# in units of |p|/(l-2), and the smallest value of the larger radius; near an axis of high order m,
+# in units of rho/(m-2).
 _NEAR, _WIDE, _LEAST, _BESIDE_AXIS = 0.4, 0.75, 0.1, 0.5
 # The distance to a zero of high order counts as at least this, so that no ball has the radius 0.
 _ORIGIN = 1e-9
@@ -65,27 +66,27 @@ class HarmonicPromises:
     the z axis and r from the origin.
 
     The promise at p is for a ball B(p, R), in the ball of radius |p| + R about the origin, where
-    `BallRange` bounds the polynomial. The paper takes the fixed ball |y| <= 1.25. Near level 0
+    `BallRange` bounds the polynomial. The paper uses the fixed ball |y| <= 1.25. Near level 0
     steps are shortened by the second-order term of the bound, which is proportional to
-    (range on |y| <= |p|+R)/R^2, so R is chosen to make that least: 2|p|/(l-2) for a single degree
-    l > 2. With the slope bound Y_(8,4) took 19 evaluations a ray, with the fixed ball 30 (27 at
+    (range on |y| <= |p|+R)/R^2, so R is chosen to minimize that: 2|p|/(l-2) for a single degree
+    l > 2. With the slope bound Y_(8,4) took 19 evaluations per ray, with the fixed ball 30 (27 at
     best, for 1.15); Y_(12,5) took 24 and 61 (50).
 
     Where f vanishes to a high order, at the origin or along the z axis, R goes to zero with the
-    distance from there, and the range on the ball as f does: every step is then a fraction of that
-    distance. With any other radius or range, steps would become smaller than such a fraction, and
-    rays that pass by would never arrive. Levels other than that at the origin need a wide ball
-    there: one promise (`TaylorRemainder`, or `Lipschitz` for proofs that do not use it) has a least
-    radius.
+    distance from there, and the range on the ball goes to zero as f does: every step is then a
+    fraction of that distance. With any other radius or range, steps would become smaller than such
+    a fraction, and rays that pass by would never arrive. Levels other than the level of the origin
+    need a wide ball there: one promise (`TaylorRemainder`, or `Lipschitz` for proofs that do not
+    use it) has a smallest radius.
 
     ball_range: ranges on balls about the origin.
-    degree, lowest_degree: the largest degree of a term, and the smallest above 0.
-    order: to which the sum, less its constant, vanishes along the z axis.
+    degree, lowest_degree: the largest degree of a term, and the smallest degree above 0.
+    order: the order to which the sum minus its constant vanishes along the z axis.
     center_radius, boundary_radius: radii of harmonic balls at r = 0 and r = 1.
-    axis_share: where rho is less than this fraction of r, rho decides how large a ball is.
+    axis_share: if rho is less than this fraction of r, rho determines the radius of the ball.
     axial: bounds of value, gradient and Hessian near an axis of order 3 or more; None if the order
         is less.
-    rounding: of value and gradient as they are evaluated.
+    rounding: the rounding of value and gradient as they are evaluated.
     """
 
     ball_range: BallRange
@@ -100,16 +101,24 @@ class HarmonicPromises:
 
     @classmethod
     def of(cls, weights: Weights, known: BallRange, *, is_divided: bool) -> HarmonicPromises:
-        """known: the ranges of the degrees. is_divided: points are divided by a size before."""
+        """The promises of a sum with these weights.
+
+        known: the ranges of the degrees.
+        is_divided: whether points are divided by a size other than 1 first.
+        """
         inner, outer = _best_radius(known, 0.0), _best_radius(known, 1.0)
         order, axial, axis_share = order_on_axis(weights), None, 0.0
         if order > 2:
-            rest = {key: weight for key, weight in weights.items() if key[0] > 0}
-            axial = value_bound(rest), gradient_bound(rest), hessian_bound(rest)
+            nonconstant = {key: weight for key, weight in weights.items() if key[0] > 0}
+            axial = (
+                value_bound(nonconstant),
+                gradient_bound(nonconstant),
+                hessian_bound(nonconstant),
+            )
             lower, upper = known.by_degree(1.0)
-            most = max(upper - known.constant, known.constant - lower)
-            # Where rho = axis_share r, both bounds of a single term are the same.
-            axis_share = (most / float(axial[0](1.0, 1.0))) ** (1 / order)
+            max_value = max(upper - known.constant, known.constant - lower)
+            # If rho = axis_share r, both bounds of a single term are the same.
+            axis_share = (max_value / float(axial[0](1.0, 1.0))) ** (1 / order)
         return cls(
             known.with_spheres(weights, 1.01 * max(inner, 1.0 + outer)),
             max(degree for degree, _ in weights),
@@ -123,27 +132,28 @@ class HarmonicPromises:
         )
 
     def ball(self, rho: Real, r: Real) -> HarmonicBall:
-        """The harmonic ball."""
+        """The harmonic ball at a point."""
         radius = self._radius(rho, r)
         lower, upper = self.ball_range.at(r + radius)
         if self.axial is not None:
-            most = self.axial[0](rho + radius, r + radius) * (1 + _ROUNDING)
-            lower = fmax(lower, self.ball_range.constant - most)
-            upper = fmin(upper, self.ball_range.constant + most)
+            axial = self.axial[0](rho + radius, r + radius) * (1 + _ROUNDING)
+            lower = fmax(lower, self.ball_range.constant - axial)
+            upper = fmin(upper, self.ball_range.constant + axial)
         margin = dr.fma(upper - lower, _ROUNDING, self._smallest(r))
         return HarmonicBall(radius, lower - margin, upper + margin)
 
     def curvatures(self, rho: Real, r: Real) -> list[TaylorRemainder]:
-        """Bounds of the Hessian H, the one of the smallest ball first."""
+        """Bounds of the Hessian H, the bound of the smallest ball first."""
         radii = [dr.inf]  # where the Hessian is constant
         if self.degree > 2:
-            share = r / (self.degree - 2)
-            radii = [_NEAR * share, fmax(_WIDE * share, _LEAST)]
+            scale = r / (self.degree - 2)
+            radii = [_NEAR * scale, fmax(_WIDE * scale, _LEAST)]
             if self.axial is not None:
                 radii.insert(0, fmin(rho * (_BESIDE_AXIS / (self.order - 2)), radii[0]))
         return [TaylorRemainder(self._curvature(rho, r, radius), radius) for radius in radii]
 
     def _curvature(self, rho: Real, r: Real, radius: Real) -> Real:
+        """A bound of the Hessian on the ball of this radius."""
         if self.degree < 3:
             constant = self.ball_range.curvature(0.0 * r)
         else:
@@ -153,7 +163,8 @@ class HarmonicPromises:
         return dr.fma(constant, 1 + _ROUNDING + _SLOPE_SHARE, self._smallest(r))
 
     def lipschitz(self, rho: Real, r: Real) -> Lipschitz | None:
-        """A Lipschitz constant on a ball with a least radius, where the harmonic ball has none."""
+        """A Lipschitz constant on a ball with a smallest radius, if the harmonic ball has none;
+        else None."""
         if self.lowest_degree < 3:
             return None
         radius = fmax(r * (_WIDE / (self.degree - 2)), _LEAST)
@@ -186,8 +197,8 @@ class HarmonicPromises:
     def _radius(self, rho: Real, r: Real) -> Real:
         """The radius of the harmonic ball.
 
-        Near an axis of order m, with (range on the ball) ~ (rho + R)^m (r + R)^(l-m), the best R
-        is 2/((m-2)/rho + (l-m)/r) where rho is a small part of r, and where it is r.
+        Near an axis of order m, with (range on the ball) ~ (rho + R)^m (r + R)^(l-m), the best R is
+        2/((m-2)/rho + (l-m)/r) if rho is a small fraction of r, as it is there.
         """
         if self.lowest_degree < 3:
             if self.center_radius < self.boundary_radius:
@@ -198,18 +209,18 @@ class HarmonicPromises:
             )
         radius = self.boundary_radius * r
         if self.axial is not None:
-            order, rest = self.order - 2.0, float(self.degree - self.order)
-            by_axis = 2 / (order / rho + rest / fmax(r, _ORIGIN))
+            order, remaining = self.order - 2.0, float(self.degree - self.order)
+            by_axis = 2 / (order / rho + remaining / fmax(r, _ORIGIN))
             radius = dr.select(rho < self.axis_share * r, fmin(by_axis, radius), radius)
         return fmax(radius, _ORIGIN * self.boundary_radius)
 
     def _smallest(self, r: Real) -> float:
-        """A bound of what underflow may have cost any sum here."""
+        """A bound of the error of any sum here by underflow."""
         return self.rounding.underflow * max(1, self.degree) ** 2 * float(dr.smallest(type(r)))
 
 
 def _best_radius(known: BallRange, distance: float) -> float:
-    """The radius R that makes (range on |y| <= distance + R)/R^2 least."""
+    """The radius R that minimizes (range on |y| <= distance + R)/R^2."""
     lower, upper = known.by_degree(distance + _RADII)
     return float(_RADII[np.argmin((upper - lower) / _RADII**2)])
 
@@ -223,8 +234,11 @@ class _SolidHarmonics(Field):
     def __init__(
         self, weights: Weights, known: BallRange, size: float, domain: Volume, axis: int = 2
     ) -> None:
-        """axis: the coordinate of p that is the z of the solid harmonics; x and y follow it
-        cyclically."""
+        """A field of these weights, with the ranges `known`, for |p| <= size.
+
+        axis: the coordinate of p that is the z of the solid harmonics; x and y follow it
+            cyclically.
+        """
         self.domain = domain
         self._axis = axis
         self._weights = weights
@@ -243,23 +257,25 @@ class _SolidHarmonics(Field):
         rho, r = dr.norm(type(s)(s.x, s.y, 0)), dr.norm(s)
         ball, lipschitz = self._promises.ball(rho, r), self._promises.lipschitz(rho, r)
         curvatures = self._promises.curvatures(rho, r)
-        known = tuple(
-            TaylorRemainder(one.constant / size**2, one.radius * size) for one in curvatures
+        promises = tuple(
+            TaylorRemainder(promise.constant / size**2, promise.radius * size)
+            for promise in curvatures
         )
-        weaker: list[Promise] = [HarmonicBall(ball.radius * size, ball.lower, ball.upper)]
+        alternatives: list[Promise] = [HarmonicBall(ball.radius * size, ball.lower, ball.upper)]
         if lipschitz is not None:
-            weaker.append(Lipschitz(lipschitz.constant / size, lipschitz.radius * size))
+            alternatives.append(Lipschitz(lipschitz.constant / size, lipschitz.radius * size))
         error = self._promises.error(rho, r, curvatures[0])
         slope = type(p)(*_rotate_axes(gradient, -self._axis - 1)) / size
-        return Sample(value, slope, known, error, alternative_promises=tuple(weaker))
+        return Sample(value, slope, promises, error, alternative_promises=tuple(alternatives))
 
     def _local(self, p: Vec3) -> Vec3:
+        """The point in the coordinates of the solid harmonics."""
         return type(p)(*_rotate_axes((p.x, p.y, p.z), self._axis + 1)) / self._size
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """Rows of the Hessian, whose trace is 0 up to rounding."""
-        s, share, k = self._local(p), 1 / self._size**2, -self._axis - 1
-        xx, yy, zz, xy, xz, yz = (share * one for one in hessian(self._weights, s.x, s.y, s.z))
+        s, scale, k = self._local(p), 1 / self._size**2, -self._axis - 1
+        xx, yy, zz, xy, xz, yz = (scale * entry for entry in hessian(self._weights, s.x, s.y, s.z))
         rows = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
         x, y, z = _rotate_axes([type(p)(*_rotate_axes(row, k)) for row in rows], k)
         return x, y, z
@@ -283,11 +299,11 @@ class SphericalHarmonic(_SolidHarmonics):
     positive multiple of x, Y_1-1 of y, Y_10 of z. m > 0 has cos(m phi), m < 0 sin(|m| phi).
 
     l, m: degree 0 <= l <= 12 and order -l <= m <= l.
-    radius: of the ball that it is clipped to, about the origin.
+    radius: the radius of the ball about the origin to which it is clipped.
 
     Raises:
         ValueError: l or m outside these ranges, or a radius that is not positive.
-        TypeError: l or m is no whole number.
+        TypeError: l or m is no integer.
     """
 
     def __init__(self, l: int, m: int, *, radius: float = 1.0) -> None:  # noqa: E741
@@ -304,11 +320,11 @@ class SphericalHarmonic(_SolidHarmonics):
 
 
 class HarmonicPolynomial(_SolidHarmonics):
-    """A harmonic polynomial given by its monomials, up to degree 12.
+    """A harmonic polynomial from its monomials, up to degree 12.
 
     coefficients: {(i, j, k): c} stands for the sum of c x^i y^j z^k; the paper's Eq. 8 is
         HarmonicPolynomial({(2, 1, 0): 1, (0, 1, 2): -1}).
-    domain: the volume it is clipped to, bounded; by default the ball of radius 1.
+    domain: the bounded volume to which it is clipped; by default the ball of radius 1.
 
     The Laplacian must vanish, up to 1e-9 of the terms that cancel in it. The polynomial is
     evaluated as a sum of solid harmonics, which agrees with it in value and z-derivative on the
@@ -327,34 +343,35 @@ class HarmonicPolynomial(_SolidHarmonics):
         domain = Ball() if domain is None else domain
         size = _enclosing_radius(domain)
         scaled = {powers: c * size ** sum(powers) for powers, c in self.coefficients.items()}
-        # The z axis of the solid harmonics is the one along which it vanishes to the highest order.
-        along = [
+        # The z axis of the solid harmonics is the axis along which the polynomial vanishes to the
+        # highest order.
+        by_axis = [
             from_monomials({_rotate_axes(k, axis + 1): c for k, c in scaled.items()})
             for axis in range(3)
         ]
-        axis = max((2, 0, 1), key=lambda axis: order_on_axis(along[axis]))
-        weights = along[axis]
+        axis = max((2, 0, 1), key=lambda axis: order_on_axis(by_axis[axis]))
+        weights = by_axis[axis]
         super().__init__(weights, BallRange.of(weights), size, domain, axis)
 
 
-def _rotate_axes(three: Sequence[Any], n: int) -> tuple[Any, Any, Any]:
-    """Three things rotated by n places: (x, y, z) becomes (y, z, x) for n = 1."""
-    return three[n % 3], three[(n + 1) % 3], three[(n + 2) % 3]
+def _rotate_axes(values: Sequence[Any], n: int) -> tuple[Any, Any, Any]:
+    """Three values rotated by n positions: (x, y, z) becomes (y, z, x) for n = 1."""
+    return values[n % 3], values[(n + 1) % 3], values[(n + 2) % 3]
 
 
-def _checked(given: Any) -> dict[tuple[int, int, int], float]:
+def _checked(coefficients: Any) -> dict[tuple[int, int, int], float]:
     """The coefficients that are not zero.
 
     Raises:
-        TypeError, ValueError: they make no harmonic polynomial.
+        TypeError, ValueError: they are no coefficients of a harmonic polynomial.
     """
-    if not isinstance(given, Mapping):
+    if not isinstance(coefficients, Mapping):
         raise TypeError(
             "a harmonic polynomial is given by its coefficients, such as {(2, 1, 0): 1, "
-            f"(0, 1, 2): -1}} for x^2 y - y z^2, not by {given!r}"
+            f"(0, 1, 2): -1}} for x^2 y - y z^2, not by {coefficients!r}"
         )
     checked: dict[tuple[int, int, int], float] = {}
-    for powers, value in cast("Mapping[Any, Any]", given).items():
+    for powers, value in cast("Mapping[Any, Any]", coefficients).items():
         try:
             i, j, k = (operator.index(n) for n in powers)
         except (TypeError, ValueError):
@@ -372,21 +389,22 @@ def _checked(given: Any) -> dict[tuple[int, int, int], float]:
             checked[i, j, k] = float(value)
     if not checked:
         raise ValueError("a harmonic polynomial needs a coefficient that is not zero")
-    rest, worst = laplacian(checked)
+    remainder, worst = laplacian(checked)
     if worst > 1e-9:
-        terms = [f"{c:g} {_monomial(powers)}".strip() for powers, c in sorted(rest.items())]
+        terms = [f"{c:g} {_monomial(powers)}".strip() for powers, c in sorted(remainder.items())]
         shown = " + ".join(terms)
         raise ValueError(f"the polynomial is not harmonic: its Laplacian is {shown}, not 0")
     return checked
 
 
 def _monomial(powers: tuple[int, int, int]) -> str:
-    named = zip("xyz", powers, strict=True)
-    return " ".join(name if n == 1 else f"{name}^{n}" for name, n in named if n)
+    """A monomial as text, such as "x^2 y"."""
+    factors = zip("xyz", powers, strict=True)
+    return " ".join(name if n == 1 else f"{name}^{n}" for name, n in factors if n)
 
 
 def _enclosing_radius(domain: Volume) -> float:
-    """The radius of a ball about the origin that holds the domain."""
+    """The radius of a ball about the origin that contains the domain."""
     if isinstance(domain, Ball):
         return float(np.linalg.norm(domain.center)) + domain.radius
     corners = np.abs(np.array(domain.bounds())).max(axis=0)

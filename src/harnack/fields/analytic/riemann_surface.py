@@ -29,14 +29,14 @@ if TYPE_CHECKING:
     from harnack.fields.analytic.branches import Branch, Complex, PreparedBranchPoint
     from harnack.geometry import Volume
 
-# Second derivatives along the ray are bounded on the whole length asked for, and on these fractions
-# of the distance to the nearest singular point; the best of several sets by experiment.
+# Second derivatives along the ray are bounded on the whole requested length, and on these fractions
+# of the distance to the nearest singular point; the best of several sets, by experiment.
 _PARTS = (0.4, 0.8)
 # Promises hold in disks whose radius is this fraction of that distance.
 _DISK = 0.5
-# The longest length of a path on which anything is proved.
+# The largest length of a ray on which anything is proved.
 _LONGEST = 1e6
-# Bounds of second derivatives are multiplied by this, for the rounding of slopes.
+# Bounds of second derivatives are multiplied by this factor, for the rounding of slopes.
 _WIDENED = 1 + 1e-4
 
 
@@ -45,8 +45,8 @@ class _BranchValue:
     """A branch at a point.
 
     phi: h - u.
-    x, y: the gradient of phi in the plane, that of -u.
-    sign_factor: the sign that it contributes to the product of all phi.
+    x, y: the gradient of phi in the plane, which is the gradient of -u.
+    sign_factor: its sign in the product of all phi.
     """
 
     phi: Real
@@ -72,11 +72,11 @@ class _BranchValue:
 class _PointBranches:
     """All branches at a point.
 
-    z, h: the point: in the plane, and the height.
+    z, h: the position of the point in the plane, and its height.
     nearest: the branch with the smallest |phi|.
-    sign: f is sign times its phi.
-    error: of all phi, by arithmetic.
-    rounding: of the position of the point.
+    sign: f is sign times the phi of that branch.
+    error: a bound of the error of all phi, by arithmetic.
+    rounding: a bound of the rounding of the position of the point.
     """
 
     z: Complex
@@ -98,18 +98,19 @@ class RiemannSurface(Field):
     function: "log", "sqrt", "cbrt", "power" (z^exponent), "asin"; a mapping {a_i: alpha_i} for the
         product of (z - a_i)^alpha_i; or a function of a Dr.Jit complex number that returns all its
         branches, each as (g, g') or (g, g', g'') in Dr.Jit complex numbers.
-    part: "imag" or "real": which part is the height h.
-    exponent: of "power": a rational number such as Fraction(2, 3) or 2 / 3.
-    argument: of "log", "sqrt", "cbrt" and "power": the mapping {a_i: n_i} of the product of
-        (z - a_i)^n_i that it is a function of, by default z.
-    singular_points: of a function of your own, the points where a branch is not analytic: complex
-        numbers, or `BranchPoint`s, which tell how all branches meet there.
-    second_bound: of a function of your own, a bound second_bound(z, r) of |g''|, of all branches,
-        on the disk of radius r about z; asked for where no singular point lies in that.
-    period: of a function of your own with one branch, by what its drawn part may be shifted.
+    part: "imag" or "real": the part of g that is the height h.
+    exponent: for "power": a rational number such as Fraction(2, 3) or 2 / 3.
+    argument: for "log", "sqrt", "cbrt" and "power": the mapping {a_i: n_i} of the product of
+        (z - a_i)^n_i that is the argument of the function, by default z.
+    singular_points: for a function of your own, the points where a branch is not analytic: complex
+        numbers, or `BranchPoint`s, which describe how all branches meet there.
+    second_bound: for a function of your own, a bound second_bound(z, r) of |g''|, of all branches,
+        on the disk of radius r about z; used only if no singular point lies in the disk.
+    period: for a function of your own with one branch, the number by which its drawn part may be
+        shifted.
     height: a factor of g.
-    domain: the volume that it is drawn in; by default the ball of radius 1 about the origin, of
-        radius 4 for "log" and 2 for "asin".
+    domain: the volume in which the surface is drawn; by default the ball of radius 1 about the
+        origin, of radius 4 for "log" and 2 for "asin".
 
     With several branches f = s min_j |phi_j|, phi_j = h - Im g_j, s the sign of the product of all
     phi_j: it is continuous and single-valued, as the product is, and zero only on the surface. With
@@ -118,20 +119,20 @@ class RiemannSurface(Field):
 
     Proof. Along a ray the set of branches is continued as long as no singular point is met: so
     branch cuts and the numbering of branches do not matter. `NearestBranchEnclosure` takes the
-    minimum over all branches of the step in which it could be reached, from their slopes and a
-    bound of |g''| on the segment of the plane below the ray, which all share
+    minimum over all branches of the step in which the branch could be reached, from their slopes
+    and a bound of |g''| on the segment of the plane below the ray, which is the same for all
     (`Branches.second_derivative_bound`): |d^2 phi_j/ds^2| <= |g''| |w|^2, w the projection of the
     ray's direction to the plane, for h is linear. So the nearest branch may change between two
-    samples: from each of them, ahead or back, all branches are proved to be out of reach. Near
-    branch points with a power > 0 all branches are near one value, and for a ray that passes at
-    another height `BranchPointEnclosure` proves the step.
+    samples: from each of the samples, ahead or back, all branches are proved to be out of reach.
+    Near branch points with a power > 0 all branches are near one value, and for a ray that passes
+    at another height `BranchPointEnclosure` proves the step.
 
     A point is a hit if f is within the tolerance times |grad f| of 0 and, near such a branch point,
     if the surface is not proved to be farther away: where the slope grows without bound, f/|grad f|
     is no distance. Near poles and logarithms every height is near the surface.
 
     Raises:
-        TypeError, ValueError: settings that do not belong together, or that are no such function.
+        TypeError, ValueError: settings that do not belong together, or an invalid function.
     """
 
     is_global = True
@@ -174,30 +175,30 @@ class RiemannSurface(Field):
             self.period = self._shift  # pyright: ignore[reportAttributeAccessIssue]
 
     def prepare(self, backend: Backend) -> RiemannSurface:
-        made = copy.copy(self)
-        made.branches = self.branches.prepare(backend)
-        made._height = dr.opaque(backend.Float, self.height)
+        field = copy.copy(self)
+        field.branches = self.branches.prepare(backend)
+        field._height = dr.opaque(backend.Float, self.height)
         if self._shift is not None and not self._is_single:
-            made._shift = dr.opaque(backend.Float, self._shift)
-        return made
+            field._shift = dr.opaque(backend.Float, self._shift)
+        return field
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """The domain, cut to the heights that the surface can have over it."""
         if self.domain is None or self._shift is not None:
             return self.domain
-        most = self._highest()
-        if not most < math.inf:
+        highest = self._highest()
+        if not highest < math.inf:
             return self.domain
-        reach = most * (1 + 1e-5) + max(abs(level) for level in levels)
+        limit = highest * (1 + 1e-5) + max(abs(level) for level in levels)
         lower, upper = self.domain.bounds()
-        if reach >= min(-lower[2], upper[2]):
+        if limit >= min(-lower[2], upper[2]):
             return self.domain
-        low, high = (np.nan_to_num(one, posinf=1e9, neginf=-1e9) for one in (lower, upper))
-        slab = Box((low[0], low[1], -reach), (high[0], high[1], reach))
+        low, high = (np.nan_to_num(corner, posinf=1e9, neginf=-1e9) for corner in (lower, upper))
+        slab = Box((low[0], low[1], -limit), (high[0], high[1], limit))
         return VolumeIntersection((self.domain, slab))
 
     def _highest(self) -> float:
-        """A bound of |h| over the domain; inf where none is known."""
+        """A bound of |h| over the domain; infinite if no bound is known."""
         assert self.domain is not None
         lower, upper = self.domain.bounds()
         corners = [complex(x, y) for x in (lower[0], upper[0]) for y in (lower[1], upper[1])]
@@ -208,87 +209,88 @@ class RiemannSurface(Field):
         return abs(self.height) * self.branches.max_abs(middle, reach)
 
     def evaluate(self, p: Vec3) -> Sample:
-        place = self._place(p)
-        sample = self._sample(place)
-        reach = self.branches.clearance(place.z)
-        radius = _DISK * fmin(reach, _LONGEST)
-        bend = (
+        local = self._place(p)
+        sample = self._sample(local)
+        clearance = self.branches.clearance(local.z)
+        radius = _DISK * fmin(clearance, _LONGEST)
+        second = (
             self._height_factor
-            * self.branches.second_derivative_bound(Disk(place.z, radius, place.rounding))
+            * self.branches.second_derivative_bound(Disk(local.z, radius, local.rounding))
             * _WIDENED
         )
         steepest: Real = 0.0
-        for sheet in place.branches:
-            steepest = fmax(sheet.steepness, steepest)
+        for branch in local.branches:
+            steepest = fmax(branch.steepness, steepest)
         # The radius within which no other branch can become the nearest: |phi_j| - |phi_i| > 0.
-        # Sheets that touch here have the same value and gradient, and stay within the same
-        # parabola; but the nearest of two is not harmonic.
-        same, touching = radius, 0 * radius
-        for sheet in place.branches:
-            lead = fmax(dr.abs(sheet.phi) - dr.abs(place.nearest.phi), 0)
-            rate = sheet.steepness + place.nearest.steepness
-            until = 2 * lead / (rate + dr.sqrt(rate * rate + 4 * bend * lead))
-            touches = sheet.coincides_with(place.nearest)
-            same = fmin(dr.select(touches, radius, until), same)
-            touching += dr.select(touches, 1, 0)
-        curved = TaylorRemainder(bend, same)
-        most = (steepest + bend * radius) * (1 + 1e-5)
-        range_ = (most * same + 0.5 * bend * same * same) * (1 + 1e-5)
-        alone = dr.select(touching < 2, same, 0)
-        ball = HarmonicBall(alone, sample.value - range_, sample.value + range_)
+        # Branches that touch at p have the same value and gradient, and stay within the same
+        # parabola; but the nearest of two branches is not harmonic.
+        free_radius, touching = radius, 0 * radius
+        for branch in local.branches:
+            lead = fmax(dr.abs(branch.phi) - dr.abs(local.nearest.phi), 0)
+            rate = branch.steepness + local.nearest.steepness
+            change_radius = 2 * lead / (rate + dr.sqrt(rate * rate + 4 * second * lead))
+            is_touching = branch.coincides_with(local.nearest)
+            free_radius = fmin(dr.select(is_touching, radius, change_radius), free_radius)
+            touching += dr.select(is_touching, 1, 0)
+        remainder = TaylorRemainder(second, free_radius)
+        max_slope = (steepest + second * radius) * (1 + 1e-5)
+        change = (max_slope * free_radius + 0.5 * second * free_radius * free_radius) * (1 + 1e-5)
+        ball_radius = dr.select(touching < 2, free_radius, 0)
+        ball = HarmonicBall(ball_radius, sample.value - change, sample.value + change)
         return Sample(
             sample.value,
             sample.gradient,
-            (curved, Lipschitz(most, radius)),
+            (remainder, Lipschitz(max_slope, radius)),
             sample.value_error,
             sample.gradient_error,
             alternative_promises=(ball,),
         )
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The ray sample with proofs from all branches, instead of from promises."""
+        """The ray sample with enclosures that are proved from all branches, instead of from
+        promises."""
         p, d = path.point(t), path.direction
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return path.enclose(self.evaluate(p))
-        place = self._place(p)
-        sample = self._sample(place)
-        slope = place.sign * place.nearest.slope(d)
-        shadow = complex_of(d.x, d.y)
-        speed = abs(shadow)
+        local = self._place(p)
+        sample = self._sample(local)
+        slope = local.sign * local.nearest.slope(d)
+        projection = complex_of(d.x, d.y)
+        speed = abs(projection)
         longest = fmin(ahead, _LONGEST * (1 + max_norm(p)))
-        reach = self.branches.clearance(place.z)
-        lengths = [longest, *(fmin(longest, part * reach / speed) for part in _PARTS)]
-        forwards = [self._enclosure(place, d, shadow, length) for length in lengths]
+        clearance = self.branches.clearance(local.z)
+        lengths = [longest, *(fmin(longest, fraction * clearance / speed) for fraction in _PARTS)]
+        forwards = [self._enclosure(local, d, projection, length) for length in lengths]
         if not self._is_single:
-            forwards += self._cusp_enclosures(place, d, shadow)
-        # A little longer than asked for, as steps are rounded down.
+            forwards += self._cusp_enclosures(local, d, projection)
+        # Slightly longer than the requested length, as steps are rounded down.
         back = fmin(back, _LONGEST) * (1 + 1e-5)
-        backwards = (self._enclosure(place, -d, -shadow, back),)
+        backwards = (self._enclosure(local, -d, -projection, back),)
         return RaySample(sample, tuple(forwards), backwards, slope)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """Rows of the Hessian, free of trace.
 
         Raises:
-            NotImplementedError: the branches of your own come without second derivatives.
+            NotImplementedError: the user's branches come without second derivatives.
         """
         z = self.branches.move_off_singularities(complex_of(p.x, p.y), self._rounding(p))
         branches = self.branches.evaluate(z)
         graphs = self._graphs(p, branches)
         xx, xy = 0 * p.x, 0 * p.x
-        place = self._nearest_branch(z, p.z, graphs, 0.0, 0.0)
-        for k, sheet in enumerate(graphs):
+        local = self._nearest_branch(z, p.z, graphs, 0.0, 0.0)
+        for k, graph in enumerate(graphs):
             second = branches[k % len(branches)].second
             if second is None:
                 raise NotImplementedError(
                     "the branches of this Riemann surface come without second derivatives: return "
                     "(g, g', g'') for each"
                 )
-            one_xx, one_xy = derivatives(second, self.part)
-            here = sheet.coincides_with(place.nearest)
-            xx, xy = dr.select(here, one_xx, xx), dr.select(here, one_xy, xy)
-        share = -place.sign * self._height
-        xx, xy, zero = share * xx, share * xy, 0 * p.x
+            new_xx, new_xy = derivatives(second, self.part)
+            is_nearest = graph.coincides_with(local.nearest)
+            xx, xy = dr.select(is_nearest, new_xx, xx), dr.select(is_nearest, new_xy, xy)
+        scale = -local.sign * self._height
+        xx, xy, zero = scale * xx, scale * xy, 0 * p.x
         vector = cast("Any", type(p))
         return vector(xx, xy, zero), vector(xy, -xx, zero), vector(zero, zero, zero)
 
@@ -310,29 +312,32 @@ class RiemannSurface(Field):
         return 4 * backend_of(p).machine_epsilon * max_norm(p)
 
     def _graphs(self, p: Vec3, branches: tuple[Branch, ...]) -> list[_BranchValue]:
-        """phi of all sheets; with a period and several branches, of the two sheets of each branch
-        next to the point.
+        """phi of all sheets; with a period and several branches, phi of the two sheets of each
+        branch next to the point.
 
-        Then the product is that of sin(pi phi/period), with phi not shifted: sin u - sin h for
-        asin.
+        In that case the product is that of sin(pi phi/period), with phi not shifted: sin u - sin h
+        for asin.
         """
-        made: list[_BranchValue] = []
-        others: list[_BranchValue] = []
-        for one in branches:
-            u = one.value.imag if self.part == "imag" else one.value.real
-            x, y = derivatives(one.first, self.part)
+        values: list[_BranchValue] = []
+        neighbors: list[_BranchValue] = []
+        for branch in branches:
+            u = branch.value.imag if self.part == "imag" else branch.value.real
+            x, y = derivatives(branch.first, self.part)
             phi, x, y = p.z - self._height * u, -self._height * x, -self._height * y
             real = cast("Any", type(phi))
             side = dr.select(phi < 0, real(-1), 1)
             if self._shift is not None and not self._is_single:
-                turns = dr.floor(phi / self._shift)
-                side = dr.select(turns == 2 * dr.floor(0.5 * turns), real(1), -1)
+                periods = dr.floor(phi / self._shift)
+                side = dr.select(periods == 2 * dr.floor(0.5 * periods), real(1), -1)
                 phi = phi - self._shift * dr.round(phi / self._shift)
-                others.append(_BranchValue(phi - dr.mulsign(real(self._shift), phi), x, y, real(1)))
-            made.append(_BranchValue(phi, x, y, side))
-        return made + others
+                neighbors.append(
+                    _BranchValue(phi - dr.mulsign(real(self._shift), phi), x, y, real(1))
+                )
+            values.append(_BranchValue(phi, x, y, side))
+        return values + neighbors
 
     def _place(self, p: Vec3) -> _PointBranches:
+        """All branches at a point, with the bounds of their errors."""
         rounding = self._rounding(p)
         z = self.branches.move_off_singularities(complex_of(p.x, p.y), rounding)
         branches = self.branches.evaluate(z)
@@ -340,145 +345,152 @@ class RiemannSurface(Field):
         error = backend_of(p).machine_epsilon * units
         for point in self.branches.points_on(z):  # slopes do not bound the rounding of values there
             if point.power is not None:
-                close = abs(z - point.at) <= 2 * rounding
+                is_close = abs(z - point.at) <= 2 * rounding
                 jump = (
                     2 * self._height_factor * point.constant * dr.power(3 * rounding, point.power)
                 )
-                error += dr.select(close, jump, 0)
+                error += dr.select(is_close, jump, 0)
         graphs = self._graphs(p, branches)
-        for sheet in graphs:  # NaN would never be chosen as the nearest
-            error = dr.select(dr.isnan(sheet.phi), dr.nan, error)
+        for graph in graphs:  # NaN would never be selected as the nearest
+            error = dr.select(dr.isnan(graph.phi), dr.nan, error)
         return self._nearest_branch(z, p.z, graphs, error, rounding)
 
     def _nearest_branch(
         self, z: Complex, h: Real, graphs: list[_BranchValue], error: Real, rounding: Real
     ) -> _PointBranches:
+        """The branches `graphs` at the point (z, h), with the nearest of them and the sign of f."""
         nearest, sign = graphs[0], type(graphs[0].phi)(1)
         if not self._is_single:
-            for one in graphs[1:]:
-                closer = dr.abs(one.phi) < dr.abs(nearest.phi)
+            for graph in graphs[1:]:
+                is_closer = dr.abs(graph.phi) < dr.abs(nearest.phi)
                 nearest = _BranchValue(
-                    dr.select(closer, one.phi, nearest.phi),
-                    dr.select(closer, one.x, nearest.x),
-                    dr.select(closer, one.y, nearest.y),
+                    dr.select(is_closer, graph.phi, nearest.phi),
+                    dr.select(is_closer, graph.x, nearest.x),
+                    dr.select(is_closer, graph.y, nearest.y),
                     nearest.sign_factor,
                 )
             # f = s |phi|, as a multiple of phi.
             sign = dr.select(nearest.phi < 0, -sign, sign)
-            for one in graphs:
-                sign = sign * one.sign_factor
+            for graph in graphs:
+                sign = sign * graph.sign_factor
         return _PointBranches(z, h, tuple(graphs), nearest, sign, error, rounding)
 
-    def _sample(self, place: _PointBranches) -> Sample:
-        nearest, sign = place.nearest, place.sign
+    def _sample(self, local: _PointBranches) -> Sample:
+        """The sample without promises."""
+        nearest, sign = local.nearest, local.sign
         vector = backend_of(nearest.phi).Array3f
         gradient = vector(sign * nearest.x, sign * nearest.y, sign)
         # No hit if the surface is proved to be farther away than f/|grad f|.
-        norm, beyond = dr.norm(gradient), self._proved_distance(place)
-        slower = dr.abs(nearest.phi) / beyond
-        doubt = dr.select(beyond > 0, fmax(norm - slower, 0), 0)
-        return Sample(place.value, gradient, (), place.error, doubt)
+        norm, distance = dr.norm(gradient), self._proved_distance(local)
+        slope = dr.abs(nearest.phi) / distance
+        gradient_error = dr.select(distance > 0, fmax(norm - slope, 0), 0)
+        return Sample(local.value, gradient, (), local.error, gradient_error)
 
     # Near branch points.
 
     def _ends_of_branches(
-        self, place: _PointBranches
+        self, local: _PointBranches
     ) -> list[tuple[PreparedBranchPoint, Complex, Real]]:
-        """Branch points with a power, z relative to each, and the height over their value."""
-        made: list[tuple[PreparedBranchPoint, Complex, Real]] = []
+        """Branch points with a power, z relative to each, and the height of the point over their
+        value."""
+        ends: list[tuple[PreparedBranchPoint, Complex, Real]] = []
         if self._is_single:
-            return made
-        for point in self.branches.points_on(place.z):
+            return ends
+        for point in self.branches.points_on(local.z):
             if point.power is None:
                 continue
             value = point.value.imag if self.part == "imag" else point.value.real
-            y = place.h - self._height * value
+            y = local.h - self._height * value
             if self._shift is not None:
                 y -= self._shift * dr.round(y / self._shift)
-            made.append((point, place.z - point.at, y))
-        return made
+            ends.append((point, local.z - point.at, y))
+        return ends
 
-    def _cusp_enclosures(self, place: _PointBranches, d: Vec3, shadow: Complex) -> list[Enclosure]:
+    def _cusp_enclosures(
+        self, local: _PointBranches, d: Vec3, projection: Complex
+    ) -> list[Enclosure]:
         """Enclosures near branch points where all branches meet."""
-        made: list[Enclosure] = []
-        speed = abs(shadow)
-        for point, away, y in self._ends_of_branches(place):
-            along = -(away.real * shadow.real + away.imag * shadow.imag) / speed
-            along = dr.select(speed > 0, along, 0)
-            across = dr.abs(away.real * shadow.imag - away.imag * shadow.real) / speed
-            across = dr.select(speed > 0, across, abs(away)) + place.rounding
+        enclosures: list[Enclosure] = []
+        speed = abs(projection)
+        for point, offset, y in self._ends_of_branches(local):
+            t_closest = -(offset.real * projection.real + offset.imag * projection.imag) / speed
+            t_closest = dr.select(speed > 0, t_closest, 0)
+            offset_norm = (
+                dr.abs(offset.real * projection.imag - offset.imag * projection.real) / speed
+            )
+            offset_norm = dr.select(speed > 0, offset_norm, abs(offset)) + local.rounding
             fall = dr.abs(d.z)
             if self._shift is None:
                 fall = fmax(-dr.mulsign(d.z, y), 0)
-            room = fmax(dr.abs(y) - place.error, 0)
-            inside = 0 * y + point.radius * (1 - 1e-6) - place.rounding
-            cone = (point.power, self._height_factor * point.constant * (1 + 1e-5), inside)
-            distance = dr.abs(place.nearest.phi)
-            made.append(
+            gap = fmax(dr.abs(y) - local.error, 0)
+            inner_radius = 0 * y + point.radius * (1 - 1e-6) - local.rounding
+            cone = (point.power, self._height_factor * point.constant * (1 + 1e-5), inner_radius)
+            distance = dr.abs(local.nearest.phi)
+            enclosures.append(
                 BranchPointEnclosure(
-                    room, fall, along, across, speed, *cone, distance, place.value >= 0
+                    gap, fall, t_closest, offset_norm, speed, *cone, distance, local.value >= 0
                 )
             )
-        return made
+        return enclosures
 
-    def _proved_distance(self, place: _PointBranches) -> Real:
-        """A proved lower bound of the distance to the surface near a branch point; 0 if there is
-        none.
+    def _proved_distance(self, local: _PointBranches) -> Real:
+        """A proved lower bound of the distance to the surface near a branch point; 0 if there is no
+        such point.
 
-        With y the height over the value there, a ball of radius r about p contains nothing of the
-        surface if C (|z - a| + r)^alpha <= y - r: so if r <= m and that power is y - m, for any m.
-        Two m are tried: y/2, and the one for which that power is y at r = m, which is nearly sharp
-        where the surface is steep.
+        With y the height over the value at the branch point a, a ball of radius r about p contains
+        no point of the surface if C (|z - a| + r)^alpha <= y - r: so if r <= m and that power is y
+        - m, for any m. Two m are tried: y/2, and the m for which that power is y at r = m, which is
+        nearly sharp where the surface is steep.
         """
-        beyond = 0 * place.h
-        for point, away, y in self._ends_of_branches(place):
+        proved = 0 * local.h
+        for point, offset, y in self._ends_of_branches(local):
             power, constant = point.power, self._height_factor * point.constant
             assert power is not None
-            y, r = dr.abs(y), abs(away)
-            for most in (0.5 * y, dr.power(y / constant, 1 / power) - r):
-                radius = dr.power(fmax(y - most, 0) / constant, 1 / power) - r
-                radius = fmin(fmin(radius, point.radius - r), most)
-                beyond = fmax(radius, beyond)
-        return beyond
+            y, r = dr.abs(y), abs(offset)
+            for height in (0.5 * y, dr.power(y / constant, 1 / power) - r):
+                radius = dr.power(fmax(y - height, 0) / constant, 1 / power) - r
+                radius = fmin(fmin(radius, point.radius - r), height)
+                proved = fmax(radius, proved)
+        return proved
 
     # Along a ray.
 
     def _enclosure(
-        self, place: _PointBranches, d: Vec3, shadow: Complex, length: Real
+        self, local: _PointBranches, d: Vec3, projection: Complex, length: Real
     ) -> Enclosure:
-        """The enclosure for a length along a ray with direction d; shadow: the projection of d to
-        the plane."""
-        stretch = PlaneSegment(place.z, shadow, length, place.rounding)
-        bend = self._height_factor * self.branches.second_derivative_bound(stretch)
-        speed = abs(shadow)
+        """The enclosure for a length along a ray with direction d; projection: the projection of d
+        to the plane."""
+        segment = PlaneSegment(local.z, projection, length, local.rounding)
+        second = self._height_factor * self.branches.second_derivative_bound(segment)
+        speed = abs(projection)
         # For the rounding of slopes, and of the position of the point.
         epsilon = backend_of(d).machine_epsilon
-        moved = dr.select(speed > 0, bend * place.rounding, 0)
-        bend = dr.select(speed > 0, bend * dr.square(speed) * _WIDENED, 0)
+        slope_error = dr.select(speed > 0, second * local.rounding, 0)
+        second = dr.select(speed > 0, second * dr.square(speed) * _WIDENED, 0)
 
-        def slopes(sheet: _BranchValue, sign: Real) -> SlopeRange:
-            slope = sheet.slope(d)
-            size = dr.abs(sheet.x * d.x) + dr.abs(sheet.y * d.y) + dr.abs(d.z)
-            return SlopeRange.around(sign * slope, 16 * epsilon * size + moved * speed)
+        def slopes(branch: _BranchValue, sign: Real) -> SlopeRange:
+            slope = branch.slope(d)
+            size = dr.abs(branch.x * d.x) + dr.abs(branch.y * d.y) + dr.abs(d.z)
+            return SlopeRange.around(sign * slope, 16 * epsilon * size + slope_error * speed)
 
         if self._is_single:
-            return ParabolaEnclosure(slopes(place.nearest, place.sign), -bend, bend, length)
-        distance = dr.abs(place.nearest.phi)
-        one = type(distance)(1)
-        sheets = tuple(
+            return ParabolaEnclosure(slopes(local.nearest, local.sign), -second, second, length)
+        distance = dr.abs(local.nearest.phi)
+        unit = type(distance)(1)
+        samples = tuple(
             BranchSample(
-                slopes(sheet, dr.mulsign(one, sheet.phi)),
-                dr.abs(sheet.phi) - distance - self._extra_rounding(sheet, place),
+                slopes(branch, dr.mulsign(unit, branch.phi)),
+                dr.abs(branch.phi) - distance - self._extra_rounding(branch, local),
             )
-            for sheet in place.branches
+            for branch in local.branches
         )
         nearest = BranchSample(
-            slopes(place.nearest, dr.mulsign(one, place.nearest.phi)), 0 * distance
+            slopes(local.nearest, dr.mulsign(unit, local.nearest.phi)), 0 * distance
         )
-        return NearestBranchEnclosure(sheets, nearest, distance, place.value >= 0, bend, length)
+        return NearestBranchEnclosure(samples, nearest, distance, local.value >= 0, second, length)
 
     @staticmethod
-    def _extra_rounding(sheet: _BranchValue, place: _PointBranches) -> Real:
-        """How much more the rounding of the point may change phi of a branch than of the
-        nearest."""
-        return fmax(sheet.steepness - place.nearest.steepness, 0) * place.rounding
+    def _extra_rounding(branch: _BranchValue, local: _PointBranches) -> Real:
+        """The difference between the changes of phi of a branch and of the nearest branch by the
+        rounding of the point; at least 0."""
+        return fmax(branch.steepness - local.nearest.steepness, 0) * local.rounding

@@ -1,11 +1,11 @@
 """Bounds of the rounding of sums of solid harmonics, and of sums of waves.
 
 Everything here is to first order in u, the unit roundoff (eps/2 of the precision in use): each
-operation is right up to a factor 1 + d, |d| <= u, so errors of factors add up. Terms of second
+operation is exact up to a factor 1 + d, |d| <= u, so errors of factors add up. Terms of second
 order are below 1e-4 of that in single precision and covered by `_SECOND_ORDER`.
 
-- `HarmonicRounding`: of `solid_harmonics.evaluate`.
-- `WaveRounding`: of `waves.evaluate_terms`.
+- `HarmonicRounding`: the rounding of `solid_harmonics.evaluate`.
+- `WaveRounding`: the rounding of `waves.evaluate_terms`.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from harnack.fields.analytic.waves import PlaneWave, Term, WaveFactor
 if TYPE_CHECKING:
     from harnack.backend import Real, Vec3
 
-# Sums of products of sizes of polynomials in cos(a), of degree 24 at most, are sampled at so many
-# a; between samples each factor changes by at most 24 pi/2/_SAMPLES of its largest size
-# (Bernstein), which the second number covers, together with terms of second order in u.
+# Sums of products of sizes of polynomials in cos(a), of degree 24 at most, are sampled at
+# `_SAMPLES` angles a; between samples each factor changes by at most 24 pi/2/_SAMPLES of its
+# largest size (Bernstein), which `_SECOND_ORDER` covers, together with terms of second order in u.
 _SAMPLES = 4000
 _SECOND_ORDER = 1.03
 
@@ -46,30 +46,30 @@ class HarmonicRounding:
     """Rounding of value and gradient of a sum of solid harmonics, in units of u, at a point of the
     unit ball with the distances rho from the z axis and r from the origin.
 
-    value_bounds, gradient_bounds: two bounds each, the smaller of which is used: one that is sharp
-        near the axis, in powers of rho and r, and one in powers of r alone (the largest of c rho^m
-        on the sphere, and not the largest c).
-    underflow: what underflow adds to the value, in smallest normal numbers.
+    value_bounds, gradient_bounds: two bounds each, the smaller of which is used: a bound that is
+        sharp near the axis, in powers of rho and r, and a bound in powers of r only (the largest
+        c rho^m on the sphere, and not the largest c).
+    underflow: the error of the value by underflow, in smallest normal numbers.
 
     With z = r c:
 
     - r^2 = x^2 + y^2 + z^2 is off by 3u of itself.
     - q_l = A z q_(l-1) - B r^2 q_(l-2), A and B the rounded coefficients of the recurrence: a step
-      adds an error of up to g_l = 4u |A z q_(l-1)| + 7u |B r^2 q_(l-2)|, and propagates those of
-      earlier steps by the same recurrence, so the error of q_l is at most the sum over k of
-      |G_lk| g_k, where G_lk is the recurrence begun with G_kk = 1 and 0 before. In units of
-      u r^(l-m) it is a function of c alone, whose largest value is found by sampling
+      adds an error of up to g_l = 4u |A z q_(l-1)| + 7u |B r^2 q_(l-2)|, and propagates the errors
+      of earlier steps by the same recurrence, so the error of q_l is at most the sum over k of
+      |G_lk| g_k, where G_lk is the recurrence that begins with G_kk = 1 and 0 before. In units of
+      u r^(l-m) it is a function of c only, whose largest value is computed by sampling
       (`_recurrence`).
     - (x + iy)^m: a product of complex numbers is off by at most 2 sqrt(2) u of its size (each
-      component by 2u (|x c| + |y s|) or 2u (|x s| + |y c|), and 4 |x c y s| <= rho^2 |w|^2), the
-      first by nothing: 2 sqrt(2) (m-1) u rho^m.
+      component by 2u (|x c| + |y s|) or 2u (|x s| + |y c|), and 4 |x c y s| <= rho^2 |w|^2), and
+      the first factor is exact: 2 sqrt(2) (m-1) u rho^m.
     - A term of the sum: 3u for its weight and two products; then u for each further term of its
       order and for each further order.
     - A point divided by the size of the domain: 3u of each coordinate, that is 3u (rho |f_rho| +
       |z f_z|).
 
-    Numbers that underflow are lost altogether: the smallest normal number for each operation, times
-    the factor by which the recurrence may enlarge it.
+    Numbers that underflow are lost altogether: the error is the smallest normal number for each
+    operation, times the factor by which the recurrence may enlarge it.
     """
 
     value_bounds: tuple[AxialBound, AxialBound]
@@ -78,12 +78,13 @@ class HarmonicRounding:
 
     @classmethod
     def of(cls, weights: Weights, *, is_divided: bool) -> HarmonicRounding:
-        """is_divided: whether points are divided by a size other than 1 first."""
+        """The rounding of a sum with these weights; is_divided: whether points are divided by a
+        size other than 1 first."""
         tables: list[dict[tuple[int, int], float]] = [{}, {}, {}, {}]
         orders = len({m for _, m in weights})
-        lost = 1.0
+        underflow = 1.0
         for (l, m), amplitude in amplitudes(weights).items():  # noqa: E741
-            # One amplitude stands for two columns: cos(m b) and sin(m b), at right angles.
+            # The amplitude stands for two columns: cos(m b) and sin(m b), at right angles.
             terms = max(sum(order == k for _, order in weights) for k in (m, -m))
             sums = (terms - 1) + (orders - 1)
             size = amplitude * legendre_weight(l, m)
@@ -98,9 +99,9 @@ class HarmonicRounding:
             ):
                 if degree >= i:
                     table[i, degree - i] = table.get((i, degree - i), 0.0) + size * constant
-            lost += 2.0 + size * _underflow(l, m)
+            underflow += 2.0 + size * _underflow(l, m)
         a, b, c, d = (AxialBound.of(table) for table in tables)
-        return cls((a, b), (c, d), lost)
+        return cls((a, b), (c, d), underflow)
 
     def value(self, rho: Real, r: Real) -> Real:
         """The bound for the value, in units of u."""
@@ -119,22 +120,22 @@ def _recurrence(l: int, m: int) -> tuple[FloatArray, FloatArray, float]:  # noqa
     times coefficients."""
     c, _ = polar_samples(_SAMPLES)
     q = Legendre(c, 1.0)
-    zero, one = 0.0 * c, 0.0 * c + 1.0
+    zeros, ones = 0.0 * c, 0.0 * c + 1.0
     if l < m:
-        return zero, zero, 0.0
-    error, spread = zero.copy(), 0.0
+        return zeros, zeros, 0.0
+    error, factors = zeros.copy(), 0.0
     for k in range(m + 1, l + 1):
         a, b = (2 * k - 1) / (k - m), (k + m - 1) / (k - m)
         committed = 4 * np.abs(a * c * q(k - 1, m))
         if k > m + 1:
             committed = committed + 7 * np.abs(b * q(k - 2, m))
-        before, now = zero, one
+        previous, current = zeros, ones
         for j in range(k + 1, l + 1):
-            step = (2 * j - 1) / (j - m) * c * now - (j + m - 1) / (j - m) * before
-            before, now = now, step
-        error = error + np.abs(now) * committed
-        spread += float(np.abs(now).max()) * (a + b + 2.0)
-    return np.abs(q(l, m) + zero), error, spread
+            step = (2 * j - 1) / (j - m) * c * current - (j + m - 1) / (j - m) * previous
+            previous, current = current, step
+        error = error + np.abs(current) * committed
+        factors += float(np.abs(current).max()) * (a + b + 2.0)
+    return np.abs(q(l, m) + zeros), error, factors
 
 
 def _product(m: int) -> float:
@@ -160,36 +161,38 @@ def _of_gradient(l: int, m: int, sums: int, is_divided: bool) -> tuple[float, fl
     In the order in which `evaluate` computes it: 4u for weights, coefficients and products in each
     component, 2u for the two terms of gx and gy, then the sums. If the point is divided by a size,
     3u (rho |H| + |z grad f_z|), f_z = (l+m) Q_(l-1)^m B being of degree l-1 and order m; and 3u for
-    the gradient divided by the size.
+    the division of the gradient by the size.
     """
     _, s = polar_samples(_SAMPLES)
-    each = 4 + 2 + 2 * sums + _product(m) + (3 if is_divided else 0)
+    operations = 4 + 2 + 2 * sums + _product(m) + (3 if is_divided else 0)
     q, q_error, _ = _recurrence(l, m)
     at_next, next_error, _ = _recurrence(l - 1, m + 1)
     below, below_error, _ = _recurrence(l - 1, m)
     power = s if m > 0 else 0.0 * s + 1.0
-    outward = s * power * (2 * m + 1) * (next_error + each * at_next)
-    around = m * (q_error + each * q)
-    up = power * (l + m) * (below_error + each * below)
-    total = np.hypot(outward + around, up)
+    radial = s * power * (2 * m + 1) * (next_error + operations * at_next)
+    azimuthal = m * (q_error + operations * q)
+    axial = power * (l + m) * (below_error + operations * below)
+    total = np.hypot(radial + azimuthal, axial)
     near, anywhere = _largest(total), _largest(total * s ** max(m - 1, 0))
     if is_divided:
         # On the sphere |H| <= l (l-1) M and |grad f_z| <= (l-1) l M: see `BallRange.curvature`.
-        rest = 3 * largest_hessian(l, m) / legendre_weight(l, m)
+        division = 3 * largest_hessian(l, m) / legendre_weight(l, m)
         if l > m:
-            rest += 3 * (l + m) * largest_gradient(l - 1, m) / legendre_weight(l - 1, m)
-        near += rest
-        anywhere += min(rest, 6 * l * (l - 1) * _largest(q * s**m))
+            division += 3 * (l + m) * largest_gradient(l - 1, m) / legendre_weight(l - 1, m)
+        near += division
+        anywhere += min(division, 6 * l * (l - 1) * _largest(q * s**m))
     return near, anywhere
 
 
 def _largest(sampled: FloatArray) -> float:
+    """The largest sample, with the margin `_SECOND_ORDER`."""
     return float(sampled.max()) * _SECOND_ORDER
 
 
 def _underflow(l: int, m: int) -> float:  # noqa: E741
-    q, _, spread = _recurrence(l, m)
-    return spread + (2 * m + 2) * float(q.max()) + 2
+    """A bound of the error of a term by underflow, in smallest normal numbers."""
+    q, _, factors = _recurrence(l, m)
+    return factors + (2 * m + 2) * float(q.max()) + 2
 
 
 # The rounding of a sine or cosine in units of u (`backend.elementary.sincos`).
@@ -202,23 +205,23 @@ Share: TypeAlias = tuple[float, float, float, float]
 class WaveRounding:
     """Rounding of a sum of waves at a point p, in units of u.
 
-    move: (x, y, z): the rounding that is the same for all terms moves the point by so much of each
-        coordinate.
+    move: (x, y, z): the rounding that is the same for all terms acts like a move of the point by
+        these multiples of the sizes of its coordinates.
     value, gradient: (constant, x, y, z), the rest of the rounding: the constant, plus x, y and z
         times the sizes of the coordinates.
-    slopes, hessian: the same for the whole rounding of the gradient and the Hessian, without taking
-        any of it for a move of the point.
+    slopes, hessian: the same for the whole rounding of the gradient and the Hessian, without
+        counting any of it as a move of the point.
 
-    A sine or cosine is right to 2u (`backend.elementary.sincos`).
+    A sine or cosine has an error of 2u (`backend.elementary.sincos`).
 
     - The angle of a factor, fl(fl(k) x + phase), is off by c u |k x|, c = 2 for the two roundings
-      of the product, 0 where k is a power of two; with a phase by 2u |phase| and u |k x| more.
-      Where all factors of an axis have the same |k|, the first is the same for all of them: a move
-      of the point by c u |x|, after which value *and* gradient are those of the moved point.
+      of the product, 0 if k is a power of two; with a phase by 2u |phase| and u |k x| more. If all
+      factors of an axis have the same |k|, the first error is the same for all of them: a move of
+      the point by c u |x|, after which value *and* gradient are those of the moved point.
     - The angle of a plane wave is off by 5u sum |k_i x_i| + 2u |phase|.
-    - A product of n factors is off by n times that of a sine, by u for each product with a factor
-      and 2u for an amplitude other than 1; a partial sum by u of its size.
-    - A derivative along one axis contains the frequency as well: 2u more; a second derivative 6u.
+    - A product of n factors is off by n times the error of a sine, by u for each product with a
+      factor and 2u for an amplitude other than 1; a partial sum by u of its size.
+    - A derivative along an axis contains the frequency as well: 2u more; a second derivative 6u.
       The error of an entry i, j of the Hessian is at most d |k_i| |k_j|, which as a matrix has the
       norm d |k|^2.
     """
@@ -233,27 +236,27 @@ class WaveRounding:
     def of(cls, terms: Sequence[Term]) -> WaveRounding:
         """The rounding of the operations of `evaluate_terms`."""
         common = [_common(terms, axis) for axis in range(3)]
-        value, gradient, alone, second = ([0.0] * 4 for _ in range(4))
-        sizes, slopes, bends = 0.0, 0.0, 0.0
+        value, gradient, total_slopes, second = ([0.0] * 4 for _ in range(4))
+        sizes, slopes, seconds = 0.0, 0.0, 0.0
         for n, term in enumerate(terms):
             size, vector = abs(term.amplitude), _vector(term)
-            steep = math.sqrt(sum(k * k for k in vector))
-            bend = size * steep * steep
-            sizes, slopes, bends = sizes + size, slopes + size * steep, bends + bend
+            norm = math.sqrt(sum(k * k for k in vector))
+            second_size = size * norm * norm
+            sizes, slopes, seconds = sizes + size, slopes + size * norm, seconds + second_size
             angle, per_axis, operations = _of_term(term, common)
             _, all_per_axis, _ = _of_term(term, (None, None, None))
-            partial = (sizes, slopes, bends) if n else (0.0, 0.0, 0.0)  # the first is added to 0
+            partial = (sizes, slopes, seconds) if n else (0.0, 0.0, 0.0)  # the first sum is exact
             value[0] += size * (angle + operations) + partial[0]
-            gradient[0] += size * steep * (angle + operations + 2) + partial[1]
-            second[0] += bend * (angle + operations + 6) + partial[2]
+            gradient[0] += size * norm * (angle + operations + 2) + partial[1]
+            second[0] += second_size * (angle + operations + 6) + partial[2]
             for axis in range(3):
                 value[axis + 1] += size * per_axis[axis]
-                gradient[axis + 1] += size * steep * per_axis[axis]
-                alone[axis + 1] += size * steep * all_per_axis[axis]
-                second[axis + 1] += bend * all_per_axis[axis]
-        alone[0] = gradient[0]
+                gradient[axis + 1] += size * norm * per_axis[axis]
+                total_slopes[axis + 1] += size * norm * all_per_axis[axis]
+                second[axis + 1] += second_size * all_per_axis[axis]
+        total_slopes[0] = gradient[0]
         moves = [0.0 if k is None else _rounded(k) for k in common]
-        a, b, c, d = ((s[0], s[1], s[2], s[3]) for s in (value, gradient, alone, second))
+        a, b, c, d = ((s[0], s[1], s[2], s[3]) for s in (value, gradient, total_slopes, second))
         return cls((moves[0], moves[1], moves[2]), a, b, c, d)
 
     def errors(self, p: Vec3, gradient: Vec3) -> tuple[Real, Real]:
@@ -273,29 +276,32 @@ class WaveRounding:
         """Errors of gradient and Hessian at p itself."""
         unit = float(dr.epsilon(type(p.x)))
 
-        def at(share: Share) -> Real:
-            far = (one * dr.abs(x) for one, x in zip(share[1:], p, strict=True))
-            return unit * (share[0] + sum(far, 0 * p.x))
+        def at(parts: Share) -> Real:
+            terms = (rate * dr.abs(x) for rate, x in zip(parts[1:], p, strict=True))
+            return unit * (parts[0] + sum(terms, 0 * p.x))
 
         return at(self.slopes), at(self.hessian)
 
 
 def _vector(term: Term) -> tuple[float, ...]:
+    """The wave vector of a term, or the frequencies of its factors."""
     if isinstance(term, PlaneWave):
         return term.wave_vector
     return tuple(factor.frequency for _, factor in term.factors)
 
 
 def _common(terms: Sequence[Term], axis: int) -> float | None:
-    """The |frequency| that all terms share along an axis; None if they have several."""
-    found: set[float] = set()
+    """The |frequency| that all terms share along an axis; None if there are several."""
+    frequencies: set[float] = set()
     for term in terms:
         if isinstance(term, PlaneWave):
             if term.wave_vector[axis] != 0:
                 return None
         else:
-            found |= {abs(factor.frequency) for other, factor in term.factors if other == axis}
-    return found.pop() if len(found) == 1 else None
+            frequencies |= {
+                abs(factor.frequency) for factor_axis, factor in term.factors if factor_axis == axis
+            }
+    return frequencies.pop() if len(frequencies) == 1 else None
 
 
 def _rounded(frequency: float) -> float:
@@ -304,8 +310,8 @@ def _rounded(frequency: float) -> float:
 
 
 def _of_term(term: Term, common: Sequence[float | None]) -> tuple[float, list[float], float]:
-    """For a term of amplitude 1: the rounding of its angles, the constant part and that in units of
-    the coordinates' sizes, and the rounding of its operations."""
+    """For a term of amplitude 1: the rounding of its angles, as a constant part and a part in units
+    of the coordinates' sizes, and the rounding of its operations."""
     if isinstance(term, PlaneWave):
         operations = _SINE + 2
         return 2 * abs(term.phase), [5 * abs(k) for k in term.wave_vector], operations
@@ -318,5 +324,7 @@ def _of_term(term: Term, common: Sequence[float | None]) -> tuple[float, list[fl
 
 
 def _of_angle(factor: WaveFactor, is_common: bool) -> float:
+    """The rounding of a factor's angle in units of u |k x|, without the part that counts as a move
+    of the point if the frequency is common to all factors."""
     total = 0.0 if is_common else _rounded(factor.frequency)
     return total + 1.0 if factor.phase else total

@@ -1,10 +1,11 @@
 """Real solid harmonics r^l Y_lm in Cartesian coordinates, up to degree 12, and their sums.
 
-r^l Y_lm = N_lm Q_l^m(z, r^2) C_m(x, y), where C_m + i S_m = (x + iy)^m (S_m for m < 0) and Q_l^m
-is r^(l-m) times the m-th derivative of the Legendre polynomial P_l, as a function of z/r: a
-polynomial in z and r^2. Both obey recurrences that lose no accuracy (that of Q is the upward
-recurrence of associated Legendre functions), where a sum of monomials cancels: at degree 12 by
-three digits. Arithmetic only, so one code serves Dr.Jit arrays, NumPy arrays and Python floats.
+r^l Y_lm = N_lm Q_l^m(z, r^2) C_m(x, y), where C_m + i S_m = (x + iy)^m (S_m for m < 0) and Q_l^m is
+r^(l-m) times the m-th derivative of the Legendre polynomial P_l, as a function of z/r: a polynomial
+in z and r^2. Both obey recurrences that lose no accuracy (the recurrence of Q is the upward
+recurrence of associated Legendre functions), whereas a sum of monomials cancels: at degree 12 by
+three digits. All operations are arithmetic, so the same code serves Dr.Jit arrays, NumPy arrays and
+Python floats.
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ Monomials: TypeAlias = Mapping[tuple[int, int, int], float]  #: (i, j, k) -> tha
 
 
 def degree_and_order(key: Any) -> tuple[int, int]:
-    """The degree l and the order m that a pair names.
+    """The degree l and the order m from a pair.
 
     Raises:
-        TypeError: it is no pair of whole numbers.
+        TypeError: it is no pair of integers.
     """
     try:
         l, m = key  # noqa: E741
@@ -40,7 +41,7 @@ def degree_and_order(key: Any) -> tuple[int, int]:
 
 
 def normalization(l: int, m: int) -> float:  # noqa: E741
-    """N_lm, with which the real Y_lm have unit mean square integral over the unit sphere."""
+    """N_lm, with which the integral of Y_lm^2 over the unit sphere is 1."""
     order = abs(m)
     ratio = math.factorial(l - order) / math.factorial(l + order)
     return math.sqrt((2 * l + 1) / (4 * math.pi) * ratio * (2 if order else 1))
@@ -52,14 +53,15 @@ def odd_factorial(m: int) -> float:
 
 
 def legendre_weight(l: int, m: int) -> float:  # noqa: E741
-    """N_lm (2m-1)!!, what `Legendre` leaves out of r^l Y_lm, m >= 0."""
+    """N_lm (2m-1)!!, the factor of r^l Y_lm that `Legendre` omits, m >= 0."""
     return normalization(l, m) * odd_factorial(m)
 
 
 class Legendre:
-    """Q_l^m / (2m-1)!! at one point, each computed once.
+    """Q_l^m / (2m-1)!! at a point, each value computed once.
 
-    Without the size of Q_m^m float32 holds them all; the weights of a sum take that factor up.
+    Without the size of Q_m^m all values are in the range of float32; the weights of a sum contain
+    that factor.
     """
 
     def __init__(self, z: Any, r2: Any) -> None:
@@ -68,7 +70,7 @@ class Legendre:
         self._known: dict[tuple[int, int], Any] = {}
 
     def __call__(self, l: int, m: int) -> Any:  # noqa: E741
-        """The value; 0.0 where l < m."""
+        """The value; 0.0 for l < m."""
         if l <= m:
             return 1.0 if l == m else 0.0
         if (l, m) not in self._known:
@@ -140,12 +142,12 @@ def hessian(weights: Weights, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any, An
             column = [(key[0], w) for key, w in weights.items() if key[1] == order]
             if column:
                 terms = _second_rates(_second_column(sorted(column), m, q), basis, x, y)
-                total = [one + term for one, term in zip(total, terms, strict=True)]
+                total = [entry + term for entry, term in zip(total, terms, strict=True)]
     return total[0], total[1], total[2], total[3], total[4], total[5]
 
 
 def unit_hessian(l: int, m: int, rho: Any, z: Any, b: float, drop: int) -> Any:  # noqa: E741
-    """The Hessian, (n, 3, 3), of r^l Y_lm / rho^drop for m >= 0 where rho^drop counts as constant.
+    """The Hessian (n, 3, 3) of r^l Y_lm / rho^drop for m >= 0, with rho^drop counted as constant.
 
     At n points of azimuth b on the unit sphere, rho and z (n,); m >= 2 + drop or drop = 0.
     """
@@ -162,7 +164,7 @@ def unit_hessian(l: int, m: int, rho: Any, z: Any, b: float, drop: int) -> Any: 
         -m * (m - 1) * power(m - 2) * math.sin((m - 2) * b),
     )
     sums = _second_column([(l, 1.0)], m, Legendre(z, 1.0))
-    xx, yy, zz, xy, xz, yz = (one + 0.0 * z for one in _second_rates(sums, basis, x, y))
+    xx, yy, zz, xy, xz, yz = (entry + 0.0 * z for entry in _second_rates(sums, basis, x, y))
     return np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=-1).reshape(-1, 3, 3)
 
 
@@ -212,7 +214,8 @@ def _column(column: Sequence[tuple[int, float]], m: int, q: Legendre) -> tuple[A
 
 
 def laplacian(coefficients: Monomials) -> tuple[dict[tuple[int, int, int], float], float]:
-    """The Laplacian's coefficients, and the largest one relative to the terms it is summed from."""
+    """The coefficients of the Laplacian, and the largest of them relative to the terms whose sum it
+    is."""
     total: dict[tuple[int, int, int], float] = {}
     size: dict[tuple[int, int, int], float] = {}
     for powers, coefficient in coefficients.items():
@@ -234,10 +237,10 @@ def laplacian(coefficients: Monomials) -> tuple[dict[tuple[int, int, int], float
 def from_monomials(coefficients: Monomials) -> dict[tuple[int, int], float]:
     """The weights of a harmonic polynomial.
 
-    A harmonic function is determined by its values and its z-derivatives on the plane z = 0. On
-    the circle r = 1 there they are the Fourier series with coefficients c_lm N_lm Q_l^m(0, 1)
-    (l - m even) and c_lm N_lm (l+m) Q_(l-1)^m(0, 1) (l - m odd), of degree at most 12: sampled
-    at 64 points they are read off exactly.
+    A harmonic function is determined by its values and its z-derivatives on the plane z = 0. On the
+    circle r = 1 there they are the Fourier series with coefficients c_lm N_lm Q_l^m(0, 1) (l - m
+    even) and c_lm N_lm (l+m) Q_(l-1)^m(0, 1) (l - m odd), of degree at most 12: 64 samples
+    determine them exactly.
     """
     n = 64
     angles = 2 * np.pi * np.arange(n) / n

@@ -1,6 +1,6 @@
 """Proved bounds of sums of solid harmonics, from samples and Bernstein's inequality.
 
-- `AxialBound`: by the distances rho and r to the z axis and to the origin.
+- `AxialBound`: bounds by the distances rho and r to the z axis and to the origin.
 - `BallRange`: ranges on spheres and balls about the origin.
 """
 
@@ -52,10 +52,10 @@ class AxialBound:
 
     r^l Y_lm vanishes to order |m| along the z axis and to order l at the origin. There it, its
     derivatives and the rounding of both are far smaller than anywhere else on the sphere of radius
-    r, and a bound that is of use there must shrink with both distances. As such a sum grows with
-    rho and r, its value at (rho(p) + R, |p| + R) is a bound on the whole ball B(p, R).
+    r, and a useful bound must shrink with both distances. As such a sum grows with rho and r, its
+    value at (rho(p) + R, |p| + R) is a bound on the whole ball B(p, R).
 
-    Every r^l Y_lm is homogeneous, so a constant c need only be found on the unit sphere. With
+    Every r^l Y_lm is homogeneous, so a constant c need only be computed on the unit sphere. With
     Q = Q_l^m of `solid_harmonics`, x + iy = sin(a) exp(i b) and z = cos(a), the functions to be
     bounded are trigonometric polynomials of degree at most l in the polar angle a once the power of
     sin(a) is divided out, and of degree 1 in m b: samples and Bernstein's inequality prove their
@@ -66,7 +66,7 @@ class AxialBound:
 
     @classmethod
     def of(cls, terms: dict[tuple[int, int], float]) -> AxialBound:
-        """terms: (i, j) -> c."""
+        """The bound with these terms; terms: (i, j) -> c."""
         powers = sorted({i for i, _ in terms}, reverse=True)
         return cls(
             tuple(
@@ -103,7 +103,7 @@ def _power(x: Real, n: int) -> Real:
 
 
 def order_on_axis(weights: Weights) -> int:
-    """The order to which a sum, less its constant, vanishes along the z axis."""
+    """The order to which a sum minus its constant vanishes along the z axis."""
     return min((abs(m) for l, m in weights if l > 0), default=0)  # noqa: E741
 
 
@@ -122,14 +122,15 @@ def hessian_bound(weights: Weights) -> AxialBound:
     return _summed(weights, lambda l, m: (max(m - 2, 0), l - 2, largest_hessian(l, m)))  # noqa: E741
 
 
-def _summed(weights: Weights, one: Callable[[int, int], tuple[int, int, float]]) -> AxialBound:
-    """The sum over terms; one: (l, m >= 0) -> power of rho, degree in both, constant for Y_lm.
+def _summed(weights: Weights, bound_of: Callable[[int, int], tuple[int, int, float]]) -> AxialBound:
+    """The sum over terms; bound_of: (l, m >= 0) -> power of rho, degree in both, constant for Y_lm.
 
-    cos(m b) and sin(m b) together have an amplitude of the root of the sum of squares.
+    cos(m b) and sin(m b) together have as amplitude the root of the sum of the squares of their
+    weights.
     """
     terms: dict[tuple[int, int], float] = {}
     for (l, m), amplitude in amplitudes(weights).items():  # noqa: E741
-        power, degree, constant = one(l, m)
+        power, degree, constant = bound_of(l, m)
         if degree >= power and constant > 0:
             key = (power, degree - power)
             terms[key] = terms.get(key, 0.0) + amplitude * constant
@@ -137,7 +138,7 @@ def _summed(weights: Weights, one: Callable[[int, int], tuple[int, int, float]])
 
 
 def amplitudes(weights: Weights) -> dict[tuple[int, int], float]:
-    """(l, m >= 0) -> amplitude of the harmonics of orders m and -m together."""
+    """(l, m >= 0) -> the amplitude of the harmonics of orders m and -m together."""
     sizes: dict[tuple[int, int], float] = {}
     for (l, m), weight in weights.items():  # noqa: E741
         sizes[l, abs(m)] = math.hypot(sizes.get((l, abs(m)), 0.0), weight)
@@ -174,8 +175,8 @@ def largest_gradient(l: int, m: int) -> float:  # noqa: E741
     """The largest |grad r^l Y_lm| / sin(a)^(m-1) on the unit sphere (m = 0: |grad|).
 
     With B = rho^m cos(m b) the components along rho and z are cos(m b) times (Q rho^m)_rho and
-    (l+m) Q_(l-1)^m rho^m, that along b is -sin(m b) m Q rho^(m-1): the length is at most the larger
-    of the two parts.
+    (l+m) Q_(l-1)^m rho^m, and the component along b is -sin(m b) m Q rho^(m-1): the length is at
+    most the larger of the two parts.
     """
     if l == 0:
         return 0.0
@@ -183,13 +184,13 @@ def largest_gradient(l: int, m: int) -> float:  # noqa: E741
     q = Legendre(z, 1.0)
     at_m, at_next = q(l, m), (2 * m + 1) * q(l - 1, m + 1)
     if m == 0:
-        radial, axial, around = -rho * at_next, l * q(l - 1, 0), 0.0 * z
+        radial, axial, azimuthal = -rho * at_next, l * q(l - 1, 0), 0.0 * z
     else:
         radial = m * at_m - rho * rho * at_next
-        axial, around = rho * ((l + m) * (q(l - 1, m) if l > m else 0.0)), m * at_m
+        axial, azimuthal = rho * ((l + m) * (q(l - 1, m) if l > m else 0.0)), m * at_m
     # The square of a directional derivative is of degree 2 l, and so is their sum.
-    steep = np.maximum(radial**2 + axial**2, around**2)
-    return legendre_weight(l, m) * math.sqrt(_proved_maximum(steep, 2 * l))
+    squares = np.maximum(radial**2 + axial**2, azimuthal**2)
+    return legendre_weight(l, m) * math.sqrt(_proved_maximum(squares, 2 * l))
 
 
 @functools.cache
@@ -197,14 +198,14 @@ def largest_hessian(l: int, m: int) -> float:  # noqa: E741
     """The largest |v . H v| / sin(a)^(m-2) on the unit sphere, v a unit vector (m < 2: |v . H v|).
 
     For fixed v in cylindrical coordinates it is of degree l in a, and A cos(m b) + B sin(m b) in b,
-    whose largest value is at most that of samples of m b at a spacing w, divided by cos(w/2).
+    whose largest value is at most the largest sample of m b at a spacing w, divided by cos(w/2).
     """
     if l < 2:
         return 0.0
     z, rho = polar_samples()
     worst = 0.0
-    for turn in np.pi * np.arange(_TURNS) / _TURNS:
-        b = turn / max(m, 1)
+    for angle in np.pi * np.arange(_TURNS) / _TURNS:
+        b = angle / max(m, 1)
         rows = unit_hessian(l, m, rho, z, float(b), drop=max(m - 2, 0))
         sizes = np.abs(np.linalg.eigvalsh(rows)).max(axis=1)
         worst = max(worst, _proved_maximum(sizes, l))
@@ -213,20 +214,21 @@ def largest_hessian(l: int, m: int) -> float:  # noqa: E741
     return worst / math.cos(0.5 * math.pi / _TURNS)
 
 
-# The product of degree and grid spacing: proved ranges are too wide by (this)^2/2 of the half
-# width.
+# The product of degree and grid spacing: proved ranges are too wide by half of its square times the
+# half width.
 _RESOLUTION = 0.1
-# Spheres on which the whole polynomial is bounded, as fractions of the largest.
+# Radii of the spheres on which the whole polynomial is bounded, as fractions of the largest radius.
 _FRACTIONS = (0.25, 0.4, 0.55, 0.7, 0.85, 1.0)
 
 
 def unit_sphere(covering: float) -> FloatArray:
-    """Points (3, n) of the unit sphere such that none of it is further than `covering` away.
+    """Points (3, n) of the unit sphere such that every point of it is within `covering` of one of
+    them.
 
-    Distances are measured along great circles. Rings at equal steps h of latitude, at equal
-    steps w of longitude: the nearest point is within h/2 and w/2 of both, and for polar angles
-    a, b the chord obeys chord^2 = 4 sin^2((a-b)/2) + 4 sin a sin b sin^2(w/4) <=
-    (h/2)^2 + sin a sin b (w/2)^2 with sin b <= sin a + h/2.
+    Distances are measured along great circles. Rings at equal steps h of latitude, at equal steps w
+    of longitude: the nearest point is within h/2 and w/2 of both, and for polar angles a, b the
+    chord obeys chord^2 = 4 sin^2((a-b)/2) + 4 sin a sin b sin^2(w/4) <= (h/2)^2 + sin a sin b
+    (w/2)^2 with sin b <= sin a + h/2.
     """
     chord = 2 * math.sin(0.5 * min(covering, math.pi))
     rings = math.ceil(math.pi / (1.4 * chord)) + 1
@@ -250,8 +252,8 @@ def proved_range(low: float, high: float, degree: int, covering: float) -> tuple
     Every point of the sphere is within `covering` (an angle) of the set. Proof: let the true
     range be [c - A, c + A]. Along the great circle through a maximum and the nearest point of
     the set, T - c is a trigonometric polynomial of degree L with |T - c| <= A, so by Bernstein's
-    inequality |T''| <= L^2 A. At the maximum T' = 0, hence `high` falls short of it by at most
-    e A, e = (L covering)^2/2; in the same way `low`. So 2A <= high - low + 2 e A.
+    inequality |T''| <= L^2 A. At the maximum T' = 0, hence `high` falls short of the maximum by at
+    most e A, e = (L covering)^2/2; in the same way `low`. So 2A <= high - low + 2 e A.
     """
     e = 0.5 * (degree * covering) ** 2
     if e >= 1:
@@ -279,13 +281,13 @@ def range_of_harmonic(l: int, m: int) -> tuple[float, float]:  # noqa: E741
 class BallRange:
     """Bounds of a harmonic polynomial f = f_0 + f_1 + ... (f_l homogeneous) on |y| <= s.
 
-    By the maximum principle a range on a sphere is one on its ball. Sampling alone proves nothing;
-    sampling with Bernstein's inequality does.
+    By the maximum principle a range on a sphere is a range on its ball. The ranges are proved by
+    samples together with Bernstein's inequality.
 
     ends: (l, lower, upper) of f_l on the unit sphere. f_l has mean 0 there, so lower <= 0 <=
         upper, and f lies in f_0 + [sum s^l lower_l, sum s^l upper_l] for |y| <= s.
-    spheres: (s, lower, upper) of f itself on some spheres. As the terms seldom have their extremes
-        at one point, this is tighter. It holds on the smaller balls too.
+    spheres: (s, lower, upper) of f itself on a few spheres of radius s. As the terms seldom have
+        their extremes at the same point, this is tighter. It holds on smaller balls, too.
     """
 
     constant: float
@@ -306,7 +308,8 @@ class BallRange:
         return cls(constant, tuple(ends))
 
     def with_spheres(self, weights: Weights, largest: float) -> BallRange:
-        """The same with the ranges of f on spheres up to a radius; unchanged for a single f_l."""
+        """The same bounds with the ranges of f on spheres up to the radius `largest`; unchanged for
+        a single f_l."""
         if len(self.ends) < 2:
             return self
         points, covering = _points(weights)
@@ -343,9 +346,9 @@ class BallRange:
     def _derivative(self, s: Real, order: int) -> Real:
         """The sum over l of l (l-1) .. (l-order+1) M |y|^(l-order), by Horner's rule."""
         total = 0.0 * s
-        most = {degree: max(-low, high) for degree, low, high in self.ends}
-        for degree in range(max(most, default=0), order - 1, -1):
-            total = total * s + math.perm(degree, order) * most.get(degree, 0.0)
+        max_abs = {degree: max(-low, high) for degree, low, high in self.ends}
+        for degree in range(max(max_abs, default=0), order - 1, -1):
+            total = total * s + math.perm(degree, order) * max_abs.get(degree, 0.0)
         return total
 
     def at(self, s: Real) -> tuple[Real, Real]:
@@ -358,12 +361,13 @@ class BallRange:
         return lower, upper
 
     def on_ball(self, s: float) -> tuple[float, float]:
-        """The same for one number: the range on |y| <= s."""
+        """The range on |y| <= s, for a single number s."""
         bounds = [self.by_degree(s), *((low, high) for r, low, high in self.spheres if s <= r)]
         return max(low for low, _ in bounds), min(high for _, high in bounds)
 
 
 def _points(weights: Weights) -> tuple[FloatArray, float]:
+    """Sample points of the unit sphere, and their covering angle, for sums with these weights."""
     covering = _RESOLUTION / max(1, max(degree for degree, _ in weights))
     return unit_sphere(covering), covering
 
@@ -378,6 +382,7 @@ def _values(weights: Weights, points: FloatArray) -> dict[int, FloatArray]:
 
 
 def sphere_range(values: dict[int, FloatArray], s: float, covering: float) -> tuple[float, float]:
-    """Proved range of the sum of f_l on the sphere of radius s; values: on the unit sphere."""
-    whole: FloatArray = np.sum([s**degree * v for degree, v in values.items()], axis=0)
-    return proved_range(float(whole.min()), float(whole.max()), max(values), covering)
+    """A proved range of the sum of f_l on the sphere of radius s; values: of each f_l on the unit
+    sphere."""
+    total: FloatArray = np.sum([s**degree * v for degree, v in values.items()], axis=0)
+    return proved_range(float(total.min()), float(total.max()), max(values), covering)

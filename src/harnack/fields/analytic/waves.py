@@ -1,7 +1,7 @@
 """Sums of sine waves: their terms, values and gradients, and proved bounds of the sum.
 
 Every Laplacian eigenfunction that separates in Cartesian coordinates is a product of sines and
-cosines, and every such product is a sum of plane waves: terms are evaluated as they are given (a
+cosines, and every such product is a sum of plane waves. Terms are evaluated in the user's form (a
 product needs one sine and one cosine for each coordinate), and bounded as plane waves.
 """
 
@@ -34,7 +34,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class WaveFactor:
-    """sin or cos of (frequency * coordinate + phase); made by `sine_factor` and `cosine_factor`."""
+    """sin or cos of (frequency * coordinate + phase); see `sine_factor` and `cosine_factor`."""
 
     frequency: float
     phase: float
@@ -64,10 +64,10 @@ def cosine_factor(frequency: float = 1.0, phase: float = 0.0) -> WaveFactor:
 
 @dataclass(frozen=True)
 class WaveProduct:
-    """amplitude times a factor of each coordinate; a coordinate left out does not enter.
+    """amplitude times a factor of each coordinate; coordinates without a factor do not enter.
 
-    Product(2.0, x=sine(3.0), y=cosine(4.0)) is 2 sin(3x) cos(4y), an eigenfunction of the
-    Laplacian with eigenvalue -(9 + 16).
+    WaveProduct(2.0, x=sine_factor(3.0), y=cosine_factor(4.0)) is 2 sin(3x) cos(4y), an
+    eigenfunction of the Laplacian with eigenvalue -(9 + 16).
     """
 
     amplitude: float
@@ -87,7 +87,7 @@ class WaveProduct:
 
     @property
     def factors(self) -> tuple[tuple[int, WaveFactor], ...]:
-        """(axis, factor) of each coordinate that enters."""
+        """(axis, factor) for each coordinate that has a factor."""
         named = enumerate((self.x, self.y, self.z))
         return tuple((axis, factor) for axis, factor in named if factor is not None)
 
@@ -115,12 +115,13 @@ def checked_terms(terms: Iterable[Term]) -> tuple[Term, ...]:
     """The terms as a tuple, of Python numbers.
 
     Raises:
-        ValueError, TypeError: there is no term, or one will not do; the message names the first.
+        ValueError, TypeError: there is no term, or a term is invalid; the message names the first
+            invalid term.
     """
-    given, checked = tuple(terms), list[Term]()
-    if not given:
+    listed, checked = tuple(terms), list[Term]()
+    if not listed:
         raise ValueError("a sum needs at least one term")
-    for n, term in enumerate(given):
+    for n, term in enumerate(listed):
         if isinstance(term, PlaneWave):
             amplitude, phase = float(term.amplitude), float(term.phase)
             checked.append(replace(term, amplitude=amplitude, phase=phase))
@@ -164,8 +165,8 @@ def evaluate_terms(terms: Sequence[Term], p: Vec3) -> tuple[Real, list[Real]]:
         values = [(axis, *rates(axis, factor)) for axis, factor in term.factors]
         value += _product([f for _, f, _ in values], term.amplitude)
         for axis, _, derivative in values:
-            others = [f for other, f, _ in values if other != axis]
-            gradient[axis] += _product([*others, derivative], term.amplitude)
+            factors = [f for factor_axis, f, _ in values if factor_axis != axis]
+            gradient[axis] += _product([*factors, derivative], term.amplitude)
     return value, gradient
 
 
@@ -198,10 +199,12 @@ def hessian_of_terms(terms: Sequence[Term], p: Vec3) -> list[list[Real]]:
 
 
 def _angle(angle: Real, phase: float) -> Real:
+    """angle + phase, without an operation if the phase is 0."""
     return angle + phase if phase else angle
 
 
 def _product(factors: Sequence[Real], amplitude: float) -> Real:
+    """The product of the factors and the amplitude."""
     product: Real = None
     for factor in factors:
         product = factor if product is None else product * factor
@@ -212,7 +215,7 @@ def _product(factors: Sequence[Real], amplitude: float) -> Real:
 
 @dataclass(frozen=True)
 class WaveBounds:
-    """A sum f = constant + sum_i A_i cos(k_i . p + phase_i), A_i > 0, and what is proved of it.
+    """Proved bounds of a sum f = constant + sum_i A_i cos(k_i . p + phase_i), A_i > 0.
 
     largest_value: |f - constant| <= sum A_i.
     largest_curvature: |v . H v| <= sum A_i (k_i . v)^2 for the Hessian H and a unit v, at most
@@ -235,7 +238,7 @@ class WaveBounds:
 
     @classmethod
     def of(cls, terms: Iterable[Term]) -> WaveBounds:
-        """The bounds of a sum, equal wave vectors added up first.
+        """The bounds of a sum, after adding up terms with equal wave vectors.
 
         Raises:
             ValueError: the sum is constant.
@@ -250,13 +253,13 @@ class WaveBounds:
             raise ValueError("the sum is constant: it has no level sets")
         vectors = np.array(list(waves))
         sizes = np.abs(np.array(list(waves.values())))
-        # All sums below are of positive numbers: a few roundings, covered by this factor.
-        up = 1.0 + 1e-12
+        # All sums below have positive terms: a few roundings, covered by this factor.
+        margin = 1.0 + 1e-12
         matrix: npt.NDArray[np.float64] = np.einsum("n,ni,nj->ij", sizes, vectors, vectors)
-        curvature = float(np.linalg.eigvalsh(matrix)[-1]) * up
+        curvature = float(np.linalg.eigvalsh(matrix)[-1]) * margin
         lengths = np.linalg.norm(vectors, axis=1)
-        value = float(sizes.sum()) * up
-        gradient = min(float(sizes @ lengths) * up, math.sqrt(value * curvature))
+        value = float(sizes.sum()) * margin
+        gradient = min(float(sizes @ lengths) * margin, math.sqrt(value * curvature))
         return cls(
             tuple(float(v) for v in lengths),
             tuple(float(v) for v in sizes),
@@ -264,13 +267,14 @@ class WaveBounds:
             value,
             gradient,
             curvature,
-            float(lengths.max()) * up * curvature,
+            float(lengths.max()) * margin * curvature,
         )
 
 
 def mean_wavelength(amplitudes: npt.ArrayLike, wavenumbers: npt.ArrayLike) -> float:
-    """2 pi over the root mean square wavenumber, weighted by amplitudes: for one wave its length,
-    for a sum that of the waves which dominate its shape, and not that of the shortest."""
+    """2 pi over the root mean square wavenumber, weighted by amplitudes: for a single wave its
+    length, for a sum the length of the waves that dominate its shape, and not of the shortest
+    wave."""
     sizes, numbers = np.abs(amplitudes), np.asarray(wavenumbers, np.float64)
     largest = float(numbers.max())
     mean = float((sizes * (numbers / largest) ** 2).sum() / sizes.sum())
@@ -286,10 +290,10 @@ def _plane_waves(term: Term) -> list[tuple[tuple[float, ...], complex]]:
         phasor = term.amplitude * complex(math.cos(term.phase), math.sin(term.phase))
         return [_canonical(term.wave_vector, phasor)]
     waves: list[tuple[tuple[float, ...], complex]] = [((0.0, 0.0, 0.0), complex(term.amplitude))]
-    for position, (axis, factor) in enumerate(term.factors):
+    for index, (axis, factor) in enumerate(term.factors):
         phasor = complex(math.cos(factor.phase), math.sin(factor.phase))
         phasor *= 1 if factor.is_cosine else -1j  # sin t = cos(t - pi/2)
-        signs = (1.0,) if position == 0 else (1.0, -1.0)
+        signs = (1.0,) if index == 0 else (1.0, -1.0)
         waves = [
             (
                 tuple(v + sign * factor.frequency * (i == axis) for i, v in enumerate(k)),
@@ -302,7 +306,7 @@ def _plane_waves(term: Term) -> list[tuple[tuple[float, ...], complex]]:
 
 
 def _canonical(k: Sequence[float], amplitude: complex) -> tuple[tuple[float, ...], complex]:
-    """cos(k.p + t) = cos(-k.p - t): the first component that is not zero is made positive."""
+    """The same wave with a positive first nonzero component of k: cos(k.p + t) = cos(-k.p - t)."""
     leading = next((v for v in k if v != 0), 0.0)
     if leading < 0:
         return tuple(-v + 0.0 for v in k), amplitude.conjugate()

@@ -46,17 +46,17 @@ if TYPE_CHECKING:
 __all__ = ["BoundaryCells"]
 
 _SHARE = 1 / (4 * math.pi)
-# The boundary of a broken mesh consists of many small loops, and its cells must be built fast. They
-# have the first number times as many near edges as the cells of a single curve, and split cells
-# share the edges beyond the second number of radii.
+# The boundary of a broken mesh consists of many small loops, and its cells must be built fast: a
+# cell may have `_NEAR_FACTOR` times as many near edges as a cell of a single curve, and the edges
+# beyond `_SHARED` radii of a split cell count for all cells inside it.
 _NEAR_FACTOR, _SHARED = 4.0, 3.5
-# The fraction of the bytes for all numbers but w at the centers: a cell has at least 64 others.
+# The fraction of the bytes for all numbers except w at the centers: a cell has at least 64 others.
 _CELL_BYTES_FRACTION = 64 / 65
-# In roundings of a coordinate: the error of a point, and the distance from an edge within which
-# samples promise nothing.
+# Bound of the error of a point, and the distance from an edge within which samples promise nothing,
+# both in roundings of a coordinate.
 _POINT_ROUNDINGS, _EDGE_ROUNDINGS = 8.0, 16.0
-# Points at which w follows from the center of a cell, and these centers, are at least this many
-# roundings away from triangles. The second number bounds the error of w there.
+# A point at which w follows from the center of its cell, and this center, are at least
+# `_TRIANGLE_ROUNDINGS` roundings away from triangles. `_MAX_BRANCH_ERROR` bounds the error of w.
 _TRIANGLE_ROUNDINGS, _MAX_BRANCH_ERROR = 64.0, 0.125
 
 
@@ -79,17 +79,17 @@ class BoundaryCells:
         cls, rays: TriangleTree, mesh: WindingMesh, low: FloatArray, high: FloatArray,
         most_bytes: int, value: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
     ) -> BoundaryCells | None:  # fmt: skip
-        """Cells of a cube around the mesh and around the box from low (3,) to high (3,); None if
-        they would take more than `most_bytes`.
+        """The cells of a cube around the mesh and around the box from low (3,) to high (3,); None
+        if the cells would take more than `most_bytes` bytes.
 
         value: gives w (n,) at points (n, 3), and bounds (n,) of its error.
         """
         backend = rays.tree.backend
         trails = closed_trails(mesh.singular_edges)
         loops = tuple(mesh.unit_vertices[trail[:-1]] for trail in trails)
-        ends = (np.array(end) for end in (low, high))
+        ends = (np.array(corner) for corner in (low, high))
         points = np.concatenate(
-            [*loops, *(((end - mesh.center) / mesh.size)[None] for end in ends)]
+            [*loops, *(((corner - mesh.center) / mesh.size)[None] for corner in ends)]
         )
         cells = build_curve_cells(
             backend,
@@ -126,70 +126,73 @@ class BoundaryCells:
 
         unit: the rounding of a coordinate of x, and of the ray on which x lies.
 
-        Proof. On the line from the cell's center c to x, w changes by that of the solid angle of
-        the boundary over 4 pi, and where the line crosses a triangle along its normal, by -1
+        Proof. On the line from the cell's center c to x, w changes by the change of the solid angle
+        of the boundary over 4 pi, and by -1 where the line crosses a triangle along its normal
         (`edge_lift`). This gives an estimate of w(x) with the errors of w(c) and of the cell. Then
-        w(x) is the number nearest to the estimate among those that are congruent modulo 1 to the
-        value of the cell, as all errors together are below three eighths. The result is NaN on a
-        triangle, and where `signed_crossings_between` or `change_from_center` are not sure. Off all
-        triangles it is the number of the side on which the ray has x, too: the t of a crossing is
-        the depth of a point of the triangle that is a few roundings off the ray, and so is the true
-        one. If x were between these two, a point of the triangle would be as near to x.
+        w(x) is the number nearest to the estimate among the numbers that are congruent modulo 1 to
+        the value of the cell, as all errors together are below three eighths. The result is NaN on
+        a triangle, and where `signed_crossings_between` or `change_from_center` is not certain. Off
+        all triangles the result is also the value on the side on which x lies on the ray: the t of
+        a crossing is the depth of a point of the triangle that is a few roundings off the ray, and
+        so is the true t. If x were between these two, a point of the triangle would be as near to
+        x.
         """
         backend, real = self.cells.backend, self.cells.backend.Float
-        found, inside = self.cells.sums(x, active)
-        way = x - found.center
-        end = dr.norm(way)
-        inside &= end > _TRIANGLE_ROUNDINGS * unit
-        d = dr.select(inside, way / end, backend.Array3f(0, 0, 1))
-        frame = RayFrame.along(backend, found.center, d)
-        change, sure = self.cells.change_from_center(found, frame, x, unit, inside)
-        turns, clear = self.rays.signed_crossings_between(frame, end, unit, inside)
+        local, inside = self.cells.sums(x, active)
+        displacement = x - local.center
+        distance = dr.norm(displacement)
+        inside &= distance > _TRIANGLE_ROUNDINGS * unit
+        direction = dr.select(inside, displacement / distance, backend.Array3f(0, 0, 1))
+        frame = RayFrame.along(backend, local.center, direction)
+        change, is_certain = self.cells.change_from_center(local, frame, x, unit, inside)
+        turns, is_clear = self.rays.signed_crossings_between(frame, distance, unit, inside)
         on_triangle = jump_sum_within(self.rays, x, _TRIANGLE_ROUNDINGS * unit, inside)
-        estimate = dr.gather(real, self.center_values, found.cell, inside) - turns + _SHARE * change
-        value = _SHARE * found.sums.angle
-        rest = estimate - value
-        number = dr.round(rest)
-        error = found.error + found.rounding
-        known = inside & sure & clear & (on_triangle == 0)
-        known &= (dr.abs(rest - number) < _MAX_BRANCH_ERROR) & (_SHARE * error < _MAX_BRANCH_ERROR)
-        return dr.select(known, value + number, dr.nan)
+        estimate = dr.gather(real, self.center_values, local.cell, inside) - turns + _SHARE * change
+        value = _SHARE * local.sums.angle
+        offset = estimate - value
+        branch = dr.round(offset)
+        error = local.error + local.rounding
+        is_valid = inside & is_certain & is_clear & (on_triangle == 0)
+        is_valid &= (dr.abs(offset - branch) < _MAX_BRANCH_ERROR) & (
+            _SHARE * error < _MAX_BRANCH_ERROR
+        )
+        return dr.select(is_valid, value + branch, dr.nan)
 
     def sample(
         self, x: Vec3, direction: Vec3 | None, unit: Real, active: Mask
     ) -> tuple[Sample, Mask]:
-        """A sample of w modulo 1 at x, and the lanes on which it is valid: those that are active
-        and whose x lies in a cell and not at an edge.
+        """A sample of w modulo 1 at x, and the mask of the lanes on which it is valid: the active
+        lanes whose x lies in a cell and not at an edge.
 
-        The promises are about w continued smoothly, and are those of `SolidAngle`.
+        The promises are about w continued smoothly, and are the promises of `SolidAngle`.
 
-        direction: (3,) a unit vector, along which `ray_promises` are given; None for none.
+        direction: (3,) a unit vector, along which `ray_promises` hold; None for no such promises.
         unit: the rounding of a coordinate.
         """
         backend = self.cells.backend
-        found, inside = self.cells.sums(x, active)
-        sums, rounding = found.sums, _POINT_ROUNDINGS * unit
-        known = remainder_promises(
+        cell_sums, inside = self.cells.sums(x, active)
+        sums, rounding = cell_sums.sums, _POINT_ROUNDINGS * unit
+        promises = remainder_promises(
             sums.cubes, sums.fourths, sums.distance * (1 - SUM_MARGIN) - rounding
         )
-        ball = lift_ball(sums.angle, sums.gradient, sums.squares, known, found.slope_error)
-        rounded = found.rounding + vertex_rounding(backend.machine_epsilon, x, sums.squares)
-        along: tuple[Lipschitz, ...] = ()
+        ball = lift_ball(sums.angle, sums.gradient, sums.squares, promises, cell_sums.slope_error)
+        rounded = cell_sums.rounding + vertex_rounding(backend.machine_epsilon, x, sums.squares)
+        ray_promises: tuple[Lipschitz, ...] = ()
         if direction is not None:
             line = RayLine(x, direction, rounding)
 
-            def rates(lengths: tuple[Real, ...], wanted: Mask) -> tuple[Real, ...]:
-                return self.cells.rates_along(found, line, lengths, wanted & inside)
+            def rates(lengths: tuple[Real, ...], lanes: Mask) -> tuple[Real, ...]:
+                return self.cells.rates_along(cell_sums, line, lengths, lanes & inside)
 
-            along = lipschitz_along(line, sums.gradient, sums.distance, rates)
+            ray_promises = lipschitz_along(line, sums.gradient, sums.distance, rates)
         sample = Sample(
             _SHARE * sums.angle,
             _SHARE * sums.gradient,
-            tuple(one.scaled(_SHARE) for one in known),
-            _SHARE * (found.error + rounded),
-            _SHARE * dr.fma(SLOPE_ROUNDINGS / 3 * unit, sums.cubes, found.slope_error),
-            truncation_error=_SHARE * found.error,
+            tuple(promise.scaled(_SHARE) for promise in promises),
+            _SHARE * (cell_sums.error + rounded),
+            _SHARE * dr.fma(SLOPE_ROUNDINGS / 3 * unit, sums.cubes, cell_sums.slope_error),
+            truncation_error=_SHARE * cell_sums.error,
             alternative_promises=(ball.scaled(_SHARE),),
-            ray_promises=tuple(one.scaled(_SHARE) for one in along),
+            ray_promises=tuple(promise.scaled(_SHARE) for promise in ray_promises),
         )
         return sample, inside & (sums.distance > _EDGE_ROUNDINGS * unit)

@@ -5,8 +5,9 @@ they pay, True for cells in any case, False for no cells, or the number of megab
 take.
 
 `trace`, `render`, and views that Python draws tell a field the number of rays
-(`Field.for_ray_count`), and the field prepares more if that pays: building the cells of a cloud
-costs as much as about six rays a point without cells. Solids pass the number on to their operands.
+(`Field.for_ray_count`), and the field builds cells if that pays: building the cells of a cloud
+costs as much as about six rays per point without cells. Solids pass the number on to their
+operands.
 
 Values at points use cells if the user requested cells, whatever the number of points. If that
 number decided, values of a block of points could lie outside of the bounds for all points.
@@ -52,11 +53,11 @@ class FieldWithCells(Field):
     """A field that may have cells. Subclasses set `cells` by `configure_cells`, and define
     `cells_pay_from`.
 
-    cells_for_values: whether values at points use the cells, too: if the user requested cells,
-        whatever the number of points, so that values and their error bounds always come from the
-        same method.
-    finer_cells: whether there are so many rays that smaller cells pay; true if the user requested
-        cells.
+    cells_for_values: whether values at points use the cells, too. It is true if the user requested
+        cells, whatever the number of points, so that values and their error bounds always come from
+        the same method.
+    finer_cells: whether the number of rays is so large that smaller cells pay; true if the user
+        requested cells.
     """
 
     cells: bool | float | None
@@ -66,7 +67,8 @@ class FieldWithCells(Field):
     _batches: Any
 
     def configure_cells(self, cells: Any) -> None:
-        """Take the argument. Raises ValueError for what is no number of megabytes."""
+        """Store the argument `cells`. Raises ValueError if it is neither a bool, None nor a number
+        of megabytes."""
         kind = cast("Any", type(cells))
         if issubclass(kind, np.bool_):  # True is no megabyte
             cells = bool(cells)
@@ -81,14 +83,14 @@ class FieldWithCells(Field):
         self._built: TransientCache[tuple[Backend, int, bool], Any] = TransientCache()
 
     def with_cells(self, cells: bool = True) -> Self:
-        """A copy with cells for rays, or with none."""
-        other = copy.copy(self)
-        other.configure_cells(cells)
-        other.cells_for_values, other._device, other._batches = False, None, TransientCache()
-        return other
+        """A copy with cells for rays, or without cells."""
+        field = copy.copy(self)
+        field.configure_cells(cells)
+        field.cells_for_values, field._device, field._batches = False, None, TransientCache()
+        return field
 
     def build_cached(self, backend: Backend, build: Callable[[], Built]) -> Built:
-        """What `build` made for a backend, for values and for tracing."""
+        """The result of `build` for a backend, computed once for values and for tracing."""
         key = backend, self.max_bytes(), self.finer_cells
         if key not in self._built:
             self._built[key] = build()
@@ -96,10 +98,11 @@ class FieldWithCells(Field):
 
     @abc.abstractmethod
     def cells_pay_from(self) -> float:
-        """The number of rays from which on cells pay; infinite for never."""
+        """The number of rays from which on cells pay; infinite if they never pay."""
 
     def finer_cells_pay_from(self) -> float:
-        """The number of rays from which on smaller cells pay. The default has one size."""
+        """The number of rays from which on smaller cells pay. By default all cells have the same
+        size."""
         return 0.0
 
     def for_ray_count(self, count: int) -> Self:
@@ -118,8 +121,9 @@ class FieldWithCells(Field):
         return int(1e6 * (_MEGABYTES if self.cells is True else float(self.cells or 0)))
 
     def describe_cells(self, built: BuiltCells | None) -> dict[str, str]:
-        """For `describe`: the number and memory of the cells of a prepared field, what those of
-        another one may take, or from how many rays on there are any."""
+        """The entry of `describe` about cells: their number and memory in a prepared field, the
+        memory that they may take in a field that is not prepared, or the number of rays from which
+        on there are cells."""
         if self.cells is None and self.cells_pay_from() < math.inf:
             return {"cells": f"from {math.ceil(self.cells_pay_from()):,} rays on"}
         if not self.cells:

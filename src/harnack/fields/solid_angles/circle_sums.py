@@ -1,10 +1,11 @@
-"""Circles: the solid angle of one at a point, and sums over many with what bounds them.
+"""Circles: the solid angle of a circle at a point, and sums over many circles with integrals that
+bound them.
 
-`UnitCircle` has the formulas, by complete elliptic integrals; `CircleSet` are circles on a backend
-and the sums over them.
+- `UnitCircle`: the formulas, by complete elliptic integrals.
+- `CircleSet`: circles on a backend, and the sums over them.
 
-Circles are one expression: Bulirsch's loop for complete elliptic integrals, unrolled, gives value,
-gradient and Hessian; their forms are chosen so that nothing cancels.
+Value, gradient and Hessian of a circle are one expression: Bulirsch's loop for complete elliptic
+integrals, unrolled. The forms of the formulas are chosen so that nothing cancels.
 """
 
 from __future__ import annotations
@@ -55,8 +56,8 @@ class UnitCircle:
 
     All integrals come from one loop of arithmetic-geometric means, which converges quadratically:
     six rounds for single precision and eight for double, unrolled to plain arithmetic. Besides the
-    means a_n it computes the differences c_(n+1) = c_n^2/(4 a_(n+1)), c_1 = (1-kc)/2, and S, the
-    sum of 2^n c_(n+1)^2/(1-kc)^2 over n >= 1. Then E = K (1 - (1-kc^2)/2 - (1-kc)^2 (1/4 + S)).
+    means a_n it computes the differences c_(n+1) = c_n^2/(4 a_(n+1)), c_1 = (1-kc)/2, and the sum
+    S of 2^n c_(n+1)^2/(1-kc)^2 over n >= 1. Then E = K (1 - (1-kc^2)/2 - (1-kc)^2 (1/4 + S)).
 
     Derivatives. Biot and Savart's integrals over the circle, D the distance from the point,
 
@@ -65,11 +66,11 @@ class UnitCircle:
     give the gradient (z x J, z y J, I3 - r^2 J), where the known form of J,
     2 (A E/Rm^2 - K)/(r^2 Rp), cancels near the axis and far away. With E as above, 1 - kc = q r,
     q = 4/(Rp (Rp + Rm)), and A = Rp^2 (1 + kc^2)/2, the terms of order 0 and 1 in 1 - kc drop out,
-    and
+    which leaves
 
-        J = K q^2 [(1 + 4 kc + kc^2)/4 - (1 + kc^2) S]/(Rp kc^2)
+        J = K q^2 [(1 + 4 kc + kc^2)/4 - (1 + kc^2) S]/(Rp kc^2).
 
-    is left. I3 - r^2 J cancels near the circle, where the equal form
+    I3 - r^2 J cancels near the circle, where the equal form
     2 [K + ((1-r)(1+r) - z^2) E/Rm^2]/Rp does not.
 
     Second derivatives need I5 and C5, with D^-5. As D^2 = A - 2r cos(phi), A I5 - 2r C5 = I3; and
@@ -94,7 +95,8 @@ class UnitCircle:
 
     @classmethod
     def at(cls, r: Real, z: Real) -> UnitCircle:
-        """r >= 0 and z: Dr.Jit numbers."""
+        """The circle's solid angle at distance r >= 0 from the axis and height z; both Dr.Jit
+        numbers."""
         real: Any = cast("Any", type(r))
         rounds = _AGM_ROUNDS["double" if float(dr.epsilon(r)) < 1e-10 else "single"]
         gap = 1 - r
@@ -104,61 +106,63 @@ class UnitCircle:
         kc = nearest * inverse
         q = 4 * inverse / (farthest + nearest)
         gamma = gap / (1 + r)
-        # c, d, p are Bulirsch's numbers for cel, m and e those of the means.
+        # c, d, p are Bulirsch's numbers for cel; m and e are the numbers of the means.
         c, d, p = real(1), dr.copysign(real(1), gamma), fmax(dr.abs(gamma), 1e-30)
         k, e, m = kc, kc, real(1)
-        total, ratio, drop = real(0), real(0.5), q * r
+        total, ratio, kc_gap = real(0), real(0.5), q * r
         for n in range(rounds):
-            before, g = c, e / p
-            c, d = c + d / p, 2 * dr.fma(before, g, d)
+            old_c, g = c, e / p
+            c, d = c + d / p, 2 * dr.fma(old_c, g, d)
             p, m = p + g, m + k
             k = 2 * dr.sqrt(e)
             e = k * m
             if n >= 1:
-                ratio = ratio * ratio * drop / (4 * 0.5 ** (n + 1) * m)
+                ratio = ratio * ratio * kc_gap / (4 * 0.5 ** (n + 1) * m)
                 total = dr.fma(2.0**n * ratio, ratio, total)
         cel = (math.pi / 2) * dr.fma(c, m, d) / (m * (m + p))
         first = (math.pi / 2 * 2.0**rounds) / m  # K
-        second = first * (1 - 0.5 * drop * (1 + kc) - drop * drop * (0.25 + total))  # E
+        second = first * (1 - 0.5 * kc_gap * (1 + kc) - kc_gap * kc_gap * (0.25 + total))  # E
         height = dr.abs(z)
         w = dr.select(r < 1, real(2 * math.pi), 0) - 4 * height * inverse / (1 + r) * cel
         w = dr.select(r == 1, math.pi - 2 * height * inverse * first, w)
         bracket = 0.25 * dr.fma(kc, 4 + kc, 1) - dr.fma(kc, kc, 1) * total
         radial = first * inverse * bracket / (kc * kc)
         third = 4 * second * inverse / square
-        beside = 2 * inverse * (first + (gap * (1 + r) - z * z) / square * second)
-        axial = dr.select(first * square < 2 * second, beside, third - drop * drop * radial)
+        near_form = 2 * inverse * (first + (gap * (1 + r) - z * z) / square * second)
+        axial = dr.select(first * square < 2 * second, near_form, third - kc_gap * kc_gap * radial)
         return cls(r, z, -dr.mulsign(w, z), nearest, farthest, q, radial, axial, third)
 
     @property
     def across(self) -> Real:
-        """z J: the gradient at right angles to the axis is (x, y) times this."""
+        """z J: the component of the gradient at right angles to the axis is (x, y) times this."""
         return (self.z * self.share) * (self.share * self.radial)
 
     def second_derivatives(self) -> tuple[Real, Real, Real]:
-        """Omega_zz, Omega_rz/r and z J: the Hessian in the directions of axis, radius and circle.
+        """Omega_zz, Omega_rz/r and z J, the entries of the Hessian in the directions of axis,
+        radius and circle.
 
         Omega_rr is minus the sum of the first and the last.
         """
         r, z = self.r, self.z
         squares = dr.fma(r, r, dr.fma(z, z, 1))  # A
         j = self.share * self.share * self.radial
-        both = self.nearest * self.farthest
-        sums = 2 * self.third + squares * j / 3  # (Rm Rp)^2 C5/r
-        up, out = z / both, r / both
+        product = self.nearest * self.farthest
+        c5 = 2 * self.third + squares * j / 3  # (Rm Rp)^2 C5/r
+        up, out = z / product, r / product
         # I5 - r C5, with I5 = (I3 + 2 r C5)/A.
-        along = dr.fma(out * out * sums, 2 - squares, self.third) / squares
-        return -3 * z * along, dr.fma(-3 * up * up, sums, j), z * j
+        axial = dr.fma(out * out * c5, 2 - squares, self.third) / squares
+        return -3 * z * axial, dr.fma(-3 * up * up, c5, j), z * j
 
 
 @dataclass(frozen=True)
 class CircleSums:
-    """Sums over circles at x.
+    """Sums over circles at a point x.
 
-    angle, gradient: of the solid angle; each circle's is in (-2 pi, 2 pi).
-    distance: to the nearest circle.
-    squares, cubes, fourths: of the integrals of |dp|/D^k, k = 2, 3 and (a bound) 4, D the distance.
-    lower, upper: a range of the lift on the ball of the radius `distance`: see `planar`.
+    angle, gradient: the solid angle and its gradient; the angle of each circle is in (-2 pi, 2 pi).
+    distance: the distance to the nearest circle.
+    squares, cubes, fourths: the integrals of |dp|/D^k, k = 2 and 3, and a bound of that for k = 4,
+        with D the distance from x.
+    lower, upper: a range of the lift on the ball of radius `distance`: see `planar`.
     """
 
     angle: Real
@@ -173,8 +177,8 @@ class CircleSums:
 
 @dataclass(frozen=True)
 class _RelativeCircle:
-    """A circle of radius a relative to x: outward is the component of x - center in its plane, of
-    length r a, and x is z a above it."""
+    """A circle of radius a relative to x: outward is the component of x - center in the circle's
+    plane, of length r a, and x is z a above this plane."""
 
     a: Real
     normal: Vec3
@@ -202,32 +206,34 @@ class CircleSet:
     ) -> CircleSet:
         """Circles in unit coordinates: relative to a center, divided by a size."""
         rows = [
-            [*(np.array(one.center) - center) / size, one.radius / size, *one.normal, 0.0]
-            for one in circles
+            [*(np.array(circle.center) - center) / size, circle.radius / size, *circle.normal, 0.0]
+            for circle in circles
         ]
         return cls(RecordTable.upload(backend, np.array(rows)))
 
     def sums(self, x: Vec3) -> CircleSums:
-        """All sums at x in one loop."""
+        """All sums at x, in one loop."""
         real, vector = self._types
         x = vector(x)
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
             angle, gradient, distance, squares, cubes, fourths, lower = state
-            seen = self._relative(row, x)
-            circle, a = seen.circle, seen.a
+            relative = self._relative(row, x)
+            circle, a = relative.circle, relative.a
             # In units of the circle's radius, so that all numbers are of order one.
-            gradient = dr.fma(vector(circle.across / (a * a)), seen.outward, gradient)
-            gradient = dr.fma(vector(circle.axial / a), seen.normal, gradient)
+            gradient = dr.fma(vector(circle.across / (a * a)), relative.outward, gradient)
+            gradient = dr.fma(vector(circle.axial / a), relative.normal, gradient)
             near, far = circle.nearest, circle.farthest
             cube = circle.third / (a * a)
-            # The sign by height: far away the angle is all rounding.
-            above = dr.mulsign(real(1), circle.z) > 0
-            window = dr.select(circle.r < 1, dr.select(above, real(-4 * math.pi), 0), -2 * math.pi)
+            # The sign comes from the height: far away the angle consists of rounding only.
+            is_above = dr.mulsign(real(1), circle.z) > 0
+            window = dr.select(
+                circle.r < 1, dr.select(is_above, real(-4 * math.pi), 0), -2 * math.pi
+            )
             return (
                 angle + circle.angle,
                 gradient,
-                fmin(seen.distance, distance),
+                fmin(relative.distance, distance),
                 squares + 2 * math.pi / (near * far * a),
                 cubes + cube,
                 fourths + cube / (near * a),
@@ -247,19 +253,20 @@ class CircleSet:
         x = vector(x)
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            seen = self._relative(row, x)
-            a, n, e = seen.a, seen.normal, seen.outward
-            along, mixed, around = seen.circle.second_derivatives()
-            share = dr.rcp(a * a)
+            relative = self._relative(row, x)
+            a, n, e = relative.a, relative.normal, relative.outward
+            axial, mixed, tangential = relative.circle.second_derivatives()
+            scale = dr.rcp(a * a)
             length = dr.norm(e)
-            out = dr.select(length > 0, e / length, 0)
-            # f_tt (I - n n - out out) + f_rr out out + f_zz n n + f_rz (n out + out n)
+            radial = dr.select(length > 0, e / length, 0)
+            # With u = radial:
+            # f_tt (I - n n - u u) + f_rr u u + f_zz n n + f_rz (n u + u n).
             total = SymmetricMatrix(*state)
-            total = total.add_outer_product(n, ((along - around) * share) * n)
-            total = total.add_outer_product(out, ((-along - 2 * around) * share) * out)
-            total = total.add_outer_product(n, (2 * mixed * share / a) * e)
+            total = total.add_outer_product(n, ((axial - tangential) * scale) * n)
+            total = total.add_outer_product(radial, ((-axial - 2 * tangential) * scale) * radial)
+            total = total.add_outer_product(n, (2 * mixed * scale / a) * e)
             return (
-                *(one + around * share for one in total.components()[:3]),
+                *(entry + tangential * scale for entry in total.components()[:3]),
                 *total.components()[3:],
             )
 
@@ -269,53 +276,56 @@ class CircleSet:
     def line_rates(
         self, line: RayLine, lengths: tuple[Real, ...], active: Mask
     ) -> tuple[Real, ...]:
-        """For each length T, a bound of the derivative along the line up to T to both sides; inf
-        where a circle may be as near as that, and on lanes that are not active.
+        """For each length T, a bound of the derivative along the line up to T to both sides of x;
+        infinite where a circle may be within T, and on lanes that are not active.
 
         For a circle of radius a, of which the nearest point is at distance d and the farthest at P,
         Biot and Savart's integrals are bounded by
 
             |grad Omega| <= integral of |dp|/D^2 = 2 pi a/(P d)
 
-        (D^2 = A - 2r cos(phi) has this integral exactly; attained at the center), and
+        (D^2 = A - 2r cos(phi) has this integral exactly; the bound is attained at the center), and
 
             integral of |dp|/D^3 = 4 a E/(P d^2) <= 2 pi a B,   B = sqrt((1/d^2 + 1/P^2)/2)/(P d),
 
         as E <= (pi/2) sqrt((1 + kc^2)/2) by Jensen's inequality for the square root. Going a length
         t, both distances fall by at most t, and both bounds fall as the distances grow. Points at r
         from the axis are at least |r - a| from the circle, which is a better bound for a line that
-        passes by the circle than the distance of one of its points. At height z above the circle's
-        plane the gradient's component along the plane is at most |z| times the integral of
-        |dp|/D^3. So for a line with the component w along the normal the derivative is at most
-        |w| 2 pi a/(P d) + sqrt(1-w^2) |z| 2 pi a B, which is small where it runs along the plane.
+        passes by the circle than the distance of a single point of the line. At height z above the
+        circle's plane the component of the gradient along the plane is at most |z| times the
+        integral of |dp|/D^3. So for a line with the component w along the normal the derivative is
+        at most |w| 2 pi a/(P d) + sqrt(1-w^2) |z| 2 pi a B, which is small if the line runs along
+        the plane.
         """
         real, vector = self._types
 
         def add(row: list[Real], rates: tuple[Any, ...]) -> tuple[Any, ...]:
-            seen = self._relative(row, line.x)
-            slack, up = line.slack, fmin(dr.abs(dr.dot(seen.normal, line.v)), 1)
-            across = dr.sqrt(fmax(1 - up * up, 0))
-            # `up` is a sum of numbers of order one, whose rounding need not be small against it.
-            up += 4 * float(dr.epsilon(line.x))
-            height = dr.abs(seen.circle.z) * seen.a + slack
+            relative = self._relative(row, line.x)
+            slack, axial = line.slack, fmin(dr.abs(dr.dot(relative.normal, line.v)), 1)
+            across = dr.sqrt(fmax(1 - axial * axial, 0))
+            # `axial` is a sum of numbers of order one: rounding may be large relative to it.
+            axial += 4 * float(dr.epsilon(line.x))
+            height = dr.abs(relative.circle.z) * relative.a + slack
             # The line projected along the axis: at s its distance from the axis is
-            # |outward + s along|.
-            along = dr.fma(vector(-dr.dot(seen.normal, line.v)), seen.normal, line.v)
-            square = dr.squared_norm(along)
-            foot = dr.select(square > 0, -dr.dot(seen.outward, along) / square, 0)
-            grown: list[Real] = []
+            # |outward + s across_v|.
+            across_v = dr.fma(vector(-dr.dot(relative.normal, line.v)), relative.normal, line.v)
+            square = dr.squared_norm(across_v)
+            t = dr.select(square > 0, -dr.dot(relative.outward, across_v) / square, 0)
+            new_rates: list[Real] = []
             for length, rate in zip(lengths, rates, strict=True):
-                ends = (clamp(foot, -length, length), -length, length)
-                low, one, other = (dr.norm(dr.fma(vector(s), along, seen.outward)) for s in ends)
-                passing = fmax(low - seen.a, seen.a - fmax(one, other))
-                near = fmax(seen.distance - length, passing) - slack
-                far = fmax(seen.farthest - length, near + slack) - slack
-                slope = 2 * math.pi * seen.a / (near * far)
+                ends = (clamp(t, -length, length), -length, length)
+                lowest, first, second = (
+                    dr.norm(dr.fma(vector(s), across_v, relative.outward)) for s in ends
+                )
+                passing = fmax(lowest - relative.a, relative.a - fmax(first, second))
+                near = fmax(relative.distance - length, passing) - slack
+                far = fmax(relative.farthest - length, near + slack) - slack
+                bound = 2 * math.pi * relative.a / (near * far)
                 mean = dr.sqrt(0.5 * (dr.rcp(near * near) + dr.rcp(far * far)))
-                highest = dr.fma(length, up, height)
-                term = slope * dr.fma(across * highest, mean, up)
-                grown.append(rate + dr.select(near > 0, term, dr.inf))
-            return tuple(grown)
+                max_height = dr.fma(length, axial, height)
+                term = bound * dr.fma(across * max_height, mean, axial)
+                new_rates.append(rate + dr.select(near > 0, term, dr.inf))
+            return tuple(new_rates)
 
         start = tuple(real(0) for _ in lengths)
         rates = self.records.for_each(add, start, "circles along", active)
@@ -328,15 +338,16 @@ class CircleSet:
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
             best, nearest = state
-            seen = self._relative(row, x)
-            # From the axis all points are equally far: any direction in the plane will do.
-            length = dr.norm(seen.outward)
-            aside = dr.normalize(_across(vector, seen.normal))
-            out = dr.select(length > 0, seen.outward / length, aside)
-            foot = dr.fma(vector(seen.a), out, vector(*row[:3]))
-            square = dr.squared_norm(x - foot)
+            relative = self._relative(row, x)
+            # All points of the circle are equally far from the axis: any direction in the plane is
+            # right.
+            length = dr.norm(relative.outward)
+            perpendicular = dr.normalize(_across(vector, relative.normal))
+            radial = dr.select(length > 0, relative.outward / length, perpendicular)
+            point = dr.fma(vector(relative.a), radial, vector(*row[:3]))
+            square = dr.squared_norm(x - point)
             closer = square < nearest
-            return dr.select(closer, foot, best), dr.select(closer, square, nearest)
+            return dr.select(closer, point, best), dr.select(closer, square, nearest)
 
         return self.records.for_each(add, (vector(0), real(dr.inf)), "nearest circle")
 
@@ -347,15 +358,15 @@ class CircleSet:
     def _relative(self, row: list[Real], x: Vec3) -> _RelativeCircle:
         vector = self.records.backend.Array3f
         center, a, normal = vector(*row[:3]), row[3], vector(*row[4:7])
-        away = x - center
-        height = dr.dot(normal, away)
+        displacement = x - center
+        height = dr.dot(normal, displacement)
         # A second projection removes the error of the first, which the rounded normal has caused.
-        outward = dr.fma(vector(-height), normal, away)
+        outward = dr.fma(vector(-height), normal, displacement)
         outward = dr.fma(vector(-dr.dot(normal, outward)), normal, outward)
         return _RelativeCircle(a, normal, outward, UnitCircle.at(dr.norm(outward) / a, height / a))
 
 
 def _across(vector: Any, n: Vec3) -> Vec3:
-    """A vector at right angles to n, not short."""
-    flat = dr.abs(n.z) < 0.7
-    return dr.select(flat, vector(-n.y, n.x, 0), vector(0, -n.z, n.y))
+    """A vector at right angles to n whose length is not small."""
+    is_flat = dr.abs(n.z) < 0.7
+    return dr.select(is_flat, vector(-n.y, n.x, 0), vector(0, -n.z, n.y))

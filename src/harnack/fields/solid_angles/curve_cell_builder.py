@@ -38,12 +38,12 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
 
 _PERIOD = 4 * math.pi
-# Edges within this many radii of the cell's ball from its center are near: the first number for
-# leaves; the second for cells that are split, as their far edges count in all cells inside them.
+# Edges within this many radii of the cell's ball from its center are near: `_NEAR` for leaves;
+# `_SHARED` for cells that are split, as their far edges count in all cells inside them.
 _NEAR, _SHARED = 3.0, 4.5
-# Cells are split if they have more near edges than the first number times the cube root of the
-# number of all edges (but at least the second number), or if truncation exceeds about the third
-# number times the integral of |dp|/D^2, a bound of the gradient. Chosen by experiment.
+# Cells are split if they have more near edges than `_MAX_NEAR_FACTOR` times the cube root of the
+# number of all edges (but at least `_MIN_NEAR`), or if truncation exceeds about `_MAX_TAIL_RATIO`
+# times the integral of |dp|/D^2, a bound of the gradient. Chosen by experiment.
 _MAX_NEAR_FACTOR, _MIN_NEAR, _MAX_TAIL_RATIO = 2.0, 6.0, 1e-5
 # If memory is short, cells get twice as many near edges and four times the truncation, in at most
 # this many attempts.
@@ -51,7 +51,8 @@ _ATTEMPTS = 4
 # Corners and centers of all cells are multiples of this over 2^DEEPEST, in unit coordinates: single
 # precision holds them exactly.
 _GRID_STEP = 2.0**-8
-# Sums in single precision, as bounds; edges that are near up to this part count as far as well.
+# The relative margin of sums in single precision that serve as bounds; edges that are near by less
+# than this fraction count as far as well.
 _SLACK = 1e-3
 # The largest number of records of near edges, so that single precision holds their indices.
 _MOST_RECORDS = 2**24
@@ -70,26 +71,26 @@ def build_curve_cells(
 
     Proof. The cell of the cube begins with all loops as its near runs and an expansion of 0. Each
     cell keeps the near edges among the runs of its parent, closed again. The cycle of the remaining
-    edges (`edge_runs.subtract_runs`) is far from its ball and goes into the expansion. So in each
-    cell, near loops and expansion together have the solid angle of the curve, modulo 4 pi.
+    edges (`edge_runs.subtract_runs`) is far from the cell's ball and goes into the expansion. So in
+    each cell, near loops and expansion together have the solid angle of the curve, modulo 4 pi.
     """
     loops = tuple(loop.astype(backend.dtype).astype(np.float64) for loop in loops)
     middle = np.round(0.5 * (low + high) / _GRID_STEP) * _GRID_STEP
     half = float(np.maximum(high - middle, middle - low).max())
     half = (math.ceil(half / _GRID_STEP) + 1) * _GRID_STEP
     edges = LoopEdges.upload(backend, loops)
-    most_near, fine = (
+    max_near, max_tail = (
         max(_MIN_NEAR, _MAX_NEAR_FACTOR * sum(map(len, loops)) ** (1 / 3)),
         _MAX_TAIL_RATIO,
     )
-    most_near, fine = near * most_near, near * fine
+    max_near, max_tail = near * max_near, near * max_tail
     for _ in range(_ATTEMPTS):
-        octree = _CurveCellBuilder(
-            backend, VertexTable.of(loops), edges, middle, half, most_near, fine, shared
+        builder = _CurveCellBuilder(
+            backend, VertexTable.of(loops), edges, middle, half, max_near, max_tail, shared
         )
-        if octree.grow(most_bytes):
-            return octree.cells()
-        most_near, fine = 2 * most_near, 4 * fine
+        if builder.grow(most_bytes):
+            return builder.cells()
+        max_near, max_tail = 2 * max_near, 4 * max_tail
     return None
 
 
@@ -98,7 +99,9 @@ class _CurveCellBuilder:
     """Cells under construction.
 
     middle, half: center (3,) of the cube, and half of its side.
-    most_near, max_tail_ratio, parent_ratio: see `_MAX_NEAR_FACTOR` and `_SHARED`.
+    most_near, max_tail_ratio: limits of `_MAX_NEAR_FACTOR` and `_MAX_TAIL_RATIO` above which a cell
+        is split.
+    parent_ratio: as `_SHARED`, for cells that are split.
     nodes: the nodes of each level, for `OctreeLookup.from_levels`.
     tables, near: records of `CurveCells`.
     leaves: the number of cells that are not split.
@@ -152,50 +155,58 @@ class _CurveCellBuilder:
         *,
         is_last: bool,
     ) -> tuple[BoolArray, EdgeRuns, EdgeExpansions]:
-        """Which cells of a level are not split, and the runs and sums of all; records of the former
-        are made."""
+        """Build one level: the mask (n,) of the cells that are not split, and the near runs and the
+        expansions of all n cells. Records of the cells that are not split are appended to `tables`
+        and `near`.
+
+        runs, far: the near runs and the expansions that the cells inherit from their parents.
+        """
         double, n = choose_backend("double"), len(centers)
-        run, place = runs.edges()
+        run, vertex_ids = runs.edges()
         cell = runs.cell[run]
-        distance = _distances(self.vertices, centers, cell, place, double)
+        distance = _distances(self.vertices, centers, cell, vertex_ids, double)
         count = np.bincount(cell, distance <= _NEAR * radius, n)
-        around = _FarBounds.of(self.edges, centers, radius)
+        far_bounds = _FarBounds.of(self.edges, centers, radius)
         is_leaf = (count <= self.most_near) & (
-            around.tail <= self.max_tail_ratio * around.total
+            far_bounds.tail <= self.max_tail_ratio * far_bounds.total
         ) | is_last
-        inner = np.where(is_leaf, _NEAR, self.parent_ratio) * radius
-        chosen, kept = runs.restrict_to_near(run, distance <= inner[cell])
-        chosen = chosen.with_apexes(self.vertices, centers, inner, np.dtype(self.backend.dtype))
-        left = subtract_runs(runs, (run, place), kept, chosen, len(self.vertices.points))
-        points = np.concatenate([self.vertices.points, runs.apex, chosen.apex])
+        near_radius = np.where(is_leaf, _NEAR, self.parent_ratio) * radius
+        near_runs, is_kept = runs.restrict_to_near(run, distance <= near_radius[cell])
+        near_runs = near_runs.with_apexes(
+            self.vertices, centers, near_radius, np.dtype(self.backend.dtype)
+        )
+        remaining = subtract_runs(
+            runs, (run, vertex_ids), is_kept, near_runs, len(self.vertices.points)
+        )
+        points = np.concatenate([self.vertices.points, runs.apex, near_runs.apex])
         rows = RecordTable.upload(double, np.column_stack([points, np.zeros((len(points), 5))]))
         far = far.plus(
             EdgeExpansions.of(
-                rows, left, to_vector3(double, centers), dr.opaque(double.Float, radius), n
+                rows, remaining, to_vector3(double, centers), dr.opaque(double.Float, radius), n
             )
         )
         if is_leaf.any():
-            table, first, packets = near_records(self.vertices, chosen, is_leaf)
+            table, first, packets = near_records(self.vertices, near_runs, is_leaf)
             self.near.append(table)
-            factor = _rounding_factor(self.vertices, chosen, centers, radius)[is_leaf]
-            given = far.subset(is_leaf), around.subset(is_leaf), factor
-            where = self.near_record_count + first, packets
-            own = _cell_records(self.backend, centers[is_leaf], radius, *given, *where)
-            self.tables.append(own)
+            factor = _rounding_factor(self.vertices, near_runs, centers, radius)[is_leaf]
+            bounds = far.subset(is_leaf), far_bounds.subset(is_leaf), factor
+            near_range = self.near_record_count + first, packets
+            records = _cell_records(self.backend, centers[is_leaf], radius, *bounds, *near_range)
+            self.tables.append(records)
             self.leaves, self.near_record_count = (
-                self.leaves + len(own),
+                self.leaves + len(records),
                 self.near_record_count + len(table),
             )
-        return is_leaf, chosen, far
+        return is_leaf, near_runs, far
 
     @property
     def size(self) -> int:
-        """Bytes of records, near edges, nodes, and the grid on top."""
-        number = np.dtype(self.backend.dtype).itemsize
+        """The number of bytes of records, near edges, nodes, and the grid of the lookup."""
+        number_size = np.dtype(self.backend.dtype).itemsize
         record = 8 * -(-(HEADER_SIZE + COEFFICIENTS) // 8)
-        lookup = OctreeLookup.memory_bytes(sum(len(one) for one in self.nodes))
+        lookup = OctreeLookup.memory_bytes(sum(len(level) for level in self.nodes))
         return (
-            number * (record * self.leaves + 4 * VERTICES_PER_RECORD * self.near_record_count)
+            number_size * (record * self.leaves + 4 * VERTICES_PER_RECORD * self.near_record_count)
             + lookup
         )
 
@@ -216,8 +227,8 @@ class _FarBounds:
     """Sums over edges at n centers, with distances D from these.
 
     least, cubes, slope: see `CurveCells.records`.
-    tail: about what a polynomial leaves out of the value. total: an upper bound of the integral of
-        |dp|/D^2 over all edges.
+    tail: an estimate of the truncation error of the value.
+    total: an upper bound of the integral of |dp|/D^2 over all edges.
     """
 
     least: FloatArray
@@ -237,44 +248,45 @@ class _FarBounds:
             least, cubes, slope, tail, total = state
             edge = Edge.between(p, q, inverse, c)
             square, length = edge.squared_distance, dr.rsqrt(inverse)
-            share, near = edge.biot_savart()[0] * length, dr.rsqrt(square)
-            is_far, ratio = square > inner * inner, rho * near
-            left_out = share * square
+            weight, inverse_distance = edge.biot_savart()[0] * length, dr.rsqrt(square)
+            is_far, ratio = square > inner * inner, rho * inverse_distance
+            remainder = weight * square
             for _ in range(DEGREE + 1):
-                left_out = left_out * ratio
-            rate = dr.fma(type(slope)(length), edge.hessian_factors()[1], slope)
+                remainder = remainder * ratio
+            new_slope = dr.fma(type(slope)(length), edge.hessian_factors()[1], slope)
             return (
                 dr.select(is_far, fmin(least, square), least),
-                cubes + dr.select(is_far, share, 0),
-                dr.select(is_far, rate, slope),
-                tail + dr.select(is_far, left_out, 0),
-                dr.fma(2 * share, square * near, total),
+                cubes + dr.select(is_far, weight, 0),
+                dr.select(is_far, new_slope, slope),
+                tail + dr.select(is_far, remainder, 0),
+                dr.fma(2 * weight, square * inverse_distance, total),
             )
 
         zero = backend.Float(0)
         start = (backend.Float(1e6), zero, backend.Array3f(0), zero, zero)
-        found = edges.for_each(add, start, "around cells")
-        dr.eval(*found)
-        numbers = (to_numpy(one).astype(np.float64) for one in found)
-        least, cubes, slope, tail, total = numbers
+        sums = edges.for_each(add, start, "around cells")
+        dr.eval(*sums)
+        columns = (to_numpy(column).astype(np.float64) for column in sums)
+        least, cubes, slope, tail, total = columns
         return cls(np.sqrt(least) * (1 - _SLACK), cubes * (1 + _SLACK), slope, tail, total)
 
     def subset(self, which: BoolArray) -> _FarBounds:
-        """Those chosen by a mask."""
-        return _FarBounds(*(one[which] for one in vars(self).values()))
+        """The sums at the centers that a mask selects."""
+        return _FarBounds(*(values[which] for values in vars(self).values()))
 
 
 def _distances(
-    vertices: VertexTable, centers: FloatArray, cell: IntArray, place: IntArray, backend: Backend
+    vertices: VertexTable, centers: FloatArray, cell: IntArray, first: IntArray, backend: Backend
 ) -> FloatArray:
-    """(k,) distances of the edges that begin at places of the table from the centers of cells."""
+    """(k,) distances of edges from the centers of cells: edge i begins at row `first[i]` of the
+    table of vertices and belongs to the cell of index `cell[i]`."""
     if not len(cell):
         return np.zeros(0)
     vector = backend.Array3f
     points, middles = to_vector3(backend, vertices.points), to_vector3(backend, centers)
-    at = upload_integers(backend, place)
+    start = upload_integers(backend, first)
     c = dr.gather(vector, middles, upload_integers(backend, cell))
-    p, q = dr.gather(vector, points, at), dr.gather(vector, points, at + 1)
+    p, q = dr.gather(vector, points, start), dr.gather(vector, points, start + 1)
     inverse = dr.rcp(fmax(dr.squared_norm(q - p), backend.Float(1e-30)))
     return to_numpy(dr.sqrt(squared_distance_to_segment(p - c, q - p, inverse)))
 
@@ -282,31 +294,31 @@ def _distances(
 def near_records(
     vertices: VertexTable, runs: EdgeRuns, is_leaf: BoolArray
 ) -> tuple[FloatArray, IntArray, IntArray]:
-    """Records of near edges (`CurveCells.near`) of cells that are not split; and of each of these
-    the first record and the number of records."""
-    rows = np.flatnonzero(is_leaf[runs.cell])
-    first, count, is_open = runs.first[rows], runs.count[rows], ~runs.is_whole[rows]
-    owner = (np.cumsum(is_leaf) - 1)[runs.cell[rows]]
+    """The records of near edges (`CurveCells.near`) of the cells that are not split; and for each
+    of these cells the index of its first record and the number of its records."""
+    run_ids = np.flatnonzero(is_leaf[runs.cell])
+    first, count, is_open = runs.first[run_ids], runs.count[run_ids], ~runs.is_whole[run_ids]
+    owner = (np.cumsum(is_leaf) - 1)[runs.cell[run_ids]]
     length = count + np.where(is_open, 3, 1)
     total = np.bincount(owner, length, int(is_leaf.sum())).astype(np.int64)
     packets = -(-total // VERTICES_PER_RECORD)
     start = np.cumsum(packets) - packets
-    # The places of runs one after the other, and how much of that lies in cells before.
+    # The position of each run's first vertex among the vertices of its own cell; then in the table.
     position = np.cumsum(length) - length - (np.cumsum(total) - total)[owner]
     position += start[owner] * VERTICES_PER_RECORD
     table = np.zeros((int(packets.sum()) * VERTICES_PER_RECORD, 4))
-    run = np.repeat(np.arange(len(rows)), count + 1)
+    run = np.repeat(np.arange(len(run_ids)), count + 1)
     k = np.arange(len(run)) - (np.cumsum(count + 1) - count - 1)[run]
-    place, source = position[run] + k, first[run] + k
-    table[place, :3] = vertices.points[source]
-    later = k > 0
-    edge = vertices.points[source[later]] - vertices.points[source[later] - 1]
-    table[place[later], 3] = inverse_squares(edge)
+    slot, source = position[run] + k, first[run] + k
+    table[slot, :3] = vertices.points[source]
+    is_later = k > 0
+    edge = vertices.points[source[is_later]] - vertices.points[source[is_later] - 1]
+    table[slot[is_later], 3] = inverse_squares(edge)
     last = (position + count)[is_open]
-    apex, begin = runs.apex[rows[is_open]], vertices.points[first[is_open]]
-    table[last + 1, :3], table[last + 2, :3] = apex, begin
+    apex, start_point = runs.apex[run_ids[is_open]], vertices.points[first[is_open]]
+    table[last + 1, :3], table[last + 2, :3] = apex, start_point
     table[last + 1, 3] = -inverse_squares(apex - table[last, :3])
-    table[last + 2, 3] = -inverse_squares(apex - begin)
+    table[last + 2, 3] = -inverse_squares(apex - start_point)
     return table.reshape(-1, 4 * VERTICES_PER_RECORD), start, packets
 
 
@@ -315,37 +327,37 @@ def _rounding_factor(
 ) -> FloatArray:
     """(n,) factors with which `edges.vertex_rounding` holds for the near loops of n cells.
 
-    It assumes edges of half length h <= 1 and vertices no farther than 1 + |x| from x. In h and in
-    that distance it is linear, so that a factor of at least 1, h, and the distance of apexes, which
-    alone may be outside of the unit ball, does for others.
+    `edges.vertex_rounding` assumes edges of half length h <= 1 and vertices at most 1 + |x| from x.
+    It is linear in h and in that distance. So a factor that is at least 1, h, and the distance of
+    the apexes, the only vertices that may be outside of the unit ball, covers all other loops.
     """
-    out = np.ones(len(centers))
-    rows = np.flatnonzero(~runs.is_whole)
-    apex, cell, first = runs.apex[rows], runs.cell[rows], runs.first[rows]
-    ends = vertices.points[first], vertices.points[first + runs.count[rows]]
+    factors = np.ones(len(centers))
+    run_ids = np.flatnonzero(~runs.is_whole)
+    apex, cell, first = runs.apex[run_ids], runs.cell[run_ids], runs.first[run_ids]
+    ends = vertices.points[first], vertices.points[first + runs.count[run_ids]]
     for end in ends:
-        np.maximum.at(out, cell, 0.51 * np.linalg.norm(apex - end, axis=1))
-    np.maximum.at(out, cell, 1.01 * (np.linalg.norm(apex - centers[cell], axis=1) + radius))
-    return out
+        np.maximum.at(factors, cell, 0.51 * np.linalg.norm(apex - end, axis=1))
+    np.maximum.at(factors, cell, 1.01 * (np.linalg.norm(apex - centers[cell], axis=1) + radius))
+    return factors
 
 
 def _cell_records(
-    backend: Backend, centers: FloatArray, radius: float, far: EdgeExpansions, around: _FarBounds,
+    backend: Backend, centers: FloatArray, radius: float, far: EdgeExpansions, bounds: _FarBounds,
     factor: FloatArray, first: IntArray, count: IntArray,
 ) -> FloatArray:  # fmt: skip
     """Records of cells (`CurveCells.records`).
 
-    Rounding of the value: that of the polynomial without its constant (`rounding_tables`), that of
-    the angle of the near loops (`LoopEdges.rounding`), and that of the constant, at most 2 pi, and
-    of two sums, at most 6 pi and the polynomial each: 32 epsilon and what the tables count for it.
-    That of the gradient, over the radius, counts as left out.
+    The rounding of the value has three parts: the polynomial without its constant
+    (`rounding_tables`); the angle of the near loops (`LoopEdges.rounding`); and the constant, at
+    most 2 pi, with two sums, at most 6 pi and the polynomial each: 32 epsilon and the share of the
+    tables for it. The rounding of the gradient, over the radius, counts as truncation.
     """
     tables = rounding_tables(DEGREE, BALL_MARGIN / math.sqrt(3))
-    coefficients, up = far.coefficients.copy(), 1 + _SLACK
+    coefficients, margin = far.coefficients.copy(), 1 + _SLACK
     coefficients[:, 0] -= _PERIOD * np.round(coefficients[:, 0] / _PERIOD)
     rounding = backend.machine_epsilon * np.abs(coefficients[:, 1:]) @ tables[1:]
     value = rounding[:, 0] + backend.machine_epsilon * (48 + 7.25 * VERTICES_PER_RECORD * count)
     slope = far.slope + rounding[:, 1:].sum(axis=1) / radius
-    inverse, least = np.full(len(first), 1 / radius), np.minimum(around.least, 1e3)
-    bounds = [far.error * up, slope * up, value * up, least, factor, around.cubes]
-    return np.column_stack([centers, inverse, *bounds, around.slope, first, count, coefficients])
+    inverse, least = np.full(len(first), 1 / radius), np.minimum(bounds.least, 1e3)
+    columns = [far.error * margin, slope * margin, value * margin, least, factor, bounds.cubes]
+    return np.column_stack([centers, inverse, *columns, bounds.slope, first, count, coefficients])

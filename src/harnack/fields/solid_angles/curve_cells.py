@@ -1,5 +1,5 @@
-"""FMM cells of curves: in each cell, the solid angle of a curve is the sum over a few near edges
-and a local expansion, a harmonic polynomial, of all other edges.
+"""FMM cells of curves: in each cell, the solid angle of a curve is the direct sum over a short list
+of near edges plus a local expansion, a harmonic polynomial, of all other edges.
 
 The cells are the leaves of an octree over a cube around the curve. The near edges of a cell are the
 edges within three radii of its ball from its center. So the cost of a sample depends on the near
@@ -13,8 +13,8 @@ by edge and no fit aliases. A cell adds, to the expansion of its parent, the edg
 the parent and are far from its own ball. Closing edges count in values and not in promises, which
 are about the curve.
 
-Accuracy scale 1 is that of the cells; above it all edges are summed. Cells are so small that fewer
-than one sample in a hundred needs that sum, because a lane that sums over all edges delays its
+The cells have accuracy scale 1; for a higher accuracy all edges are summed. Cells are so small that
+fewer than 1 % of all samples need that sum, because a lane that sums over all edges delays its
 packet. Extents of curves with cells have few planes: with 1,024 vertices, clipping at the hull took
 three times as long as the march.
 """
@@ -47,9 +47,9 @@ if TYPE_CHECKING:
 
 # Numbers of a record before the coefficients, and vertices in a record of near edges.
 HEADER_SIZE, VERTICES_PER_RECORD = 15, 2
-# Areas of so many roundings do not tell on which side of a line an edge passes.
+# Areas below this many roundings do not tell on which side of a line an edge passes.
 _SIDE_ROUNDINGS = 64.0
-# Lengths up to this part of the distance to far edges are used along lines.
+# Rates along lines are bounded for lengths up to this fraction of the distance to far edges.
 _LINE_FRACTION = 0.5
 
 
@@ -86,15 +86,17 @@ class CurveCellSums:
 class CurveCells:
     """Cells on a backend.
 
-    lookup: of cells, which are its leaves.
-    records: center and one over the radius; bounds of what the polynomial leaves out of value and
-        gradient, and of the rounding of the value; of the edges that are not near a lower bound
-        of the distance from the center; the factor of `EdgeSums.squares`; of the same edges an
-        upper bound of the integral of |dp|/D^3, D the distance from the center, and its gradient;
-        first record and number of records of near edges | coefficients.
-    near: records of two vertices each: place, and for the edge that leads there one over the square
-        of its length, negative for edges that close a run, 0 where there is no edge.
-    count, size: the number of cells, and their bytes.
+    lookup: the octree whose leaves are the cells.
+    records: one record per cell: center (3,) and one over the radius; bounds of the truncation
+        errors of value and gradient, and of the rounding of the value; a lower bound of the
+        distance of the far edges from the center; the factor of `EdgeSums.squares`; an upper bound
+        of the integral of |dp|/D^3 over the far edges, D the distance from the center, and its
+        gradient (3,); index of the first record of near edges, and the number of these records |
+        coefficients.
+    near: records of two vertices each: for each vertex its position (3,) and, for the edge that
+        leads to it, one over its squared length, negative for edges that close a run, 0 where there
+        is no edge.
+    count, size: the number of cells, and the number of their bytes.
     """
 
     backend: Backend
@@ -105,13 +107,13 @@ class CurveCells:
     size: int
 
     def centers(self) -> FloatArray:
-        """(count, 3), which the backend's numbers hold exactly."""
+        """The centers (count, 3) of the cells, which numbers of the backend hold exactly."""
         row = self.records.read_record(dr.arange(self.backend.UInt32, self.count))
         return to_numpy(self.backend.Array3f(*row[:3])).astype(np.float64)
 
     def sums(self, x: Vec3, active: Mask) -> tuple[CurveCellSums, Mask]:
-        """The sums over all edges at x, and the mask of points for which they hold: those that are
-        active and lie in the cube.
+        """The sums over all edges at x, and the mask of the lanes on which they hold: the active
+        lanes whose point lies in the cube.
 
         Proof of the bound of I3, the integral of |dp|/D^3, of far edges at a point u from the
         center, by I3 and its gradient there. With s the cosine of the angle between u and p - c and
@@ -124,129 +126,145 @@ class CurveCells:
         most its gradient times that; for near edges `edges.vertex_rounding` counts it.
         """
         vector, index = self.backend.Array3f, self.backend.UInt32
-        number, inside = self.lookup.find_leaf(x)
+        cell, inside = self.lookup.find_leaf(x)
         active = active & inside
-        row = self.records.read_record(number, active)
+        row = self.records.read_record(cell, active)
         inverse, error, slope_error, rounding, least, factor, cubes = row[3:10]
         center = vector(*row[:3])
         u = x - center
-        constant, *others = row[HEADER_SIZE : HEADER_SIZE + COEFFICIENTS]
-        polynomial = [self.backend.Float(0), *others]
+        constant, *rest = row[HEADER_SIZE : HEADER_SIZE + COEFFICIENTS]
+        polynomial = [self.backend.Float(0), *rest]
         value, *slopes = evaluate_expansion(polynomial, [*(u * inverse)], DEGREE)
-        rest = inverse * vector(*slopes)
-        steep = dr.norm(rest) + slope_error
-        rounding = dr.fma(2.25 * self.backend.machine_epsilon * (1 + dr.norm(x)), steep, rounding)
+        slope = inverse * vector(*slopes)
+        bound = dr.norm(slope) + slope_error
+        rounding = dr.fma(2.25 * self.backend.machine_epsilon * (1 + dr.norm(x)), bound, rounding)
         first, count = index(row[13]), dr.select(active, index(row[14]), 0)
         near = self._sum_near(x, first, count)
-        away = dr.norm(u) * (1 + SUM_MARGIN)
-        q, free = away / least, least - away
-        share = least / free
-        psi = dr.fma(q, dr.fma(3, q, -8), 6) * share * share * share
-        far = dr.fma(cubes, dr.fma(dr.square(q), psi, 1), dr.dot(u, vector(*row[10:13])))
+        distance = dr.norm(u) * (1 + SUM_MARGIN)
+        q, free = distance / least, least - distance
+        ratio = least / free
+        psi = dr.fma(q, dr.fma(3, q, -8), 6) * ratio * ratio * ratio
+        far_i3 = dr.fma(cubes, dr.fma(dr.square(q), psi, 1), dr.dot(u, vector(*row[10:13])))
         sums = EdgeSums(
             near.angle + (constant + value),
-            near.gradient + rest,
+            near.gradient + slope,
             fmin(near.distance, free),
             near.squares * factor,
-            near.cubes + far,
-            near.fourths + far / free,
+            near.cubes + far_i3,
+            near.fourths + far_i3 / free,
         )
-        parts = error, slope_error, rounding, rest, far, free, first, count, number, center, value
-        return CurveCellSums(sums, *parts), active
+        details = (
+            error,
+            slope_error,
+            rounding,
+            slope,
+            far_i3,
+            free,
+            first,
+            count,
+            cell,
+            center,
+            value,
+        )
+        return CurveCellSums(sums, *details), active
 
     def change_from_center(
         self, found: CurveCellSums, frame: RayFrame, x: Vec3, unit: Real, active: Mask
     ) -> tuple[Real, Mask]:
         """The change of the solid angle from the cell's center to x, followed continuously along
-        the line, and the lanes on which the change is certain.
+        the line, and the mask of the lanes on which the change is certain.
 
+        found: the sums at x.
         frame: of the rays from the center to x.
         unit: the rounding of a coordinate.
 
-        Proof. What the far edges add is the polynomial in all of the ball. The near loops are
-        closed, so that the lifted sum of their edges (`edge_lift`) is their solid angle; it has no
-        jumps on the line, as long as this does not meet an edge. Where rounding leaves it open on
-        which side an edge passes, nothing is known: a coordinate across is off by a few units of
-        the ends' distances, at most eight, and both parts of a factor by that times the ends'
-        coordinates; only factors near the negative axis leave open which way they turn.
+        Proof. The far edges add the polynomial in all of the ball. The near loops are closed, so
+        that the lifted sum of their edges (`edge_lift`) is their solid angle; it has no jumps on
+        the line, as long as the line meets no edge. Where rounding leaves it open on which side an
+        edge passes, the change is not certain: a coordinate across the line is off by a few units
+        of the distances of the edge's ends, at most eight, and both parts of a factor by that times
+        the coordinates of the ends; only for factors near the negative axis is it open which way
+        they turn.
         """
         real, vector, index = self.backend.Float, self.backend.Array3f, self.backend.UInt32
         count, center = dr.select(active, found.count, 0), found.center
 
-        def more(i: Any, *_: Any) -> Mask:
+        def runs(i: Any, *_: Any) -> Mask:
             return i < count
 
-        def body(i: Any, p: Vec3, sure: Mask, *products: Real) -> tuple[Any, ...]:
+        def body(i: Any, p: Vec3, is_certain: Mask, *products: Real) -> tuple[Any, ...]:
             row = self.near.read_record(found.near_first + i, i < count)
-            there, here = LiftedProduct(*products[:3]), LiftedProduct(*products[3:])
-            a, a_here = view_vertex(p, frame, x), view_vertex(p, frame, center)
+            at_x, at_center = LiftedProduct(*products[:3]), LiftedProduct(*products[3:])
+            a, a_center = view_vertex(p, frame, x), view_vertex(p, frame, center)
             for k in range(VERTICES_PER_RECORD):
                 q, inverse = vector(*row[4 * k : 4 * k + 3]), row[4 * k + 3]
-                b, b_here = view_vertex(q, frame, x), view_vertex(q, frame, center)
-                size = dr.abs(b.u) + dr.abs(b.v)
-                sure &= size > _SIDE_ROUNDINGS * unit  # off the vertex
-                slack = _SIDE_ROUNDINGS * unit * (size + dr.abs(a.u) + dr.abs(a.v))
-                there, is_sure = _with_edge(there, a, b, inverse != 0, slack)
-                here, is_sure_here = _with_edge(here, a_here, b_here, inverse != 0, slack)
-                sure &= is_sure & is_sure_here
-                a, a_here, p = b, b_here, q
-            return i + 1, p, sure, *there.parts(), *here.parts()
+                b, b_center = view_vertex(q, frame, x), view_vertex(q, frame, center)
+                offset = dr.abs(b.u) + dr.abs(b.v)
+                is_certain &= offset > _SIDE_ROUNDINGS * unit  # off the vertex
+                slack = _SIDE_ROUNDINGS * unit * (offset + dr.abs(a.u) + dr.abs(a.v))
+                at_x, sure_x = _with_edge(at_x, a, b, inverse != 0, slack)
+                at_center, sure_center = _with_edge(
+                    at_center, a_center, b_center, inverse != 0, slack
+                )
+                is_certain &= sure_x & sure_center
+                a, a_center, p = b, b_center, q
+            return i + 1, p, is_certain, *at_x.parts(), *at_center.parts()
 
-        one = LiftedProduct.identity(real).parts()
-        start = index(0), vector(0), self.backend.Bool(active), *one, *one
-        _, _, sure, *products = dr.while_loop(start, more, body, label="from the center")
-        there, here = LiftedProduct(*products[:3]), LiftedProduct(*products[3:])
-        return there.angle() - here.angle() + found.expansion_change, sure
+        identity = LiftedProduct.identity(real).parts()
+        start = index(0), vector(0), self.backend.Bool(active), *identity, *identity
+        _, _, is_certain, *products = dr.while_loop(start, runs, body, label="from the center")
+        at_x, at_center = LiftedProduct(*products[:3]), LiftedProduct(*products[3:])
+        return at_x.angle() - at_center.angle() + found.expansion_change, is_certain
 
     def rates_along(
         self, found: CurveCellSums, line: RayLine, lengths: tuple[Real, ...], active: Mask
     ) -> tuple[Real, ...]:
-        """As `trail_sums.line_rates`, at the points of these sums.
+        """As `trail_sums.line_rates`, at the points of the sums `found`.
 
-        Proof. f changes along a line by the sum of what the fields of all edges add up to along it.
-        For near edges that is bounded by `add_edge_rates`. The field H of all others at x is the
-        gradient of the polynomial, up to `slope_error`, with the fields of closing edges, which are
-        in the near loops. Along v it adds to f at x + sv at most |s||H . v| + s^2/2 K for |s| <= r,
-        with r half the distance d of far edges, and K the constant of
+        Proof. f changes along a line by the sum of the changes that the fields of all edges cause
+        along it. For near edges `add_edge_rates` bounds these. The field H of all other edges at x
+        is the gradient of the polynomial, up to `slope_error`, with the fields of closing edges,
+        which are in the near loops. Along v it adds to f at x + sv at most |s||H . v| + s^2/2 K for
+        |s| <= r, with r half the distance d of far edges, and K the constant of
         `curve_queries.remainder_promises` for q = 1/2, which is 3/2 (I3 + d I4), at most 3 I3.
         """
         vector, x = self.backend.Array3f, line.x
         count = dr.select(active, found.count, 0)
 
-        def more(i: Any, *_: Any) -> Mask:
+        def runs(i: Any, *_: Any) -> Mask:
             return i < count
 
-        def body(i: Any, p: Vec3, rest: Vec3, *rates: Real) -> tuple[Any, ...]:
+        def body(i: Any, p: Vec3, field: Vec3, *rates: Real) -> tuple[Any, ...]:
             row = self.near.read_record(found.near_first + i, i < count)
             for k in range(VERTICES_PER_RECORD):
                 q, inverse = vector(*row[4 * k : 4 * k + 3]), row[4 * k + 3]
                 edge = Edge.between(p, q, dr.select(inverse > 0, inverse, 1), x)
-                grown = add_edge_rates(line, edge, lengths, rates)
-                pairs = zip(grown, rates, strict=True)
+                new_rates = add_edge_rates(line, edge, lengths, rates)
+                pairs = zip(new_rates, rates, strict=True)
                 rates = tuple(dr.select(inverse > 0, new, old) for new, old in pairs)
                 w, c = edge.biot_savart()
-                rest = rest + dr.select(inverse < 0, w * c, 0)
+                field = field + dr.select(inverse < 0, w * c, 0)
                 p = q
-            return i + 1, p, rest, *rates
+            return i + 1, p, field, *rates
 
         start = (self.backend.UInt32(0), vector(0), found.expansion_gradient)
         start = (*start, *(self.backend.Float(0) for _ in lengths))
-        _, _, rest, *rates = dr.while_loop(start, more, body, label="near edges along")
-        slope = dr.abs(dr.dot(rest, line.v)) + found.slope_error
+        _, _, field, *rates = dr.while_loop(start, runs, body, label="near edges along")
+        slope = dr.abs(dr.dot(field, line.v)) + found.slope_error
         slope = slope + SUM_MARGIN * found.sums.squares
-        bend = (1 + SUM_MARGIN) * 1.5 * found.far_i3  # K/2
+        half_k = (1 + SUM_MARGIN) * 1.5 * found.far_i3  # K/2
         reach = _LINE_FRACTION * found.far_distance
         return tuple(
-            dr.select(active & (length <= reach), rate + dr.fma(length, bend, slope), dr.inf)
+            dr.select(active & (length <= reach), rate + dr.fma(length, half_k, slope), dr.inf)
             for rate, length in zip(rates, lengths, strict=True)
         )
 
     def _sum_near(self, x: Vec3, first: Any, count: Any) -> EdgeSums:
-        """As `sum_over_edges`, over the near loops. Edges that close runs do not count for the
-        distance, for cubes and for fourths, which are of the curve."""
+        """As `sum_over_edges`, over the near loops. Edges that close runs do not count in the
+        distance, in cubes and in fourths, which are about the curve."""
         real, index, vector = self.backend.Float, self.backend.UInt32, self.backend.Array3f
 
-        def more(i: Any, *_: Any) -> Mask:
+        def runs(i: Any, *_: Any) -> Mask:
             return i < count
 
         def body(i: Any, *state: Any) -> tuple[Any, ...]:
@@ -257,29 +275,29 @@ class CurveCells:
                 b = q - x
                 lb, sb, cb = spinor(b)
                 re, im = inner_product((ca[0], ca[1], ca[2], ca[3]), cb)
-                e, is_edge, counts = q - p, inverse != 0, inverse > 0
+                e, is_edge, on_curve = q - p, inverse != 0, inverse > 0
                 weight = (la + lb) * (sa * sb) / (la * lb * dr.fma(re, re, im * im))
                 weight = dr.select(is_edge, weight, 0)
                 re, im = dr.select(is_edge, re, 1), dr.select(is_edge, im, 0)
                 zr, zi = dr.fma(zr, re, -(zi * im)), dr.fma(zr, im, zi * re)
                 g = dr.fma(vector(weight), dr.cross(a, e), g)
-                size = dr.select(is_edge, dr.abs(inverse), 1)
-                square = squared_distance_to_segment(a, e, size)
-                share, near = weight * dr.rsqrt(size), dr.rsqrt(square)
-                squares = squares + dr.select(is_edge, share * square * near, 0)
-                d2 = dr.select(counts, fmin(square, d2), d2)
-                cubes = cubes + dr.select(counts, share, 0)
-                fourths = fourths + dr.select(counts, share * near, 0)
+                inverse_square = dr.select(is_edge, dr.abs(inverse), 1)
+                square = squared_distance_to_segment(a, e, inverse_square)
+                term, inverse_d = weight * dr.rsqrt(inverse_square), dr.rsqrt(square)
+                squares = squares + dr.select(is_edge, term * square * inverse_d, 0)
+                d2 = dr.select(on_curve, fmin(square, d2), d2)
+                cubes = cubes + dr.select(on_curve, term, 0)
+                fourths = fourths + dr.select(on_curve, term * inverse_d, 0)
                 p, a, la, sa, ca = q, b, lb, sb, cb
             scale = dr.rcp(dr.abs(zr) + dr.abs(zi))
             zr, zi = zr * scale, zi * scale
             return i + 1, zr, zi, g, d2, squares, cubes, fourths, p, a, la, sa, *ca
 
-        one, zero = real(1), real(0)
-        start = (one, zero, vector(0), real(dr.inf), zero, zero, zero, vector(0), vector(1), one,
-                 one, one, zero, zero, zero)  # fmt: skip
-        found = dr.while_loop((index(0), *start), more, body, label="near edges")[1:8]
-        zr, zi, g, d2, squares, cubes, fourths = found
+        unit, zero = real(1), real(0)
+        start = (unit, zero, vector(0), real(dr.inf), zero, zero, zero, vector(0), vector(1), unit,
+                 unit, unit, zero, zero, zero)  # fmt: skip
+        sums = dr.while_loop((index(0), *start), runs, body, label="near edges")[1:8]
+        zr, zi, g, d2, squares, cubes, fourths = sums
         angle = 2 * dr.atan2(zi, zr)
         return EdgeSums(angle, 2 * g, dr.sqrt(d2), 4 * squares, 2 * cubes, 2 * fourths)
 
@@ -287,8 +305,8 @@ class CurveCells:
 def _with_edge(
     product: LiftedProduct, a: VertexView, b: VertexView, is_edge: Mask, slack: Real
 ) -> tuple[LiftedProduct, Mask]:
-    """The product with the factor of an edge, if it is one, and where that is not within the slack
-    of the negative axis."""
+    """The product, times the factor of the edge from a to b where `is_edge` is true; and the mask
+    of the lanes on which that factor is not within the slack of the negative axis."""
     re, im = ends_factor(a, b, type(slack)(1))
     is_sure = ~is_edge | (dr.abs(im) > slack) | (re > slack)
     return product.times(dr.select(is_edge, re, 1), dr.select(is_edge, im, 0)), is_sure

@@ -1,9 +1,10 @@
-"""Points with noise made ready for a smoothed sum of dipoles: moved onto the surface, with normals
-where there are none, and the length over which to smooth.
+"""Noisy points prepared for a smoothed sum of dipoles: the points moved onto the surface, estimated
+normals where the cloud has none, and the smoothing length.
 
-Estimated normals are turned by the sum itself (Lin et al. 2024): where most of them are right, the
-sum of all, smoothed over several points, falls across the surface in the right direction at the
-others too, such as those of a thin ear whose two sides were told apart wrongly.
+The sum itself corrects the signs of estimated normals (Lin et al. 2024): where most of the normals
+are right, the sum of all dipoles, smoothed over several points, falls across the surface in the
+right direction at the other points, too, such as the points of a thin ear whose two sides were
+confused.
 """
 
 from __future__ import annotations
@@ -31,20 +32,24 @@ if TYPE_CHECKING:
     # Gradients (n, 3) of the sum at its points, given points, normals, areas and the smoothing.
     Gradients = Callable[[FloatArray, FloatArray, FloatArray, float], FloatArray]
 
-# Normals are turned so often, by sums smoothed over so many spacings.
+# The number of rounds in which signs of normals are corrected, and the smoothing length of the sums
+# that correct them, in spacings.
 _FLIP_ROUNDS, _FLIP_SMOOTHING = 2, 3.0
-# The smoothing length in spacings of the points that were moved; with little noise it is this times
-# the root of noise over spacing, and if that is below the last number, there is none.
+# The smoothing length in spacings is `_SMOOTHING`, or with little noise `_SMOOTHING_OF_ROOT` times
+# the root of noise over spacing; if that is below `_NO_NOISE`, points stay and nothing is smoothed.
 _SMOOTHING, _SMOOTHING_OF_ROOT, _NO_NOISE = 0.9, 1.4, 0.1
-# The fewest points among which a surface, and what is far from it, can be seen.
+# The smallest number of points that shows a surface, and outliers far from it.
 _MIN_POINTS = 32
 
 
 @dataclass(frozen=True)
 class DenoisedCloud:
-    """points, normals: (m, 3) of the points that were kept, moved onto the surface. smoothing: the
-    length over which their sum is to be smoothed; 0 where there is hardly any noise. facts: what
-    was found, as for `Field.describe`."""
+    """The points that were kept, and how to smooth their sum.
+
+    points, normals: (m, 3) of the points that were kept, moved onto the surface.
+    smoothing: the length over which their sum is to be smoothed; 0 if there is hardly any noise.
+    report: the estimated noise and related numbers, as for `Field.describe`.
+    """
 
     points: FloatArray
     normals: FloatArray
@@ -53,58 +58,63 @@ class DenoisedCloud:
 
     @classmethod
     def of(cls, points: Any, normals: Any | None, gradients: Gradients) -> DenoisedCloud:
-        """normals: (n, 3) or None to estimate them.
+        """Denoise points (n, 3) with normals (n, 3), or None to estimate the normals.
 
         Warns of points that are left out, as they are far from all others.
 
         Raises:
-            CloudError: as `validate_cloud` and `estimate_normals`; few points.
+            CloudError: as `validate_cloud` and `estimate_normals`; or there are too few points.
         """
         x = as_cloud_points(points)
-        given = None if normals is None else as_unit_normals(normals, len(x))
+        known_normals = None if normals is None else as_unit_normals(normals, len(x))
         if len(x) < _MIN_POINTS:
             raise CloudError(
                 f"{len(x)} points do not show how much noise they have, at least {_MIN_POINTS} are "
                 'needed for smoothing="auto": give a length'
             )
         total, tree = len(x), build_point_tree(x)
-        alone = outlier_indices(x, tree)
-        if len(alone):
-            x = np.delete(x, alone, axis=0)
-            given = None if given is None else np.delete(given, alone, axis=0)
+        outliers = outlier_indices(x, tree)
+        if len(outliers):
+            x = np.delete(x, outliers, axis=0)
+            known_normals = (
+                None if known_normals is None else np.delete(known_normals, outliers, axis=0)
+            )
             tree = build_point_tree(x)
             warnings.warn(
-                f"{len(alone):,} of {total:,} points are far from all others and were left out",
+                f"{len(outliers):,} of {total:,} points are far from all others and were left out",
                 stacklevel=4,
             )
-        cloud = CloudDenoiser(x, estimate_noise(x, given, tree), tree)
-        if given is None:
-            moved, turned = cloud.denoise_points_and_normals(_normals(cloud, gradients))
+        cloud = CloudDenoiser(x, estimate_noise(x, known_normals, tree), tree)
+        if known_normals is None:
+            new_points, new_normals = cloud.denoise_points_and_normals(_normals(cloud, gradients))
         else:
-            moved, turned = cloud.denoise_points(given), given[cloud.selected]
+            new_points, new_normals = (
+                cloud.denoise_points(known_normals),
+                known_normals[cloud.selected],
+            )
         noise, spacing = cloud.noise.deviation, cloud.spacing
-        length = min(_SMOOTHING, _SMOOTHING_OF_ROOT * (noise / spacing) ** 0.5)
-        facts = {
+        smoothing = min(_SMOOTHING, _SMOOTHING_OF_ROOT * (noise / spacing) ** 0.5)
+        report = {
             "given": total,
-            "left out": len(alone),
+            "left out": len(outliers),
             "noise": float(f"{noise:.3g}"),
             "spacing": float(f"{spacing:.3g}"),
             "neighbors": cloud.noise.neighbor_count,
         }
-        if length < _NO_NOISE:
-            return cls(x[cloud.selected], turned, 0.0, facts)
-        return cls(moved, turned, length * spacing, facts)
+        if smoothing < _NO_NOISE:
+            return cls(x[cloud.selected], new_normals, 0.0, report)
+        return cls(new_points, new_normals, smoothing * spacing, report)
 
 
 def _normals(cloud: CloudDenoiser, gradients: Gradients) -> FloatArray:
-    """Normals (m, 3) of the chosen points as they are given."""
+    """Estimated normals (m, 3) of the selected points at their original positions."""
     x = cloud.points[cloud.selected]
     normals = estimate_normals(x)
     areas = np.full(len(x), cloud.spacing**2)
     for _ in range(_FLIP_ROUNDS):
-        slope = gradients(x, normals, areas, _FLIP_SMOOTHING * cloud.spacing)
-        against = np.einsum("ij,ij->i", slope, normals) > 0
-        # Not the others, whose planes are less rounded at edges.
-        normals[against] = -slope[against]
+        slopes = gradients(x, normals, areas, _FLIP_SMOOTHING * cloud.spacing)
+        is_flipped = np.einsum("ij,ij->i", slopes, normals) > 0
+        # Other normals stay as they are: the fitted planes are less rounded at edges.
+        normals[is_flipped] = -slopes[is_flipped]
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     return normals

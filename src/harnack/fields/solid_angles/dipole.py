@@ -1,9 +1,10 @@
 """The dipole potential of oriented point clouds: Poisson reconstruction without a grid.
 
-`DipolePotential` is the field, `DipoleTree` its sum by a tree, with far dipoles as multipoles.
+- `DipolePotential`: the field.
+- `DipoleTree`: its sum by a tree, with multipole moments of far dipoles.
 
-The points of a field stay as they are (attributes such as `points` cannot be set): trees, cells and
-extents are made of them once. `with_points` makes another field.
+The points of a field do not change (attributes such as `points` cannot be set): trees, cells and
+extents are computed from them once. `with_points` makes another field.
 """
 
 from __future__ import annotations
@@ -56,9 +57,9 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
     from harnack.tree import BalancedTree
 
-# Cells are built by themselves from so many rays a point, and so many rays, on, and up to so many
-# points. To build them takes as long as to trace about 6 rays a point without them; smaller ones,
-# in which a ray takes two thirds of the time, pay from more rays a point on.
+# Cells pay from `_PAYS` rays per point and `_LEAST_RAYS` rays on, and up to `_MOST_POINTS` points:
+# to build them takes as long as to trace about 6 rays per point without them. Smaller cells, in
+# which a ray takes two thirds of the time, pay from `_FINER_PAYS` rays per point on.
 _PAYS, _LEAST_RAYS, _MOST_POINTS = 7, 100_000, 200_000
 _FINER_PAYS = 60
 # A point counts as near if the squared distance is less than this fraction of its area.
@@ -66,14 +67,16 @@ _SINGLE_POINT = 0.04
 
 
 BuildCells: TypeAlias = "Callable[[list[NodeMoments], FloatArray, RecordTable], DipoleCells | None]"
-"""Makes cells from the moments of a tree, and its dipoles as rows and on the backend."""
+"""Builds cells from the moments of a tree, its dipoles as rows, and the same on the backend."""
 
 
 @dataclass(frozen=True)
 class DipoleTree:
-    """sum_i m_i.(y_i - x)/|y_i - x|^3 on a backend; a record holds y_i, m_i and |m_i|.
+    """The sum of m_i.(y_i - x)/|y_i - x|^3 over dipoles i on a backend; a record holds y_i, m_i and
+    |m_i|.
 
-    cells: where samples cost only what is near; None for none.
+    cells: FMM cells, with which the cost of a sample depends on near dipoles only; None for no
+        cells.
     """
 
     clusters: Treecode
@@ -89,10 +92,10 @@ class DipoleTree:
         cls, backend: Backend, tree: BalancedTree, points: FloatArray, moments: FloatArray,
         accuracy: float, build: BuildCells | None = None,
     ) -> DipoleTree:  # fmt: skip
-        """From points (n, 3) of size about one and moments (n, 3), area times normal.
+        """The tree of points (n, 3) of size about one and moments (n, 3), area times normal.
 
-        tree: `dipole_hierarchy` these points, or of the same points at earlier positions.
-        build: makes cells.
+        tree: `dipole_hierarchy` of these points, or of the same points at earlier positions.
+        build: builds cells.
         """
         levels = dipole_tree_moments(tree, points[:, None], moments[:, None], points, points)
         rows = dipole_records(points, moments)
@@ -108,7 +111,8 @@ class DipoleTree:
         return self.clusters.coarsest_accuracy if self.cells is None else 1.0
 
     def values(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:
-        """Value and the derivatives asked for at x; closer: the detail, at least 1."""
+        """Value and derivatives up to order `derivatives` at x; closer: the accuracy scale, at
+        least 1."""
         unit, detail = (
             coordinate_rounding(x),
             fmax(self.backend.Float(closer), self.backend.Float(1)),
@@ -119,101 +123,103 @@ class DipoleTree:
     def _sums(self, x: Vec3, detail: Real, unit: Real, derivatives: int) -> tuple[SourceSums, Vec3]:
         """All sums, and the moment of the nearest dipole of a near leaf."""
         add, vector = _dipole_adder(x, unit, derivatives), self.backend.Array3f
-        sums, own = self.clusters.sums(x, detail, add, (vector(0),), derivatives=derivatives)
-        return sums, own[0]
+        sums, state = self.clusters.sums(x, detail, add, (vector(0),), derivatives=derivatives)
+        return sums, state[0]
 
     def _near_sums(
         self, x: Vec3, detail: Real, unit: Real, derivatives: int = 1
     ) -> tuple[SourceSums, Vec3]:
-        """As `_sums`, by the cells where there are any and derivatives are not second ones."""
+        """As `_sums`, by the cells if there are cells and no second derivatives are requested."""
         if self.cells is None or derivatives == 2:
             return self._sums(x, detail, unit, derivatives)
-        add, none = _dipole_adder(x, unit, 1), (self.backend.Array3f(0),)
-        sums, own = self.cells.sums_with_tree(self.clusters, x, detail, (add, add), none)
-        return sums, own[0]
+        add, start = _dipole_adder(x, unit, 1), (self.backend.Array3f(0),)
+        sums, state = self.cells.sums_with_tree(self.clusters, x, detail, (add, add), start)
+        return sums, state[0]
 
     def sample(self, x: Vec3, detail: Real) -> Sample:
         """Value, gradient and promises at x: see `SourceSums.sample`.
 
-        With cells, details up to 1 are what their expansions give, and larger ones the tree's.
+        With cells, accuracy scales up to 1 have the accuracy of the cells' expansions, and larger
+        scales come from the tree.
         """
         unit = coordinate_rounding(x)
-        found, nearest = self._near_sums(x, detail, unit)
-        # Where the field of one point dominates, shade with that point's normal, reversed, as f
-        # is larger inside.
-        weight = dr.norm(nearest)
-        beside = (
-            found.singularity_distance * found.singularity_distance < _SINGLE_POINT * weight
-        ) & (weight > 0)
-        normal = dr.select(beside, -nearest / weight, dr.normalize(found.gradient))
-        return found.sample(1.0, unit, self.rounding, normal)
+        sums, nearest = self._near_sums(x, detail, unit)
+        # Where the field of a single point dominates, shading uses that point's normal, reversed,
+        # as f is larger inside.
+        area = dr.norm(nearest)
+        is_dominated = (
+            sums.singularity_distance * sums.singularity_distance < _SINGLE_POINT * area
+        ) & (area > 0)
+        normal = dr.select(is_dominated, -nearest / area, dr.normalize(sums.gradient))
+        return sums.sample(1.0, unit, self.rounding, normal)
 
 
 def _dipole_adder(x: Vec3, unit: Real, derivatives: int) -> AddPrimitive:
-    """A function that adds a dipole to sums at x, and keeps the moment of the nearest one."""
+    """A function that adds a dipole to sums at x, and stores the moment of the nearest dipole."""
     vector = cast("Any", type(x))
 
     def add(
-        row: list[Real], active: Mask, sums: SourceSums, own: tuple[Any, ...]
+        row: list[Real], active: Mask, sums: SourceSums, state: tuple[Any, ...]
     ) -> tuple[SourceSums, tuple[Any, ...]]:
         inverse, terms = _dipole(row, x, derivatives)
-        distance, some = dr.rcp(inverse), active & (row[6] > 0)
+        distance, has_area = dr.rcp(inverse), active & (row[6] > 0)
         # An upper bound of 1/(distance - 2 unit), 2 unit being the rounding of the distance:
-        # 1/(1-z) <= 1 + 2z for z <= 1/2. Nearer to a dipole nothing is known, and all bounds
-        # are infinite. Padding has no area and adds nothing.
+        # 1/(1-z) <= 1 + 2z for z <= 1/2. Nearer to a dipole all bounds are infinite. Padding has
+        # no area and adds nothing.
         z = 2 * unit * inverse
-        closer = dr.select(z <= 0.5, dr.fma(2 * z, inverse, inverse), dr.inf)
-        closer = dr.select(some, closer, 0)
-        fourth = row[6] * dr.square(closer * closer)
-        nearer = some & (distance <= sums.singularity_distance)
+        inverse_bound = dr.select(z <= 0.5, dr.fma(2 * z, inverse, inverse), dr.inf)
+        inverse_bound = dr.select(has_area, inverse_bound, 0)
+        fourth = row[6] * dr.square(inverse_bound * inverse_bound)
+        is_nearest = has_area & (distance <= sums.singularity_distance)
         added = sums.add_term(terms, active & (inverse < dr.inf))
-        new = dataclasses.replace(
+        new_sums = dataclasses.replace(
             added,
-            rounding=added.rounding + dipole_rounding(row[6], closer, unit),
-            singularity_distance=dr.select(nearer, distance, sums.singularity_distance),
+            rounding=added.rounding + dipole_rounding(row[6], inverse_bound, unit),
+            singularity_distance=dr.select(is_nearest, distance, sums.singularity_distance),
             s4=sums.s4 + fourth,
-            s5=dr.fma(fourth, closer, sums.s5),
+            s5=dr.fma(fourth, inverse_bound, sums.s5),
         )
-        return new, (dr.select(nearer, vector(*row[3:6]), own[0]),)
+        return new_sums, (dr.select(is_nearest, vector(*row[3:6]), state[0]),)
 
     return add
 
 
 def _dipole(row: list[Real], x: Vec3, derivatives: int) -> tuple[Real, SourceTerm]:
-    """One over the distance to a dipole, and its value and, if asked for, gradient (paper, Eq. 12
-    and 15) and Hessian.
+    """One over the distance to a dipole, and its value and, for derivatives >= 1, gradient (paper,
+    Eq. 12 and 15) and, for derivatives = 2, Hessian.
 
-    With z = y - x and u = 1/|z|: f = m.z u^3, grad f = 3 (m.z) u^5 z - m u^3, and
-    Hess f = 15 (m.z) u^7 z z^T - 3 u^5 (m z^T + z m^T + (m.z) I).
+    With z = y - x and u = 1/|z|: f = m.z u^3, grad f = 3 (m.z) u^5 z - m u^3, and Hess f = 15 (m.z)
+    u^7 z z^T - 3 u^5 (m z^T + z m^T + (m.z) I).
     """
     vector = cast("Any", type(x))
     z, m = vector(*row[:3]) - x, vector(*row[3:6])
     u = dr.rsqrt(dr.squared_norm(z))
     u2 = u * u
-    along = dr.dot(m, z)
-    value = along * u * u2
+    product = dr.dot(m, z)
+    value = product * u * u2
     if derivatives == 0:
         return u, SourceTerm(value)
-    gradient = (u * u2) * dr.fma(vector(3 * along * u2), z, -m)
+    gradient = (u * u2) * dr.fma(vector(3 * product * u2), z, -m)
     if derivatives == 1:
         return u, SourceTerm(value, gradient)
     # In terms of the unit vector n = u z, so that no power of u overflows unless the result does.
-    n, four = u * z, 3 * (u2 * u2)
-    along = dr.dot(m, n)
+    n, scale = u * z, 3 * (u2 * u2)
+    product = dr.dot(m, n)
     pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
     hessian = (
-        four * (5 * along * n[i] * n[j] - m[i] * n[j] - n[i] * m[j] - (along if i == j else 0))
+        scale * (5 * product * n[i] * n[j] - m[i] * n[j] - n[i] * m[j] - (product if i == j else 0))
         for i, j in pairs
     )
     return u, SourceTerm(value, gradient, SymmetricMatrix(*hessian))
 
 
 _VALUES, _TRACED = 2.0, 4.0
-# The least smoothing length, as a part of half the size of the cloud; the most points at which its
-# level is looked for; the least level that is one, as a part of 2 pi if areas are estimated.
+# The smallest smoothing length, as a fraction of half the size of the cloud; the largest number of
+# points from which the level is computed; the smallest valid level, as a fraction of 2 pi if areas
+# are estimated, and as a number otherwise.
 _LEAST_SMOOTHING, _MAX_LEVEL_SAMPLES = 1e-5, 10_000
 _LEAST_PART, _LEAST_LEVEL = 0.1, 1e-3
-# A tenth of the points may be off a smoothed surface by this part of the cloud's longest side.
+# A tenth of the points may be off a smoothed surface by this fraction of the cloud's longest side.
 _FAR_OF_SIZE = 0.04
 
 
@@ -228,44 +234,44 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         f(x) = sum a_i n_i.(p_i - x) (rho_i^2 + 5 h^2/2)/(rho_i^2 + h^2)^(5/2),  rho_i = |p_i - x|,
 
     is the sum above blurred: averaged about x with the weight 15 h^4/(8 pi (rho^2 + h^2)^(7/2)),
-    whose standard deviation along each axis is h/sqrt(2). It is finite everywhere, and its surface
-    passes through no point, but on both sides of them: `default_level` is the median of f at the
-    points. Details smaller than h are lost, edges become round, parts thinner than h may
-    vanish. h = 1.4 sqrt(noise * spacing) was good on two meshes, with the standard
-    deviation of the noise along an axis and the distance between neighboring points.
+    whose standard deviation along each axis is h/sqrt(2). It is finite everywhere. Its surface
+    passes through no point, but has points on both sides: `default_level` is the median of f at the
+    points. Details smaller than h are lost, edges become round, parts thinner than h may vanish.
+    h = 1.4 sqrt(noise * spacing) was good on two meshes, with the standard deviation of the noise
+    along an axis and the distance between neighboring points.
 
-    smoothing="auto": for points with noise that is not known. The sum is then not that of the
-    points given: those far from all others are left out, with a warning; the others are moved along
-    their normals to where their neighbors say that the surface is (`geometry.denoising`), a part of
-    them if noise is larger than the spacing; and their sum is smoothed over their spacing, or less.
-    Normals that are estimated are corrected by the sum and by the moved points. `points`,
-    `normals`, `areas` and `smoothing` are those of the sum, and `describe` has the noise that was
-    found, and how many points were given and left out.
+    smoothing="auto": for points with noise of unknown size. The sum is then not that of the input
+    points: points far from all others are left out, with a warning; the remaining points are moved
+    along their normals onto the surface that fits their neighbors (`geometry.denoising`), only a
+    part of the points if noise is larger than the spacing; and their sum is smoothed over their
+    spacing, or less. Estimated normals are corrected by the sum and by the moved points. `points`,
+    `normals`, `areas` and `smoothing` are the data of that sum, and `describe` has the estimated
+    noise, and the numbers of points of the input and of points that were left out.
 
     points: (n, 3).
     normals: (n, 3), outward, of any length; or "estimate", from neighbors, oriented along a
         spanning tree (`geometry.estimate_normals`).
     areas: (n,), or None to estimate them from neighbors (Barill et al. 2018, Sec. 3.1).
     smoothing: see above, in the points' unit; 0 for the sum of dipoles itself.
-    accuracy: a cluster of points is taken as a whole beyond `accuracy` times its radius; by
-        default 2 for values at points and 4 for tracing, which takes more where the tolerance asks
-        for it. At least 1.5. By default gradients at points are looked at more closely, until their
-        error is about 1 % of their length or less in most places (`gradient_error_bound` bounds
-        it).
-    cells: for many rays through many points: cells in which the near points count one by one and
-        all others as one polynomial, so that an evaluation for tracing costs a tenth. None builds
-        them where they pay (`for_ray_count`), for pictures of small clouds and for path tracing;
-        True always, also for values and gradients at points, which pays from some 600 values a
-        point on; False never. They take some 1 kB a point, or the megabytes that are given (True:
-        256) with larger and slower cells; where these would be too large, none are built, and
-        `describe` of a prepared field says so. Building takes as long as tracing 100,000 to a
-        million rays without cells, for each precision, at the first trace, and several times the
-        memory. All bounds are proved, whatever is given.
+    accuracy: the sum uses the multipole moments of a cluster of points beyond `accuracy` times its
+        radius; by default 2 for values at points and 4 for tracing, which uses a larger accuracy
+        where the tolerance needs it. At least 1.5. By default the accuracy of gradients at points
+        is increased until their error is about 1 % of their length or less in most places
+        (`gradient_error_bound` bounds it).
+    cells: for many rays through many points: FMM cells, in which near points are summed directly
+        and all others are one polynomial, so that an evaluation for tracing costs a tenth. None
+        builds them where they pay (`for_ray_count`), for pictures of small clouds and for path
+        tracing; True always, also for values and gradients at points, which pays from some 600
+        values per point on; False never. They take some 1 kB per point, or the number of megabytes
+        of this argument (True: 256) with larger and slower cells; if these would be too large,
+        there are no cells, and `describe` of a prepared field reports this. Building takes as long
+        as tracing 100,000 to a million rays without cells, for each precision, at the first trace,
+        and several times the memory. All bounds are proved, whatever the arguments.
 
     `with_points` gives the field of points that have moved.
 
-    Raises CloudError (a ValueError) for what is no oriented point cloud; ValueError for a
-    smoothing or an accuracy that cannot be.
+    Raises CloudError (a ValueError) if the arguments are no oriented point cloud; ValueError for an
+    invalid smoothing or accuracy.
     """
 
     period: ClassVar[float | None] = None
@@ -297,10 +303,10 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
             points, normals, smoothing = self._fitted(points, normals, areas, smoothing)
         if isinstance(normals, str):
             normals = estimate_normals(points)
-        some = 1.0 if areas is None else areas
-        points, normals, some = validate_cloud(points, normals, some)
+        known_areas = 1.0 if areas is None else areas
+        points, normals, known_areas = validate_cloud(points, normals, known_areas)
         self._set_points(
-            points, normals, estimate_areas(points, normals) if areas is None else some
+            points, normals, estimate_areas(points, normals) if areas is None else known_areas
         )
         self.accuracy = accuracy
         self.configure_cells(cells)
@@ -320,8 +326,8 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
     def _fitted(
         self, points: Any, normals: Any, areas: Any, smoothing: str
     ) -> tuple[FloatArray, FloatArray, float]:
-        """Points, normals and the length of `smoothing="auto"`; `fit_report` says what was
-        found."""
+        """Points, normals and smoothing length of `smoothing="auto"`; `fit_report` becomes the
+        report about the noise."""
         if smoothing != "auto":
             raise ValueError(f'smoothing must be a length or "auto", not {smoothing!r}')
         if areas is not None:
@@ -334,13 +340,14 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
             field = DipolePotential(x, n, areas, smoothing=length)
             return np.asarray(field.rough_value_and_gradient(x)[1], np.float64)
 
-        given = None if isinstance(normals, str) else normals
-        found = DenoisedCloud.of(points, given, gradients)
-        self.fit_report = found.report
-        return found.points, found.normals, found.smoothing
+        known_normals = None if isinstance(normals, str) else normals
+        cloud = DenoisedCloud.of(points, known_normals, gradients)
+        self.fit_report = cloud.report
+        return cloud.points, cloud.normals, cloud.smoothing
 
     def _median_level(self) -> float:
-        """The median of the smoothed sum at (some of) the points."""
+        """The median of the smoothed sum at the points, or at a sample of the points if there are
+        many."""
         if not _LEAST_SMOOTHING <= self.smoothing / self._size <= 1:
             raise ValueError(
                 f"smoothing={self.smoothing:g} is a length in the unit of the points, whose cloud "
@@ -348,27 +355,27 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
                 f"{_LEAST_SMOOTHING * self._size:.2g} and {self._size:.2g}, such as the length of "
                 "the noise"
             )
-        some = self.points[:: -(-len(self.points) // _MAX_LEVEL_SAMPLES)]
-        values = np.asarray(self.value(some, precision="double"))
+        samples = self.points[:: -(-len(self.points) // _MAX_LEVEL_SAMPLES)]
+        values = np.asarray(self.value(samples, precision="double"))
         level = float(np.median(values))
-        # Areas that are given may stand for other things than a surface.
-        least = _LEAST_PART * 2 * math.pi if self.is_estimated[1] else _LEAST_LEVEL
-        if not abs(level) >= least:
+        # Areas from the user may stand for other things than a surface.
+        min_level = _LEAST_PART * 2 * math.pi if self.is_estimated[1] else _LEAST_LEVEL
+        if not abs(level) >= min_level:
             raise CloudError(
                 f"the smoothed sum is {level:.2g} at the points, where it should be about 2 pi: "
                 "normals cancel each other, or the points lie in a plane or on a line and enclose "
                 "nothing, or what they enclose is thinner than the smoothing"
             )
         if not self.fit_report and self.is_estimated[1]:
-            self._warn_if_far(some, values - level)
+            self._warn_if_far(samples, values - level)
         return level
 
     def _warn_if_far(self, points: FloatArray, values: FloatArray) -> None:
-        """Warn if the smoothed surface leaves a tenth of the points, with values above the level,
-        far away, by their slopes."""
-        slopes = self.rough_value_and_gradient(points, precision="double")[1]
-        steep = np.linalg.norm(slopes, axis=1)
-        far = float(np.quantile(np.abs(values) / np.maximum(steep, 1e-300), 0.9))
+        """Warn if a tenth of the points is far from the smoothed surface, to first order: `values`
+        are the values at the points minus the level."""
+        gradients = self.rough_value_and_gradient(points, precision="double")[1]
+        norms = np.linalg.norm(gradients, axis=1)
+        far = float(np.quantile(np.abs(values) / np.maximum(norms, 1e-300), 0.9))
         longest = float((self._box[1] - self._box[0]).max())
         if far > _FAR_OF_SIZE * longest:
             warnings.warn(
@@ -383,11 +390,11 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         self, points: Any, normals: Any | Literal["estimate"] = None, areas: Any = None
     ) -> DipolePotential:
         """The potential of the same points at other positions (n, 3); normals and areas as for a
-        new one.
+        new field.
 
-        The tree, if there is one, keeps its shape and gets new centers, radii, moments and bounds.
-        All promises are computed from the new positions, so a tree whose points moved far is slower
-        than a new one, never wrong. Raises CloudError as for a new field.
+        If this field has a tree, the tree keeps its shape and gets new centers, radii, moments and
+        bounds. All promises are computed from the new positions, so a tree whose points moved far
+        is slower than a new tree, never wrong. Raises CloudError as for a new field.
         """
         field = DipolePotential(
             points,
@@ -406,23 +413,24 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         return field
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
-        on = self._batch_data(backend_of(x))
-        x = on.to_unit(x)
+        data = self._batch_data(backend_of(x))
+        x = data.to_unit(x)
         weight = float(self.areas.sum()) / self._size**2
         return (
-            on.tree.values(x, derivatives, closer)
+            data.tree.values(x, derivatives, closer)
             .with_far_field_errors(x, 64, weight)
-            .rescaled(on.size)
+            .rescaled(data.size)
         )
 
     def sharp_values_at(self, x: Vec3) -> PointValues:
         if self.accuracy is not None:
             return self.values_at(x, 1)
-        return sharpened(lambda place, closer: self.values_at(place, 1, closer), x)
+        return sharpened(lambda points, factor: self.values_at(points, 1, factor), x)
 
     @functools.cached_property
     def _hierarchy(self) -> BalancedTree:
-        """The tree's shape, from these points or, of moved ones, from where they were."""
+        """The tree's shape, from these points or, if they were moved, from their earlier
+        positions."""
         return self._given_hierarchy or dipole_hierarchy((self.points - self._center) / self._size)
 
     def _upload(self, backend: Backend, *, traced: bool) -> _DipoleData:
@@ -441,7 +449,7 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         return _DipoleData(*frame_parameters(backend, self._center, self._size), tree)
 
     def _cell_builder(self, backend: Backend, half: float) -> BuildCells:
-        """What makes cells of the cube [-half, half]^3, once for a backend."""
+        """A function that builds the cells of the cube [-half, half]^3, once for a backend."""
 
         def build(
             levels: list[NodeMoments], rows: FloatArray, dipoles: RecordTable
@@ -457,14 +465,14 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         return build
 
     def _half_side(self, unit: FloatArray) -> float:
-        """Half the side of the cube of cells, which holds the `extent` of the default level: rays
-        begin at the faces of that."""
+        """Half the side of the cube of cells, which contains the `extent` of the default level, as
+        rays begin at the faces of the extent."""
         reach = math.sqrt(float(self.areas.sum()) / self.default_level) / self._size
         return 1.001 * (float(np.abs(unit).max()) + reach)
 
     def cells_pay_from(self) -> float:
-        few = len(self.points) <= _MOST_POINTS and not self.smoothing
-        return max(_LEAST_RAYS, _PAYS * len(self.points)) if few else math.inf
+        is_small = len(self.points) <= _MOST_POINTS and not self.smoothing
+        return max(_LEAST_RAYS, _PAYS * len(self.points)) if is_small else math.inf
 
     def finer_cells_pay_from(self) -> float:
         return _FINER_PAYS * len(self.points)
@@ -498,18 +506,19 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
 
     @property
     def smoothing(self) -> float:
-        """How far the surface is smoothed. It stays as it is: the default level depends on it."""
+        """The smoothing length of the surface. It cannot be set: the default level depends on
+        it."""
         return self._smoothing
 
     def describe(self) -> dict[str, Any]:
-        said = ("estimated" if one else "given" for one in self.is_estimated)
-        named = dict(zip(("normals", "areas"), said, strict=True))
+        origins = ("estimated" if is_estimated else "given" for is_estimated in self.is_estimated)
+        sources = dict(zip(("normals", "areas"), origins, strict=True))
         tree = None if self._device is None else self._device.tree
         cells = self.describe_cells(tree.cells if isinstance(tree, DipoleTree) else None)
-        about = {"points": len(self.points), **named, **self.fit_report, **cells}
+        report = {"points": len(self.points), **sources, **self.fit_report, **cells}
         if self.smoothing:
-            about |= {"smoothing": self.smoothing, "level": self.default_level}
-        return about
+            report |= {"smoothing": self.smoothing, "level": self.default_level}
+        return report
 
 
 @dataclass(frozen=True)

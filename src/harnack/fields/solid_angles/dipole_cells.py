@@ -66,17 +66,20 @@ if TYPE_CHECKING:
     from harnack.fields.solid_angles.treecode import AddPrimitive, Treecode
     from harnack.tree import BalancedTree, PackedTree
 
-# Factors k of `dipole_expansion`, by experiment: for a cell's own primitives, and for those that it
-# gathers for all cells in it. The second is larger, as each level of cells adds to the truncation.
+# Factors k of `dipole_expansion`, by experiment: for cells that are not split, and for cells that
+# are, whose far primitives count in all cells inside them. The second factor is larger, as each
+# level of cells adds to the truncation.
 _NEAR, _SHARED = 2.5, 4.0
-# Nodes of the tree are left to the cells in a cell up to this share of the radius of its ball.
+# Nodes of the tree with a radius up to this fraction of the radius of a cell's ball are left to the
+# cells inside it.
 _SMALL_NODE_RATIO = 0.35
-# Cells are split that have more near primitives, by experiment; where memory is short, twice as
-# many, again and again, up to a number, or this part of all triangles, with which the tree, or
-# cells of edges, are faster. Cells of points for very many rays have this part as many.
+# Cells are split if they have more than `_MOST_NEAR` near primitives, by experiment. If memory is
+# short, this limit is doubled again and again, up to `_MAX_NEAR`, or up to `_MAX_NEAR_FRACTION` of
+# all triangles, from where on the tree, or cells of edges, are faster. Cells of points for very
+# many rays have the fraction `_FINER_FRACTION` of that limit.
 _MOST_NEAR, _MAX_NEAR, _MAX_NEAR_FRACTION = 64, 512, 1 / 8
 _FINER_FRACTION = 3 / 8
-# So many cells are made at once.
+# The number of cells that are built at once.
 _CHUNK_SIZE = 1 << 14
 # Numbers of a record before the coefficients, and the base in which the first index is stored:
 # single precision holds no integers above 2^24.
@@ -88,14 +91,14 @@ _NO_LIMIT = 2**31 - 1
 class DipoleCells:
     """Cells on a backend.
 
-    lookup: of cells, which are its leaves.
-    records: center and one over the radius; bounds of truncation of value and gradient, everywhere
-        and in powers of the distance (`DipoleExpansions`), and of the rounding of the value;
-        `DipoleExpansions.s4` and `least`; first index (two numbers) and number of near primitives |
-        coefficients.
+    lookup: the octree whose leaves are the cells.
+    records: one record per cell: center and one over the radius; bounds of truncation of value and
+        gradient, everywhere and in powers of the distance (`DipoleExpansions`), and of the rounding
+        of the value; `DipoleExpansions.s4` and `min_distance`; first index (two numbers) and number
+        of near primitives | coefficients.
     near: the near primitives, as rows of `primitives`.
-    primitives: records of all of them, in the slots of their tree.
-    count, size: the number of cells, and their bytes.
+    primitives: records of all primitives, in the slots of their tree.
+    count, size: the number of cells, and the number of their bytes.
     """
 
     backend: Backend
@@ -109,10 +112,11 @@ class DipoleCells:
     def sums(
         self, x: Vec3, active: Mask, add: AddPrimitive, own: tuple[Any, ...]
     ) -> tuple[SourceSums, tuple[Any, ...], Mask]:
-        """The sums over all primitives at x, with gradients, a state of the caller's own, and the
-        mask of points for which they hold: those that are active and lie in the cube.
+        """The sums over all primitives at x, with gradients; the caller's own state; and the mask
+        of the lanes on which the sums hold: the active lanes whose point lies in the cube.
 
         add: as for `Treecode.sums`, for near primitives.
+        own: the caller's own state, which `add` updates.
 
         Proof of the bounds on far primitives, D >= least from the center, at a point a from it: the
         distance to x is at least D - a >= D (1 - a/least), so that the sum of area/distance^4 is at
@@ -122,9 +126,9 @@ class DipoleCells:
         at most the gradient times that, and by that squared times 4 `s4` (`SourceSums.sample`).
         """
         vector, index = self.backend.Array3f, self.backend.UInt32
-        number, inside = self.lookup.find_leaf(x)
+        cell, inside = self.lookup.find_leaf(x)
         active = active & inside
-        row = self.records.read_record(number, active)
+        row = self.records.read_record(cell, active)
         u, inverse = x - vector(*row[:3]), row[3]
         y = u * inverse
         value, *slopes = evaluate_expansion(
@@ -133,33 +137,35 @@ class DipoleCells:
         error, slope_error, tail, tail_slope, rounding, fourth, least, low, high, count = row[
             4:_HEADER_SIZE
         ]
-        away = dr.norm(u) * (1 + SUM_MARGIN)
-        error, slope_error = _with_tail(away * inverse, error, slope_error, tail, tail_slope)
-        free = least - away
+        distance = dr.norm(u) * (1 + SUM_MARGIN)
+        error, slope_error = _with_tail(distance * inverse, error, slope_error, tail, tail_slope)
+        free = least - distance
         s4 = fourth * dr.square(dr.square(least / free))
-        zero, gradient, moved = (
+        zero, gradient, shift = (
             self.backend.Float(0),
             inverse * vector(*slopes),
             2 * coordinate_rounding(x),
         )
-        rounding = dr.fma(moved, dr.norm(gradient) + slope_error + 4 * moved * s4, rounding)
+        rounding = dr.fma(shift, dr.norm(gradient) + slope_error + 4 * shift * s4, rounding)
         far = SourceSums(
             value, gradient, None, error, slope_error, None, rounding, free, s4, s4 / free, zero
         )
         first, count = index(low) + index(high) * _INDEX_BASE, dr.select(active, index(count), 0)
 
-        def more(i: Any, *_: Any) -> Mask:
+        def runs(i: Any, *_: Any) -> Mask:
             return i < count
 
         def step(i: Any, sums: Any, own: Any) -> tuple[Any, ...]:
-            go = i < count
-            primitive = self.primitives.read_record(dr.gather(index, self.near, first + i, go), go)
-            new, own = add(primitive, go, SourceSums.from_state(sums), own)
-            return i + 1, new.to_state(), own
+            in_list = i < count
+            primitive = self.primitives.read_record(
+                dr.gather(index, self.near, first + i, in_list), in_list
+            )
+            new_sums, own = add(primitive, in_list, SourceSums.from_state(sums), own)
+            return i + 1, new_sums.to_state(), own
 
         start = (index(0), far.to_state(), own)
-        _, parts, own = dr.while_loop(start, more, step, label="near primitives")
-        sums, n = SourceSums.from_state(parts), self.backend.Float(count)
+        _, state, own = dr.while_loop(start, runs, step, label="near primitives")
+        sums, n = SourceSums.from_state(state), self.backend.Float(count)
         added = (_NEAR + 1) * self.backend.machine_epsilon * n * sums.s4 / inverse
         sums = dataclasses.replace(sums, gradient_truncation=sums.gradient_truncation + added)
         return sums, own, active
@@ -168,18 +174,19 @@ class DipoleCells:
         self, tree: Treecode, x: Vec3, detail: Real, add: tuple[AddPrimitive, AddPrimitive],
         own: tuple[Any, ...], where: Mask = True,
     ) -> tuple[SourceSums, tuple[Any, ...]]:  # fmt: skip
-        """The sums at x, with gradients, and a state of the caller's own: of details up to 1 by the
-        cells, and of larger ones or outside of the cube by the tree of the same primitives.
+        """The sums at x, with gradients, and the caller's own state: from the cells for details up
+        to 1, and from the tree of the same primitives for larger details or outside of the cube.
 
-        add: what adds a near primitive to the sums of a cell, and to those of the tree.
+        add: adds a near primitive to the sums of a cell, and to the sums of the tree.
+        own: the caller's own state.
         """
         in_cell, in_tree = add
-        here, finer = self.backend.Bool(where), fmax(detail, self.backend.Float(1))
-        found, state, known = self.sums(x, here & (detail <= 1), in_cell, own)
-        others, theirs = tree.sums(x, finer, in_tree, own, here & ~known)
-        pairs = zip(state, theirs, strict=True)
-        state = tuple(dr.select(known, one, other) for one, other in pairs)
-        return found.select(~known, others), state
+        lanes, tree_detail = self.backend.Bool(where), fmax(detail, self.backend.Float(1))
+        sums, state, is_valid = self.sums(x, lanes & (detail <= 1), in_cell, own)
+        tree_sums, tree_state = tree.sums(x, tree_detail, in_tree, own, lanes & ~is_valid)
+        pairs = zip(state, tree_state, strict=True)
+        state = tuple(dr.select(is_valid, ours, theirs) for ours, theirs in pairs)
+        return sums.select(~is_valid, tree_sums), state
 
 
 def _with_tail(
@@ -189,14 +196,19 @@ def _with_tail(
     power = 1.0 + 0 * q
     for _ in range(DEGREE):
         power = power * q
-    up = 1 + SUM_MARGIN
-    return dr.fma(tail * up, power * q, error), dr.fma(tail_slope * up, power, slope)
+    margin = 1 + SUM_MARGIN
+    return dr.fma(tail * margin, power * q, error), dr.fma(tail_slope * margin, power, slope)
 
 
 @dataclass(frozen=True)
 class _CellLevel:
-    """The cells of one size: centers (n, 3), the radius of their balls, which are not split, and
-    the number of near primitives of those."""
+    """The cells of one size.
+
+    centers: (n, 3) centers of the cells.
+    radius: the radius of their balls.
+    is_leaf: (n,) whether a cell is not split.
+    near: (n,) the number of near primitives, exact for cells that are not split.
+    """
 
     centers: FloatArray
     radius: float
@@ -208,37 +220,37 @@ def build_cells(
     backend: Backend, tree: BalancedTree, levels: list[NodeMoments], rows: FloatArray,
     primitives: RecordTable, half: float, most_bytes: int, *, finer: bool = False,
 ) -> DipoleCells | None:  # fmt: skip
-    """Cells of a cube [-h, h]^3, h at least `half`, of at most so many bytes, not counting what it
-    takes to build them, which is several times as much; None where those would be too large to be
-    of use. h has so few digits that single precision holds the centers of all cells exactly.
+    """Cells of a cube [-h, h]^3, h at least `half`, of at most `most_bytes` bytes, not counting the
+    memory for building them, which is several times as much; None if useful cells would need more
+    memory. h has so few digits that single precision holds the centers of all cells exactly.
 
     levels, rows: the moments of the tree, and its primitives in their slots (`source_tree`).
-        primitives: records of the latter on the backend, in the same slots.
-    finer: whether cells are for very many rays. Where they would take more bytes, they are larger
-        and have more near primitives.
+    primitives: records of the primitives on the backend, in the same slots.
+    finer: whether cells are for very many rays. If small cells would take more bytes, cells are
+        larger and have more near primitives.
 
     Proof that each primitive counts once in each cell that is not split. The root of the octree
-    begins with the root of the tree. A cell that is split adds what is far from it to the
+    begins with the root of the tree. A cell that is split adds the primitives far from it to the
     expansions of all cells in it, and leaves the rest, nodes and primitives, to each of its octants
-    (`PendingSources.split_far`). In a cell that is not split nothing but near primitives is left.
+    (`PendingSources.split_far`). In a cell that is not split only near primitives are left.
     """
     packed = source_tree(tree, levels, rows)
     step = 2.0 ** (math.ceil(math.log2(half)) - 8)
     half = math.ceil(half / step) * step
-    few, most_near = _MOST_NEAR, _MAX_NEAR
+    start_near, max_near = _MOST_NEAR, _MAX_NEAR
     if finer:
-        few = int(_FINER_FRACTION * few)
+        start_near = int(_FINER_FRACTION * start_near)
     if packed.primitives.packets_per_record > 1:
-        part = int(_MAX_NEAR_FRACTION * (tree.leaf_slots != NO_PRIMITIVE).sum())
-        most_near = max(_MOST_NEAR, min(_MAX_NEAR, part))
-    octree = _octree_within_memory(packed, half, backend, (few, most_near), most_bytes)
+        limit = int(_MAX_NEAR_FRACTION * (tree.leaf_slots != NO_PRIMITIVE).sum())
+        max_near = max(_MOST_NEAR, min(_MAX_NEAR, limit))
+    octree = _octree_within_memory(packed, half, backend, (start_near, max_near), most_bytes)
     if octree is None:
         return None
     double, shifts = (
         packed.backend,
         local_to_local_matrices(DEGREE, 0.5 / (math.sqrt(3) * BALL_MARGIN)),
     )
-    sources, above = (
+    sources, parents = (
         PendingSources.of_root(double),
         _ParentExpansions(DipoleExpansions.zero(1), shifts, 0.0),
     )
@@ -248,29 +260,31 @@ def build_cells(
     splits, count, total = 0, 0, 0
     for level in octree:
         leaves, split = np.flatnonzero(level.is_leaf), np.flatnonzero(~level.is_leaf)
-        radius, none_stay = (dr.opaque(double.Float, one) for one in (level.radius, -1.0))
-        for some in _chunks(leaves):
-            own, c = sources.subset(double, some), to_vector3(double, level.centers[some])
-            sums, close = own.split_far(packed, c, radius, _NEAR, none_stay)
-            lengths = to_numpy(close.primitives.count).astype(np.int64)
+        radius, none_stay = (dr.opaque(double.Float, number) for number in (level.radius, -1.0))
+        for cells in _chunks(leaves):
+            batch, c = sources.subset(double, cells), to_vector3(double, level.centers[cells])
+            sums, nearby = batch.split_far(packed, c, radius, _NEAR, none_stay)
+            lengths = to_numpy(nearby.primitives.count).astype(np.int64)
             first = total + np.cumsum(lengths) - lengths
-            placed = level.centers[some], level.radius
-            table = _cell_records(backend, *placed, sums.plus(above.of(some)), first, lengths)
+            geometry = level.centers[cells], level.radius
+            table = _cell_records(backend, *geometry, sums.plus(parents.of(cells)), first, lengths)
             tables.append(table.astype(backend.dtype))
-            near.append(to_numpy(close.primitives.entries)[: int(lengths.sum())])
+            near.append(to_numpy(nearby.primitives.entries)[: int(lengths.sum())])
             total += int(lengths.sum())
         nodes.append(encode_nodes(level.is_leaf, count, splits))
         count, splits = count + len(leaves), splits + len(split)
-        found: list[DipoleExpansions] = []
-        left: list[PendingSources] = []
-        for some in _chunks(split):
-            ours, c = sources.subset(double, some), to_vector3(double, level.centers[some])
-            sums, rest = ours.split_far(packed, c, radius, _SHARED, _SMALL_NODE_RATIO * radius)
-            found.append(sums.plus(above.of(some)))
-            left.append(rest)
+        split_sums: list[DipoleExpansions] = []
+        pending: list[PendingSources] = []
+        for cells in _chunks(split):
+            inner, c = sources.subset(double, cells), to_vector3(double, level.centers[cells])
+            sums, rest = inner.split_far(packed, c, radius, _SHARED, _SMALL_NODE_RATIO * radius)
+            split_sums.append(sums.plus(parents.of(cells)))
+            pending.append(rest)
         if len(split):
-            above = _ParentExpansions(DipoleExpansions.concatenate(found), shifts, level.radius)
-            sources = PendingSources.concatenate(double, left).subset(
+            parents = _ParentExpansions(
+                DipoleExpansions.concatenate(split_sums), shifts, level.radius
+            )
+            sources = PendingSources.concatenate(double, pending).subset(
                 double, np.repeat(np.arange(len(split)), 8)
             )
     table, entries = np.concatenate(tables), np.concatenate(near)
@@ -283,67 +297,71 @@ def build_cells(
 
 
 def _chunks(cells: IntArray) -> list[IntArray]:
-    """Cells by so many at once that lists of what is far from them take little memory."""
+    """The cells in batches, so small that lists of the sources far from them take little memory."""
     return [cells[start : start + _CHUNK_SIZE] for start in range(0, len(cells), _CHUNK_SIZE)]
 
 
 @dataclass(frozen=True)
 class _ParentExpansions:
-    """The sums that cells of a level take over from those around them, `sums` with this radius, in
-    whose order their octants come. shifts: `local_expansion.local_to_local_matrices`."""
+    """The sums that cells of a level inherit from their parents.
+
+    sums: the sums of the parents, whose octants come in the order of the parents.
+    shifts: `local_expansion.local_to_local_matrices`.
+    radius: the radius of the parents' balls.
+    """
 
     sums: DipoleExpansions
     shifts: FloatArray
     radius: float
 
     def of(self, cells: IntArray) -> DipoleExpansions:
-        """Those of some cells of the level, by their numbers."""
-        if not self.radius:  # the first level has nothing above
+        """The inherited sums of the cells of the level with these indices."""
+        if not self.radius:  # the first level has no parents
             return self.sums
-        parents, which = np.unique(cells // 8, return_inverse=True)
+        parents, parent_index = np.unique(cells // 8, return_inverse=True)
         octants = self.sums.subset(parents).to_octants(self.shifts, self.radius)
-        return octants.subset(8 * which + cells % 8)
+        return octants.subset(8 * parent_index + cells % 8)
 
 
 def _cell_records(
     backend: Backend, centers: FloatArray, radius: float, sums: DipoleExpansions, first: IntArray,
     lengths: IntArray,
 ) -> FloatArray:  # fmt: skip
-    """Records of cells. Rounding is that of `rounding_tables`, for coordinates within a cell; that
-    of positions is counted where they are known, and that of the gradient, over the radius, counts
-    as truncation."""
+    """Records of cells. The rounding of the value is that of `rounding_tables`, for coordinates
+    within a cell. The rounding of positions is added during evaluation; the rounding of the
+    gradient, over the radius, counts as truncation."""
     tables = rounding_tables(DEGREE, BALL_MARGIN / math.sqrt(3))
     rounding = backend.machine_epsilon * np.abs(sums.coefficients) @ tables
     slope = sums.slope + rounding[:, 1:].sum(axis=1) / radius
-    up, inverse = 1 + SUM_MARGIN, np.full(len(first), 1 / radius)
-    least = np.minimum(sums.min_distance, 1e3) / up
+    margin, inverse = 1 + SUM_MARGIN, np.full(len(first), 1 / radius)
+    least = np.minimum(sums.min_distance, 1e3) / margin
     bounds = (sums.error, slope, sums.tail, sums.tail_slope, rounding[:, 0], sums.s4)
-    numbered = first % _INDEX_BASE, first // _INDEX_BASE, lengths
-    head = [centers, inverse, *(one * up for one in bounds), least, *numbered]
+    near_range = first % _INDEX_BASE, first // _INDEX_BASE, lengths
+    head = [centers, inverse, *(bound * margin for bound in bounds), least, *near_range]
     return np.column_stack([*head, sums.coefficients])
 
 
 def _octree_within_memory(
     packed: PackedTree, half: float, backend: Backend, near: tuple[int, int], most_bytes: int
 ) -> list[_CellLevel] | None:
-    """The octree, with as few near primitives in a cell as memory allows, from the first number on;
-    None where it takes more than the second: lists of near ones take nearly as much memory,
-    whatever the size of the cells."""
+    """The octree with the smallest limit of near primitives per cell that fits in memory, beginning
+    with the first number of `near`; None if even the second number takes too much memory: lists of
+    near primitives take nearly as much memory, whatever the size of the cells."""
 
     def is_too_large(levels: list[_CellLevel]) -> bool:
         return _bytes(backend, levels) > most_bytes
 
-    some, most_near = near
-    while (octree := _octree(packed, half, some, is_too_large)) is None and some < most_near:
-        some = min(2 * some, most_near)
+    limit, most_near = near
+    while (octree := _octree(packed, half, limit, is_too_large)) is None and limit < most_near:
+        limit = min(2 * limit, most_near)
     return octree
 
 
 def _octree(
     packed: PackedTree, half: float, most_near: int, too_large: Callable[[list[_CellLevel]], bool]
 ) -> list[_CellLevel] | None:
-    """The cells of a cube, level by level, split where more primitives are near; None where they
-    are too large."""
+    """The cells of a cube, level by level, split where more than `most_near` primitives are near;
+    None if they are too large."""
     backend = packed.backend
     root = PendingSources.of_root(backend)
     levels: list[_CellLevel] = []
@@ -352,14 +370,14 @@ def _octree(
         side = half / 2 ** len(levels)
         radius = math.sqrt(3) * side * BALL_MARGIN
         is_last = len(levels) == MAX_DEPTH
-        most = dr.opaque(backend.UInt32, _NO_LIMIT if is_last else most_near)
+        limit = dr.opaque(backend.UInt32, _NO_LIMIT if is_last else most_near)
         near, none_stay = dr.opaque(backend.Float, _NEAR * radius), dr.opaque(backend.Float, -1.0)
-        ours, c = (
+        roots, c = (
             root.subset(backend, np.zeros(len(centers), np.int64)),
             to_vector3(backend, centers),
         )
-        found = ours.primitives_of(packed, c, near, none_stay, None, far=False, most=most)
-        count = to_numpy(found).astype(np.int64)
+        counts = roots.primitives_of(packed, c, near, none_stay, None, far=False, most=limit)
+        count = to_numpy(counts).astype(np.int64)
         is_leaf = np.broadcast_to(count <= most_near, len(centers)) | is_last
         levels.append(_CellLevel(centers, radius, is_leaf, count))
         if too_large(levels):
@@ -369,12 +387,12 @@ def _octree(
 
 
 def _bytes(backend: Backend, levels: list[_CellLevel]) -> int:
-    """Bytes of cells: records, lists of near primitives, and nodes; of cells that are still to be
-    split, no less than eight records each."""
+    """The number of bytes of cells: records, lists of near primitives, and nodes; and at least
+    eight records for each cell that is still to be split."""
     leaves, near = 8 * int((~levels[-1].is_leaf).sum()), 0
-    for one in levels:
-        leaves += int(one.is_leaf.sum())
-        near += int(one.near[one.is_leaf].sum())
-    nodes = sum(len(one.is_leaf) for one in levels)
+    for level in levels:
+        leaves += int(level.is_leaf.sum())
+        near += int(level.near[level.is_leaf].sum())
+    nodes = sum(len(level.is_leaf) for level in levels)
     record = 8 * -(-(_HEADER_SIZE + COEFFICIENTS) // 8) * np.dtype(backend.dtype).itemsize
     return record * leaves + 4 * near + OctreeLookup.memory_bytes(nodes)

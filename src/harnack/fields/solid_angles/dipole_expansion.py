@@ -1,10 +1,10 @@
-"""What far dipoles and triangles add to balls: local expansions, and bounds of what is left out.
+"""Local expansions of far dipoles and triangles in balls, and bounds of their truncation errors.
 
-- `source_tree`: a tree of primitives, dipoles or triangles, in double precision, with all that
+- `source_tree`: a tree of primitives, dipoles or triangles, in double precision, with all data that
   expansions need; `triangle_sources`: triangles as records.
 - `DipoleExpansions`: sums over far nodes and far primitives.
-- `PendingSources`: the primitives of balls, parted into such sums and what is left to smaller
-  balls.
+- `PendingSources`: the primitives of balls, split into such sums and the sources that are left to
+  smaller balls.
 
 A node of radius R is far from a ball of radius rho if their centers are farther apart than k rho +
 `_NODE_RATIO` R, a triangle if they are farther apart than k rho + `TRIANGLE_RATIO` R, a dipole if
@@ -50,11 +50,11 @@ if TYPE_CHECKING:
 # Harmonics have degree l.
 # ruff: noqa: E741
 
-# The degree of local expansions, and the largest of the multipoles that they are made of.
+# The degree of local expansions, and the largest degree of the multipoles they are computed from.
 DEGREE, _MULTIPOLE_DEGREE = 6, 4
 COEFFICIENTS = (DEGREE + 1) ** 2
 _NODE_RATIO = 4.0
-# The same factor of triangles, by experiment; and the moments in their records, besides the first.
+# The same factor for triangles, by experiment; and the moments in their records, besides the first.
 TRIANGLE_RATIO = 1.5
 _TRIANGLE_MOMENTS = tuple(key for key in coefficient_keys(_MULTIPOLE_DEGREE) if key[0] > 2)
 # Numbers of a record of a dipole, and of a triangle before its moments.
@@ -63,27 +63,30 @@ _DIPOLE_SIZE, _TRIANGLE_HEADER_SIZE = 8, 14
 _ROUNDING = 2.0**-20
 # Moments of a node, in order.
 _MOMENTS = tuple(key for key in coefficient_keys(_MULTIPOLE_DEGREE) if key[0])
-# Sums of many positive numbers in double precision, as bounds.
+# Factor by which sums of many positive numbers in double precision become bounds.
 _ROUNDED_UP = 1 + 1e-9
 
 
 def source_tree(tree: BalancedTree, levels: list[NodeMoments], rows: FloatArray) -> PackedTree:
-    """Nodes: center, `_NODE_RATIO` times the radius, radius, area | moments up to
-    `_MULTIPOLE_DEGREE`, (E, G) of `multipole.truncation_bounds`, and the sup norms of the moments.
-    rows: of primitives in slots, dipoles (`treecode.dipole_records`) or `triangle_sources`."""
+    """The tree of primitives. Its nodes hold: center, `_NODE_RATIO` times the radius, radius, area
+    | moments up to `_MULTIPOLE_DEGREE`, (E, G) of `multipole.truncation_bounds`, and the sup norms
+    of the moments.
+
+    rows: primitives in slots, dipoles (`treecode.dipole_records`) or `triangle_sources`.
+    """
     numbers: list[FloatArray] = []
     for level in levels:
         reach = _NODE_RATIO * level.radius
-        left_out, slope, _ = truncation_bounds(level, reach, _MULTIPOLE_DEGREE - 1)
+        error, slope, _ = truncation_bounds(level, reach, _MULTIPOLE_DEGREE - 1)
         moments = _columns(level, _MOMENTS)
         norms = [sup_norm(level.moments, l) for l in range(1, _MULTIPOLE_DEGREE + 1)]
         head = [level.center, reach, level.radius, level.area]
-        numbers.append(np.column_stack([*head, *moments, left_out, slope, *norms]))
+        numbers.append(np.column_stack([*head, *moments, error, slope, *norms]))
     return pack_tree(choose_backend("double"), tree, numbers, rows)
 
 
 def _columns(level: NodeMoments, keys: Iterable[tuple[int, int, int]]) -> list[FloatArray]:
-    """These of the moments of nodes."""
+    """The real or imaginary parts (k,) of the moments of nodes with these keys."""
     return [level.moments[l, m].imag if part else level.moments[l, m].real for l, m, part in keys]
 
 
@@ -93,18 +96,18 @@ def triangle_sources(corners: FloatArray) -> FloatArray:
     1, 3 and 4, and the moments 3 and 4.
 
     The second moment about the centroid is a mean of vectors from there, and so is 0. A triangle
-    whose area is rounded to 0 is given one of 1e-30: records without an area are empty slots, and
+    whose area is rounded to 0 gets an area of 1e-30: records without an area are empty slots, and
     its edges count.
     """
-    alone = BalancedTree(np.arange(len(corners), dtype=np.int64)[:, None], ())
-    level = triangle_tree_moments(alone, corners)[0]
+    leaves = BalancedTree(np.arange(len(corners), dtype=np.int64)[:, None], ())
+    level = triangle_tree_moments(leaves, corners)[0]
     moments, reach = level.moments, TRIANGLE_RATIO * level.radius
-    left_out, slope, _ = truncation_bounds(level, reach, _MULTIPOLE_DEGREE - 1)
+    error, slope, _ = truncation_bounds(level, reach, _MULTIPOLE_DEGREE - 1)
     normal = 2 * moments[1, 1].real, 2 * moments[1, 1].imag, moments[1, 0].real
     higher = _columns(level, _TRIANGLE_MOMENTS)
     norms = [sup_norm(moments, l) for l in (1, 3, 4)]
     head = [level.center, *normal, np.maximum(level.area, 1e-30), reach, level.radius]
-    return np.column_stack([*head, left_out, slope, *norms, *higher])
+    return np.column_stack([*head, error, slope, *norms, *higher])
 
 
 @dataclass(frozen=True)
@@ -112,11 +115,10 @@ class DipoleExpansions:
     """Sums over far primitives of n balls.
 
     coefficients: (n, COEFFICIENTS) of the local expansion (`local_expansion.coefficient_keys`).
-    error, slope: (n,) bounds of what it leaves out of value and gradient, anywhere in the ball.
-    tail, tail_slope: (n,) of what it leaves out besides: at a distance a from the center at most
-        q^(p+1) and q^p times these, with q = a/radius and p = `DEGREE`.
-    s4: (n,) bounds of the sums of area/D^4, D the least distance of a primitive from the
-        center.
+    error, slope: (n,) bounds of the truncation errors of value and gradient, anywhere in the ball.
+    tail, tail_slope: (n,) bounds of further truncation errors: at a distance a from the center at
+        most q^(p+1) and q^p times these, with q = a/radius and p = `DEGREE`.
+    s4: (n,) bounds of the sums of area/D^4, D the smallest distance of a primitive from the center.
     min_distance: (n,) a distance from the center within which there are none of these primitives.
     """
 
@@ -130,43 +132,45 @@ class DipoleExpansions:
 
     @classmethod
     def zero(cls, n: int) -> DipoleExpansions:
-        """Sums over nothing."""
+        """Sums over no primitives."""
         zero = np.zeros(n)
         return cls(np.zeros((n, COEFFICIENTS)), *(5 * [zero]), min_distance=np.full(n, np.inf))
 
     def plus(self, other: DipoleExpansions) -> DipoleExpansions:
-        """The sums over the primitives of both."""
+        """The sums over the primitives of both operands."""
         bounds = "error", "slope", "tail", "tail_slope", "s4"
-        sums = (_ROUNDED_UP * (getattr(self, one) + getattr(other, one)) for one in bounds)
-        least = np.minimum(self.min_distance, other.min_distance)
-        return DipoleExpansions(self.coefficients + other.coefficients, *sums, min_distance=least)
+        sums = (_ROUNDED_UP * (getattr(self, name) + getattr(other, name)) for name in bounds)
+        min_distance = np.minimum(self.min_distance, other.min_distance)
+        return DipoleExpansions(
+            self.coefficients + other.coefficients, *sums, min_distance=min_distance
+        )
 
     def subset(self, which: IntArray) -> DipoleExpansions:
-        """Those of these balls; a ball may occur several times."""
-        return DipoleExpansions(*(one[which] for one in vars(self).values()))
+        """The sums of the balls with these indices; a ball may occur several times."""
+        return DipoleExpansions(*(values[which] for values in vars(self).values()))
 
     @classmethod
     def concatenate(cls, parts: list[DipoleExpansions]) -> DipoleExpansions:
-        """The sums of all balls, part by part."""
-        columns = zip(*(vars(one).values() for one in parts), strict=True)
+        """The sums of all balls, in the order of `parts`."""
+        columns = zip(*(vars(part).values() for part in parts), strict=True)
         return cls(*(np.concatenate(column) for column in columns))
 
     def to_octants(self, shifts: FloatArray, radius: float) -> DipoleExpansions:
-        """The same sums seen from the eight octants of cells with balls of this radius, octant
-        by octant of each cell.
+        """The same sums about the centers of the eight octants of cells with balls of this radius,
+        all octants of a cell in a row.
 
         Proof. The ball of an octant lies in that of the cell, so that bounds of errors are bounds
-        there as well, but what a polynomial leaves out is not small about an octant's center. This
-        center is half a radius away, or less by the margin, so that distances
-        shrink by at most that, and 1/D^4 grows by at most (1 - radius/(2 least))^-4, D >= least.
+        there as well, but the truncation error of the polynomial is not small about an octant's
+        center. This center is half a radius away, or less by the margin, so that distances shrink
+        by at most that, and 1/D^4 grows by at most (1 - radius/(2 least))^-4, D >= least.
         """
         shifted = np.einsum("oab,kb->koa", shifts, self.coefficients)
-        share = 0.5 * radius / self.min_distance  # 0 where there is nothing
+        ratio = 0.5 * radius / self.min_distance  # 0 where there is nothing
         error, slope = self.error + self.tail, self.slope + self.tail_slope
-        far = self.s4 / (1 - share) ** 4, self.min_distance - 0.5 * radius
+        far = self.s4 / (1 - ratio) ** 4, self.min_distance - 0.5 * radius
         bounds = _ROUNDED_UP * error, _ROUNDED_UP * slope, 0 * error, 0 * slope, *far
-        others = (np.repeat(one, 8) for one in bounds)
-        return DipoleExpansions(shifted.reshape(-1, COEFFICIENTS), *others)
+        repeated = (np.repeat(bound, 8) for bound in bounds)
+        return DipoleExpansions(shifted.reshape(-1, COEFFICIENTS), *repeated)
 
     @classmethod
     def over_nodes(
@@ -177,10 +181,10 @@ class DipoleExpansions:
         def term(i: Any, active: Mask) -> list[Any]:
             head, payload = tree.node_heads.read_record(i, active), tree.payload(i, active)
             numbers = dict(zip(_MOMENTS, payload, strict=False))
-            left_out, slope_left_out, *norms = payload[len(_MOMENTS) :]
+            error, slope_error, *norms = payload[len(_MOMENTS) :]
             r = c - tree.backend.Array3f(*head[:3])
-            found = _ClusterExpansion.of(r, _pairs(numbers), norms, radius)
-            return found.of_cluster(left_out, slope_left_out, head[4], head[5], radius)
+            expansion = _ClusterExpansion.of(r, _pairs(numbers), norms, radius)
+            return expansion.of_cluster(error, slope_error, head[4], head[5], radius)
 
         return cls._accumulated(tree.backend, lists, term)
 
@@ -195,15 +199,15 @@ class DipoleExpansions:
             first = {(1, 0): (row[5], 0.0), (1, 1): (0.5 * row[3], 0.5 * row[4])}
             r = c - tree.backend.Array3f(*row[:3])
             if tree.primitives.packets_per_record == 1:
-                found = _ClusterExpansion.of(r, first, [row[6]], radius)
-                bounds = found.rounding, found.rounding / radius, found.tail, found.tail_slope
-                rest = row[6] * _fourth(found.inverse), dr.rcp(found.inverse)
-                return [*found.coefficients, *bounds, *rest]
-            size, left_out, slope_left_out, *norms = row[_DIPOLE_SIZE:_TRIANGLE_HEADER_SIZE]
+                local = _ClusterExpansion.of(r, first, [row[6]], radius)
+                bounds = local.rounding, local.rounding / radius, local.tail, local.tail_slope
+                rest = row[6] * _fourth(local.inverse), dr.rcp(local.inverse)
+                return [*local.coefficients, *bounds, *rest]
+            size, error, slope_error, *norms = row[_DIPOLE_SIZE:_TRIANGLE_HEADER_SIZE]
             higher = dict(zip(_TRIANGLE_MOMENTS, row[_TRIANGLE_HEADER_SIZE:], strict=False))
             norms.insert(1, 0 * size)
-            found = _ClusterExpansion.of(r, first | _pairs(higher), norms, radius)
-            return found.of_cluster(left_out, slope_left_out, size, row[6], radius)
+            local = _ClusterExpansion.of(r, first | _pairs(higher), norms, radius)
+            return local.of_cluster(error, slope_error, size, row[6], radius)
 
         return cls._accumulated(tree.backend, lists, term)
 
@@ -211,23 +215,26 @@ class DipoleExpansions:
     def _accumulated(
         cls, backend: Backend, lists: LaneLists, term: Callable[[Any, Mask], list[Any]]
     ) -> DipoleExpansions:
-        """term: from an entry of a list, all numbers, the last of which is a minimum."""
+        """The sums of `term` over the entries of lists.
+
+        term: from an entry of a list, all numbers, the last of which is a minimum.
+        """
         zero = backend.Float(0)
 
         def add(i: Any, active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            *sums, least = state
+            *sums, minimum = state
             *added, nearest = term(i, active)
             pairs = zip(sums, added, strict=True)
-            new = [old + dr.select(active, one, 0) for old, one in pairs]
-            return *new, dr.select(active, fmin(least, nearest), least)
+            new = [old + dr.select(active, values, 0) for old, values in pairs]
+            return *new, dr.select(active, fmin(minimum, nearest), minimum)
 
         start = (*([zero] * (COEFFICIENTS + 5)), zero + dr.inf)
-        found = for_each_entry(backend, lists, add, start)
-        dr.eval(*found)
+        totals = for_each_entry(backend, lists, add, start)
+        dr.eval(*totals)
         n = dr.width(lists.count)
-        columns = [np.broadcast_to(to_numpy(one), n) for one in found]
+        columns = [np.broadcast_to(to_numpy(values), n) for values in totals]
         coefficients = np.stack(columns[:COEFFICIENTS], axis=1)
-        bounds = (one * _ROUNDED_UP for one in columns[COEFFICIENTS:-1])
+        bounds = (values * _ROUNDED_UP for values in columns[COEFFICIENTS:-1])
         return cls(coefficients, *bounds, min_distance=columns[-1] / _ROUNDED_UP)
 
 
@@ -246,9 +253,13 @@ def _pairs(numbers: dict[Any, Any]) -> dict[tuple[int, int], tuple[Any, Any]]:
 
 @dataclass(frozen=True)
 class _ClusterExpansion:
-    """The local expansion of multipole terms: coefficients times powers of the ball's radius,
-    bounds of what it leaves out of value and gradient on the ball's sphere, of the rounding of the
-    value, and one over the distance."""
+    """The local expansion of multipole terms.
+
+    coefficients: coefficients times powers of the ball's radius.
+    tail, tail_slope: bounds of the truncation errors of value and gradient on the ball's sphere.
+    rounding: a bound of the rounding of the value.
+    inverse: one over the distance.
+    """
 
     coefficients: list[Any]
     tail: Any
@@ -258,10 +269,14 @@ class _ClusterExpansion:
 
     @classmethod
     def of(cls, r: Vec3, moments: Any, norms: list[Any], radius: Real) -> _ClusterExpansion:
-        """r: from the multipoles to the ball's center. norms: of the terms l = 1, 2, ...: term l is
-        at most norms[l-1]/r^(l+1). The bounds are those of `tail_factors`, whose c grows with l:
-        they bound all terms of degree j > p, so that at q times the radius, q <= 1, q^(p+1) times
-        as much, and q^p times as much for the gradient, is left out.
+        """The expansion of multipole terms in the ball of this radius.
+
+        r: from the multipoles to the ball's center.
+        norms: of the terms l = 1, 2, ...: term l is at most norms[l-1]/r^(l+1).
+
+        The bounds are those of `tail_factors`, whose c grows with l: they bound all terms of degree
+        j > p, so that at q times the radius, q <= 1, the truncation error is q^(p+1) times as much,
+        and q^p times as much for the gradient.
 
         Rounding, in double precision: each product of a coefficient passes through fewer than 2^10
         roundings, its shifts to smaller cells included, and the sum of the absolute values of all
@@ -269,51 +284,53 @@ class _ClusterExpansion:
         compute it). So value, and gradient times the radius, are off by at most 2^-20 of that.
         """
         inverse = dr.rsqrt(dr.squared_norm(r))
-        seen = irregular_harmonics(r.x, r.y, r.z, inverse, DEGREE + len(norms))
+        harmonics = irregular_harmonics(r.x, r.y, r.z, inverse, DEGREE + len(norms))
         powers, q = [1.0], radius * inverse
-        total, largest, u, power = 0.0, 0.0, inverse, q
+        total, magnitude, u, power = 0.0, 0.0, inverse, q
         for _ in range(DEGREE):
             powers.append(powers[-1] * radius)
             power = power * q
-        found = zip(
-            coefficient_keys(DEGREE), multipole_to_local(moments, seen, DEGREE), strict=True
+        terms = zip(
+            coefficient_keys(DEGREE), multipole_to_local(moments, harmonics, DEGREE), strict=True
         )
-        coefficients = [one * powers[j] for (j, _, _), one in found]
+        coefficients = [term * powers[j] for (j, _, _), term in terms]
         ratio = 1.0
         for l, norm in enumerate(norms, start=1):
             u = u * inverse
             factor, ratio = tail_factors(DEGREE, l)
-            total, largest = total + factor * norm * u, largest + norm * u
-        steeper = ratio * (DEGREE + 2) / (DEGREE + 1)
+            total, magnitude = total + factor * norm * u, magnitude + norm * u
+        slope_ratio = ratio * (DEGREE + 2) / (DEGREE + 1)
         tail = total * power / (1 - ratio * q)
-        slope = (DEGREE + 1) * total * power / (1 - steeper * q)
-        return cls(coefficients, tail, slope / radius, _ROUNDING * largest, inverse)
+        slope = (DEGREE + 1) * total * power / (1 - slope_ratio * q)
+        return cls(coefficients, tail, slope / radius, _ROUNDING * magnitude, inverse)
 
     def of_cluster(
         self, left_out: Real, slope_left_out: Real, size: Real, area: Real, radius: Real
     ) -> list[Any]:
-        """The numbers of `DipoleExpansions` of a cluster of dipoles with moments up to
+        """The numbers of `DipoleExpansions` for a cluster of dipoles with moments up to
         `_MULTIPOLE_DEGREE`.
 
         left_out, slope_left_out: (E, G) of `multipole.truncation_bounds`, for points that are no
-        nearer than the ball. size: the cluster's radius. area: that of its dipoles.
+            nearer than the ball.
+        size: the cluster's radius.
+        area: the area of its dipoles.
         """
         distance = dr.rcp(self.inverse)
-        near = dr.rcp(distance - radius)
-        power = near
+        inverse_gap = dr.rcp(distance - radius)
+        power = inverse_gap
         for _ in range(_MULTIPOLE_DEGREE + 1):
-            power = power * near
+            power = power * inverse_gap
         error = self.rounding + left_out * power
-        slope = self.rounding / radius + slope_left_out * power * near
-        least = distance - size
-        rest = self.tail, self.tail_slope, area * _fourth(dr.rcp(least)), least
-        return [*self.coefficients, error, slope, *rest]
+        slope = self.rounding / radius + slope_left_out * power * inverse_gap
+        min_distance = distance - size
+        bounds = self.tail, self.tail_slope, area * _fourth(dr.rcp(min_distance)), min_distance
+        return [*self.coefficients, error, slope, *bounds]
 
 
 @dataclass(frozen=True)
 class PendingSources:
-    """Primitives that balls have still to take into account: those of the nodes of one list for
-    each ball, and those of another list, rows of the tree's primitives."""
+    """Sources that balls have still to take into account: for each ball a list of nodes, whose
+    primitives all count, and a list of primitives, as rows of the tree's primitives."""
 
     nodes: LaneLists
     primitives: LaneLists
@@ -324,36 +341,38 @@ class PendingSources:
         return cls(LaneLists.of_root(backend), LaneLists.empty(backend))
 
     def subset(self, backend: Backend, lanes: IntArray) -> PendingSources:
-        """Those of these balls; a ball may occur several times."""
+        """The sources of the balls with these indices; a ball may occur several times."""
         return PendingSources(
             self.nodes.subset(backend, lanes), self.primitives.subset(backend, lanes)
         )
 
     @classmethod
     def concatenate(cls, backend: Backend, parts: list[PendingSources]) -> PendingSources:
-        """Those of all balls, part by part."""
-        nodes = LaneLists.concatenate(backend, [one.nodes for one in parts])
-        return cls(nodes, LaneLists.concatenate(backend, [one.primitives for one in parts]))
+        """The sources of all balls, in the order of `parts`."""
+        nodes = LaneLists.concatenate(backend, [part.nodes for part in parts])
+        return cls(nodes, LaneLists.concatenate(backend, [part.primitives for part in parts]))
 
     def split_far(
         self, tree: PackedTree, c: Vec3, radius: Real, factor: float, smallest: Real
     ) -> tuple[DipoleExpansions, PendingSources]:
-        """Sums over what is farther than `factor` radii from the centers c of balls, and the rest.
+        """The sums over the sources farther than `factor` radii from the centers c of balls, and
+        the remaining sources.
 
-        smallest: inner nodes up to this radius stay nodes where they are not far. Others are
+        smallest: inner nodes up to this radius stay nodes if they are not far. Larger nodes are
             replaced by their children, and leaves by their primitives, which are far or near.
 
-        Each primitive is in just one far node, or is itself far, or is in the rest.
+        Each primitive is in exactly one far node, or is itself far, or is among the remaining
+        sources.
         """
         backend, inner = tree.backend, factor * radius
-        far, left = (
+        far, pending = (
             build_lists(
                 backend,
                 lambda put, far=far: _nodes(tree, self.nodes, c, inner, smallest, put, far=far),
             )
             for far in (True, False)
         )
-        far_primitives, near = (
+        far_primitives, near_primitives = (
             build_lists(
                 backend,
                 lambda put, far=far: self.primitives_of(tree, c, inner, smallest, put, far=far),
@@ -362,7 +381,7 @@ class PendingSources:
         )
         sums = DipoleExpansions.over_nodes(tree, far, c, radius)
         sums = sums.plus(DipoleExpansions.over_primitives(tree, far_primitives, c, radius))
-        return sums, PendingSources(left, near)
+        return sums, PendingSources(pending, near_primitives)
 
     def primitives_of(
         self,
@@ -375,13 +394,14 @@ class PendingSources:
         far: bool,
         most: Any = None,
     ) -> Any:
-        """The number of primitives, of the second list and of leaves that are not far, that are
-        farther from c than `inner` and their reach, or of the others; for `build_lists`. Once it is
-        more than `most`, not all may be counted.
+        """The number of far primitives, of the list of primitives and of leaves that are not far,
+        or with far = False the number of the other primitives; for `build_lists`. A primitive is
+        far if it is farther from c than `inner` and its reach. If there are more than `most`, not
+        all may be counted.
 
         A leaf that is far has no near primitives. A triangle's box lies in the ball of its node, so
-        that the triangle's radius is at most the diameter of that: its centroid is farther from c
-        than inner + 4 R - R, and the reach is at most 1.5 * 2 R.
+        that the triangle's radius is at most the diameter of that ball: its centroid is farther
+        from c than inner + 4 R - R, and the reach is at most 1.5 * 2 R.
         """
         index, vector = tree.backend.UInt32, tree.backend.Array3f
         are_points = tree.primitives.packets_per_record == 1
@@ -393,23 +413,23 @@ class PendingSources:
 
         def visit(node: VisitedNode, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
             square = dr.squared_norm(c - vector(*node.head[:3]))
-            down = square <= dr.square(inner + node.head[3])
-            if are_points and not far:  # only nodes that come near have near points
-                down &= square <= dr.square(inner + node.head[4] * (1 + 1e-9) + 1e-12)
-            down &= node.is_leaf | (node.head[4] > smallest)
+            enters = square <= dr.square(inner + node.head[3])
+            if are_points and not far:  # only nodes whose ball comes near have near points
+                enters &= square <= dr.square(inner + node.head[4] * (1 + 1e-9) + 1e-12)
+            enters &= node.is_leaf | (node.head[4] > smallest)
             if most is not None:
-                down &= state[0] <= most
+                enters &= state[0] <= most
 
-            def more(slot: Any, *_: Any) -> Mask:
-                return down & node.is_leaf & (slot < tree.leaf_size)
+            def runs(slot: Any, *_: Any) -> Mask:
+                return enters & node.is_leaf & (slot < tree.leaf_size)
 
             def step(slot: Any, count: Any) -> tuple[Any, ...]:
-                chosen = is_chosen(tree.primitive(node.leaf, slot, down), down)
+                chosen = is_chosen(tree.primitive(node.leaf, slot, enters), enters)
                 if put is not None:
                     put(count, node.leaf * tree.leaf_size + slot, chosen)
                 return slot + 1, count + dr.select(chosen, index(1), index(0))
 
-            return down, (dr.while_loop((index(0), state[0]), more, step, label="primitives")[1],)
+            return enters, (dr.while_loop((index(0), state[0]), runs, step, label="primitives")[1],)
 
         def listed(i: Any, active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
             chosen = is_chosen(tree.primitives.read_record(i, active), active)
@@ -417,8 +437,8 @@ class PendingSources:
                 put(state[0], i, chosen)
             return (state[0] + dr.select(chosen, index(1), index(0)),)
 
-        found = traverse_subtrees(tree, self.nodes, visit, (index(0),))
-        return for_each_entry(tree.backend, self.primitives, listed, found)[0]
+        counts = traverse_subtrees(tree, self.nodes, visit, (index(0),))
+        return for_each_entry(tree.backend, self.primitives, listed, counts)[0]
 
 
 def _nodes(
@@ -431,17 +451,18 @@ def _nodes(
     *,
     far: bool,
 ) -> Any:
-    """The number of nodes in listed subtrees that are far from c, or of the inner ones that are
-    left: not far, with a radius of at most `smallest`; for `build_lists`. Others are replaced by
-    their children; leaves that are not far are in neither."""
+    """The number of nodes in listed subtrees that are far from c, or with far = False the number of
+    pending inner nodes, which are not far and have a radius of at most `smallest`; for
+    `build_lists`. Other nodes are replaced by their children; leaves that are not far are in
+    neither list."""
     index, vector = tree.backend.UInt32, tree.backend.Array3f
 
     def visit(node: VisitedNode, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
         is_far = dr.squared_norm(c - vector(*node.head[:3])) > dr.square(inner + node.head[3])
-        is_left = ~is_far & ~node.is_leaf & (node.head[4] <= smallest)
-        chosen = is_far if far else is_left
+        is_pending = ~is_far & ~node.is_leaf & (node.head[4] <= smallest)
+        chosen = is_far if far else is_pending
         if put is not None:
             put(state[0], node.index, chosen)
-        return ~(is_far | is_left), (state[0] + dr.select(chosen, index(1), index(0)),)
+        return ~(is_far | is_pending), (state[0] + dr.select(chosen, index(1), index(0)),)
 
     return traverse_subtrees(tree, lists, visit, (index(0),))[0]

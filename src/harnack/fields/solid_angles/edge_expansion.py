@@ -1,7 +1,8 @@
-"""What far edges add to balls: harmonic polynomials, and bounds of what these leave out.
+"""Harmonic polynomials of far edges in balls, and bounds of their truncation errors.
 
-Solid angles of cycles of directed edges far from a ball with the center c and the radius rho. With
-p = c + d on an edge from c + a to c + a + e, Biot and Savart's field of the edge at c + u is
+The solid angles are those of cycles of directed edges far from a ball with the center c and the
+radius rho. With p = c + d on an edge from c + a to c + a + e, Biot and Savart's field of the edge
+at c + u is
 
     h(u) = (a - u) x e W(u),    W(u) = integral over [0, 1] of dt/|a + te - u|^3,
 
@@ -10,8 +11,8 @@ and grad Omega is the sum of these over the cycle. So Omega(c + u) - Omega(c) is
     g(u) = integral over [0, 1] of u . h(su) ds = u . (a x e) integral of W(su) ds.
 
 Each g is harmonic in the ball by itself: u . h(u) = e . (u x grad) phi(u), with phi(u) the integral
-of dt/|a + te - u|, and u x grad maps harmonic functions to harmonic ones, degree by degree; the
-integral over s divides the part of degree l by l.
+of dt/|a + te - u|, and u x grad maps harmonic functions to harmonic functions, degree by degree;
+the integral over s divides the part of degree l by l.
 
 - `EdgeExpansions.of`: the sum over the edges of cycles, for many balls at once.
 - `tail_bounds`: the bound of the terms of higher degree.
@@ -41,13 +42,13 @@ if TYPE_CHECKING:
 
 DEGREE = 6
 COEFFICIENTS = (DEGREE + 1) ** 2
-# Edges are cut into pieces with half lengths of at most this part of their distance from the ball;
-# on each, Gauss's rule has so many nodes.
+# Edges are cut into pieces with half lengths of at most `_MAX_PIECE` times their distance from the
+# ball; on each piece, Gauss's rule has `_NODES` nodes.
 _MAX_PIECE, _NODES = 1 / 6, 4
-# What rounding does to an edge's share of the angle at the center, and to its polynomial: see
+# Rounding of an edge's term of the angle at the center, and of its polynomial: see
 # `EdgeExpansions.of` and `_EdgePiece.sums`.
 _ANGLE_ROUNDING, _TERM_ROUNDING = 2.0**-36, 2.0**-28
-# Sums of many positive numbers in double precision, as bounds.
+# Factor by which sums of many positive numbers in double precision become bounds.
 _ROUNDED_UP = 1 + 1e-9
 
 
@@ -57,7 +58,7 @@ class EdgeExpansions:
 
     coefficients: (n, COEFFICIENTS) of the polynomial (`local_expansion.coefficient_keys`); its
         value at the center is known modulo 4 pi.
-    error, slope: (n,) bounds of what it leaves out of value and gradient, anywhere in the ball.
+    error, slope: (n,) bounds of the truncation errors of value and gradient, anywhere in the ball.
     """
 
     coefficients: FloatArray
@@ -70,39 +71,44 @@ class EdgeExpansions:
         return cls(np.zeros((n, COEFFICIENTS)), np.zeros(n), np.zeros(n))
 
     def plus(self, other: EdgeExpansions) -> EdgeExpansions:
-        """The sums over the edges of both."""
+        """The sums over the edges of both operands."""
         error, slope = self.error + other.error, self.slope + other.slope
         total = self.coefficients + other.coefficients
         return EdgeExpansions(total, error * _ROUNDED_UP, slope * _ROUNDED_UP)
 
     def subset(self, which: Any) -> EdgeExpansions:
-        """Those chosen by a mask or by numbers."""
-        return EdgeExpansions(*(one[which] for one in vars(self).values()))
+        """The sums of the balls that a mask or indices select."""
+        return EdgeExpansions(*(values[which] for values in vars(self).values()))
 
     def to_octants(self, is_split: BoolArray, shifts: FloatArray, radius: float) -> EdgeExpansions:
-        """The same cycles seen from the octants of cells with balls of this radius that are split;
-        the balls of the octants lie in those of the cells. shifts:
-        `local_expansion.local_to_local_matrices`.
+        """The same cycles about the centers of the octants of the cells that are split; the balls
+        of the octants lie in the balls of the cells.
+
+        shifts: `local_expansion.local_to_local_matrices`.
+        radius: the radius of the cells' balls.
 
         In double precision sums of 49 products lose less than 2^-46 of the sum of absolute values;
         harmonics R_jk are at most 1 in the ball, and count twice at most.
         """
-        given, rows = self.coefficients[is_split], shifts.reshape(-1, COEFFICIENTS)
-        shifted = (given @ rows.T).reshape(-1, COEFFICIENTS)
-        sizes = np.abs(shifts).sum(axis=1)
-        lost = 2.0**-44 * (np.abs(given) @ sizes.T).ravel()
-        error, slope = (np.repeat(one[is_split], 8) for one in (self.error, self.slope))
-        return EdgeExpansions(shifted, error + lost, slope + 2 * DEGREE / radius * lost)
+        coefficients, matrix = self.coefficients[is_split], shifts.reshape(-1, COEFFICIENTS)
+        shifted = (coefficients @ matrix.T).reshape(-1, COEFFICIENTS)
+        column_sums = np.abs(shifts).sum(axis=1)
+        rounding = 2.0**-44 * (np.abs(coefficients) @ column_sums.T).ravel()
+        error, slope = (np.repeat(bound[is_split], 8) for bound in (self.error, self.slope))
+        return EdgeExpansions(shifted, error + rounding, slope + 2 * DEGREE / radius * rounding)
 
     @classmethod
     def of(
         cls, points: RecordTable, edges: CellEdges, c: Vec3, radius: Real, n: int
     ) -> EdgeExpansions:
-        """The sums over edges, for balls around c, n lanes. points: rows (x, y, z).
+        """The sums over edges, for balls around c, n lanes.
+
+        points: rows (x, y, z).
 
         Rounding of the angle at the center, as in `LoopEdges.rounding`: each edge is off by less
-        than 2^-46 and by what moving its ends by 2^-50 of coordinates below 2^3 does, which is less
-        than 2^-46 over the distance; all are farther than 2^-9, the radius of the finest cells.
+        than 2^-46 and by the effect of moving its ends by 2^-50 of coordinates below 2^3, which is
+        less than 2^-46 over the distance; all edges are farther than 2^-9, the radius of the finest
+        cells.
         """
         if not len(edges.cell):
             return cls.zero(n)
@@ -110,10 +116,12 @@ class EdgeExpansions:
         count = np.bincount(edges.cell, minlength=n)
         first = upload_integers(backend, np.cumsum(count) - count)
         lengths = upload_integers(backend, count)
-        start, end = (upload_integers(backend, one) for one in (edges.start, edges.end))
+        start, end = (upload_integers(backend, values) for values in (edges.start, edges.end))
         sums = _over_pieces(points, start, end, first, lengths, c, radius)
         dr.eval(*sums)
-        zr, zi, error, slope, *coefficients = (np.broadcast_to(to_numpy(one), n) for one in sums)
+        zr, zi, error, slope, *coefficients = (
+            np.broadcast_to(to_numpy(values), n) for values in sums
+        )
         table = np.stack([2 * np.arctan2(zi, zr), *coefficients], axis=1)
         return cls(table, error * _ROUNDED_UP + _ANGLE_ROUNDING * count, slope * _ROUNDED_UP)
 
@@ -121,39 +129,44 @@ class EdgeExpansions:
 def _over_pieces(
     points: RecordTable, start: Any, end: Any, first: Any, count: Any, c: Vec3, radius: Real
 ) -> tuple[Any, ...]:
-    """The product of spinors of edges, bounds of errors, and the coefficients after the first."""
+    """The product of spinors of edges (real and imaginary part), bounds of errors of value and
+    gradient, and all coefficients after the first."""
     backend = points.backend
     index, real, vector = backend.UInt32, backend.Float, backend.Array3f
 
-    def more(j: Any, *_: Any) -> Mask:
+    def runs(j: Any, *_: Any) -> Mask:
         return j < count
 
     def body(j: Any, t: Real, zr: Real, zi: Real, *sums: Real) -> tuple[Any, ...]:
         active = j < count
-        places = (dr.gather(index, one, first + j, active) for one in (start, end))
-        rows = (points.read_record(place, active) for place in places)
+        point_ids = (dr.gather(index, values, first + j, active) for values in (start, end))
+        rows = (points.read_record(point_id, active) for point_id in point_ids)
         a, b = (vector(*row[:3]) - c for row in rows)
         piece = _EdgePiece.of(a, b, t, radius)
         re, im = inner_product(spinor(a)[2], spinor(b)[2])
         re, im = dr.fma(zr, re, -(zi * im)), dr.fma(zr, im, zi * re)
         scale = dr.rcp(dr.abs(re) + dr.abs(im))
-        some = active & (t == 0) & dr.isfinite(scale)
-        zr, zi = dr.select(some, re * scale, zr), dr.select(some, im * scale, zi)
-        added = [dr.select(active, one, 0) for one in piece.sums(radius)]
-        new = [old + one for old, one in zip(sums, added, strict=True)]
+        is_valid = active & (t == 0) & dr.isfinite(scale)
+        zr, zi = dr.select(is_valid, re * scale, zr), dr.select(is_valid, im * scale, zi)
+        added = [dr.select(active, values, 0) for values in piece.sums(radius)]
+        new = [old + values for old, values in zip(sums, added, strict=True)]
         is_last = piece.stop >= 1
         j = j + dr.select(is_last, index(1), index(0))
         return j, dr.select(is_last, 0, piece.stop), zr, zi, *new
 
     zero = real(0)
     state = (index(0), zero, real(1), zero, *([zero] * (COEFFICIENTS + 1)))
-    return dr.while_loop(state, more, body, label="far edges")[2:]
+    return dr.while_loop(state, runs, body, label="far edges")[2:]
 
 
 @dataclass(frozen=True)
 class _EdgePiece:
-    """A piece of an edge: its middle, relative to the center of the ball, the vector from its start
-    to its end, and the place on the edge, from 0 to 1, where it ends."""
+    """A piece of an edge.
+
+    middle: its middle, relative to the center of the ball.
+    e: the vector from its start to its end.
+    stop: the parameter, from 0 to 1, at which the piece ends on the edge.
+    """
 
     middle: Vec3
     e: Vec3
@@ -161,11 +174,11 @@ class _EdgePiece:
 
     @classmethod
     def of(cls, a: Vec3, b: Vec3, t: Real, radius: Real) -> _EdgePiece:
-        """The piece from t on of the edge from a to b."""
+        """The piece that begins at the parameter t of the edge from a to b."""
         vector, e = cast("Any", type(a)), b - a
-        begin = dr.fma(vector(t), e, a)
-        longest = (2 * _MAX_PIECE / (1 + _MAX_PIECE)) * (dr.norm(begin) - radius)
-        step = longest * dr.rsqrt(dr.squared_norm(e))
+        start = dr.fma(vector(t), e, a)
+        max_length = (2 * _MAX_PIECE / (1 + _MAX_PIECE)) * (dr.norm(start) - radius)
+        step = max_length * dr.rsqrt(dr.squared_norm(e))
         stop = dr.select(step > 0, fmin(t + step, type(t)(1)), 1)
         stop = dr.select(1 - stop < 0.3 * (stop - t), 1, stop)
         return cls(dr.fma(vector(0.5 * (t + stop)), e, a), (stop - t) * e, stop)
@@ -186,20 +199,20 @@ class _EdgePiece:
         for node, weight in zip(nodes.tolist(), (0.5 * weights).tolist(), strict=True):
             d = dr.fma(type(self.e)(0.5 * node), self.e, self.middle)
             inverse = dr.rcp(dr.norm(d))
-            value_left, slope_left = tail_bounds(radius * inverse)
+            value_tail, slope_tail = tail_bounds(radius * inverse)
             strength = weight * area * dr.square(inverse)
             rounding = _TERM_ROUNDING * weight * 2 * half * inverse
-            error = error + rounding + strength * value_left
-            slope = slope + (rounding + strength * slope_left) / radius
+            error = error + rounding + strength * value_tail
+            slope = slope + (rounding + strength * slope_tail) / radius
             for key, pair in irregular_harmonics(d.x, d.y, d.z, inverse, DEGREE).items():
                 old = total.get(key, [0.0, 0.0])
-                total[key] = [one + weight * new for one, new in zip(old, pair, strict=True)]
+                total[key] = [part + weight * new for part, new in zip(old, pair, strict=True)]
         return [error, slope, *_rotated_coefficients(total, self.e, radius)]
 
 
 def tail_bounds(q: Any) -> tuple[Any, Any]:
-    """Bounds of all terms of degree above p = DEGREE of one point of an edge, and of their gradient
-    times rho, as multiples of |d x dp|/|d|^2; q = rho/|d|.
+    """Bounds of all terms of degree above p = DEGREE of a single point of an edge, and of their
+    gradient times rho, as multiples of |d x dp|/|d|^2; q = rho/|d|.
 
     Proof. With phi = sum over j of |u|^j P_j(s)/|d|^(j+1), s the cosine of the angle between u and
     d, u x grad phi = sum of |u|^j P_j'(s)/|d|^(j+1) (u x d)/(|u||d|), so that the term of degree j
@@ -214,41 +227,41 @@ def tail_bounds(q: Any) -> tuple[Any, Any]:
     for _ in range(DEGREE):
         power = power * q
     factor = math.sqrt((DEGREE + 2) / (2 * (DEGREE + 1)))
-    rest = 1 / (1 - q)
-    rest = dr.select(q < 1, rest, dr.inf)
-    value = factor * power * rest
-    return value, value * rest * (DEGREE + 1 - DEGREE * q)
+    geometric = 1 / (1 - q)
+    geometric = dr.select(q < 1, geometric, dr.inf)
+    value = factor * power * geometric
+    return value, value * geometric * (DEGREE + 1 - DEGREE * q)
 
 
 def _quadrature_errors(distance: Real, half: Real, area: Real, radius: Real) -> tuple[Real, Real]:
     """Bounds of the error of Gauss's rule on a piece, for value and gradient.
 
-    distance: D of the middle of the piece from the ball. half: h, half its length. area:
-    |a x e|.
+    distance: D, the distance of the middle of the piece from the ball.
+    half: h, half the length of the piece.
+    area: |a x e|.
 
     Proof. With b from the point su to the middle and v the unit vector along the piece, W is the
     mean of |b + zv|^-3 over real z in [-h, h]. For complex z, (b + zv)^2 has two roots of modulus
     |b| >= D, so that |(b + zv)^2| >= (D - |z|)^2. On the ellipse with foci -h and h and half axes
-    that add up to hr, |z| <= h (r + 1/r)/2 =: S. With S = 8/11 D the integrand is at most
-    M = (11/(3D))^3, and its Chebyshev coefficients are at most 2 M r^-k. The rule with n nodes is
-    exact up to degree 2n - 1; beyond, odd terms vanish and for even k >= 8 the mean of T_k over
-    [-1, 1] is at most 1/63, that of the rule at most 1: in all the mean is off by at most
-    2.04 M r^-2n/(1 - r^-2). g is |u||a x e| times a mean of that. The gradient is a x e times the
-    same, plus u . (a x e) times a mean of s times the gradient of W: 3 times the mean of
-    (b + zv)/|b + zv|^5, which on the ellipse is at most 3 (D+S)/(D-S)^5 (that falls with D), and
-    the mean of s is 1/2.
+    that add up to hr, |z| <= h (r + 1/r)/2 =: S. With S = 8/11 D the integrand is at most M =
+    (11/(3D))^3, and its Chebyshev coefficients are at most 2 M r^-k. The rule with n nodes is exact
+    up to degree 2n - 1; beyond, odd terms vanish, and for even k >= 8 the mean of T_k over [-1, 1]
+    is at most 1/63 and the rule gives at most 1: in all the mean is off by at most 2.04 M r^-2n/(1
+    - r^-2). g is |u||a x e| times such a mean. The gradient is a x e times the same mean, plus u .
+    (a x e) times a mean of s times the gradient of W: 3 times the mean of (b + zv)/|b + zv|^5,
+    which on the ellipse is at most 3 (D+S)/(D-S)^5 (which falls with D), and the mean of s is 1/2.
     """
     x = (8 / 11) * distance / half
     r = x + dr.sqrt(dr.square(x) - 1)
     inverse = dr.square(dr.rcp(r))
     power = dr.square(dr.square(inverse))
-    near = dr.rcp((3 / 11) * distance)
-    cube = near * dr.square(near)
-    off = area * 2.04 * power / (1 - inverse) * cube
-    steep = 1.5 * (19 / 11) * distance * dr.square(near)
-    good = (distance > 0) & (x > 1)
-    error = dr.select(good, off * radius, dr.select(half > 0, dr.inf, 0))
-    return error, dr.select(good, off * (1 + radius * steep), error)
+    inverse_gap = dr.rcp((3 / 11) * distance)
+    cube = inverse_gap * dr.square(inverse_gap)
+    mean_error = area * 2.04 * power / (1 - inverse) * cube
+    slope_factor = 1.5 * (19 / 11) * distance * dr.square(inverse_gap)
+    is_valid = (distance > 0) & (x > 1)
+    error = dr.select(is_valid, mean_error * radius, dr.select(half > 0, dr.inf, 0))
+    return error, dr.select(is_valid, mean_error * (1 + radius * slope_factor), error)
 
 
 def _rotated_coefficients(phi: dict[Any, list[Any]], e: Vec3, radius: Real) -> list[Real]:
@@ -262,7 +275,7 @@ def _rotated_coefficients(phi: dict[Any, list[Any]], e: Vec3, radius: Real) -> l
     powers: list[Any] = [1.0]
     for _ in range(DEGREE):
         powers.append(powers[-1] * radius)
-    out: list[Real] = []
+    coefficients: list[Real] = []
     for j, k, part in coefficient_keys(DEGREE):
         if j == 0:
             continue
@@ -277,5 +290,5 @@ def _rotated_coefficients(phi: dict[Any, list[Any]], e: Vec3, radius: Real) -> l
         if k < j:
             a, b = phi[j, k + 1]
             real, imag = real + up * (-e.x * b + e.y * a), imag + up * (e.x * a + e.y * b)
-        out.append(powers[j] / j * (imag if part else real))
-    return out
+        coefficients.append(powers[j] / j * (imag if part else real))
+    return coefficients

@@ -35,24 +35,26 @@ if TYPE_CHECKING:
     from harnack.tree.balanced_tree import FloatArray, IntArray
     from harnack.tree.triangle_tree import RayFrame
 
-# Edges in a trip of the loop; those that pad the last one have no length and no direction.
+# The number of edges in a trip of the loop; edges that pad the last trip have length and direction
+# 0.
 _EDGES_PER_TRIP = 4
 # The size of the imaginary part of a factor where it would be zero.
 _TINY = 1e-36
 # A bound of the rounding of a product's angle Omega = 2 arg, in units u of half the distance from 1
-# to the next number: so many for each factor, and so many L e' of `LiftedEdge.bounds` besides.
+# to the next number: for each factor `FACTOR_ROUNDINGS` units, and `STEEP_ROUNDINGS` units times L
+# e' of `LiftedEdge.bounds` besides.
 #
-# Proof. Errors of arguments add up, as each step is compared with the exact product of the numbers
-# that it was given. (1) `times` multiplies by F: each part of the result is off by at most u times
-# the size of one product and u times itself, the result by 2 u of its length, and scaling it by
-# another u. The factor common to both parts does not turn it. (2) F = <chi_a, chi_b>, with chi =
-# (s, a') of length sqrt(2 s |a|), and |F| = P c, P = |chi_a||chi_b|, c the cosine of half the angle
-# that the edge subtends. By Cauchy and Schwarz no partial sum is more than P. The real part has
-# three roundings, of at most u P each, the imaginary part two: F is off by sqrt(13) u P, and turned
-# by 3.61 u/c. Together Omega is off by 2 (3 + 3.61/c) u. Where the edge subtends at most a right
-# angle, 1/c <= sqrt(2): by 16.3 u. Where it subtends more, x lies in the ball over it: with length
-# L = 2h and distance d <= h, 1/c <= sqrt(d^2 + h^2)/d <= L e', e' = h/(d sqrt(d^2 + h^2)): by 7.3
-# u L e' besides.
+# Proof. Errors of arguments add up, as each step is compared with the exact product of its rounded
+# inputs. (1) `times` multiplies by F: each part of the result is off by at most u times the size of
+# a single product and u times itself, the result by 2 u of its length, and scaling it by another u.
+# The factor common to both parts does not turn it. (2) F = <chi_a, chi_b>, with chi = (s, a') of
+# length sqrt(2 s |a|), and |F| = P c, P = |chi_a||chi_b|, c the cosine of half the angle that the
+# edge subtends. By Cauchy and Schwarz no partial sum is more than P. The real part has three
+# roundings, of at most u P each, the imaginary part two: F is off by sqrt(13) u P, and turned by
+# 3.61 u/c. Together Omega is off by 2 (3 + 3.61/c) u. If the edge subtends at most a right angle,
+# 1/c <= sqrt(2): by 16.3 u. If it subtends more, x lies in the ball over it: with length L = 2h and
+# distance d <= h, 1/c <= sqrt(d^2 + h^2)/d <= L e', e' = h/(d sqrt(d^2 + h^2)): by 7.3 u L e'
+# besides.
 FACTOR_ROUNDINGS, STEEP_ROUNDINGS = 16.5, 7.5
 
 
@@ -66,16 +68,16 @@ class LiftedEdges:
     def upload(cls, backend: Backend, vertices: FloatArray, edges: IntArray) -> LiftedEdges:
         """Edges (k, 2) between vertices (n, 3); an edge of weight w is repeated w times."""
         table = edge_records(vertices, edges)
-        nothing = np.concatenate([table[0, :3], [0.0], table[0, :3], table[0, 7:]])
-        return cls(RecordTable.upload(backend, table, nothing, _EDGES_PER_TRIP))
+        padding = np.concatenate([table[0, :3], [0.0], table[0, :3], table[0, 7:]])
+        return cls(RecordTable.upload(backend, table, padding, _EDGES_PER_TRIP))
 
 
 def edge_records(vertices: FloatArray, edges: IntArray) -> FloatArray:
     """(k, 8) for directed edges (k, 2): lower end, direction, higher end, 1/length^2.
 
-    The ends are ordered by vertex index, as those of triangles are (`tree.triangle_tree`), so that
-    `edge_function` gives the same bits here and there; direction is 1 if the edge runs from lower
-    to higher, -1 if it runs back.
+    The ends are ordered by vertex index, like the ends of edges of triangles
+    (`tree.triangle_tree`), so that `edge_function` gives the same bits for both; direction is 1 if
+    the edge runs from the lower to the higher index, -1 if it runs back.
     """
     low, high = vertices[edges.min(axis=1)], vertices[edges.max(axis=1)]
     direction = np.where(edges[:, 0] < edges[:, 1], 1.0, -1.0)
@@ -84,13 +86,13 @@ def edge_records(vertices: FloatArray, edges: IntArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class LiftedEdge:
-    """An edge relative to a point x, and to rays of one direction.
+    """An edge relative to a point x, and to rays of a single direction.
 
-    edge: relative to x.
+    edge: the edge relative to x.
     ends: its end points, in the order of their indices.
-    frame: of the rays.
-    direction: 1 or -1: whether the boundary runs from the first end to the second or back; the sign
-        of all that the edge adds.
+    frame: the frame of the rays.
+    direction: 1 if the boundary runs from the first end to the second, -1 if it runs back; the sign
+        of all terms of the edge.
     """
 
     edge: Edge
@@ -120,8 +122,8 @@ class LiftedEdge:
         return re, self.direction * im
 
     def terms(self, derivatives: int, active: Mask) -> SourceTerm:
-        """What the edge adds to the derivatives of the sum of angles that are asked for; 0 where it
-        is not active."""
+        """The edge's terms of the derivatives of the sum of angles, up to order `derivatives`; 0
+        where it is not active."""
         if derivatives == 0:
             return SourceTerm(None)
         weight, c = self.edge.biot_savart()
@@ -135,38 +137,41 @@ class LiftedEdge:
         )
 
     def bounds(self, unit: Real) -> tuple[Real, Real, Real]:
-        """A bound of the rounding of Omega_e and of its factor in the product, and what the edge
-        adds to s4 and s5 of `SourceSums`.
+        """A bound of the rounding of Omega_e and of its factor in the product, and the edge's terms
+        of s4 and s5 of `SourceSums`.
 
         unit: the rounding of a coordinate, `coordinate_rounding`, which is twice that of correct
             rounding.
 
         Rounding. The ends of the edge, x and their differences are off by half a unit together, and
         the angle by that times Biot and Savart's field, which is at most twice the first number e'
-        of `edge_variation`; roundings of s are as if the ends had moved by another half, and the
-        same bits of an end serve both edges there. What is left is the rounding of the factor's own
-        sums and of the product: `FACTOR_ROUNDINGS`, and `STEEP_ROUNDINGS` L e' where the edge, of
+        of `edge_variation`; roundings of s act like moving the ends by another half unit, and the
+        same bits of an end serve both of its edges. The rest is the rounding of the factor's own
+        sums and of the product: `FACTOR_ROUNDINGS`, and `STEEP_ROUNDINGS` L e' if the edge, of
         length L, subtends more than a right angle. It is less than 4 pi in any case.
 
         Variation. Taylor's remainder after the linear term is at most 3/4 t^2 times the integral of
         |dp|/(rho^3 (1-t/rho)) (`curve_queries.remainder_promises`). With a = L/2 and distance d an
         edge has int rho^-3 <= 2a/(d^2 sqrt(d^2+a^2)) =: 2e, int rho^-4 <= 2e/d; and 1/(1-q) <= 1 +
-        q/(1-b) <= 1 + q rise/4 on [0, b] (`SourceSums.sample`). So an edge adds to the remainder
-        what s4 += e/2 and s5 += 3e/(8d) do. d is reduced by its rounding.
+        q/(1-b) <= 1 + q rise/4 on [0, b] (`SourceSums.sample`). So the terms s4 += e/2 and s5 +=
+        3e/(8d) bound the edge's part of the remainder. d is reduced by its rounding.
         """
         distance = fmax(dr.sqrt(self.edge.squared_distance) - 2 * unit, 0)
         first, e = edge_variation(distance * distance, self.edge.inverse_square_length)
-        own = FACTOR_ROUNDINGS * float(dr.epsilon(first))
-        steep = (
+        factor_rounding = FACTOR_ROUNDINGS * float(dr.epsilon(first))
+        steep_rounding = (
             STEEP_ROUNDINGS * float(dr.epsilon(first)) * dr.rsqrt(self.edge.inverse_square_length)
         )
-        rounding = fmin(dr.fma(dr.fma(2.0, unit, steep), first, own), 4 * dr.pi)
+        rounding = fmin(
+            dr.fma(dr.fma(2.0, unit, steep_rounding), first, factor_rounding), 4 * dr.pi
+        )
         return rounding, 0.5 * e, 0.375 * dr.rcp(distance) * e
 
 
 @dataclass(frozen=True)
 class LiftedSums:
-    """Sums over terms and edges, in which the edges' angles are still a product of factors."""
+    """Sums over terms and edges, in which the angles of the edges are still a product of
+    factors."""
 
     sums: SourceSums
     product: LiftedProduct
@@ -184,7 +189,7 @@ class LiftedSums:
         return cls(SourceSums.from_state(parts[0]), LiftedProduct(*parts[1]))
 
     def parts(self) -> tuple[Any, ...]:
-        """The parts of the sums and those of the product, for the state of a loop."""
+        """The parts of the sums and of the product, for the state of a loop."""
         return self.sums.to_state(), self.product.parts()
 
     def add_edge(self, edge: LiftedEdge, unit: Real, active: Mask) -> LiftedSums:
@@ -194,11 +199,11 @@ class LiftedSums:
         rounding, s4, s5 = edge.bounds(unit)
         # A factor of 1 scales the product, too.
         rounding = dr.select(active, rounding, 2 * float(dr.epsilon(rounding)))
-        free = fmin(dr.sqrt(edge.edge.squared_distance), sums.singularity_distance)
+        distance = fmin(dr.sqrt(edge.edge.squared_distance), sums.singularity_distance)
         sums = dataclasses.replace(
             sums,
             rounding=sums.rounding + rounding,
-            singularity_distance=dr.select(active, free, sums.singularity_distance),
+            singularity_distance=dr.select(active, distance, sums.singularity_distance),
             s4=sums.s4 + dr.select(active, s4, 0),
             s5=sums.s5 + dr.select(active, s5, 0),
         )
@@ -207,18 +212,18 @@ class LiftedSums:
 
     @property
     def angle(self) -> Real:
-        """The sum of Omega_e."""
+        """The sum of Omega_e over the edges."""
         return self.product.angle()
 
     def total(self) -> SourceSums:
-        """The sums with the edges' angles added to the value."""
+        """The sums with the angles of the edges added to the value."""
         return self.sums.add_term(SourceTerm(self.angle), True)
 
 
 def lifted_sums(edges: LiftedEdges, x: Vec3, derivatives: int) -> LiftedSums:
     """All sums at points x in one loop over the edges, for the direction d = z.
 
-    derivatives: 0 for the angle alone, 1 with the gradient, 2 with the Hessian. Results that are
+    derivatives: 0 for the angle only, 1 with the gradient, 2 with the Hessian. Results that are
         not used are not computed.
     """
     backend, unit = edges.records.backend, coordinate_rounding(x)
@@ -244,7 +249,7 @@ def edge_rates(edges: LiftedEdges, x: Vec3, derivatives: int) -> SourceSums:
         edge = LiftedEdge.between(p, q, row[3], row[7], VerticalRayFrame(x), x)
         sums = SourceSums.from_state(state).add_term(edge.terms(derivatives, active), True)
         _, s4, s5 = edge.bounds(unit)
-        s4, s5 = (dr.select(active, one, 0) for one in (s4, s5))
+        s4, s5 = (dr.select(active, bound, 0) for bound in (s4, s5))
         return dataclasses.replace(sums, s4=sums.s4 + s4, s5=sums.s5 + s5).to_state()
 
     start = SourceSums.zero(backend, dr.inf, derivatives).to_state()
@@ -253,12 +258,12 @@ def edge_rates(edges: LiftedEdges, x: Vec3, derivatives: int) -> SourceSums:
 
 @dataclass(frozen=True)
 class VertexView:
-    """A vertex relative to x and to rays.
+    """A vertex relative to a point x and to rays.
 
-    offset: from x to the vertex.
-    length: of the offset.
+    offset: the vector from x to the vertex.
+    length: the length of the offset.
     u, v: the vertex's coordinates across the rays.
-    s: the length less the component of the offset along the rays.
+    s: the length minus the component of the offset along the rays.
     """
 
     offset: Vec3
@@ -269,7 +274,7 @@ class VertexView:
 
 
 def view_vertex(p: Vec3, frame: RayFrame, x: Vec3) -> VertexView:
-    """A vertex p relative to x and to rays of a frame."""
+    """A vertex p relative to x and to the rays of a frame."""
     offset = p - x
     length = dr.norm(offset)
     u, v = frame.transverse(p)
@@ -280,7 +285,7 @@ def view_vertex(p: Vec3, frame: RayFrame, x: Vec3) -> VertexView:
 def ends_factor(a: VertexView, b: VertexView, direction: Real) -> tuple[Real, Real]:
     """F_e of the edge from a to b; direction: positive if a has the lower index, else negative.
 
-    `side` is given the ends in the order of their indices, as everywhere.
+    `edge_function` takes the ends in the order of their indices, as everywhere.
     """
     rises = direction > 0
     low, high = (dr.select(rises, a.u, b.u), dr.select(rises, a.v, b.v)), (
@@ -291,7 +296,8 @@ def ends_factor(a: VertexView, b: VertexView, direction: Real) -> tuple[Real, Re
 
 
 def edge_factor(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Real, Real]:
-    """F_e of the edge from a to b, each (u, v, z) across the direction and along it.
+    """F_e of the edge from a to b, both given as (u, v, z): two coordinates across the direction,
+    and the coordinate along it. la, lb: |a| and |b|.
 
     s_a is computed as |a'|^2/(|a| + a.d) where a.d > 0, so that nothing cancels.
     """
@@ -299,32 +305,34 @@ def edge_factor(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Real, Real]:
 
 
 def _factor(a: tuple[Real, Real], b: tuple[Real, Real], sa: Real, sb: Real) -> tuple[Real, Real]:
-    """F_e from the ends' coordinates across the direction, and s of each.
+    """F_e from the coordinates of the ends across the direction, and s of each end.
 
     A ray exactly through an edge or a vertex is treated as by `tree.triangle_tree.signed_crossing`:
     as if it passed at a v, and then a u, infinitely little below zero.
     """
     real, (au, av), (bu, bv) = cast("Any", type(sa)), a, b
-    in_line = (au == 0) & (av == 0), (bu == 0) & (bv == 0)
-    ax, bx = dr.select(in_line[0], real(-1e-18), au), dr.select(in_line[1], real(-1e-18), bu)
+    on_ray = (au == 0) & (av == 0), (bu == 0) & (bv == 0)
+    ax, bx = dr.select(on_ray[0], real(-1e-18), au), dr.select(on_ray[1], real(-1e-18), bu)
     im = -edge_function((ax, av), (bx, bv))
     re = dr.fma(sa, sb, dr.fma(ax, bx, av * bv))
     tie = dr.select(av == bv, ax - bx, bv - av)
-    # Only the sign of a real factor matters. It may be so small that it would be no longer than the
-    # number that stands for its imaginary part.
-    straight = im == 0
-    re = dr.select(straight, dr.select((re < 0) & ~(in_line[0] & in_line[1]), real(-1), 1), re)
-    return re, dr.select(straight, dr.mulsign(real(_TINY), tie), im)
+    # Only the sign of a real factor matters. The factor may be so small that it would be no larger
+    # than the number that stands for its imaginary part.
+    is_real = im == 0
+    re = dr.select(is_real, dr.select((re < 0) & ~(on_ray[0] & on_ray[1]), real(-1), 1), re)
+    return re, dr.select(is_real, dr.mulsign(real(_TINY), tie), im)
 
 
 def _length_less_axial(a: Vec3, length: Real) -> Real:
-    across = dr.fma(a.x, a.x, a.y * a.y)
-    return dr.select(a.z > 0, across / (length + a.z), length - a.z)
+    """s = |a| - a.d of a vector a = (u, v, z) with z along the direction d, without
+    cancellation."""
+    square = dr.fma(a.x, a.x, a.y * a.y)
+    return dr.select(a.z > 0, square / (length + a.z), length - a.z)
 
 
 @dataclass(frozen=True)
 class LiftedProduct:
-    """A product re + i im of factors, scaled to a length of about one, and the number of its full
+    """A product re + i im of factors, scaled to a length of about 1, and the number of its full
     turns."""
 
     re: Real
@@ -341,26 +349,26 @@ class LiftedProduct:
         return self.re, self.im, self.turns
 
     def times(self, re: Real, im: Real) -> LiftedProduct:
-        """The product with one factor more.
+        """The product with a further factor re + i im.
 
-        Arguments lie in (-pi, pi]. That of the product is their sum if they have different signs;
-        otherwise the sum has left the interval exactly if its imaginary part has the other sign.
-        For two factors of argument -pi/2 it has: the sum -pi is pi and one turn less.
+        Arguments lie in (-pi, pi]. The argument of the product is their sum if they have different
+        signs; otherwise the sum has left the interval exactly if its imaginary part has the other
+        sign. For two factors of argument -pi/2 it has: the sum -pi is pi and a turn less.
         """
         pr = dr.fma(self.re, re, -(self.im * im))
         pi = dr.fma(self.re, im, self.im * re)
         scale = dr.rcp(dr.abs(pr) + dr.abs(pi))
-        one = type(pr)(1)
+        unit = type(pr)(1)
         pi = dr.select(pi == 0, 0, pi)  # no zero with a sign, which would be -pi
-        # Then one of the two arguments is at least pi/2; testing for it keeps underflow from
-        # counting.
-        left = (self.re <= 0) | (re <= 0)
-        over = dr.select((self.im >= 0) & (im >= 0) & (pi < 0) & left, one, 0)
-        under = dr.select((self.im < 0) & (im < 0) & (pi >= 0) & left, one, 0)
-        some = dr.isfinite(scale)
+        # The sum can leave the interval only if one of the arguments is at least pi/2 in size;
+        # testing for this keeps underflow from counting.
+        may_wrap = (self.re <= 0) | (re <= 0)
+        over = dr.select((self.im >= 0) & (im >= 0) & (pi < 0) & may_wrap, unit, 0)
+        under = dr.select((self.im < 0) & (im < 0) & (pi >= 0) & may_wrap, unit, 0)
+        is_finite = dr.isfinite(scale)
         return LiftedProduct(
-            dr.select(some, pr * scale, self.re),
-            dr.select(some, pi * scale, self.im),
+            dr.select(is_finite, pr * scale, self.re),
+            dr.select(is_finite, pi * scale, self.im),
             self.turns + over - under,
         )
 

@@ -1,13 +1,15 @@
-"""Runs of consecutive edges of closed loops that are near to cells, each closed by one more vertex.
+"""Runs of consecutive edges of closed loops that are near to cells, each closed by a further
+vertex.
 
 A run with its closing edges, from its last vertex to its apex and on to its first, is a closed
-loop. So the solid angle of a curve is that of the closed near runs, modulo 4 pi, plus that of what
-is left: far edges and the closing edges, reversed. These are a cycle, too: each vertex is entered
-as often as it is left.
+loop. So the solid angle of a curve is that of the closed near runs, modulo 4 pi, plus that of the
+remaining edges: far edges and the closing edges, reversed. These are a cycle, too: each vertex is
+entered as often as it is left.
 
 - `VertexTable`: the vertices of loops, such that every run is consecutive.
-- `EdgeRuns`: the runs of many cells. `EdgeRuns.restrict_to_near` gives those of smaller cells, and
-  what is left.
+- `EdgeRuns`: the runs of many cells. `EdgeRuns.restrict_to_near` gives the runs of smaller cells,
+  and the edges in them.
+- `subtract_runs`: the remaining edges.
 """
 
 from __future__ import annotations
@@ -20,8 +22,8 @@ import numpy as np
 if TYPE_CHECKING:
     from harnack.backend import BoolArray, FloatArray, IntArray
 
-# Runs with so few far edges in between are one: closing a run takes two edges and begins another
-# one.
+# Runs with at most this many far edges in between are joined: closing a run takes two edges and
+# begins another run.
 _MAX_GAP = 3
 # The distance of an apex from the center, in units of the radius beyond which edges are far.
 _APEX_RATIO = 2.5
@@ -29,10 +31,11 @@ _APEX_RATIO = 2.5
 
 @dataclass(frozen=True)
 class VertexTable:
-    """Vertices (m, 3) of closed loops, each twice in a row and its first once more, so that a run
-    that goes on across a loop's end is consecutive.
+    """Vertices of closed loops, in a table in which every run of edges is consecutive.
 
-    first, sizes: of each loop the place of its first vertex, and the number of its edges.
+    points: (m, 3) the vertices of each loop, twice in a row, and its first vertex a third time, so
+        that a run that continues across the end of a loop is consecutive.
+    first, sizes: for each loop the row of its first vertex, and the number of its edges.
     """
 
     points: FloatArray
@@ -50,9 +53,10 @@ class VertexTable:
 
 @dataclass(frozen=True)
 class CellEdges:
-    """Directed edges of n cells, in the order of these, between rows of a table of points.
+    """Directed edges of n cells, sorted by cell, between rows of a table of points.
 
-    start, end: (k,) rows. cell: (k,) numbers of cells.
+    start, end: (k,) rows of the table.
+    cell: (k,) indices of cells.
     """
 
     start: IntArray
@@ -62,12 +66,12 @@ class CellEdges:
 
 @dataclass(frozen=True)
 class EdgeRuns:
-    """Runs of the edges of loops, in the order of n cells.
+    """Runs of the edges of loops, sorted by cell.
 
     cell: (m,) the cell that a run belongs to.
-    first, count: (m,) the place of its first vertex in the table, and the number of its edges.
+    first, count: (m,) the row of its first vertex in the table, and the number of its edges.
     is_whole: (m,) whether it is a whole loop, which needs no apex.
-    apex: (m, 3) points that close runs; of no meaning for whole loops.
+    apex: (m, 3) points that close runs; unused for whole loops.
     """
 
     cell: IntArray
@@ -80,103 +84,108 @@ class EdgeRuns:
     def of_loops(cls, table: VertexTable) -> EdgeRuns:
         """All loops, whole, as the runs of one cell."""
         n = len(table.sizes)
-        whole = np.ones(n, np.bool_)
-        return cls(np.zeros(n, np.int64), table.first, table.sizes, whole, np.zeros((n, 3)))
+        is_whole = np.ones(n, np.bool_)
+        return cls(np.zeros(n, np.int64), table.first, table.sizes, is_whole, np.zeros((n, 3)))
 
     def to_octants(self, is_split: BoolArray) -> EdgeRuns:
         """The runs of cells that are split, for each of their eight children."""
-        chosen = is_split[self.cell]
-        number = np.cumsum(is_split) - 1
-        parent, count = number[self.cell[chosen]], int(chosen.sum())
-        again = np.tile(np.arange(count), 8)
-        cell = 8 * parent[again] + np.repeat(np.arange(8), count)
+        is_chosen = is_split[self.cell]
+        split_index = np.cumsum(is_split) - 1
+        parent, count = split_index[self.cell[is_chosen]], int(is_chosen.sum())
+        repeated = np.tile(np.arange(count), 8)
+        cell = 8 * parent[repeated] + np.repeat(np.arange(8), count)
         order = np.argsort(cell, kind="stable")
-        chosen_rows = np.flatnonzero(chosen)[again[order]]
-        return self._some(chosen_rows, cell[order])
+        rows = np.flatnonzero(is_chosen)[repeated[order]]
+        return self._some(rows, cell[order])
 
     def _some(self, rows: IntArray, cell: IntArray) -> EdgeRuns:
+        """The runs at these rows, of the cells `cell`."""
         return EdgeRuns(
             cell, self.first[rows], self.count[rows], self.is_whole[rows], self.apex[rows]
         )
 
     def edges(self) -> tuple[IntArray, IntArray]:
-        """For each edge of all runs its run, and the place of its first vertex."""
+        """For each edge of all runs, the index of its run, and the row of its first vertex."""
         run = np.repeat(np.arange(len(self.count)), self.count)
-        begin = np.cumsum(self.count) - self.count
-        return run, np.arange(len(run)) - begin[run] + self.first[run]
+        start = np.cumsum(self.count) - self.count
+        return run, np.arange(len(run)) - start[run] + self.first[run]
 
     def restrict_to_near(self, run: IntArray, is_near: BoolArray) -> tuple[EdgeRuns, BoolArray]:
-        """The runs of near edges, and for each edge whether it is in one of them.
+        """The runs of near edges, and for each edge whether it is in such a run.
 
-        run, is_near: (k,) for each of `edges`, its run, and whether it is near. Apexes are to be
-            chosen (`with_apexes`).
+        run, is_near: (k,) for each of `edges`, its run, and whether it is near.
+
+        The apexes of the new runs are still to be chosen (`with_apexes`).
         """
-        begin = np.cumsum(self.count) - self.count
-        near = np.flatnonzero(is_near)
-        owner = run[near]
-        breaks = np.ones(len(near), np.bool_)
-        breaks[1:] = (owner[1:] != owner[:-1]) | (np.diff(near) > _MAX_GAP + 1)
+        start = np.cumsum(self.count) - self.count
+        near_ids = np.flatnonzero(is_near)
+        owner = run[near_ids]
+        breaks = np.ones(len(near_ids), np.bool_)
+        breaks[1:] = (owner[1:] != owner[:-1]) | (np.diff(near_ids) > _MAX_GAP + 1)
         starts = np.flatnonzero(breaks)
-        ends = np.append(starts[1:], len(near))[: len(starts)] - 1
-        low, high, owner = near[starts], near[ends], owner[starts]
-        offset, count = low - begin[owner], high - low + 1
-        # Runs of whole loops may go on across the end.
+        ends = np.append(starts[1:], len(near_ids))[: len(starts)] - 1
+        first_near, last_near, owner = near_ids[starts], near_ids[ends], owner[starts]
+        offset, count = first_near - start[owner], last_near - first_near + 1
+        # Runs of whole loops may continue across the end of the loop.
         is_first, is_last = np.ones((2, len(owner)), np.bool_)
         is_first[1:] = is_last[:-1] = owner[1:] != owner[:-1]
         first_of = np.maximum.accumulate(np.where(is_first, np.arange(len(owner)), 0))
         size = self.count[owner]
-        between = offset[first_of] + size - (offset + count)
-        joins = is_last & self.is_whole[owner] & (between <= _MAX_GAP)
-        alone = joins & is_first
-        joined = joins & ~is_first
-        longer = count + np.where(joined, between + count[first_of], 0)
-        keep = np.ones(len(owner), np.bool_)
-        keep[first_of[joined]] = False
-        offset, longer = np.where(alone, 0, offset), np.where(alone, size, longer)
-        whole = self.is_whole[owner] & (longer >= size)
+        gap = offset[first_of] + size - (offset + count)
+        may_join = is_last & self.is_whole[owner] & (gap <= _MAX_GAP)
+        closes_itself = may_join & is_first
+        is_joined = may_join & ~is_first
+        length = count + np.where(is_joined, gap + count[first_of], 0)
+        is_kept = np.ones(len(owner), np.bool_)
+        is_kept[first_of[is_joined]] = False
+        offset, length = np.where(closes_itself, 0, offset), np.where(closes_itself, size, length)
+        is_whole = self.is_whole[owner] & (length >= size)
         marks = np.zeros(len(run) + 1, np.int64)
-        stop = offset + longer
-        np.add.at(marks, begin[owner[keep]] + offset[keep], 1)
+        stop = offset + length
+        np.add.at(marks, start[owner[is_kept]] + offset[is_kept], 1)
         inside = np.minimum(stop, size)
-        np.add.at(marks, begin[owner[keep]] + inside[keep], -1)
-        over = keep & (stop > size)
-        np.add.at(marks, begin[owner[over]], 1)
-        np.add.at(marks, begin[owner[over]] + (stop - size)[over], -1)
-        kept = np.cumsum(marks[:-1]) > 0
-        cell, first = self.cell[owner][keep], (self.first[owner] + offset)[keep]
-        none = np.zeros((int(keep.sum()), 3))
-        return EdgeRuns(cell, first, longer[keep], whole[keep], none), kept
+        np.add.at(marks, start[owner[is_kept]] + inside[is_kept], -1)
+        wraps = is_kept & (stop > size)
+        np.add.at(marks, start[owner[wraps]], 1)
+        np.add.at(marks, start[owner[wraps]] + (stop - size)[wraps], -1)
+        in_run = np.cumsum(marks[:-1]) > 0
+        cell, first = self.cell[owner][is_kept], (self.first[owner] + offset)[is_kept]
+        apexes = np.zeros((int(is_kept.sum()), 3))
+        return EdgeRuns(cell, first, length[is_kept], is_whole[is_kept], apexes), in_run
 
     def with_apexes(
         self, table: VertexTable, centers: FloatArray, radius: FloatArray, number: np.dtype[Any]
     ) -> EdgeRuns:
-        """The same runs with apexes; radius: beyond which edges are far.
+        """The same runs with apexes; radius: the distance from the centers beyond which edges are
+        far.
 
-        With unit vectors to both ends, the apex lies in the direction of their sum, or where that
-        is short of any direction at right angles to their difference: so at most at a right angle
-        to both ends, which are farther than the radius r, and the closing edges are no nearer than
+        With unit vectors to both ends, the apex lies in the direction of their sum, or if that is
+        short in a direction at right angles to their difference: so at most at a right angle to
+        both ends, which are farther than the radius r, and the closing edges are no nearer than
         2.5/sqrt(1 + 2.5^2) = 0.928 r.
         """
         center = centers[self.cell]
         first = _unit(table.points[self.first] - center)
         last = _unit(table.points[self.first + self.count] - center)
         mean = first + last
-        between = _unit(first - last)
-        axis = np.eye(3)[np.abs(between).argmin(axis=1)]
-        across = _unit(axis - (axis * between).sum(axis=1, keepdims=True) * between)
-        across *= np.where((across * mean).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
-        short = np.linalg.norm(mean, axis=1, keepdims=True) < 0.1
-        apex = center + _APEX_RATIO * radius[self.cell, None] * np.where(short, across, _unit(mean))
+        difference = _unit(first - last)
+        axis = np.eye(3)[np.abs(difference).argmin(axis=1)]
+        perpendicular = _unit(axis - (axis * difference).sum(axis=1, keepdims=True) * difference)
+        perpendicular *= np.where((perpendicular * mean).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
+        is_short = np.linalg.norm(mean, axis=1, keepdims=True) < 0.1
+        apex = center + _APEX_RATIO * radius[self.cell, None] * np.where(
+            is_short, perpendicular, _unit(mean)
+        )
         apex = apex.astype(number).astype(np.float64)
         return EdgeRuns(self.cell, self.first, self.count, self.is_whole, apex)
 
     def closing_edges(self, apexes: int) -> tuple[CellEdges, CellEdges]:
-        """The edges from the ends of runs to their apexes, and from the apexes to the beginnings of
-        the runs; apexes: the row of the first apex in the table of points."""
-        rows = np.flatnonzero(~self.is_whole)
-        first, last = self.first[rows], self.first[rows] + self.count[rows]
-        cell = self.cell[rows]
-        return CellEdges(last, apexes + rows, cell), CellEdges(apexes + rows, first, cell)
+        """The edges from the ends of runs to their apexes, and the edges from the apexes to the
+        beginnings of the runs; apexes: the row of the first apex in the table of points."""
+        run_ids = np.flatnonzero(~self.is_whole)
+        first, last = self.first[run_ids], self.first[run_ids] + self.count[run_ids]
+        cell = self.cell[run_ids]
+        return CellEdges(last, apexes + run_ids, cell), CellEdges(apexes + run_ids, first, cell)
 
 
 def _unit(vectors: FloatArray) -> FloatArray:
@@ -201,28 +210,28 @@ def subtract_runs(
     The edges refer to a table of points with the vertices first, then the apexes of `before`, then
     the apexes of `after`.
     """
-    left = np.flatnonzero(~kept)
-    run, place = (one[left] for one in edges)
-    inner = after.closing_edges(vertices + len(before.cell))
+    remaining = np.flatnonzero(~kept)
+    run, vertex = (part[remaining] for part in edges)
+    closing = after.closing_edges(vertices + len(before.cell))
     return _merged(
         [
-            CellEdges(place, place + 1, before.cell[run]),
+            CellEdges(vertex, vertex + 1, before.cell[run]),
             *before.closing_edges(vertices),
-            *(CellEdges(one.end, one.start, one.cell) for one in inner),
+            *(CellEdges(part.end, part.start, part.cell) for part in closing),
         ]
     )
 
 
 def _merged(groups: list[CellEdges]) -> CellEdges:
     """The edges of all groups, sorted by cell; each group must be sorted by cell."""
-    cells = 1 + max((int(one.cell[-1]) for one in groups if len(one.cell)), default=0)
-    counts = [np.bincount(one.cell, minlength=cells) for one in groups]
+    cell_count = 1 + max((int(group.cell[-1]) for group in groups if len(group.cell)), default=0)
+    counts = [np.bincount(group.cell, minlength=cell_count) for group in groups]
     total = np.sum(counts, axis=0)
-    at = np.cumsum(total) - total
+    position = np.cumsum(total) - total
     start, end, cell = np.empty((3, int(total.sum())), np.int64)
-    for one, count in zip(groups, counts, strict=True):
-        rank = np.arange(len(one.cell)) - np.repeat(np.cumsum(count) - count, count)
-        place = np.repeat(at, count) + rank
-        start[place], end[place], cell[place] = one.start, one.end, one.cell
-        at = at + count
+    for group, count in zip(groups, counts, strict=True):
+        rank = np.arange(len(group.cell)) - np.repeat(np.cumsum(count) - count, count)
+        slot = np.repeat(position, count) + rank
+        start[slot], end[slot], cell[slot] = group.start, group.end, group.cell
+        position = position + count
     return CellEdges(start, end, cell)

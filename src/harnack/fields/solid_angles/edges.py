@@ -30,30 +30,30 @@ if TYPE_CHECKING:
 
 __all__ = ["Edge", "edge_variation"]
 
-# From p, q, 1/length^2 of the edge from p to q, and a state: the state with that edge added.
+# A function of p, q, 1/length^2 of the edge from p to q, and a state, that returns the state with
+# that edge added.
 EachEdge: TypeAlias = "Callable[[Vec3, Vec3, Real, tuple[Any, ...]], tuple[Any, ...]]"
 
-# The largest 1/length^2 of a record, within the range of float32. Edges without a length, used as
-# padding or made so by rounding, have it too: they have no angle, no gradient, hardly any
-# variation.
+# The largest 1/length^2 of a record, within the range of float32. Edges of length 0, as padding or
+# by rounding, have it, too: they have no angle, no gradient, hardly any variation.
 _MAX_INVERSE_SQUARE = 1e30
 
 
 def inverse_squares(edges: FloatArray) -> FloatArray:
-    """1/length^2 (k,) of edges (k, 3), or the largest number that records hold, if less.
+    """1/length^2 (k,) of edges (k, 3), limited to the largest number that records hold.
 
-    Too small a number harms neither distances, as the foot of the perpendicular is off by less than
-    the edge's length, at most 1e-15, far below the rounding of distances; nor bounds of the
-    variation, as 1/sqrt(d^2 (1 + 4 d^2/length^2)) grows.
+    A number that is too small harms neither distances, as the nearest point of the line is off by
+    less than the edge's length, at most 1e-15, far below the rounding of distances; nor bounds of
+    the variation, as 1/sqrt(d^2 (1 + 4 d^2/length^2)) grows.
     """
     squared = (edges * edges).sum(axis=1)
     return 1 / np.maximum(squared, 1 / _MAX_INVERSE_SQUARE)
 
 
 def single_edges(start: FloatArray, end: FloatArray, direction: Any = 1.0) -> FloatArray:
-    """(k, 8) records of edges from (k, 3) to (k, 3): start, direction, end, 1/length^2.
+    """(k, 8) records of edges from start (k, 3) to end (k, 3): start, direction, end, 1/length^2.
 
-    direction: 1 or -1, (k,): whether the edge runs from start to end or back.
+    direction: (k,) 1 if the edge runs from start to end, -1 if it runs back.
     """
     direction = np.broadcast_to(direction, len(start))
     return np.column_stack([start, direction, end, inverse_squares(end - start)])
@@ -63,8 +63,8 @@ def single_edges(start: FloatArray, end: FloatArray, direction: Any = 1.0) -> Fl
 class LoopEdges:
     """Records of `edges_per_record` consecutive edges each, of closed loops.
 
-    A record holds run + 1 vertices as (x, y, z, 1/|edge to the next|^2). Records do not depend on
-    each other, so several loops need no special case.
+    A record holds `edges_per_record` + 1 vertices as (x, y, z, 1/|edge to the next|^2). Records do
+    not depend on each other, so several loops need no special case.
     """
 
     records: RecordTable
@@ -75,8 +75,8 @@ class LoopEdges:
         cls, backend: Backend, loops: tuple[FloatArray, ...], run: int | None = None
     ) -> LoopEdges:
         """The edges of closed loops, each of shape (n, 3); run: None to choose it by the loops."""
-        run, number = run or _edges_per_record(loops), backend.dtype
-        rounded = (loop.astype(number).astype(np.float64) for loop in loops)
+        run, dtype = run or _edges_per_record(loops), backend.dtype
+        rounded = (loop.astype(dtype).astype(np.float64) for loop in loops)
         table = np.concatenate([_runs(loop, run) for loop in rounded])
         return cls(RecordTable.upload(backend, table), run)
 
@@ -85,21 +85,21 @@ class LoopEdges:
         return self.records.backend
 
     def rounding(self, records: Any) -> Any:
-        """A bound of the rounding of the angle of so many records, to which `vertex_rounding` is to
-        be added.
+        """A bound of the rounding of the angle of `records` records, to which `vertex_rounding` is
+        to be added.
 
-        Proof, with u = epsilon/2. Omega = 2 arg of a product of n factors, those of padding among
-        them; errors of arguments add up, as each step is compared with the exact product of the
-        numbers that it was given. (1) Multiplying by a factor F: each part of the result is off by
-        at most u times the size of one product and u times itself, the result by 2 u of its length,
-        and by another u where it is scaled, after every second factor. (2) F = <chi_a, chi_b>,
+        Proof, with u = epsilon/2. Omega = 2 arg of a product of n factors, including the factors of
+        padding; errors of arguments add up, as each step is compared with the exact product of its
+        rounded inputs. (1) Multiplying by a factor F: each part of the result is off by at most u
+        times the size of a single product and u times itself, the result by 2 u of its length, and
+        by another u where it is scaled, after every second factor. (2) F = <chi_a, chi_b>,
         |chi|^2 = 2 s |a|, has the length P c, P = |chi_a||chi_b|, c the cosine of half the angle
         that the edge subtends. One of the four numbers of chi is 0. By Cauchy and Schwarz no
         partial sum is more than P: the real part has at most three roundings, of at most u P each,
         and the imaginary part two, of at most u P together where the real part has three and of 1.7
         u P otherwise: F is off by 3.2 u P, and turned by 3.2 u/c. Together Omega is off by 2 (2.5 +
-        3.2/c) u for each factor. Where the edge subtends at most a right angle, 1/c <= sqrt(2): by
-        7.1 epsilon. Where it subtends more, x lies in the ball over it: with half length h <= 1 and
+        3.2/c) u for each factor. If the edge subtends at most a right angle, 1/c <= sqrt(2): by
+        7.1 epsilon. If it subtends more, x lies in the ball over it: with half length h <= 1 and
         distance d <= h, 1/c <= sqrt(2) h/d, and the integral of |dp|/D^2 is at least pi/2/d: by 2.9
         epsilon times that besides. (3) |a| and s = |a| + |a_z| have relative errors of 2.5 u and
         3.5 u, which turn chi as if the vertex had moved by 3.5 u |a|; the rounding of p - x moves
@@ -132,34 +132,35 @@ class LoopEdges:
 
 
 def vertex_rounding(epsilon: float, x: Vec3, squares: Real) -> Real:
-    """What rounding adds to `LoopEdges.rounding` near the curve; squares: `EdgeSums.squares`."""
+    """The rounding of the angle near the curve, to be added to `LoopEdges.rounding`; squares:
+    `EdgeSums.squares`."""
     return epsilon * dr.fma(2.25, dr.norm(x), 2.9 + 2.25) * squares
 
 
 def _edges_per_record(loops: tuple[FloatArray, ...]) -> int:
-    """Eight edges a record, or four where eight would be mostly padding."""
+    """Eight edges per record, or four where eight would be mostly padding."""
     edges = sum(len(loop) for loop in loops)
     padded = sum(-(-len(loop) // 8) * 8 for loop in loops)
     return 8 if padded <= 1.2 * edges else 4
 
 
 def _runs(loop: FloatArray, run: int) -> FloatArray:
-    trips = -(-len(loop) // run)
-    stays = np.repeat(loop[:1], trips * run + 1 - len(loop), axis=0)
-    path = np.concatenate([loop, stays])  # back to the start, then edges without a length
+    """Records of consecutive edges of a closed loop (n, 3), with `run` edges each."""
+    record_count = -(-len(loop) // run)
+    padding = np.repeat(loop[:1], record_count * run + 1 - len(loop), axis=0)
+    path = np.concatenate([loop, padding])  # back to the start, then edges of length 0
     inverse = inverse_squares(path[1:] - path[:-1])
     rows = np.concatenate([path, np.append(inverse, 0.0)[:, None]], axis=1)
-    index = np.arange(trips)[:, None] * run + np.arange(run + 1)[None, :]
-    return rows[index].reshape(trips, -1)
+    index = np.arange(record_count)[:, None] * run + np.arange(run + 1)[None, :]
+    return rows[index].reshape(record_count, -1)
 
 
 @dataclass(frozen=True)
 class Edge:
     """The edge from p to q, relative to a point x: a = p - x and b = q - x.
 
-    e: q - p, which has no rounding of x.
-    inverse_square_length: 1/|e|^2; any finite number for an edge without a length, which has no
-        field.
+    e: q - p, which is free of the rounding of x.
+    inverse_square_length: 1/|e|^2; any finite number for an edge of length 0, which has no field.
 
     With c = a x e, the edge adds to the gradient of a solid angle Biot and Savart's field w c
     (paper, Eq. 11),
@@ -170,7 +171,7 @@ class Edge:
 
     Second derivatives. The derivative of w c along the axis j is c dw/dx_j - w (axis_j x e). The
     second term is antisymmetric. Around closed curves the fields add up to a gradient, whose
-    derivative is symmetric: the antisymmetric parts cancel, and what is left is
+    derivative is symmetric: the antisymmetric parts cancel, and the rest is
 
         Hessian = sum over edges of (c grad w^T + grad w c^T)/2,
 
@@ -188,10 +189,10 @@ class Edge:
         J = w [ ((|a|-|b|)^2 + |a||b|)/(|a||b|)^2 + (|a|+|b|)^2/(|a||b| D) ],
 
     where the integral written out, s/h^2 (...) between two ends, loses all digits far away and in
-    line with the edge. The difference of the cubes is taken from |b| - |a| = e.(a+b)/(|a|+|b|).
-    h = a - (a.e) e/L^2 cancels where it is short: a fused multiply-add rounds it once, and the rest
-    of the error lies along e, where a second projection removes it. With c = h x e, the three stay
-    at right angles.
+    line with the edge. The difference of the cubes is computed from
+    |b| - |a| = e.(a+b)/(|a|+|b|). h = a - (a.e) e/L^2 cancels where it is short: a fused
+    multiply-add rounds it once, and the rest of the error lies along e, where a second projection
+    removes it. With c = h x e, the three vectors c, h and e stay at right angles.
     """
 
     a: Vec3
@@ -215,22 +216,22 @@ class Edge:
         return squared_distance_to_segment(self.a, self.e, self.inverse_square_length)
 
     def biot_savart(self) -> tuple[Real, Vec3]:
-        """w and c of Biot and Savart's field w c, which the edge adds to the gradient; w = 0 at
-        points in line with the edge."""
+        """w and c of Biot and Savart's field w c, the edge's term of the gradient; w = 0 at points
+        in line with the edge."""
         (la, lb), c = self.lengths, dr.cross(self.a, self.e)
         square = dr.squared_norm(c)
         return dr.select(square > 0, (la + lb) / (la * lb * self._denominator(square)), 0), c
 
     def biot_savart_of_lengths(self, la: Real, lb: Real) -> tuple[Real, Vec3]:
-        """The same as `biot_savart`, for given |a| and |b|, with one division."""
-        c, both, dot = dr.cross(self.a, self.e), la * lb, dr.dot(self.a, self.b)
-        square, beside = dr.squared_norm(c), dot < 0
-        above = (la + lb) * dr.select(beside, both - dot, 1)
-        below = both * dr.select(beside, square, both + dot)
-        return dr.select(square > 0, above / below, 0), c
+        """The same as `biot_savart`, from la = |a| and lb = |b|, with one division."""
+        c, product, dot = dr.cross(self.a, self.e), la * lb, dr.dot(self.a, self.b)
+        square, is_obtuse = dr.squared_norm(c), dot < 0
+        numerator = (la + lb) * dr.select(is_obtuse, product - dot, 1)
+        denominator = product * dr.select(is_obtuse, square, product + dot)
+        return dr.select(square > 0, numerator / denominator, 0), c
 
     def hessian_factors(self) -> tuple[Vec3, Vec3]:
-        """c and grad w: the edge's share of the Hessian is (c grad w^T + grad w c^T)/2.
+        """c and grad w: the edge's term of the Hessian is (c grad w^T + grad w c^T)/2.
 
         Lengths should be of order one, to stay far from overflow: the terms fall like distance^-5
         and grow like distance^-3.
@@ -239,12 +240,17 @@ class Edge:
         h = dr.fma(vector(-dr.dot(a, e) * self.inverse_square_length), e, a)
         h = dr.fma(vector(-dr.dot(h, e) * self.inverse_square_length), e, h)
         c, (la, lb) = dr.cross(h, e), self.lengths
-        alpha, beta, total, apart = 1 / la, 1 / lb, la + lb, la - lb
-        both, share = alpha * beta, total / self._denominator(dr.squared_norm(c))
-        across = both * both * share * (dr.fma(apart * apart, both, 1) + total * share)
-        cubes = both * dr.fma(alpha, alpha, dr.fma(beta, beta, both))
-        along = dr.dot(e, a + self.b) / total * cubes * self.inverse_square_length
-        return c, across * h + along * e
+        alpha, beta, total, difference = 1 / la, 1 / lb, la + lb, la - lb
+        inverse, ratio = alpha * beta, total / self._denominator(dr.squared_norm(c))
+        h_factor = (
+            inverse
+            * inverse
+            * ratio
+            * (dr.fma(difference * difference, inverse, 1) + total * ratio)
+        )
+        cubes = inverse * dr.fma(alpha, alpha, dr.fma(beta, beta, inverse))
+        e_factor = dr.dot(e, a + self.b) / total * cubes * self.inverse_square_length
+        return c, h_factor * h + e_factor * e
 
     def _denominator(self, square: Real) -> Real:
         """D; square: |c|^2."""
@@ -255,7 +261,10 @@ class Edge:
 def edge_variation(square: Real, inverse: Real) -> tuple[Real, Real]:
     """h/(d sqrt(d^2+h^2)), and that divided by d, for an edge of half length h at distance d.
 
-    square: d^2. inverse: 1/(2h)^2. `LiftedEdge.bounds` says what they bound.
+    square: d^2.
+    inverse: 1/(2h)^2.
+
+    `LiftedEdge.bounds` explains which quantities these two bound.
     """
     first = dr.rsqrt(square * dr.fma(square, 4 * inverse, 1))
     return first, first * dr.rsqrt(square)
@@ -264,19 +273,19 @@ def edge_variation(square: Real, inverse: Real) -> tuple[Real, Real]:
 # Two complex numbers, as four reals.
 Spinor: TypeAlias = "tuple[Real, Real, Real, Real]"
 
-# Products are scaled after so many factors, without squares: near a vertex or far away, the product
-# of a few factors leaves the range of float32.
+# Products are scaled after this many factors, without squares: near a vertex or far away, the
+# product of a few factors leaves the range of float32.
 _RENORMALIZE_EVERY = 2
 
 
 @dataclass(frozen=True)
 class EdgeSums:
-    """Sums over all edges at x.
+    """Sums over all edges at a point x.
 
     angle, gradient: Omega in (-2pi, 2pi], and its gradient.
-    distance: to the nearest edge.
-    squares, cubes, fourths: integrals of |dp|/D^k along the edges, D the distance to p: an upper
-        bound of that for k = 2, that for k = 3, and an upper bound of that for k = 4.
+    distance: the distance to the nearest edge.
+    squares, cubes, fourths: integrals of |dp|/D^k along the edges, D the distance from x to p: an
+        upper bound for k = 2, the integral for k = 3, and an upper bound for k = 4.
     """
 
     angle: Real
@@ -290,16 +299,16 @@ class EdgeSums:
 def sum_over_edges(edges: LoopEdges, x: Vec3, active: Mask = True) -> EdgeSums:
     """All sums at x in one loop, on lanes that are active.
 
-    It is the only loop that costs anything in a trace of a curve, so it is written for throughput:
-    eight edges a trip, vertices fetched in aligned packets of eight floats, one square root, one
-    division and about eighty additions and multiplications for each edge. For its rounding see
-    `LoopEdges.rounding`.
+    Nearly all of the time of tracing a curve is spent in this loop, so it is written for
+    throughput: eight edges per trip, vertices fetched in aligned packets of eight floats, one
+    square root, one division and about eighty additions and multiplications for each edge. For its
+    rounding see `LoopEdges.rounding`.
 
     Solid angle. For unit spinors chi(a) of the directions a = p_i - x, the product of
     <chi(p_i), chi(p_{i+1})> around a closed loop has argument Omega/2 (the Berry phase of spin
     1/2; it equals the fan formula of van Oosterom and Strackee 1983, Eq. 10, with the apex at
-    infinity). With s = |a| + |a_z| and A = a_x + i a_y, chi is (s, A) above and (conj A, s)
-    below: neither cancels, and the gauge drops out because each vertex enters once plain and
+    infinity). With s = |a| + |a_z| and A = a_x + i a_y, chi is (s, A) for a_z >= 0 and (conj A, s)
+    for a_z < 0: neither cancels, and the gauge drops out because each vertex enters once plain and
     once conjugated. A factor vanishes only on its own edge, whereas a fan of triangles is singular
     on lines through its apex.
 
@@ -309,9 +318,10 @@ def sum_over_edges(edges: LoopEdges, x: Vec3, active: Mask = True) -> EdgeSums:
     Integrals. Biot and Savart's field of an edge of length L at distance h from its line is h times
     the integral of |dp|/D^3, and |a x b| = h L: so that integral is L times the weight of a x b in
     the gradient. With d, the distance to the edge, the integral of |dp|/D^4 is at most 1/d of it,
-    and that of |dp|/D^2 at most 2d times it: in polar angles around the foot of x on the line, both
-    are integrals from t1, cos t1 = h/d, to t2, and 2 (sin t2 - sin t1) >= (t2 - t1) cos t1, since
-    the difference is concave in t2, 0 at t1, and at pi/2 not less than 0 (tan(u/2) >= u/2).
+    and that of |dp|/D^2 at most 2d times it: in polar angles around the point of the line nearest
+    to x, both are integrals from t1, cos t1 = h/d, to t2, and
+    2 (sin t2 - sin t1) >= (t2 - t1) cos t1, since the difference is concave in t2, 0 at t1, and at
+    pi/2 not less than 0 (tan(u/2) >= u/2).
     """
     real, x = edges.backend.Float, edges.backend.Array3f(x)
 
@@ -334,10 +344,10 @@ def sum_over_edges(edges: LoopEdges, x: Vec3, active: Mask = True) -> EdgeSums:
             g = dr.fma(type(g)(weight), dr.cross(a, e), g)
             square = squared_distance_to_segment(a, e, inverse)
             d2 = fmin(square, d2)
-            share = weight * dr.rsqrt(inverse)
-            near = dr.rsqrt(square)
-            cubes, fourths = cubes + share, dr.fma(share, near, fourths)
-            squares = dr.fma(share, square * near, squares)
+            term = weight * dr.rsqrt(inverse)
+            inverse_d = dr.rsqrt(square)
+            cubes, fourths = cubes + term, dr.fma(term, inverse_d, fourths)
+            squares = dr.fma(term, square * inverse_d, squares)
             p, a, la, sa, ca = q, b, lb, sb, cb
         return zr, zi, g, d2, squares, cubes, fourths
 
@@ -374,11 +384,11 @@ def spinor(a: Vec3) -> tuple[Real, Real, Spinor]:
     """|a|, |a| + |a_z| and the (unnormalized) spinor of direction a as four reals."""
     length = dr.sqrt(dr.fma(a.z, a.z, dr.fma(a.x, a.x, a.y * a.y)))
     s = length + dr.abs(a.z)
-    up = a.z >= 0
+    is_up = a.z >= 0
     chi = (
-        dr.select(up, s, a.x),
-        dr.select(up, 0, -a.y),
-        dr.select(up, a.x, s),
-        dr.select(up, a.y, 0),
+        dr.select(is_up, s, a.x),
+        dr.select(is_up, 0, -a.y),
+        dr.select(is_up, a.x, s),
+        dr.select(is_up, a.y, 0),
     )
     return length, s, chi

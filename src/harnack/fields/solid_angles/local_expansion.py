@@ -1,14 +1,14 @@
 """Local expansions: the field of dipoles outside of a ball as a harmonic polynomial in the ball.
 
 With the harmonics of `multipole` and coefficients L_jk about the center c of a ball of radius rho,
-every f that is harmonic there is
+every f that is harmonic in the ball is
 
     f(c + u) = sum_{j>=0} sum_k conj(R_jk(u)) L_jk,      L_j,-k = (-1)^k conj L_jk.
 
-- `multipole_to_local`: L_jk of dipoles given by their moments about a point outside of the ball.
+- `multipole_to_local`: L_jk of dipoles from their moments about a point outside of the ball.
 - `local_to_local_matrices`: L_jk about the centers of the eight octants of a cell.
-- `evaluate_expansion`: the polynomial, of coefficients that a record holds.
-- `tail_factors`: a bound of the terms of higher degree; `rounding_tables`: of all rounding.
+- `evaluate_expansion`: the polynomial, from the coefficients in a record.
+- `tail_factors`: a bound of the terms of higher degree; `rounding_tables`: a bound of all rounding.
 
 Coefficients are stored as real and imaginary parts for k >= 0 in the order of `coefficient_keys`,
 times rho^j, so that u is taken in units of rho.
@@ -48,11 +48,11 @@ def irregular_harmonics(x: Any, y: Any, z: Any, inverse: Any, degree: int) -> Pa
     By definition I_lm = (l+m)! (l-m)! R_lm / r^(2l+1), and R_lm(v / r^2) = R_lm(v) / r^(2l).
     """
     square = inverse * inverse
-    out: Pairs = {}
+    harmonics: Pairs = {}
     for (l, m), (re, im) in regular_harmonics(x * square, y * square, z * square, degree).items():
         scale = float(math.factorial(l + m) * math.factorial(l - m)) * inverse
-        out[l, m] = scale * re, scale * im if m else 0.0
-    return out
+        harmonics[l, m] = scale * re, scale * im if m else 0.0
+    return harmonics
 
 
 def _signed(values: Pairs, l: int, m: int) -> tuple[Any, Any]:
@@ -65,17 +65,17 @@ def _signed(values: Pairs, l: int, m: int) -> tuple[Any, Any]:
 
 def multipole_to_local(moments: Pairs, seen: Pairs, degree: int) -> list[Any]:
     """L_jk, in the order of `coefficient_keys`, of dipoles with these moments about a point y;
-    those of degrees l that are not given are 0.
+    moments of degrees that are not in `moments` count as 0.
 
-    seen: I_lm (`irregular_harmonics`) at c - y, of degree `degree` and the largest of the moments
-        together.
+    seen: I_lm (`irregular_harmonics`) at c - y, up to the degree `degree` plus the largest degree
+        of the moments.
 
     Proof. f(x) = -sum conj(M_lm) I_lm(x - y). The addition theorem of R, applied to both arguments
-    of 1/|r + u - y| = sum conj(R_lm(y)) I_lm(r + u) = sum conj(R_lm(y - u)) I_lm(r), gives
-    I_lm(r + u) = sum_jk conj(R_jk(-u)) I_(l+j),(m+k)(r), as the R_lm are linearly independent, and
-    R_jk(-u) = (-1)^j R_jk(u). So L_jk = -(-1)^j sum_lm conj(M_lm) I_(l+j),(m+k)(c - y).
+    of 1/|r + u - y| = sum conj(R_lm(y)) I_lm(r + u) = sum conj(R_lm(y - u)) I_lm(r), gives I_lm(r +
+    u) = sum_jk conj(R_jk(-u)) I_(l+j),(m+k)(r), as the R_lm are linearly independent, and R_jk(-u)
+    = (-1)^j R_jk(u). So L_jk = -(-1)^j sum_lm conj(M_lm) I_(l+j),(m+k)(c - y).
     """
-    out: list[Any] = []
+    coefficients: list[Any] = []
     degrees = sorted({l for l, _ in moments})
     for j in range(degree + 1):
         for k in range(j + 1):
@@ -88,49 +88,49 @@ def multipole_to_local(moments: Pairs, seen: Pairs, degree: int) -> list[Any]:
                     if k:
                         im = im + (a * v - b * u)
             sign = -1.0 if j % 2 == 0 else 1.0
-            out += [sign * re, sign * im] if k else [sign * re]
-    return out
+            coefficients += [sign * re, sign * im] if k else [sign * re]
+    return coefficients
 
 
 def local_to_local_matrices(degree: int, offset: float) -> FloatArray:
-    """(8, n, n) matrices T, one for each octant of a cube in the order of its corners, z fastest:
-    T @ L are the coefficients about the octant's center, in units of its own radius, which is half
+    """(8, n, n) matrices T, one for each octant of a cube in the order of its corners, z fastest: T
+    @ L are the coefficients about the octant's center, in units of its own radius, which is half
     that of the cube.
 
-    offset: of an octant's center along each axis, in units of the cube's radius.
+    offset: the offset of an octant's center along each axis, in units of the cube's radius.
 
     R_jk(s + v) = sum R_ab(v) R_(j-a),(k-b)(s), so that L'_ab = sum_jk L_jk conj(R_(j-a),(k-b)(s)):
     exact, as all are polynomials.
     """
     order = coefficient_keys(degree)
-    place = {key: i for i, key in enumerate(order)}
-    out = np.zeros((8, len(order), len(order)))
+    index = {key: i for i, key in enumerate(order)}
+    matrices = np.zeros((8, len(order), len(order)))
     for octant, corner in enumerate(itertools.product((-offset, offset), repeat=3)):
         x, y, z = corner
         shifted = regular_harmonics(x, y, z, degree)
-        for (j, k, part), column in place.items():
+        for (j, k, part), column in index.items():
             for sign in (1, -1) if k else (1,):  # L_j,-k = (-1)^k conj L_jk counts too
-                given = 1j if part else 1.0
+                unit = 1j if part else 1.0
                 if sign < 0:
-                    given = (-1) ** k * np.conj(given)
+                    unit = (-1) ** k * np.conj(unit)
                 for a, b in {(a, b) for a, b, _ in order if a <= j}:
                     if abs(sign * k - b) > j - a:
                         continue
                     u, v = _signed(shifted, j - a, sign * k - b)
-                    term = given * (u - 1j * v) * 0.5**a
-                    out[octant, place[a, b, 0], column] += term.real
+                    term = unit * (u - 1j * v) * 0.5**a
+                    matrices[octant, index[a, b, 0], column] += term.real
                     if b:
-                        out[octant, place[a, b, 1], column] += term.imag
-    return out
+                        matrices[octant, index[a, b, 1], column] += term.imag
+    return matrices
 
 
 def evaluate_expansion(coefficients: Sequence[Any], y: Sequence[Any], degree: int) -> list[Any]:
-    """The polynomial and its three derivatives at y, all in units of the radius.
+    """The polynomial and its three first derivatives at y, all in units of the radius.
 
-    With A_jk = w_k conj L_jk, w_0 = 1 and w_k = 2 otherwise, f = Re sum A_jk R_jk over k >= 0.
-    By the derivatives of R_jk (`multipole`), and as R_j,-1 = -conj R_j1, each derivative is
-    Re sum B_jk R_jk, with B^z_jk = A_j+1,k and, up to factors 2 where k + 1 or k - 1 is 0,
-    B^x_jk = (A_j+1,k+1 - A_j+1,k-1)/2, B^y_jk = i (A_j+1,k+1 + A_j+1,k-1)/2.
+    With A_jk = w_k conj L_jk, w_0 = 1 and w_k = 2 otherwise, f = Re sum A_jk R_jk over k >= 0. By
+    the derivatives of R_jk (`multipole`), and as R_j,-1 = -conj R_j1, each derivative is Re sum
+    B_jk R_jk, with B^z_jk = A_j+1,k and, up to factors 2 where k + 1 or k - 1 is 0, B^x_jk =
+    (A_j+1,k+1 - A_j+1,k-1)/2, B^y_jk = i (A_j+1,k+1 + A_j+1,k-1)/2.
     """
     r, a = (
         regular_harmonics(y[0], y[1], y[2], degree),
@@ -156,7 +156,7 @@ def evaluate_expansion(coefficients: Sequence[Any], y: Sequence[Any], degree: in
 
 
 class _AbsoluteValues:
-    """Absolute values: differences are sums."""
+    """Numbers whose arithmetic sums absolute values: differences are sums."""
 
     def __init__(self, number: Any) -> None:
         self.number = number
@@ -179,21 +179,21 @@ class _AbsoluteValues:
 
 
 def rounding_tables(degree: int, largest: float) -> FloatArray:
-    """(n, 4) numbers whose products with |L_jk|, summed up, and with the backend's epsilon bound
-    the rounding of `evaluate_expansion` for coordinates up to `largest`.
+    """(n, 4) numbers. Their products with |L_jk|, summed up and multiplied by the backend's
+    epsilon, bound the rounding of `evaluate_expansion` for coordinates up to `largest`.
 
     Proof. Value and derivatives are sums of products of coefficients, coordinates and constants,
-    each of which passes through at most n = 9 degree + 2 (degree + 1)^2 roundings: 6 a degree in
-    the recurrence of R_jk, 3 a degree of the coordinates, and those of the sums. So they are off by
-    at most 1.01 n u times the sum of the absolute values of the products (u = epsilon/2), which is
-    the same expression with all signs positive, at the largest coordinates.
+    each of which passes through at most n = 9 degree + 2 (degree + 1)^2 roundings: 6 per degree in
+    the recurrence of R_jk, 3 per degree of the coordinates, and the roundings of the sums. So they
+    are off by at most 1.01 n u times the sum of the absolute values of the products (u =
+    epsilon/2), which is the same expression with all signs positive, at the largest coordinates.
     """
     count = (degree + 1) ** 2
-    one = _AbsoluteValues(np.full(count, largest))
-    rows = [_AbsoluteValues(row) for row in np.eye(count)]
-    sums = evaluate_expansion(rows, (one, one, one), degree)
+    coordinate = _AbsoluteValues(np.full(count, largest))
+    units = [_AbsoluteValues(row) for row in np.eye(count)]
+    sums = evaluate_expansion(units, (coordinate, coordinate, coordinate), degree)
     roundings = 0.51 * (9 * degree + 2 * count)
-    return roundings * np.stack([part.number for part in sums], axis=1)
+    return roundings * np.stack([absolute.number for absolute in sums], axis=1)
 
 
 def tail_factors(degree: int, l: int) -> tuple[float, float]:
@@ -206,7 +206,7 @@ def tail_factors(degree: int, l: int) -> tuple[float, float]:
 
     Proof. The derivative of order j along a line is at most (l+j)!/l! B/D^(l+1+j) at c
     (`multipole.truncation_bounds`), so that the term of degree j is at most C(l+j, j) q^j
-    B/D^(l+1). From j = p+1 on, each of these is at most c q times the one before. By Bernstein and
+    B/D^(l+1). From j = p+1 on, each of these is at most c q times the term before. By Bernstein and
     Szego's inequality a harmonic polynomial of degree j has a gradient of at most j/rho times its
     largest value on the sphere; and j C(l+j, j) grows by (l+j+1)/j at most.
     """

@@ -36,26 +36,28 @@ class Morph(BatchedField):
     four dimensions' of the talk on Gillespie et al. 2024, with level pi^2 of the sum.)
 
     At w = 0 and w = gap the field is the winding number of the mesh itself, with jumps across its
-    triangles. Between the ends what is drawn is the surface of a *quadrature*: each mesh is
-    replaced by oriented points at the centroids of its triangles, cut so that their edges are at
-    most `spacing` times the height; where triangles are much smaller than that, one point stands
-    for several. The sum over these is as harmonic as the integral, and the surface of that sum is
-    found with proof; `quadrature_displacement` bounds how far the surface of the integral is.
+    triangles. Between the ends the surface is that of a *quadrature*: each mesh is replaced by
+    oriented points at the centroids of its triangles, cut so that their edges are at most `spacing`
+    times the height; where triangles are much smaller than that, a single point stands for several
+    triangles. The sum over these points is harmonic, like the integral, and the surface of that sum
+    is traced with proof; `quadrature_displacement` bounds its distance from the surface of the
+    integral.
 
     mesh_a, mesh_b: pairs (vertices (n, 3), faces (m, 3)), counter-clockwise seen from outside.
         Holes are allowed: between the ends a dent reaches into the solid there, as the surface is
         where both winding numbers, blurred, add up to 1; at the ends the level 1/2 spans them.
-    gap: how far apart the solids are, in the unit of the meshes. With a large one the slices in
+    gap: the distance between the solids, in the unit of the meshes. With a large gap the slices in
         the middle are small, or empty: for solids of half-diagonal 1, 0.1 to 0.2 is good.
     w: in [0, gap]. Like `gap` it is a kernel parameter: other numbers compile nothing.
-    spacing: see above, at most 2. Less is sharper, and needs 1/spacing^2 times as many points.
-        For real meshes surfaces were off by at most 0.02, 0.04 and 0.09 of w for 1, 1.4 and 2.
-    accuracy: between the ends, clusters of points are taken as a whole beyond `accuracy` times
-        their radius. Bounds of the truncation are part of every promise, and tracing uses more
-        detail where the tolerance asks for it. At least 2.
+    spacing: see above, at most 2. A smaller spacing gives sharper surfaces, and needs 1/spacing^2
+        times as many points. For real meshes surfaces were off by at most 0.02, 0.04 and 0.09 of w
+        for 1, 1.4 and 2.
+    accuracy: between the ends, the sum uses the moments of a cluster of points beyond `accuracy`
+        times its radius. Bounds of the truncation are part of every promise, and tracing uses a
+        higher accuracy where the tolerance needs it. At least 2.
 
     Raises:
-        MeshError: a ValueError, as `validate_mesh`; something that is no pair.
+        MeshError: a ValueError, as `validate_mesh`; or an argument is no pair.
         ValueError: gap, w, spacing or accuracy out of range; w so near to an end, but not at it,
             that more than four million points would be needed.
     """
@@ -101,20 +103,20 @@ class Morph(BatchedField):
         the surface of the integral over the triangles, in the unit of the meshes; 0 at the ends.
 
         It is a bound of the error of the quadrature, far above the true error for meshes of regular
-        triangles, over the size of the gradient.
+        triangles, divided by the length of the gradient.
         """
         if isinstance(self._slice, MorphSlice):
             return self._slice.quadrature_displacement(points, precision)
         return np.zeros(len(np.asarray(points)))
 
     def describe(self) -> dict[str, Any]:
-        place = {"w": self.w, "gap": self.gap}
+        heights = {"w": self.w, "gap": self.gap}
         if isinstance(self._slice, WindingNumber):
-            return {**place, "shows": "mesh " + "ab"[self.w > 0], **self._slice.describe()}
+            return {**heights, "shows": "mesh " + "ab"[self.w > 0], **self._slice.describe()}
         points = self._slice.point_counts
-        return {**place, "points of a": points[0], "points of b": points[1]}
+        return {**heights, "points of a": points[0], "points of b": points[1]}
 
-    # All other methods are those of the slice.
+    # All other methods delegate to the slice.
 
     def prepare(self, backend: Backend) -> Field:
         return self._slice.prepare(backend)
@@ -163,12 +165,12 @@ class Morph(BatchedField):
 
 
 def _checked(mesh: Any, name: str) -> tuple[FloatArray, IntArray]:
-    """A validated mesh; MeshError that names it."""
+    """A validated mesh (vertices, faces); raises MeshError with the name of the argument."""
     try:
         vertices, faces = mesh
     except (TypeError, ValueError):
         raise MeshError(f"{name}: give a pair (vertices, faces)") from None
     try:
         return validate_mesh(vertices, faces)
-    except MeshError as wrong:
-        raise MeshError(f"{name}: {wrong}") from None
+    except MeshError as error:
+        raise MeshError(f"{name}: {error}") from None

@@ -2,8 +2,8 @@
 
 - `MorphSlice`: the field.
 - `SlicedKernel`: its kernel, with the proof of its bounds.
-- `quadrature_points`: triangle meshes as oriented points; large triangles are cut, small ones
-  merged.
+- `quadrature_points`: triangle meshes as oriented points; large triangles are cut, small triangles
+  are merged.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 GRADIENT_BOUND = 1.1855
 """Half the largest gradient of a dipole in four dimensions, times D^3, used as Q_2."""
 
-# Degrees of the polynomial for the last i_n in single and double precision: the singularity at
+# Degrees of the polynomial for the last i_n, by the number of bytes of a number: the singularity at
 # c = -1 makes coefficients fall as 5.8^-k.
 _DEGREES = {4: 12, 8: 22}
 
@@ -77,7 +77,7 @@ class SlicedKernel(RadialKernel):
         i_k = (2k s^2 i_(k+1) + c)/(2k-1)   by parts: positive terms, which lose no digits.
 
     The last i_n = int_0^1 (sin(phi t)/sin phi)^(2n-2) dt phi/sin phi, cos phi = c, is a function of
-    c that is analytic but for c <= -1: on [0, 1] it is computed as a polynomial.
+    c that is analytic except for c <= -1: on [0, 1] it is computed as a polynomial.
 
     Bound. |d^m K[u_1, ..., u_m]| <= m!/D^(m+1) for unit vectors, as for 1/r at the distance D;
     attained for w = 0. Proof. Equal vectors u are the worst (Banach 1938). The m-th derivative of
@@ -87,11 +87,11 @@ class SlicedKernel(RadialKernel):
         I = int_0^1 U_m(a x) x^m (1 - s^2 x^2)^(-1/2) dx.
 
     For s = 1, that is w = 0, it is (pi/2) P_m(a), at most pi/2. For s < 1 the weight is that for
-    s = 1 times one that falls from 1, so that I is the same integral for s = 1 up to some b <= 1
-    (Bonnet). That is the largest for b = 1, or where U_m(a b) = 0 at an angle k pi/(m+1), k >= 1.
-    Lobes between such angles alternate and grow with x, as x^m (1 - x^2)^(-1/2) does: the integral
-    is at most its last lobe, which is the largest if it ends at b = 1, where it is below 0.4 for
-    m <= 7 (quadrature in `tests/fields/test_morph.py`).
+    s = 1 times a factor that falls from 1, so that I is the same integral for s = 1 up to a number
+    b <= 1 (Bonnet). The integral is largest for b = 1, or where U_m(a b) = 0 at an angle
+    k pi/(m+1), k >= 1. Lobes between such angles alternate and grow with x, as
+    x^m (1 - x^2)^(-1/2) does: the integral is at most its last lobe, which is the largest if it
+    ends at b = 1, where it is below 0.4 for m <= 7 (quadrature in `tests/fields/test_morph.py`).
 
     In four dimensions the gradient of n.grad_x K is at most 2 * 1.1855/D^3: its square is
     cos^2 (K''^2 + (dw K')^2) + sin^2 (K'/r)^2, cos the cosine of the angle from n to z, and so at
@@ -128,7 +128,7 @@ class SlicedKernel(RadialKernel):
 
 @functools.cache
 def moment_polynomial(n: int, degree: int) -> tuple[float, ...]:
-    """i_n as a polynomial in 2c - 1 on [-1, 1], coefficients from the constant on."""
+    """i_n as a polynomial in 2c - 1 on [-1, 1], with coefficients in ascending order."""
     t, weight = legendre.leggauss(48)
     t, weight = 0.5 * (t + 1), 0.5 * weight
 
@@ -139,14 +139,15 @@ def moment_polynomial(n: int, degree: int) -> tuple[float, ...]:
 
     nodes = chebyshev.chebpts1(2 * degree)
     series = chebyshev.chebfit(nodes, moment(nodes), degree)
-    return tuple(float(one) for one in chebyshev.cheb2poly(series))
+    return tuple(float(coefficient) for coefficient in chebyshev.cheb2poly(series))
 
 
 def _horner(x: Real, coefficients: tuple[float, ...]) -> Real:
-    out: Real = coefficients[-1]
-    for one in coefficients[-2::-1]:
-        out = dr.fma(out, x, one)
-    return out
+    """The polynomial at x, with coefficients in ascending order."""
+    total: Real = coefficients[-1]
+    for coefficient in coefficients[-2::-1]:
+        total = dr.fma(total, x, coefficient)
+    return total
 
 
 def _factor(k: int) -> float:
@@ -154,20 +155,21 @@ def _factor(k: int) -> float:
     return 2 / math.pi * 2.0**k * math.factorial(k)
 
 
-# The size of the cells in which triangles are merged, and the longest edge of such triangles, as a
-# fraction of the longest edge of pieces.
+# The size of the cells in which triangles are merged, and the longest edge of triangles to merge,
+# both as a fraction of the longest edge of pieces.
 _CELL = 0.54
 
 
 @dataclass(frozen=True)
 class QuadraturePoints:
-    """Points that stand for pieces of triangles, or for several small ones.
+    """Points that stand for pieces of triangles, or for several small triangles.
 
     points: (n, 3) centroids.
-    moments: (n, 3) area times normal, summed up.
-    farthest: the largest distance of a point of a triangle from the point that stands for it.
-    second_moment_ratio: the largest ratio, over all points, of the integral of |d|^2 over what the
-        point stands for, d the offset from the point, to the length of its moment.
+    moments: (n, 3) sums of area times normal.
+    farthest: the largest distance of a point of a triangle from the quadrature point that stands
+        for it.
+    second_moment_ratio: the largest ratio, over all points, of the integral of |d|^2 over the
+        triangles of the point, d the offset from the point, to the length of its moment.
     first_moment_ratio: the same for the Frobenius norm of the sum of moment times d.
     """
 
@@ -179,46 +181,48 @@ class QuadraturePoints:
 
 
 def piece_counts(corners: FloatArray, longest: float) -> IntArray:
-    """The number of pieces (m,) to cut each edge of triangles (m, 3, 3) into, so that none is
+    """The number of pieces (m,) to cut each edge of triangles (m, 3, 3) into, so that no piece is
     longer than `longest`."""
     return np.maximum(np.ceil(_longest_edges(corners) / longest), 1).astype(np.int64)
 
 
 def quadrature_points(corners: FloatArray, longest: float) -> QuadraturePoints:
     """Centroids of triangles (m, 3, 3), cut into similar pieces with edges of at most `longest`;
-    for those much smaller, one point for all in a cell that face the same way."""
-    small = _longest_edges(corners) <= _CELL * longest
+    for triangles much smaller than that, a single point for all triangles in a cell that face the
+    same way."""
+    is_small = _longest_edges(corners) <= _CELL * longest
     parts = [
-        make(some, longest)
-        for make, some in ((_subdivide, corners[~small]), (_merge_small, corners[small]))
-        if len(some)
+        sample(rows, longest)
+        for sample, rows in ((_subdivide, corners[~is_small]), (_merge_small, corners[is_small]))
+        if len(rows)
     ]
     return QuadraturePoints(
-        np.concatenate([one.points for one in parts]),
-        np.concatenate([one.moments for one in parts]),
-        max(one.farthest for one in parts),
-        max(one.second_moment_ratio for one in parts),
-        max(one.first_moment_ratio for one in parts),
+        np.concatenate([part.points for part in parts]),
+        np.concatenate([part.moments for part in parts]),
+        max(part.farthest for part in parts),
+        max(part.second_moment_ratio for part in parts),
+        max(part.first_moment_ratio for part in parts),
     )
 
 
 def _longest_edges(corners: FloatArray) -> FloatArray:
+    """The lengths (m,) of the longest edges of triangles (m, 3, 3)."""
     return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
 
 
 def _farthest(corners: FloatArray, points: FloatArray) -> FloatArray:
-    """The largest distance of a corner (m, 3, 3) from points (m, 3): (m,)."""
+    """(m,) the largest distance of a corner of each triangle (m, 3, 3) from its point (m, 3)."""
     return np.linalg.norm(corners - points[:, None], axis=2).max(axis=1)
 
 
 def _areas(corners: FloatArray) -> FloatArray:
-    """Area times normal, (m, 3)."""
+    """(m, 3) area times normal of triangles (m, 3, 3)."""
     a, b, c = np.moveaxis(corners, 1, 0)
     return 0.5 * np.cross(b - a, c - a)
 
 
 def _mean_squares(corners: FloatArray) -> FloatArray:
-    """The mean square distance from the centroid over triangles: (m,)."""
+    """(m,) the mean square distance from the centroid over each triangle (m, 3, 3)."""
     return ((corners - np.roll(corners, 1, axis=1)) ** 2).sum(axis=(1, 2)) / 36
 
 
@@ -228,66 +232,72 @@ def _subdivide(corners: FloatArray, longest: float) -> QuadraturePoints:
     points: list[FloatArray] = []
     moments: list[FloatArray] = []
     for count in np.unique(counts):
-        some = corners[counts == count]
-        a, b, c = np.moveaxis(some, 1, 0)
+        triangles = corners[counts == count]
+        a, b, c = np.moveaxis(triangles, 1, 0)
         # Pieces with the orientation of the triangle, and the rotated ones between them.
         i, j = np.indices((count, count)).reshape(2, -1)
         steps = [(i + j < count, 1 / 3), (i + j < count - 1, 2 / 3)]
-        u, v = (np.concatenate([k[one] + third for one, third in steps]) / count for k in (i, j))
+        u, v = (
+            np.concatenate([index[mask] + shift for mask, shift in steps]) / count
+            for index in (i, j)
+        )
         middle = a[:, None] + u[:, None] * (b - a)[:, None] + v[:, None] * (c - a)[:, None]
         points.append(middle.reshape(-1, 3))
-        moments.append(np.repeat(_areas(some) / count**2, count**2, axis=0))
+        moments.append(np.repeat(_areas(triangles) / count**2, count**2, axis=0))
     spread = float((_mean_squares(corners) / counts**2).max())
     farthest = float((_farthest(corners, corners.mean(axis=1)) / counts).max())
     return QuadraturePoints(np.concatenate(points), np.concatenate(moments), farthest, spread, 0.0)
 
 
 def _merge_small(corners: FloatArray, longest: float) -> QuadraturePoints:
-    """One point for all triangles whose centroids are in a cell and whose normals have the same
-    largest component: their moments add up to at least 1/sqrt(3) of their area."""
-    moments, middles = _areas(corners), corners.mean(axis=1)
+    """A single point for all triangles whose centroids are in the same cell and whose normals have
+    the same largest component: their moments add up to at least 1/sqrt(3) of their area."""
+    moments, centroids = _areas(corners), corners.mean(axis=1)
     axis = np.abs(moments).argmax(axis=1)
     side = np.take_along_axis(moments, axis[:, None], axis=1)[:, 0] > 0
-    cells = np.floor(middles / (_CELL * longest)).astype(np.int64)
+    cells = np.floor(centroids / (_CELL * longest)).astype(np.int64)
     keys = np.column_stack([cells, 2 * axis + side])
     _, group = np.unique(keys, axis=0, return_inverse=True)
     group = group.ravel()
     area = np.linalg.norm(moments, axis=1)
-    points = _sums(group, area[:, None] * middles) / _sums(group, area[:, None])
-    d = middles - points[group]
+    points = _sums(group, area[:, None] * centroids) / _sums(group, area[:, None])
+    d = centroids - points[group]
     total = _sums(group, moments)
     length = np.linalg.norm(total, axis=1)
     square = area * (_mean_squares(corners) + (d * d).sum(axis=1))
     outer = np.einsum("ki,kj->kij", moments, d).reshape(-1, 9)
-    slant = np.linalg.norm(_sums(group, outer), axis=1)
+    first = np.linalg.norm(_sums(group, outer), axis=1)
     spread = float((_sums(group, square[:, None])[:, 0] / length).max())
     farthest = float(_farthest(corners, points[group]).max())
-    return QuadraturePoints(points, total, farthest, spread, float((slant / length).max()))
+    return QuadraturePoints(points, total, farthest, spread, float((first / length).max()))
 
 
 def _sums(group: IntArray, values: FloatArray) -> FloatArray:
-    """Sums of rows (m, k) of the same group: (groups, k)."""
-    columns: list[FloatArray] = [np.bincount(group, one).astype(np.float64) for one in values.T]
+    """The sums (groups, k) of the rows of `values` (m, k) that belong to the same group."""
+    columns: list[FloatArray] = [
+        np.bincount(group, column).astype(np.float64) for column in values.T
+    ]
     return np.column_stack(columns)
 
 
 MOST_POINTS = 4_000_000
-"""Points of the quadrature of both meshes together."""
+"""The largest number of points of the quadrature of both meshes together."""
 
 _SMALLEST_LEVEL = 1e-6
-# The most cells that are tested in one round for an extent.
+# The largest number of cells that are tested in one round for an extent.
 _MOST_CELLS = 40_000
-# Cells of the grid along its longest side, by experiment.
+# The number of cells of the grid along its longest side, by experiment.
 _ACROSS = 128
 
 
 class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
     """f(x) = (U_a(x, w) + U_b(x, gap - w))/(2 pi^2), 0 < w < gap: see `Morph`.
 
-    corners: two arrays (m, 3, 3) of triangles. w, gap, spacing, accuracy: as for `Morph`.
+    corners: two arrays (m, 3, 3) of triangles.
+    w, gap, spacing, accuracy: as for `Morph`.
 
-    Promises, with the 4D distances D of all points, d the least of them (`SlicedKernel` has the
-    proof that second derivatives are no larger than those of dipoles at a distance D):
+    Promises, with the 4D distances D of all points and d the smallest of them (`SlicedKernel` has
+    the proof that second derivatives are no larger than those of dipoles at a distance D):
     `TaylorRemainder` within 0.45 d, and a `HarmonicBall` of dimension 4 and radius 0.35 d, which
     proves shorter steps.
     """
@@ -302,67 +312,70 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         super().__init__()
         self.heights = (w, gap - w)
         self.spacing, self.accuracy = spacing, accuracy
-        low = np.min([one.min(axis=(0, 1)) for one in corners], axis=0)
-        high = np.max([one.max(axis=(0, 1)) for one in corners], axis=0)
+        low = np.min([pair.min(axis=(0, 1)) for pair in corners], axis=0)
+        high = np.max([pair.max(axis=(0, 1)) for pair in corners], axis=0)
         self._box = low, high
         self._center = round_to_single(0.5 * (low + high))
         # A power of two, so that lengths are scaled without rounding.
         self._size = 2.0 ** math.ceil(math.log2(0.5 * float((high - low).max())))
         longest = [spacing * height for height in self.heights]
-        _check_count([piece_counts(*one) for one in zip(corners, longest, strict=True)], w, gap)
-        self._pieces = tuple(quadrature_points(*one) for one in zip(corners, longest, strict=True))
-        self._dipoles = tuple(self._clustered(one) for one in self._pieces)
+        _check_count([piece_counts(*pair) for pair in zip(corners, longest, strict=True)], w, gap)
+        self._pieces = tuple(
+            quadrature_points(*pair) for pair in zip(corners, longest, strict=True)
+        )
+        self._dipoles = tuple(self._clustered(pair) for pair in self._pieces)
         self._extents: TransientCache[tuple[float, ...], Volume] = TransientCache()
         self._occupied: TransientCache[tuple[float, ...], OccupancyGrid] = TransientCache()
 
     def _clustered(self, pieces: QuadraturePoints) -> ClusteredDipoles:
-        """The pieces in unit coordinates, scaled so that f is the sum of both."""
-        share = 1 / (8 * math.pi * self._size**2)
+        """The dipoles of the pieces in unit coordinates, scaled so that f is the sum over both
+        meshes."""
+        scale = 1 / (8 * math.pi * self._size**2)
         points = (pieces.points - self._center) / self._size
-        return ClusteredDipoles.of(dipole_records(points, share * pieces.moments))
+        return ClusteredDipoles.of(dipole_records(points, scale * pieces.moments))
 
     @property
     def point_counts(self) -> tuple[int, ...]:
-        """Points of the quadrature of each mesh."""
-        return tuple(len(one.rows) for one in self._dipoles)
+        """The number of points of the quadrature of each mesh."""
+        return tuple(len(dipoles.rows) for dipoles in self._dipoles)
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
-        on = self._batch_data(backend_of(x))
-        x = on.to_unit(x)
-        sums = on.sums(x, closer, derivatives).sums
-        rounding = 8 * on.backend.machine_epsilon * dr.abs(sums.value)
+        buffers = self._batch_data(backend_of(x))
+        x = buffers.to_unit(x)
+        sums = buffers.sums(x, closer, derivatives).sums
+        rounding = 8 * buffers.backend.machine_epsilon * dr.abs(sums.value)
         values = sums.values(1.0, coordinate_rounding(x), rounding)
-        weight = sum(float(one.rows[:, 6].sum()) for one in self._dipoles)
-        return values.with_far_field_errors(x, 64, weight).rescaled(on.size)
+        weight = sum(float(dipoles.rows[:, 6].sum()) for dipoles in self._dipoles)
+        return values.with_far_field_errors(x, 64, weight).rescaled(buffers.size)
 
     def quadrature_displacement(
         self, points: Any, precision: Precision | None = None
     ) -> FloatArray:
         """As `Morph.quadrature_displacement`.
 
-        Let a point at distance D stand for a part of the mesh with moment m. Its error is at most
-        2 |T|_*/D^3, |T|_* the nuclear norm of T = sum of m_i times d_i, at most sqrt(3) times the
-        Frobenius norm, plus the remainder of Taylor's formula: |m| times the mean of
-        |d|^2 (3-2q)/((1-q)^2 D^4), q = |d|/D (`RadialSums.remainder`). It is infinite where the
-        part may reach as far as D from its point.
+        Let a point at distance D stand for a part of the mesh with moment m. Its error is at most 2
+        |T|_*/D^3, |T|_* the nuclear norm of T = sum of m_i times d_i, at most sqrt(3) times the
+        Frobenius norm, plus the remainder of Taylor's formula: |m| times the mean of |d|^2
+        (3-2q)/((1-q)^2 D^4), q = |d|/D (`RadialSums.remainder`). It is infinite where a point of
+        the part may be as far as D from the quadrature point.
         """
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Real]:
-            on = self._batch_data(backend)
-            x = on.to_unit(x)
+            data = self._batch_data(backend)
+            x = data.to_unit(x)
             error, gradient = backend.Float(0), backend.Array3f(0)
-            for cloud, piece, height in zip(on.clouds, self._pieces, self.heights, strict=True):
+            for cloud, piece, height in zip(data.clouds, self._pieces, self.heights, strict=True):
                 sums = cloud.sums(x, 1.0, 1)
-                share = piece.farthest / height
-                bend = dr.inf
-                if share < 1:
-                    bend = sums.remainder(share, piece.farthest / self._size, 1.0)
-                error = dr.fma(piece.second_moment_ratio / self._size**2, bend, error)
+                ratio = piece.farthest / height
+                remainder = dr.inf
+                if ratio < 1:
+                    remainder = sums.remainder(ratio, piece.farthest / self._size, 1.0)
+                error = dr.fma(piece.second_moment_ratio / self._size**2, remainder, error)
                 error = dr.fma(
                     2 * math.sqrt(3) * piece.first_moment_ratio / self._size, sums.q2_d3, error
                 )
                 gradient = gradient + sums.sums.gradient
-            return (error / dr.norm(gradient) * on.size,)
+            return (error / dr.norm(gradient) * data.size,)
 
         return evaluate_points(points, kernel, precision)[0]
 
@@ -386,9 +399,9 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
 
     def extent(self, levels: tuple[float, ...]) -> Volume:
         """A box without its cells that are proved empty (`tight_extent`): at a distance rho from
-        all points |f| is at most their weight over rho^2."""
+        all points |f| is at most the sum of their weights over rho^2."""
         if levels not in self._extents:
-            weight = sum(float(one.rows[:, 6].sum()) for one in self._dipoles)
+            weight = sum(float(dipoles.rows[:, 6].sum()) for dipoles in self._dipoles)
             reach = 1.0001 * self._size * math.sqrt(weight / min(abs(level) for level in levels))
             low, high = self._box
             self._extents[levels] = tight_extent(
@@ -404,7 +417,7 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
 
 @dataclass(frozen=True)
 class _SliceBuffers(UnitFrame):
-    """The points of both meshes on a backend, each mesh with a height of its own."""
+    """The points of both meshes on a backend, for each mesh at its own height."""
 
     clouds: tuple[RadialTreecode, ...]
 
@@ -416,7 +429,7 @@ class _SliceBuffers(UnitFrame):
         return sums
 
     def sample(self, p: Vec3, detail: Real) -> Sample:
-        """f at points p, in units of `size`."""
+        """The sample of f at points p, in units of `size`."""
         x = self.to_unit(p)
         radial = self.sums(x, detail, 1)
         sums = radial.sums
@@ -426,8 +439,8 @@ class _SliceBuffers(UnitFrame):
         nearest = sums.singularity_distance * (1 - SUM_MARGIN) - 8 * self.backend.machine_epsilon
         nearest = fmax(nearest, 0)
         r = BALL_FRACTION * nearest
-        moved = radial.variation(r, 1.0)
-        ball = HarmonicBall(r * self.size, sums.value - moved, sums.value + moved, dimension=4)
+        change = radial.variation(r, 1.0)
+        ball = HarmonicBall(r * self.size, sums.value - change, sums.value + change, dimension=4)
         return Sample(
             sums.value,
             sums.gradient / self.size,
@@ -440,7 +453,8 @@ class _SliceBuffers(UnitFrame):
 
 
 def _check_count(counts: Sequence[Any], w: float, gap: float) -> None:
-    count = sum(int((one.astype(float) ** 2).sum()) for one in counts)
+    """Raise ValueError if the quadrature would need more than `MOST_POINTS` points."""
+    count = sum(int((pieces.astype(float) ** 2).sum()) for pieces in counts)
     if count > MOST_POINTS:
         raise ValueError(
             f"w = {w:g} is so near to an end of the gap {gap:g} that {count:,} points would be "

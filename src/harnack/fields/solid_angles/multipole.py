@@ -1,4 +1,4 @@
-"""Multipole moments of dipoles, those of the nodes of a tree, and bounds of truncated expansions.
+"""Multipole moments of dipoles, moments of the nodes of a tree, and bounds of truncated expansions.
 
 The potential of dipoles a_i n_i at y_i = c + d_i at a point x = c + r is
 
@@ -14,10 +14,10 @@ R_lm(a+b) = sum R_l'm'(a) R_l-l',m-m'(b), d/dz R_lm = R_l-1,m, (d/dx + i d/dy) R
   and moments about another point.
 - `NodeMoments`, from `dipole_tree_moments` or `triangle_tree_moments`: the moments of all nodes of
   a tree.
-- `truncation_bounds`, `remainder_constants`: bounds of the terms that are left out, and of those
-  that are not.
+- `truncation_bounds`, `remainder_constants`: bounds of the terms beyond an order, and of the terms
+  up to it.
 
-A complex number is a pair here, of numbers or arrays of any kind, NumPy's and Dr.Jit's alike.
+Here a complex number is a pair of numbers or arrays of any kind, of NumPy or of Dr.Jit.
 """
 
 from __future__ import annotations
@@ -49,92 +49,92 @@ Pairs = dict[tuple[int, int], Pair]
 
 # The largest l for which moments are computed.
 MAX_DEGREE = 5
-# The (l, m) for which moments are stored: 1 <= l <= KNOWN and 0 <= m <= l.
+# The (l, m) for which moments are stored: 1 <= l <= MAX_DEGREE and 0 <= m <= l.
 MOMENT_KEYS = tuple((l, m) for l in range(1, MAX_DEGREE + 1) for m in range(l + 1))
 
 
 def regular_harmonics(x: Any, y: Any, z: Any, order: int) -> Pairs:
     """R_lm for l <= order and 0 <= m <= l; the imaginary part is the number 0 if m = 0."""
     r2 = x * x + y * y + z * z
-    out: Pairs = {(0, 0): (0 * x + 1, 0.0)}
+    harmonics: Pairs = {(0, 0): (0 * x + 1, 0.0)}
     for m in range(order + 1):
         if m:
             u, v = x * (1 / (2 * m)), y * (1 / (2 * m))
-            re, im = out[m - 1, m - 1]
-            out[m, m] = (re * u, re * v) if m == 1 else (re * u - im * v, re * v + im * u)
+            re, im = harmonics[m - 1, m - 1]
+            harmonics[m, m] = (re * u, re * v) if m == 1 else (re * u - im * v, re * v + im * u)
         for l in range(m + 1, order + 1):
             scale = 1 / ((l + m) * (l - m))
-            along, back = (scale * (2 * l - 1)) * z, scale * r2
-            re, im = out[l - 1, m]
-            re, im = along * re, along * im if m else 0.0
+            z_factor, r2_factor = (scale * (2 * l - 1)) * z, scale * r2
+            re, im = harmonics[l - 1, m]
+            re, im = z_factor * re, z_factor * im if m else 0.0
             if l - 2 >= m:
-                last = out[l - 2, m]
-                re, im = re - back * last[0], im - back * last[1] if m else 0.0
-            out[l, m] = re, im
-    return out
+                second = harmonics[l - 2, m]
+                re, im = re - r2_factor * second[0], im - r2_factor * second[1] if m else 0.0
+            harmonics[l, m] = re, im
+    return harmonics
 
 
 def dipole_moments(harmonics: Pairs, nx: Any, ny: Any, nz: Any) -> Pairs:
-    """M_lm of a dipole n, whose length is its area, at d, from R_lm(d) for l < KNOWN; or those of
-    one that is spread out, from the means of R_lm."""
+    """M_lm of a dipole n, whose length is its area, at d, from R_lm(d) for l < MAX_DEGREE; or of a
+    dipole that is spread out, from the means of R_lm."""
     r, x, y = _with_negative_orders(harmonics), 0.5 * nx, 0.5 * ny
-    out: Pairs = {}
+    moments: Pairs = {}
     for l, m in MOMENT_KEYS:
-        re, im = (nz * part for part in r[l - 1, m]) if m < l else (0.0, 0.0)
+        re, im = (nz * component for component in r[l - 1, m]) if m < l else (0.0, 0.0)
         if abs(m + 1) < l:  # less (x - iy) R_l-1,m+1
             a, b = r[l - 1, m + 1]
             re, im = re - (x * a + y * b), im - (x * b - y * a)
         if abs(m - 1) < l:  # plus (x + iy) R_l-1,m-1
             a, b = r[l - 1, m - 1]
             re, im = re + (x * a - y * b), im + (x * b + y * a)
-        out[l, m] = re, im if m else 0.0
-    return out
+        moments[l, m] = re, im if m else 0.0
+    return moments
 
 
 def multipole_to_multipole(moments: Pairs, x: Any, y: Any, z: Any) -> Pairs:
     """Moments about c, from the moments of the same dipoles about c + (x, y, z)."""
-    r, given = (
+    r, old = (
         _with_negative_orders(regular_harmonics(x, y, z, MAX_DEGREE - 1)),
         _with_negative_orders(moments),
     )
-    out: Pairs = {}
+    shifted: Pairs = {}
     for l, m in MOMENT_KEYS:
         re, im = moments[l, m]
         for k in range(1, l):
             for j in range(max(-k, m - l + k), min(k, m + l - k) + 1):
-                (a, b), (u, v) = given[k, j], r[l - k, m - j]
+                (a, b), (u, v) = old[k, j], r[l - k, m - j]
                 re = re + (a * u - b * v)
                 if m:
                     im = im + (a * v + b * u)
-        out[l, m] = re, im
-    return out
+        shifted[l, m] = re, im
+    return shifted
 
 
 def _with_negative_orders(values: Pairs) -> Pairs:
-    """R_lm or M_lm with those for m < 0 added."""
-    turned = {
+    """R_lm or M_lm together with the entries for m < 0."""
+    negative = {
         (l, -m): (re, -im) if m % 2 == 0 else (-re, im) for (l, m), (re, im) in values.items() if m
     }
-    return values | turned
+    return values | negative
 
 
-# Moments of nodes. All in double precision: sums over dipoles and over children in Dr.Jit, on many
-# threads and without temporaries; the rest, one row for each node, in NumPy.
+# Moments of nodes, all in double precision: sums over dipoles and over children in Dr.Jit, on many
+# threads and without temporaries; the rest, with a row for each node, in NumPy.
 
 Moments = dict[tuple[int, int], npt.NDArray[np.complex128]]
 # Degree, order, and 0 for the real or 1 for the imaginary part.
 _PARTS = tuple((l, m, part) for l, m in MOMENT_KEYS for part in range(2 if m else 1))
-# How many numbers `_powers` gives.
+# The number of numbers that `_powers` returns.
 _POWERS = 10
 
 
 @dataclass(frozen=True)
 class NodeMoments:
-    """The nodes of one level of the tree.
+    """The nodes of a level of the tree.
 
-    center: (k, 3) about which the moments are taken: the mean position of the dipoles, weighted by
-        area.
-    radius: (k,) of a ball around it that contains all the dipoles.
+    center: (k, 3) the point about which the moments are taken: the mean position of the dipoles,
+        weighted by area.
+    radius: (k,) of a ball around the center that contains all dipoles.
     area: (k,) sum of a_i = |a_i n_i|.
     second_moment, third_moment, fourth_moment: (k, 3, 3), (k, 3) and (k,) sums of a_i d_i d_i^T, of
         a_i |d_i|^2 d_i and of a_i |d_i|^4.
@@ -155,8 +155,8 @@ def dipole_tree_moments(
 ) -> list[NodeMoments]:
     """Moments of the nodes of all levels, from the leaves to the root.
 
-    points, normals: (n, s, 3) dipoles of each of n primitives; a normal's length is its area.
-    low, high: (n, 3) boxes that hold the primitives.
+    points, normals: (n, s, 3) the s dipoles of each of n primitives; a normal's length is its area.
+    low, high: (n, 3) boxes that contain the primitives.
     """
     backend, each = choose_backend("double"), points.shape[1]
     p, n, lows, highs = (upload_floats(backend, x.ravel()) for x in (points, normals, low, high))
@@ -188,7 +188,8 @@ def triangle_tree_moments(tree: BalancedTree, corners: FloatArray) -> list[NodeM
 
 @dataclass(frozen=True)
 class _Dipole:
-    """A dipole that is spread over points, with weights of sum 1. Its length is its area."""
+    """A dipole that is spread over points, with weights of sum 1. The length of its normal is its
+    area."""
 
     normal: Vec3
     points: Sequence[tuple[float, Vec3]]
@@ -204,12 +205,15 @@ class _DipolePrimitive:
 
 
 def _row(backend: Backend, buffer: Real, i: Any) -> Vec3:
+    """Vector i of a buffer of vectors."""
     return backend.Array3f(*(dr.gather(backend.Float, buffer, 3 * i + k) for k in range(3)))
 
 
 def _levels(
     backend: Backend, tree: BalancedTree, primitive: Callable[[Any], _DipolePrimitive]
 ) -> list[NodeMoments]:
+    """Moments of the nodes of all levels, from the leaves to the root; primitive: from the index of
+    a primitive, its dipoles."""
     level, parts, low, high = _leaves(backend, tree, primitive)
     levels = [level]
     for arity in tree.arities:
@@ -225,7 +229,7 @@ def _leaves(
 ) -> tuple[NodeMoments, list[Real], FloatArray, FloatArray]:
     """The leaves, their `_PARTS` on the backend, and boxes around them.
 
-    One lane for each leaf, which visits its primitives twice: for the center, and for the moments
+    Each lane is a leaf, which visits its primitives twice: for the center, and for the moments
     about it.
     """
     index, real, vector = backend.UInt32, backend.Float, backend.Array3f
@@ -244,50 +248,55 @@ def _leaves(
 
         return dr.while_loop((first, *state), more, step, label="slots")[1:]
 
-    def measured(of: _DipolePrimitive, low: Vec3, high: Vec3, area: Real, weighted: Vec3) -> Any:
-        for one in of.dipoles:
-            size = dr.norm(one.normal)
-            area, weighted = area + size, weighted + size * sum(w * p for w, p in one.points)
-        return fmin(low, of.low), fmax(high, of.high), area, weighted
+    def measure(source: _DipolePrimitive, low: Vec3, high: Vec3, area: Real, weighted: Vec3) -> Any:
+        for dipole in source.dipoles:
+            size = dr.norm(dipole.normal)
+            area, weighted = area + size, weighted + size * sum(w * p for w, p in dipole.points)
+        return fmin(low, source.low), fmax(high, source.high), area, weighted
 
-    def summed(of: _DipolePrimitive, *parts: Real) -> tuple[Any, ...]:
-        for one in of.dipoles:
-            away = [(weight, point - center) for weight, point in one.points]
-            more = _powers(dr.norm(one.normal), away) + _flat(_spread_out(one.normal, away))
+    def sum_up(source: _DipolePrimitive, *parts: Real) -> tuple[Any, ...]:
+        for dipole in source.dipoles:
+            offsets = [(weight, point - center) for weight, point in dipole.points]
+            more = _powers(dr.norm(dipole.normal), offsets) + _flat(
+                _spread_out(dipole.normal, offsets)
+            )
             parts = tuple(a + b for a, b in zip(parts, more, strict=True))
         return parts
 
-    nothing = (vector(dr.inf), vector(-dr.inf), real(0), vector(0))
-    low, high, area, weighted = visit(measured, nothing)
+    start = (vector(dr.inf), vector(-dr.inf), real(0), vector(0))
+    low, high, area, weighted = visit(measure, start)
     # The mean position weighted by area, or the box's center if there is no area.
     center = dr.select(area > 0, weighted / dr.select(area > 0, area, 1), 0.5 * (low + high))
-    sums = visit(summed, (real(0),) * (_POWERS + len(_PARTS)))
+    sums = visit(sum_up, (real(0),) * (_POWERS + len(_PARTS)))
     powers, parts = sums[:_POWERS], sums[_POWERS:]
     dr.eval(low, high, area, center, *sums)
     boxes = to_numpy(low), to_numpy(high)
-    at, (xx, yy, zz, xy, xz, yz, *third, fourth) = to_numpy(center), map(to_numpy, powers)
+    middle, (xx, yy, zz, xy, xz, yz, *third, fourth) = to_numpy(center), map(to_numpy, powers)
     second = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
     sizes = to_numpy(area), second, np.stack(third, axis=1), fourth
     return (
-        NodeMoments(at, _bounding_radius(at, *boxes), *sizes, _moments_of(parts)),
+        NodeMoments(middle, _bounding_radius(middle, *boxes), *sizes, _moments_of(parts)),
         list(parts),
         *boxes,
     )
 
 
 def _powers(area: Real, points: Sequence[tuple[float, Vec3]]) -> list[Real]:
-    """What a dipole adds to `second_moment` (xx, yy, zz, xy, xz, yz), `third_moment` and
+    """The terms of a dipole in `second_moment` (xx, yy, zz, xy, xz, yz), `third_moment` and
     `fourth_moment`."""
     total: list[Real] = [area * 0] * _POWERS
     for weight, d in points:
-        square, share = dr.squared_norm(d), weight * area
+        square, weighted_area = dr.squared_norm(d), weight * area
         pairs = (d.x * d.x, d.y * d.y, d.z * d.z, d.x * d.y, d.x * d.z, d.y * d.z)
         powers = (*pairs, *(square * d), square * square)
-        total = [dr.fma(share, one, old) for one, old in zip(powers, total, strict=True)]
+        total = [
+            dr.fma(weighted_area, power, old) for power, old in zip(powers, total, strict=True)
+        ]
     return total
 
 
 def _spread_out(normal: Vec3, points: Sequence[tuple[float, Vec3]]) -> Pairs:
+    """The moments of a dipole that is spread over points with weights."""
     means: Pairs = {}
     for weight, d in points:
         for key, (re, im) in regular_harmonics(d.x, d.y, d.z, MAX_DEGREE - 1).items():
@@ -302,66 +311,71 @@ def _flat(moments: Pairs) -> list[Any]:
 
 
 def _moments_of(parts: Sequence[Real]) -> Moments:
-    out = {key: np.zeros(dr.width(parts[0]), np.complex128) for key in MOMENT_KEYS}
+    """`Moments` from `_PARTS` on the backend."""
+    moments = {key: np.zeros(dr.width(parts[0]), np.complex128) for key in MOMENT_KEYS}
     for (l, m, part), values in zip(_PARTS, parts, strict=True):
         if part:
-            out[l, m].imag = to_numpy(values)
+            moments[l, m].imag = to_numpy(values)
         else:
-            out[l, m].real = to_numpy(values)
-    return out
+            moments[l, m].real = to_numpy(values)
+    return moments
 
 
 def _parents(
     backend: Backend, below: NodeMoments, parts: list[Real], low: FloatArray, high: FloatArray
 ) -> tuple[NodeMoments, list[Real]]:
-    """The level above, whose boxes are given, and its `_PARTS`."""
+    """The level of the parents, with boxes from low to high (n, 3), and its `_PARTS`."""
     count, arity = len(low), len(below.area) // len(low)
     area = below.area.reshape(-1, arity).sum(axis=1)
     weighted = (below.area[:, None] * below.center).reshape(-1, arity, 3).sum(axis=1)
-    some = (area > 0)[:, None]
-    center = np.where(some, weighted / np.where(some, area[:, None], 1), 0.5 * (low + high))
+    has_area = (area > 0)[:, None]
+    center = np.where(has_area, weighted / np.where(has_area, area[:, None], 1), 0.5 * (low + high))
     shift = below.center - np.repeat(center, arity, axis=0)
-    given: Pairs = dict.fromkeys(MOMENT_KEYS, (0.0, 0.0))
+    pairs: Pairs = dict.fromkeys(MOMENT_KEYS, (0.0, 0.0))
     for (l, m, part), values in zip(_PARTS, parts, strict=True):
-        given[l, m] = (given[l, m][0], values) if part else (values, 0.0)
-    found = _flat(multipole_to_multipole(given, *(upload_floats(backend, one) for one in shift.T)))
-    dr.eval(*found)
+        pairs[l, m] = (pairs[l, m][0], values) if part else (values, 0.0)
+    shifted = _flat(
+        multipole_to_multipole(pairs, *(upload_floats(backend, column) for column in shift.T))
+    )
+    dr.eval(*shifted)
     first = arity * dr.arange(backend.UInt32, count)
-    sums = [sum(dr.gather(backend.Float, one, first + k) for k in range(arity)) for one in found]
+    sums = [
+        sum(dr.gather(backend.Float, column, first + k) for k in range(arity)) for column in shifted
+    ]
     dr.eval(*sums)
     second, third, fourth = (
-        one.reshape(count, arity, *one.shape[1:]).sum(axis=1) for one in _moved(below, shift)
+        column.reshape(count, arity, *column.shape[1:]).sum(axis=1)
+        for column in _moved(below, shift)
     )
-    reach, moments = _bounding_radius(center, low, high), _moments_of(sums)
-    return NodeMoments(center, reach, area, second, third, fourth, moments), sums
+    radius, moments = _bounding_radius(center, low, high), _moments_of(sums)
+    return NodeMoments(center, radius, area, second, third, fourth, moments), sums
 
 
 def _moved(level: NodeMoments, s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Second, third and fourth about center - s, that is, with d + s for d. About its own center a
-    node's first moment is 0."""
+    """Second, third and fourth moments about center - s, that is, with d + s for d. About its own
+    center a node's first moment is 0."""
     a, square = level.area[:, None], (s * s).sum(axis=1)
-    trace, bent = (
+    trace, m2_s = (
         np.einsum("kii->k", level.second_moment),
         np.einsum("kij,kj->ki", level.second_moment, s),
     )
     second = level.second_moment + a[:, None] * s[:, :, None] * s[:, None]
-    third = level.third_moment + trace[:, None] * s + 2 * bent + a * square[:, None] * s
+    third = level.third_moment + trace[:, None] * s + 2 * m2_s + a * square[:, None] * s
     fourth = level.fourth_moment + 2 * trace * square + level.area * square * square
-    return second, third, fourth + 4 * ((level.third_moment + bent) * s).sum(axis=1)
+    return second, third, fourth + 4 * ((level.third_moment + m2_s) * s).sum(axis=1)
 
 
 def _bounding_radius(center: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Distance from the center to the farthest corner of the box."""
+    """(k,) the distance from the center to the farthest corner of the box."""
     return np.linalg.norm(np.maximum(high - center, center - low), axis=1)
 
 
 def cartesian_coefficients(moments: Moments, order: int = 2) -> FloatArray:
-    """(k, 15) coefficients of the terms l <= order + 1, as `treecode.multipole_terms` reads
-    them.
+    """(k, 15) coefficients of the terms l <= order + 1, as `treecode.multipole_terms` reads them.
 
-    Term l is P_l(r)/r^(2l+1) with harmonic polynomials P_1 = D.r; P_2 with the coefficients of
-    xx, yy, 2xy, 2xz, 2yz (zz follows: the trace is zero); P_3 with those of xyy, xzz, xxy, yzz,
-    xxz, yyz, xyz (x^3, y^3, z^3 follow).
+    Term l is P_l(r)/r^(2l+1) with harmonic polynomials P_1 = D.r; P_2 with the coefficients of xx,
+    yy, 2xy, 2xz, 2yz (zz follows: the trace is zero); P_3 with the coefficients of xyy, xzz, xxy,
+    yzz, xxz, yyz, xyz (x^3, y^3, z^3 follow).
     """
     real = {key: value.real for key, value in moments.items()}
     imag = {key: value.imag for key, value in moments.items()}
@@ -381,9 +395,9 @@ def cartesian_coefficients(moments: Moments, order: int = 2) -> FloatArray:
         -3 * r30 - r32,
         2 * i32,
     ]
-    kept = -np.stack([*dipole, *quadrupole, *octupole], axis=1)
-    kept[:, (3, 8, 15)[order] :] = 0
-    return kept
+    coefficients = -np.stack([*dipole, *quadrupole, *octupole], axis=1)
+    coefficients[:, (3, 8, 15)[order] :] = 0
+    return coefficients
 
 
 def triangle_rule() -> tuple[FloatArray, FloatArray]:
@@ -402,7 +416,7 @@ def triangle_rule() -> tuple[FloatArray, FloatArray]:
 
 # Bounds of the terms.
 
-# A bound times this is still a bound after it was rounded down to single precision a few times.
+# A bound times this factor is still a bound after a few roundings to single precision.
 _ROUND_UP = 1 + 2.0**-20
 
 
@@ -433,18 +447,18 @@ def truncation_bounds(
     -(l+1) has, by the same inequality, a gradient of at most l+1 times its largest value on the
     sphere through the point; the rest is then sum_{l>=6} l (l+1) q^(l-5)
     = q (42 - 70q + 30q^2)/(1-q)^3. Its derivatives along lines are harmonic of degree -(l+2), so
-    that second ones are at most (l+1)(l+2) times it, and sum_{l>=6} l (l+1) (l+2) q^(l-5)
+    that second derivatives are at most (l+1)(l+2) times it, and sum_{l>=6} l (l+1) (l+2) q^(l-5)
     = q (336 - 840q + 720q^2 - 210q^3)/(1-q)^4. Each term times r^(k+1) (r^(k+2), r^(k+3)) does not
-    grow with r, so the value at `nearest` serves. A little is added for the rounding to single
-    precision.
+    grow with r, so the value at `nearest` is a bound. The results are increased slightly for the
+    rounding to single precision.
     """
     r = np.maximum(nearest, 1e-50)  # so that powers do not underflow
     q = np.minimum(level.radius / r, 0.99)
     k = order + 2
-    rest = level.fourth_moment * level.radius / r ** (6 - k)
-    value = rest * (6 - 5 * q) / (1 - q) ** 2
-    slope = rest * (42 - 70 * q + 30 * q * q) / (1 - q) ** 3
-    second = rest * (336 - 840 * q + 720 * q * q - 210 * q**3) / (1 - q) ** 4
+    tail = level.fourth_moment * level.radius / r ** (6 - k)
+    value = tail * (6 - 5 * q) / (1 - q) ** 2
+    slope = tail * (42 - 70 * q + 30 * q * q) / (1 - q) ** 3
+    second = tail * (336 - 840 * q + 720 * q * q - 210 * q**3) / (1 - q) ** 4
     for l in range(k, MAX_DEGREE + 1):
         term = sup_norm(level.moments, l) / r ** (l - k)
         value, slope, second = (
@@ -466,8 +480,8 @@ def remainder_constants(level: NodeMoments, rough: float) -> tuple[FloatArray, F
     The term l, a harmonic function of degree -(l+1), is at most B_l/r^(l+1), and its k-th
     derivative along a line (l+k)!/l! B_l/r^(l+1+k) (the argument of `truncation_bounds`, k times).
     So Taylor's remainder is at most B_l Phi_l(q) t^2/r^(l+3). In Phi_l/Phi_1 the ratio of
-    coefficients, (l+k)!/(l! (k+1)!), grows with k, so that the quotient grows with q: W_l =
-    Phi_l(Q)/Phi_1(Q) serves. With r >= r0: A = B_1 + W_2 B_2/r0 and K = sum_{l>=3} W_l
+    coefficients, (l+k)!/(l! (k+1)!), grows with k, so that the quotient grows with q, and W_l =
+    Phi_l(Q)/Phi_1(Q) is a bound. With r >= r0: A = B_1 + W_2 B_2/r0 and K = sum_{l>=3} W_l
     B_l/r0^(l-3), for l >= 6 of B_l <= l R^(l-5) sum a |d|^4, with Phi_l(Q) < (1-Q)^-(l+1)/Q^2.
     """
     r0, q = np.maximum(rough * level.radius, 1e-50), max_step_fraction(rough)
@@ -475,8 +489,8 @@ def remainder_constants(level: NodeMoments, rough: float) -> tuple[FloatArray, F
     ratio = [((1 - q) ** -(n + 1) - 1 - (n + 1) * q) / first for n in range(MAX_DEGREE + 1)]
     terms = [ratio[n] * sup_norm(level.moments, n) for n in range(1, MAX_DEGREE + 1)]
     x = 1 / (rough * (1 - q))
-    rest = x * (6 - 5 * x) / (1 - x) ** 2 / ((1 - q) ** 6 * first)
-    wide = rest * level.fourth_moment / r0**2 + sum(
+    tail = x * (6 - 5 * x) / (1 - x) ** 2 / ((1 - q) ** 6 * first)
+    higher = tail * level.fourth_moment / r0**2 + sum(
         term / r0**n for n, term in enumerate(terms[2:])
     )
-    return terms[0] + terms[1] / r0, wide
+    return terms[0] + terms[1] / r0, higher

@@ -9,26 +9,26 @@ if TYPE_CHECKING:
 
 
 class OrientedPoints:
-    """Points (n, 3), unit normals (n, 3) and areas (n,). They stay as they are, since all else is
-    computed from them once: other points make another field. Subclasses set them by
-        `_set_points`."""
+    """Points (n, 3), unit normals (n, 3) and areas (n,). They cannot be set, since all other data
+    are computed from them once: other points make another field. Subclasses set them by
+    `_set_points`."""
 
     def _set_points(self, points: FloatArray, normals: FloatArray, areas: FloatArray) -> None:
-        for one in (points, normals, areas):
-            one.setflags(write=False)
+        for array in (points, normals, areas):
+            array.setflags(write=False)
         self._points, self._normals, self._areas = points, normals, areas
 
     @property
     def points(self) -> FloatArray:
-        """(n, 3)."""
+        """The points (n, 3)."""
         return self._points
 
     @property
     def normals(self) -> FloatArray:
-        """(n, 3), of unit length."""
+        """The normals (n, 3), of unit length."""
         return self._normals
 
     @property
     def areas(self) -> FloatArray:
-        """(n,), that each point stands for."""
+        """The areas (n,) that the points stand for."""
         return self._areas

@@ -2,11 +2,11 @@
 wrote of a `SolidAngle`.
 
 Off its triangles the winding number w of a mesh is, modulo 1, the solid angle of its boundary over
-4 pi, and the level set of that spans the boundary. Where the triangles themselves lie on it, w has
-the level right beside all of them: on which side of it w is there, and so whether w passes the
-level where it jumps, is a matter of rounding, or of how far a flat triangle is from a round
-surface. What has the level is then a checkerboard; but within the coarseness of the triangles it is
-the mesh itself.
+4 pi, and the level set of that spans the boundary. If the triangles themselves lie on this level
+set, w has the level right beside all of them: the side of it on which w is, and so whether w passes
+the level at the jump, depends on rounding, or on the distance of a flat triangle from a curved
+surface. The points with the level then form a checkerboard; but up to the coarseness of the
+triangles the level set is the mesh itself.
 """
 
 from __future__ import annotations
@@ -24,21 +24,23 @@ if TYPE_CHECKING:
 
 __all__ = ["lies_on_own_level"]
 
-# Of the mesh's size: vertices are on the surface within this, the rounding of single precision and
-# of decimals in files. A box of this height without a bottom is such a sheet.
+# Vertices are on the surface within this fraction of the mesh's size, the rounding of single
+# precision and of decimals in files. A box of this height without a bottom is such a sheet.
 _ON_SURFACE = 1e-5
-# Where all vertices are on the boundary, w at centers of triangles is the level up to this: beside
-# a thin triangle w is so steep that every surface is near it.
+# If all vertices are on the boundary, w at centers of triangles is the level up to this number:
+# beside a thin triangle w is so steep that every surface is near it.
 _ROUNDING = 1e-7
-# Centers of triangles are within this part of the longest edge; those that `mesh` makes within a
-# twentieth.
+# Centers of triangles are within this fraction of the longest edge from the surface; of triangles
+# that `mesh` makes within a twentieth.
 _FLAT = 0.1
-# Of so many vertices and centers, this part have to be so; the first decides most meshes.
+# Of at most `_MOST` vertices and centers, the fraction `_NEARLY_ALL` has to be near the surface;
+# the first `_FIRST` points decide most meshes.
 _MOST, _NEARLY_ALL, _FIRST = 400, 0.99, 1
-# So many points are compared with the sum over all triangles, within this part of a turn.
+# At `_COUNTED` points the sum over all triangles is compared, within the fraction `_SAME` of a
+# turn.
 _COUNTED, _SAME = 8, 0.25
 _AT_ONCE = 1 << 20
-# The apex of all edges' triangles; any direction that edges are not likely to have.
+# The apex of the triangles of all edges: a direction that edges are not likely to have.
 _APEX: FloatArray = np.array([0.3017, 0.5043, 0.8091]) / math.sqrt(
     0.3017**2 + 0.5043**2 + 0.8091**2
 )
@@ -48,12 +50,12 @@ def lies_on_own_level(mesh: WindingMesh, level: float) -> bool:
     """Whether the triangles of an open mesh lie on the surface that spans its boundary, with this
     level of w modulo 1, and are the points at which w jumps from the level by one.
 
-    Looked at and not proved: vertices that are not on the boundary are on that surface within the
-    rounding of files, in first order, but for one in a hundred; if there are none, w has the level
-    at centers of triangles, up to rounding; centers are within a part of the triangles' edges. Then
-    it is all of the surface: of each edge of the boundary, which is that of one triangle, one sheet
-    of it begins, and every part of it ends there (a harmonic function has no closed level set but
-    about its poles).
+    This is a numerical test and no proof: 99 % of the vertices that are not on the boundary are on
+    that surface within the rounding of files, in first order; if there are no such vertices, w has
+    the level at centers of triangles, up to rounding; centers are within a fraction of the
+    triangles' edges. Then the mesh is all of the surface: from each edge of the boundary, which
+    belongs to a single triangle, one sheet of the surface begins, and every part of it ends there
+    (a harmonic function has no closed level set except about its poles).
     """
     if not len(mesh.singular_edges) or (mesh.multiplicity != 1).any():
         return False
@@ -66,11 +68,11 @@ def lies_on_own_level(mesh: WindingMesh, level: float) -> bool:
     is_filled = inner.any()
     points = _some(x[inner] if is_filled else corners.mean(axis=1), _MOST)
     # In units in which the mesh has a size of one to two.
-    most = 2 * _ON_SURFACE if is_filled else _ROUNDING
+    limit = 2 * _ON_SURFACE if is_filled else _ROUNDING
 
-    def is_on(places: FloatArray) -> BoolArray:
-        gap, distance = _offsets(edges, places, level)
-        return (distance if is_filled else gap) < most
+    def is_on(queries: FloatArray) -> BoolArray:
+        gap, distance = _offsets(edges, queries, level)
+        return (distance if is_filled else gap) < limit
 
     if not is_on(points[:_FIRST]).all() or np.mean(is_on(points)) < _NEARLY_ALL:
         return False
@@ -79,20 +81,21 @@ def lies_on_own_level(mesh: WindingMesh, level: float) -> bool:
     _, far = _offsets(edges, corners.mean(axis=1), level)
     if np.mean(far < _FLAT * longest) < _NEARLY_ALL:
         return False
-    # The mean of w on both sides, which are the level and one more or less than it.
+    # The mean of w on both sides, where w is the level, and the level plus or minus 1.
     mean = np.array([_mean_winding(mesh.corners, point) for point in _some(points, _COUNTED)])
-    return any(bool((np.abs(mean - level - way) < _SAME).all()) for way in (-0.5, 0.5))
+    return any(bool((np.abs(mean - level - side) < _SAME).all()) for side in (-0.5, 0.5))
 
 
-def _some(rows: FloatArray, most: int) -> FloatArray:
-    """At most so many rows, from all over."""
-    return rows[:: -(-len(rows) // most)]
+def _some(rows: FloatArray, max_count: int) -> FloatArray:
+    """At most `max_count` rows, evenly spaced."""
+    return rows[:: -(-len(rows) // max_count)]
 
 
 def _offsets(edges: FloatArray, points: FloatArray, level: float) -> tuple[FloatArray, FloatArray]:
-    """By how much w modulo 1 at points (n, 3) differs from a level, and how far they are from the
-    surface that spans closed edges (k, 2, 3), by the slope of their solid angle: the sum of those
-    of triangles from each edge to an apex far away."""
+    """The difference of w modulo 1 from a level at points (n, 3), and the distance of the
+    points, to first order, from the surface that spans closed edges (k, 2, 3). w and its
+    gradient come from the solid angle of the edges, the sum of those of triangles from each edge
+    to an apex far away."""
     gaps: list[FloatArray] = []
     slopes: list[FloatArray] = []
     step = max(1, _AT_ONCE // len(edges))
@@ -102,11 +105,11 @@ def _offsets(edges: FloatArray, points: FloatArray, level: float) -> tuple[Float
         a, b = np.linalg.norm(p, axis=2), np.linalg.norm(q, axis=2)
         normal: FloatArray = np.cross(p, q)
         cosine = a * b + (p * q).sum(axis=2)
-        below = cosine + b * (p @ _APEX) + a * (q @ _APEX)
-        turn = 2 * np.arctan2(normal @ _APEX, below)
+        denominator = cosine + b * (p @ _APEX) + a * (q @ _APEX)
+        angle = 2 * np.arctan2(normal @ _APEX, denominator)
         with np.errstate(divide="ignore", invalid="ignore"):  # on an edge it has no slope
             rates = ((a + b) / (a * b * cosine))[:, :, None] * normal
-        gap: FloatArray = turn.sum(axis=1) / (4 * math.pi) - level
+        gap: FloatArray = angle.sum(axis=1) / (4 * math.pi) - level
         gaps.append(np.abs(gap - np.round(gap)))
         slopes.append(np.linalg.norm(rates.sum(axis=1), axis=1) / (4 * math.pi))
     gap = np.concatenate(gaps)
@@ -114,8 +117,9 @@ def _offsets(edges: FloatArray, points: FloatArray, level: float) -> tuple[Float
 
 
 def _mean_winding(corners: FloatArray, point: FloatArray) -> float:
-    """The mean of the winding numbers on both sides of a mesh (m, 3, 3) at a point of it: that of
-    all triangles but those that it lies on, which fill half of all directions."""
+    """The mean of the winding numbers on both sides of a mesh (m, 3, 3) at a point of it: the
+    winding number of all triangles except those that contain the point, which fill half of all
+    directions."""
     angles = solid_angles(corners, point)
     is_off = np.abs(angles) < 2 * (math.pi - _ON_SURFACE)
     return float(angles[is_off].sum()) / (4 * math.pi)

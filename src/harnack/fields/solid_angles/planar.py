@@ -1,24 +1,24 @@
 """Curves that bound a region of a plane, and the range of their solid angle near a point.
 
-Let disjoint simple loops of one plane have winding numbers 0 and 1 only, such as an outline with
-holes, each of opposite orientation: they bound a region S of the plane. Above the plane f is minus
-the solid angle of S and lies in (-2 pi, 0); below, it lies in (0, 2 pi). Let d be the distance from
-x to the curves and h that to the plane, h <= d. On the ball B(x, d), which meets no curve, f has a
-continuous lift; the ball meets the plane in a disk D of radius sqrt(d^2 - h^2), inside of S or
-outside of it.
+Let disjoint simple loops of a single plane have winding numbers 0 and 1 only, such as an outline
+with holes, each of opposite orientation: they bound a region S of the plane. Above the plane f is
+minus the solid angle of S and lies in (-2 pi, 0); below, it lies in (0, 2 pi). Let d be the
+distance from x to the curves and h the distance to the plane, h <= d. On the ball B(x, d), which
+meets no curve, f has a continuous lift; the ball meets the plane in a disk D of radius sqrt(d^2 -
+h^2), inside of S or outside of it.
 
 - Outside, the lift is f on both sides of the plane: it lies in (-2 pi, 2 pi).
-- Inside, it continues f of the one side by f of the other minus or plus 4 pi: from above it lies in
-  (-4 pi, 0), from below in (0, 4 pi), whichever side x is on.
+- Inside, it continues f of one side by f of the other side minus or plus 4 pi: from above it lies
+  in (-4 pi, 0), from below in (0, 4 pi), whichever side x is on.
 - B(x, h) does not meet the plane: there the lift lies in (-2 pi, 0) or in (0, 2 pi).
 
 f itself tells where D is. At x, D has the solid angle 2 pi (1 - h/d). Inside, |f| is at least that,
-for S contains D; outside, |f| is at most 2 pi less that, for S is in the rest of the plane. If
-h < d/2, |f| = pi separates the two cases; else one of them may be proved, and if none is, B(x, h)
-is used, whose radius is at least d/2. In rounded arithmetic f is not known well near the curve:
-where h < d/2 and it is not known where D is, the lift lies in (-4 pi, 4 pi) in either case.
+for S contains D; outside, |f| is at most 2 pi minus that, for S is in the rest of the plane. If h <
+d/2, |f| = pi separates the two cases; otherwise either case may be proved, and if neither is, B(x,
+h) is used, whose radius is at least d/2. In rounded arithmetic the error of f is large near the
+curve: if h < d/2 and neither case is certain, the lift lies in (-4 pi, 4 pi) in either case.
 
-The range is 4 pi wide, where that of a curve in convex position is 12 pi wide.
+The range is 4 pi wide, whereas the range for a curve in convex position is 12 pi wide.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _MOST_VERTICES = 2048  # the tests take quadratic time
 
 @dataclass(frozen=True)
 class PlanarRegion:
-    """The plane n.x = offset of a region, n (3,) such that the solid angle is negative above."""
+    """The plane n.x = offset of a region, n (3,) such that the solid angle is negative above it."""
 
     normal: FloatArray
     offset: float
@@ -62,41 +62,41 @@ class PlanarRegion:
         """A ball and a range of the lift on it: see the module.
 
         angle: f modulo 4 pi.
-        height: over the plane, along its normal, off by at most `slack`.
-        distance: to the curves, or less.
+        height: the height over the plane, along its normal, off by at most `slack`.
+        distance: the distance to the curves, or less.
         slack: a length that bounds the rounding of positions.
-        error: of the angle, beyond rounding.
+        error: a bound of the error of the angle, beyond rounding.
         """
         turn = 2 * math.pi
         f = angle - 2 * turn * dr.round(angle / (2 * turn))
-        above = dr.abs(height) + slack
-        share = above / distance
+        height_bound = dr.abs(height) + slack
+        ratio = height_bound / distance
         # Near the curve the rounding of positions moves f by up to about 2 slack/distance.
-        doubt = 1e-3 + 16 * slack / distance + error
-        is_inside = dr.abs(f) > turn * fmax(share, 0.5) + doubt
-        is_outside = dr.abs(f) < turn * fmin(1 - share, 0.5) - doubt
-        free = fmax(dr.abs(height) - slack, 0)
-        is_beside = ~(is_inside | is_outside) & (free >= 0.4 * distance)
+        tolerance = 1e-3 + 16 * slack / distance + error
+        is_inside = dr.abs(f) > turn * fmax(ratio, 0.5) + tolerance
+        is_outside = dr.abs(f) < turn * fmin(1 - ratio, 0.5) - tolerance
+        free_height = fmax(dr.abs(height) - slack, 0)
+        is_beside = ~(is_inside | is_outside) & (free_height >= 0.4 * distance)
         zero = type(f)(0)
-        radius = dr.select(is_beside, free, distance)
+        radius = dr.select(is_beside, free_height, distance)
         lower = dr.select(is_outside, -turn, -2 * turn)
         upper = dr.select(is_outside, turn, 2 * turn)
         lower = dr.select(is_inside, dr.select(f < 0, lower, zero), lower)
         upper = dr.select(is_inside, dr.select(f < 0, zero, upper), upper)
         lower = dr.select(is_beside, dr.select(height > 0, -turn, zero), lower)
         upper = dr.select(is_beside, dr.select(height > 0, zero, turn), upper)
-        # f was reduced modulo 4 pi; the promise is about the value that the sample states.
-        moved = angle - f
-        return HarmonicBall(radius, lower + moved, upper + moved)
+        # f was reduced modulo 4 pi; the promise is about the value in the sample.
+        branch = angle - f
+        return HarmonicBall(radius, lower + branch, upper + branch)
 
 
 @dataclass(frozen=True)
 class _PlanarLoop:
     """A simple loop in a plane.
 
-    points: (k, 2) of a polygon, or the center of a circle.
-    radius: of a circle, 0 for a polygon.
-    sign: 1 if it runs counter-clockwise, else -1.
+    points: (k, 2) the vertices of a polygon, or the center (1, 2) of a circle.
+    radius: the radius of a circle, 0 for a polygon.
+    sign: 1 if the loop runs counter-clockwise, else -1.
     """
 
     points: FloatArray
@@ -119,11 +119,11 @@ class _PlanarLoop:
 
 
 def planar_region(loops: Loops, circles: Sequence[Circle]) -> PlanarRegion | None:
-    """The region that the curves bound in their plane; None if they are not found to bound one.
+    """The region that the curves bound in their plane, or None.
 
-    That is if the loops do not lie in one plane up to 1e-12 of their size, cross or come nearer to
-    each other than 1e-6 of it, have winding numbers other than 0 and 1 (or 0 and -1), or have more
-    than 2048 vertices.
+    It is None if the loops do not lie in one plane up to 1e-12 of their size, cross or come nearer
+    to each other than 1e-6 of it, have winding numbers other than 0 and 1 (or 0 and -1), or have
+    more than 2048 vertices.
     """
     if sum(map(len, loops)) > _MOST_VERTICES or len(loops) + len(circles) > _MOST_VERTICES // 8:
         return None
@@ -131,26 +131,26 @@ def planar_region(loops: Loops, circles: Sequence[Circle]) -> PlanarRegion | Non
     if plane is None:
         return None
     normal, origin, size, axes = plane
-    flat: list[_PlanarLoop] = []
-    for loop in loops:
-        centered = (loop - origin) / size
+    outlines: list[_PlanarLoop] = []
+    for polygon in loops:
+        centered = (polygon - origin) / size
         edges = np.roll(centered, -1, axis=0) - centered
-        if len(loop) < 3 or not (edges * edges).sum(axis=1).all() or not is_simple(centered):
+        if len(polygon) < 3 or not (edges * edges).sum(axis=1).all() or not is_simple(centered):
             return None
         points = centered @ axes.T
-        following = np.roll(points, -1, axis=0)
-        area = float((points[:, 0] * following[:, 1] - points[:, 1] * following[:, 0]).sum())
-        flat.append(_PlanarLoop(points, 0.0, 1 if area > 0 else -1))
-    for one in circles:
-        center = ((np.array(one.center) - origin) / size) @ axes.T
-        sign = 1 if float(np.dot(one.normal, normal)) > 0 else -1
-        flat.append(_PlanarLoop(center[None], one.radius / size, sign))
-    if not all(_are_separated(one, other) for one, other in itertools.combinations(flat, 2)):
+        next_points = np.roll(points, -1, axis=0)
+        area = float((points[:, 0] * next_points[:, 1] - points[:, 1] * next_points[:, 0]).sum())
+        outlines.append(_PlanarLoop(points, 0.0, 1 if area > 0 else -1))
+    for loop in circles:
+        center = ((np.array(loop.center) - origin) / size) @ axes.T
+        sign = 1 if float(np.dot(loop.normal, normal)) > 0 else -1
+        outlines.append(_PlanarLoop(center[None], loop.radius / size, sign))
+    if not all(_are_separated(loop, other) for loop, other in itertools.combinations(outlines, 2)):
         return None
     # The winding number just inside each loop: the sum of the signs of all loops around it.
     inside = [
-        sum(other.sign for other in flat if other is one or other.contains(one.some_point))
-        for one in flat
+        sum(other.sign for other in outlines if other is loop or other.contains(loop.some_point))
+        for loop in outlines
     ]
     lowest, highest = min(0, *inside), max(0, *inside)
     if highest - lowest != 1:
@@ -163,8 +163,8 @@ def _plane_of(
     loops: Loops, circles: Sequence[Circle]
 ) -> tuple[FloatArray, FloatArray, float, FloatArray] | None:
     """Normal, origin, size and two axes (2, 3), right-handed, of a plane that contains all curves;
-    None if there is none."""
-    points = np.concatenate([*loops, *(one.polygon(4) for one in circles)])
+    None if there is no such plane."""
+    points = np.concatenate([*loops, *(circle.polygon(4) for circle in circles)])
     lower, upper = points.min(axis=0), points.max(axis=0)
     size = float((upper - lower).max())
     origin: FloatArray = 0.5 * (lower + upper)
@@ -173,7 +173,7 @@ def _plane_of(
     x: FloatArray = (points - origin) / size
     if circles:
         normal = np.array(circles[0].normal)
-        # The plane of the first circle is given exactly.
+        # The plane of the first circle is known exactly.
         origin = np.array(circles[0].center)
         x = (points - origin) / size
     else:
@@ -183,7 +183,7 @@ def _plane_of(
     if not np.abs(x @ normal).max() <= _FLAT:
         return None
     # Small loops must not be tilted more than large ones.
-    for loop in (*loops, *(one.polygon(4) for one in circles)):
+    for loop in (*loops, *(circle.polygon(4) for circle in circles)):
         span = loop - loop[0]
         if not np.abs(span @ normal).max() <= _TILT * np.abs(span).max():
             return None
@@ -192,25 +192,27 @@ def _plane_of(
     return normal, origin, size, np.stack([first, np.cross(normal, first)])
 
 
-def _are_separated(one: _PlanarLoop, other: _PlanarLoop) -> bool:
+def _are_separated(first: _PlanarLoop, second: _PlanarLoop) -> bool:
     """Whether two loops are at least _APART from each other."""
-    if one.radius > 0 and other.radius > 0:
-        between = float(np.linalg.norm(one.points[0] - other.points[0]))
-        sum_gap = between - (one.radius + other.radius)
-        return max(sum_gap, abs(one.radius - other.radius) - between) >= _APART
-    if other.radius > 0:
-        one, other = other, one
-    p, q = other.points, np.roll(other.points, -1, axis=0)
-    if one.radius > 0:
-        e, away = q - p, one.points[0] - p
-        share = np.clip((away * e).sum(axis=1) / (e * e).sum(axis=1), 0, 1)
-        nearest = float(np.linalg.norm(away - share[:, None] * e, axis=1).min())
-        farthest = float(np.linalg.norm(away, axis=1).max())
-        return nearest - one.radius >= _APART or one.radius - farthest >= _APART
-    first, second = (_embed_in_space(x.points, np.roll(x.points, -1, axis=0)) for x in (one, other))
-    for a, b in zip(*first, strict=True):
-        many = (np.broadcast_to(end, second[0].shape) for end in (a, b))
-        if not segment_distance_lower_bound(*many, *second).min() >= _APART:
+    if first.radius > 0 and second.radius > 0:
+        distance = float(np.linalg.norm(first.points[0] - second.points[0]))
+        outer_gap = distance - (first.radius + second.radius)
+        return max(outer_gap, abs(first.radius - second.radius) - distance) >= _APART
+    if second.radius > 0:
+        first, second = second, first
+    p, q = second.points, np.roll(second.points, -1, axis=0)
+    if first.radius > 0:
+        e, offset = q - p, first.points[0] - p
+        fraction = np.clip((offset * e).sum(axis=1) / (e * e).sum(axis=1), 0, 1)
+        nearest = float(np.linalg.norm(offset - fraction[:, None] * e, axis=1).min())
+        farthest = float(np.linalg.norm(offset, axis=1).max())
+        return nearest - first.radius >= _APART or first.radius - farthest >= _APART
+    edges_a, edges_b = (
+        _embed_in_space(x.points, np.roll(x.points, -1, axis=0)) for x in (first, second)
+    )
+    for a, b in zip(*edges_a, strict=True):
+        repeated = (np.broadcast_to(end, edges_b[0].shape) for end in (a, b))
+        if not segment_distance_lower_bound(*repeated, *edges_b).min() >= _APART:
             return False
     return True
 

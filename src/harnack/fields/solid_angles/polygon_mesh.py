@@ -2,7 +2,7 @@
 
 - `PolygonMesh`: the field, with a patch for each face.
 - `FaceLoops`: the boundary curves of all faces on a backend; `FaceSolidAngle`: the solid angle of a
-  face, which may be another face in each lane.
+  face, which may differ from lane to lane.
 - `face_boxes`: boxes that are proved to contain the surface of each face.
 """
 
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 __all__ = ["PERIOD", "FaceData", "FaceLoops", "FaceSolidAngle", "PolygonMesh", "face_boxes"]
 
 PERIOD = 4 * math.pi
-# Edges of a record; a fixed number, so that all meshes share kernels.
+# The number of edges of a record, which is fixed so that all meshes share kernels.
 EDGES_PER_RECORD = 4
 # Records are counted in floats; single precision holds no larger integers without gaps.
 _MOST_RECORDS = 2**24
@@ -59,7 +59,7 @@ class FaceLoops:
     heads: for each face its center and size, the first record of its edges, the number of these
         records (negative if the face is in convex position), and bounds of the rounding of a point,
         in units of the face, and of the value.
-    edges: of all faces, each in its own unit coordinates.
+    edges: the edges of all faces, each face in its own unit coordinates.
     """
 
     heads: RecordTable
@@ -81,27 +81,27 @@ class FaceLoops:
         magnitude = np.maximum(np.abs(low), np.abs(high)).max(axis=1) / size
         x /= size[face][:, None]
         loops = tuple(np.split(x, faces.loop_starts[1:]))
-        trips = np.bincount(faces.face_of_loop, -(-faces.loop_sizes // EDGES_PER_RECORD)).astype(
+        counts = np.bincount(faces.face_of_loop, -(-faces.loop_sizes // EDGES_PER_RECORD)).astype(
             np.int64
         )
-        if trips.sum() >= _MOST_RECORDS:
+        if counts.sum() >= _MOST_RECORDS:
             raise ValueError(
                 f"{len(x):,} corners of faces are too many: cut the mesh into parts, and give "
                 "them as a list to draw"
             )
-        signed = np.where(faces.in_convex_position, -trips, trips)
+        signed = np.where(faces.in_convex_position, -counts, counts)
         edges = LoopEdges.upload(backend, loops, EDGES_PER_RECORD)
         heads = np.column_stack(
             [
-                center, size, np.cumsum(trips) - trips, signed,
+                center, size, np.cumsum(counts) - counts, signed,
                 backend.machine_epsilon * (6 + 2 * magnitude),
-                edges.rounding(trips),
+                edges.rounding(counts),
             ]
         )  # fmt: skip
         return cls(RecordTable.upload(backend, heads), edges)
 
     def face(self, index: Any) -> FaceSolidAngle:
-        """The solid angle of the face with that index, which may differ from lane to lane."""
+        """The solid angle of the face with index `index`, which may differ from lane to lane."""
         row = self.heads.read_record(index)
         backend = self.heads.backend
         count = backend.UInt32
@@ -111,7 +111,12 @@ class FaceLoops:
 
 @dataclass(frozen=True)
 class FaceData(UnitFrame):
-    """The head of a face, in each lane another, with its edges."""
+    """The head of a face, which may differ from lane to lane, with its edges.
+
+    trips: the number of records of edges, negative if the face is in convex position.
+    rounding, value_rounding: bounds of the rounding of a point, in units of the face, and of the
+        value.
+    """
 
     edges: LoopEdges
     trips: Real
@@ -120,10 +125,10 @@ class FaceData(UnitFrame):
 
 
 class FaceSolidAngle(Field):
-    """The solid angle of a face, in each lane another.
+    """The solid angle of a face, which may differ from lane to lane.
 
-    Its promises are those of `SolidAngle`, which proves them. The ball is that of "convex" if the
-    face is in convex position, else that of "edges".
+    Its promises are those of `SolidAngle`, which has their proofs. The ball is that of "convex" if
+    the face is in convex position, else that of "edges".
     """
 
     period: ClassVar[float | None] = PERIOD
@@ -144,53 +149,59 @@ class FaceSolidAngle(Field):
         backend, x, rounding = face.backend, face.to_unit(p), face.rounding
         sums = sum_over_edges(face.edges, x)
         distance = sums.distance * (1 - SUM_MARGIN) - rounding
-        known = remainder_promises(sums.cubes, sums.fourths, distance)
-        swept = lift_ball(sums.angle, sums.gradient, sums.squares, known)
-        convex = face.trips < 0
+        promises = remainder_promises(sums.cubes, sums.fourths, distance)
+        lift = lift_ball(sums.angle, sums.gradient, sums.squares, promises)
+        is_convex = face.trips < 0
         ball = HarmonicBall(
-            dr.select(convex, distance, swept.radius),
-            dr.select(convex, -1.5 * PERIOD, swept.lower),
-            dr.select(convex, 1.5 * PERIOD, swept.upper),
+            dr.select(is_convex, distance, lift.radius),
+            dr.select(is_convex, -1.5 * PERIOD, lift.lower),
+            dr.select(is_convex, 1.5 * PERIOD, lift.upper),
         )
         # On the curve itself, up to rounding: as in `SolidAngle`.
-        met = sums.distance <= 2 * rounding
-        steep = backend.Array3f(0, 0, 4 * PERIOD / rounding)
-        gradient = dr.select(met, steep, sums.gradient)
+        on_curve = sums.distance <= 2 * rounding
+        steep_gradient = backend.Array3f(0, 0, 4 * PERIOD / rounding)
+        gradient = dr.select(on_curve, steep_gradient, sums.gradient)
         error = vertex_rounding(backend.machine_epsilon, x, sums.squares)
-        error = dr.select(met, 0, error) + face.value_rounding
-        error = dr.select(met, 8 * PERIOD, error)
-        along: tuple[Lipschitz, ...] = ()
+        error = dr.select(on_curve, 0, error) + face.value_rounding
+        error = dr.select(on_curve, 8 * PERIOD, error)
+        ray_promises: tuple[Lipschitz, ...] = ()
         if direction is not None:
             line = RayLine(x, backend.Array3f(direction), rounding)
 
             def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
                 return line_rates(face.edges, line, lengths, active)
 
-            along = lipschitz_along(line, sums.gradient, sums.distance, rates)
-        value = dr.select(met, 0, sums.angle)
+            ray_promises = lipschitz_along(line, sums.gradient, sums.distance, rates)
+        value = dr.select(on_curve, 0, sums.angle)
         sample = Sample(
-            value, gradient, known, error, alternative_promises=(ball,), ray_promises=along
+            value,
+            gradient,
+            promises,
+            error,
+            alternative_promises=(ball,),
+            ray_promises=ray_promises,
         )
         return space_scaled(sample, face.size)
 
 
-# All cells are split so many times, those at the sides of a box up to this many times; in at most
-# so many rounds, and for at most so many pairs of an edge and a cell.
+# All cells are split `_MIN_DEPTH` times, cells at the sides of a box up to `_MAX_DEPTH` times; in
+# at most `_ROUNDS` rounds, and for at most `_MOST_PAIRS` pairs of an edge and a cell.
 _MIN_DEPTH, _MAX_DEPTH, _ROUNDS, _MOST_PAIRS = 2, 7, 24, 30_000_000
-# Boxes are wider than proved by this fraction of the size of a face.
+# Boxes are enlarged by this fraction of the size of a face.
 _SLACK = 1e-4
 _CORNERS = np.array(list(itertools.product((0, 1), repeat=3)), dtype=np.float64)
 
 
 def face_boxes(faces: PolygonFaces, levels: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
-    """Lower and upper corners (m, 3) of boxes that hold the level sets of the faces' solid angles.
+    """Lower and upper corners (m, 3) of boxes that contain the level sets of the faces' solid
+    angles.
 
     In double precision, for all faces at once; computed once for a mesh and its levels.
 
     The 2 pi level of a face in convex position lies in its convex hull (paper, Theorem B.1), which
     lies in the box of its vertices. Other surfaces lie in the isoperimetric box of
-    `SolidAngle.extent`; of its cells those that are proved empty are removed (`_are_empty`), and
-    the box is that around the others.
+    `SolidAngle.extent`; the cells of this box that are proved empty are removed (`_are_empty`), and
+    the result is the box around the other cells.
     """
     low, high = faces.face_boxes()
     nearest = min(abs(math.remainder(level, PERIOD)) for level in levels)
@@ -209,7 +220,7 @@ def _carve_boxes(
     faces: PolygonFaces, carved: IntArray, lower: FloatArray, upper: FloatArray,
     levels: tuple[float, ...],
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-    """Boxes of some faces, around the cells that are not proved empty.
+    """Boxes of the faces `carved`, around the cells that are not proved empty.
 
     Only the cells at the sides of a box can make it smaller, so only these are split further.
     """
@@ -218,19 +229,19 @@ def _carve_boxes(
     corners = np.bincount(faces.face_of_corner)
     cells = _FaceCells(carved, lower[carved], np.zeros(len(carved), dtype=np.int64))
     low, high = cells.boxes(sides)
-    for turn in range(_ROUNDS):
-        ends = cells.depth < _MIN_DEPTH
-        if turn >= _MIN_DEPTH:
-            place = np.searchsorted(carved, cells.face)
-            ends = cells.touch(low[place], high[place], sides) & (cells.depth < _MAX_DEPTH)
-        pairs += 8 * int(corners[cells.face[ends]].sum())
-        if not ends.any() or pairs > _MOST_PAIRS:
+    for step in range(_ROUNDS):
+        is_split = cells.depth < _MIN_DEPTH
+        if step >= _MIN_DEPTH:
+            rows = np.searchsorted(carved, cells.face)
+            is_split = cells.touch(low[rows], high[rows], sides) & (cells.depth < _MAX_DEPTH)
+        pairs += 8 * int(corners[cells.face[is_split]].sum())
+        if not is_split.any() or pairs > _MOST_PAIRS:
             break
-        parts = cells.subset(ends).split(sides)
-        size = parts.sizes(sides)
+        octants = cells.subset(is_split).split(sides)
+        size = octants.sizes(sides)
         half = 0.5 * np.linalg.norm(size, axis=1)
-        empty = _are_empty(curves, parts.face, parts.corner + 0.5 * size, half, levels)
-        cells = cells.subset(~ends).joined(parts.subset(~empty))
+        is_empty = _are_empty(curves, octants.face, octants.corner + 0.5 * size, half, levels)
+        cells = cells.subset(~is_split).joined(octants.subset(~is_empty))
         low, high = cells.boxes(sides)
     return low, high
 
@@ -239,9 +250,9 @@ def _carve_boxes(
 class _FaceCells:
     """Cells of the boxes of faces.
 
-    face: (k,) the face of each cell, increasing; every face has at least one.
+    face: (k,) the face of each cell, increasing; every face has at least one cell.
     corner: (k, 3) lower corners.
-    depth: (k,) how often the face's box was split to get the cell.
+    depth: (k,) the number of splits of the face's box that gave the cell.
     """
 
     face: IntArray
@@ -259,15 +270,15 @@ class _FaceCells:
         return low, np.maximum.reduceat(self.corner + self.sizes(sides), first)
 
     def touch(self, low: FloatArray, high: FloatArray, sides: FloatArray) -> BoolArray:
-        """(k,) whether a cell lies at a side of the box from low to high (k, 3), within a quarter
-        of the cell's size."""
+        """(k,) whether a cell lies at a side of the box from low to high (k, 3), up to a quarter of
+        the cell's size."""
         size = self.sizes(sides)
         at_low = self.corner < low + 0.25 * size
         at_high: BoolArray = self.corner > high - 1.25 * size
         return np.logical_or.reduce(at_low | at_high, axis=1)
 
     def subset(self, chosen: BoolArray) -> _FaceCells:
-        """The cells chosen by a mask (k,)."""
+        """The cells selected by a mask (k,)."""
         return _FaceCells(self.face[chosen], self.corner[chosen], self.depth[chosen])
 
     def split(self, sides: FloatArray) -> _FaceCells:
@@ -279,7 +290,7 @@ class _FaceCells:
         return _FaceCells(face, np.repeat(self.corner, 8, axis=0) + steps * half, depth)
 
     def joined(self, others: _FaceCells) -> _FaceCells:
-        """These cells and others."""
+        """The cells of both operands."""
         face = np.concatenate([self.face, others.face])
         order = np.argsort(face, kind="stable")
         corner = np.concatenate([self.corner, others.corner])
@@ -302,40 +313,42 @@ def _are_empty(
       S = sum_e 2 [asinh(a/(d_e - h)) - asinh(a/d_e)].
     - The second derivative along a line is at most 2 sum_e int rho^-3 over the edge, and that
       integral at most 2a/((d_e - h)^2 sqrt((d_e - h)^2 + a^2)) (`LiftedEdge.bounds`): with the
-      slope here, S = |grad f| h + h^2 sum_e 2a/((d_e - h)^2 sqrt((d_e - h)^2 + a^2)).
+      gradient at the center, S = |grad f| h + h^2 sum_e 2a/((d_e - h)^2 sqrt((d_e - h)^2 + a^2)).
 
     A cell that contains a point of the curve is never empty.
     """
     backend = curves.heads.backend
     real = backend.Float
     index = upload_integers(backend, face)
-    on = curves.face(index).face
-    x = (to_vector3(backend, centers) - on.center) / on.size
-    h = upload_floats(backend, half) / on.size
+    data = curves.face(index).face
+    x = (to_vector3(backend, centers) - data.center) / data.size
+    h = upload_floats(backend, half) / data.size
 
     def add(p: Vec3, q: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
-        zr, zi, slope, nearest, moved, bend = state
+        zr, zi, slope, nearest, change, second = state
         edge = Edge.between(p, q, inverse, x)
         re, im = inner_product(spinor(edge.a)[2], spinor(edge.b)[2])
         zr, zi = dr.fma(zr, re, -(zi * im)), dr.fma(zr, im, zi * re)
         scale = dr.rcp(dr.abs(zr) + dr.abs(zi))
         weight, c = edge.biot_savart()
         distance, a = dr.sqrt(edge.squared_distance), 0.5 * dr.rsqrt(inverse)
-        rest = distance - h
-        moved = moved + 2 * (dr.asinh(a / rest) - dr.asinh(a / distance))
-        bend = bend + 2 * a / (rest * rest * dr.sqrt(rest * rest + a * a))
+        gap = distance - h
+        change = change + 2 * (dr.asinh(a / gap) - dr.asinh(a / distance))
+        second = second + 2 * a / (gap * gap * dr.sqrt(gap * gap + a * a))
         slope = dr.fma(type(slope)(weight), c, slope)
-        return zr * scale, zi * scale, slope, fmin(distance, nearest), moved, bend
+        return zr * scale, zi * scale, slope, fmin(distance, nearest), change, second
 
     start = (real(1), real(0), backend.Array3f(0), real(dr.inf), real(0), real(0))
-    zr, zi, slope, nearest, moved, bend = on.edges.for_each(add, start, "face boxes")
-    variation = fmin(moved, h * dr.fma(h, bend, dr.norm(slope)))
-    f, far, s = (to_numpy(one) for one in (2 * dr.atan2(zi, zr), nearest > 1.001 * h, variation))
-    gap = np.full(len(f), math.inf)
+    zr, zi, slope, nearest, change, second = data.edges.for_each(add, start, "face boxes")
+    variation = fmin(change, h * dr.fma(h, second, dr.norm(slope)))
+    f, is_off, s = (
+        to_numpy(column) for column in (2 * dr.atan2(zi, zr), nearest > 1.001 * h, variation)
+    )
+    level_gap = np.full(len(f), math.inf)
     for level in levels:
-        apart = np.remainder(f - level + 0.5 * PERIOD, PERIOD) - 0.5 * PERIOD
-        gap = np.minimum(gap, np.abs(apart))
-    return far & (gap > s * (1 + 1e-9) + 1e-9)
+        offset = np.remainder(f - level + 0.5 * PERIOD, PERIOD) - 0.5 * PERIOD
+        level_gap = np.minimum(level_gap, np.abs(offset))
+    return is_off & (level_gap > s * (1 + 1e-9) + 1e-9)
 
 
 # Levels nearer than this to a multiple of 4 pi are refused: their surfaces are unbounded.
@@ -351,20 +364,20 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
         seen from outside; or a list of such loops, of which holes run clockwise. Faces may have
         different numbers of corners, and need not be joined.
 
-    The surface of a face is where its solid angle is 2 pi, modulo 4 pi; another `level` bulges it
-    to one side. The faces are separate surfaces that meet in their common edges:
+    The surface of a face is the set on which its solid angle is 2 pi, modulo 4 pi; another `level`
+    bulges it to one side. The faces are separate surfaces that meet in their common edges:
     `Hits.primitive_index` is the index of the face that was hit, the normal is that of its surface,
-    to the positive side. Each is traced alone, with the proofs of `SolidAngle`, so that a ray pays
-    only for faces whose boxes it enters (`harnack.fields.capabilities`). `face(k)` gives the solid
-    angle of one.
+    to the positive side. Each face is traced by itself, with the proofs of `SolidAngle`, so that a
+    ray pays only for faces whose boxes it enters (`harnack.fields.capabilities`). `face(k)` is the
+    solid angle of face k.
 
     Raises:
-        MeshError: a ValueError, for what `geometry.validate_polygons` refuses.
+        MeshError: a ValueError, for vertices and faces that `geometry.validate_polygons` refuses.
     """
 
     period: ClassVar[float | None] = PERIOD
     default_level: float = 2 * math.pi
-    over_relaxation: float = 1.3  # that of `SolidAngle`
+    over_relaxation: float = 1.3  # as for `SolidAngle`
 
     def __init__(self, vertices: Any, faces: Any) -> None:
         super().__init__()
@@ -381,7 +394,7 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
 
     @property
     def vertices(self) -> FloatArray:
-        """(n, 3) vertices."""
+        """The vertices (n, 3)."""
         return self.faces.vertices
 
     @property
@@ -390,7 +403,7 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
         return self.faces.edges
 
     def face(self, index: int) -> SolidAngle:
-        """The solid angle of the boundary of one face."""
+        """The solid angle of the boundary of the face with this index."""
         if not 0 <= index < self.faces.face_count:
             last = self.faces.face_count - 1
             raise IndexError(f"there is no face {index}: they are counted from 0 to {last}")
@@ -399,7 +412,7 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
     def boxes(self, levels: tuple[float, ...] | None = None) -> tuple[FloatArray, FloatArray]:
         """Lower and upper corners (m, 3) of boxes proved to contain the surface of each face.
 
-        levels: of the surfaces; None for the default.
+        levels: the levels of the surfaces; None for the default.
         """
         levels = self.levels if levels is None else levels
         if levels not in self._boxes:
@@ -407,7 +420,7 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
         return self._boxes[levels]
 
     def evaluate(self, p: Vec3) -> NoReturn:
-        """Raises TypeError: there is a function for each face, and none for the mesh."""
+        """Raises TypeError: there is a function for each face, but none for the mesh."""
         del p
         raise TypeError(
             "a polygon mesh is no level set of one function, but of one for each face: ask a "

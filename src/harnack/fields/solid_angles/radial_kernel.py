@@ -1,14 +1,15 @@
-"""What a dipole, or a cluster of dipoles, of a radial potential K(r) adds to a sum, and its bounds.
+"""The terms of a dipole, or of a cluster of dipoles, of a radial potential K(r) in a sum, and their
+bounds.
 
-With psi_0 = K and psi_(k+1) = -psi_k'/r a dipole m at y = x + z gives -m.grad_y K = m.z psi_1, and
-a polynomial P(z) times psi_k has the gradient grad P psi_k - P psi_(k+1) z and the Hessian
-HP psi_k - (grad P z^T + z grad P^T) psi_(k+1) - P psi_(k+1) I + P psi_(k+2) z z^T (in z; the
-gradient in x has the opposite sign). A `RadialKernel` defines K and bounds of its derivatives; all
-else is shared by screened sums (`screened.YukawaKernel`) and by slices of four dimensions
-(`morph_slice.SlicedKernel`).
+With psi_0 = K and psi_(k+1) = -psi_k'/r a dipole m at y = x + z has the term -m.grad_y K = m.z
+psi_1, and a polynomial P(z) times psi_k has the gradient grad P psi_k - P psi_(k+1) z and the
+Hessian HP psi_k - (grad P z^T + z grad P^T) psi_(k+1) - P psi_(k+1) I + P psi_(k+2) z z^T (in z;
+the gradient in x has the opposite sign). A `RadialKernel` defines K and bounds of its derivatives;
+all else is shared by screened sums (`screened.YukawaKernel`), smoothed sums
+(`smoothed.SmoothedKernel`) and slices of four dimensions (`morph_slice.SlicedKernel`).
 
-Distances. A kernel may be regular at r = 0: it uses D = sqrt(r^2 + height^2) for all distances,
-those in four dimensions to a point at that height over the space of the dipoles. Its bounds are
+Distances. A kernel may be regular at r = 0: it uses D = sqrt(r^2 + height^2) for all distances, the
+distances in four dimensions to a point at that height over the space of the dipoles. Its bounds are
 |d^m K[u_1, ..., u_m]| <= m! Q_m/D^(m+1) for unit vectors u_i, with Q_m at most 1, growing with m,
 and falling with D if not constant.
 """
@@ -33,8 +34,8 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Mask, Real, Vec3
 
 
-# Radii of the `TaylorRemainder` promises, in distances to the nearest dipole: each is the best
-# somewhere.
+# Radii of the `TaylorRemainder` promises, in distances to the nearest dipole: each proves the
+# longest steps for some rays.
 _REACHES = (0.1, 0.25, 0.45)
 # `RadialSums.variation` holds within this fraction of the distance to the nearest dipole.
 BALL_FRACTION = 0.35
@@ -42,7 +43,8 @@ BALL_FRACTION = 0.35
 
 @dataclass(frozen=True)
 class KernelValues:
-    """A kernel at a distance D: psi_k = scale thetas[k]/D^(2k), for as many k as were asked for."""
+    """A kernel at a distance D: psi_k = scale thetas[k]/D^(2k), for k from 0 to the requested
+    order."""
 
     scale: Real
     thetas: Sequence[Real]
@@ -63,7 +65,8 @@ class RadialKernel(abc.ABC):
 
     @abc.abstractmethod
     def bounds(self, distance: Real, last: int) -> list[Real]:
-        """Q_2 to Q_last, at least Q_3, at all distances from this one on; last is at most 6."""
+        """Q_2 to Q_last, at least Q_3, which hold at all distances from `distance` on; last is at
+        most 6."""
 
     @abc.abstractmethod
     def growth(self, r: Real) -> Real:
@@ -71,12 +74,12 @@ class RadialKernel(abc.ABC):
 
     @abc.abstractmethod
     def accepting_distance(self, radius: FloatArray, accuracy: float) -> FloatArray:
-        """The D from which on clusters of these radii are taken as a whole."""
+        """The distances D from which on the moments of clusters of these radii are used."""
 
 
 @dataclass(frozen=True)
 class PolynomialTerm:
-    """A term P(z) psi_k: P, its gradient and Hessian, all times D^(-2k); k = 1, 2, 3 is its
+    """A term P(z) psi_k: P, its gradient and its Hessian, all times D^(-2k); k = 1, 2, 3 is its
     position in a list."""
 
     value: Real
@@ -86,8 +89,8 @@ class PolynomialTerm:
 
 @dataclass(frozen=True)
 class RadialSums:
-    """Sums over all dipoles, weights w_i = |m_i|, distances d_i, with Q_m at d_i; clusters add
-    bounds of the sums over their dipoles.
+    """Sums over all dipoles with weights w_i = |m_i| and distances d_i, with Q_m at d_i; clusters
+    add bounds of the sums over their dipoles.
 
     sums: value, derivatives and bounds; s4 and s5 are the sums of w Q_3/d^4 and w Q_3/d^5, which
         for Q_3 = 1 are those of `SourceSums`.
@@ -114,39 +117,39 @@ class RadialSums:
         return self.sums.to_state(), self.q2_d3, self.q2_d4
 
     def plus(self, source: SourceAtPoint, rounding: Real, active: Mask) -> RadialSums:
-        """The sums with one more dipole or cluster, where active.
+        """The sums with a further dipole or cluster, where active.
 
-        rounding: of the term, as a fraction of w Q_2/d^2, which is at least its absolute value; the
-            rounding of positions adds 6 epsilon w Q_2/d^3, and that of the sum is counted by
-            `SourceSums.add_term`.
+        rounding: the rounding of the term, as a fraction of w Q_2/d^2, which is at least its
+            absolute value. The rounding of positions adds 6 epsilon w Q_2/d^3;
+            `SourceSums.add_term` counts the rounding of the sum.
         """
         tail, sums = source.tail, self.sums.add_term(source.terms, active)
-        steep = source.weight * tail.second * tail.cube
-        bent = source.weight * tail.third * tail.cube * tail.inverse
-        bounds = steep, steep * tail.inverse, bent, bent * tail.inverse
+        q2_d3 = source.weight * tail.second * tail.cube
+        q3_d4 = source.weight * tail.third * tail.cube * tail.inverse
+        bounds = q2_d3, q2_d3 * tail.inverse, q3_d4, q3_d4 * tail.inverse
         errors = source.error, source.gradient_error, source.hessian_error
-        steep, steeper, bent, more_bent, error, slope, second = (
-            dr.select(active, one, 0) for one in (*bounds, *errors)
+        q2_d3, q2_d4, q3_d4, q3_d5, error, slope, second = (
+            dr.select(active, bound, 0) for bound in (*bounds, *errors)
         )
-        nearer, old = fmin(tail.distance, sums.singularity_distance), sums.hessian_truncation
-        # Dr.Jit's epsilon is half the distance from 1 to the next number, that of the bounds is
-        # all.
-        positions = 6 * 2 * float(dr.epsilon(steep))
+        nearest, old = fmin(tail.distance, sums.singularity_distance), sums.hessian_truncation
+        # Dr.Jit's epsilon is half the distance from 1 to the next number; the epsilon of the bounds
+        # is the whole distance.
+        shift = 6 * 2 * float(dr.epsilon(q2_d3))
         sums = dataclasses.replace(
             sums,
             truncation=sums.truncation + error,
             gradient_truncation=sums.gradient_truncation + slope,
             hessian_truncation=None if old is None else old + second,
-            rounding=dr.fma(steep, dr.fma(rounding, tail.distance, positions), sums.rounding),
-            singularity_distance=dr.select(active, nearer, sums.singularity_distance),
-            s4=sums.s4 + bent,
-            s5=sums.s5 + more_bent,
+            rounding=dr.fma(q2_d3, dr.fma(rounding, tail.distance, shift), sums.rounding),
+            singularity_distance=dr.select(active, nearest, sums.singularity_distance),
+            s4=sums.s4 + q3_d4,
+            s5=sums.s5 + q3_d5,
         )
-        return RadialSums(sums, self.q2_d3 + steep, self.q2_d4 + steeper)
+        return RadialSums(sums, self.q2_d3 + q2_d3, self.q2_d4 + q2_d4)
 
     def remainder(self, share: float, r: Real, growth: Real) -> Real:
-        """A bound of |f(y) - f(x) - grad f.(y-x)|/|y-x|^2 for |y-x| <= r, r being `share` times the
-        distance to the nearest dipole, or less; growth: that of the kernel for r.
+        """A bound of |f(y) - f(x) - grad f.(y-x)|/|y-x|^2 for |y-x| <= r, with r at most `share`
+        times the distance to the nearest dipole; growth: the growth of the kernel for r.
 
         Each term's second derivatives are at most |K^(3)| = 6 Q_3/(d_i-s)^4 at distance s from x,
         and by Taylor the integral of (t-s) times that bounds the term's remainder, t = |y-x|. With
@@ -158,26 +161,26 @@ class RadialSums:
     def curvatures(
         self, growth: Callable[[Real], Real], most: Real, size: Real
     ) -> tuple[TaylorRemainder, ...]:
-        """`remainder` as promises, in units of `size`; most: the distance to the nearest dipole, or
-        less."""
-        radii = [(share, share * most) for share in _REACHES]
+        """`remainder` as promises, in units of `size`; most: a lower bound of the distance to the
+        nearest dipole."""
+        radii = [(fraction, fraction * most) for fraction in _REACHES]
         return tuple(
-            TaylorRemainder(2 * self.remainder(share, r, growth(r)) / (size * size), r * size)
-            for share, r in radii
+            TaylorRemainder(2 * self.remainder(fraction, r, growth(r)) / (size * size), r * size)
+            for fraction, r in radii
         )
 
     def variation(self, r: Real, growth: Real) -> Real:
-        """A bound of |f(y) - f(x)| on B(x, r); r: `BALL_FRACTION` times the distance to the nearest
-        dipole, or less. It is the integral of |K^(2)| = 2 Q_2/(d_i-s)^3, where 1/(1-q)^2 - 1 = 2q +
-        ... is convex as well."""
+        """A bound of |f(y) - f(x)| on B(x, r), with r at most `BALL_FRACTION` times the distance to
+        the nearest dipole. It is the integral of |K^(2)| = 2 Q_2/(d_i-s)^3, where 1/(1-q)^2 - 1 =
+        2q + ... is convex as well."""
         chord = (1 / (1 - BALL_FRACTION) ** 2 - 1 - 2 * BALL_FRACTION) / BALL_FRACTION**2
-        moved = dr.fma(chord * r, self.q2_d4, 2 * self.q2_d3)
-        return (1 + SUM_MARGIN) * growth * r * moved
+        change = dr.fma(chord * r, self.q2_d4, 2 * self.q2_d3)
+        return (1 + SUM_MARGIN) * growth * r * change
 
 
 @dataclass(frozen=True)
 class KernelBounds:
-    """Q_2 and Q_3 at a distance and beyond, and powers of that distance."""
+    """Q_2 and Q_3 that hold at a distance and beyond, and powers of that distance."""
 
     distance: Real
     inverse: Real
@@ -187,7 +190,7 @@ class KernelBounds:
 
     @classmethod
     def of(cls, distance: Real, inverse: Real, bounds: Sequence[Real]) -> KernelBounds:
-        """bounds: Q_2, Q_3, ... there."""
+        """The bounds at a distance; bounds: Q_2, Q_3, ... there."""
         return cls(distance, inverse, inverse * inverse * inverse, bounds[0], bounds[1])
 
 
@@ -200,45 +203,51 @@ def combine_terms(
 ) -> SourceTerm:
     """The sum of terms at z, inverse = 1/D, with psi_0 to psi_(len(parts) + derivatives).
 
-    derivatives: 0 for the value, 1 with the gradient, 2 with the Hessian. Powers of 1/D are spread
-    over the factors, so that none overflows.
+    derivatives: 0 for the value, 1 with the gradient, 2 with the Hessian.
+
+    Powers of 1/D are spread over the factors, so that no factor overflows.
     """
     vector = _type_of(z)
     theta, scale, u2 = radial.thetas, radial.scale, inverse * inverse
-    value, along, twice = 0.0, 0.0, 0.0
-    gradient, slopes, matrix = vector(0), vector(0), [0.0] * 6
+    value, radial_part, second_part = 0.0, 0.0, 0.0
+    gradient, gradients, matrix = vector(0), vector(0), [0.0] * 6
     for k, part in enumerate(parts, start=1):
         value = dr.fma(theta[k], part.value, value)
         if derivatives == 0:
             continue
-        along = dr.fma(theta[k + 1], part.value, along)
+        radial_part = dr.fma(theta[k + 1], part.value, radial_part)
         gradient = dr.fma(vector(theta[k]), part.gradient, gradient)
         if derivatives == 2:
-            twice = dr.fma(theta[k + 2], part.value, twice)
-            slopes = dr.fma(vector(theta[k + 1]), part.gradient, slopes)
+            second_part = dr.fma(theta[k + 2], part.value, second_part)
+            gradients = dr.fma(vector(theta[k + 1]), part.gradient, gradients)
             if part.hessian is not None:
                 matrix = [dr.fma(theta[k], h, m) for h, m in zip(part.hessian, matrix, strict=True)]
     if derivatives == 0:
         return SourceTerm(scale * value)
-    along = along * u2
-    first = scale * dr.fma(vector(along), z, -gradient)
+    radial_part = radial_part * u2
+    slope = scale * dr.fma(vector(radial_part), z, -gradient)
     if derivatives < 2:
-        return SourceTerm(scale * value, first, None)
-    rest = SymmetricMatrix(*(scale * m for m in matrix))
-    across = dr.fma(vector(twice * u2), z, -2 * slopes)
-    rest = rest.add_outer_product((scale * u2) * across, z)
-    along = scale * along
-    whole = dataclasses.replace(rest, xx=rest.xx - along, yy=rest.yy - along, zz=rest.zz - along)
-    return SourceTerm(scale * value, first, whole)
+        return SourceTerm(scale * value, slope, None)
+    hessian = SymmetricMatrix(*(scale * m for m in matrix))
+    row = dr.fma(vector(second_part * u2), z, -2 * gradients)
+    hessian = hessian.add_outer_product((scale * u2) * row, z)
+    radial_part = scale * radial_part
+    total = dataclasses.replace(
+        hessian,
+        xx=hessian.xx - radial_part,
+        yy=hessian.yy - radial_part,
+        zz=hessian.zz - radial_part,
+    )
+    return SourceTerm(scale * value, slope, total)
 
 
 @dataclass(frozen=True)
 class SourceAtPoint:
-    """What a dipole or a cluster adds at x, and what bounds its derivatives near x.
+    """The terms of a dipole or a cluster at x, with bounds of its derivatives near x.
 
-    weight: of all its dipoles.
-    tail: bounds of the kernel at the distance of the nearest of them, or less.
-    error, gradient_error, hessian_error: the truncation, for a cluster.
+    weight: the sum of the weights of all its dipoles.
+    tail: bounds of the kernel at a lower bound of the distance to its nearest dipole.
+    error, gradient_error, hessian_error: the truncation errors of a cluster.
     """
 
     terms: SourceTerm
@@ -252,7 +261,7 @@ class SourceAtPoint:
 def dipole_source(
     row: Sequence[Real], x: Vec3, kernel: RadialKernel, derivatives: int
 ) -> SourceAtPoint:
-    """A dipole, given as eight numbers (position, moment, weight = |moment|, 0), at x."""
+    """A dipole at x, from eight numbers (position, moment, weight = |moment|, 0)."""
     vector = _type_of(x)
     z, m = vector(row[0], row[1], row[2]) - x, vector(row[3], row[4], row[5])
     squared = dr.squared_norm(z) + kernel.height_square

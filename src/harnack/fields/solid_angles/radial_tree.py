@@ -1,12 +1,13 @@
-"""Sums of dipoles of a radial potential: one by one, or far ones in clusters by a tree.
+"""Sums of dipoles of a radial potential: direct sums, or sums with clusters of far dipoles by a
+tree.
 
 Expansion. Dipoles m_i at c + d_i, |d_i| <= R, at the point x = c - z, r = D of z: by Taylor in d_i
 
     w = -sum_i m_i.grad K(z + d_i) = -(T1[D] + T2[D^2] + T3[D^3]/2) K(z) + (rest),
 
-T1 = sum m, T2 = sym sum m d, T3 = sym sum m d d. With psi_k as in `radial_kernel`, D K = -z
-psi_1, T2[D^2] K = T2[z,z] psi_2 - tr T2 psi_1, T3[D^3] K = 3 z.tr T3 psi_2 - T3[z,z,z] psi_3.
-K is not harmonic in three dimensions, so that traces count: 19 numbers instead of 15.
+T1 = sum m, T2 = sym sum m d, T3 = sym sum m d d. With psi_k as in `radial_kernel`, D K = -z psi_1,
+T2[D^2] K = T2[z,z] psi_2 - tr T2 psi_1, T3[D^3] K = 3 z.tr T3 psi_2 - T3[z,z,z] psi_3. K is not
+harmonic in three dimensions, so that traces count: 19 numbers instead of 15.
 
 Truncation. The rest of Taylor's formula is an integral of the fourth derivative of K along the
 segment from c to c + d_i, which is at most 4! Q_4/(r - s |d_i|)^5. In that, Q_4 is at most its
@@ -15,8 +16,8 @@ with q = |d|/r
 
     |rest| <= Q_4 |m| (1/(1-q)^2 - 1 - 2q - 3q^2)/r^2 = Q_4 |m| |d|^3 (4-3q)/((1-q)^2 r^5),
 
-for Q_4 = 1 attained by a dipole on the line to x that points along it. (4-3q)/(1-q)^2 grows with
-q, so R/r serves for all. For the gradient, likewise from 2/(r - .)^3,
+for Q_4 = 1 attained by a dipole on the line to x that points along it. (4-3q)/(1-q)^2 grows with q,
+so that q = R/r gives a bound for all dipoles. For the gradient, likewise from 2/(r - .)^3,
 
     Q_5 |m| |d|^3 (20 - 30q + 12q^2)/((1-q)^3 r^6),
 
@@ -62,14 +63,14 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
 
 
-# Dipoles in a trip of the direct sum, by experiment.
+# The number of dipoles in a trip of the direct sum, by experiment.
 _DIPOLES_PER_TRIP = 4
 
 
 class RadialSum(abc.ABC):
     """Dipoles on a backend, and sums over them.
 
-    rounding: of a dipole's term, as `RadialSums.plus` takes it.
+    rounding: the rounding of a dipole's term, as `RadialSums.plus` takes it.
     """
 
     def __init__(self, backend: Backend, rows: FloatArray, kernel: RadialKernel) -> None:
@@ -77,23 +78,25 @@ class RadialSum(abc.ABC):
         self.rounding = dr.opaque(backend.Float, 12 * backend.machine_epsilon)
 
     def sums(self, x: Vec3, closer: Real, derivatives: int) -> RadialSums:
-        """Value, derivatives and bounds at x; clusters are taken as a whole from `closer` times
+        """Value, derivatives and bounds at x; the moments of clusters are used from `closer` times
         the `accepting_distance` on. derivatives: as for `SourceSums.zero`."""
         return self.accumulate(RadialSums.zero(self.backend, derivatives), x, closer)
 
     @abc.abstractmethod
     def accumulate(self, sums: RadialSums, x: Vec3, closer: Real) -> RadialSums:
-        """Sums over other dipoles, with those over these at x added; `closer` as for `sums`."""
+        """The sums over other dipoles, with the terms of these dipoles at x added; `closer` as for
+        `sums`."""
 
     def _with_dipole(
         self, row: list[Real], x: Vec3, derivatives: int, state: tuple[Any, ...]
     ) -> tuple[Any, ...]:
+        """The state of the sums with a dipole added."""
         dipole = dipole_source(row, x, self.kernel, derivatives)
         return RadialSums.of(state).plus(dipole, self.rounding, True).parts()
 
 
 class DirectSum(RadialSum):
-    """All dipoles one by one, without truncation."""
+    """The direct sum over all dipoles, without truncation."""
 
     def __init__(self, backend: Backend, rows: FloatArray, kernel: RadialKernel) -> None:
         super().__init__(backend, rows, kernel)
@@ -110,7 +113,8 @@ class DirectSum(RadialSum):
 
 
 class RadialTreecode(RadialSum):
-    """Near dipoles one by one, far ones in clusters from the kernel's `accepting_distance` on."""
+    """The direct sum over near dipoles, and the moments of clusters of far dipoles, from the
+    kernel's `accepting_distance` on."""
 
     def __init__(
         self, backend: Backend, dipoles: ClusteredDipoles, kernel: RadialKernel, accuracy: float
@@ -134,34 +138,34 @@ class RadialTreecode(RadialSum):
             return RadialSums.of(state).plus(cluster, self.rounding, node.far).parts()
 
         height = self.kernel.height_square
-        walked = traverse_clusters(
+        total = traverse_clusters(
             self._tree, x, closer, far, near, sums.parts(), height_square=height
         )
-        return RadialSums.of(walked)
+        return RadialSums.of(total)
 
 
 def cluster_source(
     head: Sequence[Real], c: Sequence[Real], z: Vec3, length: Real, kernel: RadialKernel,
     derivatives: int,
 ) -> SourceAtPoint:  # fmt: skip
-    """A node with the numbers of `node_records`, its center at z, D = length, with its
-    truncation."""
+    """A node with the numbers of `node_records`, its center at z, D = length, with its truncation
+    errors."""
     radius, weight = head[4], head[5]
     inverse = dr.rcp(length)
     parts = cluster_parts(c, z, inverse)
     radial = kernel.at(length, inverse, len(parts) + derivatives)
     terms = combine_terms(parts, z, inverse, radial, derivatives)
     nearest = length - radius
-    share = dr.rcp(nearest)
+    inverse_nearest = dr.rcp(nearest)
     bounds = kernel.bounds(nearest, 6)
-    tail = KernelBounds.of(nearest, share, bounds)
+    tail = KernelBounds.of(nearest, inverse_nearest, bounds)
     fourth, fifth, sixth = bounds[2:]
     q = radius * inverse
-    common = c[23] * inverse * inverse * inverse * share * share
+    common = c[23] * inverse * inverse * inverse * inverse_nearest * inverse_nearest
     error = common * fourth * dr.fma(-3, q, 4)
-    slope = common * share * fifth * dr.fma(q, dr.fma(12, q, -30), 20)
-    rest = dr.fma(q, dr.fma(q, dr.fma(-60, q, 216), -270), 120)
-    second = common * share * share * sixth * rest
+    slope = common * inverse_nearest * fifth * dr.fma(q, dr.fma(12, q, -30), 20)
+    polynomial = dr.fma(q, dr.fma(q, dr.fma(-60, q, 216), -270), 120)
+    second = common * inverse_nearest * inverse_nearest * sixth * polynomial
     return SourceAtPoint(terms, weight, tail, error, slope, second)
 
 
@@ -169,7 +173,7 @@ def cluster_source(
 class ClusteredDipoles:
     """A tree over dipoles with its moments: all data of the sum that do not depend on the kernel.
 
-    rows: the dipoles (n, 8), as `dipole_records` gives them, which are the leaves of the tree.
+    rows: the dipoles (n, 8), from `dipole_records`, which are the leaves of the tree.
     levels: the moments of the nodes of each level.
     """
 
@@ -184,8 +188,8 @@ class ClusteredDipoles:
         return cls(rows, tree, taylor_tree_moments(tree, rows))
 
     def packed(self, backend: Backend, kernel: RadialKernel, accuracy: float) -> PackedTree:
-        """The tree on a backend; the kernel decides from which distance on clusters are taken as a
-        whole."""
+        """The tree on a backend; the kernel decides from which distance on the moments of clusters
+        are used."""
         numbers = [
             node_records(level, kernel.accepting_distance(level.radius, accuracy))
             for level in self.levels
@@ -195,8 +199,12 @@ class ClusteredDipoles:
 
 @dataclass(frozen=True)
 class TaylorMoments:
-    """The nodes of one level: center (k, 3), radius, weight, third = sum w |d|^3 (k,) each, and
-    T1 (k, 3), T2 (k, 3, 3), T3 (k, 3, 3, 3), symmetric."""
+    """The nodes of a level.
+
+    center: (k, 3).
+    radius, weight, third: (k,) each; third = sum w |d|^3.
+    t1, t2, t3: T1 (k, 3), T2 (k, 3, 3), T3 (k, 3, 3, 3), symmetric.
+    """
 
     center: FloatArray
     radius: FloatArray
@@ -211,7 +219,7 @@ def taylor_tree_moments(tree: BalancedTree, rows: FloatArray) -> list[TaylorMome
     """Moments of all levels, from the leaves to the root.
 
     T1, T2, T3 are translated from a child's center to its parent's, d -> d + s: T2 gains sym(T1 s)
-    and T3 sym(2 T2 s + T1 s s). All else is computed from the dipoles themselves.
+    and T3 sym(2 T2 s + T1 s s). Everything else is computed from the dipoles themselves.
     """
     slots = records_in_slots(tree, rows)
     levels: list[TaylorMoments] = []
@@ -238,6 +246,8 @@ def taylor_tree_moments(tree: BalancedTree, rows: FloatArray) -> list[TaylorMome
 def _moved(
     children: TaylorMoments, center: FloatArray, arity: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """T1, T2, T3 of the parents of groups of `arity` children, about the parents' centers (k,
+    3)."""
     s = children.center - np.repeat(center, arity, axis=0)
     t1, t2, t3 = children.t1, children.t2, children.t3
     first = np.einsum("ki,kj->kij", t1, s)
@@ -249,6 +259,7 @@ def _moved(
 def _symmetric(
     t1: FloatArray, t2: FloatArray, t3: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The symmetric parts of the three tensors."""
     orders = itertools.permutations((1, 2, 3))
     total = sum((t3.transpose(0, *order) for order in orders), start=np.zeros_like(t3))
     return t1, 0.5 * (t2 + t2.transpose(0, 2, 1)), total / 6

@@ -1,6 +1,7 @@
 """The winding number of oriented points with a screened (Yukawa) kernel.
 
-`ScreenedWindingNumber` is the field, `YukawaKernel` its kernel with the proof of its bounds.
+- `ScreenedWindingNumber`: the field.
+- `YukawaKernel`: its kernel, with the proof of its bounds.
 """
 
 from __future__ import annotations
@@ -52,16 +53,16 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
 
 MAX_LENGTHS = 80.0
-"""Beyond this many screening lengths exponentials are held at exp(-80) = 2e-35, near the end of the
-range of single precision: bounds are then too large, and values off by less than
+"""Beyond this many screening lengths exponentials keep the value exp(-80) = 2e-35, near the end of
+the range of single precision: bounds are then too large, and values off by less than
 1e-33 area/(4 pi rho^2)."""
 
-# By how much the harmonic ball is smaller where the kernel falls fast.
+# The factor that makes the harmonic ball smaller where the kernel falls fast.
 _BALL_SHRINKAGE = 0.1
-# A cluster is never taken as a whole nearer than this many radii.
+# The moments of a cluster are never used nearer than this many radii.
 _MIN_ACCEPTANCE = 1.5
-# For the default level: the number of pairs of a point and a dipole, and the most and the fewest
-# points.
+# For the default level: the number of pairs of a point and a dipole, and the largest and the
+# smallest number of points.
 _PAIRS, _MOST_PROBES, _LEAST_PROBES = 8_000_000, 512, 24
 
 
@@ -103,12 +104,12 @@ class YukawaKernel(RadialKernel):
         decay = dr.exp(-t)
         sum2 = dr.fma(t, dr.fma(t, 0.5, 1), 1)
         sum3 = dr.fma(t * t * t, 1 / 6, sum2)
-        out = [decay * sum2, decay * sum3]
+        factors = [decay * sum2, decay * sum3]
         power = decay * (t * t * t)
         for m in range(4, last + 1):
             power = power * t
-            out.append(dr.fma(power, 1 / math.factorial(m), out[-1]))
-        return out
+            factors.append(dr.fma(power, 1 / math.factorial(m), factors[-1]))
+        return factors
 
     def growth(self, r: Real) -> Real:
         return dr.exp(self.kappa * r)
@@ -120,60 +121,62 @@ class YukawaKernel(RadialKernel):
 def thetas(t: Real, last: int) -> list[Real]:
     """theta_0(t), ..., theta_last(t)."""
     square = t * t
-    out: list[Real] = [1.0, 1 + t]
+    values: list[Real] = [1.0, 1 + t]
     for k in range(2, last + 1):
-        out.append(dr.fma(square, out[k - 2], (2 * k - 1) * out[k - 1]))
-    return out
+        values.append(dr.fma(square, values[k - 2], (2 * k - 1) * values[k - 1]))
+    return values
 
 
 def screened_promises(
     radial: RadialSums, f: Real, gradient: Vec3, kernel: YukawaKernel, size: Real, epsilon: float
 ) -> tuple[tuple[TaylorRemainder, ...], HarmonicBall]:
-    """What `ScreenedWindingNumber` promises: second derivatives, and a ball, which proves shorter
-    steps. f, gradient: at the point, in units of `size`.
+    """The promises of `ScreenedWindingNumber`: of second derivatives, and a ball, which proves
+    shorter steps.
 
-    Radii stay below 36 lengths, so that exp(kappa r) times sums in which exponentials are held at
-    exp(-80) neither overflows nor grows.
+    f, gradient: value and gradient at the point, in units of `size`.
+
+    Radii stay below 36 screening lengths, so that exp(kappa r) times sums in which exponentials are
+    at least exp(-80) neither overflows nor grows.
     """
     sums, kappa = radial.sums, kernel.kappa
     nearest = fmax(sums.singularity_distance * (1 - SUM_MARGIN) - 8 * epsilon, 0)
-    most = fmin(nearest, MAX_LENGTHS / kappa)
-    known = radial.curvatures(kernel.growth, most, size)
-    r = BALL_FRACTION * most / dr.fma(_BALL_SHRINKAGE * kappa, most, 1)
+    max_radius = fmin(nearest, MAX_LENGTHS / kappa)
+    promises = radial.curvatures(kernel.growth, max_radius, size)
+    r = BALL_FRACTION * max_radius / dr.fma(_BALL_SHRINKAGE * kappa, max_radius, 1)
     growth = kernel.growth(r)
     slope = dr.norm(gradient) + sums.gradient_truncation
-    bent = (1 + SUM_MARGIN) * r * dr.fma(r, radial.remainder(BALL_FRACTION, r, growth), slope)
-    moved = fmin(radial.variation(r, growth), bent)
-    least = dr.cos(fmin(kappa * r, math.pi))
-    ends = (f - moved, f + moved)
-    products = [end * least for end in ends]
+    taylor = (1 + SUM_MARGIN) * r * dr.fma(r, radial.remainder(BALL_FRACTION, r, growth), slope)
+    change = fmin(radial.variation(r, growth), taylor)
+    min_cosine = dr.cos(fmin(kappa * r, math.pi))
+    ends = (f - change, f + change)
+    products = [end * min_cosine for end in ends]
     lower, upper = fmin(ends[0], products[0]), fmax(ends[1], products[1])
     # A negative cosine exchanges the ends of the interval.
     lower, upper = fmin(lower, products[1]), fmax(upper, products[0])
-    return known, HarmonicBall(r * size, lower, upper, dimension=4)
+    return promises, HarmonicBall(r * size, lower, upper, dimension=4)
 
 
 def accepting_distance(radius: FloatArray, kappa: float, accuracy: float) -> FloatArray:
-    """The distance r from which on a cluster is taken as a whole:
-    accuracy R Q_4(kappa (r-R))^(1/5) <= r.
+    """The distance r from which on the moments of a cluster are used: accuracy R Q_4(kappa
+    (r-R))^(1/5) <= r.
 
-    For each unit of area, clusters of radius R on a surface cost 1/R^2 and have an error of
-    R^3/r^5 Q_4; the sum of errors is smallest at a given cost if R is proportional to
-    r Q_4^(-1/5). Found by bisection, from the safe side.
+    For each unit of area, clusters of radius R on a surface cost 1/R^2 and have an error of R^3/r^5
+    Q_4; the sum of errors is smallest at a fixed cost if R is proportional to r Q_4^(-1/5).
+    Computed by bisection, from the safe side.
     """
     low, high = _MIN_ACCEPTANCE * radius, accuracy * radius
     for _ in range(40):
         r = 0.5 * (low + high)
         t = kappa * (r - radius)
         q4 = np.exp(-t) * (1 + t * (1 + t / 2 * (1 + t / 3 * (1 + t / 4))))
-        good = accuracy * radius * q4**0.2 <= r
-        low, high = np.where(good, low, r), np.where(good, r, high)
+        is_accepted = accuracy * radius * q4**0.2 <= r
+        low, high = np.where(is_accepted, low, r), np.where(is_accepted, r, high)
     return high + 1e-5
 
 
 def mean_at_dipoles(rows: FloatArray, kappa: float) -> float:
-    """The mean of w over (some of) the dipoles, weighted, each without those at its own
-    position."""
+    """The mean of w over the dipoles, or a sample of them, weighted, each without the dipoles at
+    its own position."""
     n = len(rows)
     count = min(n, max(_LEAST_PROBES, min(_MOST_PROBES, _PAIRS // n)))
     probes = np.unique(np.linspace(0, n - 1, count).astype(np.int64))
@@ -182,11 +185,11 @@ def mean_at_dipoles(rows: FloatArray, kappa: float) -> float:
     for i in probes:
         d = (x - x[i], y - y[i], z - z[i])
         square = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
-        apart = square > 0
-        rho = np.sqrt(np.where(apart, square, 1))
-        weight = np.where(apart, (1 + kappa * rho) * np.exp(-kappa * rho) / rho**3, 0)
-        along = moment[0] * d[0] + moment[1] * d[1] + moment[2] * d[2]
-        values.append(float(along @ weight))
+        is_apart = square > 0
+        rho = np.sqrt(np.where(is_apart, square, 1))
+        weight = np.where(is_apart, (1 + kappa * rho) * np.exp(-kappa * rho) / rho**3, 0)
+        product = moment[0] * d[0] + moment[1] * d[1] + moment[2] * d[2]
+        values.append(float(product @ weight))
     return float(np.average(values, weights=rows[probes, 6]))
 
 
@@ -194,10 +197,10 @@ MethodName = Literal["auto", "sum", "tree"]
 
 # The largest number of dipoles for which the direct sum is faster than a tree.
 _MOST_SUMMED = 2000
-# The most cells that are tested in one round for an extent.
+# The largest number of cells that are tested in one round for an extent.
 _MOST_CELLS = 4096
 _SMALLEST_LEVEL = 1e-20
-# Nearer to a dipole than so many roundings w is not known; it may be any number up to the second.
+# Nearer to a dipole than `_ON_DIPOLE` roundings w may be any number up to `_ANY_LEVEL`.
 _ON_DIPOLE, _ANY_LEVEL = 32, 1e5
 
 
@@ -210,7 +213,7 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
 
         Laplacian w = w/l^2:   w is not harmonic.
 
-    What it means. For dense samples of a closed surface with outward normals, w is 1 - u inside and
+    Meaning. For dense samples of a closed surface with outward normals, w is 1 - u inside and
     -u outside, where u, between 0 and 1, is the blurred indicator of the inside: u - l^2 Laplacian
     u = 1 inside, 0 outside (Green's second identity). So w falls from 1 - u to -u at the surface
     and decays like exp(-distance/l) on both sides: far points have no effect, holes wider than a
@@ -221,15 +224,15 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
     between neighboring points: else the level sets are those of single dipoles.
 
     points, normals: (n, 3), normals of any length, to the outside.
-    areas: (n,) that each point stands for; None estimates them.
+    areas: (n,) the areas that the points stand for; None estimates them.
     length: l, in the points' unit.
-    method: "sum" (all dipoles), "tree" (far ones in clusters), "auto".
-    accuracy: for the tree, a cluster of radius R is taken as a whole where its screened error is as
-        small as that of an unscreened one at distance accuracy * R. The error is bounded and part
-        of every promise. Tracing uses more detail where the tolerance asks for it.
+    method: "sum" (all dipoles), "tree" (clusters of far dipoles), "auto".
+    accuracy: for the tree, the moments of a cluster of radius R are used where its screened error
+        is as small as that of an unscreened cluster at distance accuracy * R. The error is bounded
+        and part of every promise. Tracing uses a higher accuracy where the tolerance needs it.
 
-    Promises (`screened_promises` has the formulas), for d_i the distances from x, d the least of
-    them:
+    Promises (`screened_promises` has the formulas), for d_i the distances from x, d the smallest
+    of them:
 
     - Curvature. On B(x, r), r < d, each term's second derivatives are at most |K'''|(d_i - s) =
       6 Q_3(kappa (d_i-s))/(d_i-s)^4 at distance s from x (`YukawaKernel`, kappa = 1/l). By
@@ -238,16 +241,16 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
       exp(kappa r) Q_3(kappa d_i) (3-2q)/(1-q)^2 t^2/d_i^4; (3-2q)/(1-q)^2 is convex, hence below
       its chord on [0, r/d].
     - HarmonicBall of dimension 4. w(y) cos(s/l) is harmonic in (y, s). For |y-x|^2 + s^2 < R^2 <
-      d^2 it is the product of a number in [w-S, w+S] and one in [cos(min(R/l, pi)), 1], so it lies
-      between the least and the largest product of ends. S bounds the change of w on B(x, R), by the
-      integral of |K''|(d_i-s) = 2 Q_2/(d_i-s)^3, where 1/(1-q)^2 - 1 = 2q + ... is bounded by its
-      chord too.
+      d^2 it is the product of a number in [w-S, w+S] and a number in [cos(min(R/l, pi)), 1], so it
+      lies between the smallest and the largest product of ends. S bounds the change of w on
+      B(x, R), by the integral of |K''|(d_i-s) = 2 Q_2/(d_i-s)^3, where 1/(1-q)^2 - 1 = 2q + ... is
+      bounded by its chord, too.
 
-    The first alone is used by default: it took 14 to 30 evaluations a ray where the second took
-    20 to 65 (spheres and tori of 270 to 2000 points, l from 0.03 to 100).
+    By default only the first promise is used: it took 14 to 30 evaluations per ray, and the second
+    took 20 to 65 (spheres and tori of 270 to 2000 points, l from 0.03 to 100).
 
-    Raises CloudError (a ValueError) as `validate_cloud`; ValueError for a length, method or
-    accuracy that cannot be.
+    Raises CloudError (a ValueError) as `validate_cloud`; ValueError for an invalid length, method
+    or accuracy.
     """
 
     has_separate_batch_data = False
@@ -273,9 +276,9 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
             areas = estimate_areas(points, normals)
         self._set_points(*validate_cloud(points, normals, areas))
         self.length, self.accuracy = float(length), float(accuracy)
-        few = len(self.points) <= _MOST_SUMMED
+        is_small = len(self.points) <= _MOST_SUMMED
         self.method: Literal["sum", "tree"] = (
-            ("sum" if few else "tree") if method == "auto" else method
+            ("sum" if is_small else "tree") if method == "auto" else method
         )
         self.has_variable_accuracy = self.method == "tree"
         low, high = self.points.min(axis=0), self.points.max(axis=0)
@@ -283,8 +286,8 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         self._center = round_to_single(0.5 * (low + high))
         # A power of two, so that lengths are scaled without rounding.
         self._size = 2.0 ** math.ceil(math.log2(extent))
-        share = self.areas[:, None] / (4 * math.pi * self._size**2)
-        self._rows = dipole_records((self.points - self._center) / self._size, share * self.normals)
+        scale = self.areas[:, None] / (4 * math.pi * self._size**2)
+        self._rows = dipole_records((self.points - self._center) / self._size, scale * self.normals)
         self._kappa = self._size / self.length
         self.default_level = mean_at_dipoles(self._rows, self._kappa)
         self._extents: TransientCache[tuple[float, ...], Volume | None] = TransientCache()
@@ -300,12 +303,12 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         method: MethodName = "auto",
         accuracy: float = 6.0,
     ) -> ScreenedWindingNumber:
-        """Dipoles at the centroids of triangles, each cut into 4 `subdivide` times first.
+        """Dipoles at the centroids of triangles, each cut into 4 triangles `subdivide` times first.
 
         This is quadrature by the midpoint rule, not the integral over the triangles. At a distance
         r > R, R the distance from the centroid to the farthest corner, a triangle of area a and
-        edges e contributes an error of at most a (e1^2+e2^2+e3^2)/36 (3-2q)/((1-q)^2 r^4)/(4 pi),
-        q = R/r (the first moment about the centroid vanishes; `radial_tree`, with one order less).
+        edges e contributes an error of at most a (e1^2+e2^2+e3^2)/36 (3-2q)/((1-q)^2 r^4)/(4 pi), q
+        = R/r (the first moment about the centroid vanishes; `radial_tree`, with one order less).
         Nearer than about an edge's length the result is not that of the mesh at all: w is smooth
         where a triangle would make it jump, and infinite at the centroids. Each subdivision divides
         that range by 2 and the error beyond it by 4.
@@ -329,34 +332,34 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         )
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
-        on = self._batch_data(backend_of(x))
-        x = on.to_unit(x)
-        sums, epsilon = on.dipoles.sums(x, closer, derivatives).sums, on.backend.machine_epsilon
+        data = self._batch_data(backend_of(x))
+        x = data.to_unit(x)
+        sums, epsilon = data.dipoles.sums(x, closer, derivatives).sums, data.backend.machine_epsilon
         values = sums.values(1.0, coordinate_rounding(x), 8 * epsilon * dr.abs(sums.value))
-        held, slope, second = self._cutoff_errors(on, sums, coordinate_rounding(x))
+        cutoff, slope, second = self._cutoff_errors(data, sums, coordinate_rounding(x))
         values = dataclasses.replace(
             values,
-            error=values.error + held,
+            error=values.error + cutoff,
             gradient_error=values.gradient_error + slope,
             hessian_error=values.hessian_error + second,
         )
         weight = float(self.areas.sum()) / (4 * math.pi * self._size**2)
-        return values.with_far_field_errors(x, 64, weight).rescaled(on.size)
+        return values.with_far_field_errors(x, 64, weight).rescaled(data.size)
 
     def _cutoff_errors(
-        self, on: _ScreenedBuffers, sums: SourceSums, unit: Real
+        self, data: _ScreenedBuffers, sums: SourceSums, unit: Real
     ) -> tuple[Real, Real, Real]:
-        """What screening adds to the rounding of value, gradient and second derivatives.
+        """The additional errors of value, gradient and second derivatives by screening.
 
-        Exponentials are held at exp(-80) = 2e-35 (`MAX_LENGTHS`), times at most
-        Q_3(80) exp(80) = 9e4. Fourth derivatives of the kernel have Q_4(t) <= (1 + t/4) Q_3(t), and
-        a coordinate is off by `unit`.
+        Exponentials are at least exp(-80) = 2e-35 (`MAX_LENGTHS`), times at most Q_3(80) exp(80) =
+        9e4. Fourth derivatives of the kernel have Q_4(t) <= (1 + t/4) Q_3(t), and a coordinate is
+        off by `unit`.
         """
-        share = dr.rcp(sums.singularity_distance)
-        held = 2e-30 * float(self._rows[:, 6].sum()) * share * share
-        fourth = 0.25 * on.kernel.kappa * sums.s4
-        second = dr.fma(SECOND_ROUNDINGS * unit, fourth, 6 * held * share * share)
-        return held, 2 * held * share, second
+        inverse = dr.rcp(sums.singularity_distance)
+        value_error = 2e-30 * float(self._rows[:, 6].sum()) * inverse * inverse
+        fourth = 0.25 * data.kernel.kappa * sums.s4
+        hessian_error = dr.fma(SECOND_ROUNDINGS * unit, fourth, 6 * value_error * inverse * inverse)
+        return value_error, 2 * value_error * inverse, hessian_error
 
     def _upload(self, backend: Backend, *, traced: bool) -> _ScreenedBuffers:
         del traced
@@ -375,53 +378,54 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         x = on.to_unit(p)
         screened, epsilon = on.dipoles.sums(x, detail, 1), on.backend.machine_epsilon
         sums, unit = screened.sums, coordinate_rounding(x)
-        held, slope, _ = self._cutoff_errors(on, sums, unit)
-        error = sums.truncation + sums.rounding + held
+        cutoff, slope, _ = self._cutoff_errors(on, sums, unit)
+        error = sums.truncation + sums.rounding + cutoff
         slope_error = sums.gradient_truncation + dr.fma(SLOPE_ROUNDINGS * unit, sums.s4, slope)
         # At a dipole, up to rounding, f has all values: the sample has a gradient so steep that
         # every level is close, and an error as large as the distance to such a level.
-        apart = (sums.singularity_distance > _ON_DIPOLE * epsilon) & dr.isfinite(sums.value)
-        steep = on.backend.Array3f(0, 0, _ANY_LEVEL / (_ON_DIPOLE * epsilon))
-        value = dr.select(apart, sums.value, 0)
-        gradient = dr.select(apart, sums.gradient, steep)
-        known, ball = screened_promises(screened, value, gradient, on.kernel, on.size, epsilon)
+        is_off_dipole = (sums.singularity_distance > _ON_DIPOLE * epsilon) & dr.isfinite(sums.value)
+        steep_gradient = on.backend.Array3f(0, 0, _ANY_LEVEL / (_ON_DIPOLE * epsilon))
+        value = dr.select(is_off_dipole, sums.value, 0)
+        gradient = dr.select(is_off_dipole, sums.gradient, steep_gradient)
+        promises, ball = screened_promises(screened, value, gradient, on.kernel, on.size, epsilon)
         return Sample(
             value,
             gradient / on.size,
-            known,
-            dr.select(apart, error, _ANY_LEVEL),
-            dr.select(apart, slope_error / on.size, 0),
-            truncation_error=dr.select(apart, sums.truncation, 0),
+            promises,
+            dr.select(is_off_dipole, error, _ANY_LEVEL),
+            dr.select(is_off_dipole, slope_error / on.size, 0),
+            truncation_error=dr.select(is_off_dipole, sums.truncation, 0),
             alternative_promises=(ball,),
         )
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
-        """ValueError for a level too small for rounding. All others occur next to every dipole."""
+        """Raises ValueError for a level too small for rounding. All other levels occur next to
+        every dipole."""
         for level in levels:
             if 0 < abs(level) < _SMALLEST_LEVEL:
                 raise ValueError(f"level {level:g} is too small to be told from 0")
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """A box proved to hold the level sets; None for level 0, which may have no end.
+        """A box proved to contain the level sets; None for level 0, which may be unbounded.
 
         At distance D from the points |w| <= sum_i w_i Q_1(D/l)/D^2, which falls with D: beyond the
-        D where that is the least |level| there is no level. Cells of that box that are proved empty
-        are removed (`tight_extent`).
+        D where that is the smallest |level| there is no level. Cells of that box that are proved
+        empty are removed (`tight_extent`).
         """
         if levels not in self._extents:
             self._extents[levels] = self._extent(levels)
         return self._extents[levels]
 
     def _extent(self, levels: tuple[float, ...]) -> Volume | None:
-        least = min(abs(level) for level in levels)
-        if least < _SMALLEST_LEVEL:
+        min_level = min(abs(level) for level in levels)
+        if min_level < _SMALLEST_LEVEL:
             return None
         total = float(self._rows[:, 6].sum())
-        low, high = 0.0, math.sqrt(total / least) * 1.001 + 1e-6
+        low, high = 0.0, math.sqrt(total / min_level) * 1.001 + 1e-6
         for _ in range(60):
             reach = 0.5 * (low + high)
             t = self._kappa * reach
-            inside = total * (1 + t) * math.exp(-t) > least * reach * reach
+            inside = total * (1 + t) * math.exp(-t) > min_level * reach * reach
             low, high = (reach, high) if inside else (low, reach)
         reach = 1.001 * high * self._size
         lower, upper = self.points.min(axis=0) - reach, self.points.max(axis=0) + reach

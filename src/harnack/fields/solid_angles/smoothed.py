@@ -1,6 +1,7 @@
 """Smoothed dipoles: sums over points of clouds with noise, without their singularities.
 
-`SmoothedKernel` is the kernel, with the proof of its bounds, `SmoothedSum` the sum by a tree.
+- `SmoothedKernel`: the kernel, with the proof of its bounds.
+- `SmoothedSum`: the sum by a tree.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Real, Vec3
     from harnack.tree import BalancedTree
 
-# Bounds of the kernel hold from this part of a distance on: promises reach `_REACHES` = 0.45 of it.
+# Bounds of the kernel at a distance hold from this fraction of it on: promises hold up to 0.45 of
+# the distance (`radial_kernel._REACHES`).
 _BOUND_FRACTION = 0.55
 
 
@@ -41,16 +43,17 @@ class SmoothedKernel(RadialKernel):
     sums of positive terms; a dipole m at y = x + z gives -m.grad_y K = m.z (rho^2 + 5 h^2/2)/D^5.
     Since Laplacian D^p = p D^(p-2) (p + 1 - (p-2) q) in three dimensions, -Laplacian K/(4 pi) =
     15 h^4/(8 pi D^7): positive, with integral 1 and second moment 3 h^2/2. So a sum over dipoles
-    is that of plain ones averaged with this weight. (1/D alone has the weight 3 h^2/(4 pi D^5),
-    whose second moment is infinite: at equal noise its surfaces were farther off.)
+    is the sum over plain dipoles averaged with this weight. (1/D by itself has the weight
+    3 h^2/(4 pi D^5), whose second moment is infinite: at equal noise its surfaces were farther
+    off.)
 
     Bound. |d^m K[u_1, ..., u_m]| <= m! Q_m/D^(m+1), Q_m = 1 + q (m+1)(m+2)/4, for unit vectors.
     Proof. Equal vectors u are the worst (Banach 1938). D is the length of Z = (z, h), and along a
     line in direction u at an angle phi from Z 1/|Z + t u|^(2 l) is the generating function of
     Gegenbauer's polynomials: its m-th derivative is m! C_m^l(-cos phi)/D^(m + 2 l), at most m!
     C_m^l(1)/D^(m + 2 l). That is m!/D^(m+1) for l = 1/2, and m! (m+1)(m+2)/(2 D^(m+3)) for l = 3/2.
-    As D >= h always, q <= 1. Bounds that are asked for at a distance hold from 0.55 of it on, so
-    that promises, which reach 0.45 of it, need no more (`growth`).
+    As D >= h always, q <= 1. The bounds at a distance hold from 0.55 of it on, so that promises,
+    which hold up to 0.45 of it, need no growth factor (`growth`).
     """
 
     def __init__(self, backend: Backend, height: float) -> None:
@@ -67,8 +70,8 @@ class SmoothedKernel(RadialKernel):
         return KernelValues(inverse, thetas)
 
     def bounds(self, distance: Real, last: int) -> list[Real]:
-        share = dr.sqrt(self.height_square) / (_BOUND_FRACTION * fmax(distance, 1e-30))
-        q = fmin(share * share, 1)
+        ratio = dr.sqrt(self.height_square) / (_BOUND_FRACTION * fmax(distance, 1e-30))
+        q = fmin(ratio * ratio, 1)
         return [dr.fma(0.25 * (m + 1) * (m + 2), q, 1) for m in range(2, last + 1)]
 
     def growth(self, r: Real) -> Real:
@@ -81,7 +84,8 @@ class SmoothedKernel(RadialKernel):
 
 @dataclass(frozen=True)
 class SmoothedSum:
-    """sum_i m_i.z_i (rho_i^2 + 5 h^2/2)/(rho_i^2 + h^2)^(5/2), z_i = y_i - x, rho_i = |z_i|."""
+    """The sum of m_i.z_i (rho_i^2 + 5 h^2/2)/(rho_i^2 + h^2)^(5/2) over dipoles i, z_i = y_i - x,
+    rho_i = |z_i|."""
 
     dipoles: RadialTreecode
 
@@ -89,18 +93,24 @@ class SmoothedSum:
     def of(
         cls, backend: Backend, tree: BalancedTree, rows: FloatArray, height: float, accuracy: float
     ) -> SmoothedSum:
-        """rows: (n, 8) of `dipole_records`. tree: `dipole_hierarchy` their points, or of the same
-        points at earlier positions. height: the smoothing length, in the units of the dipoles."""
+        """The sum over dipoles.
+
+        rows: (n, 8), from `dipole_records`.
+        tree: `dipole_hierarchy` of their points, or of the same points at earlier positions.
+        height: the smoothing length, in the units of the dipoles.
+        """
         clustered = ClusteredDipoles(rows, tree, taylor_tree_moments(tree, rows))
         return cls(RadialTreecode(backend, clustered, SmoothedKernel(backend, height), accuracy))
 
     @property
     def coarsest_accuracy(self) -> float:
-        """The detail of coarse evaluations (`Field.coarsest_accuracy`): there are none."""
+        """The accuracy scale of coarse samples (`Field.coarsest_accuracy`): there are no coarse
+        samples."""
         return 1.0
 
     def values(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:
-        """Value and the derivatives asked for at x; closer: the detail, at least 1."""
+        """Value and derivatives up to order `derivatives` at x; closer: the accuracy scale, at
+        least 1."""
         sums = self.dipoles.sums(x, closer, derivatives).sums
         rounding = 8 * self.dipoles.backend.machine_epsilon * dr.abs(sums.value)
         return sums.values(1.0, coordinate_rounding(x), rounding)

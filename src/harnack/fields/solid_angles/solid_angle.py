@@ -68,18 +68,19 @@ if TYPE_CHECKING:
 LiftBoundName = Literal["auto", "planar", "edges", "convex", "paper"]
 
 _PERIOD = 4 * math.pi
-# Levels nearer than this to a multiple of 4 pi count as one.
+# Levels nearer than this to a multiple of 4 pi count as such a multiple.
 _LEVEL_MARGIN = 1e-9 * _PERIOD
-# The most pairs of a cell and a vertex in one round for an extent.
+# The largest number of pairs of a cell and a vertex in one round for an extent.
 _MOST_PAIRS = 3_000_000
 # Sides of the polygons that stand for circles where a boundary is drawn.
 _SIDES = 256
-# Cells are built by themselves from so many rays times edges on, for no fewer rays and edges. To
-# trace those takes five times as long as to build the cells of a knot; those of a tangle of a
-# thousand edges take ten times as long as a knot's.
+# Cells pay if the number of rays times the number of edges is at least `_PAYS`, and there are at
+# least `_LEAST_RAYS` rays and `_LEAST_EDGES` edges. To trace these takes five times as long as to
+# build the cells of a knot; the cells of a tangle of a thousand edges take ten times as long as
+# those of a knot.
 _PAYS, _LEAST_RAYS, _LEAST_EDGES = 2.5e8, 1e6, 48
-# The most planes of the extent of a curve in convex position with cells, by experiment: with
-# hundreds, clipping rays takes longer than the march.
+# The largest number of planes of the extent of a curve in convex position with cells, by
+# experiment: with hundreds, clipping rays takes longer than the march.
 _MAX_PLANES = 48
 
 
@@ -99,14 +100,14 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
     and steps rest on that. The other proofs, chosen by `bound=`, need the range of the lift on a
     ball: on wavy polygons and knots they take 1.4 to 2 times as many evaluations.
 
-    lift_bound: how the lift is bounded on a ball. "auto" takes "planar" where its hypothesis is
-    checked to hold, "convex" where that does, else "edges"; if loops are Dr.Jit arrays it takes
-    "edges" in any case, so that curves that are moved step by step do not change kernels.
+    lift_bound: the bound of the lift on a ball. "auto" chooses "planar" if its hypothesis is
+    checked to hold, "convex" if that hypothesis holds, else "edges"; if loops are Dr.Jit arrays it
+    chooses "edges" in any case, so that curves that are moved step by step do not change kernels.
 
     - "edges" holds for **every** curve: |grad f| and the bound of second derivatives bound the
       change of f (`lift_ball`).
     - "planar": on B(x, d), d the distance to the curve, the lift stays in a range 4 pi wide if all
-      loops together bound a region of a plane (`planar`); else, for circles alone, in the sum of
+      loops together bound a region of a plane (`planar`); else, for circles only, in the sum of
       one such range for each circle.
     - "convex": on B(x, d) the lift stays in (-6 pi, 6 pi) if the curve is one loop without
       self-intersections on the boundary of a convex set: a segment crosses the 2 pi level, where
@@ -114,17 +115,17 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
     - "paper" assumes that range for any curve and promises nothing else, as the paper does. It is
       false for coils and links and exists for comparisons: hits can be missed.
 
-    cells: for many rays and curves of many vertices: cells in which the near edges count one by one
-    and all others as one polynomial, with a proved remainder, so that an evaluation for tracing
-    costs about the same whatever the number of edges; where the remainder decides, all edges are
-    summed up. None builds them where they pay (`for_ray_count`), True always, False never. They
-    take some 2 to 10 MB, at most the megabytes that are given (True: 256); where these would be too
-    small, none are built, and `describe` of a prepared field says so. Building takes as long as
-    tracing some 200,000 to 600,000 camera rays without cells, for each precision, at the first
-    trace. Circles have no cells, and cost what they cost. Values and derivatives at points are
-    those of all edges.
+    cells: for many rays and curves of many vertices: FMM cells, in which near edges are summed
+    directly and all others are one polynomial, with a proved remainder, so that an evaluation for
+    tracing costs about the same whatever the number of edges; where the remainder decides, all
+    edges are summed. None builds them where they pay (`for_ray_count`), True always, False never.
+    They take some 2 to 10 MB, at most the number of megabytes of this argument (True: 256); if that
+    is too small, there are no cells, and `describe` of a prepared field reports this. Building
+    takes as long as tracing some 200,000 to 600,000 camera rays without cells, for each precision,
+    at the first trace. Circles have no cells. Values and derivatives at points are those of all
+    edges.
 
-    Raises CurveError for loops that are not closed curves, ValueError for "convex" where the
+    Raises CurveError for loops that are not closed curves, ValueError for "convex" if the
     hypothesis fails, and for cells if a loop is a Dr.Jit array, as its vertices may move.
     """
 
@@ -142,8 +143,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         super().__init__()
         self.circles: tuple[Circle, ...]
         curves, self._differentiable_loops = _movable_loops(loops)
-        found, self.circles = validate_curves(curves)
-        self._loops: Loops = tuple(_read_only(loop) for loop in found)
+        net, self.circles = validate_curves(curves)
+        self._loops: Loops = tuple(_read_only(loop) for loop in net)
         self._net_loops: Loops = cancel_opposite_edges(self.loops) if self.loops else ()
         self._net_circles = cancel_opposite_circles(self.circles)
         is_circle = not self._net_loops and len(self._net_circles) == 1
@@ -170,8 +171,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
 
     @property
     def loops(self) -> Loops:
-        """The loops of vertices as given. They stay as they are, as all else is computed from them
-        once: another curve is another field."""
+        """The loops of vertices, as in the argument. They cannot be set, as all other data are
+        computed from them once: another curve is another field."""
         return self._loops
 
     @property
@@ -181,56 +182,59 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
 
     @property
     def boundary_curves(self) -> tuple[FloatArray, ...]:
-        return (*self._net_loops, *(one.polygon(_SIDES) for one in self._net_circles))
+        return (*self._net_loops, *(circle.polygon(_SIDES) for circle in self._net_circles))
 
     def _points_around(self) -> FloatArray:
         """Points (n, 3) whose convex hull contains the curves: vertices, and polygons around
-        circles. If all curves cancel, those of the curves as given."""
+        circles. If all curves cancel, the points of the curves of the arguments."""
         loops, circles = self._net_loops, self._net_circles
         if self._all_cancel:
             loops, circles = self.loops, self.circles
-        return np.concatenate([*loops, *(one.polygon(64, circumscribed=True) for one in circles)])
+        return np.concatenate(
+            [*loops, *(circle.polygon(64, circumscribed=True) for circle in circles)]
+        )
 
-    def _choose(self, asked: LiftBoundName) -> Literal["edges", "planar", "range"]:
-        if asked == "auto":
+    def _choose(self, option: LiftBoundName) -> Literal["edges", "planar", "range"]:
+        """The bound of the lift for an option. Raises ValueError if its hypothesis fails."""
+        if option == "auto":
             if self._differentiable_loops:
                 return "edges"
             if self._region is not None or (self._net_circles and not self._net_loops):
                 return "planar"
             return "range" if self.convex_position else "edges"
-        if asked == "convex" and not self.convex_position:
+        if option == "convex" and not self.convex_position:
             raise ValueError(
                 'lift_bound="convex" needs one loop without self-intersections on the boundary '
                 'of its convex hull, and this is not one; use lift_bound="auto"'
             )
-        if asked == "planar":
+        if option == "planar":
             if self._region is None and (self._net_loops or not self._net_circles):
                 raise ValueError(
                     'lift_bound="planar" needs disjoint loops that bound a region of a plane, or '
                     'circles alone, and this is neither; use lift_bound="auto"'
                 )
             return "planar"
-        if asked not in ("edges", "convex", "paper"):
+        if option not in ("edges", "convex", "paper"):
             names = ("auto", "planar", "edges", "convex", "paper")
             raise ValueError(
-                f"unknown lift_bound {asked!r}; use auto, planar, edges, convex or paper"
-                f"{did_you_mean(asked, names)}"
+                f"unknown lift_bound {option!r}; use auto, planar, edges, convex or paper"
+                f"{did_you_mean(option, names)}"
             )
-        return "edges" if asked == "edges" else "range"
+        return "edges" if option == "edges" else "range"
 
     def _upload(self, backend: Backend, *, traced: bool) -> _CurveData:
         # Centered and scaled to unit size: products of eight lengths stay far from overflow. The
         # backend's precision holds the center exactly, so that subtracting it near the curve is
         # exact.
-        cast = np.float64 if backend.precision == "double" else np.float32
+        dtype = np.float64 if backend.precision == "double" else np.float32
         if (size := float(np.abs(self._center).max()) + self._size) > 0.1 * float(
-            np.finfo(cast).max
+            np.finfo(dtype).max
         ):
             raise ValueError(
                 f"coordinates up to {size:g} are too large for {backend.precision} precision: "
                 "choose units nearer to 1"
             )
-        center = self._center.astype(cast).astype(np.float64)
+        center = self._center.astype(dtype).astype(np.float64)
         unit = tuple((loop - center) / self._size for loop in self._net_loops)
         edges = LoopEdges.upload(backend, unit) if unit else None
         circles = None
@@ -261,7 +265,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         )
 
     def _box(self, center: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The corners of a box that holds the curve and the default level, in unit coordinates."""
+        """The corners of a box that contains the curve and the default level, in unit
+        coordinates."""
         volume = self.extent((self.default_level,))
         corners = [] if volume is None else [np.stack(volume.bounds())]
         points = np.concatenate([*self._net_loops, *corners]) - center
@@ -275,7 +280,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return SolidAngle([*self.loops, *self.circles], lift_bound=self.lift_bound_option)
 
     def _data_for(self, p: Vec3) -> _CurveData:
-        """The data; without cells if `prepare` was not called."""
+        """The data on the device; without cells if `prepare` was not called."""
         if self._device is None:
             return self._upload(backend_of(p), traced=False)
         return self._device
@@ -291,9 +296,9 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return self.at_accuracy(backend.Float(EXACT)) if self.has_variable_accuracy else self
 
     def at_accuracy(self, detail: Real) -> Field:
-        closer = copy.copy(self)
-        closer._detail = detail
-        return closer
+        field = copy.copy(self)
+        field._detail = detail
+        return field
 
     def evaluate(self, p: Vec3) -> Sample:
         return self._sample(p, None)
@@ -302,98 +307,102 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         """The sample with promises along the ray, which prove long steps if the ray runs along an
         edge."""
         del ahead, back
-        knows_lines = not self._all_cancel and self.lift_bound_option != "paper"
-        direction = path.direction if knows_lines else None
+        has_line_promises = not self._all_cancel and self.lift_bound_option != "paper"
+        direction = path.direction if has_line_promises else None
         return path.enclose(self._sample(path.point(t), direction))
 
     def _sample(self, p: Vec3, direction: Vec3 | None) -> Sample:
-        """The sample at p; with promises along a unit direction, if one is given."""
-        on = self._data_for(p)
+        """The sample at p; with promises along a unit direction, unless it is None."""
+        data = self._data_for(p)
         if self._all_cancel:
-            return self._zero_sample(on, p)
-        x = on.to_unit(p)
-        sums, left_out = on.at_detail(x, self._detail)
-        epsilon = on.backend.machine_epsilon
-        rounding = on.rounding
+            return self._zero_sample(data, p)
+        x = data.to_unit(p)
+        sums, errors = data.at_detail(x, self._detail)
+        epsilon = data.backend.machine_epsilon
+        rounding = data.rounding
         distance = sums.distance * (1 - SUM_MARGIN) - rounding
-        known = remainder_promises(sums.cubes, sums.fourths, distance)
-        rounded = left_out.rounding + vertex_rounding(epsilon, x, sums.squares)
+        promises = remainder_promises(sums.cubes, sums.fourths, distance)
+        value_rounding = errors.rounding + vertex_rounding(epsilon, x, sums.squares)
         if self.lift_bound == "edges":
-            ball = lift_ball(sums.angle, sums.gradient, sums.squares, known, left_out.slope)
+            ball = lift_ball(sums.angle, sums.gradient, sums.squares, promises, errors.slope)
         elif self.lift_bound == "planar":
-            ball = self._planar_ball(on, x, sums, distance, left_out.value)
+            ball = self._planar_ball(data, x, sums, distance, errors.value)
         else:
-            ball = _convex_ball(sums.angle, distance, left_out.value + rounded)
-        # At the curve itself, up to rounding, f has all values (`remaining_edges`) and no
-        # gradient: give one so steep that the point counts as close to any level. Anywhere else NaN
-        # stays NaN, and the tracer accepts no such point.
-        met = sums.distance <= 2 * rounding
-        steep = on.backend.Array3f(0, 0, 4 * _PERIOD / rounding)
-        gradient = dr.select(met, steep, sums.gradient)
-        gradient_error = left_out.slope
-        truncation = dr.select(met, 0, left_out.value)
-        error = truncation + dr.select(met, left_out.rounding, rounded)
+            ball = _convex_ball(sums.angle, distance, errors.value + value_rounding)
+        # At the curve itself, up to rounding, f has all values (`remaining_edges`) and no gradient:
+        # the sample has a gradient so steep that the point counts as close to any level. Anywhere
+        # else NaN stays NaN, and the tracer accepts no such point.
+        on_curve = sums.distance <= 2 * rounding
+        steep_gradient = data.backend.Array3f(0, 0, 4 * _PERIOD / rounding)
+        gradient = dr.select(on_curve, steep_gradient, sums.gradient)
+        gradient_error = errors.slope
+        truncation = dr.select(on_curve, 0, errors.value)
+        error = truncation + dr.select(on_curve, errors.rounding, value_rounding)
         if sums.circles is not None:
-            own = sums.circles
+            circles = sums.circles
             # Measured: 15 units in the last place of a circle's angle and 60 of its gradient (near
             # it, 10 elsewhere). Its position is rounded by a few units too.
-            place = epsilon * (4 + 4 * dr.max(dr.abs(x)))
-            value = 16 * epsilon * len(self._net_circles) + place * own.squares
-            error = error + dr.select(met, 0, value)
-            slope = 32 * epsilon * own.squares + 1.5 * place * own.cubes
+            point_error = epsilon * (4 + 4 * dr.max(dr.abs(x)))
+            value = 16 * epsilon * len(self._net_circles) + point_error * circles.squares
+            error = error + dr.select(on_curve, 0, value)
+            slope = 32 * epsilon * circles.squares + 1.5 * point_error * circles.cubes
             gradient_error = gradient_error + slope
-        gradient_error = dr.select(met, 0, gradient_error)
-        error = dr.select(met, 8 * _PERIOD, error)  # the steep gradient times 2 rounding
-        along = _along_curves(on, x, sums, left_out, direction)
+        gradient_error = dr.select(on_curve, 0, gradient_error)
+        error = dr.select(on_curve, 8 * _PERIOD, error)  # the steep gradient times 2 rounding
+        ray_promises = _along_curves(data, x, sums, errors, direction)
         if self.lift_bound_option == "paper":
-            known = (ball,)
-        value = dr.select(met, 0, sums.angle)
+            promises = (ball,)
+        value = dr.select(on_curve, 0, sums.angle)
         sample = Sample(
             value,
             gradient,
-            known,
+            promises,
             error,
             gradient_error,
             truncation_error=truncation,
             alternative_promises=(ball,),
-            ray_promises=along,
+            ray_promises=ray_promises,
         )
-        return space_scaled(sample, on.size)
+        return space_scaled(sample, data.size)
 
     def _planar_ball(
-        self, on: _CurveData, x: Vec3, sums: CurveSums, distance: Real, error: Real
+        self, data: _CurveData, x: Vec3, sums: CurveSums, distance: Real, error: Real
     ) -> HarmonicBall:
+        """The ball of `lift_bound="planar"`: of the region of a plane, or of circles."""
         if self._region is None:
-            own = sums.circles
-            assert own is not None
-            return HarmonicBall(distance, own.lower, own.upper)
-        slack = on.rounding + on.backend.machine_epsilon * 4 * dr.max(dr.abs(x))
-        return self._region.lift_range(sums.angle, on.height(x), distance, slack, error)
+            circles = sums.circles
+            assert circles is not None
+            return HarmonicBall(distance, circles.lower, circles.upper)
+        slack = data.rounding + data.backend.machine_epsilon * 4 * dr.max(dr.abs(x))
+        return self._region.lift_range(sums.angle, data.height(x), distance, slack, error)
 
-    def _zero_sample(self, on: _CurveData, p: Vec3) -> Sample:
+    def _zero_sample(self, data: _CurveData, p: Vec3) -> Sample:
         """The sample of f = 0, if all edges cancel: it holds on any ball. The range has a positive
-        width, as bounds divide by it; no level lies in it (`validate_levels`)."""
-        x = on.to_unit(p)
-        radius = 1e6 * (1 + dr.norm(x)) * on.size
-        zero = dr.zeros(on.backend.Float, dr.width(p))
+        width, as bounds divide by it; it contains no level (`validate_levels`)."""
+        x = data.to_unit(p)
+        radius = 1e6 * (1 + dr.norm(x)) * data.size
+        zero = dr.zeros(data.backend.Float, dr.width(p))
         ball = HarmonicBall(radius, zero - _LEVEL_MARGIN, zero + _LEVEL_MARGIN)
-        return Sample(zero, on.backend.Array3f(zero), (ball,))
+        return Sample(zero, data.backend.Array3f(zero), (ball,))
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """Rows of the Hessian, whose trace is 0 up to rounding. It grows without limit at the
         curve."""
-        on = self._data_for(p)
+        data = self._data_for(p)
         if self._all_cancel:
-            zero = dr.zeros(on.backend.Array3f, dr.width(p))
+            zero = dr.zeros(data.backend.Array3f, dr.width(p))
             return zero, zero, zero
-        x, share = on.to_unit(p), 1 / (on.size * on.size)
-        rows = on.backend.Array3f(0), on.backend.Array3f(0), on.backend.Array3f(0)
-        if on.edges is not None:
-            rows = hessian_over_edges(on.edges, x)
-        if on.circles is not None:
-            more = on.circles.hessian(x).rows(on.backend.Array3f)
-            rows = tuple(one + other for one, other in zip(rows, more, strict=True))
-        first, second, third = (row * share for row in rows)
+        x, scale = data.to_unit(p), 1 / (data.size * data.size)
+        rows = data.backend.Array3f(0), data.backend.Array3f(0), data.backend.Array3f(0)
+        if data.edges is not None:
+            rows = hessian_over_edges(data.edges, x)
+        if data.circles is not None:
+            circle_rows = data.circles.hessian(x).rows(data.backend.Array3f)
+            rows = tuple(
+                edge_row + circle_row
+                for edge_row, circle_row in zip(rows, circle_rows, strict=True)
+            )
+        first, second, third = (row * scale for row in rows)
         return first, second, third
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
@@ -401,75 +410,75 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         (`source_sums.SLOPE_ROUNDINGS`), with distances reduced by their rounding. Infinite at the
         curve."""
         del sample
-        on = self._data_for(p)
+        data = self._data_for(p)
         if self._all_cancel:
             return 0.0, 0.0
-        x = on.to_unit(p)
-        sums, unit = on.sums(x), coordinate_rounding(x)
+        x = data.to_unit(p)
+        sums, unit = data.sums(x), coordinate_rounding(x)
         distance = sums.distance - 4 * unit
-        known = (distance > 0) & (sums.distance > 2 * on.rounding)  # see `evaluate`
-        share = dr.select(known, dr.square(dr.square(sums.distance / distance)), dr.inf)
-        slope = SLOPE_ROUNDINGS / 3 * unit * sums.cubes * share / on.size
-        second = 0.25 * SECOND_ROUNDINGS * unit * sums.cubes / sums.distance * share
-        return slope, second / (on.size * on.size)
+        is_off_curve = (distance > 0) & (sums.distance > 2 * data.rounding)  # see `evaluate`
+        growth = dr.select(is_off_curve, dr.square(dr.square(sums.distance / distance)), dr.inf)
+        slope = SLOPE_ROUNDINGS / 3 * unit * sums.cubes * growth / data.size
+        second = 0.25 * SECOND_ROUNDINGS * unit * sums.cubes / sums.distance * growth
+        return slope, second / (data.size * data.size)
 
     def gradient_change_bound(self, p: Vec3, radius: Real) -> Real:
         """See `curve_queries.gradient_change_bound`; the rounding of positions is included."""
-        on = self._data_for(p)
+        data = self._data_for(p)
         if self._all_cancel:
             return 0 * p.x
-        x, reach = on.to_unit(p), radius / on.size + on.rounding
-        sums = on.sums(x)
-        distance = sums.distance * (1 - SUM_MARGIN) - on.rounding
-        return gradient_change_bound(sums.cubes, sums.fourths, distance, reach) / on.size
+        x, unit_radius = data.to_unit(p), radius / data.size + data.rounding
+        sums = data.sums(x)
+        distance = sums.distance * (1 - SUM_MARGIN) - data.rounding
+        return gradient_change_bound(sums.cubes, sums.fourths, distance, unit_radius) / data.size
 
     def closest_boundary_point(self, p: Vec3) -> Vec3 | None:
         """The closest point of the curve, without edges that cancel (`remaining_edges`)."""
         if self._all_cancel:
             return None
-        on = self._data_for(p)
-        x = on.to_unit(p)
-        nearest, square = on.backend.Array3f(0), on.backend.Float(dr.inf)
+        data = self._data_for(p)
+        x = data.to_unit(p)
+        nearest, square = data.backend.Array3f(0), data.backend.Float(dr.inf)
         if self._net_loops:
-            center = to_numpy(on.center).reshape(3).astype(np.float64)
+            center = to_numpy(data.center).reshape(3).astype(np.float64)
             start, end = ((q - center) / self._size for q in remaining_edges(self._net_loops))
-            nearest = closest_on_segments(segment_records(on.backend, start, end), x)
+            nearest = closest_on_segments(segment_records(data.backend, start, end), x)
             square = dr.squared_norm(x - nearest)
-        if on.circles is not None:
-            other, apart = on.circles.closest(x)
-            nearest = dr.select(apart < square, other, nearest)
-        return nearest * on.size + on.center
+        if data.circles is not None:
+            circle_point, circle_square = data.circles.closest(x)
+            nearest = dr.select(circle_square < square, circle_point, nearest)
+        return nearest * data.size + data.center
 
     def parameters(self) -> tuple[Any, ...]:
-        return tuple(one for one in self._differentiable_loops if _is_drjit(one))
+        return tuple(loop for loop in self._differentiable_loops if _is_drjit(loop))
 
     def differentiable_value(self, p: Vec3) -> Real:
         backend = backend_of(p)
         # If vertices can move one by one, all edges are summed: after a move they may not cancel.
         loops = self._differentiable_loops or self._net_loops
         angle = differentiable_angle(backend, loops, p)
-        on = self._data_for(p)
-        if on.circles is None:
+        data = self._data_for(p)
+        if data.circles is None:
             return angle
         # To first order in p, as reverse mode cannot pass a recorded loop.
         with dr.suspend_grad():
             q = dr.detach(p)
-            own = on.circles.sums(on.to_unit(q))
-        return angle + own.angle + dr.dot(own.gradient / on.size, p - q)
+            sums = data.circles.sums(data.to_unit(q))
+        return angle + sums.angle + dr.dot(sums.gradient / data.size, p - q)
 
     def continuous_change(self, p: FloatArray, q: FloatArray) -> FloatArray | None:
         if self._net_circles:
             return None
         backend = choose_backend("double")
-        on = self._without_cells.prepare(backend)._data_for(backend.Array3f(0))
-        if on.edges is None:
+        data = self._without_cells.prepare(backend)._data_for(backend.Array3f(0))
+        if data.edges is None:
             return np.zeros(len(p))
-        edges = on.edges
+        edges = data.edges
 
-        def between(start: Vec3, end: Vec3) -> tuple[Real]:
-            return (continuous_change(edges, on.to_unit(start), on.to_unit(end)),)
+        def changes(start: Vec3, end: Vec3) -> tuple[Real]:
+            return (continuous_change(edges, data.to_unit(start), data.to_unit(end)),)
 
-        return map_batches(backend, between, p, q)[0]
+        return map_batches(backend, changes, p, q)[0]
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
         for level in levels:
@@ -481,16 +490,16 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
                 )
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """Where the level sets must lie.
+        """A volume that contains the level sets.
 
         The 2 pi level of a curve in convex position lies in its convex hull (paper, Theorem B.1).
         For any curves of total length L: at x, at distance rho from all of them, a loop has angular
-        length at most L_i/rho =: t_i; a closed spherical curve of length t < 2 pi,
-        cut into simple loops, bounds |area| <= 2 pi - sqrt(4 pi^2 - t^2) =: phi(t) (isoperimetry
-        on the sphere; phi is convex with phi(0) = 0, so the pieces add up to at most phi of the
-        whole). So |Omega| < l wherever L/rho < sqrt(l (4 pi - l)): a level at distance l from
-        the multiples of 4 pi lies within rho = L/sqrt(l (4 pi - l)) of the curves. Cells of that
-        box that are proved to hold no level are then cut away (`tight_extent`).
+        length at most L_i/rho =: t_i; a closed spherical curve of length t < 2 pi, cut into simple
+        loops, bounds |area| <= 2 pi - sqrt(4 pi^2 - t^2) =: phi(t) (isoperimetry on the sphere; phi
+        is convex with phi(0) = 0, so the pieces add up to at most phi of the whole). So |Omega| < l
+        wherever L/rho < sqrt(l (4 pi - l)): a level at distance l from the multiples of 4 pi lies
+        within rho = L/sqrt(l (4 pi - l)) of the curves. Cells of that box that are proved to
+        contain no level are then cut away (`tight_extent`).
         """
         if levels not in self._extents:
             self._extents[levels] = self._extent(levels)
@@ -498,23 +507,24 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
 
     def _extent(self, levels: tuple[float, ...]) -> Volume | None:
         points = self._points_around()
-        away = [abs(math.remainder(float(level), _PERIOD)) for level in levels]
-        nearest = min(away)
+        gaps = [abs(math.remainder(float(level), _PERIOD)) for level in levels]
+        nearest = min(gaps)
         if nearest < _LEVEL_MARGIN:
             return None
         if self._all_cancel:
-            return ConvexHull.from_points(points)  # there is no surface: any volume will do
-        # Curves whose vertices may move share kernels: their extent is always found the same way.
+            return ConvexHull.from_points(points)  # there is no surface: any volume is right
+        # Curves whose vertices may move share kernels: their extent is always computed the same
+        # way.
         in_hull = self.convex_position and nearest > 2 * math.pi * (1 - 1e-9)
         if (
             in_hull and self.has_variable_accuracy
         ):  # some half-spaces of the hull: all of it lies in them
             hull = ConvexHull.from_points(points).padded(1e-4 * self._size)
-            few = slice(_MAX_PLANES)
-            return ConvexHull(hull.normals[few], hull.offsets[few], hull.lower, hull.upper)
+            planes = slice(_MAX_PLANES)
+            return ConvexHull(hull.normals[planes], hull.offsets[planes], hull.lower, hull.upper)
         if in_hull and not self._differentiable_loops:
             return ConvexHull.from_points(points).padded(1e-4 * self._size)
-        length = sum(one.length for one in self._net_circles)
+        length = sum(circle.length for circle in self._net_circles)
         length += total_length(self._net_loops) if self._net_loops else 0.0
         reach = 1.0001 * length / math.sqrt(nearest * (_PERIOD - nearest))
         lower, upper = points.min(axis=0) - reach, points.max(axis=0) + reach
@@ -524,15 +534,15 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return tight_extent(proved, levels, lower, upper, max(8, _MOST_PAIRS // vertices))
 
     def with_cells(self, cells: bool = True) -> Self:
-        other = super().with_cells(cells)
-        other.has_variable_accuracy, other._extents = cells, TransientCache()
-        return other
+        field = super().with_cells(cells)
+        field.has_variable_accuracy, field._extents = cells, TransientCache()
+        return field
 
     def cells_pay_from(self) -> float:
         edges = sum(map(len, self._net_loops))
         is_fixed = not self._differentiable_loops and self.lift_bound_option != "paper"
-        few = not is_fixed or edges < _LEAST_EDGES
-        return math.inf if few else max(_LEAST_RAYS, _PAYS / edges)
+        never_pays = not is_fixed or edges < _LEAST_EDGES
+        return math.inf if never_pays else max(_LEAST_RAYS, _PAYS / edges)
 
     def describe(self) -> dict[str, Any]:
         return {
@@ -550,12 +560,12 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
 class _CurveData(UnitFrame):
     """The data of curves on a backend.
 
-    edges, circles: None if there are none.
-    plane: normal (x, y, z) and offset of the `PlanarRegion`, if there is one.
-    rounding: that of a point's position, in units of the curve. Near the curve p - center is exact,
-        division and the curve's own coordinates have a few roundings of size 1, and p itself was
-        rounded once, at the curve's distance from 0.
-    value_rounding: that of the angle, by the number of its edges (`LoopEdges.rounding`).
+    edges, circles: None if there are no edges or no circles.
+    plane: normal (x, y, z) and offset of the `PlanarRegion`; None without a region.
+    rounding: the rounding of a point's position, in units of the curve. Near the curve p - center
+        is exact, division and the curve's own coordinates have a few roundings of size 1, and p
+        itself was rounded once, at the curve's distance from 0.
+    value_rounding: the rounding of the angle, by the number of its edges (`LoopEdges.rounding`).
     """
 
     edges: LoopEdges | None
@@ -566,36 +576,39 @@ class _CurveData(UnitFrame):
     cells: CurveCells | None = None
 
     def at_detail(self, x: Vec3, detail: Real) -> tuple[CurveSums, CellErrors]:
-        """All sums at x, by the cells where there are any and the detail is at most 1."""
+        """All sums at x, with their errors; by the cells if there are cells and the detail is at
+        most 1."""
         if self.cells is None or self.edges is None:
             return self.sums(x), CellErrors(0.0, 0.0, self.value_rounding)
-        found, in_cells = self.cells.sums(x, detail <= 1)
-        others = sum_over_edges(self.edges, x, ~in_cells)
-        pairs = zip(vars(found.sums).values(), vars(others).values(), strict=True)
-        sums = CurveSums(*(dr.select(in_cells, one, other) for one, other in pairs))
-        left_out = CellErrors(
-            dr.select(in_cells, found.error, 0),
-            dr.select(in_cells, found.slope_error, 0),
-            dr.select(in_cells, found.rounding, self.value_rounding),
-            found,
+        cell_sums, in_cells = self.cells.sums(x, detail <= 1)
+        edge_sums = sum_over_edges(self.edges, x, ~in_cells)
+        pairs = zip(vars(cell_sums.sums).values(), vars(edge_sums).values(), strict=True)
+        sums = CurveSums(*(dr.select(in_cells, inner, outer) for inner, outer in pairs))
+        errors = CellErrors(
+            dr.select(in_cells, cell_sums.error, 0),
+            dr.select(in_cells, cell_sums.slope_error, 0),
+            dr.select(in_cells, cell_sums.rounding, self.value_rounding),
+            cell_sums,
             in_cells,
         )
         if self.circles is not None:
-            own = self.circles.sums(x)
-            sums = sums.plus(dataclasses.replace(CurveSums.of(own), circles=own))
-        return sums, left_out
+            circles = self.circles.sums(x)
+            sums = sums.plus(dataclasses.replace(CurveSums.of(circles), circles=circles))
+        return sums, errors
 
     def edge_rates(
         self, left_out: CellErrors, line: RayLine, lengths: tuple[Real, ...], active: Mask
     ) -> tuple[Real, ...]:
-        """Those of `rates_along`, by the cells where the sums are theirs."""
+        """`line_rates` of the edges, by the cells on the lanes whose sums are from the cells."""
         assert self.edges is not None
         if self.cells is None or left_out.cell is None:
             return line_rates(self.edges, line, lengths, active)
         inside = left_out.in_cells
-        others = line_rates(self.edges, line, lengths, active & ~inside)
-        own = self.cells.rates_along(left_out.cell, line, lengths, active & inside)
-        return tuple(fmin(one, other) for one, other in zip(own, others, strict=True))
+        outside_rates = line_rates(self.edges, line, lengths, active & ~inside)
+        cell_rates = self.cells.rates_along(left_out.cell, line, lengths, active & inside)
+        return tuple(
+            fmin(first, second) for first, second in zip(cell_rates, outside_rates, strict=True)
+        )
 
     def height(self, x: Vec3) -> Real:
         """The height of x over the plane."""
@@ -608,8 +621,8 @@ class _CurveData(UnitFrame):
         if self.edges is not None:
             parts.append(CurveSums.of(sum_over_edges(self.edges, x)))
         if self.circles is not None:
-            own = self.circles.sums(x)
-            parts.append(dataclasses.replace(CurveSums.of(own), circles=own))
+            circles = self.circles.sums(x)
+            parts.append(dataclasses.replace(CurveSums.of(circles), circles=circles))
         return functools.reduce(CurveSums.plus, parts)
 
 
@@ -618,7 +631,7 @@ class CellErrors:
     """Bounds of the truncation errors of value and gradient in FMM cells, and of the rounding of
     the value.
 
-    cell, in_cells: the sums in cells, and the lanes on which they were used.
+    cell, in_cells: the sums in cells, and the mask of the lanes on which they were used.
     """
 
     value: Real
@@ -630,8 +643,8 @@ class CellErrors:
 
 @dataclass(frozen=True)
 class CurveSums:
-    """Sums over edges and circles, as `EdgeSums`; circles: those over circles alone, None if there
-    are none."""
+    """Sums over edges and circles, as `EdgeSums`; circles: the sums over circles only, None if
+    there are no circles."""
 
     angle: Real
     gradient: Vec3
@@ -643,12 +656,12 @@ class CurveSums:
 
     @classmethod
     def of(cls, sums: EdgeSums | CircleSums) -> CurveSums:
-        """The sums over edges or circles alone."""
+        """The sums over edges or circles only."""
         integrals = sums.squares, sums.cubes, sums.fourths
         return cls(sums.angle, sums.gradient, sums.distance, *integrals)
 
     def plus(self, other: CurveSums) -> CurveSums:
-        """The sums of both."""
+        """The sums over the curves of both operands."""
         return CurveSums(
             self.angle + other.angle,
             self.gradient + other.gradient,
@@ -662,33 +675,34 @@ class CurveSums:
 
 def _convex_ball(angle: Real, distance: Real, error: Real) -> HarmonicBall:
     """The ball for curves in convex position, whose lift stays in (-6 pi, 6 pi) if its value at the
-    center is the principal one, in (-2 pi, 2 pi).
+    center is the principal value, in (-2 pi, 2 pi).
 
-    angle: the value, which need not be that one. error: of the angle: where it leaves two values
-    possible, the range holds those of both.
+    angle: the value, which may differ from the principal value by a multiple of 4 pi.
+    error: a bound of the error of the angle: if two principal values are possible, the range
+        contains the ranges of both.
     """
     principal = angle - _PERIOD * dr.round(angle / _PERIOD)
-    moved = angle - principal
-    wraps = dr.select(dr.abs(principal) > 0.5 * _PERIOD - error, _PERIOD, 0)
-    lower, upper = dr.select(principal < 0, wraps, 0), dr.select(principal > 0, wraps, 0)
-    return HarmonicBall(distance, moved - 1.5 * _PERIOD - lower, moved + 1.5 * _PERIOD + upper)
+    branch = angle - principal
+    period = dr.select(dr.abs(principal) > 0.5 * _PERIOD - error, _PERIOD, 0)
+    lower, upper = dr.select(principal < 0, period, 0), dr.select(principal > 0, period, 0)
+    return HarmonicBall(distance, branch - 1.5 * _PERIOD - lower, branch + 1.5 * _PERIOD + upper)
 
 
 def _along_curves(
-    on: _CurveData, x: Vec3, sums: CurveSums, left_out: CellErrors, direction: Vec3 | None
+    data: _CurveData, x: Vec3, sums: CurveSums, errors: CellErrors, direction: Vec3 | None
 ) -> tuple[Lipschitz, ...]:
-    """Promises at x, in unit coordinates, along a direction, if one is given."""
+    """Promises at x, in unit coordinates, along a direction; none if the direction is None."""
     if direction is None:
         return ()
-    line = RayLine(x, on.backend.Array3f(direction), on.rounding)
+    line = RayLine(x, data.backend.Array3f(direction), data.rounding)
 
     def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
-        found: list[tuple[Real, ...]] = []
-        if on.edges is not None:
-            found.append(on.edge_rates(left_out, line, lengths, active))
-        if on.circles is not None:
-            found.append(on.circles.line_rates(line, lengths, active))
-        return tuple(sum(several) for several in zip(*found, strict=True))
+        summands: list[tuple[Real, ...]] = []
+        if data.edges is not None:
+            summands.append(data.edge_rates(errors, line, lengths, active))
+        if data.circles is not None:
+            summands.append(data.circles.line_rates(line, lengths, active))
+        return tuple(sum(terms) for terms in zip(*summands, strict=True))
 
     return lipschitz_along(line, sums.gradient, sums.distance, rates)
 
@@ -702,18 +716,18 @@ def _read_only(loop: FloatArray) -> FloatArray:
 
 def _movable_loops(loops: Any) -> tuple[Any, tuple[Any, ...]]:
     """Curves as `validate_curves` takes them; and all loops, with Dr.Jit arrays as 3-vectors, if
-    some are Dr.Jit arrays."""
-    several = isinstance(loops, list | tuple)
-    parts: list[Any] = [*loops] if several else [loops]
+    there are Dr.Jit arrays among them."""
+    is_list = isinstance(loops, list | tuple)
+    parts: list[Any] = [*loops] if is_list else [loops]
     if not any(map(_is_drjit, parts)):
         return loops, ()
     parts = [
-        tensor_to_vectors(one, "a loop", CurveShapeError) if is_tensor(one) else one
-        for one in parts
+        tensor_to_vectors(loop, "a loop", CurveShapeError) if is_tensor(loop) else loop
+        for loop in parts
     ]
-    curves = [to_numpy(one) if _is_drjit(one) else one for one in parts]
-    movable = tuple(one for one in parts if not isinstance(one, Circle))
-    return curves if several else curves[0], movable
+    curves = [to_numpy(loop) if _is_drjit(loop) else loop for loop in parts]
+    movable = tuple(loop for loop in parts if not isinstance(loop, Circle))
+    return curves if is_list else curves[0], movable
 
 
 def _is_drjit(value: Any) -> bool:

@@ -1,13 +1,13 @@
 """Sums over the edges of closed curves, for rays that run along edges and for many points.
 
-- `line_rates`: how little a solid angle changes along a line that runs along an edge.
-- `TrailValues`: boundary parts of winding numbers at many points; values alone, fast.
+- `line_rates`: bounds of the change of a solid angle along a line, also along an edge.
+- `TrailValues`: boundary parts of winding numbers at many points; values only, fast.
 - `LiftedTrails`: the same along rays, with derivatives and bounds.
 
-Rays know their line. Balls beside a long edge are small, and a ray that runs along it would need
-thousands. An edge's share of the slope along a given line is of constant sign and vanishes where
-they are in one plane; the sums it takes, over curves and over the trees of meshes alike, are made
-only near the curve, on rays that hardly climb.
+Balls beside a long edge are small, and a ray that runs along it would need thousands of them. But
+the term of an edge in the slope along a fixed line has constant sign and vanishes if edge and line
+are in one plane. The sums of these terms, over curves and over the trees of meshes alike, are
+computed only near the curve, on rays along which f hardly changes.
 """
 
 from __future__ import annotations
@@ -42,22 +42,22 @@ if TYPE_CHECKING:
 
 __all__ = ["LiftedTrails", "RayLine", "add_edge_rates", "line_rates", "lipschitz_along"]
 
-# Bounds along the line of a ray are computed where the ray may run along the curve: where it is
-# nearer to it than the first fraction of the curve's size, and its slope is below the second
-# fraction of the gradient. Elsewhere only where the ray may run along a flat part of the surface:
-# where the slope is below the third fraction of the gradient.
+# Bounds along the line of a ray are computed if the ray may run along the curve: if it is nearer to
+# it than `_NEAR_CURVE` times the curve's size, and its slope is below `_NEAR_SLOPE` times the
+# gradient. Elsewhere only if the ray may run along a flat part of the surface: if the slope is
+# below `_FAR_SLOPE` times the gradient.
 _NEAR_CURVE, _NEAR_SLOPE, _FAR_SLOPE = 0.001, 0.25, 1e-3
 # The number of lengths for which bounds are computed: in geometric progression from half the
 # distance to the curve towards the size of the curve.
 _LENGTHS = 6
 
-# The rates for lengths, on lanes that are active.
+# A function of lengths and a mask: the rates for the lengths, on lanes that are active.
 Rates: TypeAlias = "Callable[[tuple[Real, ...], Mask], tuple[Real, ...]]"
 
 
 @dataclass(frozen=True)
 class RayLine:
-    """Lines x + s v, with lengths of order one; rounding: that of their points."""
+    """Lines x + s v, with lengths of order one; rounding: the rounding of their points."""
 
     x: Vec3
     v: Vec3
@@ -75,17 +75,17 @@ def lipschitz_along(
     """Lipschitz constants of f along lines, for lengths from half the distance to the curve towards
     its size; finite only on lanes where they may be worth their cost.
 
-    Along a straight edge the longest is of use, near its ends the others; along a flat part of the
-    surface, bounded by a plane curve, the shortest.
+    Along a straight edge the longest length is of use, near its ends the other lengths; along a
+    flat part of the surface, bounded by a plane curve, the shortest.
     """
-    slope, steepness = dr.dot(gradient, line.v), dr.norm(gradient)
-    flat = dr.select(distance < _NEAR_CURVE, _NEAR_SLOPE, _FAR_SLOPE) * steepness
+    slope, norm = dr.dot(gradient, line.v), dr.norm(gradient)
+    max_slope = dr.select(distance < _NEAR_CURVE, _NEAR_SLOPE, _FAR_SLOPE) * norm
     first = 0.5 * fmax(distance, type(distance)(1e-30))
-    longer, lengths = dr.power(first, -1 / _LENGTHS), [first]
+    ratio, lengths = dr.power(first, -1 / _LENGTHS), [first]
     for _ in range(_LENGTHS - 1):
-        lengths.append(lengths[-1] * longer)
-    found = rates(tuple(lengths), dr.abs(slope) < flat)
-    pairs = zip(found, lengths, strict=True)
+        lengths.append(lengths[-1] * ratio)
+    rate_bounds = rates(tuple(lengths), dr.abs(slope) < max_slope)
+    pairs = zip(rate_bounds, lengths, strict=True)
     return tuple(Lipschitz(rate * (1 + SUM_MARGIN), length) for rate, length in pairs)
 
 
@@ -98,8 +98,8 @@ def line_rates(
     active, which cost nothing if their neighbors are not active either.
 
     A ball about a point near the curve is as small as the distance to it, so a ray that runs along
-    a long edge would need thousands of them. Along a *given* line much more is known. With
-    a = p - x, e the edge from p to q and v the unit direction, an edge's share of df/ds at x + s v
+    a long edge would need thousands of balls. Along a *fixed* line there are better bounds. With
+    a = p - x, e the edge from p to q and v the unit direction, an edge's term of df/ds at x + s v
     is
 
         v . (a - s v) x e  w(s) = c w(s),   c = v . (a x e),   w(s) = integral over [0, 1] of
@@ -110,11 +110,11 @@ def line_rates(
 
         w <= 1/(rho^2 sqrt(rho^2 + h^2)),
 
-    for a point of the edge at length l from the nearest one is at least sqrt(rho^2 + l^2) away, and
-    the integral over an interval of l of length 2h is largest if it is centered. From x to x + s v,
-    |s| <= T, the distance falls by at most T, and nowhere below the distance rho' of the edge from
-    the whole line, nor below the distance rho" of the segment from the line through the edge (a ray
-    may meet that one at a small angle, far ahead). So for |s| <= T
+    for a point of the edge at length l from the nearest point is at least sqrt(rho^2 + l^2) away,
+    and the integral over an interval of l of length 2h is largest if it is centered. From x to
+    x + s v, |s| <= T, the distance falls by at most T, and nowhere below the distance rho' of the
+    edge from the whole line, nor below the distance rho" of the segment from the line through the
+    edge (a ray may meet that line at a small angle, far ahead). So for |s| <= T
 
         |f(x + s v) - f(x)| <= |s| K,   K = sum_e |c| / (rho^2 sqrt(rho^2 + h^2)),
                                         rho = max(d_e - T, rho', rho").
@@ -133,10 +133,10 @@ def add_edge_rates(
 ) -> tuple[Real, ...]:
     """The rates with an edge added, relative to the line's x.
 
-    m = a x v and n = e x v are a and e projected along the line and turned by a right angle.
+    m = a x v and n = e x v are a and e projected along the line and rotated by a right angle.
     Distances in the plane across the line are computed from them, and so is c = v . m x n, which is
-    then small where both are, whatever the lengths of a and e: its error is at most 8 epsilon |m|
-    |e| and slack |n|.
+    then small if both are, whatever the lengths of a and e: its error is at most 8 epsilon |m| |e|
+    and slack |n|.
     """
     a, e, inverse, slack = edge.a, edge.e, edge.inverse_square_length, line.slack
     epsilon = float(dr.epsilon(type(inverse)))
@@ -145,32 +145,34 @@ def add_edge_rates(
     quarter = 0.25 * dr.rcp(inverse)  # h^2
     c += 16 * epsilon * dr.norm(m) * dr.sqrt(quarter) + 2 * slack * dr.norm(n)
     square = dr.squared_norm(n)
-    foot = dr.select(square > 0, clamp(-dr.dot(m, n) / square, 0, 1), 0)
-    passing = dr.norm(dr.fma(type(a)(foot), n, m)) - slack
+    t = dr.select(square > 0, clamp(-dr.dot(m, n) / square, 0, 1), 0)
+    line_distance = dr.norm(dr.fma(type(a)(t), n, m)) - slack
     distance = dr.sqrt(edge.squared_distance) - slack
     # (a - s v) x e = area + s n, of length |e| times the distance from the line through the edge.
     area, per_length = dr.cross(a, e), dr.sqrt(inverse)
-    nearest = dr.select(square > 0, -dr.dot(area, n) / square, 0)
-    grown: list[Real] = []
+    s_nearest = dr.select(square > 0, -dr.dot(area, n) / square, 0)
+    new_rates: list[Real] = []
     for length, rate in zip(lengths, rates, strict=True):
-        s = clamp(nearest, -length, length)
-        through = dr.norm(dr.fma(type(a)(s), n, area)) * per_length - slack
-        rho = fmax(fmax(distance - length, passing), through)
+        s = clamp(s_nearest, -length, length)
+        segment_distance = dr.norm(dr.fma(type(a)(s), n, area)) * per_length - slack
+        rho = fmax(fmax(distance - length, line_distance), segment_distance)
         square = rho * rho
         term = c * dr.rcp(square) * dr.rsqrt(square + quarter)
         # Infinite where the line may meet the edge.
-        grown.append(rate + dr.select(rho > 0, term, dr.inf))
-    return tuple(grown)
+        new_rates.append(rate + dr.select(rho > 0, term, dr.inf))
+    return tuple(new_rates)
 
 
 # Values at many points.
 
-# Edges of a record: its five vertices and the number of its edges fill two packets of eight.
+# The number of edges of a record: its five vertices and its number of edges fill two packets of
+# eight.
 _EDGES_PER_RECORD = 4
-# Points of a lane: as many as registers hold, by experiment.
+# The number of points of a lane: as many as registers hold, by experiment.
 _POINTS_PER_LANE = 3
-# Signs of `side` are not trusted where it is closer to zero than this many rounding errors of its
-# products; its own are six at most, those of `tree.triangle_tree.edge_function` one.
+# Signs of imaginary parts of factors count as uncertain if they are closer to zero than this many
+# rounding errors of their products; their own errors are six at most, and
+# `tree.triangle_tree.edge_function` has one.
 _SIDE_ROUNDINGS = 16
 # Beyond this distance, in sizes of the mesh, the products of lengths could leave float32.
 _FAR = 1024.0
@@ -201,7 +203,7 @@ class _FloatFormat:
         return bits >> (self.mantissa + self.bias.bit_length() + 1)
 
     def reciprocal_power_of_two(self, x: Real) -> Real:
-        """The power of two that brings x > 0 between one and two."""
+        """The power of two that scales x > 0 to between one and two."""
         exponent = dr.reinterpret_array(self.integer, x) & ((2 * self.bias + 1) << self.mantissa)
         return dr.reinterpret_array(type(x), (2 * self.bias << self.mantissa) - exponent)
 
@@ -225,12 +227,12 @@ class _AngleProduct:
     def times(self, bits: _FloatFormat, factor: Complex) -> _AngleProduct:
         """The product with a further factor.
 
-        The factor's argument, in [-pi, pi], takes theta at most one half plane forward, or one back
+        The factor's argument, in [-pi, pi], moves theta at most one half plane forward, or one back
         if the sign bit of its imaginary part is set; and it does so exactly if the sign of y
         changes. That holds for the computed y as well: its sign differs from that of the exact
         value only if its two terms cancel, and then the exact theta is close to the very multiple
-        of pi that the count says it has crossed (arguments of like signs and y x' < 0: about +-pi;
-        of unlike signs: about 0). A term that underflows keeps its sign bit.
+        of pi that the count of half turns has crossed (arguments of like signs and y x' < 0: about
+        +-pi; of unlike signs: about 0). A term that underflows keeps its sign bit.
         """
         x = dr.fma(self.x, factor[0], -(self.y * factor[1]))
         y = dr.fma(self.x, factor[1], self.y * factor[0])
@@ -238,13 +240,13 @@ class _AngleProduct:
         return _AngleProduct(x, y, self.half + (changes & (bits.sign(factor[1]) | 1)))
 
     def times_product(self, bits: _FloatFormat, other: _AngleProduct) -> _AngleProduct:
-        """The product with another one, whose half turns are added."""
+        """The product with another product, whose half turns are added."""
         z = self.times(bits, (other.x, other.y))
         return _AngleProduct(z.x, z.y, z.half + ((other.half + 1) & -2))
 
     def scaled(self, bits: _FloatFormat) -> tuple[_AngleProduct, Real]:
-        """The same with length about one, and the length it had. Scaling by a power of two is
-        exact."""
+        """The same product with a length of about one, and its length before. Scaling by a power of
+        two is exact."""
         length = dr.abs(self.x) + dr.abs(self.y)
         scale = bits.reciprocal_power_of_two(length)
         return _AngleProduct(self.x * scale, self.y * scale, self.half), length
@@ -266,22 +268,26 @@ class TrailValues:
     chain of triangles enters every vertex as often as it leaves it, so that its edges form closed
     trails. The part of a factor that belongs to a vertex is computed once and not for each of its
     edges; a record of edges is fetched once for several points; there are no divisions. Points at
-    which rounding could have changed a sign are marked, so that `edge_lift` computes them again.
+    which rounding could have changed a sign are marked, so that they can be computed again by
+    `edge_lift`.
     """
 
     records: RecordTable
 
     @classmethod
     def upload(cls, backend: Backend, vertices: FloatArray, edges: IntArray) -> TrailValues:
-        """Edges (k, 2) between vertices (n, 3), as often out of a vertex as into it."""
+        """Edges (k, 2) between vertices (n, 3), which leave each vertex as often as they enter
+        it."""
         rows: list[FloatArray] = []
         for trail in closed_trails(edges):
             count = len(trail) - 1
-            trips = -(-count // _EDGES_PER_RECORD)
-            first = _EDGES_PER_RECORD * np.arange(trips)[:, None]
+            record_count = -(-count // _EDGES_PER_RECORD)
+            first = _EDGES_PER_RECORD * np.arange(record_count)[:, None]
             index = np.minimum(first + np.arange(_EDGES_PER_RECORD + 1), count)
-            filled = np.minimum(count - first, _EDGES_PER_RECORD)
-            rows.append(np.concatenate([vertices[trail[index]].reshape(trips, -1), filled], 1))
+            edge_counts = np.minimum(count - first, _EDGES_PER_RECORD)
+            rows.append(
+                np.concatenate([vertices[trail[index]].reshape(record_count, -1), edge_counts], 1)
+            )
         return cls(RecordTable.upload(backend, np.concatenate(rows)))
 
     def turns(self, x: Vec3, ray_sign: Real) -> tuple[Real, Mask]:
@@ -289,34 +295,34 @@ class TrailValues:
 
         ray_sign: 1 for the direction d = z; -1 for x and the edges mirrored in a plane z = const.
 
-        Each lane of the kernel takes several points. The mask holds where rounding could have
-        changed the sign of a `side`, where a product of factors nearly underflows (near an edge or
-        a short one), and farther than 1024 mesh sizes away along any axis.
+        Each lane of the kernel computes several points. The mask is true where rounding could have
+        changed the sign of an imaginary part, where a product of factors nearly underflows (near an
+        edge or a short edge), and farther than 1024 mesh sizes away along any axis.
         """
         dr.eval(x, ray_sign)
         backend, n = self.records.backend, dr.width(x)
         real, index = backend.Float, backend.UInt32
         lanes = -(-n // _POINTS_PER_LANE)
         lane = dr.arange(index, lanes)
-        apart, last = dr.opaque(index, lanes), dr.opaque(index, n - 1)  # for any n one kernel
-        places = [dr.minimum(lane + k * apart, last) for k in range(_POINTS_PER_LANE)]
+        stride, last = dr.opaque(index, lanes), dr.opaque(index, n - 1)  # for any n one kernel
+        point_ids = [dr.minimum(lane + k * stride, last) for k in range(_POINTS_PER_LANE)]
         points = [
-            (dr.gather(backend.Array3f, x, place), dr.gather(real, ray_sign, place))
-            for place in places
+            (dr.gather(backend.Array3f, x, point_id), dr.gather(real, ray_sign, point_id))
+            for point_id in point_ids
         ]
-        products, doubts = self._over_records(points)
-        turns = [-one.turns() for one in products]  # of conjugate factors
-        dr.eval(*turns, *doubts)
-        all_turns, all_doubts = dr.empty(real, n), dr.empty(real, n)
-        for place, turn, doubt in zip(places, turns, doubts, strict=True):
-            dr.scatter(all_turns, turn, place)
-            dr.scatter(all_doubts, doubt, place)
-        far = max_norm(x) > _FAR
-        return all_turns, (all_doubts <= 0) | far
+        products, margins = self._over_records(points)
+        turns = [-product.turns() for product in products]  # of conjugate factors
+        dr.eval(*turns, *margins)
+        all_turns, all_margins = dr.empty(real, n), dr.empty(real, n)
+        for point_id, turn, margin in zip(point_ids, turns, margins, strict=True):
+            dr.scatter(all_turns, turn, point_id)
+            dr.scatter(all_margins, margin, point_id)
+        is_far = max_norm(x) > _FAR
+        return all_turns, (all_margins <= 0) | is_far
 
     def _over_records(self, points: list[Point]) -> tuple[list[_AngleProduct], list[Real]]:
-        """For each point the product of all factors, and a number that is at most 0 where it is
-        uncertain."""
+        """For each point the product of all factors, and a number that is at most 0 if the product
+        is uncertain."""
         backend = self.records.backend
         real, bits = backend.Float, _FloatFormat.of(backend)
         slack = real(-_SIDE_ROUNDINGS * 0.5 * backend.machine_epsilon)
@@ -325,76 +331,77 @@ class TrailValues:
             # Edges that pad a record lead from a vertex to itself: they are never uncertain.
             slacks = [dr.select(row[15] > k, slack, 1) for k in range(_EDGES_PER_RECORD)]
             pairs = zip(points, state, strict=True)
-            return tuple(_with_record(bits, row, slacks, x, old) for x, old in pairs)
+            return tuple(_with_record(bits, row, slacks, x, previous) for x, previous in pairs)
 
-        one = (real(1), real(0), bits.integer(0), real(1))
-        out = self.records.for_each(add, tuple(one for _ in points), "trails")
-        return [_AngleProduct(*one[:3]) for one in out], [one[3] for one in out]
+        entry = (real(1), real(0), bits.integer(0), real(1))
+        products = self.records.for_each(add, tuple(entry for _ in points), "trails")
+        return [_AngleProduct(*entry[:3]) for entry in products], [entry[3] for entry in products]
 
 
 def _with_record(
     bits: _FloatFormat, row: list[Real], slacks: list[Real], x: Point, state: tuple[Any, ...]
 ) -> tuple[Any, ...]:
-    """The product (x, y, half) and the number of `_over_records` with the four edges of a record.
+    """The product (x, y, half) and the number of `_over_records`, with the four edges of a record
+    added.
 
-    The four are multiplied among themselves first: that product has an argument of nearly zero,
-    where rounding has the least effect.
+    The four factors are multiplied with each other first: their product has an argument of nearly
+    zero, where rounding has the least effect.
     """
-    z, doubt = _AngleProduct(*state[:3]), state[3]
+    z, margin = _AngleProduct(*state[:3]), state[3]
     smallest = 2.0**-100 if bits.mantissa < 50 else 2.0**-800
     a = _relative_vertex(bits, row[0:3], x)
     part: _AngleProduct | None = None
     for k in range(_EDGES_PER_RECORD):
         b = _relative_vertex(bits, row[3 * k + 3 : 3 * k + 6], x)
-        factor, sure = _factor(a, b, slacks[k])
-        doubt = fmin(sure, doubt)
+        factor, sign_margin = _factor(a, b, slacks[k])
+        margin = fmin(sign_margin, margin)
         part = _AngleProduct.of(bits, factor) if part is None else part.times(bits, factor)
         if k == 1:
             part, length = part.scaled(bits)
-            doubt = fmin(length - smallest, doubt)
+            margin = fmin(length - smallest, margin)
         a = b
     z, length = z.times_product(bits, cast("_AngleProduct", part)).scaled(bits)
-    return z.x, z.y, z.half, fmin(length - smallest, doubt)
+    return z.x, z.y, z.half, fmin(length - smallest, margin)
 
 
 def _relative_vertex(bits: _FloatFormat, vertex: list[Real], point: Point) -> Seen:
-    """A vertex relative to a point: (u t, v t, s t) with t = |a| + |z| and s = |a| - way z.
+    """A vertex relative to a point: (u t, v t, s t) with t = |a| + |z| and s = |a| - ray_sign z.
 
     s t is (|a| + |z|)^2 or u^2 + v^2, so that no difference cancels.
     """
-    x, way = point
+    x, ray_sign = point
     u, v, z = vertex[0] - x[0], vertex[1] - x[1], vertex[2] - x[2]
-    across = dr.fma(u, u, v * v)
-    t = dr.sqrt(dr.fma(z, z, across)) + dr.abs(z)
-    signs = dr.reinterpret_array(bits.integer, z) ^ dr.reinterpret_array(bits.integer, way)
-    s = dr.select(signs < 0, t * t, across)
+    square = dr.fma(u, u, v * v)
+    t = dr.sqrt(dr.fma(z, z, square)) + dr.abs(z)
+    signs = dr.reinterpret_array(bits.integer, z) ^ dr.reinterpret_array(bits.integer, ray_sign)
+    s = dr.select(signs < 0, t * t, square)
     return u * t, v * t, s
 
 
 def _factor(a: Seen, b: Seen, slack: Real) -> tuple[Complex, Real]:
-    """The conjugate of F_e times a positive number; and a number that is at most 0 where its sign
-    is uncertain."""
-    back = a[1] * b[0]
-    im = dr.fma(a[0], b[1], -back)
+    """The conjugate of F_e times a positive number; and a number that is at most 0 if the sign of
+    its imaginary part is uncertain."""
+    product = a[1] * b[0]
+    im = dr.fma(a[0], b[1], -product)
     re = dr.fma(a[2], b[2], dr.fma(a[0], b[0], a[1] * b[1]))
-    return (re, im), dr.fma(dr.abs(back), slack, dr.abs(im))
+    return (re, im), dr.fma(dr.abs(product), slack, dr.abs(im))
 
 
 def closed_trails(edges: IntArray) -> list[IntArray]:
     """Directed edges (k, 2) as trails of vertices, each ending where it begins; each edge once.
 
     Raises:
-        ValueError: an edge leads to a vertex from which none goes on.
+        ValueError: an edge leads to a vertex that no further edge leaves.
     """
-    onwards: defaultdict[int, list[int]] = defaultdict(list)
+    successors: defaultdict[int, list[int]] = defaultdict(list)
     for a, b in edges.tolist():
-        onwards[a].append(b)
+        successors[a].append(b)
     trails: list[IntArray] = []
-    for start in list(onwards):
-        while onwards[start]:
+    for start in list(successors):
+        while successors[start]:
             trail = [start]
-            while onwards[trail[-1]]:
-                trail.append(onwards[trail[-1]].pop())
+            while successors[trail[-1]]:
+                trail.append(successors[trail[-1]].pop())
             if trail[-1] != start:
                 raise ValueError(f"edges: not closed, more go to vertex {trail[-1]} than from it")
             trails.append(np.array(trail, np.int64))
@@ -403,7 +410,7 @@ def closed_trails(edges: IntArray) -> list[IntArray]:
 
 # Sums along rays.
 
-# Edges of a record: of these two, that which wastes less memory for padding.
+# Possible numbers of edges of a record; the number that wastes less memory for padding is used.
 _RECORD_SIZES = 3, 4
 
 
@@ -411,12 +418,12 @@ _RECORD_SIZES = 3, 4
 class LiftedTrails:
     """Closed trails of edges on a backend, as records of `edges_per_record` consecutive edges.
 
-    For `edge_lift`'s sum along rays, edge by edge, with decisions made by the same bits. The part
+    For the sum of `edge_lift` along rays, edge by edge, with decisions from the same bits. The part
     of a factor that belongs to a vertex is computed once and not for each of its edges, and roots
     and divisions, which cost most, are shared by edges where a bound allows it.
 
-    A record holds run + 1 vertices, run numbers 1/length^2, and run lengths: negative where the
-    edge runs from a higher to a lower index, 0 where there is no edge.
+    With run = `edges_per_record`, a record holds run + 1 vertices, run numbers 1/length^2, and run
+    lengths: negative if the edge runs from a higher to a lower index, 0 if there is no edge.
     """
 
     records: RecordTable
@@ -434,12 +441,12 @@ class LiftedTrails:
         return cls(RecordTable.upload(backend, np.concatenate(rows)), run)
 
     def sum(self, frame: RayFrame, x: Vec3, active: Mask = True) -> SourceSums:
-        """The sum of Omega_e at points x of rays, where active, and what promises are made of.
+        """The sum of Omega_e at points x of rays, where active, and the sums that promises need.
 
         Derivatives. With w of `Edge`, L w is the integral of |dp|/rho^3 over an edge, and 1/d times
         that bounds the integral of |dp|/rho^4, d the distance to it; for all edges of a record the
-        d of the nearest serves. So they add to the remainder what s4 += L w/4 and s5 += 3 L w/(16
-        d) do (`LiftedEdge.bounds`).
+        d of the nearest edge gives a bound. So the terms s4 += L w/4 and s5 += 3 L w/(16 d) bound
+        their part of the remainder (`LiftedEdge.bounds`).
 
         Rounding. As in `LiftedEdge.bounds`, with Biot and Savart's field, which is at most d L w,
         for 2 e': |a x e| is the length of e times the distance from its line. By Cauchy and Schwarz
@@ -448,39 +455,39 @@ class LiftedTrails:
         """
         backend = self.records.backend
         real, unit = backend.Float, fmax(coordinate_rounding(frame.o), coordinate_rounding(x))
-        own = 0.5 * backend.machine_epsilon * FACTOR_ROUNDINGS * self.edges_per_record
-        steep = 0.5 * backend.machine_epsilon * STEEP_ROUNDINGS
+        factor_rounding = 0.5 * backend.machine_epsilon * FACTOR_ROUNDINGS * self.edges_per_record
+        steep_rounding = 0.5 * backend.machine_epsilon * STEEP_ROUNDINGS
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            product, g, least, rounding, s4, s5 = state
+            product, g, min_square, rounding, s4, s5 = state
             product = LiftedProduct(*product)
             a = view_vertex(self._vertex(row, 0), frame, x)
-            total, spread, nearest, longest = real(0), real(0), real(dr.inf), real(0)
+            total, weighted, nearest, longest = real(0), real(0), real(dr.inf), real(0)
             for k in range(self.edges_per_record):
                 p, q = self._vertex(row, k), self._vertex(row, k + 1)
-                inverse, signed = self._edge(row, k)
+                inverse, length = self._edge(row, k)
                 b = view_vertex(q, frame, x)
-                re, im = ends_factor(a, b, signed)
-                is_edge = signed != 0
+                re, im = ends_factor(a, b, length)
+                is_edge = length != 0
                 product = product.times(dr.select(is_edge, re, 1), dr.select(is_edge, im, 0))
                 edge = Edge(a.offset, b.offset, q - p, inverse)
                 w, c = edge.biot_savart_of_lengths(a.length, b.length)
                 g = dr.fma(type(g)(w), c, g)
-                integral = dr.abs(signed) * w
+                integral = dr.abs(length) * w
                 square = dr.select(is_edge, edge.squared_distance, dr.inf)
                 total, nearest = total + integral, fmin(nearest, square)
-                longest = fmax(longest, dr.abs(signed))
-                spread = spread + dr.select(is_edge, integral * square, 0)
+                longest = fmax(longest, dr.abs(length))
+                weighted = weighted + dr.select(is_edge, integral * square, 0)
                 a = b
             distance = fmax(dr.sqrt(nearest) - 2 * unit, 0)
-            field = dr.fma(steep, longest, unit) * dr.sqrt(total * spread)
-            rounding = rounding + (field + own)
+            field = dr.fma(steep_rounding, longest, unit) * dr.sqrt(total * weighted)
+            rounding = rounding + (field + factor_rounding)
             s5 = dr.fma(0.1875 * total, dr.rcp(distance), s5)
-            return product.parts(), g, fmin(nearest, least), rounding, s4 + 0.25 * total, s5
+            return product.parts(), g, fmin(nearest, min_square), rounding, s4 + 0.25 * total, s5
 
-        one = LiftedProduct.identity(real).parts()
-        start = (one, backend.Array3f(0), real(dr.inf), real(0), real(0), real(0))
-        product, g, least, rounding, s4, s5 = self.records.for_each(
+        identity = LiftedProduct.identity(real).parts()
+        start = (identity, backend.Array3f(0), real(dr.inf), real(0), real(0), real(0))
+        product, g, min_square, rounding, s4, s5 = self.records.for_each(
             add, start, "trails along", active
         )
         sums = SourceSums.zero(backend, dr.inf, 1)
@@ -489,7 +496,7 @@ class LiftedTrails:
             total=LiftedProduct(*product).angle(),
             gradient=g,
             rounding=rounding,
-            singularity_distance=dr.sqrt(least),
+            singularity_distance=dr.sqrt(min_square),
             s4=s4,
             s5=s5,
         )
@@ -504,13 +511,15 @@ class LiftedTrails:
 
 
 def _rows(vertices: FloatArray, trail: IntArray, run: int) -> FloatArray:
-    """Records of a trail; edges that pad the last one have no length."""
+    """Records of a trail; edges that pad the last record have length 0."""
     count = len(trail) - 1
-    trips = -(-count // run)
-    index = np.minimum(run * np.arange(trips)[:, None] + np.arange(run + 1), count)
+    record_count = -(-count // run)
+    index = np.minimum(run * np.arange(record_count)[:, None] + np.arange(run + 1), count)
     path = trail[index]
-    begin, end = path[:, :-1], path[:, 1:]
-    inverse = inverse_squares((vertices[end] - vertices[begin]).reshape(-1, 3)).reshape(trips, run)
-    length = np.where(begin < end, 1, -1) / np.sqrt(inverse)
+    start, end = path[:, :-1], path[:, 1:]
+    inverse = inverse_squares((vertices[end] - vertices[start]).reshape(-1, 3)).reshape(
+        record_count, run
+    )
+    length = np.where(start < end, 1, -1) / np.sqrt(inverse)
     length = np.where(index[:, :-1] < index[:, 1:], length, 0)
-    return np.concatenate([vertices[path].reshape(trips, -1), inverse, length], axis=1)
+    return np.concatenate([vertices[path].reshape(record_count, -1), inverse, length], axis=1)

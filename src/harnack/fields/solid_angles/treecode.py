@@ -1,9 +1,9 @@
-"""Sums over a tree of dipoles: far clusters as multipoles, near primitives one by one.
+"""Sums over a tree of dipoles: multipole moments of far clusters, direct sums over near primitives.
 
-- `traverse_clusters`: visits a tree so that far clusters are taken as a whole.
-- `Treecode`: the sums over such a tree; what triangles and points share. The caller adds the
+- `traverse_clusters`: a traversal of a tree with its far clusters.
+- `Treecode`: the sums over such a tree, shared by triangles and points. The caller adds the
   primitives of near leaves.
-- `multipole_terms`: what a far node adds to value, gradient and Hessian.
+- `multipole_terms`: the terms of a far node in value, gradient and Hessian.
 - `dipole_records`, `records_in_slots`: oriented points as records, also in the leaves of a tree.
 """
 
@@ -54,10 +54,10 @@ class ClusterView:
 
     head: its numbers that every visit reads.
     payload: its other numbers, fetched where it is far.
-    r: from its center to x.
+    r: the vector from its center to x.
     square: |r|^2, plus the square of the height.
     inverse: 1/sqrt(square), or 0 where the node is not far.
-    far: whether it is far enough to be taken as a whole.
+    far: whether it is far enough to use its moments.
     """
 
     head: tuple[Real, ...]
@@ -75,10 +75,10 @@ def traverse_clusters(
     tree: PackedTree, x: Vec3, closer: Real, add_cluster: EachCluster,
     add_primitive: PrimitiveBody, state: State, active: Mask = True, height_square: Real = 0.0,
 ) -> State:  # fmt: skip
-    """The state after a walk over a tree whose nodes begin with their center and the distance from
-    which on they may be taken as a whole.
+    """The state after the traversal of a tree whose nodes begin with their center and the distance
+    from which on their moments may be used.
 
-    closer: nodes are taken as a whole from so many times that distance on.
+    closer: the moments of nodes are used from this many times that distance on.
     add_cluster: from a cluster and the state, the state with the node added where it is far.
     add_primitive: as for `tree.for_each_primitive`, for the leaves that are not far.
     height_square: added to the squares of all distances: in four dimensions, the square of the
@@ -89,16 +89,16 @@ def traverse_clusters(
     def visit(node: VisitedNode, state: State) -> tuple[Mask, State]:
         r = x - vector(*node.head[:3])
         square = dr.squared_norm(r) + height_square
-        far = square > dr.square(node.head[3] * closer)
-        inverse = dr.select(far, dr.rsqrt(square), 0)
-        cluster = ClusterView(node.head, node.payload(far), r, square, inverse, far)
+        is_far = square > dr.square(node.head[3] * closer)
+        inverse = dr.select(is_far, dr.rsqrt(square), 0)
+        cluster = ClusterView(node.head, node.payload(is_far), r, square, inverse, is_far)
         state = add_cluster(cluster, state)
-        return ~far, for_each_primitive(node, ~far & node.is_leaf, add_primitive, state)
+        return ~is_far, for_each_primitive(node, ~is_far & node.is_leaf, add_primitive, state)
 
     return traverse(tree, visit, state, active)
 
 
-# The most dipoles in a leaf, and the children of a node: by experiment.
+# The largest number of dipoles in a leaf, and the number of children of a node: by experiment.
 _LEAF_SIZE, _ARITY = 8, 4
 
 
@@ -108,13 +108,16 @@ def dipole_hierarchy(points: FloatArray) -> BalancedTree:
 
 
 def dipole_records(points: FloatArray, moments: FloatArray) -> FloatArray:
-    """(n, 8) records: position, moment, its length, 0. moments: (n, 3) area times normal."""
+    """(n, 8) records: position, moment, its length, 0.
+
+    moments: (n, 3) area times normal.
+    """
     weight = np.linalg.norm(moments, axis=1, keepdims=True)
     return np.concatenate([points, moments, weight, np.zeros_like(weight)], axis=1)
 
 
 def empty_record(row: FloatArray) -> FloatArray:
-    """Records (..., 8) at the places of dipoles (..., 8), without a moment, which add nothing."""
+    """Records (..., 8) at the positions of dipoles (..., 8), with moment 0, which add nothing."""
     empty = np.zeros_like(row)
     empty[..., :3] = row[..., :3]
     return empty
@@ -129,11 +132,12 @@ def records_in_slots(tree: BalancedTree, rows: FloatArray) -> FloatArray:
 
 
 def multipole_terms(c: Sequence[Real], r: Vec3, inverse: Real, derivatives: int) -> SourceTerm:
-    """sum_l P_l(r)/r^(2l+1) for l = 1, 2, 3, and its derivatives, with the coefficients c that
-    `multipole.cartesian_coefficients` lays out; inverse = 1/|r|.
+    """sum_l P_l(r)/r^(2l+1) for l = 1, 2, 3, and its derivatives, with the coefficients c in the
+    order of `multipole.cartesian_coefficients`; inverse = 1/|r|.
 
-    derivatives: 0 for the value, 1 with the gradient, 2 with the Hessian too. With u = 1/|r|,
-    G_l = grad P_l (so that l P_l = G_l.r by Euler) and H_l the Hessian of P_l,
+    derivatives: 0 for the value, 1 with the gradient, 2 with the Hessian, too.
+
+    With u = 1/|r|, G_l = grad P_l (so that l P_l = G_l.r by Euler) and H_l the Hessian of P_l,
 
         f      = sum P_l u^(2l+1)
         grad f = sum G_l u^(2l+1) - s r,           s = sum (2l+1) P_l u^(2l+3)
@@ -177,8 +181,8 @@ def multipole_terms(c: Sequence[Real], r: Vec3, inverse: Real, derivatives: int)
 def _hessian(
     c: Sequence[Real], r: Vec3, g: tuple[Vec3, ...], p: tuple[Real, ...], u: tuple[Real, Real]
 ) -> SymmetricMatrix:
-    """The Hessian of `multipole_terms`; g and p are scaled by powers of u to the size of those of l
-    = 1."""
+    """The Hessian of `multipole_terms`; g and p are scaled by powers of u to the size of the terms
+    with l = 1."""
     x, y, z = r
     (g1, g2, g3), (p1, p2, p3), (u2, u3) = g, p, u
     u4 = u2 * u2
@@ -202,8 +206,8 @@ def _hessian(
         (v.x * y, v.y * x), (v.x * z, v.z * x), (v.y * z, v.z * y),
     )  # fmt: skip
     parts = [
-        (square * u2 + cube * u4 - one - other + w * a * b - (s if k < 3 else 0)) * u3
-        for k, (square, cube, (one, other), (a, b)) in enumerate(
+        (square * u2 + cube * u4 - left - right + w * a * b - (s if k < 3 else 0)) * u3
+        for k, (square, cube, (left, right), (a, b)) in enumerate(
             zip(squares, cubes, crossed, pairs, strict=True)
         )
     ]
@@ -212,11 +216,11 @@ def _hessian(
 
 ExtraState: TypeAlias = "tuple[Any, ...]"
 
-# Coarse evaluations take nodes as a whole beyond this many times their radius.
+# Coarse evaluations use the moments of nodes beyond this many times their radius.
 _COARSE_RATIO = 2.5
 # The number of roundings by which the gradient of a far node itself may be wrong.
 _FAR_GRADIENT_ROUNDINGS = 64.0
-# The free distance, in units of coordinates, if no term bounds it.
+# The distance that is free of sources, in units of coordinates, if no term bounds it.
 _NO_SOURCE_DISTANCE = 1e4
 
 # A function of a record, a mask, the sums, and a further state of the caller. It returns sums and
@@ -244,7 +248,7 @@ class Treecode:
     tree: the nodes, with the records of `node_records`.
     accuracy: at accuracy scale 1, nodes are far beyond this many times their radius.
     coarse_ratio: the same number for coarse evaluations.
-    order: of the multipole moments.
+    order: the order of the multipole moments.
     coarse_error_ratio: the truncation error of a coarse evaluation is at most this many times the
         stored bound.
     gradient_error_ratio, hessian_error_ratio: at distance r, the truncation error of the gradient
@@ -280,23 +284,23 @@ class Treecode:
         the median of the ratio of the two bounds.
         """
         rough = min(accuracy, _COARSE_RATIO)
-        close = [truncation_bounds(level, accuracy * level.radius, order) for level in levels]
-        roughly = [truncation_bounds(level, rough * level.radius, order) for level in levels]
-        looser = _median_ratio(roughly[0][0], close[0][0])
+        fine_bounds = [truncation_bounds(level, accuracy * level.radius, order) for level in levels]
+        coarse_bounds = [truncation_bounds(level, rough * level.radius, order) for level in levels]
+        factor = _median_ratio(coarse_bounds[0][0], fine_bounds[0][0])
         nodes: list[FloatArray] = []
-        steeper = bent = 0.0
-        for level, *bounds in zip(levels, close, roughly, strict=True):
+        slope_max = second_max = 0.0
+        for level, *bounds in zip(levels, fine_bounds, coarse_bounds, strict=True):
             error, slope, second = (
-                np.maximum(one, other / looser) for one, other in zip(*bounds, strict=True)
+                np.maximum(fine, coarse / factor) for fine, coarse in zip(*bounds, strict=True)
             )
-            some = error > 0
-            steeper = max(steeper, float((slope[some] / error[some]).max(initial=0.0)))
-            bent = max(bent, float((second[some] / error[some]).max(initial=0.0)))
+            nonzero = error > 0
+            slope_max = max(slope_max, float((slope[nonzero] / error[nonzero]).max(initial=0.0)))
+            second_max = max(second_max, float((second[nonzero] / error[nonzero]).max(initial=0.0)))
             nodes.append(node_records(level, order, rough, error))
         packed = pack_tree(backend, tree, nodes, primitives)
-        ratios = looser, steeper * (1 + 1e-6), bent * (1 + 1e-6)
-        on_device = (dr.opaque(backend.Float, ratio) for ratio in ratios)
-        return cls(backend, packed, accuracy, rough, order, *on_device)
+        ratios = factor, slope_max * (1 + 1e-6), second_max * (1 + 1e-6)
+        uploaded = (dr.opaque(backend.Float, ratio) for ratio in ratios)
+        return cls(backend, packed, accuracy, rough, order, *uploaded)
 
     @property
     def coarsest_accuracy(self) -> float:
@@ -304,7 +308,7 @@ class Treecode:
         return self.coarse_ratio / self.accuracy
 
     def acceptance_ratio(self, detail: Real) -> Real:
-        """The distance from which on nodes are taken as a whole, in radii of the node."""
+        """The distance from which on the moments of a node are used, in radii of the node."""
         return fmax(self.accuracy * detail, self.backend.Float(self.coarse_ratio))
 
     def sums(
@@ -315,7 +319,8 @@ class Treecode:
 
         detail: the accuracy scale of `Field.at_accuracy`; infinity gives the direct sum.
         add: adds a primitive of a near leaf (`AddPrimitive`).
-        derivatives: 0 for the value alone, 1 with the gradient, 2 with the Hessian.
+        own: the caller's own state, which `add` updates.
+        derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
         """
         free, closer = (
             free_radius_fraction(self.coarse_ratio),
@@ -325,14 +330,14 @@ class Treecode:
 
         def add_cluster(node: ClusterView, state: ExtraState) -> ExtraState:
             c, inverse = node.payload, node.inverse
-            left_out = c[15] * self._decay(inverse)
-            slope = left_out * inverse
+            error = c[15] * self._decay(inverse)
+            slope = error * inverse
             sums = SourceSums.from_state(state[0]).add_far_node(
                 multipole_terms(c, node.r, inverse, derivatives),
                 node.far,
                 inverse,
                 dr.fma(node.head[5], inverse * inverse, node.head[4]),
-                (left_out, slope, slope * inverse),
+                (error, slope, slope * inverse),
                 free * (node.square * inverse),
                 unit,
             )
@@ -345,18 +350,18 @@ class Treecode:
         far_off = _NO_SOURCE_DISTANCE * (1 + dr.max(dr.abs(x)))
         start = (SourceSums.zero(self.backend, far_off, derivatives).to_state(), own)
         state = traverse_clusters(self.tree, x, closer, add_cluster, add_primitive, start, active)
-        sums, looser = (
+        sums, factor = (
             SourceSums.from_state(state[0]),
             dr.select(detail < 1, self.coarse_error_ratio, 1),
         )
         second = sums.hessian_truncation
         sums = dataclasses.replace(
             sums,
-            truncation=looser * sums.truncation,
-            gradient_truncation=looser * self.gradient_error_ratio * sums.gradient_truncation,
+            truncation=factor * sums.truncation,
+            gradient_truncation=factor * self.gradient_error_ratio * sums.gradient_truncation,
             hessian_truncation=None
             if second is None
-            else looser * self.hessian_error_ratio * second,
+            else factor * self.hessian_error_ratio * second,
         )
         return sums, state[1]
 
@@ -365,14 +370,14 @@ class Treecode:
         return sums.values(share, unit, rounding, _FAR_GRADIENT_ROUNDINGS)
 
     def _decay(self, inverse: Real) -> Real:
-        """r^-(order + 3), which the first term left out is proportional to."""
-        power = inverse * inverse * inverse
+        """r^-(order + 3), to which the first term beyond the order is proportional."""
+        decay = inverse * inverse * inverse
         for _ in range(self.order):
-            power = power * inverse
-        return power
+            decay = decay * inverse
+        return decay
 
 
 def _median_ratio(larger: FloatArray, smaller: FloatArray) -> float:
     """The median of the ratio larger/smaller, at least 1."""
-    some = smaller > 0
-    return max(1.0, float(np.median(larger[some] / smaller[some]))) if some.any() else 1.0
+    nonzero = smaller > 0
+    return max(1.0, float(np.median(larger[nonzero] / smaller[nonzero]))) if nonzero.any() else 1.0

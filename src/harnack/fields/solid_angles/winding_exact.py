@@ -1,13 +1,13 @@
-"""Winding numbers without truncation: crossings of one ray, and the boundary edges.
-
-See `edge_lift` for the formula. At points the cost is that of one ray through a tree of boxes plus
-one pass over the edges at which the triangles do not cancel, however many triangles there are.
+"""Winding numbers without truncation: crossings of a ray, and the boundary edges.
 
 `ExactWinding` is the winding number of a mesh, at points and along rays.
 
+See `edge_lift` for the formula. At points the cost is that of one ray through a tree of boxes plus
+one pass over the edges at which the triangles do not cancel, whatever the number of triangles.
+
 Winding numbers have two evaluators. `winding_exact`: crossings of one ray plus the boundary edges
 (the antipodal method), no truncation. `winding_tree`: multipoles, for soups. The tree's truncation
-is bounded by the next two moments, measured, and an absolute rest; the bound is part of
+is bounded by the next two moments, which are computed, and an absolute rest; the bound is part of
 `Sample.value_error` and `gradient_error`, by which the tracer shortens its steps.
 """
 
@@ -49,7 +49,7 @@ _SHARE = 1 / (4 * math.pi)
 class ExactWinding:
     """w of a mesh on a backend, in units in which the mesh has a size of about one.
 
-    rounding: of w, after all terms have been added.
+    rounding: the rounding of w, after all terms have been added.
     """
 
     backend: Backend
@@ -64,21 +64,22 @@ class ExactWinding:
     def of(
         cls, backend: Backend, mesh: WindingMesh, rays: TriangleTree, traced: bool
     ) -> ExactWinding:
-        """Everything uploaded; traced: also what `sample_interval` needs."""
+        """The winding number of a mesh, uploaded; traced: also the data that `sample_interval`
+        needs."""
         if not len(mesh.singular_edges):
             return cls(backend, rays, None, None, None, None, final_rounding(backend))
         vertices, edges = mesh.unit_vertices, mesh.singular_edges
-        along, loops = None, None
+        ray_trails, loops = None, None
         if traced:
             trails = closed_trails(edges)
-            along = LiftedTrails.upload(backend, vertices, trails)
+            ray_trails = LiftedTrails.upload(backend, vertices, trails)
             loops = LoopEdges.upload(backend, tuple(vertices[trail[:-1]] for trail in trails))
         return cls(
             backend,
             rays,
             LiftedEdges.upload(backend, vertices, edges),
             TrailValues.upload(backend, vertices, edges),
-            along,
+            ray_trails,
             loops,
             final_rounding(backend),
         )
@@ -92,32 +93,34 @@ class ExactWinding:
     def fast_values(self, x: Vec3) -> Real:
         """w at points, as by `values`, for a third of the work; not while a loop is being recorded.
 
-        Crossings are decided by `tree.triangle_tree.signed_crossing`. Wherever `TrailValues` is
+        Crossings are decided by `tree.triangle_tree.signed_crossing`. Where `TrailValues` is
         uncertain about an edge, the sum over edges is computed again by `lifted_sums`, which
         decides by the same bits.
         """
         # Rays lead away from the middle of the mesh, so that less of it lies ahead. For a mirrored
         # mesh the winding number changes its sign.
-        way = dr.select(x.z >= 0, self.backend.Float(1), -1)
-        turns = self.rays.signed_crossings_vertical(x, way)
+        ray_sign = dr.select(x.z >= 0, self.backend.Float(1), -1)
+        turns = self.rays.signed_crossings_vertical(x, ray_sign)
         if self.trails is None or self.edges is None:
-            return dr.select(way > 0, turns, 0 - turns)  # no zero with a sign
-        dr.eval(x, way, turns)
-        around, doubt = self.trails.turns(x, way)
-        value = way * (turns + around)
-        dr.eval(value, doubt)
-        again = dr.compress(doubt)
-        if len(again):
-            dr.scatter(value, self.values(dr.gather(type(x), x, again), 0).value, again)
+            return dr.select(ray_sign > 0, turns, 0 - turns)  # no zero with a sign
+        dr.eval(x, ray_sign, turns)
+        edge_turns, is_uncertain = self.trails.turns(x, ray_sign)
+        value = ray_sign * (turns + edge_turns)
+        dr.eval(value, is_uncertain)
+        uncertain_ids = dr.compress(is_uncertain)
+        if len(uncertain_ids):
+            dr.scatter(
+                value, self.values(dr.gather(type(x), x, uncertain_ids), 0).value, uncertain_ids
+            )
         return value
 
     def values(self, x: Vec3, derivatives: int) -> PointValues:
-        """w and the derivatives asked for at points."""
+        """w and its derivatives up to order `derivatives` at points."""
         real = self.backend.Float
         turns = self.rays.signed_crossings_vertical(x, real(1))
         if self.edges is None:
-            nothing = self.backend.Array3f(0), SymmetricMatrix.zero(real)
-            return PointValues(turns, real(self.rounding), *nothing, real(0), real(0))
+            zeros = self.backend.Array3f(0), SymmetricMatrix.zero(real)
+            return PointValues(turns, real(self.rounding), *zeros, real(0), real(0))
         sums, unit = lifted_sums(self.edges, x, derivatives).total(), coordinate_rounding(x)
         sums = sums.add_term(SourceTerm(4 * math.pi * turns), True)
         return sums.values(_SHARE, unit, self.rounding)
@@ -134,17 +137,17 @@ class ExactWinding:
         `SourceSums.sample`."""
         del behind, detail
         if self.edges is None:
-            nothing = self.backend.Array3f(0)
-            return Sample(self.backend.Float(turns), nothing, (Lipschitz(0.0),), 0.0)
+            zero = self.backend.Array3f(0)
+            return Sample(self.backend.Float(turns), zero, (Lipschitz(0.0),), 0.0)
         if self.ray_trails is None or self.loops is None:
             raise RuntimeError("uploaded for points and not for rays")
-        found = self.ray_trails.sum(frame, x, active)
-        found = found.add_term(SourceTerm(4 * math.pi * turns), True)
+        sums = self.ray_trails.sum(frame, x, active)
+        sums = sums.add_term(SourceTerm(4 * math.pi * turns), True)
         unit = fmax(coordinate_rounding(frame.o), coordinate_rounding(x))
         line, loops = RayLine(x, frame.d, 8 * unit), self.loops
 
-        def rates(lengths: tuple[Real, ...], wanted: Mask) -> tuple[Real, ...]:
-            return line_rates(loops, line, lengths, wanted & active)
+        def rates(lengths: tuple[Real, ...], lanes: Mask) -> tuple[Real, ...]:
+            return line_rates(loops, line, lengths, lanes & active)
 
-        known = lipschitz_along(line, found.gradient, found.singularity_distance, rates)
-        return found.sample(_SHARE, unit, self.rounding, along=known)
+        promises = lipschitz_along(line, sums.gradient, sums.singularity_distance, rates)
+        return sums.sample(_SHARE, unit, self.rounding, along=promises)

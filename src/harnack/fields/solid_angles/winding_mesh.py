@@ -1,4 +1,4 @@
-"""A mesh prepared for winding numbers: welded, duplicates canceled, scaled, in a tree."""
+"""Meshes prepared for winding numbers: welded, duplicates canceled, scaled, in a tree."""
 
 from __future__ import annotations
 
@@ -18,26 +18,28 @@ from harnack.geometry.welding import Welded, rounding_of
 from harnack.tree import BalancedTree, build_balanced_tree
 from harnack.tree.triangle_tree import MAX_TRIANGLES, PARITY_COLUMN, triangle_records
 
-# The most triangles in a leaf, and the children of a node: by experiment.
+# The largest number of triangles in a leaf, and the number of children of a node: by experiment.
 _LEAF_SIZE, _ARITY = 8, 4
-# Properties that stay valid when vertices move: they depend on faces alone, or need not be the
-# best.
+# Properties that stay valid when vertices move: they depend on faces only, or need not be optimal.
 _VERTEX_INDEPENDENT = ("triangles", "tree", "ray_tree", "singular_flags")
 
 
 @dataclass(frozen=True)
 class WindingMesh:
-    """What the evaluators of a winding number are made of. Double precision, in NumPy.
+    """The data from which the evaluators of a winding number are built, in double precision, in
+    NumPy.
 
-    vertices: (n, 3), as given.
-    faces: (m, 3) indices of welded vertices, no two alike.
-    multiplicity: (m,) how often each face is given, less how often it is given reversed.
-    input_face: (m,) the face, as given, that each comes from.
+    vertices: (n, 3), in the order of the input.
+    faces: (m, 3) indices of welded vertices, no two faces equal.
+    multiplicity: (m,) the number of copies of each face in the input minus the number of reversed
+        copies.
+    input_face: (m,) the index of the input face from which each face comes.
     singular_edges: (k, 2) directed edges at which triangles do not cancel, an edge of weight 2
         twice.
-    input_faces: (g, 3) all faces, as given.
-    weld_map: (n,) the vertex that stands for each. rounded: how many places were joined with
-        others, from which they were apart by rounding (`geometry.welding`).
+    input_faces: (g, 3) all faces of the input.
+    weld_map: (n,) the vertex that stands for each vertex.
+    rounded: the number of positions that were joined with other positions, from which they differed
+        by rounding (`geometry.welding`).
     center, size: `unit_vertices` = (vertices - center)/size; the size is a power of two, so that
         scaling lengths is exact.
     """
@@ -55,7 +57,7 @@ class WindingMesh:
 
     @classmethod
     def of(cls, vertices: npt.ArrayLike, faces: npt.ArrayLike) -> WindingMesh:
-        """From vertices (n, 3) and faces (m, 3).
+        """The mesh of vertices (n, 3) and faces (m, 3).
 
         Raises:
             MeshError: as `validate_mesh`; or all faces cancel; or there are too many.
@@ -82,27 +84,27 @@ class WindingMesh:
         )
 
     def with_vertices(self, vertices: npt.ArrayLike) -> WindingMesh:
-        """The mesh with other positions of its vertices (n, 3). It shares what follows from the
-        faces alone, and the shape of trees that have been built; positions, boxes and moments are
-        new.
+        """The mesh with other positions of its vertices (n, 3). It shares the data that depend on
+        the faces only, and the shape of trees that have been built; positions, boxes and moments
+        are new.
 
         Raises:
-            MeshError: as `validate_mesh`; another number of vertices; vertices that coincided, so
-                that faces were joined there, come apart.
+            MeshError: as `validate_mesh`; another number of vertices; or vertices that coincided,
+                so that faces were joined there, come apart.
         """
-        x, given = validate_mesh(vertices, self.input_faces)
+        x, faces = validate_mesh(vertices, self.input_faces)
         if len(x) != len(self.vertices):
             raise MeshError(
                 f"vertices: {len(x)} of them, where {len(self.vertices)} were before: moving "
                 "vertices keeps their number and their order"
             )
-        apart = (x != x[self.weld_map]).any(axis=1)
-        if self.rounded and apart.any():
-            apart = np.abs(x - x[self.weld_map]).max(axis=1) > rounding_of(x)
-        if apart.any():
-            torn = given[apart[given]]
-            if len(torn):
-                i = int(torn[0])
+        has_moved = (x != x[self.weld_map]).any(axis=1)
+        if self.rounded and has_moved.any():
+            has_moved = np.abs(x - x[self.weld_map]).max(axis=1) > rounding_of(x)
+        if has_moved.any():
+            torn_faces = faces[has_moved[faces]]
+            if len(torn_faces):
+                i = int(torn_faces[0])
                 raise MeshError(
                     f"vertices: {i} and {self.weld_map[i]} were at the same place, where faces "
                     "were "
@@ -110,13 +112,15 @@ class WindingMesh:
                 )
         center, size = _center_and_size(x, self.faces)
         mesh = dataclasses.replace(self, vertices=x, center=center, size=size)
-        made = vars(self)
-        vars(mesh).update({name: made[name] for name in _VERTEX_INDEPENDENT if name in made})
+        properties = vars(self)
+        vars(mesh).update(
+            {name: properties[name] for name in _VERTEX_INDEPENDENT if name in properties}
+        )
         return mesh
 
     @functools.cached_property
     def unit_vertices(self) -> FloatArray:
-        """(n, 3) vertices about the origin, of size about one."""
+        """(n, 3) the vertices in unit coordinates: about the origin, of size about one."""
         return (self.vertices - self.center) / self.size
 
     @functools.cached_property
@@ -163,7 +167,7 @@ class WindingMesh:
 
     @functools.cached_property
     def levels(self) -> list[NodeMoments]:
-        """Moments of the nodes."""
+        """Moments of the nodes of all levels of the tree."""
         return triangle_tree_moments(self.tree, self.corners)
 
     @functools.cached_property
@@ -176,14 +180,14 @@ class WindingMesh:
         flags = np.zeros((len(self.triangles), 3))
         ends = np.sort(self.triangles, axis=1)
         for k, (i, j) in enumerate(((0, 1), (1, 2), (0, 2))):
-            near = np.flatnonzero(at_ends[ends[:, i]] & at_ends[ends[:, j]])
-            edges: IntArray = ends[near, i] * count + ends[near, j]
-            flags[near, k] = keys.take(np.searchsorted(keys, edges), mode="clip") == edges
+            candidates = np.flatnonzero(at_ends[ends[:, i]] & at_ends[ends[:, j]])
+            edges: IntArray = ends[candidates, i] * count + ends[candidates, j]
+            flags[candidates, k] = keys.take(np.searchsorted(keys, edges), mode="clip") == edges
         return flags
 
     @functools.cached_property
     def box(self) -> tuple[Any, Any]:
-        """Lowest and highest coordinates of the triangles."""
+        """The lowest and the highest coordinates of the triangles."""
         return _box(self.vertices, self.faces)
 
     @functools.cached_property
@@ -201,12 +205,14 @@ class WindingMesh:
 
 
 def _box(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, FloatArray]:
+    """The corners (3,) of the box around the vertices that faces use."""
     used = np.zeros(len(vertices), np.bool_)
     used[faces] = True
     return vertices[used].min(axis=0), vertices[used].max(axis=0)
 
 
 def _center_and_size(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, float]:
+    """`WindingMesh.center` and `WindingMesh.size`."""
     low, high = _box(vertices, faces)
     size = 2.0 ** np.ceil(np.log2(0.5 * float((high - low).max())))
     return round_to_single(0.5 * (low + high)), float(size)

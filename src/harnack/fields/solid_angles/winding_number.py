@@ -1,11 +1,13 @@
 """The generalized winding number of triangle meshes, whose level set closes holes and repairs
 triangle soups and overlaps.
 
-`WindingNumber` is the field. `winding_extent` and `winding_cells` prove in which volume and cells
-its level sets lie: on its triangles, and on the surfaces that span its holes. Modulo 1 a winding
-number does not jump, and it takes a level only on the surfaces that span holes. Cells in which it
-is proved to take no level modulo 1 count as empty, whether or not they contain triangles: there
-rays sample the winding number only where they cross triangles.
+- `WindingNumber`: the field.
+- `winding_extent`, `winding_cells`: the volume and the cells that are proved to contain its level
+  sets, on its triangles and on the surfaces that span its holes.
+
+Modulo 1 a winding number does not jump, and it takes a level only on the surfaces that span holes.
+Cells in which it is proved to take no level modulo 1 count as empty, whether or not they contain
+triangles: there rays sample the winding number only where they cross triangles.
 """
 
 from __future__ import annotations
@@ -61,10 +63,11 @@ if TYPE_CHECKING:
 
 __all__ = ["WindingModuloOne", "winding_box", "winding_cells", "winding_extent"]
 
-# The most cells that are tested in one round for an extent, and how often the box is halved.
+# The largest number of cells that are tested in one round for an extent, and the number of times
+# that the box is halved.
 _MOST_CELLS = 20_000
 _FINEST = 6
-# Cells of the grid along its longest side, by experiment.
+# The number of cells of the grid along its longest side, by experiment.
 _CELLS_ACROSS = 192
 
 
@@ -119,18 +122,18 @@ class WindingModuloOne(Field):
 def winding_cells(
     winding: ModuloOneEvaluable, extent: Volume, levels: tuple[float, ...]
 ) -> OccupancyGrid:
-    """Cells over an extent, empty where w modulo 1 is proved to stay off the levels."""
+    """Cells over an extent, empty if w modulo 1 is proved to stay off the levels in them."""
     return occupied_cells(WindingModuloOne(winding), levels, extent, _CELLS_ACROSS)
 
 
 def winding_extent(
     winding: ModuloOneEvaluable, mesh: WindingMesh, levels: tuple[float, ...]
 ) -> Volume | None:
-    """A polytope that holds the level sets of the winding number of a mesh; for a closed mesh a
+    """A polytope that contains the level sets of the winding number of a mesh; for a closed mesh a
     box.
 
     A point of a level set lies on a triangle, where w jumps over the level, or off the triangles,
-    and then w has the level there modulo 1 too. The polytope contains all triangles, and all cells
+    and then w has the level there modulo 1, too. The polytope contains all triangles, and all cells
     of `winding_box` in which w modulo 1, which does not jump at triangles, is not proved to be off
     the level.
     """
@@ -145,86 +148,92 @@ def winding_extent(
 
 
 def winding_box(mesh: WindingMesh, levels: tuple[float, ...]) -> Box:
-    """A box around the mesh that holds the level sets, wider by the smaller of two distances.
+    """A box around the mesh that contains the level sets, wider than the mesh by the smaller of two
+    distances.
 
-    (a) At distance rho from the mesh |w| <= area/(4 pi rho^2). (b) Off the triangles 4 pi w
-    is the solid angle of the singular edges mod 4 pi, and a level at distance l from the
-    multiples of 4 pi lies within L/sqrt(l (4 pi - l)) of edges of total length L (isoperimetry
-    on the sphere: see `SolidAngle.extent`).
+    (a) At distance rho from the mesh |w| <= area/(4 pi rho^2). (b) Off the triangles 4 pi w is the
+    solid angle of the singular edges mod 4 pi, and a level at distance l from the multiples of 4 pi
+    lies within L/sqrt(l (4 pi - l)) of edges of total length L (isoperimetry on the sphere: see
+    `SolidAngle.extent`).
     """
     low, high = mesh.box
     slack = 1e-4 * float((high - low).max())
     nearest = min(abs(level) for level in levels)
-    wide = math.sqrt(mesh.area / (4 * math.pi * max(nearest, 1e-12)))
-    away = min(abs(math.remainder(level, 1.0)) for level in levels) * 4 * math.pi
-    narrow = mesh.boundary_length / math.sqrt(max(away * (4 * math.pi - away), 1e-12))
-    reach = low, high
+    by_area = math.sqrt(mesh.area / (4 * math.pi * max(nearest, 1e-12)))
+    gap = min(abs(math.remainder(level, 1.0)) for level in levels) * 4 * math.pi
+    by_edges = mesh.boundary_length / math.sqrt(max(gap * (4 * math.pi - gap), 1e-12))
+    box = low, high
     if len(mesh.singular_edges):
         ends = mesh.vertices[mesh.singular_edges].reshape(-1, 3)
-        near = np.minimum(low, ends.min(axis=0) - narrow)
-        reach = near, np.maximum(high, ends.max(axis=0) + narrow)
-    return Box(np.maximum(reach[0], low - wide) - slack, np.minimum(reach[1], high + wide) + slack)
+        edge_low = np.minimum(low, ends.min(axis=0) - by_edges)
+        box = edge_low, np.maximum(high, ends.max(axis=0) + by_edges)
+    return Box(
+        np.maximum(box[0], low - by_area) - slack, np.minimum(box[1], high + by_area) + slack
+    )
 
 
 MethodName = Literal["auto", "exact", "tree"]
 
-# Up to so many boundary edges the exact method is used: an edge costs about a nanosecond, a tree
-# two to three microseconds.
+# Up to this number of boundary edges the exact method is used: an edge costs about a nanosecond, a
+# tree two to three microseconds.
 _MOST_EDGES = 2048
-# With fewer edges samples cost so little that no cells are made for them.
+# With fewer edges samples cost so little that cells do not pay.
 _FEW_EDGES = 64
-# Cells are built from so many rays an edge on, for no fewer rays and for no more edges.
+# Cells pay from `_PAYS` rays per edge and `_LEAST_RAYS` rays on, for at most `_MOST_IN_CELLS`
+# edges.
 _PAYS, _LEAST_RAYS, _MOST_IN_CELLS = 3.0, 5e3, 100_000
-# With more edges than this many times the triangles the mesh is a soup, whose cells add up near
-# triangles, not edges; they are built from so many rays a triangle on, for no more triangles.
+# With more edges than `_SOUP_RATIO` times the triangles the mesh is a soup, whose cells sum over
+# near triangles, not edges; they pay from `_SOUP_PAYS` rays per triangle on, for at most
+# `_MOST_OF_SOUP` triangles.
 _SOUP_RATIO, _SOUP_PAYS, _MOST_OF_SOUP = 1.5, 12.0, 50_000
-# Their cube is wider than the extent, where all rays begin, by this factor, for values at points:
-# some large cells more.
+# The cube of these cells is larger than the extent, where all rays begin, by this factor, for
+# values at points: this adds a few large cells.
 _CUBE_FACTOR = 2.002
 # The accuracy of values at points, and of traces, by experiment.
 _VALUES, _TRACED = 2.0, 4.0
-# See `WindingNumber._center_values`: 16.5 roundings of each of 100,000 edges, and as much of the
-# steep ones near a point, are less than 1e-6 (`edge_lift.FACTOR_ROUNDINGS`).
+# See `WindingNumber._center_values`: 16.5 roundings of each of 100,000 edges, and as much for the
+# steep terms near a point, are less than 1e-6 (`edge_lift.FACTOR_ROUNDINGS`).
 _EXACT_ERROR = 1e-6
-# A point within so many roundings of a coordinate of a triangle may be on either side of it.
+# A point nearer to a triangle than this many roundings of a coordinate may be on either side of it.
 _ON_TRIANGLE = 8.0
 
 
 class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
-    """w of a triangle mesh: how often it winds around a point (Jacobson et al. 2013).
+    """The winding number w of a triangle mesh around a point (Jacobson et al. 2013).
 
-    For a closed mesh 1 inside and 0 outside; for a mesh with holes, cracks, duplicated or flipped
-    faces, self-intersections, or a triangle soup, a function that is harmonic off the triangles
-    and jumps by whole numbers across them. Its 1/2-surface is the mesh where the mesh is sound, and
-    spans its holes. Faces are counter-clockwise seen from outside.
+    For a closed mesh w is 1 inside and 0 outside; for a mesh with holes, cracks, duplicated or
+    flipped faces, self-intersections, or a triangle soup, it is a function that is harmonic off the
+    triangles and jumps by integers across them. Its 1/2-surface is the mesh where the mesh is
+    sound, and spans its holes. Faces are counter-clockwise seen from outside.
 
     vertices: (n, 3).
     faces: (m, 3) indices into them.
     method: "exact" (`edge_lift`: no truncation, cost by boundary edges), "tree" (`winding_tree`),
         or "auto": exact up to 2048 boundary edges.
-    accuracy: for the tree, a cluster of triangles is taken as a whole beyond `accuracy` times its
-        radius; more is slower and sharper. At least 1.5; by default 2 for values at points and 4
-        for tracing, which uses more detail where the tolerance asks for it. By default gradients
-        and Hessians at points are not those of this tree but sums over the boundary edges, right
-        to rounding, up to 32,768 of these; beyond, gradients are looked at closely enough for an
-        error of about 1 % of their length in most places (`gradient_error_bound` bounds it).
-    order: of the multipoles of the tree: 0 (dipoles), 1 or 2 (octupoles).
-    cells: for many rays: cells in which w, but for a whole number, is the solid angle of a few
-        near edges and one polynomial for all others, with a proved remainder (`boundary_cells`), so
-        that a sample costs the same however many edges there are. In a soup, where triangles have
+    accuracy: for the tree, the moments of a cluster of triangles are used beyond `accuracy` times
+        its radius; a larger accuracy is slower and has smaller errors. At least 1.5; by default 2
+        for values at points and 4 for tracing, which uses a higher accuracy where the tolerance
+        needs it. By default gradients and Hessians at points do not come from this tree but from
+        sums over the boundary edges, exact up to rounding, for up to 32,768 edges; for more edges,
+        the accuracy of gradients is increased until their error is about 1 % of their length in
+        most places (`gradient_error_bound` bounds it).
+    order: the order of the multipoles of the tree: 0 (dipoles), 1 or 2 (octupoles).
+    cells: for many rays: FMM cells in which w, up to an integer, is the solid angle of a few near
+        edges plus one polynomial for all others, with a proved remainder (`boundary_cells`), so
+        that a sample costs the same whatever the number of edges. In a soup, where triangles have
         hardly an edge in common, near triangles take the place of edges, with the tree as method
         (`dipole_cells`). None builds them where they pay (`for_ray_count`), True always, False
-        never; at most the megabytes that are given (True: 256), and several times as much while
-        they are built. Those of soups, where they were asked for, give values and gradients at
-        points too, which pays from some 2,000 points a triangle on; all other values and
-        derivatives at points are those of `method`.
+        never; they take at most the number of megabytes of this argument (True: 256), and several
+        times as much while they are built. The cells of soups, if the user requested them, give
+        values and gradients at points, too, which pays from some 2,000 points per triangle on; all
+        other values and derivatives at points are those of `method`.
 
     A mesh that lies on its own spanning surface, such as a file that `mesh` wrote of a
-    `SolidAngle`, or any that is flat, has the level right beside all of its triangles, where
-    rounding decides on which side. Then the surface is the mesh itself, every triangle and nothing
-    else: so it is traced, meshed and measured, while values stay what they are (`own_sheet`). Other
-    open sheets have the level where they lie before the surface that spans their boundary, and not
-    where they lie behind it.
+    `SolidAngle`, or any flat mesh, has the level right beside all of its triangles, where rounding
+    decides on which side. Then the surface is the mesh itself, every triangle and nothing else: so
+    it is traced, meshed and measured, while values do not change (`own_sheet`). Other open meshes
+    have the level where they lie before the surface that spans their boundary, and not where they
+    lie behind it.
 
     Hits on triangles have `Hits.primitive_index`; `facet_faces` gives the face of each.
     `with_vertices` gives the field for the same faces when vertices have moved.
@@ -254,9 +263,9 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
             raise ValueError(f"accuracy must lie between 1.5 and 100, not {accuracy}")
         order = as_integer_in_range(order, "order", 0, 2)
         self._mesh = WindingMesh.of(vertices, faces)
-        few = len(self.mesh.singular_edges) <= _MOST_EDGES
+        has_few_edges = len(self.mesh.singular_edges) <= _MOST_EDGES
         self._method: Literal["exact", "tree"] = (
-            ("exact" if few else "tree") if method == "auto" else method
+            ("exact" if has_few_edges else "tree") if method == "auto" else method
         )
         self.accuracy, self.order = accuracy, order
         self.configure_cells(cells)
@@ -269,11 +278,11 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
     @no_derivatives
     def with_vertices(self, vertices: Any) -> WindingNumber:
         """The winding number of the same faces with other positions of their vertices (n, 3), for
-        less work than a new one.
+        less work than a new field.
 
         Faces are not joined and sorted into a tree again: the tree keeps its shape, and gets new
         centers, radii, moments and bounds. All promises are computed from the new positions, so a
-        tree whose vertices moved far is slower than a new one, never wrong.
+        tree whose vertices moved far is slower than a new tree, never wrong.
 
         Raises MeshError as for a new mesh, and for vertices that coincided and come apart.
         """
@@ -287,12 +296,12 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
 
     @property
     def method(self) -> Literal["exact", "tree"]:
-        """How w is computed, which is decided once."""
+        """The method by which w is computed, which is decided once."""
         return self._method
 
     @property
     def mesh(self) -> WindingMesh:
-        """The triangles. They stay as they are: see `with_vertices`."""
+        """The triangles. They cannot be set: see `with_vertices`."""
         return self._mesh
 
     @property
@@ -306,11 +315,11 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return prepared
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
-        on = self._batch_data(backend_of(x))
-        winding, x = on.winding, on.to_unit(x)
+        data = self._batch_data(backend_of(x))
+        winding, x = data.winding, data.to_unit(x)
         if isinstance(winding, TreeWinding):
             if derivatives == 2 and self.accuracy is None:
-                rates = self._boundary_rates(on, winding).at(x, 2, closer)
+                rates = self._boundary_rates(data, winding).at(x, 2, closer)
                 values = with_rates(winding.values(x, 0, closer), rates)
             else:
                 values = winding.values(x, derivatives, closer)
@@ -318,34 +327,37 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
             values = winding.values(x, derivatives)
             if derivatives == 0:
                 values = dataclasses.replace(values, value=winding.fast_values(x))
-        return self._stated(on, x, values)
+        return self._stated(data, x, values)
 
     def sharp_values_at(self, x: Vec3) -> PointValues:
-        on = self._batch_data(backend_of(x))
-        winding = on.winding
+        data = self._batch_data(backend_of(x))
+        winding = data.winding
         if not isinstance(winding, TreeWinding) or self.accuracy is not None:
             return self.values_at(x, 1)
-        x = on.to_unit(x)
+        x = data.to_unit(x)
         dr.eval(x)
-        rates = self._boundary_rates(on, winding)
+        rates = self._boundary_rates(data, winding)
         values = rates.sharp(x)
         if rates.summed is not winding:
-            values = with_rates(winding.values(x, 0, on.backend.Float(1)), values)
-        return self._stated(on, x, values)
+            values = with_rates(winding.values(x, 0, data.backend.Float(1)), values)
+        return self._stated(data, x, values)
 
-    def _boundary_rates(self, on: _WindingData, winding: TreeWinding) -> BoundaryRates:
-        if on.backend not in self._rates:
-            self._rates[on.backend] = BoundaryRates.of(on.backend, self.mesh, self.order, winding)
-        return self._rates[on.backend]
+    def _boundary_rates(self, data: _WindingData, winding: TreeWinding) -> BoundaryRates:
+        """The derivatives from the boundary, once for a backend."""
+        if data.backend not in self._rates:
+            self._rates[data.backend] = BoundaryRates.of(
+                data.backend, self.mesh, self.order, winding
+            )
+        return self._rates[data.backend]
 
-    def _stated(self, on: _WindingData, x: Vec3, values: PointValues) -> PointValues:
-        """Values at unit coordinates x, with all that their errors are made of."""
+    def _stated(self, data: _WindingData, x: Vec3, values: PointValues) -> PointValues:
+        """Values at unit coordinates x, with all parts of their errors, in the user's units."""
         # Within rounding of a triangle, it is not known on which side of it x is.
-        on_triangle = jump_sum_within(on.rays, x, _ON_TRIANGLE * coordinate_rounding(x))
+        on_triangle = jump_sum_within(data.rays, x, _ON_TRIANGLE * coordinate_rounding(x))
         values = dataclasses.replace(values, error=values.error + on_triangle)
         weight = self.mesh.area / (4 * math.pi * self.mesh.size**2)
         return values.with_far_field_errors(x, 64 + len(self.mesh.singular_edges), weight).rescaled(
-            on.size
+            data.size
         )
 
     def _upload(self, backend: Backend, *, traced: bool) -> _WindingData:
@@ -356,43 +368,44 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
             winding = ExactWinding.of(backend, mesh, rays, traced)
         else:
             winding = TreeWinding.of(backend, mesh, accuracy, self.order)
-        on = _WindingData(*frame_parameters(backend, mesh.center, mesh.size), winding, rays)
+        data = _WindingData(*frame_parameters(backend, mesh.center, mesh.size), winding, rays)
         if not self.cells or not len(mesh.singular_edges) or not (traced or self.cells_for_values):
-            return on
-        return self._add_cells(on, traced=traced)
+            return data
+        return self._add_cells(data, traced=traced)
 
-    def _add_cells(self, on: _WindingData, *, traced: bool) -> _WindingData:
-        """The data with cells: those of triangles, or for tracing those of edges."""
-        mesh, most_bytes, winding = self.mesh, self.max_bytes(), on.winding
+    def _add_cells(self, data: _WindingData, *, traced: bool) -> _WindingData:
+        """The data with cells: cells of triangles, or for tracing cells of edges."""
+        mesh, most_bytes, winding = self.mesh, self.max_bytes(), data.winding
         extent = self.extent((self.default_level,))
         assert extent is not None
         low, high = extent.bounds()
         if self._is_soup and isinstance(winding, TreeWinding):
             reach = float(np.maximum(high - mesh.center, mesh.center - low).max()) / mesh.size
             cells = self.build_cached(
-                on.backend, lambda: winding.build_cells(mesh, _CUBE_FACTOR * reach, most_bytes)
+                data.backend, lambda: winding.build_cells(mesh, _CUBE_FACTOR * reach, most_bytes)
             )
             if cells is not None:
-                return dataclasses.replace(on, winding=dataclasses.replace(winding, cells=cells))
+                return dataclasses.replace(data, winding=dataclasses.replace(winding, cells=cells))
         if not traced:
-            return on
-        cells = BoundaryCells.build(on.rays, mesh, low, high, most_bytes, self._center_values)
-        return dataclasses.replace(on, cells=cells)
+            return data
+        cells = BoundaryCells.build(data.rays, mesh, low, high, most_bytes, self._center_values)
+        return dataclasses.replace(data, cells=cells)
 
     @property
     def _is_soup(self) -> bool:
-        """Whether triangles have so few edges in common that cells add up triangles."""
+        """Whether triangles have so few edges in common that cells sum over triangles."""
         edges, triangles = len(self.mesh.singular_edges), len(self.mesh.triangles)
         return self.method == "tree" and edges > _SOUP_RATIO * triangles
 
     def _center_values(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """w at points (n, 3), and bounds of its error; those of the rounding of an exact sum, in
-        double precision and off triangles by many roundings in single precision, are far below."""
-        plain = self.with_cells(False)  # else this would be asked for itself
-        value = np.array(plain.value(points, precision="double"))
+        """w at points (n, 3), and bounds of its error; the rounding of an exact sum, in double
+        precision and at points off triangles by many roundings in single precision, is far below
+        the bound."""
+        field = self.with_cells(False)  # with cells, this would call itself
+        value = np.array(field.value(points, precision="double"))
         if self.method == "exact":
             return value, np.full(len(value), _EXACT_ERROR)
-        return value, plain.error_bound(points, precision="double")
+        return value, field.error_bound(points, precision="double")
 
     @property
     def has_unknown_branch(self) -> bool:
@@ -401,15 +414,20 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
     def cells_pay_from(self) -> float:
         edges, triangles = len(self.mesh.singular_edges), len(self.mesh.triangles)
         if self._is_soup:
-            few = triangles <= _MOST_OF_SOUP
-            return max(_LEAST_RAYS, _SOUP_PAYS * triangles) if few else math.inf
+            is_small = triangles <= _MOST_OF_SOUP
+            return max(_LEAST_RAYS, _SOUP_PAYS * triangles) if is_small else math.inf
         pays = _FEW_EDGES <= edges <= _MOST_IN_CELLS
         return max(_LEAST_RAYS, _PAYS * edges) if pays else math.inf
 
     def occupied_cells(self, levels: tuple[float, ...]) -> OccupancyGrid | None:
-        """Cells by `winding_cells`, if edges are not few, for the exact method or by cells."""
-        few = len(self.mesh.singular_edges) < _FEW_EDGES
-        if few or self.is_of_sheets_alone(levels) or (self.method != "exact" and not self.cells):
+        """Cells by `winding_cells`, if there are many edges, for the exact method or with FMM
+        cells."""
+        is_small = len(self.mesh.singular_edges) < _FEW_EDGES
+        if (
+            is_small
+            or self.is_of_sheets_alone(levels)
+            or (self.method != "exact" and not self.cells)
+        ):
             return None
         extent = self.extent(levels)
         if extent is None:
@@ -421,53 +439,55 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
     def evaluate(self, p: Vec3) -> Sample:
         """w itself, jumps included, with promises about w continued smoothly through all
         triangles."""
-        on, frame = self._upward_rays(p)
-        return _sample_at_start(on, frame, on.winding.crossings_ahead(frame, 0, True), 1.0)
+        data, frame = self._upward_rays(p)
+        return _sample_at_start(data, frame, data.winding.crossings_ahead(frame, 0, True), 1.0)
 
     def without_jumps(self) -> Field | None:
         return WindingModuloOne(self)
 
     def evaluate_modulo_one(self, p: Vec3, detail: Real = 0.0) -> Sample:
-        """A sample of w minus an integer that is not known and may differ from point to point; by
-        default the coarsest sample."""
-        on, frame = self._upward_rays(p)
-        detail = on.backend.Float(detail)
-        if on.cells is None:
-            return _sample_at_start(on, frame, on.backend.Float(0), detail)
-        in_cells, inside = on.cells.sample(frame.o, None, coordinate_rounding(frame.o), detail <= 0)
-        other = _sample_at_start(on, frame, on.backend.Float(0), detail, ~inside)
-        return other.select(inside, space_scaled(in_cells, on.size))
+        """A sample of w minus an unknown integer, which may differ from point to point; by default
+        the coarsest sample."""
+        data, frame = self._upward_rays(p)
+        detail = data.backend.Float(detail)
+        if data.cells is None:
+            return _sample_at_start(data, frame, data.backend.Float(0), detail)
+        in_cells, inside = data.cells.sample(
+            frame.o, None, coordinate_rounding(frame.o), detail <= 0
+        )
+        outside = _sample_at_start(data, frame, data.backend.Float(0), detail, ~inside)
+        return outside.select(inside, space_scaled(in_cells, data.size))
 
     def value_if_cheap(self, p: Vec3, rounding: Real, active: Mask) -> Real:
-        on = self._data_for(p)
-        if on.cells is None:
-            return on.backend.Float(dr.nan)
-        x = on.to_unit(p)
-        return on.cells.value_where_known(
-            x, fmax(coordinate_rounding(x), rounding / on.size), active
+        data = self._data_for(p)
+        if data.cells is None:
+            return data.backend.Float(dr.nan)
+        x = data.to_unit(p)
+        return data.cells.value_where_known(
+            x, fmax(coordinate_rounding(x), rounding / data.size), active
         )
 
     def _upward_rays(self, p: Vec3) -> tuple[_WindingData, RayFrame]:
         """The data, and rays from p, on which all triangles lie ahead."""
-        on = self._data_for(p)
-        return on, RayFrame.along(on.backend, on.to_unit(p), on.backend.Array3f(0, 0, 1))
+        data = self._data_for(p)
+        return data, RayFrame.along(data.backend, data.to_unit(p), data.backend.Array3f(0, 0, 1))
 
     def next_jump(
         self, o: Vec3, d: Vec3, after: JumpCrossing, t_max: Real, active: Mask
     ) -> JumpCrossing:
-        on = self._data_for(o)
-        frame = RayFrame.along(on.backend, on.to_unit(o), d)
-        behind = (after.t / on.size, after.facet)
-        t, sheet, turn, normal = on.rays.next_crossing(frame, behind, t_max / on.size, active)
+        data = self._data_for(o)
+        frame = RayFrame.along(data.backend, data.to_unit(o), d)
+        behind = (after.t / data.size, after.facet)
+        t, facet, sign, normal = data.rays.next_crossing(frame, behind, t_max / data.size, active)
         # w is larger on the side opposite to the normal.
-        return JumpCrossing(t * on.size, sheet, -turn, -normal)
+        return JumpCrossing(t * data.size, facet, -sign, -normal)
 
     def initial_offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
-        on = self._data_for(o)
+        data = self._data_for(o)
         if self.only_sheets:
-            return on.backend.Float(0)
-        frame = RayFrame.along(on.backend, on.to_unit(o), d)
-        return on.winding.crossings_ahead(frame, t_min / on.size, active)
+            return data.backend.Float(0)
+        frame = RayFrame.along(data.backend, data.to_unit(o), d)
+        return data.winding.crossings_ahead(frame, t_min / data.size, active)
 
     def is_of_sheets_alone(self, levels: tuple[float, ...]) -> bool:
         if len(levels) != 1:
@@ -488,28 +508,28 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
     ) -> Field:
         if self.only_sheets:
             return _BesideSheets(self._data_for(o).backend, self._level_of_sheets, behind, ahead)
-        on = self._data_for(o)
-        frame = RayFrame.along(on.backend, on.to_unit(o), d)
-        start = JumpCrossing(behind.t / on.size, behind.facet, behind.jump, behind.normal)
-        return _WindingOnInterval(on, frame, start, offset)
+        data = self._data_for(o)
+        frame = RayFrame.along(data.backend, data.to_unit(o), d)
+        start = JumpCrossing(behind.t / data.size, behind.facet, behind.jump, behind.normal)
+        return _WindingOnInterval(data, frame, start, offset)
 
     def distance_to_jumps(self, p: Vec3) -> Real:
-        on = self._data_for(p)
-        return distance_lower_bound(on.rays, on.to_unit(p)) * on.size
+        data = self._data_for(p)
+        return distance_lower_bound(data.rays, data.to_unit(p)) * data.size
 
     def nearest_facet(
         self, p: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
     ) -> NearestFacet:
-        on = self._data_for(p)
-        found = next_closest_triangle(
-            on.rays, on.to_unit(p), after, dr.square(limit / on.size), active
+        data = self._data_for(p)
+        facet = next_closest_triangle(
+            data.rays, data.to_unit(p), after, dr.square(limit / data.size), active
         )
-        length = dr.norm(found.normal)
-        up = on.backend.Array3f(0, 0, 1)
-        normal = dr.select(length > 0, found.normal / length, up)
-        is_inner = found.is_inner & (length > 0)
+        length = dr.norm(facet.normal)
+        up = data.backend.Array3f(0, 0, 1)
+        normal = dr.select(length > 0, facet.normal / length, up)
+        is_inner = facet.is_inner & (length > 0)
         return NearestFacet(
-            found.squared_distance, found.triangle, found.offset * on.size, normal, is_inner
+            facet.squared_distance, facet.triangle, facet.offset * data.size, normal, is_inner
         )
 
     def jump_mesh(self) -> tuple[FloatArray, IntArray, bool] | None:
@@ -547,25 +567,26 @@ class _WindingData(UnitFrame):
 
     @property
     def built(self) -> BuiltCells | None:
-        """The cells, those of edges or of triangles."""
+        """The cells, of edges or of triangles."""
         if self.cells is None and isinstance(self.winding, TreeWinding):
             return self.winding.cells
         return self.cells
 
 
 def _sample_at_start(
-    on: _WindingData, frame: RayFrame, turns: Real, detail: Real, active: Mask = True
+    data: _WindingData, frame: RayFrame, turns: Real, detail: Real, active: Mask = True
 ) -> Sample:
-    """The sample where rays begin, where active; turns: the sum of the signs of all crossings
+    """The sample at the start of rays, where active; turns: the sum of the signs of all crossings
     ahead."""
-    nowhere = JumpCrossing(0.0, on.backend.UInt32(NO_FACET), 0.0, on.backend.Array3f(0, 0, 1))
-    detail = on.backend.Float(detail)
-    sample = on.winding.sample_interval(frame, frame.o, nowhere, turns, detail, active)
-    return space_scaled(dataclasses.replace(sample, ray_promises=()), on.size)
+    start = JumpCrossing(0.0, data.backend.UInt32(NO_FACET), 0.0, data.backend.Array3f(0, 0, 1))
+    detail = data.backend.Float(detail)
+    sample = data.winding.sample_interval(frame, frame.o, start, turns, detail, active)
+    return space_scaled(dataclasses.replace(sample, ray_promises=()), data.size)
 
 
 class _WindingOnInterval(Field):
-    """A winding number on a ray interval; behind: the crossing where it starts, in unit lengths."""
+    """A winding number on a ray interval; behind: the crossing at the start of the interval, in
+    unit lengths."""
 
     def __init__(
         self,
@@ -588,23 +609,23 @@ class _WindingOnInterval(Field):
         return _WindingOnInterval(self._on, self._frame, self._behind, self._offset, detail)
 
     def evaluate(self, p: Vec3) -> Sample:
-        on, frame = self._on, self._frame
-        x, detail = on.to_unit(p), self._detail
-        if on.cells is None:
-            sample = on.winding.sample_interval(frame, x, self._behind, self._offset, detail)
-            return space_scaled(sample, on.size)
+        data, frame = self._on, self._frame
+        x, detail = data.to_unit(p), self._detail
+        if data.cells is None:
+            sample = data.winding.sample_interval(frame, x, self._behind, self._offset, detail)
+            return space_scaled(sample, data.size)
         unit = fmax(coordinate_rounding(frame.o), coordinate_rounding(x))
-        # Cells are coarser than the coarsest samples that know the number.
-        in_cells, inside = on.cells.sample(x, frame.d, unit, detail < self.coarsest_accuracy)
-        sample = on.winding.sample_interval(frame, x, self._behind, self._offset, detail, ~inside)
+        # Cells are coarser than the coarsest samples whose branch is known.
+        in_cells, inside = data.cells.sample(x, frame.d, unit, detail < self.coarsest_accuracy)
+        sample = data.winding.sample_interval(frame, x, self._behind, self._offset, detail, ~inside)
         sample = dataclasses.replace(sample.select(inside, in_cells), branch_unknown=inside)
-        return space_scaled(sample, on.size)
+        return space_scaled(sample, data.size)
 
 
 class _BesideSheets(Field):
-    """On a ray interval of a mesh that is the surface as a whole: constant, and so far from the
-    level that it passes it where it jumps at the sheet ahead; or where none is ahead, as the sheet
-    behind has left it."""
+    """The field on a ray interval of a mesh that is the surface as a whole: constant, and so far
+    from the level that it passes the level at the jump at the triangle ahead; or, if no triangle is
+    ahead, at the triangle behind."""
 
     def __init__(
         self, backend: Backend, level: float, behind: JumpCrossing, ahead: JumpCrossing

@@ -1,11 +1,12 @@
-"""Gradients and Hessians of winding numbers at points: those of the boundary alone.
+"""Gradients and Hessians of winding numbers at points, from the boundary only.
 
-Off the triangles w is, but for a whole number, the solid angle of its boundary edges over 4 pi. So
-all surfaces with these edges have the same derivatives. The triangles of a mesh with small holes
-nearly cancel: a tree over them leaves out many times its gradient. Two other sums do not:
+Off the triangles w is, up to an integer, the solid angle of its boundary edges over 4 pi. So all
+surfaces with these edges have the same derivatives. The triangles of a mesh with small holes nearly
+cancel: the truncation error of a tree over them is many times its gradient. Two other sums have no
+such error:
 
-- over the edges, one by one (Biot and Savart's law), for few edges;
-- of *caps*, fans of triangles over the loops that the edges make, by a tree.
+- a direct sum over the edges (Biot and Savart's law), for few edges;
+- a sum by a tree over *caps*, fans of triangles over the loops that the edges form.
 """
 
 from __future__ import annotations
@@ -31,12 +32,12 @@ if TYPE_CHECKING:
 
 __all__ = ["BoundaryRates", "with_rates"]
 
-# Up to so many edges are summed one by one, by experiment: that takes as long as trees do that are
-# looked at closely enough.
+# Up to this number of edges the sum is direct, by experiment: it then takes as long as trees of
+# sufficient accuracy.
 _FEW = 32_768
-# A tree over caps takes clusters as a whole beyond so many times their radius.
+# A tree over caps uses the moments of clusters beyond this many times their radius.
 _ACCURACY = 2.0
-# Caps are of use if they have less area than this part of the mesh.
+# Caps are of use if their area is less than this fraction of the area of the mesh.
 _SMALLER = 0.5
 
 
@@ -44,7 +45,7 @@ _SMALLER = 0.5
 class BoundaryRates:
     """The derivatives of w off the triangles, in units in which the mesh has a size of about one.
 
-    summed: the edges; or a tree of caps, or of the triangles themselves; None of a closed mesh.
+    summed: the edges; or a tree of caps, or of the triangles themselves; None for a closed mesh.
     """
 
     summed: LiftedEdges | TreeWinding | None
@@ -53,8 +54,11 @@ class BoundaryRates:
     def of(
         cls, backend: Backend, mesh: WindingMesh, order: int, whole: TreeWinding
     ) -> BoundaryRates:
-        """Of a mesh with a tree over its triangles, which is used where it has cells, and where
-        caps would be no smaller, as those of a soup."""
+        """The derivatives of the winding number of a mesh.
+
+        whole: a tree over the mesh's triangles, which is used if it has cells, and if caps would be
+            no smaller, as for a soup.
+        """
         if not len(mesh.singular_edges):
             return cls(None)
         if whole.cells is not None:
@@ -69,7 +73,8 @@ class BoundaryRates:
         return cls(TreeWinding.of(backend, caps, _ACCURACY, order))
 
     def at(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:
-        """The derivatives asked for, at one detail, with a value of no meaning."""
+        """The derivatives up to order `derivatives` at the accuracy scale `closer`; the value has
+        no meaning."""
         if isinstance(self.summed, TreeWinding):
             return self.summed.values(x, derivatives, closer)
         real = cast("Any", type(x.x))
@@ -81,9 +86,9 @@ class BoundaryRates:
         return sums.values(1 / (4 * math.pi), coordinate_rounding(x), real(0))
 
     def sharp(self, x: Vec3) -> PointValues:
-        """Those of `at` with the gradient to about 1 % of its length (`sharpened`)."""
+        """As `at`, with an error of the gradient of about 1 % of its length (`sharpened`)."""
         if isinstance(self.summed, TreeWinding):
-            return sharpened(lambda place, closer: self.at(place, 1, closer), x)
+            return sharpened(lambda points, accuracy: self.at(points, 1, accuracy), x)
         return self.at(x, 1, 1.0)
 
 
@@ -94,10 +99,10 @@ def with_rates(value: PointValues, rates: PointValues) -> PointValues:
 
 def caps_of(mesh: WindingMesh) -> WindingMesh:
     """Triangles with the same boundary as a mesh, in the same unit coordinates: a fan over each of
-    the loops that its singular edges make, about the middle of the loop's vertices."""
+    the loops that its singular edges form, about the mean of the loop's vertices."""
     loops = simple_loops(mesh.singular_edges)
-    middles = [mesh.vertices[loop].mean(axis=0) for loop in loops]
-    vertices = np.concatenate([mesh.vertices, middles])
+    centers = [mesh.vertices[loop].mean(axis=0) for loop in loops]
+    vertices = np.concatenate([mesh.vertices, centers])
     fans = [
         loop[None]
         if len(loop) == 3
@@ -105,28 +110,28 @@ def caps_of(mesh: WindingMesh) -> WindingMesh:
         for k, loop in enumerate(loops)
     ]
     faces = np.concatenate(fans)
-    once, own = np.ones(len(faces), np.int64), np.arange(len(faces))
+    ones, ids = np.ones(len(faces), np.int64), np.arange(len(faces))
     welded = np.arange(len(vertices))
     return WindingMesh(
-        vertices, faces, once, own, mesh.singular_edges, faces, welded, 0, mesh.center, mesh.size
+        vertices, faces, ones, ids, mesh.singular_edges, faces, welded, 0, mesh.center, mesh.size
     )
 
 
 def simple_loops(edges: IntArray) -> list[IntArray]:
-    """Closed directed edges (k, 2) as loops of vertices, each of which comes once in a loop: the
-    smallest that a walk along the edges closes."""
+    """Closed directed edges (k, 2) as loops of vertices that visit each of their vertices once: the
+    smallest loops that a walk along the edges closes."""
     loops: list[IntArray] = []
     for trail in closed_trails(edges):
         path: list[int] = []
-        place: dict[int, int] = {}
+        position: dict[int, int] = {}
         for vertex in trail.tolist():
-            if vertex not in place:
-                place[vertex] = len(path)
+            if vertex not in position:
+                position[vertex] = len(path)
                 path.append(vertex)
                 continue
-            start = place[vertex]
+            start = position[vertex]
             loops.append(np.array(path[start:], np.int64))
-            for passed in path[start + 1 :]:
-                del place[passed]
+            for dropped in path[start + 1 :]:
+                del position[dropped]
             path = path[: start + 1]
     return loops

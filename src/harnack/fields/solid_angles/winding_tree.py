@@ -1,18 +1,19 @@
-"""Winding numbers by a tree: clusters of far triangles as multipoles, near ones exactly.
+"""Winding numbers by a tree: multipole moments of clusters of far triangles, near triangles
+exactly.
 
 Barill et al. 2018 ("Fast winding numbers for soups and clouds") with orders 0 to 2, gradients and
 Hessians from the same moments, a bound of the truncation, and promises.
 
 Near triangles. By Stokes' theorem the field of a set of triangles is that of the boundary of their
-union, so only edges at which they do not cancel are summed up. `edge_lift` says how crossings and
-edges together make the winding number: both are decided by the same bits, so that an edge that two
+union, so only edges at which they do not cancel are summed. `edge_lift` explains how crossings and
+edges together give the winding number: both are decided by the same bits, so that an edge that two
 triangles share contributes no rounding error.
 
-Soups have the cells of clouds: where triangles have hardly an edge in common, three edges each
-would have to be near. Near triangles are added as the tree adds those of its leaves, and far ones
-are sheets of dipoles with two more moments, so that a cell's sample knows all of w and needs no
-whole number. They are built in a quarter of the time of cells of edges. Soups of few triangles,
-each as large as all of it, have those of edges.
+Soups have the same cells as clouds: if triangles have hardly an edge in common, cells of edges
+would have three near edges for each triangle. Near triangles are added as in the leaves of the
+tree, and far triangles are sheets of dipoles with two more moments, so that a sample in a cell
+gives all of w, including its integer. These cells are built in a quarter of the time of cells of
+edges. Soups of few triangles, each as large as the whole soup, have cells of edges.
 """
 
 from __future__ import annotations
@@ -55,16 +56,20 @@ if TYPE_CHECKING:
     from harnack.fields.solid_angles.treecode import AddPrimitive
     from harnack.fields.solid_angles.winding_mesh import WindingMesh
 
-# The first of three columns of a record after those of `tree.triangle_tree`: 1 where an edge is
+# The first of three columns of a record after the columns of `tree.triangle_tree`: 1 if an edge is
 # singular.
 SINGULAR = INVERSE_SQUARES_COLUMN + 3
-# The corners that edges join, and 1 or -1 for whether they run in the triangle's direction.
+# The corners that edges join, and 1 if they run in the triangle's direction, else -1.
 _EDGES = ((0, 1, 1.0), (1, 2, 1.0), (0, 2, -1.0))
 
 
 @dataclass(frozen=True)
 class NearEdge:
-    """An edge of a triangle. is_singular: whether the triangles at it do not cancel."""
+    """An edge of a near triangle.
+
+    edge: the edge relative to a point.
+    is_singular: whether the triangles at it do not cancel.
+    """
 
     edge: LiftedEdge
     is_singular: Mask
@@ -72,8 +77,8 @@ class NearEdge:
     def is_open(self, reach: Real) -> Mask:
         """Whether the edge may be part of the boundary of the triangles near x.
 
-        It is not if it is nearer than (reach - 1)/2 times its length L and not singular: a far
-        node with a triangle at it has radius R >= L/2 and is farther than reach R, hence the edge
+        It is not if it is not singular and nearer than (reach - 1)/2 times its length L: a far node
+        with a triangle at it has radius R >= L/2 and is farther than reach R, hence the edge
         farther than (reach - 1) R. So all triangles at it are near, and they cancel there.
 
         In a cell the same holds of a triangle that is far from it, with `TRIANGLE_RATIO` for the
@@ -86,8 +91,7 @@ class NearEdge:
 
 
 def edges_of(row: list[Real], x: Vec3, frame: RayFrame | VerticalRayFrame) -> Iterator[NearEdge]:
-    """The edges of the triangle of a record, relative to x; they have no length in an empty
-    slot."""
+    """The edges of the triangle of a record, relative to x; in an empty slot they have length 0."""
     ends = corners_of(row, cast("Any", type(x)))
     for k, (i, j, sign) in enumerate(_EDGES):
         inverse = dr.select(row[NUMBER_COLUMN] >= 0, row[INVERSE_SQUARES_COLUMN + k], 0)
@@ -102,8 +106,10 @@ _SHARE = 1 / (4 * math.pi)
 
 @dataclass(frozen=True)
 class TreeWinding:
-    """w of a mesh on a backend, in units in which the mesh has a size of about one. cells: for
-    samples with gradients up to detail 1."""
+    """w of a mesh on a backend, in units in which the mesh has a size of about one.
+
+    cells: for samples with gradients up to detail 1; None for no cells.
+    """
 
     clusters: Treecode
     rounding: Real
@@ -113,7 +119,7 @@ class TreeWinding:
     def of(
         cls, backend: Backend, mesh: WindingMesh, accuracy: float, order: int,
     ) -> TreeWinding:  # fmt: skip
-        """Everything but cells, uploaded."""
+        """The winding number of a mesh, uploaded, without cells."""
         records = np.concatenate([mesh.records, mesh.singular_flags], axis=1)
         slots = records_in_slots(mesh.tree, records)
         rounding = final_rounding(backend)
@@ -122,7 +128,7 @@ class TreeWinding:
         return cls(clusters, rounding)
 
     def build_cells(self, mesh: WindingMesh, half: float, most_bytes: int) -> DipoleCells | None:
-        """Cells of the cube [-half, half]^3, of at most so many bytes: see `dipole_cells`."""
+        """Cells of the cube [-half, half]^3, of at most `most_bytes` bytes: see `dipole_cells`."""
         sources, triangles = (
             mesh.tree.values_in_slots(triangle_sources(mesh.corners)),
             self.clusters.tree,
@@ -147,7 +153,8 @@ class TreeWinding:
         return self.clusters.coarsest_accuracy if self.cells is None else 1.0
 
     def values(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:
-        """w and the derivatives asked for at points; closer: the detail, at least 1.
+        """w and its derivatives up to order `derivatives` at points; closer: the accuracy scale, at
+        least 1.
 
         Near triangles add their crossings with the rays from x along z, and their open edges.
         """
@@ -178,40 +185,40 @@ class TreeWinding:
 
         is_ahead(row, t): whether a crossing at t with the triangle of a record is ahead.
         """
-        one = LiftedProduct.identity(self.backend.Float).parts()
+        start = LiftedProduct.identity(self.backend.Float).parts()
 
         def adder(reach: Real) -> AddPrimitive:
             def add(
-                row: list[Real], active: Mask, sums: SourceSums, own: tuple[Any, ...]
+                row: list[Real], active: Mask, sums: SourceSums, state: tuple[Any, ...]
             ) -> tuple[SourceSums, tuple[Any, ...]]:
-                t, turn = signed_crossing(row, frame)
+                t, sign = signed_crossing(row, frame)
                 # A crossing is a full turn of the product, which counts them without rounding.
-                re, im, turns = own
-                turns = turns + dr.select(active & is_ahead(row, t), turn, 0)
+                re, im, turns = state
+                turns = turns + dr.select(active & is_ahead(row, t), sign, 0)
                 lifted = LiftedSums(sums, LiftedProduct(re, im, turns))
-                for near in edges_of(row, x, frame):
-                    lifted = lifted.add_edge(near.edge, unit, active & near.is_open(reach))
+                for edge in edges_of(row, x, frame):
+                    lifted = lifted.add_edge(edge.edge, unit, active & edge.is_open(reach))
                 return lifted.sums, lifted.product.parts()
 
             return add
 
-        sums, product = self._near_sums(x, detail, adder, one, where, derivatives)
+        sums, product = self._near_sums(x, detail, adder, start, where, derivatives)
         return LiftedSums(sums, LiftedProduct(*product)).total()
 
     def _near_sums(
         self, x: Vec3, detail: Real, adder: Callable[[Real], AddPrimitive], own: tuple[Any, ...],
         where: Mask, derivatives: int = 1,
     ) -> tuple[SourceSums, tuple[Any, ...]]:  # fmt: skip
-        """The sums, and a state of the caller's own, by the cells where there are any, the detail
-        is at most 1 and derivatives are not second ones.
+        """The sums, and the caller's own state, by the cells if there are cells, the detail is at
+        most 1 and no second derivatives are requested.
 
-        adder: from the reach of `NearEdge.is_open`, what adds a near triangle.
+        adder: from the reach of `NearEdge.is_open`, a function that adds a near triangle.
         """
         if self.cells is None or derivatives == 2:
             add = adder(self.clusters.acceptance_ratio(detail))
             return self.clusters.sums(x, detail, add, own, where, derivatives=derivatives)
-        beyond = self.clusters.acceptance_ratio(fmax(detail, self.backend.Float(1)))
-        adders = adder(self.backend.Float(TRIANGLE_RATIO)), adder(beyond)
+        acceptance = self.clusters.acceptance_ratio(fmax(detail, self.backend.Float(1)))
+        adders = adder(self.backend.Float(TRIANGLE_RATIO)), adder(acceptance)
         return self.cells.sums_with_tree(self.clusters, x, detail, adders, own, where)
 
     def crossings_ahead(self, frame: RayFrame, t: Real, active: Mask) -> Real:
@@ -231,8 +238,8 @@ class TreeWinding:
         rounding puts x.
 
         Promises. For far dipoles see `SourceSums.sample`. The near triangles' field is that of
-        their open edges, and f is harmonic up to the nearest of them; what they add to the
-        remainder is in `LiftedEdge.bounds`.
+        their open edges, and f is harmonic up to the nearest of them; `LiftedEdge.bounds` has their
+        terms of the remainder.
         """
         del turns
         index, unit = (
@@ -244,12 +251,12 @@ class TreeWinding:
             number = index(fmax(row[NUMBER_COLUMN], self.backend.Float(0)))
             return ~((t < behind.t) | ((t == behind.t) & (number <= behind.facet)))
 
-        found = self._sums(frame, x, detail, unit, is_ahead, 1, active)
+        sums = self._sums(frame, x, detail, unit, is_ahead, 1, active)
         line = RayLine(x, frame.d, 8 * unit)
-        known = lipschitz_along(
-            line, found.gradient, found.singularity_distance, self._rates(line, active)
+        promises = lipschitz_along(
+            line, sums.gradient, sums.singularity_distance, self._rates(line, active)
         )
-        return found.sample(_SHARE, unit, self.rounding, along=known)
+        return sums.sample(_SHARE, unit, self.rounding, along=promises)
 
     def _rates(self, line: RayLine, where: Mask) -> Rates:
         """The rates of `trail_sums.line_rates` for 4 pi w on a line."""
@@ -259,13 +266,13 @@ class TreeWinding:
 
             def adder(reach: Real) -> AddPrimitive:
                 def add(
-                    row: list[Real], active: Mask, sums: SourceSums, own: tuple[Any, ...]
+                    row: list[Real], active: Mask, sums: SourceSums, old: tuple[Any, ...]
                 ) -> tuple[SourceSums, tuple[Any, ...]]:
                     for near in edges_of(row, line.x, VerticalRayFrame(line.x)):
-                        open_ = active & near.is_open(reach)
-                        new = add_edge_rates(line, near.edge.edge, lengths, own)
-                        own = tuple(dr.select(open_, a, b) for a, b in zip(new, own, strict=True))
-                    return sums, own
+                        is_open = active & near.is_open(reach)
+                        new = add_edge_rates(line, near.edge.edge, lengths, old)
+                        old = tuple(dr.select(is_open, a, b) for a, b in zip(new, old, strict=True))
+                    return sums, old
 
                 return add
 
