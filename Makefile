@@ -58,7 +58,7 @@ test-frameworks: $(STAMP)
 # Chromium draws pages and views, with a GPU that is computed on the CPU; pictures go to out/browser.
 test-browser: $(STAMP)
 	$(BIN)/python scripts/bootstrap.py browser
-	$(BIN)/python -m pytest -q -n auto --dist loadfile -m browser tests/view
+	$(BIN)/python -m pytest -q -n auto --dist loadfile -m browser tests/live
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -34,7 +34,7 @@ def _wires() -> list[hk.Surface]:
         )
         for radius, tilt in ((1.0, 0.2), (0.8, -0.5), (0.9, 0.8))
     ]  # fmt: skip
-    return [hk.level_set(ring, tolerance=1e-5) for ring in rings]
+    return [hk.traced_surface(ring, tolerance=1e-5) for ring in rings]
 
 
 def _scenes() -> dict[str, tuple[Surfaces, str, Camera]]:
@@ -44,11 +44,11 @@ def _scenes() -> dict[str, tuple[Surfaces, str, Camera]]:
     carved = hk.Sphere(1.0) - hk.Torus(1.0, 0.25)
     return {
         "trefoil knot's surface": (
-            lambda: [hk.level_set(knot, tolerance=2e-4)], "two-tone", Camera(elevation=48)
+            lambda: [hk.traced_surface(knot, tolerance=2e-4)], "two-tone", Camera(elevation=48)
         ),
-        "ball less a torus": (lambda: [hk.level_set(carved, tolerance=2e-4)], "clay", Camera()),
+        "ball less a torus": (lambda: [hk.traced_surface(carved, tolerance=2e-4)], "clay", Camera()),
         "gyroid wall": (
-            lambda: [hk.level_set(gyroid, solid=(-0.4, 0.4), tolerance=2e-4)], "copper", Camera()
+            lambda: [hk.traced_surface(gyroid, level=(-0.4, 0.4), side="between", tolerance=2e-4)], "copper", Camera()
         ),
         "letters": (letters.surfaces, letters.materials[0], letters.camera),
         "wires": (_wires, "clay", Camera()),

@@ -147,7 +147,7 @@ class BlobFormula(Formula):
 
         sums = [summed(group, blob) for group in self.records]
         for group in sums[1:]:
-            sums[0] = hk.maximum(sums[0], group)
+            sums[0] = hk.math.maximum(sums[0], group)
         return sums[0] - self.scene.threshold
 
     def restrict(self, p: Any, direction: Any) -> BlobsAlong:

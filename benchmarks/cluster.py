@@ -86,7 +86,7 @@ def _queries(folder: Path, workers: int, chunks: int) -> tuple[float, float]:
             client.compute(field.value(block)).result()
         start = time.perf_counter()
         values = field.value(points[: chunks * CHUNK])
-        hk.to_zarr(values, folder / f"{workers}.zarr", client=client, progress=workers == 2)
+        hk.io.to_zarr(values, folder / f"{workers}.zarr", client=client, progress=workers == 2)
         seconds = time.perf_counter() - start
         peak = max(client.run(_peak).values())
     return chunks * CHUNK / seconds, peak

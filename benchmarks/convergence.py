@@ -70,7 +70,7 @@ def errors(
         for k in range(1, steps + 1):
             hits = hk.trace(
                 field, eye[None], d, precision="double", tolerance=1e-12,
-                max_steps=k, bound=bound, overstep=overstep,
+                max_steps=k, enclosures=bound, over_relaxation=overstep,
             )  # fmt: skip
             lengths.append(hits.t)
         results[bound] = _measure(field, eye, d, np.array(lengths), t_exact)

@@ -63,7 +63,7 @@ def distances(n: int = POINTS) -> str:
         x = _around(field, count)
         hk.signed_distance(field, x[:200])
         seconds = _cpu(lambda field=field, x=x: hk.signed_distance(field, x))
-        bounds = hk.distance_bounds(field, x[: min(count, 20_000)])
+        bounds = hk.distance.distance_bounds(field, x[: min(count, 20_000)])
         gap = (bounds.upper - bounds.lower) / np.ptp(x, axis=0).max()
         median, upper = np.quantile(gap, [0.5, 0.9])
         rows.append(

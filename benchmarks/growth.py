@@ -102,7 +102,7 @@ def along_rays(series: str, elements: int, field: hk.Field) -> AlongRays:
     backend = choose_backend()
     eye, directions = camera(WIDTH)
     o, d = to_vector3(backend, eye[None]), to_vector3(backend, directions)
-    surface = hk.level_set(field.prepare(backend))
+    surface = hk.Surface(field.prepare(backend))
     hits: list[hk.Hits] = []
 
     def call() -> None:

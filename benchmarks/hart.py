@@ -311,7 +311,7 @@ def _on_our_tracer() -> list[str]:
     o, directions = to_vector3(backend, eye[None]), to_vector3(backend, d)
     looks: dict[Any, float] = {}
     for bound in ("lipschitz", _Tangent, "quadratic-taylor", None):
-        surface = hk.level_set(_Ellipsoid(), 0.0, bound=bound, tolerance=_NEAR)
+        surface = hk.traced_surface(_Ellipsoid(), 0.0, enclosures=bound, tolerance=_NEAR)
         looks[bound] = float(hk.trace(surface, o, directions).evaluations.numpy().mean())
     return [
         "On our tracer, a convex ellipsoid, drawn in a ball, takes "

@@ -79,12 +79,12 @@ def measure(
             seconds.append(core)
         return _row(method, t.numpy(), np.isfinite(t.numpy()), n.numpy(), seconds, lengths,
                     reference)  # fmt: skip
-    surface = hk.level_set(
+    surface = hk.traced_surface(
         field,
         level,
-        bound=bound,
-        overstep=1.0,
-        tolerance=hk.HitTolerance(distance=0.0, value=1e-3),
+        enclosures=bound,
+        over_relaxation=1.0,
+        tolerance=hk.tracer.HitTolerance(distance=0.0, value=1e-3),
     )
     hits = None
     for _ in range(3):  # the first run compiles
@@ -150,11 +150,13 @@ def all_roots(count: int = 10_000, checked: int = 1_000) -> list[str]:
                 continue
             field = BlobFormula(scene, groups=groups) if uses_formula else scene.field(groups)
             level = 0.0 if uses_formula else scene.threshold
-            surface = hk.level_set(field, level, bound=bound, tolerance=1e-3, overstep=1.0)
+            surface = hk.traced_surface(
+                field, level, enclosures=bound, tolerance=1e-3, over_relaxation=1.0
+            )
             seconds: list[float] = []
             for _ in range(2):
                 core = time.process_time()
-                hits = hk.trace(surface, origins, directions, t_max=end, all_hits=24)
+                hits = hk.crossings(surface, origins, directions, t_max=end, max_crossings=24)
                 dr.sync_thread()
                 seconds.append(time.process_time() - core)
             looks, crossings = hits.evaluations.numpy(), hits.count.numpy()

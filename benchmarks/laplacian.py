@@ -37,19 +37,23 @@ class GyroidByLaplacian(hk.Field):
     ) -> None:
         self.scale, self.share, self.domain = 2 * math.pi / cell, share, domain
 
-    def evaluate(self, p: Any) -> hk.Sample:
+    def evaluate(self, p: Any) -> hk.fields.Sample:
         k = self.scale
         (sx, cx), (sy, cy), (sz, cz) = (dr.sincos(k * coordinate) for coordinate in (p.x, p.y, p.z))
         value = sx * cy + sy * cz + sz * cx
         gradient = k * type(p)(cx * cy - sz * sx, cy * cz - sx * sy, cz * cx - sy * sz)
         if self.share is None:
-            return hk.Sample(value, gradient, (hk.Lipschitz(k * _STEEPEST * (1 + 1e-6)),))
+            return hk.fields.Sample(
+                value, gradient, (hk.proofs.Lipschitz(k * _STEEPEST * (1 + 1e-6)),)
+            )
         movement = _STEEPEST * self.share + 1e-5
         lower = fmax(value - movement, -_LARGEST - 1e-5)
         upper = fmin(value + movement, _LARGEST + 1e-5)
         ends = -2 * k * k * upper, -2 * k * k * lower
         radius = type(value)(self.share / k)
-        return hk.Sample(value, gradient, (hk.BoundedLaplacian(radius, lower, upper, *ends),))
+        return hk.fields.Sample(
+            value, gradient, (hk.proofs.BoundedLaplacian(radius, lower, upper, *ends),)
+        )
 
 
 def laplacian() -> str:

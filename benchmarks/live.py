@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from tests.view.browsers import Page, chromium
 
 import harnack as hk
 from harnack.geometry import example_curves
-from tests.view.browsers import Page, chromium
 
 VERTICES, SIZE, SECONDS, EVENTS = 64, 512, 4.0, 60
 # What makes the panel let Python draw, or not.
@@ -114,7 +114,7 @@ def measured(choice: str) -> tuple[float, float, float, float]:
     field = hk.SolidAngle(example_curves.torus_knot(2, 3, VERTICES))
     with (
         chromium() as browser,
-        hk.view(field, level=6.0, opens=False, waits=False) as view,
+        hk.view(field, level=6.0, open_browser=False, block=False) as view,
     ):
         page = Page(browser, view.address, (SIZE, SIZE), samples=1)
         page.rest()

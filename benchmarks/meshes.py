@@ -189,7 +189,9 @@ def _walls() -> list[_Row]:
 
     def ours() -> Any:
         box = hk.Box((-1, -1, -1), (1, 1, 1))
-        return hk.mesh(hk.Gyroid(cell=1.0), solid=(-_WALL, _WALL), clip=box, tolerance=2e-3)
+        return hk.mesh(
+            hk.Gyroid(cell=1.0), level=(-_WALL, _WALL), side="between", clip=box, tolerance=2e-3
+        )
 
     mesh, seconds = _timed(ours)
     evaluations = mesh.metadata["harnack"]["evaluations"]
@@ -242,7 +244,7 @@ def _manifold_wall(step: float) -> _Row | None:
             recorded.append((x, y, z))
             return -1.0
 
-        manifold3d.Manifold.level_set(record, ends, step)
+        manifold3d.Manifold.Surface(record, ends, step)
         wall = _WALL - np.abs(_gyroid(np.array(recorded))[0])
         values = dict(zip(recorded, wall.tolist(), strict=True))
 
@@ -253,7 +255,7 @@ def _manifold_wall(step: float) -> _Row | None:
                 values[x, y, z] = value
             return value
 
-        solid = manifold3d.Manifold.level_set(replay, ends, step, 0.0, 1e-4)
+        solid = manifold3d.Manifold.Surface(replay, ends, step, 0.0, 1e-4)
         solid = solid ^ manifold3d.Manifold.cube([2, 2, 2], True)
         arrays = solid.to_mesh()
         recorded[:] = list(values)

@@ -32,7 +32,7 @@ def pictures() -> str:
 
     def staged(fields: list[hk.Field]) -> Any:
         rays = 3 * _SIZE[0] * _SIZE[1] * _SPP  # as `render` counts them
-        surfaces = (hk.level_set(one).for_rays(rays) for one in fields)
+        surfaces = (hk.Surface(one).for_rays(rays) for one in fields)
         objects = [StudioObject(one, material, has_default_tolerance=True) for one in surfaces]
         return build_studio(mi, objects, size=_SIZE, camera=Camera())
 
@@ -111,7 +111,7 @@ def _as_mesh(mi: Any, studio: Any) -> tuple[Any, int]:
     r, angle = (grid.ravel() for grid in np.meshgrid(r, angle, indexing="ij"))
     flat = 0.9995 * r[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
     o = np.column_stack([np.vstack([[0, 0], flat]), np.full(len(flat) + 1, 2.0)])
-    fine = replace(carrier.surface, tolerance=hk.HitTolerance(1e-5))
+    fine = replace(carrier.surface, tolerance=hk.tracer.HitTolerance(1e-5))
     hits = hk.trace(fine, o, [[0, 0, -1.0]])
     j, i = np.meshgrid(np.arange(_RINGS), np.arange(_RINGS - 2))
 

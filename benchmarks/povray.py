@@ -107,7 +107,10 @@ def _gyroid() -> Drawn:
     k = 3 * math.pi
 
     def formula(x: Any, y: Any, z: Any) -> Any:
-        s, c = [hk.sin(k * axis) for axis in (x, y, z)], [hk.cos(k * axis) for axis in (x, y, z)]
+        s, c = (
+            [hk.math.sin(k * axis) for axis in (x, y, z)],
+            [hk.math.cos(k * axis) for axis in (x, y, z)],
+        )
         return -(s[0] * c[1] + s[1] * c[2] + s[2] * c[0])
 
     def values(p: np.ndarray) -> np.ndarray:
@@ -278,8 +281,12 @@ def by_harnack(
     dr.set_thread_count(threads)
     try:
         o, directions = to_vector3(backend, EYE[None]), to_vector3(backend, d)
-        surface = hk.level_set(
-            drawn.field, drawn.level, clip=drawn.domain, tolerance=TOLERANCE, confirm=confirm
+        surface = hk.traced_surface(
+            drawn.field,
+            drawn.level,
+            clip=drawn.domain,
+            tolerance=TOLERANCE,
+            require_crossing=confirm,
         )
         cores, walls, hits = [], [], None
         for _ in range(4):
@@ -412,7 +419,7 @@ def compare_with_povray() -> str:
             t, core, wall = by_harnack(drawn, d, threads)
             name = f"harnack, {threads} thread{'s'[: threads > 1]}"
             rows.append((name, core / len(d), wall / len(d), t[checked]))
-        t, core, wall = by_harnack(drawn, d, 1, confirm=True)
+        t, core, wall = by_harnack(drawn, d, 1, require_crossing=True)
         rows.append(("harnack, 1 thread, confirm=True", core / len(d), wall / len(d), t[checked]))
         t, _, _ = by_povray(drawn, d, every, positions=True)
         assert t is not None

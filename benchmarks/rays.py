@@ -59,7 +59,7 @@ def measure(
     eye, directions = camera(WIDTH)
     o = to_vector3(backend, eye[None])
     d = to_vector3(backend, directions)
-    surface = hk.level_set(field or scene.make(), bound=bound, overstep=overstep)
+    surface = hk.traced_surface(field or scene.make(), enclosures=bound, over_relaxation=overstep)
     seconds, hits = [], None
     for _ in range(REPEATS + 1):  # the first run compiles
         wall, core = time.perf_counter(), time.process_time()

@@ -37,7 +37,7 @@ def fields() -> dict[str, hk.Field]:
     return named | {
         "dipole cloud, 10,000 points": hk.DipolePotential(*bumpy_cloud(10_000)),
         "dipole cloud, 100,000 points": hk.DipolePotential(*bumpy_cloud(100_000)),
-        "screened cloud, 4,000 points": hk.ScreenedWindingNumber(
+        "screened cloud, 4,000 points": hk.fields.ScreenedWindingNumber(
             points, normals, areas, length=0.5, method="tree"
         ),
         "mesh by tree, 73,728 triangles": hk.WindingNumber(v, damaged, method="tree"),
@@ -54,7 +54,7 @@ def measure() -> dict[str, list[float]]:
     o, d = to_vector3(backend, eye[None]), to_vector3(backend, directions)
     rows: dict[str, list[float]] = {}
     for name, field in fields().items():
-        surface = hk.level_set(field.prepare(backend))
+        surface = hk.Surface(field.prepare(backend))
         hits = hk.trace(surface, o, d, t_max=10.0)  # compiles
         seconds: list[float] = []
         for _ in range(REPEATS):

@@ -17,13 +17,13 @@ import harnack as hk
 def main(folder: Path, size: tuple[int, int] = (640, 480)) -> dict[str, float]:
     field = hk.SolidAngle(hk.geometry.example_curves.wavy_polygon(64))
     hk.render(
-        field, folder / "comparing_bounds.png", show="evaluations", bound="classic", size=size
+        field, folder / "comparing_bounds.png", show="evaluations", enclosures="classic", size=size
     )
     x, y = np.meshgrid(np.linspace(-1.2, 1.2, 60), np.linspace(-1.2, 1.2, 60))
     origins = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 2.0)])
     work, found = {}, set()
     for bound in ("classic", "slope", "caps", None):
-        hits = hk.trace(field, origins, [[0.1, 0.2, -1.0]], bound=bound)
+        hits = hk.trace(field, origins, [[0.1, 0.2, -1.0]], enclosures=bound)
         work[bound or "default"] = float(hits.evaluations.mean())
         found.add(int((hits.status == hk.RayStatus.HIT).sum()))
     for name, evaluations in work.items():

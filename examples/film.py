@@ -21,7 +21,7 @@ def main(folder: Path, size: tuple[int, int] = (320, 240), frames: int = 24) -> 
         path,
         frames=frames,
         fps=12,
-        turn=90,
+        orbit=90,
         level=lambda s: 2 * np.pi - 1.4 * np.pi * np.sin(2 * np.pi * s),
         camera=hk.Camera(elevation=20),
         size=size,

@@ -37,8 +37,8 @@ class Wires(hk.Field):
             gradient = gradient + slope * (a / r_a + b / r_b)
             # By the triangle inequality total <= L + 2 times the distance of the segment.
             radius = dr.minimum(radius, 0.5 * (total - length))
-        promises = (hk.HarmonicBall(radius, lower=0.0, upper=math.inf),)
-        return hk.Sample(value, gradient, promises, error)
+        promises = (hk.proofs.HarmonicBall(radius, lower=0.0, upper=math.inf),)
+        return hk.fields.Sample(value, gradient, promises, error)
 
 
 def tetrahedron() -> Wires:

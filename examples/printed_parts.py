@@ -13,18 +13,20 @@ import numpy as np
 
 import harnack as hk
 
-HEXAGON = hk.outline.regular_polygon(6, 13 / math.sqrt(3))  # 13 mm from side to side
+HEXAGON = hk.io.outline.regular_polygon(6, 13 / math.sqrt(3))  # 13 mm from side to side
 
 
-def bolt() -> hk.Solid:
-    return hk.metric_thread("M8", 22.0) | hk.Extrusion(HEXAGON, 5.3).translated((0, 0, -5.3))
+def bolt() -> hk.solids.Solid:
+    return hk.solids.metric_thread("M8", 22.0) | hk.Extrusion(HEXAGON, 5.3).translated((0, 0, -5.3))
 
 
-def nut() -> hk.Solid:
-    return hk.Extrusion(HEXAGON, 6.5) - hk.metric_thread("M8", 8.0, internal=True, clearance=0.1)
+def nut() -> hk.solids.Solid:
+    return hk.Extrusion(HEXAGON, 6.5) - hk.solids.metric_thread(
+        "M8", 8.0, internal=True, clearance=0.1
+    )
 
 
-def vase() -> hk.Solid:
+def vase() -> hk.solids.Solid:
     """Seven waves around, turned by a quarter and half as wide again above; walls of 1.8 mm."""
     angle = np.linspace(0, 2 * math.pi, 420, endpoint=False)
     radius = 24 + 2.5 * np.cos(7 * angle)
@@ -35,15 +37,15 @@ def vase() -> hk.Solid:
     return body - (hollow & hk.Cuboid((60.0, 60.0, 60.0)).translated((0, 0, 62)))
 
 
-def plate() -> hk.Solid:
-    word = hk.outline.text("harnack", 12.0)
+def plate() -> hk.solids.Solid:
+    word = hk.io.outline.text("harnack", 12.0)
     low, high = np.concatenate(word).min(axis=0) - 4, np.concatenate(word).max(axis=0) + 4
     rim = np.array([low, (high[0], low[1]), high, (low[0], high[1])])
     # A little way into the plate, so that no faces coincide.
     return hk.Extrusion([rim], 2.0) | hk.Extrusion(word, 1.5).translated((0, 0, 1.5))
 
 
-def lattice() -> hk.Solid:
+def lattice() -> hk.solids.Solid:
     gyroid = hk.Gyroid(5.0)
     walls = hk.solid(gyroid, between=gyroid.levels_of_thickness(0.8))
     return walls & hk.Cylinder(20.0, 20.0)
@@ -53,7 +55,7 @@ def seifert() -> hk.SolidAngle:
     return hk.SolidAngle(16 * hk.geometry.example_curves.torus_knot(2, 3, 128))
 
 
-PARTS: dict[str, Callable[[], hk.Solid | hk.SolidAngle]] = {
+PARTS: dict[str, Callable[[], hk.solids.Solid | hk.SolidAngle]] = {
     part.__name__: part for part in (bolt, nut, vase, plate, lattice, seifert)
 }
 # Where parts stand in the picture.
@@ -70,8 +72,8 @@ PLACES = {
 def standing(name: str) -> hk.Surface:
     part, place = PARTS[name](), PLACES[name]
     if isinstance(part, hk.SolidAngle):
-        return hk.level_set(hk.SolidAngle([loop + place for loop in part.loops]))
-    return hk.level_set(part.translated(place), tolerance=hk.HitTolerance(2e-3))
+        return hk.Surface(hk.SolidAngle([loop + place for loop in part.loops]))
+    return hk.traced_surface(part.translated(place), tolerance=hk.tracer.HitTolerance(2e-3))
 
 
 def main(
@@ -87,7 +89,7 @@ def main(
     volumes: dict[str, float] = {}
     for name in names:
         part = PARTS[name]()
-        if isinstance(part, hk.Solid):
+        if isinstance(part, hk.solids.Solid):
             triangles = hk.mesh(part, tolerance=tolerance, simplify=True)
         else:
             triangles = hk.mesh(part, thickness=2.0, tolerance=tolerance, simplify=True)

@@ -23,7 +23,7 @@ def main(folder: Path, size: tuple[int, int] = (640, 480)) -> int:
         folder / "spanning_surface.png",
         level=2 * np.pi,
         show="shaded",
-        boundary=0.04,  # a tube around the knot
+        boundary_radius=0.04,  # a tube around the knot
         camera=hk.Camera(azimuth=-60, elevation=35),
         size=size,
     )

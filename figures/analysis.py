@@ -79,9 +79,12 @@ def figure_19(width: int) -> Report:
     }
     below = []
     for label, (function, part, radius, camera) in opened.items():
-        field = hk.RiemannSurface(function, part, domain=hk.Ball(radius=radius))
+        field = hk.fields.RiemannSurface(function, part, domain=hk.Ball(radius=radius))
         picture, counts = drawn(
-            hk.level_set(field, tolerance=2e-4), fitting(width), camera=camera, material="two-tone"
+            hk.traced_surface(field, tolerance=2e-4),
+            fitting(width),
+            camera=camera,
+            material="two-tone",
         )
         below.append(Panel(picture, f"{label}, full view"))
         texts.append(
@@ -112,14 +115,14 @@ def figure_20(width: int) -> Report:
         (
             drawn(
                 hk.Gyroid(cell=0.8, domain=hk.Box((-1, -1, -1), (1, 1, 1))), fitting(2 * width),
-                camera=camera, solid=(-0.35, 0.35), material="silver",
+                camera=camera, level=(-0.35, 0.35), side="between", material="silver",
             ),
             "a wall as it is printed, in a box",
         ),
     ]  # fmt: skip
     texts = [f"{label}: {counts}" for (_, counts), label in pictures]
     view = View.of(_sphere(), fitting(width), camera)
-    published = view.trace(sheet, bound="classic", overstep=1.75)
+    published = view.trace(sheet, enclosures="classic", over_relaxation=1.75)
     counts = Counts.of(published.status, published.evaluations)
     caption = (
         "The gyroid sin x cos y + sin y cos z + sin z cos x, which is not harmonic, but a slice "
@@ -141,12 +144,14 @@ def figure_21(width: int) -> Report:
     camera = Camera(azimuth=-50, elevation=26)
     picture, counts = scene("eigenfunctions", 2 * width, camera=camera)
     terms = [
-        hk.WaveProduct(1.0, x=hk.sine_factor(k), y=hk.sine_factor(k), z=hk.sine_factor(k))
+        hk.fields.WaveProduct(
+            1.0, x=hk.fields.sine_factor(k), y=hk.fields.sine_factor(k), z=hk.fields.sine_factor(k)
+        )
         for k in (6.0, 2.0)
     ]
     side = math.pi / 2
     box = hk.Box((-side, -side, -side), (side, side, side))
-    field = hk.EigenfunctionSum(terms, domain=box)
+    field = hk.fields.EigenfunctionSum(terms, domain=box)
     corners = side * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     view = View.of(corners, fitting(width), camera)
     rows = []
@@ -155,7 +160,7 @@ def figure_21(width: int) -> Report:
         ("with the slope", "slope", 1.4),
         ("all proofs", None, None),
     ):
-        hits = view.trace(field, level=0.5, bound=bound, overstep=overstep)
+        hits = view.trace(field, level=0.5, enclosures=bound, over_relaxation=overstep)
         rows.append(f"{name}: {Counts.of(hits.status, hits.evaluations)}")
     caption = (
         "The 1/2 level of sin 6x sin 6y sin 6z + sin 2x sin 2y sin 2z, as a solid in a cube of "

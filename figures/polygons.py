@@ -33,8 +33,8 @@ def figure_1(width: int) -> Report:
     picture = view.shade(hits.normal, hits.is_hit)
     t = np.where(hits.is_hit, hits.t, np.inf)
     for lines, color in (
-        (hk.TubeNetwork(points, segments, 0.006), (0.25, 0.25, 0.25)),
-        (hk.TubeNetwork(samples[[0, -1]], [(0, 1)], 0.012), (0.75, 0.55, 0.1)),
+        (hk.solids.TubeNetwork(points, segments, 0.006), (0.25, 0.25, 0.25)),
+        (hk.solids.TubeNetwork(samples[[0, -1]], [(0, 1)], 0.012), (0.75, 0.55, 0.1)),
     ):
         line_hits = view.trace(lines)
         nearer = line_hits.is_hit & (line_hits.t < t)
@@ -90,7 +90,7 @@ def _steps(
     lengths = [0.0]
     for max_steps in range(1, 400):
         hits = hk.trace(
-            field, start[None], d[None], max_steps=max_steps, bound=bound, overstep=overstep,
+            field, start[None], d[None], max_steps=max_steps, enclosures=bound, over_relaxation=overstep,
             precision="double",
         )  # fmt: skip
         if hits.t[0] > lengths[-1]:
@@ -229,7 +229,9 @@ def _crossings(field: hk.SolidAngle, vertices: Array, faces: Array) -> tuple[int
     triangles."""
     u = np.linspace(-0.97, 0.97, 50) + 1.234e-3
     grid = np.stack(np.meshgrid(u, u, [2.0], indexing="ij"), axis=-1).reshape(-1, 3)
-    level = hk.trace(field, grid, [[0, 0, -1.0]], all_hits=6, precision="double", t_max=4.0)
+    level = hk.crossings(
+        field, grid, [[0, 0, -1.0]], max_crossings=6, precision="double", t_max=4.0
+    )
     corners = vertices[faces][..., :2]
     sides = []
     for k in range(3):

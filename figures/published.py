@@ -93,7 +93,9 @@ def claimed_angle(field: hk.SolidAngle) -> Claim:
     def look(p: Array) -> tuple[Array, Array, Array]:
         sample = ready.evaluate(to_vector3(backend, p))
         (ball,) = [
-            promise for promise in sample.all_promises if isinstance(promise, hk.HarmonicBall)
+            promise
+            for promise in sample.all_promises
+            if isinstance(promise, hk.proofs.HarmonicBall)
         ]
         return to_numpy(sample.value), to_numpy(sample.gradient), to_numpy(ball.radius)
 

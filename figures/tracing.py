@@ -40,7 +40,7 @@ def figure_4(width: int) -> Report:
         for row, view in zip(panels, views, strict=True):
             d = view.directions()
             start, end = _in_ball(view.eye, d)
-            truth = view.trace(field, level=level, clip=ball, tolerance=1e-6, confirm=True)
+            truth = view.trace(field, level=level, clip=ball, tolerance=1e-6, require_crossing=True)
             ends = published(claim, view.eye, d, start, end)
             missed = truth.is_hit & ~(ends.t < truth.t + 0.01) & (ends.evaluations < MOST)
             rising = (truth.normal * d).sum(axis=1) > 0
@@ -167,7 +167,7 @@ def figure_22(width: int) -> Report:
             f"a ray, {ends.evaluations[hit].mean():.0f} a hitting one, {ends.evaluations.max()} "
             f"at most ({lost} rays reach the limit of {MOST})"
         )
-    classic = view.trace(field, bound="classic", overstep=1.75)
+    classic = view.trace(field, enclosures="classic", over_relaxation=1.75)
     hits = view.trace(field)
     panels.append(Panel(heat(hits.evaluations, 250, view.size), "harnack, same scale"))
     panels.append(Panel(heat(hits.evaluations, 25, view.size), "harnack, a tenth of the scale"))

@@ -25,7 +25,7 @@ def main(folder: Path) -> None:
             lambda x, y, z: (3 * x * x * y - y**3) / 2, interval=0.1, width=0.012, color="white"
         ),
     ]
-    graph = hk.HeightField(lambda x, y: (x**3 - 3 * x * y * y) / 2, domain=hk.Ball())
+    graph = hk.fields.HeightField(lambda x, y: (x**3 - 3 * x * y * y) / 2, domain=hk.Ball())
     hk.render(graph, folder / "view-conjugates.png", isolines=net, material="plastic", **shaded)
     trefoil = hk.SolidAngle(hk.geometry.example_curves.torus_knot(2, 3, 60))
     heights = hk.Isolines("z", interval=0.2, color="white")

@@ -3,12 +3,13 @@
 import harnack as hk
 hits = hk.trace(hk.SolidAngle(vertices), origins, directions)
 
-Names are imported when they are first used, as `__init__.pyi` lists them: unused names take no time
-to start.
+The names at the top are imported when they are first used, as `__init__.pyi` lists them, and so are
+the namespaces, modules with everything else: unused names take no time to start.
 """
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import Any, cast
 
 import lazy_loader
@@ -18,11 +19,38 @@ from harnack import backend as backend
 from harnack._version import __version__ as __version__
 from harnack.name_suggestions import did_you_mean
 
-_import, __dir__, __all__ = cast("Any", lazy_loader).attach_stub(__name__, __file__)
+_import, _, _names = cast("Any", lazy_loader).attach_stub(__name__, __file__)
+_NAMESPACES = (
+    "arithmetic", "distance", "enclosures", "fields", "files", "gallery", "geometry", "io",
+    "kernels", "live", "math", "meshing", "printing", "proofs", "rendering", "solids", "testing",
+    "tracer",
+)  # fmt: skip
+__all__ = [  # pyright: ignore[reportUnsupportedDunderAll]
+    name for name in _names if name not in (*_NAMESPACES, "backend")
+]
 
 
 def __getattr__(name: str) -> Any:
+    if name in _NAMESPACES:
+        return import_module(f"{__name__}.{name}")
     if name in __all__:
         return _import(name)
-    hint = did_you_mean(name, __all__)
+    namespace = _namespace_of(name)
+    if namespace is not None:
+        raise AttributeError(f"{name} is in a namespace: {__name__}.{namespace}.{name}")
+    hint = did_you_mean(name, (*__all__, *_NAMESPACES))
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint}")
+
+
+def __dir__() -> list[str]:
+    return sorted((*__all__, *_NAMESPACES))
+
+
+def _namespace_of(name: str) -> str | None:
+    """The namespace that has a public name; None if there is none."""
+    if name.startswith("_"):
+        return None
+    for namespace in _NAMESPACES:
+        if name in getattr(import_module(f"{__name__}.{namespace}"), "__all__", ()):
+            return namespace
+    return None

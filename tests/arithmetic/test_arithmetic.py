@@ -169,31 +169,31 @@ def root(x: Any) -> Any:
 
 
 TRUTHS: dict[str, tuple[ElementaryFunction, Callable[[Any], tuple[Any, Any, Any]]]] = {
-    "exp": (hk.exp, lambda x: (np.exp(x),) * 3),
-    "log": (hk.log, lambda x: (np.log(x), 1 / x + 0 * np.log(x), -1 / x**2 + 0 * np.log(x))),
-    "sqrt": (hk.sqrt, lambda x: (np.sqrt(x), 0.5 / np.sqrt(x), -0.25 / (x * np.sqrt(x)))),
-    "sin": (hk.sin, lambda x: (np.sin(x), np.cos(x), -np.sin(x))),
-    "cos": (hk.cos, lambda x: (np.cos(x), -np.sin(x), -np.cos(x))),
+    "exp": (hk.math.exp, lambda x: (np.exp(x),) * 3),
+    "log": (hk.math.log, lambda x: (np.log(x), 1 / x + 0 * np.log(x), -1 / x**2 + 0 * np.log(x))),
+    "sqrt": (hk.math.sqrt, lambda x: (np.sqrt(x), 0.5 / np.sqrt(x), -0.25 / (x * np.sqrt(x)))),
+    "sin": (hk.math.sin, lambda x: (np.sin(x), np.cos(x), -np.sin(x))),
+    "cos": (hk.math.cos, lambda x: (np.cos(x), -np.sin(x), -np.cos(x))),
     "tan": (
-        hk.tan,
+        hk.math.tan,
         lambda x: (np.tan(x), 1 / np.cos(x) ** 2, 2 * np.sin(x) / np.cos(x) ** 3),
     ),
     "tanh": (
-        hk.tanh,
+        hk.math.tanh,
         lambda x: (np.tanh(x), 1 / np.cosh(x) ** 2, -2 * np.tanh(x) / np.cosh(x) ** 2),
     ),
-    "atan": (hk.atan, lambda x: (np.arctan(x), 1 / (1 + x**2), -2 * x / (1 + x**2) ** 2)),
+    "atan": (hk.math.atan, lambda x: (np.arctan(x), 1 / (1 + x**2), -2 * x / (1 + x**2) ** 2)),
     "asin": (
-        hk.asin,
+        hk.math.asin,
         lambda x: (np.arcsin(x), root(x), x * root(x) ** 3),
     ),
     "acos": (
-        hk.acos,
+        hk.math.acos,
         lambda x: (np.arccos(x), -root(x), -x * root(x) ** 3),
     ),
-    "sinh": (hk.sinh, lambda x: (np.sinh(x), np.cosh(x), np.sinh(x))),
-    "cosh": (hk.cosh, lambda x: (np.cosh(x), np.sinh(x), np.cosh(x))),
-    "abs": (hk.absolute, lambda x: (np.abs(x), np.sign(x), 0 * x)),
+    "sinh": (hk.math.sinh, lambda x: (np.sinh(x), np.cosh(x), np.sinh(x))),
+    "cosh": (hk.math.cosh, lambda x: (np.cosh(x), np.sinh(x), np.cosh(x))),
+    "abs": (hk.math.absolute, lambda x: (np.abs(x), np.sign(x), 0 * x)),
     **{
         f"power {n}": (power(n), long_power(n))
         for n in (0.0, 1.0, 2.0, 3.0, 4.0, 7.0, -1.0, -2.0, -3.0, 0.5, 1.5, 2.5, -0.5, 1 / 3, 12.7)
@@ -228,7 +228,7 @@ def test_angles(precision: Any) -> None:
         boxes = [interval(backend, *one, exact=exact) for one in (ys, xs)]
         one = Interval.point(backend.Float(1))
         jets = [Jet(box, (one,), (ZERO,), piece_length=backend.Float(0)) for box in boxes]
-        made = hk.atan2(*jets)
+        made = hk.math.atan2(*jets)
         for v, u in zip(inside(rng, *ys), inside(rng, *xs), strict=True):
             v, u = (part.astype(Long) + 0 for part in (v, u))  # no -0
             with np.errstate(all="ignore"):
@@ -264,7 +264,9 @@ FORMULAS: dict[str, tuple[Callable[..., Any], Callable[..., Any]]] = {
         lambda x, y, z: Long(0.1) * (x * x * y - 3 * z) + x / 3 + (z - Long(0.7)) ** 3 / y,
     ),
     "mixed": (
-        lambda x, y, z: hk.sin(3 * x) * hk.exp(-y * y) + hk.cos(x * z) / (2 + hk.tanh(z)),
+        lambda x, y, z: (
+            hk.math.sin(3 * x) * hk.math.exp(-y * y) + hk.math.cos(x * z) / (2 + hk.math.tanh(z))
+        ),
         lambda x, y, z: np.sin(3 * x) * np.exp(-y * y) + np.cos(x * z) / (2 + np.tanh(z)),
     ),
     "crease": (
@@ -278,7 +280,7 @@ FORMULAS: dict[str, tuple[Callable[..., Any], Callable[..., Any]]] = {
         lambda x, y, z: np.sqrt((np.sqrt(x * x + y * y) - 1) ** 2 + z * z) - Long(0.3),
     ),
     "angle": (
-        lambda x, y, z: hk.atan2(y * z + 0.1, x - y) + 0.3 * hk.atan2(2.0, x),
+        lambda x, y, z: hk.math.atan2(y * z + 0.1, x - y) + 0.3 * hk.math.atan2(2.0, x),
         lambda x, y, z: np.arctan2(y * z + Long(0.1), x - y) + Long(0.3) * np.arctan2(Long(2), x),
     ),
     **{
@@ -412,11 +414,13 @@ def check_mostly(result: Interval, true: Any, relative: float) -> None:
     assert narrow.mean() > 0.95
 
 
-@pytest.mark.parametrize("make", [lambda y: 1 / y, hk.tan, lambda y: y**-2.0, lambda y: 1 / y**3])
+@pytest.mark.parametrize(
+    "make", [lambda y: 1 / y, hk.math.tan, lambda y: y**-2.0, lambda y: 1 / y**3]
+)
 def test_nothing_is_known_across_a_pole(make: Callable[[Any], Any]) -> None:
     """1/y falls on both sides of 0 and is larger behind it: its slope there is no number <= 0."""
     backend = choose_backend("double")
-    at = backend.Array3f(0, -1 if make is not hk.tan else 1, 0)
+    at = backend.Array3f(0, -1 if make is not hk.math.tan else 1, 0)
     jet = make(
         Jet.along_ray(at, backend.Array3f(0, 1, 0), backend.Float(0.0), backend.Float(2.0))[1]
     )
@@ -445,7 +449,7 @@ def test_kinds_of_numbers() -> None:
     jet = Jet.at_point(backend.Array3f(1, 2, 3))[0]
     for larger in (maximum(0.5, jet), np.maximum(0.5, jet), np.maximum(jet, 0.5)):
         assert float(larger.value.lower[0]) == 1.0
-    assert float(hk.absolute(jet - 3).value.lower[0]) <= 2.0
+    assert float(hk.math.absolute(jet - 3).value.lower[0]) <= 2.0
 
 
 @pytest.mark.parametrize(
@@ -469,7 +473,7 @@ def test_values_hold_all_values_and_say_where_there_are_none() -> None:
     centers, half = rng.uniform(-2, 2, (2000, 3)), rng.uniform(0, 0.5, 2000)
 
     def formula(x: Any, y: Any, z: Any) -> Any:
-        root = hk.sqrt(x * y) if isinstance(x, Values) else np.sqrt(x * y)
+        root = hk.math.sqrt(x * y) if isinstance(x, Values) else np.sqrt(x * y)
         return maximum(root + z**2, (z + 3.0) ** 0.5 - y) * x
 
     p = backend.Array3f(*(backend.Float(value) for value in centers.T))
@@ -509,9 +513,9 @@ def test_ends_that_are_no_number_stay_unknown(precision: Any) -> None:
 def test_roots_of_sums_of_squares_have_the_slopes_of_norms() -> None:
     backend = choose_backend("double")
     x, y, _ = Jet.over_ball(backend.Array3f(0.0, 0.1, 0.0), backend.Float(0.2))
-    written = hk.sqrt(x * x / 4 + 2 * y**2)
+    written = hk.math.sqrt(x * x / 4 + 2 * y**2)
     exact = norm(x * 0.5, y * 2**0.5)
     for slope, right in zip(written.first_derivatives, exact.first_derivatives, strict=True):
         np.testing.assert_allclose(np.array(slope.lower), np.array(right.lower), rtol=1e-9)
         np.testing.assert_allclose(np.array(slope.upper), np.array(right.upper), rtol=1e-9)
-    assert np.isinf(np.array(hk.sqrt(x * x - y * y).first_derivatives[0].upper))
+    assert np.isinf(np.array(hk.math.sqrt(x * x - y * y).first_derivatives[0].upper))

@@ -253,7 +253,9 @@ def test_all_proofs_hit_the_same(name: str, precision: str) -> None:
     rays = to_vector3(backend, o), to_vector3(backend, target - o)
 
     def hits(bound: str | None) -> tuple[Any, Any]:
-        found = hk.trace(hk.level_set(field, bound=bound, tolerance=1e-5, max_steps=1000), *rays)
+        found = hk.trace(
+            hk.traced_surface(field, enclosures=bound, tolerance=1e-5, max_steps=1000), *rays
+        )
         return found.status.numpy(), found.t.numpy()
 
     status, t = hits(None)
@@ -278,7 +280,7 @@ def test_all_proofs_hit_the_same(name: str, precision: str) -> None:
 def test_proofs_of_formulas_say_what_they_need() -> None:
     with pytest.raises(ValueError, match="no bound applies"):
         hk.trace(
-            hk.level_set(hk.SphericalHarmonic(4, 2), bound="bottom-up-quadratic"),
+            hk.traced_surface(hk.SphericalHarmonic(4, 2), enclosures="bottom-up-quadratic"),
             np.array([[3.0, 0, 0]]),
             np.array([[-1.0, 0, 0]]),
         )

@@ -73,7 +73,7 @@ def with_torch(name: str, precision: Precision) -> tuple[np.ndarray, list[np.nda
     function, arrays = CASES[name]
     dtype = torch.float32 if precision == "single" else torch.float64
     arguments = [torch.tensor(a, dtype=dtype, requires_grad=True) for a in arrays]
-    result = hk.wrap_for_torch(function)(*arguments)
+    result = hk.io.wrap_for_torch(function)(*arguments)
     weights = torch.arange(1, result.numel() + 1, dtype=dtype).reshape(result.shape)
     (result * weights).sum().backward()
     return result.detach().numpy(), [value.grad.numpy() for value in arguments]
@@ -83,7 +83,7 @@ def with_jax(name: str, precision: Precision) -> tuple[np.ndarray, list[np.ndarr
     function, arrays = CASES[name]
     with jax.enable_x64(precision == "double"):
         given = [jax.numpy.asarray(a, "f4" if precision == "single" else "f8") for a in arrays]
-        result, pull_back = jax.vjp(hk.wrap_for_jax(function), *given)
+        result, pull_back = jax.vjp(hk.io.wrap_for_jax(function), *given)
         weights = jax.numpy.arange(1, result.size + 1, dtype=result.dtype).reshape(result.shape)
         return np.asarray(result), [np.asarray(one) for one in pull_back(weights)]
 
@@ -138,8 +138,8 @@ def test_jax_compiles_around_a_wrapped_function() -> None:
         return lambda x, n: (wrapped(x, n)["sum"] * jax.numpy.arange(20)).sum()
 
     x, n = jax.numpy.asarray(POINTS, "f4"), jax.numpy.array([3], "i4")
-    plain = hk.wrap_for_jax(count)
-    shaped = hk.wrap_for_jax(count, result_like=lambda x, n: {"sum": x[:, 0], "repeats": n})
+    plain = hk.io.wrap_for_jax(count)
+    shaped = hk.io.wrap_for_jax(count, result_like=lambda x, n: {"sum": x[:, 0], "repeats": n})
     assert jax.jit(shaped)(x, n)["repeats"] == 3
     expected = 2 * POINTS * np.arange(20)[:, None]
     for gradient in (
@@ -153,7 +153,7 @@ def test_jax_compiles_around_a_wrapped_function() -> None:
     with pytest.raises(TypeError, match=r"cannot run inside jax\.jit.*result="):
         jax.jit(plain)(x, n)
     with pytest.raises(TypeError, match=r"returns Dr\.Jit arrays or tensors.*not Hits"):
-        hk.wrap_for_jax(lambda v: hk.trace(hk.SolidAngle(v), EYE[None], AWAY))(x)
+        hk.io.wrap_for_jax(lambda v: hk.trace(hk.SolidAngle(v), EYE[None], AWAY))(x)
 
 
 def test_results_that_are_arguments_or_come_twice() -> None:
@@ -162,7 +162,7 @@ def test_results_that_are_arguments_or_come_twice() -> None:
         return x, y, y
 
     def loss(x: Any, factor: Any) -> Any:
-        return sum(k * one.sum() for k, one in enumerate(hk.wrap_for_jax(twice)(x, factor), 1))
+        return sum(k * one.sum() for k, one in enumerate(hk.io.wrap_for_jax(twice)(x, factor), 1))
 
     by_x, by_factor = jax.grad(loss, argnums=(0, 1))(jax.numpy.arange(3.0), 10.0)
     np.testing.assert_allclose(by_x, np.full(3, 1 + 5 * 10.0))
@@ -172,10 +172,10 @@ def test_results_that_are_arguments_or_come_twice() -> None:
 def test_compiled_gradients_of_many_points() -> None:
     """So many that JAX hands them over by another thread."""
     points = jax.numpy.asarray(np.tile(POINTS, (5000, 1)), "f4")
-    wrapped = hk.wrap_for_jax(angles, result_like=lambda vertices, points: points[:, 0])
+    wrapped = hk.io.wrap_for_jax(angles, result_like=lambda vertices, points: points[:, 0])
     gradient = jax.jit(jax.grad(lambda v, p: wrapped(v, 2 * p).mean()))
     vertices = jax.numpy.asarray(LOOP, "f4")
-    few = jax.grad(lambda v, p: hk.wrap_for_jax(angles)(v, 2 * p).mean())(vertices, points[:20])
+    few = jax.grad(lambda v, p: hk.io.wrap_for_jax(angles)(v, 2 * p).mean())(vertices, points[:20])
     np.testing.assert_allclose(gradient(vertices, points), few, atol=1e-4)
 
 
@@ -189,8 +189,8 @@ def test_all_of_hits_comes_out() -> None:
     in_torch = (torch.tensor(a, dtype=torch.float32) for a in rays)
     in_jax = (jax.numpy.asarray(a, "f4") for a in rays)
     for found in (
-        hk.wrap_for_torch(everything)(*in_torch),
-        hk.wrap_for_jax(everything)(*in_jax),
+        hk.io.wrap_for_torch(everything)(*in_torch),
+        hk.io.wrap_for_jax(everything)(*in_jax),
     ):
         assert found.keys() == vars(expected).keys()
         for name, value in vars(expected).items():
@@ -226,12 +226,12 @@ def test_whether_rays_hit_has_no_derivative(framework: str) -> None:
     arguments = [np.asarray(value, np.float32) for value in (LOOP, EYE[None], AWAY)]
     if framework == "torch":
         tensors = [torch.tensor(value, requires_grad=True) for value in arguments]
-        result = hk.wrap_for_torch(seen)(*tensors)
+        result = hk.io.wrap_for_torch(seen)(*tensors)
 
         def differentiated() -> None:
             result.sum().backward()
     else:
-        result, pull_back = jax.vjp(hk.wrap_for_jax(seen), *arguments)
+        result, pull_back = jax.vjp(hk.io.wrap_for_jax(seen), *arguments)
 
         def differentiated() -> None:
             pull_back(jax.numpy.ones_like(result))
@@ -251,12 +251,12 @@ def test_graphs_of_pytorch_can_be_gone_back_through_again() -> None:
         total = (result * weight).sum()
         return torch.autograd.grad(total, vertices, retain_graph=again)[0]
 
-    kept = hk.wrap_for_torch(depths)(vertices, *rest)
+    kept = hk.io.wrap_for_torch(depths)(vertices, *rest)
     for weight in weights:
-        alone = gradient(hk.wrap_for_torch(depths)(vertices, *rest), weight, False)
+        alone = gradient(hk.io.wrap_for_torch(depths)(vertices, *rest), weight, False)
         torch.testing.assert_close(gradient(kept, weight, True), alone)
     points = torch.tensor(POINTS[:2])
-    assert torch.autograd.gradcheck(lambda v: hk.wrap_for_torch(angles)(v, points), (vertices,))
+    assert torch.autograd.gradcheck(lambda v: hk.io.wrap_for_torch(angles)(v, points), (vertices,))
 
 
 def test_containers_and_other_arguments_are_passed_on() -> None:
@@ -264,7 +264,7 @@ def test_containers_and_other_arguments_are_passed_on() -> None:
         return {"twice": scale * points, "count": hk.SolidAngle(LOOP).value(points)}
 
     points = torch.tensor(POINTS, requires_grad=True)
-    result = hk.wrap_for_torch(both)(points, 2.0)
+    result = hk.io.wrap_for_torch(both)(points, 2.0)
     assert list(result) == ["twice", "count"]
     result["twice"].sum().backward()
     torch.testing.assert_close(points.grad, torch.full_like(points, 2.0))
@@ -280,8 +280,8 @@ def test_a_step_compiles_nothing_after_the_first_two(name: str) -> None:
     vertices = torch.tensor(circle, dtype=torch.float32, requires_grad=True)
     rest = [torch.tensor(a, dtype=torch.float32) for a in arrays[1:]]
     optimizer = torch.optim.Adam([vertices], lr=0.03)
-    in_torch = hk.wrap_for_torch(function)
-    in_jax = jax.value_and_grad(lambda *given: (hk.wrap_for_jax(function)(*given) ** 2).sum())
+    in_torch = hk.io.wrap_for_torch(function)
+    in_jax = jax.value_and_grad(lambda *given: (hk.io.wrap_for_jax(function)(*given) ** 2).sum())
     certificates: set[str] = set()
 
     def step(k: int) -> None:
@@ -314,8 +314,8 @@ loop = hk.geometry.example_curves.wavy_polygon(12)
 hk.render(hk.SolidAngle(loop), size=(16, 16), show="shaded", progress=False)
 value = lambda v, p: hk.SolidAngle(v).value(p)
 v, p = torch.tensor(loop, requires_grad=True), torch.tensor([[0, 0, 0.5]], dtype=torch.float64)
-hk.wrap_for_torch(value)(v, p).sum().backward()
-found = jax.grad(lambda *given: hk.wrap_for_jax(value)(*given)[0])(np.float32(loop), np.float32(p))
+hk.io.wrap_for_torch(value)(v, p).sum().backward()
+found = jax.grad(lambda *given: hk.io.wrap_for_jax(value)(*given)[0])(np.float32(loop), np.float32(p))
 np.testing.assert_allclose(v.grad.numpy(), found, atol=1e-5)
 """
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
@@ -348,8 +348,8 @@ def test_fields_of_learned_numbers_are_refused(framework: str, made: Any) -> Non
     def differentiated() -> Any:
         if framework == "torch":
             r = torch.ones(1, requires_grad=True)
-            return hk.wrap_for_torch(first_hits)(r)
-        return jax.vjp(hk.wrap_for_jax(first_hits), jax.numpy.ones(1))
+            return hk.io.wrap_for_torch(first_hits)(r)
+        return jax.vjp(hk.io.wrap_for_jax(first_hits), jax.numpy.ones(1))
 
     with pytest.raises(NotImplementedError, match="which carry derivatives"):
         differentiated()

@@ -160,7 +160,7 @@ HARMONIC = hk.SphericalHarmonic(3, 2)
 
 def cut(k: int) -> hk.geometry.Volume:
     box = hk.Box((-1 - 0.1 * k, -1, -1), (1, 2, 0.5 + 0.01 * k))
-    return hk.VolumeIntersection([hk.Ball((0.01 * k, 0, 0), 1 + 0.1 * k), box])
+    return hk.geometry.VolumeIntersection([hk.Ball((0.01 * k, 0, 0), 1 + 0.1 * k), box])
 
 
 def lines(k: int) -> list[hk.Isolines]:
@@ -192,17 +192,20 @@ PICTURES: dict[str, Callable[[int], int]] = {
     },
     "clipped": lambda k: drawn(HARMONIC, k, "path", level=0.1 + 0.01 * k, clip=cut(k)),
     "glass": lambda k: drawn(
-        HARMONIC, k, "path", solid=(-np.inf, 0.1 + 0.01 * k), clip=cut(k), material="glass"
+        HARMONIC, k, "path", level=0.1 + 0.01 * k, side="below", clip=cut(k), material="glass"
     ),
     "amber": lambda k: drawn(
-        HARMONIC, k, "shaded", solid=(-np.inf, 0.1 + 0.01 * k), clip=cut(k), material="amber"
+        HARMONIC, k, "shaded", level=0.1 + 0.01 * k, side="below", clip=cut(k), material="amber"
     ),
-    "wall": lambda k: drawn(HARMONIC, k, "shaded", solid=(-0.1 - 0.01 * k, 0.2), clip=cut(k)),
+    "wall": lambda k: drawn(
+        HARMONIC, k, "shaded", level=(-0.1 - 0.01 * k, 0.2), side="between", clip=cut(k)
+    ),
     "section": lambda k: drawn(
         HARMONIC,
         k,
         "shaded",
-        solid=(-np.inf, 0.1 + 0.01 * k),
+        level=0.1 + 0.01 * k,
+        side="below",
         cut_material="gold",
         section=hk.HalfSpace((0.02 * k, -1, 0.3), 0.01 * k),
     ),

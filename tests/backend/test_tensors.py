@@ -134,7 +134,7 @@ def test_components_that_are_one_number_have_the_derivative_of_their_sum() -> No
         vertices = BACKEND.Array3f(*(BACKEND.Float(c) for c in (*flat.T[:2], height[0])))
         origins = BACKEND.Array3f(*(BACKEND.Float(c) for c in (*o.T[:2], height[1])))
         dr.enable_grad(vertices, origins)
-        hits = hk.trace(hk.SolidAngle(vertices), origins, d, level=5.0, all_hits=2)
+        hits = hk.crossings(hk.SolidAngle(vertices), origins, d, level=5.0, max_crossings=2)
         dr.backward(dr.sum(dr.select(dr.isfinite(hits.t), hits.t, 0)))
         z.append((float(dr.sum(vertices.grad.z)[0]), float(dr.sum(origins.grad.z)[0])))
     assert min(map(abs, z[0])) > 0.1

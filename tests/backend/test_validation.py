@@ -68,21 +68,21 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "solid": (lambda: hk.mesh(SPHERE, solid=[]), r"^solid must be \(low, high\)"),
     "progress": (lambda: hk.mesh(SPHERE, progress=True), "^progress must be a function"),
     "progress of a distance": (
-        lambda: hk.closest_points(SPHERE, [[2, 0, 0]], progress=1.0),
+        lambda: hk.distance.closest_points(SPHERE, [[2, 0, 0]], progress=1.0),
         "^progress must be a func",
     ),
     "method": (lambda: hk.signed_distance(SPHERE, [[2, 0, 0]], method=ROW), "^unknown method"),
     "precision": (lambda: hk.trace(SPHERE, [[2, 0, 0]], [[1, 0, 0]], precision=ROW), "^precision"),
     "no field for lines": (
-        lambda: hk.curvature_lines(None, [[1, 0, 0]], step=0.1, length=1),
+        lambda: hk.distance.curvature_lines(None, [[1, 0, 0]], step=0.1, length=1),
         "harnack field is needed",
     ),
     "level of lines": (
-        lambda: hk.curvature_lines(SPHERE, [[1, 0, 0]], step=0.1, length=1, level="a"),
+        lambda: hk.distance.curvature_lines(SPHERE, [[1, 0, 0]], step=0.1, length=1, level="a"),
         "^level must be a number",
     ),
     "clip of lines": (
-        lambda: hk.curvature_lines(SPHERE, [[1, 0, 0]], step=0.1, length=1, clip=SPHERE),
+        lambda: hk.distance.curvature_lines(SPHERE, [[1, 0, 0]], step=0.1, length=1, clip=SPHERE),
         "^clip must be a volume",
     ),
     "no field to check": (lambda: hk.testing.check_field(None), "harnack field is needed"),
@@ -99,7 +99,7 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
         "^tolerance must be a Tolerance",
     ),
     "a level set for a field": (
-        lambda: hk.signed_distance(hk.level_set(SPHERE), [[2, 0, 0]]),
+        lambda: hk.signed_distance(hk.Surface(SPHERE), [[2, 0, 0]]),
         "take its .field, and what ",
     ),
     "level of a formula": (lambda: hk.expression("x", level=None), "^level must be a number"),
@@ -109,7 +109,7 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "order": (lambda: hk.WindingNumber(*TRIANGLE, order=ROW), "^order must be an integer"),
     "points of a cloud": (lambda: hk.DipolePotential(None, [[0, 0, 1]]), "points"),
     "spacing": (
-        lambda: hk.Morph(TRIANGLE, TRIANGLE, gap=1.0, w=0.5, spacing="a"),
+        lambda: hk.fields.Morph(TRIANGLE, TRIANGLE, gap=1.0, w=0.5, spacing="a"),
         "^spacing must be a num",
     ),
     "starts": (lambda: hk.Tube(TRIANGLE[0], 0.1, starts=3), "^starts must be indices"),
@@ -117,28 +117,43 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: hk.Tube(TRIANGLE[0], 0.1, flattening_error=None),
         "^flattening_error must be a num",
     ),
-    "fade": (lambda: hk.Noise(fade={}), "^the fade must be"),
+    "fade": (lambda: hk.solids.Noise(fade={}), "^the fade must be"),
     "domain of points": (
-        lambda: hk.HRBF([[1, 0, 0]], [[1, 0, 0]], domain=SPHERE),
+        lambda: hk.fields.HRBF([[1, 0, 0]], [[1, 0, 0]], domain=SPHERE),
         "^domain must be a volume",
     ),
     "domain over the plane": (
-        lambda: hk.HeightField(lambda x, y: x, domain="box"),
+        lambda: hk.fields.HeightField(lambda x, y: x, domain="box"),
         "^domain must be a volume",
     ),
-    "amplitude": (lambda: hk.PlaneWave("a", (1, 0, 0)), "^the amplitude of a plane wave must"),
-    "wave vector": (lambda: hk.PlaneWave(1.0, 3.0), "^the wave vector must be three numbers"),
-    "factor": (lambda: hk.WaveProduct(1.0, x=2.0), "^x of a product is made by sine or cosine"),
-    "frequency": (lambda: hk.sine_factor(None), "^the frequency of a factor must be a number"),
-    "radius of a branch point": (lambda: hk.BranchPoint(0, radius="a"), "^the radius of a branch "),
+    "amplitude": (
+        lambda: hk.fields.PlaneWave("a", (1, 0, 0)),
+        "^the amplitude of a plane wave must",
+    ),
+    "wave vector": (
+        lambda: hk.fields.PlaneWave(1.0, 3.0),
+        "^the wave vector must be three numbers",
+    ),
+    "factor": (
+        lambda: hk.fields.WaveProduct(1.0, x=2.0),
+        "^x of a product is made by sine or cosine",
+    ),
+    "frequency": (
+        lambda: hk.fields.sine_factor(None),
+        "^the frequency of a factor must be a number",
+    ),
+    "radius of a branch point": (
+        lambda: hk.fields.BranchPoint(0, radius="a"),
+        "^the radius of a branch ",
+    ),
     "order of an harmonic": (
-        lambda: hk.HypersphericalHarmonic(2, 1, 0.5),
+        lambda: hk.fields.HypersphericalHarmonic(2, 1, 0.5),
         "^the order m must be a",
     ),
-    "order of a lobe": (lambda: hk.Lobes(2, {}), "^m must be a whole number"),
-    "support": (lambda: hk.CompactKernel(ROW), "^support must be a number"),
+    "order of a lobe": (lambda: hk.fields.Lobes(2, {}), "^m must be a whole number"),
+    "support": (lambda: hk.kernels.CompactKernel(ROW), "^support must be a number"),
     "parts": (
-        lambda: hk.VolumeIntersection([None]),
+        lambda: hk.geometry.VolumeIntersection([None]),
         "^each part of an intersection must be a volume",
     ),
     "end of a slider": (lambda: hk.Slider(None, 1.0), "^low must be a number"),
@@ -155,15 +170,15 @@ def test_wrong_arguments_are_refused_by_name(name: str) -> None:
 
 
 def test_levels_in_a_row_of_numpy() -> None:
-    assert hk.level_set(SPHERE, ROW).levels == tuple(ROW)
+    assert hk.Surface(SPHERE, ROW).levels == tuple(ROW)
     with pytest.raises(ValueError, match="at least one"):
-        hk.level_set(SPHERE, np.zeros(0))
+        hk.Surface(SPHERE, np.zeros(0))
     with pytest.raises(TypeError, match="level must be a number, or several"):
-        hk.level_set(SPHERE, np.eye(2))
+        hk.Surface(SPHERE, np.eye(2))
 
 
 @pytest.mark.parametrize("make", [
-    lambda x: hk.Sphere(x), lambda x: hk.Ball(radius=x), lambda x: hk.HitTolerance(x),
+    lambda x: hk.Sphere(x), lambda x: hk.Ball(radius=x), lambda x: hk.tracer.HitTolerance(x),
     lambda x: hk.Sphere(1.0).offset(x),
 ])  # fmt: skip
 def test_what_is_no_number_is_a_type_error(make: Callable[[Any], Any]) -> None:

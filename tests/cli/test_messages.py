@@ -104,7 +104,7 @@ def test_a_picture_larger_than_memory_is_refused(monkeypatch: pytest.MonkeyPatch
         (lambda: hk.signed_distance(icosphere(1), [[0, 0, 1]]), "needed, .* not of type"),  # pyright: ignore
         (lambda: hk.mesh(abs), "a function: of a formula, take harnack.expression"),  # pyright: ignore
         (lambda: hk.render("x^2 + y^2 = 1"), "no such file; of a formula, take"),
-        (lambda: hk.signed_distance(hk.level_set(POLYGON), [[0, 0, 1]]), "Surface: take its .f"),  # pyright: ignore
+        (lambda: hk.signed_distance(hk.Surface(POLYGON), [[0, 0, 1]]), "Surface: take its .f"),  # pyright: ignore
         (lambda: hk.render([[POLYGON]]), "give one at a time, or to harnack.render one flat list"),
         (lambda: hk.render([KNOT]), "level sets, not what is of type ndarray: of points"),
         (lambda: hk.trace(hk.Gyroid(1.0, domain="ball"), *RAY), "domain of a Gyroid must be a"),  # pyright: ignore

@@ -50,7 +50,7 @@ def test_blocks_give_what_whole_arrays_give(field: hk.Field, points: Any, direct
 def test_distances_by_blocks(points: Any) -> None:
     first = hk.signed_distance(POLYGON, points, method="first_order").compute()
     np.testing.assert_array_equal(first, hk.signed_distance(POLYGON, POINTS, method="first_order"))
-    bounds = hk.distance_bounds(hk.Sphere(1.0), points)
+    bounds = hk.distance.distance_bounds(hk.Sphere(1.0), points)
     lower, upper = dask.compute(bounds.lower, bounds.upper)
     true = np.abs(np.linalg.norm(POINTS, axis=1) - 1)
     assert (lower <= true + 1e-12).all()
@@ -59,8 +59,8 @@ def test_distances_by_blocks(points: Any) -> None:
 
 def test_crossings_and_rays_that_share_a_direction(points: Any) -> None:
     down = [[0.0, 0.0, -1.0]]
-    lazy = hk.trace(POLYGON, points, down, all_hits=2, t_max=np.full(300, 4.0))
-    expected = hk.trace(POLYGON, POINTS, down, all_hits=2, t_max=np.full(300, 4.0))
+    lazy = hk.crossings(POLYGON, points, down, max_crossings=2, t_max=np.full(300, 4.0))
+    expected = hk.crossings(POLYGON, POINTS, down, max_crossings=2, t_max=np.full(300, 4.0))
     np.testing.assert_array_equal(lazy.t.compute(), expected.t)
 
 
@@ -125,7 +125,7 @@ def test_zarr_files_can_be_gone_on_with(
     path, told = tmp_path / "w.zarr", list[float]()
     given: dict[str, Any] = {"client": client if with_client else None, "progress": told.append}
     gradient = POLYGON.gradient(points)
-    found = hk.to_zarr(gradient, path, **given)
+    found = hk.io.to_zarr(gradient, path, **given)
     np.testing.assert_array_equal(found[:], POLYGON.gradient(POINTS))
     assert sum(told) == pytest.approx(1)
     chunks = {one: one.stat().st_mtime_ns for one in path.rglob("*") if one.parent.name == "1"}
@@ -134,7 +134,7 @@ def test_zarr_files_can_be_gone_on_with(
     kept = path / "c" / "0" / "0"
     when = kept.stat().st_mtime_ns
     told.clear()
-    found = hk.to_zarr(gradient, path, **given)
+    found = hk.io.to_zarr(gradient, path, **given)
     np.testing.assert_array_equal(found[:], POLYGON.gradient(POINTS))
     assert told == pytest.approx([2 / 3, 1 / 3])
     assert kept.stat().st_mtime_ns == when
@@ -143,7 +143,7 @@ def test_zarr_files_can_be_gone_on_with(
 @zarr_only
 def test_zeros_are_written_too(points: Any, tmp_path: Path) -> None:
     """Zarr leaves out chunks of zeros unless told not to; they would be computed again."""
-    hk.to_zarr(da.zeros(40, chunks=10), tmp_path / "z.zarr", progress=False)
+    hk.io.to_zarr(da.zeros(40, chunks=10), tmp_path / "z.zarr", progress=False)
     assert len(list((tmp_path / "z.zarr" / "c").iterdir())) == 4
 
 
@@ -151,25 +151,25 @@ def test_zeros_are_written_too(points: Any, tmp_path: Path) -> None:
 def test_blocks_without_rows_need_no_chunk(tmp_path: Path) -> None:
     for k, lengths in enumerate([(0,), (20, 0)]):
         points = da.from_array(POINTS[: sum(lengths)], chunks=(lengths, 3))
-        found = hk.to_zarr(POLYGON.value(points), tmp_path / f"{k}.zarr", progress=False)
+        found = hk.io.to_zarr(POLYGON.value(points), tmp_path / f"{k}.zarr", progress=False)
         np.testing.assert_array_equal(found[:], POLYGON.value(POINTS[: sum(lengths)]))
 
 
 @zarr_only
 def test_files_that_cannot_be_are_refused(points: Any, tmp_path: Path) -> None:
     path = tmp_path / "w.zarr"
-    hk.to_zarr(POLYGON.value(points), path, progress=False)
+    hk.io.to_zarr(POLYGON.value(points), path, progress=False)
     with pytest.raises(ValueError, match="holds another array"):
-        hk.to_zarr(POLYGON.value(points, precision="double"), path, progress=False)
+        hk.io.to_zarr(POLYGON.value(points, precision="double"), path, progress=False)
     with pytest.raises(ValueError, match="holds another array"):
-        hk.to_zarr(POLYGON.value(points + 1), path, progress=False)
+        hk.io.to_zarr(POLYGON.value(points + 1), path, progress=False)
     (tmp_path / "no.zarr").mkdir()
     with pytest.raises(ValueError, match="is no Zarr array"):
-        hk.to_zarr(POLYGON.value(points), tmp_path / "no.zarr", progress=False)
+        hk.io.to_zarr(POLYGON.value(points), tmp_path / "no.zarr", progress=False)
     with pytest.raises(TypeError, match="writes a Dask array"):
-        hk.to_zarr(POINTS, path)
+        hk.io.to_zarr(POINTS, path)
     uneven = POLYGON.value(points.rechunk(((10, 200, 90), 3)))
     with pytest.raises(ValueError, match="unequal lengths"):
-        hk.to_zarr(uneven, tmp_path / "u.zarr")
+        hk.io.to_zarr(uneven, tmp_path / "u.zarr")
     with pytest.raises((OSError, ValueError), match="no_folder"):
-        hk.to_zarr(POLYGON.value(points), tmp_path / "no_folder" / "a.zarr", progress=False)
+        hk.io.to_zarr(POLYGON.value(points), tmp_path / "no_folder" / "a.zarr", progress=False)

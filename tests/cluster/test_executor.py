@@ -60,7 +60,7 @@ class Squares:
 def test_workers_draw_the_same_picture(way: dict[str, Any], client: Any) -> None:
     alone = hk.render(POLYGON, **SMALL, **way)
     assert_same(hk.render(POLYGON, client=client, **SMALL, **way), alone)
-    assert_same(hk.render(POLYGON, client=client, tiles=7, **SMALL, **way), alone)
+    assert_same(hk.render(POLYGON, client=client, chunks=7, **SMALL, **way), alone)
 
 
 @pytest.mark.slow
@@ -116,12 +116,12 @@ def test_a_checkpoint_spares_what_is_done(
 def test_films_are_the_same_and_grow(tmp_path: Path, client: Any) -> None:
     small: dict[str, Any] = {"size": (24, 18), "progress": False}
     paths = [tmp_path / f"{k}.gif" for k in range(4)]
-    hk.animate(POLYGON, paths[0], frames=4, turn=360, **small)
-    hk.animate(POLYGON, paths[1], frames=4, turn=360, client=client, **small)
+    hk.animate(POLYGON, paths[0], frames=4, orbit=360, **small)
+    hk.animate(POLYGON, paths[1], frames=4, orbit=360, client=client, **small)
     kept: dict[str, Any] = {"checkpoint": tmp_path / "parts", **small}
-    hk.animate(POLYGON, paths[2], frames=4, turn=360, client=client, **kept)
+    hk.animate(POLYGON, paths[2], frames=4, orbit=360, client=client, **kept)
     assert len(list((tmp_path / "parts").iterdir())) == 4
-    hk.animate(POLYGON, paths[3], frames=8, turn=360, **kept)  # at every second place of these
+    hk.animate(POLYGON, paths[3], frames=8, orbit=360, **kept)  # at every second place of these
     assert len(list((tmp_path / "parts").iterdir())) == 8
     data = [path.read_bytes() for path in paths]
     assert data[0] == data[1] == data[2] != data[3]

@@ -74,7 +74,11 @@ def test_surfaces_keep_their_names_when_they_are_used(name: str) -> None:
 
 
 def test_functions_of_formulas_are_sent_by_name() -> None:
-    for one in (hk.exp, hk.sin, hk.absolute if hasattr(hk, "absolute") else hk.cos):
+    for one in (
+        hk.math.exp,
+        hk.math.sin,
+        hk.math.absolute if hasattr(hk, "absolute") else hk.math.cos,
+    ):
         assert pickle.loads(pickle.dumps(one)) is one
 
 

@@ -116,9 +116,11 @@ class Truncated(BatchedField):
         self.errors, self.left, self.share = (gradient, hessian), left, share
         self.asked: list[tuple[int, float]] = []
 
-    def evaluate(self, p: Any) -> hk.Sample:
+    def evaluate(self, p: Any) -> hk.fields.Sample:
         r = dr.norm(p)
-        return hk.Sample(1 / r - 1, -p / (r * r * r), (hk.HarmonicBall(r, -1.0, math.inf),))
+        return hk.fields.Sample(
+            1 / r - 1, -p / (r * r * r), (hk.proofs.HarmonicBall(r, -1.0, math.inf),)
+        )
 
     def values_at(self, x: Any, derivatives: int, closer: Any = 1.0) -> PointValues:
         dr.eval(x, closer)
@@ -200,8 +202,8 @@ def _waves(x: np.ndarray) -> tuple[hk.Field, np.ndarray, np.ndarray]:
     angles = x.astype(np.longdouble) @ k.T.astype(np.longdouble) + phases
     g = -np.einsum("nk,k,ki->ni", np.sin(angles), sizes, k)
     h = -np.einsum("nk,k,ki,kj->nij", np.cos(angles), sizes, k, k)
-    terms = [hk.PlaneWave(a, tuple(v), c) for a, v, c in zip(sizes, k, phases, strict=True)]
-    return hk.EigenfunctionSum(terms), g, h
+    terms = [hk.fields.PlaneWave(a, tuple(v), c) for a, v, c in zip(sizes, k, phases, strict=True)]
+    return hk.fields.EigenfunctionSum(terms), g, h
 
 
 def _gyroid(x: np.ndarray) -> tuple[hk.Field, np.ndarray, np.ndarray]:
@@ -302,8 +304,8 @@ def test_solids_made_of_sums_over_trees_know_their_curvature() -> None:
 class Unstated(hk.Field):
     """|p|^2 - 1, with second derivatives whose errors it does not state."""
 
-    def evaluate(self, p: Any) -> hk.Sample:
-        return hk.Sample(dr.squared_norm(p) - 1, 2 * p, (hk.TaylorRemainder(2.0),))
+    def evaluate(self, p: Any) -> hk.fields.Sample:
+        return hk.fields.Sample(dr.squared_norm(p) - 1, 2 * p, (hk.proofs.TaylorRemainder(2.0),))
 
     def hessian(self, p: Any) -> tuple[Any, Any, Any]:
         kind = type(p)

@@ -39,9 +39,11 @@ class Charge(hk.Field):
 
     domain = hk.Ball(radius=4.0)
 
-    def evaluate(self, p: Any) -> hk.Sample:
+    def evaluate(self, p: Any) -> hk.fields.Sample:
         r = dr.norm(p)
-        return hk.Sample(1 / r - 1, -p / (r * r * r), (hk.HarmonicBall(r, -1.0, math.inf),))
+        return hk.fields.Sample(
+            1 / r - 1, -p / (r * r * r), (hk.proofs.HarmonicBall(r, -1.0, math.inf),)
+        )
 
     def hessian(self, p: Any) -> Any:
         r = dr.norm(p)
@@ -56,10 +58,12 @@ class Ellipsoid(hk.Field):
     b: float = 1.0
     c: float = 1.5
 
-    def evaluate(self, p: Any) -> hk.Sample:
+    def evaluate(self, p: Any) -> hk.fields.Sample:
         q = type(p)(p.x / self.a**2, p.y / self.b**2, p.z / self.c**2)
-        return hk.Sample(
-            dr.dot(p, q) - 1, 2 * q, (hk.TaylorRemainder(2 / min(self.a, self.b, self.c) ** 2),)
+        return hk.fields.Sample(
+            dr.dot(p, q) - 1,
+            2 * q,
+            (hk.proofs.TaylorRemainder(2 / min(self.a, self.b, self.c) ** 2),),
         )
 
 
@@ -69,11 +73,11 @@ class Torus(hk.Field):
     default_level = 0.16
     domain = hk.Ball(radius=3.0)
 
-    def evaluate(self, p: Any) -> hk.Sample:
+    def evaluate(self, p: Any) -> hk.fields.Sample:
         rho = dr.sqrt(p.x * p.x + p.y * p.y)
         away = rho - 1
         gradient = type(p)(2 * away * p.x / rho, 2 * away * p.y / rho, 2 * p.z)
-        return hk.Sample(away * away + p.z * p.z, gradient, (hk.Lipschitz(8.0),))
+        return hk.fields.Sample(away * away + p.z * p.z, gradient, (hk.proofs.Lipschitz(8.0),))
 
     def hessian(self, p: Any) -> Any:
         rho = dr.sqrt(p.x * p.x + p.y * p.y)
@@ -91,14 +95,14 @@ class Helicoid(hk.Field):
 
     period = 2 * math.pi
 
-    def evaluate(self, p: Any) -> hk.Sample:
+    def evaluate(self, p: Any) -> hk.fields.Sample:
         square = p.x * p.x + p.y * p.y
         gradient = type(p)(p.y / square, -p.x / square, 1.0)
         # Over half the distance from the axis the azimuth turns by no more than asin(1/2).
         reach = 0.5 * dr.sqrt(square)
         value = p.z - dr.atan2(p.y, p.x)
-        ball = hk.HarmonicBall(reach, value - reach - 0.53, value + reach + 0.53)
-        return hk.Sample(value, gradient, (ball,))
+        ball = hk.proofs.HarmonicBall(reach, value - reach - 0.53, value + reach + 0.53)
+        return hk.fields.Sample(value, gradient, (ball,))
 
     def hessian(self, p: Any) -> Any:
         x, y = p.x, p.y
@@ -116,9 +120,9 @@ class Reversed(hk.Field):
     def __init__(self, of: hk.Field) -> None:
         self.of = of
 
-    def evaluate(self, p: Any) -> hk.Sample:
+    def evaluate(self, p: Any) -> hk.fields.Sample:
         sample = self.of.evaluate(p)
-        return hk.Sample(-sample.value, -sample.gradient, (hk.Lipschitz(1e3),))
+        return hk.fields.Sample(-sample.value, -sample.gradient, (hk.proofs.Lipschitz(1e3),))
 
     def hessian(self, p: Any) -> Any:
         x, y, z = self.of.hessian(p)
@@ -130,8 +134,8 @@ class Bare(hk.Field):
 
     default_level = 1.0
 
-    def evaluate(self, p: Any) -> hk.Sample:
-        return hk.Sample(dr.norm(p), p / dr.norm(p), (hk.Lipschitz(1.0),))
+    def evaluate(self, p: Any) -> hk.fields.Sample:
+        return hk.fields.Sample(dr.norm(p), p / dr.norm(p), (hk.proofs.Lipschitz(1.0),))
 
 
 class Step(hk.Field):
@@ -147,10 +151,10 @@ class Step(hk.Field):
     def __init__(self, side: Any = None) -> None:
         self.side = side
 
-    def evaluate(self, p: Any) -> hk.Sample:
+    def evaluate(self, p: Any) -> hk.fields.Sample:
         side = dr.select(p.x > 0, 1.0, 0.0) if self.side is None else self.side
-        known = (hk.Lipschitz(0.3),)
-        return hk.Sample(0.3 * p.z + side, type(p)(0.0, 0.0, 0.3), known)
+        known = (hk.proofs.Lipschitz(0.3),)
+        return hk.fields.Sample(0.3 * p.z + side, type(p)(0.0, 0.0, 0.3), known)
 
     def next_jump(self, o: Any, d: Any, after: Any, t_max: Any, active: Any) -> JumpCrossing:
         t = -o.x / d.x
@@ -563,8 +567,8 @@ def test_every_point_has_a_distance_from_a_cloud(kind: str, n: int) -> None:
     field = {
         "dipoles": lambda: hk.DipolePotential(*cloud, accuracy=100.0),
         "dipoles by tree": lambda: hk.DipolePotential(*cloud),
-        "screened": lambda: hk.ScreenedWindingNumber(*cloud, length=0.7),
-        "barely screened": lambda: hk.ScreenedWindingNumber(*cloud, length=5.0),
+        "screened": lambda: hk.fields.ScreenedWindingNumber(*cloud, length=0.7),
+        "barely screened": lambda: hk.fields.ScreenedWindingNumber(*cloud, length=5.0),
     }[kind]()
     rng = np.random.default_rng(0)
     x = np.concatenate([rng.uniform(-2, 2, (150, 3)), rng.normal(size=(10, 3)) * 20])
@@ -592,9 +596,9 @@ def test_the_lower_bound_is_attained_by_planes_and_spheres(precision: Any) -> No
     x = rng.uniform(-0.5, 0.5, (500, 3))
 
     class Plane(hk.Field):
-        def evaluate(self, p: Any) -> hk.Sample:
+        def evaluate(self, p: Any) -> hk.fields.Sample:
             slope = type(p)(2.0, 1.0, -2.0)
-            return hk.Sample(dr.dot(p, slope), slope, (hk.TaylorRemainder(0.0),))
+            return hk.fields.Sample(dr.dot(p, slope), slope, (hk.proofs.TaylorRemainder(0.0),))
 
     flat = np.abs(x @ [2, 1, -2]) / 3
     found = np.abs(signed_distance(Plane(), x, method="lower_bound", precision=precision))
@@ -775,7 +779,7 @@ def test_surfaces_along_which_the_gradient_is_zero(text: str, exact: Any) -> Non
     x = np.concatenate([[[0, 0, 1.5]], np.random.default_rng(4).uniform(-2, 2, (150, 3))])
     computed = signed_distance(hk.expression(text, domain=BOX), x)
     assert np.abs(np.abs(computed) - exact(x)).max() < 1e-7
-    bounds = hk.distance_bounds(hk.expression(text, domain=BOX), x[:10])
+    bounds = hk.distance.distance_bounds(hk.expression(text, domain=BOX), x[:10])
     assert (bounds.lower <= exact(x[:10]) + 1e-12).all()
 
 

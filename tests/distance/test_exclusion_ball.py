@@ -26,7 +26,9 @@ def test_the_ball_ends_at_the_center_of_curvature(side: int, share: float) -> No
     """Of the cylinder side z = y^2: within the radius 1/2 of curvature its vertex is nearest, and
     beyond that it is not, so that no ball may be free."""
     vector, real = DOUBLE.Array3f, DOUBLE.Float
-    sample = Sample(real(0), vector(0, 0, side), (hk.TaylorRemainder(2.0, cubic_constant=0.0),))
+    sample = Sample(
+        real(0), vector(0, 0, side), (hk.proofs.TaylorRemainder(2.0, cubic_constant=0.0),)
+    )
     rows = vector(0, 0, 0), vector(0, -2, 0), vector(0, 0, 0)
     x = vector(0, 0, side * 0.5 * share)
     free = float(np.array(exclusion_radius(sample, rows, x, vector(0)))[0])
@@ -42,7 +44,7 @@ def test_the_second_remainder_is_attained_by_poissons_kernel(dimension: int) -> 
     q = np.linspace(0.01, 0.9, 30)
     second = {2: 2, 3: 5, 4: 9}[dimension]
     rest = (1 + q) / (1 - q) ** (dimension - 1) - 1 - dimension * q - second * q * q
-    ball = hk.HarmonicBall(1.0, -1.0, math.inf, dimension)
+    ball = hk.proofs.HarmonicBall(1.0, -1.0, math.inf, dimension)
     found = np.array(
         taylor_remainder(Sample(DOUBLE.Float(0), DOUBLE.Array3f(0), (ball,)), DOUBLE.Float(q), 2)
     )
@@ -51,7 +53,7 @@ def test_the_second_remainder_is_attained_by_poissons_kernel(dimension: int) -> 
 
 def test_third_derivatives_of_waves() -> None:
     """Attained by one wave; of the gyroid, by differences of second derivatives."""
-    wave = hk.PlaneWave(3.0, (0.0, 4.0, 3.0))
+    wave = hk.fields.PlaneWave(3.0, (0.0, 4.0, 3.0))
     assert WaveBounds.of([wave]).max_third_derivative == pytest.approx(3 * 5**3, rel=1e-9)
     rng, h = np.random.default_rng(0), 1e-4
     p, v = rng.uniform(-4, 4, (2000, 3)), rng.normal(size=(2000, 3))

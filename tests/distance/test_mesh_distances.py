@@ -352,7 +352,7 @@ def test_meshes_with_holes(
         return search(surface, *given)
 
     monkeypatch.setattr(closest_point_search, "search", counted)
-    found = hk.distance_bounds(field, x, precision=precision)
+    found = hk.distance.distance_bounds(field, x, precision=precision)
     assert searched == [False]
     upper = cKDTree(points_of_surface(field, vertices, faces, 100_000)).query(x)[0]
     rounding = 1e-5 if precision == "single" else 1e-9
@@ -376,7 +376,7 @@ def test_levels_that_others_are_modulo_one() -> None:
     all_faces = np.concatenate([outer, kept[:, ::-1] + len(ball), kept[:, ::-1] + len(ball)])
     field = hk.WindingNumber(vertices, all_faces)
     x = np.random.default_rng(0).uniform(-0.5, 0.5, (300, 3))
-    found = hk.distance_bounds(field, x)
+    found = hk.distance.distance_bounds(field, x)
     upper = cKDTree(points_of_surface(field, vertices, all_faces, 100_000)).query(x)[0]
     assert (found.lower <= upper + 1e-9).all()
     assert (found.upper >= upper - 0.03).all()
@@ -399,7 +399,7 @@ def test_feet_are_where_the_level_comes() -> None:
         np.concatenate([faces, faces + n, flat + 2 * n]),
     )
     x = np.array([[0.10139405, 0.49233492, -0.13777074], [0.1, 0.2, -0.14], [-0.4, 0.1, -0.2]])
-    found = hk.distance_bounds(field, x)
+    found = hk.distance.distance_bounds(field, x)
     exact = distances_to_triangles(x, 1.3 * vertices[faces]).min(axis=1)
     assert np.allclose(found.upper, exact, rtol=1e-9)
     assert (found.lower <= exact).all()
@@ -409,7 +409,7 @@ def test_feet_are_where_the_level_comes() -> None:
 def test_one_triangle_has_no_level_beyond_a_half(level: float) -> None:
     field = hk.WindingNumber([(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)])
     with pytest.warns(RuntimeWarning, match="no closest point was found for 2 of 2"):
-        found = hk.distance_bounds(field, [[0.3, 0.3, 0.5], [0.0, 0.0, 0.0]], level=level)
+        found = hk.distance.distance_bounds(field, [[0.3, 0.3, 0.5], [0.0, 0.0, 0.0]], level=level)
     assert np.isnan(found.closest_points).all()
 
 
@@ -419,7 +419,7 @@ def test_a_vertex_of_a_soup_that_the_level_does_not_reach() -> None:
     corners = np.random.default_rng(0).normal(size=(180, 3))
     field = hk.WindingNumber(corners, np.arange(180).reshape(-1, 3))
     x = corners[np.abs(corners - [-0.7410805, -0.2374157, 0.7391781]).sum(axis=1).argsort()[:1]]
-    found = hk.distance_bounds(field, x)
+    found = hk.distance.distance_bounds(field, x)
     assert 0.19 < found.upper[0] < 0.25
     about = 1e-6 * np.random.default_rng(1).normal(size=(2000, 3))
     largest = [
@@ -565,9 +565,9 @@ def test_points_nearer_than_proved_are_refused() -> None:
     class Boastful(hk.Field):
         """|p| - 1, but said to be ten times as flat."""
 
-        def evaluate(self, p: Any) -> hk.Sample:
+        def evaluate(self, p: Any) -> hk.fields.Sample:
             r = dr.norm(p)
-            return hk.Sample(r - 1, p / r, (hk.Lipschitz(0.1),))
+            return hk.fields.Sample(r - 1, p / r, (hk.proofs.Lipschitz(0.1),))
 
     x = np.array([[0.0, 0.5, 0.0], [0.0, 0.0, 1.2]])
     with (
@@ -603,12 +603,12 @@ TWO = hk.WindingNumber(
 
 @pytest.mark.slow
 def test_a_rim_that_the_level_meets_modulo_one_alone_is_none_of_the_surface() -> None:
-    found = hk.distance_bounds(TWO, [[0, -0.6, 0.6]], level=0.2)
+    found = hk.distance.distance_bounds(TWO, [[0, -0.6, 0.6]], level=0.2)
     assert found.lower[0] <= found.upper[0]
     assert found.upper[0] == pytest.approx(0.6)
     rng = np.random.default_rng(0)
     x = rng.uniform([-1, -1, 0], [1, 1, 1.2], (24, 3))
-    found = hk.distance_bounds(TWO, x, level=0.2)
+    found = hk.distance.distance_bounds(TWO, x, level=0.2)
     u = rng.normal(size=(24, 2000, 3))
     u /= np.linalg.norm(u, axis=2, keepdims=True)
     # w is seen on both sides of the level about every foot, and on one within the lower bound.

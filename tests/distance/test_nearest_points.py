@@ -24,9 +24,9 @@ from tests.oracles.mesh_distance import distances_to_triangles
 PRECISIONS = ("double", "single")
 
 
-def check_bounds(field: hk.Field, x: np.ndarray, **given: Any) -> hk.DistanceBounds:
+def check_bounds(field: hk.Field, x: np.ndarray, **given: Any) -> hk.distance.DistanceBounds:
     """That the parts of the answer agree with one another."""
-    found = hk.distance_bounds(field, x, **given)
+    found = hk.distance.distance_bounds(field, x, **given)
     away = np.linalg.norm(x - found.closest_points, axis=1)
     assert np.allclose(found.upper, away, rtol=1e-6, atol=1e-12 * (1 + np.abs(x).max()))
     assert (found.lower <= found.upper).all()
@@ -164,10 +164,12 @@ def test_a_surface_without_extent() -> None:
     class Waves(hk.Field):
         """sin x: planes at all multiples of pi, which have no end."""
 
-        def evaluate(self, p: Any) -> hk.Sample:
+        def evaluate(self, p: Any) -> hk.fields.Sample:
             import drjit as dr
 
-            return hk.Sample(dr.sin(p.x), type(p)(dr.cos(p.x), 0, 0), (hk.TaylorRemainder(1.0),))
+            return hk.fields.Sample(
+                dr.sin(p.x), type(p)(dr.cos(p.x), 0, 0), (hk.proofs.TaylorRemainder(1.0),)
+            )
 
     x = np.random.default_rng(6).uniform(-20, 20, (200, 3))
     exact = np.abs(x[:, 0] - np.pi * np.round(x[:, 0] / np.pi))
@@ -182,11 +184,11 @@ def test_an_empty_level_set() -> None:
     class Positive(hk.Field):
         domain = hk.Ball(radius=1.0)
 
-        def evaluate(self, p: Any) -> hk.Sample:
-            return hk.Sample(2 + p.x, type(p)(1, 0, 0), (hk.TaylorRemainder(0.0),))
+        def evaluate(self, p: Any) -> hk.fields.Sample:
+            return hk.fields.Sample(2 + p.x, type(p)(1, 0, 0), (hk.proofs.TaylorRemainder(0.0),))
 
     with pytest.warns(RuntimeWarning, match="no closest point was found for 1 of 1"):
-        found = hk.distance_bounds(Positive(), [[0.1, 0.2, 0.3]])
+        found = hk.distance.distance_bounds(Positive(), [[0.1, 0.2, 0.3]])
     assert np.isnan(found.upper).all()
 
 
@@ -210,7 +212,7 @@ def test_parts_make_no_difference(monkeypatch: pytest.MonkeyPatch) -> None:
     parts = hk.signed_distance(field, x, progress=messages.append)
     assert np.allclose(parts, whole, rtol=1e-12)
     assert any("cells" in one for one in messages)
-    hk.distance_bounds(field, x[:5], progress=messages.append)
+    hk.distance.distance_bounds(field, x[:5], progress=messages.append)
     assert "cells for" in messages[-1]
 
 
@@ -223,7 +225,7 @@ def test_the_remainder_is_attained_by_poissons_kernel(dimension: int) -> None:
     real = choose_backend("double").Float
     q = np.linspace(0.01, 0.9, 30)
     rest = (1 + q) / (1 - q) ** (dimension - 1) - 1 - dimension * q
-    ball = hk.HarmonicBall(1.0, -1.0, math.inf, dimension)
+    ball = hk.proofs.HarmonicBall(1.0, -1.0, math.inf, dimension)
     zero = choose_backend("double").Array3f(0)
     found = np.array(taylor_remainder(Sample(real(0), zero, (ball,)), real(q)))
     assert (found >= rest * (1 - 1e-9)).all()
@@ -354,7 +356,7 @@ def test_points_of_the_boundary_and_from_very_far(name: str) -> None:
     nearest, _ = cKDTree(on).query(far)
     assert (found.upper[2 * len(corners) :] <= nearest + 1e-9).all()
     for n in (0, 1):
-        assert hk.distance_bounds(field, far[:n]).closest_points.shape == (n, 3)
+        assert hk.distance.distance_bounds(field, far[:n]).closest_points.shape == (n, 3)
 
 
 @pytest.mark.slow
@@ -394,7 +396,7 @@ def test_feet_on_clouds_are_on_the_exact_surface(cells: Any) -> None:
     points = n * (1 + 0.1 * n[:, :1] ** 2)
     field = hk.DipolePotential(points, n, cells=cells)
     x = 1.7 * rng.normal(size=(400, 3))
-    found = hk.distance_bounds(field, x)
+    found = hk.distance.distance_bounds(field, x)
     at_points = cKDTree(points).query(found.closest_points)[0] == 0
     assert at_points.mean() < 0.5
     total = dipole_sum(points, n * field.areas[:, None])
@@ -417,7 +419,7 @@ def test_beside_a_point_of_a_cloud(precision: Any) -> None:
     which = np.arange(400) % 50
     for u in (1e-3, 1e-5):
         x = points[which] + u * d
-        found = hk.distance_bounds(field, x, precision=precision)
+        found = hk.distance.distance_bounds(field, x, precision=precision)
         away = np.linalg.norm(x.astype(np.float32) - points[which], axis=1)
         assert (found.upper <= np.maximum(u, away) * (1 + 1e-6) + 1e-12).all()
         assert (found.lower <= found.upper).all()

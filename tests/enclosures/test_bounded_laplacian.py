@@ -192,9 +192,11 @@ def test_one_proof_of_a_bounded_laplacian_is_used_by_default(name: str) -> None:
     o, d = rays(np.random.default_rng(1), 200)
     plain = hk.trace(field, o, d, level=level)
     for bound in ("laplacian", BoundedLaplacianEnclosure):
-        np.testing.assert_array_equal(hk.trace(field, o, d, level=level, bound=bound).t, plain.t)
+        np.testing.assert_array_equal(
+            hk.trace(field, o, d, level=level, enclosures=bound).t, plain.t
+        )
     with pytest.raises(ValueError, match=r'BoundedLaplacian.*choose .*"laplacian"'):
-        hk.trace(field, o, d, level=level, bound="lipschitz")
+        hk.trace(field, o, d, level=level, enclosures="lipschitz")
 
 
 def test_the_name_takes_lipschitz_constants_where_there_is_nothing_else() -> None:

@@ -35,7 +35,9 @@ class Blobs(Field):
             u = (p - type(p)(*center.tolist())) / WIDTH
             one = dr.exp(-dr.squared_norm(u))
             value, gradient = value + one, gradient - 2 / WIDTH * one * u
-        return Sample(value, gradient, (hk.TaylorRemainder(2 * len(CENTERS) / WIDTH**2),), 1e-6)
+        return Sample(
+            value, gradient, (hk.proofs.TaylorRemainder(2 * len(CENTERS) / WIDTH**2),), 1e-6
+        )
 
 
 class TaylorBlobs(Blobs):
@@ -151,7 +153,7 @@ def test_candidates_grow_and_shrink() -> None:
         domain = hk.Box((-5.0,) * 3, (5.0,) * 3)
 
         def evaluate(self, p: Any) -> Sample:
-            return Sample(p.x - 1, type(p)(1, 0, 0), (hk.Lipschitz(math.inf),))
+            return Sample(p.x - 1, type(p)(1, 0, 0), (hk.proofs.Lipschitz(math.inf),))
 
         def sample_ray(self, path: RayPath, t: Any, ahead: Any, back: Any) -> RaySample:
             look = path.enclose(self.evaluate(path.point(t)))
@@ -198,8 +200,8 @@ def test_enclosures_of_values_of_any_size_miss_nothing(unit: float) -> None:
             return RaySample(seen, (ahead,), (back,), look.slope * unit)
 
     o, d = rays(20_000)
-    plain = hk.trace(TaylorBlobs(), o, d, tolerance=1e-5, overstep=1.8)
-    scaled = hk.trace(Scaled(), o, d, tolerance=1e-5, overstep=1.8)
+    plain = hk.trace(TaylorBlobs(), o, d, tolerance=1e-5, over_relaxation=1.8)
+    scaled = hk.trace(Scaled(), o, d, tolerance=1e-5, over_relaxation=1.8)
     assert (plain.is_hit == scaled.is_hit).mean() > 0.9998
 
 
@@ -213,7 +215,7 @@ def test_a_level_within_a_large_error_is_not_passed() -> None:
             near = dr.abs(p.x) < 0.3
             value = p.x - dr.select(near, 0.001, 0.0)
             error = dr.select(near, 0.001001, 0.0)
-            return Sample(value, type(p)(1, 0, 0), (hk.TaylorRemainder(1.0),), error)
+            return Sample(value, type(p)(1, 0, 0), (hk.proofs.TaylorRemainder(1.0),), error)
 
     hits = hk.trace(Off(), [[2e-4, 0, 0]], [[-1.0, 0, 0]], level=0.0)
     assert hits.status[0] != int(hk.RayStatus.MISS)

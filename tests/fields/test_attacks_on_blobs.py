@@ -21,11 +21,15 @@ SHARPNESS, TAIL = 1.0, 1e-3
 GAUSSIAN = math.sqrt(1 - math.log(TAIL) / SHARPNESS)
 # A kernel, where it ends, and its formula in the squared distance as a part of that.
 KERNELS: dict[str, tuple[Any, float, Any]] = {
-    "compact": (hk.CompactKernel(1.02), 1.02, lambda q: (1 - q) ** 3),
-    "cubic": (hk.CubicKernel(2.0), 2.0, lambda q: 1 - 3 * q + 2 * q**1.5),
-    "sextic": (hk.SexticKernel(1.3), 1.3, lambda q: 1 - (22 * q - 17 * q**2 + 4 * q**3) / 9),
+    "compact": (hk.kernels.CompactKernel(1.02), 1.02, lambda q: (1 - q) ** 3),
+    "cubic": (hk.kernels.CubicKernel(2.0), 2.0, lambda q: 1 - 3 * q + 2 * q**1.5),
+    "sextic": (
+        hk.kernels.SexticKernel(1.3),
+        1.3,
+        lambda q: 1 - (22 * q - 17 * q**2 + 4 * q**3) / 9,
+    ),
     "gaussian": (
-        hk.GaussianKernel(SHARPNESS, TAIL),
+        hk.kernels.GaussianKernel(SHARPNESS, TAIL),
         GAUSSIAN,
         lambda q: np.exp(SHARPNESS * GAUSSIAN**2 * (1 - q)) - 1 - SHARPNESS * GAUSSIAN**2 * (1 - q),
     ),
@@ -165,7 +169,9 @@ def test_rays_that_all_but_touch_cross_twice(name: str, precision: Any) -> None:
     scene = Sum(name, np.zeros((1, 3)), np.ones(1), np.ones(1), None)
     depths = np.array([0.1, 1e-3, 2e-4] if precision == "single" else [0.1, 1e-4, 1e-6, 1e-9])
     o = np.column_stack([1 - depths, 0 * depths - 6, 0 * depths])
-    hits = hk.trace(scene.blobs, o, [[0, 1.0, 0]], precision=precision, tolerance=1e-10, all_hits=4)
+    hits = hk.crossings(
+        scene.blobs, o, [[0, 1.0, 0]], precision=precision, tolerance=1e-10, max_crossings=4
+    )
     half = np.sqrt(1 - (1 - depths) ** 2)
     assert (hits.count == 2).all()
     assert (hits.side[:, :2] == [1, -1]).all()
@@ -173,7 +179,7 @@ def test_rays_that_all_but_touch_cross_twice(name: str, precision: Any) -> None:
     assert (np.abs(hits.t[:, 0] - (6 - half)) < off + 1e-9).all()
     assert (np.abs(hits.t[:, 1] - (6 + half)) < off + 1e-9).all()
     confirmed = hk.trace(
-        scene.blobs, o, [[0, 1.0, 0]], precision=precision, tolerance=1e-10, confirm=True
+        scene.blobs, o, [[0, 1.0, 0]], precision=precision, tolerance=1e-10, require_crossing=True
     )
     np.testing.assert_array_equal(confirmed.t, hits.t[:, 0])
 
@@ -248,7 +254,7 @@ def test_slopes_of_hrbf_on_short_pieces(precision: Any, offset: float) -> None:
     rng = np.random.default_rng(0)
     n = rng.normal(size=(17, 3))
     n /= np.linalg.norm(n, axis=1)[:, None]
-    f = hk.HRBF(n * (1 + 0.2 * np.sin(3 * n[:, :1])) + offset, 2.0 * n)
+    f = hk.fields.HRBF(n * (1 + 0.2 * np.sin(3 * n[:, :1])) + offset, 2.0 * n)
     backend = choose_backend(precision)
     count = 500
     p = rng.uniform(-1.5, 1.5, (count, 3)) + offset

@@ -24,7 +24,7 @@ def unit(v: Any) -> np.ndarray:
 def test_windows_far_above_small_circles_hold() -> None:
     """The solid angle of a small circle vanishes in rounding, and its sign told on which side of it
     a point is: the lift fell 0.5 below its window, where a level lay."""
-    big, small = hk.Circle(1.0), hk.Circle(1e-4, (1.25, 0.0, 0.25))
+    big, small = hk.geometry.Circle(1.0), hk.geometry.Circle(1e-4, (1.25, 0.0, 0.25))
     n, rng = 200, np.random.default_rng(0)
     x = np.array(small.center) + np.column_stack(
         [6e-5 * rng.uniform(-1, 1, (n, 2)), rng.uniform(0.25, 1, n)]
@@ -55,7 +55,10 @@ def test_rays_beside_circles_far_from_the_origin_end(offset: float) -> None:
     radius 0 was all that was promised: one ray in ten ran out of steps."""
     rng, n = np.random.default_rng(3), 600
     center, normal = np.array([offset, -offset, offset]), unit([0.3, 0.5, 0.8])
-    ring = [hk.Circle(1, tuple(center), tuple(normal)), hk.Circle(0.5, tuple(center), -normal)]
+    ring = [
+        hk.geometry.Circle(1, tuple(center), tuple(normal)),
+        hk.geometry.Circle(0.5, tuple(center), -normal),
+    ]
     first = unit(np.cross(normal, [0.3, 0.5, 0.1]))
     turn = rng.uniform(0, 2 * np.pi, (n, 1))
     radius = rng.choice([0.5, 1.0], (n, 1))
@@ -71,12 +74,12 @@ def test_rays_beside_circles_far_from_the_origin_end(offset: float) -> None:
 
 def test_small_circles_that_are_tilted_are_in_no_plane() -> None:
     """Such a circle lies in the plane to within its radius, and was taken for a hole of it."""
-    outline = hk.Circle(1)
+    outline = hk.geometry.Circle(1)
     for radius, normal in ((5e-13, (1, 0, 0)), (1e-10, (0.009, 0, -1))):
-        hole = hk.Circle(radius, (0.3, 0, 0), normal)
+        hole = hk.geometry.Circle(radius, (0.3, 0, 0), normal)
         for both in ([outline, hole], [hole, outline]):
             with pytest.raises(ValueError, match="neither"):
                 hk.SolidAngle([np.eye(3) + 9, *both], lift_bound="planar")
             assert hk.SolidAngle(both)._region is None  # pyright: ignore[reportPrivateUsage]
-    flat = hk.SolidAngle([outline, hk.Circle(1e-10, (0.3, 0, 0), (0, 0, -1))])
+    flat = hk.SolidAngle([outline, hk.geometry.Circle(1e-10, (0.3, 0, 0), (0, 0, -1))])
     assert flat._region is not None  # pyright: ignore[reportPrivateUsage]

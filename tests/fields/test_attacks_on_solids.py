@@ -13,7 +13,7 @@ from harnack.arithmetic import Jet
 from harnack.backend import choose_backend
 
 PRECISIONS = ("single", "double")
-CREASE = hk.expression(lambda x, y, z: hk.maximum(x, y, z) - 0.3)
+CREASE = hk.expression(lambda x, y, z: hk.math.maximum(x, y, z) - 0.3)
 
 
 @pytest.mark.parametrize(
@@ -36,12 +36,12 @@ def test_solids_turn_anticlockwise(axis: Any, degrees: float, start: Any, end: A
 @pytest.mark.parametrize(
     ("solid", "o", "d", "t"),
     [
-        (hk.DoubleCone(), (0, 0, 3), (0, 0, -1), 3.0),
-        (hk.DoubleCone().rotated(90, "x").translated((0, 3, 0)), (0, 0, 0), (0, 1, 0), 3.0),
-        (hk.DoubleCone().twisted(2.0) - hk.Torus(1.0, 0.2), (0, 0, 3), (0, 0, -1), 3.0),
+        (hk.solids.DoubleCone(), (0, 0, 3), (0, 0, -1), 3.0),
+        (hk.solids.DoubleCone().rotated(90, "x").translated((0, 3, 0)), (0, 0, 0), (0, 1, 0), 3.0),
+        (hk.solids.DoubleCone().twisted(2.0) - hk.Torus(1.0, 0.2), (0, 0, 3), (0, 0, -1), 3.0),
         (hk.Torus(0.5, 0.75), (0, 0, 3), (0, 0, -1), 3 - np.sqrt(0.75**2 - 0.5**2)),
-        (hk.Superellipsoid((1.0, 1.0)), (-3, 0, 0), (1, 0, 0), 2.0),
-        (hk.Supertorus((1.0, 3.0), 0.75, 0.25), (-3, 0, 0), (1, 0, 0), 2.0),
+        (hk.solids.Superellipsoid((1.0, 1.0)), (-3, 0, 0), (1, 0, 0), 2.0),
+        (hk.solids.Supertorus((1.0, 3.0), 0.75, 0.25), (-3, 0, 0), (1, 0, 0), 2.0),
         (CREASE, (-1, 2.5, 2.5), (1, -2, -2), 3.3),
     ],
     ids=["cone", "moved", "combined", "spindle", "octahedron", "diamond", "crease"],
@@ -84,7 +84,7 @@ def test_shrunk_blends_are_not_clipped(power: float) -> None:
 def test_powers_of_numbers(bound: Any) -> None:
     """2**x was a TypeError of Dr.Jit, when it was traced."""
     field = hk.expression(lambda x, y, z: 2**x - y - 1)
-    hits = hk.trace(field, [[2.0, 0, 0]], [[0, 1.0, 0]], t_max=9.0, bound=bound)
+    hits = hk.trace(field, [[2.0, 0, 0]], [[0, 1.0, 0]], t_max=9.0, enclosures=bound)
     assert hits.t[0] == pytest.approx(3.0, abs=1e-3)
     with pytest.raises(ValueError, match="the base must be positive"):
         hk.expression(lambda x, y, z: (-2) ** x - y)
@@ -112,7 +112,7 @@ def test_little_is_lost_far_from_the_origin() -> None:
         (lambda: hk.expression(lambda x, y, z: 1.0 if x == 0 else y), TypeError, "left - right"),
         (lambda: hk.expression(lambda x, y, z: np.ones(2) * x), TypeError, "type ndarray"),
         (lambda: hk.expression(lambda x, y, z: x * np.ones(2)), TypeError, "type ndarray"),
-        (lambda: hk.expression(lambda x, y, z: hk.maximum(x, None)), TypeError, "type NoneType"),
+        (lambda: hk.expression(lambda x, y, z: hk.math.maximum(x, None)), TypeError, "type NoneType"),
         (lambda: hk.expression(lambda x, y, z: x ** "2"[1:]), TypeError, "exponent of x"),  # type: ignore[operator]
         (lambda: hk.expression(lambda x, y, z: np.float64(-2) ** x), ValueError, "must be pos"),
         (lambda: hk.solid(hk.Gyroid(1.0), between=(1.0,)), ValueError, "numbers, two of them"),  # type: ignore[arg-type]
@@ -126,7 +126,7 @@ def test_bad_input_is_named(make: Any, error: Any, message: str) -> None:
 
 
 def test_levels_may_be_numbers_of_numpy() -> None:
-    assert isinstance(hk.solid(hk.Gyroid(1.0), below=np.float32(0.25)), hk.Solid)  # type: ignore[arg-type]
+    assert isinstance(hk.solid(hk.Gyroid(1.0), below=np.float32(0.25)), hk.solids.Solid)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
@@ -134,9 +134,9 @@ def test_levels_may_be_numbers_of_numpy() -> None:
     ("formula", "value"),
     [
         (lambda x: np.sin(x**0), np.sin(1.0)),
-        (lambda x: hk.cos(0 * x + 0.3), np.cos(0.3)),
+        (lambda x: hk.math.cos(0 * x + 0.3), np.cos(0.3)),
         (lambda x: 0 * x + 0.1, 0.1),
-        (lambda x: hk.norm(0 * x + 0.1, 0 * x + 0.2), np.hypot(0.1, 0.2)),
+        (lambda x: hk.math.norm(0 * x + 0.1, 0 * x + 0.2), np.hypot(0.1, 0.2)),
         (lambda x: x**0 / 3, 1 / 3),
     ],
 )
@@ -156,7 +156,7 @@ def test_constants_made_of_coordinates_are_held(formula: Any, value: float, prec
 
 
 def test_functions_of_numpy_with_the_same_meaning() -> None:
-    """numpy.arctan and its like had no ranges, although harnack.atan has."""
+    """numpy.arctan and its like had no ranges, although harnack.math.atan has."""
     hits = hk.trace(
         hk.expression(lambda x, y, z: np.arctan(x) - 0.5), [[-2.0, 0, 0]], [[1.0, 0, 0]]
     )
@@ -178,12 +178,12 @@ def test_functions_of_numpy_with_the_same_meaning() -> None:
     ids=["origin", "flat", "rim"],
 )  # fmt: skip
 def test_no_crossing_is_lost(solid: Any, o: Any, d: Any, roots: Any, precision: Any) -> None:
-    all_hits = hk.trace(solid, [o], [d], all_hits=4, precision=precision)
+    all_hits = hk.crossings(solid, [o], [d], max_crossings=4, precision=precision)
     assert all_hits.status[0] == hk.RayStatus.MISS  # there are no others
     assert all_hits.count[0] == len(roots)
     off = 2.0 if d[2] == 2e-5 else 1e-2  # at so small an angle rounding moves it far
     assert all_hits.t[0, : len(roots)] == pytest.approx(roots, abs=off)
-    confirmed = hk.trace(solid, [o], [d], confirm=True, precision=precision)
+    confirmed = hk.trace(solid, [o], [d], require_crossing=True, precision=precision)
     assert confirmed.t[0] == pytest.approx(roots[0], abs=off)
 
 

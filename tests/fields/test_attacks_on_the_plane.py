@@ -24,7 +24,7 @@ def test_rays_from_creases_miss_nothing(bound: str, precision: Any) -> None:
     o = np.column_stack([rng.uniform(0.05, 0.8, n), 0 * np.ones(n), rng.uniform(0.02, 0.6, n)])
     d = rng.normal(size=(n, 3))
     d /= np.linalg.norm(d, axis=1)[:, None]
-    hits = hk.trace(hk.RiemannSurface("asin"), o, d, bound=bound, precision=precision)
+    hits = hk.trace(hk.fields.RiemannSurface("asin"), o, d, enclosures=bound, precision=precision)
     assert (hits.status != hk.RayStatus.OUT_OF_STEPS).all()
     end = np.minimum(hits.t, 1.2)
     x = o[:, None] + (np.linspace(0, 1, 800) * end[:, None])[..., None] * d[:, None]
@@ -44,7 +44,7 @@ def test_rays_through_zeros_of_whole_powers_end(
     function: Any, settings: dict[str, Any], precision: Any
 ) -> None:
     """g was made by its logarithm, which has no value at a zero: rays ran out of steps there."""
-    field = hk.RiemannSurface(function, **settings)
+    field = hk.fields.RiemannSurface(function, **settings)
     hits = hk.trace(field, [[0, 0, 2.0], [1e-21, 0, 2.0]], [[0, 0, -1.0]], precision=precision)
     np.testing.assert_allclose(hits.t, 2.0, atol=1.1e-4)
 
@@ -63,11 +63,11 @@ def test_what_is_not_a_number_is_not_free(bound: Any) -> None:
         return [(z, 1.0), *lost(z)]
 
     for field in (
-        hk.RiemannSurface(lost, **settings),
-        hk.RiemannSurface(one_is_lost, **settings),
-        hk.LevelCurves(lost, **settings),
+        hk.fields.RiemannSurface(lost, **settings),
+        hk.fields.RiemannSurface(one_is_lost, **settings),
+        hk.fields.LevelCurves(lost, **settings),
     ):
-        hits = hk.trace(field, o, d, bound=bound, max_steps=20)
+        hits = hk.trace(field, o, d, enclosures=bound, max_steps=20)
         assert (hits.status == hk.RayStatus.OUT_OF_STEPS).all()
 
 
@@ -90,6 +90,6 @@ def test_functions_of_ones_own_are_tried_at_once() -> None:
             **settings,
         }
         with pytest.raises(error, match=words):
-            hk.RiemannSurface(function, **given)
+            hk.fields.RiemannSurface(function, **given)
     with pytest.raises(ValueError, match="level must be finite"):
-        hk.LevelCurves("log", level=math.nan)
+        hk.fields.LevelCurves("log", level=math.nan)

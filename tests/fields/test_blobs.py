@@ -20,11 +20,11 @@ from harnack.fields.samples import Ray
 from harnack.testing import check_field
 
 KERNELS = {
-    "compact": hk.CompactKernel(1.6),
-    "cubic": hk.CubicKernel(2.0),
-    "sextic": hk.SexticKernel(1.8),
-    "gaussian": hk.GaussianKernel(1.0, 1e-2),
-    "sharp": hk.GaussianKernel(5.0, 0.2),
+    "compact": hk.kernels.CompactKernel(1.6),
+    "cubic": hk.kernels.CubicKernel(2.0),
+    "sextic": hk.kernels.SexticKernel(1.8),
+    "gaussian": hk.kernels.GaussianKernel(1.0, 1e-2),
+    "sharp": hk.kernels.GaussianKernel(5.0, 0.2),
 }
 PRECISIONS = ("single", "double")
 SLOWLY = pytest.mark.slow
@@ -312,7 +312,7 @@ def check_first_hits(blobs: hk.Blobs, count: int, precision: Any, most_looks: fl
     """Against values sampled densely in double precision: no crossing before a hit, none on a miss,
     and the surface at a hit."""
     o, d, length = rounded(choose_backend(precision), *box_rays(blobs, count))
-    tolerance = hk.HitTolerance(value=1e-3, distance=1e-30)
+    tolerance = hk.tracer.HitTolerance(value=1e-3, distance=1e-30)
     hits = hk.trace(blobs, o, d, t_max=length, tolerance=tolerance, precision=precision)
     assert (hits.status != hk.RayStatus.OUT_OF_STEPS).all()
     assert np.mean(hits.evaluations) <= most_looks
@@ -405,7 +405,7 @@ def test_equal_centers_far_from_the_origin(precision: Any) -> None:
     o = np.array([1e4, 1e4, 1e4 - 10.0])
     beside = np.array([[0.0, 0, 0], [3, 0, 0], [20, 0, 0]])
     hits = hk.trace(blobs, o + beside, [[0, 0, 1.0]] * 3, precision=precision)
-    kernel = hk.CompactKernel(1.6)
+    kernel = hk.kernels.CompactKernel(1.6)
     level = np.cbrt(0.5 / kernel.amplitude)  # two equal blobs are one of twice the weight
     radius = 1.6 * np.sqrt(1 - level)
     np.testing.assert_allclose(hits.t[:2], [10 - radius, 9.5], atol=4e-3)
@@ -460,9 +460,9 @@ def test_what_are_no_blobs(arguments: Any, settings: Any, message: str) -> None:
 
 def test_what_no_kernel_can_be() -> None:
     for wrong in (
-        lambda: hk.CompactKernel(0.9),
-        lambda: hk.GaussianKernel(0.0),
-        lambda: hk.GaussianKernel(1.0, 2.0),
+        lambda: hk.kernels.CompactKernel(0.9),
+        lambda: hk.kernels.GaussianKernel(0.0),
+        lambda: hk.kernels.GaussianKernel(1.0, 2.0),
     ):
         with pytest.raises(ValueError, match="must"):
             wrong()

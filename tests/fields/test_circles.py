@@ -99,12 +99,12 @@ def test_values_on_the_axis_and_in_the_plane(precision: Any) -> None:
     assert (np.sign(axial) == np.where(r < 1, 1, -1)).all()
 
 
-def random_circle(rng: np.random.Generator, scale: float = 1.0) -> hk.Circle:
+def random_circle(rng: np.random.Generator, scale: float = 1.0) -> hk.geometry.Circle:
     center, normal = scale * rng.uniform(-1, 1, 3), rng.normal(size=3)
-    return hk.Circle(scale * rng.uniform(0.2, 1.0), tuple(center), tuple(normal))
+    return hk.geometry.Circle(scale * rng.uniform(0.2, 1.0), tuple(center), tuple(normal))
 
 
-def points_about(rng: np.random.Generator, circle: hk.Circle, n: int) -> np.ndarray:
+def points_about(rng: np.random.Generator, circle: hk.geometry.Circle, n: int) -> np.ndarray:
     """A third anywhere, a third near the circle, a third near its plane and its axis."""
     x = rng.normal(0, 1.5, (n, 3))
     third = n // 3
@@ -145,7 +145,7 @@ def test_any_circle_agrees_with_carlson_s_integrals(precision: Any) -> None:
 def test_a_circle_agrees_with_a_polygon_of_4096_sides(precision: Any) -> None:
     """The polygon of the same area: what is left falls with the square of the sides' length."""
     rng = np.random.default_rng(2)
-    circle = hk.Circle(0.7, (0.3, -0.2, 0.1), (1.0, 2.0, -1.5))
+    circle = hk.geometry.Circle(0.7, (0.3, -0.2, 0.1), (1.0, 2.0, -1.5))
     half = math.pi / 4096
     share = math.sqrt(2 * half / math.sin(2 * half))
     center = np.array(circle.center)
@@ -171,20 +171,26 @@ def court(height: float = 0.0) -> np.ndarray:
     return np.array([[-1, -1.4, height], [1, -1.4, 0], [1, 1.25, height], [-1, 1.25, 0.0]])
 
 
-HOLE = hk.Circle(0.6, normal=(0, 0, -1))
-TILTED = hk.Circle(0.8, (0.1, 0.2, 0.3), (1, 2, 3))
+HOLE = hk.geometry.Circle(0.6, normal=(0, 0, -1))
+TILTED = hk.geometry.Circle(0.8, (0.1, 0.2, 0.3), (1, 2, 3))
 FIELDS: dict[str, hk.SolidAngle] = {
-    "circle": hk.SolidAngle(hk.Circle(1.0)),
+    "circle": hk.SolidAngle(hk.geometry.Circle(1.0)),
     "circle, edges": hk.SolidAngle(TILTED, lift_bound="edges"),
-    "large circle": hk.SolidAngle(hk.Circle(300.0, (500.0, 0, -200.0), (1, 0, 1))),
-    "ring": hk.SolidAngle([hk.Circle(1.0), hk.Circle(0.4, (0.2, 0, 0), (0, 0, -1))]),
-    "coaxial": hk.SolidAngle([hk.Circle(1.0), hk.Circle(0.8, (0, 0, 0.5))]),
-    "linked": hk.SolidAngle([hk.Circle(1.0), hk.Circle(1.0, (1.0, 0, 0), (0, 1, 0))]),
+    "large circle": hk.SolidAngle(hk.geometry.Circle(300.0, (500.0, 0, -200.0), (1, 0, 1))),
+    "ring": hk.SolidAngle(
+        [hk.geometry.Circle(1.0), hk.geometry.Circle(0.4, (0.2, 0, 0), (0, 0, -1))]
+    ),
+    "coaxial": hk.SolidAngle([hk.geometry.Circle(1.0), hk.geometry.Circle(0.8, (0, 0, 0.5))]),
+    "linked": hk.SolidAngle(
+        [hk.geometry.Circle(1.0), hk.geometry.Circle(1.0, (1.0, 0, 0), (0, 1, 0))]
+    ),
     "court": hk.SolidAngle([court(), HOLE]),
     "court, edges": hk.SolidAngle([court(), HOLE], lift_bound="edges"),
     "bent court": hk.SolidAngle([court(0.4), HOLE]),
-    "trefoil and circle": hk.SolidAngle([example_curves.torus_knot(2, 3, 40), hk.Circle(0.5)]),
-    "twice": hk.SolidAngle([hk.Circle(1.0), hk.Circle(1.0)]),
+    "trefoil and circle": hk.SolidAngle(
+        [example_curves.torus_knot(2, 3, 40), hk.geometry.Circle(0.5)]
+    ),
+    "twice": hk.SolidAngle([hk.geometry.Circle(1.0), hk.geometry.Circle(1.0)]),
 }
 SOME = ("circle", "ring", "coaxial", "court")
 EVERY = [pytest.param(name, marks=() if name in SOME else pytest.mark.slow) for name in FIELDS]
@@ -276,7 +282,7 @@ def test_the_bound_of_second_derivatives_is_attained_on_the_axis() -> None:
     bend = 1.5 * to_numpy(sums_over(field, on_axis).cubes) / square
     along = np.abs(field.hessian(on_axis, precision="double")[:, 2, 2])
     np.testing.assert_allclose(along, bend, rtol=1e-12)
-    x = points_about(np.random.default_rng(0), hk.Circle(1.0), 30000)
+    x = points_about(np.random.default_rng(0), hk.geometry.Circle(1.0), 30000)
     largest = np.abs(np.linalg.eigvalsh(field.hessian(x, precision="double"))).max(axis=1)
     share = largest * square / (1.5 * to_numpy(sums_over(field, x).cubes))
     assert 0.95 < share.max() <= 1 + 1e-9
@@ -305,7 +311,7 @@ def test_hessians_are_derivatives_of_gradients(name: str) -> None:
 
 
 def test_circles_that_are_run_back_cancel() -> None:
-    there = hk.Circle(1.0, (0.5, 0, 0), (0, 3, 4))
+    there = hk.geometry.Circle(1.0, (0.5, 0, 0), (0, 3, 4))
     nothing = hk.SolidAngle([there, there.reversed()])
     assert not hk.trace(nothing, [[0.5, 0, 2]], [[0, 0, -1]]).is_hit.any()
     with pytest.raises(ValueError, match="cancel each other"):
@@ -316,20 +322,25 @@ def test_circles_that_are_run_back_cancel() -> None:
 
 
 def test_regions_of_planes_are_found() -> None:
-    ring, hole = hk.Circle(1.0), hk.Circle(0.3, normal=(0, 0, -1))
+    ring, hole = hk.geometry.Circle(1.0), hk.geometry.Circle(0.3, normal=(0, 0, -1))
     assert planar_region((), (ring, hole)) is not None
     assert planar_region((), (ring.reversed(), hole.reversed())) is not None
     assert planar_region((court(),), (HOLE,)) is not None
     assert planar_region((court()[::-1],), (HOLE.reversed(),)) is not None
-    assert planar_region((), (hk.Circle(1.0), hk.Circle(1.0, (3, 0, 0)))) is not None
+    assert (
+        planar_region((), (hk.geometry.Circle(1.0), hk.geometry.Circle(1.0, (3, 0, 0)))) is not None
+    )
     # A hole run the same way counts twice; the other way outside, there are three values.
     assert planar_region((), (ring, hole.reversed())) is None
-    assert planar_region((), (hk.Circle(1.0), hk.Circle(1.0, (3, 0, 0), (0, 0, -1)))) is None
+    assert (
+        planar_region((), (hk.geometry.Circle(1.0), hk.geometry.Circle(1.0, (3, 0, 0), (0, 0, -1))))
+        is None
+    )
     # Crossing, touching, in another plane, not flat.
-    assert planar_region((), (ring, hk.Circle(0.5, (0.8, 0, 0), (0, 0, -1)))) is None
-    assert planar_region((), (ring, hk.Circle(0.5, (0.5, 0, 0), (0, 0, -1)))) is None
-    assert planar_region((), (ring, hk.Circle(0.5, (0, 0, 1e-3), (0, 0, -1)))) is None
-    assert planar_region((court(),), (hk.Circle(1.05, normal=(0, 0, -1)),)) is None
+    assert planar_region((), (ring, hk.geometry.Circle(0.5, (0.8, 0, 0), (0, 0, -1)))) is None
+    assert planar_region((), (ring, hk.geometry.Circle(0.5, (0.5, 0, 0), (0, 0, -1)))) is None
+    assert planar_region((), (ring, hk.geometry.Circle(0.5, (0, 0, 1e-3), (0, 0, -1)))) is None
+    assert planar_region((court(),), (hk.geometry.Circle(1.05, normal=(0, 0, -1)),)) is None
     assert planar_region((court(1e-6),), (HOLE,)) is None
     assert FIELDS["bent court"].describe()["lift_bound"] == "edges"
     with pytest.raises(ValueError, match="region of a plane"):
@@ -339,27 +350,27 @@ def test_regions_of_planes_are_found() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: hk.Circle(0.0), "radius of a circle"),
-        (lambda: hk.Circle(math.nan), "finite"),
-        (lambda: hk.Circle(-1.0), "radius of a circle"),
-        (lambda: hk.Circle([1.0, 2.0]), "must be a number"),  # type: ignore[arg-type]
-        (lambda: hk.Circle(1.0, (0, 0)), "three numbers"),  # type: ignore[arg-type]
-        (lambda: hk.Circle(1.0, (0, 0, math.inf)), "finite"),
-        (lambda: hk.Circle(1.0, (0, 0, 1e200)), "smaller units"),
-        (lambda: hk.Circle(1.0, normal=(0, 0, 0)), "direction of its axis"),
-        (lambda: hk.SolidAngle([hk.Circle(1.0), [[0, 0, 0], [1, 0, 0]]]), "loop 1 has 2"),
+        (lambda: hk.geometry.Circle(0.0), "radius of a circle"),
+        (lambda: hk.geometry.Circle(math.nan), "finite"),
+        (lambda: hk.geometry.Circle(-1.0), "radius of a circle"),
+        (lambda: hk.geometry.Circle([1.0, 2.0]), "must be a number"),  # type: ignore[arg-type]
+        (lambda: hk.geometry.Circle(1.0, (0, 0)), "three numbers"),  # type: ignore[arg-type]
+        (lambda: hk.geometry.Circle(1.0, (0, 0, math.inf)), "finite"),
+        (lambda: hk.geometry.Circle(1.0, (0, 0, 1e200)), "smaller units"),
+        (lambda: hk.geometry.Circle(1.0, normal=(0, 0, 0)), "direction of its axis"),
+        (lambda: hk.SolidAngle([hk.geometry.Circle(1.0), [[0, 0, 0], [1, 0, 0]]]), "loop 1 has 2"),
     ],
 )
 def test_what_is_no_circle(make: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make()
     with pytest.raises(TypeError, match="radius of a circle"):
-        hk.Circle("one")  # type: ignore[arg-type]
+        hk.geometry.Circle("one")  # type: ignore[arg-type]
     assert issubclass(CurveError, ValueError)
 
 
 def test_where_a_circle_is() -> None:
-    circle = hk.Circle(2.0, (1.0, -1.0, 0.5), (0.0, 3.0, 4.0))
+    circle = hk.geometry.Circle(2.0, (1.0, -1.0, 0.5), (0.0, 3.0, 4.0))
     assert circle.normal == (0.0, 0.6, 0.8)
     low, high = circle.bounds()
     polygon = circle.polygon(2000)
@@ -384,7 +395,7 @@ def test_closest_points_of_the_boundary() -> None:
     np.testing.assert_allclose(np.linalg.norm(nearest - x, axis=1), d, rtol=1e-9)
     on = MixedOracle(field.loops, field.circles)(nearest + 1e-12).smooth
     assert (on < 1e-9).all()
-    found = hk.closest_points(field, x[:20], level=-2 * math.pi + 1.2, precision="double")
+    found = hk.distance.closest_points(field, x[:20], level=-2 * math.pi + 1.2, precision="double")
     away = np.abs(np.remainder(field.value(found, precision="double") - 1.2, FOUR_PI) - FOUR_PI / 2)
     assert ((away < 1e-9) | (MixedOracle(field.loops, field.circles)(found).smooth < 1e-9)).all()
     assert (np.linalg.norm(found - x[:20], axis=1) <= d[:20] + 1e-9).all()
@@ -402,31 +413,48 @@ def test_values_can_be_differentiated_in_points() -> None:
     assert backend_of(x) is backend
 
 
-def random_curves(rng: np.random.Generator, kind: int) -> tuple[list[np.ndarray], list[hk.Circle]]:
+def random_curves(
+    rng: np.random.Generator, kind: int
+) -> tuple[list[np.ndarray], list[hk.geometry.Circle]]:
     """One of eight kinds of curves with circles, about 1 in size."""
     kinds = [
         lambda: ([], [random_circle(rng)]),
-        lambda: ([], [hk.Circle(1.0), hk.Circle(rng.uniform(0.1, 0.7), (0.2, 0, 0), (0, 0, -1))]),
         lambda: (
             [],
-            [hk.Circle(rng.uniform(0.5, 1), (0, 0, z)) for z in np.linspace(-0.5, 0.5, 3)],
+            [
+                hk.geometry.Circle(1.0),
+                hk.geometry.Circle(rng.uniform(0.1, 0.7), (0.2, 0, 0), (0, 0, -1)),
+            ],
         ),
-        lambda: ([], [hk.Circle(1.0), hk.Circle(1.0, (rng.uniform(0.2, 1.8), 0, 0), (0, 1, 0.3))]),
+        lambda: (
+            [],
+            [hk.geometry.Circle(rng.uniform(0.5, 1), (0, 0, z)) for z in np.linspace(-0.5, 0.5, 3)],
+        ),
+        lambda: (
+            [],
+            [
+                hk.geometry.Circle(1.0),
+                hk.geometry.Circle(1.0, (rng.uniform(0.2, 1.8), 0, 0), (0, 1, 0.3)),
+            ],
+        ),
         lambda: ([], [random_circle(rng) for _ in range(int(rng.integers(2, 7)))]),
         lambda: ([court()], [HOLE]),
         lambda: ([court(rng.uniform(-0.5, 0.5))], [HOLE, random_circle(rng)]),
-        lambda: ([example_curves.spiky_polygon(rng, int(rng.integers(5, 12)))], [hk.Circle(0.5)]),
+        lambda: (
+            [example_curves.spiky_polygon(rng, int(rng.integers(5, 12)))],
+            [hk.geometry.Circle(0.5)],
+        ),
     ]
     return kinds[kind % len(kinds)]()
 
 
 def placed(
-    rng: np.random.Generator, loops: list[np.ndarray], circles: list[hk.Circle]
-) -> tuple[list[np.ndarray], list[hk.Circle]]:
+    rng: np.random.Generator, loops: list[np.ndarray], circles: list[hk.geometry.Circle]
+) -> tuple[list[np.ndarray], list[hk.geometry.Circle]]:
     """Rotated at random, 1e-3 to 1e3 in size, and moved by up to twice its size."""
     scale, turn, shift = 10 ** rng.uniform(-3, 3), rotation(rng), rng.uniform(-1, 1, 3)
     moved = [
-        hk.Circle(
+        hk.geometry.Circle(
             scale * one.radius,
             tuple(scale * (turn @ np.array(one.center) + shift)),
             tuple(turn @ np.array(one.normal)),
@@ -502,7 +530,7 @@ def test_many_first_hits(seed: int, precision: Any) -> None:
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_rays_in_the_plane_and_at_the_circle(precision: Any) -> None:
     """Rays that run along the disk, through the circle itself and along the axis."""
-    field = hk.SolidAngle(hk.Circle(1.0))
+    field = hk.SolidAngle(hk.geometry.Circle(1.0))
     o = np.array(
         [[-3.0, 0, 0], [-3.0, 0, 1e-6], [0, 0, 3.0], [-3.0, 1.0, 0], [-3, 2, 0], [1, 0, 2]]
     )

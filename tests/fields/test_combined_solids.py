@@ -80,7 +80,7 @@ def near_spanning(p: FloatArray) -> FloatArray:
     return (np.abs(offset) - 0.4).reshape(p.shape[:-1])
 
 
-CASES: dict[str, tuple[Callable[[], hk.Solid], Values]] = {
+CASES: dict[str, tuple[Callable[[], hk.solids.Solid], Values]] = {
     "difference": (
         lambda: hk.Sphere(1.0) - hk.Torus(0.8, 0.3),
         lambda p: np.maximum(sphere(p), -torus(p, 0.8, 0.3)),
@@ -90,7 +90,7 @@ CASES: dict[str, tuple[Callable[[], hk.Solid], Values]] = {
         lambda p: np.minimum(sphere(p, 0.9), torus(p, 1.2, 0.2)),
     ),
     "hollow": (
-        lambda: hk.Sphere(1.0) & ~hk.Sphere(0.9) & hk.Plane((0, 0, 1), 0.2),
+        lambda: hk.Sphere(1.0) & ~hk.Sphere(0.9) & hk.solids.Plane((0, 0, 1), 0.2),
         lambda p: np.maximum(np.maximum(sphere(p), -sphere(p, 0.9)), p[..., 2] - 0.2),
     ),
     "grown": (
@@ -175,7 +175,9 @@ def rays(count: int, seed: int, center: Any, size: float) -> tuple[FloatArray, F
     return o + np.asarray(center), d / np.linalg.norm(d, axis=1, keepdims=True)
 
 
-def missed(make: Callable[[], hk.Solid], value: Values, precision: Any, count: int) -> FloatArray:
+def missed(
+    make: Callable[[], hk.solids.Solid], value: Values, precision: Any, count: int
+) -> FloatArray:
     """By how much hits come after the first sample inside, in units of the samples' distance."""
     center = (1, 2, 3) if value is CASES["moved gyroid"][1] else (0, 0, 0)
     o, d = rays(count, 3, center, 1.3)
@@ -220,7 +222,7 @@ def test_combinations_keep_their_promises(name: str) -> None:
 def test_sphere_tracing_finds_the_same_hits(name: str) -> None:
     o, d = rays(2000, 5, (0, 0, 0), 1.3)
     solid = CASES[name][0]()
-    ours, theirs = (hk.trace(solid, o, d, t_max=8.0, bound=one) for one in (None, "lipschitz"))
+    ours, theirs = (hk.trace(solid, o, d, t_max=8.0, enclosures=one) for one in (None, "lipschitz"))
     same = ours.is_hit == theirs.is_hit
     assert same.mean() > 0.998  # rays that graze within the tolerance stop anywhere
     both = ours.is_hit & theirs.is_hit
@@ -291,7 +293,7 @@ def test_a_union_reaches_as_far_as_its_parts() -> None:
     assert low[0] <= -1
     assert high[0] >= 6
     assert (far - hk.Sphere(9.0)).sublevel_extent() is not None
-    assert (far | hk.Plane()).sublevel_extent() is None
+    assert (far | hk.solids.Plane()).sublevel_extent() is None
     assert (~far).sublevel_extent() is None
     inside = hk.solid(hk.Blobs([[0, 0, 0]], [1.0]), above=0.5).sublevel_extent()
     assert inside is None or np.isfinite(inside.bounds()).all()
@@ -379,22 +381,22 @@ def test_second_derivatives_of_walls() -> None:
 
 
 def test_numbers_of_numpy_are_numbers() -> None:
-    wave = hk.PlaneWave(np.float64(1.0), tuple(np.array([1.0, 2.0, 3.0])))  # type: ignore[arg-type]
-    same = hk.EigenfunctionSum([hk.PlaneWave(1.0, (1.0, 2.0, 3.0))])
+    wave = hk.fields.PlaneWave(np.float64(1.0), tuple(np.array([1.0, 2.0, 3.0])))  # type: ignore[arg-type]
+    same = hk.fields.EigenfunctionSum([hk.fields.PlaneWave(1.0, (1.0, 2.0, 3.0))])
     x = [[0.1, 0.2, 0.3]]
-    assert hk.EigenfunctionSum([wave]).value(x) == same.value(x)
+    assert hk.fields.EigenfunctionSum([wave]).value(x) == same.value(x)
     tapered = hk.Sphere(1).tapered((np.float64(0), np.int64(1)), (np.int64(2), np.float32(0.5)))
     assert tapered.value(x) == hk.Sphere(1).tapered((0, 1), (2, 0.5)).value(x)
     ball = hk.Sphere(1)
     blend = ball.blended(ball.translated((1, 0, 0)), np.float32(0.5), power=np.int64(2))
     assert blend.value(x) == ball.blended(ball.translated((1, 0, 0)), 0.5).value(x)
-    noise = hk.FractalNoise(octaves=np.int64(2), seed=np.int32(1))  # type: ignore[arg-type]
-    assert noise.value(x) == hk.FractalNoise(octaves=2, seed=1).value(x)
-    assert hk.Julia(iterations=np.int64(5)).iterations == 5  # type: ignore[arg-type]
+    noise = hk.solids.FractalNoise(octaves=np.int64(2), seed=np.int32(1))  # type: ignore[arg-type]
+    assert noise.value(x) == hk.solids.FractalNoise(octaves=2, seed=1).value(x)
+    assert hk.solids.Julia(iterations=np.int64(5)).iterations == 5  # type: ignore[arg-type]
     ray = [[3, 0, 0]], [[-1, 0, 0]]
     for overstep in (np.float32(1.25), np.float64(1.25), np.int64(1)):
-        hits = hk.trace(ball, *ray, overstep=overstep)  # type: ignore[arg-type]
-        assert hits.t == hk.trace(ball, *ray, overstep=float(overstep)).t
+        hits = hk.trace(ball, *ray, over_relaxation=overstep)  # type: ignore[arg-type]
+        assert hits.t == hk.trace(ball, *ray, over_relaxation=float(overstep)).t
     with pytest.raises(ValueError, match="finite numbers"):
         hk.Sphere(1).tapered(("a", 1), (2, 0.5))  # type: ignore[arg-type]
 

@@ -107,8 +107,12 @@ CURVES: dict[str, Field] = {
     "Hopf link": hk.SolidAngle(example_curves.hopf_link(20)),
     "Borromean rings": hk.SolidAngle(example_curves.borromean_rings(20)),
     "holes": hk.SolidAngle(example_curves.square_with_holes(12)),
-    "ring of circles": hk.SolidAngle([hk.Circle(1.0), hk.Circle(0.4, normal=(0, 0, -1))]),
-    "trefoil and circle": hk.SolidAngle([example_curves.torus_knot(2, 3, 60), hk.Circle(0.5)]),
+    "ring of circles": hk.SolidAngle(
+        [hk.geometry.Circle(1.0), hk.geometry.Circle(0.4, normal=(0, 0, -1))]
+    ),
+    "trefoil and circle": hk.SolidAngle(
+        [example_curves.torus_knot(2, 3, 60), hk.geometry.Circle(0.5)]
+    ),
     "spiky": hk.SolidAngle(example_curves.spiky_polygon(_RNG, 17)),
     "random": hk.SolidAngle(example_curves.random_closed_curve(_RNG, 40)),
 }
@@ -116,8 +120,8 @@ REAL: dict[str, Field] = {
     "Y 2,0": hk.SphericalHarmonic(2, 0),
     "Y 5,3": hk.SphericalHarmonic(5, 3),
     "Y 12,-7, large": hk.SphericalHarmonic(12, -7, radius=50.0),
-    "lobes 3,2": hk.Lobes(3, 2),
-    "lobes 2,1, positive": hk.Lobes(2, 1, sign="positive", scale=20.0),
+    "lobes 3,2": hk.fields.Lobes(3, 2),
+    "lobes 2,1, positive": hk.fields.Lobes(2, 1, sign="positive", scale=20.0),
     "Eq. 8": hk.HarmonicPolynomial({(2, 1, 0): 1, (0, 1, 2): -1}),
     "polynomial off center": hk.HarmonicPolynomial(
         {(2, 1, 0): 1, (0, 1, 2): -1, (1, 0, 0): 0.3, (0, 0, 0): 0.1, (1, 1, 1): 0.5},
@@ -125,24 +129,24 @@ REAL: dict[str, Field] = {
     ),
     "gyroid": hk.Gyroid(),
     "gyroid, small": hk.Gyroid(cell=0.01, domain=hk.Box((0, 0, 0), (0.03, 0.02, 0.02))),
-    "P": hk.SchwarzP(cell=2.0),
-    "D": hk.SchwarzD(cell=100.0),
-    "Fig. 21": hk.EigenfunctionSum(
+    "P": hk.fields.SchwarzP(cell=2.0),
+    "D": hk.fields.SchwarzD(cell=100.0),
+    "Fig. 21": hk.fields.EigenfunctionSum(
         [
             WaveProduct(1.0, sine_factor(6), sine_factor(6), sine_factor(6)),
             WaveProduct(1.0, sine_factor(2), sine_factor(2), sine_factor(2)),
         ]
     ),
-    "plane waves": hk.EigenfunctionSum(
+    "plane waves": hk.fields.EigenfunctionSum(
         [
             PlaneWave(0.7, (1.0, -2.0, 0.5), 0.3),
             WaveProduct(0.4, x=cosine_factor(2.0), y=sine_factor(3.0, 0.2)),
             WaveProduct(0.25),
         ]
     ),
-    "hyperspherical 4,2,1": hk.HypersphericalHarmonic(4, 2, 1),
-    "hyperspherical 6,6,5, in a ball": hk.HypersphericalHarmonic(6, 6, 5, domain=hk.Ball()),
-    "Fourier series": hk.FourierSeries.fit(
+    "hyperspherical 4,2,1": hk.fields.HypersphericalHarmonic(4, 2, 1),
+    "hyperspherical 6,6,5, in a ball": hk.fields.HypersphericalHarmonic(6, 6, 5, domain=hk.Ball()),
+    "Fourier series": hk.fields.FourierSeries.fit(
         lambda x: np.exp(-4 * (x**2).sum(axis=1)) + 0.2 * x[:, 0],
         ((-1.0, -1.0, -0.5), (1.0, 1.0, 0.5)),
         (7, 6, 4),
@@ -167,7 +171,7 @@ FIELDS = {
     "smoothed": hk.DipolePotential(
         *_SPHERE, np.full(60, 4 * math.pi / 60), smoothing=0.2, accuracy=100.0
     ),
-    "screened": hk.ScreenedWindingNumber(
+    "screened": hk.fields.ScreenedWindingNumber(
         *_SPHERE, np.full(60, 4 * math.pi / 60), length=0.7, method="sum"
     ),
     **CURVES,
@@ -233,10 +237,10 @@ APPROXIMATE: dict[str, Field] = {
     "dipoles, accuracy 2": hk.DipolePotential(*_CLOUD, accuracy=2.0),
     "dipoles, accuracy 4": hk.DipolePotential(*_CLOUD, accuracy=4.0),
     "smoothed by tree": hk.DipolePotential(*_CLOUD, smoothing=0.1, accuracy=2.0),
-    "screened by tree": hk.ScreenedWindingNumber(*_CLOUD, length=0.7, method="tree"),
+    "screened by tree": hk.fields.ScreenedWindingNumber(*_CLOUD, length=0.7, method="tree"),
     "mesh by tree, accuracy 2": hk.WindingNumber(*_DAMAGED, method="tree", accuracy=2.0),
     "mesh by tree, accuracy 4": hk.WindingNumber(*_DAMAGED, method="tree", accuracy=4.0),
-    "morph": hk.Morph(icosphere(2), _DAMAGED, gap=0.4, w=0.15),
+    "morph": hk.fields.Morph(icosphere(2), _DAMAGED, gap=0.4, w=0.15),
     "mesh, exact": hk.WindingNumber(*_DAMAGED, method="exact"),
     "closed mesh, exact": hk.WindingNumber(*icosphere(1), method="exact"),
 }
@@ -252,8 +256,8 @@ def test_every_field_there_is_is_tested() -> None:
     shapes = [shape for shape, _ in SHAPES.values()]
     tested = {type(field) for field in (*FIELDS.values(), *APPROXIMATE.values(), *shapes)}
     # Those have contracts in the test files of their own.
-    tested |= {hk.Blobs, hk.HRBF, hk.Molecule, hk.PolygonMesh, hk.TubeNetwork}
-    tested |= {hk.RiemannSurface, hk.HeightField, hk.LevelCurves}
+    tested |= {hk.Blobs, hk.fields.HRBF, hk.fields.Molecule, hk.PolygonMesh, hk.solids.TubeNetwork}
+    tested |= {hk.fields.RiemannSurface, hk.fields.HeightField, hk.fields.LevelCurves}
     assert all(any(issubclass(one, kind) for one in tested) for kind in exported)
     proofs = {
         kind
@@ -292,10 +296,10 @@ def test_every_proof_from_ranges_holds(name: str, bound: str) -> None:
         name == "displaced" and bound in PROOFS and bound != "interval"
     ):  # noise is known by its derivatives alone
         with pytest.raises(TypeError, match="gives ranges of derivatives alone"):
-            check_ray_samples(SHAPES[name][0], points, bound=bound)
+            check_ray_samples(SHAPES[name][0], points, enclosures=bound)
         return
     for precision in ("single", "double"):
-        check_ray_samples(SHAPES[name][0], points, rng=5, bound=bound, precision=precision)
+        check_ray_samples(SHAPES[name][0], points, rng=5, enclosures=bound, precision=precision)
 
 
 @pytest.mark.parametrize("name", SOME)

@@ -451,7 +451,7 @@ def test_values_and_derivatives_are_those_of_all_edges() -> None:
 
 
 def test_circles_beside_cells() -> None:
-    loops = [wavy(64), hk.Circle(0.4, normal=(0, 0, -1))]
+    loops = [wavy(64), hk.geometry.Circle(0.4, normal=(0, 0, -1))]
     o, d = rays(wavy(64), 2000)
     plain, hits = (hk.trace(hk.SolidAngle(loops, cells=some), o, d) for some in (False, True))
     assert (plain.is_hit != hits.is_hit).mean() < 2e-3
@@ -498,7 +498,7 @@ def test_many_rays_get_cells_by_themselves() -> None:
         hk.SolidAngle(curve, cells=False),
         hk.SolidAngle(curve, lift_bound="paper"),
         hk.SolidAngle(vector(*curve.T)),
-        hk.SolidAngle(hk.Circle(1.0, (0, 0, 0), (0, 0, 1))),
+        hk.SolidAngle(hk.geometry.Circle(1.0, (0, 0, 0), (0, 0, 1))),
     ):
         assert one.for_ray_count(10**9) is one
     x = places(curve, 500, 6)

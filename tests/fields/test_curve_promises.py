@@ -89,8 +89,8 @@ def test_the_bound_of_squares_is_attained_far_off_and_nearly_at_a_mere_half() ->
 
 FIELDS = {
     **{name: hk.SolidAngle(loops) for name, loops in CURVES.items()},
-    "circle": hk.SolidAngle(hk.Circle(1.0)),
-    "court": hk.SolidAngle([1.5 * CURVES["square"][0], hk.Circle(0.8, normal=(0, 0, -1))]),
+    "circle": hk.SolidAngle(hk.geometry.Circle(1.0)),
+    "court": hk.SolidAngle([1.5 * CURVES["square"][0], hk.geometry.Circle(0.8, normal=(0, 0, -1))]),
 }
 
 

@@ -72,7 +72,7 @@ def makers() -> Iterator[tuple[str, Callable[..., Any]]]:
     for field in (hk.DipolePotential(POINTS, POINTS), hk.WindingNumber(POINTS[:3], [[0, 1, 2]])):
         move = getattr(field, "with_points", None) or field.with_vertices
         yield f"{type(field).__name__}.{move.__name__}", move
-    for name, own in vars(hk.Solid).items():
+    for name, own in vars(hk.solids.Solid).items():
         is_maker = inspect.isfunction(own) and own.__annotations__.get("return") == "Solid"
         if is_maker and not name.startswith("_") and name not in ("prepare", "map_operands"):
             yield f"Solid.{name}", getattr(hk.Sphere(1.0), name)
@@ -168,13 +168,16 @@ def moved_curve() -> hk.SolidAngle:
 PARTS: dict[str, tuple[dict[str, Any], Callable[[Any], Any]]] = {
     "PlaneWave": (
         {"amplitude": 1.0, "wave_vector": (1.0, 2.0, 3.0)},
-        lambda one: hk.EigenfunctionSum([one]),
+        lambda one: hk.fields.EigenfunctionSum([one]),
     ),
     "WaveProduct": (
-        {"amplitude": 1.0, "x": hk.sine_factor(2.0)},
-        lambda one: hk.EigenfunctionSum([one]),
+        {"amplitude": 1.0, "x": hk.fields.sine_factor(2.0)},
+        lambda one: hk.fields.EigenfunctionSum([one]),
     ),
-    "BranchPoint": ({"location": 0j}, lambda one: hk.RiemannSurface("sqrt", singular_points=[one])),
+    "BranchPoint": (
+        {"location": 0j},
+        lambda one: hk.fields.RiemannSurface("sqrt", singular_points=[one]),
+    ),
     "Circle": ({"radius": 1.0}, lambda one: hk.SolidAngle([one])),
     **{
         name: ({}, lambda one: hk.Blobs(POINTS, 0.5, kernel=one))

@@ -18,7 +18,11 @@ POINTS = np.random.default_rng(2).uniform(-0.9, 0.9, (200, 3))
 
 
 def waves(x: Any, y: Any, z: Any) -> Any:
-    return hk.sin(3 * x) * hk.exp(-y * y) + hk.sqrt(z * z + 1) / (2 + x) - hk.tanh(y) ** 3
+    return (
+        hk.math.sin(3 * x) * hk.math.exp(-y * y)
+        + hk.math.sqrt(z * z + 1) / (2 + x)
+        - hk.math.tanh(y) ** 3
+    )
 
 
 def reference(p: Any) -> Any:
@@ -44,7 +48,7 @@ def test_value_gradient_and_hessian_are_those_of_the_formula() -> None:
 
 
 def test_numpy_and_plain_operators_mean_the_same() -> None:
-    ours = hk.expression(lambda x, y, z: hk.cos(x) + abs(y) ** 3 - hk.maximum(z, 0.1))
+    ours = hk.expression(lambda x, y, z: hk.math.cos(x) + abs(y) ** 3 - hk.math.maximum(z, 0.1))
     theirs = hk.expression(lambda x, y, z: np.cos(x) + np.abs(y) ** 3 - np.maximum(z, 0.1))
     o, d = [[0.1, -3, 0.2]], [[0.05, 1, 0.1]]
     one, two = (hk.trace(field, o, d, level=0.5) for field in (ours, theirs))
@@ -57,11 +61,11 @@ def test_numpy_and_plain_operators_mean_the_same() -> None:
     [
         (3, TypeError, "must be callable"),
         (lambda x, y: x, TypeError, "must take three coordinates"),
-        (lambda x, y, z: math.sin(x), TypeError, "use harnack.sin"),
+        (lambda x, y, z: math.sin(x), TypeError, "use harnack.math.sin"),
         (lambda x, y, z: x if x > 0 else y, TypeError, ""),
         (lambda x, y, z: np.fmod(x, y), TypeError, "has no proved ranges"),
         (lambda x, y, z: x / 0, ZeroDivisionError, "constant 0"),
-        (lambda x, y, z: hk.norm(x, y, p=0.5), ValueError, "at least 1"),
+        (lambda x, y, z: hk.math.norm(x, y, p=0.5), ValueError, "at least 1"),
     ],
 )
 def test_mistakes_are_told_when_the_field_is_made(
@@ -176,12 +180,12 @@ def test_what_is_returned_must_be_a_number() -> None:
 def test_where_a_formula_is_not_defined_there_is_no_surface() -> None:
     """log(x) - y has no value at x < 0: a proved miss. The larger of it and another function may
     count as that one there: neither a hit nor a proved miss."""
-    field = hk.expression(lambda x, y, z: hk.log(x) - y)
+    field = hk.expression(lambda x, y, z: hk.math.log(x) - y)
     hits = hk.trace(field, [[-1, 0, 3], [1.0, 3.0, 0]], [[0, 0, -1], [0, -1, 0]], t_max=5.0,
                     max_steps=60)  # fmt: skip
     assert hits.status.tolist() == [hk.RayStatus.MISS, hk.RayStatus.HIT]
     assert hits.t[1] == pytest.approx(3.0, abs=1e-3)
-    larger = hk.expression(lambda x, y, z: hk.maximum(hk.log(x) - y, z))
+    larger = hk.expression(lambda x, y, z: hk.math.maximum(hk.math.log(x) - y, z))
     ray = hk.trace(larger, [[-1, 0, 3]], [[0, 0, -1]], t_max=5.0, max_steps=60)
     assert ray.status.tolist() == [hk.RayStatus.OUT_OF_STEPS]
 
@@ -208,11 +212,11 @@ def test_steps_of_a_parabola_are_the_longest_there_are() -> None:
     check_ray_samples(field, POINTS, rng=4)
     for factor in (1.001, 1.01):
         with pytest.raises(BrokenPromiseError):
-            check_ray_samples(field, POINTS, rng=4, bound=scaled_pieces(factor))
+            check_ray_samples(field, POINTS, rng=4, enclosures=scaled_pieces(factor))
 
 
 def scaled_pieces(factor: float) -> Any:
-    return mutated_enclosure(hk.PiecewiseTaylorEnclosure, factor)
+    return mutated_enclosure(hk.proofs.PiecewiseTaylorEnclosure, factor)
 
 
 def test_a_twisted_ellipsoid_takes_less_than_six_looks() -> None:
@@ -220,7 +224,7 @@ def test_a_twisted_ellipsoid_takes_less_than_six_looks() -> None:
     size = np.array([1.0, 0.3, 2.0])
 
     def twisted(x: Any, y: Any, z: Any) -> Any:
-        c, s = hk.cos(2 * z), hk.sin(2 * z)
+        c, s = hk.math.cos(2 * z), hk.math.sin(2 * z)
         u, v = x * c + y * s, y * c - x * s
         return (u / size[0]) ** 2 + (v / size[1]) ** 2 + (z / size[2]) ** 2 - 1
 
@@ -230,7 +234,7 @@ def test_a_twisted_ellipsoid_takes_less_than_six_looks() -> None:
     o = rng.normal(size=(4000, 3))
     o *= 5 / np.linalg.norm(o, axis=1, keepdims=True)
     hits = hk.trace(field, o, rng.uniform(-1, 1, (4000, 3)) * box - o,
-                    tolerance=hk.HitTolerance(value=1e-3, distance=1e-12))  # fmt: skip
+                    tolerance=hk.tracer.HitTolerance(value=1e-3, distance=1e-12))  # fmt: skip
     assert hits.evaluations.mean() < 6
     assert (hits.status != hk.RayStatus.OUT_OF_STEPS).all()
 
@@ -246,7 +250,7 @@ def test_a_formula_that_compiles_for_long_says_so_before() -> None:
         def function(*values: Any) -> Any:
             for k, weights in enumerate(layers):
                 if k:
-                    values = tuple(hk.tanh(v) for v in values)
+                    values = tuple(hk.math.tanh(v) for v in values)
                 values = tuple(
                     sum((float(w) * v for w, v in zip(row, values, strict=True)), start=0.0)
                     for row in weights
@@ -258,7 +262,7 @@ def test_a_formula_that_compiles_for_long_says_so_before() -> None:
     with pytest.warns(UserWarning, match="operations.* [0-9]+ s to compile.*Long formulas"):
         hk.expression(network((16, 16)))
     with pytest.warns(UserWarning, match="Long formulas"):
-        hk.HeightField(lambda x, y: network((16, 16))(x, y, 0.0 * x))
+        hk.fields.HeightField(lambda x, y: network((16, 16))(x, y, 0.0 * x))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         hk.expression(network((8, 8)))
@@ -269,12 +273,12 @@ def test_scalars_of_numpy_are_numbers_in_samples_and_promises() -> None:
     class Height(hk.Field):
         domain = hk.Ball()
 
-        def evaluate(self, p: Any) -> hk.Sample:
+        def evaluate(self, p: Any) -> hk.fields.Sample:
             known = (
-                hk.Lipschitz(np.float64(1.001)),
-                hk.TaylorRemainder(np.float64(0.0), np.float32(9)),
+                hk.proofs.Lipschitz(np.float64(1.001)),
+                hk.proofs.TaylorRemainder(np.float64(0.0), np.float32(9)),
             )
-            return hk.Sample(p.z, type(p)(0, 0, 1), known, np.float64(1e-6))
+            return hk.fields.Sample(p.z, type(p)(0, 0, 1), known, np.float64(1e-6))
 
     assert hk.trace(Height(), [[0, 0, 0.5]], [[0, 0, -1]]).t[0] == pytest.approx(0.5, abs=2e-4)
 

@@ -23,7 +23,7 @@ FIELDS: dict[str, hk.Field] = {
     "tree": hk.WindingNumber(VERTICES, FACES[np.arange(len(FACES)) % 3 > 0], method="tree"),
     # Gradients are right by themselves, values as far as they are asked to be.
     "cloud": hk.DipolePotential(VERTICES, VERTICES, accuracy=50),
-    "screened": hk.ScreenedWindingNumber(VERTICES, VERTICES, length=1.0),
+    "screened": hk.fields.ScreenedWindingNumber(VERTICES, VERTICES, length=1.0),
 }
 POINTS = np.array([[0.3, 0.2, 0.5], [0.1, -0.4, 0.25], [-0.6, 0.2, -0.3], [1.4, 0.3, 0.2]])
 
@@ -31,8 +31,8 @@ POINTS = np.array([[0.3, 0.2, 0.5], [0.1, -0.4, 0.25], [-0.6, 0.2, -0.3], [1.4, 
 class Plane(hk.Field):
     """f = x."""
 
-    def evaluate(self, p: Any) -> hk.Sample:
-        return hk.Sample(p.x, type(p)(1, 0, 0), (hk.Lipschitz(1.0),))
+    def evaluate(self, p: Any) -> hk.fields.Sample:
+        return hk.fields.Sample(p.x, type(p)(1, 0, 0), (hk.proofs.Lipschitz(1.0),))
 
 
 @pytest.mark.few(4)
@@ -175,12 +175,12 @@ def test_fields_print_as_they_were_made() -> None:
         hk.WindingNumber(*icosphere(2)),
         cut.twisted(1.0),
         hk.expression(lambda x, y, z: x + y - z),
-        hk.LevelCurves("log", "imag"),
+        hk.fields.LevelCurves("log", "imag"),
         hk.Blobs([[0, 0, 0]], 1.0),
-        hk.RiemannSurface("sqrt"),
-        cut.translated((1, 2, 3)) | hk.Plane(),
+        hk.fields.RiemannSurface("sqrt"),
+        cut.translated((1, 2, 3)) | hk.solids.Plane(),
     )
     for field in many:
         assert "0x" not in repr(field)
         assert len(repr(field)) < 200
-        assert "0x" not in repr(hk.level_set(field).field)
+        assert "0x" not in repr(hk.Surface(field).field)

@@ -80,8 +80,8 @@ def test_a_series_is_fitted_exactly(shape: tuple[int, int, int]) -> None:
     np.testing.assert_allclose(fit_cosines(values.reshape(grid), shape), a, atol=1e-13)
     box = (tuple(low), tuple(low + size))
     for fitted in (
-        hk.FourierSeries.fit(values.reshape(grid), box, shape),
-        hk.FourierSeries.fit(lambda p: by_terms(a, low, size, p).value, box, shape),
+        hk.fields.FourierSeries.fit(values.reshape(grid), box, shape),
+        hk.fields.FourierSeries.fit(lambda p: by_terms(a, low, size, p).value, box, shape),
     ):
         assert fitted.fit_error is not None
         assert fitted.fit_error < 1e-12
@@ -142,15 +142,15 @@ def test_series_keep_their_promises(kind: str) -> None:
     move, scale = {"far away": (300.0, 1.0), "tiny": (0.0, 1e-3)}.get(kind, (0.0, 1.0))
     box = tuple(tuple(move + scale * v for v in corner) for corner in CUBE)
     terms = (9, 5, 3) if kind == "anisotropic" else 7
-    field = hk.FourierSeries.fit(lambda x: blobs((x - move) / scale), box, terms)
+    field = hk.fields.FourierSeries.fit(lambda x: blobs((x - move) / scale), box, terms)
     check_field(field, count=150, directions=6)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("terms", [2, 16, (16, 4, 9)])
 def test_other_series_keep_their_promises(terms: Any) -> None:
-    check_field(hk.FourierSeries.fit(blobs, CUBE, terms), count=150)
-    torus = hk.FourierSeries.fit(
+    check_field(hk.fields.FourierSeries.fit(blobs, CUBE, terms), count=150)
+    torus = hk.fields.FourierSeries.fit(
         lambda x: np.hypot(np.hypot(x[:, 0], x[:, 1]) - 0.6, x[:, 2]) - 0.25,
         CUBE,
         3 if terms == 2 else terms,  # it is even on every axis: of two terms one is left
@@ -160,7 +160,7 @@ def test_other_series_keep_their_promises(terms: Any) -> None:
 
 @pytest.mark.slow
 def test_local_bounds_that_are_too_small_are_seen() -> None:
-    field = hk.FourierSeries.fit(blobs, CUBE, 8)
+    field = hk.fields.FourierSeries.fit(blobs, CUBE, 8)
     assert field._bounds.cells
     cells = tuple(dataclasses.replace(c, bounds=0.5 * c.bounds) for c in field._bounds.cells)
     field._bounds = dataclasses.replace(field._bounds, cells=cells)
@@ -199,7 +199,7 @@ def agree(field: Any, level: float, n: int, size: float, precision: Any, **setti
 @pytest.mark.slow
 @pytest.mark.parametrize("precision", ["single", pytest.param("double", marks=pytest.mark.slow)])
 def test_first_hits_of_figure_21(precision: Any) -> None:
-    field = hk.FourierSeries.fit(figure_21, FIG_21, 10)
+    field = hk.fields.FourierSeries.fit(figure_21, FIG_21, 10)
     assert field.fit_error is not None
     assert field.fit_error < 1e-12
     ball = hk.Ball(radius=math.pi / 2)
@@ -212,9 +212,9 @@ def test_first_hits_of_figure_21(precision: Any) -> None:
 @pytest.mark.parametrize("name", ["figure 21", "blobs"])
 def test_first_hits_of_many_rays(name: str, precision: Any) -> None:
     if name == "blobs":
-        agree(hk.FourierSeries.fit(blobs, CUBE, 12), 0.0, 800, 1.2, precision)
+        agree(hk.fields.FourierSeries.fit(blobs, CUBE, 12), 0.0, 800, 1.2, precision)
     else:
-        field = hk.FourierSeries.fit(figure_21, FIG_21, 10)
+        field = hk.fields.FourierSeries.fit(figure_21, FIG_21, 10)
         ball = hk.Ball(radius=math.pi / 2)
         agree(field, 0.5, 2000, math.pi / 2, precision, clip=ball)
 
@@ -222,7 +222,7 @@ def test_first_hits_of_many_rays(name: str, precision: Any) -> None:
 @pytest.mark.slow
 def test_displacements_are_those_of_the_surfaces() -> None:
     """A sphere whose radius grew by 0.01: the surfaces are that far apart."""
-    wave = hk.FourierSeries.fit(lambda x: np.exp(-4 * (x**2).sum(axis=1)), CUBE, 10)
+    wave = hk.fields.FourierSeries.fit(lambda x: np.exp(-4 * (x**2).sum(axis=1)), CUBE, 10)
     level = math.exp(-4 * 0.5**2)
     wave._source = lambda x: np.exp(-4 * (np.linalg.norm(x, axis=1) - 0.01) ** 2)
     found = wave.displacement(level)
@@ -230,13 +230,13 @@ def test_displacements_are_those_of_the_surfaces() -> None:
     assert found.mean == pytest.approx(0.01, rel=0.03)
     assert found.largest < 0.012
     x = midpoints(np.full(3, -1.2), np.full(3, 1.2), (40, 40, 40))
-    grid = hk.FourierSeries.fit(np.exp(-4 * (x**2).sum(axis=1)).reshape((40,) * 3), CUBE, 9)
+    grid = hk.fields.FourierSeries.fit(np.exp(-4 * (x**2).sum(axis=1)).reshape((40,) * 3), CUBE, 9)
     found = grid.displacement(level)
     assert 0 < found.mean <= found.largest < 0.005
     with pytest.raises(ValueError, match="no point with level"):
         wave.displacement(-7.0)
     with pytest.raises(ValueError, match="no function to miss"):
-        hk.FourierSeries(np.ones((2, 2, 2)), CUBE).displacement()
+        hk.fields.FourierSeries(np.ones((2, 2, 2)), CUBE).displacement()
 
 
 @pytest.mark.slow
@@ -244,7 +244,7 @@ def test_values_have_derivatives() -> None:
     import drjit as dr
     from drjit.llvm.ad import Array3f64
 
-    field = hk.FourierSeries.fit(blobs, CUBE, 6)
+    field = hk.fields.FourierSeries.fit(blobs, CUBE, 6)
     p = Array3f64([0.1, 0.3], [0.2, -0.4], [-0.3, 0.1])
     dr.enable_grad(p)
     dr.backward(dr.sum(field.value(p)))
@@ -260,7 +260,9 @@ def test_another_function_compiles_no_kernel() -> None:
     def trace(k: int) -> int:
         move = 0.01 * k
         box = tuple(tuple(v + move for v in corner) for corner in CUBE)
-        field = hk.FourierSeries.fit(lambda x: (1 + move) * blobs(x - move), box, 4, samples=16)
+        field = hk.fields.FourierSeries.fit(
+            lambda x: (1 + move) * blobs(x - move), box, 4, samples=16
+        )
         return compiled(lambda: hk.trace(field, o, d, level=0.1 + move), size=300)
 
     assert trace(0) > 0
@@ -292,8 +294,12 @@ def nan_at_one(x: np.ndarray) -> np.ndarray:
         (lambda: fit(blobs, box=((0, 0, 0), (1, 1, 0))), ValueError, "finite sides longer than 0"),
         (lambda: fit(blobs, box=hk.Box((0, 0, 0), (1, 1, math.inf))), ValueError, "finite sides"),
         (lambda: fit(blobs, box=3.0), TypeError, "a harnack.Box or two corners"),
-        (lambda: hk.FourierSeries(np.ones((2, 2)), CUBE), ValueError, "K_x, K_y, K_z"),
-        (lambda: hk.FourierSeries(np.ones((1, 1, 1)), CUBE), ValueError, "series is constant"),
+        (lambda: hk.fields.FourierSeries(np.ones((2, 2)), CUBE), ValueError, "K_x, K_y, K_z"),
+        (
+            lambda: hk.fields.FourierSeries(np.ones((1, 1, 1)), CUBE),
+            ValueError,
+            "series is constant",
+        ),
         (
             lambda: hk.trace(fit(blobs, 4), [[3.0, 0, 0]], [[-1.0, 0, 0]], level=99.0),
             ValueError,
@@ -307,4 +313,4 @@ def test_what_is_refused(make: Any, kind: type[Exception], message: str) -> None
 
 
 def fit(function: Any, terms: Any = 6, *, box: Any = CUBE, **settings: Any) -> Any:
-    return hk.FourierSeries.fit(function, box, terms, **settings)
+    return hk.fields.FourierSeries.fit(function, box, terms, **settings)

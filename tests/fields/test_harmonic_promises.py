@@ -231,7 +231,7 @@ def test_rays_by_zeros_of_high_order_arrive(bound: str | None, precision: Any) -
             ("by the axis", 6),
         ):
             o, d = rays(kind, 2000, 3)
-            hits = hk.trace(field, o, d, bound=bound, precision=precision)
+            hits = hk.trace(field, o, d, enclosures=bound, precision=precision)
             spent = hits.status == hk.RayStatus.OUT_OF_STEPS
             assert spent.sum() <= most, (kind, field.l)
 
@@ -240,7 +240,7 @@ def test_rays_by_zeros_of_high_order_arrive(bound: str | None, precision: Any) -
 def test_the_axis_of_high_order_may_be_any(bound: str | None) -> None:
     o, d = rays("by the axis", 2000, 4)
     turned = [np.roll(one, 1, axis=1) for one in (o, d)]  # z becomes x
-    hits = hk.trace(POLYNOMIALS["about x"], *turned, bound=bound, precision="double")
+    hits = hk.trace(POLYNOMIALS["about x"], *turned, enclosures=bound, precision="double")
     assert (hits.status != hk.RayStatus.OUT_OF_STEPS).all()
     assert hits.evaluations.mean() < 90
 
@@ -250,7 +250,7 @@ def test_levels_beside_that_of_the_zero_are_reached(bound: str | None) -> None:
     """Rays that start at the zero, where the balls for level 0 have no room."""
     field = hk.SphericalHarmonic(9, 9)
     d = rays("origin", 300, 5)[1]
-    hits = hk.trace(field, np.zeros((1, 3)), d, level=0.05, bound=bound, precision="double")
+    hits = hk.trace(field, np.zeros((1, 3)), d, level=0.05, enclosures=bound, precision="double")
     assert (hits.status != hk.RayStatus.OUT_OF_STEPS).all()
     assert hits.is_hit.sum() > 10
     assert np.abs(sample_field(field, hits.position[hits.is_hit]).value - 0.05).max() < 1e-3

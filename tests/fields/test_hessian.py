@@ -17,14 +17,21 @@ from harnack.geometry import example_curves
 from harnack.geometry.polygons import remaining_edges
 from harnack.testing import BrokenPromiseError, check_field
 
-MANY_TERMS = hk.EigenfunctionSum(
+MANY_TERMS = hk.fields.EigenfunctionSum(
     [
-        hk.PlaneWave(0.7, (1.0, -2.0, 0.5), 0.3),
-        hk.PlaneWave(-0.4, (0.0, 3.0, 0.0)),
-        hk.WaveProduct(0.4, x=hk.cosine_factor(2.0), y=hk.sine_factor(3.0, 0.2)),
-        hk.WaveProduct(1.3, hk.sine_factor(1.0), hk.cosine_factor(2.0, -1.0), hk.sine_factor(0.5)),
-        hk.WaveProduct(0.25, z=hk.sine_factor(2.0)),
-        hk.WaveProduct(0.1),
+        hk.fields.PlaneWave(0.7, (1.0, -2.0, 0.5), 0.3),
+        hk.fields.PlaneWave(-0.4, (0.0, 3.0, 0.0)),
+        hk.fields.WaveProduct(
+            0.4, x=hk.fields.cosine_factor(2.0), y=hk.fields.sine_factor(3.0, 0.2)
+        ),
+        hk.fields.WaveProduct(
+            1.3,
+            hk.fields.sine_factor(1.0),
+            hk.fields.cosine_factor(2.0, -1.0),
+            hk.fields.sine_factor(0.5),
+        ),
+        hk.fields.WaveProduct(0.25, z=hk.fields.sine_factor(2.0)),
+        hk.fields.WaveProduct(0.1),
     ]
 )
 FIELDS: dict[str, hk.Field] = {
@@ -38,8 +45,8 @@ FIELDS: dict[str, hk.Field] = {
         {(2, 1, 0): 1, (0, 1, 2): -1, (1, 1, 1): 0.5, (1, 0, 0): 3}
     ),
     "gyroid": hk.Gyroid(cell=3.0),
-    "P": hk.SchwarzP(),
-    "D": hk.SchwarzD(),
+    "P": hk.fields.SchwarzP(),
+    "D": hk.fields.SchwarzD(),
     "many terms": MANY_TERMS,
 }
 HARMONIC = ("triangle", "wavy", "large trefoil", "holes", "Y 0,0 + x", "Y 12,-7", "polynomial")
@@ -148,13 +155,13 @@ def test_closed_form_of_a_polynomial() -> None:
 
 def test_a_product_of_waves_is_a_sum_of_plane_waves() -> None:
     """2 sin a cos b = sin(a+b) + sin(a-b), with the same factor twice in the sum."""
-    product = hk.EigenfunctionSum(
-        [hk.WaveProduct(2.0, x=hk.sine_factor(1.5), z=hk.cosine_factor(2.5))]
+    product = hk.fields.EigenfunctionSum(
+        [hk.fields.WaveProduct(2.0, x=hk.fields.sine_factor(1.5), z=hk.fields.cosine_factor(2.5))]
     )
-    waves = hk.EigenfunctionSum(
+    waves = hk.fields.EigenfunctionSum(
         [
-            hk.PlaneWave(1.0, (1.5, 0.0, 2.5), -0.5 * math.pi),
-            hk.PlaneWave(1.0, (1.5, 0.0, -2.5), -0.5 * math.pi),
+            hk.fields.PlaneWave(1.0, (1.5, 0.0, 2.5), -0.5 * math.pi),
+            hk.fields.PlaneWave(1.0, (1.5, 0.0, -2.5), -0.5 * math.pi),
         ]
     )
     x = random_points(product, 100)
@@ -227,8 +234,8 @@ def test_a_hessian_may_be_asked_for_in_a_recorded_loop() -> None:
 class Bare(hk.Field):
     """A field that gives what tracing needs and no more."""
 
-    def evaluate(self, p: Any) -> hk.Sample:
-        return hk.Sample(p.x, type(p)(1.0, 0.0, 0.0), (hk.Lipschitz(1.0),))
+    def evaluate(self, p: Any) -> hk.fields.Sample:
+        return hk.fields.Sample(p.x, type(p)(1.0, 0.0, 0.0), (hk.proofs.Lipschitz(1.0),))
 
 
 def test_a_field_without_second_derivatives_says_so() -> None:
@@ -250,9 +257,9 @@ class Spoiled(hk.Field):
     yx: float = 0.0
     domain = hk.Ball(radius=1.0)
 
-    def evaluate(self, p: Any) -> hk.Sample:
-        ball = hk.HarmonicBall(type(p.x)(1.0), -8.0, 8.0)
-        return hk.Sample(p.x * p.y, type(p)(p.y, p.x, 0.0), (ball,))
+    def evaluate(self, p: Any) -> hk.fields.Sample:
+        ball = hk.proofs.HarmonicBall(type(p.x)(1.0), -8.0, 8.0)
+        return hk.fields.Sample(p.x * p.y, type(p)(p.y, p.x, 0.0), (ball,))
 
     def hessian(self, p: Any) -> Any:
         row = type(p)
@@ -280,8 +287,8 @@ class Creased(Spoiled):
 
     has_creases = True
 
-    def evaluate(self, p: Any) -> hk.Sample:
-        return dataclasses.replace(super().evaluate(p), promises=(hk.Lipschitz(1.0),))
+    def evaluate(self, p: Any) -> hk.fields.Sample:
+        return dataclasses.replace(super().evaluate(p), promises=(hk.proofs.Lipschitz(1.0),))
 
 
 def test_check_field_sees_a_wrong_hessian_where_there_may_be_creases() -> None:

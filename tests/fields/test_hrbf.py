@@ -13,18 +13,18 @@ from harnack.fields import Formula
 from harnack.testing import check_field
 
 
-def surface(count: int = 17, seed: int = 1, **settings: Any) -> hk.HRBF:
+def surface(count: int = 17, seed: int = 1, **settings: Any) -> hk.fields.HRBF:
     rng = np.random.default_rng(seed)
     n = rng.normal(size=(count, 3))
     n /= np.linalg.norm(n, axis=1)[:, None]
-    return hk.HRBF(n * (1 + 0.2 * np.sin(3 * n[:, :1])), 2.0 * n, **settings)
+    return hk.fields.HRBF(n * (1 + 0.2 * np.sin(3 * n[:, :1])), 2.0 * n, **settings)
 
 
 def test_it_passes_through_the_points_along_the_normals() -> None:
     f = surface()
     np.testing.assert_allclose(f.value(f.points, precision="double"), 0, atol=1e-12)
     np.testing.assert_allclose(f.gradient(f.points, precision="double"), f.normals, atol=1e-12)
-    far = hk.HRBF(1e3 * f.points + 1e5, f.normals)
+    far = hk.fields.HRBF(1e3 * f.points + 1e5, f.normals)
     np.testing.assert_allclose(far.value(1e3 * f.points + 1e5, precision="double"), 0, atol=1e-7)
 
 
@@ -45,7 +45,7 @@ def test_values_and_derivatives_are_those_of_the_formula() -> None:
 @pytest.mark.parametrize("offset", [0.0, 1e3])
 def test_single_precision_is_within_the_stated_error(offset: float) -> None:
     base = surface()
-    f = hk.HRBF(base.points + offset, base.normals)
+    f = hk.fields.HRBF(base.points + offset, base.normals)
     x = np.random.default_rng(0).uniform(-1.5, 1.5, (1000, 3)) + offset
     x = x.astype(np.float32).astype(np.float64)
     sample = f.prepare(choose_backend("single")).evaluate(to_vector3(choose_backend("single"), x))
@@ -60,7 +60,7 @@ def test_ranges_hold_and_are_attained(precision: Any) -> None:
     """Two points far apart, so that one of them decides: its ranges are reached. The lines pass the
     points at any distance, through them too."""
     rng = np.random.default_rng(3)
-    f = hk.HRBF([[0.1, 0.2, 0.3], [0.4, -0.8, 0.1]], [[1.0, 0.5, 0], [0.2, 0.3, -1]])
+    f = hk.fields.HRBF([[0.1, 0.2, 0.3], [0.4, -0.8, 0.1]], [[1.0, 0.5, 0], [0.2, 0.3, -1]])
     backend = choose_backend(precision)
     count = 200
     d = rng.normal(size=(count, 3))
@@ -108,7 +108,7 @@ def test_first_hits(precision: Any, bound: Any) -> None:
     d = rng.uniform(-1, 1, (300, 3)) - o
     d /= np.linalg.norm(d, axis=1)[:, None]
     o, d = (one.astype(np.float32).astype(np.float64) for one in (o, d))
-    hits = hk.trace(f, o, d, precision=precision, bound=bound)
+    hits = hk.trace(f, o, d, precision=precision, enclosures=bound)
     assert (hits.status != hk.RayStatus.OUT_OF_STEPS).all()
     found = hits.status == hk.RayStatus.HIT
     assert 0.6 < found.mean() < 0.95
@@ -142,4 +142,4 @@ def test_first_hits(precision: Any, bound: Any) -> None:
 )
 def test_what_are_no_points(points: Any, normals: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        hk.HRBF(points, normals)
+        hk.fields.HRBF(points, normals)

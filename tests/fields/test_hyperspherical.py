@@ -75,7 +75,7 @@ def test_all_functions_are_the_textbook_ones() -> None:
 def test_values_of_fields(indices: tuple[int, int, int]) -> None:
     x = points(200)
     exact = reference(*indices, on_sphere(x))
-    field = hk.HypersphericalHarmonic(*indices)
+    field = hk.fields.HypersphericalHarmonic(*indices)
     np.testing.assert_allclose(field.value(x, precision="double"), exact, atol=1e-13)
     low, high = field.value_range
     many = reference(*indices, on_sphere(points(20_000)))
@@ -90,7 +90,7 @@ def test_polynomials_are_taken_apart() -> None:
     x = points(200)
     X = on_sphere(x).T
     exact = X[0] * X[1] * (X[0] ** 2 + X[1] ** 2 - 3 * X[2] ** 2 - 3 * X[3] ** 2)
-    field = hk.HypersphericalHarmonic.from_polynomial(QUARTIC)
+    field = hk.fields.HypersphericalHarmonic.from_polynomial(QUARTIC)
     np.testing.assert_allclose(field.value(x, precision="double"), exact, atol=1e-14)
     assert 0.5 <= field.value_range[1] < 0.505
 
@@ -126,7 +126,7 @@ def test_arcs_end_at_infinity() -> None:
 
 
 def test_an_arc_that_is_too_flat_is_seen() -> None:
-    class TooFlat(hk.HypersphericalHarmonic):
+    class TooFlat(hk.fields.HypersphericalHarmonic):
         def sample_ray(self, *given: Any) -> Any:
             self._known = self._narrow
             return super().sample_ray(*given)
@@ -143,7 +143,7 @@ def test_an_arc_that_is_too_flat_is_seen() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("indices", ALL[::7])
 def test_every_seventh_function_keeps_its_promises(indices: tuple[int, int, int]) -> None:
-    field = hk.HypersphericalHarmonic(*indices)
+    field = hk.fields.HypersphericalHarmonic(*indices)
     level = 0.4 * field.value_range[0] + 0.6 * field.value_range[1]
     check_field(field, points(400), levels=(level,) if indices[0] else ())
 
@@ -186,7 +186,7 @@ def missed(field: Any, value: Any, level: float, n: int, precision: Any, seed: i
 
 @pytest.mark.parametrize("precision", ["single", "double"])
 def test_first_hits(precision: Any) -> None:
-    field = hk.HypersphericalHarmonic.from_polynomial(QUARTIC)
+    field = hk.fields.HypersphericalHarmonic.from_polynomial(QUARTIC)
     hits = missed(field, quartic, 0.15, 300, precision)
     assert hits.evaluations.mean() < 13  # 10.2; the proofs alone, without aimed trials, took 17
 
@@ -196,7 +196,7 @@ def test_first_hits(precision: Any) -> None:
 @pytest.mark.parametrize("indices", [(6, 6, 6), (5, 5, 0), (6, 4, -4)])
 def test_zeros_of_high_order(indices: tuple[int, int, int], precision: Any) -> None:
     """Level 0 crosses itself at the origin and on the axis, to the order of j and m."""
-    field = hk.HypersphericalHarmonic(*indices, domain=hk.Ball(radius=25.0))
+    field = hk.fields.HypersphericalHarmonic(*indices, domain=hk.Ball(radius=25.0))
     hits = missed(field, lambda X: reference(*indices, X), 0.0, 400, precision)
     assert hits.evaluations.mean() < 30  # without bounds beside the zeros up to 170
     near = points(300, 4) * np.random.default_rng(1).choice([0.02, 0.1, 1], (300, 3))
@@ -206,14 +206,16 @@ def test_zeros_of_high_order(indices: tuple[int, int, int], precision: Any) -> N
 @pytest.mark.slow
 @pytest.mark.parametrize("precision", ["single", "double"])
 def test_first_hits_of_many_rays(precision: Any) -> None:
-    missed(hk.HypersphericalHarmonic.from_polynomial(QUARTIC), quartic, 0.15, 5000, precision, 1)
+    missed(
+        hk.fields.HypersphericalHarmonic.from_polynomial(QUARTIC), quartic, 0.15, 5000, precision, 1
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("precision", ["single", "double"])
 @pytest.mark.parametrize("indices", SOME)
 def test_first_hits_of_others(indices: tuple[int, int, int], precision: Any) -> None:
-    field = hk.HypersphericalHarmonic(*indices)
+    field = hk.fields.HypersphericalHarmonic(*indices)
     pole = field._known.pole
     level = 0.7 * pole + 0.3 * max(field.value_range, key=lambda end: abs(end - pole))
     missed(field, lambda X: reference(*indices, X), level, 800, precision, 2)
@@ -223,14 +225,16 @@ def test_first_hits_of_others(indices: tuple[int, int, int], precision: Any) -> 
 def test_rays_without_an_end_are_proved_to_miss(precision: Any) -> None:
     """No extent, no domain, no t_max: the angle left until infinity is covered."""
 
-    class Endless(hk.HypersphericalHarmonic):
+    class Endless(hk.fields.HypersphericalHarmonic):
         def extent(self, levels: Any) -> None:
             return None
 
     o, d = rays(2000)
     field = Endless(4, 2, 1)
     level = 0.4 * field.value_range[1]
-    ended = hk.trace(hk.HypersphericalHarmonic(4, 2, 1), o, d, level=level, precision=precision)
+    ended = hk.trace(
+        hk.fields.HypersphericalHarmonic(4, 2, 1), o, d, level=level, precision=precision
+    )
     hits = hk.trace(field, o, d, level=level, t_max=math.inf, precision=precision)
     assert (hits.status != int(hk.RayStatus.OUT_OF_STEPS)).all()
     assert (hits.is_hit == ended.is_hit).mean() > 0.999
@@ -242,7 +246,7 @@ def test_extents_hold_the_level() -> None:
     x = points(200_000, 3)
     r = np.linalg.norm(x, axis=1)
     for indices in SOME:
-        field = hk.HypersphericalHarmonic(*indices)
+        field = hk.fields.HypersphericalHarmonic(*indices)
         value = reference(*indices, on_sphere(x))
         pole = field._known.pole
         for share in (0.2, 0.6):
@@ -252,16 +256,16 @@ def test_extents_hold_the_level() -> None:
             ball = field.extent((level,))
             beyond = value[r > ball.radius] - level
             assert (np.sign(beyond) == np.sign(pole - level)).all()
-    assert hk.HypersphericalHarmonic(3, 1, 0).extent((0.0,)) is None
+    assert hk.fields.HypersphericalHarmonic(3, 1, 0).extent((0.0,)) is None
 
 
 @pytest.mark.parametrize(
     ("make", "kind", "message"),
     [
-        (lambda: hk.HypersphericalHarmonic(7, 0, 0), ValueError, "degree l must be 0 to 6, not 7"),
-        (lambda: hk.HypersphericalHarmonic(3, 4, 0), ValueError, "j must be 0 to l = 3, not 4"),
-        (lambda: hk.HypersphericalHarmonic(3, 2, -3), ValueError, "order m must be -2 to 2"),
-        (lambda: hk.HypersphericalHarmonic(2.5, 1, 0), TypeError, "whole number"),  # type: ignore[arg-type]
+        (lambda: hk.fields.HypersphericalHarmonic(7, 0, 0), ValueError, "degree l must be 0 to 6, not 7"),
+        (lambda: hk.fields.HypersphericalHarmonic(3, 4, 0), ValueError, "j must be 0 to l = 3, not 4"),
+        (lambda: hk.fields.HypersphericalHarmonic(3, 2, -3), ValueError, "order m must be -2 to 2"),
+        (lambda: hk.fields.HypersphericalHarmonic(2.5, 1, 0), TypeError, "whole number"),  # type: ignore[arg-type]
         (lambda: polynomial({(2, 0, 0, 0): 1}), ValueError, "not harmonic in R\\^4"),
         (lambda: polynomial({(1, 0, 0, 0): 1, (0, 2, 0, 0): 1}), ValueError, "one degree"),
         (lambda: polynomial({(1, 0, 0, 0): 0}), ValueError, "zero: it has no level sets"),
@@ -269,7 +273,7 @@ def test_extents_hold_the_level() -> None:
         (lambda: polynomial({(1, 1, 0, 0): math.nan}), ValueError, "not a finite number"),
         (lambda: polynomial({(7, 0, 0, 0): 1}), ValueError, "degree must be 0 to 6, not 7"),
         (
-            lambda: hk.trace(hk.HypersphericalHarmonic(2, 1, 0), [[3.0, 0, 0]], [[-1.0, 0, 0]],
+            lambda: hk.trace(hk.fields.HypersphericalHarmonic(2, 1, 0), [[3.0, 0, 0]], [[-1.0, 0, 0]],
                              level=9.0),
             ValueError,
             "no surface has level 9",
@@ -282,4 +286,4 @@ def test_what_is_refused(make: Any, kind: type[Exception], message: str) -> None
 
 
 def polynomial(coefficients: Any) -> Any:
-    return hk.HypersphericalHarmonic.from_polynomial(coefficients)
+    return hk.fields.HypersphericalHarmonic.from_polynomial(coefficients)

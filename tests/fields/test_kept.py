@@ -24,7 +24,7 @@ FIELDS: dict[str, Callable[[], hk.Field]] = {
     "mesh": lambda: hk.WindingNumber(VERTICES, FACES[5:]),
     "tree": lambda: hk.WindingNumber(VERTICES, FACES[5:], method="tree"),
     "cloud": lambda: hk.DipolePotential(VERTICES, VERTICES),
-    "screened": lambda: hk.ScreenedWindingNumber(VERTICES, VERTICES, length=1.0),
+    "screened": lambda: hk.fields.ScreenedWindingNumber(VERTICES, VERTICES, length=1.0),
 }
 
 
@@ -57,9 +57,9 @@ def test_a_field_with_an_attribute_set_is_uploaded_again() -> None:
     class Shifted(hk.SolidAngle):
         shift = 0.0
 
-        def evaluate(self, p: Any) -> hk.Sample:
+        def evaluate(self, p: Any) -> hk.fields.Sample:
             sample = super().evaluate(p)
-            return hk.Sample(
+            return hk.fields.Sample(
                 sample.value + self.shift, sample.gradient, sample.promises, sample.value_error
             )
 
@@ -77,8 +77,10 @@ class Ball(hk.Field):
     radius: float
     domain = hk.Ball(radius=2)
 
-    def evaluate(self, p: Any) -> hk.Sample:
-        return hk.Sample(dr.norm(p) - self.radius, p / dr.norm(p), (hk.Lipschitz(1.0),))
+    def evaluate(self, p: Any) -> hk.fields.Sample:
+        return hk.fields.Sample(
+            dr.norm(p) - self.radius, p / dr.norm(p), (hk.proofs.Lipschitz(1.0),)
+        )
 
     def prepare(self, backend: Any) -> Ball:
         return Ball(dr.opaque(backend.Float, float(self.radius)))

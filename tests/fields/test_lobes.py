@@ -12,15 +12,17 @@ from harnack.testing import BrokenPromiseError, check_field
 from tests.oracles.oracle import OracleValues, first_crossings
 
 SMALL = {
-    "both": hk.Lobes(2, 0),
-    "positive": hk.Lobes(3, -2, sign="positive", scale=2.5),
-    "sum": hk.Lobes.combined({(0, 0): 0.3, (2, 0): 1.0, (3, 3): -0.4}),
+    "both": hk.fields.Lobes(2, 0),
+    "positive": hk.fields.Lobes(3, -2, sign="positive", scale=2.5),
+    "sum": hk.fields.Lobes.combined({(0, 0): 0.3, (2, 0): 1.0, (3, 3): -0.4}),
 }
 MORE = {
-    "p": hk.Lobes(1, 0, sign="negative"),
-    "constant": hk.Lobes(0, 0, scale=1e-3),
-    "steep": hk.Lobes(12, 5),
-    "sum, negative": hk.Lobes.combined({(5, 1): 1.0, (4, 0): 0.7}, sign="negative", scale=1e4),
+    "p": hk.fields.Lobes(1, 0, sign="negative"),
+    "constant": hk.fields.Lobes(0, 0, scale=1e-3),
+    "steep": hk.fields.Lobes(12, 5),
+    "sum, negative": hk.fields.Lobes.combined(
+        {(5, 1): 1.0, (4, 0): 0.7}, sign="negative", scale=1e4
+    ),
 }
 
 
@@ -125,7 +127,7 @@ def test_all_lobes_keep_their_promises(name):
 
 
 def test_a_bound_that_is_too_small_is_noticed():
-    class Wrong(hk.Lobes):
+    class Wrong(hk.fields.Lobes):
         def _second_derivatives(self, farthest):
             least, most = super()._second_derivatives(farthest)
             return 0.2 * least, 0.2 * most
@@ -136,7 +138,7 @@ def test_a_bound_that_is_too_small_is_noticed():
 
 @pytest.mark.parametrize("precision", ["single", "double"])
 def test_first_hits_of_lobes(precision):
-    hits = compare(hk.Lobes(3, 2), 400, 0, precision, 1e-4)
+    hits = compare(hk.fields.Lobes(3, 2), 400, 0, precision, 1e-4)
     assert hits.evaluations.mean() < 14
 
 
@@ -156,14 +158,14 @@ def test_the_values_are_those_of_spherical_harmonics():
         value = field.value(x, precision="double")
         inside = radius_less_length(field, x)
         np.testing.assert_array_equal(value < 0, inside < 0)
-    positive, negative = hk.Lobes(3, 1).positive, hk.Lobes(3, 1).negative
+    positive, negative = hk.fields.Lobes(3, 1).positive, hk.fields.Lobes(3, 1).negative
     both = np.minimum(radius_less_length(positive, x), radius_less_length(negative, x))
-    np.testing.assert_array_equal(hk.Lobes(3, 1).value(x, precision="double") < 0, both < 0)
+    np.testing.assert_array_equal(hk.fields.Lobes(3, 1).value(x, precision="double") < 0, both < 0)
 
 
 def test_rays_down_the_axis_end_at_the_origin():
     """From below, where Y_10 is negative, the positive lobe begins at the origin."""
-    hits = hk.trace(hk.Lobes(1, 0).positive, [[0, 0, -2]], [[0, 0, 1]], tolerance=1e-5)
+    hits = hk.trace(hk.fields.Lobes(1, 0).positive, [[0, 0, -2]], [[0, 0, 1]], tolerance=1e-5)
     assert hits.is_hit.all()
     assert abs(hits.t[0] - 2) < 1e-4
 
@@ -171,12 +173,12 @@ def test_rays_down_the_axis_end_at_the_origin():
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda: hk.Lobes(13, 0), "degree"),
-        (lambda: hk.Lobes(2, 3), "order"),
-        (lambda: hk.Lobes(2, 1, scale=0.0), "scale"),
-        (lambda: hk.Lobes(2, 1, sign="left"), "part must be"),
-        (lambda: hk.Lobes(0, 0).negative, "no direction"),
-        (lambda: hk.Lobes.combined({}), "coefficient"),
+        (lambda: hk.fields.Lobes(13, 0), "degree"),
+        (lambda: hk.fields.Lobes(2, 3), "order"),
+        (lambda: hk.fields.Lobes(2, 1, scale=0.0), "scale"),
+        (lambda: hk.fields.Lobes(2, 1, sign="left"), "part must be"),
+        (lambda: hk.fields.Lobes(0, 0).negative, "no direction"),
+        (lambda: hk.fields.Lobes.combined({}), "coefficient"),
     ],
 )
 def test_what_makes_no_lobes_is_refused(make, said):
@@ -188,27 +190,27 @@ def test_what_makes_no_lobes_is_refused(make, said):
 def test_scales_that_a_precision_has_no_room_for_are_refused(precision: str) -> None:
     """Found by an attack: at 1e-24 the first hit was missed in single precision."""
     o, d = [[0, 0, 1.0]], [[0, 0, -1.0]]
-    for lobes in (hk.Lobes(2, 0, scale=1e-70), hk.Lobes.combined({(2, 0): 1e70})):
+    for lobes in (hk.fields.Lobes(2, 0, scale=1e-70), hk.fields.Lobes.combined({(2, 0): 1e70})):
         with pytest.raises(ValueError, match="another unit of length"):
             hk.trace(lobes, o, d, precision=precision)
-    small = hk.Lobes(2, 0, scale=1e-5)
+    small = hk.fields.Lobes(2, 0, scale=1e-5)
     reach = small.extent_radius()
     hits = hk.trace(small, [[0, 0, 3 * reach]], d, tolerance=1e-4 * reach, precision=precision)
     assert hits.t[0] == pytest.approx(2 * reach, rel=1e-3)
 
 
 def test_second_derivatives_at_the_origin_are_numbers() -> None:
-    for lobes in (hk.Lobes(2, 1), hk.Lobes(2, 1).positive):
+    for lobes in (hk.fields.Lobes(2, 1), hk.fields.Lobes(2, 1).positive):
         assert np.isfinite(lobes.hessian([[0, 0, 0]])).all()
 
 
 @pytest.mark.parametrize("scale", ["2", None, 1j, True])
 def test_scales_are_numbers(scale: Any) -> None:
     with pytest.raises(TypeError, match="scale of lobes must be a number"):
-        hk.Lobes(2, 0, scale=scale)
+        hk.fields.Lobes(2, 0, scale=scale)
 
 
 @pytest.mark.parametrize("key", [2, "20", (2.5, 0), (True, 0), (1, 2, 3)])
 def test_harmonics_are_named_by_two_whole_numbers(key: Any) -> None:
     with pytest.raises(TypeError, match="two whole numbers"):
-        hk.Lobes.combined({key: 1.0})
+        hk.fields.Lobes.combined({key: 1.0})

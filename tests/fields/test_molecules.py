@@ -165,7 +165,7 @@ def test_drawn_from_the_command_line(tmp_path: Path, monkeypatch: Any) -> None:
 
 def test_atoms_are_balls_of_their_radii() -> None:
     atoms = Atoms(np.zeros((1, 3)), np.array([1.7]), ("C",), "one atom")
-    hits = hk.trace(hk.Molecule(atoms), [[0, 0, -9.0]], [[0, 0, 1.0]], tolerance=1e-5)
+    hits = hk.trace(hk.fields.Molecule(atoms), [[0, 0, -9.0]], [[0, 0, 1.0]], tolerance=1e-5)
     np.testing.assert_allclose(hits.t, 7.3, atol=1e-4)
 
 
@@ -179,7 +179,7 @@ def test_the_surface_is_that_of_gaussians_but_for_their_tails() -> None:
     gaussians = np.exp(1 - q).sum(1)
     off = []
     for tail in (1 / 32, 1e-3, 1e-5):
-        field = hk.Molecule(atoms, tail=tail)
+        field = hk.fields.Molecule(atoms, tail=tail)
         value = field.value(x, precision="double")
         off.append((np.abs(value - gaussians) / gaussians)[gaussians > 0.5].max())
     assert 0.1 < off[0] < 0.6
@@ -194,7 +194,7 @@ def test_a_helix_of_atoms(precision: Any) -> None:
     turn = np.arange(400) * 0.35
     positions = np.column_stack([5 * np.cos(turn), 5 * np.sin(turn), 0.25 * turn])
     radii = np.where(np.arange(400) % 3 == 0, 1.52, 1.7)
-    field = hk.Molecule(Atoms(positions, radii, ("C",) * 400, "a helix"))
+    field = hk.fields.Molecule(Atoms(positions, radii, ("C",) * 400, "a helix"))
     assert "grid" in field.describe()
     rng = np.random.default_rng(1)
     o = rng.normal(size=(400, 3))
@@ -202,7 +202,7 @@ def test_a_helix_of_atoms(precision: Any) -> None:
     d = positions[rng.integers(0, 400, 400)] + rng.uniform(-3, 3, (400, 3)) - o
     d /= np.linalg.norm(d, axis=1)[:, None]
     o, d = (one.astype(np.float32).astype(np.float64) for one in (o, d))
-    hits = hk.trace(field, o, d, precision=precision, tolerance=hk.HitTolerance(1e-4))
+    hits = hk.trace(field, o, d, precision=precision, tolerance=hk.tracer.HitTolerance(1e-4))
     assert np.mean(hits.evaluations) < 7
     found = hits.status == hk.RayStatus.HIT
     assert 0.5 < found.mean() < 1

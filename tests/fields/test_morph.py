@@ -27,8 +27,8 @@ BUMPY = (0.8 * bumpy_sphere(3)[0], bumpy_sphere(3)[1])
 GAP = 0.3
 
 
-def morph(w: float, **options: Any) -> hk.Morph:
-    return hk.Morph(TORUS, BUMPY, gap=GAP, w=w, **options)
+def morph(w: float, **options: Any) -> hk.fields.Morph:
+    return hk.fields.Morph(TORUS, BUMPY, gap=GAP, w=w, **options)
 
 
 def ball(x: np.ndarray, radius: float, w: float) -> np.ndarray:
@@ -39,7 +39,7 @@ def ball(x: np.ndarray, radius: float, w: float) -> np.ndarray:
     return bent + math.pi * (np.arctan(near / w) + np.arctan(far / w))
 
 
-def exact(field: hk.Morph, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def exact(field: hk.fields.Morph, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """f and its gradient at x (n, 3), by the plain sum over the points of the quadrature."""
     slice_: Any = field._slice
     sums = [
@@ -148,7 +148,9 @@ def test_balls_in_closed_form() -> None:
     a, b = np.array([-0.3, 0, 0]), np.array([0.4, 0.2, 0])
     x = np.random.default_rng(2).normal(0, 0.7, (500, 3))
     for w in (0.06, 0.2, 0.34):
-        field = hk.Morph((0.8 * vertices + a, faces), (0.6 * vertices + b, faces), gap=0.4, w=w)
+        field = hk.fields.Morph(
+            (0.8 * vertices + a, faces), (0.6 * vertices + b, faces), gap=0.4, w=w
+        )
         wanted = (ball(x - a, 0.8, w) + ball(x - b, 0.6, 0.4 - w)) / (2 * math.pi**2)
         off = np.abs(field.value(x, precision="double") - wanted)
         assert off.max() < 2e-3
@@ -220,7 +222,7 @@ def rays(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return o, d / np.linalg.norm(d, axis=1, keepdims=True)
 
 
-def compare(field: hk.Morph, n: int, precision: str, seed: int) -> int:
+def compare(field: hk.fields.Morph, n: int, precision: str, seed: int) -> int:
     """Trace n random rays, look for earlier crossings densely; the number of hits."""
     o, d = rays(n, seed)
     tolerance = 1e-3
@@ -297,7 +299,7 @@ def test_slices_near_an_end_are_near_the_mesh_in_proportion() -> None:
 @pytest.mark.slow
 def test_meshes_with_holes() -> None:
     vertices, faces = BUMPY
-    field = hk.Morph(TORUS, (vertices, remove_faces(faces, 0.1, seed=0)), gap=GAP, w=0.2)
+    field = hk.fields.Morph(TORUS, (vertices, remove_faces(faces, 0.1, seed=0)), gap=GAP, w=0.2)
     assert hk.trace(field, *rays(100, 9), tolerance=1e-3).is_hit.any()
 
 
@@ -306,7 +308,7 @@ def test_another_slice_compiles_no_kernel() -> None:
     o, d = rays(40, 10)
 
     def trace(k: int) -> int:
-        field = hk.Morph(TORUS, BUMPY, gap=GAP + 0.001 * k, w=0.06 + 0.007 * k)
+        field = hk.fields.Morph(TORUS, BUMPY, gap=GAP + 0.001 * k, w=0.06 + 0.007 * k)
         return compiled(lambda: hk.trace(field, o, d, tolerance=1e-2), size=40)
 
     trace(0), trace(1)
@@ -333,7 +335,7 @@ def test_heights_outside_the_gap(w: float) -> None:
 def test_bad_input() -> None:
     for gap in (0.0, -1.0, math.inf, math.nan):
         with pytest.raises(ValueError, match="gap must be positive"):
-            hk.Morph(TORUS, BUMPY, gap=gap, w=0.0)
+            hk.fields.Morph(TORUS, BUMPY, gap=gap, w=0.0)
     for spacing in (0.0, 2.5, math.nan):
         with pytest.raises(ValueError, match="spacing must be"):
             morph(0.1, spacing=spacing)
@@ -342,12 +344,12 @@ def test_bad_input() -> None:
     with pytest.raises(ValueError, match="so near to an end"):
         morph(1e-5)
     with pytest.raises(MeshError, match=r"mesh_a: give a pair \(vertices, faces\)"):
-        hk.Morph(None, BUMPY, gap=GAP, w=0.1)  # type: ignore[arg-type]
+        hk.fields.Morph(None, BUMPY, gap=GAP, w=0.1)  # type: ignore[arg-type]
     vertices, faces = BUMPY
     with pytest.raises(MeshError, match=r"mesh_b: .*out of range"):
-        hk.Morph(TORUS, (vertices, faces + 999), gap=GAP, w=0.1)
+        hk.fields.Morph(TORUS, (vertices, faces + 999), gap=GAP, w=0.1)
     with pytest.raises(MeshError, match=r"mesh_b: .*finite"):
-        hk.Morph(TORUS, (vertices * np.nan, faces), gap=GAP, w=0.1)
+        hk.fields.Morph(TORUS, (vertices * np.nan, faces), gap=GAP, w=0.1)
 
 
 @pytest.mark.slow

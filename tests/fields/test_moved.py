@@ -112,7 +112,7 @@ def test_hits_are_those_of_a_new_field(motion: Any, method: Any) -> None:
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     rays = to_vector3(backend, o), to_vector3(backend, d)
     moved, new = (
-        hk.trace(hk.level_set(one.prepare(backend)), *rays, t_max=10 * size)
+        hk.trace(hk.Surface(one.prepare(backend)), *rays, t_max=10 * size)
         for one in (field.with_vertices(x), winding(x, method=method))
     )
     dr.eval(moved.t, new.t)

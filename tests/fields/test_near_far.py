@@ -458,7 +458,7 @@ def test_a_cloud_stays_as_it_is(name: str) -> None:
     points, normals, _ = cloud(20)
     for field in (
         hk.DipolePotential(points, normals),
-        hk.ScreenedWindingNumber(points, normals, length=1.0),
+        hk.fields.ScreenedWindingNumber(points, normals, length=1.0),
     ):
         given = getattr(field, name)
         with pytest.raises(AttributeError, match=name):

@@ -147,7 +147,7 @@ def test_vectors_are_unit_and_spread_evenly() -> None:
 
 
 def test_noise_is_continuous_across_the_lattice_and_depends_on_the_seed() -> None:
-    one, two = hk.Noise(1.0), hk.Noise(1.0, seed=1)
+    one, two = hk.solids.Noise(1.0), hk.solids.Noise(1.0, seed=1)
     rng = np.random.default_rng(4)
     x = rng.uniform(-4, 4, (200, 3))
     x[:, 0] = np.round(x[:, 0])
@@ -159,10 +159,10 @@ def test_noise_is_continuous_across_the_lattice_and_depends_on_the_seed() -> Non
 
 def test_constants_of_sums() -> None:
     """1/f noise has n times the constant of noise, Brownian noise less than twice."""
-    one = hk.Noise().lipschitz
-    assert hk.FractalNoise(6, 1.0).lipschitz == pytest.approx(6 * one, rel=1e-6)
-    assert hk.FractalNoise(6, 2.0).lipschitz == pytest.approx((2 - 2.0**-5) * one, rel=1e-6)
-    field = hk.FractalNoise(5, 1.3, 1.7, 0.4)
+    one = hk.solids.Noise().lipschitz
+    assert hk.solids.FractalNoise(6, 1.0).lipschitz == pytest.approx(6 * one, rel=1e-6)
+    assert hk.solids.FractalNoise(6, 2.0).lipschitz == pytest.approx((2 - 2.0**-5) * one, rel=1e-6)
+    field = hk.solids.FractalNoise(5, 1.3, 1.7, 0.4)
     x = np.random.default_rng(5).uniform(-3, 3, (4000, 3))
     slopes = np.linalg.norm(field.gradient(x, precision="double"), axis=1)
     assert 0.2 * field.lipschitz < slopes.max() <= field.lipschitz
@@ -171,5 +171,5 @@ def test_constants_of_sums() -> None:
 
 def test_nothing_is_claimed_where_the_lattice_is_finer_than_numbers() -> None:
     """Rays from there run out of steps; they do not miss."""
-    hits = hk.trace(hk.Noise(1e12), [[0.0, 0.0, 1e3]], [[0.0, 0.0, 1.0]], t_max=1.0)
+    hits = hk.trace(hk.solids.Noise(1e12), [[0.0, 0.0, 1e3]], [[0.0, 0.0, 1.0]], t_max=1.0)
     assert hits.status[0] == int(hk.RayStatus.OUT_OF_STEPS)

@@ -11,13 +11,13 @@ import pytest
 import harnack as hk
 from harnack.testing import check_field
 
-WAVES = hk.HeightField(lambda x, y: 0.3 * hk.sin(3 * x) * hk.cos(3 * y))
+WAVES = hk.fields.HeightField(lambda x, y: 0.3 * hk.math.sin(3 * x) * hk.math.cos(3 * y))
 THREE = {1: 1, -1: 1, 1j: -1}
 CURVES = {
-    "charges": hk.LevelCurves("log", argument=THREE),
-    "angles": hk.LevelCurves("log", "imag", argument=THREE, level=1.0),
-    "cubic": hk.LevelCurves({0: 1, 1: 1, 1j: 1}, level=0.2),
-    "pole": hk.LevelCurves({0.3: -2}, "imag", level=0.5),
+    "charges": hk.fields.LevelCurves("log", argument=THREE),
+    "angles": hk.fields.LevelCurves("log", "imag", argument=THREE, level=1.0),
+    "cubic": hk.fields.LevelCurves({0: 1, 1: 1, 1j: 1}, level=0.2),
+    "pole": hk.fields.LevelCurves({0.3: -2}, "imag", level=0.5),
 }
 
 
@@ -54,7 +54,7 @@ def test_promises_of_a_height_field_hold() -> None:
 def check_curves(name: str, n: int, precision: Any, bound: Any, samples: int) -> None:
     field = CURVES[name]
     o, d = rays(n)
-    hits = hk.trace(field, o, d, precision=precision, bound=bound)
+    hits = hk.trace(field, o, d, precision=precision, enclosures=bound)
     hit = hits.status == hk.RayStatus.HIT
     assert (hits.status != hk.RayStatus.OUT_OF_STEPS).all()
     assert hit.sum() > 0.2 * n
@@ -128,27 +128,29 @@ def test_height_fields_are_clipped_to_their_heights() -> None:
 
 def test_harnack_in_the_plane_takes_few_steps() -> None:
     """The lemniscate |z^2 - 1| = 1 from a horizontal ray: it meets the axis at sqrt 2."""
-    field = hk.LevelCurves("log", argument={1: 1, -1: 1})
-    hits = hk.trace(field, [[3.0, 0, 0]], [[-1, 0, 0]], bound="slope")
+    field = hk.fields.LevelCurves("log", argument={1: 1, -1: 1})
+    hits = hk.trace(field, [[3.0, 0, 0]], [[-1, 0, 0]], enclosures="slope")
     assert hits.t[0] == pytest.approx(3 - math.sqrt(2), abs=1e-3)
     assert hits.evaluations[0] < 20
 
 
 def test_errors_say_what_is_wrong() -> None:
     with pytest.raises(ValueError, match="one branch"):
-        hk.LevelCurves("sqrt")
+        hk.fields.LevelCurves("sqrt")
     with pytest.raises(ValueError, match="part must be"):
-        hk.LevelCurves("log", "both")
+        hk.fields.LevelCurves("log", "both")
     with pytest.raises(TypeError, match="callable"):
-        hk.HeightField(3)  # type: ignore[arg-type]
+        hk.fields.HeightField(3)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="bounded domain"):
-        hk.HeightField(lambda x, y: x + y, domain=hk.HalfSpace((0, 0, 1), 0.0))
+        hk.fields.HeightField(lambda x, y: x + y, domain=hk.HalfSpace((0, 0, 1), 0.0))
     with pytest.raises(TypeError, match="functions of plain"):
-        hk.HeightField(lambda x, y: math.sin(x))
+        hk.fields.HeightField(lambda x, y: math.sin(x))
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize("field", [hk.LevelCurves("log", "imag"), hk.RiemannSurface("log")])
+@pytest.mark.parametrize(
+    "field", [hk.fields.LevelCurves("log", "imag"), hk.fields.RiemannSurface("log")]
+)
 def test_walls_of_entire_fields_go_beyond_where_they_are_drawn(field: hk.Field) -> None:
     """Angle-valued ones were cut to it: values said inside where rays missed."""
     walls = hk.solid(field, around=(0, 0.3))

@@ -181,7 +181,7 @@ def test_what_evaluate_must_return_is_said_at_first_use(name: str, use: str) -> 
     }
     with pytest.raises(TypeError, match=message) as raised:
         uses[use]()
-    assert "return harnack.Sample(value, gradient, promises)" in str(raised.value)
+    assert "return harnack.fields.Sample(value, gradient, promises)" in str(raised.value)
 
 
 class Charge(Field):
@@ -208,12 +208,12 @@ def test_bounds_that_do_not_apply_name_those_that_do(
 ) -> None:
     """Namely all whose sharpest proof makes steps of the promises."""
     with pytest.raises(ValueError, match=r"promises .*; choose .*, or leave bound=None") as raised:
-        hk.trace(field, *RAY, bound=bound)
+        hk.trace(field, *RAY, enclosures=bound)
     named = set(re.findall(r'"(.+?)"', str(raised.value)))
     assert named >= some
     for name in ENCLOSURE_NAMES:
         with nullcontext() if name in named else pytest.raises(ValueError, match="no bound appl"):
-            hk.trace(field, *RAY, bound=choose_enclosures(name).kinds[0])
+            hk.trace(field, *RAY, enclosures=choose_enclosures(name).kinds[0])
 
 
 def test_a_promise_is_needed_and_half_a_range_is_enough() -> None:

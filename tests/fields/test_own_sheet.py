@@ -104,7 +104,7 @@ def test_a_sheet_is_kept() -> None:
     with pytest.raises(hk.MeshingError, match="choose a larger max_triangles"):
         hk.mesh(field(original), max_triangles=20)
     with pytest.raises(hk.MeshingError, match="nothing is inside"):
-        hk.mesh(field(original), solid=(0.5, math.inf))
+        hk.mesh(field(original), level=0.5, side="above")
 
 
 def crossings(part: trimesh.Trimesh, o: np.ndarray, d: np.ndarray) -> np.ndarray:
@@ -131,7 +131,7 @@ def test_rays_hit_every_triangle_and_nothing_else() -> None:
     assert np.isfinite(right[:, 0]).sum() > 200
     hit = np.asarray(first.is_hit)
     assert np.abs(first.t[hit] - right[hit, 0]).max() < 1e-12
-    every = hk.trace(w, o, d, precision="double", all_hits=4)
+    every = hk.crossings(w, o, d, precision="double", max_crossings=4)
     assert (every.count == np.isfinite(right).sum(axis=1)).all()
     assert np.abs(every.t[hit, 0] - right[hit, 0]).max() < 1e-12
 
@@ -151,11 +151,11 @@ def test_distances_are_those_from_the_triangles() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("level", [2 * math.pi, math.pi])
 def test_what_was_written_is_read_back(level: float) -> None:
-    result = hk.mesh(hk.SolidAngle(SADDLE), level, tolerance=1e-2, cell_size=0.25)
+    result = hk.mesh(hk.SolidAngle(SADDLE), level=level, tolerance=1e-2, cell_size=0.25)
     written: Any = result.export(file_type="stl")
     w = field(trimesh.load(io.BytesIO(written), file_type="stl"))  # pyright: ignore
     levels = (-0.75, -0.5, -0.25, 0.25, 0.5, 0.75)
     of = [one_level for one_level in levels if w.is_of_sheets_alone((one_level,))]
     assert of in ([[-0.5, 0.5]] if level > 6 else [[-0.75, 0.25], [-0.25, 0.75]])
     for one_level in of:
-        assert hk.mesh(w, one_level).area == pytest.approx(result.area, rel=1e-6)
+        assert hk.mesh(w, level=one_level).area == pytest.approx(result.area, rel=1e-6)

@@ -81,7 +81,7 @@ def by_face(
 class OnePart(hk.Field):
     """One part of a field, as a field of its own."""
 
-    def __init__(self, whole: hk.PolygonMesh | hk.TubeNetwork, index: int) -> None:
+    def __init__(self, whole: hk.PolygonMesh | hk.solids.TubeNetwork, index: int) -> None:
         self.whole, self.index, self.one = whole, index, whole
         self.period, self.default_level = whole.period, whole.default_level  # type: ignore[misc]
         lower, upper = (ends[index] for ends in whole.boxes())
@@ -92,7 +92,7 @@ class OnePart(hk.Field):
         made.one = self.whole.prepare(backend).patch(dr.opaque(backend.UInt32, self.index))
         return made
 
-    def evaluate(self, p: Any) -> hk.Sample:
+    def evaluate(self, p: Any) -> hk.fields.Sample:
         if self.one is self.whole:
             return self.prepare(backend_of(p)).evaluate(p)
         return self.one.evaluate(p)
@@ -112,7 +112,7 @@ def test_parts_keep_their_promises(index: int) -> None:
 
 @pytest.mark.slow
 def test_segments_keep_their_promises() -> None:
-    tubes = hk.TubeNetwork(10 * SQUARE, [[0, 1], [1, 2], [0, 2]], [0.5, 0.1, 1e-3])
+    tubes = hk.solids.TubeNetwork(10 * SQUARE, [[0, 1], [1, 2], [0, 2]], [0.5, 0.1, 1e-3])
     for index in range(3):
         check_field(OnePart(tubes, index), count=60, directions=4)
 
@@ -285,8 +285,8 @@ def test_a_face_in_a_lane_is_the_solid_angle_of_that_face(precision: Any) -> Non
         np.testing.assert_allclose(to_numpy(sample.gradient)[here], gradient, atol=tolerance * size)
         alone = face.prepare(backend).evaluate(to_vector3(backend, p[here]))
         for one, mine in zip(alone.promises, sample.promises, strict=True):
-            assert isinstance(one, hk.TaylorRemainder)
-            assert isinstance(mine, hk.TaylorRemainder)
+            assert isinstance(one, hk.proofs.TaylorRemainder)
+            assert isinstance(mine, hk.proofs.TaylorRemainder)
             for ours, its in ((mine.radius, one.radius), (mine.constant, one.constant)):
                 np.testing.assert_allclose(
                     to_numpy(ours)[here], to_numpy(its), rtol=1e-3, atol=1e-5
@@ -305,7 +305,9 @@ def test_boxes_hold_the_surfaces(level: float) -> None:
             rng = np.random.default_rng(k)
             o = middle + 3 * rng.normal(size=(1000, 3))
             d = middle + 0.3 * rng.normal(size=(1000, 3)) - o
-            hits = hk.trace(face, o, d, level=level, t_max=20.0, precision="double", confirm=True)
+            hits = hk.trace(
+                face, o, d, level=level, t_max=20.0, precision="double", require_crossing=True
+            )
             seen = hits.position[hits.is_hit]
             assert len(seen)
             assert (seen >= lower[k] - 1e-6).all()
@@ -356,7 +358,7 @@ def test_derivatives_by_rays() -> None:
 def test_pictures(show: str) -> None:
     vertices, faces = patches(24)
     mesh = hk.PolygonMesh(vertices, faces)
-    tubes = hk.TubeNetwork(mesh.vertices, mesh.edges, 0.02)
+    tubes = hk.solids.TubeNetwork(mesh.vertices, mesh.edges, 0.02)
     settings: dict[str, Any] = {"show": show, "size": (64, 48), "spp": 4, "camera": Camera()}
     alone = hk.render(mesh, **settings)
     both = hk.render([mesh, tubes], material=["eggshell", "gold"], **settings)
@@ -401,9 +403,9 @@ def test_what_a_polygon_mesh_is_not() -> None:
     with pytest.raises(TypeError, match="no level set of one function"):
         hk.signed_distance(mesh, [[0, 0, 1.0]])
     with pytest.raises(NotImplementedError, match="all_hits takes one function"):
-        hk.trace(mesh, o, d, all_hits=2)
+        hk.crossings(mesh, o, d, max_crossings=2)
     with pytest.raises(NotImplementedError, match="confirm takes one function"):
-        hk.trace(mesh, o, d, confirm=True)
+        hk.trace(mesh, o, d, require_crossing=True)
     with pytest.raises(ValueError, match="multiple of 4 pi"):
         hk.trace(mesh, o, d, level=0.0)
     with pytest.raises(IndexError, match="there is no face 1"):
@@ -419,7 +421,9 @@ def test_tubes_are_the_union_of_tubes(precision: Any) -> None:
     edges = np.unique(np.sort(edges, axis=1), axis=0)
     radius = np.linspace(0.02, 0.1, len(edges))
     o, d = rays(400, 7, vertices)
-    hits = hk.trace(hk.TubeNetwork(vertices, edges, radius), o, d, level=0.01, precision=precision)
+    hits = hk.trace(
+        hk.solids.TubeNetwork(vertices, edges, radius), o, d, level=0.01, precision=precision
+    )
     t, which = np.full(len(o), np.inf), np.full(len(o), -1)
     for k, (pair, r) in enumerate(zip(edges, radius, strict=True)):
         one = hk.trace(hk.Tube(vertices[pair], r), o, d, level=0.01, precision=precision)
@@ -447,7 +451,7 @@ def test_tubes_are_the_union_of_tubes(precision: Any) -> None:
 )
 def test_bad_tubes_are_refused(points: Any, segments: Any, radius: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        hk.TubeNetwork(points, segments, radius)
+        hk.solids.TubeNetwork(points, segments, radius)
 
 
 def test_patches_cover_a_mesh_once() -> None:

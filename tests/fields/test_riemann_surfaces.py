@@ -61,7 +61,7 @@ def of_asin(z: np.ndarray, h: np.ndarray, part: str) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Case:
-    field: hk.RiemannSurface
+    field: hk.fields.RiemannSurface
     product: Product
     radius: float
 
@@ -71,33 +71,35 @@ def root(z: Any) -> Any:
     return [(w, 0.5 / w), (-w, -0.5 / w)]
 
 
-OWN = hk.RiemannSurface(
+OWN = hk.fields.RiemannSurface(
     root,
-    singular_points=[hk.BranchPoint(0, power=0.5)],
+    singular_points=[hk.fields.BranchPoint(0, power=0.5)],
     second_bound=lambda z, r: 0.25 * (abs(z) - r) ** -1.5,
 )
 HALF, THIRD = Fraction(1, 2), Fraction(1, 3)
 CASES = {
-    "log": Case(hk.RiemannSurface("log"), of_angle, 4.0),
-    "sqrt": Case(hk.RiemannSurface("sqrt"), of_powers({0: HALF}), 1.0),
+    "log": Case(hk.fields.RiemannSurface("log"), of_angle, 4.0),
+    "sqrt": Case(hk.fields.RiemannSurface("sqrt"), of_powers({0: HALF}), 1.0),
     "own": Case(OWN, of_powers({0: HALF}), 1.0),
-    "real sqrt": Case(hk.RiemannSurface("sqrt", "real"), of_powers({0: HALF}, "real"), 1.0),
-    "cbrt": Case(hk.RiemannSurface("cbrt"), of_powers({0: THIRD}), 1.0),
-    "2/3": Case(hk.RiemannSurface("power", exponent=2 / 3), of_powers({0: 2 * THIRD}), 1.0),
-    "5/2": Case(hk.RiemannSurface("power", exponent=2.5), of_powers({0: 5 * HALF}), 1.0),
-    "-1/2": Case(hk.RiemannSurface("power", exponent=-0.5), of_powers({0: -HALF}), 1.0),
-    "pole": Case(hk.RiemannSurface({0: -1}), of_powers({0: Fraction(-1)}), 1.0),
-    "asin": Case(hk.RiemannSurface("asin"), lambda z, h: of_asin(z, h, "imag"), 2.0),
-    "real asin": Case(hk.RiemannSurface("asin", "real"), lambda z, h: of_asin(z, h, "real"), 2.0),
+    "real sqrt": Case(hk.fields.RiemannSurface("sqrt", "real"), of_powers({0: HALF}, "real"), 1.0),
+    "cbrt": Case(hk.fields.RiemannSurface("cbrt"), of_powers({0: THIRD}), 1.0),
+    "2/3": Case(hk.fields.RiemannSurface("power", exponent=2 / 3), of_powers({0: 2 * THIRD}), 1.0),
+    "5/2": Case(hk.fields.RiemannSurface("power", exponent=2.5), of_powers({0: 5 * HALF}), 1.0),
+    "-1/2": Case(hk.fields.RiemannSurface("power", exponent=-0.5), of_powers({0: -HALF}), 1.0),
+    "pole": Case(hk.fields.RiemannSurface({0: -1}), of_powers({0: Fraction(-1)}), 1.0),
+    "asin": Case(hk.fields.RiemannSurface("asin"), lambda z, h: of_asin(z, h, "imag"), 2.0),
+    "real asin": Case(
+        hk.fields.RiemannSurface("asin", "real"), lambda z, h: of_asin(z, h, "real"), 2.0
+    ),
     "elliptic": Case(
-        hk.RiemannSurface(
+        hk.fields.RiemannSurface(
             "sqrt", argument={0: 1, 1: 1, -1: 1}, height=0.5, domain=hk.Ball(radius=2.0)
         ),
         of_powers({0: HALF, 1: HALF, -1: HALF}, height=0.5),
         2.0,
     ),
     "product": Case(
-        hk.RiemannSurface({0: 0.5, 1: THIRD, 0.5j: -0.5}, domain=hk.Ball(radius=2.0)),
+        hk.fields.RiemannSurface({0: 0.5, 1: THIRD, 0.5j: -0.5}, domain=hk.Ball(radius=2.0)),
         of_powers({0: HALF, 1: THIRD, 0.5j: -HALF}),
         2.0,
     ),
@@ -190,7 +192,7 @@ def test_promises_and_looks_of_all_hold(name: str) -> None:
 
 
 def test_a_bound_that_is_too_small_is_found() -> None:
-    wrong = hk.RiemannSurface(
+    wrong = hk.fields.RiemannSurface(
         root, singular_points=[0], second_bound=lambda z, r: 0.05 * (abs(z) - r) ** -1.5
     )
     with pytest.raises(BrokenPromiseError):
@@ -198,7 +200,7 @@ def test_a_bound_that_is_too_small_is_found() -> None:
 
 
 def test_a_singular_point_left_out_is_found() -> None:
-    wrong = hk.RiemannSurface(
+    wrong = hk.fields.RiemannSurface(
         root, singular_points=[5], second_bound=lambda z, r: 0.25 * abs(z) ** -1.5
     )
     with pytest.raises(BrokenPromiseError):
@@ -207,8 +209,8 @@ def test_a_singular_point_left_out_is_found() -> None:
 
 def test_a_branch_point_whose_constant_is_too_small_is_found() -> None:
     """Random rays hardly come near: 1.4 of the square root of 2 passed."""
-    point = hk.BranchPoint(0, 0.5, 0.99)
-    wrong = hk.RiemannSurface(
+    point = hk.fields.BranchPoint(0, 0.5, 0.99)
+    wrong = hk.fields.RiemannSurface(
         root, singular_points=[point], second_bound=lambda z, r: 0.25 * (abs(z) - r) ** -1.5
     )
     with pytest.raises(BrokenPromiseError, match=r"constant must be at least (1|0.9999)"):
@@ -309,7 +311,7 @@ def test_hits_beside_branch_points_are_near_the_surface(name: str, precision: An
 def test_crossings_of_all_sheets_are_counted(name: str, precision: Any) -> None:
     case = CASES[name]
     o, d = rays(300, case.radius, seed=5)
-    hits = hk.trace(case.field, o, d, precision=precision, all_hits=12)
+    hits = hk.crossings(case.field, o, d, precision=precision, max_crossings=12)
     across = -np.einsum("nk,nk->n", o, d)
     half = np.sqrt(case.radius**2 - np.einsum("nk,nk->n", o, o) + across**2)
     t = across[:, None] + half[:, None] * np.linspace(-1, 1, 8000)
@@ -343,7 +345,7 @@ def test_other_bounds_find_the_same_hits(bound: str) -> None:
     case = CASES["sqrt"]
     o, d = rays(150, 1.0, seed=9)
     ours = hk.trace(case.field, o, d)
-    theirs = hk.trace(case.field, o, d, bound=bound, max_steps=20_000)
+    theirs = hk.trace(case.field, o, d, enclosures=bound, max_steps=20_000)
     # What a ray does near the rim of the ball or an edge of a sheet may differ by the tolerance.
     same = (ours.status == theirs.status) & np.isclose(ours.t, theirs.t, atol=5e-3)
     assert same.mean() > 0.97
@@ -413,13 +415,13 @@ def test_values_are_those_of_numpy() -> None:
 
 
 def test_extents_are_the_heights_that_there_are() -> None:
-    field = hk.RiemannSurface("sqrt", domain=hk.Box((-1, -1, -9), (1, 1, 9)))
+    field = hk.fields.RiemannSurface("sqrt", domain=hk.Box((-1, -1, -9), (1, 1, 9)))
     volume = field.extent((0.0,))
     assert volume is not None
     assert volume.bounds()[1][2] == pytest.approx(2**0.25, rel=1e-4)
     miss = hk.trace(field, [[-3, 0, 3.0]], [[1, 0, 0]])
     assert miss.evaluations[0] == 0
-    pole = hk.RiemannSurface({0: -1}, domain=hk.Box((-1, -1, -9), (1, 1, 9)))
+    pole = hk.fields.RiemannSurface({0: -1}, domain=hk.Box((-1, -1, -9), (1, 1, 9)))
     assert pole.extent((0.0,)) is pole.domain
 
 
@@ -458,11 +460,11 @@ def test_extents_are_the_heights_that_there_are() -> None:
 )
 def test_errors_say_what_is_wrong(arguments: Any, settings: Any, message: str) -> None:
     with pytest.raises((TypeError, ValueError), match=message):
-        hk.RiemannSurface(*arguments, **settings)
+        hk.fields.RiemannSurface(*arguments, **settings)
 
 
 def test_levels_of_the_logarithm_are_the_surface_moved_up() -> None:
-    hits = hk.trace(hk.RiemannSurface("log"), [[1, 0, 3.0]], [[0, 0, -1]], level=0.5)
+    hits = hk.trace(hk.fields.RiemannSurface("log"), [[1, 0, 3.0]], [[0, 0, -1]], level=0.5)
     assert hits.t[0] == pytest.approx(2.5, abs=1e-3)
 
 
@@ -470,7 +472,7 @@ def test_levels_of_the_logarithm_are_the_surface_moved_up() -> None:
 @pytest.mark.parametrize("precision", ["single", "double"])
 def test_walls_about_all_sheets_are_met_first(precision: Any) -> None:
     """Levels +-0.05 of the cube root: the nearest sheet is so far below or above."""
-    field = hk.RiemannSurface("cbrt")
+    field = hk.fields.RiemannSurface("cbrt")
     o, d = rays(300, 1.0, seed=8)
     hits = hk.trace(field, o, d, level=(-0.05, 0.05), precision=precision)
     hit = hits.status == hk.RayStatus.HIT
@@ -492,7 +494,9 @@ def test_walls_about_all_sheets_are_met_first(precision: Any) -> None:
 def test_other_heights_and_places_compile_no_kernel() -> None:
     def trace(k: int) -> int:
         exponents = {0.1 * k: 0.5, 1 + 0.1j * k: Fraction(1, 3)}
-        field = hk.RiemannSurface(exponents, height=1 + 0.1 * k, domain=hk.Ball(radius=2 + 0.1 * k))
+        field = hk.fields.RiemannSurface(
+            exponents, height=1 + 0.1 * k, domain=hk.Ball(radius=2 + 0.1 * k)
+        )
         return compiled(lambda: hk.trace(field, *rays(300, 1.0, seed=k)), size=300)
 
     trace(0), trace(1)
@@ -518,7 +522,7 @@ def test_hits_carry_derivatives() -> None:
     place = np.array([0.3, 0.4, 2.0])
     o = backend.Array3f(*place.tolist())
     dr.enable_grad(o)
-    field = hk.RiemannSurface("sqrt")
+    field = hk.fields.RiemannSurface("sqrt")
     dr.backward(hk.trace(field, o, backend.Array3f(0.05, 0, -1)).t)
     for k in range(3):
         step = 1e-5 * np.eye(3)[k]

@@ -540,7 +540,7 @@ def test_first_hits(length: float, bound: str | None) -> None:
     for cloud in (sphere_cloud(rng, 150), torus_cloud(rng, 200), soup(rng, 20)):
         field = field_of(cloud, length)
         for level in (field.default_level, 0.4):
-            hits += compare(field, level, int(rng.integers(1000)), bound=bound)
+            hits += compare(field, level, int(rng.integers(1000)), enclosures=bound)
     assert hits > 60
 
 

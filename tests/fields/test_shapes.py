@@ -137,11 +137,11 @@ def supertorus(x: Any, powers: Any, major: float, minor: float) -> Any:
     return pair(norm(x[..., :2], powers[0]) - major, x[..., 2], powers[1]) - minor
 
 
-NOISE = hk.Noise(2.0, 0.7, seed=5)
-FRACTAL = hk.FractalNoise(3, 1.0, 2.0, 0.15, fade="cubic")
+NOISE = hk.solids.Noise(2.0, 0.7, seed=5)
+FRACTAL = hk.solids.FractalNoise(3, 1.0, 2.0, 0.15, fade="cubic")
 TUBE = hk.Tube.bezier(CURVE, 0.2, tolerance=2e-3)
 C = (-0.2, 0.8, 0.0, 0.0)
-SCREW = hk.Thread([(0, 0.8), (0.1, 0.8), (0.25, 0.5)], 0.4, starts=2, left_handed=True)
+SCREW = hk.solids.Thread([(0, 0.8), (0.1, 0.8), (0.25, 0.5)], 0.4, starts=2, left_handed=True)
 TURN = np.linspace(0, 2 * np.pi, 90, endpoint=False)
 STAR = (0.8 + 0.25 * np.cos(5 * TURN))[:, None] * np.column_stack([np.cos(TURN), np.sin(TURN)])
 # A hole, which runs the same way around, and an island in it.
@@ -163,7 +163,7 @@ UNITED = from_manifold(
 
 SHAPES: dict[str, tuple[Any, Oracle]] = {
     "plane": (
-        hk.Plane((1.0, 2.0, -2.0), 0.3),
+        hk.solids.Plane((1.0, 2.0, -2.0), 0.3),
         lambda x: x @ np.array([1.0, 2.0, -2.0]) / 3 - 0.3,
     ),
     "sphere": (hk.Sphere(0.8, (0.1, 0.2, 0.0)), lambda x: norm(x - [0.1, 0.2, 0.0]) - 0.8),
@@ -177,7 +177,7 @@ SHAPES: dict[str, tuple[Any, Oracle]] = {
         lambda x: box(np.stack([norm(x[..., :2]), x[..., 2]], -1), [0.5, 0.8]),
     ),
     "double cone": (
-        hk.DoubleCone(0.6),
+        hk.solids.DoubleCone(0.6),
         lambda x: norm(x[..., :2]) * math.cos(0.6) - np.abs(x[..., 2]) * math.sin(0.6),
     ),
     "capsule": (
@@ -192,14 +192,14 @@ SHAPES: dict[str, tuple[Any, Oracle]] = {
     ),
     **{
         f"superellipsoid {p} {q}": (
-            hk.Superellipsoid((p, q), (1.0, 0.7, 0.9)),
+            hk.solids.Superellipsoid((p, q), (1.0, 0.7, 0.9)),
             lambda x, p=p, q=q: powered(x, (p, q), (1.0, 0.7, 0.9)),
         )
         for p, q in ((4.0, 4.0), (1.0, 1.0), (1.5, 3.0), (2.0, 1.3))
     },
     **{
         f"supertorus {p} {q}": (
-            hk.Supertorus((p, q), 0.9, 0.3),
+            hk.solids.Supertorus((p, q), 0.9, 0.3),
             lambda x, p=p, q=q: supertorus(x, (p, q), 0.9, 0.3),
         )
         for p, q in ((4.0, 4.0), (1.2, 1.5))
@@ -230,10 +230,10 @@ SHAPES: dict[str, tuple[Any, Oracle]] = {
     "thread": (SCREW, lambda x: screw(x, SCREW)),
     "noise": (NOISE, lambda x: noise(x, NOISE)),
     "displaced": (
-        hk.DisplacedSolid(hk.Sphere(), FRACTAL),
+        hk.solids.DisplacedSolid(hk.Sphere(), FRACTAL),
         lambda x: norm(x) - 1 + noise(x, FRACTAL),
     ),
-    "julia": (hk.Julia(C, 8, 0.1), lambda x: julia(x, C, 8, 0.1)),
+    "julia": (hk.solids.Julia(C, 8, 0.1), lambda x: julia(x, C, 8, 0.1)),
 }  # fmt: skip
 
 EVERY = pytest.mark.parametrize("name", SHAPES)
@@ -354,7 +354,7 @@ def test_lipschitz_constants_are_attained(name: str) -> None:
     "powers", [(1.0, 1.0), (1.0, 2.0), (2.0, 1.0), (1.3, 1.7), (4.0, 4.0), (3.0, 1.2), (1.5, 5.0)]
 )
 def test_constants_of_norms_are_attained(powers: tuple[float, float]) -> None:
-    shape = hk.Superellipsoid(powers)
+    shape = hk.solids.Superellipsoid(powers)
     most = steepest(lambda x: powered(x, powers, (1.0, 1.0, 1.0)), np.random.default_rng(5))
     assert 0.99 * shape.lipschitz <= most <= shape.lipschitz * (1 + 1e-6)
 
@@ -414,7 +414,8 @@ def test_sphere_tracing_finds_the_same(name: str) -> None:
     d = rng.uniform(-0.9, 0.9, (300, 3)) - o
     d /= norm(d)[:, None]
     one, two = (
-        hk.trace(shape, o, d, t_max=6.0, precision="double", bound=b) for b in (None, "lipschitz")
+        hk.trace(shape, o, d, t_max=6.0, precision="double", enclosures=b)
+        for b in (None, "lipschitz")
     )
     a, b = np.array(one.t), np.array(two.t)
     both = np.isfinite(a) & np.isfinite(b)
@@ -448,8 +449,8 @@ class Blended(Formula):
     lipschitz = 2**0.5
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        a = hk.norm(x - 0.6, y, z) - 0.5
-        b = hk.maximum(abs(x + 0.4), abs(y), abs(z)) - 0.4
+        a = hk.math.norm(x - 0.6, y, z) - 0.5
+        b = hk.math.maximum(abs(x + 0.4), abs(y), abs(z)) - 0.4
         return blend_union(a, b, 0.4)
 
 
@@ -477,7 +478,10 @@ def test_flattening_is_as_stated() -> None:
 def test_metric_threads_have_their_sizes() -> None:
     """M8: 8 mm across crests, 6.647 mm across roots (ISO 724), 7.188 mm across the pitch line."""
     pitch = 1.25
-    screw, cut = hk.metric_thread("M8", 20.0), hk.metric_thread("M8", 20.0, internal=True)
+    screw, cut = (
+        hk.solids.metric_thread("M8", 20.0),
+        hk.solids.metric_thread("M8", 20.0, internal=True),
+    )
     z = 10.0 + pitch * np.linspace(0, 1, 2001)
     for solid in (screw, cut):
         angle = 0.7
@@ -492,7 +496,7 @@ def test_metric_threads_have_their_sizes() -> None:
         assert np.mean(edge > 3.998) == pytest.approx(1 / 8, abs=5e-3)
         assert np.mean(edge < 6.65 / 2) == pytest.approx(1 / 4, abs=5e-3)
     # A screw and its nut are twice the clearance apart, across crests, roots and flanks.
-    loose, wide = hk.metric_thread("M8", 20.0, clearance=0.05), hk.metric_thread(
+    loose, wide = hk.solids.metric_thread("M8", 20.0, clearance=0.05), hk.solids.metric_thread(
         "M8", 20.0, internal=True, clearance=0.05
     )  # fmt: skip
     points = x.reshape(-1, 3)
@@ -505,7 +509,7 @@ def test_metric_threads_have_their_sizes() -> None:
         assert np.median(one[near]) == pytest.approx(0.05, abs=1e-9)
         assert one[near].min() > 0.0249  # beside a corner, where another edge is nearest
     # On the pitch line of M12, 10.863 across: both flanks are 0.2 apart, and not 0.1 and 0.3.
-    bolt, hole = hk.metric_thread("M12", 20.0, clearance=0.1), hk.metric_thread(
+    bolt, hole = hk.solids.metric_thread("M12", 20.0, clearance=0.1), hk.solids.metric_thread(
         "M12", 20.0, internal=True, clearance=0.1
     )  # fmt: skip
     flanks = [[10.863 / 2, 0.0, 7.0 + turn * 1.75] for turn in (-3 / 16, 5 / 16)]
@@ -529,16 +533,16 @@ def test_coils_stay_within_their_flattening() -> None:
     [
         (lambda: hk.Sphere(0.0), "radius of a sphere must be positive"),
         (lambda: hk.Sphere(1.0, (0, math.nan, 0)), "must be finite"),
-        (lambda: hk.Plane((0, 0, 0)), "must not be zero"),
-        (lambda: hk.Plane((0, 1)), "three numbers, not 2"),
+        (lambda: hk.solids.Plane((0, 0, 0)), "must not be zero"),
+        (lambda: hk.solids.Plane((0, 1)), "three numbers, not 2"),
         (lambda: hk.Ellipsoid((1, -1, 1)), "must be positive"),
         (lambda: hk.Cylinder(1.0, 0.0), "half the height"),
-        (lambda: hk.DoubleCone(2.0), "between 0 and pi/2"),
+        (lambda: hk.solids.DoubleCone(2.0), "between 0 and pi/2"),
         (lambda: hk.Capsule((0, 0, 0), (0, 0, 0)), "use Sphere"),
         (lambda: hk.Torus(1.0, math.inf), "minor radius"),
         (lambda: hk.Cuboid((1, 1, 1), 2.0), "least half side"),
-        (lambda: hk.Superellipsoid((0.5, 2.0)), "at least 1"),
-        (lambda: hk.Supertorus((2.0,)), "two numbers"),
+        (lambda: hk.solids.Superellipsoid((0.5, 2.0)), "at least 1"),
+        (lambda: hk.solids.Supertorus((2.0,)), "two numbers"),
         (lambda: hk.Tube(np.zeros((3, 3)), 0.1), "two points or more"),
         (lambda: hk.Tube(np.zeros((3, 2)), 0.1), "must have shape"),
         (lambda: hk.Tube.bezier(np.zeros((5, 3)), 0.1), "3 n \\+ 1"),
@@ -549,25 +553,25 @@ def test_coils_stay_within_their_flattening() -> None:
         (lambda: hk.SolidOfRevolution([(-0.1, 0), (1, 0), (1, 1)]), "lies in r >= 0"),
         (lambda: hk.Tube.helix(1.0, 1.0, 0.0, 0.1), "its turns must be positive"),
         (lambda: hk.Tube.helix(1.0, 1.0, 1.0, 0.1, tolerance=1e-30), "larger tolerance"),
-        (lambda: hk.Thread([(0, 1), (1, 1)], 1.0), "rises by less than the pitch"),
-        (lambda: hk.Thread([(-0.6, 1)], 1.0), "begins within half a pitch of 0"),
-        (lambda: hk.Thread([(0, -1)], 1.0), "must be positive"),
-        (lambda: hk.Thread([(0, math.nan)], 1.0), "finite"),
-        (lambda: hk.Thread([0, 1], 1.0), "has shape"),
-        (lambda: hk.Thread([(0, 1)], 1.0, starts=0), "starts of a thread"),
-        (lambda: hk.metric_thread("8", 10.0), "named as"),
-        (lambda: hk.metric_thread(8, 10.0), "named as"),
-        (lambda: hk.metric_thread("M13", 10.0), "no coarse thread M13"),
-        (lambda: hk.metric_thread("M8x7", 10.0), "leaves no core"),
-        (lambda: hk.metric_thread("M8", 1.0), "must be longer"),
-        (lambda: hk.metric_thread("M8", 10.0, clearance=0.2), "clearance of M8"),
-        (lambda: hk.metric_thread("M8", 10.0, clearance=-0.1), "clearance of M8"),
-        (lambda: hk.Noise(0.0), "frequency of noise"),
-        (lambda: hk.Noise(fade="linear"), "quintic"),
-        (lambda: hk.FractalNoise(0), "octaves"),
-        (lambda: hk.Julia((1, 2, 3)), "four numbers"),
-        (lambda: hk.Julia(iterations=0), "from 1 to 60"),
-        (lambda: hk.Julia((20.0, 0, 0, 0)), "no longer than 10"),
+        (lambda: hk.solids.Thread([(0, 1), (1, 1)], 1.0), "rises by less than the pitch"),
+        (lambda: hk.solids.Thread([(-0.6, 1)], 1.0), "begins within half a pitch of 0"),
+        (lambda: hk.solids.Thread([(0, -1)], 1.0), "must be positive"),
+        (lambda: hk.solids.Thread([(0, math.nan)], 1.0), "finite"),
+        (lambda: hk.solids.Thread([0, 1], 1.0), "has shape"),
+        (lambda: hk.solids.Thread([(0, 1)], 1.0, starts=0), "starts of a thread"),
+        (lambda: hk.solids.metric_thread("8", 10.0), "named as"),
+        (lambda: hk.solids.metric_thread(8, 10.0), "named as"),
+        (lambda: hk.solids.metric_thread("M13", 10.0), "no coarse thread M13"),
+        (lambda: hk.solids.metric_thread("M8x7", 10.0), "leaves no core"),
+        (lambda: hk.solids.metric_thread("M8", 1.0), "must be longer"),
+        (lambda: hk.solids.metric_thread("M8", 10.0, clearance=0.2), "clearance of M8"),
+        (lambda: hk.solids.metric_thread("M8", 10.0, clearance=-0.1), "clearance of M8"),
+        (lambda: hk.solids.Noise(0.0), "frequency of noise"),
+        (lambda: hk.solids.Noise(fade="linear"), "quintic"),
+        (lambda: hk.solids.FractalNoise(0), "octaves"),
+        (lambda: hk.solids.Julia((1, 2, 3)), "four numbers"),
+        (lambda: hk.solids.Julia(iterations=0), "from 1 to 60"),
+        (lambda: hk.solids.Julia((20.0, 0, 0, 0)), "no longer than 10"),
     ],
 )
 def test_wrong_numbers(make: Callable[[], Any], words: str) -> None:

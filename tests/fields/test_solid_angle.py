@@ -389,7 +389,7 @@ def test_a_curve_that_cancels_as_a_whole_has_no_surface(
     o[:3], d[:3] = [0, 0, 0], np.eye(3)  # on the curve
     for level in (2 * math.pi, 0.5):
         for bound in (None, "classic", "slope"):
-            end = hk.trace(field, o, d, level=level, precision=precision, bound=bound)
+            end = hk.trace(field, o, d, level=level, precision=precision, enclosures=bound)
             assert (end.status == int(hk.RayStatus.MISS)).all()
     far = hk.trace(Unbounded(NOTHING[name]), o, d, precision=precision)
     assert (far.status == int(hk.RayStatus.MISS)).all()

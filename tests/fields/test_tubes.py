@@ -81,7 +81,7 @@ def test_what_is_no_bundle_of_tubes() -> None:
 
 def _in_unbounded_solids() -> dict[str, tuple[Any, float]]:
     """Solids without bounds that hold a tube, and where a ray down at (.3, .02) meets it first."""
-    tube, plane = hk.Tube([[-1, 0, 0], [1, 0, 0]], 0.1), hk.Plane((0, 0, 1), -0.5)
+    tube, plane = hk.Tube([[-1, 0, 0], [1, 0, 0]], 0.1), hk.solids.Plane((0, 0, 1), -0.5)
     bent = hk.Tube.bezier([[-1, 0, 0], [-0.3, 0, 0], [0.3, 0, 0], [1, 0, 0]], 0.1)
     many = hk.Tube.from_polylines(
         [[[x, 0, 0], [x + 0.1, 0, 0]] for x in np.arange(-5, 5, 0.1)], 0.1
@@ -95,7 +95,7 @@ def _in_unbounded_solids() -> dict[str, tuple[Any, float]]:
         "moved and scaled": ((tube.scaled(0.5) | plane).scaled(2), top),
         "complements": (~(~tube & ~plane), top),
         "difference": (
-            hk.Plane((0, 0, 1), 1.0) - tube.translated((0, 0, 0.95)),
+            hk.solids.Plane((0, 0, 1), 1.0) - tube.translated((0, 0, 0.95)),
             1.0 + 0.05 + 0.098,
         ),
         "without a plane": (tube, top),

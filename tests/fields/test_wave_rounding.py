@@ -52,19 +52,19 @@ _RNG = np.random.default_rng(4)
 FIELDS = {
     "gyroid": hk.Gyroid(),
     "gyroid, far": hk.Gyroid(domain=hk.Ball((500.0, 0.0, 0.0), 10.0)),
-    "P": hk.SchwarzP(cell=2.0),
+    "P": hk.fields.SchwarzP(cell=2.0),
     # These were 113 and 31 times as far off as stated.
-    "D, a hundred cells": hk.SchwarzD(cell=0.01, domain=hk.Ball(radius=1.0)),
-    "plane waves": hk.EigenfunctionSum(
+    "D, a hundred cells": hk.fields.SchwarzD(cell=0.01, domain=hk.Ball(radius=1.0)),
+    "plane waves": hk.fields.EigenfunctionSum(
         [PlaneWave(1.0, (30.0, -20.0, 5.0), 0.3), PlaneWave(0.5, (1.0, 2.0, -40.0), 2.0)],
         domain=hk.Ball(radius=3.0),
     ),
-    "unlike frequencies": hk.EigenfunctionSum(
+    "unlike frequencies": hk.fields.EigenfunctionSum(
         [WaveProduct(1.0, sine_factor(6.3), sine_factor(5.1, 1.0)),
         WaveProduct(-0.4, cosine_factor(63.0), None, sine_factor(2.0))],
         domain=hk.Box((-3, -3, -3), (3, 3, 3)),
     ),
-    "many": hk.EigenfunctionSum(
+    "many": hk.fields.EigenfunctionSum(
         [
             PlaneWave(float(a), tuple(float(v) for v in k), float(phase))  # type: ignore[arg-type]
             for a, k, phase in zip(

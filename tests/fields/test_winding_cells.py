@@ -111,7 +111,7 @@ def test_rays_from_inside_and_far_away_and_of_a_clip() -> None:
     compare(mesh, far, d, precision="double")
     clip = hk.Ball((0.3, 0.1, 0.0), 0.7)
     fields = with_cells(mesh), with_cells(mesh, False)
-    one, other = (hk.trace(hk.level_set(field, clip=clip), far, d) for field in fields)
+    one, other = (hk.trace(hk.Surface(field, clip=clip), far, d) for field in fields)
     assert (one.is_hit != other.is_hit).mean() <= 2e-3
     assert one.is_hit.sum() > 100
 

@@ -21,12 +21,12 @@ def area(loops: Any) -> float:
 
 
 def test_regular_polygons() -> None:
-    (corners,) = hk.outline.regular_polygon(6, 2.0)
+    (corners,) = hk.io.outline.regular_polygon(6, 2.0)
     assert np.linalg.norm(corners, axis=1) == pytest.approx(2.0)
     assert area([corners]) == pytest.approx(6 * math.sqrt(3))
     for sides in (2, 2.5, True, 10**7):
         with pytest.raises(ValueError, match="number of sides"):
-            hk.outline.regular_polygon(sides, 1.0)  # type: ignore[arg-type]
+            hk.io.outline.regular_polygon(sides, 1.0)  # type: ignore[arg-type]
 
 
 # Text.
@@ -34,22 +34,27 @@ def test_regular_polygons() -> None:
 
 def test_letters_have_their_holes() -> None:
     pytest.importorskip("matplotlib")
-    loops = hk.outline.text("harnack", 10.0)
+    loops = hk.io.outline.text("harnack", 10.0)
     assert len(loops) == 9  # two letters a, with a hole each
-    coarse, fine = (hk.outline.text("oO", 1.0, tolerance=one) for one in (1e-2, 1e-5))
+    coarse, fine = (hk.io.outline.text("oO", 1.0, tolerance=one) for one in (1e-2, 1e-5))
     assert sum(map(len, fine)) > 8 * sum(map(len, coarse))
     assert area(coarse) == pytest.approx(area(fine), rel=0.05)
-    assert area(hk.outline.text("o", 3.0)) == pytest.approx(9 * area(hk.outline.text("o", 1.0)))
+    assert area(hk.io.outline.text("o", 3.0)) == pytest.approx(
+        9 * area(hk.io.outline.text("o", 1.0))
+    )
 
 
 def test_lines_of_text() -> None:
     pytest.importorskip("matplotlib")
-    one, two = hk.outline.text("ii", align="center"), hk.outline.text("i\n\nii", align="center")
+    one, two = (
+        hk.io.outline.text("ii", align="center"),
+        hk.io.outline.text("i\n\nii", align="center"),
+    )
     assert len(two) == len(one) + 2
     low, high = (np.concatenate(two).min(axis=0), np.concatenate(two).max(axis=0))
     assert low[0] == pytest.approx(-high[0])
     assert low[1] == pytest.approx(-2.4, abs=0.05)
-    assert len(hk.outline.text("$x$")) == 7  # no formula
+    assert len(hk.io.outline.text("$x$")) == 7  # no formula
 
 
 @pytest.mark.parametrize(
@@ -72,7 +77,7 @@ def test_lines_of_text() -> None:
 def test_what_is_no_text_is_said(words: Any, options: Any, complaint: str) -> None:
     pytest.importorskip("matplotlib")
     with pytest.raises(ValueError, match=complaint):
-        hk.outline.text(words, **options)
+        hk.io.outline.text(words, **options)
 
 
 # SVG.
@@ -82,7 +87,7 @@ def drawn(folder: Path, inside: str, **options: Any) -> Any:
     pytest.importorskip("svgpathtools")
     file = folder / "drawing.svg"
     file.write_text(f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 9 9">{inside}</svg>')
-    return hk.outline.svg(file, **options)
+    return hk.io.outline.svg(file, **options)
 
 
 @pytest.mark.parametrize(
@@ -165,7 +170,7 @@ def test_entities_are_refused(tmp_path: Path, encoding: str) -> None:
     file = tmp_path / "bomb.svg"
     file.write_bytes(f'<?xml version="1.0" encoding="{encoding}"?>{text}'.encode(encoding))
     with pytest.raises(ValueError, match="entities are not read"):
-        hk.outline.svg(file)
+        hk.io.outline.svg(file)
     file.write_bytes(b" " * (33 * 2**20))
     with pytest.raises(ValueError, match="at most 32 MB"):
-        hk.outline.svg(file)
+        hk.io.outline.svg(file)

@@ -130,7 +130,7 @@ def test_normals_turned_inwards_do_not_matter_to_what_is_smoothed() -> None:
 @pytest.mark.parametrize("count", [60, 400])
 def test_hermite_interpolation_is_meshed_by_signs(count: int) -> None:
     points, normals = sphere(count)
-    made = hk.mesh(hk.HRBF(points, normals), tolerance=4e-3, cell_size=0.15)
+    made = hk.mesh(hk.fields.HRBF(points, normals), tolerance=4e-3, cell_size=0.15)
     assert made.metadata["harnack"]["made_by"] == "signs"
     check_ball(made, 0.03)
 

@@ -45,7 +45,7 @@ def test_nothing_is_changed_where_there_is_nothing_in_common() -> None:
 
 
 @pytest.mark.parametrize("hole", [ROD, NEAR, BALL & NEAR])
-def test_what_is_added_and_cut_away_again_is_not_made(hole: hk.Solid) -> None:
+def test_what_is_added_and_cut_away_again_is_not_made(hole: hk.solids.Solid) -> None:
     """Triangles of the rod passed through others, which was refused, or left a crumb."""
     shell = BALL.shell(0.2)
     made = hk.mesh((shell | hole) - hole, tolerance=5e-3)  # of the rod, which is longer

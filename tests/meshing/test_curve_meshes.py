@@ -105,7 +105,7 @@ def test_relaxed_triangles_have_larger_angles_and_the_same_rim() -> None:
     disc = example_curves.wavy_polygon(24, amplitude=0.0)
     x = np.concatenate([disc, np.column_stack([*rng.uniform(-0.6, 0.6, (2, 60)), np.zeros(60)])])
     faces = Delaunay(x[:, :2]).simplices.astype(np.int64)
-    flat = LevelFunction(hk.Plane((0.0, 0.0, 1.0)), 0.0)
+    flat = LevelFunction(hk.solids.Plane((0.0, 0.0, 1.0)), 0.0)
     moved = relax_vertices(flat, x, faces, 1.0, None)
     before, after = (least_angles(y, faces) for y in (x, moved))
     assert (moved[: len(disc)] == disc).all()
@@ -281,7 +281,7 @@ def test_reaches_are_proved() -> None:
 @pytest.mark.parametrize("level", [0.5, 1.0, 1.5, 2.5, 3.0, 3.5])
 def test_levels(level: float) -> None:
     loops = loops_of("wavy")
-    mesh = hk.mesh(hk.SolidAngle(loops), level * math.pi, tolerance=4e-3)
+    mesh = hk.mesh(hk.SolidAngle(loops), level=level * math.pi, tolerance=4e-3)
     check_surface(mesh, loops, 1)
 
 

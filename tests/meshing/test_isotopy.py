@@ -32,7 +32,7 @@ NO_CURVE = BoundaryCurve(np.zeros((0, 3)), np.zeros((0, 2), np.int64))
     [
         (hk.SolidAngle(example_curves.torus_knot(2, 3, 48)), 0.3),
         (hk.SolidAngle(example_curves.wavy_polygon(24)), 0.3),
-        (hk.SolidAngle([hk.Circle(1.0)]), 0.3),
+        (hk.SolidAngle([hk.geometry.Circle(1.0)]), 0.3),
         (hk.Gyroid(cell=1.0), 0.5),
     ],
 )
@@ -74,12 +74,12 @@ def first_mesh(
 )
 def test_all_of_a_gyroid_is_proved(level: float, spacing: float | None) -> None:
     box = hk.Box(*(end.tolist() for end in BOX))
-    mesh = hk.mesh(hk.Gyroid(cell=1.0), level, clip=box, tolerance=0.02, cell_size=spacing)
+    mesh = hk.mesh(hk.Gyroid(cell=1.0), level=level, clip=box, tolerance=0.02, cell_size=spacing)
     assert mesh.metadata["harnack"]["isotopy"] == 1.0
 
 
 def test_a_field_that_promises_nothing_proves_nothing() -> None:
-    mesh = hk.mesh(hk.Sphere(0.8), solid=False, tolerance=0.01, cell_size=0.2)
+    mesh = hk.mesh(hk.Sphere(0.8), side="surface", tolerance=0.01, cell_size=0.2)
     assert mesh.metadata["harnack"]["isotopy"] == 0.0
 
 
@@ -152,5 +152,5 @@ def test_four_corners_on_the_level() -> None:
 def test_thin_necks_of_a_gyroid_are_proved_by_small_pieces() -> None:
     """0.9936 with three halvings of tetrahedra, 0.9997 with five: near level 1 necks are thin."""
     box = hk.Box((-1, -1, -1), (1, 1, 1))
-    mesh = hk.mesh(hk.Gyroid(1.0), 0.9, clip=box, cell_size=0.09, tolerance=1e-2)
+    mesh = hk.mesh(hk.Gyroid(1.0), level=0.9, clip=box, cell_size=0.09, tolerance=1e-2)
     assert mesh.metadata["harnack"]["isotopy"] > 0.9995

@@ -96,7 +96,7 @@ def test_what_is_lost_elsewhere_does_not_count() -> None:
     assert LOST not in told
     assert made.volume == pytest.approx(4, rel=5e-3)
     assert LOST in meshed(FIN, **options)[1]
-    assert LOST in meshed(hk.level_set(FIN, 0.9), cell_size=0.2, tolerance=4e-3)[1]
+    assert LOST in meshed(hk.Surface(FIN, 0.9), cell_size=0.2, tolerance=4e-3)[1]
 
 
 def test_islands_of_blobs_and_sheets_of_clouds() -> None:

@@ -119,7 +119,7 @@ _CARVED = hk.Sphere(1.0) - hk.Cuboid((0.5, 0.5, 2.0))
     ids=["tiny", "far", "union far", "touching in an edge", "touching in a point"],
 )
 def test_what_is_closed_in_memory_and_not_in_a_file_is_not_written(
-    part: hk.Solid, message: str, tmp_path: Path
+    part: hk.solids.Solid, message: str, tmp_path: Path
 ):
     made = hk.mesh(part, tolerance=2e-2)
     assert made.is_watertight
@@ -209,24 +209,24 @@ def test_solids_know_the_waves_they_are_made_of():
     below = hk.solid(_GYROID, below=0.0)
     for part, expected in [
         (_GYROID, wave),
-        (hk.SchwarzP(5.0), 5.0),
+        (hk.fields.SchwarzP(5.0), 5.0),
         (_WALLS, wave),
         (~_WALLS, wave),
         (_WALLS.offset(0.1), wave),
         (_WALLS.translated((1, 2, 3)).rotated(30, "x").scaled((1.0, 2.0, 0.5)), 0.5 * wave),
-        (_WALLS & hk.Sphere(1.0) | hk.solid(hk.SchwarzP(2.0), below=0.0), 2.0),
+        (_WALLS & hk.Sphere(1.0) | hk.solid(hk.fields.SchwarzP(2.0), below=0.0), 2.0),
         (below.twisted(0.1), wave),
         (below.tapered((0, 1.0), (1, 0.5)), 0.5 * wave),
         (below.blended(hk.Sphere(1.0), 0.1), wave),
-        (hk.EigenfunctionSum([hk.PlaneWave(1.0, (1, 0, 0)), hk.PlaneWave(1e-9, (90, 0, 0))]),
+        (hk.fields.EigenfunctionSum([hk.fields.PlaneWave(1.0, (1, 0, 0)), hk.fields.PlaneWave(1e-9, (90, 0, 0))]),
          2 * math.pi),
-        (hk.FourierSeries(np.eye(4)[3].reshape(4, 1, 1), hk.Box((0, 0, 0), (3, 1, 1))), 2.0),
+        (hk.fields.FourierSeries(np.eye(4)[3].reshape(4, 1, 1), hk.Box((0, 0, 0), (3, 1, 1))), 2.0),
     ]:  # fmt: skip
         assert part.min_wavelength == pytest.approx(expected, rel=1e-5)
     assert (hk.Sphere(1.0) | hk.Torus(0.8, 0.3)).min_wavelength is None
 
 
-def _volume(part: hk.Solid, half: tuple[float, float, float], step: float) -> float:
+def _volume(part: hk.solids.Solid, half: tuple[float, float, float], step: float) -> float:
     """By the middles of cells within a box."""
     axes = [np.arange(-h + 0.5 * step, h, step) for h in half]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -237,7 +237,7 @@ def _volume(part: hk.Solid, half: tuple[float, float, float], step: float) -> fl
 @pytest.mark.parametrize(
     ("part", "half", "bodies"),
     [
-        (hk.solid(hk.SchwarzP(1.0), between=(-0.3, 0.3)) & hk.Cylinder(0.6, 6.0),
+        (hk.solid(hk.fields.SchwarzP(1.0), between=(-0.3, 0.3)) & hk.Cylinder(0.6, 6.0),
          (0.6, 0.6, 6.0), 1),
         (_WALLS.scaled(0.1) & hk.Cylinder(0.3, 3.0), (0.3, 0.3, 3.0), 1),
         pytest.param(_WALLS & hk.Cylinder(10.0, 10.0), (10.0,) * 3, None, marks=pytest.mark.slow),
@@ -245,7 +245,7 @@ def _volume(part: hk.Solid, half: tuple[float, float, float], step: float) -> fl
     ids=["Schwarz P", "gyroid", "gyroid of 20 mm"],
 )  # fmt: skip
 def test_cells_are_as_small_as_a_lattice_needs(
-    part: hk.Solid, half: tuple[float, float, float], bodies: int | None
+    part: hk.solids.Solid, half: tuple[float, float, float], bodies: int | None
 ):
     """A 24th of these parts is a third of a cell or half of it, where walls are missed, or found
     in pieces, the wrong volume and all."""
@@ -260,7 +260,7 @@ def test_cells_are_as_small_as_a_lattice_needs(
 
 @pytest.mark.slow
 def test_a_spacing_that_is_asked_for_is_not_changed_for_waves():
-    part = hk.solid(hk.SchwarzP(1.0), below=0.0) & hk.Cuboid((0.3, 0.3, 3.0))
+    part = hk.solid(hk.fields.SchwarzP(1.0), below=0.0) & hk.Cuboid((0.3, 0.3, 3.0))
     assert hk.mesh(part, cell_size=0.25, tolerance=2e-2).metadata["harnack"]["spacing"] == 0.25
     with pytest.raises(TriangleLimitError, match="max_triangles"):
         hk.mesh(part, tolerance=2e-2, max_triangles=500)

@@ -35,13 +35,13 @@ def test_an_octahedron_of_absolute_values() -> None:
 
 @pytest.mark.slow
 def test_smooth_surfaces_have_no_creases() -> None:
-    mesh = hk.mesh(hk.Gyroid(1.0), 0.2, clip=BOX, tolerance=4e-3)
+    mesh = hk.mesh(hk.Gyroid(1.0), level=0.2, clip=BOX, tolerance=4e-3)
     assert mesh.metadata["harnack"]["creases"] == 0
 
 
 @pytest.mark.slow
 def test_a_cut_ball_as_one_greatest_value() -> None:
-    field = hk.expression(lambda x, y, z: hk.maximum(x * x + y * y + z * z - 0.81, z - 0.3))
+    field = hk.expression(lambda x, y, z: hk.math.maximum(x * x + y * y + z * z - 0.81, z - 0.3))
     mesh = hk.mesh(field, solid=BELOW, clip=BOX, tolerance=4e-3)
     cap = math.pi * 0.6**2 * (2.7 - 0.6) / 3  # of height 0.6 of a ball of radius 0.9
     assert mesh.is_watertight
@@ -69,7 +69,7 @@ def test_walls_far_thinner_than_cells_are_refused(half: float) -> None:
 
 @pytest.mark.slow
 def test_knife_edges_are_noticed() -> None:
-    edge = hk.expression(lambda x, y, z: hk.maximum(z - 0.05 * x, -z - 0.05 * x) + 0 * y)
+    edge = hk.expression(lambda x, y, z: hk.math.maximum(z - 0.05 * x, -z - 0.05 * x) + 0 * y)
     with pytest.raises(hk.MeshingError, match="make the solid of smooth parts"):
         hk.mesh(edge, solid=BELOW, clip=BOX, tolerance=4e-3, cell_size=1 / 12)
     above = hk.solid(hk.expression(lambda x, y, z: z - 0.05 * x + 0 * y), below=0)
@@ -81,18 +81,22 @@ def test_knife_edges_are_noticed() -> None:
 def test_a_function_without_a_slope_is_refused_with_a_reason() -> None:
     """It said that the tolerance takes 3e302 triangles."""
     with pytest.raises(hk.MeshingError, match="Julia is constant at"):
-        hk.mesh(hk.Julia(iterations=6), tolerance=1e-2)
+        hk.mesh(hk.solids.Julia(iterations=6), tolerance=1e-2)
 
 
 @pytest.mark.slow
 def test_slices_of_morphs() -> None:
     torus, ball = torus_mesh(0.75, 0.3, 24, 12), bumpy_sphere(2)
-    mesh = hk.mesh(hk.Morph(torus, ball, gap=0.2, w=0.02), solid=(0.5, math.inf), tolerance=1e-2)
+    mesh = hk.mesh(
+        hk.fields.Morph(torus, ball, gap=0.2, w=0.02), level=0.5, side="above", tolerance=1e-2
+    )
     assert mesh.is_watertight
     assert mesh.metadata["harnack"]["euler_characteristic"] == 0  # a torus still
-    off = hk.Morph(torus, ball, gap=0.2, w=0.02).value(mesh.vertices, precision="double") - 0.5
+    off = (
+        hk.fields.Morph(torus, ball, gap=0.2, w=0.02).value(mesh.vertices, precision="double") - 0.5
+    )
     assert np.abs(off).max() < 0.05
-    end = hk.mesh(hk.Morph(torus, ball, gap=0.2, w=0.0), tolerance=1e-2)  # the mesh itself
+    end = hk.mesh(hk.fields.Morph(torus, ball, gap=0.2, w=0.0), tolerance=1e-2)  # the mesh itself
     assert end.is_watertight
     assert end.metadata["harnack"]["euler_characteristic"] == 0
 
@@ -103,7 +107,7 @@ def test_slices_of_morphs() -> None:
     [((1.0, 1.0), (1.0, 1.0, 1.0), 4 / 3), ((2.0, 2.0), (1.0, 0.5, 0.3), 0.2 * math.pi)],
 )
 def test_superellipsoids(powers: Any, radii: Any, volume: float) -> None:
-    mesh = hk.mesh(hk.Superellipsoid(powers, radii), tolerance=4e-3)
+    mesh = hk.mesh(hk.solids.Superellipsoid(powers, radii), tolerance=4e-3)
     assert mesh.is_watertight
     assert mesh.metadata["harnack"]["euler_characteristic"] == 2
     assert mesh.volume == pytest.approx(volume, rel=6e-3)
@@ -112,11 +116,11 @@ def test_superellipsoids(powers: Any, radii: Any, volume: float) -> None:
 def test_level_curves_are_walls_and_angles_are_refused() -> None:
     """Re log((z-1)/(z+1)) = 0 is the plane x = 0; the imaginary part is an angle."""
     charges = {1: 1, -1: -1}
-    mesh = hk.mesh(hk.LevelCurves("log", argument=charges), tolerance=4e-3)
+    mesh = hk.mesh(hk.fields.LevelCurves("log", argument=charges), tolerance=4e-3)
     assert np.abs(mesh.vertices[:, 0]).max() < 1e-9
     assert mesh.area == pytest.approx(4 * 0.5, rel=1e-6)
     with pytest.raises(TypeError, match="is angle-valued, and mesh"):
-        hk.mesh(hk.LevelCurves("log", "imag", argument=charges))
+        hk.mesh(hk.fields.LevelCurves("log", "imag", argument=charges))
 
 
 def test_dipoles_of_a_sphere() -> None:
@@ -126,7 +130,7 @@ def test_dipoles_of_a_sphere() -> None:
     round_ = np.sqrt(1 - height**2)
     points = np.column_stack([round_ * np.cos(turn), round_ * np.sin(turn), height])
     field = hk.DipolePotential(points, points)
-    mesh = hk.mesh(field, solid=(2 * math.pi, math.inf), tolerance=4e-2)
+    mesh = hk.mesh(field, level=2 * math.pi, side="above", tolerance=4e-2)
     assert mesh.is_watertight
     assert mesh.metadata["harnack"]["euler_characteristic"] == 2
     assert mesh.volume == pytest.approx(4 / 3 * math.pi, rel=0.03)
@@ -135,8 +139,8 @@ def test_dipoles_of_a_sphere() -> None:
 @pytest.mark.slow
 def test_circles_are_refused_and_their_polygons_are_not() -> None:
     with pytest.raises(TypeError, match=r"give circle\.polygon"):
-        hk.mesh(hk.SolidAngle([hk.Circle(1.0)]))
-    ring = hk.Circle(1.0).polygon(48)
+        hk.mesh(hk.SolidAngle([hk.geometry.Circle(1.0)]))
+    ring = hk.geometry.Circle(1.0).polygon(48)
     mesh = hk.mesh(hk.SolidAngle([ring]), tolerance=4e-3)
     assert mesh.area == pytest.approx(24 * math.sin(math.pi / 24), rel=1e-6)
 

@@ -17,7 +17,7 @@ from harnack.tree.empty_space import BoxCells, nonempty_cells, refine_cells
 
 def test_periodic_surfaces_end_at_the_faces_of_a_box() -> None:
     box = hk.Box((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
-    mesh = hk.mesh(hk.Gyroid(cell=1.0), 0.2, clip=box, tolerance=4e-3, cell_size=0.09)
+    mesh = hk.mesh(hk.Gyroid(cell=1.0), level=0.2, clip=box, tolerance=4e-3, cell_size=0.09)
     rim = mesh.vertices[np.unique(mesh.metadata["harnack"]["boundary"])]
     assert (np.abs(np.abs(rim).max(axis=1) - 0.5) < 1e-12).all()
     assert np.abs(mesh.vertices).max() <= 0.5
@@ -44,16 +44,19 @@ def test_a_level_set_is_meshed_as_it_is_traced() -> None:
     box, half = hk.Box((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3)), hk.HalfSpace((0, 0, 1), 0.1)
     coarse: dict[str, Any] = {"tolerance": 2e-2, "cell_size": 0.1}
     field = hk.Gyroid(1.0)
-    made = hk.mesh(hk.level_set(field, 0.2, clip=box, section=half), **coarse)
-    same = hk.mesh(field, 0.2, clip=box, section=half, **coarse)
+    made = hk.mesh(hk.Surface(field, 0.2, clip=box, section=half), **coarse)
+    same = hk.mesh(field, level=0.2, clip=box, section=half, **coarse)
     assert (made.vertices == same.vertices).all()
-    solid = hk.level_set(field, solid=(-0.2, 0.2), clip=box)
+    solid = hk.Surface(field, level=(-0.2, 0.2), side="between", clip=box)
     wall = hk.mesh(solid, **coarse)
-    assert (wall.vertices == hk.mesh(field, solid=(-0.2, 0.2), clip=box, **coarse).vertices).all()
+    assert (
+        wall.vertices
+        == hk.mesh(field, level=(-0.2, 0.2), side="between", clip=box, **coarse).vertices
+    ).all()
     assert hk.mesh(solid, level=0.1, **coarse).metadata["harnack"]["level"] == 0.1
-    ball = hk.mesh(hk.level_set(hk.Sphere(0.8), 0.1), tolerance=2e-2)  # a `Solid`
+    ball = hk.mesh(hk.Surface(hk.Sphere(0.8), 0.1), tolerance=2e-2)  # a `Solid`
     assert ball.volume == pytest.approx(4 / 3 * math.pi * 0.9**3, rel=0.05)
-    several = hk.level_set(field, [-0.2, 0.2], clip=box)
+    several = hk.Surface(field, [-0.2, 0.2], clip=box)
     with pytest.raises(ValueError, match=r"of a Gyroid has 2 levels \(-0.2, 0.2\).*level=-0.2"):
         hk.mesh(several)
     assert hk.mesh(several, level=0.2, **coarse).metadata["harnack"]["level"] == 0.2
@@ -62,7 +65,7 @@ def test_a_level_set_is_meshed_as_it_is_traced() -> None:
 @pytest.mark.parametrize(
     ("field", "arguments", "message"),
     [
-        (hk.Plane(), {}, "give clip=harnack.Box"),
+        (hk.solids.Plane(), {}, "give clip=harnack.Box"),
         (hk.Gyroid(1.0), {"level": 9.0}, "no surface has level"),
         (hk.Sphere(0.5), {"clip": hk.Box((1, 1, 1), (2, 2, 2))}, "is empty"),
         (
@@ -78,7 +81,7 @@ def test_a_level_set_is_meshed_as_it_is_traced() -> None:
         ),
         (hk.SolidAngle(example_curves.wavy_polygon(12)), {"tolerance": 0.0}, "tolerance"),
         (hk.SolidAngle(example_curves.wavy_polygon(12)), {"spacing": -1.0}, "spacing"),
-        (hk.SolidAngle(hk.Circle(1.0)), {}, "circle.polygon"),
+        (hk.SolidAngle(hk.geometry.Circle(1.0)), {}, "circle.polygon"),
         ("curve", {}, "a harnack field is needed"),
     ],
 )

@@ -61,7 +61,7 @@ def test_between_two_levels_that_are_the_same_triangles_is_nothing() -> None:
     cube = trimesh.creation.box((1.0, 1.0, 1.0))
     field = hk.WindingNumber(cube.vertices, cube.faces)
     with pytest.raises(hk.MeshingError, match="no thickness"):
-        hk.mesh(field, solid=(0.25, 0.75), tolerance=1e-2)
+        hk.mesh(field, level=(0.25, 0.75), side="between", tolerance=1e-2)
 
 
 def strip(turns: int) -> trimesh.Trimesh:

@@ -88,12 +88,12 @@ def test_thin_walls_beds_and_units() -> None:
 
 
 def test_thickness_is_that_of_plates_balls_and_wedges() -> None:
-    plate = hk.wall_thickness(FINE_PLATE)
+    plate = hk.printing.wall_thickness(FINE_PLATE)
     assert np.unique(plate.values.round(5)).tolist() == [2.0, 10.0, 20.0]
     assert plate.thinnest == pytest.approx(2.0, abs=1e-5)
     assert (np.abs(plate.thin_locations(3.0)[:, 2]) == 1.0).all()
     # The widest ball within an inscribed polyhedron of the unit sphere.
-    ball = hk.wall_thickness(example_meshes.icosphere(3))
+    ball = hk.printing.wall_thickness(example_meshes.icosphere(3))
     assert 1.98 < ball.thinnest <= ball.values.max() < 2.0
     # A wedge of half-angle a: the ball that touches one side at a distance s from the edge touches
     # the other as well if its radius is s tan a.
@@ -101,7 +101,7 @@ def test_thickness_is_that_of_plates_balls_and_wedges() -> None:
     wedge = trimesh.convex.convex_hull(half)
     for _ in range(4):
         wedge = wedge.subdivide()
-    found = hk.wall_thickness(wedge)
+    found = hk.printing.wall_thickness(wedge)
     center = wedge.triangles_center
     side = (wedge.face_normals[:, 1] < -0.9) & (center[:, 0] > 3)
     side &= np.abs(center[:, 2]) < 0.6  # beside the ends the ray's length is given
@@ -111,12 +111,12 @@ def test_thickness_is_that_of_plates_balls_and_wedges() -> None:
 
 def test_thickness_of_a_solid_is_that_of_its_mesh() -> None:
     shell = hk.Sphere(1.0) - hk.Sphere(0.8)
-    found = hk.wall_thickness(shell, tolerance=4e-3)
+    found = hk.printing.wall_thickness(shell, tolerance=4e-3)
     assert found.values.min() > 0.2 - 0.02
     colored = found.to_colored_mesh(0.1, 0.3)
     assert len(colored.visual.face_colors) == len(found.values)
     with pytest.raises(TypeError, match="tolerance is for solids"):
-        hk.wall_thickness(PLATE, tolerance=1e-3)
+        hk.printing.wall_thickness(PLATE, tolerance=1e-3)
 
 
 def test_the_command_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -184,7 +184,7 @@ def test_parts_in_the_material_of_others_are_wrong() -> None:
 def test_thickness_knows_no_unit(scale: float) -> None:
     # Rays ended at once where a mesh was less than 1 long, and it was said to be thin all over.
     plate = (FINE_PLATE.vertices * scale, FINE_PLATE.faces)
-    found = hk.wall_thickness(plate)
+    found = hk.printing.wall_thickness(plate)
     assert found.thinnest == pytest.approx(2.0 * scale, rel=1e-5)
     assert np.median(found.values) > 2.5 * scale
 
@@ -194,7 +194,7 @@ def test_foils_are_thin(height: float) -> None:
     # Rays that began beyond the other side ran into the open: 0.0067 and 32 were found.
     foil = trimesh.creation.box((20.0, 10.0, height))
     is_flat = np.abs(foil.face_normals[:, 2]) > 0.5
-    assert hk.wall_thickness(foil).values[is_flat].max() < 3.3e-5
+    assert hk.printing.wall_thickness(foil).values[is_flat].max() < 3.3e-5
 
 
 @pytest.mark.parametrize("bed", [220, (220, 220), (220, 220, 0), "abc"])

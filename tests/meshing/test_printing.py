@@ -79,7 +79,7 @@ def test_vertices_where_faces_are_no_manifold_are_found() -> None:
 @pytest.fixture(scope="module")
 def walls() -> Any:
     """Gyroid walls |g| < 0.3 in a box."""
-    return hk.mesh(hk.Gyroid(1.0), solid=(-0.3, 0.3), clip=BOX, tolerance=2e-3)
+    return hk.mesh(hk.Gyroid(1.0), level=(-0.3, 0.3), side="between", clip=BOX, tolerance=2e-3)
 
 
 def gyroid(x: np.ndarray) -> np.ndarray:
@@ -112,13 +112,13 @@ def test_solids_are_given_by_levels_as_they_are_drawn() -> None:
     """The same part by `solid=`, by `hk.solid`, and by the domain in place of the clip."""
     settings: dict[str, Any] = {"tolerance": 4e-3}
     box = hk.Box((-0.4, -0.4, -0.4), (0.4, 0.4, 0.4))
-    field = hk.SchwarzP(1.0, domain=box)
-    one = hk.mesh(field, solid=(-0.2, 0.2), **settings)
-    other = hk.mesh(hk.solid(hk.SchwarzP(1.0), between=(-0.2, 0.2)), clip=box, **settings)
+    field = hk.fields.SchwarzP(1.0, domain=box)
+    one = hk.mesh(field, level=(-0.2, 0.2), side="between", **settings)
+    other = hk.mesh(hk.solid(hk.fields.SchwarzP(1.0), between=(-0.2, 0.2)), clip=box, **settings)
     assert is_part(one)
     assert one.volume == pytest.approx(other.volume, rel=1e-9)
-    inside = hk.mesh(field, solid=(-math.inf, -0.2), **settings)
-    outside = hk.mesh(field, solid=(0.2, math.inf), **settings)
+    inside = hk.mesh(field, level=-0.2, side="below", **settings)
+    outside = hk.mesh(field, level=0.2, side="above", **settings)
     assert is_part(inside)
     assert is_part(outside)
     assert one.volume + inside.volume + outside.volume == pytest.approx(0.8**3, rel=1e-6)
@@ -140,7 +140,7 @@ def lens(r: float, s: float, d: float) -> float:
          4 / 3 * math.pi * 0.512 - lens(0.8, 0.5, 0.6)),
         (hk.Sphere(0.8) | hk.Sphere(0.5).translated((0.6, 0, 0)),
          4 / 3 * math.pi * (0.512 + 0.125) - lens(0.8, 0.5, 0.6)),
-        (hk.Sphere(0.8) & ~hk.Plane((0, 0, 1), 0.0), 2 / 3 * math.pi * 0.512),
+        (hk.Sphere(0.8) & ~hk.solids.Plane((0, 0, 1), 0.0), 2 / 3 * math.pi * 0.512),
         (hk.Torus(0.8, 0.2).rotated(20, "x"), 2 * math.pi**2 * 0.8 * 0.04),
     ],
     ids=["ball", "difference", "union", "half", "torus"],
@@ -169,7 +169,7 @@ def test_boxes_are_exact_and_so_are_their_creases() -> None:
     ],
     ids=["moved", "rotated", "scaled"],
 )
-def test_boxes_anywhere_are_twelve_triangles(part: hk.Solid) -> None:
+def test_boxes_anywhere_are_twelve_triangles(part: hk.solids.Solid) -> None:
     mesh = hk.mesh(part)
     assert is_part(mesh)
     assert len(mesh.faces) == 12
@@ -205,7 +205,7 @@ def test_a_thick_seifert_surface_ends_at_the_knot() -> None:
 )
 def test_spheres_that_are_cut_have_the_area_left(clip: Any) -> None:
     """Of a sphere of radius r, a plane at height h leaves 2 pi r (r + h) or 2 pi r (r - h)."""
-    mesh = hk.mesh(hk.Sphere(0.5), solid=False, clip=clip, tolerance=2e-3)
+    mesh = hk.mesh(hk.Sphere(0.5), side="surface", clip=clip, tolerance=2e-3)
     checks.check_manifold(mesh.faces)
     assert clip.padded(1e-12).contains_points(mesh.vertices).all()
     expected = {
@@ -224,7 +224,11 @@ def test_spheres_that_are_cut_have_the_area_left(clip: Any) -> None:
 def test_a_level_without_extent_is_cut_by_the_clip() -> None:
     curve = example_curves.wavy_polygon(32)
     mesh = hk.mesh(
-        hk.SolidAngle(curve), 4 * math.pi, clip=hk.Ball(radius=2.0), tolerance=1e-2, cell_size=0.2
+        hk.SolidAngle(curve),
+        level=4 * math.pi,
+        clip=hk.Ball(radius=2.0),
+        tolerance=1e-2,
+        cell_size=0.2,
     )
     assert np.linalg.norm(mesh.vertices, axis=1).max() <= 2 * (1 + 1e-9)
     rim = mesh.vertices[np.unique(mesh.metadata["harnack"]["boundary"])]
@@ -302,7 +306,7 @@ def test_simplified_parts_are_within_the_tolerance() -> None:
     settings: dict[str, Any] = {"clip": hk.Box((-0.4, -0.4, -0.4), (0.4, 0.4, 0.4))}
     tolerance, size = 1e-2, 0.8
     mesh = hk.mesh(
-        hk.Gyroid(1.0), solid=(0.0, math.inf), simplify=True, tolerance=tolerance, **settings
+        hk.Gyroid(1.0), level=0.0, side="above", simplify=True, tolerance=tolerance, **settings
     )
     assert is_part(mesh)
     assert len(mesh.faces) < 0.7 * mesh.metadata["harnack"]["triangles_before_simplification"]
@@ -367,11 +371,11 @@ def test_cavities_belong_to_the_innermost_shell_around_them() -> None:
         kept(nested((1.0, 0.0, True)))
 
 
-class Holed(hk.FormulaSolid):
+class Holed(hk.solids.FormulaSolid):
     """A sphere that is no number beside its center."""
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        return hk.sqrt(x * x + y * y + z * z - 0.3) - 0.7
+        return hk.math.sqrt(x * x + y * y + z * z - 0.3) - 0.7
 
 
 CURVE = hk.SolidAngle(example_curves.wavy_polygon(12))
@@ -409,7 +413,7 @@ CURVE = hk.SolidAngle(example_curves.wavy_polygon(12))
         (CURVE, {"solid": (1.0, math.inf)}, "angle-valued"),
         (CURVE, {"clip": hk.Ball((9, 9, 9), 1)}, "empty"),
         (CURVE, {"tolerance": 1e-9}, "triangles"),
-        (hk.RiemannSurface("log"), {}, "angle-valued"),
+        (hk.fields.RiemannSurface("log"), {}, "angle-valued"),
         (Holed(), {"clip": BOX}, "no finite value"),
     ],
 )  # fmt: skip

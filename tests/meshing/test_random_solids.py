@@ -18,7 +18,7 @@ Function = Callable[[Any], Any]
 TOLERANCE = 8e-3
 
 
-def primitive(rng: np.random.Generator) -> tuple[hk.Solid, Function]:
+def primitive(rng: np.random.Generator) -> tuple[hk.solids.Solid, Function]:
     """A solid and its own formula: negative inside."""
     kind, r = rng.integers(5), float(rng.uniform(0.3, 0.8))
     if kind == 0:
@@ -43,7 +43,7 @@ def primitive(rng: np.random.Generator) -> tuple[hk.Solid, Function]:
     return hk.solid((x, faces)), lambda p: (p @ normal.T - away).max(axis=1)
 
 
-def random_solid(rng: np.random.Generator) -> tuple[hk.Solid, Function]:
+def random_solid(rng: np.random.Generator) -> tuple[hk.solids.Solid, Function]:
     whole, inside = primitive(rng)
     for _ in range(int(rng.integers(1, 4))):
         part, own = primitive(rng)

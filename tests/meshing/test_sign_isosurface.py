@@ -127,7 +127,7 @@ def test_a_cloud_is_closed_and_near() -> None:
     check(made)
     assert np.abs(np.linalg.norm(made.vertices, axis=1) - 1).max() < 0.02
     half = hk.mesh(
-        hk.DipolePotential(points, points), solid=(2 * math.pi, math.inf), tolerance=4e-3,
+        hk.DipolePotential(points, points), level=2 * math.pi, side="above", tolerance=4e-3,
         cell_size=0.12, section=hk.HalfSpace((0, 0, 1), 0.0),
     )  # fmt: skip
     check(half)
@@ -158,7 +158,7 @@ def test_what_is_refused() -> None:
     with pytest.raises(TypeError, match="no normals to thicken"):
         hk.mesh(field, thickness=0.1)
     with pytest.raises(ValueError, match="solid=True is for solids"):
-        hk.mesh(field, solid=True)
+        hk.mesh(field, side="below")
     with pytest.raises(ValueError, match="level 0 of a winding number"):
         hk.mesh(field, level=0.0)
     with pytest.raises(hk.MeshingError, match="max_triangles"):

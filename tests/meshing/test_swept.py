@@ -63,7 +63,7 @@ def test_revolved_outlines_keep_their_rings() -> None:
     [([(0, 4), (0.5, 4), (1, 3)], 1, False), ([(0, 4), (1, 3), (1.5, 3)], 3, True)],
 )
 def test_threads_keep_their_edges(profile: Any, starts: int, left_handed: bool) -> None:
-    thread = hk.Thread(profile, 2.0, starts, left_handed)
+    thread = hk.solids.Thread(profile, 2.0, starts, left_handed)
     solid = thread & hk.Cylinder(4.5, 5.0)
     mesh = hk.mesh(solid)
     assert mesh.is_watertight
@@ -129,14 +129,14 @@ def test_tubes_of_several_polylines_offset_and_cut() -> None:
     # Two capsules of radius r less what they have in common, 16/3 r^3.
     right = 2 * math.pi * 0.2**2 * (2 + 4 / 3 * 0.2) - 16 / 3 * 0.2**3
     assert grown.volume == pytest.approx(right, rel=6e-3)
-    half = hk.mesh(cross & hk.Plane((0, 0, 1)), tolerance=1e-3)
+    half = hk.mesh(cross & hk.solids.Plane((0, 0, 1)), tolerance=1e-3)
     assert half.volume == pytest.approx(0.5 * hk.mesh(cross, tolerance=1e-3).volume, rel=2e-3)
 
 
 def test_a_bolt_and_its_nut_do_not_meet() -> None:
-    hexagon = hk.outline.regular_polygon(6, 13 / math.sqrt(3))
-    bolt = hk.metric_thread("M8", 12.0, clearance=0.1)
-    nut = hk.Extrusion(hexagon, 6.5) - hk.metric_thread("M8", 8.0, internal=True)
+    hexagon = hk.io.outline.regular_polygon(6, 13 / math.sqrt(3))
+    bolt = hk.solids.metric_thread("M8", 12.0, clearance=0.1)
+    nut = hk.Extrusion(hexagon, 6.5) - hk.solids.metric_thread("M8", 8.0, internal=True)
     meshes = [hk.mesh(one, tolerance=2e-3) for one in (bolt, nut)]
     assert all(one.is_watertight for one in meshes)
     inside = bolt.translated((0.0, 0.0, -2.5)).value(meshes[1].vertices, precision="double")

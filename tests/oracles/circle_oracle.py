@@ -23,7 +23,7 @@ class MixedOracle:
     """The solid angle of polygons and circles, modulo 4 pi, with its gradient."""
 
     loops: Sequence[FloatArray]
-    circles: Sequence[hk.Circle]
+    circles: Sequence[hk.geometry.Circle]
 
     def __call__(self, x: FloatArray) -> OracleValues:
         parts = [circle_values(circle, x) for circle in self.circles]
@@ -36,7 +36,7 @@ class MixedOracle:
                             gradient, smooth)  # fmt: skip
 
 
-def circle_values(circle: hk.Circle, x: FloatArray) -> OracleValues:
+def circle_values(circle: hk.geometry.Circle, x: FloatArray) -> OracleValues:
     """Solid angle at points (n, 3), by the formulas of Paxton (1959) and of a current loop."""
     normal = np.array(circle.normal)
     away = (x - np.array(circle.center)) / circle.radius

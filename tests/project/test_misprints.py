@@ -65,8 +65,8 @@ def test_equation_22_the_inner_cover_is_where_f_is_minus_the_radius() -> None:
 
 def test_equation_29_the_largest_norm_is_of_absolute_values() -> None:
     x, y = -3.0, 1.0
-    assert hk.norm(x, y, p=math.inf) == 3.0 != max(x, y)
-    assert hk.norm(x, y, p=200.0) == pytest.approx(3.0, rel=1e-6)
+    assert hk.math.norm(x, y, p=math.inf) == 3.0 != max(x, y)
+    assert hk.math.norm(x, y, p=200.0) == pytest.approx(3.0, rel=1e-6)
 
 
 @pytest.mark.parametrize(("p", "q"), [(1.0, 4.0), (4.0, 1.2), (1.2, 1.6)])

@@ -44,7 +44,7 @@ def middle(mask: np.ndarray) -> np.ndarray:
 def test_a_position_is_where_the_camera_stands(position: tuple[float, float, float]) -> None:
     """The nearest depth is that of the nearest point; and the surface is in the picture, whole."""
     depth = draw(camera=position, show="depth", size=(96, 72))
-    distance = np.linalg.norm(np.array(position) - hk.closest_points(FIELD, [position])[0])
+    distance = np.linalg.norm(np.array(position) - hk.distance.closest_points(FIELD, [position])[0])
     assert depth.min() == pytest.approx(distance, abs=0.03 * distance)
     hit = np.isfinite(depth)
     assert hit.any()
@@ -309,7 +309,7 @@ def test_a_tube_is_drawn_around_the_curve() -> None:
     bare = np.isfinite(draw(show="depth"))
     thick = np.isfinite(draw(show="depth", boundary=0.1))
     assert thick.sum() > 1.05 * bare.sum()
-    ring = hk.SolidAngle(hk.Circle(1.0, (0, 0, 0), (0, 0, 1)))
+    ring = hk.SolidAngle(hk.geometry.Circle(1.0, (0, 0, 0), (0, 0, 1)))
     camera = hk.Camera(elevation=90, box=hk.Box((-1.2, -1.2, -0.2), (1.2, 1.2, 0.2)))
     areas = [
         np.isfinite(draw(ring, show="depth", camera=camera, size=(96, 96), **rim)).sum()
@@ -425,7 +425,7 @@ def test_options_that_cannot_be(
 def test_pictures_of_numbers_stand_before_a_color(show: str) -> None:
     asked = {"of": "z"} if show == "value" else {}
     picture = hk.render(
-        hk.Sphere(1.0), show=show, backdrop="white", colorbar=True, size=(40, 120),
+        hk.Sphere(1.0), show=show, backdrop="white", color_bar=True, size=(40, 120),
         progress=False, **asked,
     )  # fmt: skip
     assert (picture.srgb[-1, -1] == 255).all()
@@ -444,14 +444,14 @@ def test_titles_of_bars_have_the_letters_of_some_typeface(monkeypatch: pytest.Mo
         face = scales.typeface_for("ψ in Höhe", 12)
         assert bytes(face.getmask("ψ")) != bytes(face.getmask("ö"))
         seen = hk.render(
-            hk.Sphere(1.0), show="depth", colorbar="ψ in Höhe", size=(40, 30), progress=False
+            hk.Sphere(1.0), show="depth", color_bar="ψ in Höhe", size=(40, 30), progress=False
         )
         assert seen.srgb.shape[1] > 40
     monkeypatch.setattr(scales, "_TYPEFACES", ())
     with pytest.raises(ValueError, match=r"no typeface .* all letters of 'über 4π'"):
-        hk.render(hk.Sphere(1.0), show="depth", colorbar="über 4π")
+        hk.render(hk.Sphere(1.0), show="depth", color_bar="über 4π")
     with pytest.raises(ValueError, match="one line of letters"):
-        hk.render(hk.Sphere(1.0), show="depth", colorbar="a\nb")
+        hk.render(hk.Sphere(1.0), show="depth", color_bar="a\nb")
 
 
 @pytest.mark.parametrize(("low", "high"), [(-0.953, 0.9999), (-0.7767, 0.9999)])

@@ -65,7 +65,7 @@ def chords(radius: float = 1.0) -> np.ndarray:
 
 @pytest.mark.parametrize("confirm", [False, True])
 def test_a_ball_absorbs_light_by_the_law_of_beer_and_lambert(confirm: bool) -> None:
-    image, chord = drawn(ball(1.0, confirm=confirm)), chords()
+    image, chord = drawn(ball(1.0, require_crossing=confirm)), chords()
     expected = SKY * TINT ** chord[..., None]
     assert 0.2 < (chord > 0.1).mean() < 0.7
     np.testing.assert_allclose(image[chord > 0.1], expected[chord > 0.1], rtol=3e-3)
@@ -87,7 +87,7 @@ def test_light_paths_lose_the_same_light() -> None:
 
 
 def test_walls_of_a_shell_absorb_and_its_hollow_does_not() -> None:
-    image = drawn(ball(1.0, solid=(-0.4, 0.0)))
+    image = drawn(ball(1.0, level=(-0.4, 0.0), side="between"))
     wall = (chords() - chords(0.6))[..., None]
     inside = (wall[..., 0] > 0.1) & (np.abs(chords(0.6) - 0.2) > 0.2)
     np.testing.assert_allclose(image[inside], (SKY * TINT**wall)[inside], rtol=1e-2)

@@ -32,7 +32,7 @@ def orange(picture: np.ndarray) -> np.ndarray:
 
 @pytest.mark.slow
 def test_a_turntable_goes_around_once(tmp_path: Path) -> None:
-    hk.animate(FIELD, tmp_path / "a.gif", turn=360, frames=6, **SMALL)
+    hk.animate(FIELD, tmp_path / "a.gif", orbit=360, frames=6, **SMALL)
     film = pictures(tmp_path / "a.gif")
     assert len(film) == 6
     assert film[0].shape == (36, 48, 3)
@@ -121,9 +121,9 @@ def test_nothing_is_compiled_after_the_second_picture(show: str, tmp_path: Path)
         return hk.SolidAngle(vertices)
 
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        hk.animate(moved, tmp_path / "a.gif", frames=3, turn=40, show=show, **SMALL)
+        hk.animate(moved, tmp_path / "a.gif", frames=3, orbit=40, show=show, **SMALL)
         dr.kernel_history_clear()
-        hk.animate(moved, tmp_path / "a.gif", frames=4, turn=50, show=show, **SMALL)
+        hk.animate(moved, tmp_path / "a.gif", frames=4, orbit=50, show=show, **SMALL)
         kernels = dr.kernel_history((dr.KernelType.JIT,))
     assert sum(not one["cache_hit"] or one["cache_disk"] for one in kernels) == 0
 
@@ -132,7 +132,7 @@ def test_nothing_is_compiled_after_the_second_picture(show: str, tmp_path: Path)
 def test_a_film_in_mp4(tmp_path: Path) -> None:
     av = pytest.importorskip("av")
     hk.animate(
-        FIELD, tmp_path / "a.mp4", frames=5, fps=12.5, turn=90, **{**SMALL, "size": (49, 37)}
+        FIELD, tmp_path / "a.mp4", frames=5, fps=12.5, orbit=90, **{**SMALL, "size": (49, 37)}
     )
     with av.open(str(tmp_path / "a.mp4")) as film:
         frames = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
@@ -173,7 +173,7 @@ def test_what_is_the_same_for_all_pictures_is_no_function(name: str, tmp_path: P
 @pytest.mark.parametrize("name", ["a.gif", "a.mp4"])
 def test_films_have_room_for_color_bars(name: str, tmp_path: Path) -> None:
     settings = {"frames": 2, "show": "value", "of": "z", "colorbar": True}
-    hk.animate(FIELD, tmp_path / name, turn=90, **{**SMALL, **settings})
+    hk.animate(FIELD, tmp_path / name, orbit=90, **{**SMALL, **settings})
     av = pytest.importorskip("av")
     with av.open(str(tmp_path / name)) as film:
         frame = next(film.decode(video=0)).to_ndarray(format="rgb24")
@@ -216,7 +216,7 @@ def test_transparent_films_keep_their_colors(tmp_path: Path) -> None:
     """Found by a user: they had a hundred colors a frame, and bands."""
     hk.animate(
         hk.Sphere(1.0), tmp_path / "a.gif", backdrop="transparent", frames=1, size=(96, 72),
-        turn=90, progress=False,
+        orbit=90, progress=False,
     )  # fmt: skip
     with Image.open(tmp_path / "a.gif") as film:
         frame = np.array(film.convert("RGBA"))

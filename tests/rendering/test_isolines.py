@@ -57,7 +57,7 @@ def test_contour_lines_of_a_sphere_are_as_wide_at_its_equator_as_near_its_poles(
 def test_width_does_not_depend_on_how_steep_the_function_is() -> None:
     points, normals = around_cylinder(100_000)
     width = 0.02
-    lines = hk.Isolines(lambda x, y, z: hk.exp(3 * z), np.exp([-3.0, 0.0, 4.5]), width=width)
+    lines = hk.Isolines(lambda x, y, z: hk.math.exp(3 * z), np.exp([-3.0, 0.0, 4.5]), width=width)
     away = np.abs(points[:, 2:] - np.array([-1.0, 0.0, 1.5])).min(axis=1)
     check_distances(lines, points, normals, away, width)
 
@@ -82,11 +82,11 @@ class Turn(hk.Field):
 
     period = 2 * np.pi
 
-    def evaluate(self, p: Any) -> hk.Sample:
+    def evaluate(self, p: Any) -> hk.fields.Sample:
         import drjit as dr
 
         square = p.x * p.x + p.y * p.y
-        return hk.Sample(dr.atan2(p.y, p.x), type(p)(-p.y, p.x, 0) / square, ())
+        return hk.fields.Sample(dr.atan2(p.y, p.x), type(p)(-p.y, p.x, 0) / square, ())
 
 
 @pytest.mark.parametrize(

@@ -146,14 +146,14 @@ def test_nothing_is_lost_and_nothing_is_said_with_enough_steps() -> None:
 
 @pytest.mark.slow
 def test_settings_of_a_level_set_are_replaced() -> None:
-    surface = hk.level_set(POLYGON, 2.5 * math.pi, tolerance=1e-3)
+    surface = hk.traced_surface(POLYGON, 2.5 * math.pi, tolerance=1e-3)
     replaced = draw([surface], show="depth", level=math.pi)
-    expected = draw(hk.level_set(POLYGON, math.pi, tolerance=1e-3), show="depth")
+    expected = draw(hk.traced_surface(POLYGON, math.pi, tolerance=1e-3), show="depth")
     np.testing.assert_array_equal(replaced, expected)
-    solid = hk.level_set(GYROID, solid=(-0.3, 0.3))
+    solid = hk.Surface(GYROID, level=(-0.3, 0.3), side="between")
     half = hk.HalfSpace((0, 0, 1), 0.0)
     clipped = draw(solid, show="depth", clip=half)
-    expected = draw(hk.level_set(GYROID, solid=(-0.3, 0.3), clip=half), show="depth")
+    expected = draw(hk.Surface(GYROID, level=(-0.3, 0.3), side="between", clip=half), show="depth")
     np.testing.assert_array_equal(clipped, expected)
     assert not np.array_equal(clipped, draw(solid, show="depth"))
 
@@ -161,14 +161,14 @@ def test_settings_of_a_level_set_are_replaced() -> None:
 @pytest.mark.few(1)
 @pytest.mark.parametrize("name", MATERIALS)
 def test_every_material_draws(name: str) -> None:
-    image = draw(GYROID, material=name, solid=(-0.3, 0.3))
+    image = draw(GYROID, material=name, level=(-0.3, 0.3), side="between")
     assert np.isfinite(image).all()
     assert 0.1 < image.mean() < 1.2
 
 
 @pytest.mark.slow
 def test_materials_are_told_apart_and_one_may_be_given_for_each_surface() -> None:
-    pair = [hk.level_set(GYROID, level) for level in (-0.5, 0.5)]
+    pair = [hk.Surface(GYROID, level) for level in (-0.5, 0.5)]
     gold, mixed = draw(pair, material="gold"), draw(pair, material=["gold", "porcelain"])
     assert np.abs(gold - mixed).mean() > 0.01
     red, same = draw(pair, material="red"), draw(pair, material=(1, 0, 0))
@@ -187,7 +187,7 @@ def test_materials_are_told_apart_and_one_may_be_given_for_each_surface() -> Non
 def test_levels_of_one_field_may_have_materials_of_their_own() -> None:
     levels, names = [-0.5, 0.5], ["red", "blue"]
     one = draw(GYROID, level=levels, material=names, show="shaded", tolerance=1e-4)
-    pair = [hk.level_set(GYROID, level, tolerance=1e-4) for level in levels]
+    pair = [hk.traced_surface(GYROID, level, tolerance=1e-4) for level in levels]
     np.testing.assert_array_equal(one, draw(pair, material=names, show="shaded"))
     with pytest.raises(ValueError, match=r"a surface is drawn twice.*level=\[a, b\]"):
         draw([GYROID, GYROID], level=levels, material=names)
@@ -205,7 +205,7 @@ def test_levels_of_one_field_may_have_materials_of_their_own() -> None:
 @pytest.mark.slow
 def test_parts_of_one_surface_may_be_drawn_as_several() -> None:
     halves = [hk.Box((0, -1, -1), (1, 1, 1)), hk.Box((-1, -1, -1), (0, 1, 1))]
-    parts = [hk.level_set(hk.Sphere(0.9), clip=half) for half in halves]
+    parts = [hk.Surface(hk.Sphere(0.9), clip=half) for half in halves]
     image = draw(parts, material=["red", "blue"], show="shaded")
     assert (image[..., 0] > 2 * image[..., 2]).any()
     assert (image[..., 2] > 2 * image[..., 0]).any()
@@ -272,8 +272,8 @@ def test_surfaces_stand_on_the_ground() -> None:
         ({"what": 3}, "draw a field"),
         ({"what": {"type": "scene"}}, "no sensor"),
         ({"what": {"type": "scene"}, "level": 3.0}, "as it is"),
-        ({"what": hk.level_set(POLYGON, clip=hk.Ball((9, 9, 9), 0.1))}, "nothing is to be seen"),
-        ({"what": hk.level_set(POLYGON, 0.0)}, "infinity"),
+        ({"what": hk.Surface(POLYGON, clip=hk.Ball((9, 9, 9), 0.1))}, "nothing is to be seen"),
+        ({"what": hk.Surface(POLYGON, 0.0)}, "infinity"),
         ({"material": "glass"}, "solid"),
     ],
 )

@@ -138,7 +138,7 @@ def test_solid_sphere_looks_like_mitsubas(name: str) -> None:
         "lamp": lamp(),
         "ground": {"type": "rectangle", "to_world": T().translate([0, 0, -1]).scale(6)},
     }
-    ours = mitsuba_shape(Sphere(), bsdf=BSDFS[name], solid=(-math.inf, 0.0))
+    ours = mitsuba_shape(Sphere(), bsdf=BSDFS[name], level=0.0, side="below")
     theirs = {"type": "sphere", "bsdf": BSDFS[name]}
     a = drawn({**surroundings, "ball": ours}, spp=256, size=24)
     b = drawn({**surroundings, "ball": theirs}, spp=256, size=24)
@@ -241,7 +241,7 @@ def test_reflections_show_both_ways() -> None:
     seen = drawn(
         {
             "sky": sky,
-            "mirror": mitsuba_shape(Sphere(), bsdf=mirror, solid=(-math.inf, 0.0)),
+            "mirror": mitsuba_shape(Sphere(), bsdf=mirror, level=0.0, side="below"),
             "red": {"type": "sphere", "radius": 2, "to_world": behind, "bsdf": red()},
         },
         **view,
@@ -265,7 +265,7 @@ def test_nearer_of_two_surfaces_hides_the_other_in_either_order() -> None:
 def test_to_world_moves_turns_and_scales() -> None:
     to_world = T().translate([0.3, 0.2, -0.1]).rotate([0.6, 0.0, 0.8], 40).scale(0.8)
     grid = hk.Gyroid(1.0, domain=hk.Ball(radius=1.0))
-    moved = mitsuba_shape(grid, to_world=to_world, solid=(-0.3, 0.3))
+    moved = mitsuba_shape(grid, to_world=to_world, level=(-0.3, 0.3), side="between")
     view = AovTask.of(mi, *_scene_and_sensor(moved)).look()
     inverse = np.linalg.inv(np.array(to_world.matrix, dtype=float).reshape(4, 4))
     points = _positions(view) @ inverse[:3, :3].T + inverse[:3, 3]
@@ -312,7 +312,7 @@ def _positions(view: Any) -> np.ndarray:
         (lambda: mitsuba_shape(GYROID, to_world=np.zeros((4, 4))), "one scale"),
         (lambda: mitsuba_shape(GYROID, to_world=np.full((4, 4), np.nan)), "finite"),
         (lambda: mitsuba_shape(GYROID, bsdf={"type": "rectangle"}), "BSDF"),
-        (lambda: mitsuba_shape(hk.level_set(GYROID), level=0.1), "level"),
+        (lambda: mitsuba_shape(hk.Surface(GYROID), level=0.1), "level"),
         (lambda: mi.load_dict({"type": "harnack_path", "max_depth": -2}), "max_depth"),
     ],
 )

@@ -125,7 +125,7 @@ def test_mitsubas_sphere_is_drawn_as_ours() -> None:
 def test_two_colors_are_for_the_two_sides() -> None:
     material = Material(diffuse(0.8, 0.1, 0.1), diffuse(0.1, 0.1, 0.8))
     images = [
-        draw(hk.level_set(Sphere(sign), tolerance=1e-4), material=material) for sign in (1, -1)
+        draw(hk.traced_surface(Sphere(sign), tolerance=1e-4), material=material) for sign in (1, -1)
     ]
     middle = [image[18:22, 28:32].mean(axis=(0, 1)) for image in images]
     assert middle[0][0] > 4 * middle[0][2]
@@ -169,9 +169,9 @@ def test_samples_of_a_pixel_are_spread(count: int) -> None:
 @pytest.mark.slow
 def test_surfaces_keep_their_own_materials_and_the_nearer_hides_the_other() -> None:
     gyroid = hk.Gyroid(1.0, domain=hk.Ball(radius=1.0))
-    levels = [hk.level_set(gyroid, level, tolerance=1e-3) for level in (-0.5, 0.5)]
+    levels = [hk.traced_surface(gyroid, level, tolerance=1e-3) for level in (-0.5, 0.5)]
     two = draw(levels, material=["plastic", "two-tone"])
-    one = draw([hk.level_set(gyroid, [-0.5, 0.5], tolerance=1e-3)], material="plastic")
+    one = draw([hk.traced_surface(gyroid, [-0.5, 0.5], tolerance=1e-3)], material="plastic")
     assert np.abs(two - one).mean() > 0.01
     swapped = draw(levels[::-1], material=["two-tone", "plastic"])
     np.testing.assert_allclose(two, swapped, atol=2e-2)
@@ -193,7 +193,7 @@ def test_what_mends_a_mesh_is_tinted() -> None:
 def test_metals_and_glass_have_a_color() -> None:
     gyroid = hk.Gyroid(1.0, domain=hk.Ball(radius=1.0))
     for name in ("gold", "glass"):
-        image = draw(gyroid, solid=(-0.4, 0.4), material=name, spp=1)
+        image = draw(gyroid, level=(-0.4, 0.4), side="between", material=name, spp=1)
         middle = image[16:24, 24:36]
         assert 0.05 < middle.mean() < 0.9
         if name == "gold":
@@ -313,7 +313,7 @@ def test_solids_have_the_color_of_their_outside_without_being_asked() -> None:
     """Found by a user: the outside of a `Solid` was tinted like the inside of an open surface."""
     small = {"material": "gold", "show": "shaded", "size": (40, 30), "progress": False}
     plain = hk.render(hk.Sphere(1.0), **small)
-    asked = hk.render(hk.Sphere(1.0), solid=(-math.inf, 0), **small)
+    asked = hk.render(hk.Sphere(1.0), level=0, side="below", **small)
     np.testing.assert_allclose(plain[15, 20], asked[15, 20], rtol=2e-2)
 
 
@@ -321,5 +321,5 @@ def test_solids_have_the_color_of_their_outside_without_being_asked() -> None:
 def test_solids_may_be_of_glass() -> None:
     small = {"show": "shaded", "size": (40, 30), "progress": False}
     glass = hk.render(hk.Sphere(1.0), material="cobalt", **small)
-    asked = hk.render(hk.Sphere(1.0), material="cobalt", solid=(-math.inf, 0), **small)
+    asked = hk.render(hk.Sphere(1.0), material="cobalt", level=0, side="below", **small)
     np.testing.assert_array_equal(glass, asked)

@@ -27,7 +27,7 @@ def gyroid(p: np.ndarray) -> np.ndarray:
 
 def solid_of(low: float, high: float, volume: Volume) -> CappedSolid:
     field = hk.Gyroid(1.0, domain=volume)
-    surface = hk.level_set(field, solid=(low, high), tolerance=TOLERANCE)
+    surface = hk.traced_surface(field, level=(low, high), side="between", tolerance=TOLERANCE)
     return CappedSolid.of(surface, surface.prepare(BACKEND))
 
 
@@ -70,7 +70,7 @@ def dense_crossings(
     [
         pytest.param(BALL, marks=pytest.mark.slow),
         pytest.param(BOX, marks=pytest.mark.slow),
-        hk.VolumeIntersection((BALL, BOX)),
+        hk.geometry.VolumeIntersection((BALL, BOX)),
     ],
 )
 @pytest.mark.parametrize(("low", "high"), [(-0.4, 0.3), (-math.inf, 0.1), (0.2, math.inf)])
@@ -143,7 +143,7 @@ def test_a_ray_that_slipped_through_a_thin_part_crosses_back_at_once() -> None:
 
 
 def test_only_solids_are_solid() -> None:
-    surface = hk.level_set(hk.Gyroid())
+    surface = hk.Surface(hk.Gyroid())
     with pytest.raises(ValueError, match="solid"):
         CappedSolid.of(surface, surface.prepare(BACKEND))
 

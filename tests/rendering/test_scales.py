@@ -22,7 +22,7 @@ KNOT = hk.SolidAngle(hk.geometry.example_curves.wavy_polygon(24))
 
 def values(of: Any, what: Any = SPHERE, **settings: Any) -> Any:
     """One ray a pixel, so that each is the color of its number."""
-    return hk.render(what, show="value", of=of, spp=1, **SMALL, **settings)
+    return hk.render(what, show="value", color_by=of, spp=1, **SMALL, **settings)
 
 
 def test_values_are_those_of_the_function_on_the_surface() -> None:
@@ -47,7 +47,7 @@ def test_where_the_function_is_not_defined_there_is_no_value() -> None:
 
 
 def test_values_do_not_depend_on_where_the_surface_stands() -> None:
-    moved = values("x", hk.level_set(SPHERE.translated((5, 0, 0))), up="-y")
+    moved = values("x", hk.Surface(SPHERE.translated((5, 0, 0))), up="-y")
     assert np.nanmin(moved) > 4
     assert np.nanmax(moved) < 6.001
 
@@ -57,7 +57,7 @@ def test_values_of_scenes_are_in_the_coordinates_of_the_world() -> None:
     look = mi.ScalarTransform4f().look_at([3, -9, 0], [3, 0, 0], [0, 0, 1])
     film = {"type": "hdrfilm", "width": 16, "height": 12}
     sensor = {"type": "perspective", "fov": 10, "to_world": look, "film": film}
-    found = hk.render({"type": "scene", "ball": ball, "s": sensor}, show="value", of="x")
+    found = hk.render({"type": "scene", "ball": ball, "s": sensor}, show="value", color_by="x")
     assert abs(np.nanmean(found) - 3) < 0.01
 
 
@@ -147,11 +147,11 @@ def test_a_bar_changes_no_number_and_no_pixel_of_the_picture(
 ) -> None:
     settings = {"show": show, "of": of, **SMALL}
     plain = hk.render(SPHERE, **settings)
-    beside = hk.render(SPHERE, tmp_path / "a.png", colorbar=True, **settings)
+    beside = hk.render(SPHERE, tmp_path / "a.png", color_bar=True, **settings)
     np.testing.assert_array_equal(plain, beside)
     np.testing.assert_array_equal(beside.srgb[:, :64], plain.srgb)
     assert beside.srgb.shape[1] > 80
-    titled = hk.render(SPHERE, colorbar="a title that takes its room", **settings)
+    titled = hk.render(SPHERE, color_bar="a title that takes its room", **settings)
     assert titled.srgb.shape[1] > beside.srgb.shape[1]
 
 
@@ -188,7 +188,7 @@ def test_ends_of_bars_are_points_where_numbers_lie_beyond(passed: tuple[bool, bo
 
 @pytest.mark.parametrize("size", [(1, 1), (8, 6), (3, 40)])
 def test_the_smallest_pictures_have_bars(size: tuple[int, int]) -> None:
-    picture = hk.render(SPHERE, show="depth", colorbar=True, size=size, progress=False)
+    picture = hk.render(SPHERE, show="depth", color_bar=True, size=size, progress=False)
     assert picture.srgb.shape[0] == size[1]
 
 
@@ -214,4 +214,4 @@ def test_what_is_wrong_is_said(settings: dict[str, Any], message: str) -> None:
 def test_without_pillow_a_bar_names_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "PIL", None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'harnack\[film\]'"):
-        hk.render(SPHERE, show="depth", colorbar=True, **SMALL)
+        hk.render(SPHERE, show="depth", color_bar=True, **SMALL)

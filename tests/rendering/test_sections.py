@@ -28,15 +28,17 @@ def _rays(n, seed):
 def test_volumes_have_something_in_common():
     box, ball = hk.Box((-1, -1, -1), (1, 1, 1)), hk.Ball(radius=1.2)
     both = box & HALF
-    assert both == hk.VolumeIntersection((box, HALF))
-    assert (both & ball) == hk.VolumeIntersection((box, HALF, ball)) == (box & (HALF & ball))
+    assert both == hk.geometry.VolumeIntersection((box, HALF))
+    assert (
+        (both & ball) == hk.geometry.VolumeIntersection((box, HALF, ball)) == (box & (HALF & ball))
+    )
     points = np.random.default_rng(0).uniform(-1.5, 1.5, (500, 3))
     inside = box.contains_points(points) & HALF.contains_points(points)
     np.testing.assert_array_equal(both.contains_points(points), inside)
     with pytest.raises(TypeError):
         _ = box & 3  # pyright: ignore
     with pytest.raises(TypeError, match="section must be a volume"):
-        hk.level_set(hk.Sphere(1.0), section=3.0)  # pyright: ignore
+        hk.Surface(hk.Sphere(1.0), section=3.0)  # pyright: ignore
 
 
 @pytest.mark.parametrize("precision", ["single", "double"])
@@ -62,8 +64,8 @@ def test_what_lies_beyond_a_section_is_not_hit(precision):
 @pytest.mark.slow
 def test_faces_of_a_solid_on_its_section_are_told_from_all_others():
     backend = choose_backend("double")
-    surface = hk.level_set(
-        hk.Sphere(1.0), solid=(-math.inf, 0.0), clip=hk.HalfSpace((-1, 0, 0), 0.5), section=HALF
+    surface = hk.Surface(
+        hk.Sphere(1.0), level=0.0, side="below", clip=hk.HalfSpace((-1, 0, 0), 0.5), section=HALF
     )
     placed = PlacedSurface.of(surface, Placement.identity(), backend)
     o, d = _rays(3000, 4)
@@ -91,25 +93,25 @@ def test_pictures_show_faces_in_their_own_material():
                 "camera": hk.Camera(azimuth=-90, elevation=0), "material": "porcelain"}  # fmt: skip
     cut = hk.HalfSpace((0, -1, 0), 0.0)
     plain = hk.render(hk.Sphere(1.0), section=cut, **settings)
-    red = hk.render(hk.Sphere(1.0), section=cut, cut_material="plastic", **settings)
-    own = hk.render(hk.Sphere(1.0), section=cut, cut_material="porcelain", **settings)
+    red = hk.render(hk.Sphere(1.0), section=cut, section_material="plastic", **settings)
+    own = hk.render(hk.Sphere(1.0), section=cut, section_material="porcelain", **settings)
     np.testing.assert_array_equal(plain, own)
     middle = red[15, 20]
     assert middle[0] > 3 * middle[1]
     assert plain[15, 20, 1] > 3 * middle[1]
     behind = {**settings, "camera": hk.Camera(azimuth=90, elevation=0)}
-    seen = hk.render(hk.Sphere(1.0), section=cut, cut_material="plastic", **behind)
+    seen = hk.render(hk.Sphere(1.0), section=cut, section_material="plastic", **behind)
     assert seen[15, 20, 1] > 0.5 * seen[15, 20, 0]
 
 
 def test_wrong_faces_are_refused():
     cut, small = hk.HalfSpace((0, 0, 1), 0.0), {"size": (8, 6), "progress": False}
     with pytest.raises(ValueError, match="section=harnack"):
-        hk.render(hk.Sphere(1.0), cut_material="gold", **small)
+        hk.render(hk.Sphere(1.0), section_material="gold", **small)
     with pytest.raises(ValueError, match="opaque"):
-        hk.render(hk.Sphere(1.0), material="glass", section=cut, cut_material="gold", **small)
+        hk.render(hk.Sphere(1.0), material="glass", section=cut, section_material="gold", **small)
     with pytest.raises(ValueError, match="solid on its section"):
-        mitsuba_shape(hk.Sphere(1.0), section=cut, cut_bsdf={"type": "diffuse"})
+        mitsuba_shape(hk.Sphere(1.0), section=cut, section_bsdf={"type": "diffuse"})
 
 
 @pytest.mark.slow
@@ -142,8 +144,8 @@ def test_a_surface_is_drawn_as_a_thick_sheet():
     camera = hk.Camera(azimuth=0, elevation=0, box=hk.Box((-1, -1, -0.5), (1, 1, 0.5)))
     settings = {"show": "depth", "size": (40, 20), "progress": False, "spp": 1, "camera": camera}
     thin = hk.render(square, **settings)
-    thick = hk.render(square, thickness=0.2, boundary=0.02, **settings)
+    thick = hk.render(square, thickness=0.2, boundary_radius=0.02, **settings)
     assert np.isfinite(thick).sum() > np.isfinite(thin).sum() + 10
     with pytest.raises(ValueError, match="a solid has an inside already"):
-        hk.render(hk.Sphere(1.0), solid=(-math.inf, 0.0), thickness=0.1, **settings)
+        hk.render(hk.Sphere(1.0), level=0.0, side="below", thickness=0.1, **settings)
     assert parse(["render", "trefoil", "--thickness", "0.1"]).thickness == 0.1

@@ -93,7 +93,7 @@ def test_what_is_lost_in_rounding_is_no_hit(precision: Any) -> None:
     rng = np.random.default_rng(5)
     normals = rng.normal(size=(100, 3))
     normals /= np.linalg.norm(normals, axis=1)[:, None]
-    field = hk.ScreenedWindingNumber(normals, normals, length=0.05, method="sum")
+    field = hk.fields.ScreenedWindingNumber(normals, normals, length=0.05, method="sum")
     o = rng.normal(size=(100, 3))
     o *= 8 / np.linalg.norm(o, axis=1)[:, None]
     d = np.cross(o, rng.normal(size=(100, 3)))
@@ -122,7 +122,7 @@ def test_closest_points_of_clouds_are_on_the_surface_whatever_the_accuracy() -> 
     normals = single(normals / np.linalg.norm(normals, axis=1)[:, None])
     field = hk.DipolePotential(normals, normals, np.full(400, np.pi / 100), accuracy=1.5)
     x = 0.8 * rng.normal(size=(12, 3))
-    feet = hk.closest_points(field, x)
+    feet = hk.distance.closest_points(field, x)
     value, gradient = dipole_sum(normals, field.areas[:, None] * field.normals)(feet)
     apart = np.linalg.norm(feet[:, None] - normals, axis=2).min(axis=1) > 1e-6
     off = np.abs(value - 2 * np.pi) / np.linalg.norm(gradient, axis=1)
@@ -255,7 +255,7 @@ def test_hits_on_dipoles_say_how_far_off_they_are() -> None:
     points = single(points / np.linalg.norm(points, axis=1)[:, None])
     areas = single(np.pi / 5 * 10 ** rng.uniform(-8, 2, n))
     chosen, o = rng.integers(n, size=400), single(rng.normal(size=(400, 3)))
-    field = hk.ScreenedWindingNumber(points, points, areas, length=5.0, method="sum")
+    field = hk.fields.ScreenedWindingNumber(points, points, areas, length=5.0, method="sum")
     hits = hk.trace(field, o, points[chosen] - o, level=-0.1, tolerance=1e-5, precision="single")
     value, gradient = field.value_and_gradient(hits.position[hits.is_hit], precision="double")
     off = np.abs(value + 0.1) / np.linalg.norm(gradient, axis=1)

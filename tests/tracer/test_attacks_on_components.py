@@ -46,7 +46,7 @@ def test_level_sets_take_what_calls_take(largest: Any) -> None:
     """True was taken for one cell; NumPy's were refused."""
     made = hk.Surface(SPHERES, (0.0,), largest=largest)
     assert hk.trace(made, *FROM_RIGHT).t[0] == pytest.approx(3.1, abs=1e-3)
-    assert hk.level_set(SPHERES, 0.0, largest=largest).largest == made.largest
+    assert hk.Surface(SPHERES, 0.0, largest=largest).largest == made.largest
 
 
 @pytest.mark.parametrize(
@@ -94,8 +94,8 @@ def test_cells_of_tiny_clips_do_not_fill_the_memory() -> None:
 def test_faces_of_solids_are_lost_where_rounding_leaves_open_which_component_it_is() -> None:
     """The face was met all the same, an eighth off."""
     backend = choose_backend("single")
-    surface = hk.level_set(
-        SPHERES, solid=(-math.inf, 0), largest=True, section=hk.HalfSpace((0, 0, 1), 0.01)
+    surface = hk.Surface(
+        SPHERES, level=0, side="below", largest=True, section=hk.HalfSpace((0, 0, 1), 0.01)
     )
     placed = PlacedSurface.of(surface, Placement.identity(), backend)
     o, d = to_vector3(backend, [[-0.6, 0, 1e5]]), to_vector3(backend, [[0, 0, -1.0]])

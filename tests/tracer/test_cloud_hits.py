@@ -142,9 +142,9 @@ def test_a_tree_that_hides_its_error_misses_hits() -> None:
 
         has_variable_accuracy = False
 
-        def evaluate(self, p: Any) -> hk.Sample:
+        def evaluate(self, p: Any) -> hk.fields.Sample:
             sample = super().evaluate(p)
-            return hk.Sample(sample.value, sample.gradient, sample.promises)
+            return hk.fields.Sample(sample.value, sample.gradient, sample.promises)
 
     some = cloud(1000)
     o, d = rays(some[0], 1000)

@@ -83,11 +83,11 @@ CASES: dict[str, tuple[Any, Any, tuple[float, ...], float]] = {
     "levels": (hk.Gyroid(1.0, domain=BALL), gyroid, (-0.5, 0.0, 0.02, 0.9), 12.0),
     "polynomial": (hk.HarmonicPolynomial(POLYNOMIAL, domain=BALL), quintic, (0.2,), 60.0),
     "waves": (
-        hk.EigenfunctionSum(
+        hk.fields.EigenfunctionSum(
             [
-                hk.PlaneWave(1.0, (3, 2, 0), -np.pi / 2),
-                hk.PlaneWave(1.0, (-1, 0, 4)),
-                hk.WaveProduct(-0.7, y=hk.sine_factor(5.0)),
+                hk.fields.PlaneWave(1.0, (3, 2, 0), -np.pi / 2),
+                hk.fields.PlaneWave(1.0, (-1, 0, 4)),
+                hk.fields.WaveProduct(-0.7, y=hk.fields.sine_factor(5.0)),
             ],
             domain=BALL,
         ),
@@ -103,8 +103,8 @@ def test_crossings_are_those_of_a_dense_oracle(name: str, precision: Any) -> Non
     field, function, levels, steepness = CASES[name]
     n, k, tolerance = 150, 60, 1e-4
     o, d = rays(n, distance=1.4)
-    found = hk.trace(
-        field, o, d, level=levels, all_hits=k, t_max=2.5, clip=BALL, tolerance=tolerance,
+    found = hk.crossings(
+        field, o, d, level=levels, max_crossings=k, t_max=2.5, clip=BALL, tolerance=tolerance,
         precision=precision,
     )  # fmt: skip
     t = np.linspace(0, 2.5, _MANY)
@@ -146,8 +146,15 @@ def test_crossings_are_those_of_a_dense_oracle(name: str, precision: Any) -> Non
 def test_the_ladder_of_an_angle_is_climbed_rung_by_rung(level: Any, precision: Any) -> None:
     field, tolerance = hk.SolidAngle(example_curves.wavy_polygon(12)), 1e-3
     o, d = rays(150, seed=3, distance=3.0)
-    found = hk.trace(
-        field, o, d, level=level, all_hits=30, t_max=6, tolerance=tolerance, precision=precision
+    found = hk.crossings(
+        field,
+        o,
+        d,
+        level=level,
+        max_crossings=30,
+        t_max=6,
+        tolerance=tolerance,
+        precision=precision,
     )
     assert (found.status == hk.RayStatus.MISS).all()
     t, wrong = np.linspace(0, 6, 6001), 0
@@ -175,17 +182,19 @@ def test_rays_that_begin_where_the_extent_does_are_seen_from_outside() -> None:
     o = rng.uniform(-0.8, 0.8, (300, 3)) + np.array([0, 0, 2])
     d = np.column_stack([rng.uniform(-0.8, 0.8, (300, 2)), np.zeros(300)]) - o
     for precision in PRECISIONS:
-        found = hk.trace(field, o, d, all_hits=3, tolerance=1e-2, precision=precision)
+        found = hk.crossings(field, o, d, max_crossings=3, tolerance=1e-2, precision=precision)
         assert (found.count == 1).all()
         np.testing.assert_allclose(found.position[:, 0, 2], 0, atol=2e-6)
-        upwards = hk.trace(field, -o, -d, all_hits=3, tolerance=1e-2, precision=precision)
+        upwards = hk.crossings(field, -o, -d, max_crossings=3, tolerance=1e-2, precision=precision)
         np.testing.assert_array_equal(found.side[:, 0], -upwards.side[:, 0])
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_a_sphere_is_entered_and_left(precision: Any) -> None:
     o, d = rays(300)
-    found = hk.trace(Sphere(), o, d, all_hits=4, t_max=9, tolerance=1e-4, precision=precision)
+    found = hk.crossings(
+        Sphere(), o, d, max_crossings=4, t_max=9, tolerance=1e-4, precision=precision
+    )
     b = -(o * d).sum(axis=1)
     c = b * b - (o * o).sum(axis=1) + 1
     hit = c > 1e-3
@@ -208,7 +217,7 @@ def test_rays_that_graze_do_not_stick(precision: Any, overstep: float) -> None:
     settings: dict[str, Any] = {
         "tolerance": tolerance, "t_max": 6.0, "precision": precision, "overstep": overstep,
     }  # fmt: skip
-    found = hk.trace(Sphere(), o, d, all_hits=9, **settings)
+    found = hk.crossings(Sphere(), o, d, max_crossings=9, **settings)
     np.testing.assert_array_equal(found.count[:3], 2)
     assert set(found.count[3:5]) <= {0, 2}
     np.testing.assert_array_equal(found.count[5:], 0)
@@ -216,7 +225,7 @@ def test_rays_that_graze_do_not_stick(precision: Any, overstep: float) -> None:
     # |f| stays within the tolerance for a length of 0.09, of which a step is 1/5 of it or more.
     assert found.evaluations.max() < 600
     plain = hk.trace(Sphere(), o, d, **settings)
-    sure = hk.trace(Sphere(), o, d, confirm=True, **settings)
+    sure = hk.trace(Sphere(), o, d, require_crossing=True, **settings)
     np.testing.assert_array_equal(plain.is_hit, off <= tolerance)
     np.testing.assert_array_equal(sure.is_hit, found.count > 0)
     np.testing.assert_array_equal(sure.t[sure.is_hit], found.t[sure.is_hit, 0])
@@ -234,10 +243,12 @@ def test_a_ray_along_the_surface_runs_out_of_steps_or_is_proved() -> None:
             return Sample(p.z, type(p)(0, 0, 1), (known,))
 
     o, d = np.zeros((1, 3)), np.array([[1.0, 0, 0]])
-    lost = hk.trace(Plane(None), o, d, all_hits=2, t_max=50.0, tolerance=1e-3, max_steps=300)
+    lost = hk.crossings(
+        Plane(None), o, d, max_crossings=2, t_max=50.0, tolerance=1e-3, max_steps=300
+    )
     assert (lost.status[0], lost.count[0]) == (hk.RayStatus.OUT_OF_STEPS, 0)
     assert 0.05 < lost.traced_to[0] < 1
-    proved = hk.trace(Plane(1e-3), o, d, all_hits=2, t_max=50.0, tolerance=1e-3)
+    proved = hk.crossings(Plane(1e-3), o, d, max_crossings=2, t_max=50.0, tolerance=1e-3)
     assert (proved.status[0], proved.count[0]) == (hk.RayStatus.MISS, 0)
     assert proved.evaluations[0] < 100
 
@@ -249,7 +260,9 @@ def test_a_ray_that_starts_on_the_surface_leaves_it_uncounted(precision: Any) ->
     n /= np.linalg.norm(n, axis=1)[:, None]
     d = rng.normal(size=(400, 3))
     d /= np.linalg.norm(d, axis=1)[:, None]
-    found = hk.trace(Sphere(), n, d, all_hits=4, t_max=9, tolerance=1e-4, precision=precision)
+    found = hk.crossings(
+        Sphere(), n, d, max_crossings=4, t_max=9, tolerance=1e-4, precision=precision
+    )
     inwards = (n * d).sum(axis=1)
     enters, leaves = inwards < -0.02, inwards > 0.02
     np.testing.assert_array_equal(found.count[enters], 1)
@@ -261,9 +274,9 @@ def test_a_ray_that_starts_on_the_surface_leaves_it_uncounted(precision: Any) ->
 
 def test_the_first_k_are_the_first_of_all() -> None:
     field, (o, d) = hk.Gyroid(1.0, domain=BALL), rays(200)
-    every = hk.trace(field, o, d, all_hits=40)
+    every = hk.crossings(field, o, d, max_crossings=40)
     for k in (1, 2, 5):
-        first = hk.trace(field, o, d, all_hits=k)
+        first = hk.crossings(field, o, d, max_crossings=k)
         assert first.t.shape == (200, k)
         assert first.position.shape == first.normal.shape == (200, k, 3)
         np.testing.assert_array_equal(first.t, every.t[:, :k])
@@ -277,8 +290,10 @@ def test_the_first_k_are_the_first_of_all() -> None:
 
 
 def test_steps_are_for_all_of_the_ray() -> None:
-    found = hk.trace(Wave(), [[0.0, 0, 0]], [[1.0, 0, 0]], all_hits=40, t_max=20.0, max_steps=25)
-    whole = hk.trace(Wave(), [[0.0, 0, 0]], [[1.0, 0, 0]], all_hits=40, t_max=20.0)
+    found = hk.crossings(
+        Wave(), [[0.0, 0, 0]], [[1.0, 0, 0]], max_crossings=40, t_max=20.0, max_steps=25
+    )
+    whole = hk.crossings(Wave(), [[0.0, 0, 0]], [[1.0, 0, 0]], max_crossings=40, t_max=20.0)
     assert found.status[0] == hk.RayStatus.OUT_OF_STEPS
     assert 25 <= found.evaluations[0] <= 26
     n = found.count[0]
@@ -290,7 +305,7 @@ def test_steps_are_for_all_of_the_ray() -> None:
 
 def test_levels_closer_than_the_tolerance_are_told_apart() -> None:
     o, d = [[-2.0, 0, 0]], [[1.0, 0, 0]]
-    found = hk.trace(Sphere(), o, d, level=(0.0, 1e-3), all_hits=9, t_max=4, tolerance=0.1)
+    found = hk.crossings(Sphere(), o, d, level=(0.0, 1e-3), max_crossings=9, t_max=4, tolerance=0.1)
     np.testing.assert_array_equal(found.side[0, :4], [-1, -1, 1, 1])
     np.testing.assert_allclose(found.t[0, :4], [0.999, 1, 3, 3.001], atol=1e-5)
     assert found.count[0] == 4
@@ -301,8 +316,8 @@ def test_confirmed_hits_are_all_hits_but_those_that_turn_back(precision: Any) ->
     field, (o, d) = hk.Gyroid(1.0, domain=BALL), rays(2000, seed=7)
     settings: dict[str, Any] = {"level": 1.2, "tolerance": 3e-3, "precision": precision}
     plain = hk.trace(field, o, d, **settings)
-    sure = hk.trace(field, o, d, confirm=True, **settings)
-    surface = hk.level_set(field, 1.2, tolerance=3e-3, confirm=True)
+    sure = hk.trace(field, o, d, require_crossing=True, **settings)
+    surface = hk.traced_surface(field, 1.2, tolerance=3e-3, require_crossing=True)
     same = hk.trace(surface, o, d, precision=precision)
     np.testing.assert_array_equal(sure.t, same.t)
     assert (plain.is_hit | ~sure.is_hit).all()
@@ -324,11 +339,11 @@ def test_a_steep_place_hides_nothing_behind_it(tolerance: float) -> None:
     pole = hk.DipolePotential([[0, 0, 0.0]], [[1.0, 0, 0]], [1.0], cells=False)
     solid = hk.solid(pole, below=6.0) & hk.Sphere(1.0)
     given: dict[str, Any] = {"precision": "double", "tolerance": tolerance}
-    hits = hk.trace(solid, [[-2, 0.01, 0.0]], [[1.0, 0, 0]], all_hits=8, **given)
+    hits = hk.crossings(solid, [[-2, 0.01, 0.0]], [[1.0, 0, 0]], max_crossings=8, **given)
     expected = [1.00005, 1.591935, 1.999994, 2.99995]
     np.testing.assert_allclose(hits.t[0, :4], expected, atol=max(5e-6, tolerance))
     assert np.isinf(hits.t[0, 4:]).all()
-    hit = hk.trace(solid, [[-0.3, 0.01, 0.0]], [[1.0, 0, 0]], confirm=True, **given)
+    hit = hk.trace(solid, [[-0.3, 0.01, 0.0]], [[1.0, 0, 0]], require_crossing=True, **given)
     assert hit.t[0] == pytest.approx(0.29999, abs=max(1e-4, tolerance))
 
 
@@ -349,7 +364,7 @@ def test_rays_between_poles_leave_the_solid_behind_them(precision: Any) -> None:
     leaves = (root > 0.1) & (value < 5.9).all(axis=1)
     assert leaves.sum() > 200
     solid = hk.solid(cloud, below=6.0) & hk.Sphere(1.3)
-    hits = hk.trace(solid, o, d, all_hits=32, precision=precision, max_steps=4000)
+    hits = hk.crossings(solid, o, d, max_crossings=32, precision=precision, max_steps=4000)
     known = leaves & (hits.status == hk.RayStatus.MISS) & np.isinf(hits.t[:, -1])
     assert known.sum() > 0.9 * leaves.sum()
     apart = np.abs(hits.t - out[:, None]).min(axis=1)
@@ -363,7 +378,7 @@ def test_drjit_rays_give_flat_arrays_with_derivatives() -> None:
     dr.enable_grad(level)
     dr.set_grad(level, 1)
     d = backend.Array3f([1.0, 0.0], [0.0, 0.0], [0.0, 1.0])
-    found = hk.trace(Sphere(), o, d, level=level, all_hits=3, t_max=9.0)
+    found = hk.crossings(Sphere(), o, d, level=level, max_crossings=3, t_max=9.0)
     assert dr.width(found.t) == dr.width(found.position) == 6
     half = math.sqrt(1.1**2 - 0.04)
     np.testing.assert_allclose(found.t, [3 - half, 3 + half, np.inf, 0.9, 3.1, np.inf])
@@ -372,7 +387,7 @@ def test_drjit_rays_give_flat_arrays_with_derivatives() -> None:
 
 
 def test_no_rays_have_no_crossings() -> None:
-    found = hk.trace(Sphere(), np.zeros((0, 3)), np.zeros((0, 3)), all_hits=5)
+    found = hk.crossings(Sphere(), np.zeros((0, 3)), np.zeros((0, 3)), max_crossings=5)
     assert found.t.shape == (0, 5)
     assert found.normal.shape == (0, 5, 3)
     assert found.count.shape == (0,)
@@ -382,14 +397,14 @@ def test_bad_settings_are_refused() -> None:
     o, d = [[-2.0, 0, 0]], [[1.0, 0, 0]]
     for wrong in (0, -3, True):
         with pytest.raises(ValueError, match="at least 1"):
-            hk.trace(Sphere(), o, d, all_hits=wrong)
+            hk.crossings(Sphere(), o, d, max_crossings=wrong)
     with pytest.raises(TypeError, match="an integer such as 8"):
-        hk.trace(Sphere(), o, d, all_hits="all")  # type: ignore[call-overload]
+        hk.crossings(Sphere(), o, d, max_crossings="all")  # type: ignore[call-overload]
     mesh = hk.WindingNumber(*icosphere(0))
     with pytest.raises(ValueError, match="all_hits takes one level of a field with sheets"):
-        hk.trace(mesh, o, d, all_hits=2, level=(0.3, 0.6))
+        hk.crossings(mesh, o, d, max_crossings=2, level=(0.3, 0.6))
     with pytest.raises(ValueError, match="confirm takes one level of a field with sheets"):
-        hk.level_set(mesh, [0.3, 0.6], confirm=True)
+        hk.traced_surface(mesh, [0.3, 0.6], require_crossing=True)
 
 
 def balls() -> tuple[FloatArray, Any]:
@@ -432,7 +447,7 @@ def test_closed_meshes_are_crossed_at_their_triangles(method: str, precision: An
     vertices, faces = balls()
     o, d = rays(200, seed=4, distance=3.0)
     mesh = hk.WindingNumber(vertices, faces, method=method)
-    found = hk.trace(mesh, o, d, all_hits=10, precision=precision)
+    found = hk.crossings(mesh, o, d, max_crossings=10, precision=precision)
     assert 2 < found.count.mean() < 6
     for i in range(len(o)):
         t, triangles = changes_of_winding(vertices, faces, o[i], d[i])
@@ -443,7 +458,7 @@ def test_closed_meshes_are_crossed_at_their_triangles(method: str, precision: An
         np.testing.assert_array_equal(found.side[i, :n], np.resize([1, -1], n))
     assert (found.primitive_index[np.isinf(found.t)] == -1).all()
     assert (found.status == hk.RayStatus.MISS).all()
-    sure = hk.trace(mesh, o, d, confirm=True, precision=precision)
+    sure = hk.trace(mesh, o, d, require_crossing=True, precision=precision)
     np.testing.assert_array_equal(sure.t, found.t[:, 0])
     np.testing.assert_array_equal(sure.primitive_index, found.primitive_index[:, 0])
 
@@ -455,7 +470,7 @@ def test_meshes_with_holes_are_crossed_where_the_winding_number_passes(method: s
     kept = np.random.default_rng(0).random(len(faces)) < 0.8
     mesh = hk.WindingNumber(vertices, faces[kept], method=method)
     o, d = rays(30, seed=6, distance=3.0)
-    found = hk.trace(mesh, o, d, all_hits=12, tolerance=1e-4)
+    found = hk.crossings(mesh, o, d, max_crossings=12, tolerance=1e-4)
     exact = hk.WindingNumber(vertices, faces[kept])
     alike = 0
     for i in range(len(o)):
@@ -484,7 +499,7 @@ def test_a_ray_that_starts_on_a_triangle_leaves_it_uncounted() -> None:
     mesh = hk.WindingNumber(vertices, faces)
     o = np.einsum("nkd,k->nd", vertices[faces[:40]], [0.3, 0.3, 0.4])
     for sign, count in ((1.0, 0), (-1.0, 1)):
-        found = hk.trace(mesh, o, sign * o, all_hits=3, precision="double")
+        found = hk.crossings(mesh, o, sign * o, max_crossings=3, precision="double")
         np.testing.assert_array_equal(found.count, count)
 
 

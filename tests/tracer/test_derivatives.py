@@ -222,7 +222,7 @@ def test_the_value_of_t_is_polished_to_rounding() -> None:
 # Flat faces, edges and ties of formulas.
 
 TALL, CAN = hk.Cuboid((0.5, 0.5, 2.0)), hk.Cylinder(0.4, 1.4)
-SOLIDS: dict[str, hk.Solid] = {
+SOLIDS: dict[str, hk.solids.Solid] = {
     "union, moved and rotated": (TALL | CAN.rotated(70, "x")).translated((0.1, 0.2, 0)).rotated(20),
     "cuboid": TALL,
     "cylinder": CAN,
@@ -322,7 +322,7 @@ def test_hits_of_clouds_are_those_of_the_whole_sum() -> None:
 
 
 OF_LOOPS: dict[str, tuple[Callable[[], hk.Field], float]] = {
-    "Julia set": (lambda: hk.Julia(), 0.0),
+    "Julia set": (lambda: hk.solids.Julia(), 0.0),
     "closed mesh": (lambda: hk.WindingNumber(*example_meshes.icosphere(1)), 0.5),
     "mesh by tree": (lambda: hk.WindingNumber(*example_meshes.icosphere(2), method="tree"), 0.5),
     "cloud of spheres": (lambda: hk.Blobs(LOOP, 0.5), 1.0),

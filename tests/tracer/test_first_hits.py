@@ -245,7 +245,7 @@ def test_the_assumed_range_misses_hits_of_a_coil_and_ours_does_not() -> None:
     points that are tried."""
     o, d = rays_down_a_coil(200)
     o, d = np.concatenate([COIL_ORIGINS, o]), np.concatenate([COIL_DIRECTIONS, d])
-    assumed = compare(COIL, o, d, 2 * math.pi, lift_bound="paper", bound="caps")
+    assumed = compare(COIL, o, d, 2 * math.pi, lift_bound="paper", enclosures="caps")
     failures: list[str] = []
     ours = compare(COIL, o, d, 2 * math.pi, failures=failures)
     assert assumed.missed > 80
@@ -278,7 +278,7 @@ def test_the_published_method_misses_hits_of_a_coil_of_eight_turns(
     )
     more = rays_down_a_coil(200)
     o, d = np.concatenate([o, more[0]]), np.concatenate([d, more[1]])
-    tally = compare(coil, o, d, 2 * math.pi, lift_bound=certificate, bound="classic")
+    tally = compare(coil, o, d, 2 * math.pi, lift_bound=certificate, enclosures="classic")
     assert tally.missed > 10 if certificate == "paper" else tally.missed == 0
 
 
@@ -297,7 +297,7 @@ def test_the_lift_of_a_coil_leaves_the_assumed_range() -> None:
     assert value + moved.max() < float(proved.upper[0])
 
 
-def movement(oracle: CurveOracle, center: np.ndarray, ball: hk.HarmonicBall) -> np.ndarray:
+def movement(oracle: CurveOracle, center: np.ndarray, ball: hk.proofs.HarmonicBall) -> np.ndarray:
     """Of the lift along the z axis through the center of a ball."""
     along = np.linspace(-0.999, 0.999, 4001)[:, None] * float(ball.radius[0])
     lift = np.unwrap(oracle(center + along * [[0.0, 0.0, 1.0]]).value, period=FOUR_PI)
@@ -348,8 +348,11 @@ def figure_21(p: np.ndarray) -> np.ndarray:
     return np.sin(6 * p).prod(axis=1) + np.sin(2 * p).prod(axis=1)
 
 
-FIGURE_21 = hk.EigenfunctionSum(
-    [hk.WaveProduct(1.0, *[hk.sine_factor(6)] * 3), hk.WaveProduct(1.0, *[hk.sine_factor(2)] * 3)]
+FIGURE_21 = hk.fields.EigenfunctionSum(
+    [
+        hk.fields.WaveProduct(1.0, *[hk.fields.sine_factor(6)] * 3),
+        hk.fields.WaveProduct(1.0, *[hk.fields.sine_factor(2)] * 3),
+    ]
 )
 EQUATION_8 = hk.HarmonicPolynomial({(2, 1, 0): 1, (0, 1, 2): -1})
 # name: field, the same function in NumPy, levels, the shortest length of interest
@@ -366,8 +369,8 @@ REAL: dict[str, tuple[Any, Callable[[np.ndarray], np.ndarray], tuple[float, ...]
     },
     "gyroid": (hk.Gyroid(), gyroid, (0.0, 0.5, -1.3), 0.5),
     "small gyroid": (hk.Gyroid(cell=0.02 * math.pi), lambda p: gyroid(100 * p), (0.0,), 0.005),
-    "P": (hk.SchwarzP(), lambda p: np.cos(p).sum(axis=1), (0.0, 1.5), 0.5),
-    "D": (hk.SchwarzD(), diamond, (0.0, 0.6), 0.4),
+    "P": (hk.fields.SchwarzP(), lambda p: np.cos(p).sum(axis=1), (0.0, 1.5), 0.5),
+    "D": (hk.fields.SchwarzD(), diamond, (0.0, 0.6), 0.4),
     "figure 21": (FIGURE_21, figure_21, (0.0, 0.4), 0.15),
     "Eq. 8": (EQUATION_8, lambda p: p[:, 1] * (p[:, 0] ** 2 - p[:, 2] ** 2), (0.0, 0.05), 0.2),
 }  # fmt: skip
@@ -389,7 +392,7 @@ def looking(value: Callable[[np.ndarray], np.ndarray], smooth: float) -> Functio
 @pytest.mark.parametrize("name", REAL)
 def test_real_valued_fields(name: str, bound: str | None) -> None:
     field, value, levels, smooth = REAL[name]
-    if bound == "lipschitz" and not isinstance(field, hk.EigenfunctionSum):
+    if bound == "lipschitz" and not isinstance(field, hk.fields.EigenfunctionSum):
         pytest.skip("has no Lipschitz constant")
     assert isinstance(field.domain, hk.Ball)
     rng, n, radius = np.random.default_rng(len(name)), 150, field.domain.radius
@@ -397,7 +400,7 @@ def test_real_valued_fields(name: str, bound: str | None) -> None:
     o = o.astype(np.float32).astype(np.float64)
     d = unit(radius * rng.uniform(0, 0.9, (n, 1)) * unit(rng.normal(size=(n, 3))) - o)
     tolerance = 1e-4 * radius
-    hits = hk.trace(field, o, d, level=list(levels), tolerance=tolerance, bound=bound)
+    hits = hk.trace(field, o, d, level=list(levels), tolerance=tolerance, enclosures=bound)
     along = (o * d).sum(axis=1)
     half = np.sqrt((0.9999 * radius) ** 2 - (o * o).sum(axis=1) + along**2)
     start = np.maximum(-along - half, 0.0)
@@ -549,9 +552,9 @@ def test_what_is_not_known_is_not_free() -> None:
     """A field whose error is NaN proves nothing."""
 
     class Unknown(hk.Field):
-        def evaluate(self, p: Any) -> hk.Sample:
+        def evaluate(self, p: Any) -> hk.fields.Sample:
             error = p.x * math.nan
-            return hk.Sample(p.z, type(p)(0, 0, 1), (hk.Lipschitz(1.0),), error)
+            return hk.fields.Sample(p.z, type(p)(0, 0, 1), (hk.proofs.Lipschitz(1.0),), error)
 
     hits = hk.trace(Unknown(), [[0.1, 0, 1]], [[0.0, 0, -1]], t_max=3.0)
     assert hits.status[0] == hk.RayStatus.OUT_OF_STEPS

@@ -109,7 +109,7 @@ def test_wrong_groups_are_noticed(monkeypatch):
 @pytest.mark.slow
 def test_pieces_that_a_clip_leaves_are_left_out():
     """Above level 1 Schwarz's P surface is a closed surface in each cell of the lattice."""
-    field, ball = hk.SchwarzP(1.0), hk.Ball(radius=0.9)
+    field, ball = hk.fields.SchwarzP(1.0), hk.Ball(radius=0.9)
     o, d = rays(4000, 3)
     hits = hk.trace(field, o, d, level=1.2, clip=ball, largest=True, tolerance=1e-5)
     cell = hk.Box((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
@@ -158,7 +158,7 @@ def test_of_a_solid_the_part_of_largest_volume_is_there(precision):
     o, d = rays(4000, 5)
     met = []
     for field, largest in ((both, True), (hk.Sphere(*BIG), False)):
-        surface = hk.level_set(field, solid=(-math.inf, 0.0), clip=clip, largest=largest)
+        surface = hk.Surface(field, level=0.0, side="below", clip=clip, largest=largest)
         placed = PlacedSurface.of(surface, Placement.identity(), backend)
         rays_of = to_vector3(backend, o), to_vector3(backend, d)
         seen = placed.intersect(*rays_of, backend.Float(1e3), backend.Bool(True))
@@ -198,11 +198,11 @@ def test_what_has_no_largest_component_is_refused():
         with pytest.raises(ValueError, match="first hits alone"):
             hk.trace(FIELDS["solids"], *ray, largest=True, **settings)
     with pytest.raises(ValueError, match="with bounds"):
-        hk.trace(hk.Plane(), *ray, largest=True)
+        hk.trace(hk.solids.Plane(), *ray, largest=True)
     with pytest.raises(ValueError, match="from 8 to 512"):
-        hk.level_set(FIELDS["solids"], largest=3)
+        hk.Surface(FIELDS["solids"], largest=3)
     with pytest.raises(ValueError, match="most cells of this Blobs could not be proved empty"):
         hk.trace(hk.Blobs([[-1, 0, 0], [1, 0, 0]], 0.5), *ray, largest=True)
     mesh = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]]), [[0, 1, 2]]
     with pytest.raises(ValueError, match="jumps or has parts"):
-        hk.level_set(hk.WindingNumber(*mesh), largest=True)
+        hk.Surface(hk.WindingNumber(*mesh), largest=True)

@@ -16,13 +16,13 @@ CYLINDER = hk.expression(lambda x, y, z: x * x + y * y - 0.25)
 def test_rays_parallel_to_a_surface_are_no_hits_at_the_end_of_the_numbers(precision: Any) -> None:
     """They were hits at 1e37, with an uncertainty of 1e31."""
     o = np.array([[0.0, 0.0, 2.0], [1.0, 2.0, 3.0], [0.1, 0.2, 2.0]])
-    along = hk.trace(hk.Plane((0, 0, 1), 0.5), o, [[1, 0, 0], [1, 1, 0], [0.3, 0.7, 0]],
+    along = hk.trace(hk.solids.Plane((0, 0, 1), 0.5), o, [[1, 0, 0], [1, 1, 0], [0.3, 0.7, 0]],
                      precision=precision)  # fmt: skip
     assert (along.status == hk.RayStatus.MISS).all()
     up = hk.trace(CYLINDER, o, [[0, 0, 1]] * 3, precision=precision)
     assert (up.status == hk.RayStatus.MISS).all()
     # The directions are rounded, and with them whether and where the ray meets the plane.
-    slanted = hk.trace(hk.Plane((1, 2, 3), 0.5), o, [[3, 0, -1], [2, -1, 0], [0, 3, -2]],
+    slanted = hk.trace(hk.solids.Plane((1, 2, 3), 0.5), o, [[3, 0, -1], [2, -1, 0], [0, 3, -2]],
                        precision=precision)  # fmt: skip
     assert (slanted.status != hk.RayStatus.HIT).all()
 
@@ -40,7 +40,7 @@ def test_a_cone_without_bounds_proves_its_misses(precision: Any) -> None:
     rng = np.random.default_rng(0)
     o, d = 2 * rng.normal(size=(1000, 3)), rng.normal(size=(1000, 3))
     angle = 0.5
-    found = hk.trace(hk.DoubleCone(angle), o, d, precision=precision)
+    found = hk.trace(hk.solids.DoubleCone(angle), o, d, precision=precision)
     assert (found.status != hk.RayStatus.OUT_OF_STEPS).all()
     # (x^2 + y^2) cos^2 = z^2 sin^2 along o + t d is a quadratic equation.
     d /= np.linalg.norm(d, axis=1)[:, None]

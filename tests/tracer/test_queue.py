@@ -21,12 +21,12 @@ from harnack.tracer.hits import _are_scattered
 
 def cut_sphere() -> hk.Surface:
     vertices, faces = icosphere(2)
-    return hk.level_set(hk.WindingNumber(vertices, faces[np.arange(len(faces)) % 7 > 0]))
+    return hk.Surface(hk.WindingNumber(vertices, faces[np.arange(len(faces)) % 7 > 0]))
 
 
 def saddle() -> hk.Surface:
     t = np.linspace(0, 2 * np.pi, 48, endpoint=False)
-    return hk.level_set(hk.SolidAngle(np.column_stack([np.cos(t), np.sin(t), 0.4 * np.cos(2 * t)])))
+    return hk.Surface(hk.SolidAngle(np.column_stack([np.cos(t), np.sin(t), 0.4 * np.cos(2 * t)])))
 
 
 def parts() -> hk.Surface:
@@ -37,16 +37,18 @@ def parts() -> hk.Surface:
 
 def fourier_series() -> hk.Surface:
     waves = np.random.default_rng(1).normal(size=(3, 3, 3))
-    return hk.level_set(hk.FourierSeries(waves, ((-1, -1, -1), (1, 1, 1))))
+    return hk.Surface(hk.fields.FourierSeries(waves, ((-1, -1, -1), (1, 1, 1))))
 
 
 CASES: dict[str, Callable[[], hk.Surface]] = {
     "curve": saddle,
     "domain": fourier_series,
-    "combined": lambda: hk.level_set(hk.Torus(1.0, 0.4) & hk.Cuboid((1.0, 1.5, 1.5))),
+    "combined": lambda: hk.Surface(hk.Torus(1.0, 0.4) & hk.Cuboid((1.0, 1.5, 1.5))),
     "sheets": cut_sphere,
     "parts": parts,
-    "confirmed": lambda: hk.level_set(hk.Gyroid(1.0, domain=hk.Ball(radius=1.0)), confirm=True),
+    "confirmed": lambda: hk.traced_surface(
+        hk.Gyroid(1.0, domain=hk.Ball(radius=1.0)), require_crossing=True
+    ),
     "few steps": lambda: replace(saddle(), max_steps=3),
 }
 

@@ -37,8 +37,8 @@ def camera(width: int) -> tuple[np.ndarray, np.ndarray]:
 def test_no_surface_slips_through(bound: str, precision: str, tolerance: float) -> None:
     field = hk.SolidAngle(example_curves.wavy_polygon(64))
     o, d = camera(48)
-    plain = hk.trace(field, o, d, overstep=1.0, tolerance=1e-5, precision="double")
-    over = hk.trace(field, o, d, bound=bound, tolerance=tolerance, precision=precision)
+    plain = hk.trace(field, o, d, over_relaxation=1.0, tolerance=1e-5, precision="double")
+    over = hk.trace(field, o, d, enclosures=bound, tolerance=tolerance, precision=precision)
     assert plain.is_hit.sum() > 500
     # Rays within the coarser tolerance of the border may go either way.
     assert (over.is_hit != plain.is_hit).sum() <= 2
@@ -50,14 +50,14 @@ def test_no_surface_slips_through(bound: str, precision: str, tolerance: float) 
 ALONG = math.pi / 2 / math.sqrt(3)
 # Formulas that jump across a plane, its normal and its distance from the origin.
 JUMPS = {
-    "atan2": (lambda x, y, z: hk.atan2(x - y, -2.0 - x * x) + 0.1 * z, (1, -1, 0), 0.0),
+    "atan2": (lambda x, y, z: hk.math.atan2(x - y, -2.0 - x * x) + 0.1 * z, (1, -1, 0), 0.0),
     "atan2 of y": ("atan2(y, x - 9)", (0, 1, 0), 0.0),
     "sign": ("(x + y - 0.2) / abs(x + y - 0.2) + 2 + 0.1*z", (1, 1, 0), 0.1 * math.sqrt(2)),
     "arc of pole": ("atan(1 / (x + 2*y + z)) + 0.01*x", (1, 2, 1), 0.0),
-    "inverse power": (lambda x, y, z: hk.tanh((x - y + 0.1 * z) ** -3.0), (1, -1, 0.1), 0.0),
-    "tangent": (lambda x, y, z: hk.atan(hk.tan(x + y + z)), (1, 1, 1), ALONG),
+    "inverse power": (lambda x, y, z: hk.math.tanh((x - y + 0.1 * z) ** -3.0), (1, -1, 0.1), 0.0),
+    "tangent": (lambda x, y, z: hk.math.atan(hk.math.tan(x + y + z)), (1, 1, 1), ALONG),
     "logarithm": (
-        lambda x, y, z: hk.atan(hk.log(abs(x - y)) * (x - y) / abs(x - y)) + 1, (1, -1, 0), 0.0,
+        lambda x, y, z: hk.math.atan(hk.math.log(abs(x - y)) * (x - y) / abs(x - y)) + 1, (1, -1, 0), 0.0,
     ),
 }  # fmt: skip
 
@@ -116,6 +116,6 @@ def test_no_ray_passes_a_jump_by_any_proof(kind: str) -> None:
 def test_height_fields_stop_at_jumps() -> None:
     o, d, t = through((1, -1, 0), 0.0)
     domain = hk.geometry.Box((-5, -5, -20), (5, 5, 20))
-    field = hk.HeightField(lambda x, y: 10 * hk.atan(1 / (x - y)), domain=domain)
+    field = hk.fields.HeightField(lambda x, y: 10 * hk.math.atan(1 / (x - y)), domain=domain)
     hits = hk.trace(field, o, d, t_max=t + 0.2, precision="single", max_steps=150)
     assert (hits.status != hk.RayStatus.MISS).all()

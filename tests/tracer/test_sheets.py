@@ -134,17 +134,19 @@ class BruteForceWinding(hk.Field):
         self.domain = hk.Box((-3.0, -3.0, -3.0), (3.0, 3.0, 3.0))
         self.stretch: Stretch | None = None
 
-    def evaluate(self, p: Vec3) -> hk.Sample:
+    def evaluate(self, p: Vec3) -> hk.fields.Sample:
         backend = backend_of(p)
         corners = [backend.Array3f(*v.tolist()) - p for v in self.vertices]
         gradient, distance, variation = self._edge_sums(backend, corners)
         value, error = self._value(backend, corners)
         error = backend.machine_epsilon * (8 + error)
         if not self.edges:
-            return hk.Sample(value, gradient, (hk.Lipschitz(1e-9),), error)
+            return hk.fields.Sample(value, gradient, (hk.proofs.Lipschitz(1e-9),), error)
         r = 0.5 * distance
         s = r * variation * (1 + 1e-4)
-        return hk.Sample(value, gradient, (hk.HarmonicBall(r, value - s, value + s),), error)
+        return hk.fields.Sample(
+            value, gradient, (hk.proofs.HarmonicBall(r, value - s, value + s),), error
+        )
 
     def _value(self, backend: Backend, corners: list[Vec3]) -> tuple[Real, Real]:
         total, error = backend.Float(0), backend.Float(0)
@@ -527,12 +529,14 @@ class Staircase(hk.Field):
     def __init__(self, slope: float, planes: dict[float, float], lift: Real | None = None) -> None:
         self.slope, self.planes, self.lift = slope, planes, lift
 
-    def evaluate(self, p: Vec3) -> hk.Sample:
+    def evaluate(self, p: Vec3) -> hk.fields.Sample:
         lift = self.lift
         if lift is None:
             lift = sum(dr.select(p.x > x, jump, 0.0) for x, jump in self.planes.items())
         gradient = type(p)(self.slope, 0, 0)
-        return hk.Sample(self.slope * p.x + lift, gradient, (hk.Lipschitz(abs(self.slope)),))
+        return hk.fields.Sample(
+            self.slope * p.x + lift, gradient, (hk.proofs.Lipschitz(abs(self.slope)),)
+        )
 
     def next_jump(
         self, o: Vec3, d: Vec3, after: JumpCrossing, t_max: Real, active: Mask
@@ -592,7 +596,7 @@ def test_staircases(precision: Any, overstep: float) -> None:
     for slope, planes, way, x, t_max, t, sheet in cases:
         hits = hk.trace(
             Staircase(slope, planes), [[x, 0.0, 0.0]], way,
-            t_max=t_max, precision=precision, overstep=overstep, tolerance=1e-5,
+            t_max=t_max, precision=precision, over_relaxation=overstep, tolerance=1e-5,
         )  # fmt: skip
         assert hits.t[0] == pytest.approx(t, abs=1e-4), (slope, planes, x)
         assert hits.primitive_index[0] == sheet, (slope, planes, x)
@@ -604,10 +608,10 @@ class Approximate(hk.Field):
     def __init__(self, gradient: float, gradient_error: Any) -> None:
         self.gradient, self.gradient_error = gradient, gradient_error
 
-    def evaluate(self, p: Vec3) -> hk.Sample:
+    def evaluate(self, p: Vec3) -> hk.fields.Sample:
         gradient = type(p)(self.gradient, 0, 0)
-        ball = hk.HarmonicBall(5.0 + 0 * p.x, p.x - 10, p.x + 10)
-        return hk.Sample(p.x, gradient, (ball,), 0.0, self.gradient_error)
+        ball = hk.proofs.HarmonicBall(5.0 + 0 * p.x, p.x - 10, p.x + 10)
+        return hk.fields.Sample(p.x, gradient, (ball,), 0.0, self.gradient_error)
 
 
 @pytest.mark.few(2)
@@ -620,7 +624,7 @@ def test_gradients_known_up_to_an_error(bound: Any, overstep: float, direction: 
     def passes(gradient: float, error: Any) -> bool:
         hits = hk.trace(
             Approximate(gradient, error), [[0.0, 0, 0]], [[direction, 0, 0]],
-            level=direction, t_max=4.0, bound=bound, overstep=overstep, tolerance=1e-5,
+            level=direction, t_max=4.0, enclosures=bound, over_relaxation=overstep, tolerance=1e-5,
         )  # fmt: skip
         assert hits.t[0] in (pytest.approx(1, abs=1e-4), math.inf)
         return bool(np.isinf(hits.t[0]))
@@ -841,7 +845,7 @@ def test_drjit_rays_get_the_same(precision: Any) -> None:
 def test_occlusion_is_a_hit() -> None:
     vertices, faces = MESHES["open cube"]
     backend = choose_backend("single")
-    prepared = hk.level_set(BruteForceWinding(vertices, faces)).prepare(backend)
+    prepared = hk.Surface(BruteForceWinding(vertices, faces)).prepare(backend)
     o, d = (backend.Array3f(v.T) for v in rays(vertices, 400))
     far = backend.Float(np.random.default_rng(0).uniform(0.1, 4, 400))
     active = dr.arange(backend.UInt32, 400) % 3 != 0
@@ -977,10 +981,10 @@ def test_what_makes_no_sense_is_refused() -> None:
     vertices, faces = MESHES["open cube"]
     field = BruteForceWinding(vertices, faces)
     with pytest.raises(ValueError, match="jumps across sheets has no closed solid"):
-        hk.level_set(field, solid=(0.5, math.inf))
+        hk.Surface(field, level=0.5, side="above")
     field.period = 1.0  # type: ignore[misc]
     with pytest.raises(ValueError, match="must be real-valued"):
-        hk.level_set(field)
+        hk.Surface(field)
 
 
 # --- pictures -------------------------------------------------------------------------------
@@ -995,7 +999,7 @@ def test_rays_that_leave_a_sheet_do_not_meet_it_again() -> None:
     backend = choose_backend("single")
     for scale in (1.0, 1e-3):
         field = BruteForceWinding(scale * vertices, faces)
-        prepared = hk.level_set(field, tolerance=1e-6 * scale).prepare(backend)
+        prepared = hk.traced_surface(field, tolerance=1e-6 * scale).prepare(backend)
         o, d = rays(vertices, 1000, seed=4)
         ray = backend.Array3f((scale * o).T), backend.Array3f(d.T)
         met = intersect_surface(prepared, *ray, math.inf, backend.Bool(True))
@@ -1021,7 +1025,9 @@ def test_rays_that_leave_a_sheet_do_not_meet_it_again() -> None:
 def test_polished_hits_stay_on_the_surface_and_sheets_where_they_are() -> None:
     vertices, faces = MESHES["open cube"]
     backend, exact = choose_backend("double"), ExactWinding(vertices, faces)
-    prepared = hk.level_set(BruteForceWinding(vertices, faces), tolerance=1e-4).prepare(backend)
+    prepared = hk.traced_surface(BruteForceWinding(vertices, faces), tolerance=1e-4).prepare(
+        backend
+    )
     o, d = rays(vertices, 500, closest=1e-2)
     ray = backend.Array3f(o.T), backend.Array3f(d.T)
     met = intersect_surface(prepared, *ray, math.inf, backend.Bool(True))

@@ -174,9 +174,9 @@ def test_crossings_beside_a_vertical_tangent() -> None:
     d /= np.linalg.norm(d)
     field = hk.expression("abs(x*y)^(1/3) = z")
     for precision in ("single", "double"):
-        hits = hk.trace(field, [o], [d], t_max=3.0, confirm=True, precision=precision)
+        hits = hk.trace(field, [o], [d], t_max=3.0, require_crossing=True, precision=precision)
         assert hits.t[0] == pytest.approx(1.00063, abs=2e-4)
-        crossings = hk.trace(field, [o], [d], t_max=3.0, all_hits=3, precision=precision)
+        crossings = hk.crossings(field, [o], [d], t_max=3.0, max_crossings=3, precision=precision)
         assert crossings.count[0] == 1
         assert crossings.t[0, 0] == pytest.approx(1.00063, abs=2e-4)
 
@@ -184,7 +184,7 @@ def test_crossings_beside_a_vertical_tangent() -> None:
 @pytest.mark.parametrize("precision", ["single", pytest.param("double", marks=pytest.mark.slow)])
 def test_valley_with_a_vertical_tangent(precision: Precision) -> None:
     """z = sqrt(|x|): along and down into its valley, from it, and confirmed."""
-    field = hk.HeightField(lambda x, y: hk.sqrt(abs(x)))
+    field = hk.fields.HeightField(lambda x, y: hk.math.sqrt(abs(x)))
     o = [[0, 0.5, 3], [1e-9, 0.5, 3], [-0.9, 0.1, 0.25], [0, 0.1, 0.25], [0, 0.5, 0.25]]
     d = [[0, 0, -1], [0, 0, -1], [1, 0, 0], [1, 0, 0], [0, -1, 0]]
     hits = hk.trace(field, o, d, precision=precision)
@@ -257,7 +257,7 @@ def test_solids_made_of_cusps(kind: str, confirm: bool) -> None:
     o, d = rays(half)
     truth = first_roots(oracle, o, d, half)
     box = hk.Box((-half,) * 3, (half,) * 3)
-    hits = hk.trace(solid, o, d, clip=box, confirm=confirm)
+    hits = hk.trace(solid, o, d, clip=box, require_crossing=confirm)
     assert not (hits.status == hk.RayStatus.OUT_OF_STEPS).any()
     np.testing.assert_allclose(hits.t, truth, atol=2e-3)
 
@@ -267,9 +267,11 @@ def test_rays_pass_where_all_squares_of_a_norm_are_zero() -> None:
 
     def box(x: Any, y: Any, z: Any) -> Any:
         q = [abs(side) - 0.75 for side in (x, y, z)]
-        out = [hk.maximum(side, 0.0) for side in q]
-        outside = hk.sqrt(out[0] * out[0] + out[1] ** 2 + 4 * out[2] ** 2)
-        return hk.minimum(-outside - hk.minimum(hk.maximum(*q), 0.0), hk.sqrt(x**2 + y**2) - 0.1)
+        out = [hk.math.maximum(side, 0.0) for side in q]
+        outside = hk.math.sqrt(out[0] * out[0] + out[1] ** 2 + 4 * out[2] ** 2)
+        return hk.math.minimum(
+            -outside - hk.math.minimum(hk.math.maximum(*q), 0.0), hk.math.sqrt(x**2 + y**2) - 0.1
+        )
 
     o, d = rays(1.0, 200)
     o[:2], d[:2] = [[0.5, 0, 0.1], [0.5, 0.5, 0]], [[-1, 0, 0], [-(0.5**0.5), -(0.5**0.5), 0]]
@@ -321,7 +323,7 @@ def test_which_formulas_turn_within_rounding() -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class Steps(hk.FormulaSolid):
+class Steps(hk.solids.FormulaSolid):
     """The product of two functions of y that go from -1 to 1 at -0.5 and at `offset`."""
 
     steepness: float = 1e9
@@ -329,7 +331,7 @@ class Steps(hk.FormulaSolid):
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         def step(at: Any) -> Any:
-            return hk.maximum(hk.minimum((y - at) * self.steepness, 1.0), -1.0)
+            return hk.math.maximum(hk.math.minimum((y - at) * self.steepness, 1.0), -1.0)
 
         return step(-0.5) * step(self.offset)
 
@@ -361,7 +363,7 @@ def test_no_level_is_passed_within_the_rounding_of_coordinates(precision: Precis
             hits.status, np.where(meets(0, o, d), hk.RayStatus.HIT, hk.RayStatus.MISS)
         )
         assert np.abs(hits.position[hits.is_hit, 1]).max() < 1e-4
-    crossings = hk.trace(Steps(), o, d, all_hits=3, **settings)
+    crossings = hk.crossings(Steps(), o, d, max_crossings=3, **settings)
     assert_array_equal(crossings.count, 1 * meets(-0.5, o, d) + meets(0.25, o, d))
     assert (crossings.status == hk.RayStatus.MISS).all()
 
@@ -374,9 +376,9 @@ def test_exponentials_that_overflow() -> None:
     half = np.sqrt(0.5 - np.sum(np.square(o)[:, 1:], axis=1))
     ends = np.stack([-half, half], axis=1) - np.array(o)[:, :1]
     settings: dict[str, Any] = {"t_max": 5.0, "precision": "single"}
-    hits = hk.trace(field, o, d, confirm=True, **settings)
+    hits = hk.trace(field, o, d, require_crossing=True, **settings)
     np.testing.assert_allclose(hits.t, [ends[0, 0], ends[1, 1]], atol=1e-4)
-    crossings = hk.trace(field, o, d, all_hits=4, **settings)
+    crossings = hk.crossings(field, o, d, max_crossings=4, **settings)
     assert crossings.count.tolist() == [2, 1]
     np.testing.assert_allclose(crossings.t[0, :2], ends[0], atol=1e-4)
     assert (crossings.status == hk.RayStatus.MISS).all()

@@ -35,7 +35,7 @@ def rays_around(n: int, seed: int = 2) -> tuple[np.ndarray, np.ndarray]:
     return o, 0.6 * rng.normal(size=(n, 3)) - o
 
 
-def screened_sum(field: hk.ScreenedWindingNumber) -> Any:
+def screened_sum(field: hk.fields.ScreenedWindingNumber) -> Any:
     """Value and gradient of a screened winding number at points, dipole by dipole."""
     y, a, m, length = field.points, field.areas, field.normals, field.length
 
@@ -107,7 +107,7 @@ def test_hits_of_clouds_meet_the_tolerance(level: float, accuracy: float | None)
 @pytest.mark.slow
 def test_hits_of_screened_clouds_meet_the_tolerance() -> None:
     """They were up to 268 tolerances off."""
-    field = hk.ScreenedWindingNumber(*noisy_sphere(1500), length=2.0, method="tree")
+    field = hk.fields.ScreenedWindingNumber(*noisy_sphere(1500), length=2.0, method="tree")
     check_cloud(field, screened_sum(field), 0.1, 1e-4, "double", 300)
 
 
@@ -194,7 +194,7 @@ def test_many_hits_meet_the_tolerance(tolerance: float, precision: Any) -> None:
         truth = dipole_sum(field.points, field.areas[:, None] * field.normals)
         check_cloud(field, truth, level, tolerance, precision, 3000)
     for length in (0.2, 3.0):
-        field = hk.ScreenedWindingNumber(*noisy_sphere(800), length=length, method="tree")
+        field = hk.fields.ScreenedWindingNumber(*noisy_sphere(800), length=length, method="tree")
         level = field.default_level
         check_cloud(field, screened_sum(field), level, tolerance, precision, 1000)
 

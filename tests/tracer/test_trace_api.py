@@ -163,8 +163,8 @@ def test_different_proofs_give_the_same_hits(bound: str | None, overstep: float)
     o, d = around(300)
     for field in (WAVY, hk.SolidAngle(example_curves.torus_knot(2, 3, 40)), GYROID):
         settings: Any = {"tolerance": 1e-7, "precision": "double", "max_steps": 20_000}
-        reference = hk.trace(field, o, d, bound="slope", overstep=1.0, **settings)
-        hits = hk.trace(field, o, d, bound=bound, overstep=overstep, **settings)
+        reference = hk.trace(field, o, d, enclosures="slope", over_relaxation=1.0, **settings)
+        hits = hk.trace(field, o, d, enclosures=bound, over_relaxation=overstep, **settings)
         assert (hits.status != reference.status).sum() <= 1
         both = hits.is_hit & reference.is_hit
         assert both.sum() > 50
@@ -213,7 +213,10 @@ def test_tolerances() -> None:
     exact = hk.trace(WAVY, o, d, tolerance=1e-12, precision="double")
     hit = exact.is_hit
     fewer = []
-    growing, by_value = hk.HitTolerance(1e-4, per_length=1e-2), hk.HitTolerance(0.0, value=0.05)
+    growing, by_value = (
+        hk.tracer.HitTolerance(1e-4, per_length=1e-2),
+        hk.tracer.HitTolerance(0.0, value=0.05),
+    )
     for tolerance in (1e-2, growing, by_value, 1e-6):
         hits = hk.trace(WAVY, o, d, tolerance=tolerance, precision="double")
         both = hit & hits.is_hit
@@ -252,7 +255,7 @@ def test_several_levels_and_periods() -> None:
 
 def test_a_level_set_holds_its_own_settings() -> None:
     o, d = around(30)
-    surface = hk.level_set(WAVY, 1.0, tolerance=1e-6)
+    surface = hk.traced_surface(WAVY, 1.0, tolerance=1e-6)
     np.testing.assert_array_equal(
         hk.trace(surface, o, d).t, hk.trace(WAVY, o, d, level=1.0, tolerance=1e-6).t
     )
@@ -309,8 +312,8 @@ def test_wrong_types_are_refused() -> None:
     ("field", "level", "message"),
     [
         (hk.Gyroid(), 1.51, r"no surface has level 1.51.*\[-1.5, 1.5\]"),
-        (hk.SchwarzP(), -3.1, r"no surface has level -3.1.*\[-3, 3\]"),
-        (hk.SchwarzD(), 1.5, r"no surface has level 1.5.*1.41421"),
+        (hk.fields.SchwarzP(), -3.1, r"no surface has level -3.1.*\[-3, 3\]"),
+        (hk.fields.SchwarzD(), 1.5, r"no surface has level 1.5.*1.41421"),
         (hk.SphericalHarmonic(4, 2), 1.0, r"no surface has level 1: .*within"),
         (hk.HarmonicPolynomial({(1, 0, 0): 2.0}), 2.5, r"no surface has level 2.5.*within"),
         (hk.Gyroid(), [0.0, 7.0], "no surface has level 7"),

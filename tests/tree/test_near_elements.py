@@ -249,7 +249,7 @@ def test_derivatives_far_from_meshes_are_within_their_bounds(distance: float, me
 def test_what_overflows_has_no_bound() -> None:
     """Second derivatives beside a dipole leave single precision."""
     points = np.eye(3)
-    field = hk.ScreenedWindingNumber(points, points, areas=np.ones(3), length=1.0)
+    field = hk.fields.ScreenedWindingNumber(points, points, areas=np.ones(3), length=1.0)
     x = points + 1e-7 * np.array([1.0, 1, 0])
     hessian, bound = field.hessian(x), field.hessian_error_bound(x)
     assert (np.isfinite(hessian).all(axis=(1, 2)) | np.isinf(bound)).all()

@@ -27,10 +27,10 @@ _BALL = icosphere(1)
 OTHERS: dict[str, Callable[[], hk.Field]] = {
     "polygon mesh": lambda: hk.PolygonMesh(_BALL[0], [[*face] for face in _BALL[1]]),
     "blobs": lambda: hk.Blobs(np.random.default_rng(1).normal(size=(30, 3)) * 0.5, radii=0.3),
-    "HRBF": lambda: hk.HRBF(_BALL[0], _BALL[0]),
-    "log": lambda: hk.RiemannSurface("log", domain=hk.Ball(radius=1.0)),
-    "asin": lambda: hk.RiemannSurface("asin", domain=hk.Ball(radius=1.0)),
-    "level curves": lambda: hk.LevelCurves("log"),
+    "HRBF": lambda: hk.fields.HRBF(_BALL[0], _BALL[0]),
+    "log": lambda: hk.fields.RiemannSurface("log", domain=hk.Ball(radius=1.0)),
+    "asin": lambda: hk.fields.RiemannSurface("asin", domain=hk.Ball(radius=1.0)),
+    "level curves": lambda: hk.fields.LevelCurves("log"),
 }
 
 
@@ -60,7 +60,7 @@ def check_same_hits(field: hk.Field, count: int) -> None:
     other = hk.trace(field, o, d, tolerance=tolerance, backend="webgpu")
     own = hk.trace(field, o, d, tolerance=tolerance)
     unit = d / np.linalg.norm(d, axis=1, keepdims=True)
-    assert tracing._compare_hits(own, other, unit, hk.HitTolerance(tolerance)) == ""
+    assert tracing._compare_hits(own, other, unit, hk.tracer.HitTolerance(tolerance)) == ""
     both = own.is_hit & other.is_hit
     assert (own.status != other.status).sum() <= 1e-3 * count
     assert both.any()
@@ -130,7 +130,7 @@ def test_what_is_not_for_other_devices() -> None:
     with pytest.raises(ValueError, match="single precision alone"):
         hk.trace(field, o, d, precision="double", backend="webgpu")
     with pytest.raises(NotImplementedError, match="first hits alone"):
-        hk.trace(field, o, d, all_hits=3, backend="webgpu")  # type: ignore[call-overload]
+        hk.crossings(field, o, d, max_crossings=3, backend="webgpu")  # type: ignore[call-overload]
     with pytest.raises(ValueError, match="'metal'"):
         hk.trace(field, o, d, backend="metal")  # type: ignore[call-overload]
     backend = hk.backend.choose_backend("single")

@@ -14,11 +14,11 @@ from harnack.cli.mesh_files import MESH_FILES
 from harnack.cli.messages import printable
 from harnack.field_from_file import UP_AXES
 from harnack.files.geometry_files import GEOMETRY_SUFFIXES
+from harnack.live.live_scene import LIVE_MODES
+from harnack.live.sliders import Slider
 from harnack.name_suggestions import did_you_mean
 from harnack.rendering import option_text as text
 from harnack.rendering.option_table import Option, options_of
-from harnack.view.live_scene import LIVE_MODES
-from harnack.view.sliders import Slider
 
 _MESH_FILE = "a mesh: .stl, .obj, .ply, .off, .glb, .gltf or .3mf"
 # Options of Python that the command line has otherwise, or not at all.

@@ -28,13 +28,13 @@ from harnack.files.file_geometry import write_atomically
 from harnack.files.geometry_files import LoadedMesh, read_geometry
 from harnack.gallery import SCENES
 from harnack.geometry.boundary_edges import weld_vertices
+from harnack.live import page, view
 from harnack.meshing import check_print, mesh, repair, wall_thickness
 from harnack.name_suggestions import did_you_mean
 from harnack.rendering import animate, render
 from harnack.rendering.animation import check_film_path
 from harnack.rendering.images import check_picture_path
 from harnack.rendering.option_table import SHORTHAND
-from harnack.view import page, view
 
 _DEMO_SIZE = (480, 360)
 

@@ -18,14 +18,14 @@ from harnack.fields import Field
 from harnack.fields.expressions import expression, looks_like_formula
 from harnack.files.geometry_files import GEOMETRY_SUFFIXES
 from harnack.gallery import SCENES, Scene
+from harnack.live import SceneFile, read_scene
+from harnack.live.live_scene import live_options
+from harnack.live.scene_file import FieldSources
 from harnack.name_suggestions import did_you_mean
 from harnack.rendering import Camera
 from harnack.rendering.option_table import STUDIO_OPTIONS, options_of
 from harnack.tracer import Surface, TraceOptions
 from harnack.tracer.trace_options import SURFACE_OPTIONS, TRACE_OPTIONS
-from harnack.view import SceneFile, read_scene
-from harnack.view.live_scene import live_options
-from harnack.view.scene_file import FieldSources
 
 _SUFFIXES = (*GEOMETRY_SUFFIXES, ".xml", ".json")
 
@@ -272,7 +272,7 @@ def _unpacked(surfaces: Any, settings: dict[str, Any]) -> tuple[Any, dict[str, A
     be the value of a keyword."""
     listed: list[Any] = [*surfaces] if isinstance(surfaces, list | tuple) else [surfaces]
     if not any(isinstance(surface, Surface) for surface in listed):
-        return surfaces, settings
+        return listed, settings
     if len(listed) != 1:
         raise ValueError("a scene of several surfaces has their levels; sliders do not apply")
     (surface,) = listed

@@ -202,8 +202,8 @@ def choose_enclosures(bound: EnclosureChoice = None) -> EnclosureKinds:
     kinds: tuple[Any, ...] = tuple(classes)
     if not kinds or not all(_is_proof(kind) for kind in kinds):
         raise TypeError(
-            "bound must be a name, or classes of enclosures such as harnack.SphericalCapEnclosure "
-            "or (harnack.SphericalCapEnclosure, harnack.LipschitzEnclosure), "
+            "bound must be a name, or classes of enclosures such as harnack.proofs.SphericalCapEnclosure "
+            "or (harnack.proofs.SphericalCapEnclosure, harnack.proofs.LipschitzEnclosure), "
             f"not {bound!r}"
         )
     return EnclosureKinds(kinds)

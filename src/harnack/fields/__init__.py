@@ -1,14 +1,13 @@
 """Fields: the functions f whose level sets are drawn, with a folder for each family.
 
-This package exports the base classes and helpers of all fields. The fields themselves are names of
-`harnack`, which `harnack/__init__.pyi` lists.
+This package exports the base classes and all fields but solids, which are in `harnack.solids`; they
+are imported when they are first used, as `__init__.pyi` lists them.
 """
 
 from __future__ import annotations
 
-from harnack.fields.capabilities import NO_FACET, JumpCrossing
-from harnack.fields.field import Field, Sample
-from harnack.fields.formula import Formula
-from harnack.fields.solids.solid import FormulaSolid, Solid
+from typing import Any, cast
 
-__all__ = ["NO_FACET", "Field", "Formula", "FormulaSolid", "JumpCrossing", "Sample", "Solid"]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = cast("Any", lazy_loader).attach_stub(__name__, __file__)

@@ -251,7 +251,7 @@ def _power(base: Any, exponent: Any) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Expression(Formula):
-    """A field f(x, y, z) that is a Python function, written with plain operators and `harnack.sin`
+    """A field f(x, y, z) that is a Python function, written with plain operators and `harnack.math.sin`
     etc.
 
     function: called with three coordinates while a kernel is being recorded; numbers in it are
@@ -283,7 +283,7 @@ def expression(
 ) -> Expression:
     """The implicit surface f(x, y, z) = level of a user-defined formula.
 
-    function: of three coordinates, written with + - * / **, abs, and the functions `harnack.sin`,
+    function: of three coordinates, written with + - * / **, abs, and the functions `harnack.math.sin`,
         `cos`, `tan`, `exp`, `log`, `sqrt`, `tanh`, `atan`, `atan2`, `asin`, `acos`, `sinh`, `cosh`,
         `maximum`, `minimum`, `norm`; NumPy's functions of the same names work too. Or a text, such
         as "x^2 + y^2 = 1 + sin(2*z)", with `max` and `min`; an equation means left - right.
@@ -294,7 +294,7 @@ def expression(
     is_convex: your promise that the function is convex, as quadrics and norms are: then steps
         towards the surface are longer. `harnack.testing.check_field` tests the promise at samples.
 
-        torus = hk.expression(lambda x, y, z: (hk.norm(x, y) - 1) ** 2 + z**2 - 0.1)
+        torus = hk.expression(lambda x, y, z: (hk.math.norm(x, y) - 1) ** 2 + z**2 - 0.1)
 
     Warns of a formula so long that the first trace takes more than about ten seconds to compile.
 

@@ -345,7 +345,7 @@ def as_jet(value: Any, like: Jet, name: str) -> Jet:
         return like.constant(float(value))
     raise TypeError(
         f"{name}: the formula returned an object of type {type(value).__name__}, not a number made "
-        "of its coordinates: write it with + - * / ** and functions such as harnack.sin"
+        "of its coordinates: write it with + - * / ** and functions such as harnack.math.sin"
     )
 
 

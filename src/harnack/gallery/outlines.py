@@ -13,7 +13,7 @@ from harnack.gallery.scene import Scene
 from harnack.rendering import Camera
 from harnack.tracer import Surface, TraceOptions
 
-# harnack.outline.text("harnack", 1000, tolerance=4): x, y of each loop, so that the scene does
+# harnack.io.outline.text("harnack", 1000, tolerance=4): x, y of each loop, so that the scene does
 # without matplotlib. Behind the letters a are their holes.
 _WORD: tuple[tuple[int, ...], ...] = (
     (91, 0, 181, 0, 181, 309, 192, 381, 223, 435, 273, 470, 338, 482, 391, 472, 429, 443, 451,

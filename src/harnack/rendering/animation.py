@@ -78,7 +78,7 @@ def animate(
     """Draw a film and write it to `path`; notebooks show what is returned.
 
         hk.animate(field, "turntable.gif", orbit=360)
-        hk.animate(lambda s: hk.Morph(a, b, gap=0.2, w=0.2 * s), "morph.mp4")
+        hk.animate(lambda s: hk.fields.Morph(a, b, gap=0.2, w=0.2 * s), "morph.mp4")
         hk.animate(field, "levels.gif", level=lambda s: 1 + 4 * s)
 
     surfaces: as `render` draws them in its studio. They, the camera and options that may change

@@ -74,9 +74,7 @@ class UnboundedSurfaceError(ValueError):
 
     def __init__(self, reason: str, usual: float | None) -> None:
         other = "" if usual is None else f", or choose another level, such as {usual:g}"
-        super().__init__(
-            f"{reason}: give it a clip, such as a ball (harnack.Ball){other}"
-        )
+        super().__init__(f"{reason}: give it a clip, such as a ball (harnack.Ball){other}")
         self.reason = reason
         self.bounded_level = usual
 

@@ -190,8 +190,8 @@ def _carrier_class(variant: str) -> Any:
         """A mesh that no ray hits, with the surface that it stands for."""
 
         def __init__(
-            self, props: Any, surface: TracedSurface, placement: Placement, tint: Any, cut_bsdf: Any,
-            isolines: Sequence[Isolines],
+            self, props: Any, surface: TracedSurface, placement: Placement, tint: Any,
+            cut_bsdf: Any, isolines: Sequence[Isolines],
         ) -> None:  # fmt: skip
             ends = bounding_box(surface)
             mi.Mesh.__init__(self, PLUGIN, 2, 2, props=props)

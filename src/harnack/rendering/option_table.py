@@ -102,7 +102,7 @@ OPTIONS: tuple[Option, ...] = (
            text.parse_levels, varies=True),
     Option("clip", "surface", _PLACED, "volume that cuts the surface: ball:X,Y,Z,RADIUS, or "
            "box:X,Y,Z,X,Y,Z between two corners", "VOLUME", text.parse_clip, varies=True),
-    Option("section", "surface", _PLACED, "plane that opens the surface: leave out what lies beyond "
+    Option("section", "surface", _PLACED, "plane that opens the surface: leave out what is beyond "
            "it, on the side that the vector X,Y,Z points to, at a distance from the origin (0)",
            "X,Y,Z[,DISTANCE]", text.parse_section, varies=True),
     Option("side", "surface", DRAWN | {"mesh"}, "surface, or the closed solid where the function "

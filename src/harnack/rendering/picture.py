@@ -78,18 +78,18 @@ def render(
         of what is drawn.
     show: "path" follows light paths; "shaded" lights first hits by a formula, in seconds and
         without noise; or what one ray a pixel found: "normal", "evaluations" (of the fields),
-        "status" and "depth", or "value", which colors the surface by the function `color_by`. Edges of
-        pictures of values are antialiased, the numbers that are returned are not.
+        "status" and "depth", or "value", which colors the surface by the function `color_by`.
+        Edges of pictures of values are antialiased, the numbers that are returned are not.
     size: (width, height) in pixels, by default (800, 600) or the scene's own.
     spp: samples a pixel of a color picture, by default 64 or the scene's own, and of the edges
         of one that is shaded or shows values, by default 9. Others have one ray a pixel.
     antialias: of shaded pictures, which pixels get all their samples: "edges", the default, those
         that differ from a neighbor; "cones" also those that a surface covers in part, found by
         a cone around each pixel. Wires thinner than a pixel then stay lines. It evaluates fields
-        about twice as often, goes by |f - level| / |grad f|, and takes no fields that jump, such as
-        winding numbers of meshes.
-    color_by: the function of which show="value" shows values on the surface: a field, "x", "y", "z", or
-        a function of three coordinates. All are those of the surface or, of a scene, of the world.
+        about twice as often, goes by |f - level| / |grad f|, and takes no fields that jump,
+        such as winding numbers of meshes.
+    color_by: the function of which show="value" shows values on the surface: a field, "x", "y",
+        "z", or a function of three coordinates. All are those of the surface or, of a scene, of the world.
     color_range: (low, high) of the colors of values, depths or evaluations, by default what is
         seen; the same for all pictures of a series.
     color_bar: True, or the title, for a bar with numbers to the right of these pictures. It widens

@@ -158,7 +158,7 @@ def _with_section_material(objects: list[StudioObject], material: Material) -> l
     if not any(map(has_faces, objects)):
         raise ValueError(
             "section_material needs a solid with a section, whose faces are of it: give a section, "
-            'such as a half-space, and for a field that is no harnack.Solid also side="below" or '
+            'such as a half-space, and for a field that is no harnack.solids.Solid also side="below" or '
             '"above"'
         )
     return [
@@ -241,8 +241,8 @@ def with_visible_inside(surface: TracedSurface, *, is_clear: bool = False) -> Tr
         ValueError: a closed solid of a field that has none (`check_has_inside`).
     """
     is_seen = is_clear or surface.section is not None
-    if surface.side is None and isinstance(surface.field, Solid) and is_seen:
-        if len(surface.levels) == 1:
-            return replace(surface, side="below")
+    is_solid = isinstance(surface.field, Solid) and len(surface.levels) == 1
+    if surface.side is None and is_solid and is_seen:
+        return replace(surface, side="below")
     check_has_inside(surface)
     return surface

@@ -56,7 +56,7 @@ class Lobes(Field):
     vanish there, and the origin belongs to the surface. To distinguish signs by color, draw both
     parts:
 
-        lobes, signs = hk.Lobes(3, 2), ["plastic", "porcelain"]
+        lobes, signs = hk.fields.Lobes(3, 2), ["plastic", "porcelain"]
         hk.render([lobes.positive, lobes.negative], material=signs, side="below")
 
     l, m: degree 0 <= l <= 12 and order -l <= m <= l.

@@ -360,7 +360,7 @@ def _around_the_origin() -> Volume:
 class HeightField(Formula):
     """The surface z = u(x, y): the level 0 of f = z - u, which is negative below it.
 
-    function: u, written with plain operators and functions such as `harnack.sin` (see
+    function: u, written with plain operators and functions such as `harnack.math.sin` (see
         `expression`); called while a kernel is being recorded, its numbers are literals of that
         kernel.
     domain: the volume in which the surface is drawn, by default the box of all points with
@@ -369,7 +369,7 @@ class HeightField(Formula):
     Along a ray f'' depends on u only, and steps are proved from its ranges. Rays are clipped to
     the range of heights that u has over the domain, which is proved on a grid of cells.
 
-        hk.HeightField(lambda x, y: 0.3 * hk.sin(3 * x) * hk.cos(3 * y))
+        hk.fields.HeightField(lambda x, y: 0.3 * hk.math.sin(3 * x) * hk.math.cos(3 * y))
 
     Raises:
         TypeError: function cannot be called with two coordinates, or uses operations without

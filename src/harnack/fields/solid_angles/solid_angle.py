@@ -286,11 +286,11 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return self._device
 
     def _evaluate_points(
-        self, points: Any, precision: Precision, wanted: Callable[[Sample], Any]
+        self, points: Any, precision: Precision | None, choose: Callable[[Sample], Any]
     ) -> npt.NDArray[Any]:
         if self.has_variable_accuracy:
-            return self._without_cells._evaluate_points(points, precision, wanted)
-        return super()._evaluate_points(points, precision, wanted)
+            return self._without_cells._evaluate_points(points, precision, choose)
+        return super()._evaluate_points(points, precision, choose)
 
     def exact(self, backend: Backend) -> Field:
         return self.at_accuracy(backend.Float(EXACT)) if self.has_variable_accuracy else self

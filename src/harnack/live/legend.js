@@ -1,4 +1,4 @@
-// What the colors of a picture mean, beside it: see harnack.view.legend_data.
+// What the colors of a picture mean, beside it: see harnack.live.legend_data.
 // @ts-check
 
 import { element, format } from "./elements.js";

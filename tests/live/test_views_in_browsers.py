@@ -39,17 +39,17 @@ def browser() -> Iterator[Any]:
 
 
 @pytest.fixture(scope="module")
-def view() -> Iterator[hk.LiveView]:
+def view() -> Iterator[hk.live.LiveView]:
     level = hk.Slider(2.0, 11.0, 6.0)
     with hk.view(
-        hk.SolidAngle(LOOP), level=level, title="T", camera=hk.Camera(zoom=1.5), opens=False,
-        waits=False,
+        hk.SolidAngle(LOOP), level=level, title="T", camera=hk.Camera(zoom=1.5), open_browser=False,
+        block=False,
     ) as one:  # fmt: skip
         yield one
 
 
 @pytest.fixture
-def page(browser: Any, view: hk.LiveView) -> Iterator[Page]:
+def page(browser: Any, view: hk.live.LiveView) -> Iterator[Page]:
     one = Page(browser, view.address, SIZE, samples=1)
     yield one
     one.close()
@@ -247,7 +247,7 @@ def test_a_picture_is_rendered_and_called_off(page: Page) -> None:
     page.tab.wait_for_function("() => panel.message.textContent.includes('stopped')")
 
 
-def test_two_windows_and_a_hundred_connections(browser: Any, view: hk.LiveView) -> None:
+def test_two_windows_and_a_hundred_connections(browser: Any, view: hk.live.LiveView) -> None:
     pages = [Page(browser, view.address, SIZE, samples=1) for _ in range(2)]
     pages[0].set("level", 3.0)
     pictures = [one.picture() for one in pages]
@@ -270,7 +270,7 @@ def test_two_windows_and_a_hundred_connections(browser: Any, view: hk.LiveView) 
     assert count(view) == 0
 
 
-def count(view: hk.LiveView) -> int:
+def count(view: hk.live.LiveView) -> int:
     with urllib.request.urlopen(f"{view.address}clients") as answer:
         return int(json.load(answer)["clients"])
 
@@ -301,7 +301,7 @@ def test_messages_that_make_no_sense_are_answered_and_harm_nobody(page: Page) ->
     assert page.message == ""
 
 
-def test_a_tab_that_is_closed_ends_its_work(browser: Any, view: hk.LiveView) -> None:
+def test_a_tab_that_is_closed_ends_its_work(browser: Any, view: hk.live.LiveView) -> None:
     page = Page(browser, view.address, SIZE, samples=1)
     page.do("() => { panel.picture(4000, 'color').catch(() => {}); }")
     page.tab.wait_for_function("() => panel.root.querySelector('progress')?.value > 0")
@@ -315,7 +315,9 @@ def test_a_tab_that_is_closed_ends_its_work(browser: Any, view: hk.LiveView) -> 
     page.close()
 
 
-def test_without_webgpu_python_draws_and_the_page_says_so(browser: Any, view: hk.LiveView) -> None:
+def test_without_webgpu_python_draws_and_the_page_says_so(
+    browser: Any, view: hk.live.LiveView
+) -> None:
     flags = ("--no-sandbox", "--disable-gpu", "--disable-features=WebGPU")
     with closing(launched(browser.browser_type, *flags)) as plain:
         page = Page(plain, view.address, SIZE, samples=1)
@@ -331,7 +333,7 @@ def test_without_webgpu_python_draws_and_the_page_says_so(browser: Any, view: hk
         page.close()
 
 
-def test_a_device_that_lies_is_not_believed(browser: Any, view: hk.LiveView) -> None:
+def test_a_device_that_lies_is_not_believed(browser: Any, view: hk.live.LiveView) -> None:
     """One factor in the shader is wrong by 1e-3. Where that is not noticed, it does nothing: as
     where a shorter proof than another one is a little shorter, or beside an edge that no ray meets.
     """
@@ -371,13 +373,13 @@ def test_a_change_during_a_check_neither_accuses_the_device_nor_is_lost(page: Pa
     assert found == ["", "", True]
 
 
-def test_others_are_not_answered(view: hk.LiveView) -> None:
+def test_others_are_not_answered(view: hk.live.LiveView) -> None:
     assert view.address.startswith("http://127.0.0.1:")
     for headers in ({"Host": "elsewhere.example"}, {"Origin": "http://elsewhere.example"}):
         with pytest.raises(urllib.error.HTTPError, match="403"):
             urllib.request.urlopen(urllib.request.Request(view.address, headers=headers))
     field = hk.Sphere(1.0)
-    with hk.view(field, host="0.0.0.0", opens=False, waits=False) as public:
+    with hk.view(field, host="0.0.0.0", open_browser=False, block=False) as public:
         token = public.address.split("token=")[1]
         address = public.address.replace("0.0.0.0", "127.0.0.1")
         assert urllib.request.urlopen(address).status == 200
@@ -386,7 +388,7 @@ def test_others_are_not_answered(view: hk.LiveView) -> None:
         with pytest.raises(urllib.error.HTTPError, match="403"):
             urllib.request.urlopen(address.replace(token, "%C3%A9"))  # no ASCII
     with pytest.raises(OSError, match="cannot be served at"):
-        hk.view(field, host="203.0.113.1", opens=False, waits=False)
+        hk.view(field, host="203.0.113.1", open_browser=False, block=False)
 
 
 def test_a_server_on_ipv6(browser: Any) -> None:
@@ -395,7 +397,7 @@ def test_a_server_on_ipv6(browser: Any) -> None:
             one.bind(("::1", 0))
     except OSError:
         pytest.skip("this machine has no IPv6")
-    with hk.view(hk.Sphere(1.0), host="::1", opens=False, waits=False) as view:
+    with hk.view(hk.Sphere(1.0), host="::1", open_browser=False, block=False) as view:
         assert re.fullmatch(r"http://\[::1\]:\d+/", view.address)
         page = Page(browser, view.address, SIZE, samples=1)
         python_draws(page)  # by the socket

@@ -17,13 +17,7 @@ import numpy as np
 from harnack.backend.validation import as_finite
 from harnack.distance import curvature
 from harnack.geometry import Ball, Box, HalfSpace
-from harnack.name_suggestions import did_you_mean
-from harnack.rendering import Camera
-from harnack.rendering.backdrops import GROUNDS
-from harnack.rendering.render_options import check_image_size
-from harnack.rendering.stage import parse_material
-from harnack.tracer import RayStatus, trace
-from harnack.view.live_scene import (
+from harnack.live.live_scene import (
     LIVE_MODES,
     LIVE_OPTIONS,
     ControlState,
@@ -34,16 +28,22 @@ from harnack.view.live_scene import (
     state_delta,
     surface_colors,
 )
-from harnack.view.preview_renderer import CameraAxes, PreviewRenderer, PreviewSurface
-from harnack.view.scene_file import parse_scene
-from harnack.view.sliders import extreme_slider_values
+from harnack.live.preview_renderer import CameraAxes, PreviewRenderer, PreviewSurface
+from harnack.live.scene_file import parse_scene
+from harnack.live.sliders import extreme_slider_values
+from harnack.name_suggestions import did_you_mean
+from harnack.rendering import Camera
+from harnack.rendering.backdrops import GROUNDS
+from harnack.rendering.render_options import check_image_size
+from harnack.rendering.stage import parse_material
+from harnack.tracer import RayStatus, trace
 
 if TYPE_CHECKING:
     from harnack.backend import FloatArray
     from harnack.geometry import Volume
+    from harnack.live.live_scene import JsonDict
+    from harnack.live.preview_renderer import Preview
     from harnack.rendering.stage import StudioObject
-    from harnack.view.live_scene import JsonDict
-    from harnack.view.preview_renderer import Preview
 
 __all__ = ["MessageHandler", "RequestError", "Session", "parse_camera"]
 

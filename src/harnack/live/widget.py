@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any, cast
 import anywidget
 import traitlets
 
-from harnack.view.live_scene import LIVE_MODES
-from harnack.view.page import MODULES, resource, script, still_png
-from harnack.view.server import check_height
-from harnack.view.session import MessageHandler, RequestError, parse_camera
+from harnack.live.live_scene import LIVE_MODES
+from harnack.live.page_file import MODULES, resource, script, still_png
+from harnack.live.server import check_height
+from harnack.live.session import MessageHandler, RequestError, parse_camera
 
 if TYPE_CHECKING:
-    from harnack.view.live_scene import JsonDict, LiveScene
+    from harnack.live.live_scene import JsonDict, LiveScene
 
 __all__ = ["Widget"]
 

@@ -16,10 +16,10 @@ anywhere. Where the browser's device is missing, slower than Python or fails its
 
 from __future__ import annotations
 
-from harnack.view.page import page
-from harnack.view.scene_file import SceneFile, SceneFileError, read_scene, write_scene
-from harnack.view.server import LiveView, view
-from harnack.view.sliders import Slider
+from harnack.live.page_file import page
+from harnack.live.scene_file import SceneFile, SceneFileError, read_scene, write_scene
+from harnack.live.server import LiveView, view
+from harnack.live.sliders import Slider
 
 __all__ = [
     "LiveView",

@@ -47,6 +47,8 @@ from harnack.fields.solids.solid import SpaceMap
 from harnack.files.file_geometry import write_atomically
 from harnack.gallery import SCENES
 from harnack.geometry import Volume
+from harnack.live.sliders import SLIDER_OPTIONS, Slider
+from harnack.live.type_checks import check_types
 from harnack.name_suggestions import did_you_mean
 from harnack.rendering import Camera, Isolines
 from harnack.rendering.framing import rotation_to_z_up
@@ -59,8 +61,6 @@ from harnack.tracer.trace_options import (
     surface_and_options,
     trace_options_among,
 )
-from harnack.view.sliders import SLIDER_OPTIONS, Slider
-from harnack.view.type_checks import check_types
 
 __all__ = [
     "FieldSources",

@@ -9,7 +9,7 @@ import { words } from "./drawing.js";
  * @typedef {{surfaces: (Surface | Partial<Surface> & {at: string, to: string, check?: Check})[],
  *            curves?: number[][][]}} Change */
 
-/** The state after a change; see `state_delta` in harnack.view.live_scene. @param {State} first
+/** The state after a change; see `state_delta` in harnack.live.live_scene. @param {State} first
  *  @param {Change} change @returns {Promise<State>} */
 export async function changed(first, change) {
   const surfaces = await Promise.all(change.surfaces.map(async (given, k) => {

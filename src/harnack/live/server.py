@@ -14,21 +14,21 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, cast
 
 from harnack.backend.validation import as_integer_in_range
+from harnack.live.live_scene import LiveScene
+from harnack.live.page_file import check_title, document, still_png
+from harnack.live.scene_file import FieldSources
+from harnack.live.session import MessageHandler, RequestError
+from harnack.live.sliders import extreme_slider_values
 from harnack.rendering.option_table import shows_options
-from harnack.view.live_scene import LiveScene
-from harnack.view.page import check_title, document, still_png
-from harnack.view.scene_file import FieldSources
-from harnack.view.session import MessageHandler, RequestError
-from harnack.view.sliders import extreme_slider_values
 
 if TYPE_CHECKING:
     from typing import Self
 
     from aiohttp import web
 
+    from harnack.live.live_scene import JsonDict
+    from harnack.live.widget import Widget
     from harnack.tracer import TraceOptions
-    from harnack.view.live_scene import JsonDict
-    from harnack.view.widget import Widget
 
 __all__ = ["LiveView", "check_height", "view"]
 
@@ -130,7 +130,7 @@ def view(
     title = title or live.content.name
     if open_browser and port == 0 and host == _LOCAL[0] and block is None and in_notebook():
         try:
-            from harnack.view.widget import Widget
+            from harnack.live.widget import Widget
         except ImportError:
             print(
                 "a view in this notebook itself needs anywidget: pip install 'harnack[notebook]'",

@@ -21,6 +21,10 @@ from harnack.backend import choose_backend, to_vector3
 from harnack.fields import Solid
 from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.geometry import HalfSpace, Volume, VolumeIntersection
+from harnack.live.legend_data import EVALUATIONS_TOP, legends
+from harnack.live.live_framing import Framing, extreme_points
+from harnack.live.scene_file import FieldSources, to_scene_text, with_flat_options
+from harnack.live.sliders import SliderValueError, SlidingContent, slider_values_in_errors
 from harnack.rendering import render
 from harnack.rendering.backdrops import FLOOR_HEIGHT, GroundBackdrop, parse_backdrop, reflectance_of
 from harnack.rendering.camera import Camera
@@ -36,10 +40,6 @@ from harnack.rendering.stage import MATERIALS, Material, StudioObject
 from harnack.rendering.studio_surfaces import studio_objects, with_visible_inside
 from harnack.tracer import HitTolerance, RayStatus, Surface, TracedSurface
 from harnack.tracer.trace_options import SURFACE_OPTIONS
-from harnack.view.legend_data import EVALUATIONS_TOP, legends
-from harnack.view.live_framing import Framing, extreme_points
-from harnack.view.scene_file import FieldSources, to_scene_text, with_flat_options
-from harnack.view.sliders import SliderValueError, SlidingContent, slider_values_in_errors
 from harnack.webgpu import as_words, labeled_leaves, pack_shader_data, record_kernel
 
 if TYPE_CHECKING:

@@ -16,8 +16,8 @@ from harnack.cli import main
 from harnack.gallery import SCENES
 from harnack.geometry import example_curves
 from harnack.geometry.example_meshes import icosphere
-from harnack.view.scene_file import _constructible_types, parse_scene, to_scene_text
-from harnack.view.type_checks import check_types
+from harnack.live.scene_file import _constructible_types, parse_scene, to_scene_text
+from harnack.live.type_checks import check_types
 
 CURVE = hk.SolidAngle(example_curves.torus_knot(2, 3, 12))
 SOLIDS = {
@@ -30,7 +30,7 @@ SOLIDS = {
         [[(0, 0), (2, 0), (0, 2)], [(0.2, 0.2), (1, 0.2), (0.2, 1)]], 0.5, twist=40.0, taper=0.5
     )
     | hk.SolidOfRevolution([(0, 0), (1, 0), (0, 1)]),
-    "threads": hk.metric_thread("M8", 10.0) | hk.Tube.helix(5.0, 2.0, 1.5, 0.3),
+    "threads": hk.solids.metric_thread("M8", 10.0) | hk.Tube.helix(5.0, 2.0, 1.5, 0.3),
     "mesh": hk.solid(icosphere(0)).shell(0.2) - hk.solid(icosphere(0)).scaled(0.3),
     "gyroid": hk.Gyroid(0.5, domain=hk.Ball((0.1, 0.0, 0.0), 1.5)),
     "formula": hk.expression("x^2 + a*y^2 = 1 + z", parameters={"a": 0.1}, level=0.25),
@@ -105,7 +105,7 @@ def test_a_scene_is_traced_at_its_level(tmp_path: Path) -> None:
 )  # fmt: skip
 def test_settings_are_checked_when_they_are_read(settings: dict[str, Any], wrong: str) -> None:
     about = {"harnack": 1, "surfaces": [{"field": {"Sphere": {}}}], "settings": settings}
-    with pytest.raises(hk.SceneFileError, match=f"settings: .*{wrong}"):
+    with pytest.raises(hk.live.SceneFileError, match=f"settings: .*{wrong}"):
         parse_scene(json.dumps(about))
 
 
@@ -119,19 +119,21 @@ def test_settings_are_checked_when_they_are_read(settings: dict[str, Any], wrong
 def test_what_could_not_be_read_is_not_written(
     settings: dict[str, Any], wrong: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(hk.SceneFileError, match=wrong):
+    with pytest.raises(hk.live.SceneFileError, match=wrong):
         hk.write_scene(tmp_path / "a.json", hk.Sphere(1.0), **settings)
     assert not any(tmp_path.iterdir())
 
 
 def test_scene_files_know_every_solid() -> None:
     solids = [getattr(hk, name) for name in hk.__all__]
-    solids = [one for one in solids if inspect.isclass(one) and issubclass(one, hk.FormulaSolid)]
+    solids = [
+        one for one in solids if inspect.isclass(one) and issubclass(one, hk.solids.FormulaSolid)
+    ]
     assert len(solids) > 10
     for kind in _constructible_types().values():
         check_types(kind, {})  # whose annotations can be read
-    for one in set(solids) - {hk.FormulaSolid}:
-        with pytest.raises(hk.SceneFileError, match="argument of"):
+    for one in set(solids) - {hk.solids.FormulaSolid}:
+        with pytest.raises(hk.live.SceneFileError, match="argument of"):
             parse_scene(
                 json.dumps({"harnack": 1, "surfaces": [{"field": {one.__name__: {"q": 1}}}]})
             )
@@ -155,7 +157,7 @@ def test_settings_and_sliders_come_back(tmp_path: Path) -> None:
         "level": 5.0
     }
     assert parse_scene(to_scene_text(CURVE, {"level": np.float32(0.5)})).settings == {"level": 0.5}
-    surface = hk.level_set(hk.Gyroid(0.5), solid=(-np.inf, 0.1), clip=hk.Ball())
+    surface = hk.Surface(hk.Gyroid(0.5), level=0.1, side="below", clip=hk.Ball())
     (found,) = parse_scene(to_scene_text([surface], {})).surfaces
     assert isinstance(found, hk.Surface)
     assert (found.solid, found.clip) == (surface.solid, surface.clip)
@@ -173,7 +175,7 @@ def test_a_file_is_found_beside_the_scene(tmp_path: Path) -> None:
     assert (
         json.loads(to_scene_text(saved.surfaces, {}, saved.sources))["surfaces"][0]["level"] == 2.0
     )
-    with pytest.raises(hk.SceneFileError, match="must not name files"):
+    with pytest.raises(hk.live.SceneFileError, match="must not name files"):
         parse_scene(json.dumps(about))
 
 
@@ -265,27 +267,27 @@ WHOLE = '{"harnack": 1, "surfaces": [{"field": %s}]}'
     ],
 )
 def test_what_is_not_known_is_refused(text: str, wrong: str) -> None:
-    with pytest.raises(hk.SceneFileError, match=wrong):
+    with pytest.raises(hk.live.SceneFileError, match=wrong):
         parse_scene(text)
 
 
 def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
     mesh = hk.WindingNumber(*icosphere(1))
-    with pytest.raises(hk.SceneFileError, match="a WindingNumber that was made in Python"):
+    with pytest.raises(hk.live.SceneFileError, match="a WindingNumber that was made in Python"):
         hk.write_scene(tmp_path / "a.json", mesh)
-    with pytest.raises(hk.SceneFileError, match="Expression that was made in Python"):
+    with pytest.raises(hk.live.SceneFileError, match="Expression that was made in Python"):
         hk.write_scene(tmp_path / "a.json", hk.expression(lambda x, y, z: x * y - z))
-    with pytest.raises(hk.SceneFileError, match="no setting 'levle'"):
+    with pytest.raises(hk.live.SceneFileError, match="no setting 'levle'"):
         hk.write_scene(tmp_path / "a.json", CURVE, levle=1.0)
-    with pytest.raises(hk.SceneFileError, match=r"written as \.json"):
+    with pytest.raises(hk.live.SceneFileError, match=r"written as \.json"):
         hk.write_scene(tmp_path / "a.txt", CURVE)
-    with pytest.raises(hk.SceneFileError, match="only those of a formula as text"):
+    with pytest.raises(hk.live.SceneFileError, match="only those of a formula as text"):
         hk.write_scene(
             tmp_path / "a.json", CURVE, isolines=hk.Isolines(hk.Sphere(1.0), interval=1.0)
         )
-    with pytest.raises(hk.SceneFileError, match="material"):
+    with pytest.raises(hk.live.SceneFileError, match="material"):
         hk.write_scene(tmp_path / "a.json", CURVE, material={"type": "diffuse"})
-    with pytest.raises(hk.SceneFileError, match="nothing to write"):
+    with pytest.raises(hk.live.SceneFileError, match="nothing to write"):
         hk.write_scene(tmp_path / "a.json", [])
     assert list(tmp_path.iterdir()) == []
 

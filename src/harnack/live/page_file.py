@@ -22,17 +22,17 @@ import numpy as np
 
 from harnack.cluster.executor import Executor, TaskResult, open_executor
 from harnack.files.file_geometry import write_atomically
+from harnack.live.live_scene import ControlState, LiveScene, encode_arrays, state_delta
+from harnack.live.sliders import slider_values_in_errors
 from harnack.progress import progress_bar
 from harnack.rendering.camera import Camera
 from harnack.rendering.mitsuba import set_variant
 from harnack.rendering.mitsuba_plugins import register
 from harnack.rendering.option_table import shows_options
-from harnack.view.live_scene import ControlState, LiveScene, encode_arrays, state_delta
-from harnack.view.sliders import slider_values_in_errors
 
 if TYPE_CHECKING:
+    from harnack.live.live_scene import JsonDict
     from harnack.tracer import TraceOptions
-    from harnack.view.live_scene import JsonDict
 
 __all__ = ["MODULES", "check_title", "document", "page", "resource", "script", "still_png"]
 
@@ -66,7 +66,7 @@ def page(
 
         hk.page(field, "surface.html")
         hk.page(field, "levels.html", level=hk.Slider(1, 12))
-        hk.page(lambda w: hk.Morph(a, b, w=w), "morph.html", w=hk.Slider(0, 1))
+        hk.page(lambda w: hk.fields.Morph(a, b, w=w), "morph.html", w=hk.Slider(0, 1))
 
     It opens in any browser with WebGPU, without Python and without a network; some want it from
     https or 127.0.0.1. Where there is none it shows a still picture and says why. The kernel that
@@ -264,7 +264,7 @@ def document(scene: Mapping[str, Any], still: str, link: str = "frames") -> str:
 
 def resource(name: str) -> str:
     """The text of a file of this folder."""
-    return resources.files("harnack.view").joinpath(name).read_text(encoding="utf-8")
+    return resources.files("harnack.live").joinpath(name).read_text(encoding="utf-8")
 
 
 _PAGE = Template("""\

@@ -13,10 +13,10 @@ import pytest
 
 import harnack as hk
 from harnack.geometry import example_curves
-from harnack.view import server
+from harnack.live import server
 from tests.view.browsers import Page, chromium, served
 
-widgets = pytest.importorskip("harnack.view.widget")
+widgets = pytest.importorskip("harnack.live.widget")
 traitlets = pytest.importorskip("traitlets")
 LOOP = example_curves.torus_knot(2, 3, 12)
 

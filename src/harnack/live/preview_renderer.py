@@ -16,6 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import to_numpy
+from harnack.live.legend_data import FAR_GRAY, HIT_COLOR, NEAR_GRAY, evaluations_share
+from harnack.live.live_scene import color_index
 from harnack.rendering.backdrops import FLOOR_HEIGHT, reflectance_of
 from harnack.rendering.images import SHOULDER_START, linear_to_srgb, to_uint8
 from harnack.rendering.integrator import OUT_OF_STEPS_COLOR
@@ -24,8 +26,6 @@ from harnack.rendering.mitsuba_plugins import register
 from harnack.rendering.scales import viridis
 from harnack.rendering.shaded_render import ambient_visibility
 from harnack.rendering.shading import FloorShadow, StudioLight
-from harnack.view.legend_data import FAR_GRAY, HIT_COLOR, NEAR_GRAY, evaluations_share
-from harnack.view.live_scene import color_index
 
 if TYPE_CHECKING:
     from harnack.backend import FloatArray

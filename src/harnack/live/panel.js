@@ -15,9 +15,9 @@ import { legend_of } from "./legend.js";
  *     settings: Settings, checks: boolean}): Promise<Change>,
  *   ask?(kind: string, given: object, on_progress?: (done: number, stop: () => void) => void): Promise<any>,
  * }} Link */
-/** Settings of `harnack.render` that are changed here: see `CONTROLLED` in harnack.view.live_scene.
+/** Settings of `harnack.render` that are changed here: see `CONTROLLED` in harnack.live.live_scene.
  * @typedef {{material?: string, boundary?: number | null}} Settings */
-/** A volume that cuts all surfaces: see `harnack.view.session`.
+/** A volume that cuts all surfaces: see `harnack.live.session`.
  * @typedef {{ball?: number[], box?: number[], plane?: number[]}} Cut */
 
 const GROUNDS = { light: [0.74, 0.73, 0.715], dark: [0.055, 0.058, 0.065] };

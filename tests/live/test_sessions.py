@@ -16,12 +16,12 @@ import trimesh
 import harnack as hk
 from harnack.geometry import example_curves
 from harnack.geometry.example_meshes import icosphere, torus_mesh
+from harnack.live import live_scene
+from harnack.live.live_scene import LiveScene, state_delta
+from harnack.live.session import MessageHandler, RequestError, Session
+from harnack.live.sliders import extreme_slider_values
 from harnack.meshing.checks import LocalizedMeshingError
 from harnack.rendering import studio_surfaces
-from harnack.view import live_scene
-from harnack.view.live_scene import LiveScene, state_delta
-from harnack.view.session import MessageHandler, RequestError, Session
-from harnack.view.sliders import extreme_slider_values
 
 LOOP = example_curves.torus_knot(2, 3, 18)
 FIELD = hk.SolidAngle(LOOP)
@@ -153,7 +153,7 @@ def outermost(live: LiveScene, ball: hk.Ball) -> float:
 
 def test_a_place_at_which_nothing_can_be_drawn_is_named() -> None:
     def torus(r: float) -> hk.Field:
-        return hk.Torus(1.0, r) if r < 0.35 else hk.Plane((0, 0, 1))
+        return hk.Torus(1.0, r) if r < 0.35 else hk.solids.Plane((0, 0, 1))
 
     live = LiveScene.of(torus, {"r": hk.Slider(0.2, 0.4, 0.3)})
     live = live.framed(extreme_slider_values(live.content.sliders))
@@ -296,7 +296,7 @@ def test_what_is_saved_can_be_opened(live: LiveScene) -> None:
     (opened,) = solid.live.surfaces_at(solid.controls({"sliders": {"level": 0.5}}))
     assert opened.surface.solid == (-np.inf, 0.5)  # with a face, at the level of the slider
     text = '{"harnack": 1, "surfaces": [{"field": {"file": "/etc/hosts"}}]}'
-    with pytest.raises(hk.SceneFileError, match="must not name files"):
+    with pytest.raises(hk.live.SceneFileError, match="must not name files"):
         session.answer({"kind": "load", "text": text})
 
 
@@ -368,7 +368,7 @@ def test_texts_that_are_no_questions(live: LiveScene) -> None:
 @pytest.mark.slow
 def test_a_page_that_is_closed_at_once_writes_nothing(caplog: pytest.LogCaptureFixture) -> None:
     """Its connection is reset before the answer to its request is written."""
-    with hk.view(hk.Sphere(1.0), opens=False, waits=False) as view:
+    with hk.view(hk.Sphere(1.0), open_browser=False, block=False) as view:
         port = int(view.address.rstrip("/").rpartition(":")[2])
         for _ in range(3):
             with socket.create_connection(("127.0.0.1", port)) as page:

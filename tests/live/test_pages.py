@@ -18,12 +18,12 @@ import harnack as hk
 from harnack.cli import main
 from harnack.geometry import example_curves
 from harnack.geometry.example_meshes import torus_mesh
-from harnack.view.sliders import SlidingContent
+from harnack.live.sliders import SlidingContent
 from harnack.webgpu import NoDeviceError, find_device
 from harnack.webgpu.device import CompiledShader
 from harnack.webgpu.wgsl import Shader
 
-page_module = import_module("harnack.view.page")  # beside the function of that name
+page_module = import_module("harnack.live.page_file")  # beside the function of that name
 
 
 def scene_of(path: Path) -> dict[str, Any]:
@@ -110,7 +110,7 @@ def test_the_places_of_sliders_are_in_the_page(tmp_path: Path) -> None:
     # The rays are the stage's: the surface stands there turned, moved and scaled.
     turned, moved, scale = np.split(np.array(scene["placement"]), [9, 12])
     o, d = (o - moved) @ turned.reshape(3, 3) / scale, d @ turned.reshape(3, 3)
-    torus = hk.level_set(hk.Torus(1.0, 0.4), 0.1, tolerance=surface["tolerance"] / scale[0])
+    torus = hk.traced_surface(hk.Torus(1.0, 0.4), 0.1, tolerance=surface["tolerance"] / scale[0])
     expected = hk.trace(torus, o, d)
     assert (found[0] != expected.status).mean() <= 2e-3
     both = expected.is_hit & (found[0] == 1)
@@ -182,7 +182,7 @@ def test_what_is_no_page(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="not drawn transparent"):
         hk.page(hk.Sphere(1.0), tmp_path / "a.html", material="glass")
     with pytest.raises(ValueError, match="reaches to infinity"):
-        hk.page(hk.Plane((0.0, 0.0, 1.0)), tmp_path / "a.html")
+        hk.page(hk.solids.Plane((0.0, 0.0, 1.0)), tmp_path / "a.html")
     with pytest.raises(TypeError, match="fields and level sets, not"):
         hk.page("gyroid", tmp_path / "a.html")
     with pytest.raises(TypeError, match="no setting 'levle'"):
@@ -205,7 +205,7 @@ def test_what_is_no_page(tmp_path: Path) -> None:
 def test_what_is_no_view(given: dict[str, Any], wrong: str) -> None:
     field: Any = hk.SolidAngle(example_curves.torus_knot(2, 3, 12))
     with pytest.raises((TypeError, ValueError), match=wrong):
-        hk.view(field, opens=False, waits=False, **given)
+        hk.view(field, open_browser=False, block=False, **given)
 
 
 def test_sliders() -> None:

@@ -1,6 +1,6 @@
 // Draws traced surfaces on the visitor's GPU: rays of a camera, the kernels that Dr.Jit recorded as
 // shaders, and the light of shaded pictures. No dependency: what is drawn comes from
-// `harnack.view.live_scene`, what is done around the kernels is in passes.wgsl.
+// `harnack.live.live_scene`, what is done around the kernels is in passes.wgsl.
 // @ts-check
 
 import { Camera, dot } from "./camera.js";
@@ -40,7 +40,7 @@ const PAINTS = 2048;
 const [CELLS, RAYS, BLOCK, SPREAD] = [64, 8, 4, 0.34];
 const BLUR = [0.025, 0.125, 0.225, 0.25, 0.225, 0.125, 0.025];
 
-/** The 32-bit words of a text, as `packed` of harnack.view.live_scene writes it; words as they are.
+/** The 32-bit words of a text, as `packed` of harnack.live.live_scene writes it; words as they are.
  *  @param {string | Uint32Array} text @returns {Promise<Uint32Array>} */
 export async function words(text) {
   if (typeof text !== "string") return text;

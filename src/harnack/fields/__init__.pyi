@@ -1,0 +1,61 @@
+"""Every field but solids, and where it is."""
+
+from .analytic.branches import BranchPoint
+from .analytic.fourier_series import FourierSeries
+from .analytic.hyperspherical import HypersphericalHarmonic
+from .analytic.lobes import Lobes
+from .analytic.periodic import EigenfunctionSum, Gyroid, SchwarzD, SchwarzP
+from .analytic.plane import HeightField, LevelCurves
+from .analytic.polynomial import HarmonicPolynomial, SphericalHarmonic
+from .analytic.riemann_surface import RiemannSurface
+from .analytic.waves import PlaneWave, WaveProduct, cosine_factor, sine_factor
+from .blobs.blobs import Blobs, Molecule
+from .blobs.hrbf import HRBF
+from .capabilities import NO_FACET, JumpCrossing
+from .expressions import expression
+from .field import Field, Sample
+from .formula import Formula
+from .solid_angles.dipole import DipolePotential
+from .solid_angles.morph import Morph
+from .solid_angles.polygon_mesh import PolygonMesh
+from .solid_angles.screened import ScreenedWindingNumber
+from .solid_angles.solid_angle import SolidAngle
+from .solid_angles.winding_number import WindingNumber
+from .solids.solid import FormulaSolid, Solid
+
+__all__ = [
+    "HRBF",
+    "NO_FACET",
+    "Blobs",
+    "BranchPoint",
+    "DipolePotential",
+    "EigenfunctionSum",
+    "Field",
+    "Formula",
+    "FormulaSolid",
+    "FourierSeries",
+    "Gyroid",
+    "HarmonicPolynomial",
+    "HeightField",
+    "HypersphericalHarmonic",
+    "JumpCrossing",
+    "LevelCurves",
+    "Lobes",
+    "Molecule",
+    "Morph",
+    "PlaneWave",
+    "PolygonMesh",
+    "RiemannSurface",
+    "Sample",
+    "SchwarzD",
+    "SchwarzP",
+    "ScreenedWindingNumber",
+    "Solid",
+    "SolidAngle",
+    "SphericalHarmonic",
+    "WaveProduct",
+    "WindingNumber",
+    "cosine_factor",
+    "expression",
+    "sine_factor",
+]

@@ -1,0 +1,7 @@
+"""Checks of parts to be printed: problems that a slicer would have, and the thickness of walls."""
+
+from __future__ import annotations
+
+from harnack.meshing import PrintCheck, PrintProblem, WallThickness, check_print, wall_thickness
+
+__all__ = ["PrintCheck", "PrintProblem", "WallThickness", "check_print", "wall_thickness"]

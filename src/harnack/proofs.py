@@ -1,0 +1,35 @@
+"""What a field of one's own promises, and the enclosures that prove steps from promises."""
+
+from __future__ import annotations
+
+from harnack.enclosures import choose_enclosures
+from harnack.enclosures.bounded_laplacian import BoundedLaplacianEnclosure
+from harnack.enclosures.enclosure import Enclosure, LevelGaps
+from harnack.enclosures.harmonic_ball import (
+    HarnackEnclosure,
+    HarnackSlopeEnclosure,
+    SphericalCapEnclosure,
+)
+from harnack.enclosures.parabola import LipschitzEnclosure, ParabolaEnclosure, TaylorEnclosure
+from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
+from harnack.enclosures.promises import BoundedLaplacian, HarmonicBall, Lipschitz, TaylorRemainder
+from harnack.fields.field import Sample
+
+__all__ = [
+    "BoundedLaplacian",
+    "BoundedLaplacianEnclosure",
+    "Enclosure",
+    "HarmonicBall",
+    "HarnackEnclosure",
+    "HarnackSlopeEnclosure",
+    "LevelGaps",
+    "Lipschitz",
+    "LipschitzEnclosure",
+    "ParabolaEnclosure",
+    "PiecewiseTaylorEnclosure",
+    "Sample",
+    "SphericalCapEnclosure",
+    "TaylorEnclosure",
+    "TaylorRemainder",
+    "choose_enclosures",
+]
