@@ -73,8 +73,8 @@ def lowest(page: Page) -> int:
 def screen_of(page: Page, curve: int, number: int) -> tuple[float, float]:
     """Where a point of a curve is in the window."""
     x, y = page.do(
-        "([c, k]) => { const p = panel.camera.project(panel.toStage(panel.curves[c][k]),"
-        " innerWidth, innerHeight); return [p.x, p.y]; }",
+        "([c, k]) => { const point = panel.placement.toStage(panel.curveEditor.curves[c][k]);"
+        " const p = panel.camera.project(point, innerWidth, innerHeight); return [p.x, p.y]; }",
         [curve, number],
     )
     return x, y
@@ -162,33 +162,33 @@ def choose(page: Page, name: str, value: str) -> None:
 
 def test_points_are_dragged_inserted_removed_smoothed_and_that_undone(page: Page) -> None:
     before = page.picture()
-    start = page.do("() => panel.curves")
+    start = page.do("() => panel.curveEditor.curves")
     page.tick("Edit points")
     with_points = page.picture("view-points")
     assert change(before, with_points) > 0.002
     x, y = screen_of(page, 0, lowest(page))
     page.drag((x, y), (x + 40, y - 30))
     assert change(with_points, page.picture("view-dragged")) > 0.01
-    moved = np.abs(np.array(page.do("() => panel.curves")) - start).max(axis=(0, 2))
+    moved = np.abs(np.array(page.do("() => panel.curveEditor.curves")) - start).max(axis=(0, 2))
     assert (moved > 1e-3).sum() == 1
     page.press("Undo")
     page.rest()
-    assert page.do("() => panel.curves") == start
+    assert page.do("() => panel.curveEditor.curves") == start
     page.press("Redo")
     page.rest()
-    assert page.do("() => panel.curves") != start
+    assert page.do("() => panel.curveEditor.curves") != start
     page.tab.keyboard.press("Control+z")
     (xa, ya), (xb, yb) = screen_of(page, 0, 5), screen_of(page, 0, 6)
     page.tab.mouse.dblclick(0.5 * (xa + xb), 0.5 * (ya + yb))
     page.rest()
-    assert len(page.do("() => panel.curves")[0]) == len(LOOP) + 1
+    assert len(page.do("() => panel.curveEditor.curves")[0]) == len(LOOP) + 1
     page.do("() => panel.root.querySelector('canvas').focus()")
     page.tab.keyboard.press("Delete")
     page.rest()
-    assert len(page.do("() => panel.curves")[0]) == len(LOOP)
+    assert len(page.do("() => panel.curveEditor.curves")[0]) == len(LOOP)
     page.press("Smooth")
     page.rest()
-    assert np.ptp(page.do("() => panel.curves")[0]) < np.ptp(start[0])
+    assert np.ptp(page.do("() => panel.curveEditor.curves")[0]) < np.ptp(start[0])
     assert page.message == ""
 
 

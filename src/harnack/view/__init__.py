@@ -10,8 +10,8 @@ the user interface, `live_framing` the camera that frames the surfaces for all s
 Three channels (`channels.js`, `slider_states.js`) bring changes: a socket to `server`, messages of
 `widget`, or state deltas stored in the page itself. Python answers requests in `session`, which
 trusts none of them, and sends the words that differ from the initial state, so that a slider
-compiles nothing anywhere. Where the browser's device is missing, slower than Python or fails its check,
-`preview_renderer` draws.
+compiles nothing anywhere. Where the browser's device is missing, slower than Python or fails its
+check, `preview_renderer` draws.
 """
 
 from __future__ import annotations

@@ -1,16 +1,19 @@
-// The window of the viewer: a canvas, a message, a legend and the controls beside them. It edits
-// curves, and it gets states and pictures from the renderer of the browser or from Python.
+// The window of the viewer: a canvas, a message, a legend and the controls beside them. It gets
+// states from Python or from the page, and pictures from the renderer of the browser or from Python.
 // @ts-check
 
 import { Camera, addScaled, dot } from "./camera.js";
+import { CurveEditor } from "./curve_editor.js";
 import {
   createButton, createCheckbox, createElement, createOptions, createRangeInput, download,
   downloadBlob, formatNumber,
 } from "./dom.js";
 import { createLegend } from "./legend.js";
+import { Placement } from "./placement.js";
 import { MODES, WebGpuRenderer, adaptScale } from "./renderer.js";
 import { applyDelta } from "./slider_states.js";
 
+/** @import {Curves} from "./curve_editor.js" */
 /** @import {Marks, Scene, Slider} from "./renderer.js" */
 /** @import {StateDelta} from "./slider_states.js" */
 /** Options of `harnack.render` that the controls change: see `LIVE_OPTIONS` in
@@ -18,7 +21,7 @@ import { applyDelta } from "./slider_states.js";
 /** A volume that cuts all surfaces: see `harnack.view.session`.
  * @typedef {{ball?: number[], box?: number[], plane?: number[]}} CutVolume */
 /** The state of the controls, as Python takes it.
- * @typedef {{sliders: Record<string, number>, loops: number[][][] | null, cut: CutVolume | null,
+ * @typedef {{sliders: Record<string, number>, loops: Curves | null, cut: CutVolume | null,
  *            settings: RenderOptions}} ControlValues */
 /** The source of states. A channel to Python answers further requests, too.
  * @typedef {{
@@ -26,7 +29,6 @@ import { applyDelta } from "./slider_states.js";
  *   request?(kind: string, parameters: object,
  *     onProgress?: (completed: number, cancel: () => void) => void): Promise<any>,
  * }} Channel */
-/** The number of a curve and that of its point. @typedef {[number, number]} PointIndex */
 
 const GROUND_REFLECTANCES = { light: [0.74, 0.73, 0.715], dark: [0.055, 0.058, 0.065] };
 /** The parameters of the volumes that cut the surfaces: least, greatest and first value.
@@ -40,11 +42,6 @@ const CUT_PARAMETERS = {
 // Choices of the list of materials, beside their names.
 const ORIGINAL_MATERIAL = "as given";
 const PLAIN_COLOR = "color";
-const CURVE_COLOR = [0.95, 0.75, 0.2, 1];
-const POINT_COLOR = [0.1, 0.1, 0.1, 1];
-const SELECTED_POINT_COLOR = [1, 0.3, 0.1, 1];
-// The distance in pixels within which a pointer takes a point.
-const PICK_RADIUS = 12;
 // The distance in pixels beyond which a press of a pointer is no click.
 const CLICK_RADIUS = 3;
 // The milliseconds without a change after which the device is checked.
@@ -70,17 +67,8 @@ export class Panel {
     this.cutKind = "none";
     /** @type {Record<string, number>} */
     this.cutParameters = {};
-    this.curves = scene.state.curves;
-    /** @type {number[][][][]} */
-    this.undoStack = [];
-    /** @type {number[][][][]} */
-    this.redoStack = [];
-    /** Whether the curves differ from those that Python has sent. */
-    this.isEdited = false;
-    /** Whether the curves can be edited now. */
-    this.isEditing = false;
-    /** @type {PointIndex | null} */
-    this.selectedPoint = null;
+    this.placement = new Placement(scene.placement);
+    this.curveEditor = new CurveEditor(this, scene.state.curves);
     /** Whether a click probes the surface. */
     this.isProbing = false;
     /** @type {Marks[]} */
@@ -147,14 +135,11 @@ export class Panel {
     /** @type {HTMLElement[]} */
     const buttons = [createButton("Reset view", () => { this.camera.reset(); this.redraw(); })];
     if (scene.editable) {
-      rows.push(createCheckbox("Edit points", (isChecked) => {
-        this.isEditing = isChecked;
-        this.selectedPoint = null;
-        this.updateMarks();
-      }));
+      rows.push(createCheckbox("Edit points", (isChecked) => this.curveEditor.setActive(isChecked)));
       buttons.push(
-        createButton("Undo", () => this.undo()), createButton("Redo", () => this.redo()),
-        createButton("Smooth", () => this.edit(this.curves.map(smoothCurve))),
+        createButton("Undo", () => this.curveEditor.undo()),
+        createButton("Redo", () => this.curveEditor.redo()),
+        createButton("Smooth", () => this.curveEditor.smooth()),
       );
     }
     buttons.push(createButton("Save picture", () => this.savePicture()));
@@ -290,7 +275,8 @@ export class Panel {
 
   /** The state of the controls now. @returns {ControlValues} */
   get controlValues() {
-    return { sliders: { ...this.sliderValues }, loops: this.isEdited ? this.curves : null,
+    const { curves, isEdited } = this.curveEditor;
+    return { sliders: { ...this.sliderValues }, loops: isEdited ? curves : null,
       cut: this.cutVolume, settings: { ...this.renderOptions } };
   }
 
@@ -382,11 +368,11 @@ export class Panel {
 
   /** Lets the camera and the curves follow mouse, touch and keys. @param {HTMLElement} target */
   listen(target) {
-    this.camera.listen(target, () => this.redraw(), (event) => this.grabPoint(event));
-    target.addEventListener("pointermove", (event) => this.dragPoint(event));
+    this.camera.listen(target, () => this.redraw(), (event) => this.pressPointer(event));
+    target.addEventListener("pointermove", (event) => this.curveEditor.dragPoint(event));
     target.addEventListener("pointerup", (event) => this.releasePointer(event));
     target.addEventListener("dblclick", (event) => this.handleDoubleClick(event));
-    target.addEventListener("keydown", (event) => this.handleKey(event));
+    target.addEventListener("keydown", (event) => { if (this.scene.editable) this.curveEditor.handleKey(event); });
   }
 
   /** The camera of the renderer; or, where Python renders, that of the panel. @returns {Camera} */
@@ -448,10 +434,12 @@ export class Panel {
 
   /** The attributes of a notebook widget that a person can change. */
   get attributes() {
-    const { camera } = this;
+    const { camera, placement } = this;
     return {
-      camera: { position: this.fromStage(camera.position), target: this.fromStage(camera.target), fov: camera.fov },
-      sliders: { ...this.sliderValues }, points: this.curves, show: this.mode,
+      camera: {
+        position: placement.fromStage(camera.position), target: placement.fromStage(camera.target), fov: camera.fov,
+      },
+      sliders: { ...this.sliderValues }, points: this.curveEditor.curves, show: this.mode,
     };
   }
 
@@ -472,20 +460,20 @@ export class Panel {
 
   /** Applies attributes that were changed in Python, and are not those that were reported.
    *  @param {{camera?: {position: number[], target: number[], fov: number},
-   *  sliders?: Record<string, number>, points?: number[][][], show?: string}} attributes */
+   *  sliders?: Record<string, number>, points?: Curves, show?: string}} attributes */
   applyAttributes(attributes) {
     for (const [name, value] of Object.entries(attributes)) {
       if (JSON.stringify(value) === this.reportedAttributes[name]) continue;
       this.reportedAttributes[name] = JSON.stringify(value);
       if (name === "camera") {
         const { position, target, fov } = /** @type {any} */ (value);
-        this.camera.lookAt(this.toStage(position), this.toStage(target), fov);
+        this.camera.lookAt(this.placement.toStage(position), this.placement.toStage(target), fov);
         this.redraw();
       } else if (name === "show") {
         this.mode = /** @type {string} */ (value);
         if (this.modeSelect) this.modeSelect.value = this.mode;
         this.redraw();
-      } else if (name === "points") this.scene.editable && this.edit(/** @type {number[][][]} */ (value));
+      } else if (name === "points") this.scene.editable && this.curveEditor.edit(/** @type {Curves} */ (value));
       else this.moveSliders(/** @type {Record<string, number>} */ (value));
     }
   }
@@ -509,7 +497,7 @@ export class Panel {
   updateLegend() {
     const legend = this.scene.legends[this.mode];
     const range = this.renderer ? this.renderer.depthRange : this.remoteDepthRange;
-    const scale = this.scene.placement[12];
+    const { scale } = this.placement;
     const elements = legend && (this.renderer || this.isRemote) ? [createLegend(
       legend, range && [range[0] / scale, range[1] / scale],
       this.ground === "dark" ? "#1a1a1c" : "#e6e6e3")] : [];
@@ -687,7 +675,7 @@ export class Panel {
         const failure = await this.renderer.setState(state, state.surfaces.some(({ check }) => check));
         if (failure) return this.useFallback(describeFailedCheck(failure));
         // The state may be older than the last edit.
-        if (!this.isEdited) this.curves = state.curves;
+        if (!this.curveEditor.isEdited) this.curveEditor.curves = state.curves;
         this.showMessage("");
         this.updateMarks();
       }
@@ -718,46 +706,14 @@ export class Panel {
 
   /** Draws the curves and their points while they are edited, and the marks of the last probe. */
   updateMarks() {
-    [this.lines, this.dots] = this.isEditing ? this.curveMarks() : [[], []];
+    [this.lines, this.dots] = this.curveEditor.createMarks();
     // Wide marks of a probe are dots.
     this.lines.push(...this.probeMarks.filter(({ width }) => width < 4));
     this.dots.push(...this.probeMarks.filter(({ width }) => width >= 4));
     this.redraw();
   }
 
-  /** Lines along the curves, and dots at their points. @returns {[Marks[], Marks[]]} */
-  curveMarks() {
-    const stageCurves = this.curves.map((curve) => curve.map((p) => this.toStage(p)));
-    const lines = stageCurves.map((curve) => ({
-      points: curve.flatMap((p, k) => [p, curve[(k + 1) % curve.length]]), color: CURVE_COLOR, width: 2.5,
-    }));
-    const dots = stageCurves.map((points) => ({ points, color: POINT_COLOR, width: 6 }));
-    const selected = this.selectedPoint && stageCurves[this.selectedPoint[0]]?.[this.selectedPoint[1]];
-    if (selected) dots.push({ points: [selected], color: SELECTED_POINT_COLOR, width: 8 });
-    return [lines, dots];
-  }
-
-  // Coordinates.
-
-  /** The point on the stage of a point in the coordinates of the surfaces. @param {number[]} p */
-  toStage(p) {
-    const { placement } = this.scene;
-    return [0, 1, 2].map((k) => placement[12] * (placement[3 * k] * p[0] + placement[3 * k + 1] * p[1]
-      + placement[3 * k + 2] * p[2]) + placement[9 + k]);
-  }
-
-  /** The point in the coordinates of the surfaces of a point on the stage. @param {number[]} p */
-  fromStage(p) {
-    const { placement } = this.scene;
-    return this.directionFromStage(p.map((x, k) => x - placement[9 + k]));
-  }
-
-  /** The vector in the coordinates of the surfaces of a vector on the stage. @param {number[]} d */
-  directionFromStage(d) {
-    const { placement } = this.scene;
-    return [0, 1, 2].map((k) => (placement[k] * d[0] + placement[3 + k] * d[1] + placement[6 + k] * d[2])
-      / placement[12]);
-  }
+  // Pointers.
 
   /** The position of a pointer in the window, and the size of this. @param {MouseEvent} event */
   pointerPosition(event) {
@@ -765,17 +721,15 @@ export class Panel {
     return { width, height, x: event.clientX - left, y: event.clientY - top };
   }
 
-  // Probing.
-
   /** The ray through a pointer, in the coordinates of the surfaces. @param {MouseEvent} event */
   pointerRay(event) {
     const { width, height, x, y } = this.pointerPosition(event);
-    const { camera } = this;
+    const { camera, placement } = this;
     const { right, up, forward } = camera.axes;
     const pixelSize = camera.pixelSize(width, height);
     const direction = addScaled(
       addScaled(forward, pixelSize * (x - 0.5 * width), right), -pixelSize * (y - 0.5 * height), up);
-    return { origin: this.fromStage(camera.position), direction: this.directionFromStage(direction) };
+    return { origin: placement.fromStage(camera.position), direction: placement.vectorFromStage(direction) };
   }
 
   /** Asks Python for the hit of the ray through a pointer, and draws the proved steps to it.
@@ -786,7 +740,7 @@ export class Panel {
       const hit = await this.channel?.request?.("probe", { ...this.controlValues, origin, direction });
       const length = Math.hypot(...direction);
       const distances = [...hit.steps, ...(hit.t === undefined ? [] : [hit.t])];
-      const points = distances.map((t) => this.toStage(addScaled(origin, t / length, direction)));
+      const points = distances.map((t) => this.placement.toStage(addScaled(origin, t / length, direction)));
       this.probeMarks = [
         { points: points.slice(1).flatMap((p, k) => [points[k], p]), color: [0.1, 0.4, 0.9, 0.9], width: 2 },
         { points: points.slice(1), color: [0.1, 0.4, 0.9, 1], width: 5 },
@@ -796,71 +750,11 @@ export class Panel {
     });
   }
 
-  // Editing of curves.
-
-  /** The point nearest to a pointer; null if none is near. @param {MouseEvent} event */
-  nearestPoint(event) {
-    const { camera } = this;
-    const { width, height, x, y } = this.pointerPosition(event);
-    /** @type {{index: PointIndex, distance: number, z: number} | null} */
-    let nearest = null;
-    for (const [c, curve] of this.curves.entries())
-      for (const [k, point] of curve.entries()) {
-        const projection = camera.project(this.toStage(point), width, height);
-        const distance = Math.hypot(projection.x - x, projection.y - y);
-        if (distance < (nearest?.distance ?? PICK_RADIUS)) nearest = { index: [c, k], distance, z: projection.z };
-      }
-    return nearest;
-  }
-
-  /** The point on a segment of a curve nearest to a pointer, and the index of the start of the
-   *  segment; null if none is near. @param {MouseEvent} event */
-  nearestPointOnSegments(event) {
-    const { camera } = this;
-    const { width, height, x, y } = this.pointerPosition(event);
-    /** @type {{index: PointIndex, point: number[], distance: number} | null} */
-    let nearest = null;
-    for (const [c, curve] of this.curves.entries())
-      for (const [k, start] of curve.entries()) {
-        const end = curve[(k + 1) % curve.length];
-        const [a, b] = [start, end].map((point) => camera.project(this.toStage(point), width, height));
-        const [dx, dy] = [b.x - a.x, b.y - a.y];
-        const s = Math.max(0, Math.min(1, ((x - a.x) * dx + (y - a.y) * dy) / Math.max(dx * dx + dy * dy, 1e-9)));
-        const distance = Math.hypot(a.x + s * dx - x, a.y + s * dy - y);
-        if (distance < (nearest?.distance ?? PICK_RADIUS))
-          nearest = { index: [c, k], point: addScaled(start, s, addScaled(end, -1, start)), distance };
-      }
-    return nearest;
-  }
-
-  /** Starts to drag the point at a pointer. Returns whether one is there.
+  /** Starts to drag a point, if one is at the pointer. Returns whether one is.
    *  @param {PointerEvent} event */
-  grabPoint(event) {
+  pressPointer(event) {
     this.pressEvent = event;
-    if (!this.isEditing || event.button !== 0) return false;
-    const nearest = this.nearestPoint(event);
-    this.selectedPoint = nearest && nearest.index;
-    if (!nearest) { this.updateMarks(); return false; }
-    this.pushUndo();
-    /** @type {Element} */ (event.target).setPointerCapture(event.pointerId);
-    this.dragged = { x: event.clientX, y: event.clientY, z: nearest.z };
-    this.updateMarks();
-    return true;
-  }
-
-  /** Moves the dragged point with a pointer. @param {PointerEvent} event */
-  dragPoint(event) {
-    if (!this.dragged || !this.selectedPoint) return;
-    const { width, height } = this.pointerPosition(event);
-    const offset = this.directionFromStage(this.camera.dragOffset(
-      this.dragged.z, event.clientX - this.dragged.x, event.clientY - this.dragged.y, width, height));
-    this.dragged = { ...this.dragged, x: event.clientX, y: event.clientY };
-    const [c, k] = this.selectedPoint;
-    // A drag is undone as a whole, to the curves that were stored when it began.
-    this.curves = this.curves.map((curve, i) => (i !== c ? curve
-      : curve.map((p, j) => (j === k ? addScaled(p, 1, offset) : p))));
-    this.isEdited = true;
-    this.updateState();
+    return this.curveEditor.grabPoint(event);
   }
 
   /** Ends a drag; probes the surface after a click. @param {PointerEvent} event */
@@ -868,71 +762,14 @@ export class Panel {
     const { pressEvent } = this;
     if (this.isProbing && pressEvent && Math.hypot(
       event.clientX - pressEvent.clientX, event.clientY - pressEvent.clientY) < CLICK_RADIUS) this.probe(event);
-    this.dragged = undefined;
+    this.curveEditor.releasePoint();
   }
 
-  /** Inserts a point in the segment at a pointer; resets the camera if curves are not edited.
+  /** Inserts a point while curves are edited, and resets the camera otherwise.
    *  @param {MouseEvent} event */
   handleDoubleClick(event) {
-    if (!this.isEditing) { this.camera.reset(); this.redraw(); return; }
-    const nearest = this.nearestPointOnSegments(event);
-    if (!nearest) return;
-    const [c, k] = nearest.index;
-    this.selectedPoint = [c, k + 1];
-    this.edit(this.curves.with(c, this.curves[c].toSpliced(k + 1, 0, nearest.point)));
-  }
-
-  /** Undoes, redoes, or removes the selected point. @param {KeyboardEvent} event */
-  handleKey(event) {
-    if (!this.scene.editable) return;
-    if ((event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z") {
-      event.preventDefault();
-      if (event.shiftKey) this.redo();
-      else this.undo();
-    } else if ((event.key === "Delete" || event.key === "Backspace") && this.isEditing && this.selectedPoint) {
-      event.preventDefault();
-      this.removePoint(this.selectedPoint);
-    }
-  }
-
-  /** @param {PointIndex} index */
-  removePoint([c, k]) {
-    if (this.curves[c].length <= 3) return this.showMessage("A curve has three points at least.");
-    this.selectedPoint = null;
-    this.edit(this.curves.with(c, this.curves[c].toSpliced(k, 1)));
-  }
-
-  /** Stores the curves, so that their next change can be undone. */
-  pushUndo() {
-    this.undoStack.push(this.curves);
-    this.redoStack.length = 0;
-  }
-
-  /** Replaces the curves; that can be undone. @param {number[][][]} curves */
-  edit(curves) {
-    this.pushUndo();
-    this.setCurves(curves);
-  }
-
-  /** @param {number[][][]} curves */
-  setCurves(curves) {
-    this.curves = curves;
-    this.isEdited = true;
-    this.updateMarks();
-    this.updateState();
-  }
-
-  undo() { this.restoreCurves(this.undoStack, this.redoStack); }
-
-  redo() { this.restoreCurves(this.redoStack, this.undoStack); }
-
-  /** @param {number[][][][]} source @param {number[][][][]} target */
-  restoreCurves(source, target) {
-    const curves = source.pop();
-    if (!curves) return;
-    target.push(this.curves);
-    this.selectedPoint = null;
-    this.setCurves(curves);
+    if (this.curveEditor.isActive) this.curveEditor.insertPoint(event);
+    else { this.camera.reset(); this.redraw(); }
   }
 }
 
@@ -944,14 +781,6 @@ function describeFailedCheck(failure) {
 /** A color of CSS. @param {number[]} color red, green, blue and opacity, from 0 to 1 */
 function cssColor(color) {
   return `rgb(${color.slice(0, 3).map((x) => Math.round(255 * x)).join(" ")} / ${0.7 * color[3]})`;
-}
-
-/** A closed curve with each point moved halfway to the middle of its neighbors.
- *  @param {number[][]} curve */
-function smoothCurve(curve) {
-  const n = curve.length;
-  return curve.map((p, k) => p.map((x, i) =>
-    0.5 * x + 0.25 * (curve[(k + 1) % n][i] + curve[(k + n - 1) % n][i])));
 }
 
 /** The answer to a probe, in words. @param {any} hit */

@@ -45,6 +45,10 @@ const TARGET_TILE_TIME = 60;
 // Milliseconds that a coarse picture should take while something moves.
 export const TARGET_FRAME_TIME = 40;
 const SAMPLES_PER_PIXEL = 16;
+// The entry points of passes.wgsl that are no render passes.
+const COMPUTE_PASSES = [
+  "camera_rays", "clear_hits", "merge_hits", "estimate_sky", "shade", "floor_rays", "merge_floor_hits",
+];
 const WORKGROUP_SIZE = 64;
 const MAX_WORKGROUPS = 65535;
 const UNIFORM_BYTES = 176;
@@ -149,10 +153,9 @@ export class WebGpuRenderer {
   async compile() {
     const { device, format } = this;
     const module = device.createShaderModule({ code: this.passes });
-    const names = ["camera_rays", "clear_hits", "merge_hits", "estimate_sky", "shade", "floor_rays", "merge_floor_hits"];
-    const computePipelines = await Promise.all(names.map((entryPoint) =>
+    const computePipelines = await Promise.all(COMPUTE_PASSES.map((entryPoint) =>
       device.createComputePipelineAsync({ layout: "auto", compute: { module, entryPoint } })));
-    names.forEach((name, k) => { this.pipelines[name] = computePipelines[k]; });
+    COMPUTE_PASSES.forEach((name, k) => { this.pipelines[name] = computePipelines[k]; });
     const blend = /** @type {GPUBlendState} */ ({
       color: { srcFactor: "src-alpha", dstFactor: "one-minus-src-alpha" }, alpha: {},
     });
@@ -453,7 +456,8 @@ export class WebGpuRenderer {
     points.forEach((p, k) => content.set([...p, pixelRatio * width], 4 * k));
     for (let k = 0; k < count; k++) content.set(color, 4 * (count + k));
     const marks = this.createBuffer(content, GPUBufferUsage.STORAGE);
-    const uniforms = this.createBuffer(new Uint8Array(this.passUniforms({ ...size, kind: count })), GPUBufferUsage.UNIFORM);
+    const uniforms = this.createBuffer(
+      new Uint8Array(this.passUniforms({ ...size, kind: count })), GPUBufferUsage.UNIFORM);
     const hits = /** @type {GPUBuffer} */ (this.hits);
     pass.setPipeline(this.pipelines[name]);
     pass.setBindGroup(0, this.createBindGroup(this.pipelines[name], { 0: uniforms, 12: hits, 13: marks }));
