@@ -15,7 +15,7 @@ export const FLOOR_RAYS = FLOOR_CELLS * FLOOR_CELLS * RAYS_PER_CELL;
 const KEY_LIGHT_RADIUS = 0.34;
 const BLUR_WEIGHTS = [0.025, 0.125, 0.225, 0.25, 0.225, 0.125, 0.025];
 
-/** Points in the unit square, spread evenly (Roberts 2018), in the order of `floor._square`. */
+/** Points in the unit square, spread evenly (Roberts 2018), in the order of `_square` in harnack.rendering.shading. */
 function spreadPoints() {
   const plasticNumber = 1.32471795724474602596;
   const cellCount = SAMPLE_BLOCK * SAMPLE_BLOCK;

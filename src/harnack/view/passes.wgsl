@@ -154,7 +154,7 @@ fn merge_hits(@builtin(global_invocation_id) id: vec3u) {
   hits[8u * pixel + 7u] = (old_info & 0x3fffu) | evaluations;
 }
 
-// The fraction of the hemisphere over each point that is not hidden by other hits: `visible_sky`.
+// The fraction of the hemisphere over each point that is not hidden by other hits: `ambient_visibility`.
 @compute @workgroup_size(64)
 fn estimate_sky(@builtin(global_invocation_id) id: vec3u) {
   if (id.x >= uniforms.count) { return; }
@@ -200,23 +200,24 @@ fn horizon_height(pixel: u32, normal: vec3f, across: vec2f, reach: f32, radius: 
   return horizon;
 }
 
-const KEY_RADIANCE = vec3f(0.74, 0.71, 0.66);
-const SKY_RADIANCE = vec3f(0.36, 0.40, 0.46);
-const GROUND_RADIANCE = vec3f(0.25, 0.225, 0.20);
+// Irradiance over pi, linear sRGB: of the key light at its brightest, of the sky and of the ground.
+const KEY_IRRADIANCE = vec3f(0.74, 0.71, 0.66);
+const SKY_IRRADIANCE = vec3f(0.36, 0.40, 0.46);
+const GROUND_IRRADIANCE = vec3f(0.25, 0.225, 0.20);
 
-// The radiance of a point in the studio's light: `Light.on`. eye: the unit vector to the camera.
+// The radiance of a point in the studio's light: `StudioLight.shade`. eye: the unit vector to the camera.
 // visible_sky, visible_key: the fractions of the sky and of the key light that reach the point.
 fn shaded_color(
   color: vec3f, normal: vec3f, eye: vec3f, is_glossy: bool, visible_sky: f32, visible_key: f32,
 ) -> vec3f {
   let wrapped = clamp((dot(normal, uniforms.key.xyz) + 0.25) / 1.25, 0.0, 1.0);
   let key_fraction = (1.0 - 0.6 * (1.0 - visible_sky)) * visible_key;
-  let sky = mix(GROUND_RADIANCE, SKY_RADIANCE, 0.5 + 0.5 * dot(normal, uniforms.up.xyz)) * visible_sky;
-  let radiance = color * (KEY_RADIANCE * (wrapped * key_fraction) + sky);
+  let sky = mix(GROUND_IRRADIANCE, SKY_IRRADIANCE, 0.5 + 0.5 * dot(normal, uniforms.up.xyz)) * visible_sky;
+  let radiance = color * (KEY_IRRADIANCE * (wrapped * key_fraction) + sky);
   if (!is_glossy) { return radiance; }
   let highlight = 0.22 * pow(max(dot(normal, normalize(uniforms.key.xyz + eye)), 0.0), 60.0);
   let rim = 0.45 * pow(1.0 - clamp(dot(normal, eye), 0.0, 1.0), 5.0);
-  return radiance + KEY_RADIANCE * (highlight * wrapped * key_fraction) + sky * rim;
+  return radiance + KEY_IRRADIANCE * (highlight * wrapped * key_fraction) + sky * rim;
 }
 
 // The fractions of the key light and of the sky that reach a point of the floor, interpolated.
@@ -286,7 +287,7 @@ fn shade(@builtin(global_invocation_id) id: vec3u) {
   picture[pixel] = mix(picture[pixel], color, uniforms.weight);
 }
 
-// Rays from the floor to the key light (kind 0) or to the sky (kind 1): `floor._parts_seen`.
+// Rays from the floor to the key light (kind 0) or to the sky (kind 1): `_visible_fractions`.
 @compute @workgroup_size(64)
 fn floor_rays(@builtin(global_invocation_id) id: vec3u) {
   if (id.x >= uniforms.count) { return; }

@@ -231,7 +231,7 @@ export class WebGpuRenderer {
     this.device.queue.writeBuffer(this.surfaceColors, 0, colors);
   }
 
-  /** Adds a compute pass to passes. @param {GPUComputePassEncoder} pass
+  /** Adds a dispatch to a compute pass. @param {GPUComputePassEncoder} pass
    *  @param {GPUComputePipeline} pipeline @param {Record<number, GPUBuffer>} buffers
    *  @param {number} count the number of threads */
   dispatch(pass, pipeline, buffers, count) {
@@ -240,11 +240,11 @@ export class WebGpuRenderer {
     pass.dispatchWorkgroups(Math.ceil(count / WORKGROUP_SIZE));
   }
 
-  /** Submits compute passes. @param {(pass: GPUComputePassEncoder) => void} addPasses */
-  submitPasses(addPasses) {
+  /** Submits a compute pass. @param {(pass: GPUComputePassEncoder) => void} addDispatches */
+  submitPass(addDispatches) {
     const encoder = this.device.createCommandEncoder();
     const pass = encoder.beginComputePass();
-    addPasses(pass);
+    addDispatches(pass);
     pass.end();
     this.device.queue.submit([encoder.finish()]);
   }
@@ -283,7 +283,7 @@ export class WebGpuRenderer {
     const [rays, expected] = await Promise.all([decodeWords(check.lanes), decodeWords(check.results)]);
     this.device.queue.writeBuffer(data, 0, new Uint32Array([count]));
     this.device.queue.writeBuffer(this.lanes, 0, /** @type {any} */ (rays));
-    this.submitPasses((pass) =>
+    this.submitPass((pass) =>
       this.dispatch(pass, pipeline, { 0: data, 1: this.lanes, 2: this.results }, count));
     const computed = await this.readBuffer(this.results, 28 * count);
     return describeDisagreement(source, count, rays, expected, computed);
@@ -312,7 +312,7 @@ export class WebGpuRenderer {
     return uniforms;
   }
 
-  /** The unit vector to the key light, which moves with the camera: `Light.of`. */
+  /** The unit vector to the key light, which moves with the camera: `StudioLight.of`. */
   keyLightDirection() {
     const { right, up, forward } = this.camera.axes;
     const length = Math.hypot(0.52, 0.62, 0.59);
@@ -345,7 +345,7 @@ export class WebGpuRenderer {
     const { queue } = this.device;
     const hits = /** @type {GPUBuffer} */ (this.hits);
     queue.writeBuffer(uniforms, 0, this.passUniforms(options));
-    this.submitPasses((pass) => {
+    this.submitPass((pass) => {
       this.dispatch(pass, pipelines.clear_hits, { 0: uniforms, 4: hits }, count);
       for (const surface of this.surfaces) {
         queue.writeBuffer(surface.data, 0, new Uint32Array([count]));
@@ -371,7 +371,7 @@ export class WebGpuRenderer {
     for (let first = 0; first < pixelCount; first += maxCount) {
       const count = Math.min(maxCount, pixelCount - first);
       this.device.queue.writeBuffer(this.uniforms, 0, this.passUniforms({ ...options, first, count }));
-      this.submitPasses((pass) => this.dispatch(pass, this.pipelines[name], buffers, count));
+      this.submitPass((pass) => this.dispatch(pass, this.pipelines[name], buffers, count));
     }
     await this.device.queue.onSubmittedWorkDone();
   }
@@ -411,7 +411,7 @@ export class WebGpuRenderer {
     queue.writeBuffer(uniforms, 0, this.passUniforms(options));
     for (const surface of this.surfaces) {
       queue.writeBuffer(surface.data, 0, new Uint32Array([count]));
-      this.submitPasses((pass) => {
+      this.submitPass((pass) => {
         this.dispatch(pass, pipelines.floor_rays,
           { 0: uniforms, 1: surface.uniforms, 2: lanes, 9: this.lightDirections }, count);
         this.dispatch(pass, surface.pipeline, { 0: surface.data, 1: lanes, 2: results }, count);
