@@ -1,6 +1,6 @@
 """Live scenes: surfaces on the studio's stage, each as a kernel for other GPUs with its data.
 
-Everything here is plain: numbers, lists and text, as `drawing.js` takes it.
+Everything here is plain: numbers, lists and text, as `renderer.js` takes it.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ _NO_OUTPUT = 99
 # Paints of a surface: the first is its own, then those of what spans what a mesh leaves open and of
 # faces on a section, then those of isolines.
 _MENDED, _CUT = 1, 2
-# `PAINTS` in drawing.js.
+# `MAX_SURFACE_COLORS` in renderer.js.
 _MOST_PAINTS = 2048
 _OF_STUDIO = ("boundary_radius", "boundary_material", "section_material", "thickness")
 # Of gzip: more takes longer, and gains little.
@@ -208,7 +208,7 @@ class LiveScene:
         return tuple(_rays(self.placement.apply(one)) for one in self.points)
 
     def scene(self, title: str) -> JsonDict:
-        """All that a page is given when it opens, as plain data for `drawing.js`."""
+        """All that a page is given when it opens, as plain data for `renderer.js`."""
         place, points = self.placement, np.concatenate(self.points)
         _, settings = self._at(self.initial_controls)
         material = settings.get("material")
@@ -573,8 +573,8 @@ def _reflectances(bsdf: Mapping[str, Any]) -> tuple[Any, Any, bool]:
 
 
 def encode_arrays(value: Any) -> Any:
-    """Replace arrays of 32-bit words by text, which `words` in drawing.js reads: base64 of gzip
-    data. The tables of meshes are repetitive, and shrink to a tenth."""
+    """Replace arrays of 32-bit words by text, which `decodeWords` in renderer.js reads: base64 of
+    gzip data. The tables of meshes are repetitive, and shrink to a tenth."""
     if isinstance(value, np.ndarray):
         return base64.b64encode(gzip.compress(value.tobytes(), _LEVEL, mtime=0)).decode()
     if isinstance(value, dict):
@@ -586,7 +586,8 @@ def encode_arrays(value: Any) -> Any:
 
 def state_delta(first: JsonDict, state: JsonDict, *, checks: bool = True) -> JsonDict:
     """Difference between a state and the initial one: changed data words per surface and all other
-    changed entries; or the whole state if its kernels differ. Inverse: `changed` in frames.js.
+    changed entries; or the whole state if its kernels differ. Inverse: `applyDelta` in
+    slider_states.js.
 
     checks: whether check rays with their answers are included. With other kernels they always are,
         as no device has checked these yet.

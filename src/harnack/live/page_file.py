@@ -45,12 +45,13 @@ _FRAMED = 100
 # one slider and of each of several; bytes of a page that are many.
 _TARGET_BYTES, _FEWEST, _MANY_BYTES = 4e6, (9, 5), 8e6
 MODULES = (
-    "camera.js", "drawing.js", "elements.js", "frames.js", "legend.js", "link.js", "panel.js",
+    "camera.js", "channels.js", "curve_editor.js", "device_check.js", "dom.js", "floor_light.js",
+    "legend.js", "panel.js", "placement.js", "renderer.js", "slider_states.js",
 )  # fmt: skip
 # What brings other states: those in the page, or Python's answers.
 _CHANNEL_SCRIPTS = {
-    "frames": "scene.sliders.length ? new Frames(scene.frames) : null",
-    "server": "new Server(`ws://${location.host}/questions${location.search}`)",
+    "frames": "scene.sliders.length ? new SliderStates(scene.frames) : null",
+    "server": "new WebSocketChannel(`ws://${location.host}/questions${location.search}`)",
 }
 
 
