@@ -158,7 +158,7 @@ export class Camera {
       this.zoom(Math.hypot(after[0], after[1]) / Math.max(Math.hypot(before[0], before[1]), 1));
       this.rollBy((Math.atan2(after[1], after[0]) - Math.atan2(before[1], before[0])) / RADIANS);
       this.pan(0.5 * x, 0.5 * y, width, height);
-    } else if (current.shiftKey || previous.button === 2) this.pan(x, y, width, height);
+    } else if (current.shiftKey || (current.buttons & 2) !== 0) this.pan(x, y, width, height);
     else this.orbit((-220 * x) / Math.min(width, height), (220 * y) / Math.min(width, height));
   }
 

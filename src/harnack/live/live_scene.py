@@ -31,7 +31,7 @@ from harnack.rendering.camera import Camera
 from harnack.rendering.framing import NothingVisibleError, bounding_box, visible_points
 from harnack.rendering.isolines import parse_isolines
 from harnack.rendering.mitsuba_plugins import register
-from harnack.rendering.option_table import names_of, refuse_unknown, shorthand_among
+from harnack.rendering.option_table import names_of, refuse_others, refuse_unknown, shorthand_among
 from harnack.rendering.placed_surface import PlacedSurface
 from harnack.rendering.render_options import check_camera
 from harnack.rendering.scales import linear_from_srgb
@@ -149,12 +149,7 @@ class LiveScene:
             TypeError, ValueError: as `render` does; also for a transparent material, a `show` that
             is not in `LIVE_MODES`, and a backdrop that is not "light" or "dark".
         """
-        still = [name for name in given if name in STILL_OPTIONS]
-        if still:
-            raise TypeError(
-                f"{', '.join(still)}: for still pictures only, as `harnack.render` draws them; "
-                "pages and views have no such option"
-            )
+        refuse_others("view", given)
         given = with_flat_options(given)
         camera, backdrop, up, show = (given.pop(name, None) for name in _STAGE_OPTIONS)
         show = "shaded" if show is None else show

@@ -23,12 +23,13 @@ import numpy as np
 from harnack.cluster.executor import Executor, TaskResult, open_executor
 from harnack.files.file_geometry import write_atomically
 from harnack.live.live_scene import ControlState, LiveScene, encode_arrays, state_delta
+from harnack.live.scene_file import with_flat_options
 from harnack.live.sliders import slider_values_in_errors
 from harnack.progress import progress_bar
 from harnack.rendering.camera import Camera
 from harnack.rendering.mitsuba import set_variant
 from harnack.rendering.mitsuba_plugins import register
-from harnack.rendering.option_table import shows_options
+from harnack.rendering.option_table import refuse_others, shows_options
 
 if TYPE_CHECKING:
     from harnack.live.live_scene import JsonDict
@@ -96,13 +97,14 @@ def page(
         TypeError: what is no field; an unknown setting; a slider that nothing depends on.
     """
     target = os.fspath(path)
-    settings = dict(keywords)
+    settings = with_flat_options({**keywords, "options": options})
+    refuse_others("page", settings)
     title, progress = settings.pop("title", ""), settings.pop("progress", True)
     client, checkpoint = settings.pop("client", None), settings.pop("checkpoint", None)
     check_title(title)
     if not target.lower().endswith((".html", ".htm")):
         raise ValueError(f"{target}: a page is written as .html")
-    job = PageJob(surfaces, {**settings, "options": options}, register().variant())
+    job = PageJob(surfaces, settings, register().variant())
     with progress_bar("page", progress) as advance:
         live = job.live
         scene = live.scene(title or live.content.name)
