@@ -14,7 +14,7 @@ from scipy import ndimage
 import harnack as hk
 from harnack.geometry import example_curves
 from harnack.geometry.example_meshes import icosphere
-from tests.view.browsers import Page, chromium, served
+from tests.live.browsers import Page, chromium, served
 
 pytestmark = pytest.mark.browser
 SIZE = (320, 240)

@@ -25,7 +25,7 @@ import pytest
 
 import harnack as hk
 from harnack.geometry import example_curves
-from tests.view.browsers import Page, chromium, launched
+from tests.live.browsers import Page, chromium, launched
 
 pytestmark = pytest.mark.browser
 SIZE = (320, 240)
