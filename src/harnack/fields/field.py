@@ -85,8 +85,8 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
     """The level that is drawn if the user names none."""
 
     over_relaxation: float = 1.4
-    """The over-relaxation factor (`Surface.overstep`) with the fewest evaluations, by experiment;
-    at least 1."""
+    """The over-relaxation factor (`TraceOptions.over_relaxation`) with the fewest evaluations, by
+    experiment; at least 1."""
 
     domain: Volume | None = None
     """The convex volume in which the field may be evaluated and is drawn; None for all of space.

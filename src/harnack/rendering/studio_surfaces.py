@@ -158,8 +158,7 @@ def _with_section_material(objects: list[StudioObject], material: Material) -> l
     if not any(map(has_faces, objects)):
         raise ValueError(
             "section_material needs a solid with a section, whose faces are of it: give a section, "
-            'such as a half-space, and for a field that is no harnack.solids.Solid also side="below" or '
-            '"above"'
+            'such as a half-space, and for a field that is no solid also side="below" or "above"'
         )
     return [
         replace(element, section_material=material) if has_faces(element) else element

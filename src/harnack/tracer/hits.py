@@ -56,7 +56,8 @@ class Hits:
         `isfinite(t)` is no such mask.
     t: (n,) ray parameter of the hit, a length; inf for a miss; for a ray that ran out of steps, the
         parameter up to which it is proved free. A hit is within the tolerance of the first root,
-        mostly before it. A confirmed hit is at a root, between two samples with f on different
+        mostly before it. A hit that requires a crossing is at a root, between two samples with f on
+        different
         sides of the level: at the root of the cubic through their values and slopes, or of a
         bisection if there is a crease between them.
     position: (n, 3) point at t, NaN for a miss.
