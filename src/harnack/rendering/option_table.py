@@ -44,6 +44,8 @@ CURVATURES = frozenset(("curvature", "curvature_lines"))
 RAYS = frozenset(("trace", "crossings"))
 VERBS = RAYS | DRAWN | DISTANCES | CURVATURES | {"mesh", "repair"}
 """The functions that take options."""
+COMMANDS = DRAWN | {"mesh", "repair"}
+"""Those that are commands of the command line as well."""
 
 _PLACED = RAYS | DRAWN | DISTANCES | {"mesh", "curvature_lines"}
 
@@ -62,8 +64,8 @@ class Option:
     help: what it is, in a sentence without a period, and its default in brackets.
     value: what a value is on the command line, such as "LENGTH" or "WxH"; "" for an option that
         takes none.
-    parse: the value of a text of the command line; None for an option that it does not have, or
-        makes of several others.
+    parse: the value of a text of the command line; None for a switch (by default False), and for an
+        option that it does not have, or makes of several others.
     check: of a value and of `show`, for a picture; it returns the value in its final form.
     default: the value if it is not set; default_of: other defaults, by verb.
     varies: whether films and sliders may change it.
@@ -86,6 +88,16 @@ class Option:
     def flag(self) -> str:
         """Its name on the command line."""
         return f"--{self.name.replace('_', '-')}"
+
+    @property
+    def is_switch(self) -> bool:
+        """Whether it takes no value on the command line, and is on if it is there."""
+        return self.parse is None and self.default is False
+
+    @property
+    def is_on_command_line(self) -> bool:
+        """Whether commands have it."""
+        return bool(self.verbs & COMMANDS) and (self.parse is not None or self.is_switch)
 
     def default_in(self, verb: str) -> Any:
         """The value that a verb has if it is not set."""
