@@ -43,8 +43,8 @@ SCENES: dict[str, Callable[[], tuple[Any, dict[str, Any]]]] = {
     "solid": lambda: (
         hk.Gyroid(0.6, domain=hk.Ball(radius=1.0)),
         {
-            "solid": (-0.6, 0.6), "section": hk.HalfSpace((1.0, -1.0, 0.5), 0.1),
-            "cut_material": "coral", "isolines": hk.Isolines("z", interval=0.25),
+            "level": (-0.6, 0.6), "side": "between", "section": hk.HalfSpace((1.0, -1.0, 0.5), 0.1),
+            "section_material": "coral", "isolines": hk.Isolines("z", interval=0.25),
         },
     ),
     "union": lambda: (

@@ -141,7 +141,7 @@ def test_material_and_tube_are_changed(drawn_by: str, page: Page) -> None:
     page.set("tube", 0.06)
     assert page.do("() => panel.control_values().settings") == {
         "material": "#0000ff",
-        "boundary": 0.06,
+        "boundary_radius": 0.06,
     }
     blue = page.picture(f"view-tube-{drawn_by}")
     assert change(golden, blue) > 0.05
@@ -413,7 +413,7 @@ def test_a_server_on_ipv6(browser: Any) -> None:
 def served_by_command() -> Iterator[tuple[Any, str]]:
     """`harnack view`, and the address of its page."""
     command = [
-        sys.executable, "-m", "harnack.cli", "view", "x^2+y^2+z^2=1", "--ball", "0,0,0,2",
+        sys.executable, "-m", "harnack.cli", "view", "x^2+y^2+z^2=1", "--clip", "ball:0,0,0,2",
         "--no-browser",
     ]  # fmt: skip
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env={**os.environ}) as one:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import drjit as dr
@@ -46,7 +45,7 @@ def drawn(*members: Any, show: str = "shaded", spp: int = 1) -> np.ndarray:
 
 def ball(index: float, radius: float = 1.0, **settings: Any) -> Any:
     bsdf = {"type": "dielectric", "int_ior": index, "ext_ior": 1.0}
-    settings = {"solid": (-math.inf, 0.0), "tint": TINT, "tolerance": 1e-5, **settings}
+    settings = {"level": 0.0, "side": "below", "tint": TINT, "tolerance": 1e-5, **settings}
     return mitsuba_shape(Sphere(), bsdf=bsdf, to_world=T().scale(radius), **settings)
 
 
@@ -132,7 +131,12 @@ def test_rays_follow_snell_and_fresnel(index: float) -> None:
 @pytest.mark.slow
 def test_named_glass_is_tinted_in_both_kinds_of_picture() -> None:
     gyroid = hk.Gyroid(1.0, domain=hk.Ball(radius=1.0))
-    small: dict[str, Any] = {"solid": (-0.4, 0.4), "size": (40, 30), "progress": False}
+    small: dict[str, Any] = {
+        "level": (-0.4, 0.4),
+        "side": "between",
+        "size": (40, 30),
+        "progress": False,
+    }
     for show in ("shaded", "path"):
         amber = render(gyroid, material="amber", show=show, spp=8, **small)[10:20, 14:26]
         clear = render(gyroid, material="glass", show=show, spp=8, **small)[10:20, 14:26]

@@ -20,6 +20,7 @@ from harnack.rendering.images import exr_bytes, tone_map
 from harnack.rendering.light_paths import PathRenderTask
 from harnack.rendering.scales import viridis
 from harnack.rendering.stage import stage_placement
+from harnack.tracer import traced_surface
 
 mi = register()
 SMALL: dict[str, Any] = {"size": (40, 30), "progress": False}
@@ -146,9 +147,9 @@ def test_nothing_is_lost_and_nothing_is_said_with_enough_steps() -> None:
 
 @pytest.mark.slow
 def test_settings_of_a_level_set_are_replaced() -> None:
-    surface = hk.traced_surface(POLYGON, 2.5 * math.pi, tolerance=1e-3)
+    surface = traced_surface(POLYGON, 2.5 * math.pi, tolerance=1e-3)
     replaced = draw([surface], show="depth", level=math.pi)
-    expected = draw(hk.traced_surface(POLYGON, math.pi, tolerance=1e-3), show="depth")
+    expected = draw(traced_surface(POLYGON, level=math.pi, tolerance=1e-3), show="depth")
     np.testing.assert_array_equal(replaced, expected)
     solid = hk.Surface(GYROID, level=(-0.3, 0.3), side="between")
     half = hk.HalfSpace((0, 0, 1), 0.0)
@@ -187,7 +188,7 @@ def test_materials_are_told_apart_and_one_may_be_given_for_each_surface() -> Non
 def test_levels_of_one_field_may_have_materials_of_their_own() -> None:
     levels, names = [-0.5, 0.5], ["red", "blue"]
     one = draw(GYROID, level=levels, material=names, show="shaded", tolerance=1e-4)
-    pair = [hk.traced_surface(GYROID, level, tolerance=1e-4) for level in levels]
+    pair = [traced_surface(GYROID, level=level, tolerance=1e-4) for level in levels]
     np.testing.assert_array_equal(one, draw(pair, material=names, show="shaded"))
     with pytest.raises(ValueError, match=r"a surface is drawn twice.*level=\[a, b\]"):
         draw([GYROID, GYROID], level=levels, material=names)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import subprocess
 import sys
 from typing import Any
@@ -24,6 +23,7 @@ from harnack.rendering.shading import (
     multijitter_offsets,
     tiled_pixel_order,
 )
+from harnack.tracer import traced_surface
 
 mi = register()
 T = mi.ScalarTransform4f
@@ -125,7 +125,7 @@ def test_mitsubas_sphere_is_drawn_as_ours() -> None:
 def test_two_colors_are_for_the_two_sides() -> None:
     material = Material(diffuse(0.8, 0.1, 0.1), diffuse(0.1, 0.1, 0.8))
     images = [
-        draw(hk.traced_surface(Sphere(sign), tolerance=1e-4), material=material) for sign in (1, -1)
+        draw(traced_surface(Sphere(sign), tolerance=1e-4), material=material) for sign in (1, -1)
     ]
     middle = [image[18:22, 28:32].mean(axis=(0, 1)) for image in images]
     assert middle[0][0] > 4 * middle[0][2]
@@ -169,9 +169,9 @@ def test_samples_of_a_pixel_are_spread(count: int) -> None:
 @pytest.mark.slow
 def test_surfaces_keep_their_own_materials_and_the_nearer_hides_the_other() -> None:
     gyroid = hk.Gyroid(1.0, domain=hk.Ball(radius=1.0))
-    levels = [hk.traced_surface(gyroid, level, tolerance=1e-3) for level in (-0.5, 0.5)]
+    levels = [traced_surface(gyroid, level=level, tolerance=1e-3) for level in (-0.5, 0.5)]
     two = draw(levels, material=["plastic", "two-tone"])
-    one = draw([hk.traced_surface(gyroid, [-0.5, 0.5], tolerance=1e-3)], material="plastic")
+    one = draw([traced_surface(gyroid, level=[-0.5, 0.5], tolerance=1e-3)], material="plastic")
     assert np.abs(two - one).mean() > 0.01
     swapped = draw(levels[::-1], material=["two-tone", "plastic"])
     np.testing.assert_allclose(two, swapped, atol=2e-2)

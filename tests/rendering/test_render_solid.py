@@ -13,6 +13,7 @@ import harnack as hk
 from harnack.backend import choose_backend, to_float, to_numpy, to_vector3
 from harnack.geometry.volume import Volume
 from harnack.rendering.surface_hits import CappedSolid, orient_normal
+from harnack.tracer import traced_surface
 
 BACKEND = choose_backend()
 BALL = hk.Ball((0.1, 0.0, -0.05), 0.9)
@@ -27,7 +28,7 @@ def gyroid(p: np.ndarray) -> np.ndarray:
 
 def solid_of(low: float, high: float, volume: Volume) -> CappedSolid:
     field = hk.Gyroid(1.0, domain=volume)
-    surface = hk.traced_surface(field, level=(low, high), side="between", tolerance=TOLERANCE)
+    surface = traced_surface(field, level=(low, high), side="between", tolerance=TOLERANCE)
     return CappedSolid.of(surface, surface.prepare(BACKEND))
 
 

@@ -145,7 +145,7 @@ def test_ticks_of_angles_are_parts_of_turns(turns: int, most: int, written: list
 def test_a_bar_changes_no_number_and_no_pixel_of_the_picture(
     show: str, of: Any, tmp_path: Path
 ) -> None:
-    settings = {"show": show, "of": of, **SMALL}
+    settings = {"show": show, "color_by": of, **SMALL}
     plain = hk.render(SPHERE, **settings)
     beside = hk.render(SPHERE, tmp_path / "a.png", color_bar=True, **settings)
     np.testing.assert_array_equal(plain, beside)
@@ -196,14 +196,14 @@ def test_the_smallest_pictures_have_bars(size: tuple[int, int]) -> None:
     ("settings", "message"),
     [
         ({"show": "value"}, "needs the function"),
-        ({"show": "value", "of": "height"}, "of: 'height' is no formula"),
-        ({"show": "depth", "of": "z"}, 'needs a picture with show="value"'),
-        ({"show": "path", "colorbar": True}, 'colorbar needs a picture with show="evaluations"'),
-        ({"show": "normal", "value_range": (0, 1)}, "value_range needs a picture with"),
-        ({"show": "depth", "value_range": (1, 0)}, "two finite numbers in order"),
-        ({"show": "depth", "value_range": 3}, "two finite numbers in order"),
-        ({"show": "depth", "colorbar": 3}, "True, False or the bar's title"),
-        ({"show": "depth", "colorbar": True, "path": "a.exr"}, r"bar is drawn in \.png"),
+        ({"show": "value", "color_by": "height"}, "of: 'height' is no formula"),
+        ({"show": "depth", "color_by": "z"}, 'needs a picture with show="value"'),
+        ({"show": "path", "color_bar": True}, 'colorbar needs a picture with show="evaluations"'),
+        ({"show": "normal", "color_range": (0, 1)}, "value_range needs a picture with"),
+        ({"show": "depth", "color_range": (1, 0)}, "two finite numbers in order"),
+        ({"show": "depth", "color_range": 3}, "two finite numbers in order"),
+        ({"show": "depth", "color_bar": 3}, "True, False or the bar's title"),
+        ({"show": "depth", "color_bar": True, "path": "a.exr"}, r"bar is drawn in \.png"),
     ],
 )
 def test_what_is_wrong_is_said(settings: dict[str, Any], message: str) -> None:

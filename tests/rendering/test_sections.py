@@ -126,7 +126,7 @@ def test_meshes_are_cut_by_sections_too():
 
 
 def test_sections_of_the_command_line():
-    options = parse(["render", "gyroid", "--section", "0,-3,4,0.5", "--cut-material", "clay"])
+    options = parse(["render", "gyroid", "--section", "0,-3,4,0.5", "--section-material", "clay"])
     cut = _section(options)
     assert cut is not None
     assert options.cut_material == "clay"
