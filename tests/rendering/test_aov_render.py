@@ -307,7 +307,7 @@ def test_there_is_no_edge_behind_the_surface(show: str, backdrop: str, elevation
 def test_a_tube_is_drawn_around_the_curve() -> None:
     """It sticks out of the surface by its radius, and follows circles."""
     bare = np.isfinite(draw(show="depth"))
-    thick = np.isfinite(draw(show="depth", boundary=0.1))
+    thick = np.isfinite(draw(show="depth", boundary_radius=0.1))
     assert thick.sum() > 1.05 * bare.sum()
     ring = hk.SolidAngle(hk.geometry.Circle(1.0, (0, 0, 0), (0, 0, 1)))
     camera = hk.Camera(elevation=90, box=hk.Box((-1.2, -1.2, -0.2), (1.2, 1.2, 0.2)))
@@ -320,13 +320,13 @@ def test_a_tube_is_drawn_around_the_curve() -> None:
 
 @pytest.mark.parametrize("radius", [0, -1, math.nan, math.inf, "wide", True])
 def test_a_tube_needs_a_radius(radius: Any) -> None:
-    with pytest.raises(ValueError, match="boundary is the radius"):
-        draw(boundary=radius)
+    with pytest.raises(ValueError, match="boundary_radius is"):
+        draw(boundary_radius=radius)
 
 
 def test_a_tube_needs_a_curve() -> None:
     with pytest.raises(ValueError, match="ends at a curve"):
-        draw(GYROID, boundary=0.1)
+        draw(GYROID, boundary_radius=0.1)
 
 
 @pytest.mark.slow
@@ -350,7 +350,8 @@ def test_pictures_show_themselves() -> None:
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["gyroid", "--solid", "-0.3:0.3", "--clip", "ball:0,0,0,3", "--backdrop", "white"],
+        ["gyroid", "--side", "between", "--level", "-0.3,0.3", "--clip", "ball:0,0,0,3"],
+        ["gyroid", "--side", "below", "--backdrop", "white"],
         ["trefoil", "--position", "-5,5,2", "--target", "0,0,0", "--backdrop", "transparent"],
         [
             "polygon",
@@ -409,15 +410,15 @@ def test_axes_with_a_minus_turn_files_from_the_command_line(up: str, tmp_path: P
         (["trefoil", "--backdrop", "white,steelbleu"], 'did you mean "steelblue"'),
         (["trefoil", "--backdrop", "missing.png"], "missing.png: there is no such file"),
         (["trefoil", "--up", "w"], "x, y, z, -x, -y, -z"),
-        (["trefoil", "--isolines", "z"], "a coordinate or a formula, and a spacing, as z:0.1"),
+        (["trefoil", "--isolines", "z"], "a coordinate or a formula, and an interval, as z:0.1"),
         (["trefoil", "--isolines", "w:1"], "'w' is unknown"),
         (["trefoil", "--show", "value", "--color-by", "x*"], "'x*' is no formula"),
         (["trefoil", "--isolines", "z:0"], "positive"),
-        (["trefoil", "--isolines-color", "red"], "color of isolines without isolines"),
+        (["trefoil", "--isolines-color", "red"], "give --isolines too"),
         (["trefoil", "--show", "value"], "such as --color-by z"),
         (["trefoil", "--enclosures", "slop"], 'did you mean "slope"'),
         (["trefoil", "--position", "1,2"], "3 numbers"),
-        (["trefoil", "--solid", "0:1"], "real-valued"),
+        (["trefoil", "--side", "below"], "real-valued"),
         (["letters", "--zoom", "-1"], "positive"),
         (["trefoil", "--position", "1,2,3", "--distance", "2"], "position or distance"),
     ],

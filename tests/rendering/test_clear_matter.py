@@ -62,9 +62,9 @@ def chords(radius: float = 1.0) -> np.ndarray:
     return 2 * np.sqrt(np.maximum(b * b - EYE @ EYE + radius**2, 0))
 
 
-@pytest.mark.parametrize("confirm", [False, True])
-def test_a_ball_absorbs_light_by_the_law_of_beer_and_lambert(confirm: bool) -> None:
-    image, chord = drawn(ball(1.0, require_crossing=confirm)), chords()
+@pytest.mark.parametrize("require_crossing", [False, True])
+def test_a_ball_absorbs_light_by_the_law_of_beer_and_lambert(require_crossing: bool) -> None:
+    image, chord = drawn(ball(1.0, require_crossing=require_crossing)), chords()
     expected = SKY * TINT ** chord[..., None]
     assert 0.2 < (chord > 0.1).mean() < 0.7
     np.testing.assert_allclose(image[chord > 0.1], expected[chord > 0.1], rtol=3e-3)
@@ -149,7 +149,7 @@ def test_bad_tints_are_refused() -> None:
         ball(1.5, tint=(0.5, 0.0, 0.5))
     with pytest.raises(TypeError, match=r"such as \(0.9, 0.5, 0.1\)"):
         ball(1.5, tint="amber")
-    with pytest.raises(ValueError, match="give solid="):
+    with pytest.raises(ValueError, match='give side="below"'):
         mitsuba_shape(Sphere(), tint=(0.5, 0.5, 0.5))
     with pytest.raises(ValueError, match="needs an inside"):
         render(Sphere(), material="amber", progress=False)

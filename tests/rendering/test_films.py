@@ -150,7 +150,7 @@ def test_a_film_in_mp4(tmp_path: Path) -> None:
         ({"frames": 0}, "frames must be from 1"),
         ({"fps": 0}, "fps"),
         ({"fps": float("nan")}, "fps"),
-        ({"orbit": float("inf")}, "turn"),
+        ({"orbit": float("inf")}, "orbit"),
         ({"material": "golf"}, "gold"),
         ({"path": "a.mp4", "backdrop": "transparent"}, "no alpha"),
         ({"path": "a.mp4", "size": (1, 20)}, "at least 2 pixels"),

@@ -97,7 +97,7 @@ def test_bands_leave_no_seam(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.few(1)
 @pytest.mark.parametrize("show", SHOW_MODES)
 def test_every_mode_makes_numbers_and_a_picture(show: str, tmp_path: Path) -> None:
-    image = draw(path=tmp_path / "a.png", show=show, of="x" if show == "value" else None)
+    image = draw(path=tmp_path / "a.png", show=show, color_by="x" if show == "value" else None)
     assert image.shape[:2] == (30, 40)
     drawn = read(tmp_path / "a.png")
     assert drawn.shape == (30, 40, 3)
@@ -146,17 +146,21 @@ def test_nothing_is_lost_and_nothing_is_said_with_enough_steps() -> None:
 
 
 @pytest.mark.slow
-def test_settings_of_a_level_set_are_replaced() -> None:
-    surface = traced_surface(POLYGON, 2.5 * math.pi, tolerance=1e-3)
-    replaced = draw([surface], show="depth", level=math.pi)
-    expected = draw(traced_surface(POLYGON, level=math.pi, tolerance=1e-3), show="depth")
-    np.testing.assert_array_equal(replaced, expected)
+def test_a_surface_is_drawn_as_its_field_with_keywords() -> None:
+    near = hk.TraceOptions(tolerance=1e-3)
+    surface = hk.Surface(POLYGON, 2.5 * math.pi).replace(level=math.pi)
+    drawn = draw([surface], show="depth", options=near)
+    np.testing.assert_array_equal(drawn, draw(POLYGON, show="depth", level=math.pi, tolerance=1e-3))
     solid = hk.Surface(GYROID, level=(-0.3, 0.3), side="between")
     half = hk.HalfSpace((0, 0, 1), 0.0)
-    clipped = draw(solid, show="depth", clip=half)
-    expected = draw(hk.Surface(GYROID, level=(-0.3, 0.3), side="between", clip=half), show="depth")
+    clipped = draw(solid.replace(clip=half), show="depth")
+    expected = draw(GYROID, show="depth", level=(-0.3, 0.3), side="between", clip=half)
     np.testing.assert_array_equal(clipped, expected)
     assert not np.array_equal(clipped, draw(solid, show="depth"))
+    with pytest.raises(TypeError, match=r"a Surface holds its own; .*surface\.replace\(clip="):
+        draw(solid, show="depth", clip=half)
+    with pytest.raises(TypeError, match=r"there are options already; .*options\.replace\(tol"):
+        draw(solid, show="depth", options=near, tolerance=1e-3)
 
 
 @pytest.mark.few(1)
@@ -275,7 +279,7 @@ def test_surfaces_stand_on_the_ground() -> None:
         ({"what": {"type": "scene"}, "level": 3.0}, "as it is"),
         ({"what": hk.Surface(POLYGON, clip=hk.Ball((9, 9, 9), 0.1))}, "nothing is to be seen"),
         ({"what": hk.Surface(POLYGON, 0.0)}, "infinity"),
-        ({"material": "glass"}, "solid"),
+        ({"material": "glass"}, "needs an inside"),
     ],
 )
 def test_errors_come_early_and_say_what_to_do(settings: dict[str, Any], word: str) -> None:

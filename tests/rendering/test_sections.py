@@ -8,7 +8,6 @@ import pytest
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.cli.arguments import parse
-from harnack.cli.commands import _section  # pyright: ignore[reportPrivateUsage]
 from harnack.rendering import mitsuba_shape
 from harnack.rendering.placed_surface import PlacedSurface, Placement
 
@@ -106,7 +105,7 @@ def test_pictures_show_faces_in_their_own_material():
 
 def test_wrong_faces_are_refused():
     cut, small = hk.HalfSpace((0, 0, 1), 0.0), {"size": (8, 6), "progress": False}
-    with pytest.raises(ValueError, match="section=harnack"):
+    with pytest.raises(ValueError, match="give a section, such as a half-space"):
         hk.render(hk.Sphere(1.0), section_material="gold", **small)
     with pytest.raises(ValueError, match="opaque"):
         hk.render(hk.Sphere(1.0), material="glass", section=cut, section_material="gold", **small)
@@ -127,11 +126,11 @@ def test_meshes_are_cut_by_sections_too():
 
 def test_sections_of_the_command_line():
     options = parse(["render", "gyroid", "--section", "0,-3,4,0.5", "--section-material", "clay"])
-    cut = _section(options)
-    assert cut is not None
-    assert options.cut_material == "clay"
-    np.testing.assert_allclose([*cut.normal, cut.offset], [0, -0.6, 0.8, 0.5])
-    assert parse(["mesh", "gyroid", "--section", "0,0,1"]).section == (0, 0, 1, 0)
+    assert options.section == hk.HalfSpace((0, -3, 4), 0.5)
+    assert options.section_material == "clay"
+    section = options.section
+    np.testing.assert_allclose([*section.normal, section.offset], [0, -0.6, 0.8, 0.5])
+    assert parse(["mesh", "gyroid", "--section", "0,0,1"]).section == hk.HalfSpace((0, 0, 1), 0)
     for wrong in ("0,0,0", "1,2", "1,2,3,4,5"):
         with pytest.raises(SystemExit):
             parse(["render", "gyroid", "--section", wrong])

@@ -86,7 +86,7 @@ _ANY = "|".join(_NAMES)
 _KEYWORD = re.compile(
     r"(?P<call>[\w.]+\((?:[^()]|\([^()]*\))*\))"
     rf"|(?<![\w.])(?P<name>{_ANY})="
-    r'(?P<value>"[^"]*"|\([^()]*\)|[\w.-]*\w|\.\.\.)'
+    r'(?P<value>"[^"]*"|\([^()]*\)|\[[^]]*\]|[\w.-]*\w|\.\.\.)'
     rf"|`(?P<quoted>{_ANY})`"
     rf"|(?<![\w./-])(?P<alone>(?=[a-z]+_)(?:{_ANY}))\b(?![/=]|\.\w)"
 )
@@ -129,7 +129,7 @@ def _option(match: re.Match[str]) -> str:
     flag = f"--{name.replace('_', '-')}"
     if match["value"] is None or name in _SWITCHES:
         return flag
-    return f"{flag} {match['value'].strip(chr(34)).strip('()').replace(' ', '')}"
+    return f"{flag} {match['value'].strip(chr(34)).strip('()[]').replace(' ', '')}"
 
 
 def level_text(level: float | None) -> str:
