@@ -104,6 +104,11 @@ class Option:
         return self.default_of.get(verb, self.default)
 
 
+def _checked(parse: Parse, check: Callable[[Any], Any]) -> Parse:
+    """A parser of texts whose values are checked before a source is read."""
+    return lambda text: check(parse(text))
+
+
 def _of_trace(name: str) -> Any:
     return TraceOptions.__dataclass_fields__[name].default
 
@@ -145,9 +150,10 @@ OPTIONS: tuple[Option, ...] = (
     Option("camera", "image", DRAWN, "camera, or the point where it stands",
            check=checks.ignoring_mode(checks.check_camera), varies=True),
     Option("size", "image", PICTURES, "width and height in pixels (800x600)", "WxH",
-           text.parse_size, checks.if_set(checks.check_image_size)),
+           _checked(text.parse_size, checks.check_image_size),
+           checks.if_set(checks.check_image_size)),
     Option("spp", "image", PICTURES, "samples per pixel (64; 9 at edges of shaded pictures)", "N",
-           text.parse_count, checks.if_set(checks.check_spp)),
+           _checked(text.parse_count, checks.check_spp), checks.if_set(checks.check_spp)),
     Option("material", "style", DRAWN, "material of the surface, by name, or a color by name or "
            "#rrggbb (two-tone)", "NAME", text.parse_material_name, varies=True),
     Option("section_material", "style", DRAWN, "material of the faces of a solid on its section "
@@ -177,11 +183,11 @@ OPTIONS: tuple[Option, ...] = (
            "{" + ",".join(checks.ANTIALIASING) + "}", text.parse_choice(*checks.ANTIALIASING),
            checks.check_antialias),
     Option("max_depth", "quality", PICTURES, "longest light path in edges, -1 for no limit (12)",
-           "N", int, checks.check_max_depth),
+           "N", text.parse_integer, checks.check_max_depth),
     Option("denoise", "quality", PICTURES, "take the noise out of a picture of light paths (needs "
            "pip install 'harnack[denoise]')", check=checks.check_denoise, default=False),
     Option("seed", "quality", PICTURES | {"mesh", "repair"}, "another seed, other noise, or other "
-           "small random moves of meshes (0)", "N", text.parse_seed,
+           "small random moves of meshes (0)", "N", text.parse_integer,
            checks.as_integer("seed"), 0),
     Option("client", "run", PICTURES | {"page"}, "workers of a Dask cluster that do the work, by "
            "its scheduler's address, such as tcp://10.0.0.1:8786 (needs pip install "
@@ -312,7 +318,9 @@ def refuse_unknown(verb: str, keywords: Mapping[str, Any]) -> None:
             known = [option.name for option in options_of(verb)]
             other_name = _OTHER_PROGRAMS_NAMES.get(name.lower())
             hint = f"; did you mean {other_name}?" if other_name else did_you_mean(name, known)
-            raise TypeError(f"{verb} has no option {name!r}{hint}; it has {', '.join(known)}")
+            raise TypeError(
+                f"{verb} has no option {name!r}{hint or '; it has ' + ', '.join(known)}"
+            )
 
 
 def shows_options(verb: str) -> Callable[[_Function], _Function]:
