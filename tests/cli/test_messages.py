@@ -363,8 +363,8 @@ def texts_of_the_library() -> list[str]:
 
 # Of objects of Python and of values of a wrong type, to which no text of the command line leads.
 ONLY_IN_PYTHON = re.compile(
-    r"(camera|isolines|options) must be |backend=|camera=harnack|the center of a ball must|a height field "
-    r"|X is a function of|.*in Python precision="
+    r"(camera|isolines|options) must be |backend=|camera=harnack|the center of a ball must"
+    r"|a height field |X is a function of|.*in Python precision="
 )
 CONSTRUCTOR = re.compile(
     r"\b(Ball|Box|HalfSpace|Camera|Slider|Isolines|Surface|TraceOptions|VolumeIntersection)\("
