@@ -171,7 +171,7 @@ OPTIONS: tuple[Option, ...] = (
            "#334455, two from bottom to top such as white,steelblue, or an image (light)",
            "BACKDROP", text.parse_backdrop_text, checks.check_backdrop, varies=True),
     Option("up", "style", DRAWN, "axis that points up (z; of files .glb, .gltf and surfaces in "
-           ".obj y)", "AXIS", text.parse_axis),
+           ".obj y)", "AXIS", text.parse_axis, varies=True),
     Option("color_by", "color", PICTURES, "coordinate or formula of x, y and z whose values "
            "show=value shows", "FORMULA", text.parse_formula, checks.check_color_by, varies=True),
     Option("color_range", "color", PICTURES, "ends of the colors of values, depths or evaluations "
