@@ -398,6 +398,7 @@ def test_messages_on_the_command_line_name_its_options_and_nothing_of_python() -
         ("give level=(low, high), or a larger `clip`", "give --level low,high, or a larger --clip"),
         ("too long: raise max_steps.", "too long: raise --max-steps."),
         ("largest=... and simplify=True", "--largest and --simplify"),
+        ("level: give at least one", "--level: give at least one"),
         ("(take_boundary=True)", "(--take-boundary)"),
         ("cut it (hk.mesh(f, level=(0, 1)))", "cut it (hk.mesh(f, level=(0, 1)))"),
         ('in Python precision="double"', 'in Python precision="double"'),

@@ -42,4 +42,4 @@ def test_commands_take_a_cluster(
     assert main(film) == 0
     assert len(list((tmp_path / "parts").iterdir())) > 4
     assert main(["render", *small, "-o", str(pictures[0]), "--chunks", "3"]) == 1
-    assert "--chunks" in capsys.readouterr().err
+    assert "--chunks: parts are drawn one by one" in capsys.readouterr().err

@@ -351,7 +351,7 @@ def test_pictures_show_themselves() -> None:
     "arguments",
     [
         ["gyroid", "--side", "between", "--level", "-0.3,0.3", "--clip", "ball:0,0,0,3"],
-        ["gyroid", "--side", "below", "--backdrop", "white"],
+        ["gyroid", "--side", "below", "--level", "0.1", "--backdrop", "white"],
         ["trefoil", "--position", "-5,5,2", "--target", "0,0,0", "--backdrop", "transparent"],
         [
             "polygon",

@@ -170,6 +170,13 @@ def test_what_is_the_same_for_all_pictures_is_no_function(name: str, tmp_path: P
     assert list(tmp_path.iterdir()) == []
 
 
+def test_classes_of_enclosures_are_no_functions(tmp_path: Path) -> None:
+    """A film refused them as functions of s."""
+    bounds = {"enclosures": hk.proofs.LipschitzEnclosure, "show": "normal", "frames": 1}
+    hk.animate(hk.Sphere(1.0), tmp_path / "a.gif", **{**SMALL, **bounds})
+    assert len(pictures(tmp_path / "a.gif")) == 1
+
+
 @pytest.mark.parametrize("name", ["a.gif", "a.mp4"])
 def test_films_have_room_for_color_bars(name: str, tmp_path: Path) -> None:
     settings = {"frames": 2, "show": "value", "color_by": "z", "color_bar": True}

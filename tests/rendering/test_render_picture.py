@@ -194,7 +194,7 @@ def test_levels_of_one_field_may_have_materials_of_their_own() -> None:
     one = draw(GYROID, level=levels, material=names, show="shaded", tolerance=1e-4)
     pair = [traced_surface(GYROID, level=level, tolerance=1e-4) for level in levels]
     np.testing.assert_array_equal(one, draw(pair, material=names, show="shaded"))
-    with pytest.raises(ValueError, match=r"a surface is drawn twice.*level=\[a, b\]"):
+    with pytest.raises(ValueError, match=r"a surface is drawn twice.*a Surface for each level"):
         draw([GYROID, GYROID], level=levels, material=names)
     turn = POLYGON.period
     with pytest.raises(ValueError, match="a surface is drawn twice"):
@@ -218,13 +218,13 @@ def test_parts_of_one_surface_may_be_drawn_as_several() -> None:
 
 @pytest.mark.slow
 def test_tubes_around_boundaries_have_a_material() -> None:
-    gold = draw(POLYGON, boundary=0.1, show="shaded")
-    same = draw(POLYGON, boundary=0.1, boundary_material="gold", show="shaded")
+    gold = draw(POLYGON, boundary_radius=0.1, show="shaded")
+    same = draw(POLYGON, boundary_radius=0.1, boundary_material="gold", show="shaded")
     np.testing.assert_array_equal(gold, same)
-    blue = draw(POLYGON, boundary=0.1, boundary_material="blue", show="shaded")
+    blue = draw(POLYGON, boundary_radius=0.1, boundary_material="blue", show="shaded")
     assert ((blue[..., 2] > 2 * blue[..., 0]) & (gold[..., 0] > gold[..., 2])).mean() > 0.005
     with pytest.raises(ValueError, match="boundary_material: tubes have no inside"):
-        draw(POLYGON, boundary=np.float32(0.1), boundary_material="glass")
+        draw(POLYGON, boundary_radius=np.float32(0.1), boundary_material="glass")
     with pytest.raises(ValueError, match="boundary_material needs the radius of the tubes"):
         draw(POLYGON, boundary_material="gold")
 

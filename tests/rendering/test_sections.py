@@ -10,6 +10,7 @@ from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.cli.arguments import parse
 from harnack.rendering import mitsuba_shape
 from harnack.rendering.placed_surface import PlacedSurface, Placement
+from harnack.tracer import traced_surface
 
 NORMAL, OFFSET = np.array([0.6, 0.0, 0.8]), 0.2
 HALF = hk.HalfSpace((0.6, 0.0, 0.8), OFFSET)
@@ -63,9 +64,8 @@ def test_what_lies_beyond_a_section_is_not_hit(precision):
 @pytest.mark.slow
 def test_faces_of_a_solid_on_its_section_are_told_from_all_others():
     backend = choose_backend("double")
-    surface = hk.Surface(
-        hk.Sphere(1.0), level=0.0, side="below", clip=hk.HalfSpace((-1, 0, 0), 0.5), section=HALF
-    )
+    clip = hk.HalfSpace((-1, 0, 0), 0.5)
+    surface = traced_surface(hk.Sphere(1.0), side="below", clip=clip, section=HALF)
     placed = PlacedSurface.of(surface, Placement.identity(), backend)
     o, d = _rays(3000, 4)
     o[1500:] = 0.3 * o[1500:] / np.linalg.norm(o[1500:], axis=1)[:, None] - [0.1, 0, 0]  # inside

@@ -82,12 +82,13 @@ def print_warnings() -> Generator[None]:
 _SWITCHES = {"take_boundary", *(option.name for option in OPTIONS if option.is_switch)}
 _NAMES = (*FILE_OPTIONS, *(option.name for option in OPTIONS if option.is_on_command_line))
 _ANY = "|".join(_NAMES)
-# A call; or an option with a value; or its name alone, in backticks or with an underscore.
+# A call; or an option with a value; or its name alone, at the start, in backticks or with an
+# underscore.
 _KEYWORD = re.compile(
     r"(?P<call>[\w.]+\((?:[^()]|\([^()]*\))*\))"
     rf"|(?<![\w.])(?P<name>{_ANY})="
     r'(?P<value>"[^"]*"|\([^()]*\)|\[[^]]*\]|[\w.-]*\w|\.\.\.)'
-    rf"|`(?P<quoted>{_ANY})`"
+    rf"|\A(?P<first>{_ANY})(?=: )|`(?P<quoted>{_ANY})`"
     rf"|(?<![\w./-])(?P<alone>(?=[a-z]+_)(?:{_ANY}))\b(?![/=]|\.\w)"
 )
 _PARAMETER = re.compile(r'parameters=\{"(\w+)": 1\.0\}')
@@ -125,7 +126,7 @@ def _option(match: re.Match[str]) -> str:
     """The option of the command line for a keyword; calls stay as they are."""
     if match["call"]:
         return match["call"]
-    name = match["name"] or match["quoted"] or match["alone"]
+    name = match["name"] or match["first"] or match["quoted"] or match["alone"]
     flag = f"--{name.replace('_', '-')}"
     if match["value"] is None or name in _SWITCHES:
         return flag
