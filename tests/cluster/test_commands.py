@@ -36,8 +36,8 @@ def test_commands_take_a_cluster(
     assert main(["render", *small, *shaded, "-o", str(pictures[0])]) == 0
     assert main(["render", *small, *shaded, "-o", str(pictures[1]), "--chunks", "3", *there]) == 0
     mi = register()
-    one, two = (np.array(mi.Bitmap(str(path))) for path in pictures)
-    np.testing.assert_array_equal(one, two)
+    alone, by_workers = (np.array(mi.Bitmap(str(path))) for path in pictures)
+    np.testing.assert_array_equal(alone, by_workers)
     film = ["animate", *small, "--frames", "2", "-o", str(tmp_path / "a.gif"), *there]
     assert main(film) == 0
     assert len(list((tmp_path / "parts").iterdir())) > 4

@@ -104,7 +104,7 @@ def test_a_checkpoint_spares_what_is_done(
         hk.render(POLYGON, **kept)
     assert len(list(tmp_path.iterdir())) == 3
     monkeypatch.setattr(CheckpointFolder, "save", own)
-    there = {one.name: one.stat().st_mtime_ns for one in tmp_path.iterdir()}
+    there = {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
     assert_same(hk.render(POLYGON, **kept), alone)
     assert all((tmp_path / name).stat().st_mtime_ns == when for name, when in there.items())
     parts = len(list(tmp_path.iterdir()))

@@ -69,8 +69,8 @@ def test_surfaces_keep_their_names_when_they_are_used(name: str) -> None:
         hk.trace(surface.replace(side="surface"), POINTS * 3, -POINTS)
     packed = SerializedObject.serialize(fresh, "test")
     assert SerializedObject.serialize(used, "test") == packed
-    for one, other in zip(packed.deserialize(), fresh, strict=True):
-        np.testing.assert_array_equal(one.field.value(POINTS), other.field.value(POINTS))
+    for sent, own in zip(packed.deserialize(), fresh, strict=True):
+        np.testing.assert_array_equal(sent.field.value(POINTS), own.field.value(POINTS))
 
 
 def test_functions_of_formulas_are_sent_by_name() -> None:

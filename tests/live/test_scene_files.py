@@ -151,16 +151,17 @@ def test_what_could_not_be_read_is_not_written(
 def test_scene_files_know_every_solid() -> None:
     solids = [getattr(hk.solids, name) for name in hk.solids.__all__]
     solids = [
-        one for one in solids if inspect.isclass(one) and issubclass(one, hk.solids.FormulaSolid)
+        kind
+        for kind in solids
+        if inspect.isclass(kind) and issubclass(kind, hk.solids.FormulaSolid)
     ]
     assert len(solids) > 10
     for kind in _constructible_types().values():
         check_types(kind, {})  # whose annotations can be read
-    for one in set(solids) - {hk.solids.FormulaSolid}:
+    for kind in set(solids) - {hk.solids.FormulaSolid}:
+        about = {"harnack": 1, "surfaces": [{"field": {kind.__name__: {"q": 1}}}]}
         with pytest.raises(hk.live.SceneFileError, match="argument of"):
-            parse_scene(
-                json.dumps({"harnack": 1, "surfaces": [{"field": {one.__name__: {"q": 1}}}]})
-            )
+            parse_scene(json.dumps(about))
 
 
 def test_settings_and_sliders_come_back(tmp_path: Path) -> None:
