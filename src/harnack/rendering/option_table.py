@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from harnack.rendering.backdrops import Backdrop
     from harnack.rendering.camera import Camera
     from harnack.rendering.isolines import Isolines
-    from harnack.rendering.studio_surfaces import MaterialLike
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
@@ -44,6 +43,8 @@ CURVATURES = frozenset(("curvature", "curvature_lines"))
 RAYS = frozenset(("trace", "crossings"))
 VERBS = RAYS | DRAWN | DISTANCES | CURVATURES | {"mesh", "repair"}
 """The functions that take options."""
+COMMANDS = DRAWN | {"mesh", "repair"}
+"""Those that are commands of the command line as well."""
 
 _PLACED = RAYS | DRAWN | DISTANCES | {"mesh", "curvature_lines"}
 
@@ -62,8 +63,8 @@ class Option:
     help: what it is, in a sentence without a period, and its default in brackets.
     value: what a value is on the command line, such as "LENGTH" or "WxH"; "" for an option that
         takes none.
-    parse: the value of a text of the command line; None for an option that it does not have, or
-        makes of several others.
+    parse: the value of a text of the command line; None for a switch (by default False), and for an
+        option that it does not have, or makes of several others.
     check: of a value and of `show`, for a picture; it returns the value in its final form.
     default: the value if it is not set; default_of: other defaults, by verb.
     varies: whether films and sliders may change it.
@@ -87,9 +88,24 @@ class Option:
         """Its name on the command line."""
         return f"--{self.name.replace('_', '-')}"
 
+    @property
+    def is_switch(self) -> bool:
+        """Whether it takes no value on the command line, and is on if it is there."""
+        return self.parse is None and self.default is False
+
+    @property
+    def is_on_command_line(self) -> bool:
+        """Whether commands have it."""
+        return bool(self.verbs & COMMANDS) and (self.parse is not None or self.is_switch)
+
     def default_in(self, verb: str) -> Any:
         """The value that a verb has if it is not set."""
         return self.default_of.get(verb, self.default)
+
+
+def _checked(parse: Parse, check: Callable[[Any], Any]) -> Parse:
+    """A parser of texts whose values are checked before a source is read."""
+    return lambda text: check(parse(text))
 
 
 def _of_trace(name: str) -> Any:
@@ -133,9 +149,10 @@ OPTIONS: tuple[Option, ...] = (
     Option("camera", "image", DRAWN, "camera, or the point where it stands",
            check=checks.ignoring_mode(checks.check_camera), varies=True),
     Option("size", "image", PICTURES, "width and height in pixels (800x600)", "WxH",
-           text.parse_size, checks.if_set(checks.check_image_size)),
+           _checked(text.parse_size, checks.check_image_size),
+           checks.if_set(checks.check_image_size)),
     Option("spp", "image", PICTURES, "samples per pixel (64; 9 at edges of shaded pictures)", "N",
-           text.parse_count, checks.if_set(checks.check_spp)),
+           _checked(text.parse_count, checks.check_spp), checks.if_set(checks.check_spp)),
     Option("material", "style", DRAWN, "material of the surface, by name, or a color by name or "
            "#rrggbb (two-tone)", "NAME", text.parse_material_name, varies=True),
     Option("section_material", "style", DRAWN, "material of the faces of a solid on its section "
@@ -153,7 +170,7 @@ OPTIONS: tuple[Option, ...] = (
            "#334455, two from bottom to top such as white,steelblue, or an image (light)",
            "BACKDROP", text.parse_backdrop_text, checks.check_backdrop, varies=True),
     Option("up", "style", DRAWN, "axis that points up (z; of files .glb, .gltf and surfaces in "
-           ".obj y)", "AXIS", text.parse_axis),
+           ".obj y)", "AXIS", text.parse_axis, varies=True),
     Option("color_by", "color", PICTURES, "coordinate or formula of x, y and z whose values "
            "show=value shows", "FORMULA", text.parse_formula, checks.check_color_by, varies=True),
     Option("color_range", "color", PICTURES, "ends of the colors of values, depths or evaluations "
@@ -165,11 +182,11 @@ OPTIONS: tuple[Option, ...] = (
            "{" + ",".join(checks.ANTIALIASING) + "}", text.parse_choice(*checks.ANTIALIASING),
            checks.check_antialias),
     Option("max_depth", "quality", PICTURES, "longest light path in edges, -1 for no limit (12)",
-           "N", int, checks.check_max_depth),
+           "N", text.parse_integer, checks.check_max_depth),
     Option("denoise", "quality", PICTURES, "take the noise out of a picture of light paths (needs "
            "pip install 'harnack[denoise]')", check=checks.check_denoise, default=False),
     Option("seed", "quality", PICTURES | {"mesh", "repair"}, "another seed, other noise, or other "
-           "small random moves of meshes (0)", "N", text.parse_seed,
+           "small random moves of meshes (0)", "N", text.parse_integer,
            checks.as_integer("seed"), 0),
     Option("client", "run", PICTURES | {"page"}, "workers of a Dask cluster that do the work, by "
            "its scheduler's address, such as tcp://10.0.0.1:8786 (needs pip install "
@@ -240,9 +257,9 @@ class RenderKeywords(TraceKeywords, total=False):
     size: tuple[int, int] | None
     spp: int | None
     material: Any
-    section_material: MaterialLike | None
+    section_material: Any
     boundary_radius: float | None
-    boundary_material: MaterialLike | None
+    boundary_material: Any
     isolines: Isolines | Any
     thickness: float | None
     backdrop: Any
@@ -297,7 +314,9 @@ def refuse_unknown(verb: str, keywords: Mapping[str, Any]) -> None:
             known = [option.name for option in options_of(verb)]
             other_name = _OTHER_PROGRAMS_NAMES.get(name.lower())
             hint = f"; did you mean {other_name}?" if other_name else did_you_mean(name, known)
-            raise TypeError(f"{verb} has no option {name!r}{hint}; it has {', '.join(known)}")
+            raise TypeError(
+                f"{verb} has no option {name!r}{hint or '; it has ' + ', '.join(known)}"
+            )
 
 
 def refuse_others(verb: str, keywords: Mapping[str, Any]) -> None:
