@@ -123,14 +123,14 @@ OPTIONS: tuple[Option, ...] = (
            "X,Y,Z[,DISTANCE]", text.parse_section, varies=True),
     Option("side", "surface", DRAWN | {"mesh"}, "surface, or the closed solid where the function "
            "is below or above the level, or between two levels", "{surface,below,above,between}",
-           text.parse_choice("surface", "below", "above", "between")),
+           text.parse_choice("surface", "below", "above", "between"), varies=True),
     Option("largest", "surface", DRAWN | {"trace", "mesh", "repair"},
-           "only the largest connected component", default=False),
+           "only the largest connected component", default=False, varies=True),
     Option("tolerance", "trace", RAYS | DRAWN | {"mesh", "repair"}, "largest distance of hits or "
            "triangles from the surface (1e-4 of its size, 1e-3 for meshes)", "LENGTH",
            text.parse_positive, varies=True),
     Option("enclosures", "trace", RAYS | DRAWN, "proof by which steps are made (the longest of all "
-           "that apply)", "NAME", text.parse_enclosures),
+           "that apply)", "NAME", text.parse_enclosures, varies=True),
     Option("max_steps", "trace", RAYS | DRAWN, "evaluations after which a ray is out of steps "
            "(2000)", "N", text.parse_count, default=_of_trace("max_steps"), varies=True),
     Option("over_relaxation", "trace", RAYS | DRAWN, "factor from 1 to 2 by which trial steps are "
@@ -141,7 +141,7 @@ OPTIONS: tuple[Option, ...] = (
            "{webgpu}", text.parse_choice("webgpu"), in_files=False),
     Option("require_crossing", "trace", DRAWN | {"trace"}, "a ray hits only where the field passes "
            "to the other side of the level, not where it comes near and turns back",
-           default=False),
+           default=False, varies=True),
     Option("show", "image", DRAWN, "picture: path follows light paths, shaded lights first hits by "
            "a formula, without noise; or what a ray found", "{" + ",".join(checks.SHOW_MODES) + "}",
            text.parse_choice(*checks.SHOW_MODES), checks.ignoring_mode(checks.check_show),
@@ -152,7 +152,8 @@ OPTIONS: tuple[Option, ...] = (
            _checked(text.parse_size, checks.check_image_size),
            checks.if_set(checks.check_image_size)),
     Option("spp", "image", PICTURES, "samples per pixel (64; 9 at edges of shaded pictures)", "N",
-           _checked(text.parse_count, checks.check_spp), checks.if_set(checks.check_spp)),
+           _checked(text.parse_count, checks.check_spp), checks.if_set(checks.check_spp),
+           varies=True),
     Option("material", "style", DRAWN, "material of the surface, by name, or a color by name or "
            "#rrggbb (two-tone)", "NAME", text.parse_material_name, varies=True),
     Option("section_material", "style", DRAWN, "material of the faces of a solid on its section "
@@ -174,20 +175,21 @@ OPTIONS: tuple[Option, ...] = (
     Option("color_by", "color", PICTURES, "coordinate or formula of x, y and z whose values "
            "show=value shows", "FORMULA", text.parse_formula, checks.check_color_by, varies=True),
     Option("color_range", "color", PICTURES, "ends of the colors of values, depths or evaluations "
-           "(what is seen)", "LOW:HIGH", text.parse_range, checks.check_color_range),
+           "(what is seen)", "LOW:HIGH", text.parse_range, checks.check_color_range, varies=True),
     Option("color_bar", "color", PICTURES, "bar with numbers beside such a picture, or its title",
-           "[TITLE]", str, checks.check_color_bar, default=False),
+           "[TITLE]", str, checks.check_color_bar, default=False, varies=True),
     Option("antialias", "quality", PICTURES, "pixels of a shaded picture that get all samples: "
            "edges in the picture, or also what cones around pixels meet (edges)",
            "{" + ",".join(checks.ANTIALIASING) + "}", text.parse_choice(*checks.ANTIALIASING),
-           checks.check_antialias),
+           checks.check_antialias, varies=True),
     Option("max_depth", "quality", PICTURES, "longest light path in edges, -1 for no limit (12)",
-           "N", text.parse_integer, checks.check_max_depth),
+           "N", text.parse_integer, checks.check_max_depth, varies=True),
     Option("denoise", "quality", PICTURES, "take the noise out of a picture of light paths (needs "
-           "pip install 'harnack[denoise]')", check=checks.check_denoise, default=False),
+           "pip install 'harnack[denoise]')", check=checks.check_denoise, default=False,
+           varies=True),
     Option("seed", "quality", PICTURES | {"mesh", "repair"}, "another seed, other noise, or other "
            "small random moves of meshes (0)", "N", text.parse_integer,
-           checks.as_integer("seed"), 0),
+           checks.as_integer("seed"), 0, varies=True),
     Option("client", "run", PICTURES | {"page"}, "workers of a Dask cluster that do the work, by "
            "its scheduler's address, such as tcp://10.0.0.1:8786 (needs pip install "
            "'harnack[cluster]')", "ADDRESS", str, in_files=False),
