@@ -239,7 +239,7 @@ def crossings(
     choices.refuse_others("crossings", "tolerance", "enclosures", "max_steps", "over_relaxation",
                           "precision")  # fmt: skip
     check_is_open("crossings", target)
-    traced = TracedSurface.of(target, choices)
+    traced = TracedSurface.of(target, choices).with_call_cache()
     k = _check_count(max_crossings)
     traced.validate_crossings("crossings")
     rays = RayBatch.of(origins, directions, t_min, t_max, choices.precision)
