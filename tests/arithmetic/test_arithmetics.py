@@ -253,10 +253,8 @@ def test_all_proofs_hit_the_same(name: str, precision: str) -> None:
     rays = to_vector3(backend, o), to_vector3(backend, target - o)
 
     def hits(bound: str | None) -> tuple[Any, Any]:
-        found = hk.trace(
-            hk.traced_surface(field, enclosures=bound, tolerance=1e-5, max_steps=1000), *rays
-        )
-        return found.status.numpy(), found.t.numpy()
+        traced = hk.trace(field, *rays, enclosures=bound, tolerance=1e-5, max_steps=1000)
+        return traced.status.numpy(), traced.t.numpy()
 
     status, t = hits(None)
     hit = status == int(hk.RayStatus.HIT)
@@ -278,12 +276,9 @@ def test_all_proofs_hit_the_same(name: str, precision: str) -> None:
 
 
 def test_proofs_of_formulas_say_what_they_need() -> None:
-    with pytest.raises(ValueError, match="no bound applies"):
-        hk.trace(
-            hk.traced_surface(hk.SphericalHarmonic(4, 2), enclosures="bottom-up-quadratic"),
-            np.array([[3.0, 0, 0]]),
-            np.array([[-1.0, 0, 0]]),
-        )
+    options = hk.TraceOptions(enclosures="bottom-up-quadratic")
+    with pytest.raises(ValueError, match="no enclosure applies"):
+        hk.trace(hk.SphericalHarmonic(4, 2), [[3.0, 0, 0]], [[-1.0, 0, 0]], options=options)
 
 
 def test_formulas_with_what_has_no_ranges_are_refused() -> None:

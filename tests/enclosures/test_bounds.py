@@ -696,14 +696,18 @@ def test_bounds_are_chosen_by_name() -> None:
     )
     some = choose_enclosures("slope")
     assert choose_enclosures(some) is some
-    with pytest.raises(ValueError, match=r"unknown bound 'harnak'; choose one of .*caps.* classic"):
+    with pytest.raises(
+        ValueError, match=r"unknown enclosures 'harnak'; choose one of .*caps.* classic"
+    ):
         choose_enclosures("harnak")
     for wrong in (3, (), (SphericalCapEnclosure, "slope"), int, Enclosure, HarmonicBallEnclosure):
-        with pytest.raises(TypeError, match=r"such as harnack\.SphericalCapEnclosure"):
+        with pytest.raises(TypeError, match=r"such as harnack\.proofs\.SphericalCapEnclosure"):
             choose_enclosures(wrong)  # type: ignore[arg-type]
     real = choose_backend("double").Float
     given = (real(0), 0.0, SlopeRange(real(0.4), real(0.4)))
-    with pytest.raises(ValueError, match=r'no bound .*Lipschitz, which.*SphericalCap.*"lipschitz"'):
+    with pytest.raises(
+        ValueError, match=r'no enclosure .*Lipschitz, which.*SphericalCap.*"lipschitz"'
+    ):
         choose_enclosures(SphericalCapEnclosure).from_promises((Lipschitz(1.0),), (), *given)
     with pytest.raises(ValueError, match=r"Sample\.promises is empty"):
         choose_enclosures(None).from_promises((), (), *given, (Lipschitz(1.0, 1.0),))

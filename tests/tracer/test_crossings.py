@@ -208,14 +208,15 @@ def test_a_sphere_is_entered_and_left(precision: Any) -> None:
 
 @pytest.mark.few(3)
 @pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("overstep", [1.0, 1.4])
-def test_rays_that_graze_do_not_stick(precision: Any, overstep: float) -> None:
+@pytest.mark.parametrize("over_relaxation", [1.0, 1.4])
+def test_rays_that_graze_do_not_stick(precision: Any, over_relaxation: float) -> None:
     tolerance = 1e-3
     off = tolerance * np.array([-50, -4, -1.2, -0.4, -0.1, 0, 0.1, 0.5, 0.9, 1.1, 4])
     o = np.column_stack([np.full(11, -3.0), 1 + off, np.zeros(11)])
     d = np.tile([1.0, 0, 0], (11, 1))
     settings: dict[str, Any] = {
-        "tolerance": tolerance, "t_max": 6.0, "precision": precision, "overstep": overstep,
+        "tolerance": tolerance, "t_max": 6.0, "precision": precision,
+        "over_relaxation": over_relaxation,
     }  # fmt: skip
     found = hk.crossings(Sphere(), o, d, max_crossings=9, **settings)
     np.testing.assert_array_equal(found.count[:3], 2)
@@ -317,8 +318,8 @@ def test_confirmed_hits_are_all_hits_but_those_that_turn_back(precision: Any) ->
     settings: dict[str, Any] = {"level": 1.2, "tolerance": 3e-3, "precision": precision}
     plain = hk.trace(field, o, d, **settings)
     sure = hk.trace(field, o, d, require_crossing=True, **settings)
-    surface = hk.traced_surface(field, 1.2, tolerance=3e-3, require_crossing=True)
-    same = hk.trace(surface, o, d, precision=precision)
+    options = hk.TraceOptions(tolerance=3e-3, require_crossing=True, precision=precision)
+    same = hk.trace(hk.Surface(field, 1.2), o, d, options=options)
     np.testing.assert_array_equal(sure.t, same.t)
     assert (plain.is_hit | ~sure.is_hit).all()
     assert 5 < (plain.is_hit & ~sure.is_hit).sum() < 200
@@ -401,10 +402,10 @@ def test_bad_settings_are_refused() -> None:
     with pytest.raises(TypeError, match="an integer such as 8"):
         hk.crossings(Sphere(), o, d, max_crossings="all")  # type: ignore[call-overload]
     mesh = hk.WindingNumber(*icosphere(0))
-    with pytest.raises(ValueError, match="all_hits takes one level of a field with sheets"):
+    with pytest.raises(ValueError, match="crossings takes one level of a field with jumps"):
         hk.crossings(mesh, o, d, max_crossings=2, level=(0.3, 0.6))
-    with pytest.raises(ValueError, match="confirm takes one level of a field with sheets"):
-        hk.traced_surface(mesh, [0.3, 0.6], require_crossing=True)
+    with pytest.raises(ValueError, match="require_crossing takes one level of a field with jumps"):
+        hk.trace(hk.Surface(mesh, [0.3, 0.6]), o, d, require_crossing=True)
 
 
 def balls() -> tuple[FloatArray, Any]:

@@ -388,11 +388,11 @@ def looking(value: Callable[[np.ndarray], np.ndarray], smooth: float) -> Functio
 
 
 @pytest.mark.few(5)
-@pytest.mark.parametrize("bound", [None, "slope", "classic", "lipschitz"])
+@pytest.mark.parametrize("enclosures", [None, "slope", "classic", "lipschitz"])
 @pytest.mark.parametrize("name", REAL)
-def test_real_valued_fields(name: str, bound: str | None) -> None:
+def test_real_valued_fields(name: str, enclosures: str | None) -> None:
     field, value, levels, smooth = REAL[name]
-    if bound == "lipschitz" and not isinstance(field, hk.fields.EigenfunctionSum):
+    if enclosures == "lipschitz" and not isinstance(field, hk.fields.EigenfunctionSum):
         pytest.skip("has no Lipschitz constant")
     assert isinstance(field.domain, hk.Ball)
     rng, n, radius = np.random.default_rng(len(name)), 150, field.domain.radius
@@ -400,7 +400,7 @@ def test_real_valued_fields(name: str, bound: str | None) -> None:
     o = o.astype(np.float32).astype(np.float64)
     d = unit(radius * rng.uniform(0, 0.9, (n, 1)) * unit(rng.normal(size=(n, 3))) - o)
     tolerance = 1e-4 * radius
-    hits = hk.trace(field, o, d, level=list(levels), tolerance=tolerance, enclosures=bound)
+    hits = hk.trace(field, o, d, level=list(levels), tolerance=tolerance, enclosures=enclosures)
     along = (o * d).sum(axis=1)
     half = np.sqrt((0.9999 * radius) ** 2 - (o * o).sum(axis=1) + along**2)
     start = np.maximum(-along - half, 0.0)
@@ -410,7 +410,7 @@ def test_real_valued_fields(name: str, bound: str | None) -> None:
     )  # fmt: skip
     assert np.isfinite(truth.beyond).sum() > 20
     # The published rule runs out of steps where the range is much larger than the gradient.
-    assert bound == "classic" or not (hits.status == hk.RayStatus.OUT_OF_STEPS).any()
+    assert enclosures == "classic" or not (hits.status == hk.RayStatus.OUT_OF_STEPS).any()
     missed = hits.t > truth.beyond + SHARE * tolerance
     assert not missed.any(), (o[missed], d[missed], hits.t[missed], truth.beyond[missed])
     at = np.flatnonzero(hits.is_hit)

@@ -1,7 +1,5 @@
 """The largest component alone: first hits against those of that component by itself."""
 
-import math
-
 import numpy as np
 import pytest
 
@@ -83,12 +81,15 @@ def test_first_hits_are_those_of_the_largest(name, precision):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("overstep", [1.0, 1.9])
+@pytest.mark.parametrize("over_relaxation", [1.0, 1.9])
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-7])
-def test_first_hits_with_other_steps(tolerance, overstep):
+def test_first_hits_with_other_steps(tolerance, over_relaxation):
     for name in FIELDS:
-        settings = {"precision": "double", "tolerance": tolerance, "overstep": overstep}
-        assert wrong(FIELDS[name], 50_000, 1, **settings) == 0
+        count = wrong(
+            FIELDS[name], 50_000, 1,
+            precision="double", tolerance=tolerance, over_relaxation=over_relaxation,
+        )  # fmt: skip
+        assert count == 0
 
 
 @pytest.mark.slow
@@ -194,9 +195,10 @@ def test_rays_whose_cells_rounding_leaves_open_are_out_of_steps():
 @pytest.mark.slow
 def test_what_has_no_largest_component_is_refused():
     ray = [[3.0, 0, 0]], [[-1.0, 0, 0]]
-    for settings in ({"confirm": True}, {"all_hits": 2}):
-        with pytest.raises(ValueError, match="first hits alone"):
-            hk.trace(FIELDS["solids"], *ray, largest=True, **settings)
+    with pytest.raises(ValueError, match="first hits alone"):
+        hk.trace(FIELDS["solids"], *ray, largest=True, require_crossing=True)
+    with pytest.raises(ValueError, match="first hits alone"):
+        hk.crossings(FIELDS["solids"], *ray, largest=True, max_crossings=2)
     with pytest.raises(ValueError, match="with bounds"):
         hk.trace(hk.solids.Plane(), *ray, largest=True)
     with pytest.raises(ValueError, match="from 8 to 512"):

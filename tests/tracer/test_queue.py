@@ -16,6 +16,7 @@ from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.backend.arrays import upload_floats
 from harnack.backend.loops import compute_on_active, loop_with_queue
 from harnack.geometry.example_meshes import icosphere
+from harnack.tracer import TracedSurface, traced_surface
 from harnack.tracer.hits import _are_scattered
 
 
@@ -40,16 +41,16 @@ def fourier_series() -> hk.Surface:
     return hk.Surface(hk.fields.FourierSeries(waves, ((-1, -1, -1), (1, 1, 1))))
 
 
-CASES: dict[str, Callable[[], hk.Surface]] = {
+CASES: dict[str, Callable[[], hk.Surface | TracedSurface]] = {
     "curve": saddle,
     "domain": fourier_series,
     "combined": lambda: hk.Surface(hk.Torus(1.0, 0.4) & hk.Cuboid((1.0, 1.5, 1.5))),
     "sheets": cut_sphere,
     "parts": parts,
-    "confirmed": lambda: hk.traced_surface(
+    "confirmed": lambda: traced_surface(
         hk.Gyroid(1.0, domain=hk.Ball(radius=1.0)), require_crossing=True
     ),
-    "few steps": lambda: replace(saddle(), max_steps=3),
+    "few steps": lambda: traced_surface(saddle(), max_steps=3),
 }
 
 
@@ -59,7 +60,7 @@ CASES: dict[str, Callable[[], hk.Surface]] = {
 )
 def test_a_queue_changes_no_bit(name: str, precision: Any) -> None:
     backend = choose_backend(precision)
-    prepared = CASES[name]().prepare(backend)
+    prepared = traced_surface(CASES[name]()).prepare(backend)
     rng = np.random.default_rng(4)
     n = 3000 if name != "parts" else 1000
     o = rng.normal(size=(n, 3)) * 1.3

@@ -40,6 +40,7 @@ from harnack.fields.samples import Ray as RayPath
 from harnack.rendering.surface_hits import intersect_surface
 from harnack.testing import mutated_enclosure
 from harnack.testing.enclosure_contracts import PromiseCase
+from harnack.tracer import traced_surface
 from harnack.tracer.level_contact import test_jump as jump_test
 from tests.oracles.exact import exact_step, on_host
 from tests.oracles.jump_oracle import first_side_changes, judge
@@ -566,9 +567,9 @@ class Staircase(hk.Field):
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize("overstep", [1.0, 1.4])
+@pytest.mark.parametrize("over_relaxation", [1.0, 1.4])
 @pytest.mark.parametrize("precision", ["single", "double"])
-def test_staircases(precision: Any, overstep: float) -> None:
+def test_staircases(precision: Any, over_relaxation: float) -> None:
     """Level 0 is met smoothly, or at a plane, or not at all, in places that are plain to see."""
     up, down = [[1.0, 0, 0]], [[-1.0, 0, 0]]
     # slope, planes, direction, start x, t_max; t of the hit, sheet
@@ -596,7 +597,7 @@ def test_staircases(precision: Any, overstep: float) -> None:
     for slope, planes, way, x, t_max, t, sheet in cases:
         hits = hk.trace(
             Staircase(slope, planes), [[x, 0.0, 0.0]], way,
-            t_max=t_max, precision=precision, over_relaxation=overstep, tolerance=1e-5,
+            t_max=t_max, precision=precision, over_relaxation=over_relaxation, tolerance=1e-5,
         )  # fmt: skip
         assert hits.t[0] == pytest.approx(t, abs=1e-4), (slope, planes, x)
         assert hits.primitive_index[0] == sheet, (slope, planes, x)
@@ -615,16 +616,19 @@ class Approximate(hk.Field):
 
 
 @pytest.mark.few(2)
-@pytest.mark.parametrize("overstep", [1.0, 1.4])
-@pytest.mark.parametrize("bound", [None, "slope", "caps"])
+@pytest.mark.parametrize("over_relaxation", [1.0, 1.4])
+@pytest.mark.parametrize("enclosures", [None, "slope", "caps"])
 @pytest.mark.parametrize("direction", [1.0, -1.0])
-def test_gradients_known_up_to_an_error(bound: Any, overstep: float, direction: float) -> None:
+def test_gradients_known_up_to_an_error(
+    enclosures: Any, over_relaxation: float, direction: float
+) -> None:
     """Trusted, a gradient of half the length leads past the level; with its error it does not."""
 
     def passes(gradient: float, error: Any) -> bool:
         hits = hk.trace(
             Approximate(gradient, error), [[0.0, 0, 0]], [[direction, 0, 0]],
-            level=direction, t_max=4.0, enclosures=bound, over_relaxation=overstep, tolerance=1e-5,
+            level=direction, t_max=4.0, enclosures=enclosures, over_relaxation=over_relaxation,
+            tolerance=1e-5,
         )  # fmt: skip
         assert hits.t[0] in (pytest.approx(1, abs=1e-4), math.inf)
         return bool(np.isinf(hits.t[0]))
@@ -845,7 +849,7 @@ def test_drjit_rays_get_the_same(precision: Any) -> None:
 def test_occlusion_is_a_hit() -> None:
     vertices, faces = MESHES["open cube"]
     backend = choose_backend("single")
-    prepared = hk.Surface(BruteForceWinding(vertices, faces)).prepare(backend)
+    prepared = traced_surface(BruteForceWinding(vertices, faces)).prepare(backend)
     o, d = (backend.Array3f(v.T) for v in rays(vertices, 400))
     far = backend.Float(np.random.default_rng(0).uniform(0.1, 4, 400))
     active = dr.arange(backend.UInt32, 400) % 3 != 0
@@ -980,8 +984,11 @@ def test_derivatives_by_parameters_are_refused() -> None:
 def test_what_makes_no_sense_is_refused() -> None:
     vertices, faces = MESHES["open cube"]
     field = BruteForceWinding(vertices, faces)
-    with pytest.raises(ValueError, match="jumps across sheets has no closed solid"):
-        hk.Surface(field, level=0.5, side="above")
+    solid = hk.Surface(field, level=0.5, side="above")
+    with pytest.raises(ValueError, match="a field that jumps has no closed solid"):
+        hk.render(solid, size=(8, 6), progress=False)
+    with pytest.raises(TypeError, match='trace takes level sets, not side="above"'):
+        hk.trace(solid, [[3.0, 0, 0]], [[-1.0, 0, 0]])
     field.period = 1.0  # type: ignore[misc]
     with pytest.raises(ValueError, match="must be real-valued"):
         hk.Surface(field)
@@ -999,7 +1006,7 @@ def test_rays_that_leave_a_sheet_do_not_meet_it_again() -> None:
     backend = choose_backend("single")
     for scale in (1.0, 1e-3):
         field = BruteForceWinding(scale * vertices, faces)
-        prepared = hk.traced_surface(field, tolerance=1e-6 * scale).prepare(backend)
+        prepared = traced_surface(field, tolerance=1e-6 * scale).prepare(backend)
         o, d = rays(vertices, 1000, seed=4)
         ray = backend.Array3f((scale * o).T), backend.Array3f(d.T)
         met = intersect_surface(prepared, *ray, math.inf, backend.Bool(True))
@@ -1025,9 +1032,7 @@ def test_rays_that_leave_a_sheet_do_not_meet_it_again() -> None:
 def test_polished_hits_stay_on_the_surface_and_sheets_where_they_are() -> None:
     vertices, faces = MESHES["open cube"]
     backend, exact = choose_backend("double"), ExactWinding(vertices, faces)
-    prepared = hk.traced_surface(BruteForceWinding(vertices, faces), tolerance=1e-4).prepare(
-        backend
-    )
+    prepared = traced_surface(BruteForceWinding(vertices, faces), tolerance=1e-4).prepare(backend)
     o, d = rays(vertices, 500, closest=1e-2)
     ray = backend.Array3f(o.T), backend.Array3f(d.T)
     met = intersect_surface(prepared, *ray, math.inf, backend.Bool(True))

@@ -237,8 +237,8 @@ def test_a_slope_proves_that_a_level_is_taken_no_sooner_than_it_is() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["union", "difference", "near", "rotated"])
-@pytest.mark.parametrize("confirm", [False, True])
-def test_solids_made_of_cusps(kind: str, confirm: bool) -> None:
+@pytest.mark.parametrize("require_crossing", [False, True])
+def test_solids_made_of_cusps(kind: str, require_crossing: bool) -> None:
     text, f, half = FORMULAS["astroid"]
     star, ball = hk.solid(hk.expression(text), below=0), hk.Sphere(0.6, center=(0.5, 0, 0))
 
@@ -257,7 +257,7 @@ def test_solids_made_of_cusps(kind: str, confirm: bool) -> None:
     o, d = rays(half)
     truth = first_roots(oracle, o, d, half)
     box = hk.Box((-half,) * 3, (half,) * 3)
-    hits = hk.trace(solid, o, d, clip=box, require_crossing=confirm)
+    hits = hk.trace(solid, o, d, clip=box, require_crossing=require_crossing)
     assert not (hits.status == hk.RayStatus.OUT_OF_STEPS).any()
     np.testing.assert_allclose(hits.t, truth, atol=2e-3)
 
