@@ -471,7 +471,7 @@ def test_meshes_with_holes_are_crossed_where_the_winding_number_passes(method: s
     kept = np.random.default_rng(0).random(len(faces)) < 0.8
     mesh = hk.WindingNumber(vertices, faces[kept], method=method)
     o, d = rays(30, seed=6, distance=3.0)
-    found = hk.crossings(mesh, o, d, max_crossings=12, tolerance=1e-4)
+    found = hk.crossings(mesh, o, d, max_crossings=12, tolerance=1e-4, precision="single")
     exact = hk.WindingNumber(vertices, faces[kept])
     alike = 0
     for i in range(len(o)):

@@ -479,7 +479,9 @@ def test_wrong_jumps_are_seen(kind: type[BruteForceWinding], factor: float) -> N
     vertices, faces = MESHES["flipped face"]
     exact = ExactWinding(vertices, faces)
     o, d = rays(vertices, 600)
-    hits = hk.trace(kind(vertices, faces, jump=factor), o, d, tolerance=TOLERANCE)
+    hits = hk.trace(
+        kind(vertices, faces, jump=factor), o, d, tolerance=TOLERANCE, precision="single"
+    )
     verdict = judge(
         hit_t(hits), exact, o, d, 0.0, leaves_domain(o, d),
         level=0.5, reach=REACH, edges=exact.edges, samples=400,
@@ -493,7 +495,9 @@ def test_the_oracle_sees_hits_that_are_late_early_or_not_there() -> None:
     exact = ExactWinding(vertices, faces)
     o, d = rays(vertices, 300)
     end = leaves_domain(o, d)
-    hits = hk.trace(BruteForceWinding(vertices, faces), o, d, tolerance=TOLERANCE)
+    hits = hk.trace(
+        BruteForceWinding(vertices, faces), o, d, tolerance=TOLERANCE, precision="single"
+    )
     limits: Any = {"level": 0.5, "reach": REACH, "edges": exact.edges, "samples": 400}
     t, found = hit_t(hits), hits.is_hit & (hits.t > 0.1)
     for spoiled, wrong in (
@@ -787,12 +791,15 @@ def test_a_sheet_at_the_start_is_met_there() -> None:
     vertices, faces = MESHES["cube along the axes"]
     field = BruteForceWinding(vertices, faces)
     o, d = np.array([[0.1, 0.2, 0.75]]), np.array([[0.0, 0.0, -1.0]])
-    hits = hk.trace(field, o, d)
+    hits = hk.trace(field, o, d, precision="single")
     assert hits.t.tolist() == [0.0]
-    hits = hk.trace(field, o + np.array([[0, 0, 1.0]]), d, t_min=1.0)
+    hits = hk.trace(field, o + np.array([[0, 0, 1.0]]), d, t_min=1.0, precision="single")
     assert hits.t.tolist() == [1.0]
-    assert hits.primitive_index.tolist() == hk.trace(field, o, d).primitive_index.tolist()
-    beyond = hk.trace(field, o, d, t_min=1e-3)
+    assert (
+        hits.primitive_index.tolist()
+        == hk.trace(field, o, d, precision="single").primitive_index.tolist()
+    )
+    beyond = hk.trace(field, o, d, t_min=1e-3, precision="single")
     assert beyond.t[0] > 1e-3
 
 
@@ -801,9 +808,9 @@ def test_few_steps_end_with_the_proved_length() -> None:
     vertices, faces = MESHES["flipped face"]
     field = BruteForceWinding(vertices, faces)
     o, d = rays(vertices, 300)
-    full = hk.trace(field, o, d)
+    full = hk.trace(field, o, d, precision="single")
     for steps in (1, 2, 3, 6):
-        short = hk.trace(field, o, d, max_steps=steps)
+        short = hk.trace(field, o, d, max_steps=steps, precision="single")
         out = short.status == hk.RayStatus.OUT_OF_STEPS
         assert out.any()
         assert (short.evaluations <= steps).all()
@@ -813,7 +820,7 @@ def test_few_steps_end_with_the_proved_length() -> None:
     boxes = BruteForceWinding(*MESHES["nested boxes"])
     ray = np.array([[0.05, 0.1, 2.9]]), np.array([[0.0, 0.0, -1.0]])
     for steps in (1, 2, 3):  # the second passes the outer box, the third hits the inner one
-        hits = hk.trace(boxes, *ray, level=1.5, max_steps=steps)
+        hits = hk.trace(boxes, *ray, level=1.5, max_steps=steps, precision="single")
         assert hits.evaluations.tolist() == [steps]
         assert hits.is_hit.tolist() == [steps == 3]
 
@@ -824,10 +831,10 @@ def test_closed_meshes_cost_one_evaluation_a_crossing() -> None:
     field = BruteForceWinding(vertices, faces)
     o = np.array([[0.05, 0.1, 2.9], [2.9, 2.8, 2.7], [0.05, 0.1, 0.0]])
     d = np.array([[0.0, 0, -1], [0, 0, -1], [0, 0, -1]])
-    hits = hk.trace(field, o, d)
+    hits = hk.trace(field, o, d, precision="single")
     assert hits.status.tolist() == [1, 0, 1]
     assert hits.evaluations.tolist() == [2, 1, 3]
-    assert hk.trace(field, o, d, level=1.5).evaluations.tolist() == [3, 1, 2]
+    assert hk.trace(field, o, d, level=1.5, precision="single").evaluations.tolist() == [3, 1, 2]
 
 
 # --- other ways in --------------------------------------------------------------------------
@@ -1057,11 +1064,11 @@ def test_walls_thinner_than_rounding_are_not_passed() -> None:
     near = hk.WindingNumber(cube.vertices, cube.faces)
     on_map = hk.WindingNumber(cube.vertices + place, cube.faces)
     rays = np.array([[0.1, 0.2, 4.0], [2.0, 0.0, 4.0]]), np.array([[0, 0, -1.0]] * 2)
-    single = hk.trace(on_map, place + rays[0], rays[1])
+    single = hk.trace(on_map, place + rays[0], rays[1], precision="single")
     assert single.status.tolist() == [hk.RayStatus.OUT_OF_STEPS, hk.RayStatus.MISS]
     double = hk.trace(on_map, place + rays[0], rays[1], precision="double")
     assert double.t == pytest.approx([3.5, np.inf])
-    far = hk.trace(near, [[0.1, 0.2, 4e6], [0.1, 0.2, 4e5]], rays[1])
+    far = hk.trace(near, [[0.1, 0.2, 4e6], [0.1, 0.2, 4e5]], rays[1], precision="single")
     assert far.status.tolist() == [hk.RayStatus.OUT_OF_STEPS, hk.RayStatus.HIT]
     assert far.t[1] == pytest.approx(4e5 - 0.5, abs=0.1)
 

@@ -293,18 +293,25 @@ def test_a_surface_and_options_are_what_the_keywords_are() -> None:
 
 
 @pytest.mark.parametrize(
-    ("volume", "side"),
-    [(hk.Ball(radius=0.5), 1.0), (hk.Box((-3, -1, -1), (3, 1, 1)), 6.0), (None, None)],
+    ("volume", "expected"),
+    [
+        (hk.Ball(radius=0.5), 1e-4),
+        (hk.Box((-3, -1, -1), (3, 1, 1)), 6e-4),
+        (hk.HalfSpace((0, 0, 1), 1.0), 1e-4),
+    ],
+    ids=["ball", "box", "no bounds"],
 )
-def test_the_default_tolerance_follows_the_longest_side(
-    volume: hk.Volume | None, side: float | None
-) -> None:
+def test_the_default_tolerance_follows_the_longest_side(volume: hk.Volume, expected: float) -> None:
     """1e-4 of it; 1e-4 without bounds."""
     o, d = around(200)
-    expected = 1e-4 if side is None else 1e-4 * side
+    endless = hk.Gyroid(domain=hk.HalfSpace((0, 0, 1), 50.0))
     # Steps that get shorter and shorter, so that hits are as far off as the tolerance lets them.
     options = hk.TraceOptions(enclosures="lipschitz", over_relaxation=1.0)
-    for surface in (hk.Surface(hk.Gyroid(), clip=volume), hk.Surface(hk.Gyroid(), section=volume)):
+    for surface in (
+        hk.Surface(hk.Gyroid(domain=volume)),
+        hk.Surface(endless, clip=volume),
+        hk.Surface(endless, section=volume),
+    ):
         hits, same, other = (
             hk.trace(surface, o, d, t_max=20.0, options=options.replace(tolerance=tolerance)).t
             for tolerance in (None, expected, 0.9 * expected)
