@@ -694,8 +694,8 @@ def test_bounds_are_chosen_by_name() -> None:
         SphericalCapEnclosure,
         LipschitzEnclosure,
     )
-    some = choose_enclosures("slope")
-    assert choose_enclosures(some) is some
+    chosen = choose_enclosures("slope")
+    assert choose_enclosures(chosen) is chosen
     with pytest.raises(
         ValueError, match=r"unknown enclosures 'harnak'; choose one of .*caps.* classic"
     ):
@@ -704,18 +704,18 @@ def test_bounds_are_chosen_by_name() -> None:
         with pytest.raises(TypeError, match=r"such as harnack\.proofs\.SphericalCapEnclosure"):
             choose_enclosures(wrong)  # type: ignore[arg-type]
     real = choose_backend("double").Float
-    given = (real(0), 0.0, SlopeRange(real(0.4), real(0.4)))
+    arguments = (real(0), 0.0, SlopeRange(real(0.4), real(0.4)))
     with pytest.raises(
         ValueError, match=r'no enclosure .*Lipschitz, which.*SphericalCap.*"lipschitz"'
     ):
-        choose_enclosures(SphericalCapEnclosure).from_promises((Lipschitz(1.0),), (), *given)
+        choose_enclosures(SphericalCapEnclosure).from_promises((Lipschitz(1.0),), (), *arguments)
     with pytest.raises(ValueError, match=r"Sample\.promises is empty"):
-        choose_enclosures(None).from_promises((), (), *given, (Lipschitz(1.0, 1.0),))
+        choose_enclosures(None).from_promises((), (), *arguments, (Lipschitz(1.0, 1.0),))
     endless = HarmonicBall(real(1), -math.inf, math.inf)
     with pytest.raises(ValueError, match="at least one limit that is not infinite"):
-        choose_enclosures(None).from_promises((endless,), (), *given)
+        choose_enclosures(None).from_promises((endless,), (), *arguments)
     with pytest.raises(ValueError, match=r'choose ("\S+" or )*"lipschitz"( or "\S+")*$'):
-        choose_enclosures(None).from_promises((), (Lipschitz(1.0),), *given)
+        choose_enclosures(None).from_promises((), (Lipschitz(1.0),), *arguments)
 
 
 def test_check_bound_refuses_a_proof_that_applies_to_nothing() -> None:

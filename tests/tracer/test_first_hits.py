@@ -126,6 +126,7 @@ def compare(
     tolerance = TOLERANCE * size
     far = 8.0 * size
     field = hk.SolidAngle(loops, lift_bound=settings.pop("lift_bound", "auto"))  # type: ignore[arg-type]
+    settings = {"precision": "single", **settings}
     hits = hk.trace(field, o, d, level=level, t_max=far, tolerance=tolerance, **settings)  # type: ignore[arg-type]
     oracle = CurveOracle(loops)
     truth = first_crossings(

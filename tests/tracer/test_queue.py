@@ -47,7 +47,7 @@ CASES: dict[str, Callable[[], hk.Surface | TracedSurface]] = {
     "combined": lambda: hk.Surface(hk.Torus(1.0, 0.4) & hk.Cuboid((1.0, 1.5, 1.5))),
     "sheets": cut_sphere,
     "parts": parts,
-    "confirmed": lambda: traced_surface(
+    "require_crossing": lambda: traced_surface(
         hk.Gyroid(1.0, domain=hk.Ball(radius=1.0)), require_crossing=True
     ),
     "few steps": lambda: traced_surface(saddle(), max_steps=3),
@@ -70,22 +70,22 @@ def test_a_queue_changes_no_bit(name: str, precision: Any) -> None:
     ends = rng.uniform(0.5, 4, n)
 
     def ended(queued: bool) -> list[np.ndarray]:
-        one = replace(prepared, uses_ray_queue=queued)
+        tracer = replace(prepared, uses_ray_queue=queued)
         rays = to_vector3(backend, o), to_vector3(backend, d)
         wanted = backend.Float(upload_floats(backend, active.astype(float))) > 0
-        hit = one.first_hit(*rays, 0, upload_floats(backend, ends), wanted)
-        blocked = one.occluded(*rays, 0, upload_floats(backend, ends), wanted)
-        found = [hit.t, hit.value, hit.gradient, hit.evaluations, hit.status, hit.facet, blocked]
-        found += [] if hit.patch is None else [hit.patch]
-        dr.eval(found)
-        return [np.broadcast_to(to_numpy(x), (n, *to_numpy(x).shape[1:])) for x in found]
+        hit = tracer.first_hit(*rays, 0, upload_floats(backend, ends), wanted)
+        blocked = tracer.occluded(*rays, 0, upload_floats(backend, ends), wanted)
+        results = [hit.t, hit.value, hit.gradient, hit.evaluations, hit.status, hit.facet, blocked]
+        results += [] if hit.patch is None else [hit.patch]
+        dr.eval(results)
+        return [np.broadcast_to(to_numpy(x), (n, *to_numpy(x).shape[1:])) for x in results]
 
     one_by_one, queued = ended(False), ended(True)
-    some = one_by_one[4]
-    assert (some == int(hk.RayStatus.HIT)).sum() > n // 20
-    assert (some[~active] == int(hk.RayStatus.MISS)).all()
+    status = one_by_one[4]
+    assert (status == int(hk.RayStatus.HIT)).sum() > n // 20
+    assert (status[~active] == int(hk.RayStatus.MISS)).all()
     if name == "few steps":
-        assert (some == int(hk.RayStatus.OUT_OF_STEPS)).any()
+        assert (status == int(hk.RayStatus.OUT_OF_STEPS)).any()
     for a, b in zip(one_by_one, queued, strict=True):
         # What a ray that missed saw last is of no meaning, but no other lane may write it.
         np.testing.assert_array_equal(a[active], b[active])

@@ -1,4 +1,4 @@
-"""Over-stepping in rounded arithmetic: no surface may slip through between two looks.
+"""Over-relaxation in rounded arithmetic: no surface may slip through between two looks.
 
 Both looks, forward from one point and back from the next, are exact to first order, so near a
 surface they meet right at it; without room for rounding, one ray in ten went through at a

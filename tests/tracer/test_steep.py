@@ -183,7 +183,7 @@ def test_crossings_beside_a_vertical_tangent() -> None:
 
 @pytest.mark.parametrize("precision", ["single", pytest.param("double", marks=pytest.mark.slow)])
 def test_valley_with_a_vertical_tangent(precision: Precision) -> None:
-    """z = sqrt(|x|): along and down into its valley, from it, and confirmed."""
+    """z = sqrt(|x|): along and down into its valley, and from it."""
     field = hk.fields.HeightField(lambda x, y: hk.math.sqrt(abs(x)))
     o = [[0, 0.5, 3], [1e-9, 0.5, 3], [-0.9, 0.1, 0.25], [0, 0.1, 0.25], [0, 0.5, 0.25]]
     d = [[0, 0, -1], [0, 0, -1], [1, 0, 0], [1, 0, 0], [0, -1, 0]]

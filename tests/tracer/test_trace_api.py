@@ -82,13 +82,13 @@ def test_precision_follows_the_arrays() -> None:
 def test_one_origin_or_one_direction_serves_all() -> None:
     o, d = around(9)
     for origins, directions in ((o[:1], d), (o, d[:1])):
-        one = hk.trace(WAVY, origins, directions)
-        all_given = hk.trace(
+        hits = hk.trace(WAVY, origins, directions)
+        repeated = hk.trace(
             WAVY, np.broadcast_to(origins, (9, 3)), np.broadcast_to(directions, (9, 3))
         )
-        assert one.t.shape == (9,)
-        np.testing.assert_array_equal(one.t, all_given.t)
-        np.testing.assert_array_equal(one.normal, all_given.normal)
+        assert hits.t.shape == (9,)
+        np.testing.assert_array_equal(hits.t, repeated.t)
+        np.testing.assert_array_equal(hits.normal, repeated.normal)
     assert hk.trace(WAVY, o[:1], d[:1], t_min=np.zeros(4)).t.shape == (4,)
 
 
