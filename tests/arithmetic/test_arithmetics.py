@@ -252,21 +252,21 @@ def test_all_proofs_hit_the_same(name: str, precision: str) -> None:
     backend = choose_backend(precision)  # type: ignore[arg-type]
     rays = to_vector3(backend, o), to_vector3(backend, target - o)
 
-    def hits(bound: str | None) -> tuple[Any, Any]:
-        traced = hk.trace(field, *rays, enclosures=bound, tolerance=1e-5, max_steps=1000)
+    def hits(enclosures: str | None) -> tuple[Any, Any]:
+        traced = hk.trace(field, *rays, enclosures=enclosures, tolerance=1e-5, max_steps=1000)
         return traced.status.numpy(), traced.t.numpy()
 
     status, t = hits(None)
     hit = status == int(hk.RayStatus.HIT)
     assert 20 < hit.sum() < 400
-    for bound in PROOFS:
-        other, there = hits(bound)
+    for enclosures in PROOFS:
+        other, there = hits(enclosures)
         out_of_steps = other == int(hk.RayStatus.OUT_OF_STEPS)
         # Bands are not relative to the value: in single precision they stall beside a surface.
-        stalls = precision == "single" and bound in ("affine", "interval")
+        stalls = precision == "single" and enclosures in ("affine", "interval")
         assert stalls or not out_of_steps.any()
         different = (other != status) & ~out_of_steps
-        assert different.sum() <= 2, bound  # rays that only graze the surface
+        assert different.sum() <= 2, enclosures  # rays that only graze the surface
         both = hit & (other == status)
         if stalls and not both.any():
             continue

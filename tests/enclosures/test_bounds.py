@@ -251,7 +251,7 @@ def test_bounds_hold_in_many_trials(bound: type[Enclosure], precision: str) -> N
 
 @pytest.mark.parametrize("precision", ["double", "single"])
 @pytest.mark.parametrize("bound", BOUNDS, ids=name_of)
-def test_mutation_is_seen_by_check_bound(bound: type[Enclosure], precision: str) -> None:
+def test_mutation_is_seen_by_check_enclosure(bound: type[Enclosure], precision: str) -> None:
     with pytest.raises(BrokenPromiseError, match="a level is met within the step"):
         check_enclosure(mutated_enclosure(bound, 1.001), precision=precision)  # type: ignore[arg-type]
 
@@ -718,7 +718,7 @@ def test_bounds_are_chosen_by_name() -> None:
         choose_enclosures(None).from_promises((), (Lipschitz(1.0),), *arguments)
 
 
-def test_check_bound_refuses_a_proof_that_applies_to_nothing() -> None:
+def test_check_enclosure_refuses_a_proof_that_applies_to_nothing() -> None:
     class Nothing(Enclosure):
         def free_length(self, gaps: LevelGaps) -> object:
             return gaps.above
