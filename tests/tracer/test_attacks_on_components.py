@@ -11,6 +11,7 @@ import pytest
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.rendering.placed_surface import PlacedSurface, Placement
+from harnack.tracer import traced_surface
 
 SPHERES = hk.Sphere(0.5, (-0.6, 0, 0)) | hk.Sphere(0.2, (2, 0, 0))
 FROM_RIGHT = [[3.0, 0, 0]], [[-1.0, 0, 0]]
@@ -100,7 +101,7 @@ def test_cells_of_tiny_clips_do_not_fill_the_memory() -> None:
 def test_faces_of_solids_are_lost_where_rounding_leaves_open_which_component_it_is() -> None:
     """The face was met all the same, an eighth off."""
     backend = choose_backend("single")
-    surface = hk.Surface(
+    surface = traced_surface(
         SPHERES, level=0, side="below", largest=True, section=hk.HalfSpace((0, 0, 1), 0.01)
     )
     placed = PlacedSurface.of(surface, Placement.identity(), backend)

@@ -7,6 +7,7 @@ import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.fields.clearance import occupied_cells
 from harnack.rendering.placed_surface import PlacedSurface, Placement
+from harnack.tracer import traced_surface
 from harnack.tree import empty_space
 
 BIG, SMALL = (0.5, (-0.6, 0.0, 0.0)), (0.3, (0.5, 0.0, 0.0))
@@ -160,12 +161,13 @@ def test_of_a_solid_the_part_of_largest_volume_is_there(precision):
     o, d = rays(4000, 5)
     met = []
     for field, largest in ((both, True), (hk.Sphere(*BIG), False)):
-        surface = hk.Surface(field, level=0.0, side="below", clip=clip, largest=largest)
+        surface = traced_surface(field, level=0.0, side="below", clip=clip, largest=largest)
         placed = PlacedSurface.of(surface, Placement.identity(), backend)
         rays_of = to_vector3(backend, o), to_vector3(backend, d)
         seen = placed.intersect(*rays_of, backend.Float(1e3), backend.Bool(True))
         blocked = placed.occludes(*rays_of, backend.Float(1e3), backend.Bool(True))
-        met.append([to_numpy(one) for one in (seen.is_hit, seen.t, blocked, seen.is_out_of_steps)])
+        results = seen.is_hit, seen.t, blocked, seen.is_out_of_steps
+        met.append([to_numpy(array) for array in results])
     (has, t, blocked, lost), (has_alone, t_alone, blocked_alone, _) = met
     assert not lost.any()
     assert 500 < has_alone.sum() < 3500
@@ -207,5 +209,5 @@ def test_what_has_no_largest_component_is_refused():
     with pytest.raises(ValueError, match="most cells of this Blobs could not be proved empty"):
         hk.trace(hk.Blobs([[-1, 0, 0], [1, 0, 0]], 0.5), *ray, largest=True)
     mesh = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]]), [[0, 1, 2]]
-    with pytest.raises(ValueError, match="jumps or has parts"):
+    with pytest.raises(ValueError, match="one continuous function, and this WindingNumber jumps"):
         hk.Surface(hk.WindingNumber(*mesh), largest=True)
