@@ -156,7 +156,7 @@ def trace(
         NotImplementedError: with a backend, a field whose kernel is not translated.
     """
     target, choices = surface_and_options("trace", surface, options, keywords, _HONORED)
-    traced = TracedSurface.of(target, choices)
+    traced = TracedSurface.of(target, choices).with_call_cache()
     if choices.backend is not None:
         if any(is_tensor(a) or dr.is_array_v(type(a)) for a in (origins, directions, t_min, t_max)):
             raise TypeError('backend="webgpu" takes rays as NumPy arrays: Dr.Jit\'s have a backend')

@@ -242,7 +242,7 @@ def crossings(
         NotImplementedError: a field with patches.
     """
     target, choices = surface_and_options("crossings", surface, options, keywords, _HONORED)
-    traced = TracedSurface.of(target, choices)
+    traced = TracedSurface.of(target, choices).with_call_cache()
     k = _check_count(max_crossings)
     traced.validate_crossings("crossings")
     rays = RayBatch.of(origins, directions, t_min, t_max, choices.precision)
