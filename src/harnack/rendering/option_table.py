@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from harnack.rendering.backdrops import Backdrop
     from harnack.rendering.camera import Camera
     from harnack.rendering.isolines import Isolines
-    from harnack.rendering.studio_surfaces import MaterialLike
+    from harnack.rendering.stage import MaterialLike
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
