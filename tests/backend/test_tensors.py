@@ -27,14 +27,16 @@ def vector(values: Any) -> Any:
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize("settings", [{}, {"all_hits": 3}])
-def test_tensors_are_traced_as_numpy_arrays_are(settings: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    ("verb", "settings"), [(hk.trace, {}), (hk.crossings, {"max_crossings": 3})]
+)
+def test_tensors_are_traced_as_numpy_arrays_are(verb: Any, settings: dict[str, Any]) -> None:
     levels = [5.0, 2 * np.pi]
     field = hk.SolidAngle(LOOP, lift_bound="edges")
     asked: Any = {"level": levels, "precision": "double", **settings}
-    expected = hk.trace(field, EYE[None], AWAY, t_max=np.full(40, 9.0), **asked)
+    expected = verb(field, EYE[None], AWAY, t_max=np.full(40, 9.0), **asked)
     asked = {"level": tensor(levels), **settings}
-    found = hk.trace(
+    found = verb(
         hk.SolidAngle(tensor(LOOP)),
         tensor(EYE[None]),
         tensor(AWAY),
