@@ -2,7 +2,8 @@
 
 A docstring here is plain text with `code`, *emphasis* and **weight**, "- " lists, indented
 formulas, entries ("name: what it is", where name is a parameter or an attribute), and the sections
-"Returns:" and "Raises:". Entries become definition lists; names that harnack exports become links.
+"Returns:" and "Raises:". Entries become definition lists; names that the reference documents become
+links.
 """
 
 from __future__ import annotations
@@ -12,11 +13,17 @@ import re
 from collections.abc import Container, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from itertools import groupby
+from pathlib import Path
 from typing import Any
 
 import harnack
 
+_REFERENCE = Path(__file__).resolve().parents[2] / "docs" / "reference"
+_DIRECTIVE = re.compile(
+    r"^\.\. (?:auto|py:)(?:class|data|function):: harnack\.([\w.]+)", re.MULTILINE
+)
 _SECTION = re.compile(r"(Returns|Raises|Yields):$")
 _ENTRY = re.compile(r"(\w+(?:, \w+)*): ?(.*)$")
 _ERROR = re.compile(r"[A-Z]\w+$")
@@ -186,8 +193,25 @@ def inline(text: str) -> str:
 
 
 def _code(text: str) -> str:
-    """Code, linked if it names something that harnack exports."""
-    name = re.sub(r"^(harnack|hk)\.", "", text).removesuffix("()")
-    if name.split(".")[0] in harnack.__all__ and re.fullmatch(r"[\w.]+", name):
-        return f":py:obj:`{text} <harnack.{name}>`"
-    return f"``{text}``"
+    """Code, linked if it names something that the reference documents."""
+    path = documented_path(text.removesuffix("()"))
+    return f"``{text}``" if path is None else f":py:obj:`{text} <{path}>`"
+
+
+def documented_path(name: str) -> str | None:
+    """The path under which the reference documents a name, or what it is an attribute of; with or
+    without its namespace. None if it does not document it."""
+    parts = re.sub(r"^(harnack|hk)\.", "", name).split(".")
+    if len(parts) > 1 and parts[0] in dir(harnack) and parts[0] not in harnack.__all__:
+        parts = parts[1:]  # a namespace
+    paths = _documented_paths()
+    if parts[0] not in paths:
+        return None
+    return ".".join((paths[parts[0]], *parts[1:]))
+
+
+@cache
+def _documented_paths() -> dict[str, str]:
+    """The paths of the reference by their last names."""
+    text = "\n".join(page.read_text(encoding="utf-8") for page in sorted(_REFERENCE.glob("*.md")))
+    return {path.rpartition(".")[2]: f"harnack.{path}" for path in _DIRECTIVE.findall(text)}
