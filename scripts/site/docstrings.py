@@ -205,13 +205,17 @@ def documented_path(name: str) -> str | None:
     if len(parts) > 1 and parts[0] in dir(harnack) and parts[0] not in harnack.__all__:
         parts = parts[1:]  # a namespace
     paths = _documented_paths()
-    if parts[0] not in paths:
-        return None
-    return ".".join((paths[parts[0]], *parts[1:]))
+    for count in (2, 1):
+        path = paths.get(".".join(parts[:count]))
+        if path is not None:
+            return ".".join((path, *parts[count:]))
+    return None
 
 
 @cache
 def _documented_paths() -> dict[str, str]:
-    """The paths of the reference by their last names."""
+    """The paths of the reference by their names without the namespace; in a module of a namespace,
+    with the module, such as "outline.text"."""
     text = "\n".join(page.read_text(encoding="utf-8") for page in sorted(_REFERENCE.glob("*.md")))
-    return {path.rpartition(".")[2]: f"harnack.{path}" for path in _DIRECTIVE.findall(text)}
+    paths = [path.split(".") for path in _DIRECTIVE.findall(text)]
+    return {".".join(path[1:] or path): ".".join(("harnack", *path)) for path in paths}
