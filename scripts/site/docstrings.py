@@ -9,6 +9,7 @@ links.
 from __future__ import annotations
 
 import inspect
+import math
 import re
 from collections.abc import Container, Iterator
 from contextlib import suppress
@@ -31,6 +32,12 @@ _RETURNED = re.compile(r"[a-z]\w*$")
 _BULLET = re.compile(r"- ")
 # Where another entry may begin within a line.
 _ANOTHER = re.compile(r"(?<=\.) (?=\w+: )")
+# Defaults of arguments, and how they are shown.
+_READABLE = {
+    "<factory>": "...",
+    repr(2 * math.pi): "2 * math.pi",
+    repr(math.pi / 6): "math.pi / 6",
+}
 # Code, or strong or plain emphasis of words: what follows a space or a bracket and ends a word.
 _MARKED = re.compile(
     r"(`[^`]+`|(?<![\w*])\*\*[A-Za-z][^*]*\*\*(?!\w)|(?<![\w*])\*[A-Za-z][^*]*\*(?!\w))"
@@ -39,7 +46,7 @@ _MARKED = re.compile(
 
 def setup(app: Any) -> dict[str, bool]:
     app.connect("autodoc-process-docstring", process)
-    app.connect("autodoc-process-signature", without_factories)
+    app.connect("autodoc-process-signature", with_readable_defaults)
     return {"parallel_read_safe": True}
 
 
@@ -48,11 +55,15 @@ def process(app: Any, what: str, name: str, thing: Any, options: Any, lines: lis
     lines[:] = list(converted(lines, names_of(thing)))
 
 
-def without_factories(
+def with_readable_defaults(
     app: Any, what: str, name: str, thing: Any, options: Any, arguments: str | None, result: Any
 ) -> tuple[str, Any] | None:
-    """Signatures that can be parsed: dataclasses write what is no Python for made defaults."""
-    return arguments and (arguments.replace("<factory>", "..."), result)
+    """Signatures that can be parsed and read: dataclasses write what is no Python for made
+    defaults, and angles are numbers. (Sphinx can take defaults from the code, but that of verbs
+    has fewer parameters than their signature.)"""
+    for default, readable in _READABLE.items():
+        arguments = arguments and arguments.replace(default, readable)
+    return arguments and (arguments, result)
 
 
 def names_of(thing: Any) -> frozenset[str]:
