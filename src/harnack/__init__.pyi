@@ -1,4 +1,4 @@
-"""The names at the top and where they are. `__init__.py` reads this file, and imports on first use."""
+"""The names at the top, and where they are. `__init__.py` imports them on first use."""
 
 from . import arithmetic as arithmetic
 from . import backend as backend

@@ -48,7 +48,7 @@ SCENES: dict[str, Callable[[], tuple[Any, dict[str, Any]]]] = {
         },
     ),
     "union": lambda: (
-        hk.union(hk.Sphere(0.8), hk.Cuboid((0.6, 0.6, 0.9))),
+        hk.union(hk.Sphere(0.8), hk.Cuboid((1.2, 1.2, 1.8))),
         {"material": "clay"},
     ),
     "two": lambda: (
@@ -92,7 +92,7 @@ def test_all_of_many_surfaces_have_their_own_materials(browser: Any, tmp_path: P
         page = Page(browser, f"{address}/a.html", SIZE, samples=1)
         picture = page.picture("page-many")
         places = page.do(
-            "(centers) => centers.map((p) => panel.camera().project(panel.to_stage(p),"
+            "(centers) => centers.map((p) => panel.camera.project(panel.placement.toStage(p),"
             " innerWidth, innerHeight))",
             centers,
         )

@@ -227,14 +227,15 @@ class FormulaNumber(abc.ABC):
 
     def __float__(self) -> float:
         raise TypeError(
-            "a formula cannot use functions of plain numbers, such as math.sin: use harnack.math.sin "
-            "and its like"
+            "a formula cannot use functions of plain numbers, such as math.sin: use those of "
+            "harnack.math"
         )
 
     def _undecided(self, *operands: Any) -> Any:
         del operands
         raise TypeError(
-            "a formula cannot decide by its coordinates: use harnack.math.maximum and harnack.math.minimum"
+            "a formula cannot decide by its coordinates: use harnack.math.maximum and "
+            "harnack.math.minimum"
         )
 
     __bool__ = __lt__ = __le__ = __gt__ = __ge__ = _undecided

@@ -135,9 +135,9 @@ class EnclosureKinds:
         if not promises:
             kinds = ", ".join(kind.__name__ for kind in Promise.__subclasses__())
             return (
-                f"the bounds asked for ({requested}) need a promise and the field makes none: "
+                f"the enclosures asked for ({requested}) need a promise and the field makes none: "
                 f"Sample.promises is empty, return one of these in it: {kinds}. Formulas are "
-                "bounded by ranges: leave bound out, or choose one of "
+                "enclosed by ranges: leave enclosures out, or choose one of "
                 f"{', '.join(_NAMES_USING_RANGES)}"
             )
         promised = " and ".join(sorted({type(promise).__name__ for promise in promises}))
@@ -151,29 +151,30 @@ class EnclosureKinds:
         ]
         if not usable:
             return (
-                f"no bound applies to what the field promises, {promised}: a HarmonicBall needs at "
+                f"no enclosure applies to what the field promises, {promised}: a HarmonicBall "
+                "needs at "
                 "least one limit that is not infinite, lower or upper, a BoundedLaplacian both"
             )
         hint = (
             ""
             if not self.uses_alternative_promises
-            else ", or leave bound=None for the sharpest there is"
+            else ", or leave enclosures out for the sharpest there is"
         )
         return (
-            f"no bound applies: the field promises {promised}, which the bounds asked for "
+            f"no enclosure applies: the field promises {promised}, which the enclosures asked for "
             f"({requested}) cannot use; choose {' or '.join(usable)}{hint}"
         )
 
 
-# The argument `bound` of functions.
+# The option `enclosures` of verbs.
 EnclosureChoice: TypeAlias = (
     str | type[Enclosure] | Iterable[type[Enclosure]] | EnclosureKinds | None
 )
 
 
-def choose_enclosures(bound: EnclosureChoice = None) -> EnclosureKinds:
-    """The classes of enclosures for an argument `bound`: a name, one or several classes, or None
-    for all that are worth their time.
+def choose_enclosures(enclosures: EnclosureChoice = None) -> EnclosureKinds:
+    """The classes of enclosures for the option `enclosures`: a name, one or several classes, or
+    None for all that are worth their time.
 
     Names: "classic" (the published rule), "slope", "caps" (caps where both ends are known, the
     slope bound elsewhere), "laplacian" (where the Laplacian is bounded), "lipschitz", and
@@ -187,24 +188,25 @@ def choose_enclosures(bound: EnclosureChoice = None) -> EnclosureKinds:
         ValueError: another name.
         TypeError: a value that is not a class of enclosures.
     """
-    if isinstance(bound, EnclosureKinds):
-        return bound
-    if bound is None:
+    if isinstance(enclosures, EnclosureKinds):
+        return enclosures
+    if enclosures is None:
         return EnclosureKinds(_KINDS_BY_NAME["pieces"], uses_alternative_promises=False)
-    if isinstance(bound, str):
-        if bound not in _KINDS_BY_NAME:
+    if isinstance(enclosures, str):
+        if enclosures not in _KINDS_BY_NAME:
+            names = ", ".join(sorted(_KINDS_BY_NAME))
             raise ValueError(
-                f"unknown bound {bound!r}; choose one of {', '.join(sorted(_KINDS_BY_NAME))}"
-                f"{did_you_mean(bound, _KINDS_BY_NAME)}"
+                f"unknown enclosures {enclosures!r}; choose one of {names}"
+                f"{did_you_mean(enclosures, _KINDS_BY_NAME)}"
             )
-        return EnclosureKinds(_KINDS_BY_NAME[bound])
-    classes = cast("Any", bound) if isinstance(bound, Iterable) else (bound,)
+        return EnclosureKinds(_KINDS_BY_NAME[enclosures])
+    classes = cast("Any", enclosures) if isinstance(enclosures, Iterable) else (enclosures,)
     kinds: tuple[Any, ...] = tuple(classes)
     if not kinds or not all(_is_proof(kind) for kind in kinds):
         raise TypeError(
-            "bound must be a name, or classes of enclosures such as harnack.proofs.SphericalCapEnclosure "
-            "or (harnack.proofs.SphericalCapEnclosure, harnack.proofs.LipschitzEnclosure), "
-            f"not {bound!r}"
+            "enclosures must be a name, or classes of enclosures such as "
+            "harnack.proofs.SphericalCapEnclosure or (harnack.proofs.SphericalCapEnclosure, "
+            f"harnack.proofs.LipschitzEnclosure), not {enclosures!r}"
         )
     return EnclosureKinds(kinds)
 

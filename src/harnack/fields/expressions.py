@@ -251,8 +251,8 @@ def _power(base: Any, exponent: Any) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Expression(Formula):
-    """A field f(x, y, z) that is a Python function, written with plain operators and `harnack.math.sin`
-    etc.
+    """A field f(x, y, z) that is a Python function, written with plain operators and the functions
+    of `harnack.math`.
 
     function: called with three coordinates while a kernel is being recorded; numbers in it are
         literals of that kernel.
@@ -283,10 +283,11 @@ def expression(
 ) -> Expression:
     """The implicit surface f(x, y, z) = level of a user-defined formula.
 
-    function: of three coordinates, written with + - * / **, abs, and the functions `harnack.math.sin`,
-        `cos`, `tan`, `exp`, `log`, `sqrt`, `tanh`, `atan`, `atan2`, `asin`, `acos`, `sinh`, `cosh`,
-        `maximum`, `minimum`, `norm`; NumPy's functions of the same names work too. Or a text, such
-        as "x^2 + y^2 = 1 + sin(2*z)", with `max` and `min`; an equation means left - right.
+    function: of three coordinates, written with + - * / **, abs, and the functions of
+        `harnack.math`: `sin`, `cos`, `tan`, `exp`, `log`, `sqrt`, `tanh`, `atan`, `atan2`, `asin`,
+        `acos`, `sinh`, `cosh`, `maximum`, `minimum`, `norm`; NumPy's functions of the same names
+        work too. Or a text, such as "x^2 + y^2 = 1 + sin(2*z)", with `max` and `min`; an equation
+        means left - right.
     parameters: numbers by their names in a text, such as {"a": 2.0} for "x^2 + y^2 = a".
     domain: the volume in which the surface is drawn, such as `harnack.Ball()`; None for all of
         space.

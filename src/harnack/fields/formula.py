@@ -76,8 +76,8 @@ class Formula(Field):
     Value, gradient, rounding errors and enclosures along rays follow from the formula by automatic
     differentiation in interval arithmetic.
 
-    lipschitz: a proved bound of |grad f| everywhere, for sphere tracing (bound="lipschitz"); None
-        if none is known.
+    lipschitz: a proved bound of |grad f| everywhere, for sphere tracing (enclosures="lipschitz");
+        None if none is known.
     is_convex: whether f is a convex function, which stays above its tangents.
     """
 
@@ -327,8 +327,9 @@ def is_jet(x: Any, name: str) -> bool:
     """
     if isinstance(x, FormulaNumber) and not isinstance(x, Jet):
         raise TypeError(
-            f"{name} gives ranges of derivatives alone, and the bound asked for is made of others: "
-            'leave bound=None, or use "pieces", "quadratic-taylor", "linear-taylor" or "segment"'
+            f"{name} gives ranges of derivatives alone, and the enclosures asked for are made of "
+            'others: leave enclosures out, or use "pieces", "quadratic-taylor", "linear-taylor" or '
+            '"segment"'
         )
     return isinstance(x, Jet)
 

@@ -95,8 +95,8 @@ class Sample:
 
 _R = TypeVar("_R", bound=Sample | Promise)
 _SAMPLE_HELP = (
-    "return harnack.fields.Sample(value, gradient, promises), with a Dr.Jit number, a Dr.Jit 3-vector and "
-    "a tuple of promises, such as (harnack.proofs.Lipschitz(1.0),) if |grad f| <= 1"
+    "return harnack.proofs.Sample(value, gradient, promises), with a Dr.Jit number, a Dr.Jit "
+    "3-vector and a tuple of promises, such as (harnack.proofs.Lipschitz(1.0),) if |grad f| <= 1"
 )
 
 

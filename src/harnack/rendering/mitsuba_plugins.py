@@ -11,7 +11,7 @@ scenes that are put together in Python.
     <float name="clip_radius" value="1"/>          a ball about clip_center, and/or a box from
     <point name="clip_lower" x="-1" y="0" z="0"/>  clip_lower to clip_upper
     <float name="tolerance" value="1e-4"/>         and the integer max_steps
-    <boolean name="confirm" value="true"/>         hits only where the field changes sign
+    <boolean name="require_crossing" value="true"/> hits only where the field changes sign
     <transform name="to_world"> ... </transform>   moves, turns and one scale for all axes
     <bsdf type="..."/>
 </shape>

@@ -89,7 +89,8 @@ def render(
         about twice as often, goes by |f - level| / |grad f|, and takes no fields that jump,
         such as winding numbers of meshes.
     color_by: the function of which show="value" shows values on the surface: a field, "x", "y",
-        "z", or a function of three coordinates. All are those of the surface or, of a scene, of the world.
+        "z", or a function of three coordinates. All are those of the surface or, of a scene, of
+        the world.
     color_range: (low, high) of the colors of values, depths or evaluations, by default what is
         seen; the same for all pictures of a series.
     color_bar: True, or the title, for a bar with numbers to the right of these pictures. It widens

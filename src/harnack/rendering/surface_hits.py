@@ -71,7 +71,7 @@ def intersect_surface(
     comes from; a normal that says otherwise (the step went past the point where a grazing ray is
     nearest) is turned to that side.
 
-    A confirmed hit is at a root already, and its side is known.
+    A hit that requires a crossing is at a root already, and its side is known.
 
     A hit on a jump surface is not moved; the normal points to the side of larger values.
     """
@@ -126,7 +126,7 @@ def _refine_hits(prepared: SurfaceTracer, ended: _MarchedRays) -> SurfaceHit:
     step = dr.select(smooth & (slope != 0), dr.clip(gap / slope, -reach, reach), 0)
     # gap > 0: the level is above, so the ray comes from the side of smaller values.
     side = dr.select(gap > 0, prepared.backend.Float(1), -1)
-    if trace.side is not None:  # confirmed hits are at a root
+    if trace.side is not None:  # hits at crossings are at a root
         step, side = dr.zeros(type(step)), trace.side
     t = dr.maximum(dr.select(met, trace.t, 0) + step, 0)
     p = dr.fma(vector(t), d, o)

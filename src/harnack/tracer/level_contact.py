@@ -7,7 +7,7 @@ can end.
   `Hysteresis` is the rule by which each crossing is counted once.
 
 A level that was reached counts as lying a tolerance beyond its place until f has left the
-tolerance. The same mechanism serves all crossings of a ray and hits that are confirmed by a change
+tolerance. The same mechanism serves all crossings of a ray and hits that require a change
 of sign. Rays that must cross start a little outside the extent, which the surface may touch.
 """
 

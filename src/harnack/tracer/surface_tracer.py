@@ -158,8 +158,8 @@ class MarchResult:
     status: a `RayStatus`.
     facet: index of the facet (see `harnack.fields.capabilities`) that was hit, at t; NO_FACET for
         other rays.
-    side: if hits are confirmed, 1 if f rises through the level along the ray, -1 if it falls
-        through it; else None. If hits are confirmed, t and gradient are those of the root, and
+    side: if hits require a crossing, 1 if f rises through the level along the ray, -1 if it falls
+        through it; else None. If hits require a crossing, t and gradient are those of the root, and
         `value` is f a little behind it.
     patch: for a union of patches, the index of the patch that was hit, NO_PATCH for other rays; for
         other fields None.

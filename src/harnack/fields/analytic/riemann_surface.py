@@ -114,8 +114,8 @@ class RiemannSurface(Field):
 
     With several branches f = s min_j |phi_j|, phi_j = h - Im g_j, s the sign of the product of all
     phi_j: it is continuous and single-valued, as the product is, and zero only on the surface. With
-    one branch f = phi, for a logarithm up to its period. level=(-w, w) with side="between" makes the surface a wall
-    whose points are at most w above or below it.
+    one branch f = phi, for a logarithm up to its period. level=(-w, w) with side="between" makes
+    the surface a wall whose points are at most w above or below it.
 
     Proof. Along a ray the set of branches is continued as long as no singular point is met: so
     branch cuts and the numbering of branches do not matter. `NearestBranchEnclosure` takes the

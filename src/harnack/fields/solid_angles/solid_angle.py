@@ -97,7 +97,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
     is 0 everywhere, every ray a proved miss, and levels that are multiples of 4 pi are refused.
 
     Promises. Second derivatives are bounded near every curve (`curve_queries.remainder_promises`),
-    and steps rest on that. The other proofs, chosen by `bound=`, need the range of the lift on a
+    and steps rest on that. The other proofs, chosen by `enclosures`, need the range of the lift on
+    a
     ball: on wavy polygons and knots they take 1.4 to 2 times as many evaluations.
 
     lift_bound: the bound of the lift on a ball. "auto" chooses "planar" if its hypothesis is
