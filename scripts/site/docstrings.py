@@ -19,6 +19,8 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+from sphinx.util.inspect import signature, stringify_signature
+
 import harnack
 
 _REFERENCE = Path(__file__).resolve().parents[2] / "docs" / "reference"
@@ -33,11 +35,7 @@ _BULLET = re.compile(r"- ")
 # Where another entry may begin within a line.
 _ANOTHER = re.compile(r"(?<=\.) (?=\w+: )")
 # Defaults of arguments, and how they are shown.
-_READABLE = {
-    "<factory>": "...",
-    repr(2 * math.pi): "2 * math.pi",
-    repr(math.pi / 6): "math.pi / 6",
-}
+_READABLE = {"<factory>": "...", repr(2 * math.pi): "2 * math.pi"}
 # Code, or strong or plain emphasis of words: what follows a space or a bracket and ends a word.
 _MARKED = re.compile(
     r"(`[^`]+`|(?<![\w*])\*\*[A-Za-z][^*]*\*\*(?!\w)|(?<![\w*])\*[A-Za-z][^*]*\*(?!\w))"
@@ -60,7 +58,17 @@ def with_readable_defaults(
 ) -> tuple[str, Any] | None:
     """Signatures that can be parsed and read: dataclasses write what is no Python for made
     defaults, and angles are numbers. (Sphinx can take defaults from the code, but that of verbs
-    has fewer parameters than their signature.)"""
+    has fewer parameters than their signature.) Of a class those of `__init__`, where Sphinx shows
+    a `__new__` that takes anything."""
+    if what == "class" and arguments and arguments.startswith("(*"):
+        aliases = app.config.autodoc_type_aliases
+        own = signature(thing.__init__, bound_method=True, type_aliases=aliases)
+        public = [p for name, p in own.parameters.items() if not name.startswith("_")]
+        arguments = stringify_signature(
+            own.replace(parameters=public),
+            show_return_annotation=False,
+            unqualified_typehints=True,
+        )
     for default, readable in _READABLE.items():
         arguments = arguments and arguments.replace(default, readable)
     return arguments and (arguments, result)

@@ -73,15 +73,15 @@ def test_another_surface_compiles_no_kernel(make: Callable[[int], hk.Field], lev
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize("asked", ["crossings", "require_crossing"])
+@pytest.mark.parametrize("search", ["crossings", "require_crossing"])
 @pytest.mark.parametrize(("make", "level"), [(knot, 6.0), (cut_sphere, 0.5)])
 def test_crossings_of_another_surface_compile_no_kernel(
-    make: Callable[[int], hk.Field], level: float, asked: str
+    make: Callable[[int], hk.Field], level: float, search: str
 ) -> None:
     o = 3 * np.random.default_rng(0).normal(size=(300, 3))
 
     def follow(surface: hk.Surface, options: hk.TraceOptions) -> Any:
-        if asked == "crossings":
+        if search == "crossings":
             return hk.crossings(surface, o, -o, max_crossings=5, options=options)
         return hk.trace(surface, o, -o, options=options.replace(require_crossing=True))
 

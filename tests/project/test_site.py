@@ -7,7 +7,7 @@ import importlib.util
 import operator
 import re
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import pytest
 
@@ -145,6 +145,22 @@ def test_marks_of_restructured_text_are_taken_as_they_stand() -> None:
     assert inline("|f_v| <= a*b*c, **every** x**2 + y**2, *unit*") == (
         r"\|f\_v\| <= a\*b\*c, **every** x\*\*2 + y\*\*2, *unit*"
     )
+
+
+@pytest.mark.parametrize(
+    ("thing", "shown"),
+    [
+        (hk.Gyroid, "(cell: float = 2 * math.pi, *, domain: Volume | None = None)"),
+        (hk.Box, "(lower: tuple[float, float, float], upper: tuple[float, float, float])"),
+    ],
+)
+def test_signatures_are_those_of_constructors(thing: type, shown: str) -> None:
+    """Fields and volumes have a `__new__` that takes anything; what is private is not shown."""
+    config = SimpleNamespace(autodoc_type_aliases={})
+    arguments, _ = extension("docstrings").with_readable_defaults(
+        SimpleNamespace(config=config), "class", "", thing, None, "(*given: Any)", None
+    )
+    assert arguments == shown
 
 
 def test_names_of_ours_become_links() -> None:
