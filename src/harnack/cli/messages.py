@@ -82,6 +82,8 @@ def print_warnings() -> Generator[None]:
 _ARGUMENT = re.compile(
     rf'(?<![(\w.])({"|".join(BY_NAME)})=("[^"]*"|True\b|\([^()]*\)|[\w.-]+(?:\.\w+)*)'
 )
+# The name of an option alone.
+_NAME = re.compile(rf"`({'|'.join(BY_NAME)})`")
 _PARAMETER = re.compile(r'parameters=\{"(\w+)": 1\.0\}')
 
 
@@ -110,6 +112,7 @@ def _explanation(error: Exception) -> str:
 def python_to_cli_terms(text: str) -> str:
     """A message of the library, with options of the command line in place of keywords of Python."""
     text = _PARAMETER.sub(r"--parameter \1=1", text)
+    text = _NAME.sub(lambda match: BY_NAME[match.group(1)].flag, text)
     return _ARGUMENT.sub(lambda match: _option(*match.groups()), text)
 
 
