@@ -13,9 +13,10 @@ import trimesh
 
 import harnack as hk
 from tests.oracles.direct_sums import winding_sum
+from tests.oracles.extents import longest_side
 
 Function = Callable[[Any], Any]
-TOLERANCE = 8e-3
+TOLERANCE = 8e-3  # as a part of the longest side
 
 
 def primitive(rng: np.random.Generator) -> tuple[hk.solids.Solid, Function]:
@@ -76,7 +77,7 @@ def judge(seed: int) -> str:
     begun = time.process_time()
     made, why = None, ""
     try:
-        made = hk.mesh(whole, tolerance=TOLERANCE)
+        made = hk.mesh(whole, tolerance=TOLERANCE * longest_side(whole))
     except hk.MeshingError as error:
         why = str(error)
     if made is None:
