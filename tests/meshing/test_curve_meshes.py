@@ -165,14 +165,14 @@ def test_mesh_and_surface_are_within_the_tolerance(name: str, tolerance: float, 
     ends = [CurveOracle(loops)(points + sign * step).value - 2 * math.pi for sign in (-1, 1)]
     below, above = (end - PERIOD * np.round(end / PERIOD) for end in ends)
     assert ((below < 0) & (above > 0) & (above - below < 0.5 * PERIOD)).all()
-    found = np.zeros((0, 3))
-    while len(found) < hits:
+    hit_points = np.zeros((0, 3))
+    while len(hit_points) < hits:
         direction = rng.normal(size=(hits, 3))
         origin = 4 * direction / np.linalg.norm(direction, axis=1)[:, None]
         aim = rng.uniform(-1.0, 1.0, origin.shape)
         seen_by = hk.trace(field, origin, aim - origin)
-        found = np.concatenate([found, seen_by.position[seen_by.is_hit]])
-    assert distances(mesh, found[:hits]).max() < tolerance
+        hit_points = np.concatenate([hit_points, seen_by.position[seen_by.is_hit]])
+    assert distances(mesh, hit_points[:hits]).max() < tolerance
 
 
 def distances(mesh: Any, points: np.ndarray) -> np.ndarray:
@@ -212,10 +212,10 @@ def squares_to_triangles(t: np.ndarray, p: np.ndarray) -> np.ndarray:
 def test_cells_that_are_too_large_for_a_coil_are_made_smaller_where_checks_fail(
     spacing: float,
 ) -> None:
-    said: list[str] = []
+    messages: list[str] = []
     field = hk.SolidAngle(loops_of("coil"))
-    mesh = hk.mesh(field, cell_size=spacing, tolerance=0.07, progress=said.append)
-    assert any("places fail: smaller cells there" in text for text in said)
+    mesh = hk.mesh(field, cell_size=spacing, tolerance=0.07, progress=messages.append)
+    assert any("places fail: smaller cells there" in text for text in messages)
     assert mesh.metadata["harnack"]["spacing"] == spacing
     check_surface(mesh, loops_of("coil"), 1)
 
@@ -310,9 +310,9 @@ def test_random_curves(kind: str, seed: int) -> None:
 def test_a_tiny_edge_does_not_force_small_cells(length: float) -> None:
     plain = example_curves.wavy_polygon(48)
     tiny = np.insert(plain, 1, plain[0] + length * (plain[1] - plain[0]) + [0, 0, length], axis=0)
-    one, other = (hk.mesh(hk.SolidAngle(loop), tolerance=1e-2) for loop in (plain, tiny))
-    check_surface(other, [tiny], 1)
-    counts = [mesh.metadata["harnack"]["evaluations"] for mesh in (one, other)]
+    plain_mesh, tiny_mesh = (hk.mesh(hk.SolidAngle(loop), tolerance=1e-2) for loop in (plain, tiny))
+    check_surface(tiny_mesh, [tiny], 1)
+    counts = [mesh.metadata["harnack"]["evaluations"] for mesh in (plain_mesh, tiny_mesh)]
     assert counts[1] < 1.3 * counts[0]
 
 

@@ -44,9 +44,9 @@ def test_a_level_set_is_meshed_as_it_is_traced() -> None:
     box, half = hk.Box((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3)), hk.HalfSpace((0, 0, 1), 0.1)
     coarse: dict[str, Any] = {"tolerance": 1.2e-2, "cell_size": 0.1}
     field = hk.Gyroid(1.0)
-    made = hk.mesh(hk.Surface(field, 0.2, clip=box, section=half), **coarse)
+    mesh = hk.mesh(hk.Surface(field, 0.2, clip=box, section=half), **coarse)
     same = hk.mesh(field, level=0.2, clip=box, section=half, **coarse)
-    assert (made.vertices == same.vertices).all()
+    assert (mesh.vertices == same.vertices).all()
     solid = hk.Surface(field, level=(-0.2, 0.2), side="between", clip=box)
     wall = hk.mesh(solid, **coarse)
     assert (
@@ -137,8 +137,8 @@ def test_cells_of_an_octree_fill_the_box_and_keep_the_set() -> None:
 def test_closed_meshes_are_turned_outwards() -> None:
     for text in ("x^2 + y^2 + z^2 = 1", "1 = x^2 + y^2 + z^2"):
         ball = hk.expression(text, domain=hk.Ball(radius=1.5))
-        made = hk.mesh(ball, tolerance=3e-2)
-        assert made.is_watertight
-        assert made.volume == pytest.approx(4 / 3 * np.pi, rel=0.02)
-        outwards = np.einsum("nk,nk->n", made.face_normals, made.triangles_center)
+        mesh = hk.mesh(ball, tolerance=3e-2)
+        assert mesh.is_watertight
+        assert mesh.volume == pytest.approx(4 / 3 * np.pi, rel=0.02)
+        outwards = np.einsum("nk,nk->n", mesh.face_normals, mesh.triangles_center)
         assert (outwards > 0).all()

@@ -114,15 +114,15 @@ def test_solids_are_given_by_levels_as_they_are_drawn() -> None:
     settings: dict[str, Any] = {"tolerance": 3.2e-3}
     box = hk.Box((-0.4, -0.4, -0.4), (0.4, 0.4, 0.4))
     field = hk.fields.SchwarzP(1.0, domain=box)
-    one = hk.mesh(field, level=(-0.2, 0.2), side="between", **settings)
-    other = hk.mesh(hk.solid(hk.fields.SchwarzP(1.0), between=(-0.2, 0.2)), clip=box, **settings)
-    assert is_part(one)
-    assert one.volume == pytest.approx(other.volume, rel=1e-9)
+    walls = hk.mesh(field, level=(-0.2, 0.2), side="between", **settings)
+    clipped = hk.mesh(hk.solid(hk.fields.SchwarzP(1.0), between=(-0.2, 0.2)), clip=box, **settings)
+    assert is_part(walls)
+    assert walls.volume == pytest.approx(clipped.volume, rel=1e-9)
     inside = hk.mesh(field, level=-0.2, side="below", **settings)
     outside = hk.mesh(field, level=0.2, side="above", **settings)
     assert is_part(inside)
     assert is_part(outside)
-    assert one.volume + inside.volume + outside.volume == pytest.approx(0.8**3, rel=1e-6)
+    assert walls.volume + inside.volume + outside.volume == pytest.approx(0.8**3, rel=1e-6)
 
 
 def lens(r: float, s: float, d: float) -> float:
@@ -439,7 +439,7 @@ def test_files_of_every_format_are_closed_when_read_again(kind: str, tmp_path: P
     command = ["mesh", "gyroid", "--tolerance", "0.006", "--scale", "10", "--quiet"]
     command += ["--clip", "box:-.3,-.3,-.3,.3,.3,.3", "-o", str(path)]
     assert main(command) == 0
-    assert [one.name for one in tmp_path.iterdir()] == [path.name]
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
     again = read_closed(path)
     np.testing.assert_allclose(again.bounds, [[-3] * 3, [3] * 3], atol=1e-5)
 

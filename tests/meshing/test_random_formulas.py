@@ -196,10 +196,10 @@ def formula_case(rng: np.random.Generator) -> Case:
     if kind == 1:
         options |= {"level": 0.0, "side": "below"}
         return Case(f"solid {text}", field, options, own, clip, True, 2.0)
-    other, small = hk.Sphere(0.7), lambda p: np.linalg.norm(p, axis=1) - 0.7
+    ball, small = hk.Sphere(0.7), lambda p: np.linalg.norm(p, axis=1) - 0.7
     return Case(
         f"less ball: {text}",
-        hk.solid(field, below=0.0) - other,
+        hk.solid(field, below=0.0) - ball,
         options,
         lambda p: np.maximum(own(p), -small(p)),
         clip,
@@ -382,12 +382,14 @@ def test_caps_over_little_of_a_solid_are_as_near_as_they_are() -> None:
 )
 def test_cells_become_smaller_only_if_the_smallest_would_do(text: str, sizes: int) -> None:
     """Of walls that are missed: one far thinner than the smallest cells is refused at once."""
-    said: list[str] = []
+    messages: list[str] = []
     box = hk.Box((-1, -1, -1), (1, 1, 1))
     refused = pytest.raises(hk.MeshingError, match="miss parts")
     with refused if sizes == 1 else contextlib.nullcontext():
-        hk.mesh(hk.expression(text), clip=box, tolerance=2.0 * TOLERANCE, progress=said.append)
-    tried = [one for one in said if one.startswith("cells of") and "miss" not in one]
+        hk.mesh(hk.expression(text), clip=box, tolerance=2.0 * TOLERANCE, progress=messages.append)
+    tried = [
+        message for message in messages if message.startswith("cells of") and "miss" not in message
+    ]
     assert len(tried) == sizes
 
 

@@ -49,10 +49,10 @@ def check(made: trimesh.Trimesh) -> dict[str, Any]:
 
 def test_a_soup_is_closed() -> None:
     with pytest.warns(UserWarning, match="are farther from the level of this WindingNumber"):
-        made = hk.mesh(hk.WindingNumber(*soup()), tolerance=6e-3, cell_size=0.1)
-    facts = check(made)
+        mesh = hk.mesh(hk.WindingNumber(*soup()), tolerance=6e-3, cell_size=0.1)
+    facts = check(mesh)
     assert facts["made_by"] == "signs"
-    assert made.volume == pytest.approx(1.0, abs=0.03)
+    assert mesh.volume == pytest.approx(1.0, abs=0.03)
     assert math.isfinite(facts["within"])
 
 
@@ -82,12 +82,12 @@ def test_vertices_lie_on_triangles_and_creases_are_sharp() -> None:
     turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
     turn[0] *= np.sign(np.linalg.det(turn))
     vertices = np.asarray(box.vertices) @ turn.T
-    made = hk.mesh(hk.WindingNumber(vertices, box.faces), tolerance=7e-3, cell_size=0.1)
-    facts = check(made)
-    off = np.abs(np.abs(made.vertices @ turn).max(axis=1) - 0.5)
+    mesh = hk.mesh(hk.WindingNumber(vertices, box.faces), tolerance=7e-3, cell_size=0.1)
+    facts = check(mesh)
+    off = np.abs(np.abs(mesh.vertices @ turn).max(axis=1) - 0.5)
     assert np.quantile(off, 0.95) < 1e-4 * 0.1  # within edges of tetrahedra, not at their ends
-    assert made.volume == pytest.approx(1.0, rel=2e-3)
-    assert facts["far"] <= 0.05 * len(made.vertices)
+    assert mesh.volume == pytest.approx(1.0, rel=2e-3)
+    assert facts["far"] <= 0.05 * len(mesh.vertices)
 
 
 def boxes(*ends: tuple[tuple[int, ...], tuple[int, ...]]) -> hk.WindingNumber:
@@ -120,19 +120,19 @@ def test_flat_parts_and_parts_in_contact(parts: hk.WindingNumber, volume: float)
 @pytest.mark.parametrize(("scale", "shift"), [(1.0, 0.0), (1e-5, 0.0), (1.0, 1e4), (1e6, -1e7)])
 def test_units_and_places(scale: float, shift: float) -> None:
     vertices, faces = icosphere(2)
-    given = scale * vertices + shift
-    made = hk.mesh(
-        hk.WindingNumber(given, faces[3:]), tolerance=2e-2 * scale, cell_size=0.2 * scale
+    moved = scale * vertices + shift
+    mesh = hk.mesh(
+        hk.WindingNumber(moved, faces[3:]), tolerance=2e-2 * scale, cell_size=0.2 * scale
     )
-    check(made)
-    assert np.linalg.norm(made.vertices - shift, axis=1).max() < 1.001 * scale
+    check(mesh)
+    assert np.linalg.norm(mesh.vertices - shift, axis=1).max() < 1.001 * scale
 
 
 def test_a_cloud_is_closed_and_near() -> None:
     points, _ = sphere_points(1000)
-    made = hk.mesh(hk.DipolePotential(points, points), tolerance=2e-2, cell_size=0.12)
-    check(made)
-    assert np.abs(np.linalg.norm(made.vertices, axis=1) - 1).max() < 0.02
+    mesh = hk.mesh(hk.DipolePotential(points, points), tolerance=2e-2, cell_size=0.12)
+    check(mesh)
+    assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - 1).max() < 0.02
     half = hk.mesh(
         hk.DipolePotential(points, points), level=2 * math.pi, side="above", tolerance=2e-2,
         cell_size=0.12, section=hk.HalfSpace((0, 0, 1), 0.0),

@@ -138,6 +138,6 @@ def test_a_bolt_and_its_nut_do_not_meet() -> None:
     bolt = hk.solids.metric_thread("M8", 12.0, clearance=0.1)
     nut = hk.Extrusion(hexagon, 6.5) - hk.solids.metric_thread("M8", 8.0, internal=True)
     meshes = [hk.mesh(part, tolerance=2.6e-2) for part in (bolt, nut)]
-    assert all(one.is_watertight for one in meshes)
+    assert all(mesh.is_watertight for mesh in meshes)
     inside = bolt.translated((0.0, 0.0, -2.5)).value(meshes[1].vertices, precision="double")
     assert inside.min() > 0.1 - 2 * 2.6e-2
