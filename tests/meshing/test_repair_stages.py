@@ -488,9 +488,9 @@ def test_settings_that_are_refused() -> None:
         hk.repair(ball(), tolerance=0)
     with pytest.raises(ValueError, match='keep is None, "all", "valid" or "none"'):
         hk.repair(ball(), keep="some")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ValueError, match='patches are "smooth" or "harmonic"'):
+    with pytest.raises(ValueError, match='filling is "smooth" or "harmonic"'):
         hk.repair(ball(), filling="flat")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ValueError, match="spacing"):
+    with pytest.raises(ValueError, match="cell_size"):
         hk.repair(ball(), cell_size=float("nan"))
 
 
