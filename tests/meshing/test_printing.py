@@ -400,7 +400,7 @@ WALLS: dict[str, Any] = {"level": (-0.3, 0.3), "side": "between"}
         (hk.Gyroid(1.0), {"side": True}, 'side must be one of "surface", "below"'),
         (hk.Gyroid(1.0), WALLS | {"level": (-9.0, 9.0)}, "no surface has level"),
         (hk.Gyroid(1.0), WALLS | {"side": "below"}, "one level, and 2 are given: -0.3, 0.3"),
-        (hk.Gyroid(1.0), WALLS | {"clip": hk.HalfSpace((1, 0, 0), 0)}, "clip="),
+        (hk.Gyroid(1.0), WALLS | {"clip": hk.HalfSpace((1, 0, 0), 0)}, "give a clip"),
         (~hk.Sphere(0.5), {}, "where it ends"),
         (hk.Sphere(0.5), {"clip": hk.Box((1, 1, 1), (2, 2, 2))}, "empty"),
         (hk.Sphere(0.5), {"side": "surface", "clip": hk.Ball((3, 0, 0), 1)}, "empty"),
@@ -467,7 +467,7 @@ def test_formats_whose_packages_lack_are_refused_early(
         (["--clip", "ball:1,2"], "4 numbers"),
         (["--thickness", "0"], "positive"),
         (["--max-triangles", "1000"], "--max-triangles"),
-        (["--max-triangles", "0"], "--max-triangles must be an integer"),
+        (["--max-triangles", "0"], "--max-triangles: '0' must be a whole number"),
         (["--clip", "cube:0,0,0,1"], "is no volume; write ball:X,Y,Z,RADIUS"),
     ],
 )
