@@ -375,8 +375,8 @@ class RenderOptions:
     backdrop: Backdrop
     up: Any
     boundary_radius: float | None
-    boundary_material: MaterialLike | None
-    section_material: MaterialLike | None
+    boundary_material: Any
+    section_material: Any
     isolines: tuple[Isolines, ...]
     thickness: float | None
     color_by: Field | None
