@@ -233,7 +233,7 @@ def test_a_twisted_ellipsoid_takes_less_than_six_looks() -> None:
     rng = np.random.default_rng(0)
     o = rng.normal(size=(4000, 3))
     o *= 5 / np.linalg.norm(o, axis=1, keepdims=True)
-    hits = hk.trace(field, o, rng.uniform(-1, 1, (4000, 3)) * box - o,
+    hits = hk.trace(field, o, rng.uniform(-1, 1, (4000, 3)) * box - o, precision="single",
                     tolerance=hk.tracer.HitTolerance(value=1e-3, distance=1e-12))  # fmt: skip
     assert hits.evaluations.mean() < 6
     assert (hits.status != hk.RayStatus.OUT_OF_STEPS).all()
