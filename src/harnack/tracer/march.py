@@ -11,7 +11,7 @@ fields.
 
 The state of the march is a record, which `backend.loops` takes apart and puts together for Dr.Jit's
 loop. The march compares samples with the facet at the end of an interval; the tracer that goes from
-facet to facet (`walks.JumpTracer`) calls the march, and not the other way round.
+facet to facet (`jump_tracer.JumpTracer`) calls the march, and not the other way round.
 """
 
 from __future__ import annotations

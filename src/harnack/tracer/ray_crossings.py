@@ -24,12 +24,12 @@ from harnack.backend.tensors import array_to_tensor
 from harnack.cluster.dask_arrays import accepts_dask_arrays
 from harnack.fields.capabilities import NO_FACET
 from harnack.tracer.derivatives import attach_derivatives, needs_derivatives, refuse_derivative
+from harnack.tracer.jump_tracer import JumpTracer, JumpTraceState
 from harnack.tracer.level_contact import Contact, RayStatus
 from harnack.tracer.rays import RayBatch
 from harnack.tracer.surface_tracer import MarchResult
 from harnack.tracer.trace_options import shows_keywords, surface_and_options
 from harnack.tracer.traced_surface import TracedSurface
-from harnack.tracer.walks import JumpTracer, JumpTraceState
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

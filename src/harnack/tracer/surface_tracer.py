@@ -18,6 +18,7 @@ from harnack.backend.loops import loop_with_queue
 from harnack.fields.capabilities import NO_FACET, NO_PATCH
 from harnack.fields.samples import Ray
 from harnack.tracer.branch_tracker import BranchTracker
+from harnack.tracer.jump_tracer import JumpTracer
 from harnack.tracer.level_contact import (
     Contact,
     Hysteresis,
@@ -26,7 +27,7 @@ from harnack.tracer.level_contact import (
     refine_crossing,
 )
 from harnack.tracer.march import March, MarchState
-from harnack.tracer.walks import JumpTracer, PatchTracer
+from harnack.tracer.patch_tracer import PatchTracer
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
