@@ -1,5 +1,6 @@
-"""`JumpTracer` traces rays through fields with jumps (see `harnack.fields.capabilities`), by the loop
-of `March`. A ray goes from one crossing of the jump surface to the next.
+"""`JumpTracer`: traces rays through fields with jumps (see `harnack.fields.capabilities`).
+
+A ray goes from one crossing of the jump surface to the next, by the loop of `March`.
 
 The winding number of a mesh jumps at its triangles, and the jumps are exact. A ray is cut into
 intervals at the triangles that it crosses. On each interval the winding number w is an ordinary
@@ -28,12 +29,12 @@ if TYPE_CHECKING:
     from harnack.fields.field import Field
     from harnack.fields.samples import Ray
 
-# Two facets count as crossed at the same point if they are no farther apart than the first number
-# of roundings of coordinates, and the cosine of the angle between them is larger than the second
-# number. The sine of a ray's angle to a facet counts as at least the third number.
+# Facets count as crossed at the same point if they are at most the first number of roundings of the
+# coordinates apart, and the cosine of the angle between them is larger than the second number. The
+# sine of a ray's angle to a facet counts as at least the third number.
 _COINCIDENT_ROUNDINGS, _MIN_COSINE, _MIN_SINE = 2.0, 0.999, 1 / 64
-# If that distance is more than this fraction of the ray, facets that face each other at the same
-# point may be the two sides of a wall.
+# If this distance of coincidence is more than this fraction of the ray, facets that face each other
+# at the same point may be the two sides of a wall.
 _COARSE = 1e-4
 
 
@@ -124,45 +125,45 @@ class JumpTracer:
         before = real(self.start * (1 - self.backend.machine_epsilon) - 1e-30)
         offset = real(self.field.initial_offset(o, d, before, state.active))
         start = JumpCrossing(before, count(NO_FACET), real(0), vector(0))
-        named = None if state.contact is None else count(NO_FACET)
-        return JumpTraceState(offset, start, state, named)
+        reported = None if state.contact is None else count(NO_FACET)
+        return JumpTraceState(offset, start, state, reported)
 
     def finish(self, outer: JumpTraceState) -> tuple[MarchState, Any]:
         """The state of rays, and the index of the facet that each ray hit, NO_FACET for none."""
         count, end = self.backend.UInt32, outer.march
-        on_sheet = end.status == HIT_AT_JUMP
-        status = dr.select(on_sheet, count(int(RayStatus.HIT)), end.status)
-        named = outer.behind.facet if outer.reported_facet is None else outer.reported_facet
-        sheet = dr.select(on_sheet, named, count(NO_FACET))
-        return dataclasses.replace(end, status=status), sheet
+        at_facet = end.status == HIT_AT_JUMP
+        status = dr.select(at_facet, count(int(RayStatus.HIT)), end.status)
+        reported = outer.behind.facet if outer.reported_facet is None else outer.reported_facet
+        facet = dr.select(at_facet, reported, count(NO_FACET))
+        return dataclasses.replace(end, status=status), facet
 
     def advance(self, outer: JumpTraceState) -> JumpTraceState:
         """Rays after one interval: at the next crossing, the end of the ray, or a hit."""
         count = self.backend.UInt32
         o, d = self.path.origin, self.path.direction
         behind, now = outer.behind, outer.march
-        ahead, last, lost = self._merge_coincident(
+        ahead, last, unclear = self._merge_coincident(
             self._next(behind, self.end, now.active), now.active
         )
         out = count(int(RayStatus.OUT_OF_STEPS))
         now = dataclasses.replace(
-            now, status=dr.select(lost, out, now.status), active=now.active & ~lost
+            now, status=dr.select(unclear, out, now.status), active=now.active & ~unclear
         )
-        stops = ahead.facet != NO_FACET
-        stop = dr.select(stops, ahead.t, self.end)
+        has_facet = ahead.facet != NO_FACET
+        stop = dr.select(has_facet, ahead.t, self.end)
         # The last step may already have proved the rest of the ray.
         goes_on = now.proved_to + now.proved_step < stop
         if now.contact is not None and self.march.hysteresis is not None:
             samples_end = self.march.hysteresis.must_sample_end(now.contact, stop)
             goes_on |= samples_end & (now.proved_to < stop)
-        active = now.active & (stops | goes_on)
+        active = now.active & (has_facet | goes_on)
         step = fmin(self.march.over_relaxation * now.proved_step, stop - now.proved_to)
         now = dataclasses.replace(now, trial_step=step, active=active)
         field = self.field.continuation(o, d, behind, ahead, outer.offset)
         now = self.march.advance(field, self.path, stop, now, ahead)
-        passed = active & stops & (now.status == int(RayStatus.MISS))
+        passed = active & has_facet & (now.status == int(RayStatus.MISS))
         if now.contact is not None:
-            return self._after_jump(outer, now, ahead, last, passed, active & stops)
+            return self._after_jump(outer, now, ahead, last, passed, active & has_facet)
         spent = passed & (now.evaluations >= self.march.max_steps)
         status = dr.select(spent, out, now.status)
         # Of several facets at a point, a hit reports `ahead`; a ray that passes goes on from
@@ -181,7 +182,7 @@ class JumpTracer:
 
     def _after_jump(
         self,
-        outer: JumpTraceState,
+        previous: JumpTraceState,
         now: MarchState,
         ahead: JumpCrossing,
         last: JumpCrossing,
@@ -192,18 +193,18 @@ class JumpTracer:
         level at a facet has passed that facet; it may be made active again."""
         spent = passed & (now.evaluations >= self.march.max_steps)
         status = dr.select(spent, self.backend.UInt32(int(RayStatus.OUT_OF_STEPS)), now.status)
-        through = passed | (stopped & (now.status == HIT_AT_JUMP))
+        is_past = passed | (stopped & (now.status == HIT_AT_JUMP))
         behind = JumpCrossing(
-            dr.select(through, last.t, outer.behind.t),
-            dr.select(through, last.facet, outer.behind.facet),
-            dr.select(through, ahead.jump, outer.behind.jump),
-            dr.select(through, ahead.normal, outer.behind.normal),
+            dr.select(is_past, last.t, previous.behind.t),
+            dr.select(is_past, last.facet, previous.behind.facet),
+            dr.select(is_past, ahead.jump, previous.behind.jump),
+            dr.select(is_past, ahead.normal, previous.behind.normal),
         )
         return JumpTraceState(
-            dr.select(through, outer.offset + ahead.jump, outer.offset),
+            dr.select(is_past, previous.offset + ahead.jump, previous.offset),
             behind,
             dataclasses.replace(now, status=status, active=passed & ~spent),
-            dr.select(through, ahead.facet, outer.reported_facet),
+            dr.select(is_past, ahead.facet, previous.reported_facet),
         )
 
     def _merge_coincident(
@@ -227,61 +228,61 @@ class JumpTracer:
         """
         real, count = self.backend.Float, self.backend.UInt32
         size = max_norm(self.path.origin)
-        close = _COINCIDENT_ROUNDINGS * self.backend.machine_epsilon * (size + first.t)
-        steep = fmax(dr.abs(dr.dot(first.normal, self.path.direction)), real(_MIN_SINE))
-        furthest = fmax(fmin(first.t + close / steep, self.end), first.t)
+        tolerance = _COINCIDENT_ROUNDINGS * self.backend.machine_epsilon * (size + first.t)
+        sine = fmax(dr.abs(dr.dot(first.normal, self.path.direction)), real(_MIN_SINE))
+        limit = fmax(fmin(first.t + tolerance / sine, self.end), first.t)
 
         def body(now: _CoincidentJumps) -> _CoincidentJumps:
-            one = self._next(JumpCrossing(now.t, now.last, 0.0, first.normal), furthest, now.active)
+            crossing = self._next(
+                JumpCrossing(now.t, now.last, 0.0, first.normal), limit, now.active
+            )
             # Facets at an angle to each other are merged only at exactly the same t.
-            level = dr.abs(dr.dot(one.normal, first.normal)) > _MIN_COSINE
-            found = now.active & (one.facet != NO_FACET) & ((one.t == first.t) | level)
-            new_up = found & (one.jump > 0) & (now.up == NO_FACET)
-            new_down = found & (one.jump < 0) & (now.down == NO_FACET)
+            parallel = dr.abs(dr.dot(crossing.normal, first.normal)) > _MIN_COSINE
+            same = now.active & (crossing.facet != NO_FACET) & ((crossing.t == first.t) | parallel)
+            new_up = same & (crossing.jump > 0) & (now.up == NO_FACET)
+            new_down = same & (crossing.jump < 0) & (now.down == NO_FACET)
             return _CoincidentJumps(
-                jump=now.jump + dr.select(found, one.jump, 0),
-                t=dr.select(found, one.t, now.t),
-                last=dr.select(found, one.facet, now.last),
-                up=dr.select(new_up, one.facet, now.up),
-                down=dr.select(new_down, one.facet, now.down),
-                normal_up=dr.select(new_up, one.normal, now.normal_up),
-                normal_down=dr.select(new_down, one.normal, now.normal_down),
-                folded=now.folded | (found & level & (one.jump * first.jump < 0)),
-                active=found,
+                jump=now.jump + dr.select(same, crossing.jump, 0),
+                t=dr.select(same, crossing.t, now.t),
+                last=dr.select(same, crossing.facet, now.last),
+                up=dr.select(new_up, crossing.facet, now.up),
+                down=dr.select(new_down, crossing.facet, now.down),
+                normal_up=dr.select(new_up, crossing.normal, now.normal_up),
+                normal_down=dr.select(new_down, crossing.normal, now.normal_down),
+                folded=now.folded | (same & parallel & (crossing.jump * first.jump < 0)),
+                active=same,
             )
 
-        none = count(NO_FACET)
+        no_facet = count(NO_FACET)
         start = _CoincidentJumps(
             jump=first.jump,
             t=first.t,
             last=first.facet,
-            up=dr.select(first.jump > 0, first.facet, none),
-            down=dr.select(first.jump < 0, first.facet, none),
+            up=dr.select(first.jump > 0, first.facet, no_facet),
+            down=dr.select(first.jump < 0, first.facet, no_facet),
             normal_up=first.normal,
             normal_down=first.normal,
             folded=self.backend.Bool(False),
             active=self.backend.Bool(active) & (first.facet != NO_FACET),
         )
-        all_there = loop_while_active(start, body, "together")
-        up, down = all_there.jump > 0, all_there.jump < 0
-        sheet = dr.select(up, all_there.up, dr.select(down, all_there.down, first.facet))
-        normal = dr.select(
-            up, all_there.normal_up, dr.select(down, all_there.normal_down, first.normal)
-        )
-        behind = JumpCrossing(all_there.t, all_there.last, first.jump, first.normal)
-        lost = all_there.folded & (all_there.jump == 0)
-        lost &= close > _COARSE * (self.end - self.start)
-        return JumpCrossing(first.t, sheet, real(all_there.jump), normal), behind, lost
+        total = loop_while_active(start, body, "together")
+        up, down = total.jump > 0, total.jump < 0
+        facet = dr.select(up, total.up, dr.select(down, total.down, first.facet))
+        normal = dr.select(up, total.normal_up, dr.select(down, total.normal_down, first.normal))
+        behind = JumpCrossing(total.t, total.last, first.jump, first.normal)
+        unclear = total.folded & (total.jump == 0)
+        unclear &= tolerance > _COARSE * (self.end - self.start)
+        return JumpCrossing(first.t, facet, real(total.jump), normal), behind, unclear
 
     def _next(self, behind: JumpCrossing, end: Real, active: Mask) -> JumpCrossing:
         """The next crossing, as arrays of this backend; none if it lies beyond the end."""
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
         ahead = self.field.next_jump(self.path.origin, self.path.direction, behind, end, active)
-        there = real(ahead.t) <= end
-        there &= count(ahead.facet) != NO_FACET
+        valid = real(ahead.t) <= end
+        valid &= count(ahead.facet) != NO_FACET
         return JumpCrossing(
-            dr.select(there, real(ahead.t), dr.inf),
-            dr.select(there, count(ahead.facet), count(NO_FACET)),
-            dr.select(there, real(ahead.jump), 0),
+            dr.select(valid, real(ahead.t), dr.inf),
+            dr.select(valid, count(ahead.facet), count(NO_FACET)),
+            dr.select(valid, real(ahead.jump), 0),
             vector(*ahead.normal),
         )

@@ -1,5 +1,7 @@
-"""`PatchTracer` traces rays through unions of patches (see `harnack.fields.capabilities`), each in
-its own box, by the loop of `March`. A ray gets the first hit of all patches.
+"""`PatchTracer`: traces rays through unions of patches (see `harnack.fields.capabilities`).
+
+Each patch lies in its own box and is marched by the loop of `March`. A ray gets the first hit of
+all patches.
 
 Patches are marched one after the other, as no single function has all of them as a level set, and a
 union of the faces of a polygon mesh would evaluate all faces at each step. A tree gives the proved
@@ -79,8 +81,8 @@ class PatchTracer:
         every patch whose box it entered before the hit, and all other patches lie behind the hit. A
         ray that is out of steps in a patch is proved free up to its entry into that box.
         """
-        walk = loop_while_active(self.begin(state), self.advance, "harnack parts")
-        return self.finish(walk)
+        end_state = loop_while_active(self.begin(state), self.advance, "harnack parts")
+        return self.finish(end_state)
 
     def begin(self, state: MarchState) -> PatchTraceState:
         """Rays before the first box."""
@@ -123,23 +125,23 @@ class PatchTracer:
             path.origin, path.direction, after, self.start, walk.t, walk.active
         )
         active = walk.active & (entry.patch != NO_PATCH)
-        near, far = fmax(entry.enter, self.start), fmin(entry.leave, walk.t)
-        part = self.field.patch(dr.select(active, entry.patch, 0))
+        start, end = fmax(entry.enter, self.start), fmin(entry.leave, walk.t)
+        patch = self.field.patch(dr.select(active, entry.patch, 0))
         spent = active & (walk.evaluations >= self.march.max_steps)
-        now = MarchState.at(backend, near, far, active & ~spent, has_detail=False)
+        now = MarchState.at(backend, start, end, active & ~spent, has_detail=False)
         now = dataclasses.replace(now, evaluations=backend.UInt32(walk.evaluations))
-        now = self.march.advance(part, path, backend.Float(far), now)
+        now = self.march.advance(patch, path, backend.Float(end), now)
         out = backend.UInt32(int(RayStatus.OUT_OF_STEPS))
         hit = active & (now.status == int(RayStatus.HIT))
         lost = spent | (active & (now.status == int(RayStatus.OUT_OF_STEPS)))
         ended = hit | lost
-        looked = active & (ended | (walk.part == NO_PATCH))
+        sampled = active & (ended | (walk.part == NO_PATCH))
         goes_on = active & ~ended if self.any_hit else active & ~lost
         return PatchTraceState(
             enter=entry.enter,
             box=entry.patch,
-            t=dr.select(hit, now.proved_to, dr.select(lost, near, walk.t)),
-            value=dr.select(looked, now.value, walk.value),
+            t=dr.select(hit, now.proved_to, dr.select(lost, start, walk.t)),
+            value=dr.select(sampled, now.value, walk.value),
             gradient=dr.select(ended, now.gradient, walk.gradient),
             excess=dr.select(ended, now.tolerance_excess, walk.excess),
             evaluations=dr.select(active, now.evaluations, walk.evaluations),
