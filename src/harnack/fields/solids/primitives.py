@@ -180,7 +180,7 @@ class DoubleCone(FormulaSolid):
         set_frozen(self, "angle", angle)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        angle = math.radians(self.angle)
+        angle = self.angle * (math.pi / 180)  # which kernels may read as a parameter
         return norm(x, y) * cos(angle) - abs(z) * sin(angle)
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
