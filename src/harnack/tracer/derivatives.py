@@ -57,7 +57,7 @@ def needs_derivatives(prepared: SurfaceTracer, o: Vec3, d: Vec3) -> bool:
     if of_field and prepared.field.has_jumps:
         name = type(prepared.field).__name__
         raise NotImplementedError(
-            f"hits of a field with sheets cannot be differentiated by its parameters: detach "
+            f"hits of a field with jumps cannot be differentiated by its parameters: detach "
             f"those of this {name} (derivatives by rays and levels are attached)"
         )
     rest: list[Any] = [o, d, *prepared.levels.values]
