@@ -39,7 +39,7 @@ demo: $(STAMP)
 
 parts: $(STAMP)
 	mkdir -p out
-	$(BIN)/harnack mesh gyroid --tolerance 0.002 --scale 30 -o out/gyroid.stl
+	$(BIN)/harnack mesh gyroid --tolerance 0.004 --scale 30 -o out/gyroid.stl
 	$(BIN)/harnack mesh trefoil --thickness 0.08 --scale 25 -o out/trefoil.stl
 
 # One worker a core; tests/conftest.py divides Dr.Jit's threads among them. Tests of a file share kernels.

@@ -1,7 +1,7 @@
 """What a sharper proof is worth.
 
 The same rays, the same surface, the same hits; what differs is the proof that steps rest on.
-`bound=` chooses it: the rule of the paper, its refinements by the slope along the ray, and what
+`enclosures=` chooses it: the rule of the paper, its refinements by the slope along the ray, and what
 harnack takes by default. Work is counted in evaluations of the function, and the picture shows it
 for each pixel.
 """

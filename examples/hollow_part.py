@@ -16,7 +16,7 @@ from harnack.geometry import example_meshes
 
 
 def main(
-    folder: Path, size: tuple[int, int] = (640, 480), tolerance: float = 6e-3
+    folder: Path, size: tuple[int, int] = (640, 480), tolerance: float = 0.36
 ) -> hk.printing.PrintCheck:
     part = hk.solid(example_meshes.torus_mesh(20.0, 10.0, 96, 48))
     gyroid = hk.Gyroid(cell=8.0)

@@ -69,23 +69,24 @@ PLACES = {
 }
 
 
-def standing(name: str) -> hk.Surface:
+def standing(name: str) -> hk.Field:
     part, place = PARTS[name](), PLACES[name]
     if isinstance(part, hk.SolidAngle):
-        return hk.Surface(hk.SolidAngle([loop + place for loop in part.loops]))
-    return hk.traced_surface(part.translated(place), tolerance=hk.tracer.HitTolerance(2e-3))
+        return hk.SolidAngle([loop + place for loop in part.loops])
+    return part.translated(place)
 
 
 def main(
     folder: Path,
     size: tuple[int, int] = (640, 480),
-    tolerance: float = 1e-3,
+    tolerance: float | None = None,
     names: tuple[str, ...] = tuple(PARTS),
 ) -> dict[str, float]:
     scene = [standing(name) for name in names]
     camera = hk.Camera(azimuth=-75, elevation=28)
     picture = folder / "printed_parts.png"
-    hk.render(scene, picture, show="shaded", material="clay", camera=camera, size=size)
+    look = {"show": "shaded", "material": "clay", "tolerance": 2e-3}
+    hk.render(scene, picture, camera=camera, size=size, **look)
     volumes: dict[str, float] = {}
     for name in names:
         part = PARTS[name]()

@@ -27,7 +27,7 @@ def main(folder: Path, size: tuple[int, int] = (640, 480)) -> int:
         camera=hk.Camera(azimuth=-60, elevation=35),
         size=size,
     )
-    triangles = hk.mesh(knot, level=2 * np.pi, tolerance=4e-3)
+    triangles = hk.mesh(knot, level=2 * np.pi, tolerance=1e-2)
     characteristic = triangles.metadata["harnack"]["euler_characteristic"]
     print(f"{len(triangles.faces):,} triangles, Euler characteristic {characteristic}")
     return characteristic

@@ -56,7 +56,7 @@ def test_a_broken_mesh_is_made_whole(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_gyroid_part_fills_what_its_walls_do(tmp_path: Path) -> None:
     # Between -w and w the gyroid fills about 2 w/3.09 of its cell, less the cut.
-    assert example("gyroid_part").main(tmp_path, SMALL, tolerance=1e-2) == pytest.approx(
+    assert example("gyroid_part").main(tmp_path, SMALL, tolerance=2e-2) == pytest.approx(
         0.23, abs=0.01
     )
     read_closed(tmp_path / "gyroid_part.stl")
@@ -67,7 +67,7 @@ def test_parts_to_print_are_closed_and_of_the_volume_that_their_formulas_say(
     tmp_path: Path,
 ) -> None:
     module = example("printed_parts")
-    volumes = module.main(tmp_path, SMALL, 2e-3, ("nut", "plate"))
+    volumes = module.main(tmp_path, SMALL, 0.03, ("nut", "plate"))
     for name in volumes:
         read_closed(tmp_path / f"{name}.stl")
     # A hexagon less a hole, whose thread is between its minor and its major diameter.
