@@ -60,9 +60,9 @@ class Page:
         self.tab.goto(address)
         self.tab.wait_for_function("window.panel")
         # Nobody is chosen to draw by the speed of this machine.
-        self.do("() => { Object.getPrototypeOf(panel).choose_renderer = async () => {}; }")
+        self.do("() => { Object.getPrototypeOf(panel).chooseRenderer = async () => {}; }")
         self.tab.wait_for_function(
-            "panel.is_remote"
+            "panel.isRemote"
             " || (panel.root.dataset.state && !/^Compiling/.test(panel.message.textContent))"
         )
 
@@ -87,15 +87,15 @@ class Page:
 
     def rest(self) -> None:
         """Until what is asked for is drawn, all of it."""
-        self.do("(n) => { if (panel.drawing) panel.drawing.samples = n; }", self.samples)
+        self.do("(n) => { if (panel.renderer) panel.renderer.samplesPerPixel = n; }", self.samples)
         self.tab.wait_for_function(
-            "() => !panel.is_changing && !panel.is_change_due && !panel.is_fetching"
+            "() => !panel.isUpdating && !panel.isUpdateDue && !panel.isFetching"
             " && !/^Compiling/.test(panel.message.textContent)"
-            " && (!panel.drawing || (!panel.drawing.busy && panel.drawing.pictures > 0))"
+            " && (!panel.renderer || (!panel.renderer.isBusy && panel.renderer.pictureCount > 0))"
         )
         # What was drawn is in the window two frames later.
         self.do("""async () => {
-          await panel.drawing?.device.queue.onSubmittedWorkDone();
+          await panel.renderer?.device.queue.onSubmittedWorkDone();
           for (let k = 0; k < 2; k++) await new Promise(requestAnimationFrame);
         }""")
 

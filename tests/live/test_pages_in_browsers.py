@@ -92,7 +92,7 @@ def test_all_of_many_surfaces_have_their_own_materials(browser: Any, tmp_path: P
         page = Page(browser, f"{address}/a.html", SIZE, samples=1)
         picture = page.picture("page-many")
         places = page.do(
-            "(centers) => centers.map((p) => panel.camera().project(panel.to_stage(p),"
+            "(centers) => centers.map((p) => panel.camera.project(panel.placement.toStage(p),"
             " innerWidth, innerHeight))",
             centers,
         )

@@ -61,7 +61,7 @@ def change(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def python_draws(page: Page) -> None:
-    page.do("() => panel.is_remote || panel.let_python_draw('')")
+    page.do("() => panel.isRemote || panel.useRemoteRenderer('')")
     page.rest()
 
 
@@ -73,8 +73,8 @@ def lowest(page: Page) -> int:
 def screen_of(page: Page, curve: int, number: int) -> tuple[float, float]:
     """Where a point of a curve is in the window."""
     x, y = page.do(
-        "([c, k]) => { const p = panel.camera().project(panel.to_stage(panel.curves[c][k]),"
-        " innerWidth, innerHeight); return [p.x, p.y]; }",
+        "([c, k]) => { const point = panel.placement.toStage(panel.curveEditor.curves[c][k]);"
+        " const p = panel.camera.project(point, innerWidth, innerHeight); return [p.x, p.y]; }",
         [curve, number],
     )
     return x, y
@@ -117,7 +117,7 @@ def test_colors_that_are_numbers_have_a_legend(drawn_by: str, page: Page) -> Non
     near, far = map(
         float, re.findall(r"from ([\d.]+), bright, to ([\d.]+), dark", page.do(legend))[0]
     )
-    position = page.do("panel.attributes().camera.position")
+    position = page.do("panel.attributes.camera.position")
     away = np.linalg.norm(np.array(position) - example_curves.torus_knot(2, 3, 200), axis=1)
     assert 0.7 * away.min() < near < away.min() * 1.1  # in the unit of the surface
     assert near < far < 1.3 * away.max()
@@ -139,7 +139,7 @@ def test_material_and_tube_are_changed(drawn_by: str, page: Page) -> None:
     choose(page, "material", "color")
     page.set("color", "#0000ff")
     page.set("tube", 0.06)
-    assert page.do("() => panel.control_values().settings") == {
+    assert page.do("() => panel.controlValues.settings") == {
         "material": "#0000ff",
         "boundary": 0.06,
     }
@@ -162,33 +162,33 @@ def choose(page: Page, name: str, value: str) -> None:
 
 def test_points_are_dragged_inserted_removed_smoothed_and_that_undone(page: Page) -> None:
     before = page.picture()
-    start = page.do("() => panel.curves")
+    start = page.do("() => panel.curveEditor.curves")
     page.tick("Edit points")
     with_points = page.picture("view-points")
     assert change(before, with_points) > 0.002
     x, y = screen_of(page, 0, lowest(page))
     page.drag((x, y), (x + 40, y - 30))
     assert change(with_points, page.picture("view-dragged")) > 0.01
-    moved = np.abs(np.array(page.do("() => panel.curves")) - start).max(axis=(0, 2))
+    moved = np.abs(np.array(page.do("() => panel.curveEditor.curves")) - start).max(axis=(0, 2))
     assert (moved > 1e-3).sum() == 1
     page.press("Undo")
     page.rest()
-    assert page.do("() => panel.curves") == start
+    assert page.do("() => panel.curveEditor.curves") == start
     page.press("Redo")
     page.rest()
-    assert page.do("() => panel.curves") != start
+    assert page.do("() => panel.curveEditor.curves") != start
     page.tab.keyboard.press("Control+z")
     (xa, ya), (xb, yb) = screen_of(page, 0, 5), screen_of(page, 0, 6)
     page.tab.mouse.dblclick(0.5 * (xa + xb), 0.5 * (ya + yb))
     page.rest()
-    assert len(page.do("() => panel.curves")[0]) == len(LOOP) + 1
+    assert len(page.do("() => panel.curveEditor.curves")[0]) == len(LOOP) + 1
     page.do("() => panel.root.querySelector('canvas').focus()")
     page.tab.keyboard.press("Delete")
     page.rest()
-    assert len(page.do("() => panel.curves")[0]) == len(LOOP)
+    assert len(page.do("() => panel.curveEditor.curves")[0]) == len(LOOP)
     page.press("Smooth")
     page.rest()
-    assert np.ptp(page.do("() => panel.curves")[0]) < np.ptp(start[0])
+    assert np.ptp(page.do("() => panel.curveEditor.curves")[0]) < np.ptp(start[0])
     assert page.message == ""
 
 
@@ -208,7 +208,7 @@ def test_a_cut_by_ball_box_and_plane(page: Page) -> None:
         assert change(whole, page.picture(f"view-{kind}")) > 0.005, kind
     page.set("offset", 0.9)
     page.rest()
-    assert page.do("() => panel.cut().plane[3]") != 0
+    assert page.do("() => panel.cutVolume.plane[3]") != 0
 
 
 def test_a_scene_is_saved_and_opened_again(page: Page, tmp_path: Path) -> None:
@@ -217,7 +217,7 @@ def test_a_scene_is_saved_and_opened_again(page: Page, tmp_path: Path) -> None:
     page.drag((100, 100), (160, 130))
     before = page.picture()
     with page.tab.expect_download() as waiting:
-        page.do("() => { panel.save_scene(); }")
+        page.do("() => { panel.saveScene(); }")
     path = tmp_path / "scene.json"
     waiting.value.save_as(path)
     saved = hk.read_scene(path)
@@ -228,7 +228,7 @@ def test_a_scene_is_saved_and_opened_again(page: Page, tmp_path: Path) -> None:
     page.press("Reset view")
     page.rest()
     page.tab.locator("input[name=scene]").set_input_files(path)
-    page.tab.wait_for_function("() => panel.values.level === 4")
+    page.tab.wait_for_function("() => panel.sliderValues.level === 4")
     # The floor, and what is seen of it, stands where the surface does at the saved level.
     opened = page.picture("view-opened")
     much = (np.abs(before.astype(int) - opened.astype(int)).max(axis=2) > 60).mean()
@@ -253,11 +253,11 @@ def test_two_windows_and_a_hundred_connections(browser: Any, view: hk.live.LiveV
     pictures = [one.picture() for one in pages]
     assert change(*pictures) > 0.02  # each has its own
     script = """async () => {
-      await panel.link.ask("change", {});
+      await panel.channel.request("change", {});
       for (let k = 0; k < 100; k++) {
-        panel.link.socket.close();
-        await new Promise((done) => panel.link.socket.addEventListener("close", done));
-        await panel.link.ask("change", { sliders: { level: 2 + k / 20 } });
+        panel.channel.socket.close();
+        await new Promise((done) => panel.channel.socket.addEventListener("close", done));
+        await panel.channel.request("change", { sliders: { level: 2 + k / 20 } });
       }
     }"""
     pages[1].do(script)
@@ -278,7 +278,7 @@ def count(view: hk.live.LiveView) -> int:
 def test_messages_that_make_no_sense_are_answered_and_harm_nobody(page: Page) -> None:
     right = page.picture()
     answers = page.do("""async () => {
-      const socket = new WebSocket(panel.link.address);
+      const socket = new WebSocket(panel.channel.address);
       await new Promise((done) => { socket.onopen = done; });
       const answers = [];
       const wrong = ["", "[", "[]", "{}", '{"id": -1}', '{"id": 1e99, "kind": "draw"}',
@@ -303,7 +303,7 @@ def test_messages_that_make_no_sense_are_answered_and_harm_nobody(page: Page) ->
 
 def test_a_tab_that_is_closed_ends_its_work(browser: Any, view: hk.live.LiveView) -> None:
     page = Page(browser, view.address, SIZE, samples=1)
-    page.do("() => { panel.picture(4000, 'color').catch(() => {}); }")
+    page.do("() => { panel.fetchPicture(4000, 'color').catch(() => {}); }")
     page.tab.wait_for_function("() => panel.root.querySelector('progress')?.value > 0")
     page.close()
     page = Page(browser, view.address, SIZE, samples=1)
@@ -349,7 +349,7 @@ def test_a_device_that_lies_is_not_believed(browser: Any, view: hk.live.LiveView
               const lie = ` = 1.001f * ${a} * ${b};`;
               one.code = one.code.slice(0, index) + lie + one.code.slice(index + text.length);
               one.key = `lie ${place}`;
-              return await panel.drawing.set(state);
+              return await panel.renderer.setState(state);
             }""",
             float(place),
         )
@@ -365,10 +365,12 @@ def test_a_change_during_a_check_neither_accuses_the_device_nor_is_lost(page: Pa
     """The data that was checked was freed under the check."""
     page.rest()
     found = page.do("""async () => {
-      const { drawing } = panel;
+      const { renderer } = panel;
       const later = structuredClone(panel.scene.state);
-      const wrong = await Promise.all([drawing.set(panel.scene.state), drawing.set(later, false)]);
-      return [...wrong, drawing.surfaces[0].given === later.surfaces[0]];
+      const wrong = await Promise.all([
+        renderer.setState(panel.scene.state), renderer.setState(later, false),
+      ]);
+      return [...wrong, renderer.surfaces[0].source === later.surfaces[0]];
     }""")
     assert found == ["", "", True]
 

@@ -154,6 +154,6 @@ def test_a_widget_is_moved_and_moves(widget: Any, tmp_path: Path) -> None:
         page.do("() => model.move('sliders', { level: 9 })")
         moved = page.picture("widget-moved")
         assert (np.abs(before.astype(int) - moved).max(axis=2) > 12).mean() > 0.02
-        assert page.do("() => panel.values.level") == 9
+        assert page.do("() => panel.sliderValues.level") == 9
         assert page.message == ""
         page.close()

@@ -67,7 +67,10 @@ class CheckpointFolder:
         Raises:
             OSError: it cannot be created, or no file can be created in it.
         """
-        folder = Path(path)
+        try:
+            folder = Path(path)
+        except TypeError:
+            raise TypeError(f"checkpoint must be the path of a folder, not {path!r:.60}") from None
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except FileExistsError:
@@ -167,10 +170,10 @@ class Executor:
 
 @contextmanager
 def open_executor(
-    client: Any = None, checkpoint: Any = None, tiles: int | None = None
+    client: Any = None, checkpoint: Any = None, chunks: int | None = None
 ) -> Generator[Executor]:
     """Context manager that yields an Executor. client: a Dask client, the address of a scheduler,
-    or None for this process. checkpoint: the path of a folder, or None. tiles: the number of tasks
+    or None for this process. checkpoint: the path of a folder, or None. chunks: the number of tasks
     of a job, or None.
 
     Raises:
@@ -182,7 +185,7 @@ def open_executor(
         import_optional("cloudpickle", "checkpoint")
         folder = CheckpointFolder.open(checkpoint)
     with connect_client(client) as dask_client:
-        yield Executor(dask_client, folder, tiles)
+        yield Executor(dask_client, folder, chunks)
 
 
 class _LocalTasks:

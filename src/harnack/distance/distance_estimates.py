@@ -23,8 +23,7 @@ from harnack.name_suggestions import did_you_mean, is_one_of
 from harnack.progress import teller
 from harnack.tracer import TracedSurface, TraceOptions
 from harnack.tracer.surface import intersection_of
-from harnack.tracer.trace_options import TRACE_OPTIONS, shows_keywords, surface_and_options
-from harnack.tracer.traced_surface import check_is_open
+from harnack.tracer.trace_options import shows_keywords, surface_and_options
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -35,15 +34,13 @@ if TYPE_CHECKING:
 __all__ = ["DistanceBounds", "Method", "closest_points", "distance_bounds", "signed_distance"]
 
 Method = Literal["first_order", "second_order", "closest_point", "lower_bound"]
-_NOT_OF_DISTANCES = (
-    "side", "largest", *(name for name in TRACE_OPTIONS if name != "precision"),
-)  # fmt: skip
+_HONORED = ("level", "clip", "section", "precision")
 # As close as rounding allows: the tracer raises it to that.
 _CLOSE = 1e-15
 
 
 @accepts_dask_arrays("points")
-@shows_keywords(*_NOT_OF_DISTANCES)
+@shows_keywords(*_HONORED)
 @no_derivatives
 def signed_distance(
     surface: Field | Surface,
@@ -117,7 +114,7 @@ def signed_distance(
 
 
 @accepts_dask_arrays("points")
-@shows_keywords(*_NOT_OF_DISTANCES)
+@shows_keywords(*_HONORED)
 @no_derivatives
 def closest_points(
     surface: Field | Surface,
@@ -161,7 +158,7 @@ class DistanceBounds:
 
 
 @accepts_dask_arrays("points")
-@shows_keywords(*_NOT_OF_DISTANCES)
+@shows_keywords(*_HONORED)
 @no_derivatives
 def distance_bounds(
     surface: Field | Surface,
@@ -230,11 +227,7 @@ def _surface(
         TypeError, ValueError: as `surface_and_options`; an option that distances do not have.
         NotImplementedError: a field with jumps whose distance is not known.
     """
-    target, choices = surface_and_options(verb, surface, options, keywords)
-    choices.refuse_others(verb, "precision")
-    check_is_open(verb, target)
-    if target.largest:
-        raise TypeError(f"{verb} has no largest: mesh the component, and take the mesh's distance")
+    target, choices = surface_and_options(verb, surface, options, keywords, _HONORED)
     field = target.field
     if field.has_jumps and type(field).distance_to_jumps is Field.distance_to_jumps:
         raise NotImplementedError(

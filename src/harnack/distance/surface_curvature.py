@@ -18,8 +18,7 @@ from harnack.backend.validation import as_positive, no_derivatives
 from harnack.distance.tangent_plane import SymmetricEigen2, TangentPlane, in_batches
 from harnack.fields.batched_fields import BatchedField
 from harnack.name_suggestions import did_you_mean, is_one_of
-from harnack.tracer.trace_options import TRACE_OPTIONS, shows_keywords, surface_and_options
-from harnack.tracer.traced_surface import check_is_open
+from harnack.tracer.trace_options import shows_keywords, surface_and_options
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -31,9 +30,7 @@ if TYPE_CHECKING:
 
 __all__ = ["CurvatureSamples", "Family", "curvature", "curvature_lines"]
 
-_NOT_OF_CURVATURE = (
-    "side", "largest", *(name for name in TRACE_OPTIONS if name != "precision"),
-)  # fmt: skip
+_HONORED_BY_LINES = ("level", "clip", "section", "precision")
 # The error of a mean curvature that is good enough: this share of it, or of one over the size of
 # the surface where that is more.
 _ACCURACY = 1e-3
@@ -67,7 +64,7 @@ class CurvatureSamples:
     gaussian_error: FloatArray
 
 
-@shows_keywords(*_NOT_OF_CURVATURE, "level", "clip", "section")
+@shows_keywords("precision")
 @no_derivatives
 def curvature(
     surface: Field | Surface,
@@ -100,11 +97,8 @@ def curvature(
         NotImplementedError: the field has no second derivatives.
         TypeError, ValueError: points that are not an (n, 3) array of finite numbers.
     """
-    for name in ("level", "clip", "section"):
-        if name in keywords:
-            raise TypeError(f"curvature has no {name}: it is that of the level set through a point")
-    target, backend = _field_and_backend("curvature", surface, options, keywords)
-    field = target.field
+    target, choices = surface_and_options("curvature", surface, options, keywords, ("precision",))
+    field, backend = target.field, choose_backend(choices.precision or "double")
     if not isinstance(field, BatchedField):
         prepared = field.prepare(backend)
 
@@ -126,22 +120,6 @@ def curvature(
         return found.curvatures()
 
     return _refine_accuracy(backend, field, by_tree, points, True)
-
-
-def _field_and_backend(
-    verb: str, surface: Field | Surface, options: TraceOptions | None, keywords: TraceKeywords
-) -> tuple[Surface, Backend]:
-    """The surface of a call, and the backend to compute on.
-
-    Raises:
-        TypeError, ValueError: as `surface_and_options`; an option that curvatures do not have.
-    """
-    target, choices = surface_and_options(verb, surface, options, keywords)
-    choices.refuse_others(verb, "precision")
-    check_is_open(verb, target)
-    if target.largest:
-        raise TypeError(f"{verb} has no largest: take points on the component, such as hits")
-    return target, choose_backend(choices.precision or "double")
 
 
 def _refine_accuracy(
@@ -282,7 +260,7 @@ _MIN_STEP_COSINE, _MAX_STEP_PER_RADIUS = math.cos(math.radians(40)), 0.5
 _MOST_STEPS = 100_000
 
 
-@shows_keywords(*_NOT_OF_CURVATURE)
+@shows_keywords(*_HONORED_BY_LINES)
 @no_derivatives
 def curvature_lines(
     surface: Field | Surface,
@@ -323,7 +301,10 @@ def curvature_lines(
         TypeError, ValueError: seeds that are not an (n, 3) array of finite numbers; a step or
             length that is not positive; an unknown family.
     """
-    target, backend = _field_and_backend("curvature_lines", surface, options, keywords)
+    target, choices = surface_and_options(
+        "curvature_lines", surface, options, keywords, _HONORED_BY_LINES
+    )
+    backend = choose_backend(choices.precision or "double")
     field, levels = target.field, list(target.level_values)
     if len(levels) > 1:
         raise ValueError(f"lines of curvature are of one level, not of {len(levels)}")

@@ -327,8 +327,8 @@ def is_jet(x: Any, name: str) -> bool:
     """
     if isinstance(x, FormulaNumber) and not isinstance(x, Jet):
         raise TypeError(
-            f"{name} gives ranges of derivatives alone, and the enclosures asked for are made of others: "
-            'leave enclosures out, or use "pieces", "quadratic-taylor", "linear-taylor" or '
+            f"{name} gives ranges of derivatives alone, and the enclosures asked for are made of "
+            'others: leave enclosures out, or use "pieces", "quadratic-taylor", "linear-taylor" or '
             '"segment"'
         )
     return isinstance(x, Jet)

@@ -1,21 +1,25 @@
-// A camera that turns about a point before it, on a stage whose z axis points up.
+// The camera of the viewer: it turns about a target, on a stage whose z axis points up, and follows
+// mouse, touch and keys.
 // @ts-check
 
 /** @typedef {[number, number, number]} Point */
-/** @typedef {{target: number[], azimuth: number, elevation: number, distance: number, fov: number}} Pose */
+/** Angles are in degrees.
+ *  @typedef {{target: number[], azimuth: number, elevation: number, distance: number, fov: number}} Pose */
 
-/** @param {number[]} a @param {number[]} b */
+/** The scalar product of two vectors. @param {number[]} a @param {number[]} b */
 export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-/** a + s b @param {number[]} a @param {number} s @param {number[]} b */
-export const add_scaled = (a, s, b) => a.map((x, k) => x + s * b[k]);
-/** @param {number[]} a @param {number[]} b */
-const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+/** The vector a + s b. @param {number[]} a @param {number} s @param {number[]} b */
+export const addScaled = (a, s, b) => a.map((x, k) => x + s * b[k]);
+/** The vector product of two vectors. @param {number[]} a @param {number[]} b */
+export const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 const RADIANS = Math.PI / 180;
+// The aspect ratio of a picture that fits into every window.
+const ASPECT_RATIO = 4 / 3;
 
 export class Camera {
   /** @param {Pose} pose */
   constructor(pose) {
-    this.home = pose;
+    this.initialPose = pose;
     this.target = pose.target;
     this.azimuth = pose.azimuth;
     this.elevation = pose.elevation;
@@ -24,128 +28,164 @@ export class Camera {
     this.roll = 0;
   }
 
-  /** As it was at first. */
-  reset() { Object.assign(this, this.home, { roll: 0 }); }
+  /** Returns to the initial pose. */
+  reset() { Object.assign(this, this.initialPose, { roll: 0 }); }
 
-  /** Stands somewhere and looks at something, upright. @param {number[]} eye
-   *  @param {number[]} target @param {number} fov */
-  look_at(eye, target, fov) {
-    const back = add_scaled(eye, -1, target);
-    const distance = Math.hypot(...back);
+  /** Moves the camera to a position, upright and facing a target.
+   *  @param {number[]} position @param {number[]} target @param {number} fov */
+  lookAt(position, target, fov) {
+    const backward = addScaled(position, -1, target);
+    const distance = Math.hypot(...backward);
     if (!(distance > 0) || !(fov > 0 && fov < 180)) return;
     Object.assign(this, {
-      target, fov, distance, roll: 0, elevation: Math.asin(back[2] / distance) / RADIANS,
+      target, fov, distance, roll: 0, elevation: Math.asin(backward[2] / distance) / RADIANS,
     });
-    if (Math.hypot(back[0], back[1]) > 1e-9 * distance)
-      this.azimuth = Math.atan2(back[1], back[0]) / RADIANS;
+    // Straight above or below the target, the azimuth is undefined and stays as it is.
+    if (Math.hypot(backward[0], backward[1]) > 1e-9 * distance)
+      this.azimuth = Math.atan2(backward[1], backward[0]) / RADIANS;
   }
 
   /** Unit vectors to the right, upwards and forwards. */
-  axes() {
+  get axes() {
     const [a, e, r] = [this.azimuth, this.elevation, this.roll].map((x) => x * RADIANS);
-    const back = [Math.cos(e) * Math.cos(a), Math.cos(e) * Math.sin(a), Math.sin(e)];
-    const level = [-Math.sin(a), Math.cos(a), 0];
-    const upright = cross(back, level);
-    const right = level.map((x, k) => Math.cos(r) * x + Math.sin(r) * upright[k]);
-    const up = upright.map((x, k) => Math.cos(r) * x - Math.sin(r) * level[k]);
-    return { right, up, forward: back.map((x) => -x) };
+    const backward = [Math.cos(e) * Math.cos(a), Math.cos(e) * Math.sin(a), Math.sin(e)];
+    const horizontal = [-Math.sin(a), Math.cos(a), 0];
+    const upright = cross(backward, horizontal);
+    const right = horizontal.map((x, k) => Math.cos(r) * x + Math.sin(r) * upright[k]);
+    const up = upright.map((x, k) => Math.cos(r) * x - Math.sin(r) * horizontal[k]);
+    return { right, up, forward: backward.map((x) => -x) };
   }
 
-  eye() { return add_scaled(this.target, -this.distance, this.axes().forward); }
+  /** The position of the camera on the stage. */
+  get position() { return addScaled(this.target, -this.distance, this.axes.forward); }
 
-  /** How wide a pixel is at distance 1. A picture of 4 : 3 fits into every window.
+  /** The width of a pixel at distance 1, in a picture of this size.
    *  @param {number} width @param {number} height */
-  pixel(width, height) {
-    return (2 * Math.tan(0.5 * this.fov * RADIANS)) / Math.min(width, (4 / 3) * height);
+  pixelSize(width, height) {
+    return (2 * Math.tan(0.5 * this.fov * RADIANS)) / Math.min(width, ASPECT_RATIO * height);
   }
 
-  /** Where a point is in a picture, in pixels, and how far before the eye.
+  /** Projects a point into a picture: x and y are in pixels, z is the depth along the camera's axis.
    *  @param {number[]} point @param {number} width @param {number} height */
   project(point, width, height) {
-    const { right, up, forward } = this.axes();
-    const direction = add_scaled(point, -1, this.eye());
+    const { right, up, forward } = this.axes;
+    const direction = addScaled(point, -1, this.position);
     const z = dot(direction, forward);
-    const pixel = z * this.pixel(width, height);
-    return { x: 0.5 * width + dot(direction, right) / pixel, y: 0.5 * height - dot(direction, up) / pixel, z };
+    const pixelSize = z * this.pixelSize(width, height);
+    return {
+      x: 0.5 * width + dot(direction, right) / pixelSize,
+      y: 0.5 * height - dot(direction, up) / pixelSize,
+      z,
+    };
   }
 
-  /** How far a point moves with a pointer, in the plane that faces the eye. @param {number} z
-   *  before the eye @param {number} x @param {number} y pixels @param {number} width
-   *  @param {number} height */
-  drag_offset(z, x, y, width, height) {
-    const { right, up } = this.axes();
-    const pixel = z * this.pixel(width, height);
-    return right.map((r, k) => pixel * (x * r - y * up[k]));
+  /** The displacement on the stage that follows a pointer, in the plane parallel to the picture.
+   *  @param {number} z the depth of the plane @param {number} x @param {number} y pixels by which
+   *  the pointer moves @param {number} width @param {number} height */
+  dragOffset(z, x, y, width, height) {
+    const { right, up } = this.axes;
+    const pixelSize = z * this.pixelSize(width, height);
+    return right.map((r, k) => pixelSize * (x * r - y * up[k]));
   }
 
-  /** Degrees. @param {number} azimuth @param {number} elevation */
+  /** Turns the camera about the target, by angles in degrees.
+   *  @param {number} azimuth @param {number} elevation */
   orbit(azimuth, elevation) {
     const [c, s] = [Math.cos(this.roll * RADIANS), Math.sin(this.roll * RADIANS)];
     this.azimuth += c * azimuth - s * elevation;
     this.elevation = Math.max(-90, Math.min(90, this.elevation + s * azimuth + c * elevation));
   }
 
-  /** Pixels. @param {number} x @param {number} y @param {number} width @param {number} height */
+  /** Moves the target with a pointer. @param {number} x @param {number} y in pixels
+   *  @param {number} width @param {number} height */
   pan(x, y, width, height) {
-    this.target = add_scaled(this.target, -1, this.drag_offset(this.distance, x, y, width, height));
+    this.target = addScaled(this.target, -1, this.dragOffset(this.distance, x, y, width, height));
   }
 
-  /** @param {number} factor */
+  /** Divides the distance from the target by a factor, within limits. @param {number} factor */
   zoom(factor) {
-    const { distance } = this.home;
+    const { distance } = this.initialPose;
     this.distance = Math.max(distance / 200, Math.min(20 * distance, this.distance / factor));
   }
 
-  /** Degrees. @param {number} angle */
-  roll_by(angle) { this.roll += angle; }
+  /** Turns the camera about its axis. @param {number} angle in degrees */
+  rollBy(angle) { this.roll += angle; }
 
-  /** Mouse, touch and keys on an element. @param {HTMLElement} element @param {() => void} changed
-   *  @param {(e: PointerEvent) => boolean} [is_taken] whether a pointer does something else */
-  listen(element, changed, is_taken = () => false) {
-    /** @type {Map<number, PointerEvent>} */
-    const down = new Map();
-    element.addEventListener("pointerdown", (e) => {
-      if (is_taken(e)) return;
-      element.setPointerCapture(e.pointerId);
-      down.set(e.pointerId, e);
+  /** Lets the camera follow mouse, touch and keys on an element.
+   *  @param {HTMLElement} element @param {() => void} onChange called when the camera has moved
+   *  @param {(event: PointerEvent) => boolean} [isTaken] whether a pressed pointer serves another
+   *  purpose */
+  listen(element, onChange, isTaken = () => false) {
+    this.listenToPointers(element, onChange, isTaken);
+    this.listenToWheel(element, onChange);
+    this.listenToKeys(element, onChange);
+  }
+
+  /** @param {HTMLElement} element @param {() => void} onChange
+   *  @param {(event: PointerEvent) => boolean} isTaken */
+  listenToPointers(element, onChange, isTaken) {
+    /** The last event of each pressed pointer. @type {Map<number, PointerEvent>} */
+    const pressedPointers = new Map();
+    element.addEventListener("pointerdown", (event) => {
+      if (isTaken(event)) return;
+      element.setPointerCapture(event.pointerId);
+      pressedPointers.set(event.pointerId, event);
     });
     for (const name of ["pointerup", "pointercancel"])
-      element.addEventListener(name, (e) => down.delete(/** @type {PointerEvent} */ (e).pointerId));
-    element.addEventListener("pointermove", (e) => {
-      const before = down.get(e.pointerId);
-      if (!before) return;
-      const [x, y] = [e.clientX - before.clientX, e.clientY - before.clientY];
-      const [width, height] = [element.clientWidth, element.clientHeight];
-      const other = [...down.values()].find((one) => one.pointerId !== e.pointerId);
-      if (other) {
-        const [now, was] = [e, before].map((one) => [one.clientX - other.clientX, one.clientY - other.clientY]);
-        this.zoom(Math.hypot(now[0], now[1]) / Math.max(Math.hypot(was[0], was[1]), 1));
-        this.roll_by((Math.atan2(now[1], now[0]) - Math.atan2(was[1], was[0])) / RADIANS);
-        this.pan(0.5 * x, 0.5 * y, width, height);
-      } else if (e.shiftKey || before.button === 2) this.pan(x, y, width, height);
-      else this.orbit((-220 * x) / Math.min(width, height), (220 * y) / Math.min(width, height));
-      down.set(e.pointerId, Object.assign(e, { first: before }));
-      changed();
+      element.addEventListener(name, (event) =>
+        pressedPointers.delete(/** @type {PointerEvent} */ (event).pointerId));
+    element.addEventListener("pointermove", (event) => {
+      const previous = pressedPointers.get(event.pointerId);
+      if (!previous) return;
+      const secondPointer = [...pressedPointers.values()].find(({ pointerId }) => pointerId !== event.pointerId);
+      this.followPointer(element, previous, event, secondPointer);
+      pressedPointers.set(event.pointerId, event);
+      onChange();
     });
-    element.addEventListener("contextmenu", (e) => e.preventDefault());
-    element.addEventListener("wheel", (e) => {
-      e.preventDefault();
-      this.zoom(Math.exp(-0.0015 * e.deltaY));
-      changed();
+    element.addEventListener("contextmenu", (event) => event.preventDefault());
+  }
+
+  /** Moves the camera as a pointer has moved. Two pointers zoom, roll and pan it; a single one pans
+   *  it with the shift key or the right button, and turns it otherwise.
+   *  @param {HTMLElement} element @param {PointerEvent} previous @param {PointerEvent} current
+   *  @param {PointerEvent | undefined} secondPointer */
+  followPointer(element, previous, current, secondPointer) {
+    const [x, y] = [current.clientX - previous.clientX, current.clientY - previous.clientY];
+    const [width, height] = [element.clientWidth, element.clientHeight];
+    if (secondPointer) {
+      const [after, before] = [current, previous].map(({ clientX, clientY }) =>
+        [clientX - secondPointer.clientX, clientY - secondPointer.clientY]);
+      this.zoom(Math.hypot(after[0], after[1]) / Math.max(Math.hypot(before[0], before[1]), 1));
+      this.rollBy((Math.atan2(after[1], after[0]) - Math.atan2(before[1], before[0])) / RADIANS);
+      this.pan(0.5 * x, 0.5 * y, width, height);
+    } else if (current.shiftKey || (current.buttons & 2) !== 0) this.pan(x, y, width, height);
+    else this.orbit((-220 * x) / Math.min(width, height), (220 * y) / Math.min(width, height));
+  }
+
+  /** @param {HTMLElement} element @param {() => void} onChange */
+  listenToWheel(element, onChange) {
+    element.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      this.zoom(Math.exp(-0.0015 * event.deltaY));
+      onChange();
     }, { passive: false });
-    element.addEventListener("keydown", (e) => {
-      if (e.ctrlKey || e.metaKey || e.altKey) return;
-      /** @type {Record<string, () => void>} */
-      const moves = {
-        ArrowLeft: () => this.orbit(-5, 0), ArrowRight: () => this.orbit(5, 0),
-        ArrowUp: () => this.orbit(0, 5), ArrowDown: () => this.orbit(0, -5),
-        "+": () => this.zoom(1.1), "=": () => this.zoom(1.1), "-": () => this.zoom(1 / 1.1),
-        "[": () => this.roll_by(-5), "]": () => this.roll_by(5), Home: () => this.reset(),
-      };
-      if (!moves[e.key]) return;
-      e.preventDefault();
-      moves[e.key]();
-      changed();
+  }
+
+  /** @param {HTMLElement} element @param {() => void} onChange */
+  listenToKeys(element, onChange) {
+    /** @type {Record<string, () => void>} */
+    const actions = {
+      ArrowLeft: () => this.orbit(-5, 0), ArrowRight: () => this.orbit(5, 0),
+      ArrowUp: () => this.orbit(0, 5), ArrowDown: () => this.orbit(0, -5),
+      "+": () => this.zoom(1.1), "=": () => this.zoom(1.1), "-": () => this.zoom(1 / 1.1),
+      "[": () => this.rollBy(-5), "]": () => this.rollBy(5), Home: () => this.reset(),
+    };
+    element.addEventListener("keydown", (event) => {
+      if (event.ctrlKey || event.metaKey || event.altKey) return;
+      if (!actions[event.key]) return;
+      event.preventDefault();
+      actions[event.key]();
+      onChange();
     });
   }
 }

@@ -1,6 +1,6 @@
 """Live scenes: surfaces on the studio's stage, each as a kernel for other GPUs with its data.
 
-Everything here is plain: numbers, lists and text, as `drawing.js` takes it.
+Everything here is plain: numbers, lists and text, as `renderer.js` takes it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from harnack.rendering.camera import Camera
 from harnack.rendering.framing import NothingVisibleError, bounding_box, visible_points
 from harnack.rendering.isolines import parse_isolines
 from harnack.rendering.mitsuba_plugins import register
-from harnack.rendering.option_table import names_of, refuse_unknown, shorthand_among
+from harnack.rendering.option_table import names_of, refuse_others, refuse_unknown, shorthand_among
 from harnack.rendering.placed_surface import PlacedSurface
 from harnack.rendering.render_options import check_camera
 from harnack.rendering.scales import linear_from_srgb
@@ -76,7 +76,7 @@ _NO_OUTPUT = 99
 # Paints of a surface: the first is its own, then those of what spans what a mesh leaves open and of
 # faces on a section, then those of isolines.
 _MENDED, _CUT = 1, 2
-# `PAINTS` in drawing.js.
+# `MAX_SURFACE_COLORS` in renderer.js.
 _MOST_PAINTS = 2048
 _OF_STUDIO = ("boundary_radius", "boundary_material", "section_material", "thickness")
 # Of gzip: more takes longer, and gains little.
@@ -149,12 +149,7 @@ class LiveScene:
             TypeError, ValueError: as `render` does; also for a transparent material, a `show` that
             is not in `LIVE_MODES`, and a backdrop that is not "light" or "dark".
         """
-        still = [name for name in given if name in STILL_OPTIONS]
-        if still:
-            raise TypeError(
-                f"{', '.join(still)}: for still pictures only, as `harnack.render` draws them; "
-                "pages and views have no such option"
-            )
+        refuse_others("view", given)
         given = with_flat_options(given)
         camera, backdrop, up, show = (given.pop(name, None) for name in _STAGE_OPTIONS)
         show = "shaded" if show is None else show
@@ -208,7 +203,7 @@ class LiveScene:
         return tuple(_rays(self.placement.apply(one)) for one in self.points)
 
     def scene(self, title: str) -> JsonDict:
-        """All that a page is given when it opens, as plain data for `drawing.js`."""
+        """All that a page is given when it opens, as plain data for `renderer.js`."""
         place, points = self.placement, np.concatenate(self.points)
         _, settings = self._at(self.initial_controls)
         material = settings.get("material")
@@ -573,8 +568,8 @@ def _reflectances(bsdf: Mapping[str, Any]) -> tuple[Any, Any, bool]:
 
 
 def encode_arrays(value: Any) -> Any:
-    """Replace arrays of 32-bit words by text, which `words` in drawing.js reads: base64 of gzip
-    data. The tables of meshes are repetitive, and shrink to a tenth."""
+    """Replace arrays of 32-bit words by text, which `decodeWords` in renderer.js reads: base64 of
+    gzip data. The tables of meshes are repetitive, and shrink to a tenth."""
     if isinstance(value, np.ndarray):
         return base64.b64encode(gzip.compress(value.tobytes(), _LEVEL, mtime=0)).decode()
     if isinstance(value, dict):
@@ -586,7 +581,8 @@ def encode_arrays(value: Any) -> Any:
 
 def state_delta(first: JsonDict, state: JsonDict, *, checks: bool = True) -> JsonDict:
     """Difference between a state and the initial one: changed data words per surface and all other
-    changed entries; or the whole state if its kernels differ. Inverse: `changed` in frames.js.
+    changed entries; or the whole state if its kernels differ. Inverse: `applyDelta` in
+    slider_states.js.
 
     checks: whether check rays with their answers are included. With other kernels they always are,
         as no device has checked these yet.

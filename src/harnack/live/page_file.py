@@ -23,12 +23,13 @@ import numpy as np
 from harnack.cluster.executor import Executor, TaskResult, open_executor
 from harnack.files.file_geometry import write_atomically
 from harnack.live.live_scene import ControlState, LiveScene, encode_arrays, state_delta
+from harnack.live.scene_file import with_flat_options
 from harnack.live.sliders import slider_values_in_errors
 from harnack.progress import progress_bar
 from harnack.rendering.camera import Camera
 from harnack.rendering.mitsuba import set_variant
 from harnack.rendering.mitsuba_plugins import register
-from harnack.rendering.option_table import shows_options
+from harnack.rendering.option_table import refuse_others, shows_options
 
 if TYPE_CHECKING:
     from harnack.live.live_scene import JsonDict
@@ -45,12 +46,13 @@ _FRAMED = 100
 # one slider and of each of several; bytes of a page that are many.
 _TARGET_BYTES, _FEWEST, _MANY_BYTES = 4e6, (9, 5), 8e6
 MODULES = (
-    "camera.js", "drawing.js", "elements.js", "frames.js", "legend.js", "link.js", "panel.js",
+    "camera.js", "channels.js", "curve_editor.js", "device_check.js", "dom.js", "floor_light.js",
+    "legend.js", "panel.js", "placement.js", "renderer.js", "slider_states.js",
 )  # fmt: skip
 # What brings other states: those in the page, or Python's answers.
 _CHANNEL_SCRIPTS = {
-    "frames": "scene.sliders.length ? new Frames(scene.frames) : null",
-    "server": "new Server(`ws://${location.host}/questions${location.search}`)",
+    "frames": "scene.sliders.length ? new SliderStates(scene.frames) : null",
+    "server": "new WebSocketChannel(`ws://${location.host}/questions${location.search}`)",
 }
 
 
@@ -95,13 +97,14 @@ def page(
         TypeError: what is no field; an unknown setting; a slider that nothing depends on.
     """
     target = os.fspath(path)
-    settings = dict(keywords)
+    settings = with_flat_options({**keywords, "options": options})
+    refuse_others("page", settings)
     title, progress = settings.pop("title", ""), settings.pop("progress", True)
     client, checkpoint = settings.pop("client", None), settings.pop("checkpoint", None)
     check_title(title)
     if not target.lower().endswith((".html", ".htm")):
         raise ValueError(f"{target}: a page is written as .html")
-    job = PageJob(surfaces, {**settings, "options": options}, register().variant())
+    job = PageJob(surfaces, settings, register().variant())
     with progress_bar("page", progress) as advance:
         live = job.live
         scene = live.scene(title or live.content.name)

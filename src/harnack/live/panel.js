@@ -1,856 +1,796 @@
-// The window: a canvas, what is said of it, and the controls beside it.
+// The window of the viewer: a canvas, a message, a legend and the controls beside them. It gets
+// states from Python or from the page, and pictures from the renderer of the browser or from Python.
 // @ts-check
 
-import { Camera, add_scaled, dot } from "./camera.js";
-import { Drawing, FRAME_TIME, SHOWS } from "./drawing.js";
-import { element, format } from "./elements.js";
-import { changed } from "./frames.js";
-import { legend_of } from "./legend.js";
+import { Camera, addScaled, dot } from "./camera.js";
+import { CurveEditor } from "./curve_editor.js";
+import {
+  createButton, createCheckbox, createElement, createOptions, createRangeInput, download,
+  downloadBlob, formatNumber,
+} from "./dom.js";
+import { createLegend } from "./legend.js";
+import { Placement } from "./placement.js";
+import { MODES, WebGpuRenderer, adaptScale } from "./renderer.js";
+import { applyDelta } from "./slider_states.js";
 
-/** @import {Marks, Scene, Slider} from "./drawing.js" */
-/** @import {Change} from "./frames.js" */
-/** What brings other states, and in a view with Python behind it what else can be asked for.
- * @typedef {{
- *   change(wanted: {sliders: Record<string, number>, loops: number[][][] | null, cut: Cut | null,
- *     settings: Settings, checks: boolean}): Promise<Change>,
- *   ask?(kind: string, given: object, on_progress?: (done: number, stop: () => void) => void): Promise<any>,
- * }} Link */
-/** Settings of `harnack.render` that are changed here: see `CONTROLLED` in harnack.live.live_scene.
- * @typedef {{material?: string, boundary?: number | null}} Settings */
+/** @import {Curves} from "./curve_editor.js" */
+/** @import {Marks, Scene, Slider} from "./renderer.js" */
+/** @import {StateDelta} from "./slider_states.js" */
+/** Options of `harnack.render` that the controls change: see `LIVE_OPTIONS` in
+ *  harnack.live.live_scene. @typedef {{material?: string, boundary_radius?: number | null}} RenderOptions */
 /** A volume that cuts all surfaces: see `harnack.live.session`.
- * @typedef {{ball?: number[], box?: number[], plane?: number[]}} Cut */
+ * @typedef {{ball?: number[], box?: number[], plane?: number[]}} CutVolume */
+/** The state of the controls, as Python takes it.
+ * @typedef {{sliders: Record<string, number>, loops: Curves | null, cut: CutVolume | null,
+ *            settings: RenderOptions}} ControlValues */
+/** The source of states. A channel to Python answers further requests, too.
+ * @typedef {{
+ *   fetchDelta(controlValues: ControlValues & {checks: boolean}): Promise<StateDelta>,
+ *   request?(kind: string, parameters: object,
+ *     onProgress?: (completed: number, cancel: () => void) => void): Promise<any>,
+ * }} Channel */
 
-const GROUNDS = { light: [0.74, 0.73, 0.715], dark: [0.055, 0.058, 0.065] };
-// What cuts the surfaces, and the numbers of it: from, to, at first.
-/** @type {Record<string, Record<string, number[]>>} */
-const CUTS = {
+const GROUND_REFLECTANCES = { light: [0.74, 0.73, 0.715], dark: [0.055, 0.058, 0.065] };
+/** The parameters of the volumes that cut the surfaces: least, greatest and first value.
+ *  @type {Record<string, Record<string, number[]>>} */
+const CUT_PARAMETERS = {
   none: {},
   ball: { size: [0.02, 1.05, 0.8] },
   box: { "size x": [0.02, 1.05, 0.6], "size y": [0.02, 1.05, 0.6], "size z": [0.02, 1.05, 0.6] },
   plane: { azimuth: [-180, 180, -60], elevation: [-90, 90, 20], offset: [-1, 1, 0] },
 };
-const CURVE = [0.95, 0.75, 0.2, 1];
-// Pixels within which a pointer takes a point.
-const PICK_RADIUS = 12;
-// Milliseconds after which nothing moves any more.
+// Choices of the list of materials, beside their names.
+const ORIGINAL_MATERIAL = "as given";
+const PLAIN_COLOR = "color";
+// The distance in pixels beyond which a press of a pointer is no click.
+const CLICK_RADIUS = 3;
+// The milliseconds without a change after which the device is checked.
 const IDLE_TIME = 400;
+// How many times faster Python must be than the device of the browser to render instead of it.
+const MIN_SPEEDUP = 1.5;
 
 export class Panel {
-  /** @param {HTMLElement} root @param {Scene} scene @param {string} passes @param {Link | null} link
-   *  @param {string} still a picture for where there is no GPU */
-  constructor(root, scene, passes, link, still) {
+  /** @param {HTMLElement} root @param {Scene} scene @param {string} passes the text of passes.wgsl
+   *  @param {Channel | null} channel @param {string} still the address of a picture, which is shown
+   *  until a surface is rendered */
+  constructor(root, scene, passes, channel, still) {
     this.root = root;
     this.scene = scene;
     this.passes = passes;
-    this.link = link;
+    this.channel = channel;
     /** @type {Record<string, number>} */
-    this.values = Object.fromEntries(scene.sliders.map((one) => [one.name, one.start]));
-    this.curves = scene.state.curves;
-    /** @type {number[][][][]} */
-    this.undo_stack = [];
-    /** @type {number[][][][]} */
-    this.redo_stack = [];
-    this.edited = false;
-    this.editing = false;
-    this.probing = false;
-    /** The least and the greatest depth of the last picture by Python, on the stage.
-     *  @type {[number, number] | null} */
-    this.depth_range = null;
-    /** @type {Camera | undefined} */
-    this.own_camera = undefined;
-    this.show = scene.show;
-    /** What was last reported of each attribute. @type {Record<string, string>} */
-    this.reported = {};
-    this.is_report_due = false;
+    this.sliderValues = Object.fromEntries(scene.sliders.map(({ name, start }) => [name, start]));
+    this.mode = scene.show;
     this.ground = scene.ground[0] < 0.3 ? "dark" : "light";
-    /** @type {Marks[]} */
-    this.probe_marks = [];
-    /** @type {Settings} */
-    this.settings = {};
-    this.cut_kind = "none";
+    /** @type {RenderOptions} */
+    this.renderOptions = {};
+    this.cutKind = "none";
     /** @type {Record<string, number>} */
-    this.cut_numbers = {};
-    /** @type {ResizeObserver[]} */
-    this.observers = [];
-    /** @type {[number, number] | null} */
-    this.selected_point = null;
-    root.classList.add("harnack");
-    this.canvas = element("canvas", { tabIndex: 0 });
-    this.canvas.setAttribute("role", "img");
-    this.canvas.setAttribute("aria-label",
-      `${scene.title}. Drag or use the arrow keys to turn it, the wheel or + and - to come closer.`);
-    this.still = element("img", { alt: scene.title, src: still });
-    this.message = element("p", { className: "message" });
-    this.message.setAttribute("role", "status");
-    this.controls = this.build();
-    this.remote_canvas = element("canvas", { tabIndex: 0, className: "remote" });
-    this.remote_canvas.style.display = "none";
-    this.image_canvas = document.createElement("canvas");
-    this.scale = 0.25;
-    this.pictures = 0;
+    this.cutParameters = {};
+    this.placement = new Placement(scene.placement);
+    this.curveEditor = new CurveEditor(this, scene.state.curves);
+    /** Whether a click probes the surface. */
+    this.isProbing = false;
+    /** @type {Marks[]} */
+    this.probeMarks = [];
     /** @type {Marks[]} */
     this.lines = [];
     /** @type {Marks[]} */
     this.dots = [];
-    this.legend = element("div");
-    const notes = element("div", { className: "notes" }, this.legend, this.message);
-    root.append(this.still, this.canvas, this.remote_canvas, notes, this.controls);
+    /** The camera where this browser does not render. @type {Camera | undefined} */
+    this.remoteCamera = undefined;
+    /** The least and the greatest depth of the last picture by Python, on the stage.
+     *  @type {[number, number] | null} */
+    this.remoteDepthRange = null;
+    /** The size of coarse pictures by Python, relative to whole ones. */
+    this.coarseScale = 0.25;
+    /** The JSON of the value of each attribute that was last reported. @type {Record<string, string>} */
+    this.reportedAttributes = {};
+    this.isReportDue = false;
+    /** @type {ResizeObserver[]} */
+    this.observers = [];
+    root.classList.add("harnack");
+    this.canvas = createElement("canvas", { tabIndex: 0 });
+    this.canvas.setAttribute("role", "img");
+    this.canvas.setAttribute("aria-label",
+      `${scene.title}. Drag or use the arrow keys to turn it, the wheel or + and - to come closer.`);
+    this.stillImage = createElement("img", { alt: scene.title, src: still });
+    this.message = createElement("p", { className: "message" });
+    this.message.setAttribute("role", "status");
+    this.controls = this.createControls();
+    this.remoteCanvas = createElement("canvas", { tabIndex: 0, className: "remote" });
+    this.remoteCanvas.style.display = "none";
+    this.imageCanvas = document.createElement("canvas");
+    this.legend = createElement("div");
+    const notes = createElement("div", { className: "notes" }, this.legend, this.message);
+    root.append(this.stillImage, this.canvas, this.remoteCanvas, notes, this.controls);
   }
 
-  /** @param {string} words @param {boolean} [is_drawn] */
-  show_message(words, is_drawn = this.drawing !== undefined) {
-    this.message.textContent = words;
-    this.canvas.style.visibility = is_drawn ? "visible" : "hidden";
-    this.still.style.display = is_drawn || this.is_remote ? "none" : "";
-    this.root.dataset.state = is_drawn ? "drawn" : words ? "message" : "";
+  /** Shows a message, and the canvas or the still picture.
+   *  @param {string} text @param {boolean} [isDrawn] whether the canvas shows a surface */
+  showMessage(text, isDrawn = this.renderer !== undefined) {
+    this.message.textContent = text;
+    this.canvas.style.visibility = isDrawn ? "visible" : "hidden";
+    this.stillImage.style.display = isDrawn || this.isRemote ? "none" : "";
+    this.root.dataset.state = isDrawn ? "drawn" : text ? "message" : "";
   }
 
-  build() {
+  /** Shows a message of what goes wrong in an action. @param {() => Promise<void>} action */
+  async showErrors(action) {
+    try {
+      await action();
+    } catch (error) {
+      this.showMessage(/** @type {Error} */ (error).message);
+    }
+  }
+
+  // Controls.
+
+  createControls() {
     const { scene } = this;
-    const show = element("select", { name: "show", onchange: () => { this.show = show.value; this.redraw(); } },
-      ...SHOWS.map((name) => element("option", { value: name }, name)));
-    const ground = element("select", { onchange: () => { this.ground = ground.value; this.redraw(); } },
-      ...Object.keys(GROUNDS).map((name) => element("option", { value: name }, name)));
-    [show.value, ground.value] = [this.show, this.ground];
-    this.show_select = show;
-    /** @type {HTMLElement[]} */
+    const hasPython = this.channel?.request !== undefined;
     const rows = [
-      element("label", {}, "Show ", show), element("label", {}, "Ground ", ground),
-      ...scene.sliders.map((one) => this.slider(one)),
+      ...this.createModeControls(), ...scene.sliders.map((slider) => this.createSlider(slider)),
     ];
     /** @type {HTMLElement[]} */
-    const buttons = [this.button("Reset view", () => { this.camera().reset(); this.redraw(); })];
+    const buttons = [createButton("Reset view", () => { this.camera.reset(); this.redraw(); })];
     if (scene.editable) {
-      const edit = element("input", { type: "checkbox", onchange: () => {
-        this.editing = edit.checked;
-        this.selected_point = null;
-        this.update_marks();
-      } });
-      rows.push(element("label", {}, edit, " Edit points"));
+      rows.push(createCheckbox("Edit points", (isChecked) => this.curveEditor.setActive(isChecked)));
       buttons.push(
-        this.button("Undo", () => this.undo(this.undo_stack, this.redo_stack)),
-        this.button("Redo", () => this.undo(this.redo_stack, this.undo_stack)),
-        this.button("Smooth", () => this.edit(this.curves.map(smoothed))),
+        createButton("Undo", () => this.curveEditor.undo()),
+        createButton("Redo", () => this.curveEditor.redo()),
+        createButton("Smooth", () => this.curveEditor.smooth()),
       );
     }
-    buttons.push(this.button("Save picture", () => this.save()));
-    if (this.link?.ask) {
-      const probe = element("input", { type: "checkbox", onchange: () => {
-        this.probing = probe.checked;
-        this.probe_marks = [];
-        this.update_marks();
-      } });
-      rows.push(element("label", {}, probe, " Probe by click"));
-      rows.push(...this.material_controls(), ...this.cut_controls());
-      const width = element("input", { type: "number", min: "16", max: "8192", value: "1600", name: "width" });
-      const quality = element("select", { name: "quality" },
-        ...["shaded", "path"].map((name) => element("option", { value: name }, name)));
-      rows.push(element("label", {}, "Render, pixels wide ", width, quality));
-      const file = element("input", { type: "file", accept: ".json", hidden: true, name: "scene",
-        onchange: () => { if (file.files?.[0]) this.load(file.files[0]); file.value = ""; } });
-      buttons.push(
-        this.button("Render", () => this.render(Number(width.value), quality.value)),
-        this.button("Save scene", () => this.save_scene()),
-        this.button("Open scene", () => file.click()), file,
+    buttons.push(createButton("Save picture", () => this.savePicture()));
+    if (hasPython) {
+      rows.push(
+        createCheckbox("Probe by click", (isChecked) => {
+          this.isProbing = isChecked;
+          this.probeMarks = [];
+          this.updateMarks();
+        }),
+        ...this.createMaterialControls(), ...this.createCutControls(),
       );
+      const { row, button } = this.createRenderControls();
+      rows.push(row);
+      buttons.push(button, ...this.createSceneFileControls());
     }
-    this.buttons = element("div", { className: "buttons" }, ...buttons);
-    this.device_note = element("small");
-    return element("details", { open: innerWidth > 600 && scene.sliders.length > 0 },
-      element("summary", {}, "Controls"), ...rows, this.buttons, this.device_note);
+    const buttonRow = createElement("div", { className: "buttons" }, ...buttons);
+    this.deviceNote = createElement("small");
+    return createElement("details", { open: innerWidth > 600 && scene.sliders.length > 0 },
+      createElement("summary", {}, "Controls"), ...rows, buttonRow, this.deviceNote);
   }
 
-  /** What the surfaces are made of, and how thick the tubes around the curves are at which they end. */
-  material_controls() {
-    const { materials, material, tube, reach, state } = this.scene;
-    const [GIVEN, COLOR] = ["as given", "color"];
-    const set = () => {
-      if (select.value === GIVEN) delete this.settings.material;
-      else this.settings.material = select.value === COLOR ? color.value : select.value;
-      color.hidden = select.value !== COLOR;
-      this.change();
-    };
-    const names = material && materials.includes(material) ? materials : [GIVEN, ...materials];
-    const select = element("select", { name: "material", onchange: set },
-      ...[...names, COLOR].map((name) => element("option", { value: name }, name)));
-    select.value = material && materials.includes(material) ? material : GIVEN;
-    const color = element("input", { type: "color", name: "color", value: "#4682b4", hidden: true, oninput: set });
-    color.setAttribute("aria-label", "Color");
-    const rows = [element("label", {}, "Material ", select, " ", color)];
-    if (!state.curves.length || "boundary" in this.values) return rows;
-    const shown = element("output", {}, tube === null ? "none" : format(tube));
-    const radius = element("input", {
-      type: "range", min: "0", max: String(Math.max(0.1 * reach, tube ?? 0)), step: "any",
-      name: "tube", value: String(tube ?? 0),
-      oninput: () => {
-        this.settings.boundary = Number(radius.value) || null;
-        shown.textContent = this.settings.boundary === null ? "none" : format(this.settings.boundary);
-        this.change();
-      },
+  /** The lists of modes and of grounds. @returns {HTMLElement[]} */
+  createModeControls() {
+    const mode = createElement("select",
+      { name: "show", onchange: () => { this.mode = mode.value; this.redraw(); } }, ...createOptions(MODES));
+    const ground = createElement("select",
+      { onchange: () => { this.ground = ground.value; this.redraw(); } },
+      ...createOptions(Object.keys(GROUND_REFLECTANCES)));
+    [mode.value, ground.value] = [this.mode, this.ground];
+    this.modeSelect = mode;
+    return [createElement("label", {}, "Show ", mode), createElement("label", {}, "Ground ", ground)];
+  }
+
+  /** @param {Slider} slider @returns {HTMLElement} */
+  createSlider(slider) {
+    const output = createElement("output", {}, formatNumber(slider.start));
+    const input = createRangeInput(slider, (value) => {
+      this.sliderValues[slider.name] = value;
+      output.textContent = formatNumber(value);
+      this.updateState();
     });
-    return [...rows, element("label", {}, "Radius of the edge's tube ", shown, radius)];
+    return createElement("label", {}, `${slider.name} `, output, input);
   }
 
-  /** What cuts the surfaces, and sliders of it. */
-  cut_controls() {
-    const numbers = element("div", { className: "cut" });
-    const chosen = element("select", { name: "cut", onchange: () => {
-      this.cut_kind = chosen.value;
-      this.cut_numbers = Object.fromEntries(
-        Object.entries(CUTS[chosen.value]).map(([name, ends]) => [name, ends[2]]));
-      numbers.replaceChildren(...Object.entries(CUTS[chosen.value]).map(([name, [low, high, start]]) => {
-        const input = element("input", {
-          type: "range", min: String(low), max: String(high), step: "any", name, value: String(start),
-          oninput: () => { this.cut_numbers[name] = Number(input.value); this.change(); },
+  /** The material of the surfaces, and the radius of the tubes around the curves at which they end.
+   *  @returns {HTMLElement[]} */
+  createMaterialControls() {
+    const { materials, material } = this.scene;
+    const onChange = () => {
+      if (select.value === ORIGINAL_MATERIAL) delete this.renderOptions.material;
+      else this.renderOptions.material = select.value === PLAIN_COLOR ? color.value : select.value;
+      color.hidden = select.value !== PLAIN_COLOR;
+      this.updateState();
+    };
+    const isNamed = material !== null && materials.includes(material);
+    const names = isNamed ? materials : [ORIGINAL_MATERIAL, ...materials];
+    const select = createElement("select", { name: "material", onchange: onChange },
+      ...createOptions([...names, PLAIN_COLOR]));
+    select.value = isNamed ? material : ORIGINAL_MATERIAL;
+    const color = createElement("input",
+      { type: "color", name: "color", value: "#4682b4", hidden: true, oninput: onChange });
+    color.setAttribute("aria-label", "Color");
+    return [createElement("label", {}, "Material ", select, " ", color), ...this.createTubeControls()];
+  }
+
+  /** @returns {HTMLElement[]} */
+  createTubeControls() {
+    const { tube, reach, state } = this.scene;
+    if (!state.curves.length || "boundary_radius" in this.sliderValues) return [];
+    const output = createElement("output", {}, tube === null ? "none" : formatNumber(tube));
+    const start = tube ?? 0;
+    const slider = { name: "tube", low: 0, high: Math.max(0.1 * reach, start), start, step: null };
+    const input = createRangeInput(slider, (value) => {
+      this.renderOptions.boundary_radius = value || null;
+      output.textContent = value ? formatNumber(value) : "none";
+      this.updateState();
+    });
+    return [createElement("label", {}, "Radius of the edge's tube ", output, input)];
+  }
+
+  /** The volume that cuts the surfaces, and sliders of its parameters. @returns {HTMLElement[]} */
+  createCutControls() {
+    const sliders = createElement("div", { className: "cut" });
+    const select = createElement("select", { name: "cut", onchange: () => {
+      const parameters = Object.entries(CUT_PARAMETERS[select.value]);
+      this.cutKind = select.value;
+      this.cutParameters = Object.fromEntries(parameters.map(([name, [, , start]]) => [name, start]));
+      sliders.replaceChildren(...parameters.map(([name, [low, high, start]]) => {
+        const input = createRangeInput({ name, low, high, start, step: null }, (value) => {
+          this.cutParameters[name] = value;
+          this.updateState();
         });
-        return element("label", {}, `${name} `, input);
+        return createElement("label", {}, `${name} `, input);
       }));
-      this.change();
-    } }, ...Object.keys(CUTS).map((name) => element("option", { value: name }, name)));
-    return [element("label", {}, "Cut by ", chosen), numbers];
+      this.updateState();
+    } }, ...createOptions(Object.keys(CUT_PARAMETERS)));
+    return [createElement("label", {}, "Cut by ", select), sliders];
   }
 
-  /** What cuts the surfaces now, in their coordinates. @returns {Cut | null} */
-  cut() {
+  /** The size and the quality of pictures that Python renders, and the button for it. */
+  createRenderControls() {
+    const width = createElement("input", { type: "number", min: "16", max: "8192", value: "1600", name: "width" });
+    const quality = createElement("select", { name: "quality" }, ...createOptions(["shaded", "path"]));
+    const row = createElement("label", {}, "Render, pixels wide ", width, quality);
+    return { row, button: createButton("Render", () => this.render(Number(width.value), quality.value)) };
+  }
+
+  /** Buttons that save and open scene files. @returns {HTMLElement[]} */
+  createSceneFileControls() {
+    const input = createElement("input", { type: "file", accept: ".json", hidden: true, name: "scene",
+      onchange: () => { if (input.files?.[0]) this.openSceneFile(input.files[0]); input.value = ""; } });
+    return [
+      createButton("Save scene", () => this.saveScene()),
+      createButton("Open scene", () => input.click()), input,
+    ];
+  }
+
+  /** The volume that cuts the surfaces now, in their coordinates. @returns {CutVolume | null} */
+  get cutVolume() {
     const { middle, reach } = this.scene;
-    const { size, azimuth, elevation, offset } = this.cut_numbers;
-    if (this.cut_kind === "ball") return { ball: [...middle, size * reach] };
-    if (this.cut_kind === "box") {
-      const half = ["x", "y", "z"].map((axis) => reach * this.cut_numbers[`size ${axis}`]);
+    const { size, azimuth, elevation, offset } = this.cutParameters;
+    if (this.cutKind === "ball") return { ball: [...middle, size * reach] };
+    if (this.cutKind === "box") {
+      const half = ["x", "y", "z"].map((axis) => reach * this.cutParameters[`size ${axis}`]);
       return { box: [...middle.map((x, k) => x - half[k]), ...middle.map((x, k) => x + half[k])] };
     }
-    if (this.cut_kind !== "plane") return null;
+    if (this.cutKind !== "plane") return null;
     const [a, b] = [azimuth, elevation].map((degrees) => degrees * Math.PI / 180);
     const normal = [Math.cos(b) * Math.cos(a), Math.cos(b) * Math.sin(a), Math.sin(b)];
     return { plane: [...normal, dot(normal, middle) + offset * reach] };
   }
 
-  /** @param {string} name @param {() => void} onclick */
-  button(name, onclick) { return element("button", { type: "button", onclick }, name); }
-
-  /** @param {Slider} one */
-  slider(one) {
-    const shown = element("output", {}, format(one.start));
-    const input = element("input", {
-      type: "range", min: String(one.low), max: String(one.high),
-      step: one.step === null ? "any" : String(one.step), name: one.name, value: String(one.start),
-      oninput: () => {
-        this.values[one.name] = Number(input.value);
-        shown.textContent = format(Number(input.value));
-        this.change();
-      },
-    });
-    return element("label", {}, `${one.name} `, shown, input);
+  /** The state of the controls now. @returns {ControlValues} */
+  get controlValues() {
+    const { curves, isEdited } = this.curveEditor;
+    return { sliders: { ...this.sliderValues }, loops: isEdited ? curves : null,
+      cut: this.cutVolume, settings: { ...this.renderOptions } };
   }
 
+  // Opening and closing.
+
+  /** Starts to render, in this browser if its device passes the check. */
   async open() {
-    if (!navigator.gpu) return this.fall_back("This browser has no WebGPU here (the page must come "
+    if (!navigator.gpu) return this.useFallback("This browser has no WebGPU here (the page must come "
       + "from https, or from 127.0.0.1)");
-    this.show_message("Compiling the surface for this GPU ...");
+    this.showMessage("Compiling the surface for this GPU ...");
     const adapter = await navigator.gpu.requestAdapter({ powerPreference: "high-performance" });
-    if (!adapter) return this.fall_back("No GPU was found for WebGPU");
+    if (!adapter) return this.useFallback("No GPU was found for WebGPU");
+    const device = await this.requestDevice(adapter);
+    if (this.isClosed) return device.destroy();
+    const renderer = new WebGpuRenderer(device, this.scene, this.canvas, this.passes);
+    const failure = await this.prepareRenderer(renderer);
+    if (this.isClosed) return device.destroy();
+    if (failure) return this.useFallback(failure);
+    this.startRenderer(renderer, adapter);
+  }
+
+  /** @param {GPUAdapter} adapter */
+  async requestDevice(adapter) {
     const { maxStorageBufferBindingSize, maxBufferSize, maxStorageBuffersPerShaderStage } = adapter.limits;
     const device = await adapter.requestDevice({ requiredLimits: {
       maxStorageBufferBindingSize, maxBufferSize, maxStorageBuffersPerShaderStage } });
-    device.lost.then((e) => { if (!this.is_closed) this.fall_back(`The GPU was lost (${e.message})`); });
-    device.addEventListener("uncapturederror", (e) => console.error(e.error.message));
-    if (this.is_closed) return device.destroy();
-    const drawing = new Drawing(device, this.scene, this.canvas, this.passes);
+    device.lost.then(({ message }) => {
+      if (!this.isClosed) this.useFallback(`The GPU was lost (${message})`);
+    });
+    device.addEventListener("uncapturederror", ({ error }) => console.error(error.message));
+    return device;
+  }
+
+  /** Compiles the initial state and checks the device. Returns why that fails; empty if it does not.
+   *  @param {WebGpuRenderer} renderer */
+  async prepareRenderer(renderer) {
     try {
-      await drawing.compile();
-      const wrong = await drawing.set(this.scene.state);
-      if (this.is_closed) return device.destroy();
-      if (wrong) return this.fall_back(`This GPU does not compute what the surface was proved with: ${wrong}`);
-    } catch (wrong) {
-      if (this.is_closed) return device.destroy();
-      return this.fall_back(`This GPU cannot compile the surface (${wrong})`);
+      await renderer.compile();
+      const failure = await renderer.setState(this.scene.state);
+      return failure && describeFailedCheck(failure);
+    } catch (error) {
+      return `This GPU cannot compile the surface (${error})`;
     }
-    this.drawing = drawing;
-    this.canvas.addEventListener("range", () => this.update_legend());
-    this.show_message("");
+  }
+
+  /** Renders in this browser from now on. @param {WebGpuRenderer} renderer @param {GPUAdapter} adapter */
+  startRenderer(renderer, adapter) {
+    this.renderer = renderer;
+    this.canvas.addEventListener("depthrange", () => this.updateLegend());
+    this.showMessage("");
     const { vendor = "", architecture = "", description = "" } = adapter.info ?? {};
     const name = description || `${vendor} ${architecture}`.trim() || "this browser's device";
-    const rays = this.scene.state.surfaces.reduce((sum, one) => sum + (one.check?.count ?? 0), 0);
-    this.show_device(`Traced by ${name}: ${rays} rays agree with Dr.Jit's.`);
+    const rayCount = this.scene.state.surfaces.reduce((sum, { check }) => sum + (check?.count ?? 0), 0);
+    this.showDevice(`Traced by ${name}: ${rayCount} rays agree with Dr.Jit's.`);
     this.listen(this.canvas);
-    this.observe(this.canvas, () => drawing.resize());
-    this.update_marks();
-    drawing.resize();
-    if (this.link?.ask) this.canvas.addEventListener("full_picture", () => this.choose_renderer(), { once: true });
+    this.observeSize(this.canvas, () => renderer.resize());
+    this.updateMarks();
+    renderer.resize();
+    if (this.channel?.request)
+      this.canvas.addEventListener("wholepicture", () => this.chooseRenderer(), { once: true });
   }
 
-  /** @param {HTMLElement} target @param {() => void} handler */
-  observe(target, handler) {
-    const one = new ResizeObserver(handler);
-    one.observe(target);
-    this.observers.push(one);
+  /** @param {HTMLElement} target @param {() => void} onResize */
+  observeSize(target, onResize) {
+    const observer = new ResizeObserver(onResize);
+    observer.observe(target);
+    this.observers.push(observer);
   }
 
-  /** Draws no more, and frees the device. */
+  /** Stops drawing, and frees the device. */
   close() {
-    this.is_closed = true;
-    for (const one of this.observers) one.disconnect();
-    clearTimeout(this.recheck_timer);
-    this.drawing?.stop();
-    this.drawing?.device.destroy();
-    this.drawing = undefined;
-    this.is_remote = false;
+    this.isClosed = true;
+    for (const observer of this.observers) observer.disconnect();
+    clearTimeout(this.recheckTimer);
+    this.renderer?.stop();
+    this.renderer?.device.destroy();
+    this.renderer = undefined;
+    this.isRemote = false;
     this.root.replaceChildren();
   }
 
-  /** Shows another scene in this place. @param {Scene} scene */
-  replace(scene) {
+  /** Replaces this panel by one of another scene. @param {Scene} scene */
+  replaceScene(scene) {
     this.close();
-    const next = new Panel(this.root, scene, this.passes, this.link, "");
-    this.root.dispatchEvent(new CustomEvent("panel", { detail: next }));
-    next.open();
+    const panel = new Panel(this.root, scene, this.passes, this.channel, "");
+    this.root.dispatchEvent(new CustomEvent("panel", { detail: panel }));
+    panel.open();
   }
 
-  /** @param {HTMLElement} target */
+  /** Lets the camera and the curves follow mouse, touch and keys. @param {HTMLElement} target */
   listen(target) {
-    this.camera().listen(target, () => this.redraw(), (e) => this.grab_point(e));
-    target.addEventListener("pointermove", (e) => this.drag(e));
-    target.addEventListener("pointerup", (e) => this.release(e));
-    target.addEventListener("dblclick", (e) => this.insert(e));
-    target.addEventListener("keydown", (e) => this.key(e));
+    this.camera.listen(target, () => this.redraw(), (event) => this.pressPointer(event));
+    target.addEventListener("pointermove", (event) => this.curveEditor.dragPoint(event));
+    target.addEventListener("pointerup", (event) => this.releasePointer(event));
+    target.addEventListener("dblclick", (event) => this.handleDoubleClick(event));
+    target.addEventListener("keydown", (event) => { if (this.scene.editable) this.curveEditor.handleKey(event); });
   }
 
-  /** @returns {Camera} */
-  camera() {
-    if (this.drawing) return this.drawing.camera;
-    this.own_camera ??= new Camera(this.scene.camera);
-    return this.own_camera;
+  /** The camera of the renderer; or, where Python renders, that of the panel. @returns {Camera} */
+  get camera() {
+    if (this.renderer) return this.renderer.camera;
+    this.remoteCamera ??= new Camera(this.scene.camera);
+    return this.remoteCamera;
   }
 
-  /** Without a GPU that can be trusted: Python draws, where it is; else a picture stands still.
-   *  @param {string} why */
-  fall_back(why) {
-    if (this.link?.ask) return this.let_python_draw(`${why}: Python draws.`);
-    this.drawing?.stop();
-    this.drawing = undefined;
-    this.show_message(`${why}: this is a still picture.`, false);
+  // The choice of a renderer.
+
+  /** Does without a device that can be trusted: Python renders, or a still picture is shown.
+   *  @param {string} reason */
+  useFallback(reason) {
+    if (this.channel?.request) return this.useRemoteRenderer(`${reason}: Python draws.`);
+    this.renderer?.stop();
+    this.renderer = undefined;
+    this.showMessage(`${reason}: this is a still picture.`, false);
   }
 
-  /** Says who traces. @param {string} words */
-  show_device(words) { if (this.device_note) this.device_note.textContent = words; }
-
-  /** @param {string} why */
-  let_python_draw(why) {
-    this.show_device("Traced by Python.");
-    const camera = this.camera();
-    this.drawing?.stop();
-    this.drawing = undefined;
-    this.own_camera = camera;
-    this.is_remote = true;
-    this.remote_canvas.style.display = "";
-    this.show_message(why, false);
-    this.listen(this.remote_canvas);
-    this.observe(this.root, () => this.redraw());
+  /** Lets Python render from now on. @param {string} message */
+  useRemoteRenderer(message) {
+    this.showDevice("Traced by Python.");
+    const { camera } = this;
+    this.renderer?.stop();
+    this.renderer = undefined;
+    this.remoteCamera = camera;
+    this.isRemote = true;
+    this.remoteCanvas.style.display = "";
+    this.showMessage(message, false);
+    this.listen(this.remoteCanvas);
+    this.observeSize(this.root, () => this.redraw());
     this.redraw();
   }
 
-  /** What a person has moved, as the attributes of a notebook's widget have it. */
-  attributes() {
-    const camera = this.camera();
+  /** Lets Python render if it is faster than the device of this browser. */
+  async chooseRenderer() {
+    const { renderer } = this;
+    if (!renderer || !this.channel?.request) return;
+    const pixelCount = (this.root.clientWidth * this.root.clientHeight) / 16;
+    let duration = 0;
+    try {
+      for (let k = 0; k < 2; k++) {  // the first picture compiles kernels
+        const start = performance.now();
+        await this.fetchPreview(0.25, false);
+        duration = performance.now() - start;
+      }
+    } catch (error) {
+      return this.showMessage(/** @type {Error} */ (error).message);
+    }
+    if (pixelCount / duration > MIN_SPEEDUP * renderer.pixelsPerMillisecond && renderer === this.renderer)
+      this.useRemoteRenderer("Python draws: it is quicker here than this browser's device.");
+  }
+
+  /** Shows which device traces. @param {string} text */
+  showDevice(text) { if (this.deviceNote) this.deviceNote.textContent = text; }
+
+  // The attributes of a notebook widget.
+
+  /** The attributes of a notebook widget that a person can change. */
+  get attributes() {
+    const { camera, placement } = this;
     return {
-      camera: { position: this.from_stage(camera.eye()), target: this.from_stage(camera.target), fov: camera.fov },
-      sliders: { ...this.values }, points: this.curves, show: this.show,
+      camera: {
+        position: placement.fromStage(camera.position), target: placement.fromStage(camera.target), fov: camera.fov,
+      },
+      sliders: { ...this.sliderValues }, points: this.curveEditor.curves, show: this.mode,
     };
   }
 
-  /** Tells those who listen what has been moved, once a frame at most. */
-  report() {
-    if (this.is_report_due) return;
-    this.is_report_due = true;
+  /** Reports changed attributes by an event, at most once a frame. */
+  reportAttributes() {
+    if (this.isReportDue) return;
+    this.isReportDue = true;
     requestAnimationFrame(() => {
-      this.is_report_due = false;
-      if (this.is_closed) return;
-      const now = this.attributes();
-      const changed = Object.fromEntries(Object.entries(now).filter(
-        ([name, value]) => JSON.stringify(value) !== this.reported[name]));
-      for (const [name, value] of Object.entries(changed)) this.reported[name] = JSON.stringify(value);
-      if (Object.keys(changed).length)
-        this.root.dispatchEvent(new CustomEvent("attributes", { detail: changed }));
+      this.isReportDue = false;
+      if (this.isClosed) return;
+      const changes = Object.entries(this.attributes).filter(
+        ([name, value]) => JSON.stringify(value) !== this.reportedAttributes[name]);
+      for (const [name, value] of changes) this.reportedAttributes[name] = JSON.stringify(value);
+      if (changes.length)
+        this.root.dispatchEvent(new CustomEvent("attributes", { detail: Object.fromEntries(changes) }));
     });
   }
 
-  /** Moves what somebody else than the person has moved.
+  /** Applies attributes that were changed in Python, and are not those that were reported.
    *  @param {{camera?: {position: number[], target: number[], fov: number},
-   *  sliders?: Record<string, number>, points?: number[][][], show?: string}} given */
-  apply_attributes(given) {
-    for (const [name, value] of Object.entries(given)) {
-      if (JSON.stringify(value) === this.reported[name]) continue;
-      this.reported[name] = JSON.stringify(value);
+   *  sliders?: Record<string, number>, points?: Curves, show?: string}} attributes */
+  applyAttributes(attributes) {
+    for (const [name, value] of Object.entries(attributes)) {
+      if (JSON.stringify(value) === this.reportedAttributes[name]) continue;
+      this.reportedAttributes[name] = JSON.stringify(value);
       if (name === "camera") {
         const { position, target, fov } = /** @type {any} */ (value);
-        this.camera().look_at(this.to_stage(position), this.to_stage(target), fov);
+        this.camera.lookAt(this.placement.toStage(position), this.placement.toStage(target), fov);
         this.redraw();
       } else if (name === "show") {
-        this.show = /** @type {string} */ (value);
-        if (this.show_select) this.show_select.value = this.show;
+        this.mode = /** @type {string} */ (value);
+        if (this.modeSelect) this.modeSelect.value = this.mode;
         this.redraw();
-      } else if (name === "points") this.scene.editable && this.edit(/** @type {number[][][]} */ (value));
-      else this.move_sliders(/** @type {Record<string, number>} */ (value));
+      } else if (name === "points") this.scene.editable && this.curveEditor.edit(/** @type {Curves} */ (value));
+      else this.moveSliders(/** @type {Record<string, number>} */ (value));
     }
   }
 
-  /** Moves sliders. @param {Record<string, number>} values */
-  move_sliders(values) {
-    Object.assign(this.values, values);
+  /** Moves sliders, and what they change. @param {Record<string, number>} values */
+  moveSliders(values) {
+    Object.assign(this.sliderValues, values);
     for (const [name, value] of Object.entries(values)) {
       const input = this.controls.querySelector(`input[name="${CSS.escape(name)}"]`);
       if (!(input instanceof HTMLInputElement)) continue;
       input.value = String(value);
-      const shown = input.parentElement?.querySelector("output");
-      if (shown) shown.textContent = format(value);
+      const output = input.parentElement?.querySelector("output");
+      if (output) output.textContent = formatNumber(value);
     }
-    this.change();
+    this.updateState();
   }
+
+  // Drawing.
 
   /** Shows what the colors of the picture mean. */
-  update_legend() {
-    const legend = this.scene.legends[this.show];
-    const range = this.drawing ? this.drawing.depth_range : this.depth_range;
-    const scale = this.scene.placement[12];
-    const made = legend && (this.drawing || this.is_remote) ? [legend_of(
+  updateLegend() {
+    const legend = this.scene.legends[this.mode];
+    const range = this.renderer ? this.renderer.depthRange : this.remoteDepthRange;
+    const { scale } = this.placement;
+    const elements = legend && (this.renderer || this.isRemote) ? [createLegend(
       legend, range && [range[0] / scale, range[1] / scale],
       this.ground === "dark" ? "#1a1a1c" : "#e6e6e3")] : [];
-    this.legend.replaceChildren(...made);
+    this.legend.replaceChildren(...elements);
   }
 
+  /** Draws again, after anything has changed. */
   redraw() {
-    const { drawing } = this;
-    this.report();
-    this.update_legend();
-    if (!drawing) { if (this.is_remote) this.draw_remotely(); return; }
-    drawing.show = this.show;
-    drawing.lines = this.lines;
-    drawing.dots = this.dots;
-    drawing.ground = GROUNDS[/** @type {"light" | "dark"} */ (this.ground)];
-    drawing.draw();
+    const { renderer } = this;
+    this.reportAttributes();
+    this.updateLegend();
+    if (!renderer) { if (this.isRemote) this.drawRemotely(); return; }
+    renderer.mode = this.mode;
+    renderer.lines = this.lines;
+    renderer.dots = this.dots;
+    renderer.groundReflectance = GROUND_REFLECTANCES[/** @type {"light" | "dark"} */ (this.ground)];
+    renderer.draw();
   }
 
-  /** Pictures from Python: coarse ones, and when nothing moves any more a whole one, first with the
-   *  shadow that was there and then with its own. */
-  async draw_remotely() {
-    this.is_picture_due = true;
-    if (this.is_fetching) return;
-    this.is_fetching = true;
+  /** Draws pictures by Python: coarse ones (step 0) while something moves; then a whole one with
+   *  the last shadow (step 1), and one with its own shadow (step 2). */
+  async drawRemotely() {
+    this.isPictureDue = true;
+    if (this.isFetching) return;
+    this.isFetching = true;
     try {
-      for (let step = 0; this.is_picture_due || step < 3; step++) {
-        if (this.is_picture_due) step = 0;
-        this.is_picture_due = false;
+      for (let step = 0; this.isPictureDue || step < 3; step++) {
+        if (this.isPictureDue) step = 0;
+        this.isPictureDue = false;
         const start = performance.now();
-        const { image, range } = await this.fetch_picture(step ? 1 : this.scale, step === 2);
-        if (this.show === "depth") this.depth_range = range;
-        this.update_legend();
-        this.show_image(image);
-        if (step === 1 && this.show !== "shaded") step = 2;  // no shadow
-        if (step) continue;
-        const better = this.scale * Math.sqrt(FRAME_TIME / Math.max(performance.now() - start, 1));
-        this.scale = Math.min(1, Math.max(0.06, 0.5 * (this.scale + better)));
+        const { image, range } = await this.fetchPreview(step ? 1 : this.coarseScale, step === 2);
+        if (this.mode === "depth") this.remoteDepthRange = range;
+        this.updateLegend();
+        this.showImage(image);
+        if (step === 1 && this.mode !== "shaded") step = 2;  // no shadow
+        if (!step) this.coarseScale = adaptScale(this.coarseScale, performance.now() - start);
       }
-      this.remote_canvas.dispatchEvent(new Event("idle"));
-    } catch (wrong) {
-      this.show_message(/** @type {Error} */ (wrong).message, false);
+      this.remoteCanvas.dispatchEvent(new Event("idle"));
+    } catch (error) {
+      this.showMessage(/** @type {Error} */ (error).message, false);
     } finally {
-      this.is_fetching = false;
+      this.isFetching = false;
     }
   }
 
-  /** Puts a picture of any size into the window, and lines and dots before it.
-   *  @param {ImageData} image */
-  show_image(image) {
+  /** Shows a picture of any size, and lines and dots in front of it. @param {ImageData} image */
+  showImage(image) {
     const [width, height] = [this.root.clientWidth, this.root.clientHeight];
-    this.image_canvas.width = image.width;
-    this.image_canvas.height = image.height;
-    this.image_canvas.getContext("2d")?.putImageData(image, 0, 0);
-    this.remote_canvas.width = width;
-    this.remote_canvas.height = height;
-    const pen = this.remote_canvas.getContext("2d");
-    if (!pen) return;
-    pen.drawImage(this.image_canvas, 0, 0, width, height);
-    const camera = this.camera();
-    const at = (/** @type {number[]} */ p) => camera.project(p, width, height);
-    const color = (/** @type {number[]} */ c) =>
-      `rgb(${c.slice(0, 3).map((x) => Math.round(255 * x)).join(" ")} / ${0.7 * c[3]})`;
-    for (const { points, color: c, width: wide } of this.lines) {
-      pen.strokeStyle = color(c);
-      pen.lineWidth = wide;
-      pen.beginPath();
-      points.map(at).forEach((p, k) => (k % 2 ? pen.lineTo(p.x, p.y) : pen.moveTo(p.x, p.y)));
-      pen.stroke();
+    this.imageCanvas.width = image.width;
+    this.imageCanvas.height = image.height;
+    this.imageCanvas.getContext("2d")?.putImageData(image, 0, 0);
+    this.remoteCanvas.width = width;
+    this.remoteCanvas.height = height;
+    const context = this.remoteCanvas.getContext("2d");
+    if (!context) return;
+    context.drawImage(this.imageCanvas, 0, 0, width, height);
+    this.drawMarks(context, width, height);
+  }
+
+  /** Draws lines and dots. @param {CanvasRenderingContext2D} context @param {number} width
+   *  @param {number} height */
+  drawMarks(context, width, height) {
+    const { camera } = this;
+    const project = (/** @type {number[]} */ point) => camera.project(point, width, height);
+    for (const marks of this.lines) {
+      context.strokeStyle = cssColor(marks.color);
+      context.lineWidth = marks.width;
+      context.beginPath();
+      marks.points.map(project).forEach(({ x, y }, k) => (k % 2 ? context.lineTo(x, y) : context.moveTo(x, y)));
+      context.stroke();
     }
-    for (const { points, color: c, width: wide } of this.dots) {
-      pen.fillStyle = color(c);
-      for (const p of points.map(at)) {
-        pen.beginPath();
-        pen.arc(p.x, p.y, 0.5 * wide, 0, 7);
-        pen.fill();
+    for (const marks of this.dots) {
+      context.fillStyle = cssColor(marks.color);
+      for (const { x, y } of marks.points.map(project)) {
+        context.beginPath();
+        context.arc(x, y, 0.5 * marks.width, 0, 7);
+        context.fill();
       }
     }
-    this.pictures++;
   }
 
-  /** A picture by Python of one ray a pixel. @param {number} scale @param {boolean} is_idle
-   *  @returns {Promise<{image: ImageData, range: [number, number]}>} */
-  fetch_picture(scale, is_idle) {
-    const camera = this.camera();
+  /** Fetches a picture by Python, with one ray in each pixel.
+   *  @param {number} scale relative to the window @param {boolean} isIdle whether nothing moves, so
+   *  that it gets its own shadow @returns {Promise<{image: ImageData, range: [number, number]}>} */
+  fetchPreview(scale, isIdle) {
+    const { camera } = this;
     const size = [this.root.clientWidth, this.root.clientHeight].map((x) => Math.max(8, Math.round(scale * x)));
-    const eye = { origin: camera.eye(), ...camera.axes(), pixel: camera.pixel(size[0], size[1]) };
-    return /** @type {any} */ (this.link).ask("draw", {
-      ...this.control_values(), size, show: this.show, ground: this.ground, eye, is_idle,
+    const eye = { origin: camera.position, ...camera.axes, pixel: camera.pixelSize(size[0], size[1]) };
+    return /** @type {any} */ (this.channel).request("draw", {
+      ...this.controlValues, size, show: this.mode, ground: this.ground, eye, is_idle: isIdle,
     });
   }
 
-  /** Lets draw who is quicker: this browser's device, or Python. */
-  async choose_renderer() {
-    const { drawing } = this;
-    if (!drawing || !this.link?.ask) return;
-    const pixels = (this.root.clientWidth * this.root.clientHeight) / 16;
-    let took = 0;
-    try {
-      for (let k = 0; k < 2; k++) {  // the first picture compiles kernels
-        const start = performance.now();
-        await this.fetch_picture(0.25, false);
-        took = performance.now() - start;
-      }
-    } catch (wrong) {
-      return this.show_message(/** @type {Error} */ (wrong).message);
-    }
-    if (pixels / took > 1.5 * drawing.rate && drawing === this.drawing)
-      this.let_python_draw("Python draws: it is quicker here than this browser's device.");
-  }
+  // Pictures and scene files.
 
-  /** What is seen now, at a size: what Python needs to draw the same. @param {number} width */
-  render_request(width) {
-    const camera = this.camera();
-    const shape = this.root.clientHeight / this.root.clientWidth;
-    const size = [width, Math.max(1, Math.round(width * shape))];
-    // The larger side's, of a camera whose 4 : 3 picture fits into the window.
-    const half = 0.5 * camera.pixel(size[0], size[1]) * Math.max(size[0], size[1]);
+  /** The request for a picture of what the window shows. @param {number} width in pixels */
+  renderRequest(width) {
+    const { camera } = this;
+    const aspectRatio = this.root.clientHeight / this.root.clientWidth;
+    const size = [width, Math.max(1, Math.round(width * aspectRatio))];
+    // Python takes the angle of the larger side; that of the camera is of a 4 : 3 picture.
+    const tangent = 0.5 * camera.pixelSize(size[0], size[1]) * Math.max(size[0], size[1]);
     return {
-      ...this.control_values(), size, show: this.show, ground: this.ground,
-      camera: { position: camera.eye(), target: camera.target, fov: (360 / Math.PI) * Math.atan(half) },
+      ...this.controlValues, size, show: this.mode, ground: this.ground,
+      camera: { position: camera.position, target: camera.target, fov: (360 / Math.PI) * Math.atan(tangent) },
     };
   }
 
-  /** A picture by Python of what is seen. @param {number} width @param {string} [quality] */
-  async picture(width, quality = "shaded") {
-    const request = this.render_request(width);
+  /** The address of a picture by Python of what the window shows.
+   *  @param {number} width @param {string} [quality] "shaded" or "path" */
+  async fetchPicture(width, quality = "shaded") {
+    const request = this.renderRequest(width);
     const show = quality === "path" && request.show === "shaded" ? "path" : request.show;
-    const bar = element("progress", { max: 1, value: 0 });
-    const { png } = await /** @type {Link} */ (this.link).ask?.("picture", { ...request, show },
-      (done, stop) => {
+    const bar = createElement("progress", { max: 1, value: 0 });
+    const { png } = await /** @type {Channel} */ (this.channel).request?.("picture", { ...request, show },
+      (completed, cancel) => {
         if (!bar.isConnected) {
-          this.show_message("Rendering ");
-          this.message.append(bar, " ", this.button("Cancel", stop));
+          this.showMessage("Rendering ");
+          this.message.append(bar, " ", createButton("Cancel", cancel));
         }
-        bar.value = done;
+        bar.value = completed;
       });
     return `data:image/png;base64,${png}`;
   }
 
-  /** @param {number} width @param {string} quality */
-  async render(width, quality) {
-    await this.with_errors_shown(async () => {
-      element("a", { href: await this.picture(width, quality), download: "surface.png" }).click();
-      this.show_message("");
+  /** Saves a picture by Python. @param {number} width @param {string} quality */
+  render(width, quality) {
+    return this.showErrors(async () => {
+      download(await this.fetchPicture(width, quality), "surface.png");
+      this.showMessage("");
     });
   }
 
-  /** Does something, or says what is wrong. @param {() => Promise<void>} what */
-  async with_errors_shown(what) {
-    try {
-      await what();
-    } catch (wrong) {
-      this.show_message(/** @type {Error} */ (wrong).message);
-    }
+  /** Saves the picture on the canvas. */
+  savePicture() {
+    this.renderer?.present(...(/** @type {[number, number]} */ (this.renderer.presentedSize)));
+    this.canvas.toBlob((blob) => { if (blob) downloadBlob(blob, "surface.png"); });
   }
 
-  /** Saves what is seen as a scene file. */
-  save_scene() {
-    return this.with_errors_shown(async () => {
-      const { text, lost } = await this.link?.ask?.("save", this.render_request(800));
-      const href = URL.createObjectURL(new Blob([text], { type: "application/json" }));
-      element("a", { href, download: "scene.json" }).click();
-      setTimeout(() => URL.revokeObjectURL(href), 1000);
-      this.show_message(lost.length ? `Saved as it stands: a file cannot hold the sliders ${lost.join(", ")}.` : "");
+  /** Saves what the window shows as a scene file. */
+  saveScene() {
+    return this.showErrors(async () => {
+      const { text, lost } = await this.channel?.request?.("save", this.renderRequest(800));
+      downloadBlob(new Blob([text], { type: "application/json" }), "scene.json");
+      this.showMessage(lost.length ? `Saved as it stands: a file cannot hold the sliders ${lost.join(", ")}.` : "");
     });
   }
 
   /** Opens a scene file in this window. @param {File} file */
-  load(file) {
-    return this.with_errors_shown(async () => this.replace(
-      await this.link?.ask?.("load", { text: await file.text() })));
+  openSceneFile(file) {
+    return this.showErrors(async () => this.replaceScene(
+      await this.channel?.request?.("load", { text: await file.text() })));
   }
 
-  /** What the sliders and the curves are now. */
-  control_values() {
-    return { sliders: { ...this.values }, loops: this.edited ? this.curves : null,
-      cut: this.cut(), settings: { ...this.settings } };
+  // States.
+
+  /** The state at the values of the controls. @param {Channel} channel
+   *  @param {boolean} checks whether it comes with rays that check the device */
+  async fetchState(channel, checks) {
+    return applyDelta(this.scene.state, await channel.fetchDelta({ ...this.controlValues, checks }));
   }
 
-  /** @param {Link} link @param {boolean} checks */
-  async fetch_state(link, checks) {
-    return changed(this.scene.state, await link.change({ ...this.control_values(), checks }));
-  }
-
-  /** Asks for the state at the sliders and points, one after the other, the last one for sure. */
-  async change() {
-    this.is_change_due = true;
-    if (this.is_changing || !this.link) return;
-    this.is_changing = true;
+  /** Gets the state at the values of the controls. States are requested one after the other; those
+   *  in between may be left out, but never the last one. */
+  async updateState() {
+    this.isUpdateDue = true;
+    if (this.isUpdating || !this.channel) return;
+    this.isUpdating = true;
     try {
-      while (this.is_change_due) {
-        this.is_change_due = false;
-        if (this.is_remote) { this.update_marks(); continue; }
-        const state = await this.fetch_state(this.link, false);
-        if (!this.drawing) continue;
-        const wrong = await this.drawing.set(state, state.surfaces.some((one) => one.check));
-        if (wrong) return this.fall_back(`This GPU does not compute what the surface was proved with: ${wrong}`);
-        // An answer may be to an older question than the last edit.
-        if (!this.edited) this.curves = state.curves;
-        this.show_message("");
-        this.update_marks();
+      while (this.isUpdateDue) {
+        this.isUpdateDue = false;
+        if (this.isRemote) { this.updateMarks(); continue; }
+        const state = await this.fetchState(this.channel, false);
+        if (!this.renderer) continue;
+        const failure = await this.renderer.setState(state, state.surfaces.some(({ check }) => check));
+        if (failure) return this.useFallback(describeFailedCheck(failure));
+        // The state may be older than the last edit.
+        if (!this.curveEditor.isEdited) this.curveEditor.curves = state.curves;
+        this.showMessage("");
+        this.updateMarks();
       }
-    } catch (wrong) {
-      this.show_message(/** @type {Error} */ (wrong).message);
+    } catch (error) {
+      this.showMessage(/** @type {Error} */ (error).message);
     } finally {
-      this.is_changing = false;
+      this.isUpdating = false;
     }
-    if (!this.link.ask) return;
-    clearTimeout(this.recheck_timer);
-    this.recheck_timer = setTimeout(() => this.recheck(), IDLE_TIME);
+    if (!this.channel.request) return;
+    clearTimeout(this.recheckTimer);
+    this.recheckTimer = setTimeout(() => this.recheckDevice(), IDLE_TIME);
   }
 
-  /** Has the device checked against Dr.Jit for what is drawn now. */
-  async recheck() {
-    if (this.is_changing || !this.drawing || !this.link) return;
-    const now = JSON.stringify(this.control_values());
+  /** Checks the device for the present state. */
+  async recheckDevice() {
+    if (this.isUpdating || !this.renderer || !this.channel) return;
+    const controlValues = JSON.stringify(this.controlValues);
     try {
-      const state = await this.fetch_state(this.link, true);
-      if (this.is_changing || !this.drawing || JSON.stringify(this.control_values()) !== now) return;
-      const wrong = await this.drawing.set(state);
-      if (wrong) this.fall_back(`This GPU does not compute what the surface was proved with: ${wrong}`);
+      const state = await this.fetchState(this.channel, true);
+      if (this.isUpdating || !this.renderer || JSON.stringify(this.controlValues) !== controlValues) return;
+      const failure = await this.renderer.setState(state);
+      if (failure) this.useFallback(describeFailedCheck(failure));
       else this.redraw();
-    } catch (wrong) {
-      this.show_message(/** @type {Error} */ (wrong).message);
+    } catch (error) {
+      this.showMessage(/** @type {Error} */ (error).message);
     }
   }
 
-  /** Draws the curves and their points while they are edited, and what was probed. */
-  update_marks() {
-    this.lines = !this.editing ? [] : this.curves.map((curve) => ({
-      points: curve.flatMap((p, k) => [this.to_stage(p), this.to_stage(curve[(k + 1) % curve.length])]),
-      color: CURVE, width: 2.5,
-    }));
-    this.dots = !this.editing ? [] : this.curves.map((curve) => ({
-      points: curve.map((p) => this.to_stage(p)), color: [0.1, 0.1, 0.1, 1], width: 6,
-    }));
-    const chosen = this.selected_point && this.curves[this.selected_point[0]]?.[this.selected_point[1]];
-    if (this.editing && chosen)
-      this.dots.push({ points: [this.to_stage(chosen)], color: [1, 0.3, 0.1, 1], width: 8 });
-    this.lines.push(...this.probe_marks.filter((one) => one.width < 4));
-    this.dots.push(...this.probe_marks.filter((one) => one.width >= 4));
+  /** Draws the curves and their points while they are edited, and the marks of the last probe. */
+  updateMarks() {
+    [this.lines, this.dots] = this.curveEditor.createMarks();
+    // Wide marks of a probe are dots.
+    this.lines.push(...this.probeMarks.filter(({ width }) => width < 4));
+    this.dots.push(...this.probeMarks.filter(({ width }) => width >= 4));
     this.redraw();
   }
 
-  /** A point of the surfaces, on the stage. @param {number[]} p */
-  to_stage(p) {
-    const { placement } = this.scene;
-    return [0, 1, 2].map((k) => placement[12] * (placement[3 * k] * p[0] + placement[3 * k + 1] * p[1]
-      + placement[3 * k + 2] * p[2]) + placement[9 + k]);
+  // Pointers.
+
+  /** The position of a pointer in the window, and the size of this. @param {MouseEvent} event */
+  pointerPosition(event) {
+    const { left, top, width, height } = this.root.getBoundingClientRect();
+    return { width, height, x: event.clientX - left, y: event.clientY - top };
   }
 
-  /** A point on the stage, in the surfaces' coordinates. @param {number[]} p */
-  from_stage(p) {
-    const { placement } = this.scene;
-    return this.direction_from_stage(p.map((x, k) => x - placement[9 + k]));
+  /** The ray through a pointer, in the coordinates of the surfaces. @param {MouseEvent} event */
+  pointerRay(event) {
+    const { width, height, x, y } = this.pointerPosition(event);
+    const { camera, placement } = this;
+    const { right, up, forward } = camera.axes;
+    const pixelSize = camera.pixelSize(width, height);
+    const direction = addScaled(
+      addScaled(forward, pixelSize * (x - 0.5 * width), right), -pixelSize * (y - 0.5 * height), up);
+    return { origin: placement.fromStage(camera.position), direction: placement.vectorFromStage(direction) };
   }
 
-  /** A direction on the stage, in the surfaces' coordinates. @param {number[]} d */
-  direction_from_stage(d) {
-    const { placement } = this.scene;
-    return [0, 1, 2].map((k) => (placement[k] * d[0] + placement[3 + k] * d[1] + placement[6 + k] * d[2])
-      / placement[12]);
-  }
-
-  /** Where a pointer is. @param {MouseEvent} e */
-  pointer(e) {
-    const box = this.root.getBoundingClientRect();
-    return { width: box.width, height: box.height, x: e.clientX - box.left, y: e.clientY - box.top };
-  }
-
-  /** The point that is nearest to a pointer; null if none is near. @param {MouseEvent} e */
-  nearest_point(e) {
-    const camera = this.camera();
-    const { width, height, x, y } = this.pointer(e);
-    /** @type {{at: [number, number], distance: number, z: number} | null} */
-    let best = null;
-    this.curves.forEach((curve, c) => curve.forEach((p, k) => {
-      const there = camera.project(this.to_stage(p), width, height);
-      const distance = Math.hypot(there.x - x, there.y - y);
-      if (distance < PICK_RADIUS && (!best || distance < best.distance)) best = { at: [c, k], distance, z: there.z };
-    }));
-    return /** @type {{at: [number, number], distance: number, z: number} | null} */ (best);
-  }
-
-  /** Whether a pointer takes a point. @param {PointerEvent} e */
-  grab_point(e) {
-    this.pressed = e;
-    if (!this.editing || e.button !== 0) return false;
-    const found = this.nearest_point(e);
-    this.selected_point = found ? found.at : null;
-    if (!found) { this.update_marks(); return false; }
-    this.push_undo();
-    /** @type {Element} */ (e.target).setPointerCapture(e.pointerId);
-    this.dragged = { x: e.clientX, y: e.clientY, z: found.z };
-    this.update_marks();
-    return true;
-  }
-
-  /** @param {PointerEvent} e */
-  drag(e) {
-    if (!this.dragged || !this.selected_point) return;
-    const { width, height } = this.pointer(e);
-    const direction = this.camera().drag_offset(
-      this.dragged.z, e.clientX - this.dragged.x, e.clientY - this.dragged.y, width, height);
-    this.dragged = { ...this.dragged, x: e.clientX, y: e.clientY };
-    const [c, k] = this.selected_point;
-    this.curves = this.curves.map((curve, i) => (i !== c ? curve
-      : curve.map((p, j) => (j === k ? add_scaled(p, 1, this.direction_from_stage(direction)) : p))));
-    this.edited = true;
-    this.change();
-  }
-
-  /** @param {PointerEvent} e */
-  release(e) {
-    const { pressed } = this;
-    if (this.probing && pressed && Math.hypot(e.clientX - pressed.clientX, e.clientY - pressed.clientY) < 3)
-      this.probe(e);
-    this.dragged = undefined;
-  }
-
-  /** Asks Python what the ray through a pointer meets, and draws its proved steps.
-   *  @param {MouseEvent} e */
-  async probe(e) {
-    const { width, height, x, y } = this.pointer(e);
-    const camera = this.camera();
-    const { right, up, forward } = camera.axes();
-    const pixel = camera.pixel(width, height);
-    const on_stage = add_scaled(add_scaled(forward, pixel * (x - 0.5 * width), right), -pixel * (y - 0.5 * height), up);
-    const eye = camera.eye();
-    const origin = this.from_stage(eye);
-    const direction = this.direction_from_stage(on_stage);
-    try {
-      const found = await this.link?.ask?.("probe", { ...this.control_values(), origin, direction });
+  /** Asks Python for the hit of the ray through a pointer, and draws the proved steps to it.
+   *  @param {MouseEvent} event */
+  probe(event) {
+    const { origin, direction } = this.pointerRay(event);
+    return this.showErrors(async () => {
+      const hit = await this.channel?.request?.("probe", { ...this.controlValues, origin, direction });
       const length = Math.hypot(...direction);
-      const at = (/** @type {number} */ t) => this.to_stage(add_scaled(origin, t / length, direction));
-      const ends = [...found.steps, ...(found.t === undefined ? [] : [found.t])].map(at);
-      this.probe_marks = [
-        { points: ends.slice(1).flatMap((p, k) => [ends[k], p]), color: [0.1, 0.4, 0.9, 0.9], width: 2 },
-        { points: ends.slice(1), color: [0.1, 0.4, 0.9, 1], width: 5 },
+      const distances = [...hit.steps, ...(hit.t === undefined ? [] : [hit.t])];
+      const points = distances.map((t) => this.placement.toStage(addScaled(origin, t / length, direction)));
+      this.probeMarks = [
+        { points: points.slice(1).flatMap((p, k) => [points[k], p]), color: [0.1, 0.4, 0.9, 0.9], width: 2 },
+        { points: points.slice(1), color: [0.1, 0.4, 0.9, 1], width: 5 },
       ];
-      this.show_message(probe_text(found));
-      this.update_marks();
-    } catch (wrong) {
-      this.show_message(/** @type {Error} */ (wrong).message);
-    }
-  }
-
-  /** A new point on the segment that is nearest to a pointer. @param {MouseEvent} e */
-  insert(e) {
-    const camera = this.camera();
-    if (!this.editing) { camera.reset(); this.redraw(); return; }
-    const { width, height, x, y } = this.pointer(e);
-    /** @type {{c: number, k: number, point: number[], distance: number} | null} */
-    let best = null;
-    this.curves.forEach((curve, c) => curve.forEach((p, k) => {
-      const q = curve[(k + 1) % curve.length];
-      const [a, b] = [p, q].map((one) => camera.project(this.to_stage(one), width, height));
-      const [dx, dy] = [b.x - a.x, b.y - a.y];
-      const s = Math.max(0, Math.min(1, ((x - a.x) * dx + (y - a.y) * dy) / Math.max(dx * dx + dy * dy, 1e-9)));
-      const distance = Math.hypot(a.x + s * dx - x, a.y + s * dy - y);
-      if (distance < PICK_RADIUS && (!best || distance < best.distance))
-        best = { c, k, point: add_scaled(p, s, add_scaled(q, -1, p)), distance };
-    }));
-    const found = /** @type {{c: number, k: number, point: number[]} | null} */ (/** @type {unknown} */ (best));
-    if (!found) return;
-    this.selected_point = [found.c, found.k + 1];
-    this.edit(this.curves.map((curve, c) => (c !== found.c ? curve
-      : [...curve.slice(0, found.k + 1), found.point, ...curve.slice(found.k + 1)])));
-  }
-
-  /** @param {KeyboardEvent} e */
-  key(e) {
-    if (!this.scene.editable) return;
-    if ((e.ctrlKey || e.metaKey) && e.key.toLowerCase() === "z") {
-      e.preventDefault();
-      if (e.shiftKey) this.undo(this.redo_stack, this.undo_stack);
-      else this.undo(this.undo_stack, this.redo_stack);
-    } else if ((e.key === "Delete" || e.key === "Backspace") && this.editing && this.selected_point) {
-      e.preventDefault();
-      const [c, k] = this.selected_point;
-      if (this.curves[c].length <= 3) return this.show_message("A curve has three points at least.");
-      this.selected_point = null;
-      this.edit(this.curves.map((curve, i) => (i === c ? curve.filter((_, j) => j !== k) : curve)));
-    }
-  }
-
-  push_undo() {
-    this.undo_stack.push(this.curves);
-    this.redo_stack.length = 0;
-  }
-
-  /** @param {number[][][]} curves */
-  edit(curves) {
-    this.push_undo();
-    this.curves = curves;
-    this.edited = true;
-    this.update_marks();
-    this.change();
-  }
-
-  /** @param {number[][][][]} from @param {number[][][][]} to */
-  undo(from, to) {
-    const curves = from.pop();
-    if (!curves) return;
-    to.push(this.curves);
-    this.curves = curves;
-    this.edited = true;
-    this.selected_point = null;
-    this.update_marks();
-    this.change();
-  }
-
-  /** What is on the canvas, as a file. */
-  save() {
-    this.drawing?.present(...(/** @type {[number, number]} */ (this.drawing.shown_size)));
-    this.canvas.toBlob((blob) => {
-      if (!blob) return;
-      const address = URL.createObjectURL(blob);
-      element("a", { href: address, download: "surface.png" }).click();
-      setTimeout(() => URL.revokeObjectURL(address), 1000);
+      this.showMessage(describeHit(hit));
+      this.updateMarks();
     });
   }
+
+  /** Starts to drag a point, if one is at the pointer. Returns whether one is.
+   *  @param {PointerEvent} event */
+  pressPointer(event) {
+    this.pressEvent = event;
+    return this.curveEditor.grabPoint(event);
+  }
+
+  /** Ends a drag; probes the surface after a click. @param {PointerEvent} event */
+  releasePointer(event) {
+    const { pressEvent } = this;
+    if (this.isProbing && pressEvent && Math.hypot(
+      event.clientX - pressEvent.clientX, event.clientY - pressEvent.clientY) < CLICK_RADIUS) this.probe(event);
+    this.curveEditor.releasePoint();
+  }
+
+  /** Inserts a point while curves are edited, and resets the camera otherwise.
+   *  @param {MouseEvent} event */
+  handleDoubleClick(event) {
+    if (this.curveEditor.isActive) this.curveEditor.insertPoint(event);
+    else { this.camera.reset(); this.redraw(); }
+  }
 }
 
-/** Each point halfway to the middle of its neighbors. @param {number[][]} curve */
-function smoothed(curve) {
-  const n = curve.length;
-  return curve.map((p, k) => p.map((x, i) =>
-    0.5 * x + 0.25 * (curve[(k + 1) % n][i] + curve[(k + n - 1) % n][i])));
+/** A message about a device that fails the check. @param {string} failure */
+function describeFailedCheck(failure) {
+  return `This GPU does not compute what the surface was proved with: ${failure}`;
 }
 
-/** What a probe has found, in words. @param {any} found */
-function probe_text(found) {
-  const looks = `${found.evaluations} evaluations`;
-  if (found.t === undefined) return `${found.status.toLowerCase().replaceAll("_", " ")}, ${looks}`;
-  const point = (/** @type {number[]} */ p) => `(${p.map(format).join(", ")})`;
-  const bent = found.mean === undefined ? ""
-    : `, mean curvature ${format(found.mean)}, Gaussian ${format(found.gaussian)}`;
-  const what = found.triangle === undefined ? `f = ${format(found.value)}`
-    : `on triangle ${found.triangle}, where f jumps`;
-  return `at ${point(found.position)}, normal ${point(found.normal)}, ${what}${bent}, ${looks}`;
+/** A color of CSS. @param {number[]} color red, green, blue and opacity, from 0 to 1 */
+function cssColor(color) {
+  return `rgb(${color.slice(0, 3).map((x) => Math.round(255 * x)).join(" ")} / ${0.7 * color[3]})`;
+}
+
+/** The answer to a probe, in words. @param {any} hit */
+function describeHit(hit) {
+  const evaluations = `${hit.evaluations} evaluations`;
+  if (hit.t === undefined) return `${hit.status.toLowerCase().replaceAll("_", " ")}, ${evaluations}`;
+  const formatPoint = (/** @type {number[]} */ p) => `(${p.map(formatNumber).join(", ")})`;
+  const value = hit.triangle === undefined ? `f = ${formatNumber(hit.value)}`
+    : `on triangle ${hit.triangle}, where f jumps`;
+  const curvature = hit.mean === undefined ? ""
+    : `, mean curvature ${formatNumber(hit.mean)}, Gaussian ${formatNumber(hit.gaussian)}`;
+  return `at ${formatPoint(hit.position)}, normal ${formatPoint(hit.normal)}, ${value}${curvature}, ${evaluations}`;
 }

@@ -1,353 +1,413 @@
-// What is done around a traced kernel: rays of the camera, what they met, the light of shaded
-// pictures (harnack.rendering.shading), and lines and points in front.
+// The passes around a traced kernel: rays of the camera, hits, the light of shaded pictures
+// (harnack.rendering.shading), and lines and dots in front of the picture.
 
-struct View {
-  eye: vec4f,         // on the stage; w: directions across the picture in which the sky is looked for
-  right: vec4f,       // unit; w: of a pixel, at distance 1
-  up: vec4f,          // unit; w: the rotation of these directions
-  forward: vec4f,     // unit; w: where rays end
-  key: vec4f,         // unit, to the key light; w: the height of the floor
-  ground: vec4f,      // reflectance; w: 1 where there is a floor
-  scale: vec4f,       // of numbers that are shown: low, 1 / (high - low)
-  behind: vec4f,      // sRGB behind pictures of numbers
-  canvas: vec2f, jitter: vec2f,
+struct PassUniforms {
+  eye: vec4f,         // on the stage; w: the number of directions along which the sky is estimated
+  right: vec4f,       // a unit vector; w: the width of a pixel at distance 1
+  up: vec4f,          // a unit vector; w: the rotation of the directions of the sky
+  forward: vec4f,     // a unit vector; w: the length of rays
+  key: vec4f,         // the unit vector to the key light; w: the height of the floor
+  ground: vec4f,      // the reflectance of the ground; w: 1 where there is a floor
+  scale: vec4f,       // of numbers that are shown as colors: low, 1 / (high - low)
+  background: vec4f,  // the sRGB color behind pictures of numbers
+  canvas_size: vec2f, jitter: vec2f,
   width: u32, height: u32, first: u32, count: u32,
-  weight: f32, show: u32, kind: u32, bands: u32,
+  weight: f32, mode: u32, kind: u32, padding: u32,
 }
-struct Surface {
-  lanes: array<vec4u, 2>,     // what the kernel's lanes are: see `value`
-  results: array<vec4u, 2>,   // where its results are: see `result`
-  number: u32,                // of its first paint
-  lane_count: u32, pad_0: u32, pad_1: u32,
+struct SurfaceUniforms {
+  lanes: array<vec4u, 2>,     // the values that the kernel's lanes take: see `write_lanes`
+  results: array<vec4u, 2>,   // the places of the kernel's results: see `read_result`
+  first_color: u32,           // the number of the first color of the surface
+  lane_count: u32, padding_0: u32, padding_1: u32,
 }
-@group(0) @binding(0) var<uniform> view: View;
-@group(0) @binding(1) var<uniform> surface: Surface;
+@group(0) @binding(0) var<uniform> uniforms: PassUniforms;
+@group(0) @binding(1) var<uniform> surface: SurfaceUniforms;
 @group(0) @binding(2) var<storage, read_write> lanes: array<f32>;
 @group(0) @binding(3) var<storage, read> results: array<u32>;
 @group(0) @binding(4) var<storage, read_write> hits: array<u32>;
 @group(0) @binding(5) var<storage, read_write> sky_visibility: array<f32>;
 @group(0) @binding(6) var<storage, read_write> picture: array<vec4f>;
-@group(0) @binding(7) var<storage, read> colors: array<vec4f>;
+@group(0) @binding(7) var<storage, read> surface_colors: array<vec4f>;
 @group(0) @binding(8) var<storage, read> floor_light: array<vec2f>;
 @group(0) @binding(9) var<storage, read> light_directions: array<vec4f>;
 @group(0) @binding(10) var<storage, read_write> occluded: array<u32>;
 
+// The place of a result that the kernel does not write, because it is 0 for all rays.
 const NO_OUTPUT = 99u;
-const NOTHING = 0u; const GROUND = 1u; const MET = 2u; const LOST = 3u;
-const HIT = 1u; const OUT_OF_STEPS = 2u;
-const SHADED = 0u; const NORMAL = 1u; const DEPTH = 2u; const EVALUATIONS = 3u; const STATUS = 4u;
-const CELLS = 64u; const REACH = 2.4; const RAYS = 8u; const BLOCK = 4u; const FAR = 3.5;
-const TAPS = 8u; const TAP_REACH = 0.16;
-const NEVER = 3.0e38;
+// The results of a kernel.
+const RESULT_STATUS = 0u; const RESULT_T = 1u; const RESULT_NORMAL = 2u;
+const RESULT_EVALUATIONS = 5u; const RESULT_COLOR = 6u;
+// The status of a ray.
+const STATUS_MISS = 0u; const STATUS_HIT = 1u; const STATUS_OUT_OF_STEPS = 2u;
+// The kind of a hit.
+const KIND_NONE = 0u; const KIND_GROUND = 1u; const KIND_SURFACE = 2u; const KIND_OUT_OF_STEPS = 3u;
+// The mode of a picture.
+const MODE_SHADED = 0u; const MODE_NORMAL = 1u; const MODE_DEPTH = 2u;
+const MODE_EVALUATIONS = 3u; const MODE_STATUS = 4u;
+// The floor: see floor_light.js.
+const FLOOR_CELLS = 64u; const RAYS_PER_CELL = 8u; const SAMPLE_BLOCK = 4u;
+const FLOOR_HALF_WIDTH = 2.4; const FLOOR_RAY_LENGTH = 3.5; const MAX_GROUND_RADIUS = 100.0;
+// The samples along each direction of the sky, and the part of the picture that they span.
+const SKY_SAMPLES = 8u; const SKY_REACH = 0.16;
+const NO_HIT_T = 3.0e38;
+const TWO_PI = 6.2831853;
 
-fn direction(pixel: u32) -> vec3f {
-  let place = vec2f(f32(pixel % view.width), f32(pixel / view.width)) + view.jitter;
-  let across = (place - 0.5 * vec2f(f32(view.width), f32(view.height))) * view.right.w;
-  return normalize(view.forward.xyz + across.x * view.right.xyz - across.y * view.up.xyz);
+fn ray_direction(pixel: u32) -> vec3f {
+  let position = vec2f(f32(pixel % uniforms.width), f32(pixel / uniforms.width)) + uniforms.jitter;
+  let offset = (position - 0.5 * vec2f(f32(uniforms.width), f32(uniforms.height))) * uniforms.right.w;
+  return normalize(uniforms.forward.xyz + offset.x * uniforms.right.xyz - offset.y * uniforms.up.xyz);
 }
-fn write_lanes(id: u32, o: vec3f, d: vec3f, end: f32) {
-  let values = array<f32, 7>(o.x, o.y, o.z, d.x, d.y, d.z, end);
+fn write_lanes(id: u32, origin: vec3f, direction: vec3f, end: f32) {
+  let values = array<f32, 7>(
+    origin.x, origin.y, origin.z, direction.x, direction.y, direction.z, end);
   for (var k = 0u; k < surface.lane_count; k++) {
-    lanes[k * view.count + id] = values[surface.lanes[k / 4u][k % 4u]];
+    lanes[k * uniforms.count + id] = values[surface.lanes[k / 4u][k % 4u]];
   }
 }
-fn result(k: u32, id: u32) -> u32 {
+fn read_result(k: u32, id: u32) -> u32 {
   let place = surface.results[k / 4u][k % 4u];
   if (place == NO_OUTPUT) { return 0u; }
-  return results[place * view.count + id];
+  return results[place * uniforms.count + id];
 }
-fn number(k: u32, id: u32) -> f32 { return bitcast<f32>(result(k, id)); }
+fn read_float_result(k: u32, id: u32) -> f32 { return bitcast<f32>(read_result(k, id)); }
 
 // Rays through pixels.
 @compute @workgroup_size(64)
 fn camera_rays(@builtin(global_invocation_id) id: vec3u) {
-  if (id.x >= view.count) { return; }
-  write_lanes(id.x, view.eye.xyz, direction(view.first + id.x), view.forward.w);
+  if (id.x >= uniforms.count) { return; }
+  write_lanes(id.x, uniforms.eye.xyz, ray_direction(uniforms.first + id.x), uniforms.forward.w);
 }
 
-// Before any surface: the floor, or nothing.
+// The hits before any surface is traced: the floor, or nothing.
 @compute @workgroup_size(64)
 fn clear_hits(@builtin(global_invocation_id) id: vec3u) {
-  if (id.x >= view.count) { return; }
-  let pixel = view.first + id.x;
-  let d = direction(pixel);
-  var t = NEVER;
-  var kind = NOTHING;
-  let far = (view.key.w - view.eye.z) / min(d.z, -1e-9);
-  let there = view.eye.xyz + far * d;
-  if (view.ground.w > 0.5 && view.show == SHADED && d.z < 0.0 && length(there.xy) < 100.0) {
-    t = far; kind = GROUND;
+  if (id.x >= uniforms.count) { return; }
+  let pixel = uniforms.first + id.x;
+  let direction = ray_direction(pixel);
+  var t = NO_HIT_T;
+  var kind = KIND_NONE;
+  let ground_t = (uniforms.key.w - uniforms.eye.z) / min(direction.z, -1e-9);
+  let ground_point = uniforms.eye.xyz + ground_t * direction;
+  let has_ground = uniforms.ground.w > 0.5 && uniforms.mode == MODE_SHADED;
+  if (has_ground && direction.z < 0.0 && length(ground_point.xy) < MAX_GROUND_RADIUS) {
+    t = ground_t; kind = KIND_GROUND;
   }
-  write_hit(pixel, t, d, vec3f(0.0, 0.0, 1.0), kind);
-}
-fn write_hit(pixel: u32, t: f32, d: vec3f, normal: vec3f, info: u32) {
-  let p = view.eye.xyz + t * d;
-  let at = 8u * pixel;
-  hits[at] = bitcast<u32>(p.x); hits[at + 1u] = bitcast<u32>(p.y);
-  hits[at + 2u] = bitcast<u32>(p.z); hits[at + 3u] = bitcast<u32>(t);
-  hits[at + 4u] = bitcast<u32>(normal.x); hits[at + 5u] = bitcast<u32>(normal.y);
-  hits[at + 6u] = bitcast<u32>(normal.z); hits[at + 7u] = info;
+  write_hit(pixel, t, direction, vec3f(0.0, 0.0, 1.0), kind);
 }
 
-// What rays have met of one surface: kept where it is nearer than what was met before. The word
-// behind a pixel: what it is, whether the side of larger values is seen, its paint, evaluations.
+// A hit has eight words: its position, t, its normal, and the info word. This has, from the lowest
+// bit on: the kind (2 bits), whether the side of larger values is seen (1), the number of the color
+// (11), and the number of evaluations (18).
+fn write_hit(pixel: u32, t: f32, direction: vec3f, normal: vec3f, info: u32) {
+  let position = uniforms.eye.xyz + t * direction;
+  let start = 8u * pixel;
+  hits[start] = bitcast<u32>(position.x); hits[start + 1u] = bitcast<u32>(position.y);
+  hits[start + 2u] = bitcast<u32>(position.z); hits[start + 3u] = bitcast<u32>(t);
+  hits[start + 4u] = bitcast<u32>(normal.x); hits[start + 5u] = bitcast<u32>(normal.y);
+  hits[start + 6u] = bitcast<u32>(normal.z); hits[start + 7u] = info;
+}
+fn hit_position(pixel: u32) -> vec3f {
+  let start = 8u * pixel;
+  return vec3f(bitcast<f32>(hits[start]), bitcast<f32>(hits[start + 1u]), bitcast<f32>(hits[start + 2u]));
+}
+fn hit_t(pixel: u32) -> f32 { return bitcast<f32>(hits[8u * pixel + 3u]); }
+fn hit_normal(pixel: u32) -> vec3f {
+  let start = 8u * pixel + 4u;
+  return vec3f(bitcast<f32>(hits[start]), bitcast<f32>(hits[start + 1u]), bitcast<f32>(hits[start + 2u]));
+}
+fn hit_normal_to_eye(pixel: u32, direction: vec3f) -> vec3f {
+  let normal = hit_normal(pixel);
+  return select(normal, -normal, dot(normal, direction) > 0.0);
+}
+fn hit_info(pixel: u32) -> u32 { return hits[8u * pixel + 7u]; }
+fn hit_kind(info: u32) -> u32 { return info & 3u; }
+fn is_visible(pixel: u32) -> bool {
+  let kind = hit_kind(hit_info(pixel));
+  return kind == KIND_GROUND || kind == KIND_SURFACE;
+}
+
+// Merges the results of one surface into the hits: they replace those that are farther.
 @compute @workgroup_size(64)
 fn merge_hits(@builtin(global_invocation_id) id: vec3u) {
-  if (id.x >= view.count) { return; }
-  let pixel = view.first + id.x;
-  let before = hits[8u * pixel + 7u];
-  let evaluations = min((before >> 14u) + result(5u, id.x), 0x3ffffu) << 14u;
-  let status = result(0u, id.x);
-  let d = direction(pixel);
-  let t = number(1u, id.x);
-  if (status == OUT_OF_STEPS) { write_hit(pixel, t, d, -d, LOST | evaluations); return; }
-  // The floor stands below what was drawn at first: it hides nothing that has moved below it.
-  let in_front = (before & 3u) == GROUND || t < bitcast<f32>(hits[8u * pixel + 3u]);
-  if (status == HIT && (before & 3u) != LOST && in_front) {
-    let n = vec3f(number(2u, id.x), number(3u, id.x), number(4u, id.x));
-    let paint = min(surface.number + result(6u, id.x), 2047u);
-    write_hit(pixel, t, d, n, MET | select(0u, 4u, dot(n, d) < 0.0) | (paint << 3u) | evaluations);
+  if (id.x >= uniforms.count) { return; }
+  let pixel = uniforms.first + id.x;
+  let old_info = hit_info(pixel);
+  let old_kind = hit_kind(old_info);
+  let evaluations = min((old_info >> 14u) + read_result(RESULT_EVALUATIONS, id.x), 0x3ffffu) << 14u;
+  let status = read_result(RESULT_STATUS, id.x);
+  let direction = ray_direction(pixel);
+  let t = read_float_result(RESULT_T, id.x);
+  if (status == STATUS_OUT_OF_STEPS) {
+    write_hit(pixel, t, direction, -direction, KIND_OUT_OF_STEPS | evaluations);
     return;
   }
-  hits[8u * pixel + 7u] = (before & 0x3fffu) | evaluations;
+  // The floor stands below the first state: it hides no surface that has moved below it.
+  let is_in_front = old_kind == KIND_GROUND || t < hit_t(pixel);
+  if (status == STATUS_HIT && old_kind != KIND_OUT_OF_STEPS && is_in_front) {
+    let normal = vec3f(read_float_result(RESULT_NORMAL, id.x), read_float_result(RESULT_NORMAL + 1u, id.x),
+      read_float_result(RESULT_NORMAL + 2u, id.x));
+    let side = select(0u, 4u, dot(normal, direction) < 0.0);
+    let color = min(surface.first_color + read_result(RESULT_COLOR, id.x), 2047u);
+    write_hit(pixel, t, direction, normal, KIND_SURFACE | side | (color << 3u) | evaluations);
+    return;
+  }
+  hits[8u * pixel + 7u] = (old_info & 0x3fffu) | evaluations;
 }
 
-fn position(pixel: u32) -> vec3f {
-  let at = 8u * pixel;
-  return vec3f(bitcast<f32>(hits[at]), bitcast<f32>(hits[at + 1u]), bitcast<f32>(hits[at + 2u]));
-}
-fn normal_to_eye(pixel: u32, d: vec3f) -> vec3f {
-  let at = 8u * pixel;
-  let n = vec3f(bitcast<f32>(hits[at + 4u]), bitcast<f32>(hits[at + 5u]), bitcast<f32>(hits[at + 6u]));
-  return select(n, -n, dot(n, d) > 0.0);
-}
-fn is_there(pixel: u32) -> bool {
-  let kind = hits[8u * pixel + 7u] & 3u;
-  return kind == GROUND || kind == MET;
-}
-
-// The part of the hemisphere over each point that nothing in the picture hides: `visible_sky`.
+// The fraction of the hemisphere over each point that is not hidden by other hits: `ambient_visibility`.
 @compute @workgroup_size(64)
 fn estimate_sky(@builtin(global_invocation_id) id: vec3u) {
-  if (id.x >= view.count) { return; }
-  let pixel = view.first + id.x;
+  if (id.x >= uniforms.count) { return; }
+  let pixel = uniforms.first + id.x;
   sky_visibility[pixel] = 1.0;
-  if (!is_there(pixel)) { return; }
-  let d = direction(pixel);
-  let p = position(pixel);
-  let n = normal_to_eye(pixel, d);
-  let t = bitcast<f32>(hits[8u * pixel + 3u]);
-  let wide = t * view.right.w * dot(d, view.forward.xyz);
-  let reach = TAP_REACH * f32(max(view.width, view.height));
-  let radius = reach * wide;
-  let x = f32(pixel % view.width); let y = f32(pixel / view.width);
-  let directions = view.eye.w;
+  if (!is_visible(pixel)) { return; }
+  let direction = ray_direction(pixel);
+  let normal = hit_normal_to_eye(pixel, direction);
+  let pixel_size = hit_t(pixel) * uniforms.right.w * dot(direction, uniforms.forward.xyz);
+  let reach = SKY_REACH * f32(max(uniforms.width, uniforms.height));
+  let direction_count = uniforms.eye.w;
   var hidden = 0.0;
-  for (var k = 0.0; k < directions; k += 1.0) {
-    let angle = (k + view.up.w) * (6.2831853 / directions);
-    let across = vec2f(cos(angle), sin(angle));
-    var highest = 0.0;
-    for (var tap = 0u; tap < TAPS; tap++) {
-      let share = (f32(tap) + fract(5.0 * view.up.w - 2.0)) / f32(TAPS);
-      let at = vec2f(x, y) + (1.0 + reach * share * share) * across;
-      if (at.x < 0.0 || at.y < 0.0 || at.x > f32(view.width) - 1.0 || at.y > f32(view.height) - 1.0) {
-        continue;
-      }
-      let other = u32(round(at.y)) * view.width + u32(round(at.x));
-      if (!is_there(other)) { continue; }
-      let toward = position(other) - p;
-      let far = max(length(toward), 1e-12);
-      let height = dot(toward, n) / far - 0.06;
-      if (height > 0.0) { highest = max(highest, height * max(1.0 - (far / radius) * (far / radius), 0.0)); }
-    }
-    hidden += highest * highest;
+  for (var k = 0.0; k < direction_count; k += 1.0) {
+    let angle = (k + uniforms.up.w) * (TWO_PI / direction_count);
+    let horizon = horizon_height(
+      pixel, normal, vec2f(cos(angle), sin(angle)), reach, reach * pixel_size);
+    hidden += horizon * horizon;
   }
-  sky_visibility[pixel] = 1.0 - hidden / directions;
+  sky_visibility[pixel] = 1.0 - hidden / direction_count;
 }
 
-const KEY = vec3f(0.74, 0.71, 0.66);
-const ABOVE = vec3f(0.36, 0.40, 0.46);
-const BELOW = vec3f(0.25, 0.225, 0.20);
+// The sine of the elevation of the highest hit along a direction across the picture. reach: in
+// pixels. radius: of the hits that count, on the stage.
+fn horizon_height(pixel: u32, normal: vec3f, across: vec2f, reach: f32, radius: f32) -> f32 {
+  let position = hit_position(pixel);
+  let pixel_position = vec2f(f32(pixel % uniforms.width), f32(pixel / uniforms.width));
+  let last_position = vec2f(f32(uniforms.width), f32(uniforms.height)) - 1.0;
+  var horizon = 0.0;
+  for (var k = 0u; k < SKY_SAMPLES; k++) {
+    let fraction = (f32(k) + fract(5.0 * uniforms.up.w - 2.0)) / f32(SKY_SAMPLES);
+    let sample_position = pixel_position + (1.0 + reach * fraction * fraction) * across;
+    if (any(sample_position < vec2f(0.0)) || any(sample_position > last_position)) { continue; }
+    let sample_pixel = u32(round(sample_position.y)) * uniforms.width + u32(round(sample_position.x));
+    if (!is_visible(sample_pixel)) { continue; }
+    let displacement = hit_position(sample_pixel) - position;
+    let distance = max(length(displacement), 1e-12);
+    let height = dot(displacement, normal) / distance - 0.06;
+    if (height > 0.0) {
+      let falloff = max(1.0 - (distance / radius) * (distance / radius), 0.0);
+      horizon = max(horizon, height * falloff);
+    }
+  }
+  return horizon;
+}
 
-// `Light.on`.
-fn lit(color: vec3f, n: vec3f, eye: vec3f, is_glossy: bool, visible: f32, reached: f32) -> vec3f {
-  let wrapped = clamp((dot(n, view.key.xyz) + 0.25) / 1.25, 0.0, 1.0);
-  let shown = (1.0 - 0.6 * (1.0 - visible)) * reached;
-  let above = mix(BELOW, ABOVE, 0.5 + 0.5 * dot(n, view.up.xyz)) * visible;
-  let radiance = color * (KEY * (wrapped * shown) + above);
+// Irradiance over pi, linear sRGB: of the key light at its brightest, of the sky and of the ground.
+const KEY_IRRADIANCE = vec3f(0.74, 0.71, 0.66);
+const SKY_IRRADIANCE = vec3f(0.36, 0.40, 0.46);
+const GROUND_IRRADIANCE = vec3f(0.25, 0.225, 0.20);
+
+// The radiance of a point in the studio's light: `StudioLight.shade`. eye: the unit vector to the camera.
+// visible_sky, visible_key: the fractions of the sky and of the key light that reach the point.
+fn shaded_color(
+  color: vec3f, normal: vec3f, eye: vec3f, is_glossy: bool, visible_sky: f32, visible_key: f32,
+) -> vec3f {
+  let wrapped = clamp((dot(normal, uniforms.key.xyz) + 0.25) / 1.25, 0.0, 1.0);
+  let key_fraction = (1.0 - 0.6 * (1.0 - visible_sky)) * visible_key;
+  let sky = mix(GROUND_IRRADIANCE, SKY_IRRADIANCE, 0.5 + 0.5 * dot(normal, uniforms.up.xyz)) * visible_sky;
+  let radiance = color * (KEY_IRRADIANCE * (wrapped * key_fraction) + sky);
   if (!is_glossy) { return radiance; }
-  let spot = 0.22 * pow(max(dot(n, normalize(view.key.xyz + eye)), 0.0), 60.0);
-  let rim = 0.45 * pow(1.0 - clamp(dot(n, eye), 0.0, 1.0), 5.0);
-  return radiance + KEY * (spot * wrapped * shown) + above * rim;
+  let highlight = 0.22 * pow(max(dot(normal, normalize(uniforms.key.xyz + eye)), 0.0), 60.0);
+  let rim = 0.45 * pow(1.0 - clamp(dot(normal, eye), 0.0, 1.0), 5.0);
+  return radiance + KEY_IRRADIANCE * (highlight * wrapped * key_fraction) + sky * rim;
 }
 
-fn floor_at(p: vec3f) -> vec2f {
-  let place = (p.xy / (2.0 * REACH) + 0.5) * f32(CELLS) - 0.5;
-  let low = floor(place);
-  let share = place - low;
+// The fractions of the key light and of the sky that reach a point of the floor, interpolated.
+fn floor_light_at(position: vec3f) -> vec2f {
+  let cell_position = (position.xy / (2.0 * FLOOR_HALF_WIDTH) + 0.5) * f32(FLOOR_CELLS) - 0.5;
+  let low = floor(cell_position);
+  let fraction = cell_position - low;
   var sum = vec2f(0.0);
   for (var k = 0u; k < 4u; k++) {
-    let step = vec2f(f32(k & 1u), f32(k >> 1u));
-    let at = vec2u(clamp(low + step, vec2f(0.0), vec2f(f32(CELLS) - 1.0)));
-    let part = mix(1.0 - share, share, step);
-    sum += part.x * part.y * floor_light[at.y * CELLS + at.x];
+    let corner = vec2f(f32(k & 1u), f32(k >> 1u));
+    let cell = vec2u(clamp(low + corner, vec2f(0.0), vec2f(f32(FLOOR_CELLS) - 1.0)));
+    let weight = mix(1.0 - fraction, fraction, corner);
+    sum += weight.x * weight.y * floor_light[cell.y * FLOOR_CELLS + cell.x];
   }
   return sum;
 }
 
-fn viridis(given: f32) -> vec3f {
-  let x = clamp(given, 0.0, 1.0);
-  var c = vec3f(-5.4321, 4.6416, 26.2721);
-  c = c * x + vec3f(4.7518, -13.7494, -65.3210);
-  c = c * x + vec3f(6.2037, 14.1540, 56.6563);
-  c = c * x + vec3f(-4.5999, -5.7582, -19.2918);
-  c = c * x + vec3f(-0.3272, 0.2148, 0.0920);
-  c = c * x + vec3f(0.1077, 1.3965, 1.3868);
-  return clamp(c * x + vec3f(0.2745, 0.0058, 0.3327), vec3f(0.0), vec3f(1.0));
+// A polynomial close to the color map of this name.
+fn viridis(value: f32) -> vec3f {
+  let x = clamp(value, 0.0, 1.0);
+  var color = vec3f(-5.4321, 4.6416, 26.2721);
+  color = color * x + vec3f(4.7518, -13.7494, -65.3210);
+  color = color * x + vec3f(6.2037, 14.1540, 56.6563);
+  color = color * x + vec3f(-4.5999, -5.7582, -19.2918);
+  color = color * x + vec3f(-0.3272, 0.2148, 0.0920);
+  color = color * x + vec3f(0.1077, 1.3965, 1.3868);
+  return clamp(color * x + vec3f(0.2745, 0.0058, 0.3327), vec3f(0.0), vec3f(1.0));
 }
 
-// Light and covered part of shaded pictures; sRGB of others.
-fn color_of(pixel: u32) -> vec4f {
-  let d = direction(pixel);
-  let info = hits[8u * pixel + 7u];
-  let kind = info & 3u;
-  let n = normal_to_eye(pixel, d);
-  if (view.show == EVALUATIONS) {
-    let x = (log2(f32(info >> 14u) + 1.0) - view.scale.x) * view.scale.y;
-    return vec4f(select(viridis(x), vec3f(1.0, 0.0, 1.0), kind == LOST), 1.0);
+// The color of a hit: the radiance in shaded pictures, sRGB in others. w: 0 where there is no hit.
+fn hit_color(pixel: u32) -> vec4f {
+  let info = hit_info(pixel);
+  let kind = hit_kind(info);
+  if (uniforms.mode == MODE_EVALUATIONS) {
+    let x = (log2(f32(info >> 14u) + 1.0) - uniforms.scale.x) * uniforms.scale.y;
+    return vec4f(select(viridis(x), vec3f(1.0, 0.0, 1.0), kind == KIND_OUT_OF_STEPS), 1.0);
   }
-  if (kind == LOST) { return vec4f(1.0, 0.0, 1.0, 1.0); }
-  if (kind == NOTHING) { return vec4f(0.0); }
-  if (view.show == NORMAL) {
-    let at = 8u * pixel + 4u;
-    return vec4f(0.5 + 0.5 * vec3f(bitcast<f32>(hits[at]), bitcast<f32>(hits[at + 1u]),
-      bitcast<f32>(hits[at + 2u])), 1.0);
-  }
-  if (view.show == STATUS) { return vec4f(0.93, 0.93, 0.90, 1.0); }
-  if (view.show == DEPTH) {
-    let x = (bitcast<f32>(hits[8u * pixel + 3u]) - view.scale.x) * view.scale.y;
+  if (kind == KIND_OUT_OF_STEPS) { return vec4f(1.0, 0.0, 1.0, 1.0); }
+  if (kind == KIND_NONE) { return vec4f(0.0); }
+  if (uniforms.mode == MODE_NORMAL) { return vec4f(0.5 + 0.5 * hit_normal(pixel), 1.0); }
+  if (uniforms.mode == MODE_STATUS) { return vec4f(0.93, 0.93, 0.90, 1.0); }
+  if (uniforms.mode == MODE_DEPTH) {
+    let x = (hit_t(pixel) - uniforms.scale.x) * uniforms.scale.y;
     return vec4f(vec3f(mix(0.95, 0.12, clamp(x, 0.0, 1.0))), 1.0);
   }
-  if (kind == GROUND) {
-    let reached = floor_at(position(pixel));
-    return vec4f(lit(view.ground.rgb, n, -d, false, min(sky_visibility[pixel], reached.y), reached.x), 1.0);
+  let direction = ray_direction(pixel);
+  let normal = hit_normal_to_eye(pixel, direction);
+  if (kind == KIND_GROUND) {
+    let light = floor_light_at(hit_position(pixel));
+    let visible_sky = min(sky_visibility[pixel], light.y);
+    return vec4f(
+      shaded_color(uniforms.ground.rgb, normal, -direction, false, visible_sky, light.x), 1.0);
   }
-  let color = colors[2u * ((info >> 3u) & 2047u) + select(1u, 0u, (info & 4u) != 0u)];
-  return vec4f(lit(color.rgb, n, -d, color.w > 0.5, sky_visibility[pixel], 1.0), 1.0);
+  let color_index = 2u * ((info >> 3u) & 2047u) + select(1u, 0u, (info & 4u) != 0u);
+  let color = surface_colors[color_index];
+  return vec4f(
+    shaded_color(color.rgb, normal, -direction, color.w > 0.5, sky_visibility[pixel], 1.0), 1.0);
 }
 
+// Adds the colors of the hits to the mean of several pictures.
 @compute @workgroup_size(64)
 fn shade(@builtin(global_invocation_id) id: vec3u) {
-  if (id.x >= view.count) { return; }
-  let pixel = view.first + id.x;
-  let color = color_of(pixel);
-  if (view.weight > 0.999) { picture[pixel] = color; return; }
-  picture[pixel] = mix(picture[pixel], color, view.weight);
+  if (id.x >= uniforms.count) { return; }
+  let pixel = uniforms.first + id.x;
+  let color = hit_color(pixel);
+  if (uniforms.weight > 0.999) { picture[pixel] = color; return; }
+  picture[pixel] = mix(picture[pixel], color, uniforms.weight);
 }
 
-// Rays from the floor to the key light (kind 0) or to the sky (kind 1): `floor._parts_seen`.
+// Rays from the floor to the key light (kind 0) or to the sky (kind 1): `_visible_fractions`.
 @compute @workgroup_size(64)
 fn floor_rays(@builtin(global_invocation_id) id: vec3u) {
-  if (id.x >= view.count) { return; }
-  let ray = view.first + id.x;
-  let cell = ray / RAYS;
-  let i = cell % CELLS; let j = cell / CELLS;
-  let place = (vec2f(f32(i), f32(j)) + 0.5) / f32(CELLS) * 2.0 * REACH - REACH;
-  let number = ((j % BLOCK) * BLOCK + i % BLOCK) * RAYS + ray % RAYS;
-  let d = light_directions[view.kind * BLOCK * BLOCK * RAYS + number].xyz;
-  write_lanes(id.x, vec3f(place, 0.0), d, FAR);
+  if (id.x >= uniforms.count) { return; }
+  let ray = uniforms.first + id.x;
+  let cell = ray / RAYS_PER_CELL;
+  let i = cell % FLOOR_CELLS; let j = cell / FLOOR_CELLS;
+  let position = (vec2f(f32(i), f32(j)) + 0.5) / f32(FLOOR_CELLS) * 2.0 * FLOOR_HALF_WIDTH - FLOOR_HALF_WIDTH;
+  let cell_of_block = (j % SAMPLE_BLOCK) * SAMPLE_BLOCK + i % SAMPLE_BLOCK;
+  let direction_index = cell_of_block * RAYS_PER_CELL + ray % RAYS_PER_CELL;
+  let direction_count = SAMPLE_BLOCK * SAMPLE_BLOCK * RAYS_PER_CELL;
+  let direction = light_directions[uniforms.kind * direction_count + direction_index].xyz;
+  write_lanes(id.x, vec3f(position, 0.0), direction, FLOOR_RAY_LENGTH);
 }
 @compute @workgroup_size(64)
 fn merge_floor_hits(@builtin(global_invocation_id) id: vec3u) {
-  if (id.x >= view.count) { return; }
-  if (result(0u, id.x) != 0u) {
-    occluded[view.kind * CELLS * CELLS * RAYS + view.first + id.x] = 1u;
+  if (id.x >= uniforms.count) { return; }
+  if (read_result(RESULT_STATUS, id.x) != STATUS_MISS) {
+    let ray_count = FLOOR_CELLS * FLOOR_CELLS * RAYS_PER_CELL;
+    occluded[uniforms.kind * ray_count + uniforms.first + id.x] = 1u;
   }
 }
 
-// The picture on the canvas.
-@group(0) @binding(11) var<storage, read> shown: array<vec4f>;
-@group(0) @binding(12) var<storage, read> drawn_hits: array<u32>;
+// The picture on the canvas. Render passes only read these buffers.
+@group(0) @binding(11) var<storage, read> displayed_picture: array<vec4f>;
+@group(0) @binding(12) var<storage, read> displayed_hits: array<u32>;
 @group(0) @binding(13) var<storage, read> marks: array<vec4f>;
 
+// A triangle that covers the canvas.
 @vertex
-fn full_screen(@builtin(vertex_index) k: u32) -> @builtin(position) vec4f {
+fn full_screen_vertex(@builtin(vertex_index) k: u32) -> @builtin(position) vec4f {
   return vec4f(f32(k & 1u) * 4.0 - 1.0, f32(k >> 1u) * 4.0 - 1.0, 0.0, 1.0);
 }
-fn to_srgb(x: vec3f) -> vec3f {
-  let y = clamp(x, vec3f(0.0), vec3f(1.0));
-  return select(1.055 * pow(y, vec3f(1.0 / 2.4)) - 0.055, 12.92 * y, y <= vec3f(0.0031308));
+fn to_srgb(color: vec3f) -> vec3f {
+  let x = clamp(color, vec3f(0.0), vec3f(1.0));
+  return select(1.055 * pow(x, vec3f(1.0 / 2.4)) - 0.055, 12.92 * x, x <= vec3f(0.0031308));
 }
-fn shouldered(x: vec3f) -> vec3f {
-  return select(1.0 - 0.2 * exp(-(x - 0.8) / 0.2), x, x <= vec3f(0.8));
+// Compresses highlights: radiance above 0.8 approaches 1.
+fn compress_highlights(radiance: vec3f) -> vec3f {
+  return select(1.0 - 0.2 * exp(-(radiance - 0.8) / 0.2), radiance, radiance <= vec3f(0.8));
 }
-@fragment
-fn display(@builtin(position) at: vec4f) -> @location(0) vec4f {
-  let size = vec2f(f32(view.width), f32(view.height));
-  let place = at.xy / view.canvas * size;
-  let low = floor(place - 0.5);
-  let share = select(place - 0.5 - low, vec2f(0.0), size >= view.canvas);
+// The color of the picture at a position in pixels; interpolated along axes in which the picture has
+// fewer pixels than the canvas.
+fn picture_color(position: vec2f, size: vec2f) -> vec4f {
+  let low = floor(position - 0.5);
+  let is_fine = size >= uniforms.canvas_size;
+  let fraction = select(position - 0.5 - low, vec2f(0.0), is_fine);
   var color = vec4f(0.0);
   for (var k = 0u; k < 4u; k++) {
-    let step = vec2f(f32(k & 1u), f32(k >> 1u));
-    let part = mix(1.0 - share, share, step);
-    if (part.x * part.y == 0.0) { continue; }
-    let p = vec2u(clamp(low + step + select(vec2f(0.0), vec2f(0.5), size >= view.canvas),
-      vec2f(0.0), size - 1.0));
-    color += part.x * part.y * shown[p.y * view.width + p.x];
+    let corner = vec2f(f32(k & 1u), f32(k >> 1u));
+    let weight = mix(1.0 - fraction, fraction, corner);
+    if (weight.x * weight.y == 0.0) { continue; }
+    let pixel = vec2u(clamp(low + corner + select(vec2f(0.0), vec2f(0.5), is_fine), vec2f(0.0), size - 1.0));
+    color += weight.x * weight.y * displayed_picture[pixel.y * uniforms.width + pixel.x];
   }
-  if (view.show != SHADED) { return vec4f(color.rgb + (1.0 - color.a) * view.behind.rgb, 1.0); }
-  let across = (at.xy - 0.5 * view.canvas) * view.right.w * size.x / view.canvas.x;
-  let d = normalize(view.forward.xyz + across.x * view.right.xyz - across.y * view.up.xyz);
-  let z = vec3f(0.0, 0.0, 1.0);
-  let wall = lit(view.ground.rgb, z, z, false, 1.0, 1.0) * (1.0 - 0.45 * pow(clamp(d.z, 0.0, 1.0), 0.7));
-  let light = shouldered(color.rgb / max(color.a, 1e-6));
-  return vec4f(to_srgb(color.a * light + (1.0 - color.a) * wall), 1.0);
-}
-
-// Lines (pairs of marks) and dots (single ones). A mark: where, and how wide in pixels; after all
-// marks come their colors.
-struct Drawn {
-  @builtin(position) at: vec4f,
-  @location(0) color: vec4f,
-  @location(1) there: vec3f,
-  @location(2) across: vec2f,
-}
-fn on_canvas(p: vec3f) -> vec4f {
-  let from_eye = p - view.eye.xyz;
-  let z = dot(from_eye, view.forward.xyz);
-  let wide = 0.5 * view.right.w * vec2f(f32(view.width), f32(view.height));
-  return vec4f(dot(from_eye, view.right.xyz) / wide.x, dot(from_eye, view.up.xyz) / wide.y, 0.5 * z, z);
-}
-@vertex
-fn line(@builtin(vertex_index) k: u32) -> Drawn {
-  let one = 2u * (k / 6u);
-  let corners = array<vec2f, 6>(vec2f(0, -1), vec2f(1, -1), vec2f(1, 1), vec2f(0, -1), vec2f(1, 1), vec2f(0, 1));
-  let c = corners[k % 6u];
-  let a = on_canvas(marks[one].xyz); let b = on_canvas(marks[one + 1u].xyz);
-  let along_line = (b.xy / b.w - a.xy / a.w) * view.canvas;
-  let side = vec2f(-along_line.y, along_line.x) / max(length(along_line), 1e-6);
-  let here = select(a, b, c.x > 0.5);
-  let end = marks[one + u32(c.x)];
-  let moved = here.xy + c.y * side * end.w / view.canvas * here.w;
-  return Drawn(vec4f(moved, here.zw), marks[one + view.kind], end.xyz, vec2f(0.0, c.y));
-}
-@vertex
-fn dot_at(@builtin(vertex_index) k: u32) -> Drawn {
-  let one = k / 6u;
-  let corners = array<vec2f, 6>(vec2f(-1, -1), vec2f(1, -1), vec2f(1, 1), vec2f(-1, -1), vec2f(1, 1), vec2f(-1, 1));
-  let c = corners[k % 6u];
-  let here = on_canvas(marks[one].xyz);
-  let moved = here.xy + c * marks[one].w / view.canvas * here.w;
-  return Drawn(vec4f(moved, here.zw), marks[one + view.kind], marks[one].xyz, c);
+  return color;
 }
 @fragment
-fn mark(drawn: Drawn) -> @location(0) vec4f {
-  let far = length(drawn.across);
-  let size = vec2f(f32(view.width), f32(view.height));
-  let p = vec2u(clamp(drawn.at.xy / view.canvas * size, vec2f(0.0), size - 1.0));
-  let before = bitcast<f32>(drawn_hits[8u * (p.y * view.width + p.x) + 3u]);
-  let hidden = distance(drawn.there, view.eye.xyz) > before * 1.003 + 0.004;
-  let edge = 1.0 - smoothstep(0.75, 1.0, far);
-  return vec4f(drawn.color.rgb, drawn.color.a * edge * select(1.0, 0.12, hidden));
+fn display(@builtin(position) position: vec4f) -> @location(0) vec4f {
+  let size = vec2f(f32(uniforms.width), f32(uniforms.height));
+  let color = picture_color(position.xy / uniforms.canvas_size * size, size);
+  if (uniforms.mode != MODE_SHADED) {
+    return vec4f(color.rgb + (1.0 - color.a) * uniforms.background.rgb, 1.0);
+  }
+  let canvas_offset = position.xy - 0.5 * uniforms.canvas_size;
+  let offset = canvas_offset * uniforms.right.w * size.x / uniforms.canvas_size.x;
+  let direction = normalize(
+    uniforms.forward.xyz + offset.x * uniforms.right.xyz - offset.y * uniforms.up.xyz);
+  let upward = vec3f(0.0, 0.0, 1.0);
+  let vignette = 1.0 - 0.45 * pow(clamp(direction.z, 0.0, 1.0), 0.7);
+  let wall = shaded_color(uniforms.ground.rgb, upward, upward, false, 1.0, 1.0) * vignette;
+  let radiance = compress_highlights(color.rgb / max(color.a, 1e-6));
+  return vec4f(to_srgb(color.a * radiance + (1.0 - color.a) * wall), 1.0);
+}
+
+// Lines have two marks, dots have one. A mark is its position on the stage and its width in pixels.
+// The buffer holds all marks, and after them their colors; `kind` is the number of marks.
+struct MarkVertex {
+  @builtin(position) position: vec4f,
+  @location(0) color: vec4f,
+  @location(1) stage_position: vec3f,
+  @location(2) offset: vec2f,  // from the middle of the mark, whose edge is at 1
+}
+fn clip_position(position: vec3f) -> vec4f {
+  let from_eye = position - uniforms.eye.xyz;
+  let z = dot(from_eye, uniforms.forward.xyz);
+  let half_size = 0.5 * uniforms.right.w * vec2f(f32(uniforms.width), f32(uniforms.height));
+  return vec4f(dot(from_eye, uniforms.right.xyz) / half_size.x, dot(from_eye, uniforms.up.xyz) / half_size.y,
+    0.5 * z, z);
+}
+@vertex
+fn line_vertex(@builtin(vertex_index) k: u32) -> MarkVertex {
+  let index = 2u * (k / 6u);
+  // x: the start or the end of the line; y: the side of it.
+  let corners = array<vec2f, 6>(vec2f(0, -1), vec2f(1, -1), vec2f(1, 1), vec2f(0, -1), vec2f(1, 1), vec2f(0, 1));
+  let corner = corners[k % 6u];
+  let start = clip_position(marks[index].xyz); let end = clip_position(marks[index + 1u].xyz);
+  let along = (end.xy / end.w - start.xy / start.w) * uniforms.canvas_size;
+  let across = vec2f(-along.y, along.x) / max(length(along), 1e-6);
+  let middle = select(start, end, corner.x > 0.5);
+  let mark = marks[index + u32(corner.x)];
+  let position = middle.xy + corner.y * across * mark.w / uniforms.canvas_size * middle.w;
+  return MarkVertex(vec4f(position, middle.zw), marks[index + uniforms.kind], mark.xyz, vec2f(0.0, corner.y));
+}
+@vertex
+fn dot_vertex(@builtin(vertex_index) k: u32) -> MarkVertex {
+  let index = k / 6u;
+  let corners = array<vec2f, 6>(
+    vec2f(-1, -1), vec2f(1, -1), vec2f(1, 1), vec2f(-1, -1), vec2f(1, 1), vec2f(-1, 1));
+  let corner = corners[k % 6u];
+  let middle = clip_position(marks[index].xyz);
+  let position = middle.xy + corner * marks[index].w / uniforms.canvas_size * middle.w;
+  return MarkVertex(vec4f(position, middle.zw), marks[index + uniforms.kind], marks[index].xyz, corner);
+}
+// The color of a mark: faint where a hit hides it.
+@fragment
+fn mark(vertex: MarkVertex) -> @location(0) vec4f {
+  let size = vec2f(f32(uniforms.width), f32(uniforms.height));
+  let pixel = vec2u(clamp(vertex.position.xy / uniforms.canvas_size * size, vec2f(0.0), size - 1.0));
+  let t = bitcast<f32>(displayed_hits[8u * (pixel.y * uniforms.width + pixel.x) + 3u]);
+  let is_hidden = distance(vertex.stage_position, uniforms.eye.xyz) > t * 1.003 + 0.004;
+  let edge = 1.0 - smoothstep(0.75, 1.0, length(vertex.offset));
+  return vec4f(vertex.color.rgb, vertex.color.a * edge * select(1.0, 0.12, is_hidden));
 }

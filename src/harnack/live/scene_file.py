@@ -66,6 +66,7 @@ __all__ = [
     "FieldSources",
     "SceneFile",
     "SceneFileError",
+    "check_sources",
     "parse_scene",
     "read_scene",
     "to_scene_text",
@@ -98,6 +99,21 @@ FieldSources = Sequence[tuple[Field, Plain]]
 """Fields, and where they come from, as scene files say it."""
 
 
+def check_sources(sources: Any) -> None:
+    """Raise TypeError for what are no pairs of a field and its text."""
+    try:
+        is_right = all(
+            isinstance(field, Field) and isinstance(text, dict) for field, text in sources
+        )
+    except (TypeError, ValueError):
+        is_right = False
+    if not is_right:
+        raise TypeError(
+            "sources must be pairs of a field and where it comes from, as SceneFile.sources has "
+            f"them, not {sources!r:.60}"
+        )
+
+
 class SceneFileError(ValueError):
     """A text is no scene file, or an object cannot be stored in a scene file."""
 
@@ -122,7 +138,8 @@ class SceneFile:
         `harnack.trace` and whatever else takes a `Surface`."""
         shorthand = {k: value for k, value in self.settings.items() if k in SURFACE_OPTIONS}
         return tuple(
-            surface_and_options("a scene", surface, None, shorthand)[0] for surface in self.surfaces
+            surface_and_options("a scene", surface, None, shorthand, SURFACE_OPTIONS)[0]
+            for surface in self.surfaces
         )
 
     @property
@@ -184,6 +201,7 @@ def write_scene(
             or a mesh that was made in Python: by its name.
     """
     target = os.fspath(path)
+    check_sources(sources)
     if not target.lower().endswith(_ENDING):
         raise SceneFileError(f"{target}: a scene is written as {_ENDING}")
     text = to_scene_text(surfaces, settings, sources)

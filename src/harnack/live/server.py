@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, cast
 
-from harnack.backend.validation import as_integer_in_range
+from harnack.backend.validation import as_integer_in_range, flag
 from harnack.live.live_scene import LiveScene
 from harnack.live.page_file import check_title, document, still_png
-from harnack.live.scene_file import FieldSources
+from harnack.live.scene_file import FieldSources, check_sources
 from harnack.live.session import MessageHandler, RequestError
 from harnack.live.sliders import extreme_slider_values
 from harnack.rendering.option_table import shows_options
@@ -122,6 +122,10 @@ def view(
     port = as_integer_in_range(port, "port", minimum=0, maximum=65535)
     height = check_height(height)
     check_title(title)
+    flag(open_browser, "open_browser")
+    check_sources(sources)
+    if block is not None:
+        flag(block, "block")
     if not isinstance(cast("Any", host), str):
         raise TypeError(f'host must be an address, such as "127.0.0.1", not {host!r:.60}')
     settings = {**keywords, "options": options}

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Widget"]
 
-_RENDER = "\nexport default { render: ({ model, el }) => widget(Panel, model, el) };\n"
+_RENDER = "\nexport default { render: ({ model, el }) => renderWidget(Panel, model, el) };\n"
 
 
 class Widget(anywidget.AnyWidget):

@@ -60,7 +60,7 @@ from harnack.meshing.sign_isosurface import (
 )
 from harnack.progress import teller
 from harnack.tracer import Surface
-from harnack.tracer.trace_options import TRACE_OPTIONS, shows_keywords, surface_and_options
+from harnack.tracer.trace_options import SURFACE_OPTIONS, shows_keywords, surface_and_options
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -74,7 +74,7 @@ if TYPE_CHECKING:
 
 __all__ = ["mesh"]
 
-_NOT_OF_MESHES = tuple(name for name in TRACE_OPTIONS if name != "tolerance")
+_HONORED = (*SURFACE_OPTIONS, "tolerance")
 
 # Cells across the level set, unless a spacing is given; curves have their own length besides.
 _ACROSS = 24
@@ -85,7 +85,7 @@ _MARGIN = 0.01
 _ROOM = 0.05
 
 
-@shows_keywords(*_NOT_OF_MESHES)
+@shows_keywords(*_HONORED)
 def mesh(
     surface: Field | Surface,
     *,
@@ -181,8 +181,7 @@ def mesh(
             meshes do not have; keywords beside an object that holds them.
         ValueError: options out of range, or that contradict each other; several levels.
     """
-    target, choices = surface_and_options("mesh", surface, options, keywords)
-    choices.refuse_others("mesh", "tolerance")
+    target, choices = surface_and_options("mesh", surface, options, keywords, _HONORED)
     accuracy = MeshTolerance.of(choices)
     check_options(cell_size, thickness, seed, max_triangles)
     simplify, largest = flag(simplify, "simplify"), target.largest > 0

@@ -56,12 +56,13 @@ from harnack.meshing.mesh_pipeline import mesh as mesh_of
 from harnack.meshing.mesh_tolerance import MeshTolerance
 from harnack.name_suggestions import is_one_of
 from harnack.progress import teller
-from harnack.tracer import TraceOptions
+from harnack.tracer.trace_options import trace_options
 
 if TYPE_CHECKING:
     import trimesh
 
     from harnack.backend import FloatArray
+    from harnack.tracer import TraceOptions
 
 __all__ = ["repair"]
 
@@ -184,12 +185,8 @@ def repair(
             cells.
     """
     largest = flag(largest, "largest")
-    if options is None:
-        options = TraceOptions(tolerance=tolerance)
-    elif tolerance is not None:
-        raise TypeError("tolerance: give it in options, or without options")
-    options.refuse_others("repair", "tolerance")
-    accuracy = MeshTolerance.of(options)
+    keywords = {} if tolerance is None else {"tolerance": tolerance}
+    accuracy = MeshTolerance.of(trace_options("repair", options, keywords, ("tolerance",)))
     asked = _checked_settings(keep, filling, accuracy, cell_size, seed, teller(progress))
     _check_is_mesh(mesh)
     _check_encloses(mesh)

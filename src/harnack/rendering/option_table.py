@@ -291,16 +291,22 @@ def complete_options(verb: str, keywords: Mapping[str, Any]) -> dict[str, Any]:
 
 def refuse_unknown(verb: str, keywords: Mapping[str, Any]) -> None:
     """Raise TypeError for a keyword that is no option of a verb."""
+    refuse_others(verb, keywords)
+    for name in keywords:
+        if name not in BY_NAME:
+            known = [option.name for option in options_of(verb)]
+            other_name = _OTHER_PROGRAMS_NAMES.get(name.lower())
+            hint = f"; did you mean {other_name}?" if other_name else did_you_mean(name, known)
+            raise TypeError(f"{verb} has no option {name!r}{hint}; it has {', '.join(known)}")
+
+
+def refuse_others(verb: str, keywords: Mapping[str, Any]) -> None:
+    """Raise TypeError for a keyword that is an option of other verbs alone."""
     for name in keywords:
         option = BY_NAME.get(name)
         if option is not None and verb not in option.verbs:
             others = ", ".join(sorted(option.verbs))
             raise TypeError(f"{verb} has no {name}: that is an option of {others}")
-        if option is None:
-            known = [option.name for option in options_of(verb)]
-            other_name = _OTHER_PROGRAMS_NAMES.get(name.lower())
-            hint = f"; did you mean {other_name}?" if other_name else did_you_mean(name, known)
-            raise TypeError(f"{verb} has no option {name!r}{hint}; it has {', '.join(known)}")
 
 
 def shows_options(verb: str) -> Callable[[_Function], _Function]:

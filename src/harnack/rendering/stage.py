@@ -145,33 +145,35 @@ MATERIALS: Mapping[str, Material] = {
 """Materials by name, that look well in the studio."""
 
 
-def parse_material(wanted: Any) -> Material:
+def parse_material(material: Any, option: str = "material") -> Material:
     """A material from its name, from a color, or from a BSDF dictionary used as it stands.
+
+    option: the name of the option, for messages.
 
     Raises:
         TypeError: it is none of these.
         ValueError: there is no material or color of that name.
     """
-    if wanted is None:
+    if material is None:
         return MATERIALS["two-tone"]
-    if isinstance(wanted, Material):
-        return wanted
-    if isinstance(wanted, Mapping):
-        return Material(dict(cast("Mapping[str, Any]", wanted)), two_sided=False)
-    if isinstance(wanted, str) and wanted.strip().lower() in MATERIALS:
-        return MATERIALS[wanted.strip().lower()]
+    if isinstance(material, Material):
+        return material
+    if isinstance(material, Mapping):
+        return Material(dict(cast("Mapping[str, Any]", material)), two_sided=False)
+    if isinstance(material, str) and material.strip().lower() in MATERIALS:
+        return MATERIALS[material.strip().lower()]
     try:
-        return _painted(linear_from_srgb(parse_color(wanted, "material")))
+        return _painted(linear_from_srgb(parse_color(material, option)))
     except TypeError:
         raise TypeError(
-            f"a material is a name, a color, a Material or a BSDF dictionary, not {wanted!r}; "
+            f"{option} must be a name, a color, a Material or a BSDF dictionary, not {material!r}; "
             f"there are {', '.join(MATERIALS)}"
         ) from None
     except ValueError:
         raise ValueError(
-            f"unknown material {wanted!r}; there are {', '.join(MATERIALS)}, and colors, by a "
+            f"unknown {option} {material!r}; there are {', '.join(MATERIALS)}, and colors, by a "
             f'name of CSS, "#rrggbb" or three numbers from 0 to 1'
-            f"{did_you_mean(wanted, (*MATERIALS, *NAMED_COLORS))}"
+            f"{did_you_mean(material, (*MATERIALS, *NAMED_COLORS))}"
         ) from None
 
 

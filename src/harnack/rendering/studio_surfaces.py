@@ -108,7 +108,7 @@ def studio_objects(
             "boundary_material needs the radius of the tubes as well, such as boundary_radius=0.03"
         )
     tube_material = parse_material(
-        _TUBE_MATERIAL if boundary_material is None else boundary_material
+        _TUBE_MATERIAL if boundary_material is None else boundary_material, "boundary_material"
     )
     if tube_material.transparent:
         raise ValueError("boundary_material: tubes have no inside, so light cannot pass through")
@@ -120,7 +120,9 @@ def studio_objects(
             replace(element, surface=_thickened(element.surface, thickness)) for element in objects
         ]
     if section_material is not None:
-        objects = _with_section_material(objects, parse_material(section_material))
+        objects = _with_section_material(
+            objects, parse_material(section_material, "section_material")
+        )
     return objects + tubes
 
 
@@ -227,8 +229,8 @@ def _surface(
     a section opens it, or it is clear."""
     if isinstance(element, TracedSurface):
         return element.with_call_cache(begins=True)
-    target, choices = surface_and_options("render", element, options, shorthand)
-    choices.refuse_others("render", *names_of("render", "trace"))
+    honored = names_of("render", "surface", "trace")
+    target, choices = surface_and_options("render", element, options, shorthand, honored)
     surface = TracedSurface.of(target, choices).with_call_cache(begins=True)
     return with_visible_inside(surface, is_clear=is_clear)
 

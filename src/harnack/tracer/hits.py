@@ -22,8 +22,8 @@ from harnack.tracer.derivatives import attach_derivatives, needs_derivatives, re
 from harnack.tracer.doubtful import Doubtful, seen_distance
 from harnack.tracer.level_contact import HitTolerance, RayStatus
 from harnack.tracer.rays import RayBatch
-from harnack.tracer.trace_options import shows_keywords, surface_and_options
-from harnack.tracer.traced_surface import TracedSurface, check_is_open
+from harnack.tracer.trace_options import TRACE_OPTIONS, shows_keywords, surface_and_options
+from harnack.tracer.traced_surface import TracedSurface
 from harnack.webgpu import evaluate_on_device, find_device
 
 if TYPE_CHECKING:
@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     from harnack.tracer.trace_options import TraceKeywords, TraceOptions
     from harnack.webgpu import Arrays
 
+# The keywords of `trace`.
+_HONORED = ("level", "clip", "section", "largest", *TRACE_OPTIONS)
 # From so many rays on it pays to look for empty cells first.
 _MIN_RAYS_FOR_CELLS = 4096
 # Rays are scattered where the directions of neighbors are farther apart than this, or their origins
@@ -103,7 +105,7 @@ class Hits:
 
 
 @accepts_dask_arrays("origins", "directions", "t_min", "t_max")
-@shows_keywords()
+@shows_keywords(*_HONORED)
 def trace(
     surface: Field | Surface,
     origins: Any,
@@ -153,8 +155,7 @@ def trace(
         RuntimeError: with a backend, there is no device, or the device disagrees.
         NotImplementedError: with a backend, a field whose kernel is not translated.
     """
-    target, choices = surface_and_options("trace", surface, options, keywords)
-    check_is_open("trace", target)
+    target, choices = surface_and_options("trace", surface, options, keywords, _HONORED)
     traced = TracedSurface.of(target, choices)
     if choices.backend is not None:
         if any(is_tensor(a) or dr.is_array_v(type(a)) for a in (origins, directions, t_min, t_max)):

@@ -28,7 +28,7 @@ from harnack.tracer.level_contact import Contact, RayStatus
 from harnack.tracer.rays import RayBatch
 from harnack.tracer.surface_tracer import MarchResult
 from harnack.tracer.trace_options import shows_keywords, surface_and_options
-from harnack.tracer.traced_surface import TracedSurface, check_is_open
+from harnack.tracer.traced_surface import TracedSurface
 from harnack.tracer.walks import JumpTracer, JumpTraceState
 
 if TYPE_CHECKING:
@@ -40,6 +40,12 @@ if TYPE_CHECKING:
     from harnack.tracer.surface import Surface
     from harnack.tracer.surface_tracer import SurfaceTracer
     from harnack.tracer.trace_options import TraceKeywords, TraceOptions
+
+# The keywords of `crossings`.
+_HONORED = (
+    "level", "clip", "section", "tolerance", "enclosures", "max_steps", "over_relaxation",
+    "precision",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -203,7 +209,7 @@ class RayCrossings:
 
 
 @accepts_dask_arrays("origins", "directions", "t_min", "t_max")
-@shows_keywords("largest", "require_crossing", "backend")
+@shows_keywords(*_HONORED)
 def crossings(
     surface: Field | Surface,
     origins: Any,
@@ -235,10 +241,7 @@ def crossings(
         TypeError, ValueError: as `trace`; also for several levels of a field with jumps.
         NotImplementedError: a field with patches.
     """
-    target, choices = surface_and_options("crossings", surface, options, keywords)
-    choices.refuse_others("crossings", "tolerance", "enclosures", "max_steps", "over_relaxation",
-                          "precision")  # fmt: skip
-    check_is_open("crossings", target)
+    target, choices = surface_and_options("crossings", surface, options, keywords, _HONORED)
     traced = TracedSurface.of(target, choices)
     k = _check_count(max_crossings)
     traced.validate_crossings("crossings")

@@ -108,15 +108,6 @@ class TraceOptions:
         """These options with other values."""
         return replace(self, **changes)
 
-    def refuse_others(self, verb: str, *honored: str) -> None:
-        """Raise TypeError for an option other than those honored by a verb, if it is set."""
-        for option in fields(self):
-            if option.name not in honored and getattr(self, option.name) != option.default:
-                raise TypeError(
-                    f"{verb} has no {option.name}; of the options of traces it has "
-                    f"{', '.join(honored) or 'none'}"
-                )
-
 
 SURFACE_OPTIONS = tuple(SurfaceKeywords.__annotations__)
 """The names of the keywords of `Surface`."""
@@ -125,21 +116,29 @@ TRACE_OPTIONS = tuple(field.name for field in fields(TraceOptions))
 
 
 def surface_and_options(
-    verb: str, surface: Any, options: TraceOptions | None, keywords: Mapping[str, Any]
+    verb: str,
+    surface: Any,
+    options: TraceOptions | None,
+    keywords: Mapping[str, Any],
+    honored: Sequence[str],
 ) -> tuple[Surface, TraceOptions]:
     """The surface and the options of a call of a verb, of which some may be given as keywords.
 
+    honored: the names of the keywords that the verb honors; the others have to have their defaults.
+
     Raises:
-        TypeError: a keyword that there is not; a keyword of `Surface` beside a `Surface`, or of
-            `TraceOptions` beside `options`; `surface` is neither a field nor a `Surface`.
+        TypeError: a keyword that there is not, or that the verb does not honor, also within
+            `surface` and `options`; a keyword of `Surface` beside a `Surface`, or of `TraceOptions`
+            beside `options`; `surface` is neither a field nor a `Surface`.
         ValueError: as `Surface` and `TraceOptions` raise it.
     """
-    known = (*SURFACE_OPTIONS, *TRACE_OPTIONS)
     for name in keywords:
-        if name not in known:
-            raise TypeError(f"{verb} has no argument {name!r}{did_you_mean(name, known)}")
+        if name in (*SURFACE_OPTIONS, *TRACE_OPTIONS) and name not in honored:
+            raise TypeError(_refusal(verb, name, honored))
+        if name not in honored:
+            raise TypeError(f"{verb} has no argument {name!r}{did_you_mean(name, honored)}")
     of_surface = {name: value for name, value in keywords.items() if name in SURFACE_OPTIONS}
-    choices = trace_options_among(options, keywords)
+    choices = trace_options(verb, options, keywords, honored)
     if isinstance(surface, Surface):
         if of_surface:
             raise TypeError(
@@ -148,7 +147,35 @@ def surface_and_options(
             )
     else:
         surface = Surface(surface, **of_surface)
+    if "side" not in honored and surface.solid_range is not None:
+        raise TypeError(
+            f'{verb} has no side, and this is side="{surface.side}" of a level: faces of a solid '
+            'on its clip are no part of a level set; give surface.replace(side="surface")'
+        )
+    if "largest" not in honored and surface.largest:
+        raise TypeError(_refusal(verb, "largest", honored))
     return surface, choices
+
+
+def trace_options(
+    verb: str, options: TraceOptions | None, keywords: Mapping[str, Any], honored: Sequence[str]
+) -> TraceOptions:
+    """The options of a call of a verb, or those of traces among its keywords.
+
+    Raises:
+        TypeError: both are given; one is set that the verb does not honor.
+    """
+    choices = trace_options_among(options, keywords)
+    for option in fields(TraceOptions):
+        if option.name not in honored and getattr(choices, option.name) != option.default:
+            raise TypeError(_refusal(verb, option.name, honored))
+    return choices
+
+
+def _refusal(verb: str, name: str, honored: Sequence[str]) -> str:
+    return (
+        f"{verb} has no {name}; of the options of surfaces and traces it has {', '.join(honored)}"
+    )
 
 
 def trace_options_among(options: Any, keywords: Mapping[str, Any]) -> TraceOptions:
@@ -181,13 +208,11 @@ def shorthand_parameters() -> dict[str, inspect.Parameter]:
     }
 
 
-def shows_keywords(*omitted: str) -> Callable[[_Function], _Function]:
+def shows_keywords(*honored: str) -> Callable[[_Function], _Function]:
     """Return a decorator of a verb that takes `**keywords: Unpack[TraceKeywords]`: its signature
-    shows these keywords by name, with their defaults, but for those omitted."""
+    shows those that it honors by name, with their defaults."""
     shorthand = shorthand_parameters()
-    return shows_parameters(
-        [parameter for name, parameter in shorthand.items() if name not in omitted]
-    )
+    return shows_parameters([shorthand[name] for name in honored])
 
 
 def shows_parameters(

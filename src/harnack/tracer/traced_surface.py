@@ -18,7 +18,12 @@ from harnack.tracer.largest_component import largest_component_cells
 from harnack.tracer.level_contact import HitTolerance
 from harnack.tracer.surface import Surface, intersection_of, level_number, side_range
 from harnack.tracer.surface_tracer import SurfaceTracer
-from harnack.tracer.trace_options import TraceOptions, surface_and_options
+from harnack.tracer.trace_options import (
+    SURFACE_OPTIONS,
+    TRACE_OPTIONS,
+    TraceOptions,
+    surface_and_options,
+)
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real
@@ -259,18 +264,8 @@ def traced_surface(
     """
     if isinstance(surface, TracedSurface) and options is None and not keywords:
         return surface
-    return TracedSurface.of(*surface_and_options(verb, surface, options, keywords))
-
-
-def check_is_open(verb: str, surface: Surface) -> None:
-    """Raise TypeError for the boundary of a closed solid, whose faces on the clip a verb does not
-    see."""
-    if surface.solid_range is not None:
-        raise TypeError(
-            f'{verb} takes level sets, not side="{surface.side}": faces of a solid on its clip are '
-            'no part of them; give surface.replace(side="surface"), or the solid as a field '
-            "(harnack.solid)"
-        )
+    honored = (*SURFACE_OPTIONS, *TRACE_OPTIONS)
+    return TracedSurface.of(*surface_and_options(verb, surface, options, keywords, honored))
 
 
 def check_has_inside(surface: TracedSurface) -> None:
