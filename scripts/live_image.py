@@ -18,7 +18,9 @@ def main(folder: Path) -> None:
     level = hk.Slider(4.0, 9.0, 6.0)
     with (
         chromium() as browser,
-        hk.view(knot, level=level, title="A trefoil's surface", open_browser=False, block=False) as view,
+        hk.view(
+            knot, level=level, title="A trefoil's surface", open_browser=False, block=False
+        ) as view,
     ):
         page = Page(browser, view.address, (960, 600), samples=2)
         page.tick("Edit points")
