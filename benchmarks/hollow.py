@@ -86,7 +86,7 @@ def _measured(path: Path) -> _Row | str:
     outer, gyroid = hk.solid(repaired), hk.Gyroid(_CELL)
     lattice = hk.solid(gyroid, between=gyroid.levels_of_thickness(0.8))
     body = outer.shell(_WALL) | (outer & lattice)
-    (x, _, z), vent = repaired.bounds.mean(axis=0), hk.Cylinder(_VENT, 6.0).rotated(90, "x")
+    (x, _, z), vent = repaired.bounds.mean(axis=0), hk.Cylinder(_VENT, 12.0).rotated(90, "x")
     axes = [np.array((x + side, repaired.bounds[0, 1], z)) for side in (-15.0, 5.0)]
     for position in axes:
         body = body - vent.translated(tuple(position))

@@ -15,7 +15,7 @@ import harnack as hk
 
 def main(folder: Path, size: tuple[int, int] = (640, 480), tolerance: float = 6e-3) -> float:
     walls = hk.solid(hk.Gyroid(cell=0.8), between=(-0.35, 0.35))
-    part = walls & (hk.Cylinder(1.0, 0.6) - hk.Cylinder(0.45, 1.0))
+    part = walls & (hk.Cylinder(1.0, 1.2) - hk.Cylinder(0.45, 2.0))
     hk.render(part, folder / "gyroid_part.png", show="shaded", material="silver", size=size)
 
     triangles = hk.mesh(part, tolerance=tolerance)

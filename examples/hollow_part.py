@@ -23,7 +23,7 @@ def main(
     walls = hk.solid(gyroid, between=gyroid.levels_of_thickness(0.8))
     hollow = part.shell(2.0) | (part & walls)
     for x in (-20.0, 20.0):
-        hollow = hollow - hk.Cylinder(2.0, 4.0).translated((x, 0.0, -10.0))
+        hollow = hollow - hk.Cylinder(2.0, 8.0).translated((x, 0.0, -10.0))
     opened = hk.HalfSpace((0.0, -1.0, 0.0), 0.0)
     hk.render(hollow, folder / "hollow_part.png", show="shaded", section=opened, size=size)
 

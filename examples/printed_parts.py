@@ -34,7 +34,7 @@ def vase() -> hk.solids.Solid:
     body = hk.Extrusion([ring], 90.0, twist=90.0, taper=1.5)
     # The hollow goes on above the rim, and ends above the floor.
     hollow = hk.Extrusion([(1 - 1.8 / 24) * ring], 99.0, twist=99.0, taper=1.55)
-    return body - (hollow & hk.Cuboid((60.0, 60.0, 60.0)).translated((0, 0, 62)))
+    return body - (hollow & hk.Cuboid((120.0, 120.0, 120.0)).translated((0, 0, 62)))
 
 
 def plate() -> hk.solids.Solid:
@@ -48,7 +48,7 @@ def plate() -> hk.solids.Solid:
 def lattice() -> hk.solids.Solid:
     gyroid = hk.Gyroid(5.0)
     walls = hk.solid(gyroid, between=gyroid.levels_of_thickness(0.8))
-    return walls & hk.Cylinder(20.0, 20.0)
+    return walls & hk.Cylinder(20.0, 40.0)
 
 
 def seifert() -> hk.SolidAngle:

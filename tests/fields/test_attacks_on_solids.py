@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import drjit as dr
@@ -38,7 +39,7 @@ def test_solids_turn_anticlockwise(axis: Any, degrees: float, start: Any, end: A
     [
         (hk.solids.DoubleCone(), (0, 0, 3), (0, 0, -1), 3.0),
         (hk.solids.DoubleCone().rotated(90, "x").translated((0, 3, 0)), (0, 0, 0), (0, 1, 0), 3.0),
-        (hk.solids.DoubleCone().twisted(2.0) - hk.Torus(1.0, 0.2), (0, 0, 3), (0, 0, -1), 3.0),
+        (hk.solids.DoubleCone().twisted(math.degrees(2.0)) - hk.Torus(1.0, 0.2), (0, 0, 3), (0, 0, -1), 3.0),
         (hk.Torus(0.5, 0.75), (0, 0, 3), (0, 0, -1), 3 - np.sqrt(0.75**2 - 0.5**2)),
         (hk.solids.Superellipsoid((1.0, 1.0)), (-3, 0, 0), (1, 0, 0), 2.0),
         (hk.solids.Supertorus((1.0, 3.0), 0.75, 0.25), (-3, 0, 0), (1, 0, 0), 2.0),
@@ -169,11 +170,11 @@ def test_functions_of_numpy_with_the_same_meaning() -> None:
     ("solid", "o", "d", "roots"),
     [
         # Rays from the origin ended where their box touches the solid, f not yet seen off 0.
-        (hk.Cuboid((0.32, 0.89, 0.803)).scaled(100), (0, 0, 0), (0, 0, 1), [80.3]),
+        (hk.Cuboid((0.64, 1.78, 1.606)).scaled(100), (0, 0, 0), (0, 0, 1), [80.3]),
         # Behind a flat solid f rose too little beyond its box for the side to be known.
-        (hk.Cuboid((100, 100, 1)), (-50, 0, 1 - 1e-3), (1, 0, 2e-5), [50]),
+        (hk.Cuboid((200, 200, 2)), (-50, 0, 1 - 1e-3), (1, 0, 2e-5), [50]),
         # On the rim the gradient is not known, and the ray was left without a gap to go on with.
-        (hk.Cylinder(100, 1), (150, 0, 1.01), (-1, 0, -1e-4), [100, 250]),
+        (hk.Cylinder(100, 2), (150, 0, 1.01), (-1, 0, -1e-4), [100, 250]),
     ],
     ids=["origin", "flat", "rim"],
 )  # fmt: skip
@@ -190,7 +191,9 @@ def test_no_crossing_is_lost(solid: Any, o: Any, d: Any, roots: Any, precision: 
 def test_the_rounding_of_one_part_makes_no_hit_inside_of_another() -> None:
     """385,000 sizes away the twisted part is known to 6 of 4, the other is 3.85 to 1e-5: their
     greatest is not zero, and was called a hit with an uncertainty of 1.5e-5."""
-    twisted = hk.solid(hk.expression("x*y*z - 0.089375"), below=0).twisted(1.3472932840911636)
+    twisted = hk.solid(hk.expression("x*y*z - 0.089375"), below=0).twisted(
+        math.degrees(1.3472932840911636)
+    )
     hill = hk.solid(hk.expression("exp(-x^2 - y^2) - z - 0.644"), below=0)
     solid = (
         (twisted & ~hill).scaled(1e-5).translated((-1.080524678e-4, 2.767405466e-4, -4.17053243e-5))

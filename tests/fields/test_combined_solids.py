@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -48,10 +49,10 @@ def shrunk(p: FloatArray) -> FloatArray:
 
 
 def test_flush_blends_bulge_as_their_docstring_says_and_a_slab_cuts_that_off() -> None:
-    plate, rib = hk.Cuboid((20.0, 20.0, 5.0)), hk.Cylinder(4.0, 5.0)
+    plate, rib = hk.Cuboid((40.0, 40.0, 10.0)), hk.Cylinder(4.0, 10.0)
     blend = plate.blended(rib, 2.0)
     ends = np.array([[0.0, 0.0, 5.585], [0.0, 0.0, 5.587], [0.0, 0.0, 4.999]])
-    inside = [blend, blend & hk.Cuboid((30.0, 30.0, 5.0))]
+    inside = [blend, blend & hk.Cuboid((60.0, 60.0, 10.0))]
     assert [(value.value(ends, precision="double") <= 0).tolist() for value in inside] == [
         [True, False, True],
         [False, False, True],
@@ -103,7 +104,7 @@ CASES: dict[str, tuple[Callable[[], hk.solids.Solid], Values]] = {
         lambda p: sphere(((p - [0.2, 0.1, -0.3]) @ TURN) / [1, 0.5, 1.5]),
     ),
     "twisted": (
-        lambda: (hk.Sphere(1.0) - hk.Torus(0.8, 0.3).translated((0.3, 0, 0))).twisted(2.0),
+        lambda: (hk.Sphere(1.0) - hk.Torus(0.8, 0.3).translated((0.3, 0, 0))).twisted(math.degrees(2.0)),
         lambda p: np.maximum(
             sphere(untwisted(p, 2.0)), -torus(untwisted(p, 2.0) - [0.3, 0, 0], 0.8, 0.3)
         ),
@@ -122,7 +123,7 @@ CASES: dict[str, tuple[Callable[[], hk.solids.Solid], Values]] = {
         lambda p: 0.7 * np.maximum(0.1 - gyroid(shrunk(p)), sphere(shrunk(p))),
     ),
     "twisted gyroid": (
-        lambda: (hk.solid(hk.Gyroid(1.0), below=0.2) & hk.Torus(0.8, 0.4)).twisted(1.0),
+        lambda: (hk.solid(hk.Gyroid(1.0), below=0.2) & hk.Torus(0.8, 0.4)).twisted(math.degrees(1.0)),
         lambda p: np.maximum(gyroid(untwisted(p, 1.0)) - 0.2, torus(untwisted(p, 1.0), 0.8, 0.4)),
     ),
     "blend": (
@@ -150,11 +151,11 @@ CASES: dict[str, tuple[Callable[[], hk.solids.Solid], Values]] = {
         ),
     ),
     "outline blended and bent": (
-        lambda: hk.Extrusion(FRAME, 0.6).twisted(1.0).blended(hk.Sphere(0.4), 0.2),
+        lambda: hk.Extrusion(FRAME, 0.6).twisted(math.degrees(1.0)).blended(hk.Sphere(0.4), 0.2),
         lambda p: blended(extruded(untwisted(p, 1.0), FRAME, 0.6), sphere(p, 0.4), 0.2, 2.0),
     ),
     "thread in a block": (
-        lambda: hk.Cuboid((0.9, 0.9, 0.5)) - SCREW.rotated(50.0, "x"),
+        lambda: hk.Cuboid((1.8, 1.8, 1.0)) - SCREW.rotated(50.0, "x"),
         lambda p: np.maximum(np.maximum(np.abs(p[..., 0]) - 0.9, np.maximum(
             np.abs(p[..., 1]) - 0.9, np.abs(p[..., 2]) - 0.5)), -screw(p @ TILT, SCREW)),
     ),
@@ -265,7 +266,7 @@ def test_a_part_past_the_level_proves_nothing() -> None:
 
 
 def test_operators_and_methods_read_like_the_drawing() -> None:
-    model = (hk.Sphere(1.0) - hk.Torus(0.8, 0.2)).twisted(2.0)
+    model = (hk.Sphere(1.0) - hk.Torus(0.8, 0.2)).twisted(math.degrees(2.0))
     hits = hk.trace(model, [[3.0, 0.1, 0.2]], [[-1.0, 0.0, 0.0]])
     assert hits.is_hit.all()
     assert (~(~model)).sublevel_extent() == model.sublevel_extent()
@@ -305,7 +306,7 @@ def test_a_union_reaches_as_far_as_its_parts() -> None:
         (lambda: hk.Sphere(1.0) | 3, TypeError, "only solids, such as"),
         (lambda: hk.Gyroid(1.0) | hk.Sphere(1.0), TypeError, "Gyroid is a field and no solid"),
         (lambda: hk.Sphere(1.0) - hk.Gyroid(1.0), TypeError, r"make one of it by harnack.solid\("),
-        (lambda: hk.Gyroid(1.0).twisted(1.0), AttributeError, "make a solid of the field first"),
+        (lambda: hk.Gyroid(1.0).twisted(math.degrees(1.0)), AttributeError, "make a solid of the field first"),
         (lambda: hk.expression(lambda x, y, z: x ^ 2), TypeError, r"powers as x\*\*2"),
         (lambda: hk.union(), ValueError, "at least one solid"),
         (lambda: hk.union(hk.Gyroid(1.0)), TypeError, "is a field and no solid"),
@@ -328,7 +329,7 @@ def test_a_union_reaches_as_far_as_its_parts() -> None:
         (lambda: hk.solid(hk.Gyroid(1.0), below=np.nan), ValueError, "finite numbers"),
         (lambda: hk.solid(SPANNING, around=(0, 7)), ValueError, "half of the period"),
         (
-            lambda: hk.solid(SPANNING, around=(0, 1)).twisted(1.0), TypeError,
+            lambda: hk.solid(SPANNING, around=(0, 1)).twisted(math.degrees(1.0)), TypeError,
             "cannot be blended, twisted or tapered",
         ),
     ],
@@ -405,7 +406,7 @@ def test_numbers_of_numpy_are_numbers() -> None:
 def test_a_ray_through_a_crease_is_a_hit_where_its_gradients_say_how_near_the_surface_is() -> None:
     """A path of the gallery's `carved` was out of steps: in a crease, where the gradient is a range
     as long as its middle, rounding was larger than what was left of the gap."""
-    carved = (hk.Sphere(1.0) - hk.Torus(0.85, 0.28)).twisted(1.5, "x")
+    carved = (hk.Sphere(1.0) - hk.Torus(0.85, 0.28)).twisted(math.degrees(1.5), "x")
     carved = carved.blended(hk.Torus(1.15, 0.12), 0.15)
     foot = np.array([0.34748355, -0.65605646, -0.66996707])
     rng = np.random.default_rng(0)

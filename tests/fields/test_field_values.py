@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import drjit as dr
@@ -173,7 +174,7 @@ def test_fields_print_as_they_were_made() -> None:
     many = (
         hk.SolidAngle(wavy_polygon(64)),
         hk.WindingNumber(*icosphere(2)),
-        cut.twisted(1.0),
+        cut.twisted(math.degrees(1.0)),
         hk.expression(lambda x, y, z: x + y - z),
         hk.fields.LevelCurves("log", "imag"),
         hk.Blobs([[0, 0, 0]], 1.0),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import pickle
 from typing import Any
 
@@ -160,7 +161,7 @@ def test_parts_in_parts_and_cavities() -> None:
     "combine",
     [
         lambda one: one.blended(hk.Sphere(0.4, (0.8, 0.0, 0.0)), 0.2),
-        lambda one: one.twisted(1.0),
+        lambda one: one.twisted(math.degrees(1.0)),
         lambda one: one.shell(0.1) - hk.Cylinder(0.2),
         lambda one: (one.offset(0.1) & hk.solid(hk.Gyroid(0.8), between=(-0.4, 0.4))).scaled(0.5),
         lambda one: one.rotated(30.0, "x").translated((100.0, -50.0, 20.0)),

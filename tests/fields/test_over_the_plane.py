@@ -161,4 +161,6 @@ def test_walls_of_entire_fields_go_beyond_where_they_are_drawn(field: hk.Field) 
     assert inside.any()
     assert first > 2
     assert hk.trace(walls, [o], [d]).t[0] == pytest.approx(first, abs=2e-3)
-    assert hk.trace(walls & hk.Cuboid((8, 8, 8)), [o], [d]).t[0] == pytest.approx(first, abs=2e-3)
+    assert hk.trace(walls & hk.Cuboid((16, 16, 16)), [o], [d]).t[0] == pytest.approx(
+        first, abs=2e-3
+    )

@@ -173,11 +173,11 @@ SHAPES: dict[str, tuple[Any, Oracle]] = {
     ),
     "cylinder": (hk.Cylinder(0.5), lambda x: norm(x[..., :2]) - 0.5),
     "cut cylinder": (
-        hk.Cylinder(0.5, 0.8),
+        hk.Cylinder(0.5, 1.6),
         lambda x: box(np.stack([norm(x[..., :2]), x[..., 2]], -1), [0.5, 0.8]),
     ),
     "double cone": (
-        hk.solids.DoubleCone(0.6),
+        hk.solids.DoubleCone(math.degrees(0.6)),
         lambda x: norm(x[..., :2]) * math.cos(0.6) - np.abs(x[..., 2]) * math.sin(0.6),
     ),
     "capsule": (
@@ -185,9 +185,9 @@ SHAPES: dict[str, tuple[Any, Oracle]] = {
         lambda x: segments(x, np.array([[0.2, 0.0, 0.0], [1.0, 0.5, -0.3]])) - 0.3,
     ),
     "torus": (hk.Torus(0.9, 0.3), lambda x: pair(norm(x[..., :2]) - 0.9, x[..., 2]) - 0.3),
-    "box": (hk.Cuboid((1.0, 0.5, 0.7)), lambda x: box(x, [1.0, 0.5, 0.7])),
+    "box": (hk.Cuboid((2.0, 1.0, 1.4)), lambda x: box(x, [1.0, 0.5, 0.7])),
     "rounded box": (
-        hk.Cuboid((1.0, 0.5, 0.7), 0.2),
+        hk.Cuboid((2.0, 1.0, 1.4), 0.2),
         lambda x: box(x, [0.8, 0.3, 0.5]) - 0.2,
     ),
     **{
@@ -536,11 +536,11 @@ def test_coils_stay_within_their_flattening() -> None:
         (lambda: hk.solids.Plane((0, 0, 0)), "must not be zero"),
         (lambda: hk.solids.Plane((0, 1)), "three numbers, not 2"),
         (lambda: hk.Ellipsoid((1, -1, 1)), "must be positive"),
-        (lambda: hk.Cylinder(1.0, 0.0), "half the height"),
-        (lambda: hk.solids.DoubleCone(2.0), "between 0 and pi/2"),
+        (lambda: hk.Cylinder(1.0, 0.0), "the height"),
+        (lambda: hk.solids.DoubleCone(120.0), "between 0 and 90 degrees"),
         (lambda: hk.Capsule((0, 0, 0), (0, 0, 0)), "use Sphere"),
         (lambda: hk.Torus(1.0, math.inf), "minor radius"),
-        (lambda: hk.Cuboid((1, 1, 1), 2.0), "least half side"),
+        (lambda: hk.Cuboid((2, 2, 2), 2.0), "least half side"),
         (lambda: hk.solids.Superellipsoid((0.5, 2.0)), "at least 1"),
         (lambda: hk.solids.Supertorus((2.0,)), "two numbers"),
         (lambda: hk.Tube(np.zeros((3, 3)), 0.1), "two points or more"),

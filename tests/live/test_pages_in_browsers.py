@@ -48,7 +48,7 @@ SCENES: dict[str, Callable[[], tuple[Any, dict[str, Any]]]] = {
         },
     ),
     "union": lambda: (
-        hk.union(hk.Sphere(0.8), hk.Cuboid((0.6, 0.6, 0.9))),
+        hk.union(hk.Sphere(0.8), hk.Cuboid((1.2, 1.2, 1.8))),
         {"material": "clay"},
     ),
     "two": lambda: (

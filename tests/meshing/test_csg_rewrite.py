@@ -10,7 +10,7 @@ from harnack.fields.solids.booleans import BooleanSolid, Complement
 from harnack.geometry import example_meshes
 from harnack.meshing.csg_rewrite import factor_common_operands
 
-BALL, CUBE, ROD = hk.Sphere(1.0), hk.Cuboid((1.0, 1.0, 1.0)), hk.Cylinder(0.3, 4.0)
+BALL, CUBE, ROD = hk.Sphere(1.0), hk.Cuboid((2.0, 2.0, 2.0)), hk.Cylinder(0.3, 8.0)
 NEAR = hk.Sphere(0.5).translated((0.7, 0.0, 0.0))
 UNIONS = {
     "of a shell": BALL.shell(0.2) | (BALL & CUBE),

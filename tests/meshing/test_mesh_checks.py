@@ -93,8 +93,8 @@ def test_edges_shorter_than_single_precision_do_not_open_a_file(tmp_path: Path, 
     assert len(read_closed(path).faces) == len(_FACES)
 
 
-_CUBE = hk.Cuboid((0.5,) * 3)
-_CARVED = hk.Sphere(1.0) - hk.Cuboid((0.5, 0.5, 2.0))
+_CUBE = hk.Cuboid((1.0,) * 3)
+_CARVED = hk.Sphere(1.0) - hk.Cuboid((1.0, 1.0, 4.0))
 
 
 @pytest.mark.few(1)
@@ -104,7 +104,7 @@ _CARVED = hk.Sphere(1.0) - hk.Cuboid((0.5, 0.5, 2.0))
         (_CARVED.scaled(1e-5), r"2e-05 long.*scale it \(apply_scale\)"),
         (hk.Torus(0.8, 0.3).translated((1e6, 0, 0)), r"up to 1e\+06 from the origin.*move it"),
         (
-            (hk.Torus(0.8, 0.3) | hk.Cuboid((0.2, 0.2, 1.0))).translated((1e6, 0, 0)),
+            (hk.Torus(0.8, 0.3) | hk.Cuboid((0.4, 0.4, 2.0))).translated((1e6, 0, 0)),
             "move it to the",
         ),
         (
@@ -215,7 +215,7 @@ def test_solids_know_the_waves_they_are_made_of():
         (_WALLS.offset(0.1), wave),
         (_WALLS.translated((1, 2, 3)).rotated(30, "x").scaled((1.0, 2.0, 0.5)), 0.5 * wave),
         (_WALLS & hk.Sphere(1.0) | hk.solid(hk.fields.SchwarzP(2.0), below=0.0), 2.0),
-        (below.twisted(0.1), wave),
+        (below.twisted(math.degrees(0.1)), wave),
         (below.tapered((0, 1.0), (1, 0.5)), 0.5 * wave),
         (below.blended(hk.Sphere(1.0), 0.1), wave),
         (hk.fields.EigenfunctionSum([hk.fields.PlaneWave(1.0, (1, 0, 0)), hk.fields.PlaneWave(1e-9, (90, 0, 0))]),
@@ -237,10 +237,10 @@ def _volume(part: hk.solids.Solid, half: tuple[float, float, float], step: float
 @pytest.mark.parametrize(
     ("part", "half", "bodies"),
     [
-        (hk.solid(hk.fields.SchwarzP(1.0), between=(-0.3, 0.3)) & hk.Cylinder(0.6, 6.0),
+        (hk.solid(hk.fields.SchwarzP(1.0), between=(-0.3, 0.3)) & hk.Cylinder(0.6, 12.0),
          (0.6, 0.6, 6.0), 1),
-        (_WALLS.scaled(0.1) & hk.Cylinder(0.3, 3.0), (0.3, 0.3, 3.0), 1),
-        pytest.param(_WALLS & hk.Cylinder(10.0, 10.0), (10.0,) * 3, None, marks=pytest.mark.slow),
+        (_WALLS.scaled(0.1) & hk.Cylinder(0.3, 6.0), (0.3, 0.3, 3.0), 1),
+        pytest.param(_WALLS & hk.Cylinder(10.0, 20.0), (10.0,) * 3, None, marks=pytest.mark.slow),
     ],
     ids=["Schwarz P", "gyroid", "gyroid of 20 mm"],
 )  # fmt: skip
@@ -260,7 +260,7 @@ def test_cells_are_as_small_as_a_lattice_needs(
 
 @pytest.mark.slow
 def test_a_spacing_that_is_asked_for_is_not_changed_for_waves():
-    part = hk.solid(hk.fields.SchwarzP(1.0), below=0.0) & hk.Cuboid((0.3, 0.3, 3.0))
+    part = hk.solid(hk.fields.SchwarzP(1.0), below=0.0) & hk.Cuboid((0.6, 0.6, 6.0))
     assert hk.mesh(part, cell_size=0.25, tolerance=2e-2).metadata["harnack"]["spacing"] == 0.25
     with pytest.raises(TriangleLimitError, match="max_triangles"):
         hk.mesh(part, tolerance=2e-2, max_triangles=500)
@@ -268,7 +268,7 @@ def test_a_spacing_that_is_asked_for_is_not_changed_for_waves():
 
 @pytest.mark.slow
 def test_thin_parts_are_made_finer_until_no_faces_pass_through_each_other():
-    made = hk.mesh(hk.Cylinder(0.01, 1.0), tolerance=4e-3)
+    made = hk.mesh(hk.Cylinder(0.01, 2.0), tolerance=4e-3)
     assert made.is_watertight
     check_no_self_intersection(np.array(made.vertices), np.array(made.faces))
     x = np.array(made.triangles_center)
@@ -277,7 +277,7 @@ def test_thin_parts_are_made_finer_until_no_faces_pass_through_each_other():
 
 @pytest.mark.slow
 def test_sharp_creases_are_found_and_not_cut_into_ever_smaller_triangles():
-    made = hk.mesh(hk.Cylinder(0.3, 1.0).translated((0.2, 0, 0)))
+    made = hk.mesh(hk.Cylinder(0.3, 2.0).translated((0.2, 0, 0)))
     assert made.is_watertight
     assert len(made.faces) < 10_000
     x = np.concatenate([made.vertices, made.triangles_center]) - (0.2, 0, 0)

@@ -187,8 +187,8 @@ def test_walls_of_the_angle_about_an_axis_between_cylinders() -> None:
     gyroid = hk.expression(
         f"sin({angle})*cos(6*z) + sin(6*z)*cos({radius}) + sin({radius})*cos({angle})"
     )
-    wall = hk.solid(gyroid, between=(-0.3, 0.3)) & hk.Cylinder(1.5, 1.0)
-    mesh = hk.mesh(wall - hk.Cylinder(0.7, 2.0), tolerance=4e-3)
+    wall = hk.solid(gyroid, between=(-0.3, 0.3)) & hk.Cylinder(1.5, 2.0)
+    mesh = hk.mesh(wall - hk.Cylinder(0.7, 4.0), tolerance=4e-3)
     assert mesh.is_watertight
     assert mesh.volume == pytest.approx(2.1754, rel=1e-2)  # by the midpoint rule
 
@@ -196,6 +196,6 @@ def test_walls_of_the_angle_about_an_axis_between_cylinders() -> None:
 @pytest.mark.slow
 def test_formulas_without_a_value_where_other_parts_leave_nothing() -> None:
     field = hk.expression("sqrt(x^2 + y^2 - 0.09)*cos(3*atan2(y, x)) - z")
-    solid = (hk.solid(field, below=0) & hk.Cylinder(1.5, 1.0)) - hk.Cylinder(0.7)
+    solid = (hk.solid(field, below=0) & hk.Cylinder(1.5, 2.0)) - hk.Cylinder(0.7)
     mesh = hk.mesh(solid, cell_size=0.1)
     assert mesh.volume == pytest.approx(5.5292, rel=1e-3)  # half of what is between

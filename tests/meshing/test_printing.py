@@ -152,7 +152,7 @@ def test_volumes_of_solids(part: Any, volume: float) -> None:
 
 
 def test_boxes_are_exact_and_so_are_their_creases() -> None:
-    part = hk.Cuboid((0.5, 0.4, 0.3)) - hk.Cuboid((0.2, 0.2, 1.0)).rotated(45, "z")
+    part = hk.Cuboid((1.0, 0.8, 0.6)) - hk.Cuboid((0.4, 0.4, 2.0)).rotated(45, "z")
     mesh = hk.mesh(part)
     assert is_part(mesh)
     assert mesh.volume == pytest.approx((1 - 0.16) * 0.8 * 0.6 + 0.16 * 0.8 * 0.6 - 0.16 * 0.6)
@@ -163,9 +163,9 @@ def test_boxes_are_exact_and_so_are_their_creases() -> None:
 @pytest.mark.parametrize(
     "part",
     [
-        hk.Cuboid((0.5, 0.4, 0.3)).translated((1, 2, 3)),
-        hk.Cuboid((0.5, 0.4, 0.3)).rotated(30, (1, 1, 0)).translated((100, 0, 0)),
-        hk.Cuboid((0.5, 0.4, 0.3)).scaled(0.5).rotated(20, "x").scaled(2),
+        hk.Cuboid((1.0, 0.8, 0.6)).translated((1, 2, 3)),
+        hk.Cuboid((1.0, 0.8, 0.6)).rotated(30, (1, 1, 0)).translated((100, 0, 0)),
+        hk.Cuboid((1.0, 0.8, 0.6)).scaled(0.5).rotated(20, "x").scaled(2),
     ],
     ids=["moved", "rotated", "scaled"],
 )
@@ -287,7 +287,7 @@ def test_too_many_hulls_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
         (hk.Sphere(0.5).translated((1e6, 0, 0)), math.pi / 6, 1),
         (hk.Sphere(1e-6), 8e-18 * math.pi / 6, 1),
         (hk.Sphere(1e6), 8e18 * math.pi / 6, 1),
-        (hk.Cuboid((0.5,) * 3) | hk.Cuboid((0.5,) * 3).translated((1, 0, 0)), 2.0, 1),
+        (hk.Cuboid((1.0,) * 3) | hk.Cuboid((1.0,) * 3).translated((1, 0, 0)), 2.0, 1),
     ],
     ids=["touching", "twice", "far", "tiny", "huge", "sharing a face"],
 )

@@ -25,10 +25,10 @@ def primitive(rng: np.random.Generator) -> tuple[hk.solids.Solid, Function]:
         return hk.Sphere(r), lambda p: np.linalg.norm(p, axis=1) - r
     if kind == 1:
         h = rng.uniform(0.3, 0.8, 3)
-        return hk.Cuboid(tuple(h.tolist())), lambda p: (np.abs(p) - h).max(axis=1)
+        return hk.Cuboid(tuple((2 * h).tolist())), lambda p: (np.abs(p) - h).max(axis=1)
     if kind == 2:
         h = float(rng.uniform(0.3, 0.8))
-        return hk.Cylinder(r, h), lambda p: np.maximum(
+        return hk.Cylinder(r, 2 * h), lambda p: np.maximum(
             np.hypot(p[:, 0], p[:, 1]) - r, np.abs(p[:, 2]) - h
         )
     if kind == 3:

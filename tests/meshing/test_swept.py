@@ -64,7 +64,7 @@ def test_revolved_outlines_keep_their_rings() -> None:
 )
 def test_threads_keep_their_edges(profile: Any, starts: int, left_handed: bool) -> None:
     thread = hk.solids.Thread(profile, 2.0, starts, left_handed)
-    solid = thread & hk.Cylinder(4.5, 5.0)
+    solid = thread & hk.Cylinder(4.5, 10.0)
     mesh = hk.mesh(solid)
     assert mesh.is_watertight
     assert off(solid, mesh) < 1e-2

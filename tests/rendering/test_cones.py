@@ -74,7 +74,7 @@ def test_no_wire_is_overlooked(thin: float) -> None:
     assert not found[away > 1.07].any()
 
 
-FLAT = (hk.Cuboid((0.5, 0.5, 1e-3)), hk.solids.Superellipsoid((1.0, 1.0), (1, 1, 0.02)))
+FLAT = (hk.Cuboid((1.0, 1.0, 0.002)), hk.solids.Superellipsoid((1.0, 1.0), (1, 1, 0.02)))
 
 
 @pytest.mark.parametrize("solid", FLAT)
@@ -170,7 +170,7 @@ def test_wires_thinner_than_a_pixel_are_lines(thin: float) -> None:
 @pytest.mark.usefixtures("black")
 def test_a_turned_plate_seen_on_edge_is_a_line() -> None:
     """Its hull is thin and the box around that is not: cones that passed it were cut away."""
-    plate = hk.Cuboid((0.3, 0.5, 1e-3)).rotated(20, "x")
+    plate = hk.Cuboid((0.6, 1.0, 0.002)).rotated(20, "x")
     columns = drawn(hk.traced_surface(plate, tolerance=1e-5), antialias="cones", spp=64).sum(axis=0)
     middle = columns[12:-12]
     assert middle.min() > 0.5 * np.median(middle)

@@ -35,7 +35,7 @@ def test_a_component_on_which_the_gradient_vanishes_is_no_larger_for_it(
 @pytest.mark.parametrize("half", [0.005, 0.001, 1e-4])
 def test_both_sides_of_a_thin_plate_are_no_smaller_than_one_of_a_thick_one(half: float) -> None:
     """Where both sides passed the same cells, one was left out of the area."""
-    solid = hk.Cuboid((0.9, 0.9, half)).translated((-1, 0, 0)) | hk.Sphere(0.535, (0.7, 0, 0))
+    solid = hk.Cuboid((1.8, 1.8, 2 * half)).translated((-1, 0, 0)) | hk.Sphere(0.535, (0.7, 0, 0))
     o, d = [[-1, 0.1, 5], [0.7, 0, 5]], [[0, 0, -1.0]]
     assert hk.trace(solid, o, d, largest=True).is_hit.tolist() == [True, False]
 

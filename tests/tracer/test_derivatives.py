@@ -221,7 +221,7 @@ def test_the_value_of_t_is_polished_to_rounding() -> None:
 
 # Flat faces, edges and ties of formulas.
 
-TALL, CAN = hk.Cuboid((0.5, 0.5, 2.0)), hk.Cylinder(0.4, 1.4)
+TALL, CAN = hk.Cuboid((1.0, 1.0, 4.0)), hk.Cylinder(0.4, 2.8)
 SOLIDS: dict[str, hk.solids.Solid] = {
     "union, moved and rotated": (TALL | CAN.rotated(70, "x")).translated((0.1, 0.2, 0)).rotated(20),
     "cuboid": TALL,

@@ -1,7 +1,5 @@
 """The largest component alone: first hits against those of that component by itself."""
 
-import math
-
 import numpy as np
 import pytest
 

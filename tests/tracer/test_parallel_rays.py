@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -40,7 +41,7 @@ def test_a_cone_without_bounds_proves_its_misses(precision: Any) -> None:
     rng = np.random.default_rng(0)
     o, d = 2 * rng.normal(size=(1000, 3)), rng.normal(size=(1000, 3))
     angle = 0.5
-    found = hk.trace(hk.solids.DoubleCone(angle), o, d, precision=precision)
+    found = hk.trace(hk.solids.DoubleCone(math.degrees(angle)), o, d, precision=precision)
     assert (found.status != hk.RayStatus.OUT_OF_STEPS).all()
     # (x^2 + y^2) cos^2 = z^2 sin^2 along o + t d is a quadratic equation.
     d /= np.linalg.norm(d, axis=1)[:, None]

@@ -43,7 +43,7 @@ def fourier_series() -> hk.Surface:
 CASES: dict[str, Callable[[], hk.Surface]] = {
     "curve": saddle,
     "domain": fourier_series,
-    "combined": lambda: hk.Surface(hk.Torus(1.0, 0.4) & hk.Cuboid((1.0, 1.5, 1.5))),
+    "combined": lambda: hk.Surface(hk.Torus(1.0, 0.4) & hk.Cuboid((2.0, 3.0, 3.0))),
     "sheets": cut_sphere,
     "parts": parts,
     "confirmed": lambda: hk.traced_surface(

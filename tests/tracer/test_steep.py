@@ -342,7 +342,7 @@ def test_numbers_are_told_before_they_are_data_of_a_kernel() -> None:
     assert steep.is_abrupt
     assert steep.prepare(backend).is_steep
     assert not flat.prepare(backend).is_steep
-    small = hk.Sphere(1e-5), hk.Cylinder(1e-3, 1e-4), hk.Cuboid((1e-4, 1.0, 1.0))
+    small = hk.Sphere(1e-5), hk.Cylinder(1e-3, 0.0002), hk.Cuboid((0.0002, 2.0, 2.0))
     assert not any(shape.prepare(backend).is_steep for shape in small)
 
 

@@ -136,7 +136,7 @@ def _drawn(*solids: Solid) -> list[Surface]:
 
 def _carved() -> list[Surface]:
     """A ball with a torus cut out, twisted, and a ring blended to it."""
-    ball = (Sphere(1.0) - Torus(0.85, 0.28)).twisted(1.5, "x")
+    ball = (Sphere(1.0) - Torus(0.85, 0.28)).twisted(86.0, "x")
     return _drawn(ball.blended(Torus(1.15, 0.12), 0.15))
 
 

@@ -187,7 +187,7 @@ class CsgMesher:
         if isinstance(solid, TransformedSolid) and not is_single_level_set(solid.field):
             return self._image(solid, level)
         if isinstance(solid, Cuboid) and solid.radius == 0 and level <= 0:
-            half = np.array(solid.half_sides) + level
+            half = 0.5 * np.array(solid.sides) + level
             return box_manifold(-half, half) if (half > 0).all() else Manifold()
         if isinstance(solid, Extrusion) and level == 0:
             return extruded_manifold(

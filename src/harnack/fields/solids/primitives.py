@@ -121,7 +121,7 @@ class Ellipsoid(FormulaSolid):
 
 @dataclass(frozen=True)
 class Cylinder(FormulaSolid):
-    """The points within `radius` of the z axis, and with |z| <= half_height unless that is None.
+    """The points within `radius` of the z axis, and with |z| <= height/2 unless that is None.
 
     Without ends f is the signed distance |(x, y)| - r (Hart, equation 25). With ends the distances
     to the side and to the ends have gradients at right angles, so that `orthogonal_intersection` is
@@ -131,57 +131,57 @@ class Cylinder(FormulaSolid):
     is_convex = True
 
     radius: float = 1.0
-    half_height: float | None = None
+    height: float | None = None
 
     lipschitz = 1.0
 
     def __post_init__(self) -> None:
         set_frozen(self, "radius", as_positive(self.radius, "the radius of a cylinder"))
-        if self.half_height is not None:
-            height = as_positive(self.half_height, "half the height of a cylinder")
-            set_frozen(self, "half_height", height)
+        if self.height is not None:
+            set_frozen(self, "height", as_positive(self.height, "the height of a cylinder"))
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         side = norm(x, y) - self.radius
         return (
             side
-            if self.half_height is None
-            else orthogonal_intersection(side, abs(z) - self.half_height)
+            if self.height is None
+            else orthogonal_intersection(side, abs(z) - 0.5 * self.height)
         )
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         if above:
             return None
-        if self.half_height is None:
+        if self.height is None:
             return None
         r, margin = self.radius, level
-        return box_around((r + margin, r + margin, self.half_height + margin))
+        return box_around((r + margin, r + margin, 0.5 * self.height + margin))
 
 
 @dataclass(frozen=True)
 class DoubleCone(FormulaSolid):
-    """The double cone around the z axis whose sides make an angle with it, in radians.
+    """The double cone around the z axis whose sides make an angle with it, in degrees.
 
     f = |(x, y)| cos(angle) - |z| sin(angle) (Hart, equation 26). Off the axis and the plane z = 0
     its gradient is a unit vector, so that its Lipschitz constant is 1. It is the signed distance
     where the nearest point of a side is not beyond the apex, and smaller elsewhere.
     """
 
-    angle: float = math.pi / 6
+    angle: float = 30.0
 
     lipschitz = 1.0 + 1e-6  # sine and cosine are rounded
 
     def __post_init__(self) -> None:
         angle = as_finite(self.angle, "the angle of a cone")
-        if not 0.0 < angle < math.pi / 2:
+        if not 0.0 < angle < 90.0:
             raise ValueError(
-                "the angle of a cone between axis and side must be between 0 and pi/2, "
+                "the angle of a cone between axis and side must be between 0 and 90 degrees, "
                 f"not {self.angle!r}"
             )
         set_frozen(self, "angle", angle)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        return norm(x, y) * cos(self.angle) - abs(z) * sin(self.angle)
+        angle = math.radians(self.angle)
+        return norm(x, y) * cos(angle) - abs(z) * sin(angle)
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         del level, above
@@ -264,7 +264,7 @@ class Torus(FormulaSolid):
 
 @dataclass(frozen=True)
 class Cuboid(FormulaSolid):
-    """The box |x| <= a, |y| <= b, |z| <= c of half sides (a, b, c), with edges rounded by `radius`.
+    """The box |x| <= a/2, |y| <= b/2, |z| <= c/2 of sides (a, b, c), with edges rounded by `radius`.
 
     f is the signed distance: that of the box smaller by the radius (`orthogonal_intersection`),
     less the radius.
@@ -272,32 +272,32 @@ class Cuboid(FormulaSolid):
 
     is_convex = True
 
-    half_sides: Point = (1.0, 1.0, 1.0)
+    sides: Point = (2.0, 2.0, 2.0)
     radius: float = 0.0
 
     lipschitz = 1.0
 
     def __post_init__(self) -> None:
-        sides = as_triple(self.half_sides, "the half sides of a box", all_positive=True)
-        set_frozen(self, "half_sides", sides)
+        sides = as_triple(self.sides, "the sides of a box", all_positive=True)
+        set_frozen(self, "sides", sides)
         radius = as_finite(self.radius, "the radius of the edges of a box")
-        if not 0.0 <= radius <= min(sides):
+        if not 0.0 <= radius <= 0.5 * min(sides):
             raise ValueError(
                 "the radius of the edges of a box must be between 0 and its least half side "
-                f"{min(sides):g}, not {self.radius!r}"
+                f"{0.5 * min(sides):g}, not {self.radius!r}"
             )
         set_frozen(self, "radius", radius)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         sides = (
-            abs(v) - (a - self.radius) for v, a in zip((x, y, z), self.half_sides, strict=True)
+            abs(v) - (0.5 * a - self.radius) for v, a in zip((x, y, z), self.sides, strict=True)
         )
         return orthogonal_intersection(*sides) - self.radius
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         if above:
             return None
-        a, b, c = (side + level for side in self.half_sides)
+        a, b, c = (0.5 * side + level for side in self.sides)
         return box_around((a, b, c))
 
 

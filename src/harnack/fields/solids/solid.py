@@ -10,6 +10,7 @@ import abc
 import copy
 import dataclasses
 import functools
+import math
 from typing import TYPE_CHECKING, Any, cast
 
 from harnack.backend.validation import as_positive, no_derivatives
@@ -186,9 +187,9 @@ class Solid(Field):
         radius (1 - 2^(-1/power)), 0.29 radius for a circle. Cut it off by a slab of the same
         height,
 
-            plate.blended(rib, 2.0) & hk.Cuboid((30.0, 30.0, 5.0))
+            plate.blended(rib, 2.0) & hk.Cuboid((60.0, 60.0, 10.0))
 
-        with 5 half the height, or let one of the solids end a radius below the other's face.
+        of height 10, or let one of the solids end a radius below the other's face.
 
         radius: the distance that the fillet reaches along both surfaces, where f is a distance.
         power: the exponent of the superellipse that the fillet is a part of: 2 for a circle, larger
@@ -279,10 +280,10 @@ class Solid(Field):
 
     @no_derivatives
     def twisted(self, rate: float, axis: str = "z") -> Solid:
-        """The solid, twisted about an axis by `rate` radians for each unit of length along it."""
+        """The solid, twisted about an axis by `rate` degrees for each unit of length along it."""
         from harnack.fields.solids.deformations import Twist
 
-        return self._apply_map(Twist(float(rate), axis))
+        return self._apply_map(Twist(math.radians(rate), axis))
 
     @no_derivatives
     def tapered(
