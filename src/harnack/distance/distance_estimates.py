@@ -51,8 +51,10 @@ def signed_distance(
     options: TraceOptions | None = None,
     **keywords: Unpack[TraceKeywords],
 ) -> FloatArray:
-    """Signed distances (n,) from points (n, 3) to a surface: positive where f > level, so negative
-    inside of a `Solid`.
+    """Signed distances (n,) from points (n, 3) to a surface, negative inside.
+
+    The inside is where f < level; of winding numbers, clouds and blobs, which are larger inside
+    (`Field.is_larger_inside`), where f > level. (trimesh has the opposite sign.)
 
     surface: a field or a `Surface`, but for `side` and `largest`, which distances do not have; of
         several levels the sign is that of the one nearest in value. Of an angle-valued field every
@@ -95,7 +97,7 @@ def signed_distance(
     field = traced.field
     if method == "closest_point":
         closest = _find("signed_distance", traced, backend, points, progress)
-        return np.copysign(closest.distance, closest.signed_value)
+        return _outwards(field) * np.copysign(closest.distance, closest.signed_value)
     if traced.clip_volume is not None and method != "lower_bound":
         raise TypeError(f'method="{method}" does not see clip and section: use "closest_point"')
     levels, prepared = traced.target_levels(backend), traced.evaluator(backend)
@@ -110,7 +112,12 @@ def signed_distance(
     if field.has_jumps and method != "lower_bound":
         to_sheet = find_closest(backend, traced, levels, x, teller(None)).distance
         result = np.copysign(np.fmin(to_sheet, np.abs(result)), result)
-    return result
+    return _outwards(field) * result
+
+
+def _outwards(field: Field) -> float:
+    """The factor that makes a distance in the direction of larger values negative inside."""
+    return -1.0 if field.is_larger_inside else 1.0
 
 
 @accepts_dask_arrays("points")

@@ -84,6 +84,10 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
     default_level: float = 0.0
     """The level that is drawn if the user names none."""
 
+    is_larger_inside: bool = False
+    """Whether f is larger inside of its surfaces than outside, as a winding number is. Signed
+    distances are negative inside: where f > level of such a field, where f < level of others."""
+
     over_relaxation: float = 1.4
     """The over-relaxation factor (`TraceOptions.over_relaxation`) with the fewest evaluations, by
     experiment; at least 1."""

@@ -90,6 +90,7 @@ class Blobs(Formula):
 
     is_cheap = False
     default_level: float = 1.0
+    is_larger_inside = True
     period: ClassVar[float | None] = None
 
     def __init__(

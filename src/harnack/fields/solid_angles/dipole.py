@@ -276,6 +276,7 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
 
     period: ClassVar[float | None] = None
     default_level: float = 2 * math.pi
+    is_larger_inside = True
 
     def __init__(
         self,

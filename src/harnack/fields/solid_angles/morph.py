@@ -63,6 +63,7 @@ class Morph(BatchedField):
     """
 
     default_level = 0.5
+    is_larger_inside = True
 
     def __init__(
         self,

@@ -303,6 +303,7 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
     """
 
     default_level = 0.5
+    is_larger_inside = True
     has_separate_batch_data = False
 
     def __init__(

@@ -254,6 +254,7 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
     """
 
     has_separate_batch_data = False
+    is_larger_inside = True
 
     def __init__(
         self,

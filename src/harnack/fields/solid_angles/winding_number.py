@@ -243,6 +243,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
 
     period: ClassVar[float | None] = None
     default_level: float = 0.5
+    is_larger_inside = True
     has_jumps: bool = True
 
     def __init__(
