@@ -1,9 +1,9 @@
 """What a sharper proof is worth.
 
 The same rays, the same surface, the same hits; what differs is the proof that steps rest on.
-`enclosures=` chooses it: the rule of the paper, its refinements by the slope along the ray, and what
-harnack takes by default. Work is counted in evaluations of the function, and the picture shows it
-for each pixel.
+`enclosures=` chooses it: the rule of the paper, its refinements by the slope along the ray, and
+what harnack takes by default. Work is counted in evaluations of the function, and the picture shows
+it for each pixel.
 """
 
 import sys
