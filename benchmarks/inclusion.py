@@ -136,7 +136,7 @@ def all_roots(count: int = 10_000, checked: int = 1_000) -> list[str]:
     origins, directions = (to_vector3(backend, array) for array in rays[:2])
     end = to_float(backend, rays[2])
     lines = [
-        f"All crossings of {count:,} rays through 80 blobs (`all_hits=24`), which is what "
+        f"All crossings of {count:,} rays through 80 blobs (`max_crossings=24`), which is what "
         "transparency needs: tables 3 (the largest of 5 sums of 16) and 4 (one sum). Their counts "
         f"are compared with 1500 samples on {checked:,} rays.\n",
         "| field | method | looks, paper | looks a ray | us a ray and core | crossings a ray "

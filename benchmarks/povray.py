@@ -420,7 +420,8 @@ def compare_with_povray() -> str:
             name = f"harnack, {threads} thread{'s'[: threads > 1]}"
             rows.append((name, core / len(d), wall / len(d), t[checked]))
         t, core, wall = by_harnack(drawn, d, 1, require_crossing=True)
-        rows.append(("harnack, 1 thread, confirm=True", core / len(d), wall / len(d), t[checked]))
+        name = "harnack, 1 thread, require_crossing=True"
+        rows.append((name, core / len(d), wall / len(d), t[checked]))
         t, _, _ = by_povray(drawn, d, every, positions=True)
         assert t is not None
         for threads in (1, every):
