@@ -28,7 +28,10 @@ from harnack.files import (
 from harnack.files.geometry_files import LoadedGeometry, ReadAs
 from harnack.rendering.framing import UP_AXES, rotation_to_z_up
 
-__all__ = ["UP_AXES", "Axis", "FieldFromFile", "field_from_file"]
+__all__ = ["FILE_OPTIONS", "UP_AXES", "Axis", "FieldFromFile", "field_from_file"]
+
+FILE_OPTIONS = ("read_as", "take_boundary", "normals", "smoothing", "up")
+"""The keywords of `field_from_file`."""
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 

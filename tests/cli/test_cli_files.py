@@ -280,7 +280,7 @@ def test_where_a_picture_goes_is_checked_before_the_file_is_read(tmp_path, capsy
         assert message in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main(["render", str(missing), "--azimuth", "inf"])
-    assert "finite number of degrees" in capsys.readouterr().err
+    assert "must be a finite number" in capsys.readouterr().err
 
 
 def test_the_gallery_lists_a_scene_a_line_however_narrow_the_window(capsys, monkeypatch) -> None:

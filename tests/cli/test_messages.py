@@ -15,13 +15,14 @@ import pytest
 import harnack as hk
 from harnack.cli import main
 from harnack.cli.arguments import parsers
-from harnack.cli.messages import OPTIONS, error_line, level_text, printable, python_to_cli_terms
+from harnack.cli.messages import error_line, level_text, printable, python_to_cli_terms
 from harnack.field_from_file import field_from_file
 from harnack.files import FileFormatError
 from harnack.geometry import example_curves
 from harnack.geometry.example_meshes import icosphere
 from harnack.name_suggestions import did_you_mean
 from harnack.rendering import MATERIALS, UnboundedSurfaceError, mitsuba_shape
+from harnack.rendering.option_table import OPTIONS
 
 POLYGON = hk.SolidAngle(example_curves.wavy_polygon(12))
 KNOT, RAY = example_curves.torus_knot(2, 3, 12), ([[0, 0, 3]], [[0, 0, -1]])
@@ -41,18 +42,22 @@ def draw(**settings: Any) -> Any:
     [
         ({"camera": (3, 3)}, r"the \(x, y, z\) where it stands, not a tuple \(3, 3\)"),
         ({"camera": "top"}, r"camera must be a harnack.Camera.*Camera\(azimuth=-50"),
-        ({"background": "dark"}, r"no setting 'background'.*; did you mean \"backdrop\"\?$"),
-        ({"levle": 3.0}, r"no setting 'levle'; there are show, .*; did you mean \"level\"\?$"),
-        ({"quality": "high"}, r"no setting 'quality'; there are .* material, .* section, largest$"),
-        ({"clip": (0, 0, 0)}, r"clip must be a volume, such as harnack.Ball"),
+        ({"background": "dark"}, r"no option 'background'; did you mean \"backdrop\"\?$"),
+        ({"levle": 3.0}, r"no option 'levle'; did you mean \"level\"\?$"),
+        ({"quality": "high"}, r"no option 'quality'; it has level, .* material, .*, progress$"),
+        ({"frames": 3}, r"render has no frames: that is an option of animate"),
+        ({"clip": (0, 0, 0)}, r"clip must be a volume: a harnack.Ball"),
         ({"level": "2pi"}, r"level must be a number, .* not '2pi'"),
         ({"level": [1.0, "a"]}, r"level must be a number, .* not 'a'"),
-        ({"solid": 3}, r"solid must be \(low, high\), two numbers, not 3"),
-        ({"tolerance": "x"}, r"tolerance must be a length or a Tolerance, not 'x'"),
+        ({"solid": (0, 1)}, r"no option 'solid'; did you mean \"side\"\?$"),
+        ({"tolerance": "x"}, r"tolerance must be a length or HitTolerance, not 'x'"),
         ({"material": 5}, r"a material is a name, .* not 5; there are two-tone"),
         ({"material": [0.5]}, r"a material is a name, a color, .* not 0.5; there are two"),
-        ({"colour": "red"}, r"no setting 'colour'; .*; did you mean \"material\"\?$"),
-        ({"filename": "a.png"}, r"no setting .*; did you mean \"path\", the second argument\?$"),
+        ({"colour": "red"}, r"no option 'colour'; did you mean \"material\"\?$"),
+        (
+            {"filename": "a.png"},
+            r"no option 'filename'; did you mean \"path\", the second argument\?$",
+        ),
         ({"size": 5}, r"size must be \(width, height\) in pixels, .* not 5"),
         ({"size": (3.5, 2)}, r"size must be .* not \(3.5, 2\)"),
         ({"size": "800x600"}, r"size must be .* not '800x600'"),
@@ -77,7 +82,9 @@ def test_a_wrong_kind_of_argument_is_named(settings: dict[str, Any], complaint: 
         ({"up": "Y"}, r"up must be one of .* not 'Y'; did you mean \"y\"\?$"),
         ({"show": "normals"}, r"show must be one of .*; did you mean \"normal\"\?$"),
         ({"backdrop": "drak"}, r"backdrop must be one of .*; did you mean \"dark\"\?$"),
-        ({"bound": "Slop"}, r"unknown bound 'Slop'.*; did you mean \"slope\"\?$"),
+        ({"enclosures": "Slop"}, r"unknown enclosures 'Slop'.*; did you mean \"slope\"\?$"),
+        ({"side": "abov"}, r"side must be one of .*; did you mean \"above\"\?$"),
+        ({"side": "between"}, r"between two levels, level=\(low, high\), and 1 are given"),
         ({"size": (10**6, 10**6)}, "each side must be 1 to 32768"),
         ({"spp": 10**12}, "spp must be at least 1 and at most 1000000"),
         ({"max_depth": 10**12}, "max_depth must be at most 2147483647"),
@@ -104,9 +111,9 @@ def test_a_picture_larger_than_memory_is_refused(monkeypatch: pytest.MonkeyPatch
         (lambda: hk.signed_distance(icosphere(1), [[0, 0, 1]]), "needed, .* not of type"),  # pyright: ignore
         (lambda: hk.mesh(abs), "a function: of a formula, take harnack.expression"),  # pyright: ignore
         (lambda: hk.render("x^2 + y^2 = 1"), "no such file; of a formula, take"),
-        (lambda: hk.signed_distance(hk.Surface(POLYGON), [[0, 0, 1]]), "Surface: take its .f"),  # pyright: ignore
+        (lambda: hk.Surface(hk.Surface(POLYGON)), "Surface: take its .field"),  # pyright: ignore
         (lambda: hk.render([[POLYGON]]), "give one at a time, or to harnack.render one flat list"),
-        (lambda: hk.render([KNOT]), "level sets, not what is of type ndarray: of points"),
+        (lambda: hk.render([KNOT]), "surfaces, not what is of type ndarray: of points"),
         (lambda: hk.trace(hk.Gyroid(1.0, domain="ball"), *RAY), "domain of a Gyroid must be a"),  # pyright: ignore
         (lambda: hk.Ball(radius="2"), "radius of a ball must be a number, not '2'"),  # pyright: ignore
         (lambda: example_curves.torus_knot("2", 3, 60), "p of a torus knot must be a whole number"),  # pyright: ignore
@@ -176,7 +183,7 @@ def test_messages_of_the_library_name_arguments_of_python(tmp_path: Path) -> Non
 @pytest.mark.parametrize("level", [0.0, 4 * math.pi, -8 * math.pi, 1e-300])
 def test_a_level_without_bounds_names_one_that_has_them(level: float) -> None:
     with pytest.raises(
-        UnboundedSurfaceError, match=r"clip=harnack.Ball.*or choose .* 6.28319"
+        UnboundedSurfaceError, match=r"such as a ball \(harnack.Ball\), or choose .* 6.28319"
     ) as e:
         draw(level=level)
     assert "multiples of its period" in str(e.value)
@@ -220,13 +227,15 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str]:
         (["render", "polygon", "--level", "4pi"], 1,
          r"level 12.5664 reaches to infinity.*; choose another --level, such as 2pi$"),
         (["render", "polygon", "--level", "1e999"], 2, "'1e999' is no level"),
-        (["render", "polygon", "--azimuth", "abc"], 2, "finite number of degrees, not 'abc'"),
+        (["render", "polygon", "--azimuth", "abc"], 2, "'abc' must be a finite number"),
         (["render", "polygon", "--size", "0x0"], 2, "each side must be 1 to 32768"),
         (["render", "polygon", "--size", "100000x100000"], 2, "each side must be 1 to 32768"),
         (["render", "polygon", "--size", "1" * 5000 + "x1"], 2, r"111\.\.\.' is no size"),
-        (["render", "polygon", "--spp", "0"], 2, "must be a number from 1 to 1000000"),
-        (["render", "polygon", "--spp", "-1"], 2, "must be a number from 1 to 1000000"),
-        (["render", "polygon", "--spp", "²"], 2, "'²' must be a number from 1 to 1000000"),
+        (["render", "polygon", "--spp", "0"], 2, "'0' must be a whole number from 1"),
+        (["render", "polygon", "--spp", "-1"], 2, "'-1' must be a whole number from 1"),
+        (["render", "polygon", "--spp", "²"], 2, "'²' must be a whole number from 1"),
+        (["render", "polygon", "--spp", "1000001"], 2, "spp must be .* at most 1000000"),
+        (["render", "polygon", "--max-depth", "x"], 2, "'x' must be an integer"),
         (["render", "polygon", "--seed", "9" * 5000], 2, "integer of at most 18 digits"),
         (["render", "polygon", "-o", ""], 1, "-o is empty"),
         (["render", "polygon", "-o", "folder.png"], 1, "it is a directory, name a file in it"),
@@ -244,7 +253,16 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str]:
         (["render", "circle.obj"], 1, "a link that leads to no file"),
         (["render", "."], 1, r"^error: '.' is no scene"),
         (["render", "x^2 + yy = 1"], 1, r"'yy' is unknown"),
-        (["render", "x*y*z = 0.1"], 1, r"infinity.*; cut it, such as by --ball 0,0,0,2$"),
+        (["render", "x*y*z = 0.1"], 1, r"infinity.*; cut it, such as by --clip ball:0,0,0,2$"),
+        (["render", "x = a"], 1, r"of a number of your own, give --parameter a=1; write"),
+        (["render", "polygon", "--boundary-material", "gold"], 1,
+         "^error: --boundary-material needs .* such as --boundary-radius 0.03$"),
+        (["render", "polygon", "--color-range", "0:1"], 1,
+         "^error: --color-range needs a picture with --show evaluations .*, not \"normal\"$"),
+        (["render", "gyroid", "--clip", "ball:1"], 2, "--clip: '1' must be 4 numbers"),
+        (["render", "gyroid", "--clip", "cone:1"], 2, "--clip: .*; write ball:X,Y,Z,RADIUS"),
+        (["render", "gyroid", "--side", "between", "--level", "0.3,0.1"], 1,
+         "--side between needs --level low,high, low < high"),
         (["mesh", "2x = 1"], 1, r"a \* missing at '2x'"),
         (["render", ""], 1, r"^error: '' is no scene"),
     ],
@@ -267,9 +285,9 @@ def test_every_complaint_is_one_line(
     before = sorted(tmp_path.iterdir())
     if arguments[0] == "render" and "--show" not in arguments:
         arguments = [*arguments[:2], "--show", "normal", *arguments[2:]]
-    found, said = run(capsys, *arguments, "--quiet")
+    exit_code, said = run(capsys, *arguments, "--quiet")
     assert re.search(complaint, said.rstrip("\n")), said
-    assert (found, said.count("\n")) == (code, 1)
+    assert (exit_code, said.count("\n")) == (code, 1)
     assert sorted(tmp_path.iterdir()) == before
 
 
@@ -301,7 +319,7 @@ def test_the_longest_name_that_the_disk_allows_is_written(tmp_path: Path) -> Non
 
 
 def test_names_that_begin_alike_are_preferred() -> None:
-    assert did_you_mean("background", ["bound", "backdrop"]) == '; did you mean "backdrop"?'
+    assert did_you_mean("background", ["back", "backdrop"]) == '; did you mean "backdrop"?'
     assert did_you_mean("GOLD", MATERIALS) == '; did you mean "gold"?'
     assert did_you_mean("zzz", MATERIALS) == ""
     assert did_you_mean(3, MATERIALS) == ""
@@ -313,48 +331,82 @@ def test_lines_are_printable() -> None:
     assert error_line(RuntimeError("two\n  lines")) == "error: two lines"
     assert "choose a smaller --size" in error_line(MemoryError("of 11 TiB"))
     assert (
-        error_line(ValueError('up= turns read_as="loops"')) == "error: --up turns --read-as loops"
+        error_line(ValueError('give read_as="loops", not cell_size'))
+        == "error: give --read-as loops, not --cell-size"
     )
 
 
-def raised_messages() -> list[str]:
-    """What the library says when it raises, as far as that is written where it does; X stands for
-    what is put in."""
-    root = Path(hk.__file__).parent
-    trees = [ast.parse(path.read_text()) for path in root.rglob("*.py")]
-    raised = [node.exc for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Raise)]
-    parts = [part for one in raised if one is not None for part in ast.walk(one)]
-    formatted = [part.values for part in parts if isinstance(part, ast.JoinedStr)]
-    single = [[part] for part in parts if isinstance(part, ast.Constant)]
-    inside = {id(piece) for pieces in formatted for piece in pieces}
-    return [
-        "".join(str(one.value) if isinstance(one, ast.Constant) else "X" for one in pieces)
-        for pieces in (*formatted, *(one for one in single if id(one[0]) not in inside))
-    ]
+def texts_of_the_library() -> list[str]:
+    """All texts of more than a word but for documentation, in which messages are; X stands for what
+    is put in."""
+    texts: list[str] = []
+    for path in Path(hk.__file__).parent.rglob("*.py"):
+        nodes = [*ast.walk(ast.parse(path.read_text()))]
+        apart = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+        formatted = [node for node in nodes if isinstance(node, ast.JoinedStr)]
+        apart |= {id(part) for node in formatted for part in node.values}
+        texts += [
+            "".join(
+                str(part.value) if isinstance(part, ast.Constant) else "X" for part in node.values
+            )
+            for node in formatted
+        ]
+        texts += [
+            node.value
+            for node in nodes
+            if isinstance(node, ast.Constant)
+            and isinstance(node.value, str)
+            and id(node) not in apart
+        ]
+    return [text for text in texts if " " in text and not re.search('<|="X"', text)]  # HTML
+
+
+# Of objects of Python and of values of a wrong type, to which no text of the command line leads.
+ONLY_IN_PYTHON = re.compile(
+    r"(camera|isolines|options) must be |backend=|camera=harnack|the center of a ball must"
+    r"|a height field |X is a function of|.*in Python precision="
+)
+CONSTRUCTOR = re.compile(
+    r"\b(Ball|Box|HalfSpace|Camera|Slider|Isolines|Surface|TraceOptions|VolumeIntersection)\("
+)
+KEYWORD = re.compile(rf"(?<![\w.])({'|'.join(option.name for option in OPTIONS)}|read_as|normals)=")
 
 
 @pytest.mark.slow
-def test_the_command_line_names_its_options_and_not_arguments_of_python() -> None:
+def test_messages_on_the_command_line_name_its_options_and_nothing_of_python() -> None:
     _, commands = parsers()
-    actions = [one for command in commands.values() for one in command._actions]
-    options = {option for one in actions for option in one.option_strings}
-    named = {one.dest for one in actions if one.option_strings}
-    assert {f"--{name.rstrip('_').replace('_', '-')}" for name in OPTIONS} <= options
-    python = re.compile(rf"(?<![(\w])({'|'.join(named)}|read_as|solid|section|clip|box|ball)=\S")
-    only_in_python = "level=[a, b]"  # as no command can be given two fields
-    messages = raised_messages()
-    assert len(messages) > 500
+    actions = [action for command in commands.values() for action in command._actions]
+    flags = {flag for action in actions for flag in action.option_strings}
+    on_command_line = {option.flag for option in OPTIONS if option.is_on_command_line}
+    assert on_command_line <= flags
+    assert not {option.flag for option in OPTIONS} - on_command_line & flags
+    messages = [text for text in texts_of_the_library() if not ONLY_IN_PYTHON.match(text)]
+    assert len(messages) > 1000
     for message in messages:
-        said = re.sub(r"\w+\([^()]*=[^()]*\)", "a call", python_to_cli_terms(message))
-        if only_in_python not in message:
-            assert not python.search(said), said
-    assert python_to_cli_terms('show="value" needs the function, such as of="z"') == (
-        "--show value needs the function, such as --of z"
-    )
-    said = python_to_cli_terms(
-        "give clip=harnack.Box(lower, upper) or harnack.Ball(center, radius)"
-    )
-    assert said == "give --box X,Y,Z,X,Y,Z or --ball X,Y,Z,RADIUS"
+        said = python_to_cli_terms(message)
+        named = [flag.rstrip("-") for flag in re.findall(r"(?<![\w-])--[a-z][a-z-]*", said)]
+        assert set(named) <= flags, said
+        assert not CONSTRUCTOR.search(said), said
+        outside_of_calls = re.sub(r"[\w.]+\((?:[^()]|\([^()]*\))*\)", "a call", said)
+        assert not KEYWORD.search(outside_of_calls), said
+
+
+@pytest.mark.parametrize(
+    ("message", "said"),
+    [
+        ('show="value" needs color_by="z"', "--show value needs --color-by z"),
+        ("give level=(low, high), or a larger `clip`", "give --level low,high, or a larger --clip"),
+        ("too long: raise max_steps.", "too long: raise --max-steps."),
+        ("largest=... and simplify=True", "--largest and --simplify"),
+        ("level: give at least one", "--level: give at least one"),
+        ("(take_boundary=True)", "(--take-boundary)"),
+        ("cut it (hk.mesh(f, level=(0, 1)))", "cut it (hk.mesh(f, level=(0, 1)))"),
+        ('in Python precision="double"', 'in Python precision="double"'),
+        ("cell_size/read_as.obj: surface.level=3", "cell_size/read_as.obj: surface.level=3"),
+    ],
+)
+def test_keywords_become_options(message: str, said: str) -> None:
+    assert python_to_cli_terms(message) == said
 
 
 def test_warnings_are_notes_without_places_in_files(

@@ -26,20 +26,20 @@ def test_pages_are_the_same(client: Any, tmp_path: Path) -> None:
     assert len(list((tmp_path / "parts").iterdir())) == 6
 
 
-def test_commands_take_a_scheduler(
+def test_commands_take_a_cluster(
     cluster: Any, client: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     small = ["gyroid", "--size", "24x18", "--quiet"]
-    there = ["--scheduler", cluster.scheduler_address, "--checkpoint", str(tmp_path / "parts")]
+    there = ["--client", cluster.scheduler_address, "--checkpoint", str(tmp_path / "parts")]
     pictures = [tmp_path / "a.png", tmp_path / "b.png"]
     shaded = ["--show", "shaded"]
     assert main(["render", *small, *shaded, "-o", str(pictures[0])]) == 0
-    assert main(["render", *small, *shaded, "-o", str(pictures[1]), "--tiles", "3", *there]) == 0
+    assert main(["render", *small, *shaded, "-o", str(pictures[1]), "--chunks", "3", *there]) == 0
     mi = register()
-    one, two = (np.array(mi.Bitmap(str(path))) for path in pictures)
-    np.testing.assert_array_equal(one, two)
-    film = ["turntable", *small, "--frames", "2", "-o", str(tmp_path / "a.gif"), *there]
+    alone, by_workers = (np.array(mi.Bitmap(str(path))) for path in pictures)
+    np.testing.assert_array_equal(alone, by_workers)
+    film = ["animate", *small, "--frames", "2", "-o", str(tmp_path / "a.gif"), *there]
     assert main(film) == 0
     assert len(list((tmp_path / "parts").iterdir())) > 4
-    assert main(["render", *small, "-o", str(pictures[0]), "--tiles", "3"]) == 1
-    assert "with --scheduler or --checkpoint only" in capsys.readouterr().err
+    assert main(["render", *small, "-o", str(pictures[0]), "--chunks", "3"]) == 1
+    assert "--chunks: parts are drawn one by one" in capsys.readouterr().err

@@ -24,7 +24,7 @@ WAYS: list[dict[str, Any]] = [
     {"show": "path", "spp": 4},
     {"show": "shaded"},
     {"show": "shaded", "antialias": "cones", "isolines": hk.Isolines("z", 0.1)},
-    {"show": "value", "of": "z"},
+    {"show": "value", "color_by": "z"},
     {"show": "evaluations"},
 ]
 
@@ -89,7 +89,7 @@ def test_a_checkpoint_spares_what_is_done(
     way: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     alone = hk.render(POLYGON, **SMALL, **way)
-    kept: dict[str, Any] = {"checkpoint": tmp_path, "tiles": 5, **SMALL, **way}
+    kept: dict[str, Any] = {"checkpoint": tmp_path, "chunks": 5, **SMALL, **way}
     put: list[str] = []
     own = CheckpointFolder.save
 
@@ -104,7 +104,7 @@ def test_a_checkpoint_spares_what_is_done(
         hk.render(POLYGON, **kept)
     assert len(list(tmp_path.iterdir())) == 3
     monkeypatch.setattr(CheckpointFolder, "save", own)
-    there = {one.name: one.stat().st_mtime_ns for one in tmp_path.iterdir()}
+    there = {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
     assert_same(hk.render(POLYGON, **kept), alone)
     assert all((tmp_path / name).stat().st_mtime_ns == when for name, when in there.items())
     parts = len(list(tmp_path.iterdir()))
@@ -131,8 +131,8 @@ def test_films_are_the_same_and_grow(tmp_path: Path, client: Any) -> None:
 def test_a_worker_that_is_killed_takes_nothing_with_it(tmp_path: Path) -> None:
     """Its parts go to the other; a run that is stopped then goes on from what is kept."""
     distributed = pytest.importorskip("distributed")
-    way: dict[str, Any] = {"size": (64, 48), "show": "path", "spp": 64, "tiles": 24}
-    alone = hk.render(POLYGON, progress=False, **{**way, "tiles": None})
+    way: dict[str, Any] = {"size": (64, 48), "show": "path", "spp": 64, "chunks": 24}
+    alone = hk.render(POLYGON, progress=False, **{**way, "chunks": None})
     kept: dict[str, Any] = {**way, "checkpoint": tmp_path}
     local = {"threads_per_worker": 1, "processes": True, "dashboard_address": None}
     done: list[float] = []
@@ -199,10 +199,10 @@ def test_damaged_parts_are_refused_by_name(tmp_path: Path) -> None:
             list(Executor(checkpoint=folder).run_tasks(Squares(), "square", [(3,)]))
 
 
-@pytest.mark.parametrize("tiles", [1, 3, 100])
+@pytest.mark.parametrize("chunks", [1, 3, 100])
 @pytest.mark.parametrize("count", [0, 1, 17])
-def test_runs_hold_everything_once(count: int, tiles: int) -> None:
-    runs = Executor(chunks=tiles).split_range(count, 6)
+def test_runs_hold_everything_once(count: int, chunks: int) -> None:
+    runs = Executor(chunks=chunks).split_range(count, 6)
     assert [k for start, stop in runs for k in range(start, stop)] == list(range(count))
     assert all(0 < stop - start <= 6 for start, stop in runs)
 
@@ -212,9 +212,9 @@ def everything_refused(tmp_path: Path) -> Iterator[tuple[dict[str, Any], str]]:
     yield {"client": 3}, "client must be a dask"
     yield {"client": "tcp://127.0.0.1:1"}, "no scheduler answers"
     yield {"checkpoint": tmp_path / "file"}, "is a file: name a folder"
-    yield {"tiles": 3}, "with a client or a checkpoint"
+    yield {"chunks": 3}, "with a client or a checkpoint"
     for wrong in (0, True, 2.5, "3", float("nan")):
-        yield {"tiles": wrong, "checkpoint": tmp_path}, "tiles must be an integer from 1"
+        yield {"chunks": wrong, "checkpoint": tmp_path}, "chunks must be an integer from 1"
 
 
 def test_wrong_settings_are_refused_by_name(

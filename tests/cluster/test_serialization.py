@@ -65,21 +65,17 @@ def test_names_do_not_depend_on_which_equal_objects_are_the_same() -> None:
 @pytest.mark.parametrize("name", ["trefoil", "cloud", "soup", "helix", "letters", "gyroid", "lava"])
 def test_surfaces_keep_their_names_when_they_are_used(name: str) -> None:
     fresh, used = SCENES[name].surfaces(), SCENES[name].surfaces()
-    for one in used:
-        hk.trace(one, POINTS * 3, -POINTS)
+    for surface in used:
+        hk.trace(surface.replace(side="surface"), POINTS * 3, -POINTS)
     packed = SerializedObject.serialize(fresh, "test")
     assert SerializedObject.serialize(used, "test") == packed
-    for one, other in zip(packed.deserialize(), fresh, strict=True):
-        np.testing.assert_array_equal(one.field.value(POINTS), other.field.value(POINTS))
+    for sent, own in zip(packed.deserialize(), fresh, strict=True):
+        np.testing.assert_array_equal(sent.field.value(POINTS), own.field.value(POINTS))
 
 
 def test_functions_of_formulas_are_sent_by_name() -> None:
-    for one in (
-        hk.math.exp,
-        hk.math.sin,
-        hk.math.absolute if hasattr(hk, "absolute") else hk.math.cos,
-    ):
-        assert pickle.loads(pickle.dumps(one)) is one
+    for function in (hk.math.exp, hk.math.sin, hk.math.cos):
+        assert pickle.loads(pickle.dumps(function)) is function
 
 
 def test_functions_that_name_modules_are_sent() -> None:

@@ -110,8 +110,10 @@ def test_the_places_of_sliders_are_in_the_page(tmp_path: Path) -> None:
     # The rays are the stage's: the surface stands there turned, moved and scaled.
     turned, moved, scale = np.split(np.array(scene["placement"]), [9, 12])
     o, d = (o - moved) @ turned.reshape(3, 3) / scale, d @ turned.reshape(3, 3)
-    torus = hk.traced_surface(hk.Torus(1.0, 0.4), 0.1, tolerance=surface["tolerance"] / scale[0])
-    expected = hk.trace(torus, o, d)
+    tolerance = surface["tolerance"] / scale[0]
+    expected = hk.trace(
+        hk.Torus(1.0, 0.4), o, d, level=0.1, tolerance=tolerance, precision="single"
+    )
     assert (found[0] != expected.status).mean() <= 2e-3
     both = expected.is_hit & (found[0] == 1)
     assert both.mean() > 0.4
@@ -124,13 +126,13 @@ def test_a_page_holds_fewer_places_where_they_are_large(
 ) -> None:
     """Each place of a parameter of a formula brings a kernel of its own."""
     formula, path = "x^2 + a*y^2 + z^2 = 1", str(tmp_path / "a.html")
-    command = ["page", formula, "--ball", "0,0,0,2", "-o", path, "--quiet", "--slider"]
+    command = ["page", formula, "--clip", "ball:0,0,0,2", "-o", path, "--quiet", "--slider"]
     monkeypatch.setattr(page_module, "_TARGET_BYTES", 1e6)
     monkeypatch.setattr(page_module, "_MANY_BYTES", 1e6)
     assert main([*command, "a=1:2"]) == 0
     assert len(scene_of(Path(path))["frames"]["frames"]) == 9
     said = capsys.readouterr()
-    assert "at 9 places of the sliders: give them larger steps, as in --slider" in said.err
+    assert "at 9 places of the sliders: give them larger steps" in said.err
     assert re.search(r"wrote .*a\.html \(\d\.\d MB\)", said.out)
     assert main([*command, "a=1:2:1"]) == 0
     assert len(scene_of(Path(path))["frames"]["frames"]) == 2
@@ -183,9 +185,9 @@ def test_what_is_no_page(tmp_path: Path) -> None:
         hk.page(hk.Sphere(1.0), tmp_path / "a.html", material="glass")
     with pytest.raises(ValueError, match="reaches to infinity"):
         hk.page(hk.solids.Plane((0.0, 0.0, 1.0)), tmp_path / "a.html")
-    with pytest.raises(TypeError, match="fields and level sets, not"):
+    with pytest.raises(TypeError, match="fields and surfaces, not"):
         hk.page("gyroid", tmp_path / "a.html")
-    with pytest.raises(TypeError, match="no setting 'levle'"):
+    with pytest.raises(TypeError, match=r"no option 'levle'; did you mean \"level\""):
         hk.page(hk.Sphere(1.0), tmp_path / "a.html", levle=0.1)
     with pytest.raises(ValueError, match='"light" or "dark"'):
         hk.page(hk.Sphere(1.0), tmp_path / "a.html", backdrop="tomato")
@@ -199,7 +201,7 @@ def test_what_is_no_page(tmp_path: Path) -> None:
         ({"port": 70_000}, "port must be an integer"), ({"height": True}, "height must be"),
         ({"height": 3}, "height must be"), ({"title": 3}, "title must be text"),
         ({"host": None}, "host must be an address"), ({"tolerance": True}, "tolerance"),
-        ({"boundary": np.nan}, "boundary"), ({"level": np.nan}, "level"),
+        ({"boundary_radius": np.nan}, "boundary_radius"), ({"level": np.nan}, "level"),
     ],
 )  # fmt: skip
 def test_what_is_no_view(given: dict[str, Any], wrong: str) -> None:

@@ -14,7 +14,7 @@ from scipy import ndimage
 import harnack as hk
 from harnack.geometry import example_curves
 from harnack.geometry.example_meshes import icosphere
-from tests.view.browsers import Page, chromium, served
+from tests.live.browsers import Page, chromium, served
 
 pytestmark = pytest.mark.browser
 SIZE = (320, 240)
@@ -43,8 +43,8 @@ SCENES: dict[str, Callable[[], tuple[Any, dict[str, Any]]]] = {
     "solid": lambda: (
         hk.Gyroid(0.6, domain=hk.Ball(radius=1.0)),
         {
-            "solid": (-0.6, 0.6), "section": hk.HalfSpace((1.0, -1.0, 0.5), 0.1),
-            "cut_material": "coral", "isolines": hk.Isolines("z", interval=0.25),
+            "level": (-0.6, 0.6), "side": "between", "section": hk.HalfSpace((1.0, -1.0, 0.5), 0.1),
+            "section_material": "coral", "isolines": hk.Isolines("z", interval=0.25),
         },
     ),
     "union": lambda: (

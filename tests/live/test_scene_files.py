@@ -16,7 +16,12 @@ from harnack.cli import main
 from harnack.gallery import SCENES
 from harnack.geometry import example_curves
 from harnack.geometry.example_meshes import icosphere
-from harnack.live.scene_file import _constructible_types, parse_scene, to_scene_text
+from harnack.live.scene_file import (
+    _constructible_types,
+    parse_scene,
+    to_scene_text,
+    with_flat_options,
+)
 from harnack.live.type_checks import check_types
 
 CURVE = hk.SolidAngle(example_curves.torus_knot(2, 3, 12))
@@ -74,14 +79,32 @@ def test_how_curves_are_traced_comes_back() -> None:
 def test_every_scene_of_the_gallery_comes_back() -> None:
     for name, scene in SCENES.items():
         surfaces = scene.surfaces()
-        origins = [(one.field, {"scene": name, "number": k}) for k, one in enumerate(surfaces)]
+        sources = [
+            (surface.field, {"scene": name, "number": k}) for k, surface in enumerate(surfaces)
+        ]
         settings = scene.settings(len(surfaces))
-        saved = parse_scene(to_scene_text(surfaces, settings, origins))
-        assert saved.settings == settings, name
-        for one, other in zip(surfaces, saved.surfaces, strict=True):
-            assert isinstance(other, hk.Surface)
-            for part in ("level_values", "clip", "section", "solid", "tolerance", "largest"):
-                assert getattr(one, part) == getattr(other, part), (name, part)
+        saved = parse_scene(to_scene_text(surfaces, settings, sources))
+        assert saved.settings == with_flat_options(settings), name
+        assert saved.trace_options == scene.options, name
+        for surface, read in zip(surfaces, saved.surfaces, strict=True):
+            assert isinstance(read, hk.Surface)
+            for part in ("level_values", "clip", "section", "side", "largest"):
+                assert getattr(surface, part) == getattr(read, part), (name, part)
+
+
+def test_surfaces_of_the_gallery_have_their_own_keywords_in_place_of_a_field() -> None:
+    """As a field alone they are traced by the keywords beside it."""
+    scene = SCENES["helix"]
+    about: dict[str, Any] = {"scene": "helix", "number": 0}
+    surfaces = [about, {"field": about}, {"field": about, "level": 0.5}]
+    whole, bare, other = parse_scene(json.dumps({"harnack": 1, "surfaces": surfaces})).surfaces
+    (own, *_) = scene.surfaces()
+    assert isinstance(whole, hk.Surface)
+    assert whole.keywords == own.keywords
+    assert whole.level_values == own.level_values
+    assert isinstance(bare, hk.Field)
+    assert isinstance(other, hk.Surface)
+    assert (other.level_values, other.side) == ((0.5,), None)
 
 
 def test_a_scene_is_traced_at_its_level(tmp_path: Path) -> None:
@@ -98,9 +121,10 @@ def test_a_scene_is_traced_at_its_level(tmp_path: Path) -> None:
     [
         ({"level": "x"}, "level"), ({"size": [1e9, 1e9]}, "size"),
         ({"material": {"Sphere": {}}}, "material"), ({"show": "nothing"}, "show"),
-        ({"spp": -1}, "spp"), ({"confirm": "yes"}, "confirm"), ({"up": 3}, "up"),
-        ({"boundary": "x"}, "boundary"), ({"thickness": True}, "thickness"),
-        ({"largest": "yes"}, "largest"), ({"denoise": 1}, "denoise"), ({"bound": 3}, "bound"),
+        ({"spp": -1}, "spp"), ({"require_crossing": "yes"}, "require_crossing"), ({"up": 3}, "up"),
+        ({"boundary_radius": "x"}, "boundary_radius"), ({"thickness": True}, "thickness"),
+        ({"largest": "yes"}, "largest"), ({"denoise": 1}, "denoise"),
+        ({"enclosures": 3}, "enclosures"),
     ],
 )  # fmt: skip
 def test_settings_are_checked_when_they_are_read(settings: dict[str, Any], wrong: str) -> None:
@@ -125,24 +149,26 @@ def test_what_could_not_be_read_is_not_written(
 
 
 def test_scene_files_know_every_solid() -> None:
-    solids = [getattr(hk, name) for name in hk.__all__]
+    solids = [getattr(hk.solids, name) for name in hk.solids.__all__]
     solids = [
-        one for one in solids if inspect.isclass(one) and issubclass(one, hk.solids.FormulaSolid)
+        kind
+        for kind in solids
+        if inspect.isclass(kind) and issubclass(kind, hk.solids.FormulaSolid)
     ]
     assert len(solids) > 10
     for kind in _constructible_types().values():
         check_types(kind, {})  # whose annotations can be read
-    for one in set(solids) - {hk.solids.FormulaSolid}:
+    for kind in set(solids) - {hk.solids.FormulaSolid}:
+        about = {"harnack": 1, "surfaces": [{"field": {kind.__name__: {"q": 1}}}]}
         with pytest.raises(hk.live.SceneFileError, match="argument of"):
-            parse_scene(
-                json.dumps({"harnack": 1, "surfaces": [{"field": {one.__name__: {"q": 1}}}]})
-            )
+            parse_scene(json.dumps(about))
 
 
 def test_settings_and_sliders_come_back(tmp_path: Path) -> None:
     settings: dict[str, Any] = {
         "clip": hk.Ball((0, 0, 0), 2.0), "section": hk.HalfSpace((1.0, 0.0, 0.0), 0.5),
-        "tolerance": 1e-3, "material": ["gold"], "backdrop": "dark", "up": "y", "boundary": 0.05,
+        "tolerance": 1e-3, "material": ["gold"], "backdrop": "dark", "up": "y",
+        "boundary_radius": 0.05,
         "camera": hk.Camera(position=(3.0, 2.0, 1.0), target=(0.0, 0.0, 0.0), fov=30.0),
         "isolines": [hk.Isolines("x*y", interval=0.25, color="navy")],
     }  # fmt: skip
@@ -160,7 +186,7 @@ def test_settings_and_sliders_come_back(tmp_path: Path) -> None:
     surface = hk.Surface(hk.Gyroid(0.5), level=0.1, side="below", clip=hk.Ball())
     (found,) = parse_scene(to_scene_text([surface], {})).surfaces
     assert isinstance(found, hk.Surface)
-    assert (found.solid, found.clip) == (surface.solid, surface.clip)
+    assert (found.side, found.clip) == (surface.side, surface.clip)
 
 
 def test_a_file_is_found_beside_the_scene(tmp_path: Path) -> None:
@@ -192,6 +218,7 @@ WRONG = {
     '{"harnack": 1, "surfaces": [' + "[" * 900 + "]" * 900 + "]}": "must be an object",
     '{"harnack": 1, "surfaces": []}': "one surface at least",
     '{"harnack": 1, "surfaces": [3]}': "must be an object",
+    '{"harnack": 1, "surfaces": [{"scene": "gyroid", "level": 1}]}': "no part of a surface of the",
     '{"harnack": 1, "surfaces": [{}]}': r"surfaces\[0\] has no field",
 }
 WRONG_FIELDS = {
@@ -205,7 +232,7 @@ WRONG_FIELDS = {
     '{"expression": {"function": "x"}}': "no kind",
     '{"scene": "gyroit"}': 'mean "gyroid"',
     '{"scene": "gyroid", "number": 9}': "no number 9",
-    '{"scene": "gyroid", "path": 9}': "no part of a field",
+    '{"scene": "gyroid", "path": 9}': "no part of a surface of the gallery",
     '{"file": "a.ply"}': "must not name files",
     '{"file": ["a.ply"]}': "file must be a text",
     '{"file": "a.ply", "read_as": "x"}': "read_as must be",

@@ -54,7 +54,9 @@ def test_nothing_is_compiled_for_sliders_and_points(live: LiveScene) -> None:
 
 NUMBERS: dict[str, tuple[Any, dict[str, Any]]] = {
     "radius": (lambda a: hk.Torus(1.0, a), {}),
-    "thickness": (hk.Gyroid(0.5, domain=hk.Ball()), {"solid": lambda a: (-a, a)}),
+    "thickness": (
+        hk.Gyroid(0.5, domain=hk.Ball()), {"level": lambda a: (-a, a), "side": "between"}
+    ),
     "clip": (hk.Gyroid(0.5), {"clip": lambda a: hk.Ball(radius=1 + a)}),
     "section": (
         hk.Torus(1.0, 0.3), {"section": lambda a: hk.HalfSpace((1.0, 0.0, 0.0), a)}
@@ -71,7 +73,7 @@ def test_nothing_is_compiled_for_numbers_of_surfaces(name: str) -> None:
 
 
 def test_the_tube_follows_the_curve() -> None:
-    live = LiveScene.of(hk.SolidAngle(LOOP), {"boundary": 0.05, "level": 6.0}, edits=True)
+    live = LiveScene.of(hk.SolidAngle(LOOP), {"boundary_radius": 0.05, "level": 6.0}, edits=True)
     session = Session(live)
     moved = LOOP.copy()
     moved[0] *= 1.5
@@ -92,11 +94,11 @@ def test_material_and_tube_are_changed_and_saved() -> None:
     (surface,) = change["surfaces"]
     assert "code" not in surface
     assert surface["paints"][0]["front"][2] > 2 * surface["paints"][0]["front"][0]
-    settings = {"material": "copper", "boundary": 0.05}
+    settings = {"material": "copper", "boundary_radius": 0.05}
     controls = session.controls({"settings": settings})
     surface, tube = live.surfaces_at(controls)
     assert abs(float(tube.surface.field.value(LOOP[0]))) < 0.06
-    (one,) = live.surfaces_at(session.controls({"settings": {"boundary": None}}))
+    (one,) = live.surfaces_at(session.controls({"settings": {"boundary_radius": None}}))
     assert one.material != surface.material
     saved = session.answer({"kind": "save", "camera": POSE, "settings": settings})
     opened = session.answer({"kind": "load", "text": saved["text"]})
@@ -294,7 +296,7 @@ def test_what_is_saved_can_be_opened(live: LiveScene) -> None:
     saved = solid.answer({"kind": "save", "camera": POSE, "cut": {"plane": [1, 0, 0, 0.1]}})
     solid.answer({"kind": "load", "text": saved["text"]})
     (opened,) = solid.live.surfaces_at(solid.controls({"sliders": {"level": 0.5}}))
-    assert opened.surface.solid == (-np.inf, 0.5)  # with a face, at the level of the slider
+    assert opened.surface.solid_range == (-np.inf, 0.5)  # with a face, at the level of the slider
     text = '{"harnack": 1, "surfaces": [{"field": {"file": "/etc/hosts"}}]}'
     with pytest.raises(hk.live.SceneFileError, match="must not name files"):
         session.answer({"kind": "load", "text": text})
@@ -322,9 +324,9 @@ def test_what_is_saved_can_be_opened(live: LiveScene) -> None:
         ({"kind": "change", "settings": {"material": ["gold"]}}, "a name or a color"),
         ({"kind": "change", "settings": {"material": "glod"}}, 'mean "gold"'),
         ({"kind": "change", "settings": {"material": "glass"}}, "not drawn transparent"),
-        ({"kind": "change", "settings": {"boundary": True}}, "a positive number"),
-        ({"kind": "change", "settings": {"boundary": float("nan")}}, "a positive number"),
-        ({"kind": "change", "settings": {"boundary": -1}}, "a positive number"),
+        ({"kind": "change", "settings": {"boundary_radius": True}}, "a positive number"),
+        ({"kind": "change", "settings": {"boundary_radius": float("nan")}}, "a positive number"),
+        ({"kind": "change", "settings": {"boundary_radius": -1}}, "a positive number"),
         ({"kind": "probe"}, "origin"),
         ({"kind": "draw", "size": [99_999, 9]}, "at most 8192|each side"),
         ({"kind": "draw", "size": [64, 48]}, "eye must be"),

@@ -25,7 +25,7 @@ import pytest
 
 import harnack as hk
 from harnack.geometry import example_curves
-from tests.view.browsers import Page, chromium, launched
+from tests.live.browsers import Page, chromium, launched
 
 pytestmark = pytest.mark.browser
 SIZE = (320, 240)
@@ -141,7 +141,7 @@ def test_material_and_tube_are_changed(drawn_by: str, page: Page) -> None:
     page.set("tube", 0.06)
     assert page.do("() => panel.controlValues.settings") == {
         "material": "#0000ff",
-        "boundary": 0.06,
+        "boundary_radius": 0.06,
     }
     blue = page.picture(f"view-tube-{drawn_by}")
     assert change(golden, blue) > 0.05
@@ -415,7 +415,7 @@ def test_a_server_on_ipv6(browser: Any) -> None:
 def served_by_command() -> Iterator[tuple[Any, str]]:
     """`harnack view`, and the address of its page."""
     command = [
-        sys.executable, "-m", "harnack.cli", "view", "x^2+y^2+z^2=1", "--ball", "0,0,0,2",
+        sys.executable, "-m", "harnack.cli", "view", "x^2+y^2+z^2=1", "--clip", "ball:0,0,0,2",
         "--no-browser",
     ]  # fmt: skip
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env={**os.environ}) as one:

@@ -14,7 +14,7 @@ import pytest
 import harnack as hk
 from harnack.geometry import example_curves
 from harnack.live import server
-from tests.view.browsers import Page, chromium, served
+from tests.live.browsers import Page, chromium, served
 
 widgets = pytest.importorskip("harnack.live.widget")
 traitlets = pytest.importorskip("traitlets")

@@ -307,26 +307,26 @@ def test_there_is_no_edge_behind_the_surface(show: str, backdrop: str, elevation
 def test_a_tube_is_drawn_around_the_curve() -> None:
     """It sticks out of the surface by its radius, and follows circles."""
     bare = np.isfinite(draw(show="depth"))
-    thick = np.isfinite(draw(show="depth", boundary=0.1))
+    thick = np.isfinite(draw(show="depth", boundary_radius=0.1))
     assert thick.sum() > 1.05 * bare.sum()
     ring = hk.SolidAngle(hk.geometry.Circle(1.0, (0, 0, 0), (0, 0, 1)))
     camera = hk.Camera(elevation=90, box=hk.Box((-1.2, -1.2, -0.2), (1.2, 1.2, 0.2)))
     areas = [
         np.isfinite(draw(ring, show="depth", camera=camera, size=(96, 96), **rim)).sum()
-        for rim in ({}, {"boundary": 0.1})
+        for rim in ({}, {"boundary_radius": 0.1})
     ]
     assert areas[1] / areas[0] == pytest.approx(1.1**2, rel=0.03)
 
 
 @pytest.mark.parametrize("radius", [0, -1, math.nan, math.inf, "wide", True])
 def test_a_tube_needs_a_radius(radius: Any) -> None:
-    with pytest.raises(ValueError, match="boundary is the radius"):
-        draw(boundary=radius)
+    with pytest.raises(ValueError, match="boundary_radius is"):
+        draw(boundary_radius=radius)
 
 
 def test_a_tube_needs_a_curve() -> None:
     with pytest.raises(ValueError, match="ends at a curve"):
-        draw(GYROID, boundary=0.1)
+        draw(GYROID, boundary_radius=0.1)
 
 
 @pytest.mark.slow
@@ -350,10 +350,21 @@ def test_pictures_show_themselves() -> None:
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["gyroid", "--solid", "-0.3:0.3", "--ball", "0,0,0,3", "--backdrop", "white"],
+        ["gyroid", "--side", "between", "--level", "-0.3,0.3", "--clip", "ball:0,0,0,3"],
+        ["gyroid", "--side", "below", "--level", "0.1", "--backdrop", "white"],
         ["trefoil", "--position", "-5,5,2", "--target", "0,0,0", "--backdrop", "transparent"],
-        ["polygon", "--box", "-1,-1,-1,0,1,1", "--bound", "slope", "--zoom", "0.9", "--fov", "40"],
-        ["trefoil", "--up", "x", "--level", "2pi", "--boundary-tube", "0.1"],
+        [
+            "polygon",
+            "--clip",
+            "box:-1,-1,-1,0,1,1",
+            "--enclosures",
+            "slope",
+            "--zoom",
+            "0.9",
+            "--fov",
+            "40",
+        ],
+        ["trefoil", "--up", "x", "--level", "2pi", "--boundary-radius", "0.1"],
         ["gyroid", "--up", "-x", "--backdrop", "white,steelblue"],
         ["trefoil", "--isolines", "z:0.2", "--isolines-width", "0.02", "--isolines-color", "#fff"],
     ],
@@ -367,7 +378,7 @@ def test_options_of_the_command(arguments: list[str], tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_values_with_a_bar_from_the_command_line(tmp_path: Path) -> None:
-    asked = ["--show", "value", "--of", "z", "--value-range", "-1:1", "--colorbar"]
+    asked = ["--show", "value", "--color-by", "z", "--color-range", "-1:1", "--color-bar"]
     small = ["--size", "32x24", "--quiet", "-o", str(tmp_path / "a.png")]
     assert main(["render", "trefoil", *asked, *small]) == 0
     assert np.array(mi.Bitmap(str(tmp_path / "a.png"))).shape[1] > 50
@@ -399,15 +410,15 @@ def test_axes_with_a_minus_turn_files_from_the_command_line(up: str, tmp_path: P
         (["trefoil", "--backdrop", "white,steelbleu"], 'did you mean "steelblue"'),
         (["trefoil", "--backdrop", "missing.png"], "missing.png: there is no such file"),
         (["trefoil", "--up", "w"], "x, y, z, -x, -y, -z"),
-        (["trefoil", "--isolines", "z"], "a coordinate or a formula, and a spacing, as z:0.1"),
+        (["trefoil", "--isolines", "z"], "a coordinate or a formula, and an interval, as z:0.1"),
         (["trefoil", "--isolines", "w:1"], "'w' is unknown"),
-        (["trefoil", "--show", "value", "--of", "x*"], "'x*' is no formula"),
+        (["trefoil", "--show", "value", "--color-by", "x*"], "'x*' is no formula"),
         (["trefoil", "--isolines", "z:0"], "positive"),
-        (["trefoil", "--isolines-color", "red"], "color of isolines without isolines"),
-        (["trefoil", "--show", "value"], "such as --of z"),
-        (["trefoil", "--bound", "slop"], 'did you mean "slope"'),
+        (["trefoil", "--isolines-color", "red"], "give --isolines too"),
+        (["trefoil", "--show", "value"], "such as --color-by z"),
+        (["trefoil", "--enclosures", "slop"], 'did you mean "slope"'),
         (["trefoil", "--position", "1,2"], "3 numbers"),
-        (["trefoil", "--solid", "0:1"], "real-valued"),
+        (["trefoil", "--side", "below"], "real-valued"),
         (["letters", "--zoom", "-1"], "positive"),
         (["trefoil", "--position", "1,2,3", "--distance", "2"], "position or distance"),
     ],
@@ -423,7 +434,7 @@ def test_options_that_cannot_be(
 @pytest.mark.few(1)
 @pytest.mark.parametrize("show", ["value", "depth", "evaluations"])
 def test_pictures_of_numbers_stand_before_a_color(show: str) -> None:
-    asked = {"of": "z"} if show == "value" else {}
+    asked = {"color_by": "z"} if show == "value" else {}
     picture = hk.render(
         hk.Sphere(1.0), show=show, backdrop="white", color_bar=True, size=(40, 120),
         progress=False, **asked,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import drjit as dr
@@ -46,7 +45,7 @@ def drawn(*members: Any, show: str = "shaded", spp: int = 1) -> np.ndarray:
 
 def ball(index: float, radius: float = 1.0, **settings: Any) -> Any:
     bsdf = {"type": "dielectric", "int_ior": index, "ext_ior": 1.0}
-    settings = {"solid": (-math.inf, 0.0), "tint": TINT, "tolerance": 1e-5, **settings}
+    settings = {"level": 0.0, "side": "below", "tint": TINT, "tolerance": 1e-5, **settings}
     return mitsuba_shape(Sphere(), bsdf=bsdf, to_world=T().scale(radius), **settings)
 
 
@@ -63,9 +62,9 @@ def chords(radius: float = 1.0) -> np.ndarray:
     return 2 * np.sqrt(np.maximum(b * b - EYE @ EYE + radius**2, 0))
 
 
-@pytest.mark.parametrize("confirm", [False, True])
-def test_a_ball_absorbs_light_by_the_law_of_beer_and_lambert(confirm: bool) -> None:
-    image, chord = drawn(ball(1.0, require_crossing=confirm)), chords()
+@pytest.mark.parametrize("require_crossing", [False, True])
+def test_a_ball_absorbs_light_by_the_law_of_beer_and_lambert(require_crossing: bool) -> None:
+    image, chord = drawn(ball(1.0, require_crossing=require_crossing)), chords()
     expected = SKY * TINT ** chord[..., None]
     assert 0.2 < (chord > 0.1).mean() < 0.7
     np.testing.assert_allclose(image[chord > 0.1], expected[chord > 0.1], rtol=3e-3)
@@ -132,7 +131,12 @@ def test_rays_follow_snell_and_fresnel(index: float) -> None:
 @pytest.mark.slow
 def test_named_glass_is_tinted_in_both_kinds_of_picture() -> None:
     gyroid = hk.Gyroid(1.0, domain=hk.Ball(radius=1.0))
-    small: dict[str, Any] = {"solid": (-0.4, 0.4), "size": (40, 30), "progress": False}
+    small: dict[str, Any] = {
+        "level": (-0.4, 0.4),
+        "side": "between",
+        "size": (40, 30),
+        "progress": False,
+    }
     for show in ("shaded", "path"):
         amber = render(gyroid, material="amber", show=show, spp=8, **small)[10:20, 14:26]
         clear = render(gyroid, material="glass", show=show, spp=8, **small)[10:20, 14:26]
@@ -145,7 +149,7 @@ def test_bad_tints_are_refused() -> None:
         ball(1.5, tint=(0.5, 0.0, 0.5))
     with pytest.raises(TypeError, match=r"such as \(0.9, 0.5, 0.1\)"):
         ball(1.5, tint="amber")
-    with pytest.raises(ValueError, match="give solid="):
+    with pytest.raises(ValueError, match='give side="below"'):
         mitsuba_shape(Sphere(), tint=(0.5, 0.5, 0.5))
     with pytest.raises(ValueError, match="needs an inside"):
         render(Sphere(), material="amber", progress=False)

@@ -14,6 +14,7 @@ from harnack.geometry import example_meshes
 from harnack.rendering import Camera, mitsuba_shape, register, render
 from harnack.rendering.shaded_render import inner_and_outer_ball
 from harnack.rendering.shading import StudioLight
+from harnack.tracer import traced_surface
 from harnack.tracer.pixel_cones import PixelCones
 
 mi = register()
@@ -27,7 +28,7 @@ RADIUS = 0.01
 def covered(what: Any, o: Any, d: Any, precision: str = "single", **settings: Any) -> np.ndarray:
     """Which cones of radius 0.01 at a distance of 4 a level set covers in part."""
     backend = choose_backend(precision)
-    surface = hk.traced_surface(what, **settings)
+    surface = traced_surface(what, **settings)
     prepared = surface.prepare(backend, crosses=True)
     kind = np.float32 if precision == "single" else np.float64
     rays = (backend.Array3f(np.asarray(a, dtype=kind).T.copy()) for a in np.broadcast_arrays(o, d))
@@ -128,7 +129,7 @@ def exact(inside: Any) -> np.ndarray:
 @pytest.mark.usefixtures("black")
 def test_a_ball_covers_as_much_of_each_pixel_as_it_should() -> None:
     radius = 0.5 + 1e-3
-    image = drawn(hk.traced_surface(hk.Sphere(radius), tolerance=1e-5), antialias="cones", spp=64)
+    image = drawn(traced_surface(hk.Sphere(radius), tolerance=1e-5), antialias="cones", spp=64)
     slope = radius / np.sqrt(AWAY**2 - radius**2)
     truth = exact(lambda y, z: np.hypot(y, z) < slope)
     assert 0.1 < truth.mean() < 0.9
@@ -136,7 +137,7 @@ def test_a_ball_covers_as_much_of_each_pixel_as_it_should() -> None:
     assert np.sqrt(np.mean((image - truth)[(truth > 0) & (truth < 1)] ** 2)) < 0.02
     less, more = (exact(lambda y, z, k=k: np.hypot(y, z) < k * slope) for k in (0.998, 1.002))
     inside = (less == 1) | (more == 0)
-    once = drawn(hk.traced_surface(hk.Sphere(radius), tolerance=1e-5), spp=1)
+    once = drawn(traced_surface(hk.Sphere(radius), tolerance=1e-5), spp=1)
     np.testing.assert_array_equal(image[inside], once[inside])
 
 
@@ -144,7 +145,7 @@ def test_a_ball_covers_as_much_of_each_pixel_as_it_should() -> None:
 def test_a_half_space_covers_as_much_of_each_pixel_as_it_should() -> None:
     tilt, height = np.array([0.0, 0.35, 1.0]) / np.hypot(0.35, 1.0), 0.0137
     half = hk.solids.Plane(tilt, height) & hk.solids.Plane((1.0, 0.0, 0.0), 0.0)
-    edge = hk.traced_surface(half, clip=hk.Ball(radius=2.0), tolerance=1e-5)
+    edge = traced_surface(half, clip=hk.Ball(radius=2.0), tolerance=1e-5)
     image = drawn(edge, antialias="cones", spp=64)
     truth = exact(lambda y, z: AWAY * (tilt[1] * y + tilt[2] * z) < height)
     assert ((truth > 0) & (truth < 1)).sum() > 0.9 * N
@@ -157,7 +158,7 @@ def test_wires_thinner_than_a_pixel_are_lines(thin: float) -> None:
     """A wire that is `thin` pixels wide covers that much of each column, more so as it slants."""
     slant = 0.23
     ends = np.array([(0.0, -1.0, -slant), (0.0, 1.0, slant)])
-    wire = hk.traced_surface(hk.Tube(ends, thin * PIXEL * AWAY / 2), tolerance=1e-6)
+    wire = traced_surface(hk.Tube(ends, thin * PIXEL * AWAY / 2), tolerance=1e-6)
     expected = thin * np.hypot(1, slant)
     columns = drawn(wire, antialias="cones", spp=144).sum(axis=0)
     assert columns.min() > 0.5 * expected  # none is broken
@@ -171,7 +172,7 @@ def test_wires_thinner_than_a_pixel_are_lines(thin: float) -> None:
 def test_a_turned_plate_seen_on_edge_is_a_line() -> None:
     """Its hull is thin and the box around that is not: cones that passed it were cut away."""
     plate = hk.Cuboid((0.6, 1.0, 0.002)).rotated(20, "x")
-    columns = drawn(hk.traced_surface(plate, tolerance=1e-5), antialias="cones", spp=64).sum(axis=0)
+    columns = drawn(traced_surface(plate, tolerance=1e-5), antialias="cones", spp=64).sum(axis=0)
     middle = columns[12:-12]
     assert middle.min() > 0.5 * np.median(middle)
 
@@ -180,8 +181,8 @@ def test_a_turned_plate_seen_on_edge_is_a_line() -> None:
 @pytest.mark.usefixtures("black")
 def test_what_hides_a_wire_hides_it_from_cones() -> None:
     ends = np.array([(-1.0, -0.3, 0.01), (-1.0, 0.3, 0.02)])
-    both = hk.traced_surface(hk.Tube(ends, 1e-4) | hk.Sphere(0.5), tolerance=1e-5)
-    alone = hk.traced_surface(hk.Sphere(0.5), tolerance=1e-5)
+    both = traced_surface(hk.Tube(ends, 1e-4) | hk.Sphere(0.5), tolerance=1e-5)
+    alone = traced_surface(hk.Sphere(0.5), tolerance=1e-5)
     images = [drawn(one, antialias="cones", spp=9) for one in (both, alone)]
     np.testing.assert_allclose(images[0], images[1], atol=0.02)
 
@@ -203,13 +204,13 @@ def test_several_surfaces_and_solids_are_found() -> None:
     camera = Camera(elevation=60)
     painted = ["clay", "plastic"]  # of clay, the wire is as bright as the ground
     settings: dict[str, Any] = {"camera": camera, "spp": 64, "material": painted}
-    gyroid = hk.traced_surface(
+    gyroid = traced_surface(
         hk.Gyroid(1.0, domain=hk.Ball(radius=0.6)),
         level=(-0.3, 0.3),
         side="between",
         tolerance=2e-4,
     )
-    what = [gyroid, hk.traced_surface(wire, tolerance=2e-5)]
+    what = [gyroid, traced_surface(wire, tolerance=2e-5)]
     found, edges = small(what, antialias="cones", **settings), small(what, **settings)
     fine = small(what, size=(32 * 8, 24 * 8), spp=16, antialias="cones", camera=camera,
                  material=painted).reshape(24, 8, 32, 8, 3).mean(axis=(1, 3))  # fmt: skip

@@ -86,7 +86,7 @@ def test_the_camera_comes_closer(tmp_path: Path) -> None:
 @pytest.mark.few(1)
 @pytest.mark.parametrize("camera", [(4.0, -6.0, 5.0), hk.Camera(distance=8.0)])
 def test_a_camera_that_has_a_place_goes_around_too(camera: Any, tmp_path: Path) -> None:
-    still = SMALL | {"frames": 4, "turn": 360}
+    still = SMALL | {"frames": 4, "orbit": 360}
     hk.animate(FIELD, tmp_path / "a.gif", camera=camera, **still)
     film = pictures(tmp_path / "a.gif")
     assert len(film) == 4
@@ -150,7 +150,7 @@ def test_a_film_in_mp4(tmp_path: Path) -> None:
         ({"frames": 0}, "frames must be from 1"),
         ({"fps": 0}, "fps"),
         ({"fps": float("nan")}, "fps"),
-        ({"turn": float("inf")}, "turn"),
+        ({"orbit": float("inf")}, "orbit"),
         ({"material": "golf"}, "gold"),
         ({"path": "a.mp4", "backdrop": "transparent"}, "no alpha"),
         ({"path": "a.mp4", "size": (1, 20)}, "at least 2 pixels"),
@@ -170,9 +170,16 @@ def test_what_is_the_same_for_all_pictures_is_no_function(name: str, tmp_path: P
     assert list(tmp_path.iterdir()) == []
 
 
+def test_classes_of_enclosures_are_no_functions(tmp_path: Path) -> None:
+    """A film refused them as functions of s."""
+    bounds = {"enclosures": hk.proofs.LipschitzEnclosure, "show": "normal", "frames": 1}
+    hk.animate(hk.Sphere(1.0), tmp_path / "a.gif", **{**SMALL, **bounds})
+    assert len(pictures(tmp_path / "a.gif")) == 1
+
+
 @pytest.mark.parametrize("name", ["a.gif", "a.mp4"])
 def test_films_have_room_for_color_bars(name: str, tmp_path: Path) -> None:
-    settings = {"frames": 2, "show": "value", "of": "z", "colorbar": True}
+    settings = {"frames": 2, "show": "value", "color_by": "z", "color_bar": True}
     hk.animate(FIELD, tmp_path / name, orbit=90, **{**SMALL, **settings})
     av = pytest.importorskip("av")
     with av.open(str(tmp_path / name)) as film:
@@ -180,7 +187,7 @@ def test_films_have_room_for_color_bars(name: str, tmp_path: Path) -> None:
     assert frame.shape[1] > SMALL["size"][0] + 10
 
 
-@pytest.mark.parametrize("settings", [{"turn": "360"}, {"fps": "24"}, {"fps": None}])
+@pytest.mark.parametrize("settings", [{"orbit": "360"}, {"fps": "24"}, {"fps": None}])
 def test_what_is_no_number_is_named(settings: dict[str, Any], tmp_path: Path) -> None:
     with pytest.raises(TypeError, match=f"{next(iter(settings))} must be a number"):
         hk.animate(FIELD, tmp_path / "a.gif", **SMALL, **settings)
@@ -205,11 +212,11 @@ def test_what_is_missing_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     target = tmp_path / "a.gif"
     arguments = ["--frames", "3", "--size", "32x24", "--spp", "1", "--quiet", "--backdrop", "white"]
-    assert main(["turntable", "trefoil", "-o", str(target), *arguments]) == 0
+    assert main(["animate", "trefoil", "-o", str(target), *arguments]) == 0
     assert "wrote" in capsys.readouterr().out
     assert len(pictures(target)) == 3
     assert (pictures(target)[0][0, 0] == 255).all()
-    assert main(["turntable", "trefoil", "-o", str(tmp_path / "a.txt")]) != 0
+    assert main(["animate", "trefoil", "-o", str(tmp_path / "a.txt")]) != 0
 
 
 def test_transparent_films_keep_their_colors(tmp_path: Path) -> None:

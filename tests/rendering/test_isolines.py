@@ -185,7 +185,7 @@ def seen(what: Any, isolines: Any, show: str, **settings: Any) -> np.ndarray:
 @pytest.mark.slow
 def test_pictures_of_values_have_isolines_and_smooth_edges() -> None:
     """Numbers are those of one ray a pixel, whatever is drawn; edges are means of several."""
-    asked: dict[str, Any] = {"show": "value", "of": "x", "backdrop": "white", **SMALL}
+    asked: dict[str, Any] = {"show": "value", "color_by": "x", "backdrop": "white", **SMALL}
     lines = hk.Isolines("x", [0.0], width=0.15, color="black")
     plain, lined = hk.render(CIRCLE, spp=1, **asked), hk.render(CIRCLE, isolines=lines, **asked)
     np.testing.assert_array_equal(plain, np.asarray(lined))
@@ -239,7 +239,7 @@ def test_lines_thinner_than_a_pixel_have_no_gaps_in_shaded_pictures() -> None:
 def test_caps_of_solids_show_isolines_of_their_own_function() -> None:
     camera = hk.Camera(elevation=89)
     box = hk.Box((-2, -2, -2), (2, 2, 0))
-    settings = {"solid": (-np.inf, 0.0), "clip": box, "camera": camera, "material": "clay"}
+    settings = {"level": 0.0, "side": "below", "clip": box, "camera": camera, "material": "clay"}
     field = hk.Sphere(1.0)
     plain = seen(field, None, "shaded", **settings)
     levels = field.value(np.array([[0.5, 0.0, 0.0]]))
@@ -252,7 +252,7 @@ def test_caps_of_solids_show_isolines_of_their_own_function() -> None:
 
 @pytest.mark.slow
 def test_lines_on_glass_are_opaque_in_shaded_pictures() -> None:
-    settings = {"solid": (-np.inf, 0.0), "material": "glass"}
+    settings = {"level": 0.0, "side": "below", "material": "glass"}
     lines = hk.Isolines("z", [0.0], width=0.3, color="black")
     plain = seen(hk.Sphere(1.0), None, "shaded", **settings)
     image = seen(hk.Sphere(1.0), lines, "shaded", **settings)

@@ -20,6 +20,7 @@ from harnack.rendering.images import exr_bytes, tone_map
 from harnack.rendering.light_paths import PathRenderTask
 from harnack.rendering.scales import viridis
 from harnack.rendering.stage import stage_placement
+from harnack.tracer import traced_surface
 
 mi = register()
 SMALL: dict[str, Any] = {"size": (40, 30), "progress": False}
@@ -96,7 +97,7 @@ def test_bands_leave_no_seam(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.few(1)
 @pytest.mark.parametrize("show", SHOW_MODES)
 def test_every_mode_makes_numbers_and_a_picture(show: str, tmp_path: Path) -> None:
-    image = draw(path=tmp_path / "a.png", show=show, of="x" if show == "value" else None)
+    image = draw(path=tmp_path / "a.png", show=show, color_by="x" if show == "value" else None)
     assert image.shape[:2] == (30, 40)
     drawn = read(tmp_path / "a.png")
     assert drawn.shape == (30, 40, 3)
@@ -145,17 +146,21 @@ def test_nothing_is_lost_and_nothing_is_said_with_enough_steps() -> None:
 
 
 @pytest.mark.slow
-def test_settings_of_a_level_set_are_replaced() -> None:
-    surface = hk.traced_surface(POLYGON, 2.5 * math.pi, tolerance=1e-3)
-    replaced = draw([surface], show="depth", level=math.pi)
-    expected = draw(hk.traced_surface(POLYGON, math.pi, tolerance=1e-3), show="depth")
-    np.testing.assert_array_equal(replaced, expected)
+def test_a_surface_is_drawn_as_its_field_with_keywords() -> None:
+    near = hk.TraceOptions(tolerance=1e-3)
+    surface = hk.Surface(POLYGON, 2.5 * math.pi).replace(level=math.pi)
+    drawn = draw([surface], show="depth", options=near)
+    np.testing.assert_array_equal(drawn, draw(POLYGON, show="depth", level=math.pi, tolerance=1e-3))
     solid = hk.Surface(GYROID, level=(-0.3, 0.3), side="between")
     half = hk.HalfSpace((0, 0, 1), 0.0)
-    clipped = draw(solid, show="depth", clip=half)
-    expected = draw(hk.Surface(GYROID, level=(-0.3, 0.3), side="between", clip=half), show="depth")
+    clipped = draw(solid.replace(clip=half), show="depth")
+    expected = draw(GYROID, show="depth", level=(-0.3, 0.3), side="between", clip=half)
     np.testing.assert_array_equal(clipped, expected)
     assert not np.array_equal(clipped, draw(solid, show="depth"))
+    with pytest.raises(TypeError, match=r"a Surface holds its own; .*surface\.replace\(clip="):
+        draw(solid, show="depth", clip=half)
+    with pytest.raises(TypeError, match=r"there are options already; .*options\.replace\(tol"):
+        draw(solid, show="depth", options=near, tolerance=1e-3)
 
 
 @pytest.mark.few(1)
@@ -187,9 +192,9 @@ def test_materials_are_told_apart_and_one_may_be_given_for_each_surface() -> Non
 def test_levels_of_one_field_may_have_materials_of_their_own() -> None:
     levels, names = [-0.5, 0.5], ["red", "blue"]
     one = draw(GYROID, level=levels, material=names, show="shaded", tolerance=1e-4)
-    pair = [hk.traced_surface(GYROID, level, tolerance=1e-4) for level in levels]
+    pair = [traced_surface(GYROID, level=level, tolerance=1e-4) for level in levels]
     np.testing.assert_array_equal(one, draw(pair, material=names, show="shaded"))
-    with pytest.raises(ValueError, match=r"a surface is drawn twice.*level=\[a, b\]"):
+    with pytest.raises(ValueError, match=r"a surface is drawn twice.*a Surface for each level"):
         draw([GYROID, GYROID], level=levels, material=names)
     turn = POLYGON.period
     with pytest.raises(ValueError, match="a surface is drawn twice"):
@@ -213,13 +218,13 @@ def test_parts_of_one_surface_may_be_drawn_as_several() -> None:
 
 @pytest.mark.slow
 def test_tubes_around_boundaries_have_a_material() -> None:
-    gold = draw(POLYGON, boundary=0.1, show="shaded")
-    same = draw(POLYGON, boundary=0.1, boundary_material="gold", show="shaded")
+    gold = draw(POLYGON, boundary_radius=0.1, show="shaded")
+    same = draw(POLYGON, boundary_radius=0.1, boundary_material="gold", show="shaded")
     np.testing.assert_array_equal(gold, same)
-    blue = draw(POLYGON, boundary=0.1, boundary_material="blue", show="shaded")
+    blue = draw(POLYGON, boundary_radius=0.1, boundary_material="blue", show="shaded")
     assert ((blue[..., 2] > 2 * blue[..., 0]) & (gold[..., 0] > gold[..., 2])).mean() > 0.005
     with pytest.raises(ValueError, match="boundary_material: tubes have no inside"):
-        draw(POLYGON, boundary=np.float32(0.1), boundary_material="glass")
+        draw(POLYGON, boundary_radius=np.float32(0.1), boundary_material="glass")
     with pytest.raises(ValueError, match="boundary_material needs the radius of the tubes"):
         draw(POLYGON, boundary_material="gold")
 
@@ -274,7 +279,7 @@ def test_surfaces_stand_on_the_ground() -> None:
         ({"what": {"type": "scene"}, "level": 3.0}, "as it is"),
         ({"what": hk.Surface(POLYGON, clip=hk.Ball((9, 9, 9), 0.1))}, "nothing is to be seen"),
         ({"what": hk.Surface(POLYGON, 0.0)}, "infinity"),
-        ({"material": "glass"}, "solid"),
+        ({"material": "glass"}, "needs an inside"),
     ],
 )
 def test_errors_come_early_and_say_what_to_do(settings: dict[str, Any], word: str) -> None:

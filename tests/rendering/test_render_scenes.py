@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -84,10 +83,14 @@ GYROID = hk.Gyroid(1.0, domain=hk.Ball(radius=1.0))
 @pytest.mark.parametrize(
     "settings",
     [
-        {"solid": (-math.inf, 0.0)},
-        {"solid": (-0.3, 0.3)},
-        {"solid": (-0.3, 0.3), "clip": hk.Box((-0.6, -0.6, -0.6), (0.6, 0.6, 0.6))},
-        {"solid": (0.2, math.inf), "clip": hk.HalfSpace((0.3, -1.0, 0.2), 0.2)},
+        {"level": 0.0, "side": "below"},
+        {"level": (-0.3, 0.3), "side": "between"},
+        {
+            "level": (-0.3, 0.3),
+            "side": "between",
+            "clip": hk.Box((-0.6, -0.6, -0.6), (0.6, 0.6, 0.6)),
+        },
+        {"level": 0.2, "side": "above", "clip": hk.HalfSpace((0.3, -1.0, 0.2), 0.2)},
     ],
     ids=["half", "wall", "box", "halfspace"],
 )

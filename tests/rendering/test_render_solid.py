@@ -13,6 +13,7 @@ import harnack as hk
 from harnack.backend import choose_backend, to_float, to_numpy, to_vector3
 from harnack.geometry.volume import Volume
 from harnack.rendering.surface_hits import CappedSolid, orient_normal
+from harnack.tracer import traced_surface
 
 BACKEND = choose_backend()
 BALL = hk.Ball((0.1, 0.0, -0.05), 0.9)
@@ -26,8 +27,13 @@ def gyroid(p: np.ndarray) -> np.ndarray:
 
 
 def solid_of(low: float, high: float, volume: Volume) -> CappedSolid:
+    if math.isinf(low) or math.isinf(high):
+        level, side = (high, "below") if math.isinf(low) else (low, "above")
+    else:
+        level, side = (low, high), "between"
     field = hk.Gyroid(1.0, domain=volume)
-    surface = hk.traced_surface(field, level=(low, high), side="between", tolerance=TOLERANCE)
+    surface = traced_surface(field, level=level, side=side, tolerance=TOLERANCE)
+    assert surface.solid_range == (low, high)
     return CappedSolid.of(surface, surface.prepare(BACKEND))
 
 
@@ -143,7 +149,7 @@ def test_a_ray_that_slipped_through_a_thin_part_crosses_back_at_once() -> None:
 
 
 def test_only_solids_are_solid() -> None:
-    surface = hk.Surface(hk.Gyroid())
+    surface = traced_surface(hk.Gyroid())
     with pytest.raises(ValueError, match="solid"):
         CappedSolid.of(surface, surface.prepare(BACKEND))
 

@@ -67,7 +67,7 @@ def test_values_from_low_to_high_go_from_blue_to_yellow() -> None:
     ends = to_uint8(viridis(np.array([0.0, 1.0])))
     assert np.abs(picture.srgb[z == z[met].min()].astype(int) - ends[0]).max() <= 1
     assert np.abs(picture.srgb[z == z[met].max()].astype(int) - ends[1]).max() <= 1
-    fixed = values("z", value_range=(-3, 3))
+    fixed = values("z", color_range=(-3, 3))
     np.testing.assert_array_equal(z, fixed)
     expected = to_uint8(viridis((z[met] + 3) / 6))
     assert np.abs(fixed.srgb[met].astype(int) - expected).max() <= 1
@@ -140,12 +140,12 @@ def test_ticks_of_angles_are_parts_of_turns(turns: int, most: int, written: list
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize(
-    ("show", "of"), [("evaluations", None), ("depth", None), ("value", "z"), ("value", KNOT)]
+    ("show", "color_by"), [("evaluations", None), ("depth", None), ("value", "z"), ("value", KNOT)]
 )
 def test_a_bar_changes_no_number_and_no_pixel_of_the_picture(
-    show: str, of: Any, tmp_path: Path
+    show: str, color_by: Any, tmp_path: Path
 ) -> None:
-    settings = {"show": show, "of": of, **SMALL}
+    settings = {"show": show, "color_by": color_by, **SMALL}
     plain = hk.render(SPHERE, **settings)
     beside = hk.render(SPHERE, tmp_path / "a.png", color_bar=True, **settings)
     np.testing.assert_array_equal(plain, beside)
@@ -196,14 +196,14 @@ def test_the_smallest_pictures_have_bars(size: tuple[int, int]) -> None:
     ("settings", "message"),
     [
         ({"show": "value"}, "needs the function"),
-        ({"show": "value", "of": "height"}, "of: 'height' is no formula"),
-        ({"show": "depth", "of": "z"}, 'needs a picture with show="value"'),
-        ({"show": "path", "colorbar": True}, 'colorbar needs a picture with show="evaluations"'),
-        ({"show": "normal", "value_range": (0, 1)}, "value_range needs a picture with"),
-        ({"show": "depth", "value_range": (1, 0)}, "two finite numbers in order"),
-        ({"show": "depth", "value_range": 3}, "two finite numbers in order"),
-        ({"show": "depth", "colorbar": 3}, "True, False or the bar's title"),
-        ({"show": "depth", "colorbar": True, "path": "a.exr"}, r"bar is drawn in \.png"),
+        ({"show": "value", "color_by": "height"}, "color_by: 'height' is no formula"),
+        ({"show": "depth", "color_by": "z"}, 'needs a picture with show="value"'),
+        ({"show": "path", "color_bar": True}, 'color_bar needs a picture with show="evaluations"'),
+        ({"show": "normal", "color_range": (0, 1)}, "color_range needs a picture with"),
+        ({"show": "depth", "color_range": (1, 0)}, "two finite numbers in order"),
+        ({"show": "depth", "color_range": 3}, "two finite numbers in order"),
+        ({"show": "depth", "color_bar": 3}, "True, False or the bar's title"),
+        ({"show": "depth", "color_bar": True, "path": "a.exr"}, r"bar is drawn in \.png"),
     ],
 )
 def test_what_is_wrong_is_said(settings: dict[str, Any], message: str) -> None:

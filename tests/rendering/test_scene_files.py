@@ -135,7 +135,7 @@ def test_errors_of_mitsuba_are_one_line_without_a_traceback(
 
 def test_in_python_too_what_is_no_scene_file_is_said(tmp_path) -> None:
     for name, complaint in (
-        ("bunny.obj", r"surface file, not a Mitsuba scene .*open_surface\(path\)\.field"),
+        ("bunny.obj", r"surface file, not a Mitsuba scene .*field_from_file\(path\)\.field"),
         ("trefoil", r"no such file; .*harnack\.gallery\.SCENES"),
         ("a.xml", "there is no such file"),
     ):

@@ -8,9 +8,9 @@ import pytest
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.cli.arguments import parse
-from harnack.cli.commands import _section  # pyright: ignore[reportPrivateUsage]
 from harnack.rendering import mitsuba_shape
 from harnack.rendering.placed_surface import PlacedSurface, Placement
+from harnack.tracer import traced_surface
 
 NORMAL, OFFSET = np.array([0.6, 0.0, 0.8]), 0.2
 HALF = hk.HalfSpace((0.6, 0.0, 0.8), OFFSET)
@@ -64,9 +64,8 @@ def test_what_lies_beyond_a_section_is_not_hit(precision):
 @pytest.mark.slow
 def test_faces_of_a_solid_on_its_section_are_told_from_all_others():
     backend = choose_backend("double")
-    surface = hk.Surface(
-        hk.Sphere(1.0), level=0.0, side="below", clip=hk.HalfSpace((-1, 0, 0), 0.5), section=HALF
-    )
+    clip = hk.HalfSpace((-1, 0, 0), 0.5)
+    surface = traced_surface(hk.Sphere(1.0), side="below", clip=clip, section=HALF)
     placed = PlacedSurface.of(surface, Placement.identity(), backend)
     o, d = _rays(3000, 4)
     o[1500:] = 0.3 * o[1500:] / np.linalg.norm(o[1500:], axis=1)[:, None] - [0.1, 0, 0]  # inside
@@ -106,7 +105,7 @@ def test_pictures_show_faces_in_their_own_material():
 
 def test_wrong_faces_are_refused():
     cut, small = hk.HalfSpace((0, 0, 1), 0.0), {"size": (8, 6), "progress": False}
-    with pytest.raises(ValueError, match="section=harnack"):
+    with pytest.raises(ValueError, match="give a section, such as a half-space"):
         hk.render(hk.Sphere(1.0), section_material="gold", **small)
     with pytest.raises(ValueError, match="opaque"):
         hk.render(hk.Sphere(1.0), material="glass", section=cut, section_material="gold", **small)
@@ -126,12 +125,12 @@ def test_meshes_are_cut_by_sections_too():
 
 
 def test_sections_of_the_command_line():
-    options = parse(["render", "gyroid", "--section", "0,-3,4,0.5", "--cut-material", "clay"])
-    cut = _section(options)
-    assert cut is not None
-    assert options.cut_material == "clay"
-    np.testing.assert_allclose([*cut.normal, cut.offset], [0, -0.6, 0.8, 0.5])
-    assert parse(["mesh", "gyroid", "--section", "0,0,1"]).section == (0, 0, 1, 0)
+    options = parse(["render", "gyroid", "--section", "0,-3,4,0.5", "--section-material", "clay"])
+    assert options.section == hk.HalfSpace((0, -3, 4), 0.5)
+    assert options.section_material == "clay"
+    section = options.section
+    np.testing.assert_allclose([*section.normal, section.offset], [0, -0.6, 0.8, 0.5])
+    assert parse(["mesh", "gyroid", "--section", "0,0,1"]).section == hk.HalfSpace((0, 0, 1), 0)
     for wrong in ("0,0,0", "1,2", "1,2,3,4,5"):
         with pytest.raises(SystemExit):
             parse(["render", "gyroid", "--section", wrong])

@@ -335,7 +335,7 @@ def _cast(backend: Backend, values: npt.NDArray[Any], name: str) -> npt.NDArray[
     if overflow.any():
         raise ValueError(
             f"{name} has {values[overflow][0]:g}, too large for single precision: "
-            'use precision="double" or smaller units'
+            'use smaller units, or in Python precision="double"'
         )
     return cast
 

@@ -7,7 +7,7 @@ import argparse
 import re
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any, NoReturn
+from typing import Any, NoReturn, cast
 
 from harnack._version import __version__
 from harnack.cli.mesh_files import MESH_FILES
@@ -21,8 +21,6 @@ from harnack.rendering import option_text as text
 from harnack.rendering.option_table import Option, options_of
 
 _MESH_FILE = "a mesh: .stl, .obj, .ply, .off, .glb, .gltf or .3mf"
-# Options of Python that the command line has otherwise, or not at all.
-_NOT_HERE = ("camera", "progress", "open_browser", "block", "height", "sources", "keep", "filling")
 _GROUP_TITLES = {
     "surface": "surface", "trace": "trace", "image": "picture", "style": "style",
     "color": "colors of values", "quality": "quality", "film": "film", "live": "page",
@@ -173,7 +171,7 @@ def _add_repair(commands: Any) -> None:
     parser.add_argument(
         "-o", "--output", metavar="FILE", help=f"{', '.join(MESH_FILES)} (FILE-repaired.ply)"
     )
-    _add_options(parser, "repair", without=("seed",), also=("keep", "filling"))
+    _add_options(parser, "repair", without=("seed",))
     _add_quiet(parser)
 
 
@@ -229,12 +227,11 @@ def _add_options(
     *,
     only: Sequence[str] | None = None,
     without: Sequence[str] = (),
-    also: Sequence[str] = (),
 ) -> None:
     """The options that a verb has in the table, in groups."""
     groups: dict[str, Any] = {}
     for option in options_of(verb):
-        if option.name in (*without, *_NOT_HERE) and option.name not in also:
+        if option.name in without or not option.is_on_command_line:
             continue
         if only is not None and option.name not in only:
             continue
@@ -246,10 +243,10 @@ def _add_options(
 
 
 def _add_option(group: Any, option: Option, verb: str) -> None:
-    if option.parse is None:
+    if option.is_switch:
         group.add_argument(option.flag, action="store_true", default=None, help=option.help)
         return
-    form: dict[str, Any] = {"type": _argument(option.parse), "metavar": option.value}
+    form: dict[str, Any] = {"type": _argument(cast("Any", option.parse)), "metavar": option.value}
     if option.value.startswith("["):
         form |= {"nargs": "?", "const": True, "metavar": option.value[1:-1]}
     if option.name == "show" and verb in ("page", "view"):

@@ -17,8 +17,9 @@ from dataclasses import dataclass
 from types import FrameType
 from typing import Any
 
+from harnack.field_from_file import FILE_OPTIONS
 from harnack.rendering import UnboundedSurfaceError
-from harnack.rendering.option_table import BY_NAME
+from harnack.rendering.option_table import OPTIONS
 
 # Ctrl-C.
 
@@ -78,9 +79,17 @@ def print_warnings() -> Generator[None]:
         yield
 
 
-# An option with a value, as messages of the library write it, that is not inside of a call.
-_ARGUMENT = re.compile(
-    rf'(?<![(\w.])({"|".join(BY_NAME)})=("[^"]*"|True\b|\([^()]*\)|[\w.-]+(?:\.\w+)*)'
+_SWITCHES = {"take_boundary", *(option.name for option in OPTIONS if option.is_switch)}
+_NAMES = (*FILE_OPTIONS, *(option.name for option in OPTIONS if option.is_on_command_line))
+_ANY = "|".join(_NAMES)
+# A call; or an option with a value; or its name alone, at the start, in backticks or with an
+# underscore.
+_KEYWORD = re.compile(
+    r"(?P<call>[\w.]+\((?:[^()]|\([^()]*\))*\))"
+    rf"|(?<![\w.])(?P<name>{_ANY})="
+    r'(?P<value>"[^"]*"|\([^()]*\)|\[[^]]*\]|[\w.-]*\w|\.\.\.)'
+    rf"|\A(?P<first>{_ANY})(?=: )|`(?P<quoted>{_ANY})`"
+    rf"|(?<![\w./-])(?P<alone>(?=[a-z]+_)(?:{_ANY}))\b(?![/=]|\.\w)"
 )
 _PARAMETER = re.compile(r'parameters=\{"(\w+)": 1\.0\}')
 
@@ -110,14 +119,18 @@ def _explanation(error: Exception) -> str:
 def python_to_cli_terms(text: str) -> str:
     """A message of the library, with options of the command line in place of keywords of Python."""
     text = _PARAMETER.sub(r"--parameter \1=1", text)
-    return _ARGUMENT.sub(lambda match: _option(*match.groups()), text)
+    return _KEYWORD.sub(_option, text)
 
 
-def _option(name: str, value: str) -> str:
-    flag = BY_NAME[name].flag
-    if value == "True":
+def _option(match: re.Match[str]) -> str:
+    """The option of the command line for a keyword; calls stay as they are."""
+    if match["call"]:
+        return match["call"]
+    name = match["name"] or match["first"] or match["quoted"] or match["alone"]
+    flag = f"--{name.replace('_', '-')}"
+    if match["value"] is None or name in _SWITCHES:
         return flag
-    return f"{flag} {value.strip(chr(34)).strip('()').replace(' ', '')}"
+    return f"{flag} {match['value'].strip(chr(34)).strip('()[]').replace(' ', '')}"
 
 
 def level_text(level: float | None) -> str:

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from harnack.cli.arguments import CAMERA_OPTIONS
 from harnack.cli.messages import printable, python_to_cli_terms
-from harnack.field_from_file import field_from_file
+from harnack.field_from_file import FILE_OPTIONS, field_from_file
 from harnack.fields import Field
 from harnack.fields.expressions import expression, looks_like_formula
 from harnack.files.geometry_files import GEOMETRY_SUFFIXES
@@ -236,13 +236,12 @@ def _of_file(path: Path, arguments: Any, chosen: dict[str, Any]) -> Content:
 
 
 def _file_options(arguments: Any) -> dict[str, Any]:
-    names = ("read_as", "take_boundary", "normals", "smoothing", "up")
-    return {name: getattr(arguments, name) for name in names}
+    return {name: getattr(arguments, name) for name in FILE_OPTIONS}
 
 
 def _refuse_file_options(arguments: Any) -> None:
-    for name in ("read_as", "take_boundary", "normals", "smoothing"):
-        if getattr(arguments, name):
+    for name in FILE_OPTIONS:
+        if name != "up" and getattr(arguments, name):  # pictures have an axis that is up, too
             raise ValueError(
                 f"--{name.replace('_', '-')} is for surface files "
                 f"({', '.join(GEOMETRY_SUFFIXES)}) only"

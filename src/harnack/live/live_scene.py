@@ -349,10 +349,7 @@ class LiveScene:
         if curve is not None:
             several = _with_loops(what, curve, controls.curves)
         if controls.cut_volume is not None:
-            own = {name: one for name, one in settings.items() if name in SURFACE_OPTIONS}
-            settings = {name: one for name, one in settings.items() if name not in own}
-            made = studio_objects(several, settings.get("material"), None, own)
-            several = [with_cut(one.surface, controls.cut_volume) for one in made]
+            several, settings = _with_cut_options(several, settings, controls.cut_volume)
         lost: list[str] = []
         for name, one in self.content.sliders.items():
             if (
@@ -386,11 +383,30 @@ def live_options(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 def with_cut(surface: TracedSurface, volume: Volume) -> TracedSurface:
     """A surface cut by one more volume; by a half-space, it is opened to be looked into."""
-    name = "section" if isinstance(volume, HalfSpace) else "clip"
-    own = getattr(surface, name)
-    both = volume if own is None else VolumeIntersection((own, volume))
+    name = _cut_option(volume)
+    both = _overlap(getattr(surface, name), volume)
     made = replace(surface, **cast("Any", {name: both})).with_call_cache(begins=True)
     return made if name == "clip" else with_visible_inside(made)
+
+
+def _with_cut_options(
+    surfaces: list[Any], settings: dict[str, Any], volume: Volume
+) -> tuple[list[Any], dict[str, Any]]:
+    """What is drawn and its settings, cut by one more volume: in the settings if they hold the
+    keywords of the surfaces, of which sliders may be values."""
+    name = _cut_option(volume)
+    if any(option in SURFACE_OPTIONS for option in settings):
+        return surfaces, {**settings, name: _overlap(settings.get(name), volume)}
+    whole = [one if isinstance(one, Surface) else Surface(one) for one in surfaces]
+    return [one.replace(**{name: _overlap(getattr(one, name), volume)}) for one in whole], settings
+
+
+def _cut_option(volume: Volume) -> str:
+    return "section" if isinstance(volume, HalfSpace) else "clip"
+
+
+def _overlap(own: Volume | None, volume: Volume) -> Volume:
+    return volume if own is None else VolumeIntersection((own, volume))
 
 
 def _with_loops(what: Any, curve: SolidAngle, loops: Any) -> list[Any]:

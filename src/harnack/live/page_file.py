@@ -117,8 +117,7 @@ def page(
         count = len(scene["frames"]["frames"])
         warnings.warn(
             f"{target} has {len(text) / 1e6:.1f} MB, because it holds what is drawn at {count:,} "
-            "places of the sliders: give them larger steps, as in "
-            "harnack.Slider(low, high, step=0.5)",
+            "places of the sliders: give them larger steps",
             stacklevel=2,
         )
 

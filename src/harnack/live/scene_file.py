@@ -37,7 +37,7 @@ import numpy as np
 
 from harnack import geometry
 from harnack.backend.validation import as_positive, as_real
-from harnack.field_from_file import field_from_file
+from harnack.field_from_file import FILE_OPTIONS, field_from_file
 from harnack.fields import Field, Solid, solids
 from harnack.fields.analytic.periodic import Gyroid, SchwarzD, SchwarzP
 from harnack.fields.analytic.polynomial import SphericalHarmonic
@@ -92,7 +92,6 @@ _CONSTRUCTION_ERRORS = (
     LookupError,
     NotImplementedError,
 )
-_FILE_OPTIONS = ("read_as", "take_boundary", "normals", "smoothing", "up")
 
 Plain = dict[str, Any]
 FieldSources = Sequence[tuple[Field, Plain]]
@@ -555,7 +554,7 @@ def _source_of(text: Any, where: str, find: Callable[[str], Path] | None) -> Fie
     if "file" not in about:
         return None
     for name in about:
-        _check_name(name, ("file", *_FILE_OPTIONS), "part of a field")
+        _check_name(name, ("file", *FILE_OPTIONS), "part of a field")
     options = {key: value for key, value in about.items() if key != "file"}
     check_types(field_from_file, options)
     if not isinstance(about["file"], str):

@@ -295,7 +295,7 @@ def _check_encloses(field: DipolePotential, level: float) -> None:
     value = float(np.median(field.value(field.points[::step], precision="double")))
     if not value > _LEAST_PART * level:
         fault = (
-            "normals face inwards: turn them around, or mesh level=-2 pi"
+            "normals face inwards: turn them around, or mesh the level -2 pi"
             if value < -_LEAST_PART * level
             else "normals cancel each other, or the points lie in a plane"
         )

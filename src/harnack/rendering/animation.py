@@ -106,7 +106,8 @@ def animate(
     if not 0 < fps <= 240:
         raise ValueError(f"fps must be more than 0 and at most 240, not {fps}")
     for name, value in arguments.items():
-        if callable(value) and not BY_NAME[name].varies and name not in ("client", "progress"):
+        is_constant = not BY_NAME[name].varies and name not in ("client", "progress")
+        if is_constant and _is_function_of_s(value):
             raise TypeError(
                 f"{name} is the same for all pictures of a film, and no function of s: give it as "
                 "render takes it"
@@ -179,7 +180,11 @@ def check_film_path(path: str | os.PathLike[str]) -> Path:
 
 def _value_at(value: Any, s: float) -> Any:
     """A setting at the time s: functions of s are called, all else is constant."""
-    return value(s) if callable(value) and not isinstance(value, type) else value
+    return value(s) if _is_function_of_s(value) else value
+
+
+def _is_function_of_s(value: Any) -> bool:
+    return callable(value) and not isinstance(value, type)
 
 
 def _cameras(

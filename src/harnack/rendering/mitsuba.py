@@ -124,7 +124,7 @@ def check_scene_file(path: Path) -> None:
     if path.suffix.lower() in GEOMETRY_SUFFIXES:
         raise FileLocation(path).error(
             "this is a surface file, not a Mitsuba scene (.xml): draw its field, "
-            "open_surface(path).field, with `from harnack.field_from_file import open_surface`"
+            "harnack.io.field_from_file(path).field"
         )
     if looks_like_formula(str(path)) and not path.exists():
         raise FileLocation(path).error(

@@ -305,7 +305,7 @@ def _section_bsdf(mi: Any, surface: TracedSurface, bsdf: Any, section_bsdf: Any)
     if surface.solid_range is None or surface.section is None:
         raise ValueError(
             "section_bsdf is of the faces of a solid on its section: give a section, such as a "
-            'half-space, and side="below" or "above" as well'
+            'half-space, and side="below" or side="above" as well'
         )
     made = as_bsdf(mi, section_bsdf)
     for one in (bsdf, made):

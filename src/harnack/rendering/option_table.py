@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from harnack.rendering.backdrops import Backdrop
     from harnack.rendering.camera import Camera
     from harnack.rendering.isolines import Isolines
-    from harnack.rendering.studio_surfaces import MaterialLike
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
@@ -44,6 +43,8 @@ CURVATURES = frozenset(("curvature", "curvature_lines"))
 RAYS = frozenset(("trace", "crossings"))
 VERBS = RAYS | DRAWN | DISTANCES | CURVATURES | {"mesh", "repair"}
 """The functions that take options."""
+COMMANDS = DRAWN | {"mesh", "repair"}
+"""Those that are commands of the command line as well."""
 
 _PLACED = RAYS | DRAWN | DISTANCES | {"mesh", "curvature_lines"}
 
@@ -62,8 +63,8 @@ class Option:
     help: what it is, in a sentence without a period, and its default in brackets.
     value: what a value is on the command line, such as "LENGTH" or "WxH"; "" for an option that
         takes none.
-    parse: the value of a text of the command line; None for an option that it does not have, or
-        makes of several others.
+    parse: the value of a text of the command line; None for a switch (by default False), and for an
+        option that it does not have, or makes of several others.
     check: of a value and of `show`, for a picture; it returns the value in its final form.
     default: the value if it is not set; default_of: other defaults, by verb.
     varies: whether films and sliders may change it.
@@ -87,9 +88,24 @@ class Option:
         """Its name on the command line."""
         return f"--{self.name.replace('_', '-')}"
 
+    @property
+    def is_switch(self) -> bool:
+        """Whether it takes no value on the command line, and is on if it is there."""
+        return self.parse is None and self.default is False
+
+    @property
+    def is_on_command_line(self) -> bool:
+        """Whether commands have it."""
+        return bool(self.verbs & COMMANDS) and (self.parse is not None or self.is_switch)
+
     def default_in(self, verb: str) -> Any:
         """The value that a verb has if it is not set."""
         return self.default_of.get(verb, self.default)
+
+
+def _checked(parse: Parse, check: Callable[[Any], Any]) -> Parse:
+    """A parser of texts whose values are checked before a source is read."""
+    return lambda text: check(parse(text))
 
 
 def _of_trace(name: str) -> Any:
@@ -107,14 +123,14 @@ OPTIONS: tuple[Option, ...] = (
            "X,Y,Z[,DISTANCE]", text.parse_section, varies=True),
     Option("side", "surface", DRAWN | {"mesh"}, "surface, or the closed solid where the function "
            "is below or above the level, or between two levels", "{surface,below,above,between}",
-           text.parse_choice("surface", "below", "above", "between")),
+           text.parse_choice("surface", "below", "above", "between"), varies=True),
     Option("largest", "surface", DRAWN | {"trace", "mesh", "repair"},
-           "only the largest connected component", default=False),
+           "only the largest connected component", default=False, varies=True),
     Option("tolerance", "trace", RAYS | DRAWN | {"mesh", "repair"}, "largest distance of hits or "
            "triangles from the surface (1e-4 of its size, 1e-3 for meshes)", "LENGTH",
            text.parse_positive, varies=True),
     Option("enclosures", "trace", RAYS | DRAWN, "proof by which steps are made (the longest of all "
-           "that apply)", "NAME", text.parse_enclosures),
+           "that apply)", "NAME", text.parse_enclosures, varies=True),
     Option("max_steps", "trace", RAYS | DRAWN, "evaluations after which a ray is out of steps "
            "(2000)", "N", text.parse_count, default=_of_trace("max_steps"), varies=True),
     Option("over_relaxation", "trace", RAYS | DRAWN, "factor from 1 to 2 by which trial steps are "
@@ -125,7 +141,7 @@ OPTIONS: tuple[Option, ...] = (
            "{webgpu}", text.parse_choice("webgpu"), in_files=False),
     Option("require_crossing", "trace", DRAWN | {"trace"}, "a ray hits only where the field passes "
            "to the other side of the level, not where it comes near and turns back",
-           default=False),
+           default=False, varies=True),
     Option("show", "image", DRAWN, "picture: path follows light paths, shaded lights first hits by "
            "a formula, without noise; or what a ray found", "{" + ",".join(checks.SHOW_MODES) + "}",
            text.parse_choice(*checks.SHOW_MODES), checks.ignoring_mode(checks.check_show),
@@ -133,9 +149,11 @@ OPTIONS: tuple[Option, ...] = (
     Option("camera", "image", DRAWN, "camera, or the point where it stands",
            check=checks.ignoring_mode(checks.check_camera), varies=True),
     Option("size", "image", PICTURES, "width and height in pixels (800x600)", "WxH",
-           text.parse_size, checks.if_set(checks.check_image_size)),
+           _checked(text.parse_size, checks.check_image_size),
+           checks.if_set(checks.check_image_size)),
     Option("spp", "image", PICTURES, "samples per pixel (64; 9 at edges of shaded pictures)", "N",
-           text.parse_count, checks.if_set(checks.check_spp)),
+           _checked(text.parse_count, checks.check_spp), checks.if_set(checks.check_spp),
+           varies=True),
     Option("material", "style", DRAWN, "material of the surface, by name, or a color by name or "
            "#rrggbb (two-tone)", "NAME", text.parse_material_name, varies=True),
     Option("section_material", "style", DRAWN, "material of the faces of a solid on its section "
@@ -153,24 +171,25 @@ OPTIONS: tuple[Option, ...] = (
            "#334455, two from bottom to top such as white,steelblue, or an image (light)",
            "BACKDROP", text.parse_backdrop_text, checks.check_backdrop, varies=True),
     Option("up", "style", DRAWN, "axis that points up (z; of files .glb, .gltf and surfaces in "
-           ".obj y)", "AXIS", text.parse_axis),
+           ".obj y)", "AXIS", text.parse_axis, varies=True),
     Option("color_by", "color", PICTURES, "coordinate or formula of x, y and z whose values "
            "show=value shows", "FORMULA", text.parse_formula, checks.check_color_by, varies=True),
     Option("color_range", "color", PICTURES, "ends of the colors of values, depths or evaluations "
-           "(what is seen)", "LOW:HIGH", text.parse_range, checks.check_color_range),
+           "(what is seen)", "LOW:HIGH", text.parse_range, checks.check_color_range, varies=True),
     Option("color_bar", "color", PICTURES, "bar with numbers beside such a picture, or its title",
-           "[TITLE]", str, checks.check_color_bar, default=False),
+           "[TITLE]", str, checks.check_color_bar, default=False, varies=True),
     Option("antialias", "quality", PICTURES, "pixels of a shaded picture that get all samples: "
            "edges in the picture, or also what cones around pixels meet (edges)",
            "{" + ",".join(checks.ANTIALIASING) + "}", text.parse_choice(*checks.ANTIALIASING),
-           checks.check_antialias),
+           checks.check_antialias, varies=True),
     Option("max_depth", "quality", PICTURES, "longest light path in edges, -1 for no limit (12)",
-           "N", int, checks.check_max_depth),
+           "N", text.parse_integer, checks.check_max_depth, varies=True),
     Option("denoise", "quality", PICTURES, "take the noise out of a picture of light paths (needs "
-           "pip install 'harnack[denoise]')", check=checks.check_denoise, default=False),
+           "pip install 'harnack[denoise]')", check=checks.check_denoise, default=False,
+           varies=True),
     Option("seed", "quality", PICTURES | {"mesh", "repair"}, "another seed, other noise, or other "
-           "small random moves of meshes (0)", "N", text.parse_seed,
-           checks.as_integer("seed"), 0),
+           "small random moves of meshes (0)", "N", text.parse_integer,
+           checks.as_integer("seed"), 0, varies=True),
     Option("client", "run", PICTURES | {"page"}, "workers of a Dask cluster that do the work, by "
            "its scheduler's address, such as tcp://10.0.0.1:8786 (needs pip install "
            "'harnack[cluster]')", "ADDRESS", str, in_files=False),
@@ -240,9 +259,9 @@ class RenderKeywords(TraceKeywords, total=False):
     size: tuple[int, int] | None
     spp: int | None
     material: Any
-    section_material: MaterialLike | None
+    section_material: Any
     boundary_radius: float | None
-    boundary_material: MaterialLike | None
+    boundary_material: Any
     isolines: Isolines | Any
     thickness: float | None
     backdrop: Any
@@ -297,7 +316,9 @@ def refuse_unknown(verb: str, keywords: Mapping[str, Any]) -> None:
             known = [option.name for option in options_of(verb)]
             other_name = _OTHER_PROGRAMS_NAMES.get(name.lower())
             hint = f"; did you mean {other_name}?" if other_name else did_you_mean(name, known)
-            raise TypeError(f"{verb} has no option {name!r}{hint}; it has {', '.join(known)}")
+            raise TypeError(
+                f"{verb} has no option {name!r}{hint or '; it has ' + ', '.join(known)}"
+            )
 
 
 def refuse_others(verb: str, keywords: Mapping[str, Any]) -> None:

@@ -72,11 +72,11 @@ def parse_count(text: str) -> int:
     """A number of things, at least 1."""
     number = int(text) if re.fullmatch(r"[0-9]{1,9}", text) else 0
     if number < 1:
-        raise ValueError(f"{quoted(text)} must be a whole number, at least 1")
+        raise ValueError(f"{quoted(text)} must be a whole number from 1 to 999999999")
     return number
 
 
-def parse_seed(text: str) -> int:
+def parse_integer(text: str) -> int:
     """An integer."""
     if not re.fullmatch(r"[+-]?[0-9]{1,18}", text):
         raise ValueError(f"{quoted(text)} must be an integer of at most 18 digits")

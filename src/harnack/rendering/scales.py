@@ -307,7 +307,7 @@ def require_pillow() -> tuple[Any, Any, Any]:
         from PIL import Image, ImageDraw, ImageFont
     except ModuleNotFoundError:
         raise ModuleNotFoundError(
-            "a color bar needs Pillow: pip install 'harnack[film]', or leave colorbar away"
+            "a color bar needs Pillow: pip install 'harnack[film]', or leave color_bar away"
         ) from None
     return Image, ImageDraw, ImageFont
 

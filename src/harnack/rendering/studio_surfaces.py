@@ -131,7 +131,7 @@ def _thickened(surface: TracedSurface, thickness: float) -> TracedSurface:
     if surface.solid_range is not None or len(surface.levels) != 1:
         raise ValueError("thickness needs a surface of one level; a solid has an inside already")
     if surface.largest:
-        raise ValueError("thickness and largest: mesh the surface by hk.mesh(..., largest=True)")
+        raise ValueError("thickness and largest exclude each other here: mesh the surface first")
     try:
         wall = mesh(surface.surface, thickness=thickness)
         # Slivers whose area is lost in rounding say nothing of the inside.
@@ -139,8 +139,8 @@ def _thickened(surface: TracedSurface, thickness: float) -> TracedSurface:
     except (MeshError, MeshingError) as wrong:
         raise ValueError(
             f"no closed mesh could be made of this surface with thickness={thickness!r}: {wrong}; "
-            "give another thickness (a smaller one where sheets meet), or mesh it by "
-            "hk.mesh(..., thickness=..., cell_size=...) and draw hk.WindingNumber of that"
+            "give another thickness (a smaller one where sheets meet), or mesh it "
+            "with a cell_size and draw the mesh"
         ) from wrong
     return TracedSurface(
         field,
@@ -160,7 +160,8 @@ def _with_section_material(objects: list[StudioObject], material: Material) -> l
     if not any(map(has_faces, objects)):
         raise ValueError(
             "section_material needs a solid with a section, whose faces are of it: give a section, "
-            'such as a half-space, and for a field that is no solid also side="below" or "above"'
+            "such as a half-space, and for a field that is no solid also "
+            'side="below" or side="above"'
         )
     return [
         replace(element, section_material=material) if has_faces(element) else element

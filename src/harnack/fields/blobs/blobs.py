@@ -337,12 +337,12 @@ def _rows(backend: Backend, blobs: Blobs) -> FloatArray:
     if is_invalid.any():
         worst = int(np.argmax(is_invalid))
         precision = "single" if backend.dtype == np.float32 else "double"
-        help_ = 'use precision="double" or ' if precision == "single" else ""
+        other = ', or in Python precision="double"' if precision == "single" else ""
         raise BlobError(
             f"blob {worst}, with a radius of {blobs.radii[worst]:g}, a weight of "
             f"{blobs.weights[worst]:g} and its center at {format_vector(blobs.centers[worst])}, is "
             f"too small, too large or too far away for {precision} precision: "
-            f"{help_}choose units nearer to 1"
+            f"choose units nearer to 1{other}"
         )
     remainder = blobs.centers - rounded
     return np.column_stack([rounded, remainder, 1 / supports, amplitude])
