@@ -126,8 +126,8 @@ def at_points(name: str, mesh: MeshArrays) -> Iterator[PointRow]:
     expected = winding_sum(vertices[faces])(x)
     for method, order in METHODS:
         field = WindingNumber(vertices, faces, method=method, order=order)
-        error = np.abs(field.value(x) - expected)
-        bound = field.error_bound(x)
+        error = np.abs(field.value(x, precision="single") - expected)
+        bound = field.error_bound(x, precision="single")
         yield PointRow(
             name, len(faces), len(field.mesh.singular_edges),
             method if method == "exact" else f"{method}, order {order}",
@@ -156,7 +156,9 @@ def along_rays(
     plain = None if len(edges) else PlainHits.of(mesh, exact, o, d, TOLERANCE)
     for method in ("exact", "tree"):
         field: Any = WindingNumber(vertices, faces, method=method)
-        hits = hk.trace(field, o, d, level=level, t_max=t_max, tolerance=TOLERANCE)
+        hits = hk.trace(
+            field, o, d, level=level, t_max=t_max, tolerance=TOLERANCE, precision="single"
+        )
         t = np.where(hits.is_hit, hits.t, np.inf).astype(np.float64)
         verdict = judge(
             t, exact, o, d, 0.0, t_max,
@@ -189,7 +191,8 @@ def _explained(
     is_near = np.zeros(len(x), np.bool_)
     for offset in (-TOLERANCE, TOLERANCE) if len(x) else ():
         points = x + offset * d
-        is_near |= np.abs(exact(points) - level) <= 2 * traced.error_bound(points) + TOLERANCE
+        bound = traced.error_bound(points, precision="single")
+        is_near |= np.abs(exact(points) - level) <= 2 * bound + TOLERANCE
     return is_near
 
 

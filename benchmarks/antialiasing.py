@@ -20,13 +20,14 @@ _SIZE = (320, 240)
 _REFERENCE, _ROUNDS = 100, 3
 _WAYS = (("edges", 1), ("edges", 9), ("edges", 25), ("cones", 9), ("cones", 25))
 
-Surfaces = Callable[[], "list[hk.Surface]"]
+Surfaces = Callable[[], "list[Any]"]
+"""A function that returns fields, or harnack.Surface."""
 
 
-def _wires() -> list[hk.Surface]:
+def _wires() -> list[hk.Field]:
     """Three rings, each a tenth to a fifth of a pixel wide."""
     angle = np.linspace(0, 2 * math.pi, 61)
-    rings = [
+    return [
         hk.Tube(
             radius * np.column_stack([np.cos(angle), tilt * np.sin(angle),
                                       math.sqrt(1 - tilt**2) * np.sin(angle)]),
@@ -34,28 +35,29 @@ def _wires() -> list[hk.Surface]:
         )
         for radius, tilt in ((1.0, 0.2), (0.8, -0.5), (0.9, 0.8))
     ]  # fmt: skip
-    return [hk.traced_surface(ring, tolerance=1e-5) for ring in rings]
 
 
-def _scenes() -> dict[str, tuple[Surfaces, str, Camera]]:
+def _scenes() -> dict[str, tuple[Surfaces, str, Camera, float]]:
+    """Of each scene: its surfaces, their material, the camera, and the tolerance."""
     letters = SCENES["letters"]
     knot = hk.SolidAngle(example_curves.torus_knot(2, 3, 120))
     gyroid = hk.Gyroid(0.5, domain=hk.Ball(radius=1.0))
     carved = hk.Sphere(1.0) - hk.Torus(1.0, 0.25)
+    wall = hk.Surface(gyroid, (-0.4, 0.4), side="between")
+    letters_tolerance = letters.options.hit_tolerance
+    assert letters_tolerance is not None
     return {
-        "trefoil knot's surface": (
-            lambda: [hk.traced_surface(knot, tolerance=2e-4)], "two-tone", Camera(elevation=48)
+        "trefoil knot's surface": (lambda: [knot], "two-tone", Camera(elevation=48), 2e-4),
+        "ball less a torus": (lambda: [carved], "clay", Camera(), 2e-4),
+        "gyroid wall": (lambda: [wall], "copper", Camera(), 2e-4),
+        "letters": (
+            letters.surfaces, letters.materials[0], letters.camera, letters_tolerance.distance
         ),
-        "ball less a torus": (lambda: [hk.traced_surface(carved, tolerance=2e-4)], "clay", Camera()),
-        "gyroid wall": (
-            lambda: [hk.traced_surface(gyroid, level=(-0.4, 0.4), side="between", tolerance=2e-4)], "copper", Camera()
-        ),
-        "letters": (letters.surfaces, letters.materials[0], letters.camera),
-        "wires": (_wires, "clay", Camera()),
+        "wires": (_wires, "clay", Camera(), 1e-5),
     }  # fmt: skip
 
 
-def _many_rays(surfaces: list[hk.Surface], material: str, camera: Camera) -> np.ndarray:
+def _many_rays(surfaces: list[Any], material: str, camera: Camera, tolerance: float) -> np.ndarray:
     """The picture with the same rays in every pixel, without a choice of pixels.
 
     A picture that is `side` times as wide and high has them all, each in the middle of a pixel.
@@ -63,8 +65,9 @@ def _many_rays(surfaces: list[hk.Surface], material: str, camera: Camera) -> np.
     side = math.isqrt(len(multijitter_offsets(_REFERENCE)))
     large = (side * _SIZE[0], side * _SIZE[1])
     image = render(
-        surfaces, show="shaded", size=large, material=material, camera=camera, spp=1, progress=False
-    )
+        surfaces, show="shaded", size=large, material=material, camera=camera, spp=1,
+        tolerance=tolerance, progress=False,
+    )  # fmt: skip
     return image.reshape(_SIZE[1], side, _SIZE[0], side, 3).mean(axis=(1, 3))
 
 
@@ -88,14 +91,14 @@ def antialiasing() -> str:
         "| scene | pixels chosen by | samples | RMS error | seconds | of one ray a pixel |",
         "|---|---|---:|---:|---:|---:|",
     ]  # fmt: skip
-    for name, (make, material, camera) in _scenes().items():
+    for name, (make, material, camera, tolerance) in _scenes().items():
         surfaces = make()
-        reference = _many_rays(surfaces, material, camera)
+        reference = _many_rays(surfaces, material, camera, tolerance)
         base = math.nan
         for antialias, spp in _WAYS:
             settings: dict[str, Any] = {
                 "show": "shaded", "size": _SIZE, "material": material, "camera": camera,
-                "spp": spp, "antialias": antialias, "progress": False,
+                "spp": spp, "antialias": antialias, "tolerance": tolerance, "progress": False,
             }  # fmt: skip
             render(surfaces, **settings)  # compiles
             seconds: list[float] = []

@@ -360,7 +360,7 @@ def measure_ours(rays: Rays, truth: Array) -> Result:
     the surface within that may count as a hit, which the oracle does not see."""
     ours = hk.trace(
         rays.field, rays.origins, rays.directions, level=rays.level, t_max=rays.far,
-        tolerance=1e-6,
+        tolerance=1e-6, precision="single",
     )  # fmt: skip
     t = np.where(ours.is_hit, ours.t, np.inf)
     return Result.of("harnack", t, float(ours.evaluations.mean()), truth)

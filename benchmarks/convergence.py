@@ -65,15 +65,15 @@ def errors(
     d, t_exact = d[exact.status == hk.RayStatus.HIT], exact.t[exact.status == hk.RayStatus.HIT]
     start, _ = _clip(field, eye, d)
     results: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-    for bound, overstep in rules:
+    for enclosures, over_relaxation in rules:
         lengths = [start]
         for k in range(1, steps + 1):
             hits = hk.trace(
                 field, eye[None], d, precision="double", tolerance=1e-12,
-                max_steps=k, enclosures=bound, over_relaxation=overstep,
+                max_steps=k, enclosures=enclosures, over_relaxation=over_relaxation,
             )  # fmt: skip
             lengths.append(hits.t)
-        results[bound] = _measure(field, eye, d, np.array(lengths), t_exact)
+        results[enclosures] = _measure(field, eye, d, np.array(lengths), t_exact)
     vertices, faces = meshed(loop)
     tree = igl.AABB()
     tree.init(vertices, faces)

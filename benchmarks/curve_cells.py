@@ -111,7 +111,7 @@ def _row(name: str, make: Callable[..., Any], count: _Rays, unit: float = 1e9) -
 
 
 def _trace(field: Any, rays: tuple[Any, Any]) -> Any:
-    hits = hk.trace(field, *rays)
+    hits = hk.trace(field, *rays, tolerance=1e-4)
     dr.eval(hits.t)
     return hits
 
@@ -138,7 +138,7 @@ def _chords(count: int) -> tuple[FloatArray, FloatArray]:
 
 
 def _bounces(field: Any, count: _Rays) -> tuple[FloatArray, FloatArray]:
-    hits = hk.trace(field, *_camera(count.width))
+    hits = hk.trace(field, *_camera(count.width), tolerance=1e-4, precision="single")
     position, normal = hits.position[hits.is_hit], hits.normal[hits.is_hit]
     rng = np.random.default_rng(1)
     chosen = rng.integers(len(position), size=count.count)

@@ -310,9 +310,11 @@ def _on_our_tracer() -> list[str]:
     eye, d = rays()
     o, directions = to_vector3(backend, eye[None]), to_vector3(backend, d)
     looks: dict[Any, float] = {}
-    for bound in ("lipschitz", _Tangent, "quadratic-taylor", None):
-        surface = hk.traced_surface(_Ellipsoid(), 0.0, enclosures=bound, tolerance=_NEAR)
-        looks[bound] = float(hk.trace(surface, o, directions).evaluations.numpy().mean())
+    for enclosures in ("lipschitz", _Tangent, "quadratic-taylor", None):
+        hits = hk.trace(
+            _Ellipsoid(), o, directions, level=0.0, enclosures=enclosures, tolerance=_NEAR
+        )
+        looks[enclosures] = float(hits.evaluations.numpy().mean())
     return [
         "On our tracer, a convex ellipsoid, drawn in a ball, takes "
         f"{looks['lipschitz']:.2f} looks a ray with its Lipschitz constant, {looks[_Tangent]:.2f} "

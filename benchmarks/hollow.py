@@ -24,7 +24,7 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 # In millimeters: the size to which parts are scaled, walls, cells, and the radius of vents; and the
-# tolerance.
+# tolerance, as a part of the longest side.
 _SIZE, _WALL, _CELL, _VENT = 80.0, 2.0, 8.0, 2.0
 _TOLERANCE = 1.2e-3
 _NAMES = ("stanford-bunny", "spot", "cow", "homer")
@@ -91,9 +91,11 @@ def _measured(path: Path) -> _Row | str:
     for position in axes:
         body = body - vent.translated(tuple(position))
     stages: list[str] = []
+    size = float(repaired.extents.max())
     with tempfile.TemporaryDirectory() as folder:
         try:
-            hk.mesh(body, tolerance=_TOLERANCE, progress=stages.append).export(f"{folder}/part.stl")
+            part = hk.mesh(body, tolerance=_TOLERANCE * size, progress=stages.append)
+            part.export(f"{folder}/part.stl")
         except MeshingError as error:
             return str(error)
         seconds = time.process_time()

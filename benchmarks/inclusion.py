@@ -18,7 +18,7 @@ from .bisection import bisect
 from .blobs import BlobFormula, Scene
 
 RAYS, CHECKED, SAMPLES = 50_000, 20_000, 600
-# Name, bound, whether ranges of derivatives are exact, looks a ray in the published table 1.
+# Name, enclosures, whether ranges of derivatives are exact, looks a ray in the published table 1.
 Method: TypeAlias = "tuple[str, str | None, bool, float | None]"
 METHODS: tuple[Method, ...] = (
     ("revised affine arithmetic, bisection", "bisect affine", True, 15.40),
@@ -63,7 +63,7 @@ def measure(
     reference: np.ndarray | None = None, precision: str = "single",
 ) -> Row:  # fmt: skip
     """First hits of rays between points of the box, to 1e-3 in value and no other tolerance."""
-    _, bound, exact, _ = method
+    _, enclosures, exact, _ = method
     backend = choose_backend(precision)  # type: ignore[arg-type]
     origins, directions, lengths = scene.rays(count)
     o, d = to_vector3(backend, origins), to_vector3(backend, directions)
@@ -71,25 +71,24 @@ def measure(
     seconds: list[float] = []
     field: hk.Field = BlobFormula(scene, exact)
     level = 0.0
-    if bound == "blobs":
-        field, bound, level = scene.field(), None, scene.threshold
-    if bound in _BISECTED:
+    if enclosures == "blobs":
+        field, enclosures, level = scene.field(), None, scene.threshold
+    if enclosures in _BISECTED:
         for _ in range(3):
-            t, n, core = bisect(backend, field, _BISECTED[bound], (o, d, end), 1e-3)
+            t, n, core = bisect(backend, field, _BISECTED[enclosures], (o, d, end), 1e-3)
             seconds.append(core)
         return _row(method, t.numpy(), np.isfinite(t.numpy()), n.numpy(), seconds, lengths,
                     reference)  # fmt: skip
-    surface = hk.traced_surface(
-        field,
-        level,
-        enclosures=bound,
+    surface = hk.Surface(field, level)
+    options = hk.TraceOptions(
+        enclosures=enclosures,
         over_relaxation=1.0,
         tolerance=hk.tracer.HitTolerance(distance=0.0, value=1e-3),
     )
     hits = None
     for _ in range(3):  # the first run compiles
         core = time.process_time()
-        hits = hk.trace(surface, o, d, t_max=end)
+        hits = hk.trace(surface, o, d, t_max=end, options=options)
         dr.sync_thread()
         seconds.append(time.process_time() - core)
     assert hits is not None
@@ -114,7 +113,7 @@ def _row(
     )  # fmt: skip
 
 
-# Rows of tables 3 and 4: name, bound, whether the benchmark's own formula is used, the paper's
+# Rows of tables 3 and 4: name, enclosures, whether the benchmark's own formula is used, the paper's
 # numbers for the largest of sums and for one sum. Ranges of that formula in closed form are of one
 # sum alone.
 _ALL_ROOTS: tuple[tuple[str, str | None, bool, float | None, float | None], ...] = (
@@ -145,18 +144,19 @@ def all_roots(count: int = 10_000, checked: int = 1_000) -> list[str]:
     ]
     for groups, name in ((5, "largest of sums"), (1, "sum")):
         reference = scene.crossings(tuple(array[:checked] for array in rays), groups, 1500)
-        for method, bound, uses_formula, *published in _ALL_ROOTS:
-            if uses_formula and bound is None and groups > 1:
+        for method, enclosures, uses_formula, *published in _ALL_ROOTS:
+            if uses_formula and enclosures is None and groups > 1:
                 continue
             field = BlobFormula(scene, groups=groups) if uses_formula else scene.field(groups)
             level = 0.0 if uses_formula else scene.threshold
-            surface = hk.traced_surface(
-                field, level, enclosures=bound, tolerance=1e-3, over_relaxation=1.0
-            )
+            surface = hk.Surface(field, level)
+            options = hk.TraceOptions(enclosures=enclosures, tolerance=1e-3, over_relaxation=1.0)
             seconds: list[float] = []
             for _ in range(2):
                 core = time.process_time()
-                hits = hk.crossings(surface, origins, directions, t_max=end, max_crossings=24)
+                hits = hk.crossings(
+                    surface, origins, directions, t_max=end, max_crossings=24, options=options
+                )
                 dr.sync_thread()
                 seconds.append(time.process_time() - core)
             looks, crossings = hits.evaluations.numpy(), hits.count.numpy()

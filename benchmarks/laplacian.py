@@ -74,11 +74,11 @@ def laplacian() -> str:
         "| hits |",
         "|---|---:|---:|---:|---:|---:|---:|",
     ]
-    for name, bound, field in known:
-        for overstep in (1.0, 1.4):
-            row = measure(gyroid, (name, bound, overstep), field)
+    for name, enclosures, field in known:
+        for over_relaxation in (1.0, 1.4):
+            row = measure(gyroid, (name, enclosures, over_relaxation), field)
             lines.append(
-                f"| {name} | {overstep} | {row.evaluations:.2f} | {row.evaluations_hitting:.2f} "
-                f"| {row.most} | {row.out_of_steps} | {row.hits} |"
+                f"| {name} | {over_relaxation} | {row.evaluations:.2f} "
+                f"| {row.evaluations_hitting:.2f} | {row.most} | {row.out_of_steps} | {row.hits} |"
             )
     return "\n".join(lines) + "\n"

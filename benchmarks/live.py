@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from tests.view.browsers import Page, chromium
 
 import harnack as hk
 from harnack.geometry import example_curves
+from tests.live.browsers import Page, chromium
 
 VERTICES, SIZE, SECONDS, EVENTS = 64, 512, 4.0, 60
 # What makes the panel let Python draw, or not.

@@ -50,17 +50,18 @@ def meshes() -> str:
         "Level 2 pi of two curves, and the wall |f| < 0.3 of a gyroid of cell 1 in a box of two "
         f"cells, cut by the box. Errors are those of {_SAMPLES:,} random points of the mesh, by "
         f"the slope of the function there, and of {_HITS:,} hits of rays to the mesh, as parts of "
-        "the size. Time is CPU time, with the evaluations of f, which for marching cubes are made "
-        "by harnack in one batch. Marching cubes (scikit-image) meets the angle's jumps of 4 pi as "
-        "surfaces; *cleaned* leaves out triangles where the angle is not near the level. Of "
-        "harnack the time includes the checks and what is proved about the topology. *Volume* is "
-        "the relative error of that of closed meshes, and whether their triangles face inwards. "
+        "the size; tolerances are parts of the longest side of the box around the level set. Time "
+        "is CPU time, with the evaluations of f, which for marching cubes are made by harnack in "
+        "one batch. Marching cubes (scikit-image) meets the angle's jumps of 4 pi as surfaces; "
+        "*cleaned* leaves out triangles where the angle is not near the level. Of harnack the time "
+        "includes the checks and what is proved about the topology. *Volume* is the relative error "
+        "of that of closed meshes, and whether their triangles face inwards. "
         f"{_peer()}\n",
         "| surface | mesh | seconds | evaluations | triangles | Euler characteristic | pieces "
         "| ends at the curve | largest error | rms | surface to mesh | volume |",
         "|---|---|---:|---:|---:|---:|---:|---|---:|---:|---:|---:|",
     ]
-    hk.mesh(hk.SolidAngle(example_curves.regular_polygon(8)), tolerance=0.05)  # compiles
+    hk.mesh(hk.SolidAngle(example_curves.regular_polygon(8)), tolerance=0.1)  # compiles
     for name, loop, steps in (
         ("wavy polygon", example_curves.wavy_polygon(64), (0.05, 0.025)),
         ("trefoil", example_curves.torus_knot(2, 3, 96), (0.06, 0.03)),
@@ -105,7 +106,11 @@ def _timed(make: Callable[[], Any]) -> tuple[Any, float]:
 
 
 def _ours(loop: FloatArray, tolerance: float) -> _Row:
-    mesh, seconds = _timed(lambda: hk.mesh(hk.SolidAngle(loop), tolerance=tolerance))
+    """tolerance: as a part of the longest side of the box around the level set."""
+    extent = hk.SolidAngle(loop).extent((2 * math.pi,))
+    assert extent is not None
+    length = tolerance * float(np.ptp(extent.bounds(), axis=0).max())
+    mesh, seconds = _timed(lambda: hk.mesh(hk.SolidAngle(loop), tolerance=length))
     evaluations = mesh.metadata["harnack"]["evaluations"]
     name = f"harnack, tolerance {tolerance:g}"
     return _Row(name, seconds, mesh, evaluations, *_curve_errors(loop, mesh))
@@ -123,7 +128,8 @@ def _curve_errors(loop: FloatArray, mesh: trimesh.Trimesh) -> tuple[float, float
     error = np.minimum(np.abs(gap) / np.linalg.norm(exact.gradient, axis=1), exact.smooth) / size
     direction = rng.normal(size=(8 * _HITS, 3))
     origin = 4 * direction / np.linalg.norm(direction, axis=1)[:, None]
-    hits = hk.trace(hk.SolidAngle(loop), origin, rng.uniform(-1, 1, origin.shape) - origin)
+    aim = rng.uniform(-1, 1, origin.shape) - origin
+    hits = hk.trace(hk.SolidAngle(loop), origin, aim, tolerance=1e-4)
     missed = _distances(mesh, np.asarray(hits.position[hits.is_hit])[:_HITS]).max() / size
     return float(error.max()), float(np.sqrt((error**2).mean())), float(missed)
 
@@ -190,7 +196,7 @@ def _walls() -> list[_Row]:
     def ours() -> Any:
         box = hk.Box((-1, -1, -1), (1, 1, 1))
         return hk.mesh(
-            hk.Gyroid(cell=1.0), level=(-_WALL, _WALL), side="between", clip=box, tolerance=2e-3
+            hk.Gyroid(cell=1.0), level=(-_WALL, _WALL), side="between", clip=box, tolerance=4e-3
         )
 
     mesh, seconds = _timed(ours)
@@ -244,7 +250,7 @@ def _manifold_wall(step: float) -> _Row | None:
             recorded.append((x, y, z))
             return -1.0
 
-        manifold3d.Manifold.Surface(record, ends, step)
+        manifold3d.Manifold.level_set(record, ends, step)
         wall = _WALL - np.abs(_gyroid(np.array(recorded))[0])
         values = dict(zip(recorded, wall.tolist(), strict=True))
 
@@ -255,7 +261,7 @@ def _manifold_wall(step: float) -> _Row | None:
                 values[x, y, z] = value
             return value
 
-        solid = manifold3d.Manifold.Surface(replay, ends, step, 0.0, 1e-4)
+        solid = manifold3d.Manifold.level_set(replay, ends, step, 0.0, 1e-4)
         solid = solid ^ manifold3d.Manifold.cube([2, 2, 2], True)
         arrays = solid.to_mesh()
         recorded[:] = list(values)

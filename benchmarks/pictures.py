@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -15,6 +14,7 @@ from harnack.rendering import Camera, register
 from harnack.rendering.integrator import PathTracer
 from harnack.rendering.light_paths import PathRenderTask, render_paths
 from harnack.rendering.stage import StudioObject, build_studio, parse_material
+from harnack.tracer import traced_surface
 
 _SIZE, _SPP, _ROUNDS = (400, 300), 16, 3
 _RINGS = 350
@@ -32,8 +32,7 @@ def pictures() -> str:
 
     def staged(fields: list[hk.Field]) -> Any:
         rays = 3 * _SIZE[0] * _SIZE[1] * _SPP  # as `render` counts them
-        surfaces = (hk.Surface(one).for_rays(rays) for one in fields)
-        objects = [StudioObject(one, material, has_default_tolerance=True) for one in surfaces]
+        objects = [StudioObject(traced_surface(one).for_rays(rays), material) for one in fields]
         return build_studio(mi, objects, size=_SIZE, camera=Camera())
 
     one, three = staged([_field()]), staged([_field(x) for x in (-2.2, 0.0, 2.2)])
@@ -111,8 +110,8 @@ def _as_mesh(mi: Any, studio: Any) -> tuple[Any, int]:
     r, angle = (grid.ravel() for grid in np.meshgrid(r, angle, indexing="ij"))
     flat = 0.9995 * r[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
     o = np.column_stack([np.vstack([[0, 0], flat]), np.full(len(flat) + 1, 2.0)])
-    fine = replace(carrier.surface, tolerance=hk.tracer.HitTolerance(1e-5))
-    hits = hk.trace(fine, o, [[0, 0, -1.0]])
+    surface = carrier.surface.surface
+    hits = hk.trace(surface, o, [[0, 0, -1.0]], tolerance=1e-5, precision="single")
     j, i = np.meshgrid(np.arange(_RINGS), np.arange(_RINGS - 2))
 
     def at(ring: Any, k: Any) -> np.ndarray:

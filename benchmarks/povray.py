@@ -273,7 +273,7 @@ def oracle(drawn: Drawn, d: np.ndarray) -> Oracle:
 
 
 def by_harnack(
-    drawn: Drawn, d: np.ndarray, threads: int, *, confirm: bool = False
+    drawn: Drawn, d: np.ndarray, threads: int, *, require_crossing: bool = False
 ) -> tuple[np.ndarray, float, float]:
     """Distances, and the best core and wall time of three after the first, which compiles."""
     backend = choose_backend()
@@ -281,17 +281,12 @@ def by_harnack(
     dr.set_thread_count(threads)
     try:
         o, directions = to_vector3(backend, EYE[None]), to_vector3(backend, d)
-        surface = hk.traced_surface(
-            drawn.field,
-            drawn.level,
-            clip=drawn.domain,
-            tolerance=TOLERANCE,
-            require_crossing=confirm,
-        )
+        surface = hk.Surface(drawn.field, drawn.level, clip=drawn.domain)
+        options = hk.TraceOptions(tolerance=TOLERANCE, require_crossing=require_crossing)
         cores, walls, hits = [], [], None
         for _ in range(4):
             wall, core = time.perf_counter(), time.process_time()
-            hits = hk.trace(surface, o, directions, t_max=20.0)
+            hits = hk.trace(surface, o, directions, t_max=20.0, options=options)
             dr.sync_thread()
             cores.append(time.process_time() - core)
             walls.append(time.perf_counter() - wall)

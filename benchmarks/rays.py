@@ -54,16 +54,19 @@ def measure(
     scene: Scene, rule: tuple[str, str | None, float | None], field: hk.Field | None = None
 ) -> Row:
     """Trace the camera's rays and count."""
-    name, bound, overstep = rule
+    name, enclosures, over_relaxation = rule
     backend = choose_backend()
     eye, directions = camera(WIDTH)
     o = to_vector3(backend, eye[None])
     d = to_vector3(backend, directions)
-    surface = hk.traced_surface(field or scene.make(), enclosures=bound, over_relaxation=overstep)
+    surface = hk.Surface(field or scene.make())
+    options = hk.TraceOptions(
+        tolerance=1e-4, enclosures=enclosures, over_relaxation=over_relaxation
+    )
     seconds, hits = [], None
     for _ in range(REPEATS + 1):  # the first run compiles
         wall, core = time.perf_counter(), time.process_time()
-        hits = hk.trace(surface, o, d, t_max=10.0)
+        hits = hk.trace(surface, o, d, t_max=10.0, options=options)
         dr.sync_thread()
         wall, core = time.perf_counter() - wall, time.process_time() - core
         # On a GPU the processor only waits: one device is one core.

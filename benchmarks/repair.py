@@ -175,7 +175,7 @@ def _meshes(folder: Path | None) -> dict[str, Arrays]:
         "gyroid": _arrays(
             hk.mesh(
                 hk.solid(hk.Gyroid(1.0), between=(-0.4, 0.4)) & hk.Sphere(0.6),
-                tolerance=5e-3,
+                tolerance=6e-3,
                 simplify=True,
             )
         ),
@@ -184,7 +184,7 @@ def _meshes(folder: Path | None) -> dict[str, Arrays]:
                 hk.Capsule((-1, 0, 0), (1, 0, 0), 0.3).blended(
                     hk.Capsule((0.3, -1, 0), (0.3, 1, 0.4), 0.2), 0.15
                 ),
-                tolerance=2e-3,
+                tolerance=5.2e-3,
             )
         ),
     }

@@ -90,8 +90,10 @@ def compare(mesh: MeshArrays, points: FloatArray, method: Any) -> list[Row]:
     field = WindingNumber(vertices, faces, **options)
     calls: dict[str, Callable[[], Any]] = {
         LIBIGL: lambda: libigl(vertices, faces, points),
-        f"{method}, value": lambda: field.value(points),
-        f"{method}, value and gradient": lambda: field.value_and_gradient(points)[0],
+        f"{method}, value": lambda: field.value(points, precision="single"),
+        f"{method}, value and gradient": lambda: field.value_and_gradient(
+            points, precision="single"
+        )[0],
     }
     exact = WindingNumber(vertices, faces, method="exact")
     truth = exact.value(points[:CHECKED], precision="double")
@@ -123,7 +125,9 @@ def throughput(surface: Path | None = None) -> str:
     damaged = closed[0], remove_faces(closed[1], 0.1, 0)
     cube = cube_points()
     soup = broken_mesh(6, "soup")
-    took = seconds_of(lambda: WindingNumber(*soup, cells=_MEGABYTES).value(cube))
+    took = seconds_of(
+        lambda: WindingNumber(*soup, cells=_MEGABYTES).value(cube, precision="single")
+    )
     groups = [
         ("bumpy sphere, 10 % of faces removed", damaged, cube, "tree"),
         ("bumpy sphere, closed", closed, cube, "exact"),

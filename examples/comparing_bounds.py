@@ -21,14 +21,14 @@ def main(folder: Path, size: tuple[int, int] = (640, 480)) -> dict[str, float]:
     )
     x, y = np.meshgrid(np.linspace(-1.2, 1.2, 60), np.linspace(-1.2, 1.2, 60))
     origins = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 2.0)])
-    work, found = {}, set()
-    for bound in ("classic", "slope", "caps", None):
-        hits = hk.trace(field, origins, [[0.1, 0.2, -1.0]], enclosures=bound)
-        work[bound or "default"] = float(hits.evaluations.mean())
-        found.add(int((hits.status == hk.RayStatus.HIT).sum()))
+    work, hit_counts = {}, set()
+    for enclosures in ("classic", "slope", "caps", None):
+        hits = hk.trace(field, origins, [[0.1, 0.2, -1.0]], enclosures=enclosures)
+        work[enclosures or "default"] = float(hits.evaluations.mean())
+        hit_counts.add(int((hits.status == hk.RayStatus.HIT).sum()))
     for name, evaluations in work.items():
         print(f"{name:8} {evaluations:6.1f} evaluations a ray")
-    print(f"hits of each: {found}")
+    print(f"hits of each: {hit_counts}")
     return work
 
 

@@ -29,12 +29,12 @@ def main(
 
     triangles = hk.mesh(hollow, tolerance=tolerance)
     triangles.export(folder / "hollow_part.stl")
-    found = hk.check_print(folder / "hollow_part.stl")
-    for one in found.problems:
-        print(one.message)
+    check = hk.check_print(folder / "hollow_part.stl")
+    for problem in check.problems:
+        print(problem.message)
     share = triangles.volume / (2 * np.pi**2 * 20.0 * 10.0**2)
-    print(f"{found.triangles:,} triangles, {share:.0%} of the space is filled")
-    return found
+    print(f"{check.triangles:,} triangles, {share:.0%} of the space is filled")
+    return check
 
 
 if __name__ == "__main__":

@@ -79,14 +79,14 @@ def standing(name: str) -> hk.Field:
 def main(
     folder: Path,
     size: tuple[int, int] = (640, 480),
-    tolerance: float | None = None,
+    tolerance: float | None = None,  # in mm; None: a thousandth of the longest side
     names: tuple[str, ...] = tuple(PARTS),
 ) -> dict[str, float]:
     scene = [standing(name) for name in names]
     camera = hk.Camera(azimuth=-75, elevation=28)
     picture = folder / "printed_parts.png"
-    look = {"show": "shaded", "material": "clay", "tolerance": 2e-3}
-    hk.render(scene, picture, camera=camera, size=size, **look)
+    look = {"show": "shaded", "material": "clay", "camera": camera, "size": size}
+    hk.render(scene, picture, tolerance=2e-3, **look)
     volumes: dict[str, float] = {}
     for name in names:
         part = PARTS[name]()

@@ -26,7 +26,7 @@ def figure_7(width: int) -> Report:
         row = []
         for order in range(degree + 1):
             field = hk.SphericalHarmonic(degree, order)
-            values = field.value(_sphere())
+            values = field.value(_sphere(), precision="single")
             lower, upper = float(values.min()), float(values.max())
             levels = [0.5 * lower, 0.15 * lower, 0.15 * upper, 0.5 * upper]
             hits = view.trace(field, level=levels, clip=ball)
@@ -81,8 +81,9 @@ def figure_19(width: int) -> Report:
     for label, (function, part, radius, camera) in opened.items():
         field = hk.fields.RiemannSurface(function, part, domain=hk.Ball(radius=radius))
         picture, counts = drawn(
-            hk.traced_surface(field, tolerance=2e-4),
+            field,
             fitting(width),
+            tolerance=2e-4,
             camera=camera,
             material="two-tone",
         )
@@ -155,12 +156,12 @@ def figure_21(width: int) -> Report:
     corners = side * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     view = View.of(corners, fitting(width), camera)
     rows = []
-    for name, bound, overstep in (
+    for name, enclosures, over_relaxation in (
         ("Harnack's inequality in four dimensions alone, over-stepping 1.75", "classic", 1.75),
         ("with the slope", "slope", 1.4),
         ("all proofs", None, None),
     ):
-        hits = view.trace(field, level=0.5, enclosures=bound, over_relaxation=overstep)
+        hits = view.trace(field, level=0.5, enclosures=enclosures, over_relaxation=over_relaxation)
         rows.append(f"{name}: {Counts.of(hits.status, hits.evaluations)}")
     caption = (
         "The 1/2 level of sin 6x sin 6y sin 6z + sin 2x sin 2y sin 2z, as a solid in a cube of "

@@ -62,7 +62,7 @@ def _square(height: float) -> Array:
 
 def _neck(field: hk.SolidAngle) -> float | None:
     """Distance of the level set from the axis at z = 0, along x; None if the ray hits nothing."""
-    hits = hk.trace(field, [[0, 0, 0]], [[1, 0, 0]], precision="double", t_max=3.0)
+    hits = hk.trace(field, [[0, 0, 0]], [[1, 0, 0]], precision="double", t_max=3.0, tolerance=1e-4)
     return float(hits.t[0]) if hits.is_hit[0] else None
 
 

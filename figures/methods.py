@@ -246,8 +246,9 @@ def _marching_cubes(field: hk.SolidAngle, cells: int) -> tuple[Array, Array, Arr
 
     u = np.linspace(-1.3, 1.3, cells + 1)
     grid = np.stack(np.meshgrid(u, u, u, indexing="ij"), axis=-1).reshape(-1, 3)
-    value = np.mod(field.value(grid), 4 * np.pi).reshape((cells + 1,) * 3)
+    value = np.mod(field.value(grid, precision="single"), 4 * np.pi).reshape((cells + 1,) * 3)
     vertices, faces, _, _ = marching_cubes(value, 2 * np.pi)
     vertices = vertices * (2.6 / cells) - 1.3
-    middle = np.mod(field.value(vertices[faces].mean(axis=1)), 4 * np.pi)
+    centers = vertices[faces].mean(axis=1)
+    middle = np.mod(field.value(centers, precision="single"), 4 * np.pi)
     return vertices, faces.astype(np.int64), np.abs(middle - 2 * np.pi) < np.pi / 2

@@ -61,6 +61,7 @@ def scene(name: str, width: int, *, share: float = 0.75, **settings: Any) -> tup
     entry = SCENES[name]
     options = {"show": "shaded", "material": list(entry.materials), **settings}
     options.setdefault("camera", entry.camera)
+    options.setdefault("options", entry.options)
     surfaces = entry.surfaces()
     if len(options["material"]) == 1:
         options["material"] *= len(surfaces)

@@ -83,15 +83,19 @@ def _with_balls(view: View, picture: Pixels, t: Array, centers: Array, radii: Ar
 
 
 def _steps(
-    field: hk.Field, start: Array, towards: Array, bound: str | None, overstep: float | None
+    field: hk.Field,
+    start: Array,
+    towards: Array,
+    enclosures: str | None,
+    over_relaxation: float | None,
 ) -> Array:
     """The points (n + 1, 3) at which a ray is evaluated on its way to the surface."""
     d = towards / np.linalg.norm(towards)
     lengths = [0.0]
     for max_steps in range(1, 400):
         hits = hk.trace(
-            field, start[None], d[None], max_steps=max_steps, enclosures=bound, over_relaxation=overstep,
-            precision="double",
+            field, start[None], d[None], max_steps=max_steps, enclosures=enclosures,
+            over_relaxation=over_relaxation, precision="double", tolerance=1e-4,
         )  # fmt: skip
         if hits.t[0] > lengths[-1]:
             lengths.append(float(hits.t[0]))

@@ -23,7 +23,7 @@ def figure_14(width: int) -> Report:
     mesh = surface.field
     assert isinstance(mesh, hk.PolygonMesh)
     size = fitting(width)
-    settings = {"camera": entry.camera}
+    settings = {"camera": entry.camera, "options": entry.options}
     net, _ = drawn(tubes, size, material="gold", **settings)
     start = time.perf_counter()
     both, _ = drawn([surface, tubes], size, material=["eggshell", "gold"], **settings)
@@ -123,7 +123,7 @@ def figure_16(width: int) -> Report:
         picture, counts = scene(name, width)
         seconds = time.perf_counter() - start
         same = replace(view, size=size)  # a quarter of the rays
-        hits = same.trace(surface)
+        hits = same.trace(surface, tolerance=entry.options.tolerance)
         spans = hits.is_hit & (hits.primitive_index < 0)
         mesh_hit = mesh_hits(vertices, faces, same.eye, same.directions())
         through = mesh_hit.is_hit & ((mesh_hit.normal * same.directions()).sum(axis=1) > 0)

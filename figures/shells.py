@@ -21,7 +21,9 @@ def figure_17(width: int) -> Report:
     for name in ("shell-ring", "shell-court", "shell-columns"):
         entry = SCENES[name]
         surfaces = entry.surfaces()
-        settings = {"camera": entry.camera, "material": list(entry.materials)}
+        settings = {
+            "camera": entry.camera, "material": list(entry.materials), "options": entry.options
+        }  # fmt: skip
         hk.render(surfaces, show="shaded", size=(32, 24), spp=4, progress=False, **settings)
         start = time.perf_counter()
         image = hk.render(
@@ -29,7 +31,7 @@ def figure_17(width: int) -> Report:
         )
         seconds = time.perf_counter() - start
         shell = surfaces[0]
-        _, counts = drawn(shell, fitting(width), camera=entry.camera)
+        _, counts = drawn(shell, fitting(width), camera=entry.camera, options=entry.options)
         outline, holes = shell.field.loops[0], shell.field.circles
         panels.append(Panel(halved(tone_map(image)), name))
         texts.append(

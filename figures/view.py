@@ -65,7 +65,9 @@ class View:
         return np.column_stack([column, 0.5 * (height - up / depth / self._scale)]), depth
 
     def trace(self, what: Any, **settings: Any) -> hk.Hits:
-        """`hk.trace` of all pixels."""
+        """`hk.trace` of all pixels, in single precision and with a tolerance of 1e-4 unless
+        `settings` are others."""
+        settings = {"precision": "single", "tolerance": 1e-4, **settings}
         return hk.trace(what, self.eye[None], self.directions(), **settings)
 
     def shade(

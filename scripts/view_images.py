@@ -33,13 +33,19 @@ def main(folder: Path) -> None:
     hk.render(trefoil, folder / "view-heights.png", isolines=heights, backdrop=sky, **shaded)
     gyroid = hk.Gyroid(1.0, domain=hk.Ball(radius=1.0))
     walls = hk.Surface(gyroid, (-0.3, 0.3), side="between")
-    small: dict[str, Any] = {"size": (400, 300), "color_bar": True}
-    hk.render(walls, folder / "view-value.png", show="value", color_by="z", **small)
-    hk.render(gyroid, folder / "view-evaluations.png", show="evaluations", **small)
+    scale: dict[str, Any] = {"size": (400, 300), "color_bar": True}
+    hk.render(walls, folder / "view-value.png", show="value", color_by="z", **scale)
+    hk.render(walls, folder / "view-evaluations.png", show="evaluations", **scale)
     smooth = hk.SolidAngle(hk.geometry.smooth_curve(POINTS))
     camera, size = hk.Camera(azimuth=25), (640, 480)
-    look: dict[str, Any] = {"show": "shaded", "size": size, "camera": camera}
-    hk.render(smooth, folder / "smooth.png", boundary_radius=0.02, **look)
+    hk.render(
+        smooth,
+        folder / "smooth.png",
+        show="shaded",
+        boundary_radius=0.02,
+        size=size,
+        camera=camera,
+    )
 
 
 if __name__ == "__main__":

@@ -55,7 +55,6 @@ nb_output_stderr = "remove"  # progress, on slow machines
 
 autodoc_typehints = "signature"
 autodoc_type_aliases = {name: name for name in ("BoolArray", "FloatArray", "IntArray", "Point")}
-autodoc_preserve_defaults = False
 autodoc_member_order = "bysource"
 # A method without a docstring of its own is explained once, where it is declared.
 autodoc_inherit_docstrings = False

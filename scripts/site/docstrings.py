@@ -2,21 +2,31 @@
 
 A docstring here is plain text with `code`, *emphasis* and **weight**, "- " lists, indented
 formulas, entries ("name: what it is", where name is a parameter or an attribute), and the sections
-"Returns:" and "Raises:". Entries become definition lists; names that harnack exports become links.
+"Returns:" and "Raises:". Entries become definition lists; names that the reference documents become
+links.
 """
 
 from __future__ import annotations
 
 import inspect
+import math
 import re
 from collections.abc import Container, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from itertools import groupby
+from pathlib import Path
 from typing import Any
+
+from sphinx.util.inspect import signature, stringify_signature
 
 import harnack
 
+_REFERENCE = Path(__file__).resolve().parents[2] / "docs" / "reference"
+_DIRECTIVE = re.compile(
+    r"^\.\. (?:auto|py:)(?:class|data|function):: harnack\.([\w.]+)", re.MULTILINE
+)
 _SECTION = re.compile(r"(Returns|Raises|Yields):$")
 _ENTRY = re.compile(r"(\w+(?:, \w+)*): ?(.*)$")
 _ERROR = re.compile(r"[A-Z]\w+$")
@@ -24,6 +34,8 @@ _RETURNED = re.compile(r"[a-z]\w*$")
 _BULLET = re.compile(r"- ")
 # Where another entry may begin within a line.
 _ANOTHER = re.compile(r"(?<=\.) (?=\w+: )")
+# Defaults of arguments, and how they are shown.
+_READABLE = {"<factory>": "...", repr(2 * math.pi): "2 * math.pi"}
 # Code, or strong or plain emphasis of words: what follows a space or a bracket and ends a word.
 _MARKED = re.compile(
     r"(`[^`]+`|(?<![\w*])\*\*[A-Za-z][^*]*\*\*(?!\w)|(?<![\w*])\*[A-Za-z][^*]*\*(?!\w))"
@@ -32,7 +44,7 @@ _MARKED = re.compile(
 
 def setup(app: Any) -> dict[str, bool]:
     app.connect("autodoc-process-docstring", process)
-    app.connect("autodoc-process-signature", without_factories)
+    app.connect("autodoc-process-signature", with_readable_defaults)
     return {"parallel_read_safe": True}
 
 
@@ -41,11 +53,25 @@ def process(app: Any, what: str, name: str, thing: Any, options: Any, lines: lis
     lines[:] = list(converted(lines, names_of(thing)))
 
 
-def without_factories(
+def with_readable_defaults(
     app: Any, what: str, name: str, thing: Any, options: Any, arguments: str | None, result: Any
 ) -> tuple[str, Any] | None:
-    """Signatures that can be parsed: dataclasses write what is no Python for made defaults."""
-    return arguments and (arguments.replace("<factory>", "..."), result)
+    """Signatures that can be parsed and read: dataclasses write what is no Python for made
+    defaults, and angles are numbers. (Sphinx can take defaults from the code, but that of verbs
+    has fewer parameters than their signature.) Of a class those of `__init__`, where Sphinx shows
+    a `__new__` that takes anything."""
+    if what == "class" and arguments and arguments.startswith("(*"):
+        aliases = app.config.autodoc_type_aliases
+        own = signature(thing.__init__, bound_method=True, type_aliases=aliases)
+        public = [p for name, p in own.parameters.items() if not name.startswith("_")]
+        arguments = stringify_signature(
+            own.replace(parameters=public),
+            show_return_annotation=False,
+            unqualified_typehints=True,
+        )
+    for default, readable in _READABLE.items():
+        arguments = arguments and arguments.replace(default, readable)
+    return arguments and (arguments, result)
 
 
 def names_of(thing: Any) -> frozenset[str]:
@@ -186,8 +212,29 @@ def inline(text: str) -> str:
 
 
 def _code(text: str) -> str:
-    """Code, linked if it names something that harnack exports."""
-    name = re.sub(r"^(harnack|hk)\.", "", text).removesuffix("()")
-    if name.split(".")[0] in harnack.__all__ and re.fullmatch(r"[\w.]+", name):
-        return f":py:obj:`{text} <harnack.{name}>`"
-    return f"``{text}``"
+    """Code, linked if it names something that the reference documents."""
+    path = documented_path(text.removesuffix("()"))
+    return f"``{text}``" if path is None else f":py:obj:`{text} <{path}>`"
+
+
+def documented_path(name: str) -> str | None:
+    """The path under which the reference documents a name, or what it is an attribute of; with or
+    without its namespace. None if it does not document it."""
+    parts = re.sub(r"^(harnack|hk)\.", "", name).split(".")
+    if len(parts) > 1 and parts[0] in dir(harnack) and parts[0] not in harnack.__all__:
+        parts = parts[1:]  # a namespace
+    paths = _documented_paths()
+    for count in (2, 1):
+        path = paths.get(".".join(parts[:count]))
+        if path is not None:
+            return ".".join((path, *parts[count:]))
+    return None
+
+
+@cache
+def _documented_paths() -> dict[str, str]:
+    """The paths of the reference by their names without the namespace; in a module of a namespace,
+    with the module, such as "outline.text"."""
+    text = "\n".join(page.read_text(encoding="utf-8") for page in sorted(_REFERENCE.glob("*.md")))
+    paths = [path.split(".") for path in _DIRECTIVE.findall(text)]
+    return {".".join(path[1:] or path): ".".join(("harnack", *path)) for path in paths}

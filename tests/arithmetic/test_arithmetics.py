@@ -252,23 +252,21 @@ def test_all_proofs_hit_the_same(name: str, precision: str) -> None:
     backend = choose_backend(precision)  # type: ignore[arg-type]
     rays = to_vector3(backend, o), to_vector3(backend, target - o)
 
-    def hits(bound: str | None) -> tuple[Any, Any]:
-        found = hk.trace(
-            hk.traced_surface(field, enclosures=bound, tolerance=1e-5, max_steps=1000), *rays
-        )
-        return found.status.numpy(), found.t.numpy()
+    def hits(enclosures: str | None) -> tuple[Any, Any]:
+        traced = hk.trace(field, *rays, enclosures=enclosures, tolerance=1e-5, max_steps=1000)
+        return traced.status.numpy(), traced.t.numpy()
 
     status, t = hits(None)
     hit = status == int(hk.RayStatus.HIT)
     assert 20 < hit.sum() < 400
-    for bound in PROOFS:
-        other, there = hits(bound)
+    for enclosures in PROOFS:
+        other, there = hits(enclosures)
         out_of_steps = other == int(hk.RayStatus.OUT_OF_STEPS)
         # Bands are not relative to the value: in single precision they stall beside a surface.
-        stalls = precision == "single" and bound in ("affine", "interval")
+        stalls = precision == "single" and enclosures in ("affine", "interval")
         assert stalls or not out_of_steps.any()
         different = (other != status) & ~out_of_steps
-        assert different.sum() <= 2, bound  # rays that only graze the surface
+        assert different.sum() <= 2, enclosures  # rays that only graze the surface
         both = hit & (other == status)
         if stalls and not both.any():
             continue
@@ -278,12 +276,9 @@ def test_all_proofs_hit_the_same(name: str, precision: str) -> None:
 
 
 def test_proofs_of_formulas_say_what_they_need() -> None:
-    with pytest.raises(ValueError, match="no bound applies"):
-        hk.trace(
-            hk.traced_surface(hk.SphericalHarmonic(4, 2), enclosures="bottom-up-quadratic"),
-            np.array([[3.0, 0, 0]]),
-            np.array([[-1.0, 0, 0]]),
-        )
+    options = hk.TraceOptions(enclosures="bottom-up-quadratic")
+    with pytest.raises(ValueError, match="no enclosure applies"):
+        hk.trace(hk.SphericalHarmonic(4, 2), [[3.0, 0, 0]], [[-1.0, 0, 0]], options=options)
 
 
 def test_formulas_with_what_has_no_ranges_are_refused() -> None:

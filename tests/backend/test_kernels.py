@@ -66,23 +66,29 @@ def test_another_surface_compiles_no_kernel(make: Callable[[int], hk.Field], lev
         d = 0.4 * rng.normal(size=(300, 3)) - o
         settings = {"level": level * (1 - 0.01 * k), "tolerance": 1e-4 * (1 + 0.1 * k)}
         # Of rays: those that pack a tree are small, and come in a few kinds by its size.
-        return compiled(lambda: hk.trace(make(k), o, d, **settings), size=300)
+        return compiled(lambda: hk.trace(make(k), o, d, precision="single", **settings), size=300)
 
     trace(0), trace(1)
     assert [trace(k) for k in range(2, 5)] == [0] * 3
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize("settings", [{"all_hits": 5}, {"confirm": True}])
+@pytest.mark.parametrize("search", ["crossings", "require_crossing"])
 @pytest.mark.parametrize(("make", "level"), [(knot, 6.0), (cut_sphere, 0.5)])
 def test_crossings_of_another_surface_compile_no_kernel(
-    make: Callable[[int], hk.Field], level: float, settings: dict[str, Any]
+    make: Callable[[int], hk.Field], level: float, search: str
 ) -> None:
     o = 3 * np.random.default_rng(0).normal(size=(300, 3))
 
+    def follow(surface: hk.Surface, options: hk.TraceOptions) -> Any:
+        if search == "crossings":
+            return hk.crossings(surface, o, -o, max_crossings=5, options=options)
+        return hk.trace(surface, o, -o, options=options.replace(require_crossing=True))
+
     def trace(k: int) -> int:
-        own = {"level": level * (1 - 0.01 * k), "tolerance": 1e-4 * (1 + 0.1 * k), **settings}
-        return compiled(lambda: hk.trace(make(k), o, -o, **own), size=300)
+        options = hk.TraceOptions(tolerance=1e-4 * (1 + 0.1 * k), precision="single")
+        surface = hk.Surface(make(k), level * (1 - 0.01 * k))
+        return compiled(lambda: follow(surface, options), size=300)
 
     trace(0), trace(1)
     assert [trace(k) for k in range(2, 6)] == [0] * 4
@@ -186,7 +192,7 @@ def test_other_isolines_compile_no_kernel() -> None:
 PICTURES: dict[str, Callable[[int], int]] = {
     **{
         show: lambda k, show=show: drawn(
-            knot(k), k, show, level=6 - 0.02 * k, of=knot(k + 1) if show == "value" else None
+            knot(k), k, show, level=6 - 0.02 * k, color_by=knot(k + 1) if show == "value" else None
         )
         for show in hk.rendering.SHOW_MODES
     },
@@ -206,7 +212,7 @@ PICTURES: dict[str, Callable[[int], int]] = {
         "shaded",
         level=0.1 + 0.01 * k,
         side="below",
-        cut_material="gold",
+        section_material="gold",
         section=hk.HalfSpace((0.02 * k, -1, 0.3), 0.01 * k),
     ),
     "largest": lambda k: drawn(
@@ -223,8 +229,9 @@ PICTURES: dict[str, Callable[[int], int]] = {
 def test_another_number_of_points_compiles_no_kernel() -> None:
     field, points = cut_sphere(0), np.random.default_rng(0).normal(size=(700, 3))
     for count in (600, 601):
-        field.value(points[:count])
-    assert [compiled(lambda n=n: field.value(points[:n])) for n in (607, 700)] == [0, 0]
+        field.value(points[:count], precision="single")
+    for count in (607, 700):
+        assert compiled(lambda n=count: field.value(points[:n], precision="single")) == 0
 
 
 @pytest.mark.slow

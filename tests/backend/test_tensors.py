@@ -27,28 +27,29 @@ def vector(values: Any) -> Any:
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize("settings", [{}, {"all_hits": 3}])
-def test_tensors_are_traced_as_numpy_arrays_are(settings: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    ("verb", "settings"), [(hk.trace, {}), (hk.crossings, {"max_crossings": 3})]
+)
+def test_tensors_are_traced_as_numpy_arrays_are(verb: Any, settings: dict[str, Any]) -> None:
     levels = [5.0, 2 * np.pi]
     field = hk.SolidAngle(LOOP, lift_bound="edges")
-    asked: Any = {"level": levels, "precision": "double", **settings}
-    expected = hk.trace(field, EYE[None], AWAY, t_max=np.full(40, 9.0), **asked)
-    asked = {"level": tensor(levels), **settings}
-    found = hk.trace(
+    settings = {"t_max": np.full(40, 9.0), **settings}
+    expected = verb(field, EYE[None], AWAY, level=levels, precision="double", **settings)
+    in_tensors = verb(
         hk.SolidAngle(tensor(LOOP)),
         tensor(EYE[None]),
         tensor(AWAY),
-        t_max=tensor(np.full(40, 9.0)),
-        **asked,
+        level=tensor(levels),
+        **{**settings, "t_max": tensor(np.full(40, 9.0))},
     )
-    assert type(found) is type(expected)
+    assert type(in_tensors) is type(expected)
     for name, value in vars(expected).items():
-        got = getattr(found, name)
-        assert dr.is_tensor_v(got)
-        assert got.shape == value.shape, name
-        assert got.numpy().dtype in (np.float64, np.int32)
+        array = getattr(in_tensors, name)
+        assert dr.is_tensor_v(array)
+        assert array.shape == value.shape, name
+        assert array.numpy().dtype in (np.float64, np.int32)
         if name != "evaluations":  # rays begin at other hulls
-            np.testing.assert_allclose(got.numpy(), value, atol=2e-4, err_msg=name)
+            np.testing.assert_allclose(array.numpy(), value, atol=2e-4, err_msg=name)
 
 
 @pytest.mark.slow

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -62,10 +62,10 @@ TRIANGLE = ([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]], [[0, 1, 2]])
 # Each was answered by an error of Python's own that named no argument, or by none.
 WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "level of a mesh": (lambda: hk.mesh(SPHERE, level="abc"), "^level must be a number"),
-    "row as level of a mesh": (lambda: hk.mesh(SPHERE, level=ROW), "^level must be a number"),
+    "row as level of a mesh": (lambda: hk.mesh(SPHERE, level=ROW), "^there are 5 levels .*of one"),
     "seed": (lambda: hk.mesh(SPHERE, seed=None), "^seed must be an integer"),
     "simplify": (lambda: hk.mesh(SPHERE, simplify=ROW), "^simplify must be True or False"),
-    "solid": (lambda: hk.mesh(SPHERE, solid=[]), r"^solid must be \(low, high\)"),
+    "side": (lambda: hk.mesh(SPHERE, side=[]), '^side must be one of "surface", "below"'),
     "progress": (lambda: hk.mesh(SPHERE, progress=True), "^progress must be a function"),
     "progress of a distance": (
         lambda: hk.distance.closest_points(SPHERE, [[2, 0, 0]], progress=1.0),
@@ -92,14 +92,15 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: hk.testing.check_field(SPHERE, count=0),
         "^count must be an integer",
     ),
-    "field of a level set": (lambda: hk.Surface(None), "harnack field is needed"),
-    "levels of a level set": (lambda: hk.Surface(SPHERE, "abc"), "^levels must be a tuple"),
-    "tolerance of a level set": (
-        lambda: hk.Surface(SPHERE, tolerance=1e-3),
-        "^tolerance must be a Tolerance",
+    "field of a surface": (lambda: hk.Surface(None), "harnack field is needed"),
+    "levels of a surface": (lambda: hk.Surface(SPHERE, "abc"), "^level must be a number, or sev"),
+    "tolerance of options": (lambda: hk.TraceOptions(tolerance=ROW), "^tolerance must be a length"),
+    "tolerance of a surface": (
+        lambda: cast("Any", hk.Surface)(SPHERE, tolerance=1e-3),
+        "unexpected keyword argument 'tolerance'",
     ),
-    "a level set for a field": (
-        lambda: hk.signed_distance(hk.Surface(SPHERE), [[2, 0, 0]]),
+    "a surface for a field": (
+        lambda: hk.testing.check_field(hk.Surface(SPHERE)),
         "take its .field, and what ",
     ),
     "level of a formula": (lambda: hk.expression("x", level=None), "^level must be a number"),

@@ -178,7 +178,7 @@ class WrongSign(BoundedLaplacianEnclosure):
 
 
 @pytest.mark.parametrize("wrong", [WithoutKernel, WithoutMean, WrongSign])
-def test_a_term_left_out_is_seen_by_check_bound(wrong: type[BoundedLaplacianEnclosure]) -> None:
+def test_a_term_left_out_is_seen_by_check_enclosure(wrong: type[BoundedLaplacianEnclosure]) -> None:
     with pytest.raises(BrokenPromiseError, match="a level is met within the step"):
         check_enclosure(wrong)
 
@@ -191,9 +191,9 @@ def test_one_proof_of_a_bounded_laplacian_is_used_by_default(name: str) -> None:
     field, level = FIELDS[name]
     o, d = rays(np.random.default_rng(1), 200)
     plain = hk.trace(field, o, d, level=level)
-    for bound in ("laplacian", BoundedLaplacianEnclosure):
+    for enclosures in ("laplacian", BoundedLaplacianEnclosure):
         np.testing.assert_array_equal(
-            hk.trace(field, o, d, level=level, enclosures=bound).t, plain.t
+            hk.trace(field, o, d, level=level, enclosures=enclosures).t, plain.t
         )
     with pytest.raises(ValueError, match=r'BoundedLaplacian.*choose .*"laplacian"'):
         hk.trace(field, o, d, level=level, enclosures="lipschitz")

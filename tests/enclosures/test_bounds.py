@@ -251,7 +251,7 @@ def test_bounds_hold_in_many_trials(bound: type[Enclosure], precision: str) -> N
 
 @pytest.mark.parametrize("precision", ["double", "single"])
 @pytest.mark.parametrize("bound", BOUNDS, ids=name_of)
-def test_mutation_is_seen_by_check_bound(bound: type[Enclosure], precision: str) -> None:
+def test_mutation_is_seen_by_check_enclosure(bound: type[Enclosure], precision: str) -> None:
     with pytest.raises(BrokenPromiseError, match="a level is met within the step"):
         check_enclosure(mutated_enclosure(bound, 1.001), precision=precision)  # type: ignore[arg-type]
 
@@ -694,27 +694,31 @@ def test_bounds_are_chosen_by_name() -> None:
         SphericalCapEnclosure,
         LipschitzEnclosure,
     )
-    some = choose_enclosures("slope")
-    assert choose_enclosures(some) is some
-    with pytest.raises(ValueError, match=r"unknown bound 'harnak'; choose one of .*caps.* classic"):
+    chosen = choose_enclosures("slope")
+    assert choose_enclosures(chosen) is chosen
+    with pytest.raises(
+        ValueError, match=r"unknown enclosures 'harnak'; choose one of .*caps.* classic"
+    ):
         choose_enclosures("harnak")
     for wrong in (3, (), (SphericalCapEnclosure, "slope"), int, Enclosure, HarmonicBallEnclosure):
-        with pytest.raises(TypeError, match=r"such as harnack\.SphericalCapEnclosure"):
+        with pytest.raises(TypeError, match=r"such as harnack\.proofs\.SphericalCapEnclosure"):
             choose_enclosures(wrong)  # type: ignore[arg-type]
     real = choose_backend("double").Float
-    given = (real(0), 0.0, SlopeRange(real(0.4), real(0.4)))
-    with pytest.raises(ValueError, match=r'no bound .*Lipschitz, which.*SphericalCap.*"lipschitz"'):
-        choose_enclosures(SphericalCapEnclosure).from_promises((Lipschitz(1.0),), (), *given)
+    arguments = (real(0), 0.0, SlopeRange(real(0.4), real(0.4)))
+    with pytest.raises(
+        ValueError, match=r'no enclosure .*Lipschitz, which.*SphericalCap.*"lipschitz"'
+    ):
+        choose_enclosures(SphericalCapEnclosure).from_promises((Lipschitz(1.0),), (), *arguments)
     with pytest.raises(ValueError, match=r"Sample\.promises is empty"):
-        choose_enclosures(None).from_promises((), (), *given, (Lipschitz(1.0, 1.0),))
+        choose_enclosures(None).from_promises((), (), *arguments, (Lipschitz(1.0, 1.0),))
     endless = HarmonicBall(real(1), -math.inf, math.inf)
     with pytest.raises(ValueError, match="at least one limit that is not infinite"):
-        choose_enclosures(None).from_promises((endless,), (), *given)
+        choose_enclosures(None).from_promises((endless,), (), *arguments)
     with pytest.raises(ValueError, match=r'choose ("\S+" or )*"lipschitz"( or "\S+")*$'):
-        choose_enclosures(None).from_promises((), (Lipschitz(1.0),), *given)
+        choose_enclosures(None).from_promises((), (Lipschitz(1.0),), *arguments)
 
 
-def test_check_bound_refuses_a_proof_that_applies_to_nothing() -> None:
+def test_check_enclosure_refuses_a_proof_that_applies_to_nothing() -> None:
     class Nothing(Enclosure):
         def free_length(self, gaps: LevelGaps) -> object:
             return gaps.above

@@ -105,7 +105,7 @@ def test_what_a_field_proves_along_a_path_is_used(precision: Any) -> None:
 def test_no_hit_of_a_path_s_own_enclosures_is_missed() -> None:
     """Against samples of f along the rays, in float64."""
     o, d = rays(1500)
-    hits = hk.trace(TaylorBlobs(), o, d, tolerance=1e-5)
+    hits = hk.trace(TaylorBlobs(), o, d, tolerance=1e-5, precision="single")
     t = np.linspace(0, 4.9, 4000)
     x = o[:, None] + t[:, None] * d[:, None]
     inside = (x**2).sum(axis=2) <= 2.5**2
@@ -200,8 +200,8 @@ def test_enclosures_of_values_of_any_size_miss_nothing(unit: float) -> None:
             return RaySample(seen, (ahead,), (back,), look.slope * unit)
 
     o, d = rays(20_000)
-    plain = hk.trace(TaylorBlobs(), o, d, tolerance=1e-5, over_relaxation=1.8)
-    scaled = hk.trace(Scaled(), o, d, tolerance=1e-5, over_relaxation=1.8)
+    plain = hk.trace(TaylorBlobs(), o, d, tolerance=1e-5, over_relaxation=1.8, precision="single")
+    scaled = hk.trace(Scaled(), o, d, tolerance=1e-5, over_relaxation=1.8, precision="single")
     assert (plain.is_hit == scaled.is_hit).mean() > 0.9998
 
 
@@ -217,7 +217,7 @@ def test_a_level_within_a_large_error_is_not_passed() -> None:
             error = dr.select(near, 0.001001, 0.0)
             return Sample(value, type(p)(1, 0, 0), (hk.proofs.TaylorRemainder(1.0),), error)
 
-    hits = hk.trace(Off(), [[2e-4, 0, 0]], [[-1.0, 0, 0]], level=0.0)
+    hits = hk.trace(Off(), [[2e-4, 0, 0]], [[-1.0, 0, 0]], level=0.0, precision="single")
     assert hits.status[0] != int(hk.RayStatus.MISS)
 
 
@@ -231,6 +231,6 @@ def test_rays_beside_the_origin_of_coordinates_reach_the_surface(distance: float
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     down = d[:, 2] < -0.2
     circle = hk.SolidAngle(np.column_stack([np.cos(t), np.sin(t), 0 * t]))
-    hits = hk.trace(circle, o[down], d[down], tolerance=1e-6)
+    hits = hk.trace(circle, o[down], d[down], tolerance=1e-6, precision="single")
     assert hits.is_hit.all()
     assert (hits.evaluations < 50).all()

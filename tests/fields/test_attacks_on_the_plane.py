@@ -16,15 +16,17 @@ PRECISIONS = ("single", "double")
 
 @pytest.mark.few(4)
 @pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("bound", ["curvature", "slope", "caps"])
-def test_rays_from_creases_miss_nothing(bound: str, precision: Any) -> None:
+@pytest.mark.parametrize("enclosures", ["curvature", "slope", "caps"])
+def test_rays_from_creases_miss_nothing(enclosures: str, precision: Any) -> None:
     """On the line of symmetry y = 0 two sheets agree in f and in all of its gradient but y, and
     were taken for one: one first hit in seven was missed by these bounds."""
     rng, n = np.random.default_rng(1), 200
     o = np.column_stack([rng.uniform(0.05, 0.8, n), 0 * np.ones(n), rng.uniform(0.02, 0.6, n)])
     d = rng.normal(size=(n, 3))
     d /= np.linalg.norm(d, axis=1)[:, None]
-    hits = hk.trace(hk.fields.RiemannSurface("asin"), o, d, enclosures=bound, precision=precision)
+    hits = hk.trace(
+        hk.fields.RiemannSurface("asin"), o, d, enclosures=enclosures, precision=precision
+    )
     assert (hits.status != hk.RayStatus.OUT_OF_STEPS).all()
     end = np.minimum(hits.t, 1.2)
     x = o[:, None] + (np.linspace(0, 1, 800) * end[:, None])[..., None] * d[:, None]
@@ -49,8 +51,8 @@ def test_rays_through_zeros_of_whole_powers_end(
     np.testing.assert_allclose(hits.t, 2.0, atol=1.1e-4)
 
 
-@pytest.mark.parametrize("bound", [None, "curvature", "slope"])
-def test_what_is_not_a_number_is_not_free(bound: Any) -> None:
+@pytest.mark.parametrize("enclosures", [None, "curvature", "slope"])
+def test_what_is_not_a_number_is_not_free(enclosures: Any) -> None:
     """A value that is not a number had no level above nor below it, and rays passed: a miss."""
     settings: dict[str, Any] = {"singular_points": [], "second_bound": lambda z, r: 1.0}
 
@@ -67,7 +69,7 @@ def test_what_is_not_a_number_is_not_free(bound: Any) -> None:
         hk.fields.RiemannSurface(one_is_lost, **settings),
         hk.fields.LevelCurves(lost, **settings),
     ):
-        hits = hk.trace(field, o, d, enclosures=bound, max_steps=20)
+        hits = hk.trace(field, o, d, enclosures=enclosures, max_steps=20)
         assert (hits.status == hk.RayStatus.OUT_OF_STEPS).all()
 
 

@@ -240,7 +240,7 @@ def derivatives(kernel: Any, q: Any) -> tuple[Any, Any]:
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize(
-    "bound",
+    "enclosures",
     [
         "pieces",
         *(
@@ -253,7 +253,7 @@ def derivatives(kernel: Any, q: Any) -> tuple[Any, Any]:
 @pytest.mark.parametrize("grouped", [False, True])
 @pytest.mark.parametrize("count", [40, 90])
 def test_steps_are_free_and_no_longer(
-    bound: Any, precision: Any, grouped: bool, count: int
+    enclosures: Any, precision: Any, grouped: bool, count: int
 ) -> None:
     """F stays within the gaps for the step proved, and some step is the longest possible."""
     backend = choose_backend(precision)
@@ -261,7 +261,7 @@ def test_steps_are_free_and_no_longer(
     blobs = scene(count, weights=np.linspace(1.5, -0.3, count), groups=groups)
     p, d, length = lines(250, 11)
     p, d, length = rounded(backend, p, d, length)
-    path = Ray(to_vector3(backend, p), to_vector3(backend, d), choose_enclosures(bound))
+    path = Ray(to_vector3(backend, p), to_vector3(backend, d), choose_enclosures(enclosures))
     look = blobs.prepare(backend).sample_ray(path, backend.Float(0), backend.Float(length), 0.0)
     value = to_numpy(look.sample.value).astype(np.float64)
     rng = np.random.default_rng(1)
@@ -284,7 +284,8 @@ def test_steps_are_free_and_no_longer(
         return ((f > (up + error)[:, None]) | (-f > (down + error)[:, None])).any(1)
 
     assert not leaves(1.0).any()
-    if bound in ("pieces", "quadratic-taylor") and precision == "double":  # exact to second order
+    is_exact_to_second_order = enclosures in ("pieces", "quadratic-taylor")
+    if is_exact_to_second_order and precision == "double":
         assert leaves(1.001).sum() > 3
 
 

@@ -395,9 +395,9 @@ def test_numbers_of_numpy_are_numbers() -> None:
     assert noise.value(x) == hk.solids.FractalNoise(octaves=2, seed=1).value(x)
     assert hk.solids.Julia(iterations=np.int64(5)).iterations == 5  # type: ignore[arg-type]
     ray = [[3, 0, 0]], [[-1, 0, 0]]
-    for overstep in (np.float32(1.25), np.float64(1.25), np.int64(1)):
-        hits = hk.trace(ball, *ray, over_relaxation=overstep)  # type: ignore[arg-type]
-        assert hits.t == hk.trace(ball, *ray, over_relaxation=float(overstep)).t
+    for factor in (np.float32(1.25), np.float64(1.25), np.int64(1)):
+        hits = hk.trace(ball, *ray, over_relaxation=factor)  # type: ignore[arg-type]
+        assert hits.t == hk.trace(ball, *ray, over_relaxation=float(factor)).t
     with pytest.raises(ValueError, match="finite numbers"):
         hk.Sphere(1).tapered(("a", 1), (2, 0.5))  # type: ignore[arg-type]
 

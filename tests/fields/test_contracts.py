@@ -251,14 +251,20 @@ LOOKS = ("pieces", "segment", "linear-taylor", "quadratic-taylor")
 
 
 def test_every_field_there_is_is_tested() -> None:
-    public = {one for one in (getattr(hk, name) for name in hk.__all__) if inspect.isclass(one)}
-    exported = {kind for kind in public if issubclass(kind, Field) and not inspect.isabstract(kind)}
+    namespaces = hk, hk.fields, hk.solids
+    public = {getattr(namespace, name) for namespace in namespaces for name in namespace.__all__}
+    exported = {
+        kind
+        for kind in filter(inspect.isclass, public)
+        if issubclass(kind, Field) and not inspect.isabstract(kind)
+    }
     shapes = [shape for shape, _ in SHAPES.values()]
     tested = {type(field) for field in (*FIELDS.values(), *APPROXIMATE.values(), *shapes)}
     # Those have contracts in the test files of their own.
     tested |= {hk.Blobs, hk.fields.HRBF, hk.fields.Molecule, hk.PolygonMesh, hk.solids.TubeNetwork}
     tested |= {hk.fields.RiemannSurface, hk.fields.HeightField, hk.fields.LevelCurves}
-    assert all(any(issubclass(one, kind) for one in tested) for kind in exported)
+    assert all(any(issubclass(each, kind) for each in tested) for kind in exported)
+    assert {hk.fields.Lobes, hk.fields.HypersphericalHarmonic, hk.solids.Thread} <= exported
     proofs = {
         kind
         for module in pkgutil.walk_packages(enclosures.__path__, "harnack.enclosures.")

@@ -47,12 +47,23 @@ MARKS = ("torch", "number", "vectors")
 REFUSED = r"cannot be differentiated by these numbers, which carry derivatives: detach them"
 
 
+# The package and its namespaces, but for tools of other kinds: drawing, meshing, testing.
+NAMESPACES = (hk, hk.fields, hk.solids, hk.kernels, hk.proofs, hk.math, hk.io, hk.distance,
+              hk.printing, hk.live, hk.tracer)  # fmt: skip
+PUBLIC: dict[str, Any] = {
+    name: getattr(namespace, name) for namespace in NAMESPACES for name in namespace.__all__
+}
+
+
 def public_classes(kind: type) -> list[type]:
-    # `harnack` has a name only once it is asked for.
-    names = [(hk, name) for name in hk.__all__] + [(geometry, name) for name in vars(geometry)]
-    found = {one for place in names if inspect.isclass(one := getattr(*place))}
-    chosen = (one for one in found if issubclass(one, kind) and not inspect.isabstract(one))
-    return sorted(chosen, key=lambda one: one.__name__)
+    classes = {value for value in (*PUBLIC.values(), *vars(geometry).values()) if is_class(value)}
+    chosen = (each for each in classes if issubclass(each, kind) and not inspect.isabstract(each))
+    return sorted(chosen, key=lambda each: each.__name__)
+
+
+def is_class(value: object) -> bool:
+    # Python 3.10 calls generic aliases, such as list[int], classes.
+    return inspect.isclass(value) and not hasattr(value, "__origin__")
 
 
 def arguments(function: Callable[..., Any]) -> list[str]:
@@ -105,32 +116,40 @@ SPHERE = hk.Sphere(0.8)
 ORIGINS, DIRECTIONS = POINTS + np.array([0, 0, 3.0]), np.tile([0, 0, -1.0], (4, 1))
 GIVEN: dict[str, Any] = {
     "field": SPHERE,
+    "surface": SPHERE,
     "function": lambda x, y, z: x * x + y * y + z * z - 1,
     "points": POINTS,
     "origins": ORIGINS,
     "directions": DIRECTIONS,
     "solids": SPHERE,
+    "seeds": POINTS,
+    "step": 0.1,
+    "length": 1.0,
+    "max_crossings": 2,
 }
 # What results have derivatives by, or do not depend on: where rays begin and end moves no hit.
-WITH_DERIVATIVES = {
-    ("trace", "field"), ("level_set", "field"), ("trace", "origins"), ("trace", "directions"),
-    ("trace", "level"), ("level_set", "level"), ("trace", "t_min"), ("trace", "t_max"),
-}  # fmt: skip
-# Functions of any numbers, of solids, and of scenes and files, whose results carry nothing.
+WITH_DERIVATIVES = {("Surface", "field"), ("Surface", "level")} | {
+    (name, argument)
+    for name in ("trace", "crossings")
+    for argument in ("surface", "origins", "directions", "level", "t_min", "t_max")
+}
+# Functions of any numbers, of solids, and of scenes and files, whose results carry nothing; and
+# those of names and of surfaces that are already checked.
 OTHERS = {
     "atan2", "maximum", "minimum", "norm", "union", "intersection", "animate", "render", "page",
     "check_print", "mesh", "read_scene", "repair", "view", "wall_thickness",
-    "wrap_for_jax", "wrap_for_torch", "write_scene",
+    "wrap_for_jax", "wrap_for_torch", "write_scene", "choose_enclosures", "field_from_file",
+    "traced_surface",
 }  # fmt: skip
 FUNCTIONS = {
-    name: getattr(hk, name)
-    for name in hk.__all__
-    if inspect.isfunction(getattr(hk, name)) and name not in OTHERS
-}
+    name: value
+    for name, value in PUBLIC.items()
+    if inspect.isfunction(value) and name not in OTHERS
+} | {"Surface": hk.Surface, "TraceOptions": hk.TraceOptions}
 # Settings that are no numbers of the result: names, counts, switches, and volumes.
 SETTINGS = {
-    "precision", "max_steps", "largest", "confirm", "all_hits", "bound", "method", "progress",
-    "is_convex", "clip", "section", "backend",
+    "precision", "max_steps", "largest", "side", "require_crossing", "max_crossings", "enclosures",
+    "method", "progress", "is_convex", "clip", "section", "backend", "options",
 }  # fmt: skip
 
 
@@ -141,19 +160,19 @@ def test_functions_refuse_each_argument_that_carries_derivatives(name: str) -> N
     for argument in parameters:
         if argument in SETTINGS:
             continue
-        given = {
-            one: GIVEN[one]
-            for one, about in parameters.items()
-            if about.default is about.empty and one in GIVEN
+        required = {
+            other: GIVEN[other]
+            for other, about in parameters.items()
+            if about.default is about.empty and other in GIVEN
         }
         for mark in MARKS:
-            is_field = argument == "field"
+            is_field = argument in ("field", "surface")
             if (name, argument) in WITH_DERIVATIVES and (is_field or mark != "torch"):
                 continue
             value = moved_curve() if is_field else learned(mark)
             value = (value, 1.0) if argument == "solid" else value
             with pytest.raises(NotImplementedError, match=REFUSED):
-                function(**{**given, argument: value})
+                function(**{**required, argument: value})
             refused += 1
     assert refused
 
@@ -168,33 +187,34 @@ def moved_curve() -> hk.SolidAngle:
 PARTS: dict[str, tuple[dict[str, Any], Callable[[Any], Any]]] = {
     "PlaneWave": (
         {"amplitude": 1.0, "wave_vector": (1.0, 2.0, 3.0)},
-        lambda one: hk.fields.EigenfunctionSum([one]),
+        lambda wave: hk.fields.EigenfunctionSum([wave]),
     ),
     "WaveProduct": (
         {"amplitude": 1.0, "x": hk.fields.sine_factor(2.0)},
-        lambda one: hk.fields.EigenfunctionSum([one]),
+        lambda wave: hk.fields.EigenfunctionSum([wave]),
     ),
     "BranchPoint": (
         {"location": 0j},
-        lambda one: hk.fields.RiemannSurface("sqrt", singular_points=[one]),
+        lambda point: hk.fields.RiemannSurface("sqrt", singular_points=[point]),
     ),
-    "Circle": ({"radius": 1.0}, lambda one: hk.SolidAngle([one])),
+    "Circle": ({"radius": 1.0}, lambda circle: hk.SolidAngle([circle])),
     **{
-        name: ({}, lambda one: hk.Blobs(POINTS, 0.5, kernel=one))
+        name: ({}, lambda kernel: hk.Blobs(POINTS, 0.5, kernel=kernel))
         for name in ("CompactKernel", "CubicKernel", "GaussianKernel", "SexticKernel")
     },
 }
 # Records of settings, results and pictures, and proofs.
-NO_PARTS = {"RayCrossings", "Camera", "CurvatureSamples", "DistanceBounds", "Hits", "Isolines",
-            "Surface", "PrintCheck", "PrintProblem", "Sample", "SceneFile", "Slider",
+NO_PARTS = {"JumpCrossing", "LevelGaps", "MarchResult", "SurfaceTracer", "TraceOptions",
+            "TracedSurface", "RayCrossings", "Camera", "CurvatureSamples", "DistanceBounds", "Hits",
+            "Isolines", "Surface", "PrintCheck", "PrintProblem", "Sample", "SceneFile", "Slider",
             "WallThickness", "HitTolerance", "LiveView"}  # fmt: skip
 
 
 def test_the_list_of_records_is_whole() -> None:
     records = {
         name
-        for name in hk.__all__
-        if inspect.isclass(kind := getattr(hk, name)) and dataclasses.is_dataclass(kind)
+        for name, kind in (PUBLIC | {"Circle": geometry.Circle}).items()
+        if is_class(kind) and dataclasses.is_dataclass(kind)
         and not issubclass(kind, hk.Field | Volume | Enclosure | Promise)
     }  # fmt: skip
     assert records - NO_PARTS <= set(PARTS)
@@ -202,9 +222,10 @@ def test_the_list_of_records_is_whole() -> None:
 
 @pytest.mark.parametrize("name", PARTS)
 def test_records_with_derivatives_are_refused_by_the_field_at_the_latest(name: str) -> None:
-    (given, made), tried = PARTS[name], 0
-    for argument, about in inspect.signature(getattr(hk, name)).parameters.items():
-        example = given.get(argument, about.default)
+    (example_arguments, field_of), tried = PARTS[name], 0
+    record = PUBLIC.get(name) or getattr(geometry, name)
+    for argument, about in inspect.signature(record).parameters.items():
+        example = example_arguments.get(argument, about.default)
         if isinstance(example, tuple):
             value: Any = (Learned(example[0]), *example[1:])
         elif isinstance(example, float | complex):
@@ -212,7 +233,7 @@ def test_records_with_derivatives_are_refused_by_the_field_at_the_latest(name: s
         else:
             continue
         with pytest.raises(NotImplementedError, match="carry derivatives"):
-            made(getattr(hk, name)(**{**given, argument: value}))
+            field_of(record(**{**example_arguments, argument: value}))
         tried += 1
     assert tried
 
@@ -223,8 +244,8 @@ def test_records_with_derivatives_are_refused_by_the_field_at_the_latest(name: s
 def objective(result: Any, weights: np.ndarray) -> Any:
     """A number made of all lanes of a result: floats, or vectors of them."""
     total = 0
-    for one in result if dr.depth_v(result) == 2 else [result]:
-        total = total + dr.sum(dr.select(dr.isfinite(one), one, 0) * DOUBLE.Float(weights))
+    for floats in result if dr.depth_v(result) == 2 else [result]:
+        total = total + dr.sum(dr.select(dr.isfinite(floats), floats, 0) * DOUBLE.Float(weights))
     return total
 
 
@@ -237,7 +258,7 @@ SOURCES: dict[str, np.ndarray] = {
 }
 
 
-def traced(all_hits: int | None, source: str, values: np.ndarray, *, enabled: bool) -> Any:
+def traced(max_crossings: int | None, source: str, values: np.ndarray, *, enabled: bool) -> Any:
     arrays: dict[str, Any] = {}
     for name, default in SOURCES.items():
         numbers = values if name == source else default
@@ -247,43 +268,45 @@ def traced(all_hits: int | None, source: str, values: np.ndarray, *, enabled: bo
         arrays[name] = of
     field = hk.SolidAngle(arrays["vertices"])
     rays, level = (arrays["origins"], arrays["directions"]), arrays["level"]
-    settings = {"level": level, "tolerance": 1e-11, "all_hits": all_hits}
-    return arrays[source], hk.trace(field, *rays, **settings)
+    settings: dict[str, Any] = {"level": level, "tolerance": 1e-11}
+    if max_crossings is None:
+        return arrays[source], hk.trace(field, *rays, **settings)
+    return arrays[source], hk.crossings(field, *rays, max_crossings=max_crossings, **settings)
 
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("source", SOURCES)
-@pytest.mark.parametrize("all_hits", [None, 1])
+@pytest.mark.parametrize("max_crossings", [None, 1])
 def test_each_result_of_a_trace_has_its_derivative_or_refuses_it(
-    source: str, all_hits: int | None
+    source: str, max_crossings: int | None
 ) -> None:
     """By the sum of all entries of a result, moved along a random direction: right, and not zero;
     or an error by name in reverse, and NaN in forward mode."""
     start = SOURCES[source]
     motion = np.random.default_rng(1).normal(size=start.shape)
-    given, hits = traced(all_hits, source, start, enabled=True)
+    array, hits = traced(max_crossings, source, start, enabled=True)
     h = 1e-5
-    ends = [traced(all_hits, source, start + s * motion, enabled=False)[1] for s in (h, -h)]
+    ends = [traced(max_crossings, source, start + s * motion, enabled=False)[1] for s in (h, -h)]
     right = set()
     for name, result in vars(hits).items():
         if not dr.is_float_v(result):
             assert not dr.grad_enabled(result)
             continue
         assert dr.grad_enabled(result)
-        change = [objective(getattr(one, name), WEIGHTS)[0] for one in ends]
+        change = [objective(getattr(end, name), WEIGHTS)[0] for end in ends]
         expected = (change[0] - change[1]) / (2 * h)
-        dr.set_grad(given, 0)
+        dr.set_grad(array, 0)
         if name not in ("t", "position"):
             with pytest.raises(NotImplementedError, match=f"^{name} of hits cannot be diff"):
                 dr.backward(objective(result, WEIGHTS), dr.ADFlag.ClearInterior)
             continue
         dr.backward(objective(result, WEIGHTS), dr.ADFlag.ClearInterior)
-        found = np.array(dr.grad(given)).T.reshape(motion.shape)
+        derivative = np.array(dr.grad(array)).T.reshape(motion.shape)
         assert abs(expected) > 1e-3
-        assert (found * motion).sum() == pytest.approx(expected, rel=1e-5)
+        assert (derivative * motion).sum() == pytest.approx(expected, rel=1e-5)
         right.add(name)
     assert right == {"t", "position"}
-    given, hits = traced(all_hits, source, start, enabled=True)
-    dr.forward(given)
+    array, hits = traced(max_crossings, source, start, enabled=True)
+    dr.forward(array)
     assert np.isnan(np.array(hits.normal.grad)).all()
     assert np.isfinite(np.array(hits.t.grad)).all()

@@ -220,8 +220,8 @@ PRECISIONS = ["double", "single"]
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("bound", [None, "caps", "slope"])
-def test_rays_by_zeros_of_high_order_arrive(bound: str | None, precision: Any) -> None:
+@pytest.mark.parametrize("enclosures", [None, "caps", "slope"])
+def test_rays_by_zeros_of_high_order_arrive(enclosures: str | None, precision: Any) -> None:
     """Of rays through the origin 97 % ran out of steps in double precision."""
     for field in (hk.SphericalHarmonic(9, 9), hk.SphericalHarmonic(12, 6)):
         for kind, most in (
@@ -231,26 +231,28 @@ def test_rays_by_zeros_of_high_order_arrive(bound: str | None, precision: Any) -
             ("by the axis", 6),
         ):
             o, d = rays(kind, 2000, 3)
-            hits = hk.trace(field, o, d, enclosures=bound, precision=precision)
+            hits = hk.trace(field, o, d, enclosures=enclosures, precision=precision)
             spent = hits.status == hk.RayStatus.OUT_OF_STEPS
             assert spent.sum() <= most, (kind, field.l)
 
 
-@pytest.mark.parametrize("bound", [None, "caps"])
-def test_the_axis_of_high_order_may_be_any(bound: str | None) -> None:
+@pytest.mark.parametrize("enclosures", [None, "caps"])
+def test_the_axis_of_high_order_may_be_any(enclosures: str | None) -> None:
     o, d = rays("by the axis", 2000, 4)
     turned = [np.roll(one, 1, axis=1) for one in (o, d)]  # z becomes x
-    hits = hk.trace(POLYNOMIALS["about x"], *turned, enclosures=bound, precision="double")
+    hits = hk.trace(POLYNOMIALS["about x"], *turned, enclosures=enclosures, precision="double")
     assert (hits.status != hk.RayStatus.OUT_OF_STEPS).all()
     assert hits.evaluations.mean() < 90
 
 
-@pytest.mark.parametrize("bound", [None, "caps"])
-def test_levels_beside_that_of_the_zero_are_reached(bound: str | None) -> None:
+@pytest.mark.parametrize("enclosures", [None, "caps"])
+def test_levels_beside_that_of_the_zero_are_reached(enclosures: str | None) -> None:
     """Rays that start at the zero, where the balls for level 0 have no room."""
     field = hk.SphericalHarmonic(9, 9)
     d = rays("origin", 300, 5)[1]
-    hits = hk.trace(field, np.zeros((1, 3)), d, level=0.05, enclosures=bound, precision="double")
+    hits = hk.trace(
+        field, np.zeros((1, 3)), d, level=0.05, enclosures=enclosures, precision="double"
+    )
     assert (hits.status != hk.RayStatus.OUT_OF_STEPS).all()
     assert hits.is_hit.sum() > 10
     assert np.abs(sample_field(field, hits.position[hits.is_hit]).value - 0.05).max() < 1e-3
@@ -274,7 +276,7 @@ def test_single_precision_hits_are_as_close_as_documented(l: int, m: int) -> Non
 
 @pytest.mark.few(3)
 @pytest.mark.parametrize(
-    "bound",
+    "enclosures",
     [
         HarnackEnclosure,
         HarnackSlopeEnclosure,
@@ -283,8 +285,8 @@ def test_single_precision_hits_are_as_close_as_documented(l: int, m: int) -> Non
         TaylorEnclosure,
     ],
 )
-def test_no_level_lies_within_a_step_near_the_zeros(bound: Any) -> None:
-    assert check_steps(POLYNOMIALS["(12, -6)"], bound, count=150) > 0
+def test_no_level_lies_within_a_step_near_the_zeros(enclosures: Any) -> None:
+    assert check_steps(POLYNOMIALS["(12, -6)"], enclosures, count=150) > 0
 
 
 @pytest.mark.parametrize("precision", ["single", "double"])

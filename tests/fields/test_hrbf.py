@@ -99,8 +99,8 @@ def test_ranges_hold_and_are_attained(precision: Any) -> None:
 
 
 @pytest.mark.parametrize("precision", ["single", "double"])
-@pytest.mark.parametrize("bound", [None, "quadratic-taylor", "segment"])
-def test_first_hits(precision: Any, bound: Any) -> None:
+@pytest.mark.parametrize("enclosures", [None, "quadratic-taylor", "segment"])
+def test_first_hits(precision: Any, enclosures: Any) -> None:
     f = surface()
     rng = np.random.default_rng(0)
     o = rng.normal(size=(300, 3))
@@ -108,11 +108,11 @@ def test_first_hits(precision: Any, bound: Any) -> None:
     d = rng.uniform(-1, 1, (300, 3)) - o
     d /= np.linalg.norm(d, axis=1)[:, None]
     o, d = (one.astype(np.float32).astype(np.float64) for one in (o, d))
-    hits = hk.trace(f, o, d, precision=precision, enclosures=bound)
+    hits = hk.trace(f, o, d, precision=precision, enclosures=enclosures)
     assert (hits.status != hk.RayStatus.OUT_OF_STEPS).all()
     found = hits.status == hk.RayStatus.HIT
     assert 0.6 < found.mean() < 0.95
-    if bound is None:
+    if enclosures is None:
         assert np.mean(hits.evaluations) < 10
     low, high = f.domain.bounds()  # type: ignore[union-attr]
     enter = np.minimum((low - o) / d, (high - o) / d).max(1)

@@ -181,7 +181,7 @@ def test_what_evaluate_must_return_is_said_at_first_use(name: str, use: str) -> 
     }
     with pytest.raises(TypeError, match=message) as raised:
         uses[use]()
-    assert "return harnack.fields.Sample(value, gradient, promises)" in str(raised.value)
+    assert "return harnack.proofs.Sample(value, gradient, promises)" in str(raised.value)
 
 
 class Charge(Field):
@@ -196,23 +196,25 @@ class Charge(Field):
 
 
 @pytest.mark.parametrize(
-    ("field", "bound", "some"),
+    ("field", "enclosures", "some"),
     [
         (hk.SolidAngle(example_curves.wavy_polygon(20)), "lipschitz", {"curvature", "caps"}),
         (Bell(bent, 1.0, 2.0), "caps", {"curvature"}),
         (Charge(), "lipschitz", {"slope", "classic"}),
     ],
 )
-def test_bounds_that_do_not_apply_name_those_that_do(
-    field: Field, bound: str, some: set[str]
+def test_enclosures_that_do_not_apply_name_those_that_do(
+    field: Field, enclosures: str, some: set[str]
 ) -> None:
     """Namely all whose sharpest proof makes steps of the promises."""
-    with pytest.raises(ValueError, match=r"promises .*; choose .*, or leave bound=None") as raised:
-        hk.trace(field, *RAY, enclosures=bound)
+    message = r"promises .*; choose .*, or leave enclosures out"
+    with pytest.raises(ValueError, match=message) as raised:
+        hk.trace(field, *RAY, enclosures=enclosures)
     named = set(re.findall(r'"(.+?)"', str(raised.value)))
     assert named >= some
     for name in ENCLOSURE_NAMES:
-        with nullcontext() if name in named else pytest.raises(ValueError, match="no bound appl"):
+        refusal = pytest.raises(ValueError, match="no enclosure applies")
+        with nullcontext() if name in named else refusal:
             hk.trace(field, *RAY, enclosures=choose_enclosures(name).kinds[0])
 
 

@@ -101,7 +101,7 @@ def test_a_sheet_is_kept() -> None:
     assert result.metadata["harnack"]["made_by"] == "faces"
     half = hk.mesh(field(original), clip=hk.HalfSpace((1, 0, 0), 0.0))
     assert half.area == pytest.approx(original.area / 2, rel=0.03)
-    with pytest.raises(hk.MeshingError, match="choose a larger max_triangles"):
+    with pytest.raises(hk.MeshingError, match="choose a larger `max_triangles`"):
         hk.mesh(field(original), max_triangles=20)
     with pytest.raises(hk.MeshingError, match="nothing is inside"):
         hk.mesh(field(original), level=0.5, side="above")

@@ -402,9 +402,9 @@ def test_what_a_polygon_mesh_is_not() -> None:
         mesh.value([[0, 0, 0]])
     with pytest.raises(TypeError, match="no level set of one function"):
         hk.signed_distance(mesh, [[0, 0, 1.0]])
-    with pytest.raises(NotImplementedError, match="all_hits takes one function"):
+    with pytest.raises(NotImplementedError, match="crossings takes one function"):
         hk.crossings(mesh, o, d, max_crossings=2)
-    with pytest.raises(NotImplementedError, match="confirm takes one function"):
+    with pytest.raises(NotImplementedError, match="require_crossing takes one function"):
         hk.trace(mesh, o, d, require_crossing=True)
     with pytest.raises(ValueError, match="multiple of 4 pi"):
         hk.trace(mesh, o, d, level=0.0)

@@ -531,16 +531,16 @@ def compare(field: ScreenedWindingNumber, level: float, seed: int, **options: An
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize(
-    ("length", "bound"),
+    ("length", "enclosures"),
     [(0.15, None), (0.6, None), (50.0, None), (0.6, "slope"), (50.0, "classic")],
 )
-def test_first_hits(length: float, bound: str | None) -> None:
+def test_first_hits(length: float, enclosures: str | None) -> None:
     rng = np.random.default_rng(12)
     hits = 0
     for cloud in (sphere_cloud(rng, 150), torus_cloud(rng, 200), soup(rng, 20)):
         field = field_of(cloud, length)
         for level in (field.default_level, 0.4):
-            hits += compare(field, level, int(rng.integers(1000)), enclosures=bound)
+            hits += compare(field, level, int(rng.integers(1000)), enclosures=enclosures)
     assert hits > 60
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -246,12 +247,13 @@ def test_the_extent_holds_every_hit_found_without_it(name: str, level: float) ->
     rng = np.random.default_rng(6)
     o = 4.0 * unit(rng.normal(size=(1500, 3)))
     d = unit(rng.uniform(-1.2, 1.2, (1500, 3)) - o)
-    free = hk.trace(Unbounded(loops), o, d, level=level, t_max=9.0, max_steps=500)
+    settings: dict[str, Any] = {"level": level, "tolerance": 1e-4}
+    free = hk.trace(Unbounded(loops), o, d, t_max=9.0, max_steps=500, **settings)
     assert free.is_hit.sum() > 200
     extent = hk.SolidAngle(loops).extent((level,))
     assert extent is not None
     assert extent.padded(1e-3).contains_points(free.position[free.is_hit]).all()
-    bounded = hk.trace(hk.SolidAngle(loops), o, d, level=level)
+    bounded = hk.trace(hk.SolidAngle(loops), o, d, **settings)
     # Rays that graze the border within the tolerance may go either way.
     assert (bounded.is_hit & ~free.is_hit).sum() + (free.is_hit & ~bounded.is_hit).sum() <= 3
     both = bounded.is_hit & free.is_hit
@@ -335,15 +337,16 @@ def test_edges_run_both_ways_are_not_there(name: str, precision: str) -> None:
     o, d = rays_beside(edge, 4000)
     field, other = hk.SolidAngle(loops), hk.SolidAngle(net)
     assert field.convex_position == other.convex_position
-    found = hk.trace(field, o, d, precision=precision)
-    expected = hk.trace(other, o, d, precision=precision)
+    hits, expected = (
+        hk.trace(curve, o, d, tolerance=1e-4, precision=precision) for curve in (field, other)
+    )
     assert (expected.status != int(hk.RayStatus.OUT_OF_STEPS)).all()
-    assert (found.status != int(hk.RayStatus.OUT_OF_STEPS)).all()
-    assert (found.is_hit != expected.is_hit).sum() <= 4  # graze within the tolerance
-    both = found.is_hit & expected.is_hit
-    assert np.quantile(np.abs(found.t[both] - expected.t[both]), 0.99) < 1e-3
+    assert (hits.status != int(hk.RayStatus.OUT_OF_STEPS)).all()
+    assert (hits.is_hit != expected.is_hit).sum() <= 4  # graze within the tolerance
+    both = hits.is_hit & expected.is_hit
+    assert np.quantile(np.abs(hits.t[both] - expected.t[both]), 0.99) < 1e-3
     # And by an oracle of its own: the field is near the level where it hits.
-    look = CurveOracle(net)(found.position[found.is_hit].astype(float))
+    look = CurveOracle(net)(hits.position[hits.is_hit].astype(float))
     gap = gap_to_levels(look.value, [2 * math.pi], FOUR_PI)
     assert (gap <= 3e-4 * look.gradient_norm).all()
     backend = choose_backend(precision)  # type: ignore[arg-type]
@@ -388,8 +391,8 @@ def test_a_curve_that_cancels_as_a_whole_has_no_surface(
     o, d = aimed_at(NOTHING[name], 300)
     o[:3], d[:3] = [0, 0, 0], np.eye(3)  # on the curve
     for level in (2 * math.pi, 0.5):
-        for bound in (None, "classic", "slope"):
-            end = hk.trace(field, o, d, level=level, precision=precision, enclosures=bound)
+        for enclosures in (None, "classic", "slope"):
+            end = hk.trace(field, o, d, level=level, precision=precision, enclosures=enclosures)
             assert (end.status == int(hk.RayStatus.MISS)).all()
     far = hk.trace(Unbounded(NOTHING[name]), o, d, precision=precision)
     assert (far.status == int(hk.RayStatus.MISS)).all()

@@ -242,11 +242,13 @@ def test_many_rays_and_crossings() -> None:
     hits = compare(mesh, *rays(mesh, 6000, 9))  # so many that a grid of empty cells is made
     assert hits.is_hit.mean() > 0.3
     o, d = rays(mesh, 300, 2)
-    for settings in ({"all_hits": 6}, {"confirm": True}):
-        one, other = (hk.trace(soup(mesh, cells), o, d, **settings) for cells in (True, False))
-        there = np.isfinite(one.t) & np.isfinite(other.t)
-        assert (np.isfinite(one.t) == np.isfinite(other.t)).mean() > 0.98
-        assert (np.abs(one.t[there] - other.t[there]) > 1e-3).mean() < 0.02
+    fields = [soup(mesh, cells) for cells in (True, False)]
+    crossings = [hk.crossings(field, o, d, max_crossings=6).t for field in fields]
+    first = [hk.trace(field, o, d, require_crossing=True).t for field in fields]
+    for t, plain_t in (crossings, first):
+        there = np.isfinite(t) & np.isfinite(plain_t)
+        assert (np.isfinite(t) == np.isfinite(plain_t)).mean() > 0.98
+        assert (np.abs(t[there] - plain_t[there]) > 1e-3).mean() < 0.02
 
 
 def test_moved_soups_have_cells_of_their_own() -> None:

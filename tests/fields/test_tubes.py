@@ -109,10 +109,13 @@ def test_tubes_are_seen_in_solids_without_bounds(name: str, precision: Any) -> N
     """The infinite length looked ahead, times a slope of 0, hid them: 0 inf is no number."""
     solid, t = _in_unbounded_solids()[name]
     o, d = [[0.3, 0.02, 2.0]], [[0.0, 0.0, -1.0]]
-    cut = {"clip": hk.HalfSpace((1, 0, 0), 5.0)}
-    for options in ({}, {"confirm": True}, {"all_hits": 4}, cut, {"t_max": 100.0}):
-        found = hk.trace(solid, o, d, precision=precision, **options)
-        assert float(np.ravel(found.t)[0]) == pytest.approx(t, abs=2e-4), options
+    cut: dict[str, Any] = {"clip": hk.HalfSpace((1, 0, 0), 5.0)}
+    settings: dict[str, Any] = {"precision": precision, "tolerance": 1e-4}
+    for options in ({}, {"require_crossing": True}, cut, {"t_max": 100.0}):
+        hits = hk.trace(solid, o, d, **settings, **options)
+        assert hits.t[0] == pytest.approx(t, abs=2e-4), options
+    crossings = hk.crossings(solid, o, d, max_crossings=4, **settings)
+    assert crossings.t[0, 0] == pytest.approx(t, abs=2e-4)
     misses = hk.trace(solid, o, [[0.0, 0.1, 1.0]], precision=precision)
     assert misses.status[0] == hk.RayStatus.MISS
     assert misses.evaluations[0] < 10

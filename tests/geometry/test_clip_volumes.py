@@ -35,6 +35,11 @@ def tetrahedron() -> np.ndarray:
     return np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 
 
+def half_space_through(point: np.ndarray) -> HalfSpace:
+    normal = np.array([1.0, -2.0, 0.5])
+    return HalfSpace(tuple(normal), float(point @ normal / np.linalg.norm(normal)))
+
+
 def make_volume(kind: str, shift: np.ndarray, scale: float) -> Volume:
     rng = np.random.default_rng(7)
     c = tuple(shift)
@@ -47,7 +52,7 @@ def make_volume(kind: str, shift: np.ndarray, scale: float) -> Volume:
             far = np.array([np.inf, np.inf, scale])
             return Box(tuple(shift - far), tuple(shift + far))
         case "half-space":
-            return HalfSpace((1.0, -2.0, 0.5), float(np.dot(shift, (1, -2, 0.5))))
+            return half_space_through(shift)
         case "tetrahedron":
             return ConvexHull.from_points(shift + scale * tetrahedron())
         case "round hull":
@@ -57,8 +62,7 @@ def make_volume(kind: str, shift: np.ndarray, scale: float) -> Volume:
         case "rod":
             return ConvexHull.from_points(shift + scale * sphere_points(rng, 20) * [0, 1, 0])
         case "cut ball":
-            cut = float(np.dot(shift, (1, -2, 0.5)))
-            return VolumeIntersection([Ball(c, scale), HalfSpace((1.0, -2.0, 0.5), cut)])
+            return VolumeIntersection([Ball(c, scale), half_space_through(shift)])
     raise AssertionError(kind)
 
 
@@ -354,6 +358,13 @@ def test_flat_and_straight_sets_get_thin_hulls():
     rod = ConvexHull.from_points(np.outer([0.0, 0.5, 2.0], [1.0, 1.0, 0.0]))
     assert rod.contains_points([[0.7, 0.7, 0.0]])[0]
     assert not rod.contains_points([[0.7, 0.7, 1e-4], [0.7, 0.71, 0], [2.1, 2.1, 0]]).any()
+
+
+def test_the_offset_of_a_half_space_is_a_distance_whatever_the_length_of_its_normal():
+    half_space = HalfSpace((0, 0, 2), 1.0)
+    assert half_space == HalfSpace((0, 0, 1), 1.0)
+    assert list(half_space.contains_points([[7, 8, 0.99], [7, 8, 1.01]])) == [True, False]
+    assert half_space.padded(0.5).planes().tolist() == [[0.0, 0.0, 1.0, 1.5]]
 
 
 @pytest.mark.parametrize(

@@ -48,17 +48,17 @@ def test_nothing_is_changed_where_there_is_nothing_in_common() -> None:
 def test_what_is_added_and_cut_away_again_is_not_made(hole: hk.solids.Solid) -> None:
     """Triangles of the rod passed through others, which was refused, or left a crumb."""
     shell = BALL.shell(0.2)
-    made = hk.mesh((shell | hole) - hole, tolerance=5e-3)  # of the rod, which is longer
-    expected = hk.mesh(shell - hole, tolerance=1e-2)
-    facts = [one.metadata["harnack"] for one in (made, expected)]
+    mesh = hk.mesh((shell | hole) - hole, tolerance=2e-2)
+    expected = hk.mesh(shell - hole, tolerance=2e-2)
+    facts = [part.metadata["harnack"] for part in (mesh, expected)]
     assert facts[0]["euler_characteristic"] == facts[1]["euler_characteristic"]
-    assert made.body_count == expected.body_count
-    assert made.volume == pytest.approx(expected.volume, rel=2e-2)
+    assert mesh.body_count == expected.body_count
+    assert mesh.volume == pytest.approx(expected.volume, rel=2e-2)
 
 
 def test_of_what_is_cut_away_whole_nothing_is_left() -> None:
     with pytest.raises(hk.MeshingError, match="empty"):
-        hk.mesh((ROD | NEAR) - ROD - NEAR, tolerance=1e-2)
+        hk.mesh((ROD | NEAR) - ROD - NEAR, tolerance=8e-2)
 
 
 def test_of_a_hollow_part_the_hollow_is_cut_away() -> None:
@@ -77,15 +77,15 @@ def test_of_a_hollow_part_the_hollow_is_cut_away() -> None:
 
 def test_the_surface_of_a_hollow_part_stays_as_it_was_given() -> None:
     """Each triangle is there once, though part and shell both have it."""
-    given = example_meshes.torus_mesh(1.0, 0.5, 24, 12)
-    part = hk.solid(given)
+    torus = example_meshes.torus_mesh(1.0, 0.5, 24, 12)
+    part = hk.solid(torus)
     hollow = part.shell(0.15) | (part & hk.solid(hk.Gyroid(1.0), between=(-0.3, 0.3)))
-    made = hk.mesh(hollow, tolerance=5e-3)
-    assert made.is_watertight
-    on_it = np.abs(part.value(np.asarray(made.triangles_center), precision="double")) < 1e-9
+    mesh = hk.mesh(hollow, tolerance=1.5e-2)
+    assert mesh.is_watertight
+    on_it = np.abs(part.value(np.asarray(mesh.triangles_center), precision="double")) < 1e-9
 
     def as_sets(corners: np.ndarray) -> set[frozenset[tuple[float, ...]]]:
-        return {frozenset(map(tuple, one.tolist())) for one in corners}
+        return {frozenset(map(tuple, triangle.tolist())) for triangle in corners}
 
-    assert on_it.sum() == len(given[1])
-    assert as_sets(np.asarray(made.triangles)[on_it]) == as_sets(given[0][given[1]])
+    assert on_it.sum() == len(torus[1])
+    assert as_sets(np.asarray(mesh.triangles)[on_it]) == as_sets(torus[0][torus[1]])

@@ -48,6 +48,10 @@ def loops_of(name: str) -> list[np.ndarray]:
     return given if isinstance(given, list) else [given]
 
 
+def longest_side(loops: list[np.ndarray]) -> float:
+    return float(np.ptp(np.concatenate(loops), axis=0).max())
+
+
 def undirected(edges: Any) -> set[tuple[int, int]]:
     return {(min(a, b), max(a, b)) for a, b in np.asarray(edges).tolist()}
 
@@ -74,7 +78,7 @@ def check_surface(mesh: Any, loops: list[np.ndarray], expected: int) -> None:
 @pytest.mark.parametrize("name", named(QUICK))
 def test_surfaces_of_curves_end_at_the_curve(name: str) -> None:
     loops, expected = loops_of(name), CURVES[name][1]
-    mesh = hk.mesh(hk.SolidAngle(loops), tolerance=2e-3)
+    mesh = hk.mesh(hk.SolidAngle(loops), tolerance=2e-3 * longest_side(loops))
     check_surface(mesh, loops, expected)
     assert mesh.body_count == 1
     facts = mesh.metadata["harnack"]
@@ -129,8 +133,9 @@ def test_topology_does_not_depend_on_place_or_spacing(name: str, seed: int) -> N
     rng = np.random.default_rng(seed)
     turn, move = Rotation.random(random_state=rng).as_matrix(), rng.uniform(-0.5, 0.5, 3)
     loops = [loop @ turn.T + move for loop in loops_of(name)]
+    tolerance = 4e-3 * longest_side(loops)
     for spacing in (None, 0.09):
-        mesh = hk.mesh(hk.SolidAngle(loops), cell_size=spacing, seed=seed, tolerance=4e-3)
+        mesh = hk.mesh(hk.SolidAngle(loops), cell_size=spacing, seed=seed, tolerance=tolerance)
         check_surface(mesh, loops, CURVES[name][1])
 
 
@@ -138,9 +143,9 @@ def test_topology_does_not_depend_on_place_or_spacing(name: str, seed: int) -> N
 @pytest.mark.parametrize(
     ("name", "tolerance", "hits"),
     [
-        ("wavy", 2e-3, 1500),
-        pytest.param("trefoil", 1e-3, 20_000, marks=pytest.mark.slow),
-        pytest.param("coil", 1e-3, 20_000, marks=pytest.mark.slow),
+        ("wavy", 4e-3, 1500),
+        pytest.param("trefoil", 3.2e-3, 20_000, marks=pytest.mark.slow),
+        pytest.param("coil", 3.4e-3, 20_000, marks=pytest.mark.slow),
     ],
 )
 def test_mesh_and_surface_are_within_the_tolerance(name: str, tolerance: float, hits: int) -> None:
@@ -153,22 +158,21 @@ def test_mesh_and_surface_are_within_the_tolerance(name: str, tolerance: float, 
     assert facts["evaluations"] < (1_500_000 if name == "coil" else 300_000)
     assert len(mesh.faces) < 25_000
     assert fifth_percentile_of_angles(mesh) >= 25
-    reach = tolerance * float(np.ptp(mesh.bounds, axis=0).max())
     points = np.asarray(mesh.sample(max(hits, 5000), seed=0))
     seen = CurveOracle(loops)(points)
-    points, slope = points[seen.smooth > reach], seen.gradient[seen.smooth > reach]
-    step = reach * slope / np.linalg.norm(slope, axis=1)[:, None]
+    points, slope = points[seen.smooth > tolerance], seen.gradient[seen.smooth > tolerance]
+    step = tolerance * slope / np.linalg.norm(slope, axis=1)[:, None]
     ends = [CurveOracle(loops)(points + sign * step).value - 2 * math.pi for sign in (-1, 1)]
     below, above = (end - PERIOD * np.round(end / PERIOD) for end in ends)
     assert ((below < 0) & (above > 0) & (above - below < 0.5 * PERIOD)).all()
-    found = np.zeros((0, 3))
-    while len(found) < hits:
+    hit_points = np.zeros((0, 3))
+    while len(hit_points) < hits:
         direction = rng.normal(size=(hits, 3))
         origin = 4 * direction / np.linalg.norm(direction, axis=1)[:, None]
         aim = rng.uniform(-1.0, 1.0, origin.shape)
         seen_by = hk.trace(field, origin, aim - origin)
-        found = np.concatenate([found, seen_by.position[seen_by.is_hit]])
-    assert distances(mesh, found[:hits]).max() < reach
+        hit_points = np.concatenate([hit_points, seen_by.position[seen_by.is_hit]])
+    assert distances(mesh, hit_points[:hits]).max() < tolerance
 
 
 def distances(mesh: Any, points: np.ndarray) -> np.ndarray:
@@ -208,10 +212,10 @@ def squares_to_triangles(t: np.ndarray, p: np.ndarray) -> np.ndarray:
 def test_cells_that_are_too_large_for_a_coil_are_made_smaller_where_checks_fail(
     spacing: float,
 ) -> None:
-    said: list[str] = []
+    messages: list[str] = []
     field = hk.SolidAngle(loops_of("coil"))
-    mesh = hk.mesh(field, cell_size=spacing, tolerance=0.02, progress=said.append)
-    assert any("places fail: smaller cells there" in text for text in said)
+    mesh = hk.mesh(field, cell_size=spacing, tolerance=0.07, progress=messages.append)
+    assert any("places fail: smaller cells there" in text for text in messages)
     assert mesh.metadata["harnack"]["spacing"] == spacing
     check_surface(mesh, loops_of("coil"), 1)
 
@@ -221,7 +225,7 @@ def test_a_coil_in_cells_that_are_too_large_raises_if_they_stay(
 ) -> None:
     monkeypatch.setattr(spanned_module(), "_MOST_LOCAL", 0)
     with pytest.raises(hk.MeshingError, match="smaller `cell_size`"):
-        hk.mesh(hk.SolidAngle(loops_of("coil")), cell_size=0.4, tolerance=0.02)
+        hk.mesh(hk.SolidAngle(loops_of("coil")), cell_size=0.4, tolerance=0.07)
 
 
 def spanned_module() -> Any:
@@ -255,12 +259,12 @@ def test_wrapping_alone_would_be_noticed(monkeypatch: pytest.MonkeyPatch) -> Non
     """Without integration a mesh of the coil in large cells fails its checks, and says so."""
     field, spacing = hk.SolidAngle(loops_of("coil")), 0.16
     monkeypatch.setattr(spanned_module(), "_MOST_LOCAL", 0)
-    mesh = hk.mesh(field, cell_size=spacing, tolerance=0.05)
+    mesh = hk.mesh(field, cell_size=spacing, tolerance=0.17)
     assert mesh.metadata["harnack"]["euler_characteristic"] == 1
     marching = sys.modules["harnack.meshing.marching_tetrahedra"]
     monkeypatch.setattr(marching, "_integrate_change", lambda field, p, q, wrapped, period: wrapped)
     with pytest.raises(hk.MeshingError, match="cell_size"):
-        hk.mesh(field, cell_size=spacing, tolerance=0.05)
+        hk.mesh(field, cell_size=spacing, tolerance=0.17)
 
 
 def test_reaches_are_proved() -> None:
@@ -281,7 +285,7 @@ def test_reaches_are_proved() -> None:
 @pytest.mark.parametrize("level", [0.5, 1.0, 1.5, 2.5, 3.0, 3.5])
 def test_levels(level: float) -> None:
     loops = loops_of("wavy")
-    mesh = hk.mesh(hk.SolidAngle(loops), level=level * math.pi, tolerance=4e-3)
+    mesh = hk.mesh(hk.SolidAngle(loops), level=level * math.pi, tolerance=1e-2)
     check_surface(mesh, loops, 1)
 
 
@@ -296,7 +300,7 @@ def test_random_curves(kind: str, seed: int) -> None:
         loop = example_curves.random_closed_curve(rng, 60)
     else:
         loop = example_curves.spiky_polygon(rng, 16)
-    mesh = hk.mesh(hk.SolidAngle(loop), tolerance=4e-3)
+    mesh = hk.mesh(hk.SolidAngle(loop), tolerance=8e-3)
     check_surface(mesh, [loop], mesh.metadata["harnack"]["euler_characteristic"])
     assert mesh.metadata["harnack"]["euler_characteristic"] % 2 == 1  # one rim
 
@@ -306,9 +310,9 @@ def test_random_curves(kind: str, seed: int) -> None:
 def test_a_tiny_edge_does_not_force_small_cells(length: float) -> None:
     plain = example_curves.wavy_polygon(48)
     tiny = np.insert(plain, 1, plain[0] + length * (plain[1] - plain[0]) + [0, 0, length], axis=0)
-    one, other = (hk.mesh(hk.SolidAngle(loop), tolerance=5e-3) for loop in (plain, tiny))
-    check_surface(other, [tiny], 1)
-    counts = [mesh.metadata["harnack"]["evaluations"] for mesh in (one, other)]
+    plain_mesh, tiny_mesh = (hk.mesh(hk.SolidAngle(loop), tolerance=1e-2) for loop in (plain, tiny))
+    check_surface(tiny_mesh, [tiny], 1)
+    counts = [mesh.metadata["harnack"]["evaluations"] for mesh in (plain_mesh, tiny_mesh)]
     assert counts[1] < 1.3 * counts[0]
 
 
@@ -316,9 +320,9 @@ def test_a_tiny_edge_does_not_force_small_cells(length: float) -> None:
 @pytest.mark.parametrize(("scale", "offset"), [(1e-3, 0.0), (1e3, 0.0), (1.0, 1e3), (1.0, 1e6)])
 def test_curves_of_any_size_and_place(scale: float, offset: float) -> None:
     loop = example_curves.wavy_polygon(48) * scale + offset
-    mesh = hk.mesh(hk.SolidAngle(loop), tolerance=5e-3)
+    mesh = hk.mesh(hk.SolidAngle(loop), tolerance=1e-2 * scale)
     check_surface(mesh, [loop], 1)
-    plain = hk.mesh(hk.SolidAngle(example_curves.wavy_polygon(48)), tolerance=5e-3)
+    plain = hk.mesh(hk.SolidAngle(example_curves.wavy_polygon(48)), tolerance=1e-2)
     assert len(mesh.faces) == pytest.approx(len(plain.faces), rel=0.05)
 
 
@@ -328,7 +332,7 @@ def test_touching_parts_of_a_curve() -> None:
         [[0, 0, 0], [1, 1, 0], [2, 0, 0], [1, -1, 0], [0, 0, 1e-6], [-1, 1, 0.2], [-2, 0, 0],
          [-1, -1, 0]], float,
     )  # fmt: skip
-    check_surface(hk.mesh(hk.SolidAngle(loop), tolerance=4e-3), [loop], 1)
+    check_surface(hk.mesh(hk.SolidAngle(loop), tolerance=1.7e-2), [loop], 1)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -79,7 +79,7 @@ def test_all_of_a_gyroid_is_proved(level: float, spacing: float | None) -> None:
 
 
 def test_a_field_that_promises_nothing_proves_nothing() -> None:
-    mesh = hk.mesh(hk.Sphere(0.8), side="surface", tolerance=0.01, cell_size=0.2)
+    mesh = hk.mesh(hk.Sphere(0.8), side="surface", tolerance=0.016, cell_size=0.2)
     assert mesh.metadata["harnack"]["isotopy"] == 0.0
 
 
@@ -152,5 +152,5 @@ def test_four_corners_on_the_level() -> None:
 def test_thin_necks_of_a_gyroid_are_proved_by_small_pieces() -> None:
     """0.9936 with three halvings of tetrahedra, 0.9997 with five: near level 1 necks are thin."""
     box = hk.Box((-1, -1, -1), (1, 1, 1))
-    mesh = hk.mesh(hk.Gyroid(1.0), level=0.9, clip=box, cell_size=0.09, tolerance=1e-2)
+    mesh = hk.mesh(hk.Gyroid(1.0), level=0.9, clip=box, cell_size=0.09, tolerance=2e-2)
     assert mesh.metadata["harnack"]["isotopy"] > 0.9995

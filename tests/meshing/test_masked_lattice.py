@@ -104,7 +104,7 @@ def test_parts_made_where_they_matter_are_the_same(
     volumes: list[float] = []
     for most in (0, math.inf):
         monkeypatch.setattr(csg_meshing, "_MANY_CELLS", most)
-        volumes.append(float(hk.mesh(PARTS[name], tolerance=5e-3).volume))
+        volumes.append(float(hk.mesh(PARTS[name], tolerance=2e-2).volume))
     assert volumes[0] == pytest.approx(volumes[1], rel=2e-3)
 
 
@@ -120,5 +120,5 @@ def test_both_sides_of_a_wall_ask_once_where_the_other_parts_are(
 
     monkeypatch.setattr(IrrelevantRegion, "relevant_cells", counted)
     monkeypatch.setattr(csg_meshing, "_MANY_CELLS", 0)
-    hk.mesh(BALL & WALLS, tolerance=1e-2)
+    hk.mesh(BALL & WALLS, tolerance=4e-2)
     assert asked == [0, 0, 1]  # of the ball, and of both sides

@@ -18,11 +18,11 @@ CUBE = trimesh.creation.box((2.0, 2.0, 2.0))
 
 def test_a_mesh_is_itself_with_a_hole() -> None:
     solid = hk.solid(CUBE).translated((5.0, 0.0, 0.0))
-    made = hk.mesh(solid - hk.Cylinder(0.5).translated((5.0, 0.0, 0.0)), tolerance=2e-3)
-    assert made.is_watertight
-    assert made.volume == pytest.approx(8 - 2 * math.pi / 4, rel=2e-3)
+    mesh = hk.mesh(solid - hk.Cylinder(0.5).translated((5.0, 0.0, 0.0)), tolerance=4e-3)
+    assert mesh.is_watertight
+    assert mesh.volume == pytest.approx(8 - 2 * math.pi / 4, rel=2e-3)
     for corner in CUBE.vertices + np.array([5.0, 0.0, 0.0]):
-        assert (made.vertices == corner).all(axis=1).any()
+        assert (mesh.vertices == corner).all(axis=1).any()
     plain = hk.mesh(hk.solid(CUBE))
     assert sorted(map(tuple, plain.vertices)) == sorted(map(tuple, CUBE.vertices))
 
@@ -75,12 +75,12 @@ def test_within_parts_in_contact_distances_are_from_their_union() -> None:
 
 def test_shells_are_as_thick_as_asked() -> None:
     ball = hk.solid(example_meshes.bumpy_sphere(3))
-    made = hk.mesh(ball.shell(0.2), tolerance=1e-2)
-    assert made.is_watertight
-    assert made.body_count == 2  # outside and inside
-    inner = made.split()[np.argmin([np.ptp(one.vertices) for one in made.split()])]
+    mesh = hk.mesh(ball.shell(0.2), tolerance=2e-2)
+    assert mesh.is_watertight
+    assert mesh.body_count == 2  # outside and inside
+    inner = mesh.split()[np.argmin([np.ptp(part.vertices) for part in mesh.split()])]
     centers = inner.triangles_center
     assert np.abs(ball.value(centers, precision="double") + 0.2).max() < 1e-2 * 2.5
-    grown = hk.mesh(hk.solid(CUBE).offset(0.2), tolerance=1e-2)
+    grown = hk.mesh(hk.solid(CUBE).offset(0.2), tolerance=2.4e-2)
     exact = 8 + 0.2 * 24 + math.pi * 0.04 * 6 + 4 / 3 * math.pi * 0.008
     assert grown.volume == pytest.approx(exact, rel=1e-2)

@@ -27,45 +27,47 @@ def test_periodic_surfaces_end_at_the_faces_of_a_box() -> None:
 
 
 def test_a_domain_that_is_a_ball_cuts() -> None:
-    mesh = hk.mesh(hk.Gyroid(1.0, domain=hk.Ball(radius=0.6)), tolerance=8e-3)
+    mesh = hk.mesh(hk.Gyroid(1.0, domain=hk.Ball(radius=0.6)), tolerance=1e-2)
     rim = mesh.vertices[np.unique(mesh.metadata["harnack"]["boundary"])]
     np.testing.assert_allclose(np.linalg.norm(rim, axis=1), 0.6, atol=1e-8)
 
 
 def test_closed_surfaces_are_watertight() -> None:
-    mesh = hk.mesh(hk.Sphere(0.8), tolerance=2e-3)
+    mesh = hk.mesh(hk.Sphere(0.8), tolerance=3.2e-3)
     assert mesh.is_watertight
     assert mesh.metadata["harnack"]["euler_characteristic"] == 2
     assert mesh.volume == pytest.approx(4 / 3 * math.pi * 0.8**3, rel=5e-3)
 
 
 def test_a_level_set_is_meshed_as_it_is_traced() -> None:
-    """Level, solid, clip and section are its own, unless others are given."""
+    """Level, side, clip and section are the surface's own."""
     box, half = hk.Box((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3)), hk.HalfSpace((0, 0, 1), 0.1)
-    coarse: dict[str, Any] = {"tolerance": 2e-2, "cell_size": 0.1}
+    coarse: dict[str, Any] = {"tolerance": 1.2e-2, "cell_size": 0.1}
     field = hk.Gyroid(1.0)
-    made = hk.mesh(hk.Surface(field, 0.2, clip=box, section=half), **coarse)
+    mesh = hk.mesh(hk.Surface(field, 0.2, clip=box, section=half), **coarse)
     same = hk.mesh(field, level=0.2, clip=box, section=half, **coarse)
-    assert (made.vertices == same.vertices).all()
+    assert (mesh.vertices == same.vertices).all()
     solid = hk.Surface(field, level=(-0.2, 0.2), side="between", clip=box)
     wall = hk.mesh(solid, **coarse)
     assert (
         wall.vertices
         == hk.mesh(field, level=(-0.2, 0.2), side="between", clip=box, **coarse).vertices
     ).all()
-    assert hk.mesh(solid, level=0.1, **coarse).metadata["harnack"]["level"] == 0.1
-    ball = hk.mesh(hk.Surface(hk.Sphere(0.8), 0.1), tolerance=2e-2)  # a `Solid`
+    assert (
+        hk.mesh(solid.replace(level=0.1, side=None), **coarse).metadata["harnack"]["level"] == 0.1
+    )
+    ball = hk.mesh(hk.Surface(hk.Sphere(0.8), 0.1), tolerance=3.6e-2)  # a `Solid`
     assert ball.volume == pytest.approx(4 / 3 * math.pi * 0.9**3, rel=0.05)
     several = hk.Surface(field, [-0.2, 0.2], clip=box)
-    with pytest.raises(ValueError, match=r"of a Gyroid has 2 levels \(-0.2, 0.2\).*level=-0.2"):
+    with pytest.raises(ValueError, match=r"there are 2 levels \(-0.2, 0.2\).*level=-0.2"):
         hk.mesh(several)
-    assert hk.mesh(several, level=0.2, **coarse).metadata["harnack"]["level"] == 0.2
+    assert hk.mesh(several.replace(level=0.2), **coarse).metadata["harnack"]["level"] == 0.2
 
 
 @pytest.mark.parametrize(
     ("field", "arguments", "message"),
     [
-        (hk.solids.Plane(), {}, "give clip=harnack.Box"),
+        (hk.solids.Plane(), {}, r"give a clip, such as a box \(harnack.Box\)"),
         (hk.Gyroid(1.0), {"level": 9.0}, "no surface has level"),
         (hk.Sphere(0.5), {"clip": hk.Box((1, 1, 1), (2, 2, 2))}, "is empty"),
         (
@@ -80,7 +82,7 @@ def test_a_level_set_is_meshed_as_it_is_traced() -> None:
             "multiple of 4 pi",
         ),
         (hk.SolidAngle(example_curves.wavy_polygon(12)), {"tolerance": 0.0}, "tolerance"),
-        (hk.SolidAngle(example_curves.wavy_polygon(12)), {"spacing": -1.0}, "spacing"),
+        (hk.SolidAngle(example_curves.wavy_polygon(12)), {"cell_size": -1.0}, "cell_size"),
         (hk.SolidAngle(hk.geometry.Circle(1.0)), {}, "circle.polygon"),
         ("curve", {}, "a harnack field is needed"),
     ],
@@ -135,8 +137,8 @@ def test_cells_of_an_octree_fill_the_box_and_keep_the_set() -> None:
 def test_closed_meshes_are_turned_outwards() -> None:
     for text in ("x^2 + y^2 + z^2 = 1", "1 = x^2 + y^2 + z^2"):
         ball = hk.expression(text, domain=hk.Ball(radius=1.5))
-        made = hk.mesh(ball, tolerance=1e-2)
-        assert made.is_watertight
-        assert made.volume == pytest.approx(4 / 3 * np.pi, rel=0.02)
-        outwards = np.einsum("nk,nk->n", made.face_normals, made.triangles_center)
+        mesh = hk.mesh(ball, tolerance=3e-2)
+        assert mesh.is_watertight
+        assert mesh.volume == pytest.approx(4 / 3 * np.pi, rel=0.02)
+        outwards = np.einsum("nk,nk->n", mesh.face_normals, mesh.triangles_center)
         assert (outwards > 0).all()

@@ -19,7 +19,7 @@ from harnack.meshing.checks import intersecting_faces
 from tests.oracles.direct_sums import winding_sum
 
 Function = Callable[[Any], Any]
-TOLERANCE = 1e-2
+TOLERANCE = 1e-2  # as a part of the longest side
 SECONDS = 10.0
 
 # Letters a to d stand for random numbers.
@@ -188,18 +188,18 @@ def formula_case(rng: np.random.Generator) -> Case:
     field, own = hk.expression(text), evaluated(text)
     is_box = rng.random() < 0.7
     volume = hk.Box((-1, -1, -1), (1, 1, 1)) if is_box else hk.Ball(radius=1.0)
-    options: dict[str, Any] = {"clip": volume, "tolerance": TOLERANCE}
+    options: dict[str, Any] = {"clip": volume, "tolerance": 2.0 * TOLERANCE}
     clip = in_box if is_box else in_ball
     kind = rng.integers(3)
     if kind == 0:
         return Case(f"surface {text}", field, options, own, clip, False, 2.0)
     if kind == 1:
-        options["solid"] = (-math.inf, 0.0)
+        options |= {"level": 0.0, "side": "below"}
         return Case(f"solid {text}", field, options, own, clip, True, 2.0)
-    other, small = hk.Sphere(0.7), lambda p: np.linalg.norm(p, axis=1) - 0.7
+    ball, small = hk.Sphere(0.7), lambda p: np.linalg.norm(p, axis=1) - 0.7
     return Case(
         f"less ball: {text}",
-        hk.solid(field, below=0.0) - other,
+        hk.solid(field, below=0.0) - ball,
         options,
         lambda p: np.maximum(own(p), -small(p)),
         clip,
@@ -238,13 +238,13 @@ def blob_case(rng: np.random.Generator) -> Case:
         groups=groups if grouped else None,
     )  # fmt: skip
     own = blobs_by_numpy(centers, radii, weights, groups, cubic)
-    options: dict[str, Any] = {"tolerance": TOLERANCE}
     reach = radii.max() * (2.0 if cubic else 1.6)
     size = float((np.ptp(centers, axis=0) + 2 * reach).max())
-    clip = everywhere
+    clip, options = everywhere, dict[str, Any]()
     if rng.random() < 0.3:
         clip, size = in_box, min(size, 2.0)
-        options |= {"clip": hk.Box((-1, -1, -1), (1, 1, 1)), "solid": (1.0, math.inf)}
+        options = {"clip": hk.Box((-1, -1, -1), (1, 1, 1)), "level": 1.0, "side": "above"}
+    options["tolerance"] = TOLERANCE * size
     return Case(f"{count} blobs", blobs, options, own, clip, True, size)
 
 
@@ -361,7 +361,7 @@ def test_what_has_no_surface_is_refused_in_seconds(text: str) -> None:
     box = hk.Box((-1, -1, -1), (1, 1, 1))
     begun = time.process_time()
     with pytest.raises(hk.MeshingError, match=REFUSED[text]):
-        hk.mesh(hk.expression(text), clip=box, tolerance=TOLERANCE)
+        hk.mesh(hk.expression(text), clip=box, tolerance=2.0 * TOLERANCE)
     assert time.process_time() - begun < SECONDS
 
 
@@ -382,12 +382,14 @@ def test_caps_over_little_of_a_solid_are_as_near_as_they_are() -> None:
 )
 def test_cells_become_smaller_only_if_the_smallest_would_do(text: str, sizes: int) -> None:
     """Of walls that are missed: one far thinner than the smallest cells is refused at once."""
-    said: list[str] = []
+    messages: list[str] = []
     box = hk.Box((-1, -1, -1), (1, 1, 1))
     refused = pytest.raises(hk.MeshingError, match="miss parts")
     with refused if sizes == 1 else contextlib.nullcontext():
-        hk.mesh(hk.expression(text), clip=box, tolerance=TOLERANCE, progress=said.append)
-    tried = [one for one in said if one.startswith("cells of") and "miss" not in one]
+        hk.mesh(hk.expression(text), clip=box, tolerance=2.0 * TOLERANCE, progress=messages.append)
+    tried = [
+        message for message in messages if message.startswith("cells of") and "miss" not in message
+    ]
     assert len(tried) == sizes
 
 

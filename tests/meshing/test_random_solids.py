@@ -13,9 +13,10 @@ import trimesh
 
 import harnack as hk
 from tests.oracles.direct_sums import winding_sum
+from tests.oracles.extents import longest_side
 
 Function = Callable[[Any], Any]
-TOLERANCE = 8e-3
+TOLERANCE = 8e-3  # as a part of the longest side
 
 
 def primitive(rng: np.random.Generator) -> tuple[hk.solids.Solid, Function]:
@@ -74,19 +75,19 @@ def judge(seed: int) -> str:
     rng = np.random.default_rng(seed)
     whole, inside = random_solid(rng)
     begun = time.process_time()
-    made, why = None, ""
+    mesh, why = None, ""
     try:
-        made = hk.mesh(whole, tolerance=TOLERANCE)
+        mesh = hk.mesh(whole, tolerance=TOLERANCE * longest_side(whole))
     except hk.MeshingError as error:
         why = str(error)
-    if made is None:
+    if mesh is None:
         assert time.process_time() - begun < 20, f"seed {seed}: refused after too long: {why}"
         return why
-    assert made.is_watertight, f"seed {seed}"
-    assert made.is_winding_consistent, f"seed {seed}"
-    assert made.volume > 0, f"seed {seed}"
-    size = float(made.extents.max())
-    corner = np.asarray(made.vertices)[np.asarray(made.faces)]
+    assert mesh.is_watertight, f"seed {seed}"
+    assert mesh.is_winding_consistent, f"seed {seed}"
+    assert mesh.volume > 0, f"seed {seed}"
+    size = float(mesh.extents.max())
+    corner = np.asarray(mesh.vertices)[np.asarray(mesh.faces)]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     large = np.linalg.norm(normal, axis=1) > (TOLERANCE * size) ** 2
     normal = normal[large] / np.linalg.norm(normal[large], axis=1)[:, None]
@@ -97,7 +98,7 @@ def judge(seed: int) -> str:
     off = 2 * TOLERANCE * size
     assert (np.abs(inside(center)) < off).all(), f"seed {seed}"
     assert (np.minimum(out, -within) > -step - off).all(), f"seed {seed}"
-    points = rng.uniform(*made.bounds, (100, 3))
+    points = rng.uniform(*mesh.bounds, (100, 3))
     value = inside(points)
     clear = np.abs(value) > step
     assert ((winding_sum(corner)(points[clear]) > 0.5) == (value[clear] < 0)).all(), f"seed {seed}"

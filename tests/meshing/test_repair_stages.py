@@ -277,11 +277,11 @@ def test_noise_of_the_size_of_triangles(seed: int) -> None:
     vertices, faces = icosphere(2)
     rng = np.random.default_rng(seed)
     noisy = vertices + rng.normal(0, 0.08 + 0.02 * seed, vertices.shape)
-    given = trimesh.Trimesh(noisy, faces[rng.random(len(faces)) > 0.05], process=False)
-    made = hk.repair(given, cell_size=0.2, tolerance=1e-2)
-    check_closed(made)
-    assert made.metadata["harnack"]["stage"] != "filled"
-    assert made.volume == pytest.approx(4.1, abs=0.5)
+    damaged = trimesh.Trimesh(noisy, faces[rng.random(len(faces)) > 0.05], process=False)
+    result = hk.repair(damaged, cell_size=0.2, tolerance=2.4e-2)
+    check_closed(result)
+    assert result.metadata["harnack"]["stage"] != "filled"
+    assert result.volume == pytest.approx(4.1, abs=0.5)
 
 
 @pytest.mark.slow
@@ -329,13 +329,13 @@ def test_corners_of_cracks_are_joined() -> None:
 
 def test_what_cannot_be_joined_is_made_anew() -> None:
     """Triangles that are moved by more than half of their size."""
-    given = loose(0.05)
-    made = hk.repair(given, cell_size=0.15, tolerance=1e-2)
-    facts = made.metadata["harnack"]
+    damaged = loose(0.05)
+    result = hk.repair(damaged, cell_size=0.15, tolerance=2e-2)
+    facts = result.metadata["harnack"]
     assert (facts["stage"], facts["kept"]) == ("remeshed", 0)
     assert "are loose" in facts["why"]
-    check_closed(made)
-    assert made.volume == pytest.approx(4.0, abs=0.3)
+    check_closed(result)
+    assert result.volume == pytest.approx(4.0, abs=0.3)
 
 
 def test_smooth_patches_continue_the_surface() -> None:
@@ -455,12 +455,12 @@ def test_loose_parts_are_kept_or_dropped() -> None:
         np.concatenate([vertices, 0.3 * vertices + 2]), np.concatenate([faces, faces + 162]),
         process=False,
     )  # fmt: skip
-    made = hk.repair(both, keep="none", cell_size=0.2, tolerance=1e-2)
-    assert made.body_count == 2
-    one = hk.repair(both, keep="none", largest=True, cell_size=0.2, tolerance=1e-2)
-    assert one.body_count == 1
-    assert one.volume > 3.5
-    assert one.metadata["harnack"]["dropped"] == 1
+    result = hk.repair(both, keep="none", cell_size=0.2, tolerance=3e-2)
+    assert result.body_count == 2
+    largest = hk.repair(both, keep="none", largest=True, cell_size=0.2, tolerance=3e-2)
+    assert largest.body_count == 1
+    assert largest.volume > 3.5
+    assert largest.metadata["harnack"]["dropped"] == 1
 
 
 @pytest.mark.parametrize("keep", ["all", "valid"])
@@ -488,9 +488,9 @@ def test_settings_that_are_refused() -> None:
         hk.repair(ball(), tolerance=0)
     with pytest.raises(ValueError, match='keep is None, "all", "valid" or "none"'):
         hk.repair(ball(), keep="some")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ValueError, match='patches are "smooth" or "harmonic"'):
+    with pytest.raises(ValueError, match='filling is "smooth" or "harmonic"'):
         hk.repair(ball(), filling="flat")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ValueError, match="spacing"):
+    with pytest.raises(ValueError, match="cell_size"):
         hk.repair(ball(), cell_size=float("nan"))
 
 

@@ -49,18 +49,23 @@ def check(made: trimesh.Trimesh) -> dict[str, Any]:
 
 def test_a_soup_is_closed() -> None:
     with pytest.warns(UserWarning, match="are farther from the level of this WindingNumber"):
-        made = hk.mesh(hk.WindingNumber(*soup()), tolerance=4e-3, cell_size=0.1)
-    facts = check(made)
+        mesh = hk.mesh(hk.WindingNumber(*soup()), tolerance=6.4e-3, cell_size=0.1)
+    facts = check(mesh)
     assert facts["made_by"] == "signs"
-    assert made.volume == pytest.approx(1.0, abs=0.03)
+    assert mesh.volume == pytest.approx(1.0, abs=0.03)
     assert math.isfinite(facts["within"])
 
 
 def test_both_ends_of_a_solid_are_told_of() -> None:
     ball = hk.DipolePotential(*sphere_points(1000))
-    ends = {end: hk.mesh(ball, solid=end, tolerance=4e-3, cell_size=0.12).metadata["harnack"]
-            for end in ((5.0, math.inf), (-math.inf, 8.0), (5.0, 8.0))}  # fmt: skip
-    low, high, both = ends.values()
+    solids = [
+        hk.Surface(ball, 5.0, side="above"),
+        hk.Surface(ball, 8.0, side="below"),
+        hk.Surface(ball, (5.0, 8.0), side="between"),
+    ]
+    low, high, both = (
+        hk.mesh(solid, tolerance=2e-2, cell_size=0.12).metadata["harnack"] for solid in solids
+    )
     for key in ("evaluations", "looked_at", "far", "undecided"):
         assert both[key] == pytest.approx(low[key] + high[key], rel=0.2, abs=20), key
     assert both["within"] == max(low["within"], high["within"])
@@ -77,12 +82,12 @@ def test_vertices_lie_on_triangles_and_creases_are_sharp() -> None:
     turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
     turn[0] *= np.sign(np.linalg.det(turn))
     vertices = np.asarray(box.vertices) @ turn.T
-    made = hk.mesh(hk.WindingNumber(vertices, box.faces), tolerance=4e-3, cell_size=0.1)
-    facts = check(made)
-    off = np.abs(np.abs(made.vertices @ turn).max(axis=1) - 0.5)
+    mesh = hk.mesh(hk.WindingNumber(vertices, box.faces), tolerance=7e-3, cell_size=0.1)
+    facts = check(mesh)
+    off = np.abs(np.abs(mesh.vertices @ turn).max(axis=1) - 0.5)
     assert np.quantile(off, 0.95) < 1e-4 * 0.1  # within edges of tetrahedra, not at their ends
-    assert made.volume == pytest.approx(1.0, rel=2e-3)
-    assert facts["far"] <= 0.05 * len(made.vertices)
+    assert mesh.volume == pytest.approx(1.0, rel=2e-3)
+    assert facts["far"] <= 0.05 * len(mesh.vertices)
 
 
 def boxes(*ends: tuple[tuple[int, ...], tuple[int, ...]]) -> hk.WindingNumber:
@@ -104,7 +109,7 @@ def boxes(*ends: tuple[tuple[int, ...], tuple[int, ...]]) -> hk.WindingNumber:
 )  # fmt: skip
 def test_flat_parts_and_parts_in_contact(parts: hk.WindingNumber, volume: float) -> None:
     """Their faces are planes of coordinates, in which every sign is as good as the other."""
-    result = hk.mesh(parts, tolerance=4e-3, cell_size=1.5)
+    result = hk.mesh(parts, tolerance=0.12, cell_size=1.5)
     facts = check(result)
     assert result.volume == pytest.approx(volume, rel=1e-3)
     assert facts["far"] <= 0.01 * facts["looked_at"]
@@ -115,19 +120,21 @@ def test_flat_parts_and_parts_in_contact(parts: hk.WindingNumber, volume: float)
 @pytest.mark.parametrize(("scale", "shift"), [(1.0, 0.0), (1e-5, 0.0), (1.0, 1e4), (1e6, -1e7)])
 def test_units_and_places(scale: float, shift: float) -> None:
     vertices, faces = icosphere(2)
-    given = scale * vertices + shift
-    made = hk.mesh(hk.WindingNumber(given, faces[3:]), tolerance=1e-2, cell_size=0.2 * scale)
-    check(made)
-    assert np.linalg.norm(made.vertices - shift, axis=1).max() < 1.001 * scale
+    moved = scale * vertices + shift
+    mesh = hk.mesh(
+        hk.WindingNumber(moved, faces[3:]), tolerance=2e-2 * scale, cell_size=0.2 * scale
+    )
+    check(mesh)
+    assert np.linalg.norm(mesh.vertices - shift, axis=1).max() < 1.001 * scale
 
 
 def test_a_cloud_is_closed_and_near() -> None:
     points, _ = sphere_points(1000)
-    made = hk.mesh(hk.DipolePotential(points, points), tolerance=4e-3, cell_size=0.12)
-    check(made)
-    assert np.abs(np.linalg.norm(made.vertices, axis=1) - 1).max() < 0.02
+    mesh = hk.mesh(hk.DipolePotential(points, points), tolerance=2e-2, cell_size=0.12)
+    check(mesh)
+    assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - 1).max() < 0.02
     half = hk.mesh(
-        hk.DipolePotential(points, points), level=2 * math.pi, side="above", tolerance=4e-3,
+        hk.DipolePotential(points, points), level=2 * math.pi, side="above", tolerance=2e-2,
         cell_size=0.12, section=hk.HalfSpace((0, 0, 1), 0.0),
     )  # fmt: skip
     check(half)
@@ -157,8 +164,6 @@ def test_what_is_refused() -> None:
     field = hk.WindingNumber(*icosphere(1))
     with pytest.raises(TypeError, match="no normals to thicken"):
         hk.mesh(field, thickness=0.1)
-    with pytest.raises(ValueError, match="solid=True is for solids"):
-        hk.mesh(field, side="below")
     with pytest.raises(ValueError, match="level 0 of a winding number"):
         hk.mesh(field, level=0.0)
     with pytest.raises(hk.MeshingError, match="max_triangles"):

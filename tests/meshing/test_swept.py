@@ -37,9 +37,9 @@ def test_flat_faces_are_exact(taper: float) -> None:
 
 def test_twisted_faces_are_within_the_tolerance() -> None:
     solid = hk.Extrusion([STAR, HOLE], 2.0, twist=90.0, taper=0.7)
-    mesh = hk.mesh(solid, tolerance=4e-3)
+    mesh = hk.mesh(solid, tolerance=3.2e-2)
     assert mesh.is_watertight
-    assert off(solid, mesh) < 4e-3 * 8.0
+    assert off(solid, mesh) < 3.2e-2
     # The corners' way up is an edge of the mesh.
     x, y, z = (np.array(mesh.vertices) * [1, 1, 0.5]).T
     corner = 4 * (1 - 0.3 * z) * np.exp(1j * (0.5 * np.pi * z + np.pi / 5))
@@ -103,12 +103,12 @@ def spline(radius: float) -> hk.Tube:
     ("tube", "volume", "tolerance"),
     [
         # By sums over distances in NumPy; of one edge twice that of a capsule.
-        (ACUTE, 0.25899, 1e-3),
-        (BACK, 0.01 * math.pi * (1 + 4 / 30), 1e-3),
-        (SQUARE, 0.1288, 1e-3),
-        pytest.param(trefoil(0.8), 56.684, 1e-3, marks=pytest.mark.slow),
-        pytest.param(spline(0.2), 1.9001, 1e-3, marks=pytest.mark.slow),
-        pytest.param(hk.Tube.helix(2.0, 0.3, 4.0, 0.2), None, 1e-3, marks=pytest.mark.slow),
+        (ACUTE, 0.25899, 1.4e-3),
+        (BACK, 0.01 * math.pi * (1 + 4 / 30), 1.2e-3),
+        (SQUARE, 0.1288, 1.2e-3),
+        pytest.param(trefoil(0.8), 56.684, 7e-3, marks=pytest.mark.slow),
+        pytest.param(spline(0.2), 1.9001, 2.6e-3, marks=pytest.mark.slow),
+        pytest.param(hk.Tube.helix(2.0, 0.3, 4.0, 0.2), None, 4.4e-3, marks=pytest.mark.slow),
     ],
     ids=["acute", "there and back", "closed", "trefoil", "spline", "coil"],
 )
@@ -118,26 +118,26 @@ def test_tubes_that_come_back_to_themselves(
     """All but the closed one were refused: creases of one function, narrower than cells."""
     mesh = hk.mesh(tube, tolerance=tolerance)
     assert mesh.is_watertight
-    assert off(tube, mesh) < tolerance * np.ptp(mesh.vertices, axis=0).max()
+    assert off(tube, mesh) < tolerance
     if volume is not None:
         assert mesh.volume == pytest.approx(volume, rel=6e-3)
 
 
 def test_tubes_of_several_polylines_offset_and_cut() -> None:
     cross = hk.Tube.from_polylines([[(-1, 0, 0), (1, 0, 0)], [(0, -1, 0), (0, 1, 0)]], 0.1)
-    grown = hk.mesh(cross.offset(0.1), tolerance=1e-3)
+    grown = hk.mesh(cross.offset(0.1), tolerance=2.4e-3)
     # Two capsules of radius r less what they have in common, 16/3 r^3.
     right = 2 * math.pi * 0.2**2 * (2 + 4 / 3 * 0.2) - 16 / 3 * 0.2**3
     assert grown.volume == pytest.approx(right, rel=6e-3)
-    half = hk.mesh(cross & hk.solids.Plane((0, 0, 1)), tolerance=1e-3)
-    assert half.volume == pytest.approx(0.5 * hk.mesh(cross, tolerance=1e-3).volume, rel=2e-3)
+    half = hk.mesh(cross & hk.solids.Plane((0, 0, 1)), tolerance=2.2e-3)
+    assert half.volume == pytest.approx(0.5 * hk.mesh(cross, tolerance=2.2e-3).volume, rel=2e-3)
 
 
 def test_a_bolt_and_its_nut_do_not_meet() -> None:
     hexagon = hk.io.outline.regular_polygon(6, 13 / math.sqrt(3))
     bolt = hk.solids.metric_thread("M8", 12.0, clearance=0.1)
     nut = hk.Extrusion(hexagon, 6.5) - hk.solids.metric_thread("M8", 8.0, internal=True)
-    meshes = [hk.mesh(one, tolerance=2e-3) for one in (bolt, nut)]
-    assert all(one.is_watertight for one in meshes)
+    meshes = [hk.mesh(part, tolerance=2.6e-2) for part in (bolt, nut)]
+    assert all(mesh.is_watertight for mesh in meshes)
     inside = bolt.translated((0.0, 0.0, -2.5)).value(meshes[1].vertices, precision="double")
-    assert inside.min() > 0.1 - 2e-3 * 2 * 13
+    assert inside.min() > 0.1 - 2 * 2.6e-2

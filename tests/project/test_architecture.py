@@ -30,7 +30,7 @@ ROOMS = (
     "rendering",
     "field_from_file",
     "gallery",
-    "view",
+    "live",
     "cli",
 )
 # Within `fields`: the interface, what families share, and the families.
@@ -54,7 +54,10 @@ FIELD_ROOMS = (
 CAPABILITIES = ("capabilities",)
 # Families do not know each other. A new one is added above and in docs/architecture.md.
 FAMILIES = FIELD_ROOMS[FIELD_ROOMS.index("solid_angles") :]
-FREE = ("__init__", "__main__", "testing")  # at the top: may import from any room
+# Modules at the top that only gather names of any rooms, for users; no room imports from them.
+NAMESPACES = ("io", "kernels", "math", "printing", "proofs", "solids")
+# At the top: may import from any room.
+FREE = ("__init__", "__main__", "testing", *NAMESPACES)
 
 
 def room_of(parts: tuple[str, ...]) -> str:
@@ -104,6 +107,23 @@ def test_file_imports_from_earlier_rooms(path: Path) -> None:
     assert misplaced_imports(path.relative_to(SOURCE), source) == []
 
 
+@pytest.mark.parametrize("name", NAMESPACES)
+def test_namespaces_define_nothing(name: str) -> None:
+    docstring, *rest = ast.parse((SOURCE / f"{name}.py").read_text(encoding="utf-8")).body
+    *imports, public = rest
+    assert isinstance(docstring, ast.Expr)
+    assert all(isinstance(statement, ast.ImportFrom) for statement in imports)
+    assert isinstance(public, ast.Assign)
+    assert [ast.unparse(target) for target in public.targets] == ["__all__"]
+    imported = {
+        alias.asname or alias.name
+        for statement in imports
+        if isinstance(statement, ast.ImportFrom) and statement.module != "__future__"
+        for alias in statement.names
+    }
+    assert imported == set(ast.literal_eval(public.value))
+
+
 def test_families_of_fields_do_not_know_each_other() -> None:
     wrong: list[str] = []
     for path in sorted((SOURCE / "fields").rglob("*.py")):
@@ -137,13 +157,13 @@ def rendering_imports() -> dict[tuple[str, ...], set[tuple[str, ...]]]:
             if isinstance(node, ast.ImportFrom):
                 assert node.level == 0, "imports are absolute"
                 stem = tuple((node.module or "").split("."))
-                found = [(*stem, alias.name) for alias in node.names] + [stem]
+                modules = [(*stem, alias.name) for alias in node.names] + [stem]
             elif isinstance(node, ast.Import):
-                found = [tuple(alias.name.split(".")) for alias in node.names]
+                modules = [tuple(alias.name.split(".")) for alias in node.names]
             else:
                 continue
-            inside = (one[2:] for one in found if one[:2] == ("harnack", "rendering"))
-            graph[name] |= {one for one in inside if one in parts.values()}
+            inside = {module[2:] for module in modules if module[:2] == ("harnack", "rendering")}
+            graph[name] |= inside & set(parts.values())
     return graph
 
 
@@ -185,6 +205,10 @@ def test_package_imports_backend_before_anything_that_may_load_drjit() -> None:
         ("tracer.py", "from . import enclosures", False),
         ("testing.py", "import harnack.cli", False),
         ("__init__.py", "import harnack.cli", False),
+        ("solids.py", "from harnack.fields.solids import Solid", False),
+        ("math.py", "import harnack.arithmetic", False),
+        ("cli/main.py", "from harnack.solids import Sphere", True),
+        ("live/session.py", "from harnack.rendering import Camera", False),
         ("misc/thing.py", "", True),
     ],
 )

@@ -39,9 +39,9 @@ def test_the_surface_of_a_trefoil_is_a_torus_with_a_hole(tmp_path: Path) -> None
 
 @pytest.mark.slow
 def test_a_hollow_part_can_be_printed(tmp_path: Path) -> None:
-    found = example("hollow_part").main(tmp_path, SMALL)
-    assert found.is_printable
-    assert found.problems == ()  # one part, and no cavity without a way out
+    check = example("hollow_part").main(tmp_path, SMALL)
+    assert check.is_printable
+    assert check.problems == ()  # one part, and no cavity without a way out
     read_closed(tmp_path / "hollow_part.stl")
 
 

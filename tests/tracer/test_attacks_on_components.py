@@ -11,6 +11,7 @@ import pytest
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.rendering.placed_surface import PlacedSurface, Placement
+from harnack.tracer import traced_surface
 
 SPHERES = hk.Sphere(0.5, (-0.6, 0, 0)) | hk.Sphere(0.2, (2, 0, 0))
 FROM_RIGHT = [[3.0, 0, 0]], [[-1.0, 0, 0]]
@@ -42,11 +43,15 @@ def test_both_sides_of_a_thin_plate_are_no_smaller_than_one_of_a_thick_one(half:
 
 @pytest.mark.few(3)
 @pytest.mark.parametrize("largest", [True, np.True_, 64, np.int64(64)])
-def test_level_sets_take_what_calls_take(largest: Any) -> None:
+def test_surfaces_take_what_calls_take(largest: Any) -> None:
     """True was taken for one cell; NumPy's were refused."""
-    made = hk.Surface(SPHERES, (0.0,), largest=largest)
-    assert hk.trace(made, *FROM_RIGHT).t[0] == pytest.approx(3.1, abs=1e-3)
-    assert hk.Surface(SPHERES, 0.0, largest=largest).largest == made.largest
+    surface = hk.Surface(SPHERES, 0.0, largest=largest)
+    for hits in (
+        hk.trace(surface, *FROM_RIGHT),
+        hk.trace(SPHERES, *FROM_RIGHT, level=0.0, largest=largest),
+    ):
+        assert hits.t[0] == pytest.approx(3.1, abs=1e-3)
+    assert hk.Surface(SPHERES, (0.0,), largest=largest).largest == surface.largest
 
 
 @pytest.mark.parametrize(
@@ -54,18 +59,20 @@ def test_level_sets_take_what_calls_take(largest: Any) -> None:
     [("x", TypeError), (8.0, TypeError), (None, TypeError), (-3, ValueError), (3, ValueError)],
 )
 def test_what_is_no_number_of_cells_is_refused(largest: Any, error: type[Exception]) -> None:
-    for make in (hk.level_set, hk.Surface):
-        with pytest.raises(error, match="from 8 to 512, not"):
-            make(SPHERES, (0.0,), largest=largest)
+    with pytest.raises(error, match="from 8 to 512, not"):
+        hk.Surface(SPHERES, (0.0,), largest=largest)
+    with pytest.raises(error, match="from 8 to 512, not"):
+        hk.trace(SPHERES, *FROM_RIGHT, largest=largest)
 
 
 @pytest.mark.parametrize("name", ["clip", "section"])
-@pytest.mark.parametrize("given", [3, hk.HalfSpace])
-def test_what_is_no_volume_is_refused(name: str, given: Any) -> None:
+@pytest.mark.parametrize("volume", [3, hk.HalfSpace])
+def test_what_is_no_volume_is_refused(name: str, volume: Any) -> None:
     """A class of volumes passed for one."""
-    for make in (hk.level_set, hk.Surface):
-        with pytest.raises(TypeError, match=f"{name} must be a volume"):
-            make(SPHERES, (0.0,), **{name: given})
+    with pytest.raises(TypeError, match=f"{name} must be a volume"):
+        hk.Surface(SPHERES, (0.0,), **{name: volume})
+    with pytest.raises(TypeError, match=f"{name} must be a volume"):
+        hk.trace(SPHERES, *FROM_RIGHT, **{name: volume})
 
 
 @pytest.mark.parametrize(
@@ -94,41 +101,39 @@ def test_cells_of_tiny_clips_do_not_fill_the_memory() -> None:
 def test_faces_of_solids_are_lost_where_rounding_leaves_open_which_component_it_is() -> None:
     """The face was met all the same, an eighth off."""
     backend = choose_backend("single")
-    surface = hk.Surface(
+    surface = traced_surface(
         SPHERES, level=0, side="below", largest=True, section=hk.HalfSpace((0, 0, 1), 0.01)
     )
     placed = PlacedSurface.of(surface, Placement.identity(), backend)
     o, d = to_vector3(backend, [[-0.6, 0, 1e5]]), to_vector3(backend, [[0, 0, -1.0]])
     seen = placed.intersect(o, d, backend.Float(1e6), backend.Bool(True))
-    assert [to_numpy(one).tolist() for one in (seen.is_hit, seen.is_out_of_steps)] == [
-        [False],
-        [True],
-    ]
+    assert to_numpy(seen.is_hit).tolist() == [False]
+    assert to_numpy(seen.is_out_of_steps).tolist() == [True]
     assert to_numpy(placed.occludes(o, d, backend.Float(1e6), backend.Bool(True))).all()
 
 
 @pytest.mark.parametrize(
     ("normal", "offset", "expected"),
     [
-        ((1e200, 0, 0), 1e200, (1, 0, 0, 1)),
+        ((1e200, 0, 0), 1, (1, 0, 0, 1)),
         ((1e155, 1e155, 0), 0, (math.sqrt(0.5), math.sqrt(0.5), 0, 0)),
         ((1e-200, 0, 0), 0, (1, 0, 0, 0)),
-        ((3e-162, 4e-162, 0), 1e-162, (0.6, 0.8, 0, 0.2)),
+        ((3e-162, 4e-162, 0), 0.2, (0.6, 0.8, 0, 0.2)),
     ],
 )
 def test_normals_of_any_length_become_unit(normal: Any, offset: float, expected: Any) -> None:
     """The first became all of space, the last was 0.6 % too long."""
-    made = hk.HalfSpace(normal, offset)
-    assert (*made.normal, made.offset) == pytest.approx(expected, rel=1e-15)
-    assert not made.contains_points([[5, 0, 0]])[0]
+    half_space = hk.HalfSpace(normal, offset)
+    assert (*half_space.normal, half_space.offset) == pytest.approx(expected, rel=1e-15)
+    assert not half_space.contains_points([[5, 0, 0]])[0]
 
 
 def test_half_spaces_that_are_almost_across_an_axis_have_no_bounds() -> None:
     """The box left out points far off the axis."""
-    made = hk.HalfSpace((1, 1e-9, 0), 0.0)
-    assert made.contains_points([[1e-3, -1e7, 0]])[0]
-    assert np.isinf(made.bounds()).all()
-    assert hk.HalfSpace((0, -2, 0), 3.0).bounds()[0].tolist() == [-math.inf, -1.5, -math.inf]
+    half_space = hk.HalfSpace((1, 1e-9, 0), 0.0)
+    assert half_space.contains_points([[1e-3, -1e7, 0]])[0]
+    assert np.isinf(half_space.bounds()).all()
+    assert hk.HalfSpace((0, -2, 0), 1.5).bounds()[0].tolist() == [-math.inf, -1.5, -math.inf]
 
 
 @pytest.mark.parametrize(

@@ -90,7 +90,8 @@ def wrong_hits(
     x = (o + hits.t[:, None] * d)[at]
     value, gradient = dipole_sum(points, areas[:, None] * normals)(x)
     steepness = np.linalg.norm(gradient, axis=1)
-    error = hk.DipolePotential(*some, accuracy=4.0).error_bound(x) + 1e-6 * np.abs(value)
+    error = hk.DipolePotential(*some, accuracy=4.0).error_bound(x, precision="single")
+    error += 1e-6 * np.abs(value)
     latest = truth.beyond + ROUNDING
     latest[at] += 1.05 * error / steepness
     missed = np.flatnonzero(np.where(hits.is_hit, hits.t, np.inf) > latest)
@@ -108,7 +109,9 @@ def test_first_hits_agree_with_the_sum_over_all_points(n: int, count: int, spaci
     some = cloud(n)
     o, d = rays(some[0], count)
     truth = crossings_of(some, o, d, spacing)
-    hits = hk.trace(hk.DipolePotential(*some), o, d, t_max=FAR, tolerance=TOLERANCE)
+    hits = hk.trace(
+        hk.DipolePotential(*some), o, d, t_max=FAR, tolerance=TOLERANCE, precision="single"
+    )
     assert not (hits.status == hk.RayStatus.OUT_OF_STEPS).any()
     missed, early = wrong_hits(hits, truth, some, o, d)
     assert len(missed) == 0, (o[missed], d[missed], hits.t[missed], truth.beyond[missed])
@@ -125,7 +128,9 @@ def test_the_oracle_sees_hits_that_are_late_or_nowhere() -> None:
     some = cloud(100)
     o, d = rays(some[0], 100)
     truth = crossings_of(some, o, d, 0.1)
-    hits = hk.trace(hk.DipolePotential(*some), o, d, t_max=FAR, tolerance=TOLERANCE)
+    hits = hk.trace(
+        hk.DipolePotential(*some), o, d, t_max=FAR, tolerance=TOLERANCE, precision="single"
+    )
     crossed = np.isfinite(truth.beyond)
     late = truth.beyond + 0.01
     for t, wrong in ((np.where(crossed, late, hits.t), 0), (0.97 * hits.t, 1)):
@@ -149,15 +154,16 @@ def test_a_tree_that_hides_its_error_misses_hits() -> None:
     some = cloud(1000)
     o, d = rays(some[0], 1000)
     truth = crossings_of(some, o, d, 0.3)
-    found = []
+    late_counts = []
     for kind in (Sure, hk.DipolePotential):
         field = kind(*some, accuracy=1.5)
-        hits = hk.trace(field, o, d, t_max=FAR, tolerance=1e-5)
+        hits = hk.trace(field, o, d, t_max=FAR, tolerance=1e-5, precision="single")
         at = hits.is_hit
-        error = field.error_bound(o + np.where(at, hits.t, 0)[:, None] * d)
-        steepness = np.linalg.norm(field.gradient(o + np.where(at, hits.t, 0)[:, None] * d), axis=1)
+        x = o + np.where(at, hits.t, 0)[:, None] * d
+        error = field.error_bound(x, precision="single")
+        steepness = np.linalg.norm(field.gradient(x, precision="single"), axis=1)
         late = np.where(at, hits.t, np.inf) > truth.beyond + ROUNDING
         late &= ~at | (kind is Sure) | (hits.t > truth.beyond + 1.1 * error / steepness)
-        found.append(int(late.sum()))
-    assert found[0] > 10
-    assert found[1] == 0
+        late_counts.append(int(late.sum()))
+    assert late_counts[0] > 10
+    assert late_counts[1] == 0

@@ -1,4 +1,4 @@
-"""All crossings of rays and confirmed hits: each crossing once, none missed, no graze."""
+"""All crossings of rays, and hits that must cross: each crossing once, none missed, no graze."""
 
 from __future__ import annotations
 
@@ -103,41 +103,41 @@ def test_crossings_are_those_of_a_dense_oracle(name: str, precision: Any) -> Non
     field, function, levels, steepness = CASES[name]
     n, k, tolerance = 150, 60, 1e-4
     o, d = rays(n, distance=1.4)
-    found = hk.crossings(
+    crossings = hk.crossings(
         field, o, d, level=levels, max_crossings=k, t_max=2.5, clip=BALL, tolerance=tolerance,
         precision=precision,
     )  # fmt: skip
     t = np.linspace(0, 2.5, _MANY)
-    assert 1 < found.count.mean() < k
-    assert (found.status == hk.RayStatus.MISS).all()
-    assert (found.traced_to == np.inf).all()
+    assert 1 < crossings.count.mean() < k
+    assert (crossings.status == hk.RayStatus.MISS).all()
+    assert (crossings.traced_to == np.inf).all()
     for i in range(n):
         p = o[i] + t[:, None] * d[i]
         f = function(p[(p * p).sum(axis=1) <= 1.5**2])
         least = sum(alternations(f, level, steepness * tolerance) for level in levels)
         most = sum(alternations(f, level, 0.0) for level in levels)
-        assert least <= found.count[i] <= most
-    at = np.isfinite(found.t)
-    np.testing.assert_array_equal(at.sum(axis=1), found.count)
-    assert (np.diff(np.where(at, found.t, 9.0 + np.arange(k)), axis=1) > 0).all()
+        assert least <= crossings.count[i] <= most
+    at = np.isfinite(crossings.t)
+    np.testing.assert_array_equal(at.sum(axis=1), crossings.count)
+    assert (np.diff(np.where(at, crossings.t, 9.0 + np.arange(k)), axis=1) > 0).all()
     # They lie on a level, and f passes it to the side that is named.
     ray = np.nonzero(at)[0]
-    where = found.position[at].astype(float)
+    where = crossings.position[at].astype(float)
     off = function(where)[:, None] - np.array(levels)
     assert (np.abs(off).min(axis=1) < steepness * (2e-5 if precision == "single" else 1e-6)).all()
     h = 1e-4
     rise = function(where + h * d[ray]) - function(where - h * d[ray])
     clear = np.abs(rise) > 1e-2 * h * steepness
     assert clear.mean() > 0.9
-    np.testing.assert_array_equal(np.sign(rise[clear]), found.side[at][clear])
+    np.testing.assert_array_equal(np.sign(rise[clear]), crossings.side[at][clear])
     gradient = np.stack(
         [function(where + h * e) - function(where - h * e) for e in np.eye(3)], axis=1
     )
     norm = np.linalg.norm(gradient, axis=1)
-    aligned = (gradient * found.normal[at]).sum(axis=1) / norm
+    aligned = (gradient * crossings.normal[at]).sum(axis=1) / norm
     assert (aligned[norm > 1e-2 * h * steepness] > 0.999).all()
-    assert (found.side[~at] == 0).all()
-    assert np.isnan(found.position[~at]).all()
+    assert (crossings.side[~at] == 0).all()
+    assert np.isnan(crossings.position[~at]).all()
 
 
 @pytest.mark.few(1)
@@ -146,7 +146,7 @@ def test_crossings_are_those_of_a_dense_oracle(name: str, precision: Any) -> Non
 def test_the_ladder_of_an_angle_is_climbed_rung_by_rung(level: Any, precision: Any) -> None:
     field, tolerance = hk.SolidAngle(example_curves.wavy_polygon(12)), 1e-3
     o, d = rays(150, seed=3, distance=3.0)
-    found = hk.crossings(
+    crossings = hk.crossings(
         field,
         o,
         d,
@@ -156,7 +156,7 @@ def test_the_ladder_of_an_angle_is_climbed_rung_by_rung(level: Any, precision: A
         tolerance=tolerance,
         precision=precision,
     )
-    assert (found.status == hk.RayStatus.MISS).all()
+    assert (crossings.status == hk.RayStatus.MISS).all()
     t, wrong = np.linspace(0, 6, 6001), 0
     for i in range(len(o)):
         p = o[i] + t[:, None] * d[i]
@@ -165,13 +165,13 @@ def test_the_ladder_of_an_angle_is_climbed_rung_by_rung(level: Any, precision: A
         rungs = [one + 4 * math.pi * m for one in np.atleast_1d(level) for m in range(-3, 3)]
         least = sum(alternations(f, rung, tolerance * steep) for rung in rungs)
         most = sum(alternations(f, rung, 0.0) for rung in rungs)
-        wrong += not least <= found.count[i] <= most
+        wrong += not least <= crossings.count[i] <= most
         # Up and down in order: a rung that is climbed is there to be left again.
         if np.ndim(level) == 0:
             turns = round((f[-1] - f[0]) / (4 * math.pi))
-            assert abs(found.side[i].sum() - turns) <= 1
+            assert abs(crossings.side[i].sum() - turns) <= 1
     assert wrong == 0
-    assert 0.3 < found.count.mean() < 10
+    assert 0.3 < crossings.count.mean() < 10
 
 
 @pytest.mark.slow
@@ -182,53 +182,54 @@ def test_rays_that_begin_where_the_extent_does_are_seen_from_outside() -> None:
     o = rng.uniform(-0.8, 0.8, (300, 3)) + np.array([0, 0, 2])
     d = np.column_stack([rng.uniform(-0.8, 0.8, (300, 2)), np.zeros(300)]) - o
     for precision in PRECISIONS:
-        found = hk.crossings(field, o, d, max_crossings=3, tolerance=1e-2, precision=precision)
-        assert (found.count == 1).all()
-        np.testing.assert_allclose(found.position[:, 0, 2], 0, atol=2e-6)
+        crossings = hk.crossings(field, o, d, max_crossings=3, tolerance=1e-2, precision=precision)
+        assert (crossings.count == 1).all()
+        np.testing.assert_allclose(crossings.position[:, 0, 2], 0, atol=2e-6)
         upwards = hk.crossings(field, -o, -d, max_crossings=3, tolerance=1e-2, precision=precision)
-        np.testing.assert_array_equal(found.side[:, 0], -upwards.side[:, 0])
+        np.testing.assert_array_equal(crossings.side[:, 0], -upwards.side[:, 0])
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_a_sphere_is_entered_and_left(precision: Any) -> None:
     o, d = rays(300)
-    found = hk.crossings(
+    crossings = hk.crossings(
         Sphere(), o, d, max_crossings=4, t_max=9, tolerance=1e-4, precision=precision
     )
     b = -(o * d).sum(axis=1)
     c = b * b - (o * o).sum(axis=1) + 1
     hit = c > 1e-3
-    np.testing.assert_array_equal(found.count[hit], 2)
-    np.testing.assert_array_equal(found.count[c < 0], 0)
-    np.testing.assert_array_equal(found.side[hit, :2], np.tile([-1, 1], (hit.sum(), 1)))
+    np.testing.assert_array_equal(crossings.count[hit], 2)
+    np.testing.assert_array_equal(crossings.count[c < 0], 0)
+    np.testing.assert_array_equal(crossings.side[hit, :2], np.tile([-1, 1], (hit.sum(), 1)))
     exact = b[hit, None] + np.sqrt(c[hit, None]) * np.array([-1, 1])
-    np.testing.assert_allclose(found.t[hit, :2], exact, atol=2e-6)
-    np.testing.assert_allclose(found.normal[hit, :2], found.position[hit, :2], atol=2e-5)
+    np.testing.assert_allclose(crossings.t[hit, :2], exact, atol=2e-6)
+    np.testing.assert_allclose(crossings.normal[hit, :2], crossings.position[hit, :2], atol=2e-5)
 
 
 @pytest.mark.few(3)
 @pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("overstep", [1.0, 1.4])
-def test_rays_that_graze_do_not_stick(precision: Any, overstep: float) -> None:
+@pytest.mark.parametrize("over_relaxation", [1.0, 1.4])
+def test_rays_that_graze_do_not_stick(precision: Any, over_relaxation: float) -> None:
     tolerance = 1e-3
     off = tolerance * np.array([-50, -4, -1.2, -0.4, -0.1, 0, 0.1, 0.5, 0.9, 1.1, 4])
     o = np.column_stack([np.full(11, -3.0), 1 + off, np.zeros(11)])
     d = np.tile([1.0, 0, 0], (11, 1))
     settings: dict[str, Any] = {
-        "tolerance": tolerance, "t_max": 6.0, "precision": precision, "overstep": overstep,
+        "tolerance": tolerance, "t_max": 6.0, "precision": precision,
+        "over_relaxation": over_relaxation,
     }  # fmt: skip
-    found = hk.crossings(Sphere(), o, d, max_crossings=9, **settings)
-    np.testing.assert_array_equal(found.count[:3], 2)
-    assert set(found.count[3:5]) <= {0, 2}
-    np.testing.assert_array_equal(found.count[5:], 0)
-    assert (found.status == hk.RayStatus.MISS).all()
+    crossings = hk.crossings(Sphere(), o, d, max_crossings=9, **settings)
+    np.testing.assert_array_equal(crossings.count[:3], 2)
+    assert set(crossings.count[3:5]) <= {0, 2}
+    np.testing.assert_array_equal(crossings.count[5:], 0)
+    assert (crossings.status == hk.RayStatus.MISS).all()
     # |f| stays within the tolerance for a length of 0.09, of which a step is 1/5 of it or more.
-    assert found.evaluations.max() < 600
+    assert crossings.evaluations.max() < 600
     plain = hk.trace(Sphere(), o, d, **settings)
     sure = hk.trace(Sphere(), o, d, require_crossing=True, **settings)
     np.testing.assert_array_equal(plain.is_hit, off <= tolerance)
-    np.testing.assert_array_equal(sure.is_hit, found.count > 0)
-    np.testing.assert_array_equal(sure.t[sure.is_hit], found.t[sure.is_hit, 0])
+    np.testing.assert_array_equal(sure.is_hit, crossings.count > 0)
+    np.testing.assert_array_equal(sure.t[sure.is_hit], crossings.t[sure.is_hit, 0])
 
 
 def test_a_ray_along_the_surface_runs_out_of_steps_or_is_proved() -> None:
@@ -260,16 +261,16 @@ def test_a_ray_that_starts_on_the_surface_leaves_it_uncounted(precision: Any) ->
     n /= np.linalg.norm(n, axis=1)[:, None]
     d = rng.normal(size=(400, 3))
     d /= np.linalg.norm(d, axis=1)[:, None]
-    found = hk.crossings(
+    crossings = hk.crossings(
         Sphere(), n, d, max_crossings=4, t_max=9, tolerance=1e-4, precision=precision
     )
     inwards = (n * d).sum(axis=1)
     enters, leaves = inwards < -0.02, inwards > 0.02
-    np.testing.assert_array_equal(found.count[enters], 1)
-    np.testing.assert_array_equal(found.side[enters, 0], 1)
-    np.testing.assert_allclose(found.t[enters, 0], -2 * inwards[enters], atol=2e-6)
-    np.testing.assert_array_equal(found.count[leaves], 0)
-    assert (found.count <= 1).all()
+    np.testing.assert_array_equal(crossings.count[enters], 1)
+    np.testing.assert_array_equal(crossings.side[enters, 0], 1)
+    np.testing.assert_allclose(crossings.t[enters, 0], -2 * inwards[enters], atol=2e-6)
+    np.testing.assert_array_equal(crossings.count[leaves], 0)
+    assert (crossings.count <= 1).all()
 
 
 def test_the_first_k_are_the_first_of_all() -> None:
@@ -290,35 +291,37 @@ def test_the_first_k_are_the_first_of_all() -> None:
 
 
 def test_steps_are_for_all_of_the_ray() -> None:
-    found = hk.crossings(
+    crossings = hk.crossings(
         Wave(), [[0.0, 0, 0]], [[1.0, 0, 0]], max_crossings=40, t_max=20.0, max_steps=25
     )
     whole = hk.crossings(Wave(), [[0.0, 0, 0]], [[1.0, 0, 0]], max_crossings=40, t_max=20.0)
-    assert found.status[0] == hk.RayStatus.OUT_OF_STEPS
-    assert 25 <= found.evaluations[0] <= 26
-    n = found.count[0]
+    assert crossings.status[0] == hk.RayStatus.OUT_OF_STEPS
+    assert 25 <= crossings.evaluations[0] <= 26
+    n = crossings.count[0]
     assert 1 <= n < whole.count[0] == 32
-    np.testing.assert_array_equal(found.t[0, :n], whole.t[0, :n])
-    assert found.t[0, n - 1] < found.traced_to[0] < whole.t[0, n + 1]
+    np.testing.assert_array_equal(crossings.t[0, :n], whole.t[0, :n])
+    assert crossings.t[0, n - 1] < crossings.traced_to[0] < whole.t[0, n + 1]
     np.testing.assert_allclose(whole.t[0, :32], (np.arange(32) + 0.5) * math.pi / 5, atol=4e-6)
 
 
 def test_levels_closer_than_the_tolerance_are_told_apart() -> None:
     o, d = [[-2.0, 0, 0]], [[1.0, 0, 0]]
-    found = hk.crossings(Sphere(), o, d, level=(0.0, 1e-3), max_crossings=9, t_max=4, tolerance=0.1)
-    np.testing.assert_array_equal(found.side[0, :4], [-1, -1, 1, 1])
-    np.testing.assert_allclose(found.t[0, :4], [0.999, 1, 3, 3.001], atol=1e-5)
-    assert found.count[0] == 4
+    crossings = hk.crossings(
+        Sphere(), o, d, level=(0.0, 1e-3), max_crossings=9, t_max=4, tolerance=0.1
+    )
+    np.testing.assert_array_equal(crossings.side[0, :4], [-1, -1, 1, 1])
+    np.testing.assert_allclose(crossings.t[0, :4], [0.999, 1, 3, 3.001], atol=1e-5)
+    assert crossings.count[0] == 4
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
-def test_confirmed_hits_are_all_hits_but_those_that_turn_back(precision: Any) -> None:
+def test_hits_that_must_cross_are_all_hits_but_those_that_turn_back(precision: Any) -> None:
     field, (o, d) = hk.Gyroid(1.0, domain=BALL), rays(2000, seed=7)
     settings: dict[str, Any] = {"level": 1.2, "tolerance": 3e-3, "precision": precision}
     plain = hk.trace(field, o, d, **settings)
     sure = hk.trace(field, o, d, require_crossing=True, **settings)
-    surface = hk.traced_surface(field, 1.2, tolerance=3e-3, require_crossing=True)
-    same = hk.trace(surface, o, d, precision=precision)
+    options = hk.TraceOptions(tolerance=3e-3, require_crossing=True, precision=precision)
+    same = hk.trace(hk.Surface(field, 1.2), o, d, options=options)
     np.testing.assert_array_equal(sure.t, same.t)
     assert (plain.is_hit | ~sure.is_hit).all()
     assert 5 < (plain.is_hit & ~sure.is_hit).sum() < 200
@@ -338,12 +341,12 @@ def test_a_steep_place_hides_nothing_behind_it(tolerance: float) -> None:
     whose deep inside, and the way out of it, were proved misses."""
     pole = hk.DipolePotential([[0, 0, 0.0]], [[1.0, 0, 0]], [1.0], cells=False)
     solid = hk.solid(pole, below=6.0) & hk.Sphere(1.0)
-    given: dict[str, Any] = {"precision": "double", "tolerance": tolerance}
-    hits = hk.crossings(solid, [[-2, 0.01, 0.0]], [[1.0, 0, 0]], max_crossings=8, **given)
+    settings: dict[str, Any] = {"precision": "double", "tolerance": tolerance}
+    hits = hk.crossings(solid, [[-2, 0.01, 0.0]], [[1.0, 0, 0]], max_crossings=8, **settings)
     expected = [1.00005, 1.591935, 1.999994, 2.99995]
     np.testing.assert_allclose(hits.t[0, :4], expected, atol=max(5e-6, tolerance))
     assert np.isinf(hits.t[0, 4:]).all()
-    hit = hk.trace(solid, [[-0.3, 0.01, 0.0]], [[1.0, 0, 0]], require_crossing=True, **given)
+    hit = hk.trace(solid, [[-0.3, 0.01, 0.0]], [[1.0, 0, 0]], require_crossing=True, **settings)
     assert hit.t[0] == pytest.approx(0.29999, abs=max(1e-4, tolerance))
 
 
@@ -378,19 +381,19 @@ def test_drjit_rays_give_flat_arrays_with_derivatives() -> None:
     dr.enable_grad(level)
     dr.set_grad(level, 1)
     d = backend.Array3f([1.0, 0.0], [0.0, 0.0], [0.0, 1.0])
-    found = hk.crossings(Sphere(), o, d, level=level, max_crossings=3, t_max=9.0)
-    assert dr.width(found.t) == dr.width(found.position) == 6
+    crossings = hk.crossings(Sphere(), o, d, level=level, max_crossings=3, t_max=9.0)
+    assert dr.width(crossings.t) == dr.width(crossings.position) == 6
     half = math.sqrt(1.1**2 - 0.04)
-    np.testing.assert_allclose(found.t, [3 - half, 3 + half, np.inf, 0.9, 3.1, np.inf])
-    moved = dr.forward_to(found.t).numpy()[[0, 1, 3, 4]]
+    np.testing.assert_allclose(crossings.t, [3 - half, 3 + half, np.inf, 0.9, 3.1, np.inf])
+    moved = dr.forward_to(crossings.t).numpy()[[0, 1, 3, 4]]
     np.testing.assert_allclose(moved, [-1.1 / half, 1.1 / half, -1, 1])
 
 
 def test_no_rays_have_no_crossings() -> None:
-    found = hk.crossings(Sphere(), np.zeros((0, 3)), np.zeros((0, 3)), max_crossings=5)
-    assert found.t.shape == (0, 5)
-    assert found.normal.shape == (0, 5, 3)
-    assert found.count.shape == (0,)
+    crossings = hk.crossings(Sphere(), np.zeros((0, 3)), np.zeros((0, 3)), max_crossings=5)
+    assert crossings.t.shape == (0, 5)
+    assert crossings.normal.shape == (0, 5, 3)
+    assert crossings.count.shape == (0,)
 
 
 def test_bad_settings_are_refused() -> None:
@@ -401,10 +404,10 @@ def test_bad_settings_are_refused() -> None:
     with pytest.raises(TypeError, match="an integer such as 8"):
         hk.crossings(Sphere(), o, d, max_crossings="all")  # type: ignore[call-overload]
     mesh = hk.WindingNumber(*icosphere(0))
-    with pytest.raises(ValueError, match="all_hits takes one level of a field with sheets"):
+    with pytest.raises(ValueError, match="crossings takes one level of a field with jumps"):
         hk.crossings(mesh, o, d, max_crossings=2, level=(0.3, 0.6))
-    with pytest.raises(ValueError, match="confirm takes one level of a field with sheets"):
-        hk.traced_surface(mesh, [0.3, 0.6], require_crossing=True)
+    with pytest.raises(ValueError, match="require_crossing takes one level of a field with jumps"):
+        hk.trace(hk.Surface(mesh, [0.3, 0.6]), o, d, require_crossing=True)
 
 
 def balls() -> tuple[FloatArray, Any]:
@@ -447,20 +450,20 @@ def test_closed_meshes_are_crossed_at_their_triangles(method: str, precision: An
     vertices, faces = balls()
     o, d = rays(200, seed=4, distance=3.0)
     mesh = hk.WindingNumber(vertices, faces, method=method)
-    found = hk.crossings(mesh, o, d, max_crossings=10, precision=precision)
-    assert 2 < found.count.mean() < 6
+    crossings = hk.crossings(mesh, o, d, max_crossings=10, precision=precision)
+    assert 2 < crossings.count.mean() < 6
     for i in range(len(o)):
         t, triangles = changes_of_winding(vertices, faces, o[i], d[i])
-        n = found.count[i]
+        n = crossings.count[i]
         assert n == len(t)
-        np.testing.assert_allclose(found.t[i, :n], t, atol=2e-5)
-        np.testing.assert_array_equal(found.primitive_index[i, :n], triangles)
-        np.testing.assert_array_equal(found.side[i, :n], np.resize([1, -1], n))
-    assert (found.primitive_index[np.isinf(found.t)] == -1).all()
-    assert (found.status == hk.RayStatus.MISS).all()
+        np.testing.assert_allclose(crossings.t[i, :n], t, atol=2e-5)
+        np.testing.assert_array_equal(crossings.primitive_index[i, :n], triangles)
+        np.testing.assert_array_equal(crossings.side[i, :n], np.resize([1, -1], n))
+    assert (crossings.primitive_index[np.isinf(crossings.t)] == -1).all()
+    assert (crossings.status == hk.RayStatus.MISS).all()
     sure = hk.trace(mesh, o, d, require_crossing=True, precision=precision)
-    np.testing.assert_array_equal(sure.t, found.t[:, 0])
-    np.testing.assert_array_equal(sure.primitive_index, found.primitive_index[:, 0])
+    np.testing.assert_array_equal(sure.t, crossings.t[:, 0])
+    np.testing.assert_array_equal(sure.primitive_index, crossings.primitive_index[:, 0])
 
 
 @pytest.mark.slow
@@ -470,11 +473,11 @@ def test_meshes_with_holes_are_crossed_where_the_winding_number_passes(method: s
     kept = np.random.default_rng(0).random(len(faces)) < 0.8
     mesh = hk.WindingNumber(vertices, faces[kept], method=method)
     o, d = rays(30, seed=6, distance=3.0)
-    found = hk.crossings(mesh, o, d, max_crossings=12, tolerance=1e-4)
+    crossings = hk.crossings(mesh, o, d, max_crossings=12, tolerance=1e-4, precision="single")
     exact = hk.WindingNumber(vertices, faces[kept])
     alike = 0
     for i in range(len(o)):
-        crossed = found.t[i, : found.count[i]]
+        crossed = crossings.t[i, : crossings.count[i]]
         near = crossed[:, None] + 1e-3 * np.linspace(-1, 1, 101) ** 3
         t = np.unique(np.concatenate([np.linspace(0, 6, 3001), near.ravel()]))
         w = exact.value(o[i] + t[:, None] * d[i], precision="double")
@@ -483,14 +486,14 @@ def test_meshes_with_holes_are_crossed_where_the_winding_number_passes(method: s
         around = np.lib.stride_tricks.sliding_window_view(np.pad(steep, 20, mode="edge"), 41)
         least = alternations(w, 0.5, 1e-3 + 1e-4 * around.max(axis=1))
         most = alternations(w, 0.5, 0.0)
-        assert least <= found.count[i] <= most
-        if found.count[i] == most:
+        assert least <= crossings.count[i] <= most
+        if crossings.count[i] == most:
             alike += 1
             np.testing.assert_allclose(crossed, t[:-1][np.diff(w > 0.5)], atol=1e-3)
     assert alike > 25
-    smooth = np.isfinite(found.t) & (found.primitive_index < 0)
-    assert 5 < smooth.sum() < np.isfinite(found.t).sum() - 10
-    value = exact.value(found.position[smooth].astype(float), precision="double")
+    smooth = np.isfinite(crossings.t) & (crossings.primitive_index < 0)
+    assert 5 < smooth.sum() < np.isfinite(crossings.t).sum() - 10
+    value = exact.value(crossings.position[smooth].astype(float), precision="double")
     assert np.quantile(np.abs(value - 0.5), 0.9) < 1e-4
 
 
@@ -499,8 +502,8 @@ def test_a_ray_that_starts_on_a_triangle_leaves_it_uncounted() -> None:
     mesh = hk.WindingNumber(vertices, faces)
     o = np.einsum("nkd,k->nd", vertices[faces[:40]], [0.3, 0.3, 0.4])
     for sign, count in ((1.0, 0), (-1.0, 1)):
-        found = hk.crossings(mesh, o, sign * o, max_crossings=3, precision="double")
-        np.testing.assert_array_equal(found.count, count)
+        crossings = hk.crossings(mesh, o, sign * o, max_crossings=3, precision="double")
+        np.testing.assert_array_equal(crossings.count, count)
 
 
 def test_the_root_of_a_cubic_is_found_in_its_bracket() -> None:

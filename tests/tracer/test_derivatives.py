@@ -306,7 +306,8 @@ def test_hits_of_clouds_are_those_of_the_whole_sum() -> None:
     o, d = rays_at(0.6, 60, 1)
     origin = vector(o)
     dr.enable_grad(origin)
-    hits = hk.trace(hk.DipolePotential(x, x, areas), origin, vector(d), level=0.5)
+    cloud = hk.DipolePotential(x, x, areas)
+    hits = hk.trace(cloud, origin, vector(d), level=0.5, tolerance=1e-4)
     dr.backward(dr.sum(dr.select(hits.is_hit, hits.t, 0)))
     hit = np.array(hits.is_hit)
     assert hit.sum() > 20

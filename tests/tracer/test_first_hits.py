@@ -126,6 +126,7 @@ def compare(
     tolerance = TOLERANCE * size
     far = 8.0 * size
     field = hk.SolidAngle(loops, lift_bound=settings.pop("lift_bound", "auto"))  # type: ignore[arg-type]
+    settings = {"precision": "single", **settings}
     hits = hk.trace(field, o, d, level=level, t_max=far, tolerance=tolerance, **settings)  # type: ignore[arg-type]
     oracle = CurveOracle(loops)
     truth = first_crossings(
@@ -388,11 +389,11 @@ def looking(value: Callable[[np.ndarray], np.ndarray], smooth: float) -> Functio
 
 
 @pytest.mark.few(5)
-@pytest.mark.parametrize("bound", [None, "slope", "classic", "lipschitz"])
+@pytest.mark.parametrize("enclosures", [None, "slope", "classic", "lipschitz"])
 @pytest.mark.parametrize("name", REAL)
-def test_real_valued_fields(name: str, bound: str | None) -> None:
+def test_real_valued_fields(name: str, enclosures: str | None) -> None:
     field, value, levels, smooth = REAL[name]
-    if bound == "lipschitz" and not isinstance(field, hk.fields.EigenfunctionSum):
+    if enclosures == "lipschitz" and not isinstance(field, hk.fields.EigenfunctionSum):
         pytest.skip("has no Lipschitz constant")
     assert isinstance(field.domain, hk.Ball)
     rng, n, radius = np.random.default_rng(len(name)), 150, field.domain.radius
@@ -400,7 +401,15 @@ def test_real_valued_fields(name: str, bound: str | None) -> None:
     o = o.astype(np.float32).astype(np.float64)
     d = unit(radius * rng.uniform(0, 0.9, (n, 1)) * unit(rng.normal(size=(n, 3))) - o)
     tolerance = 1e-4 * radius
-    hits = hk.trace(field, o, d, level=list(levels), tolerance=tolerance, enclosures=bound)
+    hits = hk.trace(
+        field,
+        o,
+        d,
+        level=list(levels),
+        tolerance=tolerance,
+        enclosures=enclosures,
+        precision="single",
+    )
     along = (o * d).sum(axis=1)
     half = np.sqrt((0.9999 * radius) ** 2 - (o * o).sum(axis=1) + along**2)
     start = np.maximum(-along - half, 0.0)
@@ -410,7 +419,7 @@ def test_real_valued_fields(name: str, bound: str | None) -> None:
     )  # fmt: skip
     assert np.isfinite(truth.beyond).sum() > 20
     # The published rule runs out of steps where the range is much larger than the gradient.
-    assert bound == "classic" or not (hits.status == hk.RayStatus.OUT_OF_STEPS).any()
+    assert enclosures == "classic" or not (hits.status == hk.RayStatus.OUT_OF_STEPS).any()
     missed = hits.t > truth.beyond + SHARE * tolerance
     assert not missed.any(), (o[missed], d[missed], hits.t[missed], truth.beyond[missed])
     at = np.flatnonzero(hits.is_hit)
@@ -495,8 +504,8 @@ def test_rays_beside_an_edge_of_a_mesh_by_tree() -> None:
     d = unit(target - o)
     steep = (d * target).sum(axis=1) < -0.3
     o, d = o[steep], d[steep]
-    exact = hk.trace(hk.WindingNumber(vertices, faces, method="exact"), o, d)
-    tree = hk.trace(hk.WindingNumber(vertices, faces, method="tree"), o, d)
+    exact = hk.trace(hk.WindingNumber(vertices, faces, method="exact"), o, d, precision="single")
+    tree = hk.trace(hk.WindingNumber(vertices, faces, method="tree"), o, d, precision="single")
     assert exact.is_hit.all()
     assert tree.is_hit.all()
     np.testing.assert_allclose(tree.t, exact.t, atol=1e-5)
@@ -571,7 +580,7 @@ def test_rounding_of_slivers_is_in_the_bound(height: float) -> None:
     )
     x = x.astype(np.float32).astype(np.float64)
     truth = field.value(x, precision="double")
-    off = np.abs(field.value(x) - truth)
+    off = np.abs(field.value(x, precision="single") - truth)
     off = np.minimum(off, np.abs(off - 1))  # the sides of points on the triangle
     slope = np.linalg.norm(field.gradient(x, precision="double"), axis=1)
-    assert (off <= field.error_bound(x) + 4e-7 * slope).all()
+    assert (off <= field.error_bound(x, precision="single") + 4e-7 * slope).all()

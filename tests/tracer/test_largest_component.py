@@ -7,6 +7,7 @@ import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.fields.clearance import occupied_cells
 from harnack.rendering.placed_surface import PlacedSurface, Placement
+from harnack.tracer import traced_surface
 from harnack.tree import empty_space
 
 BIG, SMALL = (0.5, (-0.6, 0.0, 0.0)), (0.3, (0.5, 0.0, 0.0))
@@ -61,7 +62,8 @@ def through_sphere(o, d, radius, center):
 def wrong(field, n, seed, **settings):
     """How many of n rays have other hits than with the big sphere alone, or run out of steps."""
     o, d = rays(n, seed)
-    if settings.get("precision") != "double":
+    settings = {"precision": "single", **settings}
+    if settings["precision"] == "single":
         o, d = (x.astype(np.float32).astype(np.float64) for x in (o, d))
     hits = hk.trace(field, o, d, largest=True, **settings)
     t, certain = through_sphere(o, d, *BIG)
@@ -81,12 +83,15 @@ def test_first_hits_are_those_of_the_largest(name, precision):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("overstep", [1.0, 1.9])
+@pytest.mark.parametrize("over_relaxation", [1.0, 1.9])
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-7])
-def test_first_hits_with_other_steps(tolerance, overstep):
+def test_first_hits_with_other_steps(tolerance, over_relaxation):
     for name in FIELDS:
-        settings = {"precision": "double", "tolerance": tolerance, "overstep": overstep}
-        assert wrong(FIELDS[name], 50_000, 1, **settings) == 0
+        count = wrong(
+            FIELDS[name], 50_000, 1,
+            precision="double", tolerance=tolerance, over_relaxation=over_relaxation,
+        )  # fmt: skip
+        assert count == 0
 
 
 @pytest.mark.slow
@@ -156,12 +161,13 @@ def test_of_a_solid_the_part_of_largest_volume_is_there(precision):
     o, d = rays(4000, 5)
     met = []
     for field, largest in ((both, True), (hk.Sphere(*BIG), False)):
-        surface = hk.Surface(field, level=0.0, side="below", clip=clip, largest=largest)
+        surface = traced_surface(field, level=0.0, side="below", clip=clip, largest=largest)
         placed = PlacedSurface.of(surface, Placement.identity(), backend)
         rays_of = to_vector3(backend, o), to_vector3(backend, d)
         seen = placed.intersect(*rays_of, backend.Float(1e3), backend.Bool(True))
         blocked = placed.occludes(*rays_of, backend.Float(1e3), backend.Bool(True))
-        met.append([to_numpy(one) for one in (seen.is_hit, seen.t, blocked, seen.is_out_of_steps)])
+        results = seen.is_hit, seen.t, blocked, seen.is_out_of_steps
+        met.append([to_numpy(array) for array in results])
     (has, t, blocked, lost), (has_alone, t_alone, blocked_alone, _) = met
     assert not lost.any()
     assert 500 < has_alone.sum() < 3500
@@ -192,9 +198,10 @@ def test_rays_whose_cells_rounding_leaves_open_are_out_of_steps():
 @pytest.mark.slow
 def test_what_has_no_largest_component_is_refused():
     ray = [[3.0, 0, 0]], [[-1.0, 0, 0]]
-    for settings in ({"confirm": True}, {"all_hits": 2}):
-        with pytest.raises(ValueError, match="first hits alone"):
-            hk.trace(FIELDS["solids"], *ray, largest=True, **settings)
+    with pytest.raises(ValueError, match="first hits alone"):
+        hk.trace(FIELDS["solids"], *ray, largest=True, require_crossing=True)
+    with pytest.raises(ValueError, match="first hits alone"):
+        hk.crossings(FIELDS["solids"], *ray, largest=True, max_crossings=2)
     with pytest.raises(ValueError, match="with bounds"):
         hk.trace(hk.solids.Plane(), *ray, largest=True)
     with pytest.raises(ValueError, match="from 8 to 512"):
@@ -202,5 +209,5 @@ def test_what_has_no_largest_component_is_refused():
     with pytest.raises(ValueError, match="most cells of this Blobs could not be proved empty"):
         hk.trace(hk.Blobs([[-1, 0, 0], [1, 0, 0]], 0.5), *ray, largest=True)
     mesh = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]]), [[0, 1, 2]]
-    with pytest.raises(ValueError, match="jumps or has parts"):
+    with pytest.raises(ValueError, match="one continuous function, and this WindingNumber jumps"):
         hk.Surface(hk.WindingNumber(*mesh), largest=True)

@@ -48,7 +48,7 @@ _POINTS = np.array([[2.0, 0.1, 0.2], [0.1, 1.7, 0.4], [0.3, 0.2, 1.1]])
 _PICTURE = {"size": (16, 12), "progress": False}
 _VERBS: dict[str, Callable[[Any], Any]] = {
     "trace": lambda f: hk.trace(f, _POINTS, -_POINTS),
-    "all hits": lambda f: hk.crossings(f, _POINTS, -_POINTS, max_crossings=3),
+    "crossings": lambda f: hk.crossings(f, _POINTS, -_POINTS, max_crossings=3),
     "shaded picture": lambda f: hk.render(f, show="shaded", **_PICTURE),
     "cones of pixels": lambda f: hk.render(f, show="shaded", antialias="cones", **_PICTURE),
     "traced light": lambda f: hk.render(f, spp=2, **_PICTURE),

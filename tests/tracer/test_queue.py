@@ -16,6 +16,7 @@ from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.backend.arrays import upload_floats
 from harnack.backend.loops import compute_on_active, loop_with_queue
 from harnack.geometry.example_meshes import icosphere
+from harnack.tracer import TracedSurface, traced_surface
 from harnack.tracer.hits import _are_scattered
 
 
@@ -40,16 +41,16 @@ def fourier_series() -> hk.Surface:
     return hk.Surface(hk.fields.FourierSeries(waves, ((-1, -1, -1), (1, 1, 1))))
 
 
-CASES: dict[str, Callable[[], hk.Surface]] = {
+CASES: dict[str, Callable[[], hk.Surface | TracedSurface]] = {
     "curve": saddle,
     "domain": fourier_series,
     "combined": lambda: hk.Surface(hk.Torus(1.0, 0.4) & hk.Cuboid((2.0, 3.0, 3.0))),
     "sheets": cut_sphere,
     "parts": parts,
-    "confirmed": lambda: hk.traced_surface(
+    "require_crossing": lambda: traced_surface(
         hk.Gyroid(1.0, domain=hk.Ball(radius=1.0)), require_crossing=True
     ),
-    "few steps": lambda: replace(saddle(), max_steps=3),
+    "few steps": lambda: traced_surface(saddle(), max_steps=3),
 }
 
 
@@ -59,7 +60,7 @@ CASES: dict[str, Callable[[], hk.Surface]] = {
 )
 def test_a_queue_changes_no_bit(name: str, precision: Any) -> None:
     backend = choose_backend(precision)
-    prepared = CASES[name]().prepare(backend)
+    prepared = traced_surface(CASES[name]()).prepare(backend)
     rng = np.random.default_rng(4)
     n = 3000 if name != "parts" else 1000
     o = rng.normal(size=(n, 3)) * 1.3
@@ -69,22 +70,22 @@ def test_a_queue_changes_no_bit(name: str, precision: Any) -> None:
     ends = rng.uniform(0.5, 4, n)
 
     def ended(queued: bool) -> list[np.ndarray]:
-        one = replace(prepared, uses_ray_queue=queued)
+        tracer = replace(prepared, uses_ray_queue=queued)
         rays = to_vector3(backend, o), to_vector3(backend, d)
         wanted = backend.Float(upload_floats(backend, active.astype(float))) > 0
-        hit = one.first_hit(*rays, 0, upload_floats(backend, ends), wanted)
-        blocked = one.occluded(*rays, 0, upload_floats(backend, ends), wanted)
-        found = [hit.t, hit.value, hit.gradient, hit.evaluations, hit.status, hit.facet, blocked]
-        found += [] if hit.patch is None else [hit.patch]
-        dr.eval(found)
-        return [np.broadcast_to(to_numpy(x), (n, *to_numpy(x).shape[1:])) for x in found]
+        hit = tracer.first_hit(*rays, 0, upload_floats(backend, ends), wanted)
+        blocked = tracer.occluded(*rays, 0, upload_floats(backend, ends), wanted)
+        results = [hit.t, hit.value, hit.gradient, hit.evaluations, hit.status, hit.facet, blocked]
+        results += [] if hit.patch is None else [hit.patch]
+        dr.eval(results)
+        return [np.broadcast_to(to_numpy(x), (n, *to_numpy(x).shape[1:])) for x in results]
 
     one_by_one, queued = ended(False), ended(True)
-    some = one_by_one[4]
-    assert (some == int(hk.RayStatus.HIT)).sum() > n // 20
-    assert (some[~active] == int(hk.RayStatus.MISS)).all()
+    status = one_by_one[4]
+    assert (status == int(hk.RayStatus.HIT)).sum() > n // 20
+    assert (status[~active] == int(hk.RayStatus.MISS)).all()
     if name == "few steps":
-        assert (some == int(hk.RayStatus.OUT_OF_STEPS)).any()
+        assert (status == int(hk.RayStatus.OUT_OF_STEPS)).any()
     for a, b in zip(one_by_one, queued, strict=True):
         # What a ray that missed saw last is of no meaning, but no other lane may write it.
         np.testing.assert_array_equal(a[active], b[active])

@@ -1,4 +1,4 @@
-"""Over-stepping in rounded arithmetic: no surface may slip through between two looks.
+"""Over-relaxation in rounded arithmetic: no surface may slip through between two looks.
 
 Both looks, forward from one point and back from the next, are exact to first order, so near a
 surface they meet right at it; without room for rounding, one ray in ten went through at a
@@ -29,16 +29,16 @@ def camera(width: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize("bound", ["slope", "caps"])
+@pytest.mark.parametrize("enclosures", ["slope", "caps"])
 @pytest.mark.parametrize(
     ("precision", "tolerance"),
     [("double", 1e-8), ("double", 1e-11), ("double", 1e-14), ("single", 1e-5), ("single", 1e-7)],
 )
-def test_no_surface_slips_through(bound: str, precision: str, tolerance: float) -> None:
+def test_no_surface_slips_through(enclosures: str, precision: str, tolerance: float) -> None:
     field = hk.SolidAngle(example_curves.wavy_polygon(64))
     o, d = camera(48)
     plain = hk.trace(field, o, d, over_relaxation=1.0, tolerance=1e-5, precision="double")
-    over = hk.trace(field, o, d, enclosures=bound, tolerance=tolerance, precision=precision)
+    over = hk.trace(field, o, d, enclosures=enclosures, tolerance=tolerance, precision=precision)
     assert plain.is_hit.sum() > 500
     # Rays within the coarser tolerance of the border may go either way.
     assert (over.is_hit != plain.is_hit).sum() <= 2
@@ -57,7 +57,8 @@ JUMPS = {
     "inverse power": (lambda x, y, z: hk.math.tanh((x - y + 0.1 * z) ** -3.0), (1, -1, 0.1), 0.0),
     "tangent": (lambda x, y, z: hk.math.atan(hk.math.tan(x + y + z)), (1, 1, 1), ALONG),
     "logarithm": (
-        lambda x, y, z: hk.math.atan(hk.math.log(abs(x - y)) * (x - y) / abs(x - y)) + 1, (1, -1, 0), 0.0,
+        lambda x, y, z: hk.math.atan(hk.math.log(abs(x - y)) * (x - y) / abs(x - y)) + 1,
+        (1, -1, 0), 0.0,
     ),
 }  # fmt: skip
 
@@ -94,7 +95,7 @@ RANGES = (
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [*RANGES, "union", "moved", "confirm"])
+@pytest.mark.parametrize("kind", [*RANGES, "union", "moved", "require_crossing"])
 def test_no_ray_passes_a_jump_by_any_proof(kind: str) -> None:
     o, d, t = through((1, -1, 0), 0.0)
     surface = hk.expression(JUMPS["atan2"][0])
@@ -104,7 +105,7 @@ def test_no_ray_passes_a_jump_by_any_proof(kind: str) -> None:
     elif kind == "moved":
         surface, o = hk.solid(surface, below=0).translated((0.3, 0.1, 0)), np.add(o, (0.3, 0.1, 0))
     else:
-        settings = {"confirm": True} if kind == "confirm" else {"bound": kind}
+        settings = {kind: True} if kind == "require_crossing" else {"enclosures": kind}
     for precision in ("single", "double"):
         hits = hk.trace(
             surface, o, d, t_max=t + 0.2, precision=precision, max_steps=150, **settings

@@ -40,6 +40,7 @@ from harnack.fields.samples import Ray as RayPath
 from harnack.rendering.surface_hits import intersect_surface
 from harnack.testing import mutated_enclosure
 from harnack.testing.enclosure_contracts import PromiseCase
+from harnack.tracer import traced_surface
 from harnack.tracer.level_contact import test_jump as jump_test
 from tests.oracles.exact import exact_step, on_host
 from tests.oracles.jump_oracle import first_side_changes, judge
@@ -478,7 +479,9 @@ def test_wrong_jumps_are_seen(kind: type[BruteForceWinding], factor: float) -> N
     vertices, faces = MESHES["flipped face"]
     exact = ExactWinding(vertices, faces)
     o, d = rays(vertices, 600)
-    hits = hk.trace(kind(vertices, faces, jump=factor), o, d, tolerance=TOLERANCE)
+    hits = hk.trace(
+        kind(vertices, faces, jump=factor), o, d, tolerance=TOLERANCE, precision="single"
+    )
     verdict = judge(
         hit_t(hits), exact, o, d, 0.0, leaves_domain(o, d),
         level=0.5, reach=REACH, edges=exact.edges, samples=400,
@@ -492,16 +495,18 @@ def test_the_oracle_sees_hits_that_are_late_early_or_not_there() -> None:
     exact = ExactWinding(vertices, faces)
     o, d = rays(vertices, 300)
     end = leaves_domain(o, d)
-    hits = hk.trace(BruteForceWinding(vertices, faces), o, d, tolerance=TOLERANCE)
+    hits = hk.trace(
+        BruteForceWinding(vertices, faces), o, d, tolerance=TOLERANCE, precision="single"
+    )
     limits: Any = {"level": 0.5, "reach": REACH, "edges": exact.edges, "samples": 400}
-    t, found = hit_t(hits), hits.is_hit & (hits.t > 0.1)
+    t, is_clear = hit_t(hits), hits.is_hit & (hits.t > 0.1)
     for spoiled, wrong in (
         (t + 10 * REACH, "missed"),
         (np.full_like(t, np.inf), "missed"),
         (0.9 * t, "early"),
     ):
-        verdict = judge(np.where(found, spoiled, t), exact, o, d, 0.0, end, **limits)
-        assert len(getattr(verdict, wrong)) > 0.8 * found.sum()
+        verdict = judge(np.where(is_clear, spoiled, t), exact, o, d, 0.0, end, **limits)
+        assert len(getattr(verdict, wrong)) > 0.8 * is_clear.sum()
     with pytest.raises(ValueError, match="must be finite"):
         first_side_changes(exact, o, d, 0.0, math.inf, level=0.5)
 
@@ -566,9 +571,9 @@ class Staircase(hk.Field):
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize("overstep", [1.0, 1.4])
+@pytest.mark.parametrize("over_relaxation", [1.0, 1.4])
 @pytest.mark.parametrize("precision", ["single", "double"])
-def test_staircases(precision: Any, overstep: float) -> None:
+def test_staircases(precision: Any, over_relaxation: float) -> None:
     """Level 0 is met smoothly, or at a plane, or not at all, in places that are plain to see."""
     up, down = [[1.0, 0, 0]], [[-1.0, 0, 0]]
     # slope, planes, direction, start x, t_max; t of the hit, sheet
@@ -596,7 +601,7 @@ def test_staircases(precision: Any, overstep: float) -> None:
     for slope, planes, way, x, t_max, t, sheet in cases:
         hits = hk.trace(
             Staircase(slope, planes), [[x, 0.0, 0.0]], way,
-            t_max=t_max, precision=precision, over_relaxation=overstep, tolerance=1e-5,
+            t_max=t_max, precision=precision, over_relaxation=over_relaxation, tolerance=1e-5,
         )  # fmt: skip
         assert hits.t[0] == pytest.approx(t, abs=1e-4), (slope, planes, x)
         assert hits.primitive_index[0] == sheet, (slope, planes, x)
@@ -615,16 +620,19 @@ class Approximate(hk.Field):
 
 
 @pytest.mark.few(2)
-@pytest.mark.parametrize("overstep", [1.0, 1.4])
-@pytest.mark.parametrize("bound", [None, "slope", "caps"])
+@pytest.mark.parametrize("over_relaxation", [1.0, 1.4])
+@pytest.mark.parametrize("enclosures", [None, "slope", "caps"])
 @pytest.mark.parametrize("direction", [1.0, -1.0])
-def test_gradients_known_up_to_an_error(bound: Any, overstep: float, direction: float) -> None:
+def test_gradients_known_up_to_an_error(
+    enclosures: Any, over_relaxation: float, direction: float
+) -> None:
     """Trusted, a gradient of half the length leads past the level; with its error it does not."""
 
     def passes(gradient: float, error: Any) -> bool:
         hits = hk.trace(
             Approximate(gradient, error), [[0.0, 0, 0]], [[direction, 0, 0]],
-            level=direction, t_max=4.0, enclosures=bound, over_relaxation=overstep, tolerance=1e-5,
+            level=direction, t_max=4.0, enclosures=enclosures, over_relaxation=over_relaxation,
+            tolerance=1e-5,
         )  # fmt: skip
         assert hits.t[0] in (pytest.approx(1, abs=1e-4), math.inf)
         return bool(np.isinf(hits.t[0]))
@@ -755,7 +763,7 @@ def test_rays_that_begin_and_end_anywhere(kind: type[BruteForceWinding]) -> None
     for settings, start, end in inside:
         rows = np.flatnonzero(start < end)
         assert len(rows) > 200
-        hits = hk.trace(field, o, d, tolerance=TOLERANCE, **settings)
+        hits = hk.trace(field, o, d, tolerance=TOLERANCE, precision="single", **settings)
         t = hit_t(hits)
         assert not hits.is_hit[start > end + 1e-5].any()
         assert ((t >= start - 1e-5) | ~hits.is_hit).all()
@@ -783,12 +791,15 @@ def test_a_sheet_at_the_start_is_met_there() -> None:
     vertices, faces = MESHES["cube along the axes"]
     field = BruteForceWinding(vertices, faces)
     o, d = np.array([[0.1, 0.2, 0.75]]), np.array([[0.0, 0.0, -1.0]])
-    hits = hk.trace(field, o, d)
+    hits = hk.trace(field, o, d, precision="single")
     assert hits.t.tolist() == [0.0]
-    hits = hk.trace(field, o + np.array([[0, 0, 1.0]]), d, t_min=1.0)
+    hits = hk.trace(field, o + np.array([[0, 0, 1.0]]), d, t_min=1.0, precision="single")
     assert hits.t.tolist() == [1.0]
-    assert hits.primitive_index.tolist() == hk.trace(field, o, d).primitive_index.tolist()
-    beyond = hk.trace(field, o, d, t_min=1e-3)
+    assert (
+        hits.primitive_index.tolist()
+        == hk.trace(field, o, d, precision="single").primitive_index.tolist()
+    )
+    beyond = hk.trace(field, o, d, t_min=1e-3, precision="single")
     assert beyond.t[0] > 1e-3
 
 
@@ -797,9 +808,9 @@ def test_few_steps_end_with_the_proved_length() -> None:
     vertices, faces = MESHES["flipped face"]
     field = BruteForceWinding(vertices, faces)
     o, d = rays(vertices, 300)
-    full = hk.trace(field, o, d)
+    full = hk.trace(field, o, d, precision="single")
     for steps in (1, 2, 3, 6):
-        short = hk.trace(field, o, d, max_steps=steps)
+        short = hk.trace(field, o, d, max_steps=steps, precision="single")
         out = short.status == hk.RayStatus.OUT_OF_STEPS
         assert out.any()
         assert (short.evaluations <= steps).all()
@@ -809,7 +820,7 @@ def test_few_steps_end_with_the_proved_length() -> None:
     boxes = BruteForceWinding(*MESHES["nested boxes"])
     ray = np.array([[0.05, 0.1, 2.9]]), np.array([[0.0, 0.0, -1.0]])
     for steps in (1, 2, 3):  # the second passes the outer box, the third hits the inner one
-        hits = hk.trace(boxes, *ray, level=1.5, max_steps=steps)
+        hits = hk.trace(boxes, *ray, level=1.5, max_steps=steps, precision="single")
         assert hits.evaluations.tolist() == [steps]
         assert hits.is_hit.tolist() == [steps == 3]
 
@@ -820,10 +831,10 @@ def test_closed_meshes_cost_one_evaluation_a_crossing() -> None:
     field = BruteForceWinding(vertices, faces)
     o = np.array([[0.05, 0.1, 2.9], [2.9, 2.8, 2.7], [0.05, 0.1, 0.0]])
     d = np.array([[0.0, 0, -1], [0, 0, -1], [0, 0, -1]])
-    hits = hk.trace(field, o, d)
+    hits = hk.trace(field, o, d, precision="single")
     assert hits.status.tolist() == [1, 0, 1]
     assert hits.evaluations.tolist() == [2, 1, 3]
-    assert hk.trace(field, o, d, level=1.5).evaluations.tolist() == [3, 1, 2]
+    assert hk.trace(field, o, d, level=1.5, precision="single").evaluations.tolist() == [3, 1, 2]
 
 
 # --- other ways in --------------------------------------------------------------------------
@@ -845,7 +856,7 @@ def test_drjit_rays_get_the_same(precision: Any) -> None:
 def test_occlusion_is_a_hit() -> None:
     vertices, faces = MESHES["open cube"]
     backend = choose_backend("single")
-    prepared = hk.Surface(BruteForceWinding(vertices, faces)).prepare(backend)
+    prepared = traced_surface(BruteForceWinding(vertices, faces)).prepare(backend)
     o, d = (backend.Array3f(v.T) for v in rays(vertices, 400))
     far = backend.Float(np.random.default_rng(0).uniform(0.1, 4, 400))
     active = dr.arange(backend.UInt32, 400) % 3 != 0
@@ -980,8 +991,11 @@ def test_derivatives_by_parameters_are_refused() -> None:
 def test_what_makes_no_sense_is_refused() -> None:
     vertices, faces = MESHES["open cube"]
     field = BruteForceWinding(vertices, faces)
-    with pytest.raises(ValueError, match="jumps across sheets has no closed solid"):
-        hk.Surface(field, level=0.5, side="above")
+    solid = hk.Surface(field, level=0.5, side="above")
+    with pytest.raises(ValueError, match="a field that jumps has no closed solid"):
+        hk.render(solid, size=(8, 6), progress=False)
+    with pytest.raises(TypeError, match='trace takes level sets, not side="above"'):
+        hk.trace(solid, [[3.0, 0, 0]], [[-1.0, 0, 0]])
     field.period = 1.0  # type: ignore[misc]
     with pytest.raises(ValueError, match="must be real-valued"):
         hk.Surface(field)
@@ -999,7 +1013,7 @@ def test_rays_that_leave_a_sheet_do_not_meet_it_again() -> None:
     backend = choose_backend("single")
     for scale in (1.0, 1e-3):
         field = BruteForceWinding(scale * vertices, faces)
-        prepared = hk.traced_surface(field, tolerance=1e-6 * scale).prepare(backend)
+        prepared = traced_surface(field, tolerance=1e-6 * scale).prepare(backend)
         o, d = rays(vertices, 1000, seed=4)
         ray = backend.Array3f((scale * o).T), backend.Array3f(d.T)
         met = intersect_surface(prepared, *ray, math.inf, backend.Bool(True))
@@ -1025,9 +1039,7 @@ def test_rays_that_leave_a_sheet_do_not_meet_it_again() -> None:
 def test_polished_hits_stay_on_the_surface_and_sheets_where_they_are() -> None:
     vertices, faces = MESHES["open cube"]
     backend, exact = choose_backend("double"), ExactWinding(vertices, faces)
-    prepared = hk.traced_surface(BruteForceWinding(vertices, faces), tolerance=1e-4).prepare(
-        backend
-    )
+    prepared = traced_surface(BruteForceWinding(vertices, faces), tolerance=1e-4).prepare(backend)
     o, d = rays(vertices, 500, closest=1e-2)
     ray = backend.Array3f(o.T), backend.Array3f(d.T)
     met = intersect_surface(prepared, *ray, math.inf, backend.Bool(True))
@@ -1052,11 +1064,11 @@ def test_walls_thinner_than_rounding_are_not_passed() -> None:
     near = hk.WindingNumber(cube.vertices, cube.faces)
     on_map = hk.WindingNumber(cube.vertices + place, cube.faces)
     rays = np.array([[0.1, 0.2, 4.0], [2.0, 0.0, 4.0]]), np.array([[0, 0, -1.0]] * 2)
-    single = hk.trace(on_map, place + rays[0], rays[1])
+    single = hk.trace(on_map, place + rays[0], rays[1], precision="single")
     assert single.status.tolist() == [hk.RayStatus.OUT_OF_STEPS, hk.RayStatus.MISS]
     double = hk.trace(on_map, place + rays[0], rays[1], precision="double")
     assert double.t == pytest.approx([3.5, np.inf])
-    far = hk.trace(near, [[0.1, 0.2, 4e6], [0.1, 0.2, 4e5]], rays[1])
+    far = hk.trace(near, [[0.1, 0.2, 4e6], [0.1, 0.2, 4e5]], rays[1], precision="single")
     assert far.status.tolist() == [hk.RayStatus.OUT_OF_STEPS, hk.RayStatus.HIT]
     assert far.t[1] == pytest.approx(4e5 - 0.5, abs=0.1)
 

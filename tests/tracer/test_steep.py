@@ -107,7 +107,7 @@ def test_hits_are_where_the_surface_is(name: str, precision: Precision) -> None:
 def test_no_surface_is_hit_where_there_is_none(text: str) -> None:
     o, d = rays(1.0)
     box = hk.Box((-1, -1, -1), (1, 1, 1))
-    hits = hk.trace(hk.expression(text), o, d, clip=box)
+    hits = hk.trace(hk.expression(text), o, d, clip=box, precision="single")
     assert (hits.status == hk.RayStatus.MISS).all()
 
 
@@ -183,7 +183,7 @@ def test_crossings_beside_a_vertical_tangent() -> None:
 
 @pytest.mark.parametrize("precision", ["single", pytest.param("double", marks=pytest.mark.slow)])
 def test_valley_with_a_vertical_tangent(precision: Precision) -> None:
-    """z = sqrt(|x|): along and down into its valley, from it, and confirmed."""
+    """z = sqrt(|x|): along and down into its valley, and from it."""
     field = hk.fields.HeightField(lambda x, y: hk.math.sqrt(abs(x)))
     o = [[0, 0.5, 3], [1e-9, 0.5, 3], [-0.9, 0.1, 0.25], [0, 0.1, 0.25], [0, 0.5, 0.25]]
     d = [[0, 0, -1], [0, 0, -1], [1, 0, 0], [1, 0, 0], [0, -1, 0]]
@@ -199,7 +199,7 @@ def test_powers_that_overflow() -> None:
     """|grad f|^2 = 1e63 at the sides of the box leaves single precision."""
     field = hk.expression("x^100 + y^100 + z^100 = 1")
     o, d = rays(2.0)
-    hits = hk.trace(field, o, d, clip=hk.Box((-2, -2, -2), (2, 2, 2)))
+    hits = hk.trace(field, o, d, clip=hk.Box((-2, -2, -2), (2, 2, 2)), precision="single")
     p = hits.position[hits.status == hk.RayStatus.HIT]
     assert len(p) > 100
     assert (abs(np.abs(p).max(1) - 1) < 0.012).all()
@@ -237,8 +237,8 @@ def test_a_slope_proves_that_a_level_is_taken_no_sooner_than_it_is() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["union", "difference", "near", "rotated"])
-@pytest.mark.parametrize("confirm", [False, True])
-def test_solids_made_of_cusps(kind: str, confirm: bool) -> None:
+@pytest.mark.parametrize("require_crossing", [False, True])
+def test_solids_made_of_cusps(kind: str, require_crossing: bool) -> None:
     text, f, half = FORMULAS["astroid"]
     star, ball = hk.solid(hk.expression(text), below=0), hk.Sphere(0.6, center=(0.5, 0, 0))
 
@@ -257,7 +257,7 @@ def test_solids_made_of_cusps(kind: str, confirm: bool) -> None:
     o, d = rays(half)
     truth = first_roots(oracle, o, d, half)
     box = hk.Box((-half,) * 3, (half,) * 3)
-    hits = hk.trace(solid, o, d, clip=box, require_crossing=confirm)
+    hits = hk.trace(solid, o, d, clip=box, require_crossing=require_crossing, precision="single")
     assert not (hits.status == hk.RayStatus.OUT_OF_STEPS).any()
     np.testing.assert_allclose(hits.t, truth, atol=2e-3)
 
@@ -276,11 +276,11 @@ def test_rays_pass_where_all_squares_of_a_norm_are_zero() -> None:
     o, d = rays(1.0, 200)
     o[:2], d[:2] = [[0.5, 0, 0.1], [0.5, 0.5, 0]], [[-1, 0, 0], [-(0.5**0.5), -(0.5**0.5), 0]]
     field = hk.expression(box)
-    hits = hk.trace(field, 0.3 * o, d)
+    hits = hk.trace(field, 0.3 * o, d, precision="single")
     assert not (hits.status == hk.RayStatus.OUT_OF_STEPS).any()
     assert hits.evaluations.mean() < 12
     points = np.random.default_rng(1).uniform(-0.7, 0.7, (50, 3))
-    assert np.isfinite(field.gradient(points)).all()
+    assert np.isfinite(field.gradient(points, precision="single")).all()
 
 
 def test_which_formulas_are_steep() -> None:

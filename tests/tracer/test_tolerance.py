@@ -226,7 +226,7 @@ def test_hits_that_rounding_makes_say_how_far_the_surface_is(power: int) -> None
     text = text.replace("s", "(x^2 + y^2 + z^2)")
     field = hk.expression(text, domain=hk.Box((-1.5,) * 3, (1.5,) * 3))
     o, d = grazing_rays(300)
-    hits = hk.trace(field, o, d, precision="single")
+    hits = hk.trace(field, o, d, tolerance=1e-4, precision="single")
     assert hits.is_hit.mean() > 0.8
     off = np.abs(np.linalg.norm(hits.position[hits.is_hit], axis=1) - 1)
     stated = 1e-4 + hits.uncertainty[hits.is_hit]
@@ -270,7 +270,7 @@ def test_hits_near_triple_lines_say_how_far_the_surface_is() -> None:
     o = target - 3 * line + rng.normal(size=(n, 3)) * 10 ** rng.uniform(-3, -0.5, (n, 1))
     target += rng.normal(size=(n, 3)) * 10 ** rng.uniform(-6, -1, (n, 1))
     field = hk.expression(ENNEPER, domain=hk.Box((-1.5,) * 3, (1.5,) * 3))
-    hits = hk.trace(field, o, target - o, precision="single")
+    hits = hk.trace(field, o, target - o, tolerance=1e-4, precision="single")
     rows = np.flatnonzero(hits.uncertainty > 5e-5)
     assert len(rows) > 10
     off = on_enneper(hits.position[rows].astype(np.float64))

@@ -24,7 +24,7 @@ FIELD = hk.SolidAngle(SQUARE)
 WAVY = hk.SolidAngle(example_curves.wavy_polygon(12))
 GYROID = hk.Gyroid(domain=hk.Ball(radius=5.0))
 DOWN = np.array([[0.0, 0.0, -1.0]])
-BOUNDS = [None, "classic", "slope", "caps", "curvature"]
+ENCLOSURES = [None, "classic", "slope", "caps", "curvature"]
 
 
 def above(n: int, height: float = 2.0, seed: int = 0) -> np.ndarray:
@@ -45,7 +45,7 @@ def around(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_shapes_and_types_of_numpy_output() -> None:
-    hits = hk.trace(FIELD, above(7), np.tile(DOWN, (7, 1)))
+    hits = hk.trace(FIELD, above(7), np.tile(DOWN, (7, 1)), precision="single")
     shapes_of = {name: array.shape for name, array in vars(hits).items()}
     assert shapes_of == {
         "t": (7,), "position": (7, 3), "normal": (7, 3), "value": (7,),
@@ -58,16 +58,37 @@ def test_shapes_and_types_of_numpy_output() -> None:
     assert hk.trace(FIELD, above(7), DOWN, precision="double").t.dtype == np.float64
 
 
+def test_precision_follows_the_arrays() -> None:
+    """float64 is traced in double precision, all others in single; `precision` says otherwise."""
+    o, d = above(7), np.tile(DOWN, (7, 1))
+    small = [array.astype(np.float32) for array in (o, d)]
+    for rays, precision, dtype in (
+        ((o, d), None, np.float64),
+        ((o, d), "single", np.float32),
+        (small, None, np.float32),
+        (small, "double", np.float64),
+        ((o.tolist(), d.tolist()), None, np.float32),
+        ((np.ones((1, 3), np.int64), -np.ones((1, 3), np.int64)), None, np.float32),
+    ):
+        hits = hk.trace(FIELD, *rays, precision=precision)
+        assert hits.t.dtype == hits.position.dtype == hits.normal.dtype == dtype
+        crossings = hk.crossings(FIELD, *rays, max_crossings=2, precision=precision)
+        assert crossings.t.dtype == crossings.position.dtype == dtype
+    in_double = hk.trace(FIELD, o, d)
+    for name, values in vars(hk.trace(FIELD, o, d, precision="double")).items():
+        np.testing.assert_array_equal(getattr(in_double, name), values)
+
+
 def test_one_origin_or_one_direction_serves_all() -> None:
     o, d = around(9)
     for origins, directions in ((o[:1], d), (o, d[:1])):
-        one = hk.trace(WAVY, origins, directions)
-        all_given = hk.trace(
+        hits = hk.trace(WAVY, origins, directions)
+        repeated = hk.trace(
             WAVY, np.broadcast_to(origins, (9, 3)), np.broadcast_to(directions, (9, 3))
         )
-        assert one.t.shape == (9,)
-        np.testing.assert_array_equal(one.t, all_given.t)
-        np.testing.assert_array_equal(one.normal, all_given.normal)
+        assert hits.t.shape == (9,)
+        np.testing.assert_array_equal(hits.t, repeated.t)
+        np.testing.assert_array_equal(hits.normal, repeated.normal)
     assert hk.trace(WAVY, o[:1], d[:1], t_min=np.zeros(4)).t.shape == (4,)
 
 
@@ -146,7 +167,7 @@ def test_t_is_a_length_whatever_the_direction() -> None:
 def test_precisions_agree() -> None:
     o, d = around(400)
     for field in (WAVY, GYROID, hk.SphericalHarmonic(5, 2)):
-        single = hk.trace(field, o, d, tolerance=1e-5)
+        single = hk.trace(field, o, d, tolerance=1e-5, precision="single")
         double = hk.trace(field, o, d, tolerance=1e-5, precision="double")
         assert (single.status != double.status).sum() <= 1  # a ray that grazes the border
         both = single.is_hit & double.is_hit
@@ -156,15 +177,19 @@ def test_precisions_agree() -> None:
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize(
-    "overstep", [1.0, *(pytest.param(x, marks=pytest.mark.slow) for x in (1.2, 1.4)), 1.9]
+    "over_relaxation", [1.0, *(pytest.param(x, marks=pytest.mark.slow) for x in (1.2, 1.4)), 1.9]
 )
-@pytest.mark.parametrize("bound", BOUNDS)
-def test_different_proofs_give_the_same_hits(bound: str | None, overstep: float) -> None:
+@pytest.mark.parametrize("enclosures", ENCLOSURES)
+def test_different_proofs_give_the_same_hits(
+    enclosures: str | None, over_relaxation: float
+) -> None:
     o, d = around(300)
     for field in (WAVY, hk.SolidAngle(example_curves.torus_knot(2, 3, 40)), GYROID):
         settings: Any = {"tolerance": 1e-7, "precision": "double", "max_steps": 20_000}
         reference = hk.trace(field, o, d, enclosures="slope", over_relaxation=1.0, **settings)
-        hits = hk.trace(field, o, d, enclosures=bound, over_relaxation=overstep, **settings)
+        hits = hk.trace(
+            field, o, d, enclosures=enclosures, over_relaxation=over_relaxation, **settings
+        )
         assert (hits.status != reference.status).sum() <= 1
         both = hits.is_hit & reference.is_hit
         assert both.sum() > 50
@@ -245,20 +270,55 @@ def test_few_steps_end_with_the_proved_length() -> None:
 
 def test_several_levels_and_periods() -> None:
     o, d = around(200)
-    single = [hk.trace(GYROID, o, d, level=level).t for level in (-0.5, 0.7)]
-    both = hk.trace(GYROID, o, d, level=[-0.5, 0.7])
+    single = [hk.trace(GYROID, o, d, level=level, tolerance=1e-4).t for level in (-0.5, 0.7)]
+    both = hk.trace(GYROID, o, d, level=[-0.5, 0.7], tolerance=1e-4)
     np.testing.assert_allclose(both.t, np.minimum(*single), atol=1e-3)
     np.testing.assert_array_equal(
         hk.trace(WAVY, o, d, level=1.0).status, hk.trace(WAVY, o, d, level=1 + 8 * math.pi).status
     )
 
 
-def test_a_level_set_holds_its_own_settings() -> None:
+def test_a_surface_and_options_are_what_the_keywords_are() -> None:
     o, d = around(30)
-    surface = hk.traced_surface(WAVY, 1.0, tolerance=1e-6)
-    np.testing.assert_array_equal(
-        hk.trace(surface, o, d).t, hk.trace(WAVY, o, d, level=1.0, tolerance=1e-6).t
-    )
+    surface, options = hk.Surface(WAVY, 1.0), hk.TraceOptions(tolerance=1e-6)
+    by_keywords = hk.trace(WAVY, o, d, level=1.0, tolerance=1e-6).t
+    for hits in (
+        hk.trace(surface, o, d, options=options),
+        hk.trace(surface, o, d, tolerance=1e-6),
+        hk.trace(WAVY, o, d, level=1.0, options=options),
+        hk.trace(surface.replace(level=2.0).replace(level=1.0), o, d, options=options),
+        hk.trace(surface, o, d, options=hk.TraceOptions().replace(tolerance=1e-6)),
+    ):
+        np.testing.assert_array_equal(hits.t, by_keywords)
+
+
+@pytest.mark.parametrize(
+    ("volume", "expected"),
+    [
+        (hk.Ball(radius=0.5), 1e-4),
+        (hk.Box((-3, -1, -1), (3, 1, 1)), 6e-4),
+        (hk.HalfSpace((0, 0, 1), 1.0), 1e-4),
+    ],
+    ids=["ball", "box", "no bounds"],
+)
+def test_the_default_tolerance_follows_the_longest_side(volume: hk.Volume, expected: float) -> None:
+    """1e-4 of it; 1e-4 without bounds."""
+    o, d = around(200)
+    endless = hk.Gyroid(domain=hk.HalfSpace((0, 0, 1), 50.0))
+    # Steps that get shorter and shorter, so that hits are as far off as the tolerance lets them.
+    options = hk.TraceOptions(enclosures="lipschitz", over_relaxation=1.0)
+    for surface in (
+        hk.Surface(hk.Gyroid(domain=volume)),
+        hk.Surface(endless, clip=volume),
+        hk.Surface(endless, section=volume),
+    ):
+        hits, same, other = (
+            hk.trace(surface, o, d, t_max=20.0, options=options.replace(tolerance=tolerance)).t
+            for tolerance in (None, expected, 0.9 * expected)
+        )
+        assert np.isfinite(hits).sum() > 20
+        np.testing.assert_array_equal(hits, same)
+        assert (hits != other).any()
 
 
 # --- what is refused ------------------------------------------------------------------------
@@ -284,13 +344,13 @@ NAN = [[math.nan, 0.0, 0.0]]
         (np.zeros((1, 3)), DOWN, {"level": math.nan}, "level must be finite"),
         (np.zeros((1, 3)), DOWN, {"level": math.inf}, "level must be finite"),
         (np.zeros((1, 3)), DOWN, {"level": []}, "level: give at least one"),
-        (np.zeros((1, 3)), DOWN, {"bound": "best"}, "unknown bound 'best'; choose one of"),
-        (np.zeros((1, 3)), DOWN, {"bound": "lipschitz"}, "no bound applies"),
+        (np.zeros((1, 3)), DOWN, {"enclosures": "best"}, "unknown enclosures 'best'; choose"),
+        (np.zeros((1, 3)), DOWN, {"enclosures": "lipschitz"}, "no enclosure applies"),
         (np.zeros((1, 3)), DOWN, {"tolerance": 0.0}, "tolerance must be positive"),
         (np.zeros((1, 3)), DOWN, {"tolerance": -1e-3}, "distance must be finite and >= 0"),
         (np.zeros((1, 3)), DOWN, {"tolerance": math.nan}, "distance must be finite and >= 0"),
-        (np.zeros((1, 3)), DOWN, {"overstep": 0.9}, r"overstep must lie in \[1, 2\)"),
-        (np.zeros((1, 3)), DOWN, {"overstep": 2.0}, r"overstep must lie in \[1, 2\)"),
+        (np.zeros((1, 3)), DOWN, {"over_relaxation": 0.9}, r"over_relaxation must lie in \[1, 2\)"),
+        (np.zeros((1, 3)), DOWN, {"over_relaxation": 2.0}, r"over_relaxation must lie in \[1, 2\)"),
         (np.zeros((1, 3)), DOWN, {"max_steps": 0}, "max_steps must be an integer from 1"),
     ],
 )  # fmt: skip

@@ -536,7 +536,7 @@ def check_triangle_limit(expected: float, most: int) -> None:
     if expected > most:
         raise TriangleLimitError(
             f"the mesh takes about {expected:.2g} triangles, and max_triangles is {most:,}: choose "
-            "a larger `tolerance` or `cell_size`, a smaller `clip`, or a larger max_triangles"
+            "a larger `tolerance` or `cell_size`, a smaller `clip`, or a larger `max_triangles`"
         )
 
 

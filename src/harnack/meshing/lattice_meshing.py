@@ -300,7 +300,7 @@ def check_estimated_triangles(
         enough = expected / limit
         raise TriangleLimitError(
             f"the tolerance takes about {expected:.1e} triangles, and max_triangles is {limit:,}: "
-            f"choose a `tolerance` {enough:.2g} times as large, or a larger max_triangles"
+            f"choose a `tolerance` {enough:.2g} times as large, or a larger `max_triangles`"
         )
 
 

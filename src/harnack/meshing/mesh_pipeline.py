@@ -400,7 +400,7 @@ def _faces_alone(
     if len(surface.faces) > asked.most_faces:
         raise TriangleLimitError(
             f"{len(surface.faces):,} triangles of the mesh are its surface, and max_triangles is "
-            f"{asked.most_faces:,}: choose a larger max_triangles, or a smaller `clip`"
+            f"{asked.most_faces:,}: choose a larger `max_triangles`, or a smaller `clip`"
         )
     known = {"level": level, "made_by": "faces", "spacing": math.nan, "evaluations": 0}
     function = LevelFunction(field, level, most_faces=asked.most_faces)

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from harnack.rendering.backdrops import Backdrop
     from harnack.rendering.camera import Camera
     from harnack.rendering.isolines import Isolines
+    from harnack.rendering.stage import MaterialLike
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
@@ -259,9 +260,9 @@ class RenderKeywords(TraceKeywords, total=False):
     size: tuple[int, int] | None
     spp: int | None
     material: Any
-    section_material: Any
+    section_material: MaterialLike | None
     boundary_radius: float | None
-    boundary_material: Any
+    boundary_material: MaterialLike | None
     isolines: Isolines | Any
     thickness: float | None
     backdrop: Any

@@ -106,6 +106,9 @@ class Material:
         return nested if back is None else {**nested, "back": back}
 
 
+MaterialLike = str | Color | Material | Mapping[str, Any]
+
+
 def _without_table(bsdf: Dictionary) -> Dictionary:
     """A BSDF with the same diffuse reflectance, which is made without the table of a rough coat's
     transmittance (0.07 s)."""

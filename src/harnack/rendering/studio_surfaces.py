@@ -19,7 +19,6 @@ from harnack.meshing import mesh
 from harnack.meshing.checks import MeshingError
 from harnack.rendering.isolines import Isolines
 from harnack.rendering.option_table import names_of
-from harnack.rendering.scales import Color
 from harnack.rendering.stage import Material, StudioObject, parse_material
 from harnack.tracer import Surface, TracedSurface, TraceOptions, traced_surface
 from harnack.tracer.trace_options import surface_and_options
@@ -27,8 +26,6 @@ from harnack.tracer.traced_surface import check_has_inside
 
 # The material of tubes around the curves at which surfaces end.
 _TUBE_MATERIAL = "gold"
-
-MaterialLike = str | Color | Material | Mapping[str, Any]
 
 
 def _is_color(materials: Any) -> bool:

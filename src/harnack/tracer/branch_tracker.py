@@ -61,27 +61,28 @@ class BranchTracker:
         is within its error of a periodic level is accepted only by (1).
         """
         sample, level = look.sample, self.levels.values[0]
-        value, rung = sample.value - level, dr.floor(before - level)
-        between = level + (rung + (value - dr.floor(value)))
+        value, branch = sample.value - level, dr.floor(before - level)
+        in_branch = level + (branch + (value - dr.floor(value)))
         nearest = sample.value + dr.round(before - sample.value)
         change = 0 * step + _MAX_CHANGE
         is_near = any_is_free(look.backward, LevelGaps(change, change), step) & (
             total_error < _MAX_ERROR
         )
         is_near &= before != 0
-        value = dr.select(is_near, nearest, between)
+        value = dr.select(is_near, nearest, in_branch)
         shift = dr.select(sample.branch_unknown, value - sample.value, 0)
         return replace(look, sample=sample.shifted(shift)), is_near
 
     def gaps(
         self, sample: Sample, is_modulo: Mask, is_sure: Mask, total_error: Real
     ) -> tuple[LevelGaps, Mask, Mask]:
-        """The gaps to solve steps for, and two masks.
+        """The level gaps for which steps are solved, and two masks.
 
-        Gaps: to the neighboring periodic levels; but to the neighboring true levels (`passes`)
-        where a periodic level that is no true level is near, or f is hardly known.
-        Masks: lanes of `passes` whose sample knows its branch; lanes to be sampled again with known
-        branch.
+        The gaps are to the neighboring periodic levels. On lanes of `passes`, where a periodic
+        level that is no true level is near or the error of f is large, they are to the neighboring
+        true levels.
+        The first mask has the lanes of `passes` whose sample knows its branch; the second has the
+        lanes to be sampled again with known branch.
 
         is_modulo: lanes whose sample gave f only modulo 1.
         is_sure: lanes on which the branch is certain even if f is within its error of a periodic
@@ -90,11 +91,11 @@ class BranchTracker:
         A ray passes a periodic level that is no true level by samples that know their branch: a
         step from such a sample may cross that level, and the next sample must know its branch, too.
         """
-        rungs, plain = self._periodic_levels.gaps(sample.value), self.levels.gaps(sample.value)
+        periodic, true = self._periodic_levels.gaps(sample.value), self.levels.gaps(sample.value)
         near = fmax(2 * total_error, _NEAR_LEVEL)
-        passes = (rungs.nearest < near) & (rungs.nearest < 0.5 * plain.nearest)
+        passes = (periodic.nearest < near) & (periodic.nearest < 0.5 * true.nearest)
         passes |= ~(total_error < _MAX_ERROR)
-        down = dr.select(passes, plain.below, rungs.below)
-        up = dr.select(passes, plain.above, rungs.above)
-        doubt = passes | (~is_sure & (rungs.nearest < 2 * total_error))
-        return LevelGaps(down, up), passes & ~is_modulo, doubt & is_modulo
+        down = dr.select(passes, true.below, periodic.below)
+        up = dr.select(passes, true.above, periodic.above)
+        unsure = passes | (~is_sure & (periodic.nearest < 2 * total_error))
+        return LevelGaps(down, up), passes & ~is_modulo, unsure & is_modulo

@@ -85,7 +85,7 @@ class _NoDerivative(dr.CustomOp):
 
 
 def refuse_derivative(prepared: SurfaceTracer, o: Vec3, d: Vec3, what: str, value: Any) -> Any:
-    """The same result of a trace, with an error (`_NoDerivative`) if its derivative is requested.
+    """The result of a trace, with an error (`_NoDerivative`) if its derivative is requested.
 
     Its derivative is not known, and zero would be wrong.
     """
@@ -108,8 +108,8 @@ def attach_derivatives(
         hit &= ~end.at_jump
     backend = prepared.backend
     with dr.suspend_grad():
-        at = dr.select(hit, t, 0)
-        here, along = dr.detach(o), dr.detach(d)
+        t_hit = dr.select(hit, t, 0)
+        origin, direction = dr.detach(o), dr.detach(d)
         steps = _NEWTON_STEPS
         if prepared.field.has_variable_accuracy:
             # Truncation is as large as the tolerance, and its derivative may be much larger.
@@ -117,35 +117,35 @@ def attach_derivatives(
             detail = dr.select(hit, backend.Float(EXACT), 0)
             prepared = replace(prepared, field=prepared.field.at_accuracy(detail))
         for _ in range(steps):
-            x = dr.fma(backend.Array3f(at), along, here)
+            x = dr.fma(backend.Array3f(t_hit), direction, origin)
             sample = prepared.sample(x)
-            miss = prepared.levels.offset_to_nearest(sample.value)
-            slope = dr.dot(sample.gradient, along)
-            step = dr.select(hit & (slope != 0), miss / slope, 0)
+            offset = prepared.levels.offset_to_nearest(sample.value)
+            slope = dr.dot(sample.gradient, direction)
+            step = dr.select(hit & (slope != 0), offset / slope, 0)
             # A grazing ray may have no root to converge to; stay near the proved point.
             limit = 4 * prepared.tolerance.distance
-            at = at + dr.clip(step, -limit, limit)
-        x = dr.fma(backend.Array3f(at), along, here)
+            t_hit = t_hit + dr.clip(step, -limit, limit)
+        x = dr.fma(backend.Array3f(t_hit), direction, origin)
         sample = prepared.sample(x)
-        slope = dr.dot(sample.gradient, along)
+        slope = dr.dot(sample.gradient, direction)
         length = norm(sample.gradient)
         normal = dr.select(hit & (length > 0), sample.gradient / length, normal)
-        dr.eval(at, x, slope, normal)
-    moving = dr.fma(backend.Array3f(at), d, o)
-    change = dr.dot(sample.gradient, moving - x)
-    if any(dr.grad_enabled(one) for one in prepared.field.parameters()):
-        value = prepared.field.differentiable_value(moving)
+        dr.eval(t_hit, x, slope, normal)
+    point = dr.fma(backend.Array3f(t_hit), d, o)
+    change = dr.dot(sample.gradient, point - x)
+    if any(dr.grad_enabled(parameter) for parameter in prepared.field.parameters()):
+        value = prepared.field.differentiable_value(point)
         change = value - dr.detach(value)
     change = change - _change_of_nearest(prepared, sample.value)
-    return dr.select(hit, _with_derivative(at, change, slope, hit), t), normal
+    return dr.select(hit, _with_derivative(t_hit, change, slope, hit), t), normal
 
 
 def _on_plane(prepared: SurfaceTracer, o: Vec3, d: Vec3, end: MarchResult) -> Real:
-    """t with the derivative of the intersection with a plane at hits on sheets."""
+    """t with the derivative of the intersection with a plane, at hits on facets."""
     with dr.suspend_grad():
-        at = dr.select(end.at_jump, end.t, 0)
+        t_hit = dr.select(end.at_jump, end.t, 0)
         slope = dr.dot(end.gradient, dr.detach(d))
-    x = dr.fma(prepared.backend.Array3f(at), d, o)
+    x = dr.fma(prepared.backend.Array3f(t_hit), d, o)
     change = dr.dot(end.gradient, x - dr.detach(x))
     return _with_derivative(end.t, change, slope, end.at_jump)
 
@@ -156,12 +156,13 @@ def _with_derivative(t: Real, change: Real, slope: Real, where: Mask) -> Real:
 
 
 def _change_of_nearest(prepared: SurfaceTracer, f: Real) -> Real:
-    """level - detach(level), a zero with a derivative, of the level nearest to f in each lane."""
+    """The number level - detach(level), a zero with a derivative, of the level nearest to f in each
+    lane."""
     nearest, change = dr.inf, prepared.backend.Float(0)
     for level in prepared.levels.values:
         with dr.suspend_grad():
-            one = Levels((dr.detach(level),), prepared.levels.period)
-            gap = one.gaps(f).nearest
+            single = Levels((dr.detach(level),), prepared.levels.period)
+            gap = single.gaps(f).nearest
             closer = gap < nearest
             nearest = dr.select(closer, gap, nearest)
         change = dr.select(closer, level - dr.detach(level), change)

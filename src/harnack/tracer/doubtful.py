@@ -22,11 +22,12 @@ if TYPE_CHECKING:
     from harnack.enclosures import Levels
     from harnack.fields.field import Field
 
-# The surface is looked for so many times as far each time, up to this fraction of the size of
-# coordinates; a change to the other side is sure only if it is no jump from one period to the next.
+# The search distance grows by the first factor in each round, up to the second number times the
+# size of coordinates. A side of the level is sure only if f is within this fraction of the period
+# of the level, so that a jump from one period to the next is no change of sides.
 _FARTHER, _FARTHEST = 1.25, 1 / 16
 _OF_PERIOD = 0.25
-# Ways from a hit: both along the gradient, and along two axes across it.
+# The number of directions from a hit: both along the gradient, and both along two axes across it.
 _WAYS = 6
 
 
@@ -48,12 +49,17 @@ class Doubtful:
 
 @dataclass(frozen=True)
 class _Looking:
-    """The state of looking.
+    """The state of the search around a hit.
 
-    distance: to look at. way: index of the way. above, below: whether f was surely seen on these
-    sides of the level. low, high: lengths along the gradient between which f turns back from the
-    level, with the slopes there. searches: whether the place is looked for where it does.
-    may_turn: whether such a place may still be found. looks: so far.
+    distance: the distance of the next sample.
+    way: index of its direction.
+    above, below: whether f was surely seen on these sides of the level.
+    low, high, low_slope, high_slope: lengths along the gradient between which f turns back from the
+        level, and the slopes there.
+    searches: whether the point at which f turns back is being searched for.
+    may_turn: whether such a point may still be found.
+    looks: the number of samples so far.
+    seen: whether the surface was seen.
     """
 
     distance: Real
@@ -89,7 +95,7 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
     farthest = fmax(_FARTHEST * hits.size, hits.distance)
     smallest = 4 * backend.machine_epsilon * hits.size
 
-    def beside(sample: Any) -> tuple[Real, Real, Mask]:
+    def offset_of(sample: Any) -> tuple[Real, Real, Mask]:
         """f less the level, the bound of its error, and whether its side is sure."""
         x, error = (
             sample.value - level,
@@ -103,32 +109,32 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
     normal, vector = hits.normal, backend.Array3f
     axis = dr.select(dr.abs(normal.x) < 0.6, vector(1, 0, 0), vector(0, 1, 0))
     across = safe_normalize(dr.cross(normal, axis))
-    other = dr.cross(normal, across)
-    x, _, is_sure = beside(at_hit)
+    second = dr.cross(normal, across)
+    x, _, is_sure = offset_of(at_hit)
     side = dr.select(x > 0, backend.Float(1), -1)
 
     def body(now: _Looking) -> _Looking:
-        way = dr.select(now.way < 2, hits.normal, dr.select(now.way < 4, across, other))
+        way = dr.select(now.way < 2, hits.normal, dr.select(now.way < 4, across, second))
         way = dr.select((now.way & 1) == 0, way, -way)
-        at = dr.select(now.searches, _between(now), now.distance)
-        sample = field.evaluate(dr.fma(type(way)(at), way, hits.position))
-        x, error, is_sure = beside(sample)
+        length = dr.select(now.searches, _between(now), now.distance)
+        sample = field.evaluate(dr.fma(type(way)(length), way, hits.position))
+        x, error, is_sure = offset_of(sample)
         above, below = now.above | (is_sure & (x > 0)), now.below | (is_sure & (x < 0))
         slope = side * dr.dot(sample.gradient, way)
         first_slope = side * dr.dot(at_hit.gradient, way)
-        seen = (above & below) | (now.searches & (dr.abs(x) <= error))
-        # Does f turn back from the level on this way?
+        is_seen = (above & below) | (now.searches & (dr.abs(x) <= error))
+        # Does f turn back from the level in this direction?
         turns = now.may_turn & ~now.searches & (now.way < 2)
         turns &= (first_slope < 0) & (slope > sample.gradient_error)
         is_low = now.searches & (slope < 0)
         is_high = turns | (now.searches & ~is_low)
-        low = dr.select(turns, 0, dr.select(is_low, at, now.low))
-        high = dr.select(is_high, at, now.high)
+        low = dr.select(turns, 0, dr.select(is_low, length, now.low))
+        high = dr.select(is_high, length, now.high)
         goes_on = turns | (now.searches & (high - low > smallest))
-        stays = goes_on & ~seen
+        stays = goes_on & ~is_seen
         way_index = dr.select(stays, now.way, (now.way + 1) % _WAYS)
         is_round = ~stays & (way_index == 0)
-        distance = dr.select(is_round & ~seen, _FARTHER * now.distance, now.distance)
+        distance = dr.select(is_round & ~is_seen, _FARTHER * now.distance, now.distance)
         return _Looking(
             distance=distance,
             way=way_index,
@@ -141,8 +147,8 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
             searches=stays,
             may_turn=now.may_turn & ~(now.searches & ~goes_on),
             looks=now.looks + 1,
-            seen=seen,
-            active=now.active & ~seen & (distance <= farthest),
+            seen=is_seen,
+            active=now.active & ~is_seen & (distance <= farthest),
         )
 
     zero, yes, no = backend.Float(0), backend.Bool(True), backend.Bool(False)
@@ -155,7 +161,8 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
 
 
 def _between(now: _Looking) -> Real:
-    """Where f may turn back: by the secant through the slopes and by bisection, in turns."""
-    share = now.low_slope / (now.low_slope - now.high_slope)
-    by_secant = ((now.looks & 1) == 0) & (share > 0) & (share < 1)
-    return dr.fma(dr.select(by_secant, share, 0.5), now.high - now.low, now.low)
+    """The length at which f may turn back: by the secant through the slopes and by bisection, in
+    turns."""
+    fraction = now.low_slope / (now.low_slope - now.high_slope)
+    by_secant = ((now.looks & 1) == 0) & (fraction > 0) & (fraction < 1)
+    return dr.fma(dr.select(by_secant, fraction, 0.5), now.high - now.low, now.low)

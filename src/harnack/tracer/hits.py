@@ -38,15 +38,17 @@ if TYPE_CHECKING:
 
 # The keywords of `trace`.
 _HONORED = ("level", "clip", "section", "largest", *TRACE_OPTIONS)
-# From so many rays on it pays to look for empty cells first.
+# With at least this many rays it pays to search for empty cells first.
 _MIN_RAYS_FOR_CELLS = 4096
-# Rays are scattered where the directions of neighbors are farther apart than this, or their origins
-# than this fraction of the spread of all (both as roots of mean squares), by so many of them.
+# Rays are scattered if the directions of successive rays differ by more than the first number, or
+# their origins by more than the second number times the spread of all origins (both as roots of
+# mean squares), measured on the third number of rays.
 _MAX_TURN, _MAX_STRAY, _SAMPLED_RAYS = 0.15, 0.7, 4096
-# A hit is doubtful where rounding adds more than this part of the tolerance to how far the surface
-# may be to first order, and more than so many roundings of the point: it is taken for so many times
-# as far, as where so many sheets meet. Where it is farther than so many tolerances to first order
-# the surface is looked for instead, which takes a kernel.
+# A hit is doubtful if rounding adds to the first-order distance of the surface more than the first
+# number times the tolerance, and more than the second number of roundings of the point. The
+# distance is then multiplied by the third number, as where this many sheets of the surface meet. If
+# the first-order distance is more than the fourth number times the tolerance, the surface is
+# searched for instead, which takes a kernel.
 _PART, _OF_POINTS, _SHEETS, _LARGE = 0.5, 64, 3, 8
 
 
@@ -59,9 +61,8 @@ class Hits:
     t: (n,) ray parameter of the hit, a length; inf for a miss; for a ray that ran out of steps, the
         parameter up to which it is proved free. A hit is within the tolerance of the first root,
         mostly before it. A hit that requires a crossing is at a root, between two samples with f on
-        different
-        sides of the level: at the root of the cubic through their values and slopes, or of a
-        bisection if there is a crease between them.
+        different sides of the level: at the root of the cubic through their values and slopes, or
+        of a bisection if there is a crease between them.
     position: (n, 3) point at t, NaN for a miss.
     normal: (n, 3) unit normal grad f/|grad f|, or of the facet that was hit, to the side of larger
         f; zero for rays without a hit.
@@ -156,7 +157,7 @@ def trace(
         NotImplementedError: with a backend, a field whose kernel is not translated.
     """
     target, choices = surface_and_options("trace", surface, options, keywords, _HONORED)
-    traced = TracedSurface.of(target, choices)
+    traced = TracedSurface.of(target, choices).with_call_cache()
     if choices.backend is not None:
         if any(is_tensor(a) or dr.is_array_v(type(a)) for a in (origins, directions, t_min, t_max)):
             raise TypeError('backend="webgpu" takes rays as NumPy arrays: Dr.Jit\'s have a backend')
@@ -203,66 +204,70 @@ def _trace(surface: TracedSurface, rays: RayBatch) -> Hits:
 
 
 def _are_scattered(backend: Backend, o: Vec3, d: Vec3) -> bool:
-    """Whether many rays follow each other that have little to do with each other, unlike those of a
-    camera. Of a packet of a processor most would then wait for the longest: bounces and chords
-    through curves, clouds and unions of shapes take half the time by a queue, and a camera's rays a
-    fifth more (measured)."""
+    """Whether there are many rays and successive rays differ much, unlike the rays of a camera.
+
+    In a packet of a processor, most of such rays would wait for the longest. Measured: bounces, and
+    chords through curves, clouds and unions of shapes, take half the time with a queue; a camera's
+    rays take a fifth more."""
     count = dr.width(o, d)
     if count < _MIN_RAYS_FOR_CELLS or dr.backend_v(d) != dr.JitBackend.LLVM:
         return False
     step = (count - 1) // min(count - 1, _SAMPLED_RAYS)
     first = dr.arange(backend.UInt32, (count - 1) // step) * dr.opaque(backend.UInt32, step)
 
-    def seen(rays: Vec3, row: Any) -> FloatArray:
-        at = row if dr.width(rays) > 1 else 0 * row
-        return to_numpy(dr.gather(backend.Array3f, rays, at)).astype(np.float64)
+    def gather(rays: Vec3, rows: Any) -> FloatArray:
+        index = rows if dr.width(rays) > 1 else 0 * rows
+        return to_numpy(dr.gather(backend.Array3f, rays, index)).astype(np.float64)
 
-    with np.errstate(over="ignore", invalid="ignore"):  # of rays that are no rays
-        begin, stray = seen(o, first), seen(o, first) - seen(o, first + 1)
-        turned = seen(d, first) - seen(d, first + 1)
-        turns = np.square(turned).sum(axis=1).mean() > _MAX_TURN**2
-        spread = 2 * begin.var(axis=0).sum()
-        return bool(turns or np.square(stray).sum(axis=1).mean() > _MAX_STRAY**2 * spread > 0)
+    with np.errstate(over="ignore", invalid="ignore"):  # in rays that are not finite
+        starts, steps = gather(o, first), gather(o, first) - gather(o, first + 1)
+        turns = gather(d, first) - gather(d, first + 1)
+        turn = np.square(turns).sum(axis=1).mean() > _MAX_TURN**2
+        spread = 2 * starts.var(axis=0).sum()
+        return bool(turn or np.square(steps).sum(axis=1).mean() > _MAX_STRAY**2 * spread > 0)
 
 
 def _first_hits(
     prepared: SurfaceTracer, o: Vec3, d: Vec3, near: Real, far: Real
 ) -> tuple[MarchResult, Hits, _Doubt | None]:
-    """Ends of rays, the same as `Hits`, without derivatives, and how sure hits are; None where
-    no hit leaves a doubt."""
+    """Ends of rays, the same as `Hits`, without derivatives, and the doubt about the hits; None if
+    no hit can be doubtful."""
     backend = prepared.backend
     end = prepared.first_hit(o, d, near, far)
     hit = end.status == int(RayStatus.HIT)
     length = norm(end.gradient)
     normal = dr.select(hit & (length > 0), end.gradient / length, 0)
-    sheet = dr.full(backend.Int32, -1, dr.width(end.status))
+    index = dr.full(backend.Int32, -1, dr.width(end.status))
     if prepared.field.has_jumps:
-        sheet = dr.reinterpret_array(backend.Int32, end.facet)  # NO_FACET becomes -1
+        index = dr.reinterpret_array(backend.Int32, end.facet)  # NO_FACET becomes -1
     if end.patch is not None:
-        sheet = dr.reinterpret_array(backend.Int32, end.patch)
+        index = dr.reinterpret_array(backend.Int32, end.patch)
     smooth = hit & ~end.at_jump
-    # Where the gradient is no number its size has no bound (`tracer.steep`).
+    # Where the gradient is NaN its length has no bound (`tracer.steep`).
     uncertain = smooth & (end.tolerance_excess > 0) & (length == length)
     uncertainty = dr.select(uncertain, end.tolerance_excess / length, 0)
     doubt = None
-    if end.side is None and not prepared.field.is_steep:  # others are at a root, or looked at
+    # Other hits are at a root, or were tested on the other side of the level.
+    if end.side is None and not prepared.field.is_steep:
         doubt = _Doubt.of(prepared, o, end.t, length, uncertainty)
         farther = _SHEETS * doubt.distance - doubt.tolerance
         uncertainty = dr.select(doubt.is_doubtful, farther, uncertainty)
     position = _positions(o, d, end.t)
-    hits = Hits(end.t, position, normal, end.value, end.evaluations, end.status, sheet, uncertainty)
+    hits = Hits(end.t, position, normal, end.value, end.evaluations, end.status, index, uncertainty)
     return end, hits, doubt
 
 
-# How far the surface is from hits that rounding may have made.
+# The distance of the surface from hits that may be due to rounding.
 
 
 @dataclass(frozen=True)
 class _Doubt:
-    """How sure hits are.
+    """How far the surface may be from hits because of rounding.
 
-    size: of coordinates up to there. tolerance: as a length. distance: of the surface, to first
-    order, with what rounding may add. is_doubtful: whether that may be much too short.
+    size: a bound of the coordinates up to the hit.
+    tolerance: the tolerance as a length.
+    distance: the distance of the surface to first order, including rounding.
+    is_doubtful: whether this distance may be much too short.
     """
 
     size: Real
@@ -274,17 +279,17 @@ class _Doubt:
     def of(
         cls, prepared: SurfaceTracer, o: Vec3, t: Real, steepness: Real, uncertainty: Real
     ) -> _Doubt:
-        """That of hits where |grad f| is the steepness; uncertainty: to first order."""
+        """The doubt about hits. steepness: |grad f| there. uncertainty: to first order."""
         t = dr.select(dr.isfinite(t), t, 0)
         size = max_norm(o) + t
         tolerance = prepared.tolerance.value_tolerance(steepness, t) / steepness
-        least = fmax(_PART * tolerance, _OF_POINTS * prepared.backend.machine_epsilon * size)
-        return cls(size, tolerance, tolerance + uncertainty, uncertainty > least)
+        limit = fmax(_PART * tolerance, _OF_POINTS * prepared.backend.machine_epsilon * size)
+        return cls(size, tolerance, tolerance + uncertainty, uncertainty > limit)
 
 
 @dataclass(frozen=True)
 class _Around:
-    """Hits to look around, and the part that each is of."""
+    """Hits around which the surface is searched for, and the index of the patch of each."""
 
     around: Doubtful
     part: Any
@@ -298,8 +303,8 @@ class _Lengths:
 
 
 def _with_seen_distances(prepared: SurfaceTracer, hits: Hits, doubt: _Doubt) -> Hits:
-    """The hits, with uncertainties within which the surface was seen where these are large. All are
-    evaluated; nothing else is where there is no such hit."""
+    """The hits, with large uncertainties replaced by distances within which the surface was seen.
+    All arrays are evaluated. If there is no large uncertainty, nothing else is computed."""
     backend, field = prepared.backend, prepared.field
     is_far = doubt.is_doubtful & (doubt.distance > _LARGE * doubt.tolerance)
     has_far = dr.zeros(backend.UInt32, 1)
@@ -308,17 +313,17 @@ def _with_seen_distances(prepared: SurfaceTracer, hits: Hits, doubt: _Doubt) -> 
     if not has_far[0]:
         return hits
 
-    def seen(rays: _Around) -> _Lengths:
+    def search(hit: _Around) -> _Lengths:
         sampled = field
         if field.has_patches:
-            sampled = field.patch(dr.reinterpret_array(backend.UInt32, rays.part))
-        return _Lengths(seen_distance(backend, sampled, prepared.levels, rays.around))
+            sampled = field.patch(dr.reinterpret_array(backend.UInt32, hit.part))
+        return _Lengths(seen_distance(backend, sampled, prepared.levels, hit.around))
 
-    around = Doubtful(hits.position, hits.normal, doubt.size, doubt.distance)
-    far = compute_on_active(
-        is_far, seen, _Around(around, hits.primitive_index), _Lengths(doubt.distance)
+    doubtful = Doubtful(hits.position, hits.normal, doubt.size, doubt.distance)
+    searched = compute_on_active(
+        is_far, search, _Around(doubtful, hits.primitive_index), _Lengths(doubt.distance)
     )
-    uncertainty = dr.select(is_far, far.length - doubt.tolerance, hits.uncertainty)
+    uncertainty = dr.select(is_far, searched.length - doubt.tolerance, hits.uncertainty)
     return replace(hits, uncertainty=uncertainty)
 
 
@@ -344,19 +349,19 @@ def _trace_on_device(surface: TracedSurface, rays: RayBatch) -> Hits:
     directions = to_numpy(lanes["d"])
 
     def differences(rows: IntArray, expected: Arrays, computed: Arrays) -> str:
-        both = Hits(**expected), Hits(**computed)
-        return _compare_hits(*both, directions[rows], surface.hit_tolerance)
+        pair = Hits(**expected), Hits(**computed)
+        return _compare_hits(*pair, directions[rows], surface.hit_tolerance)
 
-    found = evaluate_on_device(find_device(), compute, lanes, prepared, differences)
-    return _as_numpy(Hits(**found), count)
+    arrays = evaluate_on_device(find_device(), compute, lanes, prepared, differences)
+    return _as_numpy(Hits(**arrays), count)
 
 
 # Where the cosine of the angle between a ray and the normal is less than this, a device that rounds
 # differently may find the hit anywhere along the surface; elsewhere, within the tolerance.
 _GRAZING = 0.1
-# What is asked of a device (in brackets: the worst of one that computes as it should, Mesa's on a
-# CPU, over 110 surfaces). At most this share of rays has another status, or hits farther off than
-# the tolerance, as at an apex (0);
+# Requirements on a device (in brackets: the worst values of a device that computes as it should,
+# Mesa's on a CPU, over 110 surfaces). At most this fraction of rays has another status, or hits
+# farther off than the tolerance, as at an apex (0);
 _MAX_OUTLIERS = 1e-3
 # nine in ten hits lie within this fraction of the tolerance (0.03), and their normals differ by no
 # more than this (2e-5);
@@ -367,39 +372,41 @@ _MAX_COUNT_CHANGE = 0.03
 
 
 def _compare_hits(
-    expected: Hits, found: Hits, directions: FloatArray, tolerance: HitTolerance
+    expected: Hits, actual: Hits, directions: FloatArray, tolerance: HitTolerance
 ) -> str:
-    """What differs in a device's hits by more than rounding explains; "" if nothing does.
+    """A message on how a device's hits differ by more than rounding explains; "" if they do not.
 
     A ray that runs along the surface, within the tolerance, may hit it anywhere there or not at
     all, and may run out of steps.
     """
-    hit, both = expected.is_hit | found.is_hit, expected.is_hit & found.is_hit
-    normal = cast("FloatArray", np.where(expected.is_hit[:, None], expected.normal, found.normal))
-    climb = np.abs((normal * directions).sum(axis=1))
-    other = expected.status != found.status
-    lost = np.maximum(expected.status, found.status) == int(RayStatus.OUT_OF_STEPS)
-    graze = lost | (hit & (climb < _GRAZING))
-    if (other & ~graze).any() or other.sum() > _MAX_OUTLIERS * len(other):
-        k = int(np.flatnonzero(other)[0])
+    hit, both = expected.is_hit | actual.is_hit, expected.is_hit & actual.is_hit
+    normal = cast("FloatArray", np.where(expected.is_hit[:, None], expected.normal, actual.normal))
+    cosine = np.abs((normal * directions).sum(axis=1))
+    differs = expected.status != actual.status
+    unproved = np.maximum(expected.status, actual.status) == int(RayStatus.OUT_OF_STEPS)
+    may_differ = unproved | (hit & (cosine < _GRAZING))
+    if (differs & ~may_differ).any() or differs.sum() > _MAX_OUTLIERS * len(differs):
+        k = int(np.flatnonzero(differs)[0])
         return (
-            f"{other.sum()} of {len(other)} rays end otherwise, such as ray {k} of the sample: "
-            f"{RayStatus(expected.status[k]).name} here, {RayStatus(found.status[k]).name} there"
+            f"{differs.sum()} of {len(differs)} rays end otherwise, such as ray {k} of the sample: "
+            f"{RayStatus(expected.status[k]).name} here, {RayStatus(actual.status[k]).name} there"
         )
     t = expected.t
     allowed = tolerance.distance + tolerance.per_length * np.where(both, t, 0)
     with np.errstate(invalid="ignore"):
-        off = np.where(both, np.abs(found.t - t), 0) * np.maximum(climb, _GRAZING)
+        offset = np.where(both, np.abs(actual.t - t), 0) * np.maximum(cosine, _GRAZING)
     rounding = 64 * np.finfo(np.float32).eps * np.where(both, 1 + np.abs(t), 1)
-    if (off > 2 * allowed + rounding).mean() > _MAX_OUTLIERS:
-        return f"hits lie up to {off.max():.2g} off the surface, and {allowed.max():.2g} is asked"
-    if both.any() and np.quantile((off - rounding)[both] / allowed[both], 0.9) > _MAX_OFFSET:
+    if (offset > 2 * allowed + rounding).mean() > _MAX_OUTLIERS:
+        return (
+            f"hits lie up to {offset.max():.2g} off the surface, and {allowed.max():.2g} is asked"
+        )
+    if both.any() and np.quantile((offset - rounding)[both] / allowed[both], 0.9) > _MAX_OFFSET:
         return "hits lie elsewhere, if within the tolerance"
-    turned = np.linalg.norm(found.normal - expected.normal, axis=1)[both & (climb >= _GRAZING)]
-    if turned.size and np.quantile(turned, 0.9) > _MAX_NORMAL_CHANGE:
+    turns = np.linalg.norm(actual.normal - expected.normal, axis=1)[both & (cosine >= _GRAZING)]
+    if turns.size and np.quantile(turns, 0.9) > _MAX_NORMAL_CHANGE:
         return "normals differ"
-    many, others = (one.evaluations.astype(np.float64) for one in (expected, found))
-    if np.abs(others - many).sum() > _MAX_COUNT_CHANGE * (many + 1).sum() + 2:
+    counts, actual_counts = (result.evaluations.astype(np.float64) for result in (expected, actual))
+    if np.abs(actual_counts - counts).sum() > _MAX_COUNT_CHANGE * (counts + 1).sum() + 2:
         return "rays take another number of evaluations"
     return ""
 
@@ -408,8 +415,8 @@ def _no_hits(rays: RayBatch) -> Hits:
     backend = rays.backend
     number, vector = dr.zeros(backend.Float, 0), dr.zeros(backend.Array3f, 0)
     count = dr.zeros(backend.UInt32, 0)
-    sheet = dr.zeros(backend.Int32, 0)
-    hits = Hits(number, vector, vector, number, count, count, sheet, number)
+    index = dr.zeros(backend.Int32, 0)
+    hits = Hits(number, vector, vector, number, count, count, index, number)
     if rays.is_numpy:
         return _as_numpy(hits, 0)
     return _as_tensors(hits) if rays.is_tensor else hits

@@ -25,8 +25,8 @@ __all__ = ["CELLS_ACROSS", "largest_component_cells"]
 
 # Cells along the longest side of the box around a surface, unless users ask for another number.
 CELLS_ACROSS = 128
-# Centers so many cells away from the surface, to first order, are far from it; the cells tell
-# nothing if more than this share of them is far.
+# Centers more than the first number of cells away from the surface, to first order, are far from
+# it; the cells do not separate components if more than the second number of them are far.
 _FAR, _MOST_FAR = 4.0, 0.5
 
 _Ends: TypeAlias = tuple[float, float]
@@ -59,33 +59,33 @@ def largest_component_cells(
             "largest needs a surface with bounds: give it a clip, such as a ball (harnack.Ball)"
         )
 
-    def made() -> OccupancyGrid:
+    def build() -> OccupancyGrid:
         return _build_cells(field.with_levels(levels), levels, volume, solid, across)
 
     if field.parameters():  # they may change in place
-        return made()
-    return _CELLS.get(field, (levels, volume, solid, across), made)
+        return build()
+    return _CELLS.get(field, (levels, volume, solid, across), build)
 
 
 def _build_cells(
     field: Field, levels: tuple[float, ...], volume: Volume, solid: _Ends | None, across: int
 ) -> OccupancyGrid:
     beyond = _distance_beyond(volume)
-    into_domain = _projection_to_domain(field)
-    within = None if solid is None else _inside_solid(field, solid)
+    to_domain = _projection_to_domain(field)
+    in_solid = None if solid is None else _inside_solid(field, solid)
     to_levels = clearance_function(field, levels, "double")
 
     def clearance(points: FloatArray) -> FloatArray:
-        free = np.maximum(beyond(points), 0.0)
-        asked, moved = into_domain(points)
-        known = np.isfinite(moved)
-        if not known.any():
-            return free
-        length = to_levels(asked[known]) - moved[known]
-        if within is not None:
-            length[within(asked[known])] = 0.0
-        free[known] = np.maximum(free[known], length)
-        return free
+        clearances = np.maximum(beyond(points), 0.0)
+        inner, distances = to_domain(points)
+        finite = np.isfinite(distances)
+        if not finite.any():
+            return clearances
+        length = to_levels(inner[finite]) - distances[finite]
+        if in_solid is not None:
+            length[in_solid(inner[finite])] = 0.0
+        clearances[finite] = np.maximum(clearances[finite], length)
+        return clearances
 
     lower, upper = (np.array(end, np.float64) for end in volume.bounds())
     if (lower > upper).any() or (lower == upper).all():  # rays do not meet a single point
@@ -117,37 +117,38 @@ def _refuse_if_unproved(
 
 
 def _projection_to_domain(field: Field) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
-    """For points (n, 3), points nearby in the field's domain, outside of which its promises need
-    not hold, and the distances between the two, (n,), infinite where none was found. If the point
-    found is at least c away from a set, the point given is at least c minus that distance away from
-    it.
+    """A function of points (n, 3) that returns nearby points (n, 3) in the field's domain, outside
+    of which its promises need not hold, and the distances (n,) between the two, infinite where no
+    such point was found. If the returned point is at least c away from a set, the argument is at
+    least c minus this distance away from it.
     """
     domain = None if field.is_global else field.domain
     backend = choose_backend("double")
     prepared = None if domain is None else domain.prepare(backend)
 
-    def into(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        moved = np.zeros(len(points))
+    def project(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        distances = np.zeros(len(points))
         if domain is None or prepared is None:
-            return points, moved
+            return points, distances
         outside = ~domain.contains_points(points)
         if not outside.any():
-            return points, moved
+            return points, distances
         x = points[outside]
         p = to_vector3(backend, x)
-        far = (1 + 1e-9) * to_numpy(prepared.signed_distance(p)) + 1e-12 * np.abs(x).max()
-        y = x - far[:, None] * to_numpy(prepared.outward_normal(p))
-        asked = points.copy()
-        asked[outside] = y
+        depth = (1 + 1e-9) * to_numpy(prepared.signed_distance(p)) + 1e-12 * np.abs(x).max()
+        y = x - depth[:, None] * to_numpy(prepared.outward_normal(p))
+        inner = points.copy()
+        inner[outside] = y
         length = 1.000001 * np.linalg.norm(x - y, axis=1)
-        moved[outside] = np.where(domain.contains_points(y), length, np.inf)
-        return asked, moved
+        distances[outside] = np.where(domain.contains_points(y), length, np.inf)
+        return inner, distances
 
-    return into
+    return project
 
 
 def _distance_beyond(volume: Volume) -> Callable[[FloatArray], FloatArray]:
-    """For points (n, 3), a lower bound of their distances from the volume, negative inside."""
+    """A function of points (n, 3): a lower bound of their distances from the volume, negative
+    inside."""
     backend = choose_backend("double")
     prepared = volume.prepare(backend)
 
@@ -162,22 +163,22 @@ def _distance_beyond(volume: Volume) -> Callable[[FloatArray], FloatArray]:
 def _samples(
     field: Field, levels: tuple[float, ...]
 ) -> Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]:
-    """For points (n, 3): how far values are from a level, the lengths of gradients, and values."""
+    """A function of points (n, 3): the gaps from f to the nearest level, |grad f|, and f."""
     backend = choose_backend("double")
     prepared = field.prepare(backend)
     targets = Levels(tuple(dr.opaque(backend.Float, level) for level in levels), field.period)
 
     def samples(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        seen = prepared.evaluate(to_vector3(backend, points))
-        found = (targets.gaps(seen.value).nearest, safe_norm(seen.gradient), seen.value)
-        gap, slope, value = (np.broadcast_to(to_numpy(one), len(points)) for one in found)
+        sample = prepared.evaluate(to_vector3(backend, points))
+        arrays = (targets.gaps(sample.value).nearest, safe_norm(sample.gradient), sample.value)
+        gap, slope, value = (np.broadcast_to(to_numpy(array), len(points)) for array in arrays)
         return gap, slope, value
 
     return samples
 
 
 def _inside_solid(field: Field, solid: _Ends) -> Callable[[FloatArray], BoolArray]:
-    """For points (n, 3), whether low <= f <= high."""
+    """A function of points (n, 3): whether low <= f <= high."""
     backend = choose_backend("double")
     prepared = field.prepare(backend)
 

@@ -170,7 +170,7 @@ CONTACT_TOLERANCE = 0.5
 # In contact, a step must not lead to where the band is less than the first number times the band
 # before, unless the step is at most the second number times the tolerance long.
 _MIN_BAND_RATIO, _SHORT_STEP = 0.25, 4.0
-# Rounds of the search for the root of a cubic.
+# The number of iterations of the search for the root of a cubic.
 _ROUNDS = 4
 
 
@@ -301,13 +301,13 @@ class Hysteresis:
         """The rule for these levels. free: `is_free_before` and `is_free_after`."""
         period = levels.period
         spacing: Real = dr.inf if period is None else period
-        for k, one in enumerate(levels.values):
+        for k, level in enumerate(levels.values):
             for other in levels.values[:k]:
-                apart = dr.abs(one - other)
+                gap = dr.abs(level - other)
                 if period is not None:
-                    apart = apart - period * dr.floor(apart / period)
-                    apart = fmin(apart, period - apart)
-                spacing = fmin(spacing, dr.select(apart > 0, apart, dr.inf))
+                    gap = gap - period * dr.floor(gap / period)
+                    gap = fmin(gap, period - gap)
+                spacing = fmin(spacing, dr.select(gap > 0, gap, dr.inf))
         return cls(levels, spacing, *free, start, rounding)
 
     def contact_tolerance(self, within: Real) -> Real:
@@ -327,8 +327,8 @@ class Hysteresis:
 
         tolerance: the hit tolerance at that point, a length.
         """
-        holds = now.band * _MIN_BAND_RATIO <= band
-        return ~now.is_touching | holds | (step <= _SHORT_STEP * tolerance)
+        comparable = now.band * _MIN_BAND_RATIO <= band
+        return ~now.is_touching | comparable | (step <= _SHORT_STEP * tolerance)
 
     def must_sample_end(self, now: Contact, end: Real) -> Mask:
         """Whether a ray that is proved free up to its end must still sample the end: in contact it
@@ -362,11 +362,11 @@ class Hysteresis:
         t, value, slope, gradient = seen.before
         x_before = -self.levels.offset_to_nearest(value)
         passes = active & touching & (side * x_before > 0) & (side * x <= 0)
-        share = cubic_root(x_before, x, (seen.t - t) * slope, (seen.t - t) * seen.slope)
+        fraction = cubic_root(x_before, x, (seen.t - t) * slope, (seen.t - t) * seen.slope)
         begins = active & ~touching & seen.is_near
-        root = dr.select(passes, t + share * (seen.t - t), dr.select(begins, seen.t, now.root))
+        root = dr.select(passes, t + fraction * (seen.t - t), dr.select(begins, seen.t, now.root))
         at_root = dr.select(begins, seen.gradient, now.gradient)
-        at_root = dr.select(passes, dr.lerp(gradient, seen.gradient, share), at_root)
+        at_root = dr.select(passes, dr.lerp(gradient, seen.gradient, fraction), at_root)
         excess = dr.select(passes | begins, seen.excess, now.tolerance_excess)
         before = dr.select(passes, t, dr.select(begins, seen.t, now.before))
         behind = dr.select(passes | begins, seen.t, now.after)
@@ -374,8 +374,8 @@ class Hysteresis:
         # Is f far enough beyond the level to have crossed it, or has it left the band?
         is_first = (now.side == 0) & ~touching
         stays = (is_first & self.is_free_before) | (seen.is_end & self.is_free_after)
-        enough = dr.select(stays, 0, _CROSSED * seen.band)
-        is_off = dr.abs(x) > fmax(enough, seen.total_error)
+        least_offset = dr.select(stays, 0, _CROSSED * seen.band)
+        is_off = dr.abs(x) > fmax(least_offset, seen.total_error)
         crosses = active & touching & is_off & (side * x < 0)
         settles = active & is_off & (side == 0)
         side = dr.select(settles | crosses, dr.select(x > 0, type(x)(1), -1), side)
@@ -412,19 +412,19 @@ class Hysteresis:
         is_off = dr.abs(behind) > fmax(_CROSSED * seen.band, seen.total_error)
         crosses = active & is_off & (side * behind < 0)
         side = dr.select(is_off, dr.select(behind > 0, one, -1), side)
-        at_sheet = passes | begins
+        at_facet = passes | begins
         return Contact(
             dr.select(active, side, now.side),
             dr.select(active, dr.abs(behind) <= seen.band, now.is_touching),
-            dr.select(at_sheet, seen.t, now.root),
-            dr.select(at_sheet, ahead.normal, now.gradient),
-            dr.select(at_sheet, 0, now.tolerance_excess),
-            dr.select(at_sheet, seen.t, now.before),
-            dr.select(at_sheet, seen.t, now.after),
+            dr.select(at_facet, seen.t, now.root),
+            dr.select(at_facet, ahead.normal, now.gradient),
+            dr.select(at_facet, 0, now.tolerance_excess),
+            dr.select(at_facet, seen.t, now.before),
+            dr.select(at_facet, seen.t, now.after),
             dr.select(active, seen.band, now.band),
         ), crosses
 
-    def _side(self, now: Contact, seen: AcceptedPoint, x: Real) -> Real:
+    def _side(self, now: Contact, point: AcceptedPoint, x: Real) -> Real:
         """The side from which a ray comes to the nearest level if it was not in contact with it: 1
         if f is larger there, -1 if it is smaller, 0 if the side is not known.
 
@@ -435,12 +435,12 @@ class Hysteresis:
         or the slope if the present value equals the level up to its error.
         """
         if self.levels.period is None:
-            above = seen.before[1] > seen.value - x
+            is_above = point.before[1] > point.value - x
         else:
-            above = dr.select(dr.abs(x) > seen.total_error, x > 0, seen.slope < 0)
+            is_above = dr.select(dr.abs(x) > point.total_error, x > 0, point.slope < 0)
         # 0 stays only for a ray of which every sample so far was near a level.
-        known = (now.side != 0) | ~seen.is_near
-        return dr.select(known, dr.select(above, type(x)(1), -1), 0)
+        known = (now.side != 0) | ~point.is_near
+        return dr.select(known, dr.select(is_above, type(x)(1), -1), 0)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ fields.
 
 The state of the march is a record, which `backend.loops` takes apart and puts together for Dr.Jit's
 loop. The march compares samples with the facet at the end of an interval; the tracer that goes from
-facet to facet (`walks.JumpTracer`) calls the march, and not the other way round.
+facet to facet (`jump_tracer.JumpTracer`) calls the march, and not the other way round.
 """
 
 from __future__ import annotations
@@ -302,73 +302,73 @@ class March:
         ahead: JumpCrossing | None = None,
     ) -> MarchState:
         """The state after one more trial point of each ray; `advance` has the proof."""
-        seen = self._sample_trial(field, path, end, now, ahead)
+        trial = self._sample_trial(field, path, end, now, ahead)
         if self.hysteresis is not None and now.contact is not None:
-            seen = self._apply_hysteresis(seen, self.hysteresis, now.contact)
-        accepted, detail, too_coarse = self._accept(field, seen, now, ahead)
+            trial = self._apply_hysteresis(trial, self.hysteresis, now.contact)
+        accepted, accuracy, too_coarse = self._accept(field, trial, now, ahead)
         fallback = now.proved_step
         if self.hysteresis is not None and now.contact is not None:
-            tolerance = dr.fma(seen.t, self.tolerance.per_length, self.tolerance.distance)
-            reaches = self.hysteresis.may_reach(now.contact, seen.band, now.trial_step, tolerance)
-            reaches &= ~now.contact.is_touching | dr.isfinite(seen.total_error)
+            tolerance = dr.fma(trial.t, self.tolerance.per_length, self.tolerance.distance)
+            reaches = self.hysteresis.may_reach(now.contact, trial.band, now.trial_step, tolerance)
+            reaches &= ~now.contact.is_touching | dr.isfinite(trial.total_error)
             shorter = fmin(now.proved_step, _RETRY_FRACTION * now.trial_step)
             fallback = dr.select(reaches | too_coarse, now.proved_step, shorter)
             accepted &= reaches
 
-        # Is it a hit, a sheet, or a crossing?
-        hit, gaps_ahead, sheet = accepted & seen.is_near, seen.gaps, None
+        # Is the trial point a hit, a facet, or a crossing?
+        is_hit, gaps_ahead, jump = accepted & trial.is_near, trial.gaps, None
         if ahead is not None:
-            sheet = test_jump(
-                ahead, accepted & seen.at_end, seen.value, seen.total_error, self.levels
+            jump = test_jump(
+                ahead, accepted & trial.at_end, trial.value, trial.total_error, self.levels
             )
             gaps_ahead = (
-                sheet.gaps if seen.passes_branch_level is None else seen.gaps_after_jump(sheet.gaps)
+                jump.gaps if trial.passes_branch_level is None else trial.gaps_after_jump(jump.gaps)
             )
-        aims, contact, value = gaps_ahead, now.contact, seen.value
+        aim_gaps, contact, value = gaps_ahead, now.contact, trial.value
         if self.hysteresis is not None and now.contact is not None:
-            contact, hit, sheet, value = self._update_contact(
-                seen, self.hysteresis, now.contact, path, now, accepted, ahead, sheet
+            contact, is_hit, jump, value = self._update_contact(
+                trial, self.hysteresis, now.contact, path, now, accepted, ahead, jump
             )
-            after = contact, value, self.levels.gaps(value), seen.band
-            gaps_ahead, aims = (
-                self.hysteresis.gaps(*after),
-                self.hysteresis.gaps(*after, CONTACT_AIM),
+            arguments = contact, value, self.levels.gaps(value), trial.band
+            gaps_ahead, aim_gaps = (
+                self.hysteresis.gaps(*arguments),
+                self.hysteresis.gaps(*arguments, CONTACT_AIM),
             )
-        elif sheet is not None and ahead is not None:
-            value = value + dr.select(sheet.at_crossing & ~sheet.is_hit, ahead.jump, 0)
+        elif jump is not None and ahead is not None:
+            value = value + dr.select(jump.at_crossing & ~jump.is_hit, ahead.jump, 0)
 
-        # How far to go from there.
-        proved = self._proved_step(seen, gaps_ahead, contact)
-        trial = self._next_trial_step(proved, seen.look, aims, now, path, seen.is_smooth)
+        # The step from the trial point.
+        proved = self._proved_step(trial, gaps_ahead, contact)
+        next_step = self._next_trial_step(proved, trial.look, aim_gaps, now, path, trial.is_smooth)
         forward = proved
         if self.occupied is not None:
-            forward, trial = self._skip_empty_cells(
-                self.occupied, path, end, seen, accepted, forward, trial
+            forward, next_step = self._skip_empty_cells(
+                self.occupied, path, end, trial, accepted, forward, next_step
             )
-        look_ahead = self._next_reach(now, seen, end, proved, contact, hit)
+        reach = self._next_reach(now, trial, end, proved, contact, is_hit)
         proved_step = dr.select(accepted, forward, fallback)
-        free = self._is_free(now, seen, end, accepted, proved_step, contact)
-        if sheet is not None:
-            free = dr.select(sheet.has_crossing, sheet.at_crossing, free)
-        evaluations = now.evaluations + 1 + seen.looks
-        status = self._status(hit, free)
-        gradient = dr.select(accepted, seen.look.sample.gradient, now.gradient)
-        if sheet is not None:
-            status, gradient = sheet.mark(status, gradient)
-        proved_to = dr.select(accepted, seen.t, now.proved_to)
-        step = dr.select(accepted, trial, dr.select(too_coarse, now.trial_step, fallback))
+        is_free = self._is_free(now, trial, end, accepted, proved_step, contact)
+        if jump is not None:
+            is_free = dr.select(jump.has_crossing, jump.at_crossing, is_free)
+        evaluations = now.evaluations + 1 + trial.looks
+        status = self._status(is_hit, is_free)
+        gradient = dr.select(accepted, trial.look.sample.gradient, now.gradient)
+        if jump is not None:
+            status, gradient = jump.mark(status, gradient)
+        proved_to = dr.select(accepted, trial.t, now.proved_to)
+        step = dr.select(accepted, next_step, dr.select(too_coarse, now.trial_step, fallback))
         return MarchState(
             proved_to=proved_to,
             trial_step=fmin(step, end - proved_to),
             proved_step=proved_step,
-            enclosure_reach=dr.select(accepted, look_ahead, now.enclosure_reach),
+            enclosure_reach=dr.select(accepted, reach, now.enclosure_reach),
             value=dr.select(accepted, value, now.value),
             gradient=gradient,
-            tolerance_excess=dr.select(accepted, seen.excess, now.tolerance_excess),
+            tolerance_excess=dr.select(accepted, trial.excess, now.tolerance_excess),
             evaluations=evaluations,
-            accuracy_scale=detail,
+            accuracy_scale=accuracy,
             status=status,
-            active=now.active & ~(hit | free | (evaluations >= self.max_steps)),
+            active=now.active & ~(is_hit | is_free | (evaluations >= self.max_steps)),
             contact=contact,
         )
 
@@ -380,36 +380,40 @@ class March:
         t = now.proved_to + now.trial_step
         if ahead is not None or now.contact is not None:  # the end exactly
             t = dr.select(now.trial_step >= end - now.proved_to, end, t)
-        seen, whole, is_modulo = field, self.branch_tracker, None
+        scaled, tracker, is_modulo = field, self.branch_tracker, None
         if now.accuracy_scale is not None and field.has_variable_accuracy:
-            knows = field.has_unknown_branch and whole is None
-            seen = field.at_accuracy(fmax(now.accuracy_scale, 1) if knows else now.accuracy_scale)
+            needs_branch = field.has_unknown_branch and tracker is None
+            scaled = field.at_accuracy(
+                fmax(now.accuracy_scale, 1) if needs_branch else now.accuracy_scale
+            )
         unproved, size = now.trial_step - now.proved_step, max_norm(path.origin) + t
-        look = seen.sample_ray(path, t, fmin(now.enclosure_reach, end - t), fmax(unproved, real(0)))
-        passes, is_doubtful, is_sure = None, None, None
-        gradient_norm = safe_norm(look.sample.gradient)
-        if whole is not None and look.sample.branch_unknown is not None:
-            is_modulo = look.sample.branch_unknown
-            error = value_error_bound(look.sample, gradient_norm, size)
-            look, is_sure = whole.resolve(look, now.value, now.trial_step, error)
-        sample = look.sample
+        ray_sample = scaled.sample_ray(
+            path, t, fmin(now.enclosure_reach, end - t), fmax(unproved, real(0))
+        )
+        passes_level, is_unsure, is_sure = None, None, None
+        gradient_norm = safe_norm(ray_sample.sample.gradient)
+        if tracker is not None and ray_sample.sample.branch_unknown is not None:
+            is_modulo = ray_sample.sample.branch_unknown
+            error = value_error_bound(ray_sample.sample, gradient_norm, size)
+            ray_sample, is_sure = tracker.resolve(ray_sample, now.value, now.trial_step, error)
+        sample = ray_sample.sample
         gaps = self.levels.gaps(sample.value)
         gap, total_error = gaps.nearest, value_error_bound(sample, gradient_norm, size)
-        if whole is not None and is_modulo is not None and is_sure is not None:
-            gaps, passes, is_doubtful = whole.gaps(sample, is_modulo, is_sure, total_error)
+        if tracker is not None and is_modulo is not None and is_sure is not None:
+            gaps, passes_level, is_unsure = tracker.gaps(sample, is_modulo, is_sure, total_error)
         if self.cone_radius is not None:
             gaps = gaps.reduced_by(self.cone_radius * t * gradient_norm)
             gap = gaps.nearest
         steep = None
         if field.is_steep:
-            look_ahead = fmin(now.enclosure_reach, end - t)
-            steep = SteepPlace.at(field, self.levels, path, t, look_ahead, sample)
+            length = fmin(now.enclosure_reach, end - t)
+            steep = SteepPlace.at(field, self.levels, path, t, length, sample)
             total_error = total_error if steep.error is None else steep.error
         steepness = fmax(gradient_norm - sample.gradient_error, real(0))
-        if look.slope_error is not None:  # the gradient is at least as long as its projection
-            steepness = fmax(dr.abs(look.slope) - look.slope_error, steepness)
-        if look.min_gradient_norm is not None:
-            steepness = fmax(look.min_gradient_norm, steepness)
+        if ray_sample.slope_error is not None:  # the gradient is at least as long as its projection
+            steepness = fmax(dr.abs(ray_sample.slope) - ray_sample.slope_error, steepness)
+        if ray_sample.min_gradient_norm is not None:
+            steepness = fmax(ray_sample.min_gradient_norm, steepness)
         if steep is not None:  # the gradient is no number where only slopes along the path are
             gradient_norm = fmax(gradient_norm, steepness)
         within = self.tolerance.value_tolerance(steepness, t)
@@ -422,18 +426,22 @@ class March:
             within = self.hysteresis.contact_tolerance(within)
         # Where not even the gradient is known, no hit is due to rounding.
         rounding = dr.select(knows_gradient, total_error - sample.truncation_error, 0)
-        is_near = self._is_near(gap, within, total_error, rounding, look, gradient_norm, size, end)
-        looks: Any = 0
+        is_near = self._is_near(
+            gap, within, total_error, rounding, ray_sample, gradient_norm, size, end
+        )
+        evaluations: Any = 0
         if steep is not None:
-            may_be = steep.is_level
-            is_near = (is_near | may_be) & now.active & dr.isfinite(total_error)
-            is_near, looks = self._is_there(field, path, t, look, gaps, size, is_near, may_be)
+            touches = steep.is_level
+            is_near = (is_near | touches) & now.active & dr.isfinite(total_error)
+            is_near, evaluations = self._is_there(
+                field, path, t, ray_sample, gaps, size, is_near, touches
+            )
         return _TrialSample(
             t=t,
             at_end=t == end,
             coordinate_size=size,
             unproved_length=unproved,
-            look=look,
+            look=ray_sample,
             gradient_norm=gradient_norm,
             gaps=gaps,
             total_error=total_error,
@@ -443,10 +451,10 @@ class March:
             accepts_unknown_side=is_near,
             excess=fmax(gap + total_error - within, real(0)),
             is_smooth=ahead is None and not field.has_variable_accuracy,
-            passes_branch_level=passes,
-            needs_branch=is_doubtful,
+            passes_branch_level=passes_level,
+            needs_branch=is_unsure,
             steep=steep,
-            looks=looks,
+            looks=evaluations,
         )
 
     def _is_there(
@@ -454,11 +462,11 @@ class March:
         field: Field,
         path: Ray,
         t: Real,
-        look: RaySample,
+        ray_sample: RaySample,
         gaps: LevelGaps,
         size: Real,
         is_near: Mask,
-        may_be: Mask,
+        touches: Mask,
     ) -> tuple[Mask, Any]:
         """Whether f really takes the level near points that are near it in value, and the number of
         evaluations that this test took.
@@ -470,126 +478,135 @@ class March:
 
         may_be: whether f may equal the level up to rounding.
         """
-        sample, p = look.sample, path.point(t)
+        sample, p = ray_sample.sample, path.point(t)
         tolerance = dr.fma(t, self.tolerance.per_length, self.tolerance.distance)
         slack = 8 * self.backend.machine_epsilon * size
         reach = fmax(tolerance, 2 * slack)
-        sure = gaps.nearest <= self.tolerance.value
-        for enclosure in look.forward:
-            sure |= enclosure.arrives(gaps, reach)
+        proved = gaps.nearest <= self.tolerance.value
+        for enclosure in ray_sample.forward:
+            proved |= enclosure.arrives(gaps, reach)
         along = down_or_up(sample.gradient, gaps, path.direction)
-        ways = (along, safe_norm(sample.gradient)), (path.direction, look.slope)
-        unsure = is_near & ~sure
-        passed, looks = beyond(
-            self.backend, field, self.levels, gaps, p, ways, sample.value, reach, may_be, unsure
+        ways = (along, safe_norm(sample.gradient)), (path.direction, ray_sample.slope)
+        unsure = is_near & ~proved
+        passed, evaluations = beyond(
+            self.backend,
+            field,
+            self.levels,
+            gaps,
+            p,
+            ways,
+            sample.value,
+            reach,
+            touches,
+            unsure,
         )
-        return is_near & (sure | passed), looks
+        return is_near & (proved | passed), evaluations
 
     def _apply_hysteresis(
-        self, seen: _TrialSample, hysteresis: Hysteresis, contact: Contact
+        self, trial: _TrialSample, hysteresis: Hysteresis, contact: Contact
     ) -> _TrialSample:
         """The same sample with gaps to the levels as the hysteresis places them. The band includes
         all rounding of f, or a ray would stick in a crease."""
         band = hysteresis.band(
-            seen.value_tolerance, seen.total_error - seen.look.sample.truncation_error
+            trial.value_tolerance, trial.total_error - trial.look.sample.truncation_error
         )
-        may_pass = seen.accepts_unknown_side & ~contact.is_touching
+        may_pass = trial.accepts_unknown_side & ~contact.is_touching
         if self.levels.period is not None:  # here only the value tells the side of a level
             may_pass = self.backend.Bool(False)
-        gaps = hysteresis.gaps(contact, seen.value, seen.gaps, band)
+        gaps = hysteresis.gaps(contact, trial.value, trial.gaps, band)
         return replace(
-            seen,
+            trial,
             gaps=gaps,
-            value_tolerance=CONTACT_TOLERANCE * seen.value_tolerance,
+            value_tolerance=CONTACT_TOLERANCE * trial.value_tolerance,
             band=band,
             accepts_unknown_side=may_pass,
         )
 
     def _accept(
-        self, field: Field, seen: _TrialSample, now: MarchState, ahead: JumpCrossing | None
+        self, field: Field, trial: _TrialSample, now: MarchState, ahead: JumpCrossing | None
     ) -> tuple[Mask, Real | None, Mask]:
         """Whether the ray is proved free up to the trial point, by a sample that is not too coarse;
         the accuracy scale of the next sample; and whether this sample was too coarse."""
         accepted = now.trial_step <= now.proved_step
         if self.over_relaxation > 1:
-            knows_side = seen.accepts_unknown_side | (seen.gaps.nearest > seen.total_error)
-            covered = any_is_free(
-                seen.look.backward, seen.gaps.reduced_by(seen.total_error), seen.unproved_length
+            knows_side = trial.accepts_unknown_side | (trial.gaps.nearest > trial.total_error)
+            proved = any_is_free(
+                trial.look.backward, trial.gaps.reduced_by(trial.total_error), trial.unproved_length
             )
-            accepted |= knows_side & covered
-        is_known = dr.isfinite(seen.total_error)  # what is not known is not free
-        if seen.steep is not None:  # values prove the next step
+            accepted |= knows_side & proved
+        is_known = dr.isfinite(trial.total_error)  # what is not known is not free
+        if trial.steep is not None:  # values prove the next step
             is_known = is_known | (now.trial_step <= now.proved_step)
         if now.accuracy_scale is None or not field.has_variable_accuracy:
             return accepted & is_known, now.accuracy_scale, self.backend.Bool(False)
-        truncation, coarsest = seen.look.sample.truncation_error, field.coarsest_accuracy
-        deciding = self._deciding_gap(seen.value, ahead, seen.at_end)
-        at = fmax(now.accuracy_scale, coarsest)
+        truncation, coarsest = trial.look.sample.truncation_error, field.coarsest_accuracy
+        deciding = self._deciding_gap(trial.value, ahead, trial.at_end)
+        accuracy = fmax(now.accuracy_scale, coarsest)
         finer, too_coarse = _refined_accuracy(
-            at, deciding, seen.total_error, truncation, seen.value_tolerance
+            accuracy, deciding, trial.total_error, truncation, trial.value_tolerance
         )
-        coarser = _next_accuracy(at, seen.gaps.nearest, truncation, coarsest)
-        if seen.passes_branch_level is not None and seen.needs_branch is not None:
-            too_coarse |= seen.needs_branch & accepted  # others go back in any case
+        coarser = _next_accuracy(accuracy, trial.gaps.nearest, truncation, coarsest)
+        if trial.passes_branch_level is not None and trial.needs_branch is not None:
+            too_coarse |= trial.needs_branch & accepted  # others go back in any case
             coarser = dr.select(
-                seen.passes_branch_level, fmax(at, 1), coarser
+                trial.passes_branch_level, fmax(accuracy, 1), coarser
             )  # the next knows it too
         accepted &= ~too_coarse & is_known
-        detail = dr.select(too_coarse, finer, dr.select(accepted, coarser, now.accuracy_scale))
-        return accepted, detail, too_coarse
+        scale = dr.select(too_coarse, finer, dr.select(accepted, coarser, now.accuracy_scale))
+        return accepted, scale, too_coarse
 
     def _update_contact(
         self,
-        seen: _TrialSample,
+        trial: _TrialSample,
         hysteresis: Hysteresis,
         contact: Contact,
         path: Ray,
         now: MarchState,
         accepted: Mask,
         ahead: JumpCrossing | None,
-        sheet: JumpTest | None,
+        jump: JumpTest | None,
     ) -> tuple[Contact, Mask, JumpTest | None, Real]:
         """The contact behind the trial point, whether rays have crossed the level, the comparison
         with the facet, and f behind the facet."""
-        value = seen.value
-        before = now.proved_to, now.value, dr.dot(now.gradient, path.direction), now.gradient
-        last = seen.at_end if sheet is None else seen.at_end & ~sheet.has_crossing
-        doubt = dr.select(
-            seen.total_error > seen.value_tolerance, fmax(seen.excess, now.tolerance_excess), 0
+        value = trial.value
+        previous = now.proved_to, now.value, dr.dot(now.gradient, path.direction), now.gradient
+        is_last = trial.at_end if jump is None else trial.at_end & ~jump.has_crossing
+        excess = dr.select(
+            trial.total_error > trial.value_tolerance, fmax(trial.excess, now.tolerance_excess), 0
         )
-        there = AcceptedPoint(
-            seen.t, value, seen.look.sample.gradient, seen.look.slope, before, doubt,
-            seen.total_error, seen.is_near, seen.band, last,
+        point = AcceptedPoint(
+            trial.t, value, trial.look.sample.gradient, trial.look.slope, previous, excess,
+            trial.total_error, trial.is_near, trial.band, is_last,
         )  # fmt: skip
-        contact, hit = hysteresis.update(contact, accepted, there)
-        if ahead is not None and sheet is not None:
-            # A crossing before the sheet comes first: the sheet will be sampled again.
-            passed = sheet.at_crossing & ~hit
-            contact, jumps = hysteresis.update_at_jump(
-                contact, passed, there, ahead, path.direction
+        contact, crosses = hysteresis.update(contact, accepted, point)
+        if ahead is not None and jump is not None:
+            # A crossing before the facet comes first: the facet will be sampled again.
+            passed = jump.at_crossing & ~crosses
+            contact, is_hit = hysteresis.update_at_jump(
+                contact, passed, point, ahead, path.direction
             )
-            sheet = replace(sheet, at_crossing=passed, is_hit=jumps)
+            jump = replace(jump, at_crossing=passed, is_hit=is_hit)
             value = value + dr.select(passed, ahead.jump, 0)
-        return contact, hit, sheet, value
+        return contact, crosses, jump, value
 
-    def _proved_step(self, seen: _TrialSample, gaps: LevelGaps, contact: Contact | None) -> Real:
+    def _proved_step(self, trial: _TrialSample, gaps: LevelGaps, contact: Contact | None) -> Real:
         """The length from the trial point that is proved free of levels with these gaps."""
-        spent = _WIDENING * seen.gaps.nearest
+        growth = _WIDENING * trial.gaps.nearest
         if self.cone_radius is not None:
-            gaps = gaps.reduced_by(spent)
-        forward = longest_free_length(seen.look.forward, gaps.reduced_by(seen.total_error))
+            gaps = gaps.reduced_by(growth)
+        forward = longest_free_length(trial.look.forward, gaps.reduced_by(trial.total_error))
         if self.cone_radius is not None:
-            slope, smallest = seen.look.slope, float(dr.smallest(self.backend.Float))
-            widening = fmax(self.cone_radius * seen.gradient_norm, smallest)
-            away = dr.select(seen.gaps.below <= seen.gaps.above, slope, -slope)
-            for_ever = (forward == dr.inf) & (away >= widening)
-            forward = dr.select(for_ever, forward, fmin(forward, spent / widening))
-        forward = dr.select(gaps.nearest > seen.total_error, forward, 0)
-        if seen.steep is not None and self.cone_radius is None:
-            free = seen.steep.free
+            slope, smallest = trial.look.slope, float(dr.smallest(self.backend.Float))
+            widening = fmax(self.cone_radius * trial.gradient_norm, smallest)
+            leaving = dr.select(trial.gaps.below <= trial.gaps.above, slope, -slope)
+            endless = (forward == dr.inf) & (leaving >= widening)
+            forward = dr.select(endless, forward, fmin(forward, growth / widening))
+        forward = dr.select(gaps.nearest > trial.total_error, forward, 0)
+        if trial.steep is not None and self.cone_radius is None:
+            length = trial.steep.free
             if contact is not None:  # in contact, levels lie elsewhere
-                free = dr.select(contact.is_touching, seen.steep.free_of(gaps), free)
-            forward = fmax(free, forward)
+                length = dr.select(contact.is_touching, trial.steep.free_of(gaps), length)
+            forward = fmax(length, forward)
         return forward
 
     def _skip_empty_cells(
@@ -597,45 +614,45 @@ class March:
         occupied: EmptySpaceGrid,
         path: Ray,
         end: Real,
-        seen: _TrialSample,
+        point: _TrialSample,
         accepted: Mask,
         forward: Real,
         trial: Real,
     ) -> tuple[Real, Real]:
         """The proved step and the trial step, extended over empty cells that follow the proved
         step."""
-        free_to = dr.select(accepted, seen.t + forward, self.ray_end)
+        free_to = dr.select(accepted, point.t + forward, self.ray_end)
         free_to = occupied.end_of_empty_run(path.origin, path.direction, free_to, self.ray_end)
-        forward = fmax(forward, dr.select(free_to >= self.ray_end, dr.inf, free_to - seen.t))
+        forward = fmax(forward, dr.select(free_to >= self.ray_end, dr.inf, free_to - point.t))
         trial = fmax(trial, forward)
         if self.only_component:
-            there = path.point(seen.t + fmin(trial, end - seen.t))
-            trial = dr.select(occupied.cell(there).empty_distance > 0, forward, trial)
+            target = path.point(point.t + fmin(trial, end - point.t))
+            trial = dr.select(occupied.cell(target).empty_distance > 0, forward, trial)
         return forward, trial
 
     def _next_reach(
         self,
         now: MarchState,
-        seen: _TrialSample,
+        trial: _TrialSample,
         end: Real,
         proved: Real,
         contact: Contact | None,
-        hit: Mask,
+        is_hit: Mask,
     ) -> Real:
         """The length that the next enclosures should reach."""
         # After a step of zero, the next enclosures need reach only a third as far: bisection.
-        candidate = fmin(now.enclosure_reach, end - seen.t)
-        shorter = dr.select(dr.isfinite(candidate), candidate / 3, 1 + 16 * seen.coordinate_size)
-        tried = dr.select(proved > 0, seen.look.reach_growth * proved, shorter)
+        candidate = fmin(now.enclosure_reach, end - trial.t)
+        shorter = dr.select(dr.isfinite(candidate), candidate / 3, 1 + 16 * trial.coordinate_size)
+        reach = dr.select(proved > 0, trial.look.reach_growth * proved, shorter)
         if now.contact is not None and contact is not None:  # off the surface: the whole ray again
             leaves = now.contact.is_touching & ~contact.is_touching
-            tried = dr.select(leaves | hit, end - seen.t, tried)
-        return tried
+            reach = dr.select(leaves | is_hit, end - trial.t, reach)
+        return reach
 
     def _is_free(
         self,
         now: MarchState,
-        seen: _TrialSample,
+        trial: _TrialSample,
         end: Real,
         accepted: Mask,
         proved_step: Real,
@@ -643,11 +660,11 @@ class March:
     ) -> Mask:
         """Whether rays are proved free of levels up to their end."""
         farthest = float(dr.largest(self.backend.Float)) ** _MISS_EXPONENT
-        proved_to = dr.select(accepted, seen.t, now.proved_to)
-        free = proved_to + proved_step >= dr.select(end == dr.inf, farthest, end)
+        proved_to = dr.select(accepted, trial.t, now.proved_to)
+        is_free = proved_to + proved_step >= dr.select(end == dr.inf, farthest, end)
         if self.hysteresis is not None and contact is not None:
-            free &= ~(accepted & self.hysteresis.must_sample_end(contact, end) & (seen.t < end))
-        return free
+            is_free &= ~(accepted & self.hysteresis.must_sample_end(contact, end) & (trial.t < end))
+        return is_free
 
     def _is_near(
         self,
@@ -655,7 +672,7 @@ class March:
         within: Real,
         total_error: Real,
         rounding: Real,
-        look: RaySample,
+        ray_sample: RaySample,
         gradient_norm: Real,
         size: Real,
         end: Real,
@@ -671,20 +688,20 @@ class March:
         near a level only by rounding and rounding leaves t uncertain by more than that size: far
         enough away, rounding would make a hit of every ray that is parallel to the surface.
         """
-        sample = look.sample
+        sample = ray_sample.sample
         near = gap <= fmax(within - sample.truncation_error, 2 * rounding)
         for promise in sample.promises:
             radius = promise.radius
             size = fmax(dr.select(dr.isfinite(radius), radius, 0), size)
         excess = gap + total_error - within
-        crosses = (gap <= within - sample.truncation_error) | (end < dr.inf)
-        crosses |= excess <= dr.abs(look.slope) * size
-        return near & crosses & (excess <= _LARGEST_UNCERTAINTY * gradient_norm * size)
+        may_hit = (gap <= within - sample.truncation_error) | (end < dr.inf)
+        may_hit |= excess <= dr.abs(ray_sample.slope) * size
+        return near & may_hit & (excess <= _LARGEST_UNCERTAINTY * gradient_norm * size)
 
     def _next_trial_step(
         self,
         forward: Real,
-        look: RaySample,
+        ray_sample: RaySample,
         gaps: LevelGaps,
         now: MarchState,
         path: Ray,
@@ -699,48 +716,52 @@ class March:
         is_smooth: whether value and slope at the last accepted point help to predict f. They do not
             for an approximate field, whose truncation error differs from point to point.
         """
-        slope = look.slope
+        slope = ray_sample.slope
         rate, gap = dr.abs(slope), dr.select(slope > 0, gaps.above, gaps.below)
         if is_smooth:
-            bend = dr.mulsign(self._second_derivative(look, now, path), slope)
-            root = dr.fma(rate, rate, 2 * bend * gap)
+            second = dr.mulsign(self._second_derivative(ray_sample, now, path), slope)
+            root = dr.fma(rate, rate, 2 * second * gap)
             target = _TRIAL_AIM * dr.select(root >= 0, 2 * gap / (rate + dr.sqrt(root)), dr.inf)
         else:
             target = _AIM_BY_SLOPE * dr.select(rate > 0, gap / rate, dr.inf)
         return fmin(self.over_relaxation * forward, fmax(target, forward))
 
-    def _second_derivative(self, look: RaySample, now: MarchState, path: Ray) -> Real:
+    def _second_derivative(self, ray_sample: RaySample, now: MarchState, path: Ray) -> Real:
         """The second derivative, at the trial point, of the cubic with the values and slopes of f
         at the trial point and at the last accepted point, a length h before; 0 if no point was
         accepted before.
 
         With D the difference quotient and s0, s the slopes: 2 (2s + s0 - 3D)/h (Hermite).
         """
-        h, slope, before = now.trial_step, look.slope, dr.dot(now.gradient, path.direction)
-        rise = look.sample.value - now.value
+        h, slope, slope_before = (
+            now.trial_step,
+            ray_sample.slope,
+            dr.dot(now.gradient, path.direction),
+        )
+        rise = ray_sample.sample.value - now.value
         if self.levels.period is not None:  # the lift that the slopes predict
-            turns = dr.round((rise - 0.5 * h * (slope + before)) / self.levels.period)
-            rise = dr.fma(turns, -self.levels.period, rise)
-        known = (now.evaluations > 0) & (h > 0)
-        return dr.select(known, 2 * (2 * slope + before - 3 * rise / h) / h, 0)
+            periods = dr.round((rise - 0.5 * h * (slope + slope_before)) / self.levels.period)
+            rise = dr.fma(periods, -self.levels.period, rise)
+        has_before = (now.evaluations > 0) & (h > 0)
+        return dr.select(has_before, 2 * (2 * slope + slope_before - 3 * rise / h) / h, 0)
 
-    def _status(self, hit: Mask, free: Mask) -> Any:
+    def _status(self, is_hit: Mask, is_free: Mask) -> Any:
         """The status of a ray that ends here."""
-        ended = dr.select(free, int(RayStatus.MISS), int(RayStatus.OUT_OF_STEPS))
-        return self.backend.UInt32(dr.select(hit, int(RayStatus.HIT), ended))
+        ended = dr.select(is_free, int(RayStatus.MISS), int(RayStatus.OUT_OF_STEPS))
+        return self.backend.UInt32(dr.select(is_hit, int(RayStatus.HIT), ended))
 
     def _deciding_gap(self, value: Real, ahead: JumpCrossing | None, at_end: Mask | None) -> Real:
         """The gap from f to the nearest level; at a facet, the smaller of the gaps from f before
         and behind the facet."""
         gap = self.levels.gaps(value).nearest
         if ahead is not None:
-            behind = self.levels.gaps(value + ahead.jump).nearest
-            gap = dr.select(at_end & (ahead.facet != NO_FACET), fmin(gap, behind), gap)
+            gap_behind = self.levels.gaps(value + ahead.jump).nearest
+            gap = dr.select(at_end & (ahead.facet != NO_FACET), fmin(gap, gap_behind), gap)
         return gap
 
 
 def _refined_accuracy(
-    detail: Real, gap: Real, total_error: Real, truncation: Real, within: Real
+    scale: Real, gap: Real, total_error: Real, truncation: Real, within: Real
 ) -> tuple[Real, Mask]:
     """The accuracy scale for a repeated sample, and whether the sample of this scale is too coarse.
 
@@ -760,14 +781,16 @@ def _refined_accuracy(
         _TRUNCATION_OF_TOLERANCE * within - _LESS_ROUNDINGS * rounding,
         _TRUNCATION_OF_ROUNDING * rounding,
     )
-    again = (gap < _REFINE_BELOW * total_error) & (truncation > allowed) & (detail < _MAX_ACCURACY)
-    wanted = fmax(_TRUNCATION_OF_GAP * gap, _TRUNCATION_OF_ALLOWED * allowed)
-    closer = clamp(dr.power(truncation / wanted, 1 / _TRUNCATION_ORDER), *_REFINEMENT_LIMITS)
-    return fmin(fmax(detail * closer, 1), _MAX_ACCURACY), again
+    too_coarse = (
+        (gap < _REFINE_BELOW * total_error) & (truncation > allowed) & (scale < _MAX_ACCURACY)
+    )
+    target = fmax(_TRUNCATION_OF_GAP * gap, _TRUNCATION_OF_ALLOWED * allowed)
+    factor = clamp(dr.power(truncation / target, 1 / _TRUNCATION_ORDER), *_REFINEMENT_LIMITS)
+    return fmin(fmax(scale * factor, 1), _MAX_ACCURACY), too_coarse
 
 
-def _next_accuracy(detail: Real, gap: Real, truncation: Real, coarsest: float) -> Real:
+def _next_accuracy(scale: Real, gap: Real, truncation: Real, coarsest: float) -> Real:
     """The accuracy scale of the next sample: 0 (coarsest) or at least 1, and never above `detail`,
     the scale of this sample. truncation, gap: of this sample."""
-    wanted = detail * dr.power(truncation / (_COARSEN * gap), 1 / _TRUNCATION_ORDER)
-    return dr.select(wanted > coarsest, fmin(fmax(wanted, 1), detail), 0)
+    target = scale * dr.power(truncation / (_COARSEN * gap), 1 / _TRUNCATION_ORDER)
+    return dr.select(target > coarsest, fmin(fmax(target, 1), scale), 0)

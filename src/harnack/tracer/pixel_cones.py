@@ -31,24 +31,24 @@ if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
     from harnack.tracer.surface_tracer import SurfaceTracer
 
-# A passage through the cover begins within this fraction of a radius outside of it, and ends so
-# many radii off the surface; steps are aimed this many radii farther than that, or than a radius
-# behind the surface.
+# A passage through the cover begins within the first number of radii outside of it, and ends the
+# second number of radii off the surface. Steps are aimed the third number of radii farther than the
+# end, or than a radius behind the surface.
 _WITHIN, _AWAY, _BEYOND = 0.02, 1.1, 0.05
-# The first of them for approximate fields, whose samples cost more the more exact they are.
+# The first number for approximate fields, whose samples cost more the more exact they are.
 _WITHIN_APPROXIMATE = 0.25
-# Steps of a passage: the shortest, and the longest first one, in radii; the longest of the others,
-# as a multiple of the step before.
+# Steps of a passage: the shortest step and the longest first step, in radii; the longest of the
+# other steps, as a multiple of the step before.
 _SHORTEST, _FIRST, _LONGER = 0.25, 32.0, 4.0
 # Samples of a passage; a cone that has none left counts as covered in part.
 _MAX_SAMPLES = 48
-# Less than any slope or second derivative that matters, in radii.
+# A number below any slope or second derivative that matters, in radii.
 _NONE = 1e-12
 
 
 @dataclass(frozen=True)
 class _CoverState:
-    """Where a ray is in the cover.
+    """The state of a ray in the cover.
 
     t, height, slope: of the last sample; the height over the surface is in radii of the cone, and
         less than 0 behind the surface.
@@ -94,64 +94,64 @@ class PixelCones:
         backend, prepared = self.prepared.backend, self.prepared
         real = backend.Float
         path = Ray(self.origin, self.direction, prepared.proofs)
-        start, last = self._clip()
-        end = fmin(last, real(t_max))
+        start, t_end = self._clip()
+        end = fmin(t_end, real(t_max))
         state = MarchState.at(
             backend, start, end, active, has_detail=prepared.field.has_variable_accuracy
         )  # fmt: skip
-        within = _WITHIN_APPROXIMATE if prepared.field.has_variable_accuracy else _WITHIN
-        tolerance = PreparedHitTolerance(real(0), within * self.radius, real(0))
-        settings = prepared.levels, tolerance, prepared.max_steps, prepared.over_relaxation
-        march = March(backend, *settings, cone_radius=self.radius)
+        margin = _WITHIN_APPROXIMATE if prepared.field.has_variable_accuracy else _WITHIN
+        tolerance = PreparedHitTolerance(real(0), margin * self.radius, real(0))
+        options = prepared.levels, tolerance, prepared.max_steps, prepared.over_relaxation
+        march = March(backend, *options, cone_radius=self.radius)
         now = march.advance(prepared.field, path, real(end), state)
-        met = now.status == int(RayStatus.HIT)
-        begin = dr.select(met, now.proved_to, 0)
+        is_hit = now.status == int(RayStatus.HIT)
+        begin = dr.select(is_hit, now.proved_to, 0)
         gap = prepared.levels.offset_to_nearest(now.value)
         level, side = now.value + gap, dr.select(gap < 0, real(1), -1)
 
-        def look(t: Real) -> tuple[Real, Real]:
-            seen = (
+        def sample_at(t: Real) -> tuple[Real, Real]:
+            field = (
                 prepared.field
                 if now.accuracy_scale is None
                 else prepared.field.at_accuracy(now.accuracy_scale)
             )
-            sample = seen.evaluate(dr.fma(backend.Array3f(t), self.direction, self.origin))
+            sample = field.evaluate(dr.fma(backend.Array3f(t), self.direction, self.origin))
             return self._height(sample.value, sample.gradient, t, side, level)
 
-        def body(old: _CoverState) -> _CoverState:
-            t = old.t + old.step
-            height, slope = look(t)
-            step = _next_step(height, slope, (slope - old.slope) / old.step, _LONGER * old.step)
-            looks = old.sample_count + 1
+        def body(last: _CoverState) -> _CoverState:
+            t = last.t + last.step
+            height, slope = sample_at(t)
+            step = _next_step(height, slope, (slope - last.slope) / last.step, _LONGER * last.step)
+            count = last.sample_count + 1
             off = (height >= _AWAY) & (slope >= 0)
-            over = (height <= -1) | off | (looks >= _MAX_SAMPLES) | (t >= last)
+            over = (height <= -1) | off | (count >= _MAX_SAMPLES) | (t >= t_end)
             step = fmax(step, _SHORTEST * self.radius * t)
-            return _CoverState(t, height, slope, step, looks, old.active & ~over)
+            return _CoverState(t, height, slope, step, count, last.active & ~over)
 
         height, slope = self._height(now.value, now.gradient, begin, side, level)
         first = _next_step(height, slope, real(0), _FIRST * self.radius * begin)
         none = backend.UInt32(0)
-        passage = _CoverState(begin, height, slope, first, none, met & (height > -1))
+        passage = _CoverState(begin, height, slope, first, none, is_hit & (height > -1))
         passage = loop_while_active(passage, body, "harnack cover")
-        return met & ~(passage.height <= -1), now.evaluations + passage.sample_count
+        return is_hit & ~(passage.height <= -1), now.evaluations + passage.sample_count
 
     def _height(
         self, value: Real, gradient: Vec3, t: Real, side: Real, level: Real
     ) -> tuple[Real, Real]:
         """The height over the surface in radii, and its slope along the ray."""
         period = self.prepared.levels.period
-        away = value - level
+        offset = value - level
         if period is not None:
-            away = dr.fma(dr.round(away / period), -period, away)
-        height = side * away
+            offset = dr.fma(dr.round(offset / period), -period, offset)
+        height = side * offset
         if self.solid is not None:
             low, high = self.solid
             height = fmax(low - value, value - high)
             side = dr.select(low - value > value - high, -1, type(value)(1))
         radius = safe_norm(gradient) * self.radius * t
-        known = radius > 0
-        slope = dr.select(known, side * dr.dot(gradient, self.direction) / radius, 0)
-        return dr.select(known, height / radius, dr.inf), slope
+        has_slope = radius > 0
+        slope = dr.select(has_slope, side * dr.dot(gradient, self.direction) / radius, 0)
+        return dr.select(has_slope, height / radius, dr.inf), slope
 
     def _clip(self) -> tuple[Real, Real]:
         """The interval of rays on which their cones can touch the surface.
@@ -175,13 +175,13 @@ class PixelCones:
         return real(start), real(end)
 
 
-def _next_step(height: Real, slope: Real, bend: Real, longest: Real) -> Real:
+def _next_step(height: Real, slope: Real, second: Real, longest: Real) -> Real:
     """The step to where the cone is predicted to be lowest, a radius behind the surface, or outside
     of the cover, whichever comes first; bend: the second derivative of the height."""
     real = cast("Any", type(height))
-    through = (height + 1 + _BEYOND) / fmax(-slope, real(_NONE))
-    lowest = dr.select(bend > _NONE, (1 + _BEYOND) * -slope / fmax(bend, real(_NONE)), dr.inf)
+    to_behind = (height + 1 + _BEYOND) / fmax(-slope, real(_NONE))
+    lowest = dr.select(second > _NONE, (1 + _BEYOND) * -slope / fmax(second, real(_NONE)), dr.inf)
     rest = fmax(_AWAY + _BEYOND - height, real(0))
-    root = dr.sqrt(slope * slope + 2 * fmax(bend, real(0)) * rest)
-    off = 2 * rest / fmax(slope + root, real(_NONE))
-    return fmin(dr.select(slope < 0, fmin(through, lowest), off), longest)
+    root = dr.sqrt(slope * slope + 2 * fmax(second, real(0)) * rest)
+    outward = 2 * rest / fmax(slope + root, real(_NONE))
+    return fmin(dr.select(slope < 0, fmin(to_behind, lowest), outward), longest)

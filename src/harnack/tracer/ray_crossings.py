@@ -24,12 +24,12 @@ from harnack.backend.tensors import array_to_tensor
 from harnack.cluster.dask_arrays import accepts_dask_arrays
 from harnack.fields.capabilities import NO_FACET
 from harnack.tracer.derivatives import attach_derivatives, needs_derivatives, refuse_derivative
+from harnack.tracer.jump_tracer import JumpTracer, JumpTraceState
 from harnack.tracer.level_contact import Contact, RayStatus
 from harnack.tracer.rays import RayBatch
 from harnack.tracer.surface_tracer import MarchResult
 from harnack.tracer.trace_options import shows_keywords, surface_and_options
 from harnack.tracer.traced_surface import TracedSurface
-from harnack.tracer.walks import JumpTracer, JumpTraceState
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -73,11 +73,11 @@ class CrossingArrays:
 
 @dataclass(frozen=True)
 class _SearchState:
-    """Where rays are, and how many crossings they have found.
+    """The state of rays, and the number of crossings that they have found.
 
     march: the state of the march; None for a field with jumps.
-    sheets: for a field with jumps the state of `JumpTracer`, which includes that of the march.
-    count: of the crossings.
+    sheets: the state of `JumpTracer`, which includes that of the march; None without jumps.
+    count: the number of crossings.
     """
 
     march: MarchState | None
@@ -113,62 +113,66 @@ def find_crossings(
     real, vector, count = backend.Float, backend.Array3f, backend.UInt32
     march, path, start, end, state = prepared.begin_march(o, d, t_min, t_max, True, crosses=True)
     n = max(dr.width(array) for array in (path.origin, path.direction, start, end))
-    place = dr.arange(count, n) * k
+    first_slot = dr.arange(count, n) * k
     # The loop scatters into these arrays, so they must lie in memory before it is recorded.
     t, side = dr.full(real, dr.inf, n * k), dr.zeros(real, n * k)
     before, behind = dr.zeros(real, n * k), dr.zeros(real, n * k)
-    gradient, sheets = dr.zeros(vector, n * k), dr.full(count, NO_FACET, n * k)
-    dr.make_opaque(t, side, before, behind, gradient, sheets)
+    gradient, facets = dr.zeros(vector, n * k), dr.full(count, NO_FACET, n * k)
+    dr.make_opaque(t, side, before, behind, gradient, facets)
     tracer = JumpTracer(march, prepared.field, path, start, end)
 
-    def one(now: _SearchState) -> _SearchState:
-        there, sheet = now, None
+    def advance(now: _SearchState) -> _SearchState:
+        next_state, facet = now, None
         if now.sheets is None:
             after = march.advance(prepared.field, path, end, now.now)
         else:
             walk = tracer.advance(now.sheets)
-            there = _SearchState(None, walk, now.count)
-            after, sheet = tracer.finish(walk)
+            next_state = _SearchState(None, walk, now.count)
+            after, facet = tracer.finish(walk)
         contact = after.contact
         assert contact is not None
         ended = now.active & (after.status == int(RayStatus.HIT))
         is_crossing = ended
-        if sheet is not None and prepared.field.only_sheets:
-            is_crossing = ended & (sheet != NO_FACET)
-        slot = place + now.count
+        if facet is not None and prepared.field.only_sheets:
+            is_crossing = ended & (facet != NO_FACET)
+        slot = first_slot + now.count
         dr.scatter(t, contact.root, slot, is_crossing)
         dr.scatter(side, contact.side, slot, is_crossing)
         dr.scatter(before, contact.before, slot, is_crossing)
         dr.scatter(behind, contact.after, slot, is_crossing)
         dr.scatter(gradient, contact.gradient, slot, is_crossing)
-        if sheet is not None:
-            dr.scatter(sheets, sheet, slot, is_crossing)
+        if facet is not None:
+            dr.scatter(facets, facet, slot, is_crossing)
         crossings = now.count + dr.select(is_crossing, count(1), 0)
-        more = ended & (crossings < k)
-        status = dr.select(more, count(int(RayStatus.MISS)), after.status)
+        goes_on = ended & (crossings < k)
+        status = dr.select(goes_on, count(int(RayStatus.MISS)), after.status)
         if now.sheets is None:
             undecided = after.proved_to + after.proved_step < end
             if march.hysteresis is not None:
                 undecided |= march.hysteresis.must_sample_end(contact, end) & (
                     after.proved_to < end
                 )
-            more &= undecided
+            goes_on &= undecided
         else:
-            more |= after.active
-        return there.with_march(dataclasses.replace(after, status=status, active=more), crossings)
+            goes_on |= after.active
+        return next_state.with_march(
+            dataclasses.replace(after, status=status, active=goes_on), crossings
+        )
 
-    begun = _SearchState(state, None, dr.zeros(count, n))
+    begin = _SearchState(state, None, dr.zeros(count, n))
     if prepared.field.has_jumps:
-        begun = _SearchState(None, tracer.begin(state), dr.zeros(count, n))
-    walk = loop_while_active(begun, one, "harnack crossings")
-    last = walk.now
-    ray, none = dr.arange(count, n * k) // k, real(0)
+        begin = _SearchState(None, tracer.begin(state), dr.zeros(count, n))
+    walk = loop_while_active(begin, advance, "harnack crossings")
+    final = walk.now
+    rays, none = dr.arange(count, n * k) // k, real(0)
     roots = Contact(side, backend.Bool(False), t, gradient, none, before, behind, none)
-    origins, directions = gather_vectors(backend, o, ray), gather_vectors(backend, d, ray)
-    t, gradient, looks = prepared.refined_crossings(origins, directions, roots, dr.isfinite(t))
-    evaluations = last.evaluations + dr.block_reduce(dr.ReduceOp.Add, looks, k)
-    followed = dr.select(last.status == int(RayStatus.MISS), dr.inf, last.proved_to)
-    return CrossingArrays(t, gradient, sheets, side, walk.count, followed, evaluations, last.status)
+    origins, directions = gather_vectors(backend, o, rays), gather_vectors(backend, d, rays)
+    t, gradient, samples = prepared.refined_crossings(origins, directions, roots, dr.isfinite(t))
+    evaluations = final.evaluations + dr.block_reduce(dr.ReduceOp.Add, samples, k)
+    traced_to = dr.select(final.status == int(RayStatus.MISS), dr.inf, final.proved_to)
+    return CrossingArrays(
+        t, gradient, facets, side, walk.count, traced_to, evaluations, final.status
+    )
 
 
 @dataclass(frozen=True)
@@ -242,7 +246,7 @@ def crossings(
         NotImplementedError: a field with patches.
     """
     target, choices = surface_and_options("crossings", surface, options, keywords, _HONORED)
-    traced = TracedSurface.of(target, choices)
+    traced = TracedSurface.of(target, choices).with_call_cache()
     k = _check_count(max_crossings)
     traced.validate_crossings("crossings")
     rays = RayBatch.of(origins, directions, t_min, t_max, choices.precision)

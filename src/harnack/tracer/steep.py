@@ -30,14 +30,15 @@ if TYPE_CHECKING:
     from harnack.fields.field import Field
     from harnack.fields.samples import Ray, Sample
 
-# A level may be the value of f up to rounding where it is farther than f changes by rounding by no
-# more than this factor, if f changes on the other side by no more than so many times as much.
+# A level may be the value of f up to rounding if its gap is at most the first number times the
+# change of f by rounding on that side, and f changes on the other side by at most the second number
+# times as much.
 _SLACK, _FAR = 1.25, 8.0
-# How many points are looked at, and after those of a search; the most before these, and the section
-# of that search.
+# The number of points that are sampled without a search, the number of points after a search, the
+# largest number of samples before these, and the golden section of the search.
 _TRIALS, _SIDES, _MOST_LOOKS, _SECTION = 5, 7, 100, 0.381966
-# The range of f on a box around a point is about that of its values if f is continuous so many
-# times as far: that of x y/(x^2 + y^2), which is at most 1/2, is then within 0.502.
+# The range of f on a box around a point is about the range of its values if f is continuous this
+# many times as far: for x y/(x^2 + y^2), which is at most 1/2, it is then within 0.502.
 _CLEAR = 1024.0
 
 
@@ -50,7 +51,7 @@ def values_between(field: Field, p: Vec3, q: Vec3, slack: Real | None = None) ->
         return None
     try:
         value = formula(*coordinates)
-    except TypeError:  # it takes ranges of derivatives alone
+    except TypeError:  # this formula takes ranges of derivatives alone
         return None
     return coordinates[0].coerce(value).checked()
 
@@ -58,13 +59,13 @@ def values_between(field: Field, p: Vec3, q: Vec3, slack: Real | None = None) ->
 def largest_change(field: Field, p: Vec3, value: Real, reach: Real) -> Real:
     """A bound of |f(y) - f(p)| for |y - p| <= `reach`; infinite if none is known.
 
-    Beside a vertical tangent |grad f| times a length is more, and may be more than f changes
-    anywhere: that of |x y|^(1/3) - z at x = 1e-10 is 1e5.
+    Beside a vertical tangent, |grad f| times a length is a larger number, which may exceed all
+    changes of f anywhere: |grad f| of |x y|^(1/3) - z at x = 1e-10 is 1e5.
     """
-    around = values_between(field, p, p, reach)
-    if around is None:
+    values = values_between(field, p, p, reach)
+    if values is None:
         return cast("Any", type(value))(dr.inf)
-    change = fmax(around.value.upper - value, value - around.value.lower)
+    change = fmax(values.value.upper - value, value - values.value.lower)
     return dr.select(dr.isfinite(change), change, dr.inf)
 
 
@@ -72,16 +73,18 @@ def largest_change(field: Field, p: Vec3, value: Real, reach: Real) -> Real:
 class SteepPlace:
     """What the values of a field prove at a trial point.
 
-    error: a bound of the error of f there, by its own rounding and by that of the point; infinite
-        where none is known. |grad f| times the rounding of the point is no bound. None for fields
-        without a formula of their values.
-    is_level: whether a level may be the value of f at the point that is meant: it lies in the range
-        of f around the rounded one, or so near to it that rounding may keep a ray from coming
-        nearer, and f is proved to be continuous there. That is no proof that it is (`beyond`).
-    free: a length of the path on which no value of f is a level, because f stays away from them or
-        has no value at all; 0 where none is proved.
-    ahead: the length on which values were asked for. fall, rise: by how much f at most is smaller
-        and larger there than at the point; infinite where no bound is known.
+    error: a bound of the error of f there, by its own rounding and by the rounding of the point;
+        infinite where no bound is known. |grad f| times the rounding of the point is no bound. None
+        for fields without a formula of their values.
+    is_level: whether a level may be the value of f at the exact point: it lies in the range of f
+        around the rounded point, or so near to this range that rounding may keep a ray from coming
+        nearer, and f is proved to be continuous there. It is no proof that f takes the level
+        (`beyond`).
+    free: a length of the path on which no value of f is a level, because f stays away from levels
+        or has no value at all; 0 where no length is proved.
+    ahead: the length of the path on which values were bounded.
+    fall, rise: bounds of how much smaller and larger f is on that length than at the point;
+        infinite where no bound is known.
     """
 
     error: Real | None
@@ -95,55 +98,62 @@ class SteepPlace:
     def at(
         cls, field: Field, levels: Levels, path: Ray, t: Real, ahead: Real, sample: Sample
     ) -> SteepPlace:
-        """The place at the parameter t, with the sample there. ahead: how far values are asked for.
+        """The bounds at the parameter t, with the sample there. ahead: the length of the path on
+        which values are bounded.
 
-        Proof of the error. The point that is meant lies in the box of all points that are at most
-        `slack` from the rounded one in each coordinate, and f there lies in the range on the box.
+        Proof of the error. The exact point lies in the box of all points that are at most `slack`
+        from the rounded point in each coordinate, so f there lies in the range on the box.
 
         Proof of the length. All points of the path on it lie in the box around its ends, rounding
-        included, and all values of f in the box lie between `low` and `high`, which hold no level.
+        included, and all values of f in the box lie in its range, which contains no level.
         """
         p, value = path.point(t), sample.value
-        kind = cast("Any", type(t))
-        slack = 8 * float(dr.epsilon(kind)) * (max_norm(path.origin) + t)
+        real = cast("Any", type(t))
+        slack = 8 * float(dr.epsilon(real)) * (max_norm(path.origin) + t)
         ahead = dr.select(dr.isfinite(ahead), ahead, 0)
         at_point = values_between(field, p, p, slack)
         on_path = values_between(field, p, path.point(t + ahead), slack)
         if at_point is None or on_path is None:
-            return cls(None, t < t, kind(0), kind(0), kind(dr.inf), kind(dr.inf))
+            return cls(None, t < t, real(0), real(0), real(dr.inf), real(dr.inf))
         below, above = value - at_point.value.lower, at_point.value.upper - value
-        known = (below >= 0) & (above >= 0) & ~at_point.jumps
+        valid = (below >= 0) & (above >= 0) & ~at_point.jumps
         gaps = levels.gaps(value)
         is_below = gaps.below < gaps.above
         near = dr.select(is_below, below, above)
         far = dr.select(is_below, above, below)
-        # Steps that are shorter than a rounding of t lead nowhere. Beside a pole f changes far more
-        # on the other side.
+        # Steps that are shorter than a rounding of t do not advance the ray. Beside a pole f
+        # changes far more on the other side.
         is_level = (gaps.nearest <= near) | ((gaps.nearest <= _SLACK * near) & (far <= _FAR * near))
         error = near if gaps.is_one_sided else fmax(near, far)
-        error = dr.select(known & dr.isfinite(error), error, dr.inf)
-        off = on_path.nowhere
+        error = dr.select(valid & dr.isfinite(error), error, dr.inf)
+        is_free = on_path.nowhere
         if levels.period is None:
-            # An end that is NaN stands for an infinite one.
+            # A bound that is NaN stands for an infinite bound.
             misses = t == t
             for level in levels.values:
                 misses &= (on_path.value.lower > level) | (on_path.value.upper < level)
-            off = off | misses
-        free = dr.select(off, ahead, 0)
+            is_free = is_free | misses
+        free = dr.select(is_free, ahead, 0)
         fall, rise = value - on_path.value.lower, on_path.value.upper - value
-        return cls(error, is_level & known, free, ahead, fall, rise)
+        return cls(error, is_level & valid, free, ahead, fall, rise)
 
     def free_of(self, gaps: LevelGaps) -> Real:
-        """A length of the path on which f moves by less than these gaps; 0 where none is proved.
-        For levels that lie elsewhere, as those of a ray in contact do (`Hysteresis`)."""
+        """A length of the path on which f changes by less than these gaps; 0 where no length is
+        proved. For levels at other places than `free`, as those of a ray in contact
+        (`Hysteresis`)."""
         return dr.select((self.fall < gaps.below) & (self.rise < gaps.above), self.ahead, 0)
 
 
 @dataclass(frozen=True)
 class _Looking:
-    """The state of looking: how often, how often behind a search, and whether a level was passed.
-    And that of the search for where f comes nearest to a level: lengths along the first way between
-    which it does, one in between, and the distance in value there."""
+    """The state of the test `beyond`.
+
+    looks, sides: the number of samples, and of the samples after the search.
+    passed: whether a level was passed.
+    low, high: the search for the point at which f comes nearest to a level: lengths along the first
+        way between which it does.
+    inner, least: a length between these, and the level gap there.
+    """
 
     looks: Any
     sides: Any
@@ -156,10 +166,13 @@ class _Looking:
 
 
 def passes(levels: Levels, value: Real, low: Real, high: Real, gaps: LevelGaps) -> Mask:
-    """Whether all numbers of a range are on the other side of a level than a value, or at it.
+    """Whether all numbers of a range are on the other side of a level than a value, or at the
+    level.
 
-    Compared with the level itself: beside a pole differences of values round it away, as 1e28 + 1.
-    gaps: from the value to the levels; they tell those of a ladder.
+    Numbers are compared with the level itself: beside a pole, differences of values round it away,
+    as 1e28 + 1 does.
+
+    gaps: from the value to the levels; they place periodic levels.
     """
     if levels.period is not None:
         return (high - value <= -gaps.below) | (low - value >= gaps.above)
@@ -194,8 +207,10 @@ def beyond(
 ) -> tuple[Mask, Any]:
     """Whether f takes a level within `reach` of p, and how many evaluations of f that took.
 
-    ways: two directions, each with the slope of f along it. value: f at p. gaps: from there to the
-        `levels`. searches: where it is worth a search, as a ray can come no nearer.
+    ways: two directions, each with the slope of f along it.
+    value: f at p.
+    gaps: from f at p to the `levels`.
+    searches: lanes on which a search is made, as the ray can come no nearer.
 
     Proof. At another point, at most `reach` away, f is on the other side of the level, and on the
     box around both it is continuous and has values everywhere: so it takes the level between them
@@ -211,44 +226,44 @@ def beyond(
     comes nearer if it meets the surface.
     """
     epsilon = float(dr.epsilon(backend.Float))
-    finest = 4 * epsilon * reach
+    shortest = 4 * epsilon * reach
 
     def body(now: _Looking) -> _Looking:
         is_first, is_far = now.looks < 3, (now.looks == 2) | (now.looks == 4)
         is_search = now.looks >= _TRIALS
-        is_side = is_search & ((now.high - now.low <= finest) | (now.looks >= _MOST_LOOKS))
+        is_side = is_search & ((now.high - now.low <= shortest) | (now.looks >= _MOST_LOOKS))
         is_behind = is_side & (now.sides == 0)
-        way = dr.select(is_first | (is_search & ~is_behind), ways[0][0], ways[1][0])
-        rate = dr.abs(dr.select(is_first, ways[0][1], ways[1][1]))
-        times = dr.select(now.looks == 0, backend.Float(1), 2)
-        distance = dr.select(is_far, reach, fmin(times * gaps.nearest / rate, reach))
+        direction = dr.select(is_first | (is_search & ~is_behind), ways[0][0], ways[1][0])
+        slope = dr.abs(dr.select(is_first, ways[0][1], ways[1][1]))
+        factor = dr.select(now.looks == 0, backend.Float(1), 2)
+        distance = dr.select(is_far, reach, fmin(factor * gaps.nearest / slope, reach))
         behind, ahead = now.inner - now.low, now.high - now.inner
         section = now.inner + _SECTION * dr.select(ahead >= behind, ahead, -behind)
         section = dr.select(is_behind, -reach, dr.select(is_side, now.inner, section))
         distance = dr.select(is_search, section, distance)
         side = dr.select((now.sides & 1) == 0, 0.5 * reach, -0.5 * reach)
-        axis = (now.sides - 1) >> 1  # no axis where it is none: 0 - 1 is a large number
-        aside = type(p)(*(dr.select(is_side & (axis == k), side, 0) for k in range(3)))
-        q = dr.fma(type(p)(distance), way, p) + aside
-        # Where q is rounded more coarsely than that, f is that at q itself.
-        size = type(p)(*(dr.select(finest > epsilon * dr.abs(x), finest, 0) for x in q))
-        around = values_between(field, q - size, q + size)
+        axis = (now.sides - 1) >> 1  # no axis if sides is 0: 0 - 1 is a large number
+        offset = type(p)(*(dr.select(is_side & (axis == k), side, 0) for k in range(3)))
+        q = dr.fma(type(p)(distance), direction, p) + offset
+        # In coordinates in which q is rounded more coarsely than this, the box is q itself.
+        half = type(p)(*(dr.select(shortest > epsilon * dr.abs(x), shortest, 0) for x in q))
+        at_q = values_between(field, q - half, q + half)
         between = values_between(field, p, q)
-        clear = values_between(field, q - _CLEAR * size, q + _CLEAR * size)
-        if around is None or between is None or clear is None:
+        around_q = values_between(field, q - _CLEAR * half, q + _CLEAR * half)
+        if at_q is None or between is None or around_q is None:
             with without_alternatives():
                 low = high = field.evaluate(q).value
             passed = passes(levels, value, low, high, gaps)
         else:
-            low, high = around.value.lower, around.value.upper
+            low, high = at_q.value.lower, at_q.value.upper
             passed = passes(levels, value, low, high, gaps)
             passed &= ~(between.jumps | between.gaps | between.nowhere)
-            passed |= holds(levels, value, low, high, gaps) & ~(clear.jumps | around.nowhere)
+            passed |= holds(levels, value, low, high, gaps) & ~(around_q.jumps | at_q.nowhere)
         nearest = dr.select(
             gaps.below < gaps.above, gaps.below + low - value, gaps.above + value - high
         )
-        left = dr.select(dr.isfinite(nearest), nearest, dr.inf)
-        now = _narrowed(now, distance, left, is_search & ~is_side)
+        gap = dr.select(dr.isfinite(nearest), nearest, dr.inf)
+        now = _narrowed(now, distance, gap, is_search & ~is_side)
         passed |= now.passed
         looks, sides = now.looks + 1, now.sides + dr.select(is_side, 1, 0)
         active = now.active & ~passed & ((looks < _TRIALS) | (searches & (sides < _SIDES)))
@@ -262,23 +277,23 @@ def beyond(
     return end.passed, end.looks
 
 
-def _narrowed(now: _Looking, at: Real, left: Real, is_search: Mask) -> _Looking:
-    """The search after f was found so far from a level in value at another length."""
-    nearer, is_farther = left <= now.least, at > now.inner
-    end, is_low = dr.select(nearer, now.inner, at), nearer == is_farther
+def _narrowed(now: _Looking, length: Real, gap: Real, is_search: Mask) -> _Looking:
+    """The state of the search after a sample at another length, with its gap to a level."""
+    nearer, is_farther = gap <= now.least, length > now.inner
+    end, is_low = dr.select(nearer, now.inner, length), nearer == is_farther
     return replace(
         now,
         low=dr.select(is_search & is_low, end, now.low),
         high=dr.select(is_search & ~is_low, end, now.high),
-        inner=dr.select(is_search & nearer, at, now.inner),
-        least=dr.select(is_search & nearer, left, now.least),
+        inner=dr.select(is_search & nearer, length, now.inner),
+        least=dr.select(is_search & nearer, gap, now.least),
     )
 
 
 def down_or_up(gradient: Vec3, gaps: LevelGaps, otherwise: Vec3) -> Vec3:
-    """The unit vector along which f goes to the nearer level; another one where the gradient has no
+    """The unit vector along which f goes to the nearer level; `otherwise` where the gradient has no
     direction."""
-    way = safe_normalize(gradient)
-    way = dr.select(gaps.below < gaps.above, -way, way)
-    known = dr.isfinite(way.x + way.y + way.z)
-    return dr.select(known, way, otherwise)
+    direction = safe_normalize(gradient)
+    direction = dr.select(gaps.below < gaps.above, -direction, direction)
+    finite = dr.isfinite(direction.x + direction.y + direction.z)
+    return dr.select(finite, direction, otherwise)

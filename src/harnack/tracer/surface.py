@@ -152,7 +152,7 @@ def intersection_of(volumes: Sequence[Volume | None]) -> Volume | None:
 
 
 def level_number(level: Any) -> float:
-    """A level as a Python number. Raises TypeError for what is no number."""
+    """A level as a Python number. Raises TypeError for a level that is no number."""
     if dr.is_array_v(type(level)):
         return float(dr.detach(level)[0])
     return as_number(level, "level must be a number, or several, such as 0.5 or 2 * math.pi")
@@ -193,7 +193,7 @@ def _in_order(levels: tuple[Any, ...], side: Side | None) -> tuple[Any, ...]:
 
 
 def _as_levels(level: Any) -> tuple[Any, ...]:
-    """One level or several, as a tuple."""
+    """The levels, given as a number or several numbers, as a tuple."""
     if is_tensor(level):
         numbers = tensor_to_array(level, "level")
         backend = backend_of(numbers)

@@ -18,6 +18,7 @@ from harnack.backend.loops import loop_with_queue
 from harnack.fields.capabilities import NO_FACET, NO_PATCH
 from harnack.fields.samples import Ray
 from harnack.tracer.branch_tracker import BranchTracker
+from harnack.tracer.jump_tracer import JumpTracer
 from harnack.tracer.level_contact import (
     Contact,
     Hysteresis,
@@ -26,7 +27,7 @@ from harnack.tracer.level_contact import (
     refine_crossing,
 )
 from harnack.tracer.march import March, MarchState
-from harnack.tracer.walks import JumpTracer, PatchTracer
+from harnack.tracer.patch_tracer import PatchTracer
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -39,14 +40,14 @@ __all__ = ["RayTracer", "SmoothTracer", "TracerFactory", "trace_queued"]
 
 
 class RayTracer(Protocol):
-    """Advances rays; each call of `advance` by one item: a trial point, an interval, or a patch."""
+    """Advances rays. Each call of `advance` makes one trial point, one interval, or one patch."""
 
     def begin(self, state: MarchState) -> Any:
         """Rays at their start."""
         ...
 
     def advance(self, walk: Any, /) -> Any:
-        """The rays after one more item."""
+        """The rays after one more trial point, interval or patch."""
         ...
 
     def finish(self, walk: Any, /) -> tuple[MarchState, Any]:
@@ -127,13 +128,13 @@ def trace_queued(
     def tracer(ray: _QueuedRay) -> RayTracer:
         return tracer_of(Ray(ray.origin, ray.direction, proofs), ray.start, ray.end)
 
-    def one(ray: _QueuedRay) -> _QueuedRay:
+    def advance(ray: _QueuedRay) -> _QueuedRay:
         return dataclasses.replace(ray, walk=tracer(ray).advance(ray.walk))
 
-    begun = tracer_of(path, start, end).begin(state)
-    rays = _QueuedRay(path.origin, path.direction, start, end, begun)
+    begin = tracer_of(path, start, end).begin(state)
+    rays = _QueuedRay(path.origin, path.direction, start, end, begin)
     return loop_with_queue(
-        rays, one, lambda ray: collect(*tracer(ray).finish(ray.walk)), "harnack queue"
+        rays, advance, lambda ray: collect(*tracer(ray).finish(ray.walk)), "harnack queue"
     )
 
 
@@ -197,7 +198,7 @@ class _EndState:
 
     @classmethod
     def of(cls, end: MarchState, sheet: Any) -> _EndState:
-        """Those of an end state."""
+        """The data of an end state."""
         names = (field.name for field in dataclasses.fields(cls) if field.name != "sheet")
         return cls(**{name: getattr(end, name) for name in names}, sheet=sheet)
 
@@ -265,8 +266,8 @@ class SurfaceTracer:
         """The surface that was hit: for a field with patches the patch, else this surface."""
         if hit.patch is None:
             return self
-        part = dr.select(hit.patch == NO_PATCH, self.backend.UInt32(0), hit.patch)
-        return replace(self, field=self.field.patch(part))
+        patch = dr.select(hit.patch == NO_PATCH, self.backend.UInt32(0), hit.patch)
+        return replace(self, field=self.field.patch(patch))
 
     def level_counts(self, p: Vec3) -> Mask:
         """Whether levels count at points p (see `only_component`)."""
@@ -298,7 +299,7 @@ class SurfaceTracer:
     ) -> MarchResult:
         """The first hit of rays o + t d, |d| = 1, for t_min <= t <= t_max. Inactive rays miss."""
         end = self._march(o, d, t_min, t_max, active, _EndState.of)
-        sheet, t, gradient, excess, side = (
+        facet, t, gradient, excess, side = (
             end.sheet,
             end.proved_to,
             end.gradient,
@@ -307,18 +308,18 @@ class SurfaceTracer:
         )
         contact, evaluations = end.contact, end.evaluations
         if contact is not None:
-            crossed = end.status == int(RayStatus.HIT)
-            root, at_root, looks = self.refined_crossings(o, d, contact, crossed)
-            t = dr.select(crossed, root, t)
-            gradient = dr.select(crossed, at_root, gradient)
-            evaluations = evaluations + looks
-            excess, side = dr.select(crossed, contact.tolerance_excess, 0), contact.side
+            is_hit = end.status == int(RayStatus.HIT)
+            root, at_root, samples = self.refined_crossings(o, d, contact, is_hit)
+            t = dr.select(is_hit, root, t)
+            gradient = dr.select(is_hit, at_root, gradient)
+            evaluations = evaluations + samples
+            excess, side = dr.select(is_hit, contact.tolerance_excess, 0), contact.side
         t = dr.select(end.status == int(RayStatus.MISS), dr.inf, t)
-        part = None
+        patch = None
         if self.field.has_patches:
-            sheet, part = self.backend.UInt32(NO_FACET), sheet
+            facet, patch = self.backend.UInt32(NO_FACET), facet
         return MarchResult(
-            t, end.value, gradient, excess, evaluations, end.status, sheet, side, part
+            t, end.value, gradient, excess, evaluations, end.status, facet, side, patch
         )
 
     def refined_crossings(
@@ -350,33 +351,33 @@ class SurfaceTracer:
             )
         occupied, free_to = None if crosses else self.occupied, start
         if occupied is not None:
-            holds = backend.Bool(active) & (start < end)
-            start, end = dr.select(holds, start, 0), dr.select(holds, end, 0)
+            may_hold = backend.Bool(active) & (start < end)
+            start, end = dr.select(may_hold, start, 0), dr.select(may_hold, end, 0)
             free_to = occupied.end_of_empty_run(path.origin, path.direction, start, end)
             if not self.field.has_jumps:
                 start = free_to
         state = MarchState.at(backend, start, end, active, has_detail=has_detail, crosses=crosses)
         if occupied is not None and self.field.has_jumps and not self.only_component:
-            # Sheets in empty cells are still compared with the level.
+            # Facets in empty cells are still compared with the level.
             state = replace(state, proved_step=free_to - start)
         if occupied is not None and self.only_component:
-            # Where rounding leaves it open in which cell a point is, nothing can be proved.
-            lost = state.active & ~self.is_resolved(path.origin, end)
+            # Where it is uncertain, by rounding, in which cell a point is, nothing can be proved.
+            unclear = state.active & ~self.is_resolved(path.origin, end)
             out = backend.UInt32(int(RayStatus.OUT_OF_STEPS))
-            status = dr.select(lost, out, state.status)
-            state = replace(state, active=state.active & ~lost, status=status)
-        whole_numbers = None
+            status = dr.select(unclear, out, state.status)
+            state = replace(state, active=state.active & ~unclear, status=status)
+        tracker = None
         if self.known_branch_volume is not None and not crosses:
-            whole_numbers = BranchTracker(self.levels)
+            tracker = BranchTracker(self.levels)
             entry, _ = self.known_branch_volume.clip(path.origin, path.direction, t_min, t_max)
             outside = (entry > t_min) & (start <= entry)
             begins = state.active & ~outside
             rounding = backend.machine_epsilon * (max_norm(path.origin) + start)
             value = self.field.value_if_cheap(path.point(start), rounding, begins)
-            knows = outside | dr.isfinite(value)
-            detail = dr.select(knows, 0, real(self.field.coarsest_accuracy))
+            has_branch = outside | dr.isfinite(value)
+            accuracy = dr.select(has_branch, 0, real(self.field.coarsest_accuracy))
             value = dr.select(dr.isfinite(value), value, 0)
-            state = replace(state, accuracy_scale=detail, value=real(value))
+            state = replace(state, accuracy_scale=accuracy, value=real(value))
         march = March(
             backend,
             self.levels,
@@ -387,7 +388,7 @@ class SurfaceTracer:
             occupied=occupied,
             ray_end=end,
             only_component=self.only_component,
-            branch_tracker=whole_numbers,
+            branch_tracker=tracker,
         )
         return march, path, real(start), real(end), state
 
@@ -406,21 +407,21 @@ class SurfaceTracer:
         is no longer than end - start: a seventh of that behind the end it is 8/7 e above the level,
         which a sample there shows.
         """
-        none, size = self.backend.Bool(False), max_norm(path.origin)
+        never, size = self.backend.Bool(False), max_norm(path.origin)
         rounding = _AT_JUMP_ROUNDINGS * self.backend.machine_epsilon * (size + t_min)
         if self.volume is None:
-            return start, end, Hysteresis.of(self.levels, (none, none), start, rounding)
+            return start, end, Hysteresis.of(self.levels, (never, never), start, rounding)
         first, last = t_min, t_max
         if self.region is not None:
             first, last = self.region.clip(path.origin, path.direction, t_min, t_max)
-        holds = start < end
+        may_hold = start < end
         length = dr.select(dr.isfinite(start) & dr.isfinite(end), end - start, 0)
-        around = _MARGIN_OF_LENGTH * length
-        before = fmax(start - fmax(_MARGIN_OF_SIZE * (size + dr.abs(start)), around), first)
-        after = fmin(end + fmax(_MARGIN_OF_SIZE * (size + dr.abs(end)), around), last)
+        margin = _MARGIN_OF_LENGTH * length
+        before = fmax(start - fmax(_MARGIN_OF_SIZE * (size + dr.abs(start)), margin), first)
+        after = fmin(end + fmax(_MARGIN_OF_SIZE * (size + dr.abs(end)), margin), last)
         free_before, free_after = before > first, after < last
-        start, end = dr.select(holds, before, start), dr.select(holds, after, end)
-        free = holds & free_before, holds & free_after
+        start, end = dr.select(may_hold, before, start), dr.select(may_hold, after, end)
+        free = may_hold & free_before, may_hold & free_after
         return start, end, Hysteresis.of(self.levels, free, start, rounding)
 
     def _march(
@@ -443,12 +444,12 @@ class SurfaceTracer:
         )
 
         def tracer(path: Ray, start: Real, end: Real) -> RayTracer:
-            here = replace(march, ray_end=end)
+            to_end = replace(march, ray_end=end)
             if self.field.has_jumps:
-                return JumpTracer(here, self.field, path, start, end)
+                return JumpTracer(to_end, self.field, path, start, end)
             if self.field.has_patches:
-                return PatchTracer(here, self.field, path, start, end, any_hit)
-            return SmoothTracer(here, self.field, path, end)
+                return PatchTracer(to_end, self.field, path, start, end, any_hit)
+            return SmoothTracer(to_end, self.field, path, end)
 
         if self.uses_ray_queue and march.hysteresis is None and not self.field.is_cheap:
             return trace_queued(tracer, path, start, end, state, collect)

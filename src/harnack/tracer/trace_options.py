@@ -226,13 +226,13 @@ def shows_parameters(
 
     def decorate(verb: _Function) -> _Function:
         signature = inspect.signature(verb)
-        own = list(signature.parameters.values())
-        others = [parameter for parameter in own if parameter.kind is parameter.VAR_KEYWORD]
-        own = [parameter for parameter in own if parameter not in others]
-        names = {parameter.name for parameter in own}
-        own += [parameter for parameter in parameters if parameter.name not in names]
+        shown = list(signature.parameters.values())
+        variadic = [parameter for parameter in shown if parameter.kind is parameter.VAR_KEYWORD]
+        shown = [parameter for parameter in shown if parameter not in variadic]
+        names = {parameter.name for parameter in shown}
+        shown += [parameter for parameter in parameters if parameter.name not in names]
         cast("Any", verb).__signature__ = signature.replace(
-            parameters=[*own, *(others if keeps_others else [])]
+            parameters=[*shown, *(variadic if keeps_others else [])]
         )
         return verb
 

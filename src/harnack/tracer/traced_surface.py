@@ -1,4 +1,4 @@
-"""`TracedSurface`: a `Surface` together with `TraceOptions`, and what one call prepares of them."""
+"""`TracedSurface`: a `Surface` with `TraceOptions`, and the data that a call prepares of both."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _T = TypeVar("_T")
 # Levels nearer than this to an integer are traced by samples that know their branch: far away a
 # winding number comes arbitrarily near to such a level.
 _INTEGER_MARGIN = 1e-3
-# The default tolerance, as a part of the longest side of the box; and of surfaces without bounds.
+# The default tolerance, as a fraction of the longest side of the box; and for unbounded surfaces.
 _RELATIVE_TOLERANCE, _UNBOUNDED_TOLERANCE = 1e-4, 1e-4
 
 _FIRST_HITS_ONLY = (
@@ -207,8 +207,8 @@ class TracedSurface:
         """The cells that may contain a level that counts; None if no cells are known."""
         if not self.largest:
             return self.memoize("cells", lambda: self.field.occupied_cells(self.level_values))
-        whole = intersection_of([self.field.domain, self.extent, self.clip])
-        arguments = self.field, self.level_values, whole, self.solid_range, self.largest
+        volume = intersection_of([self.field.domain, self.extent, self.clip])
+        arguments = self.field, self.level_values, volume, self.solid_range, self.largest
         key = "largest", self.clip, self.side, self.largest
         return self.memoize(key, lambda: largest_component_cells(*arguments))
 

@@ -1,0 +1,288 @@
+"""`JumpTracer`: traces rays through fields with jumps (see `harnack.fields.capabilities`).
+
+A ray goes from one crossing of the jump surface to the next, by the loop of `March`.
+
+The winding number of a mesh jumps at its triangles, and the jumps are exact. A ray is cut into
+intervals at the triangles that it crosses. On each interval the winding number w is an ordinary
+smooth field, and at each crossing the values on both sides are compared with the level. Crossings
+come from our own query and not from Embree's: whether a ray passes an edge must be decided by the
+same bits for both triangles of the edge *and* for the boundary sum, or w is wrong by 1 behind the
+edge; and the query must work in double precision.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+
+from harnack.backend.elementary import fmax, fmin, max_norm
+from harnack.backend.loops import loop_while_active
+from harnack.fields.capabilities import NO_FACET, JumpCrossing
+from harnack.tracer.level_contact import HIT_AT_JUMP, RayStatus
+from harnack.tracer.march import March, MarchState
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.fields.field import Field
+    from harnack.fields.samples import Ray
+
+# Facets count as crossed at the same point if they are at most the first number of roundings of the
+# coordinates apart, and the cosine of the angle between them is larger than the second number. The
+# sine of a ray's angle to a facet counts as at least the third number.
+_COINCIDENT_ROUNDINGS, _MIN_COSINE, _MIN_SINE = 2.0, 0.999, 1 / 64
+# If this distance of coincidence is more than this fraction of the ray, facets that face each other
+# at the same point may be the two sides of a wall.
+_COARSE = 1e-4
+
+
+@dataclass(frozen=True)
+class JumpTraceState:
+    """The state of rays through a field with jumps.
+
+    offset: `Field.initial_offset` plus all jumps since the start.
+    behind: the jump crossing that was passed last.
+    march: the state of the march.
+    reported_facet: for rays that look for crossings: index of the facet to report for the last
+        crossing; None for other rays.
+    """
+
+    offset: Real
+    behind: JumpCrossing
+    march: MarchState
+    reported_facet: Any | None = None
+
+    @property
+    def active(self) -> Mask:
+        return self.march.active
+
+
+@dataclass(frozen=True)
+class _CoincidentJumps:
+    """Jump crossings at the same point of a ray, up to rounding.
+
+    jump: the sum of their jumps.
+    t, last: ray parameter and facet index of the last of them.
+    up, normal_up: index and normal of the first facet at which f jumps up; NO_FACET if none.
+    down, normal_down: index and normal of the first facet at which f jumps down; NO_FACET if none.
+    folded: whether f jumps the other way at a facet parallel to the first.
+    active: whether there may be more of them.
+    """
+
+    jump: Real
+    t: Real
+    last: Any
+    up: Any
+    down: Any
+    normal_up: Vec3
+    normal_down: Vec3
+    folded: Mask
+    active: Mask
+
+
+@dataclass(frozen=True)
+class JumpTracer:
+    """Traces rays through a field with jumps, from `start` to `end`.
+
+    Between two jump crossings the field is continuous, and `March` proves that ray interval as it
+    proves any ray. This class adds the order of the intervals.
+
+    A smooth hit is a point within the tolerance of a level of the function that continues the
+    interval. The level set of f may end at a facet. Within the tolerance of this end, a ray may
+    hit the continued level set although the facet cuts it off: mostly near singular edges, where
+    gradients grow without limit.
+    """
+
+    march: March
+    field: Field
+    path: Ray
+    start: Real
+    end: Real
+
+    @property
+    def backend(self) -> Backend:
+        return self.march.backend
+
+    def run(self, state: MarchState) -> tuple[MarchState, Any]:
+        """The end state of rays, and the index of the facet that each ray hit (NO_FACET: none).
+
+        Proof that no hit is missed: crossings come in order, so the intervals cover the ray. On
+        each interval `march` samples a continuous function, up to and including the last point,
+        where the values before and behind the facet are compared with the level. From there the ray
+        goes on with the step that the value behind the facet allows. So the part of the ray up to
+        `proved_to` is free of smooth levels, and every facet on it was compared with the level.
+
+        Rays begin just before `start`, so that a facet at the very start is not skipped.
+        """
+        return self.finish(loop_while_active(self.begin(state), self.advance, "harnack intervals"))
+
+    def begin(self, state: MarchState) -> JumpTraceState:
+        """Rays at their start."""
+        real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
+        o, d = self.path.origin, self.path.direction
+        before = real(self.start * (1 - self.backend.machine_epsilon) - 1e-30)
+        offset = real(self.field.initial_offset(o, d, before, state.active))
+        start = JumpCrossing(before, count(NO_FACET), real(0), vector(0))
+        reported = None if state.contact is None else count(NO_FACET)
+        return JumpTraceState(offset, start, state, reported)
+
+    def finish(self, outer: JumpTraceState) -> tuple[MarchState, Any]:
+        """The state of rays, and the index of the facet that each ray hit, NO_FACET for none."""
+        count, end = self.backend.UInt32, outer.march
+        at_facet = end.status == HIT_AT_JUMP
+        status = dr.select(at_facet, count(int(RayStatus.HIT)), end.status)
+        reported = outer.behind.facet if outer.reported_facet is None else outer.reported_facet
+        facet = dr.select(at_facet, reported, count(NO_FACET))
+        return dataclasses.replace(end, status=status), facet
+
+    def advance(self, outer: JumpTraceState) -> JumpTraceState:
+        """Rays after one interval: at the next crossing, the end of the ray, or a hit."""
+        count = self.backend.UInt32
+        o, d = self.path.origin, self.path.direction
+        behind, now = outer.behind, outer.march
+        ahead, last, unclear = self._merge_coincident(
+            self._next(behind, self.end, now.active), now.active
+        )
+        out = count(int(RayStatus.OUT_OF_STEPS))
+        now = dataclasses.replace(
+            now, status=dr.select(unclear, out, now.status), active=now.active & ~unclear
+        )
+        has_facet = ahead.facet != NO_FACET
+        stop = dr.select(has_facet, ahead.t, self.end)
+        # The last step may already have proved the rest of the ray.
+        goes_on = now.proved_to + now.proved_step < stop
+        if now.contact is not None and self.march.hysteresis is not None:
+            samples_end = self.march.hysteresis.must_sample_end(now.contact, stop)
+            goes_on |= samples_end & (now.proved_to < stop)
+        active = now.active & (has_facet | goes_on)
+        step = fmin(self.march.over_relaxation * now.proved_step, stop - now.proved_to)
+        now = dataclasses.replace(now, trial_step=step, active=active)
+        field = self.field.continuation(o, d, behind, ahead, outer.offset)
+        now = self.march.advance(field, self.path, stop, now, ahead)
+        passed = active & has_facet & (now.status == int(RayStatus.MISS))
+        if now.contact is not None:
+            return self._after_jump(outer, now, ahead, last, passed, active & has_facet)
+        spent = passed & (now.evaluations >= self.march.max_steps)
+        status = dr.select(spent, out, now.status)
+        # Of several facets at a point, a hit reports `ahead`; a ray that passes goes on from
+        # `last`.
+        crossing = JumpCrossing(
+            dr.select(passed, last.t, ahead.t),
+            dr.select(passed, last.facet, ahead.facet),
+            ahead.jump,
+            ahead.normal,
+        )
+        return JumpTraceState(
+            dr.select(passed, outer.offset + ahead.jump, outer.offset),
+            crossing,
+            dataclasses.replace(now, status=status, active=passed & ~spent),
+        )
+
+    def _after_jump(
+        self,
+        previous: JumpTraceState,
+        now: MarchState,
+        ahead: JumpCrossing,
+        last: JumpCrossing,
+        passed: Mask,
+        stopped: Mask,
+    ) -> JumpTraceState:
+        """The state, after an interval, of rays that look for crossings. A ray that has crossed the
+        level at a facet has passed that facet; it may be made active again."""
+        spent = passed & (now.evaluations >= self.march.max_steps)
+        status = dr.select(spent, self.backend.UInt32(int(RayStatus.OUT_OF_STEPS)), now.status)
+        is_past = passed | (stopped & (now.status == HIT_AT_JUMP))
+        behind = JumpCrossing(
+            dr.select(is_past, last.t, previous.behind.t),
+            dr.select(is_past, last.facet, previous.behind.facet),
+            dr.select(is_past, ahead.jump, previous.behind.jump),
+            dr.select(is_past, ahead.normal, previous.behind.normal),
+        )
+        return JumpTraceState(
+            dr.select(is_past, previous.offset + ahead.jump, previous.offset),
+            behind,
+            dataclasses.replace(now, status=status, active=passed & ~spent),
+            dr.select(is_past, ahead.facet, previous.reported_facet),
+        )
+
+    def _merge_coincident(
+        self, first: JumpCrossing, active: Mask
+    ) -> tuple[JumpCrossing, JumpCrossing, Mask]:
+        """Merge all jump crossings at the same t, up to rounding, into one with the sum of their
+        jumps.
+
+        Returns the merged crossing, the last of its crossings (from which the ray continues), and
+        the lanes on which it is uncertain whether the crossings are at the same point.
+
+        A ray through an edge or a vertex crosses several facets at once, in no particular order: f
+        jumps there by the sum of their jumps, and there is no interval between them. The same holds
+        for facets in the same plane: facets that follow each other more closely than coordinates
+        are rounded count as at the same t, as rounding decides their order. The merged crossing has
+        the index and normal of the first facet whose jump has the sign of the sum.
+
+        Far from the origin of rays or of coordinates, rounding may be as large as the thickness of
+        a wall, whose two sides would cancel. So if rounding is no small part of the ray, parallel
+        facets whose jumps cancel make the crossing uncertain.
+        """
+        real, count = self.backend.Float, self.backend.UInt32
+        size = max_norm(self.path.origin)
+        tolerance = _COINCIDENT_ROUNDINGS * self.backend.machine_epsilon * (size + first.t)
+        sine = fmax(dr.abs(dr.dot(first.normal, self.path.direction)), real(_MIN_SINE))
+        limit = fmax(fmin(first.t + tolerance / sine, self.end), first.t)
+
+        def body(now: _CoincidentJumps) -> _CoincidentJumps:
+            crossing = self._next(
+                JumpCrossing(now.t, now.last, 0.0, first.normal), limit, now.active
+            )
+            # Facets at an angle to each other are merged only at exactly the same t.
+            parallel = dr.abs(dr.dot(crossing.normal, first.normal)) > _MIN_COSINE
+            same = now.active & (crossing.facet != NO_FACET) & ((crossing.t == first.t) | parallel)
+            new_up = same & (crossing.jump > 0) & (now.up == NO_FACET)
+            new_down = same & (crossing.jump < 0) & (now.down == NO_FACET)
+            return _CoincidentJumps(
+                jump=now.jump + dr.select(same, crossing.jump, 0),
+                t=dr.select(same, crossing.t, now.t),
+                last=dr.select(same, crossing.facet, now.last),
+                up=dr.select(new_up, crossing.facet, now.up),
+                down=dr.select(new_down, crossing.facet, now.down),
+                normal_up=dr.select(new_up, crossing.normal, now.normal_up),
+                normal_down=dr.select(new_down, crossing.normal, now.normal_down),
+                folded=now.folded | (same & parallel & (crossing.jump * first.jump < 0)),
+                active=same,
+            )
+
+        no_facet = count(NO_FACET)
+        start = _CoincidentJumps(
+            jump=first.jump,
+            t=first.t,
+            last=first.facet,
+            up=dr.select(first.jump > 0, first.facet, no_facet),
+            down=dr.select(first.jump < 0, first.facet, no_facet),
+            normal_up=first.normal,
+            normal_down=first.normal,
+            folded=self.backend.Bool(False),
+            active=self.backend.Bool(active) & (first.facet != NO_FACET),
+        )
+        total = loop_while_active(start, body, "together")
+        up, down = total.jump > 0, total.jump < 0
+        facet = dr.select(up, total.up, dr.select(down, total.down, first.facet))
+        normal = dr.select(up, total.normal_up, dr.select(down, total.normal_down, first.normal))
+        behind = JumpCrossing(total.t, total.last, first.jump, first.normal)
+        unclear = total.folded & (total.jump == 0)
+        unclear &= tolerance > _COARSE * (self.end - self.start)
+        return JumpCrossing(first.t, facet, real(total.jump), normal), behind, unclear
+
+    def _next(self, behind: JumpCrossing, end: Real, active: Mask) -> JumpCrossing:
+        """The next crossing, as arrays of this backend; none if it lies beyond the end."""
+        real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
+        ahead = self.field.next_jump(self.path.origin, self.path.direction, behind, end, active)
+        valid = real(ahead.t) <= end
+        valid &= count(ahead.facet) != NO_FACET
+        return JumpCrossing(
+            dr.select(valid, real(ahead.t), dr.inf),
+            dr.select(valid, count(ahead.facet), count(NO_FACET)),
+            dr.select(valid, real(ahead.jump), 0),
+            vector(*ahead.normal),
+        )
