@@ -135,10 +135,11 @@ def find(name: str) -> Any:
 
 def members_of(kind: type) -> Iterator[tuple[str, Any]]:
     """The public methods and properties that a class itself defines and documents."""
-    for name, value in vars(kind).items():
+    attributes: dict[str, Any] = dict(vars(kind))
+    for name, value in attributes.items():
         if name.startswith("_"):
             continue
-        member = value.__func__ if isinstance(value, classmethod | staticmethod) else value
+        member: Any = getattr(value, "__func__", value)
         if (isinstance(member, property) or inspect.isfunction(member)) and inspect.getdoc(member):
             yield name, getattr(kind, name)
 
