@@ -9,7 +9,7 @@ FRAMEWORKS := torch==2.13.0 "jax==0.10.2; python_version >= '3.11'" "jaxlib==0.1
 TYPES := 'typescript@5.9.3', '@webgpu/types@0.1.66'
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo parts test test-slow test-frameworks test-browser lint format site site-pictures images
+.PHONY: help setup demo parts test test-slow test-frameworks test-browser lint format site reference site-pictures images
 .PHONY: bench figures clean
 
 help:
@@ -23,6 +23,7 @@ help:
 	@echo "make lint       check style and types"
 	@echo "make format     apply the style"
 	@echo "make site       build the documentation into site/; a warning is an error"
+	@echo "make reference  write signatures and the table of options into the docs"
 	@echo "make images     render the pictures of README and docs into docs/images"
 	@echo "make bench      run the benchmarks; they write their tables into the docs"
 	@echo "make figures    remake the paper's figures, measured, into docs/figures.md"
@@ -80,6 +81,9 @@ images: $(STAMP)
 # Notebooks are run while the site is built.
 site: $(STAMP)
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet -c scripts/site -d out/site . site
+
+reference: $(STAMP)
+	$(BIN)/python scripts/reference.py
 
 # Those that are missing; delete one to have it made anew.
 site-pictures: $(STAMP)

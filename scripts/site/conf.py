@@ -71,31 +71,41 @@ copybutton_exclude = ".linenos, .gp, .go"
 
 CONTENTS = {
     "First steps": ["docs/notebooks/*", "docs/examples", "docs/gallery", "docs/platforms"],
-    "Guides": [
+    "Guide": [
+        "docs/surfaces",
         "docs/pictures",
-        "docs/live",
+        "docs/own-field",
         "docs/meshes",
-        "docs/printing",
-        "docs/distances",
         "docs/implicit",
-        "docs/plane",
-        "docs/circles",
-        "docs/polygon-meshes",
-        "docs/morph",
+        "docs/printing",
+        "docs/live",
         "docs/frameworks",
-        "docs/cookbook",
+        "docs/precision",
+        "docs/distances",
         "docs/cluster",
+        "docs/cookbook",
     ],
+    "More surfaces": ["docs/circles", "docs/polygon-meshes", "docs/plane", "docs/morph"],
     "Reference": [
-        f"docs/reference/{page}"
-        for page in (
-            *("tracing", "pictures", "meshing", "distances", "fields-of-curves"),
-            *("fields-of-meshes", "harmonic-fields", "solids", "blobs", "volumes"),
-            *("bounds", "own-fields", "files-and-shapes", "backend"),
-        )
+        "docs/options",
+        *(
+            f"docs/reference/{page}"
+            for page in (
+                *("tracing", "pictures", "meshing", "distances", "fields-of-curves"),
+                *("fields-of-meshes", "harmonic-fields", "solids", "blobs", "volumes"),
+                *("bounds", "own-fields", "files-and-shapes", "backend"),
+            )
+        ),
     ],
-    "Measured": ["docs/benchmarks", "docs/figures", "docs/misprints"],
-    "Project": ["docs/architecture", "docs/glossary", "CONTRIBUTING", "CHANGELOG"],
+    "Research": [
+        "docs/proofs",
+        "docs/benchmarks",
+        "docs/figures",
+        "docs/misprints",
+        "docs/glossary",
+        "docs/architecture",
+    ],
+    "Project": ["CONTRIBUTING", "CHANGELOG"],
 }
 
 

@@ -36,7 +36,7 @@ def main() -> None:
 def draw_scene(name: str, path: Path) -> None:
     """The scene, shaded unless it shows what rays found."""
     scene = SCENES[name]
-    show = "shaded" if scene.show == "color" else scene.show
+    show = "shaded" if scene.show == "path" else scene.show
     picture = scene.render(show=show, size=_SIZE, progress=False)
     path.parent.mkdir(parents=True, exist_ok=True)
     picture.to_pil().convert("RGB").save(path, quality=_QUALITY)

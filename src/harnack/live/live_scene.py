@@ -103,7 +103,7 @@ class ControlState:
     values: of all sliders.
     curves: vertices (n, 3) of each loop, in place of those of the field's curve.
     cut_volume: a volume that cuts all surfaces; a half-space opens them, as `section` of
-        `level_set` does.
+        `harnack.Surface` does.
     settings: a selection of `LIVE_OPTIONS`, in place of those that the scene was opened with.
     """
 

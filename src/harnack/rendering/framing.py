@@ -177,7 +177,7 @@ def check_offset(points: FloatArray) -> None:
     said = (
         f"what is drawn is {size:.4g} long and {far:.4g} from the origin, and pictures are "
         "computed in single precision: {}; move it to the origin: subtract its center from the "
-        "points that it is made of (of formulas and shapes, moved(...) does so)"
+        "points that it is made of (of a solid, translated(...) does so)"
     )
     if far > _NOTHING_LEFT * size:
         raise ValueError(said.format("too little is left of its coordinates"))

@@ -264,7 +264,7 @@ def mitsuba_shape(
         scene = mitsuba.load_dict({
             "type": "scene",
             "integrator": {"type": "harnack_path"},
-            "surface": harnack.rendering.shape(field, bsdf={"type": "roughconductor"}),
+            "surface": harnack.rendering.mitsuba_shape(field, bsdf={"type": "roughconductor"}),
             ...
         })
 
