@@ -15,7 +15,7 @@ from harnack.fields.field import check_is_field
 from harnack.fields.solid_angles.dipole import DipolePotential
 from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.fields.solid_angles.winding_number import WindingNumber
-from harnack.geometry import Box, Volume, VolumeIntersection
+from harnack.geometry import Box, Volume
 from harnack.meshing.bcc_lattice import BccLattice
 from harnack.meshing.checks import (
     EmptySurfaceError,
@@ -60,6 +60,7 @@ from harnack.meshing.sign_isosurface import (
 )
 from harnack.progress import teller
 from harnack.tracer import Surface
+from harnack.tracer.surface import intersection_of
 from harnack.tracer.trace_options import SURFACE_OPTIONS, shows_keywords, surface_and_options
 
 if TYPE_CHECKING:
@@ -190,7 +191,7 @@ def mesh(
     is_closed = bool(solid) or thickness is not None
     if simplify and not is_closed:
         raise ValueError('simplify is for closed meshes: give side="below" or thickness as well')
-    volume = _volume(field, target.clip, target.section)
+    volume = intersection_of([field.domain, target.clip, target.section])
     asked = _MeshOptions(volume, accuracy, cell_size, seed, max_triangles, report)
     if uses_sign_meshing(field):
         made = _mesh_from_signs(field, level, solid, thickness is not None, asked)
@@ -525,17 +526,6 @@ def _checked(field: Field) -> Field:
             "field than SolidAngle where its surfaces end"
         )
     return field
-
-
-def _volume(field: Field, clip: Volume | None, section: Volume | None) -> Volume | None:
-    """What the level sets are cut by: the clip, the domain where the field ends there or there is
-    no clip, and the section."""
-    ends = field.domain is not None and not (field.is_global and clip is not None)
-    parts = dict.fromkeys((clip, field.domain if ends else None, section))
-    kept = [one for one in parts if one is not None]
-    if len(kept) < 2:
-        return kept[0] if kept else None
-    return VolumeIntersection(kept)
 
 
 def _mesh_solid(

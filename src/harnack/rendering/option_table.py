@@ -136,7 +136,8 @@ OPTIONS: tuple[Option, ...] = (
            "(2000)", "N", text.parse_count, default=_of_trace("max_steps"), varies=True),
     Option("over_relaxation", "trace", RAYS | DRAWN, "factor from 1 to 2 by which trial steps are "
            "longer than proved ones (the field's own)", "FACTOR", text.parse_positive, varies=True),
-    Option("precision", "trace", RAYS | DISTANCES | CURVATURES, "arithmetic (that of the input)",
+    Option("precision", "trace", RAYS | DISTANCES | CURVATURES, "arithmetic (that of the "
+           "input; double for distances and curvatures)",
            "{single,double}", text.parse_choice("single", "double"), in_files=False),
     Option("backend", "trace", frozenset(("trace",)), "webgpu for any GPU of the system",
            "{webgpu}", text.parse_choice("webgpu"), in_files=False),
