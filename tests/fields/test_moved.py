@@ -61,7 +61,7 @@ def test_values_are_within_the_bound(motion: Any) -> None:
     oracle = 1e-13  # is rounded as well
     assert (off <= moved.error_bound(points, precision="double") + oracle).all()
     assert off.max() > 1e-12  # the tree is used
-    single = np.abs(moved.value(points) - exact)
+    single = np.abs(moved.value(points, precision="single") - exact)
     assert np.quantile(single, 0.99) < 1e-2
 
 

@@ -76,6 +76,7 @@ def test_many_first_hits(kind: str, method: Any, precision: Any, seed: int) -> N
 
 def compare(mesh: Mesh, o: np.ndarray, d: np.ndarray, **settings: Any) -> hk.Hits:
     """Rays end as without cells, but for grazes within the tolerance."""
+    settings = {"tolerance": 1e-4, "precision": "single", **settings}
     hits = hk.trace(with_cells(mesh), o, d, **settings)
     plain = hk.trace(with_cells(mesh, False), o, d, **settings)
     assert not (hits.status == hk.RayStatus.OUT_OF_STEPS).any()
