@@ -12,6 +12,7 @@ import trimesh
 
 import harnack as hk
 from harnack.cli.mesh_files import write_mesh
+from harnack.geometry.example_meshes import bumpy_sphere
 from harnack.meshing.checks import (
     LocalizedMeshingError,
     MeshingError,
@@ -321,3 +322,13 @@ def test_a_cloud_by_dipoles_is_right(n: int):
         around = above(x[off, None] + part * tolerance * ways)
         passes |= (np.sign(around) != np.sign(value[off, None])).any(axis=1)
     assert passes.all()
+
+
+def test_the_outside_of_a_closed_mesh_has_no_end() -> None:
+    """It was closed at the walls of the box in which it was meshed, without a word."""
+    field = hk.WindingNumber(*bumpy_sphere(1))
+    with pytest.raises(MeshingError, match="reaches to infinity: choose the other side, or give a"):
+        hk.mesh(field, side="below", cell_size=0.4)
+    shell = hk.mesh(field, side="below", cell_size=0.4, clip=hk.Box((-2, -2, -2), (2, 2, 2)))
+    inside = hk.mesh(field, side="above", cell_size=0.4)
+    assert shell.volume + inside.volume == pytest.approx(64.0)

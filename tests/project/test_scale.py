@@ -107,6 +107,7 @@ def test_arrays_of_float64_are_computed_in_double_precision(name: str) -> None:
 
 def test_input_of_other_kinds_is_computed_in_single_precision() -> None:
     field = FIELDS["gyroid ball"](1.0)
+    assert field.value(list(POINTS)).dtype == np.float64  # a list of arrays of float64
     for points in (POINTS.astype(np.float32), POINTS.tolist()):
         assert field.value(points).dtype == np.float32
         assert field.value(points, precision="double").dtype == np.float64

@@ -9,7 +9,7 @@ import functools
 import importlib
 import os
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, cast
 
 import drjit as dr
 import numpy as np
@@ -163,9 +163,15 @@ def choose_backend(precision: Precision = "single") -> Backend:
 
 def precision_of_input(*arrays: Any) -> Precision:
     """The precision in which to compute with array-likes: double if any of them is an array of
-    float64, else single (float32, integers, lists of Python numbers)."""
-    kinds = [getattr(array, "dtype", None) for array in arrays]
-    return "double" if any(kind == np.float64 for kind in kinds if kind is not None) else "single"
+    float64, or a list of such arrays, else single (float32, integers, lists of numbers)."""
+
+    def is_double(array: Any) -> bool:
+        if isinstance(array, list | tuple):
+            return any(map(is_double, cast("list[Any]", array)))
+        dtype = getattr(array, "dtype", None)
+        return dtype is not None and dtype == np.float64
+
+    return "double" if any(map(is_double, arrays)) else "single"
 
 
 def backend_of(array: Any) -> Backend:

@@ -326,6 +326,11 @@ def _mesh_from_signs(
         cut = volume or Box(tuple(box.lower.tolist()), tuple(box.upper.tolist()))
         whole ^= volume_manifold(cut, box.lower, box.upper, 0.5 * asked.tolerance.at(size))
         made, is_apart = from_manifold(whole), False
+        if volume is None and ((made.vertices == box.lower) | (made.vertices == box.upper)).any():
+            raise MeshingError(
+                f"the solid on this side of the level of {type(field).__name__} reaches to "
+                "infinity: choose the other side, or give a clip, such as a box (harnack.Box)"
+            )
     if not len(made.faces):
         raise MeshingError("the level set is empty: it lies outside of the clip")
     if is_apart:
