@@ -56,9 +56,8 @@ def test_the_error_falls_with_the_fourth_power_of_the_step() -> None:
 @pytest.mark.slow
 def test_lines_end_at_umbilics_at_curves_and_at_the_clip_volume() -> None:
     # On a sphere every point is an umbilic: no direction is known, and there is no line.
-    assert [len(line) for line in hk.distance.curvature_lines(hk.Sphere(), SEEDS, step=0.1, length=1.0)] == [
-        0, 0, 0,
-    ]  # fmt: skip
+    lines = hk.distance.curvature_lines(hk.Sphere(), SEEDS, step=0.1, length=1.0)
+    assert [len(line) for line in lines] == [0, 0, 0]
     # The surface of a circle at the level 1.2 is a surface of revolution: meridians end at the
     # circle, near which the surface is ever more bent, or at the axis, where there is an umbilic.
     field = hk.SolidAngle(hk.geometry.Circle(1.0))

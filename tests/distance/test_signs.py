@@ -48,5 +48,5 @@ def test_clips_cut_the_surface_whose_distance_is_measured() -> None:
     assert (np.abs(hk.signed_distance(surface, points, method="lower_bound")) <= exact + 1e-9).all()
     with pytest.raises(TypeError, match='method="first_order" does not see clip'):
         hk.signed_distance(surface, points, method="first_order")
-    with pytest.raises(NotImplementedError, match="takes no clip.* which jumps"):
+    with pytest.raises(NotImplementedError, match=r"takes no clip.* which jumps"):
         hk.signed_distance(hk.WindingNumber(VERTICES, FACES), points, clip=cut)

@@ -331,4 +331,4 @@ def test_the_outside_of_a_closed_mesh_has_no_end() -> None:
         hk.mesh(field, side="below", cell_size=0.4)
     shell = hk.mesh(field, side="below", cell_size=0.4, clip=hk.Box((-2, -2, -2), (2, 2, 2)))
     inside = hk.mesh(field, side="above", cell_size=0.4)
-    assert shell.volume + inside.volume == pytest.approx(64.0)
+    assert shell.volume + inside.volume == pytest.approx(64.0, rel=1e-3)

@@ -277,6 +277,8 @@ def _mesh_from_signs(
         return _faces_alone(field, levels[0], solid, asked)
     volume, box = asked.volume, _box(field, levels, asked.volume)
     size = float((box.upper - box.lower).max())
+    if solid and _is_outside_inside(field, ends, box):
+        box = _unlimited_box(field, volume)
     cells, attempts = _cells_by_signs(field, size, asked.spacing)
     # Where nothing ends at the box, its cells should not lie along what is symmetrical.
     room = np.zeros(3) if box.has_walls else size * np.array([0.0037, 0.0053, 0.0029])
@@ -326,11 +328,6 @@ def _mesh_from_signs(
         cut = volume or Box(tuple(box.lower.tolist()), tuple(box.upper.tolist()))
         whole ^= volume_manifold(cut, box.lower, box.upper, 0.5 * asked.tolerance.at(size))
         made, is_apart = from_manifold(whole), False
-        if volume is None and ((made.vertices == box.lower) | (made.vertices == box.upper)).any():
-            raise MeshingError(
-                f"the solid on this side of the level of {type(field).__name__} reaches to "
-                "infinity: choose the other side, or give a clip, such as a box (harnack.Box)"
-            )
     if not len(made.faces):
         raise MeshingError("the level set is empty: it lies outside of the clip")
     if is_apart:
@@ -724,6 +721,36 @@ def _box(field: Field, levels: tuple[float, ...], volume: Volume | None) -> _Mes
     if not (lower < upper).all():
         raise MeshingError("the level set is empty: it lies outside of the clip")
     return _MeshingBox(lower, upper, volume is not None)
+
+
+def _is_outside_inside(field: Field, ends: tuple[float, float], box: _MeshingBox) -> bool:
+    """Whether the values of the solid, between both ends, are those outside of the box around all
+    its levels: no level passes there, so that a point of it decides."""
+    center, half = 0.5 * (box.lower + box.upper), 0.5 * (box.upper - box.lower)
+    signs = np.array(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3)).reshape(3, -1).T
+    signs = signs[signs.any(axis=1)]
+    points = np.concatenate([center + factor * half * signs for factor in (1.5, 1.02)])
+    if field.domain is not None:
+        points = points[field.domain.contains_points(points)]
+    if not len(points):
+        return False
+    value = float(np.asarray(field.value(points[:1], precision="double"))[0])
+    return ends[0] <= value <= ends[1]
+
+
+def _unlimited_box(field: Field, volume: Volume | None) -> _MeshingBox:
+    """The box of the volume, for a solid that goes on outside of its levels' box.
+
+    Raises:
+        MeshingError: the volume has no bounds, so that the solid has none.
+    """
+    bounds = None if volume is None else _bounds_of(volume)
+    if bounds is None or not np.isfinite(bounds).all():
+        raise MeshingError(
+            f"the solid on this side of the level of {type(field).__name__} reaches to infinity: "
+            "choose the other side, or give a clip with bounds, such as a box (harnack.Box)"
+        )
+    return _MeshingBox(*bounds, True)
 
 
 def _around_curve(field: SolidAngle, extent: Volume | None, volume: Volume | None) -> _MeshingBox:
