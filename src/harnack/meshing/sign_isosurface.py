@@ -430,7 +430,7 @@ class _CreaseRefinement:
         function: SignFunction,
         x: FloatArray,
         normals: FloatArray,
-        bent: BoolArray,
+        is_creased: BoolArray,
         faces: IntArray,
         tolerance: float,
     ) -> _CreaseRefinement:
@@ -439,7 +439,7 @@ class _CreaseRefinement:
         planes, stay."""
         every = Edges.of(half_edges(faces))
         edges = every.edge_of_pair.reshape(3, -1).T
-        rows = np.flatnonzero((every.multiplicity == 2) & ~bent[every.vertices].any(axis=1))
+        rows = np.flatnonzero((every.multiplicity == 2) & ~is_creased[every.vertices].any(axis=1))
         ends = every.vertices[rows]
         one, other = normals[ends[:, 0]], normals[ends[:, 1]]
         a, b = x[ends[:, 0]], x[ends[:, 1]]
@@ -463,7 +463,7 @@ class _CreaseRefinement:
             )
         )
         on_crease = (total > _MIN_CREASE_ANGLE) & (angle > _CREASE_ANGLE_SHARE * total)
-        is_bent = np.concatenate([bent, on_crease])
+        is_bent = np.concatenate([is_creased, on_crease])
         new = vertex[edges]
         corner = np.flatnonzero((new >= 0).all(axis=1) & is_bent[np.maximum(new, 0)].all(axis=1))
         inner, inner_normal, corner = _crease_corners(function, x, normals, faces, corner)

@@ -41,7 +41,7 @@ class BranchTracker:
         return Levels(self.levels.values, 1.0)
 
     def resolve(
-        self, look: RaySample, before: Real, step: Real, total_error: Real
+        self, ray_sample: RaySample, before: Real, step: Real, total_error: Real
     ) -> tuple[RaySample, Mask]:
         """Add the branch to samples that lack it.
 
@@ -60,18 +60,18 @@ class BranchTracker:
         before. A point that is not proved is not accepted, whatever its value. A point at which f
         is within its error of a periodic level is accepted only by (1).
         """
-        sample, level = look.sample, self.levels.values[0]
+        sample, level = ray_sample.sample, self.levels.values[0]
         value, rung = sample.value - level, dr.floor(before - level)
         between = level + (rung + (value - dr.floor(value)))
         nearest = sample.value + dr.round(before - sample.value)
         change = 0 * step + _MAX_CHANGE
-        is_near = any_is_free(look.backward, LevelGaps(change, change), step) & (
+        is_near = any_is_free(ray_sample.backward, LevelGaps(change, change), step) & (
             total_error < _MAX_ERROR
         )
         is_near &= before != 0
         value = dr.select(is_near, nearest, between)
         shift = dr.select(sample.branch_unknown, value - sample.value, 0)
-        return replace(look, sample=sample.shifted(shift)), is_near
+        return replace(ray_sample, sample=sample.shifted(shift)), is_near
 
     def gaps(
         self, sample: Sample, is_modulo: Mask, is_sure: Mask, total_error: Real

@@ -68,9 +68,9 @@ class _NoDerivative(dr.CustomOp):
     """The identity, whose derivative is not known: reverse mode raises. Forward mode, which goes
     from parameters to all that depends on them, wanted or not, gives NaN."""
 
-    def eval(self, value: Any, what: str, sources: list[Any]) -> Any:
+    def eval(self, value: Any, quantity: str, sources: list[Any]) -> Any:
         del sources
-        self._what = what
+        self._quantity = quantity
         return value
 
     def forward(self) -> None:
@@ -79,18 +79,18 @@ class _NoDerivative(dr.CustomOp):
     def backward(self) -> None:
         if dr.any(self.grad_out() != 0, axis=None):  # it is zero for a result that is not used
             raise NotImplementedError(
-                f"{self._what} of hits cannot be differentiated, only t and position can: detach "
-                "it where it is used (drjit.detach)"
+                f"{self._quantity} of hits cannot be differentiated, only t and position can: "
+                "detach it where it is used (drjit.detach)"
             )
 
 
-def refuse_derivative(prepared: SurfaceTracer, o: Vec3, d: Vec3, what: str, value: Any) -> Any:
+def refuse_derivative(prepared: SurfaceTracer, o: Vec3, d: Vec3, quantity: str, value: Any) -> Any:
     """The same result of a trace, with an error (`_NoDerivative`) if its derivative is requested.
 
     Its derivative is not known, and zero would be wrong.
     """
     sources = [o, d, *prepared.levels.values, *prepared.field.parameters()]
-    return dr.custom(_NoDerivative, value, what, sources)
+    return dr.custom(_NoDerivative, value, quantity, sources)
 
 
 def attach_derivatives(

@@ -179,7 +179,7 @@ def _as_tensors(hits: Hits) -> Hits:
 def _trace(surface: TracedSurface, rays: RayBatch) -> Hits:
     """The hits, as Dr.Jit arrays; with derivatives if the rays came as such."""
     backend, o, d, count = rays.backend, rays.origin, rays.direction, rays.count
-    prepared = surface.for_rays(count).prepare(backend, many=count >= _MIN_RAYS_FOR_CELLS)
+    prepared = surface.for_rays(count).prepare(backend, many_rays=count >= _MIN_RAYS_FOR_CELLS)
     if not prepared.field.is_cheap and _are_scattered(backend, dr.detach(o), dr.detach(d)):
         prepared = replace(prepared, uses_ray_queue=True)
     with dr.suspend_grad():
@@ -283,10 +283,10 @@ class _Doubt:
 
 
 @dataclass(frozen=True)
-class _Around:
-    """Hits to look around, and the part that each is of."""
+class _HitsOfParts:
+    """Hits around which the surface is looked for, and the part of the field of each hit."""
 
-    around: Doubtful
+    hits: Doubtful
     part: Any
 
 
@@ -308,15 +308,15 @@ def _with_seen_distances(prepared: SurfaceTracer, hits: Hits, doubt: _Doubt) -> 
     if not has_far[0]:
         return hits
 
-    def seen(rays: _Around) -> _Lengths:
+    def seen(rays: _HitsOfParts) -> _Lengths:
         sampled = field
         if field.has_patches:
             sampled = field.patch(dr.reinterpret_array(backend.UInt32, rays.part))
-        return _Lengths(seen_distance(backend, sampled, prepared.levels, rays.around))
+        return _Lengths(seen_distance(backend, sampled, prepared.levels, rays.hits))
 
     around = Doubtful(hits.position, hits.normal, doubt.size, doubt.distance)
     far = compute_on_active(
-        is_far, seen, _Around(around, hits.primitive_index), _Lengths(doubt.distance)
+        is_far, seen, _HitsOfParts(around, hits.primitive_index), _Lengths(doubt.distance)
     )
     uncertainty = dr.select(is_far, far.length - doubt.tolerance, hits.uncertainty)
     return replace(hits, uncertainty=uncertainty)
@@ -331,7 +331,7 @@ def _positions(o: Vec3, d: Vec3, t: Real) -> Vec3:
 
 def _trace_on_device(surface: TracedSurface, rays: RayBatch) -> Hits:
     count = rays.count
-    prepared = surface.prepare(rays.backend, many=count >= _MIN_RAYS_FOR_CELLS)
+    prepared = surface.prepare(rays.backend, many_rays=count >= _MIN_RAYS_FOR_CELLS)
     lanes = {
         name: array + dr.zeros(type(array), count)
         for name, array in zip(("o", "d", "near", "far"), rays.arrays, strict=True)

@@ -130,12 +130,12 @@ class JumpTest:
 
 
 def test_jump(
-    ahead: JumpCrossing, there: Mask, value: Real, total_error: Real, levels: Levels
+    ahead: JumpCrossing, is_at_crossing: Mask, value: Real, total_error: Real, levels: Levels
 ) -> JumpTest:
     """Compare the values on the two sides of a facet with the levels.
 
     ahead: the crossing at the end of the ray interval.
-    there: lanes whose samples are accepted and lie at that crossing.
+    is_at_crossing: lanes whose samples are accepted and lie at that crossing.
     value: f there, before the jump, known up to `total_error`.
 
     The facet belongs to the surface if a level lies between the values on its two sides. These are
@@ -146,7 +146,7 @@ def test_jump(
     sum of their jumps (`JumpTracer._merge_coincident`).
     """
     has_crossing = ahead.facet != NO_FACET
-    at_crossing = has_crossing & there
+    at_crossing = has_crossing & is_at_crossing
     behind = value + dr.select(at_crossing, ahead.jump, 0)
     low, high = fmin(value, behind) - total_error, fmax(value, behind) + total_error
     is_hit = at_crossing & (levels.gaps(low).above <= high - low)
@@ -352,34 +352,34 @@ class Hysteresis:
             dr.select(contact.is_touching, fmax(above - x, 0), gaps.above),
         )
 
-    def update(self, now: Contact, active: Mask, seen: AcceptedPoint) -> tuple[Contact, Mask]:
+    def update(self, now: Contact, active: Mask, point: AcceptedPoint) -> tuple[Contact, Mask]:
         """The contact behind an accepted point, and whether the ray has crossed the level."""
-        x = -self.levels.offset_to_nearest(seen.value)
+        x = -self.levels.offset_to_nearest(point.value)
         touching = now.is_touching
-        side = dr.select(touching, now.side, self._side(now, seen, x))
+        side = dr.select(touching, now.side, self._side(now, point, x))
 
         # The root, if f has changed sides since the last point.
-        t, value, slope, gradient = seen.before
+        t, value, slope, gradient = point.before
         x_before = -self.levels.offset_to_nearest(value)
         passes = active & touching & (side * x_before > 0) & (side * x <= 0)
-        share = cubic_root(x_before, x, (seen.t - t) * slope, (seen.t - t) * seen.slope)
-        begins = active & ~touching & seen.is_near
-        root = dr.select(passes, t + share * (seen.t - t), dr.select(begins, seen.t, now.root))
-        at_root = dr.select(begins, seen.gradient, now.gradient)
-        at_root = dr.select(passes, dr.lerp(gradient, seen.gradient, share), at_root)
-        excess = dr.select(passes | begins, seen.excess, now.tolerance_excess)
-        before = dr.select(passes, t, dr.select(begins, seen.t, now.before))
-        behind = dr.select(passes | begins, seen.t, now.after)
+        share = cubic_root(x_before, x, (point.t - t) * slope, (point.t - t) * point.slope)
+        begins = active & ~touching & point.is_near
+        root = dr.select(passes, t + share * (point.t - t), dr.select(begins, point.t, now.root))
+        at_root = dr.select(begins, point.gradient, now.gradient)
+        at_root = dr.select(passes, dr.lerp(gradient, point.gradient, share), at_root)
+        excess = dr.select(passes | begins, point.excess, now.tolerance_excess)
+        before = dr.select(passes, t, dr.select(begins, point.t, now.before))
+        behind = dr.select(passes | begins, point.t, now.after)
 
         # Is f far enough beyond the level to have crossed it, or has it left the band?
         is_first = (now.side == 0) & ~touching
-        stays = (is_first & self.is_free_before) | (seen.is_end & self.is_free_after)
-        enough = dr.select(stays, 0, _CROSSED * seen.band)
-        is_off = dr.abs(x) > fmax(enough, seen.total_error)
+        stays = (is_first & self.is_free_before) | (point.is_end & self.is_free_after)
+        enough = dr.select(stays, 0, _CROSSED * point.band)
+        is_off = dr.abs(x) > fmax(enough, point.total_error)
         crosses = active & touching & is_off & (side * x < 0)
         settles = active & is_off & (side == 0)
         side = dr.select(settles | crosses, dr.select(x > 0, type(x)(1), -1), side)
-        is_touching = dr.select(touching, dr.abs(x) <= seen.band, seen.is_near)
+        is_touching = dr.select(touching, dr.abs(x) <= point.band, point.is_near)
         return Contact(
             dr.select(active, side, now.side),
             dr.select(active, is_touching, touching),
@@ -388,11 +388,11 @@ class Hysteresis:
             excess,
             before,
             behind,
-            dr.select(active, seen.band, now.band),
+            dr.select(active, point.band, now.band),
         ), crosses
 
     def update_at_jump(
-        self, now: Contact, active: Mask, seen: AcceptedPoint, ahead: JumpCrossing, d: Vec3
+        self, now: Contact, active: Mask, point: AcceptedPoint, ahead: JumpCrossing, d: Vec3
     ) -> tuple[Contact, Mask]:
         """The contact behind the facet `ahead`, and whether the jump of f there crosses the level.
 
@@ -401,30 +401,30 @@ class Hysteresis:
 
         A field with jumps has a single level here. A ray that starts on a facet is on neither side.
         """
-        x = -self.levels.offset_to_nearest(seen.value)
+        x = -self.levels.offset_to_nearest(point.value)
         one = type(x)(1)
         side = dr.select(now.is_touching, now.side, dr.select(x > 0, one, -1))
-        starts = dr.abs(dr.dot(ahead.normal, d)) * (seen.t - self.start) <= self.rounding
+        starts = dr.abs(dr.dot(ahead.normal, d)) * (point.t - self.start) <= self.rounding
         side = dr.select(starts, 0, side)
         behind = x + ahead.jump
         passes = active & (side * x > 0) & (side * behind <= 0)
-        begins = active & ~now.is_touching & (dr.abs(behind) <= seen.band)
-        is_off = dr.abs(behind) > fmax(_CROSSED * seen.band, seen.total_error)
+        begins = active & ~now.is_touching & (dr.abs(behind) <= point.band)
+        is_off = dr.abs(behind) > fmax(_CROSSED * point.band, point.total_error)
         crosses = active & is_off & (side * behind < 0)
         side = dr.select(is_off, dr.select(behind > 0, one, -1), side)
         at_sheet = passes | begins
         return Contact(
             dr.select(active, side, now.side),
-            dr.select(active, dr.abs(behind) <= seen.band, now.is_touching),
-            dr.select(at_sheet, seen.t, now.root),
+            dr.select(active, dr.abs(behind) <= point.band, now.is_touching),
+            dr.select(at_sheet, point.t, now.root),
             dr.select(at_sheet, ahead.normal, now.gradient),
             dr.select(at_sheet, 0, now.tolerance_excess),
-            dr.select(at_sheet, seen.t, now.before),
-            dr.select(at_sheet, seen.t, now.after),
-            dr.select(active, seen.band, now.band),
+            dr.select(at_sheet, point.t, now.before),
+            dr.select(at_sheet, point.t, now.after),
+            dr.select(active, point.band, now.band),
         ), crosses
 
-    def _side(self, now: Contact, seen: AcceptedPoint, x: Real) -> Real:
+    def _side(self, now: Contact, point: AcceptedPoint, x: Real) -> Real:
         """The side from which a ray comes to the nearest level if it was not in contact with it: 1
         if f is larger there, -1 if it is smaller, 0 if the side is not known.
 
@@ -435,11 +435,11 @@ class Hysteresis:
         or the slope if the present value equals the level up to its error.
         """
         if self.levels.period is None:
-            above = seen.before[1] > seen.value - x
+            above = point.before[1] > point.value - x
         else:
-            above = dr.select(dr.abs(x) > seen.total_error, x > 0, seen.slope < 0)
+            above = dr.select(dr.abs(x) > point.total_error, x > 0, point.slope < 0)
         # 0 stays only for a ray of which every sample so far was near a level.
-        known = (now.side != 0) | ~seen.is_near
+        known = (now.side != 0) | ~point.is_near
         return dr.select(known, dr.select(above, type(x)(1), -1), 0)
 
 
@@ -456,7 +456,7 @@ class _Bisection:
 
 
 def refine_crossing(
-    field: Field, levels: Levels, tolerance: PreparedHitTolerance, path: Ray, found: Contact,
+    field: Field, levels: Levels, tolerance: PreparedHitTolerance, path: Ray, contact: Contact,
     active: Mask,
 ) -> tuple[Real, Vec3, Any]:  # fmt: skip
     """Refine a crossing by bisection.
@@ -468,9 +468,9 @@ def refine_crossing(
     both the tolerance and the error of f, the bracket is narrowed by bisection, with f on different
     sides of the level at its ends.
     """
-    side = -found.side
-    count = dr.uint32_array_t(type(found.root))
-    smallest = 4 * float(dr.epsilon(type(found.root)))
+    side = -contact.side
+    count = dr.uint32_array_t(type(contact.root))
+    smallest = 4 * float(dr.epsilon(type(contact.root)))
 
     def body(now: _Bisection) -> _Bisection:
         sample, size = field.evaluate(path.point(now.t)), max_norm(path.origin) + now.t
@@ -492,7 +492,9 @@ def refine_crossing(
             now.active & goes_on,
         )
 
-    begin = _Bisection(found.before, found.after, found.root, found.gradient, count(0), active)
+    begin = _Bisection(
+        contact.before, contact.after, contact.root, contact.gradient, count(0), active
+    )
     end = loop_while_active(begin, body, "harnack roots")
     return end.t, end.gradient, end.looks
 
