@@ -252,7 +252,7 @@ def extract_from_signs(
         before = len(cut.points)
         check_triangle_limit(len(faces) + 2 * len(cut.points), function.most_faces)
         start, end = (flat[cut.ends[:, k]] for k in (0, 1))
-        feet = start + cut.share[:, None] * (end - start)
+        feet = start + cut.fraction[:, None] * (end - start)
         corner_feet = feet[cut.vertex_of_edge[cut.edges[cut.rows]] - len(x)]
         flat = np.concatenate([flat, feet, corner_feet.mean(axis=1)])
         x, faces = cut.applied(x, faces)
@@ -407,7 +407,7 @@ class _CreaseRefinement:
     edges: (m, 3) of all faces.
     vertex_of_edge: (k,) of edges, the index of the new vertex, or -1.
     ends: (c, 2) the ends of the edges that are split.
-    share: (c,) the fraction along each of these edges where it is split.
+    fraction: (c,) the fraction along each of these edges where it is split.
     corner_faces: (d, 3) faces with a new vertex within.
     rows: (d,) the indices of these faces.
     points, normals: of the new vertices, those of edges first.
@@ -417,7 +417,7 @@ class _CreaseRefinement:
     edges: IntArray
     vertex_of_edge: IntArray
     ends: IntArray
-    share: FloatArray
+    fraction: FloatArray
     corner_faces: IntArray
     rows: IntArray
     points: FloatArray

@@ -50,14 +50,14 @@ class Doubtful:
 class _Looking:
     """The state of looking.
 
-    distance: to look at. way: index of the way. above, below: whether f was surely seen on these
-    sides of the level. low, high: lengths along the gradient between which f turns back from the
-    level, with the slopes there. searches: whether the place is looked for where it does.
+    distance: to look at. way_index: of the direction. above, below: whether f was surely seen on
+    these sides of the level. low, high: lengths along the gradient between which f turns back from
+    the level, with the slopes there. searches: whether the place is looked for where it does.
     may_turn: whether such a place may still be found. looks: so far.
     """
 
     distance: Real
-    way: Any
+    way_index: Any
     above: Mask
     below: Mask
     low: Real
@@ -67,7 +67,7 @@ class _Looking:
     searches: Mask
     may_turn: Mask
     looks: Any
-    seen: Mask
+    is_seen: Mask
     active: Mask
 
 
@@ -108,8 +108,8 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
     side = dr.select(x > 0, backend.Float(1), -1)
 
     def body(now: _Looking) -> _Looking:
-        way = dr.select(now.way < 2, hits.normal, dr.select(now.way < 4, across, other))
-        way = dr.select((now.way & 1) == 0, way, -way)
+        way = dr.select(now.way_index < 2, hits.normal, dr.select(now.way_index < 4, across, other))
+        way = dr.select((now.way_index & 1) == 0, way, -way)
         at = dr.select(now.searches, _between(now), now.distance)
         sample = field.evaluate(dr.fma(type(way)(at), way, hits.position))
         x, error, is_sure = beside(sample)
@@ -118,7 +118,7 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
         first_slope = side * dr.dot(at_hit.gradient, way)
         seen = (above & below) | (now.searches & (dr.abs(x) <= error))
         # Does f turn back from the level on this way?
-        turns = now.may_turn & ~now.searches & (now.way < 2)
+        turns = now.may_turn & ~now.searches & (now.way_index < 2)
         turns &= (first_slope < 0) & (slope > sample.gradient_error)
         is_low = now.searches & (slope < 0)
         is_high = turns | (now.searches & ~is_low)
@@ -126,12 +126,12 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
         high = dr.select(is_high, at, now.high)
         goes_on = turns | (now.searches & (high - low > smallest))
         stays = goes_on & ~seen
-        way_index = dr.select(stays, now.way, (now.way + 1) % _WAYS)
+        way_index = dr.select(stays, now.way_index, (now.way_index + 1) % _WAYS)
         is_round = ~stays & (way_index == 0)
         distance = dr.select(is_round & ~seen, _FARTHER * now.distance, now.distance)
         return _Looking(
             distance=distance,
-            way=way_index,
+            way_index=way_index,
             above=above,
             below=below,
             low=low,
@@ -141,7 +141,7 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
             searches=stays,
             may_turn=now.may_turn & ~(now.searches & ~goes_on),
             looks=now.looks + 1,
-            seen=seen,
+            is_seen=seen,
             active=now.active & ~seen & (distance <= farthest),
         )
 
@@ -151,7 +151,7 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
         zero, no, yes, backend.UInt32(0), no, yes,
     )  # fmt: skip
     end = loop_while_active(begin, body, "harnack doubtful hits")
-    return dr.select(end.seen, end.distance, dr.inf)
+    return dr.select(end.is_seen, end.distance, dr.inf)
 
 
 def _between(now: _Looking) -> Real:
