@@ -11,9 +11,9 @@ _MIN_SIMILARITY = 0.6
 _COMMON_PREFIX_BONUS = 0.02
 
 
-def is_one_of(name: object, known: Iterable[str]) -> bool:
+def is_one_of(name: object, names: Iterable[str]) -> bool:
     """Whether a value is a string and one of the known names."""
-    return isinstance(name, str) and name in known
+    return isinstance(name, str) and name in names
 
 
 def did_you_mean(misspelled: object, candidates: Iterable[str]) -> str:

@@ -128,11 +128,11 @@ def test_arcs_end_at_infinity() -> None:
 def test_an_arc_that_is_too_flat_is_seen() -> None:
     class TooFlat(hk.fields.HypersphericalHarmonic):
         def sample_ray(self, *given: Any) -> Any:
-            self._known = self._narrow
+            self._range = self._narrow
             return super().sample_ray(*given)
 
     field = TooFlat(4, 2, 1)
-    kept = field._known
+    kept = field._range
     field._narrow = type(kept)(  # type: ignore[attr-defined]
         kept.degree, 0.6 * kept.low, 0.6 * kept.high, kept.lower, kept.upper, kept.pole
     )
@@ -216,7 +216,7 @@ def test_first_hits_of_many_rays(precision: Any) -> None:
 @pytest.mark.parametrize("indices", SOME)
 def test_first_hits_of_others(indices: tuple[int, int, int], precision: Any) -> None:
     field = hk.fields.HypersphericalHarmonic(*indices)
-    pole = field._known.pole
+    pole = field._range.pole
     level = 0.7 * pole + 0.3 * max(field.value_range, key=lambda end: abs(end - pole))
     missed(field, lambda X: reference(*indices, X), level, 800, precision, 2)
 
@@ -248,7 +248,7 @@ def test_extents_hold_the_level() -> None:
     for indices in SOME:
         field = hk.fields.HypersphericalHarmonic(*indices)
         value = reference(*indices, on_sphere(x))
-        pole = field._known.pole
+        pole = field._range.pole
         for share in (0.2, 0.6):
             level = pole + share * (field.value_range[1] - pole)
             if not level < field.value_range[1] - 1e-9:

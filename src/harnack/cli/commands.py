@@ -82,7 +82,7 @@ def _view(arguments: Any) -> int:
 
 
 def _output(arguments: Any, path: Path, suffix: str, kind: str) -> str:
-    """The file to write: the one that is named, or one named like the source."""
+    """The file to write: the output of the arguments, or a file named like the source."""
     if arguments.output == "":
         raise ValueError(f"-o is empty: name the {kind} to write, such as a{suffix}")
     return arguments.output or f"{path.stem or kind}{suffix}"
@@ -124,35 +124,35 @@ def _mesh(arguments: Any) -> int:
 
 
 def _repair(arguments: Any) -> int:
-    """A closed mesh of a damaged one."""
+    """A closed mesh from a damaged mesh."""
     import trimesh  # here: half a second that few need
 
     source = Path(arguments.mesh)
     target = check_mesh_path(arguments.output or f"{source.stem}-repaired.ply")
-    found = read_geometry(source, "winding")
-    if not isinstance(found, LoadedMesh):
+    loaded = read_geometry(source, "winding")
+    if not isinstance(loaded, LoadedMesh):
         raise ValueError(f"{source} holds no mesh to repair")
-    print_line(f"{source}: {python_to_cli_terms(found.summary)}")
+    print_line(f"{source}: {python_to_cli_terms(loaded.summary)}")
     chosen = options_set("repair", arguments)
     # Files such as .stl list the corners of each face anew.
-    kept, faces = np.unique(weld_vertices(found.vertices)[found.faces], return_inverse=True)
-    given = trimesh.Trimesh(found.vertices[kept], faces.reshape(-1, 3), process=False)
+    used, faces = np.unique(weld_vertices(loaded.vertices)[loaded.faces], return_inverse=True)
+    damaged = trimesh.Trimesh(loaded.vertices[used], faces.reshape(-1, 3), process=False)
     with Console().status("starting") as status:
-        made = repair(given, progress=None if arguments.quiet else status.update, **chosen)
-    write_mesh(made, target)
-    facts = made.metadata["harnack"]
+        repaired = repair(damaged, progress=None if arguments.quiet else status.update, **chosen)
+    write_mesh(repaired, target)
+    facts = repaired.metadata["harnack"]
     if facts["differs"] is not None:
         print_line(
             f"not quite what was given: {facts['differs']['share']:.2%} of the points that were "
             "compared are on the wrong side"
         )
-    print_line(f"{_repaired(facts, len(faces), len(made.faces))}, Euler characteristic "
+    print_line(f"{_repaired(facts, len(faces), len(repaired.faces))}, Euler characteristic "
          f"{facts['euler_characteristic']}")  # fmt: skip
     print_line(f"wrote {target}")
     return 0
 
 
-def _repaired(facts: dict[str, Any], given: int, made: int) -> str:
+def _repaired(facts: dict[str, Any], old: int, new: int) -> str:
     """What `repair` kept, changed and added; and why not more was kept."""
     parts = _counted(len(facts["parts"]), "part")
     if facts["dropped"]:
@@ -160,27 +160,27 @@ def _repaired(facts: dict[str, Any], given: int, made: int) -> str:
     why = "" if facts["why"] is None else f" since {facts['why']}"
     if facts["stage"] == "remeshed":
         return (
-            f"made anew: {made:,} triangles in place of {given:,}{why}; {facts['far']:,} vertices "
+            f"made anew: {new:,} triangles in place of {old:,}{why}; {facts['far']:,} vertices "
             f"and centers are beyond the tolerance, all are within {facts['within']:.2g}; {parts}"
         )
     if facts["stage"] == "boolean_union":
-        return f"bodies united: {made:,} triangles around them, of {given:,}{why}; {parts}"
+        return f"bodies united: {new:,} triangles around them, of {old:,}{why}; {parts}"
     added = f"{_counted(facts['holes'], 'hole')}, {facts['patches']:,} triangles added"
     if facts["stage"] == "filled":
-        return f"{added} to {given:,}, which are all kept; {parts}"
-    start, kept = f"kept what is sound{why}", facts["kept"]
+        return f"{added} to {old:,}, which are all kept; {parts}"
+    start, remaining = f"kept what is sound{why}", facts["kept"]
     if facts["stage"] == "welded":
-        kept = facts["joined"]
+        remaining = facts["joined"]
         start = f"corners joined that moved up to {facts['moved']:.2g}{why}"
-    out = ", ".join(f"{count:,} {what}" for what, count in facts["left_out"].items() if count)
+    out = ", ".join(f"{count:,} {reason}" for reason, count in facts["left_out"].items() if count)
     return (
-        f"{start}: {kept:,} triangles of {given:,}, {facts['turned']:,} "
+        f"{start}: {remaining:,} triangles of {old:,}, {facts['turned']:,} "
         f"of them turned over; left out {out or 'none'}; {added}; {parts}"
     )
 
 
-def _counted(count: int, what: str) -> str:
-    return f"{count:,} {what}" + ("" if count == 1 else "s")
+def _counted(count: int, noun: str) -> str:
+    return f"{count:,} {noun}" + ("" if count == 1 else "s")
 
 
 def _check(arguments: Any) -> int:
@@ -192,29 +192,29 @@ def _check(arguments: Any) -> int:
             )
         if check_mesh_path(arguments.colors).suffix.lower() not in (".ply", ".glb"):
             raise ValueError(f"--colors {arguments.colors}: only .ply and .glb hold colors")
-    found = check_print(
+    report = check_print(
         arguments.mesh, min_thickness=arguments.min_thickness, build_volume=arguments.build_volume
     )
     if arguments.json:
-        print(json.dumps(found.as_dict()))
+        print(json.dumps(report.as_dict()))
     else:
-        size = " x ".join(f"{one:.4g}" for one in found.size)
-        volume = "not closed" if found.volume is None else f"volume {found.volume:.4g}"
-        print_line(f"{arguments.mesh}: {found.triangles:,} triangles, {size}, {volume}")
-        for one in found.problems:
-            print_line(f"{'wrong' if one.is_error else 'note'}: {one.kind}: {one.message}")
-        if found.is_printable:
+        size = " x ".join(f"{side:.4g}" for side in report.size)
+        volume = "not closed" if report.volume is None else f"volume {report.volume:.4g}"
+        print_line(f"{arguments.mesh}: {report.triangles:,} triangles, {size}, {volume}")
+        for fault in report.problems:
+            print_line(f"{'wrong' if fault.is_error else 'note'}: {fault.kind}: {fault.message}")
+        if report.is_printable:
             print_line("nothing is wrong")
     if arguments.colors is not None:
-        thin = wall_thickness(arguments.mesh)
+        walls = wall_thickness(arguments.mesh)
         with write_atomically(Path(arguments.colors)) as partial:
             kind = Path(arguments.colors).suffix.lower()[1:]
             cast(
-                "Any", thin.to_colored_mesh(arguments.min_thickness, 3 * arguments.min_thickness)
+                "Any", walls.to_colored_mesh(arguments.min_thickness, 3 * arguments.min_thickness)
             ).export(partial, kind)
         if not arguments.json:
             print_line(f"wrote {arguments.colors}")
-    return 0 if found.is_printable else 1
+    return 0 if report.is_printable else 1
 
 
 def _gallery(arguments: Any) -> int:
@@ -230,13 +230,13 @@ def _gallery(arguments: Any) -> int:
                 f"no scene is named {name!r}; there are {', '.join(SCENES)}"
                 f"{did_you_mean(name, SCENES)}"
             )
-    wanted = [SCENES[name] for name in arguments.names] or list(SCENES.values())
+    scenes = [SCENES[name] for name in arguments.names] or list(SCENES.values())
     if arguments.demo:
-        wanted = [scene for scene in wanted if scene.demo_spp > 0]
+        scenes = [scene for scene in scenes if scene.demo_spp > 0]
     folder = _create_folder(arguments.output)
-    for index, scene in enumerate(wanted, start=1):
+    for index, scene in enumerate(scenes, start=1):
         console.print(
-            f"{index}/{len(wanted)} [bold]{scene.name}[/]: {scene.title}", highlight=False
+            f"{index}/{len(scenes)} [bold]{scene.name}[/]: {scene.title}", highlight=False
         )
         target = folder / f"{scene.name}.png"
         small = {"size": _DEMO_SIZE, "spp": scene.demo_spp} if arguments.demo else {}
@@ -244,7 +244,7 @@ def _gallery(arguments: Any) -> int:
             target, **{**small, **options_set("render", arguments), "progress": not arguments.quiet}
         )
         print_line(f"    {target}")
-    print_line(f"{len(wanted)} pictures in {folder.resolve()}")
+    print_line(f"{len(scenes)} pictures in {folder.resolve()}")
     return 0
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 __all__ = ["MESH_FILES", "check_mesh_path", "write_mesh"]
 
 MESH_FILES = (".stl", ".ply", ".obj", ".glb", ".3mf")
-"""What meshes are written to."""
+"""Endings of the files that meshes are written to."""
 
 
 def check_mesh_path(path: str | os.PathLike[str]) -> Path:

@@ -69,11 +69,11 @@ def print_warnings() -> Generator[None]:
     with warnings.catch_warnings():
         shown = warnings.showwarning
 
-        def note(message: Any, category: type[Warning], *place: Any, **more: Any) -> None:
+        def note(message: Any, category: type[Warning], *args: Any, **kwargs: Any) -> None:
             if issubclass(category, UserWarning | RuntimeWarning):
                 print(f"note: {python_to_cli_terms(str(message))}", file=sys.stderr)
             else:
-                shown(message, category, *place, **more)
+                shown(message, category, *args, **kwargs)
 
         warnings.showwarning = note
         yield

@@ -277,8 +277,8 @@ def _unpacked(surfaces: Any, settings: dict[str, Any]) -> tuple[Any, dict[str, A
     (surface,) = listed
     if surface.side == "between":
         raise ValueError("this scene is a solid between two levels; a slider does not apply")
-    own = {name: value for name, value in surface.keywords.items() if value}
-    return surface.field, {"level": surface.level_values[0], **own, **settings}
+    keywords = {name: value for name, value in surface.keywords.items() if value}
+    return surface.field, {"level": surface.level_values[0], **keywords, **settings}
 
 
 def _with_flat_options(settings: dict[str, Any], sliders: Mapping[str, Any]) -> dict[str, Any]:

@@ -37,10 +37,10 @@ def accepts_dask_arrays(*names: str) -> Callable[[Function], Function]:
         )
 
         @functools.wraps(function)
-        def general(*given: Any, **settings: Any) -> Any:
-            if not any(map(is_dask_array, (*given, *settings.values()))):
-                return function(*given, **settings)
-            arguments = signature.bind(*given, **settings).arguments
+        def general(*args: Any, **kwargs: Any) -> Any:
+            if not any(map(is_dask_array, (*args, *kwargs.values()))):
+                return function(*args, **kwargs)
+            arguments = signature.bind(*args, **kwargs).arguments
             # Methods take the place of `self` by position, and the rest by name.
             rest = arguments.pop(next(iter(signature.parameters)))
             named = {**arguments.pop(variadic, {}), **arguments}

@@ -121,10 +121,10 @@ class Executor:
     checkpoint: CheckpointFolder | None = None
     chunks: int | None = None
 
-    def split_range(self, count: int, most: int) -> list[tuple[int, int]]:
-        """Split range(count) into runs (start, stop) of at most `most` items. The runs are shorter
-        if `chunks`, or else the number of the client's threads, asks for more tasks."""
-        size = max(1, min(most, count))
+    def split_range(self, count: int, max_size: int) -> list[tuple[int, int]]:
+        """Split range(count) into runs (start, stop) of at most `max_size` items. The runs are
+        shorter if `chunks`, or else the number of the client's threads, asks for more tasks."""
+        size = max(1, min(max_size, count))
         if self.chunks is not None:
             size = max(1, min(size, -(-count // self.chunks)))
         elif self.client is not None:

@@ -60,21 +60,21 @@ _GENERATED_ID = re.compile(r"[0-9a-f]{32}")
 # cloudpickle's list of modules is one for all threads.
 _REGISTRY_LOCK = threading.RLock()
 _MISSING = (
-    "{what} needs Dask, which is not installed: pip install 'harnack[cluster]', on each machine of "
-    "the cluster in the same version"
+    "{purpose} needs Dask, which is not installed: pip install 'harnack[cluster]', on each machine "
+    "of the cluster in the same version"
 )
 
 
-def import_optional(name: str, what: str) -> Any:
+def import_optional(name: str, purpose: str) -> Any:
     """Import a module that the extra `cluster` installs.
 
     Raises:
-        ModuleNotFoundError: it is not installed. The message says that `what` needs it.
+        ModuleNotFoundError: it is not installed. The message says that `purpose` needs it.
     """
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(_MISSING.format(what=what)) from error
+        raise ModuleNotFoundError(_MISSING.format(purpose=purpose)) from error
 
 
 @functools.cache
@@ -97,31 +97,31 @@ class SerializedObject:
     """A pickled object.
 
     content_hash: 32 hexadecimal digits, equal for equal contents and equal versions of this
-        library, of `package_versions` and of `others`.
+        library, of `package_versions` and of `packages`.
     data: the pickle.
     file_digests: (path, digest) of each file that the object names.
     package_versions: the versions where it was pickled; `deserialize` refuses others.
-    others: (name, version) of other installed packages that it uses.
+    packages: (name, version) of other installed packages that it uses.
     """
 
     content_hash: str
     data: bytes
     file_digests: tuple[tuple[str, str], ...] = ()
     package_versions: str = ""
-    others: tuple[tuple[str, str], ...] = ()
+    packages: tuple[tuple[str, str], ...] = ()
 
     @classmethod
-    def serialize(cls, thing: Any, what: str) -> SerializedObject:
+    def serialize(cls, value: Any, label: str) -> SerializedObject:
         """Pickle an object.
 
         Raises:
             ModuleNotFoundError: the extra `cluster` is not installed.
-            TypeError: the object cannot be pickled. The messages begin with `what`.
+            TypeError: the object cannot be pickled. The messages begin with `label`.
         """
-        name, pickler = _hash_and_files(thing, what)
-        data = _written(_cacheless_pickler, thing, what).file.getvalue()
-        files, others = sorted(pickler.files.items()), sorted(pickler.others.items())
-        return cls(name, data, tuple(files), package_versions(), tuple(others))
+        name, pickler = _hash_and_files(value, label)
+        data = _written(_cacheless_pickler, value, label).file.getvalue()
+        files, packages = sorted(pickler.files.items()), sorted(pickler.packages.items())
+        return cls(name, data, tuple(files), package_versions(), tuple(packages))
 
     def deserialize(self) -> Any:
         """The object. It is the same object as at the last call, as long as it is among the objects
@@ -139,10 +139,10 @@ class SerializedObject:
 
 @functools.lru_cache(maxsize=4)
 def _deserialize_cached(packed: SerializedObject) -> Any:
-    sent = [packed.package_versions, *(f"{name} {version}" for name, version in packed.others)]
+    sent = [packed.package_versions, *(f"{name} {version}" for name, version in packed.packages)]
     local = [
         package_versions(),
-        *(f"{name} {installed_version(name)}" for name, _ in packed.others),
+        *(f"{name} {installed_version(name)}" for name, _ in packed.packages),
     ]
     if sent != local:
         raise RuntimeError(
@@ -159,7 +159,7 @@ def _deserialize_cached(packed: SerializedObject) -> Any:
     return pickle.loads(packed.data)
 
 
-def content_hash(thing: Any, what: str) -> str:
+def content_hash(value: Any, label: str) -> str:
     """32 hexadecimal digits that depend on everything an object contains, on the contents of the
     files that it names, and on `package_versions`.
 
@@ -169,25 +169,26 @@ def content_hash(thing: Any, what: str) -> str:
     Raises:
         ModuleNotFoundError, TypeError: as `SerializedObject.serialize`.
     """
-    return _hash_and_files(thing, what)[0]
+    return _hash_and_files(value, label)[0]
 
 
-def _hash_and_files(value: Any, what: str, words: frozenset[str] = frozenset()) -> tuple[str, Any]:
+def _hash_and_files(value: Any, label: str, words: frozenset[str] = frozenset()) -> tuple[str, Any]:
     """The content hash of an object, and the pickler that wrote it, which has noted files and
     packages."""
     try:
-        pickler = _written(_hashing_pickler, value, what, words, fast=True)
+        pickler = _written(_hashing_pickler, value, label, words, fast=True)
     except (RecursionError, TypeError, ValueError):  # an object that holds itself
-        pickler = _written(_hashing_pickler, value, what, words)
+        pickler = _written(_hashing_pickler, value, label, words)
     data = (
-        f"{package_versions()} {sorted(pickler.others.items())}".encode() + pickler.file.getvalue()
+        f"{package_versions()} {sorted(pickler.packages.items())}".encode()
+        + pickler.file.getvalue()
     )
     return hashlib.blake2b(data, digest_size=16).hexdigest(), pickler
 
 
 def _written(
-    make_class: Callable[[Any], Any], value: Any, what: str, words: frozenset[str] = frozenset(), *,
-    fast: bool = False,
+    make_class: Callable[[Any], Any], value: Any, label: str, words: frozenset[str] = frozenset(),
+    *, fast: bool = False,
 ) -> Any:  # fmt: skip
     """A pickler of the class that `make_class` returns, after it has written an object into its
     `file`.
@@ -195,15 +196,15 @@ def _written(
     Which attributes of modules are needed is known only when all code was written. So the object is
     written again until no name is missing; this ends, since the code has finitely many names.
     """
-    cloudpickle = import_optional("cloudpickle", what)
+    cloudpickle = import_optional("cloudpickle", label)
     while True:
-        pickler = make_class(cloudpickle.Pickler)(what, words)
+        pickler = make_class(cloudpickle.Pickler)(label, words)
         pickler.fast = fast
         try:
             pickler.dump(value)
         except (pickle.PicklingError, TypeError, AttributeError) as error:
             raise TypeError(
-                f"{what}: it cannot be sent to another process or written down ({error}); make it "
+                f"{label}: it cannot be sent to another process or written down ({error}); make it "
                 "of arrays, numbers and the classes of this library"
             ) from error
         words = frozenset(pickler.words)
@@ -270,7 +271,7 @@ def _cacheless_pickler(base: Any) -> Callable[..., Any]:
         def __init__(self, context: str, words: frozenset[str]) -> None:
             self.file = io.BytesIO()
             super().__init__(self.file, protocol=_PROTOCOL)
-            self.what = context
+            self.context = context
             self.words = set(words)
             self.modules: list[tuple[ModuleType, frozenset[str]]] = []
             self.spaces: dict[int, Namespace] = {}
@@ -369,7 +370,7 @@ def _hashing_pickler(base: Any) -> Callable[..., Any]:
         def __init__(self, context: str, words: frozenset[str]) -> None:
             super().__init__(context, words)
             self.files: dict[str, str] = {}
-            self.others: dict[str, str] = {}
+            self.packages: dict[str, str] = {}
             self.begun: dict[int, tuple[Any, int]] = {}
 
         def persistent_id(self, obj: Any) -> Any:
@@ -379,12 +380,12 @@ def _hashing_pickler(base: Any) -> Callable[..., Any]:
             if obj_type is set or obj_type is frozenset:  # whose order differs
                 members = cast("set[Any] | frozenset[Any]", obj)
                 words = frozenset(cast("set[str]", self.words))
-                hashed = [_hash_and_files(member, self.what, words) for member in members]
+                hashed = [_hash_and_files(member, self.context, words) for member in members]
                 for _, pickler in hashed:
                     self.words |= pickler.words
                     self.modules += pickler.modules
                     self.files |= pickler.files
-                    self.others |= pickler.others
+                    self.packages |= pickler.packages
                 return obj_type.__name__, sorted(name for name, _ in hashed)
             return self.of_file(obj) if isinstance(obj, str | os.PathLike) else None
 
@@ -432,7 +433,7 @@ def _hashing_pickler(base: Any) -> Callable[..., Any]:
                 root not in (*_PACKAGES, "cloudpickle")
                 and (version := installed_version(root)) is not None
             ):
-                self.others[root] = version
+                self.packages[root] = version
             elif module is not None and (path := compiled_file(module)) is not None:
                 self.files[path] = str(_file_digest(path))
 

@@ -58,10 +58,10 @@ class SentModule(ModuleType):
 class Namespace:
     """The module in which functions look for names; it is opened as a `SentModule`.
 
-    known: the attributes that it has whatever names functions use.
+    attributes: the attributes that it has whichever names functions use.
     """
 
-    known: Mapping[str, Any]
+    attributes: Mapping[str, Any]
 
     @classmethod
     def of(cls, names: Mapping[str, Any]) -> Namespace:
@@ -69,13 +69,13 @@ class Namespace:
         return cls({key: names[key] for key in _OF_EACH if key in names})
 
     def __reduce__(self) -> Any:
-        return sent_module, (self.known,)
+        return sent_module, (self.attributes,)
 
 
-def sent_module(known: Mapping[str, Any]) -> SentModule:
-    """A module with only the attributes in `known`."""
-    module = SentModule(str(known.get("__name__", "")))
-    vars(module).update(known)
+def sent_module(attributes: Mapping[str, Any]) -> SentModule:
+    """A module with only the attributes `attributes`."""
+    module = SentModule(str(attributes.get("__name__", "")))
+    vars(module).update(attributes)
     return module
 
 

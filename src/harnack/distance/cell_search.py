@@ -97,7 +97,7 @@ class InitialGuess:
     estimate: FloatArray
     on_boundary: bool = True
 
-    def some(self, rows: IntArray | slice) -> InitialGuess:
+    def select(self, rows: IntArray | slice) -> InitialGuess:
         """The initial guess for the queries `rows`."""
         return replace(self, feet=self.feet[rows], estimate=self.estimate[rows])
 
@@ -131,7 +131,7 @@ class _Cube:
 
 
 def search(
-    surface: TracedSurface, points: FloatArray, known: InitialGuess, descents: DescentMethods,
+    surface: TracedSurface, points: FloatArray, guess: InitialGuess, descents: DescentMethods,
     tolerance: StoppingRule, progress: Callable[[str], None],
 ) -> SearchResult:  # fmt: skip
     """The nearest points of a level set to `points` (n, 3)."""
@@ -140,9 +140,9 @@ def search(
         if (box[0] > box[1]).any():
             return SearchResult(np.full_like(points, np.nan), np.full(len(points), np.inf))
         return _search_in_batches(
-            surface, _Cube.around(*box), points, known, descents, tolerance, progress
+            surface, _Cube.around(*box), points, guess, descents, tolerance, progress
         )
-    feet, lower = known.feet.copy(), np.zeros(len(points))
+    feet, lower = guess.feet.copy(), np.zeros(len(points))
     rows = np.arange(len(points))
     half = 0.0
     for _ in range(_MAX_BOX_GROWTHS):
@@ -153,7 +153,7 @@ def search(
         distances = np.linalg.norm(x - feet[rows], axis=1)
         half = max(4 * half, 1.0 + 4 * root.half, 1.1 * float(np.nanmax(distances, initial=0.0)))
         root = _Cube(root.center, root.half + half)
-        start = replace(known.some(rows), feet=feet[rows])
+        start = replace(guess.select(rows), feet=feet[rows])
         result = _search_in_batches(surface, root, x, start, descents, tolerance, progress)
         # Beyond the cube there may be more of the surface.
         wall_distances = root.half - np.abs(x - root.center).max(axis=1)
@@ -200,7 +200,7 @@ def _search_in_batches(
             cells,
             trees,
             points[rows],
-            guess.some(rows),
+            guess.select(rows),
             descents,
             tolerance.length,
             limit,
@@ -267,17 +267,17 @@ class _CellSearch:
         cells: SurfaceCells,
         trees: tuple[CellTree, CellTree] | None,
         points: FloatArray,
-        known: InitialGuess,
+        guess: InitialGuess,
         descents: DescentMethods,
         tolerance: float,
-        most: int,
+        max_cells: int,
     ) -> None:
         self.trees = trees
         self.proofs, self.cells, self.points, self.descents = proofs, cells, points, descents
         self.backend = choose_backend("double")
-        self.known, self.feet, self.free = known, known.feet.copy(), np.zeros(len(points))
+        self.guess, self.feet, self.free = guess, guess.feet.copy(), np.zeros(len(points))
         self.lower, self.tolerance = np.zeros(len(points)), tolerance
-        self.max_cells = most
+        self.max_cells = max_cells
 
     def run(self, progress: Callable[[str], None]) -> SearchResult:
         """The closest points and the lower bounds of the distances."""
@@ -292,7 +292,7 @@ class _CellSearch:
             # Where two parts of the surface meet or cross within a cell, descents may not have
             # begun on both of them; and a promise that does not hold may have left out cells.
             ids = np.flatnonzero(self._is_unproved() | np.isnan(self.feet[:, 0]))
-            ids = ids[self.known.estimate[ids] < _MIN_GAIN * self._distance(ids)]
+            ids = ids[self.guess.estimate[ids] < _MIN_GAIN * self._distance(ids)]
             self._descend(ids, self.points[ids])
         return SearchResult(self.feet, self.lower)
 
@@ -364,7 +364,7 @@ class _CellSearch:
             )
 
         self.feet, self.free, lower, start, *feet, unresolved = in_batches(
-            backend, compute, self.points, self.known.feet
+            backend, compute, self.points, self.guess.feet
         )
         self.lower = self._rounded(lower, self.points)
         ids = np.flatnonzero(unresolved)
@@ -392,7 +392,7 @@ class _CellSearch:
 
     def _is_boundary(self, rows: IntArray | slice) -> BoolArray:
         """Whether the best point is the initial guess, on the boundary."""
-        return self.known.on_boundary & (self.feet[rows] == self.known.feet[rows]).all(axis=1)
+        return self.guess.on_boundary & (self.feet[rows] == self.guess.feet[rows]).all(axis=1)
 
     def _descend_from_best_start(self, tree: CellTree) -> FloatArray:
         """Descend from the surface points that seem nearest, which are returned (n, 3)."""

@@ -83,9 +83,9 @@ class SurfaceCells:
     def __len__(self) -> int:
         return len(self.half)
 
-    def select(self, which: BoolArray) -> SurfaceCells:
+    def select(self, mask: BoolArray) -> SurfaceCells:
         """The cells that a mask (n,) selects."""
-        return SurfaceCells(*(column[which] for column in vars(self).values()))
+        return SurfaceCells(*(column[mask] for column in vars(self).values()))
 
     @property
     def is_single_piece(self) -> BoolArray:
@@ -176,14 +176,14 @@ class CellTree:
         return self._walk(x, visit_cell, start, lambda state: dr.square(state[0]))[1]
 
     def closer_candidates(
-        self, x: Vec3, best: BestCandidate, others: tuple[Vec3, ...], tolerance: Real, marks: Any
+        self, x: Vec3, best: BestCandidate, points: tuple[Vec3, ...], tolerance: Real, marks: Any
     ) -> tuple[Real, list[Vec3]]:
         """Find cells that may hold a point nearer to x than `best`.
 
         Returns a lower bound of the distance from x to the surface, at most best.distance; and the
         surface points (`FAR_SENTINEL` for none) of the few cells with the smallest estimated
         distance, among those whose lower bound is below best.distance - tolerance. Points that are
-        not separated from `best`, from `others` or from each other (`_SEPARATION`) are skipped. In
+        not separated from `best`, from `points` or from each other (`_SEPARATION`) are skipped. In
         `marks`, if it is not None, a Bool is set for every cell with such a lower bound, whether
         its point is skipped or not.
         """
@@ -203,7 +203,7 @@ class CellTree:
             estimate = cell.estimate(x)
             is_listed = is_open_cell & (estimate < best.distance + cell.estimate_slack)
             is_listed &= cell.is_separated(best.point, best.separation_factor)
-            for other in others:
+            for other in points:
                 is_listed &= cell.is_separated(other, 1.0)
             estimate = dr.select(is_listed, estimate, dr.inf)
             insert = functools.partial(with_candidate, cell, estimate)

@@ -76,10 +76,10 @@ class _HessianBounds:
     half_norm: Real
 
     @classmethod
-    def of(cls, sample: Sample, rows: Rows, way: Vec3) -> _HessianBounds:
+    def of(cls, sample: Sample, rows: Rows, direction: Vec3) -> _HessianBounds:
         plane = TangentPlane.of(sample.gradient)
         eigen = SymmetricEigen2.of(*plane.restrict_hessian(rows))
-        smallest = dr.select(dr.dot(way, plane.n) > 0, eigen.smallest, -eigen.largest)
+        smallest = dr.select(dr.dot(direction, plane.n) > 0, eigen.smallest, -eigen.largest)
         hn = matvec(rows, plane.n)
         squares = dr.squared_norm(rows[0]) + dr.squared_norm(rows[1]) + dr.squared_norm(rows[2])
         return cls(

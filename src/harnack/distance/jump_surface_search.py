@@ -52,12 +52,12 @@ class JumpSurfaceSearch:
 
     scale: an upper bound of the coordinates that the field computes with, for bounds of rounding
         errors.
-    most: the largest number of facets that are examined for each point.
+    max_facets: the largest number of facets that are examined for each point.
     """
 
     surface: SurfaceTracer
     scale: float
-    most: int
+    max_facets: int
 
     def closest(self, x: Vec3, limit: Real) -> tuple[Vec3, Vec3]:
         """A point of the surface on a facet, nearer to x than `limit` (NaN where none is found),
@@ -76,7 +76,7 @@ class JumpSurfaceSearch:
         backend = self.surface.backend
         real, index, vector = backend.Float, backend.UInt32, backend.Array3f
         next_facet = self._next_jump(x)
-        max_count = dr.opaque(index, self.most)
+        max_count = dr.opaque(index, self.max_facets)
         length = (
             _PROBE_HALF_LENGTH * backend.machine_epsilon * fmax(real(self.scale), dr.max(dr.abs(x)))
         )
@@ -258,10 +258,10 @@ class _HitPlane:
     offset: Real
 
     @classmethod
-    def where(cls, mask: Mask, one: _HitPlane, other: _HitPlane) -> _HitPlane:
-        """The plane `one` in lanes of the mask, `other` elsewhere."""
-        normal = dr.select(mask, one.normal, other.normal)
-        return cls(normal, dr.select(mask, one.offset, other.offset))
+    def where(cls, mask: Mask, plane: _HitPlane, other: _HitPlane) -> _HitPlane:
+        """The plane `plane` in lanes of the mask, `other` elsewhere."""
+        normal = dr.select(mask, plane.normal, other.normal)
+        return cls(normal, dr.select(mask, plane.offset, other.offset))
 
     def is_apart(self, other: _HitPlane) -> Mask:
         """Whether both are planes, and not nearly parallel."""
@@ -310,9 +310,9 @@ class _HitPlanes:
             for number in (plane.normal, plane.offset)
         )
 
-    def updated(self, plane: _HitPlane, seen: Mask, best: Mask) -> _HitPlanes:
-        """The planes with another one added, where `seen`; as the plane of the best point, where
-        `best`."""
+    def updated(self, plane: _HitPlane, is_hit: Mask, best: Mask) -> _HitPlanes:
+        """The planes with `plane` added on lanes of `is_hit`; as the plane of the best point on
+        lanes of `best`."""
         first, second, third = self.first, self.second, self.third
         select = _HitPlane.where
         is_apart = first.is_apart(plane)
@@ -321,7 +321,7 @@ class _HitPlanes:
             select(is_apart, first, second),
             select(is_apart & second.is_apart(plane), second, third),
         )
-        is_new = seen & ~best & is_apart
+        is_new = is_hit & ~best & is_apart
         otherwise = _HitPlanes(
             first,
             select(is_new, plane, second),

@@ -79,11 +79,11 @@ class SymmetricEigen2:
             dr.fma(self.cosine, v, -self.sine * u),
         )
 
-    def combination(self, most: Real, least: Real) -> tuple[Real, Real]:
+    def combination(self, u: Real, v: Real) -> tuple[Real, Real]:
         """The vector (u, v) with these coordinates."""
         return (
-            dr.fma(self.cosine, most, -self.sine * least),
-            dr.fma(self.sine, most, self.cosine * least),
+            dr.fma(self.cosine, u, -self.sine * v),
+            dr.fma(self.sine, u, self.cosine * v),
         )
 
 
@@ -152,11 +152,11 @@ def in_batches(
     backend: Backend,
     compute: Callable[..., tuple[Real | Vec3, ...]],
     points: Any,
-    *others: FloatArray,
+    *vectors: FloatArray,
 ) -> tuple[Any, ...]:
     """The results of `compute` for points of shape (n, 3), as float64 arrays (n,) or (n, 3).
 
-    others: further vectors of the same shape, passed to `compute` with the points, one for each
+    vectors: further vectors of the same shape, passed to `compute` with the points, one for each
         lane; their values are not checked.
 
     Raises:
@@ -165,7 +165,7 @@ def in_batches(
     """
     _check_size(points)
     with np.errstate(over="ignore"):
-        rounded = (values.astype(backend.dtype, copy=False) for values in others)
+        rounded = (values.astype(backend.dtype, copy=False) for values in vectors)
         results = field_points.map_batches(backend, compute, points, *rounded, at_once=_AT_ONCE)
     return tuple(values.astype(np.float64, copy=False) for values in results)
 

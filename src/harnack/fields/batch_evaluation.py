@@ -86,13 +86,13 @@ def map_batches(
     backend: Backend,
     compute: Callable[..., tuple[Any, ...]],
     points: Any,
-    *others: npt.NDArray[Any],
+    *arguments: npt.NDArray[Any],
     at_once: int = _BATCH_SIZE,
 ) -> tuple[npt.NDArray[Any], ...]:
     """The results of `compute` for points (n, 3), as arrays (n,) or (n, 3) in its precision.
 
     points: an array-like, or a Dr.Jit 3-vector.
-    others: further arguments of `compute`, vectors (n, 3) of any values, one row for each point.
+    arguments: further arguments of `compute`, vectors (n, 3) of any values, one row for each point.
     at_once: the number of points of a batch.
 
     Raises:
@@ -111,7 +111,7 @@ def map_batches(
             results = compute(
                 *(
                     _part(backend, array, start, lanes) if n else backend.Array3f(0)
-                    for array in (vectors, *others)
+                    for array in (vectors, *arguments)
                 )
             )
             dr.eval(*results)

@@ -336,22 +336,22 @@ class FieldCache(Generic[Value]):
 
     def __init__(self) -> None:
         # By identity: users' fields may be equal to others, or have no hash.
-        self._kept: dict[int, tuple[Any, dict[str, Any], Value]] = {}
+        self._entries: dict[int, tuple[Any, dict[str, Any], Value]] = {}
 
     def get(self, field: Field, key: Any, make: Callable[[], Value]) -> Value:
         """The cached value of a field if it belongs to this key and no attribute of the field was
         set since it was computed; else `make()`, which is then cached."""
-        if id(field) in self._kept:
-            kept_key, attributes, value = self._kept[id(field)]
+        if id(field) in self._entries:
+            kept_key, attributes, value = self._entries[id(field)]
             now = vars(field)
             same = attributes.keys() == now.keys()
             if same and kept_key == key and all(attributes[name] is now[name] for name in now):
                 return value
         value = make()
         if value is not field:
-            if id(field) not in self._kept:
-                finalize(field, self._kept.pop, id(field), None).atexit = False
-            self._kept[id(field)] = key, {**vars(field)}, value
+            if id(field) not in self._entries:
+                finalize(field, self._entries.pop, id(field), None).atexit = False
+            self._entries[id(field)] = key, {**vars(field)}, value
         return value
 
 

@@ -112,10 +112,10 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
     has_creases: bool = False
     """Whether the gradient may jump, as it does where the surfaces of a union meet."""
 
-    def __new__(cls, *given: Any, **named: Any) -> Self:
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         """Refuse arguments with derivatives enabled, unless the class defines `parameters`."""
         if cls.has_no_parameters():
-            check_no_derivatives(cls.__name__, given, named)
+            check_no_derivatives(cls.__name__, args, kwargs)
         return super().__new__(cls)
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -388,48 +388,48 @@ class EvaluateOnly(Field):
 
 
 def validate_levels_in_range(
-    levels: tuple[float, ...], value_range: tuple[float, float], what: str = "the function"
+    levels: tuple[float, ...], value_range: tuple[float, float], name: str = "the function"
 ) -> None:
     """Raise ValueError if a level lies outside the range that is proved to contain all values of f.
 
-    what: the name of the function, for the message.
+    name: the name of the function, for the message.
     """
     lower, upper = value_range
     for level in levels:
         if not lower <= level <= upper:
             raise ValueError(
-                f"no surface has level {level:g}: {what} stays within [{lower:.6g}, {upper:.6g}]"
+                f"no surface has level {level:g}: {name} stays within [{lower:.6g}, {upper:.6g}]"
             )
 
 
-def check_is_field(given: Any) -> None:
+def check_is_field(value: Any) -> None:
     """Raise TypeError unless the argument is a field whose domain is a volume or None."""
-    if not isinstance(given, Field):
+    if not isinstance(value, Field):
         raise TypeError(
-            f"a harnack field is needed, such as harnack.Gyroid(1.0), not {suggest_field(given)}"
+            f"a harnack field is needed, such as harnack.Gyroid(1.0), not {suggest_field(value)}"
         )
-    check_volume(given.domain, f"the domain of a {type(given).__name__}")
+    check_volume(value.domain, f"the domain of a {type(value).__name__}")
 
 
-def suggest_field(given: Any) -> str:
+def suggest_field(value: Any) -> str:
     """The text of an error message: the kind of an object that is not a field, and how to make a
     field of it."""
-    kind, name = type(given).__name__, getattr(given, "__name__", "")
-    if isinstance(getattr(given, "field", None), Field):
+    kind, name = type(value).__name__, getattr(value, "__name__", "")
+    if isinstance(getattr(value, "field", None), Field):
         return f"a {kind}: take its .field, and what else this takes of it, such as its level"
-    parts: list[Any] = [*given] if type(given) in (list, tuple) else []
+    parts: list[Any] = [*value] if type(value) in (list, tuple) else []
     if any(isinstance(part, Field) for part in parts):
         return f"a {kind} of fields: give one at a time, or to harnack.render one flat list"
-    if inspect.isclass(given) and issubclass(given, Field):
+    if inspect.isclass(value) and issubclass(value, Field):
         return f"the class {name} itself: make one of it, {name}(...)"
-    if hasattr(given, "vertices") and hasattr(given, "faces"):
+    if hasattr(value, "vertices") and hasattr(value, "faces"):
         return f"a {kind}: of a mesh, take harnack.WindingNumber(mesh.vertices, mesh.faces)"
-    if isinstance(given, str):
-        return f"{given[:80]!r}: of a formula, take harnack.expression(text)"
-    if isinstance(given, np.ndarray | list | tuple):
+    if isinstance(value, str):
+        return f"{value[:80]!r}: of a formula, take harnack.expression(text)"
+    if isinstance(value, np.ndarray | list | tuple):
         return (
             f"of type {kind}: of points (n, 3) of a closed curve, take harnack.SolidAngle(points)"
         )
-    if callable(given):
+    if callable(value):
         return "a function: of a formula, take harnack.expression(function)"
     return f"of type {kind}"

@@ -220,36 +220,36 @@ class SourceSums:
             s5=dr.fma(fourth, inverse, self.s5),
         )
 
-    def values(self, share: float, unit: Real, rounding: Real, outside: float = 0.0) -> PointValues:
-        """`share` times f and its derivatives, as far as they were summed, with error bounds.
+    def values(self, scale: float, unit: Real, rounding: Real, outside: float = 0.0) -> PointValues:
+        """`scale` times f and its derivatives, as far as they were summed, with error bounds.
 
         unit: the rounding of a coordinate, at least epsilon.
         rounding: a bound of the rounding of the value that these sums do not count.
         outside: the number of further roundings of gradients far from all terms, where distances
             are as long as coordinates: roundings of powers of the distance and of sums of moments.
         """
-        value, error = share * self.value, dr.fma(share, self.truncation + self.rounding, rounding)
+        value, error = scale * self.value, dr.fma(scale, self.truncation + self.rounding, rounding)
         if self.gradient is None:
             return PointValues(value, error)
         rounded = SLOPE_ROUNDINGS * unit
         if outside:
             rounded = rounded + outside * fmax(unit - 2 * float(dr.epsilon(self.value)), 0)
-        slope = share * dr.fma(rounded, self.s4, self.gradient_truncation)
+        slope = scale * dr.fma(rounded, self.s4, self.gradient_truncation)
         if self.hessian is None:
-            return PointValues(value, error, share * self.gradient, None, slope)
-        hessian = SymmetricMatrix(*(share * part for part in self.hessian.components()))
-        second = share * dr.fma(SECOND_ROUNDINGS * unit, self.s5, self.hessian_truncation)
-        return PointValues(value, error, share * self.gradient, hessian, slope, second)
+            return PointValues(value, error, scale * self.gradient, None, slope)
+        hessian = SymmetricMatrix(*(scale * part for part in self.hessian.components()))
+        second = scale * dr.fma(SECOND_ROUNDINGS * unit, self.s5, self.hessian_truncation)
+        return PointValues(value, error, scale * self.gradient, hessian, slope, second)
 
     def sample(
         self,
-        share: float,
+        factor: float,
         unit: Real,
         rounding: Real,
         normal: Vec3 | None = None,
         along: tuple[Lipschitz, ...] = (),
     ) -> Sample:
-        """`share` times f as a sample with promises.
+        """`factor` times f as a sample with promises.
 
         unit: the rounding of a coordinate. rounding: of the value, from other sources. along:
             further promises, for f along a line.
@@ -265,20 +265,20 @@ class SourceSums:
         at most |g| r more, and is harmonic: dipoles of far nodes are farther away than 1 - 1/rough
         times the center, and `max_step_fraction` is less.
         """
-        g = share * self.gradient
-        slope_error = share * dr.fma(SLOPE_ROUNDINGS * unit, self.s4, self.gradient_truncation)
+        g = factor * self.gradient
+        slope_error = factor * dr.fma(SLOPE_ROUNDINGS * unit, self.s4, self.gradient_truncation)
         distance = self.singularity_distance * (1 - SUM_MARGIN) - 4 * unit
-        scale, radii = (2 + 2 * SUM_MARGIN) * share, [(b, b * distance) for b in _REACHES]
+        scale, radii = (2 + 2 * SUM_MARGIN) * factor, [(b, b * distance) for b in _REACHES]
         taylor = [TaylorRemainder(scale * self.remainder(b, r), r) for b, r in radii]
         slope, widest = dr.norm(g) + slope_error, taylor[-1]
         r = widest.radius
         variation = (1 + SUM_MARGIN) * r * dr.fma(0.5 * r, widest.constant, slope)
-        value = share * self.value
+        value = factor * self.value
         ball = HarmonicBall(r, value - variation, value + variation)
         # At a singular point f has all values: the sample has a gradient so steep that every level
         # is close to first order, and an error as large as the distance to such a level. Likewise
         # near a singular point, where rounding leaves nothing of the gradient.
-        reach, max_error = 16 * unit, share * 1.6e5 * math.pi
+        reach, max_error = 16 * unit, factor * 1.6e5 * math.pi
         is_regular = (
             (self.singularity_distance > reach)
             & dr.isfinite(value)
@@ -289,8 +289,8 @@ class SourceSums:
         )
         is_regular, reach = is_regular & ~is_lost, fmax(self.singularity_distance, reach)
         steep_gradient = type(g)(0, 0, max_error / reach)
-        error = dr.fma(share, self.truncation + self.rounding, rounding)
-        along = tuple(promise.scaled(share) for promise in along)
+        error = dr.fma(factor, self.truncation + self.rounding, rounding)
+        along = tuple(promise.scaled(factor) for promise in along)
         return Sample(
             dr.select(is_regular, value, 0),
             dr.select(is_regular, g, steep_gradient),
@@ -298,7 +298,7 @@ class SourceSums:
             dr.select(is_regular, error, max_error),
             dr.select(is_regular, slope_error, 0),
             normal,
-            dr.select(is_regular, share * self.truncation, 0),
+            dr.select(is_regular, factor * self.truncation, 0),
             (ball,),
             along,
         )

@@ -39,9 +39,9 @@ class Volume(abc.ABC):
     `a & b` is the intersection of two volumes, which is convex as well.
     """
 
-    def __new__(cls, *given: Any, **named: Any) -> Self:
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         """Refuses numbers with derivatives, which would be dropped."""
-        check_no_derivatives(cls.__name__, given, named)
+        check_no_derivatives(cls.__name__, args, kwargs)
         return super().__new__(cls)
 
     def __and__(self, other: object) -> Volume:
@@ -132,12 +132,12 @@ def as_point(value: Iterable[float], name: str, *, finite: bool = True) -> Point
     return numbers
 
 
-def check_volume(given: object, name: str) -> None:
+def check_volume(value: object, name: str) -> None:
     """Raise TypeError for a value that is neither a volume nor None."""
-    if given is not None and not isinstance(given, Volume):
+    if value is not None and not isinstance(value, Volume):
         raise TypeError(
             f"{name} must be a volume: a harnack.Ball, harnack.Box or harnack.HalfSpace, or an "
-            f"intersection of these, not {given!r}"
+            f"intersection of these, not {value!r}"
         )
 
 

@@ -73,8 +73,8 @@ _LANES = ("o 0", "o 1", "o 2", "d 0", "d 1", "d 2", "far")
 _RESULTS = ("status", "t", "normal 0", "normal 1", "normal 2", "evaluations", "paint")
 # The place of a result that no shader writes, because it is 0 for all rays.
 _NO_OUTPUT = 99
-# Paints of a surface: the first is its own, then those of what spans what a mesh leaves open and of
-# faces on a section, then those of isolines.
+# Paints of a surface: the first is its own, then those of hole fillings and of faces on a section,
+# then those of isolines.
 _MENDED, _CUT = 1, 2
 # `MAX_SURFACE_COLORS` in renderer.js.
 _MOST_PAINTS = 2048
@@ -137,8 +137,9 @@ class LiveScene:
 
     @classmethod
     def of(
-        cls, what: Any, given: Mapping[str, Any], *, edits: bool = False, sources: FieldSources = ()
-    ) -> LiveScene:
+        cls, surfaces: Any, options: Mapping[str, Any], *, edits: bool = False,
+        sources: FieldSources = (),
+    ) -> LiveScene:  # fmt: skip
         """The live scene of the arguments of `page` or `view`.
 
         edits: whether vertices of curves are to be moved, so that the recorded kernel must not
@@ -149,9 +150,9 @@ class LiveScene:
             TypeError, ValueError: as `render` does; also for a transparent material, a `show` that
             is not in `LIVE_MODES`, and a backdrop that is not "light" or "dark".
         """
-        refuse_others("view", given)
-        given = with_flat_options(given)
-        camera, backdrop, up, show = (given.pop(name, None) for name in _STAGE_OPTIONS)
+        refuse_others("view", options)
+        options = with_flat_options(options)
+        camera, backdrop, up, show = (options.pop(name, None) for name in _STAGE_OPTIONS)
         show = "shaded" if show is None else show
         if show not in LIVE_MODES:
             raise ValueError(
@@ -160,17 +161,17 @@ class LiveScene:
         ground = GroundBackdrop("light") if backdrop is None else parse_backdrop(backdrop)
         if not isinstance(ground, GroundBackdrop):
             raise ValueError('backdrop: what is drawn live stands on a ground: "light" or "dark"')
-        subject = SlidingContent.of(what, given)
-        start = subject.starts
+        content = SlidingContent.of(surfaces, options)
+        start = content.starts
         with slider_values_in_errors(start):
-            drawn = _objects_at(subject, start)
+            drawn = _objects_at(content, start)
             backend = choose_backend("single")
-            points = tuple(visible_points(one.surface, backend) for one in drawn)
+            points = tuple(visible_points(body.surface, backend) for body in drawn)
         curve = _curve_of(drawn) if edits else None
         up, camera = "z" if up is None else up, check_camera(camera)
         framing = Framing.of(camera, up, np.concatenate(points), is_whole=True)
         return cls(
-            subject, points, camera, up, framing, ground.name, curve is not None, show, sources
+            content, points, camera, up, framing, ground.name, curve is not None, show, sources
         )
 
     def framed(self, places: Iterable[Mapping[str, float]]) -> LiveScene:
@@ -186,9 +187,9 @@ class LiveScene:
         points = [*self.points]
         for values in places:
             with suppress(SliderValueError), slider_values_in_errors(values):
-                for one in _objects_at(self.content, values):
+                for body in _objects_at(self.content, values):
                     with suppress(NothingVisibleError):
-                        points.append(extreme_points(visible_points(one.surface, backend)))
+                        points.append(extreme_points(visible_points(body.surface, backend)))
         framing = Framing.of(self.camera, self.up, np.concatenate(points), is_whole=False)
         return replace(self, framing=framing)
 
@@ -200,10 +201,10 @@ class LiveScene:
     @cached_property
     def rays(self) -> tuple[tuple[FloatArray, FloatArray], ...]:
         """Rays on the stage by which devices are checked, of each surface."""
-        return tuple(_rays(self.placement.apply(one)) for one in self.points)
+        return tuple(_rays(self.placement.apply(points)) for points in self.points)
 
     def scene(self, title: str) -> JsonDict:
-        """All that a page is given when it opens, as plain data for `renderer.js`."""
+        """All data that a page needs when it opens, as plain data for `renderer.js`."""
         place, points = self.placement, np.concatenate(self.points)
         _, settings = self._at(self.initial_controls)
         material = settings.get("material")
@@ -218,12 +219,12 @@ class LiveScene:
             "show": self.show,
             "ground": reflectance_of(self.backdrop).tolist(),
             "sliders": [
-                {"name": name, "low": one.low, "high": one.high, "start": one.start,
-                 "step": one.step}
-                for name, one in self.content.sliders.items()
+                {"name": name, "low": slider.low, "high": slider.high, "start": slider.start,
+                 "step": slider.step}
+                for name, slider in self.content.sliders.items()
             ],
             "editable": self.editable,
-            "materials": [name for name, one in MATERIALS.items() if not one.transparent],
+            "materials": [name for name, material in MATERIALS.items() if not material.transparent],
             "material": material if isinstance(material, str) else None,
             "tube": None if (tube := settings.get("boundary_radius")) is None else float(tube),
             "middle": middle.tolist(),
@@ -241,12 +242,12 @@ class LiveScene:
     @property
     def pose(self) -> JsonDict:
         """The camera's position, target and field of view, in the surfaces' coordinates."""
-        seen, place = self.framing.camera, self.placement
-        azimuth, elevation = np.radians([seen["azimuth"], seen["elevation"]])
+        orbit, place = self.framing.camera, self.placement
+        azimuth, elevation = np.radians([orbit["azimuth"], orbit["elevation"]])
         back = np.array([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)]) * np.cos(elevation)
-        target = np.array(seen["target"])
-        eye, at = place.apply_inverse(np.stack([target + seen["distance"] * back, target]))
-        return {"position": eye.tolist(), "target": at.tolist(), "fov": seen["fov"]}
+        target = np.array(orbit["target"])
+        eye, at = place.apply_inverse(np.stack([target + orbit["distance"] * back, target]))
+        return {"position": eye.tolist(), "target": at.tolist(), "fov": orbit["fov"]}
 
     @property
     def initial_controls(self) -> ControlState:
@@ -258,22 +259,22 @@ class LiveScene:
         NumPy's; `encode_arrays` makes them text."""
         drawn = self.surfaces_at(controls)
         with slider_values_in_errors(controls.values):
-            placed = [self.place(one) for one in drawn]
+            placed = [self.place(body) for body in drawn]
         surfaces = [
-            _kernel_data(one, where, *self.rays[min(k, len(self.rays) - 1)])
-            for k, (one, where) in enumerate(zip(drawn, placed, strict=True))
+            _kernel_data(body, placed_surface, *self.rays[min(k, len(self.rays) - 1)])
+            for k, (body, placed_surface) in enumerate(zip(drawn, placed, strict=True))
         ]
-        colors = sum(len(one["paints"]) for one in surfaces)
+        colors = sum(len(surface["paints"]) for surface in surfaces)
         if colors > _MOST_PAINTS:
             raise ValueError(
                 f"the surfaces and their isolines have {colors:,} colors, and what moves is drawn "
                 f"with {_MOST_PAINTS:,} at most: draw fewer surfaces at once"
             )
         curves: list[Any] = []
-        for k, one in enumerate(drawn):
-            if all(one.surface.field is not other.surface.field for other in drawn[:k]):
-                curves += one.surface.field.boundary_curves
-        return {"surfaces": surfaces, "curves": [np.asarray(one).tolist() for one in curves]}
+        for k, body in enumerate(drawn):
+            if all(body.surface.field is not other.surface.field for other in drawn[:k]):
+                curves += body.surface.field.boundary_curves
+        return {"surfaces": surfaces, "curves": [np.asarray(curve).tolist() for curve in curves]}
 
     def surfaces_at(self, controls: ControlState) -> list[StudioObject]:
         """The surfaces of a state as objects of the studio."""
@@ -281,16 +282,16 @@ class LiveScene:
             return self._drawn(controls)
 
     def _at(self, controls: ControlState) -> tuple[Any, dict[str, Any]]:
-        """What is drawn, and its settings."""
-        what, settings = self.content.at(controls.values)
+        """The content and its settings."""
+        content, settings = self.content.at(controls.values)
         settings |= controls.settings
         if "boundary_radius" in controls.settings and settings["boundary_radius"] is None:
             settings.pop("boundary_material", None)
-        return what, settings
+        return content, settings
 
     def _drawn(self, controls: ControlState) -> list[StudioObject]:
-        what, settings = self._at(controls)
-        drawn = _studio_objects(what, settings)
+        content, settings = self._at(controls)
+        drawn = _studio_objects(content, settings)
         curve = _curve_of(drawn) if self.editable else None
         if (
             curve is not None
@@ -298,144 +299,148 @@ class LiveScene:
             and settings.get("boundary_radius") is not None
         ):
             # The tube around the curve is that of the moved one.
-            drawn = _studio_objects(_with_loops(what, curve, controls.curves), settings)
+            drawn = _studio_objects(_with_loops(content, curve, controls.curves), settings)
             curve = _curve_of(drawn)
-        drawn = [self._fitted(one) for one in drawn]
+        drawn = [self._fitted(body) for body in drawn]
         if controls.cut_volume is not None:
             drawn = [
-                replace(one, surface=with_cut(one.surface, controls.cut_volume)) for one in drawn
+                replace(body, surface=with_cut(body.surface, controls.cut_volume)) for body in drawn
             ]
         if curve is None:
             return drawn
         # As Dr.Jit's arrays: those of NumPy decide which proof is taken.
         backend = choose_backend("single")
         loops = curve.loops if controls.curves is None else controls.curves
-        field = SolidAngle([to_vector3(backend, one) for one in loops])
+        field = SolidAngle([to_vector3(backend, loop) for loop in loops])
         return [
-            replace(one, surface=replace(one.surface, field=field).with_call_cache(begins=True))
-            if one.surface.field is curve
-            else one
-            for one in drawn
+            replace(body, surface=replace(body.surface, field=field).with_call_cache(begins=True))
+            if body.surface.field is curve
+            else body
+            for body in drawn
         ]
 
-    def render_still(self, controls: ControlState, **others: Any) -> Picture:
-        """A still picture of a state by `render`. others: settings of `render`."""
+    def render_still(self, controls: ControlState, **options: Any) -> Picture:
+        """A still picture of a state by `render`. options: of `render`, in place of the scene's."""
         _, settings = self._at(controls)
-        own = {
+        style = {
             name: settings[name] for name in ("isolines", "section_material") if name in settings
         }
         drawn = self.surfaces_at(controls)
-        if isinstance(others.get("camera"), Camera):
-            others["camera"] = self.framing.with_box(others["camera"])
-        usual: dict[str, Any] = {"backdrop": self.backdrop, "up": self.up, "progress": False}
-        materials = [one.material for one in drawn]
+        if isinstance(options.get("camera"), Camera):
+            options["camera"] = self.framing.with_box(options["camera"])
+        defaults: dict[str, Any] = {"backdrop": self.backdrop, "up": self.up, "progress": False}
+        materials = [body.material for body in drawn]
         return render(
-            [one.surface for one in drawn], material=materials, **{**usual, **own, **others}
+            [body.surface for body in drawn], material=materials, **{**defaults, **style, **options}
         )
 
-    def to_scene_text(self, controls: ControlState, **others: Any) -> tuple[str, list[str]]:
+    def to_scene_text(self, controls: ControlState, **options: Any) -> tuple[str, list[str]]:
         """The state as the text of a scene file, and the names of the sliders that are not in it,
-        because their functions are Python's: the file has the result of these functions. others:
-        settings of `render` besides those of the content.
+        because their functions are Python's: the file has the result of these functions.
+        options: of `render`, besides those of the content.
 
         Raises:
             SceneFileError: a text cannot hold it.
         """
-        if isinstance(others.get("camera"), Camera):
-            others["camera"] = self.framing.with_box(others["camera"])
-        what, settings = self._at(controls)
-        several: list[Any] = [*what] if isinstance(what, list | tuple) else [what]
-        curve = _curve_of(_studio_objects(what, settings)) if controls.curves else None
+        if isinstance(options.get("camera"), Camera):
+            options["camera"] = self.framing.with_box(options["camera"])
+        content, settings = self._at(controls)
+        surfaces: list[Any] = [*content] if isinstance(content, list | tuple) else [content]
+        curve = _curve_of(_studio_objects(content, settings)) if controls.curves else None
         if curve is not None:
-            several = _with_loops(what, curve, controls.curves)
+            surfaces = _with_loops(content, curve, controls.curves)
         if controls.cut_volume is not None:
-            several, settings = _with_cut_options(several, settings, controls.cut_volume)
+            surfaces, settings = _with_cut_options(surfaces, settings, controls.cut_volume)
         lost: list[str] = []
-        for name, one in self.content.sliders.items():
+        for name, slider in self.content.sliders.items():
             if (
-                self.content.settings.get(name) is one and name not in controls.settings
+                self.content.settings.get(name) is slider and name not in controls.settings
             ):  # in the place of what surfaces have
-                settings[name] = replace(one, start=controls.values[name])
+                settings[name] = replace(slider, start=controls.values[name])
             else:
                 lost.append(name)
-        return to_scene_text(several, {**settings, **others}, self.sources), lost
+        return to_scene_text(surfaces, {**settings, **options}, self.sources), lost
 
-    def _fitted(self, one: StudioObject) -> StudioObject:
-        """The same, with a tolerance that suits its size on the stage if it has none."""
-        if one.surface.tolerance is not None:
-            return one
+    def _fitted(self, body: StudioObject) -> StudioObject:
+        """The object with a tolerance: its own, or one that suits its size on the stage."""
+        if body.surface.tolerance is not None:
+            return body
         tolerance = HitTolerance(_TOLERANCE / self.placement.scale)
-        return replace(one, surface=replace(one.surface, tolerance=tolerance))
+        return replace(body, surface=replace(body.surface, tolerance=tolerance))
 
-    def place(self, one: StudioObject) -> PlacedSurface:
+    def place(self, body: StudioObject) -> PlacedSurface:
         """A surface on the stage, with its data on the backend."""
-        size = float(np.linalg.norm(np.diff(bounding_box(one.surface), axis=0)))
+        size = float(np.linalg.norm(np.diff(bounding_box(body.surface), axis=0)))
         backend = choose_backend("single")
-        return PlacedSurface.of(one.surface, self.placement, backend, one.isolines, size)
+        return PlacedSurface.of(body.surface, self.placement, backend, body.isolines, size)
 
 
 def live_options(settings: Mapping[str, Any]) -> dict[str, Any]:
     """The options of `render` that pages and views take: without those of still pictures only, such
     as a size, and with "shaded" in place of a `show` that cannot be drawn interactively."""
-    taken = {name: one for name, one in settings.items() if name not in STILL_OPTIONS}
-    return {**taken, "show": taken["show"] if taken.get("show") in LIVE_MODES else "shaded"}
+    options = {name: value for name, value in settings.items() if name not in STILL_OPTIONS}
+    return {**options, "show": options["show"] if options.get("show") in LIVE_MODES else "shaded"}
 
 
 def with_cut(surface: TracedSurface, volume: Volume) -> TracedSurface:
     """A surface cut by one more volume; by a half-space, it is opened to be looked into."""
     name = _cut_option(volume)
-    both = _overlap(getattr(surface, name), volume)
-    made = replace(surface, **cast("Any", {name: both})).with_call_cache(begins=True)
-    return made if name == "clip" else with_visible_inside(made)
+    combined = _overlap(getattr(surface, name), volume)
+    cut_surface = replace(surface, **cast("Any", {name: combined})).with_call_cache(begins=True)
+    return cut_surface if name == "clip" else with_visible_inside(cut_surface)
 
 
 def _with_cut_options(
     surfaces: list[Any], settings: dict[str, Any], volume: Volume
 ) -> tuple[list[Any], dict[str, Any]]:
-    """What is drawn and its settings, cut by one more volume: in the settings if they hold the
-    keywords of the surfaces, of which sliders may be values."""
+    """The surfaces and settings, cut by one more volume: in the settings if they hold the keywords
+    of the surfaces, of which sliders may be values."""
     name = _cut_option(volume)
     if any(option in SURFACE_OPTIONS for option in settings):
         return surfaces, {**settings, name: _overlap(settings.get(name), volume)}
-    whole = [one if isinstance(one, Surface) else Surface(one) for one in surfaces]
-    return [one.replace(**{name: _overlap(getattr(one, name), volume)}) for one in whole], settings
+    whole = [surface if isinstance(surface, Surface) else Surface(surface) for surface in surfaces]
+    return [
+        surface.replace(**{name: _overlap(getattr(surface, name), volume)}) for surface in whole
+    ], settings
 
 
 def _cut_option(volume: Volume) -> str:
+    """The option of surfaces that a volume is the value of."""
     return "section" if isinstance(volume, HalfSpace) else "clip"
 
 
-def _overlap(own: Volume | None, volume: Volume) -> Volume:
-    return volume if own is None else VolumeIntersection((own, volume))
+def _overlap(previous: Volume | None, volume: Volume) -> Volume:
+    """The intersection of two volumes, of which the first may be None, for all of space."""
+    return volume if previous is None else VolumeIntersection((previous, volume))
 
 
-def _with_loops(what: Any, curve: SolidAngle, loops: Any) -> list[Any]:
+def _with_loops(content: Any, curve: SolidAngle, loops: Any) -> list[Any]:
     """Fields and surfaces with other vertices of one curve."""
     moved = SolidAngle([*loops])
 
-    def edited(one: Any) -> Any:
-        if isinstance(one, Surface) and one.field is curve:
-            return one.replace(field=moved)
-        return moved if one is curve else one
+    def edited(surface: Any) -> Any:
+        if isinstance(surface, Surface) and surface.field is curve:
+            return surface.replace(field=moved)
+        return moved if surface is curve else surface
 
-    several: list[Any] = [*what] if isinstance(what, list | tuple) else [what]
-    return [edited(one) for one in several]
+    surfaces: list[Any] = [*content] if isinstance(content, list | tuple) else [content]
+    return [edited(surface) for surface in surfaces]
 
 
-def _objects_at(subject: SlidingContent, values: Mapping[str, float]) -> list[StudioObject]:
-    return _studio_objects(*subject.at(values))
+def _objects_at(content: SlidingContent, values: Mapping[str, float]) -> list[StudioObject]:
+    return _studio_objects(*content.at(values))
 
 
 def _studio_objects(surfaces: Any, options: Mapping[str, Any]) -> list[StudioObject]:
     studio = {name: options[name] for name in _OF_STUDIO if name in options}
     isolines = parse_isolines(options.get("isolines"))
-    drawn = studio_objects(
+    bodies = studio_objects(
         surfaces, options.get("material"), None, _surface_and_trace(options), isolines=isolines,
         **studio,
     )  # fmt: skip
-    for element in drawn:
-        check_opaque(element.material)
-    return drawn
+    for body in bodies:
+        check_opaque(body.material)
+    return bodies
 
 
 def _surface_and_trace(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -452,15 +457,15 @@ def check_opaque(material: Material) -> None:
         )
 
 
-def _curve_of(drawn: Sequence[StudioObject]) -> SolidAngle | None:
-    """The one field whose curve can be edited; None where there is none, or more than one."""
-    found = {id(one.surface.field): one.surface.field for one in drawn}
-    curves = [one for one in found.values() if isinstance(one, SolidAngle) and not one.circles]
+def _curve_of(bodies: Sequence[StudioObject]) -> SolidAngle | None:
+    """The field whose curve can be edited; None if there is no such field, or more than one."""
+    fields = {id(body.surface.field): body.surface.field for body in bodies}
+    curves = [f for f in fields.values() if isinstance(f, SolidAngle) and not f.circles]
     return curves[0] if len(curves) == 1 else None
 
 
 def _kernel_data(
-    one: StudioObject, placed: PlacedSurface, o: FloatArray, d: FloatArray
+    body: StudioObject, placed: PlacedSurface, o: FloatArray, d: FloatArray
 ) -> JsonDict:
     """A surface as plain data: its shader, the words that the shader reads, its colors, and rays
     with Dr.Jit's answers."""
@@ -478,22 +483,22 @@ def _kernel_data(
             "evaluations": met.evaluations, "paint": color_index(met),
         }  # fmt: skip
 
-    made = record_kernel(compute, lanes, placed)
-    given = dict(labeled_leaves("lane", lanes))
-    results = {name: made.results.get(f"result {name}") for name in _RESULTS}
+    kernel = record_kernel(compute, lanes, placed)
+    inputs = dict(labeled_leaves("lane", lanes))
+    results = {name: kernel.results.get(f"result {name}") for name in _RESULTS}
     if any(results[name] is None for name in _RESULTS[:-1]):
         raise ValueError("what rays meet is the same for all of them: there is nothing to draw")
     answers = [np.zeros(len(o), np.uint32) if x is None else as_words(x) for x in results.values()]
     return {
-        "key": hashlib.sha256(made.shader.code.encode()).hexdigest()[:16],
-        "code": made.shader.code,
-        "data": pack_shader_data(made.shader, made.data),
-        "lanes": [_LANES.index(label.removeprefix("lane ")) for label in made.shader.lanes],
-        "results": [_place(made, f"result {name}") for name in _RESULTS],
-        "paints": surface_colors(one),
-        "tolerance": placed_tolerance(one, placed),
+        "key": hashlib.sha256(kernel.shader.code.encode()).hexdigest()[:16],
+        "code": kernel.shader.code,
+        "data": pack_shader_data(kernel.shader, kernel.data),
+        "lanes": [_LANES.index(label.removeprefix("lane ")) for label in kernel.shader.lanes],
+        "results": [_place(kernel, f"result {name}") for name in _RESULTS],
+        "paints": surface_colors(body),
+        "tolerance": placed_tolerance(body, placed),
         "check": {
-            "lanes": np.stack([as_words(given[label]) for label in made.shader.lanes]),
+            "lanes": np.stack([as_words(inputs[label]) for label in kernel.shader.lanes]),
             "results": np.stack(answers),
             "count": len(o),
         },
@@ -503,8 +508,8 @@ def _kernel_data(
 def status_of(met: SurfaceHit) -> Any:
     """The `RayStatus` of each ray."""
     hit, out, miss = (
-        type(met.evaluations)(int(one))
-        for one in (RayStatus.HIT, RayStatus.OUT_OF_STEPS, RayStatus.MISS)
+        type(met.evaluations)(int(status))
+        for status in (RayStatus.HIT, RayStatus.OUT_OF_STEPS, RayStatus.MISS)
     )
     return dr.select(met.is_out_of_steps, out, dr.select(met.is_hit, hit, miss))
 
@@ -518,16 +523,16 @@ def color_index(met: SurfaceHit) -> Any:
     return dr.select(met.isoline_index > 0, index(met.isoline_index) + _CUT, plain)
 
 
-def placed_tolerance(one: StudioObject, placed: PlacedSurface) -> float:
+def placed_tolerance(body: StudioObject, placed: PlacedSurface) -> float:
     """The tolerance as a length of the stage."""
-    return one.surface.hit_tolerance.distance * float(placed.scale[0])
+    return body.surface.hit_tolerance.distance * float(placed.scale[0])
 
 
-def _place(made: RecordedKernel, label: str) -> int:
+def _place(kernel: RecordedKernel, label: str) -> int:
     """The place of a result in the shader's output, or `_NO_OUTPUT` if it is 0 for all rays."""
-    if label in made.constants:
+    if label in kernel.constants:
         return _NO_OUTPUT
-    return made.shader.results.index(label)
+    return kernel.shader.results.index(label)
 
 
 def _rays(points: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -542,20 +547,20 @@ def _rays(points: FloatArray) -> tuple[FloatArray, FloatArray]:
     return o, direction / np.linalg.norm(direction, axis=1, keepdims=True)
 
 
-def surface_colors(one: StudioObject) -> list[JsonDict]:
+def surface_colors(body: StudioObject) -> list[JsonDict]:
     """The colors of each paint in shaded pictures: linear sRGB of the sides of larger and of
     smaller values, and whether they are glossy."""
-    surface, mi = one.surface, register()
+    surface, mi = body.surface, register()
     is_solid = surface.solid_range is not None
-    front, back, glossy = _reflectances(one.material.bsdf(solid=is_solid, traced_light=False))
+    front, back, glossy = _reflectances(body.material.bsdf(solid=is_solid, traced_light=False))
     inside = mi.Bool(not is_solid and not isinstance(surface.field, Solid))
     sides = two_sided_color(front, back, inside), back
-    mended = [hole_filling_tint(side, mi.Bool(True)) for side in sides]
-    paints = [_paint(sides[0], sides[1], glossy), _paint(mended[0], mended[1], glossy)]
-    cut = one.material if one.section_material is None else one.section_material
-    front, back, glossy = _reflectances(cut.bsdf(solid=is_solid, traced_light=False))
+    fillings = [hole_filling_tint(side, mi.Bool(True)) for side in sides]
+    paints = [_paint(sides[0], sides[1], glossy), _paint(fillings[0], fillings[1], glossy)]
+    section = body.material if body.section_material is None else body.section_material
+    front, back, glossy = _reflectances(section.bsdf(solid=is_solid, traced_light=False))
     paints.append(_paint(front, back, glossy))
-    lines = [mi.Color3f(*linear_from_srgb(line.srgb)) for line in one.isolines]
+    lines = [mi.Color3f(*linear_from_srgb(line.srgb)) for line in body.isolines]
     return [*paints, *(_paint(line, line, False) for line in lines)]
 
 
@@ -571,14 +576,14 @@ def _reflectances(bsdf: Mapping[str, Any]) -> tuple[Any, Any, bool]:
     """The reflectances of a BSDF's two sides, as shaded pictures use them, and whether it is
     glossy."""
     mi = register()
-    made = mi.load_dict(dict(bsdf), parallel=False)
+    plugin = mi.load_dict(dict(bsdf), parallel=False)
     colors: list[Any] = []
     for side in (1, -1):
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.wi, si.t = mi.Vector3f(0, 0, side), mi.Float(1)
-        straight = mi.Color3f(made.eval_diffuse_reflectance(si, True))
-        colors.append(reflectance(straight, mi.Bool(False)))
-    flags = made.flags()
+        diffuse = mi.Color3f(plugin.eval_diffuse_reflectance(si, True))
+        colors.append(reflectance(diffuse, mi.Bool(False)))
+    flags = plugin.flags()
     glossy = mi.has_flag(flags, mi.BSDFFlags.Glossy) or mi.has_flag(flags, mi.BSDFFlags.Delta)
     return colors[0], colors[1], bool(glossy)
 
@@ -589,9 +594,9 @@ def encode_arrays(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return base64.b64encode(gzip.compress(value.tobytes(), _LEVEL, mtime=0)).decode()
     if isinstance(value, dict):
-        return {name: encode_arrays(one) for name, one in cast("JsonDict", value).items()}
+        return {name: encode_arrays(entry) for name, entry in cast("JsonDict", value).items()}
     if isinstance(value, list):
-        return [encode_arrays(one) for one in cast("list[Any]", value)]
+        return [encode_arrays(entry) for entry in cast("list[Any]", value)]
     return value
 
 
@@ -611,11 +616,11 @@ def state_delta(first: JsonDict, state: JsonDict, *, checks: bool = True) -> Jso
         return state
     surfaces: list[JsonDict] = []
     for old, new in pairs:
-        own = {k: one for k, one in new.items() if k not in ("data", "check") and one != old[k]}
+        changes = {k: v for k, v in new.items() if k not in ("data", "check") and v != old[k]}
         at = np.flatnonzero(old["data"] != new["data"]).astype(np.uint32)
-        own |= {"at": at, "to": new["data"][at]}
-        surfaces.append(own | ({"check": new["check"]} if checks else {}))
-    made: JsonDict = {"surfaces": surfaces}
+        changes |= {"at": at, "to": new["data"][at]}
+        surfaces.append(changes | ({"check": new["check"]} if checks else {}))
+    delta: JsonDict = {"surfaces": surfaces}
     if state["curves"] != first["curves"]:
-        made["curves"] = state["curves"]
-    return made
+        delta["curves"] = state["curves"]
+    return delta

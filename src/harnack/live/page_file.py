@@ -142,11 +142,11 @@ def _places(live: LiveScene) -> dict[str, list[float]]:
     step as many as make no large file, where what is drawn changes much from place to place.
 
     Raises:
-        ValueError: there are too many choices of them.
+        ValueError: there are too many combinations of places.
     """
     sliders = live.content.sliders
-    several = max(2, min(_MAX_SLIDER_VALUES, int(_CHOICES ** (1 / max(1, len(sliders))))))
-    places = {name: one.values(several) for name, one in sliders.items()}
+    count = max(2, min(_MAX_SLIDER_VALUES, int(_CHOICES ** (1 / max(1, len(sliders))))))
+    places = {name: slider.values(count) for name, slider in sliders.items()}
     total = math.prod(map(len, places.values()))
     if total > _MOST_CHOICES:
         raise ValueError(
@@ -154,31 +154,31 @@ def _places(live: LiveScene) -> dict[str, list[float]]:
             f"without Python behind it has to hold, and {_MOST_CHOICES:,} at most: give larger "
             "steps or fewer sliders, or use harnack.view"
         )
-    if all(one.step is not None for one in sliders.values()):
+    if all(slider.step is not None for slider in sliders.values()):
         return places
-    ends = ({name: one[k] for name, one in places.items()} for k in (0, -1))
+    ends = ({name: values[k] for name, values in places.items()} for k in (0, -1))
     largest = max(len(json.dumps(_slider_state(live, place))) for place in ends)
-    fewest = min(several, _FEWEST[len(sliders) > 1])
-    while several > fewest and largest * math.prod(map(len, places.values())) > _TARGET_BYTES:
-        several = max(fewest, (several + 1) // 2)
-        places = {name: one.values(several) for name, one in sliders.items()}
+    fewest = min(count, _FEWEST[len(sliders) > 1])
+    while count > fewest and largest * math.prod(map(len, places.values())) > _TARGET_BYTES:
+        count = max(fewest, (count + 1) // 2)
+        places = {name: slider.values(count) for name, slider in sliders.items()}
     return places
 
 
 def _framing_values(places: Mapping[str, list[float]]) -> Mapping[str, list[float]]:
-    """The places that are framed: all, or of many every other one and the last."""
+    """The places that are framed: all, or of many places every other place and the last one."""
     if math.prod(map(len, places.values())) <= _FRAMED:
         return places
-    return {name: sorted({*one[::2], one[-1]}) for name, one in places.items()}
+    return {name: sorted({*values[::2], values[-1]}) for name, values in places.items()}
 
 
 def _slider_combinations(places: Mapping[str, list[float]]) -> list[dict[str, float]]:
     """One place of each slider, in all combinations, the last slider's going fastest."""
-    return [dict(zip(places, one, strict=True)) for one in itertools.product(*places.values())]
+    return [dict(zip(places, place, strict=True)) for place in itertools.product(*places.values())]
 
 
 def _slider_state(live: LiveScene, values: Mapping[str, float]) -> JsonDict:
-    """What a place of the sliders changes of the first state."""
+    """The delta from the initial state to the state at a place of the sliders."""
     with slider_values_in_errors(values):
         state = live.state(ControlState(values))
     return encode_arrays(state_delta(live.initial_state, state, checks=False))
@@ -193,20 +193,20 @@ class PageJob:
     variant: str
 
     @functools.cached_property
-    def given(self) -> LiveScene:
-        """The live scene of the arguments."""
+    def unframed(self) -> LiveScene:
+        """The live scene of the arguments, framed for the start values of its sliders."""
         set_variant(self.variant)
         return LiveScene.of(self.surfaces, dict(self.settings))
 
     @functools.cached_property
     def places(self) -> dict[str, list[float]]:
         """The slider values that the page holds, by slider."""
-        return _places(self.given)
+        return _places(self.unframed)
 
     @functools.cached_property
     def live(self) -> LiveScene:
         """The live scene, framed for all slider values that the page holds."""
-        return self.given.framed(_slider_combinations(_framing_values(self.places)))
+        return self.unframed.framed(_slider_combinations(_framing_values(self.places)))
 
     @functools.cached_property
     def digest(self) -> str:
@@ -234,19 +234,19 @@ class PageJob:
 
 
 def _slider_states(job: PageJob, workers: Executor, advance: Any) -> JsonDict:
-    """The places of the sliders, and what is drawn at each choice of them."""
+    """The places of the sliders, and the delta of the state at each combination of them."""
     frames: list[JsonDict] = []
-    parts = [(values, job.digest) for values in _slider_combinations(job.places)]
-    for found in workers.run_tasks(job, "state", parts):
-        frames.append(json.loads(found["text"].tobytes()))
-        advance(1 / len(parts))
+    tasks = [(values, job.digest) for values in _slider_combinations(job.places)]
+    for result in workers.run_tasks(job, "state", tasks):
+        frames.append(json.loads(result["text"].tobytes()))
+        advance(1 / len(tasks))
     return {"places": job.places, "frames": frames}
 
 
 def script(*names: str) -> str:
     """The JavaScript modules of this folder, joined into one script."""
     parts = [resource(name) for name in names]
-    text = "\n".join(re.sub(r"^import .*?;\n", "", one, flags=re.M | re.S) for one in parts)
+    text = "\n".join(re.sub(r"^import .*?;\n", "", part, flags=re.M | re.S) for part in parts)
     return re.sub(r"^export ", "", text, flags=re.M)
 
 

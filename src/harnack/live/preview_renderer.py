@@ -143,7 +143,7 @@ class PreviewRenderer:
         self, mi: Any, painted: Sequence[PreviewSurface], eye: CameraAxes, size: tuple[int, int], *,
         has_floor: bool,
     ) -> dict[str, Any]:  # fmt: skip
-        """What the rays through the middles of the pixels meet first."""
+        """The first hits of the rays through the middles of the pixels, arrays by name."""
         columns, rows = (dr.opaque(mi.UInt32, n) for n in size)
         index = dr.arange(mi.UInt32, size[0] * size[1])
         pixel = dr.opaque(mi.Float, eye.pixel)
@@ -162,17 +162,17 @@ class PreviewRenderer:
             ground = (d.z < 0) & (dr.norm(origin + far * d) < 100.0)
             t = dr.select(ground, far, t)
         evaluations = mi.UInt32(0)
-        for one in painted:
-            met = one.placed.intersect(o, vector(d), mi.Float(dr.inf), mi.Bool(True))
+        for surface in painted:
+            met = surface.placed.intersect(o, vector(d), mi.Float(dr.inf), mi.Bool(True))
             evaluations += met.evaluations
             lost |= met.is_out_of_steps
             # The floor stands below what was drawn at first: it hides nothing that has moved below.
             nearer = met.is_hit & ~met.is_out_of_steps & (ground | (met.t < t))
             n = mi.Vector3f(met.normal)
-            own, shines = _color(mi, one.paints, color_index(met), dr.dot(n, d) < 0)
+            paint_color, shines = _color(mi, surface.paints, color_index(met), dr.dot(n, d) < 0)
             t = dr.select(nearer, met.t, t)
             normal = dr.select(nearer, n, normal)
-            color = dr.select(nearer, own, color)
+            color = dr.select(nearer, paint_color, color)
             glossy = dr.select(nearer, shines, glossy)
             ground &= ~nearer
         met = dr.isfinite(t) & ~lost
@@ -193,21 +193,21 @@ class _Casting:
 
     def occluded(self, ray: Any, active: Any) -> Any:
         vector = mitsuba_backend(self.mi).Array3f
-        found = self.mi.Bool(False)
-        for one in self.painted:
-            found |= one.placed.occludes(vector(ray.o), vector(ray.d), ray.maxt, active)
-        return found
+        is_occluded = self.mi.Bool(False)
+        for surface in self.painted:
+            is_occluded |= surface.placed.occludes(vector(ray.o), vector(ray.d), ray.maxt, active)
+        return is_occluded
 
 
 def _color(
-    mi: Any, paints: Sequence[Mapping[str, Any]], paint: Any, in_front: Any
+    mi: Any, paints: Sequence[Mapping[str, Any]], index: Any, in_front: Any
 ) -> tuple[Any, Any]:
     """For each ray the color of the paint that it meets, and whether that is glossy."""
     color, glossy = mi.Color3f(0), mi.Bool(False)
-    for k, one in enumerate(paints):
-        sides = (_vector(mi, one[name], mi.Color3f) for name in ("front", "back"))
-        color = dr.select(paint == k, dr.select(in_front, *sides), color)
-        glossy = dr.select(paint == k, dr.opaque(mi.Bool, one["glossy"]), glossy)
+    for k, paint in enumerate(paints):
+        sides = (_vector(mi, paint[name], mi.Color3f) for name in ("front", "back"))
+        color = dr.select(index == k, dr.select(in_front, *sides), color)
+        glossy = dr.select(index == k, dr.opaque(mi.Bool, paint["glossy"]), glossy)
     return color, glossy
 
 

@@ -99,7 +99,7 @@ FieldSources = Sequence[tuple[Field, Plain]]
 
 
 def check_sources(sources: Any) -> None:
-    """Raise TypeError for what are no pairs of a field and its text."""
+    """Raise TypeError unless the sources are pairs of a field and its text."""
     try:
         is_right = all(
             isinstance(field, Field) and isinstance(text, dict) for field, text in sources
@@ -156,8 +156,9 @@ def read_scene(path: str | os.PathLike[str]) -> SceneFile:
     Files named in it are looked for beside it.
 
     Raises:
-        SceneFileError (a ValueError): what is no such file: which part, and what is wrong.
-        OSError: it cannot be read.
+        SceneFileError (a ValueError): the file is no scene file; the message names the part that
+            is wrong, and why.
+        OSError: the file cannot be read.
     """
     source = Path(path)
     if source.stat().st_size > _MAX_BYTES:
@@ -175,8 +176,8 @@ def read_scene(path: str | os.PathLike[str]) -> SceneFile:
 def _resolve_file(folder: Path, name: str) -> Path:
     """The path of a file that a scene names. If it does not exist, a file of the same name beside
     the scene is taken: scenes are sent to others together with their files."""
-    found = folder / name
-    return found if found.exists() or not (folder / found.name).exists() else folder / found.name
+    path = folder / name
+    return path if path.exists() or not (folder / path.name).exists() else folder / path.name
 
 
 def write_scene(
@@ -186,7 +187,7 @@ def write_scene(
     sources: FieldSources = (),
     **settings: Any,
 ) -> None:
-    """Write what is drawn, and how, into a scene file.
+    """Write surfaces, and the options by which they are drawn, into a scene file.
 
         hk.write_scene("mine.json", hk.SolidAngle(curve), level=2.0, material="gold")
 
@@ -196,8 +197,8 @@ def write_scene(
     sources: fields that come from files or from the gallery, and where from.
 
     Raises:
-        SceneFileError (a ValueError): something that a text cannot hold, such as a Python function
-            or a mesh that was made in Python: by its name.
+        SceneFileError (a ValueError): a text cannot hold something, such as a Python function or a
+            mesh that was made in Python; the message names it.
     """
     target = os.fspath(path)
     check_sources(sources)
@@ -265,19 +266,19 @@ def with_flat_options(settings: Mapping[str, Any]) -> dict[str, Any]:
     return flat
 
 
-def _json(made: Any, depth: int = 0) -> str:
+def _json(value: Any, depth: int = 0) -> str:
     """JSON with a line for each entry, and rows of numbers on one line."""
-    flat = json.dumps(made, allow_nan=False)
-    if len(flat) <= 88 - 2 * depth or not isinstance(made, dict | list):
+    flat = json.dumps(value, allow_nan=False)
+    if len(flat) <= 88 - 2 * depth or not isinstance(value, dict | list):
         return flat
     space = "  " * (depth + 1)
     entries: list[str] = []
-    if isinstance(made, dict):
-        for name, one in cast("Plain", made).items():
-            entries.append(f"{space}{json.dumps(name)}: {_json(one, depth + 1)}")
+    if isinstance(value, dict):
+        for name, entry in cast("Plain", value).items():
+            entries.append(f"{space}{json.dumps(name)}: {_json(entry, depth + 1)}")
     else:
-        entries = [space + _json(one, depth + 1) for one in cast("list[Any]", made)]
-    first, last = "{}" if isinstance(made, dict) else "[]"
+        entries = [space + _json(entry, depth + 1) for entry in cast("list[Any]", value)]
+    first, last = "{}" if isinstance(value, dict) else "[]"
     return f"{first}\n" + ",\n".join(entries) + "\n" + "  " * depth + last
 
 
@@ -297,58 +298,61 @@ def _surface_text(surface: Any, sources: FieldSources) -> Plain:
     return text
 
 
-def _field_text(one: Field, sources: FieldSources) -> Plain:
-    for known, origin in sources:
-        if one is known:
+def _field_text(field: Field, sources: FieldSources) -> Plain:
+    for source_field, origin in sources:
+        if field is source_field:
             return origin
-    if isinstance(one, Expression) and isinstance(one.function, TextFormula):
-        made: Plain = {"formula": one.function.text, "parameters": dict(one.function.parameters)}
-        extra = {"domain": one.domain, "level": one.default_level, "is_convex": one.is_convex}
-        usual = inspect.signature(expression).parameters
-        made |= {k: _to_json_value(v) for k, v in extra.items() if v != usual[k].default}
-        return {name: value for name, value in made.items() if value != {}}
-    if type(one) is SolidAngle and not one.circles:
-        how = {"lift_bound": one.lift_bound_option, "cells": one.cells}
-        usual = inspect.signature(SolidAngle).parameters
-        own = {name: value for name, value in how.items() if value != usual[name].default}
-        _check_cells(own)
-        return {"curves": [np.asarray(loop).tolist() for loop in one.loops], **own}
-    if type(one).__name__ not in _constructible_types():
+    if isinstance(field, Expression) and isinstance(field.function, TextFormula):
+        text: Plain = {
+            "formula": field.function.text,
+            "parameters": dict(field.function.parameters),
+        }
+        extra = {"domain": field.domain, "level": field.default_level, "is_convex": field.is_convex}
+        params = inspect.signature(expression).parameters
+        text |= {k: _to_json_value(v) for k, v in extra.items() if v != params[k].default}
+        return {name: value for name, value in text.items() if value != {}}
+    if type(field) is SolidAngle and not field.circles:
+        values = {"lift_bound": field.lift_bound_option, "cells": field.cells}
+        params = inspect.signature(SolidAngle).parameters
+        options = {name: value for name, value in values.items() if value != params[name].default}
+        _check_cells(options)
+        return {"curves": [np.asarray(loop).tolist() for loop in field.loops], **options}
+    if type(field).__name__ not in _constructible_types():
         raise SceneFileError(
-            f"a {type(one).__name__} that was made in Python cannot be written into a scene file, "
-            "which holds curves, formulas, solids, surfaces of files and of the gallery"
+            f"a {type(field).__name__} that was made in Python cannot be written into a scene "
+            "file, which holds curves, formulas, solids, surfaces of files and of the gallery"
         )
-    made = _object_text(one)
-    _check_round_trip(one, _field_of(made, "field", None))
-    return made
+    text = _object_text(field)
+    _check_round_trip(field, _field_of(text, "field", None))
+    return text
 
 
-def _check_cells(how: Mapping[str, Any]) -> None:
-    """Raise for megabytes: how much memory is used is not up to a file."""
-    if not isinstance(how.get("cells", True), bool):
-        raise SceneFileError(f"cells of a scene are true or false, not {how['cells']!r:.60}")
+def _check_cells(options: Mapping[str, Any]) -> None:
+    """Raise SceneFileError for a number of megabytes: a file must not choose the memory used."""
+    if not isinstance(options.get("cells", True), bool):
+        raise SceneFileError(f"cells of a scene are true or false, not {options['cells']!r:.60}")
 
 
-def _check_round_trip(one: Field, other: Field) -> None:
-    """Raise SceneFileError for a field of which the text says too little."""
+def _check_round_trip(field: Field, copy: Field) -> None:
+    """Raise SceneFileError if the field that was read back from the text differs from the field."""
     points = np.random.default_rng(0).normal(size=(256, 3))
-    same = np.array_equal(one.value(points), other.value(points), equal_nan=True)
-    if not same or one.default_level != other.default_level or one.domain != other.domain:
-        raise SceneFileError(f"a {type(one).__name__} like this one cannot be written: its own "
+    same = np.array_equal(field.value(points), copy.value(points), equal_nan=True)
+    if not same or field.default_level != copy.default_level or field.domain != copy.domain:
+        raise SceneFileError(f"a {type(field).__name__} like this one cannot be written: its own "
                              "arguments do not say all of it")  # fmt: skip
 
 
-def _object_text(one: Any) -> Plain:
+def _object_text(instance: Any) -> Plain:
     """A field or a volume by its class and its arguments."""
-    given: Plain = {}
-    for name, about in inspect.signature(one.__class__).parameters.items():
-        if name.startswith("_") or not hasattr(one, name):
+    arguments: Plain = {}
+    for name, parameter in inspect.signature(instance.__class__).parameters.items():
+        if name.startswith("_") or not hasattr(instance, name):
             continue  # `_check_round_trip` finds what would be lost
-        value = getattr(one, name)
-        if _same(value, about.default):
+        value = getattr(instance, name)
+        if _same(value, parameter.default):
             continue
-        given[name] = _to_json_value(value)
-    return {type(one).__name__: given}
+        arguments[name] = _to_json_value(value)
+    return {type(instance).__name__: arguments}
 
 
 def _same(value: Any, default: Any) -> bool:
@@ -369,7 +373,7 @@ def _to_json_value(value: Any) -> Any:
     if isinstance(value, np.integer):
         return int(cast("Any", value))
     if isinstance(value, Sequence):
-        return [_to_json_value(one) for one in cast("Sequence[Any]", value)]
+        return [_to_json_value(entry) for entry in cast("Sequence[Any]", value)]
     if isinstance(value, Field):
         return _field_text(value, ())
     if type(value).__name__ in _constructible_types():
@@ -393,18 +397,16 @@ def _setting_text(name: str, value: Any, sources: FieldSources) -> Any:
     if name == "enclosures" and not isinstance(value, str):
         raise SceneFileError("enclosures: only those chosen by name can be written")
     if isinstance(value, Camera):
-        every = {one.name: getattr(value, one.name) for one in dataclasses.fields(value)}
-        usual = {one.name: one.default for one in dataclasses.fields(value)}
-        return {key: _to_json_value(one) for key, one in every.items() if one != usual[key]}
+        values = {option.name: getattr(value, option.name) for option in dataclasses.fields(value)}
+        defaults = {option.name: option.default for option in dataclasses.fields(value)}
+        return {key: _to_json_value(v) for key, v in values.items() if v != defaults[key]}
     if isinstance(value, Isolines):
         if not isinstance(value.function, str):
             raise SceneFileError("isolines: only those of a formula as text can be written")
         names = ("function", "levels", "interval", "width", "color")
-        return {
-            key: _to_json_value(one) for key in names if (one := getattr(value, key)) is not None
-        }
+        return {key: _to_json_value(v) for key in names if (v := getattr(value, key)) is not None}
     if name == "isolines" and isinstance(value, Sequence):
-        return [_setting_text(name, one, sources) for one in cast("Sequence[Any]", value)]
+        return [_setting_text(name, entry, sources) for entry in cast("Sequence[Any]", value)]
     try:
         return _to_json_value(value)
     except SceneFileError as wrong:
@@ -417,45 +419,43 @@ def _setting_text(name: str, value: Any, sources: FieldSources) -> Any:
 def parse_scene(text: str, find: Callable[[str], Path] | None = None) -> SceneFile:
     """The scene of a text.
 
-    find: where a file is that the text names; None if it must not name any.
+    find: the path of a file, from its name in the text; None if the text must not name files.
 
     Raises:
         SceneFileError: as `read_scene`.
     """
     try:
-        given = json.loads(
-            text, parse_constant=_no_number, object_pairs_hook=_reject_duplicate_keys
-        )
+        data = json.loads(text, parse_constant=_no_number, object_pairs_hook=_reject_duplicate_keys)
     except (ValueError, RecursionError) as wrong:
         raise SceneFileError(f"it is no JSON: {wrong}") from None
     try:
-        return _scene_of(given, find)
+        return _scene_of(data, find)
     except RecursionError:
         raise SceneFileError("more things are within each other than can be read") from None
 
 
-def _scene_of(given: Any, find: Callable[[str], Path] | None) -> SceneFile:
-    whole = _object(given, "a scene")
-    if whole.get("harnack") != VERSION or whole["harnack"] is True:
+def _scene_of(data: Any, find: Callable[[str], Path] | None) -> SceneFile:
+    scene_data = _object(data, "a scene")
+    if scene_data.get("harnack") != VERSION or scene_data["harnack"] is True:
         raise SceneFileError(f'it must say "harnack": {VERSION}, the version of scene files')
-    for name in whole:
+    for name in scene_data:
         _check_name(name, ("harnack", "surfaces", "settings", "sliders"), "part")
-    listed = whole.get("surfaces")
+    listed = scene_data.get("surfaces")
     if not isinstance(listed, list) or not listed:
         raise SceneFileError("surfaces must be a list of one surface at least")
     sources: list[tuple[Field, Plain]] = []
     surfaces = tuple(
-        _surface_of(one, f"surfaces[{k}]", find, sources)
-        for k, one in enumerate(cast("list[Any]", listed))
+        _surface_of(entry, f"surfaces[{k}]", find, sources)
+        for k, entry in enumerate(cast("list[Any]", listed))
     )
-    settings = _settings_of(_object(whole.get("settings", {}), "settings"), _KNOWN)
-    sliders = _object(whole.get("sliders", {}), "sliders")
-    made: dict[str, Slider] = {}
-    for name, one in sliders.items():
+    settings = _settings_of(_object(scene_data.get("settings", {}), "settings"), _KNOWN)
+    entries = _object(scene_data.get("sliders", {}), "sliders")
+    sliders: dict[str, Slider] = {}
+    for name, entry in entries.items():
         _check_name(name, SLIDER_OPTIONS, "slider")
-        made[name] = _construct(Slider, one, f"sliders: {name}")
-        settings[name] = made[name].start
-    scene = SceneFile(surfaces, settings, made, tuple(sources))
+        sliders[name] = _construct(Slider, entry, f"sliders: {name}")
+        settings[name] = sliders[name].start
+    scene = SceneFile(surfaces, settings, sliders, tuple(sources))
     _check_values(scene)
     return scene
 
@@ -488,45 +488,45 @@ def _no_number(name: str) -> float:
 
 
 def _reject_duplicate_keys(pairs: list[tuple[str, Any]]) -> Plain:
-    made: Plain = {}
-    for name, one in pairs:
-        if name in made:
+    data: Plain = {}
+    for name, value in pairs:
+        if name in data:
             raise ValueError(f"{name!r:.60} is said twice in one object")
-        made[name] = one
-    return made
+        data[name] = value
+    return data
 
 
-def _object(given: Any, where: str) -> Plain:
-    if not isinstance(given, dict):
-        raise SceneFileError(f"{where} must be an object with names, not {given!r:.60}")
-    return cast("Plain", given)
+def _object(value: Any, where: str) -> Plain:
+    if not isinstance(value, dict):
+        raise SceneFileError(f"{where} must be an object with names, not {value!r:.60}")
+    return cast("Plain", value)
 
 
-def _check_name(name: str, known: Sequence[str], what: str) -> None:
+def _check_name(name: str, known: Sequence[str], kind: str) -> None:
     if name not in known:
-        raise SceneFileError(f"there is no {what} {name!r:.60}{did_you_mean(name, known)}")
+        raise SceneFileError(f"there is no {kind} {name!r:.60}{did_you_mean(name, known)}")
 
 
 def _surface_of(
     entry: Any, where: str, find: Callable[[str], Path] | None, sources: list[tuple[Field, Plain]]
 ) -> Field | Surface:
-    about = dict(_object(entry, where))
+    data = dict(_object(entry, where))
     try:
-        if "scene" in about:
-            surface = _gallery_surface(about)
-            sources.append((surface.field, about))
+        if "scene" in data:
+            surface = _gallery_surface(data)
+            sources.append((surface.field, data))
             return surface
-        if "field" not in about:
+        if "field" not in data:
             raise SceneFileError(f"{where} has no field")
-        for name in about:
+        for name in data:
             _check_name(name, _SURFACE_KEYS, "keyword of a surface")
-        text = about.pop("field")
+        text = data.pop("field")
         field = _source_of(text, where, find)
         if field is not None:
             sources.append((field, text))
         else:
             field = _field_of(text, f"{where}: field", find)
-        keywords = _settings_of(about, SURFACE_OPTIONS)
+        keywords = _settings_of(data, SURFACE_OPTIONS)
         return Surface(field, **keywords) if keywords else field
     except SceneFileError:
         raise
@@ -534,10 +534,10 @@ def _surface_of(
         raise SceneFileError(f"{where}: {wrong}") from None
 
 
-def _gallery_surface(about: Plain) -> Surface:
-    for name in about:
+def _gallery_surface(data: Plain) -> Surface:
+    for name in data:
         _check_name(name, ("scene", "number"), "part of a surface of the gallery")
-    scene, number = about["scene"], about.get("number", 0)
+    scene, number = data["scene"], data.get("number", 0)
     if not isinstance(scene, str) or scene not in SCENES:
         raise SceneFileError(f"no scene is named {scene!r:.60}{did_you_mean(str(scene), SCENES)}")
     surfaces = SCENES[scene].surfaces()
@@ -547,79 +547,79 @@ def _gallery_surface(about: Plain) -> Surface:
 
 
 def _source_of(text: Any, where: str, find: Callable[[str], Path] | None) -> Field | None:
-    """The field of a surface of the gallery, or of a file; None for another."""
-    about = _object(text, f"{where}: field")
-    if "scene" in about:
-        return _gallery_surface(about).field
-    if "file" not in about:
+    """The field of a surface of the gallery, or of a file; None for other fields."""
+    data = _object(text, f"{where}: field")
+    if "scene" in data:
+        return _gallery_surface(data).field
+    if "file" not in data:
         return None
-    for name in about:
+    for name in data:
         _check_name(name, ("file", *FILE_OPTIONS), "part of a field")
-    options = {key: value for key, value in about.items() if key != "file"}
+    options = {key: value for key, value in data.items() if key != "file"}
     check_types(field_from_file, options)
-    if not isinstance(about["file"], str):
-        raise SceneFileError(f"{where}: file must be a text, not {about['file']!r:.60}")
+    if not isinstance(data["file"], str):
+        raise SceneFileError(f"{where}: file must be a text, not {data['file']!r:.60}")
     if find is None:
         raise SceneFileError("a scene that is opened in a browser must not name files")
-    return field_from_file(find(about["file"]), **cast("Any", options)).field
+    return field_from_file(find(data["file"]), **cast("Any", options)).field
 
 
-def _field_of(given: Any, where: str, find: Callable[[str], Path] | None) -> Field:
-    about = _object(given, where)
-    if "curves" in about:
-        for name in about:
+def _field_of(value: Any, where: str, find: Callable[[str], Path] | None) -> Field:
+    data = _object(value, where)
+    if "curves" in data:
+        for name in data:
             _check_name(name, ("curves", "lift_bound", "cells"), "part of curves")
-        how = {name: value for name, value in about.items() if name != "curves"}
-        check_types(SolidAngle, how)
-        _check_cells(how)
-        return SolidAngle(about["curves"], **how)
-    if "formula" in about:
+        options = {name: value for name, value in data.items() if name != "curves"}
+        check_types(SolidAngle, options)
+        _check_cells(options)
+        return SolidAngle(data["curves"], **options)
+    if "formula" in data:
         known = ("formula", "parameters", "domain", "level", "is_convex")
-        for name in about:
+        for name in data:
             _check_name(name, known, "part of a formula")
         plain = ("formula", "parameters")
-        own = {
-            name: _from_json_value(one, where) for name, one in about.items() if name not in plain
+        arguments = {
+            name: _from_json_value(part, where) for name, part in data.items() if name not in plain
         }
-        own["parameters"] = _object(about.get("parameters", {}), f"{where}: parameters")
-        if not isinstance(about["formula"], str):
+        arguments["parameters"] = _object(data.get("parameters", {}), f"{where}: parameters")
+        if not isinstance(data["formula"], str):
             raise SceneFileError(f"{where}: a formula is a text")
-        for name, one in own["parameters"].items():
-            as_real(one, f"{where}: parameters: {name}")
-        check_types(expression, own)
-        return expression(about["formula"], **own)
-    made = _from_json_value(about, where)
-    if not isinstance(made, Field):
-        raise SceneFileError(f"{where}: this is no field: {given!r:.60}")
-    return made
+        for name, number in arguments["parameters"].items():
+            as_real(number, f"{where}: parameters: {name}")
+        check_types(expression, arguments)
+        return expression(data["formula"], **arguments)
+    field = _from_json_value(data, where)
+    if not isinstance(field, Field):
+        raise SceneFileError(f"{where}: this is no field: {value!r:.60}")
+    return field
 
 
-def _from_json_value(given: Any, where: str) -> Any:
+def _from_json_value(value: Any, where: str) -> Any:
     """Numbers, names and lists as they are; objects of one of the kinds that there are."""
-    if isinstance(given, list):
-        return tuple(_from_json_value(one, where) for one in cast("list[Any]", given))
-    if given in ("inf", "-inf"):
-        return float(given)
-    if not isinstance(given, dict):
-        return given
-    about = cast("Plain", given)
-    if "curves" in about or "formula" in about:
-        return _field_of(about, where, None)
+    if isinstance(value, list):
+        return tuple(_from_json_value(entry, where) for entry in cast("list[Any]", value))
+    if value in ("inf", "-inf"):
+        return float(value)
+    if not isinstance(value, dict):
+        return value
+    data = cast("Plain", value)
+    if "curves" in data or "formula" in data:
+        return _field_of(data, where, None)
     kinds = _constructible_types()
-    if len(about) != 1:
-        raise SceneFileError(f"{where}: write one name and its arguments, not {about!r:.60}")
-    ((name, arguments),) = about.items()
+    if len(data) != 1:
+        raise SceneFileError(f"{where}: write one name and its arguments, not {data!r:.60}")
+    ((name, arguments),) = data.items()
     _check_name(name, tuple(kinds), "kind of field or volume")
     return _construct(kinds[name], arguments, f"{where}: {name}")
 
 
-def _construct(kind: type, given: Any, where: str) -> Any:
+def _construct(kind: type, value: Any, where: str) -> Any:
     known = [name for name in inspect.signature(kind).parameters if not name.startswith("_")]
-    about = _object(given, where)
-    for name in about:
+    data = _object(value, where)
+    for name in data:
         _check_name(name, known, f"argument of {kind.__name__}")
     try:
-        values = {name: _from_json_value(one, where) for name, one in about.items()}
+        values = {name: _from_json_value(entry, where) for name, entry in data.items()}
         check_types(kind, values)
         return kind(**values)
     except SceneFileError:
@@ -628,37 +628,37 @@ def _construct(kind: type, given: Any, where: str) -> Any:
         raise SceneFileError(f"{where}: {wrong}") from None
 
 
-def _settings_of(given: Plain, known: Sequence[str]) -> Plain:
-    made: Plain = {}
-    for name, one in given.items():
+def _settings_of(data: Plain, known: Sequence[str]) -> Plain:
+    settings: Plain = {}
+    for name, value in data.items():
         _check_name(name, known, "setting")
         if name == "camera":
-            made[name] = _construct(Camera, one, name)
+            settings[name] = _construct(Camera, value, name)
         elif name == "isolines":
-            listed = cast("list[Any]", one if isinstance(one, list) else [one])
-            made[name] = [_construct(Isolines, each, name) for each in listed]
+            listed = cast("list[Any]", value if isinstance(value, list) else [value])
+            settings[name] = [_construct(Isolines, style, name) for style in listed]
         else:
-            value = _from_json_value(one, name)
-            made[name] = (
-                [*value] if name in ("material", "level") and type(value) is tuple else value
+            plain = _from_json_value(value, name)
+            settings[name] = (
+                [*plain] if name in ("material", "level") and type(plain) is tuple else plain
             )
-    return made
+    return settings
 
 
 def _constructible_types() -> dict[str, type]:
-    """Fields and volumes that are their class and its arguments: solids, volumes, and some more.
-    None of them reads files or calls what it is given."""
-    found: dict[str, type] = {one.__name__: one for one in _EXTRA_FIELD_TYPES}
-    rooms = [
-        import_module(f"{solids.__name__}.{one.name}") for one in iter_modules(solids.__path__)
+    """The classes of scene files by name: solids, volumes, maps of space and some more fields, each
+    determined by its arguments. No constructor reads files or calls its arguments."""
+    types: dict[str, type] = {kind.__name__: kind for kind in _EXTRA_FIELD_TYPES}
+    modules = [
+        import_module(f"{solids.__name__}.{info.name}") for info in iter_modules(solids.__path__)
     ]
-    for room in (*rooms, geometry):
-        for name, one in vars(room).items():
+    for module in (*modules, geometry):
+        for name, kind in vars(module).items():
             if (
-                inspect.isclass(one)
-                and issubclass(one, Solid | Volume | SpaceMap)
-                and dataclasses.is_dataclass(one)
+                inspect.isclass(kind)
+                and issubclass(kind, Solid | Volume | SpaceMap)
+                and dataclasses.is_dataclass(kind)
                 and not name.startswith("_")
             ):
-                found[name] = one
-    return found
+                types[name] = kind
+    return types

@@ -144,18 +144,18 @@ def view(
             return Widget(live, title, height)
     scene = live.scene(title)
     token = "" if host in _LOCAL else secrets.token_urlsafe(16)
-    served = _PageServer(live, document(scene, still_png(live), link="server"), token)
-    made = served.start(host, port)
-    print(f"{scene['title']}: {made.address}", file=sys.stderr)
+    server = _PageServer(live, document(scene, still_png(live), link="server"), token)
+    live_view = server.start(host, port)
+    print(f"{scene['title']}: {live_view.address}", file=sys.stderr)
     if token:
         print("open to the network: whoever has this address can use it", file=sys.stderr)
     if open_browser:
-        webbrowser.open(made.address)
+        webbrowser.open(live_view.address)
     if block is None:
         block = not (hasattr(sys, "ps1") or "ipykernel" in sys.modules)
     if block:
-        made.wait()
-    return made
+        live_view.wait()
+    return live_view
 
 
 def check_height(height: Any) -> int:
@@ -207,8 +207,8 @@ class _PageServer:
             asyncio.set_event_loop(loop)
             try:
                 loop.run_forever()
-                for one in self.clients:
-                    one.is_gone = True
+                for client in self.clients:
+                    client.is_gone = True
                 loop.run_until_complete(runner.cleanup())
                 self.worker.shutdown(wait=False, cancel_futures=True)
                 loop.close()
@@ -231,9 +231,9 @@ class _PageServer:
         reach this one under any host name."""
         name = request.host.rsplit(":", 1)[0].strip("[]")
         if self.token:
-            given = request.query.get("token", "")
-            same = secrets.compare_digest(given.encode("utf-8", "replace"), self.token.encode())
-            return "" if same else "the token is wrong"
+            token = request.query.get("token", "")
+            is_right = secrets.compare_digest(token.encode("utf-8", "replace"), self.token.encode())
+            return "" if is_right else "the token is wrong"
         if name not in _LOCAL:
             return "this view is for its own machine alone"
         origin = request.headers.get("Origin")
@@ -284,8 +284,8 @@ class _PageServer:
                 if question is None:
                     continue
                 if len(waiting) >= _WAITING:
-                    many = f"more than {_WAITING} questions at once"
-                    await _send(socket, {"id": question["id"], "error": many})
+                    problem = f"more than {_WAITING} questions at once"
+                    await _send(socket, {"id": question["id"], "error": problem})
                     continue
                 task = asyncio.ensure_future(self._answer(socket, client, question))
                 waiting.add(task)
@@ -298,14 +298,14 @@ class _PageServer:
         return socket
 
     async def _answer(
-        self, socket: web.WebSocketResponse, client: MessageHandler, asked: JsonDict
+        self, socket: web.WebSocketResponse, client: MessageHandler, question: JsonDict
     ) -> None:
         loop = asyncio.get_running_loop()
 
         def send(part: JsonDict) -> None:
             asyncio.run_coroutine_threadsafe(_send(socket, part), loop)
 
-        await _send(socket, await loop.run_in_executor(self.worker, client.answer, asked, send))
+        await _send(socket, await loop.run_in_executor(self.worker, client.answer, question, send))
 
 
 async def _send(socket: web.WebSocketResponse, answer: JsonDict | bytes) -> None:

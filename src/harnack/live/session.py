@@ -73,12 +73,17 @@ class Cancelled(Exception):
 
 @dataclass
 class _PreviewCache:
-    """What is painted: what it was made of, its surfaces, the same prepared, and how many rays were
-    traced."""
+    """The surfaces of a state, prepared for previews.
+
+    key: the controls that they were prepared for.
+    drawn: the surfaces as objects of the studio.
+    prepared: the surfaces on the stage, with their paints.
+    rays: the number of rays that were traced through them.
+    """
 
     key: Any
     drawn: list[StudioObject]
-    made: list[PreviewSurface] = field(default_factory=list[PreviewSurface])
+    prepared: list[PreviewSurface] = field(default_factory=list[PreviewSurface])
     rays: int = 0
 
 
@@ -94,15 +99,15 @@ class MessageHandler:
         """The question in a text; None for a "cancel", which is carried out here.
 
         Raises:
-            RequestError: it holds none.
+            RequestError: the text holds no question.
         """
         try:
-            given = json.loads(text)
+            data = json.loads(text)
         except (ValueError, RecursionError):
             raise RequestError("a question is an object in JSON") from None
-        if not isinstance(given, dict):
+        if not isinstance(data, dict):
             raise RequestError("a question is an object")
-        question = cast("JsonDict", given)
+        question = cast("JsonDict", data)
         if question.get("kind") == "cancel" and type(question.get("which")) is int:
             self._cancelled.add(question["which"])
             return None
@@ -112,11 +117,11 @@ class MessageHandler:
         return question
 
     def answer(self, question: JsonDict, send: Callable[[JsonDict], None]) -> JsonDict | bytes:
-        """What to send back: an object, or of a picture its number, height, width and the ends of
-        its depths (single precision), four bytes each, the last byte first, and then its pixels:
-        red, green, blue and alpha, row by row.
+        """The message to send back: an object; or for a picture its number, height, width and the
+        ends of its depths (single precision), four bytes each, the last byte first, and then its
+        pixels: red, green, blue and alpha, row by row.
 
-        send: sends how much is done of what takes long.
+        send: sends the progress of long work.
         """
         number, done, last = question["id"], 0.0, time.monotonic()
 
@@ -160,8 +165,8 @@ class Session:
             since the last call; an exception that it raises ends the work.
 
         Raises:
-            RequestError: it makes no sense; the message says what does.
-            ValueError, TypeError, ...: what the library says of numbers that make no surface.
+            RequestError: the question makes no sense; the message says which questions do.
+            ValueError, TypeError, ...: errors of the library for numbers that make no surface.
         """
         kinds = {
             "change": self._delta_response,
@@ -180,36 +185,36 @@ class Session:
         """The state that a question asks about.
 
         Raises:
-            RequestError: it makes no sense.
+            RequestError: the question makes no sense.
         """
         values = self._values(question.get("sliders", {}))
         loops, cut = self._loops(question.get("loops")), _volume(question.get("cut"))
         return ControlState(values, loops, cut, _settings(question.get("settings", {})))
 
-    def _values(self, given: Any) -> dict[str, float]:
+    def _values(self, numbers: Any) -> dict[str, float]:
         sliders = self.live.content.sliders
-        if not isinstance(given, dict):
+        if not isinstance(numbers, dict):
             raise RequestError("sliders must be numbers by name")
         values = dict(self.live.content.starts)
-        for name, value in cast("dict[str, Any]", given).items():
+        for name, value in cast("dict[str, Any]", numbers).items():
             if name not in sliders:
                 raise RequestError(f"there is no slider {name!r}{did_you_mean(name, sliders)}")
-            one = sliders[name]
-            if not _is_number(value) or not one.low <= value <= one.high:
+            slider = sliders[name]
+            if not _is_number(value) or not slider.low <= value <= slider.high:
                 raise RequestError(
-                    f"{name} must be a number from {one.low:g} to {one.high:g}, not {value!r}"
+                    f"{name} must be a number from {slider.low:g} to {slider.high:g}, not {value!r}"
                 )
-            values[name] = float(value) if one.step is None else one.nearest(value)
+            values[name] = float(value) if slider.step is None else slider.nearest(value)
         return values
 
-    def _loops(self, given: Any) -> list[FloatArray] | None:
-        if given is None:
+    def _loops(self, curves: Any) -> list[FloatArray] | None:
+        if curves is None:
             return None
         if not self.live.editable:
             raise RequestError("loops: this surface has no curve whose points can be moved")
-        if not isinstance(given, list) or not given:
+        if not isinstance(curves, list) or not curves:
             raise RequestError("loops must be a list of curves")
-        loops = [_points(one, "loops") for one in cast("list[Any]", given)]
+        loops = [_points(curve, "loops") for curve in cast("list[Any]", curves)]
         if sum(map(len, loops)) > _MOST_POINTS:
             raise RequestError(f"loops: at most {_MOST_POINTS:,} points")
         return loops
@@ -227,43 +232,43 @@ class Session:
         """The first hit of a ray of the surfaces' coordinates, and how far each step was proved."""
         origin = _points([question.get("origin")], "origin")
         direction = _points([question.get("direction")], "direction")
-        surfaces = [one.surface for one in self.live.surfaces_at(controls)]
-        every = [trace(one.surface, origin, direction, options=one.options) for one in surfaces]
-        nearest = min(range(len(every)), key=lambda k: float(every[k].t[0]))
-        hits, surface = every[nearest], surfaces[nearest]
+        surfaces = [s.surface for s in self.live.surfaces_at(controls)]
+        results = [trace(s.surface, origin, direction, options=s.options) for s in surfaces]
+        nearest = min(range(len(results)), key=lambda k: float(results[k].t[0]))
+        hits, surface = results[nearest], surfaces[nearest]
         steps = [0.0]
-        for most in range(1, min(int(hits.evaluations[0]), _MOST_STEPS)):
-            options = surface.options.replace(max_steps=most)
+        for count in range(1, min(int(hits.evaluations[0]), _MOST_STEPS)):
+            options = surface.options.replace(max_steps=count)
             reached = trace(surface.surface, origin, direction, options=options).t[0]
             if steps[-1] < reached < hits.t[0]:
                 steps.append(float(reached))
-        there: JsonDict = {
+        answer: JsonDict = {
             "status": RayStatus(int(hits.status[0])).name,
             "evaluations": int(hits.evaluations[0]),
             "steps": steps,
         }
         if not hits.is_hit[0]:
-            return there
+            return answer
         point = hits.position
-        there |= {
+        answer |= {
             "t": float(hits.t[0]),
             "position": point[0].tolist(),
             "normal": hits.normal[0].tolist(),
         }
         if hits.primitive_index[0] >= 0:  # f jumps there, and has no derivatives
-            return there | {"triangle": int(hits.primitive_index[0])}
+            return answer | {"triangle": int(hits.primitive_index[0])}
         value, period = float(surface.field.value(point)[0]), surface.field.period
         if period is not None and len(surface.level_values):
-            # The one of its values that is nearest to a level.
+            # The value, of those that differ by whole periods, that is nearest to a level.
             levels = np.asarray(surface.level_values, np.float64)
-            away = np.round((levels - value) / period) * period
-            value += float(away[np.argmin(np.abs(value + away - levels))])
-        there["value"] = value
+            shifts = np.round((levels - value) / period) * period
+            value += float(shifts[np.argmin(np.abs(value + shifts - levels))])
+        answer["value"] = value
         try:
-            bent = curvature(surface.field, point)
+            kappa = curvature(surface.field, point)
         except NotImplementedError:
-            return there
-        return there | {"mean": float(bent.mean[0]), "gaussian": float(bent.gaussian[0])}
+            return answer
+        return answer | {"mean": float(kappa.mean[0]), "gaussian": float(kappa.gaussian[0])}
 
     def _preview_response(
         self, question: Mapping[str, Any], controls: ControlState, report: Progress
@@ -278,55 +283,55 @@ class Session:
         eye = question.get("eye")
         if not isinstance(eye, dict):
             raise RequestError("eye must be an object of origin, right, up, forward and pixel")
-        given = cast("JsonDict", eye)
+        axes = cast("JsonDict", eye)
         origin, right, up, forward = (
-            _points([given.get(name)], f"eye: {name}")[0]
+            _points([axes.get(name)], f"eye: {name}")[0]
             for name in ("origin", "right", "up", "forward")
         )
-        pixel: Any = given.get("pixel")
+        pixel: Any = axes.get("pixel")
         if not _is_number(pixel) or not pixel > 0:
             raise RequestError("eye: pixel must be a positive number")
-        seen = CameraAxes(origin, right, up, forward, pixel)
+        camera = CameraAxes(origin, right, up, forward, pixel)
         return self._painter.paint(
-            self._surfaces(controls, size[0] * size[1]), seen, size, show=show, ground=ground,
+            self._surfaces(controls, size[0] * size[1]), camera, size, show=show, ground=ground,
             is_idle=question.get("is_idle") is True,
         )  # fmt: skip
 
     def _surfaces(self, controls: ControlState, rays: int) -> list[PreviewSurface]:
         """The surfaces, prepared once as long as only the camera moves, and once more where all
         rays so far pay for cells."""
-        loops = None if controls.curves is None else [one.tobytes() for one in controls.curves]
+        loops = None if controls.curves is None else [loop.tobytes() for loop in controls.curves]
         key = controls.values, loops, controls.cut_volume, controls.settings
         state = self._painted
         if state is None or state.key != key:
             state = self._painted = _PreviewCache(key, self.live.surfaces_at(controls))
         state.rays += rays
-        drawn = [replace(one, surface=one.surface.for_rays(state.rays)) for one in state.drawn]
+        drawn = [replace(body, surface=body.surface.for_rays(state.rays)) for body in state.drawn]
         pairs = zip(drawn, state.drawn, strict=True)
-        if not state.made or any(a.surface.field is not b.surface.field for a, b in pairs):
+        if not state.prepared or any(a.surface.field is not b.surface.field for a, b in pairs):
             state.drawn = drawn
-            state.made = [
-                PreviewSurface(self.live.place(one), surface_colors(one)) for one in drawn
+            state.prepared = [
+                PreviewSurface(self.live.place(body), surface_colors(body)) for body in drawn
             ]
-        return state.made
+        return state.prepared
 
     def _picture_response(
         self, question: Mapping[str, Any], controls: ControlState, report: Progress
     ) -> JsonDict:
-        """A picture of what is seen, as base64 of a PNG file."""
+        """A picture of the state from the camera of the question, as base64 of a PNG file."""
         size = _size(question)
-        made: Any = self.live.render_still(
+        picture: Any = self.live.render_still(
             controls, show=question.get("show", "shaded"), size=size, progress=report,
             camera=self._camera(question), spp=question.get("spp"),
             backdrop=question.get("ground", self.live.backdrop),
         )  # fmt: skip
-        return {"png": base64.b64encode(made._repr_png_()).decode()}
+        return {"png": base64.b64encode(picture._repr_png_()).decode()}
 
     def _camera(self, question: Mapping[str, Any]) -> Camera:
         """The camera of a question, in the surfaces' coordinates."""
         place = self.live.placement
         eye, target, fov = parse_camera(question.get("camera"))
-        eye, target = (place.apply_inverse(one[None])[0] for one in (eye, target))
+        eye, target = (place.apply_inverse(point[None])[0] for point in (eye, target))
         return Camera(position=tuple(eye.tolist()), target=tuple(target.tolist()), fov=fov)
 
     def _save(
@@ -344,7 +349,7 @@ class Session:
     ) -> JsonDict:
         """Replaces the scene by that of a scene file, and returns it as `LiveScene.scene` does.
 
-        See `live_options` for what of its settings is taken.
+        `live_options` selects the settings of the file that are used.
         """
         text = question.get("text")
         if not isinstance(text, str):
@@ -357,15 +362,15 @@ class Session:
         return self.live.scene(self.live.content.name)
 
 
-def parse_camera(given: Any) -> tuple[FloatArray, FloatArray, float]:
+def parse_camera(camera: Any) -> tuple[FloatArray, FloatArray, float]:
     """Position (3,), target (3,) and field of view, in degrees, of an object that holds them.
 
     Raises:
-        RequestError: it does not.
+        RequestError: the object does not hold them.
     """
-    if not isinstance(given, dict):
+    if not isinstance(camera, dict):
         raise RequestError("camera must be an object of position, target and fov")
-    pose = cast("JsonDict", given)
+    pose = cast("JsonDict", camera)
     eye, target = (
         _points([pose.get(name)], f"camera: {name}")[0] for name in ("position", "target")
     )
@@ -386,15 +391,15 @@ def _size(question: Mapping[str, Any]) -> tuple[int, int]:
     return size
 
 
-def _volume(given: Any) -> Volume | None:
-    """What cuts all surfaces, in their coordinates."""
-    if given is None:
+def _volume(cut: Any) -> Volume | None:
+    """The volume that cuts all surfaces, in their coordinates; None for no cut."""
+    if cut is None:
         return None
     kinds = {"ball": 4, "box": 6, "plane": 4}
-    about = cast("JsonDict", given) if isinstance(given, dict) else {}
-    if len(about) != 1 or not set(about) <= set(kinds):
+    data = cast("JsonDict", cut) if isinstance(cut, dict) else {}
+    if len(data) != 1 or not set(data) <= set(kinds):
         raise RequestError(f"cut is one of {', '.join(kinds)} and its numbers")
-    ((kind, numbers),) = about.items()
+    ((kind, numbers),) = data.items()
     listed = cast("list[Any]", numbers) if isinstance(numbers, list) else []
     if len(listed) != kinds[kind] or not all(map(_is_number, listed)):
         raise RequestError(f"cut: a {kind} has {kinds[kind]} finite numbers")
@@ -405,11 +410,11 @@ def _volume(given: Any) -> Volume | None:
     return HalfSpace(tuple(listed[:3]), listed[3])
 
 
-def _settings(given: Any) -> dict[str, Any]:
+def _settings(data: Any) -> dict[str, Any]:
     """Settings that a person has changed: see `LIVE_OPTIONS`."""
-    if not isinstance(given, dict):
+    if not isinstance(data, dict):
         raise RequestError("settings must be an object with names")
-    settings = cast("JsonDict", given)
+    settings = cast("JsonDict", data)
     for name, value in settings.items():
         if name not in LIVE_OPTIONS:
             raise RequestError(
@@ -427,11 +432,11 @@ def _settings(given: Any) -> dict[str, Any]:
     return settings
 
 
-def _points(given: Any, name: str) -> FloatArray:
+def _points(numbers: Any, name: str) -> FloatArray:
     """Points (n, 3) of finite numbers."""
     wrong = f"{name}: points are three finite numbers each"
     try:
-        points: FloatArray = np.array(given, dtype=np.float64)
+        points: FloatArray = np.array(numbers, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         raise RequestError(wrong) from None
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():

@@ -97,68 +97,67 @@ class SlidingContent:
     sliders: Mapping[str, Slider]
 
     @classmethod
-    def of(cls, what: Any, given: Mapping[str, Any]) -> SlidingContent:
+    def of(cls, content: Any, options: Mapping[str, Any]) -> SlidingContent:
         """The content of the arguments of `view` or `page`: a slider is the value of an option that
         is a number, or the argument of functions.
 
         Raises:
-            TypeError: a function of something that is no slider, or a slider that nothing depends
-                on.
+            TypeError: a function has an argument that is no slider, or nothing depends on a slider.
         """
-        sliders = {name: one for name, one in given.items() if isinstance(one, Slider)}
-        settings = {name: one for name, one in given.items() if name not in sliders}
+        sliders = {name: value for name, value in options.items() if isinstance(value, Slider)}
+        settings = {name: value for name, value in options.items() if name not in sliders}
         settings |= {name: sliders[name] for name in sliders if name in SLIDER_OPTIONS}
-        asked: set[str] = set(settings) & set(sliders)
-        for name, one in {"the first argument": what, **settings}.items():
-            if _is_function(one):
-                arguments = _arguments(one)
-                for argument, about in arguments.items():
-                    if argument not in sliders and about.default is about.empty:
+        used: set[str] = set(settings) & set(sliders)
+        for name, value in {"the first argument": content, **settings}.items():
+            if _is_function(value):
+                arguments = _arguments(value)
+                for argument, parameter in arguments.items():
+                    if argument not in sliders and parameter.default is parameter.empty:
                         raise TypeError(
                             f"{name} is a function of {argument!r}, and there is no such "
                             f"slider{did_you_mean(argument, sliders)}: give "
                             f"{argument}=harnack.Slider(...)"
                         )
-                asked |= set(arguments)
+                used |= set(arguments)
         for name in sliders:
-            if name not in asked:
+            if name not in used:
                 raise TypeError(
                     f"nothing depends on the slider {name!r}: it is no option that is a number, "
                     "and no function has an argument of that name"
                     f"{did_you_mean(name, SLIDER_OPTIONS)}"
                 )
-        return cls(what, settings, sliders)
+        return cls(content, settings, sliders)
 
     @property
     def starts(self) -> dict[str, float]:
         """The start values of the sliders."""
-        return {name: cast("float", one.start) for name, one in self.sliders.items()}
+        return {name: cast("float", slider.start) for name, slider in self.sliders.items()}
 
     @property
     def name(self) -> str:
         """The name of the initial content, in words."""
-        what, _ = self.at(self.starts)
-        several: list[Any] = [*what] if isinstance(what, list | tuple) else [what]
-        return ", ".join(repr(getattr(one, "field", one)) for one in several)
+        content, _ = self.at(self.starts)
+        surfaces: list[Any] = [*content] if isinstance(content, list | tuple) else [content]
+        return ", ".join(repr(getattr(surface, "field", surface)) for surface in surfaces)
 
     def at(self, values: Mapping[str, float]) -> tuple[Any, dict[str, Any]]:
         """The content and its settings, for values of all sliders."""
-        settings = {name: self._at(name, one, values) for name, one in self.settings.items()}
+        settings = {name: self._at(name, value, values) for name, value in self.settings.items()}
         return self._at("", self.content, values), settings
 
-    def _at(self, name: str, one: Any, values: Mapping[str, float]) -> Any:
-        if isinstance(one, Slider):
+    def _at(self, name: str, value: Any, values: Mapping[str, float]) -> Any:
+        if isinstance(value, Slider):
             return values[name]
-        if not _is_function(one):
-            return one
+        if not _is_function(value):
+            return value
         by_place: list[Any] = []
         by_name: dict[str, Any] = {}
-        for argument, about in _arguments(one).items():
-            if about.kind is about.POSITIONAL_ONLY:
-                by_place.append(values.get(argument, about.default))
+        for argument, parameter in _arguments(value).items():
+            if parameter.kind is parameter.POSITIONAL_ONLY:
+                by_place.append(values.get(argument, parameter.default))
             elif argument in values:
                 by_name[argument] = values[argument]
-        return one(*by_place, **by_name)
+        return value(*by_place, **by_name)
 
 
 class SliderValueError(ValueError):
@@ -188,21 +187,21 @@ def slider_values_in_errors(values: Mapping[str, float]) -> Generator[None]:
 
 
 def extreme_slider_values(sliders: Mapping[str, Slider]) -> list[dict[str, float]]:
-    """All sliders at their ends, in all combinations of up to three sliders; of more, one after the
-    other at its ends while the others stand where they start."""
-    ends = {name: (one.low, one.high) for name, one in sliders.items()}
+    """All sliders at their ends, in all combinations of up to three sliders; of more sliders, each
+    in turn at its ends while the others stand at their start values."""
+    ends = {name: (slider.low, slider.high) for name, slider in sliders.items()}
     if len(sliders) <= _COMBINED:
         return [dict(zip(ends, place, strict=True)) for place in itertools.product(*ends.values())]
-    starts = {name: cast("float", one.start) for name, one in sliders.items()}
-    return [{**starts, name: end} for name, both in ends.items() for end in both]
+    starts = {name: cast("float", slider.start) for name, slider in sliders.items()}
+    return [{**starts, name: end} for name, interval in ends.items() for end in interval]
 
 
 def _arguments(function: Any) -> dict[str, inspect.Parameter]:
-    """Those that have a name."""
-    several = inspect.signature(function).parameters
+    """The parameters of a function by name, without `*args` and `**kwargs`."""
+    parameters = inspect.signature(function).parameters
     kinds = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-    return {name: about for name, about in several.items() if about.kind not in kinds}
+    return {name: p for name, p in parameters.items() if p.kind not in kinds}
 
 
-def _is_function(one: Any) -> bool:
-    return callable(one) and not isinstance(one, type | Field | Surface)
+def _is_function(value: Any) -> bool:
+    return callable(value) and not isinstance(value, type | Field | Surface)

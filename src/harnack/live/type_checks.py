@@ -27,16 +27,17 @@ class ValueTypeError(TypeError):
     """An argument does not have the type of its annotation."""
 
 
-def check_types(function: Callable[..., Any], given: dict[str, Any]) -> None:
+def check_types(function: Callable[..., Any], arguments: dict[str, Any]) -> None:
     """Check arguments of a class or a function against its annotations. Lists are tuples in
-    `given`, and may be the values of array arguments too, whose numbers the function itself checks.
+    `arguments`, and may be the values of array arguments too, whose numbers the function itself
+    checks.
 
     Raises:
         ValueTypeError: the message names the argument, and the required type.
     """
     target = function.__init__ if isinstance(function, type) else function
     hints = typing.get_type_hints(target, localns=_NAMES)
-    for name, value in given.items():
+    for name, value in arguments.items():
         if name in hints and not _fits(value, hints[name]):
             raise ValueTypeError(f"{name} must be {_words(hints[name])}, not {value!r:.60}")
 
@@ -46,7 +47,7 @@ def _fits(value: Any, hint: Any) -> bool:
     if hint is Any or origin is np.ndarray:
         return True
     if origin in (typing.Union, types.UnionType):
-        return any(_fits(value, one) for one in arguments)
+        return any(_fits(value, member) for member in arguments)
     if origin is typing.Literal:
         return value in arguments
     if hint is float or hint is int:
@@ -54,23 +55,23 @@ def _fits(value: Any, hint: Any) -> bool:
     if isinstance(origin, type) and issubclass(origin, Mapping):
         return isinstance(value, dict)
     if origin is tuple and arguments[-1] is not Ellipsis:
-        several = cast("tuple[Any, ...]", value if isinstance(value, tuple) else ())
-        return len(several) == len(arguments) and all(map(_fits, several, arguments))
+        entries = cast("tuple[Any, ...]", value if isinstance(value, tuple) else ())
+        return len(entries) == len(arguments) and all(map(_fits, entries, arguments))
     if origin is tuple or (isinstance(origin, type) and issubclass(origin, Iterable)):
         is_list = isinstance(value, tuple)
-        return is_list and all(_fits(one, arguments[0]) for one in cast("tuple[Any, ...]", value))
+        return is_list and all(_fits(part, arguments[0]) for part in cast("tuple[Any, ...]", value))
     return not isinstance(hint, type) or isinstance(value, hint)
 
 
 def _words(hint: Any) -> str:
-    """A type, for those who write scene files."""
+    """A type in words, for people who write scene files."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         return " or ".join(map(_words, arguments))
     if origin is typing.Literal:
         return " or ".join(map(repr, arguments))
     if arguments:
-        kinds = dict.fromkeys(_words(one) for one in arguments if one is not Ellipsis)
+        kinds = dict.fromkeys(_words(kind) for kind in arguments if kind is not Ellipsis)
         count = (
             "" if origin is not tuple or Ellipsis in arguments else f"{len(arguments)} entries, "
         )

@@ -119,7 +119,7 @@ class BccLattice:
         return index[(index < self.counts).all(axis=1)]
 
     def relevant_cells(
-        self, clearance: Clearance, matter: IntArray, values: Clearance, most_faces: int
+        self, clearance: Clearance, cells: IntArray, values: Clearance, most_faces: int
     ) -> tuple[IntArray, BoolArray]:
         """Indices (n, 3) of the relevant cells to mesh, and a mask (counts) of all relevant cells.
 
@@ -129,22 +129,22 @@ class BccLattice:
         chosen has the sign of its relevant corners, and if one corner is irrelevant all are
         positive.
 
-        matter: (k, 3) indices of the relevant cells (`nonempty_cells`).
+        cells: (k, 3) indices of the relevant cells (`nonempty_cells`).
         values: of the function.
 
         Raises:
             MeshingError: too many cells are chosen.
         """
         does = np.zeros(tuple(self.counts.tolist()), np.bool_)
-        does[tuple(matter.T)] = True
-        centers = self.points(2 * matter + 1)
+        does[tuple(cells.T)] = True
+        centers = self.points(2 * cells + 1)
         half_diagonal = 0.5 * float(np.linalg.norm(self.size))
         chosen = clearance(centers) <= half_diagonal * (1 + 1e-9)
-        rim = np.flatnonzero(~chosen & ~self.interior_cells(does)[tuple(matter.T)])
+        rim = np.flatnonzero(~chosen & ~self.interior_cells(does)[tuple(cells.T)])
         chosen[rim[values(centers[rim]) <= 0]] = True
         if int(chosen.sum()) > min(MOST_CELLS, most_faces):
             raise triangle_limit_error(float(chosen.sum()), min(MOST_CELLS, most_faces))
-        return matter[chosen], does
+        return cells[chosen], does
 
     def interior_cells(self, cells: BoolArray) -> BoolArray:
         """A mask, of the shape `counts`, of the cells in `cells` all of whose neighbors in the
@@ -222,12 +222,12 @@ def distinct_rows(rows: IntArray) -> IntArray:
     return _key_rows(sorted_unique(_keys(rows, shape)), shape)
 
 
-def triangle_limit_error(cells: float, most: int) -> TriangleLimitError:
+def triangle_limit_error(cells: float, max_cells: int) -> TriangleLimitError:
     """The error for too many cells."""
     return TriangleLimitError(
         f"about {cells:.1e} cells hold the surface, which makes some {3 * cells:.0e} triangles; "
-        f"at most {most:,} cells are made (max_triangles, and never more than {MOST_CELLS:,}): "
-        "choose a larger `cell_size` or `tolerance`, or a smaller `clip`"
+        f"at most {max_cells:,} cells are made (max_triangles, and never more than {MOST_CELLS:,})"
+        ": choose a larger `cell_size` or `tolerance`, or a smaller `clip`"
     )
 
 

@@ -53,14 +53,14 @@ ROUNDING = 16 * 2.0**-52
 _UNDERFLOW = 1e-290
 
 
-def near_pairs(vertices: FloatArray, faces: IntArray, among: BoolArray | None) -> IntArray:
+def near_pairs(vertices: FloatArray, faces: IntArray, mask: BoolArray | None) -> IntArray:
     """Pairs (k, 2) of faces (m, 3) that may have more in common than the vertices that they share,
     each once; all others are proved not to (`_are_apart`).
 
     vertices: (n, 3), finite.
-    among: (m,) mask of chosen faces; pairs without a chosen face are left out.
+    mask: (m,) mask of chosen faces; pairs without a chosen face are left out.
     """
-    chosen = np.ones(len(faces), np.bool_) if among is None else among
+    chosen = np.ones(len(faces), np.bool_) if mask is None else mask
     batches = [np.zeros((0, 2), np.int64)]
     if not chosen.any():
         return batches[0]
@@ -91,11 +91,11 @@ class _FaceBoxTree:
     order: IntArray
 
     @classmethod
-    def of(cls, corners: FloatArray, chosen: BoolArray) -> _FaceBoxTree:
+    def of(cls, corners: FloatArray, mask: BoolArray) -> _FaceBoxTree:
         a, b, c = (corners[:, k] for k in range(3))
         lower, upper = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
         hierarchy = build_balanced_tree(0.5 * (lower + upper), leaf_size=_LEAF_SIZE)
-        numbers = np.column_stack([np.arange(len(corners)), chosen]).astype(np.float64)
+        numbers = np.column_stack([np.arange(len(corners)), mask]).astype(np.float64)
         records = np.concatenate([lower, upper, numbers], axis=1)
         placed = hierarchy.values_in_slots(records)
         placed[hierarchy.leaf_slots == NO_PRIMITIVE, _NUMBER] = -1.0
@@ -103,15 +103,15 @@ class _FaceBoxTree:
         order = hierarchy.leaf_slots[hierarchy.leaf_slots != NO_PRIMITIVE]
         return cls(pack_tree(choose_backend("double"), hierarchy, levels, placed), records, order)
 
-    def overlapping(self, rows: IntArray, room: int) -> tuple[Any, Any] | None:
+    def overlapping(self, rows: IntArray, limit: int) -> tuple[Any, Any] | None:
         """The pairs of a face in `rows` and any face whose boxes overlap, as two lists, in no
-        order; None if there are more than `room`."""
+        order; None if there are more than `limit`."""
         backend = self.tree.backend
         real, vector, integer = backend.Float, backend.Array3f, backend.UInt32
         columns = [real(np.ascontiguousarray(column)) for column in self.records[rows].T]
         low, high, own_number = vector(*columns[:3]), vector(*columns[3:6]), columns[_NUMBER]
-        number, max_count = dr.zeros(integer, 1), dr.opaque(integer, room)
-        column, partners = dr.zeros(integer, room), dr.zeros(integer, room)
+        number, max_count = dr.zeros(integer, 1), dr.opaque(integer, limit)
+        column, partners = dr.zeros(integer, limit), dr.zeros(integer, limit)
 
         def overlap(row: Any) -> Mask:
             return dr.all((vector(*row[:3]) <= high) & (vector(*row[3:6]) >= low))
@@ -134,7 +134,7 @@ class _FaceBoxTree:
         traverse(self.tree, visit, (real(0),))
         dr.eval(number, column, partners)
         count = int(to_numpy(number)[0])
-        if count > room:
+        if count > limit:
             return None
         listed = dr.arange(integer, count)
         return dr.gather(integer, column, listed), dr.gather(integer, partners, listed)
@@ -154,10 +154,10 @@ class _PairTests:
         a, b, c = (backend.UInt32(np.ascontiguousarray(column, np.uint32)) for column in faces.T)
         return cls(RecordTable.upload(backend, vertices), (a, b, c))
 
-    def unseparated(self, one: Any, other: Any) -> IntArray:
+    def unseparated(self, first: Any, second: Any) -> IntArray:
         """(k, 2) the pairs that are not proved apart, in order."""
         backend = self.points.backend
-        names = [[dr.gather(backend.UInt32, k, i) for k in self.corners] for i in (one, other)]
+        names = [[dr.gather(backend.UInt32, k, i) for k in self.corners] for i in (first, second)]
         triangles = [
             tuple(backend.Array3f(*self.points.read_record(name)[:3]) for name in three)
             for three in names
@@ -165,7 +165,7 @@ class _PairTests:
         shared = [[name == another for another in names[1]] for name in names[0]]
         a, b = cast("tuple[Corners, Corners]", triangles)
         rows = dr.compress(~_are_apart(a, b, shared))
-        pairs = [to_numpy(dr.gather(backend.UInt32, i, rows)) for i in (one, other)]
+        pairs = [to_numpy(dr.gather(backend.UInt32, i, rows)) for i in (first, second)]
         unsorted = np.stack(pairs, axis=1).astype(np.int64)
         return unsorted[np.lexsort(unsorted.T[::-1])]
 

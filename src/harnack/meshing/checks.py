@@ -161,7 +161,7 @@ def misoriented_faces(function: LevelFunction, vertices: FloatArray, faces: IntA
 
 
 def intersecting_faces(
-    vertices: FloatArray, faces: IntArray, among: BoolArray | None = None
+    vertices: FloatArray, faces: IntArray, mask: BoolArray | None = None
 ) -> IntArray:
     """Indices of faces (m, 3) that meet other faces in more than shared corners and edges, decided
     exactly: faces that an edge of another face passes through, faces that lie on another face in
@@ -174,10 +174,10 @@ def intersecting_faces(
     (separating axes), whatever they share: faces that are there twice, or folded back onto their
     neighbors, do. Only pairs whose boxes overlap are tested.
 
-    among: (m,) mask of chosen faces; pairs without a chosen face are not tested.
+    mask: (m,) mask of chosen faces; pairs without a chosen face are not tested.
     """
     crossing_faces: list[IntArray] = []
-    for pairs, heights in _pairs_in_doubt(vertices, faces, among):
+    for pairs, heights in _pairs_in_doubt(vertices, faces, mask):
         first, second = faces[pairs[:, 0]], faces[pairs[:, 1]]
         meet = np.zeros(len(pairs), np.bool_)
         rows = np.flatnonzero((heights[0] == 0).all(axis=1) & (heights[1] == 0).all(axis=1))
@@ -531,12 +531,13 @@ def check_no_self_intersection(vertices: FloatArray, faces: IntArray) -> None:
         )
 
 
-def check_triangle_limit(expected: float, most: int) -> None:
+def check_triangle_limit(expected: float, max_triangles: int) -> None:
     """Raise TriangleLimitError if more triangles are expected than may be made."""
-    if expected > most:
+    if expected > max_triangles:
         raise TriangleLimitError(
-            f"the mesh takes about {expected:.2g} triangles, and max_triangles is {most:,}: choose "
-            "a larger `tolerance` or `cell_size`, a smaller `clip`, or a larger `max_triangles`"
+            f"the mesh takes about {expected:.2g} triangles, and max_triangles is "
+            f"{max_triangles:,}: choose a larger `tolerance` or `cell_size`, a smaller `clip`, "
+            "or a larger `max_triangles`"
         )
 
 

@@ -144,10 +144,10 @@ class Shells:
         np.maximum.at(upper, number, corners.max(axis=1))
         return cls(number, volumes, lower, upper, corners)
 
-    def winding_number(self, around: Any, part: Any) -> float:
-        """The winding number of the component `around` at a point of the component `part`."""
-        point = self.corners[np.argmax(self.component_of_face == part)].mean(axis=0)
-        return winding_around(self.corners[self.component_of_face == around], point)
+    def winding_number(self, outer: Any, inner: Any) -> float:
+        """The winding number of the component `outer` at a point of the component `inner`."""
+        point = self.corners[np.argmax(self.component_of_face == inner)].mean(axis=0)
+        return winding_around(self.corners[self.component_of_face == outer], point)
 
     def nesting_depths(self) -> IntArray:
         """(k,) how often all other components wind around each component, at a point of it: more

@@ -256,7 +256,11 @@ class CsgMesher:
                     raise
                 self.report(f"{wrong}; so only where the other parts leave something")
         return mesh_closed_surface(
-            function, lattice, self.tolerance, self.report, elsewhere=elsewhere or self._elsewhere()
+            function,
+            lattice,
+            self.tolerance,
+            self.report,
+            irrelevant=elsewhere or self._elsewhere(),
         )
 
     def _elsewhere(self) -> IrrelevantRegion | None:
@@ -670,13 +674,13 @@ def _checked(
     return surface
 
 
-def apart_of(whole: Manifold, tolerance: float) -> TriangleMesh:
+def apart_of(manifold: Manifold, tolerance: float) -> TriangleMesh:
     """The surface of the assembled parts, none of whose triangles pass through each other.
 
     Raises:
         MeshingError: it is empty, or triangles cross.
     """
-    return _apart(_Assembly(whole), tolerance)
+    return _apart(_Assembly(manifold), tolerance)
 
 
 def _apart(parts: TriangleMesh | _Assembly, tolerance: float) -> TriangleMesh:
@@ -705,13 +709,13 @@ def _apart(parts: TriangleMesh | _Assembly, tolerance: float) -> TriangleMesh:
 class _Assembly:
     """Assembled parts, in a volume or in all of space."""
 
-    whole: Manifold
+    manifold: Manifold
     volume: Volume | None = None
 
     def without_slivers(self, length: float) -> TriangleMesh:
         """The surface without short edges and slivers, whose removal moves it by up to a length,
         and without bodies that are only rounding error."""
-        simpler = without_short_edges(self.whole, length) if length > 0 else self.whole
+        simpler = without_short_edges(self.manifold, length) if length > 0 else self.manifold
         surface = drop_degenerate_components(from_manifold(simpler))
         return surface if self.volume is None else _on_box(surface, self.volume)
 

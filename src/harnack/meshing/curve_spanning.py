@@ -55,12 +55,13 @@ def restore_curve_edges(
     function: LevelFunction,
     vertices: FloatArray,
     faces: IntArray,
-    kept: int,
+    curve_count: int,
     cut: int,
     height: float,
 ) -> tuple[FloatArray, IntArray]:
     """Restore edges of the boundary curve that were subdivided for the tetrahedra, so that only the
-    first `kept` vertices, those of the curve, are on the boundary. Returns vertices and faces.
+    first `curve_count` vertices, the vertices of the curve, are on the boundary. Returns vertices
+    and faces.
 
     Long edges of a curve are subdivided so that cells near them need not be as large. The extra
     points are moved off the edge into the surface, by at most the tolerance, and the gap is filled:
@@ -68,19 +69,19 @@ def restore_curve_edges(
     twists about the edge, and a triangle along all of it is within the tolerance only if its height
     is about the tolerance.
 
-    kept, cut: vertices before `kept` are those of the curve; from there to `cut` they are the extra
-        points on its edges.
+    curve_count, cut: vertices before `curve_count` are the vertices of the curve; from there to
+        `cut` they are the extra points on its edges.
     height: how far the extra points are moved, at most.
     """
-    if cut == kept:
+    if cut == curve_count:
         return vertices, faces
     successor = dict(boundary_edges(faces).tolist())
     chains: list[list[int]] = []
-    for start in range(kept):
+    for start in range(curve_count):
         chain = [start]
         while (vertex := successor.get(chain[-1])) is not None:
             chain.append(vertex)
-            if vertex < kept:
+            if vertex < curve_count:
                 break
         if len(chain) > 2:
             chains.append(chain)

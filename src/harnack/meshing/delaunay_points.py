@@ -94,14 +94,14 @@ class BoundaryCurve:
         pairs = np.array(edges, np.int64).reshape(-1, 2)
         return cls(np.concatenate([*points, *inner_points, np.zeros((0, 3))]), pairs)
 
-    def split(self, which: BoolArray) -> BoundaryCurve:
-        """The curve with the midpoints of the edges that the mask `which` (k,) selects as
+    def split(self, mask: BoolArray) -> BoundaryCurve:
+        """The curve with the midpoints of the edges that the mask `mask` (k,) selects as
         additional points."""
-        a, b = self.edges[which].T
+        a, b = self.edges[mask].T
         middle = len(self.points) + np.arange(len(a))
         points = np.concatenate([self.points, 0.5 * (self.points[a] + self.points[b])])
         halves = np.concatenate([np.stack([a, middle], axis=1), np.stack([middle, b], axis=1)])
-        return BoundaryCurve(points, np.concatenate([self.edges[~which], halves]))
+        return BoundaryCurve(points, np.concatenate([self.edges[~mask], halves]))
 
     def split_near(self, places: RefinementBalls, longest: float) -> BoundaryCurve:
         """The curve with edges that meet the balls `places` divided until they are no longer than

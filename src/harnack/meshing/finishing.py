@@ -167,13 +167,13 @@ _CREASE = math.cos(math.radians(30))
 _SIMPLER, _MENDED = (0.4, 0.2, 0.1), 0.05
 
 
-def check_options(spacing: Any, thickness: Any, seed: Any, most: Any) -> None:
+def check_options(spacing: Any, thickness: Any, seed: Any, max_triangles: Any) -> None:
     """Raise ValueError or TypeError for numbers out of range."""
     for name, value in (("cell_size", spacing), ("thickness", thickness)):
         if value is not None and not 0 < as_real(value, name) < math.inf:
             raise ValueError(f"{name} must be a positive length, not {value!r}")
     as_integer_in_range(seed, "seed", 0, 2**63 - 1)
-    as_integer_in_range(most, "max_triangles", 1, 2**63 - 1)
+    as_integer_in_range(max_triangles, "max_triangles", 1, 2**63 - 1)
 
 
 def vertex_normals(function: LevelFunction, surface: TriangleMesh) -> FloatArray:

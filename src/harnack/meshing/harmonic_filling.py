@@ -103,7 +103,7 @@ class HarmonicFilling:
 
 
 def harmonic_patches(
-    vertices: FloatArray, faces: IntArray, edges: IntArray, asked: HoleFillingOptions
+    vertices: FloatArray, faces: IntArray, edges: IntArray, options: HoleFillingOptions
 ) -> HarmonicFilling:
     """Fill the holes of a mesh by harmonic fillings that end at its boundary edges (k, 2), in the
     direction of its faces; or, where that fails, by triangles in holes of three edges, and harmonic
@@ -113,16 +113,16 @@ def harmonic_patches(
         MeshingError: fillings could not be computed, or intersect the mesh or each other.
     """
     try:
-        return _fill_all_holes(vertices, faces, edges, asked)
+        return _fill_all_holes(vertices, faces, edges, options)
     except MeshingError as error:
         missing = triangle_fills(vertices, faces, edges)
         if not len(missing):
             raise
         first = error
-    asked.report(f"once more, with triangles in {len(missing):,} holes of three edges")
+    options.report(f"once more, with triangles in {len(missing):,} holes of three edges")
     together = np.concatenate([faces, missing])
     try:
-        filling = _fill_all_holes(vertices, together, checked_boundary_edges(together), asked)
+        filling = _fill_all_holes(vertices, together, checked_boundary_edges(together), options)
     except MeshingError as error:
         raise MeshingError(
             f"{first}; and with triangles in {len(missing):,} holes of three edges: {error}"

@@ -216,8 +216,8 @@ class IntendedSolid:
                 "program that made it"
             )
 
-    def difference(self, surface: TriangleMesh, away: float) -> Difference | None:
-        """The difference of a closed surface from the input, at points farther than `away` from
+    def difference(self, surface: TriangleMesh, distance: float) -> Difference | None:
+        """The difference of a closed surface from the input, at points farther than `distance` from
         both, and next to closed parts and farther than that from the surface; None if there is
         none.
         """
@@ -230,11 +230,11 @@ class IntendedSolid:
         )
         field = _winding_number(surface.vertices, surface.faces)
         both = np.concatenate([self.vertices[self.oriented], corner])
-        missing, added, distant = _on_other_side(points, w, field, both, away)
+        missing, added, distant = _on_other_side(points, w, field, both, distance)
         beside, windings = self.beside
-        lost, filled, beside_far = _on_other_side(beside, windings, field, corner, away)
+        lost, filled, beside_far = _on_other_side(beside, windings, field, corner, distance)
         distant = np.concatenate([distant, beside_far])
-        volumes = self._volumes(surface, away)
+        volumes = self._volumes(surface, distance)
         if not len(distant) and volumes is None:
             return None
         missing, added = missing + lost, added + filled

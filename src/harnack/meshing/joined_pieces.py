@@ -78,7 +78,7 @@ def boundary_of_solid(vertices: FloatArray, faces: IntArray) -> TriangleMesh:
     pieces = cut.pieces[bounds]
     looks_in = (cut.front > cut.back)[bounds]
     pieces = np.where(looks_in[:, None, None], pieces[:, ::-1], pieces)
-    points = np.concatenate([cut.unit, pieces.reshape(-1, 3)])
+    points = np.concatenate([cut.vertices, pieces.reshape(-1, 3)])
     group = connected_groups(pairs_within(points, _SAME), len(points))
     first = np.unique(group, return_index=True)[1][group]  # corners of the mesh come first
     joined = first[len(x) :].reshape(-1, 3)
@@ -93,13 +93,13 @@ class _Cut:
     """Pieces (k, 3, 3) of some faces of a mesh, cut along each other, in coordinates of at most
     about one: center + size times these are the original coordinates.
 
-    unit: (n, 3) vertices. faces: the faces that were cut; owner: (k,) the face of the mesh that
+    vertices: (n, 3). faces: the faces that were cut; owner: (k,) the face of the mesh that
         each piece is of. front, back: (k,) winding numbers on its sides. is_thick: (k,) whether
         these are known.
     """
 
     rays: TriangleTree
-    unit: FloatArray
+    vertices: FloatArray
     faces: IntArray
     center: FloatArray
     size: float
@@ -135,7 +135,7 @@ class _Cut:
         """(k,) which pieces lie on a face that precedes their own, in one plane, if all faces were
         cut: of several pieces in one place a single one is enough."""
         is_there = np.zeros(len(self.pieces), np.bool_)
-        covered, covering = overlapping_faces(self.rays, self.unit, self.faces)
+        covered, covering = overlapping_faces(self.rays, self.vertices, self.faces)
         covered, covering = covered[covering < covered], covering[covering < covered]
         order = np.argsort(self.owner, kind="stable")
         start, end = (
@@ -144,7 +144,7 @@ class _Cut:
         count = end - start
         past = np.cumsum(count) - count
         rows = order[np.arange(int(count.sum())) + np.repeat(start - past, count)]
-        triangle = self.unit[self.faces[np.repeat(covering, count)]]
+        triangle = self.vertices[self.faces[np.repeat(covering, count)]]
         middle, normal = self.pieces[rows].mean(axis=1), area_normals(triangle)
         within = np.ones(len(rows), np.bool_)
         for i, j in ((0, 1), (1, 2), (2, 0)):

@@ -119,7 +119,7 @@ def check_no_missed_parts(
     surface: tuple[FloatArray, IntArray],
     size: float,
     box: tuple[FloatArray, FloatArray],
-    elsewhere: Clearance | None = None,
+    irrelevant: Clearance | None = None,
 ) -> None:
     """Raise if the level set has parts, two cells long or longer, away from its triangles: thin
     walls, knife edges, islands.
@@ -130,7 +130,7 @@ def check_no_missed_parts(
 
     samples: at points (n, 3) of the lattice. is_beside: (n,) which points are corners of cut
         tetrahedra.
-    surface: vertices and faces. size: of a cell. box: where the level set counts; elsewhere: the
+    surface: vertices and faces. size: of a cell. box: where the level set counts; irrelevant: the
         radius around points within which it does not count.
 
     Raises:
@@ -160,8 +160,8 @@ def check_no_missed_parts(
     if len(faces) and len(x):
         mesh_points = np.concatenate([vertices[np.unique(faces)], vertices[faces].mean(axis=1)])
         x = x[searching.cKDTree(mesh_points).query(x)[0] > _MIN_MESH_DISTANCE * size]
-    if elsewhere is not None and len(x):
-        x = x[elsewhere(x) <= 0]
+    if irrelevant is not None and len(x):
+        x = x[irrelevant(x) <= 0]
     part = _longest_part(x, _CLUSTER_DISTANCE * size)
     if len(part) and np.ptp(part, axis=0).max() >= _MIN_MISSED_LENGTH * size:
         _check_off_level_around(function, part, _FLAT_AROUND * size)
@@ -350,18 +350,18 @@ class IrrelevantRegion:
         default_factory=dict[tuple[float, ...], IntArray]
     )
 
-    def relevant_cells(self, lattice: BccLattice, most: int) -> IntArray:
+    def relevant_cells(self, lattice: BccLattice, limit: int) -> IntArray:
         """Indices (n, 3) of the cells that are not proved to lie in the region, and of a border of
         cells around them.
 
         Raises:
-            MeshingError: there are more cells than `most` triangles take.
+            MeshingError: there are more cells than `limit` triangles take.
         """
-        key = (*lattice.lower.tolist(), *lattice.size.tolist(), *lattice.counts.tolist(), most)
+        key = (*lattice.lower.tolist(), *lattice.size.tolist(), *lattice.counts.tolist(), limit)
         if key not in self.cached_cells:
             border = _BORDER * float(lattice.size.max())
             self.cached_cells[key] = lattice.nonempty_cells(
-                lambda points: self.clearance(points) - border, most
+                lambda points: self.clearance(points) - border, limit
             )
         return self.cached_cells[key]
 
@@ -409,7 +409,7 @@ def mesh_closed_surface(
     report: Callable[[str], None],
     *,
     as_cut: bool = False,
-    elsewhere: IrrelevantRegion | None = None,
+    irrelevant: IrrelevantRegion | None = None,
 ) -> TriangleMesh:
     """The boundary of the points of a lattice's box where the function is negative.
 
@@ -421,18 +421,18 @@ def mesh_closed_surface(
     as_cut: whether to leave the triangles as the cells cut them, which never pass through each
         other, and to leave out parts between points of the lattice: for functions with creases
         everywhere, as distances from meshes, and cells of about the tolerance.
-    elsewhere: the region where the surface does not matter: except for a few cells at its border,
+    irrelevant: the region where the surface does not matter: except for a few cells at its border,
         the function counts as positive there, and the surface is closed by coarse triangles.
 
     Raises:
         MeshingError: too many cells.
     """
     limit, does_matter = function.most_faces, None
-    if elsewhere is None:
+    if irrelevant is None:
         cells = lattice.nonempty_cells(function.clearance, limit)
     else:
         cells, does_matter = lattice.relevant_cells(
-            function.clearance, elsewhere.relevant_cells(lattice, limit), function.values, limit
+            function.clearance, irrelevant.relevant_cells(lattice, limit), function.values, limit
         )
     outer = lattice.outer_cells()
     if does_matter is not None:
@@ -457,7 +457,7 @@ def mesh_closed_surface(
         return TriangleMesh.without_unused_vertices(vertices, np.concatenate([rest, *caps]))
     _check_nothing_missed(
         function, points, samples, corners, first, faces, lattice, inner,
-        None if elsewhere is None else elsewhere.clearance,
+        None if irrelevant is None else irrelevant.clearance,
     )  # fmt: skip
     # Triangles that end at the outermost cells are moved and cut, their ends are not.
     if len(rest):
@@ -655,9 +655,9 @@ class _InitialMesh:
         cut[self.rows] |= self.crossed
         return cut
 
-    def is_beside(self, chosen: BoolArray) -> BoolArray:
+    def is_beside(self, mask: BoolArray) -> BoolArray:
         """Whether each vertex is one of the chosen points, or on an edge that ends there."""
-        return np.concatenate([chosen, chosen[self.ends].any(axis=1)])
+        return np.concatenate([mask, mask[self.ends].any(axis=1)])
 
 
 def _march(

@@ -52,17 +52,17 @@ class LevelSamples:
         """The samples at the points that `rows`, indices or a mask, select."""
         return LevelSamples(self.value[rows], self.gradient[rows], self.quarter_period_radius[rows])
 
-    def replaced(self, rows: Any, others: LevelSamples) -> LevelSamples:
-        """The samples, with those at points `rows` replaced by `others`."""
+    def replaced(self, rows: Any, samples: LevelSamples) -> LevelSamples:
+        """The samples, with `samples` in place of the samples at points `rows`."""
         value, gradient, reach = (
             self.value.copy(),
             self.gradient.copy(),
             self.quarter_period_radius.copy(),
         )
         value[rows], gradient[rows], reach[rows] = (
-            others.value,
-            others.gradient,
-            others.quarter_period_radius,
+            samples.value,
+            samples.gradient,
+            samples.quarter_period_radius,
         )
         return LevelSamples(value, gradient, reach)
 
@@ -77,12 +77,12 @@ class EvaluatorCache:
     """Fields on the backend of double precision, each prepared once."""
 
     def __init__(self) -> None:
-        self._made: dict[int, tuple[Field, Field]] = {}
+        self._evaluators: dict[int, tuple[Field, Field]] = {}
 
     def of(self, field: Field) -> Field:
-        if id(field) not in self._made:  # it is stored, so that no other field has its id
-            self._made[id(field)] = field, field.prepare(choose_backend("double"))
-        return self._made[id(field)][1]
+        if id(field) not in self._evaluators:  # it is stored, so that no other field has its id
+            self._evaluators[id(field)] = field, field.prepare(choose_backend("double"))
+        return self._evaluators[id(field)][1]
 
 
 @dataclass

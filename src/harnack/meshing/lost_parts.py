@@ -111,7 +111,7 @@ class PointsOnLevel:
         jumps &= (np.minimum(np.abs(ahead), np.abs(behind)) > _CLEARLY) & (area[rows] > 0)
         return cls(points[jumps], np.where(ahead > 0, 1.0, -1.0)[jumps, None] * normal[jumps])
 
-    def some(self, rows: Any) -> PointsOnLevel:
+    def select(self, rows: Any) -> PointsOnLevel:
         """The points that `rows`, indices or a mask, select."""
         return PointsOnLevel(self.points[rows], self.normals[rows])
 
@@ -120,7 +120,7 @@ class PointsOnLevel:
         is_in = ((self.points > lower) & (self.points < upper)).all(axis=1)
         if volume is not None:
             is_in &= volume.contains_points(self.points)
-        return self.some(is_in)
+        return self.select(is_in)
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ class LostParts:
         these that are farther than half a cell; within: a distance within which all points are, by
         corners and centers of triangles; inf if there are none.
     missing, filled: (k, 3), selections of the far points: on parts that are missing, and in gaps
-        that are filled; others: points for which neither is known.
+        that are filled; unexplained: points for which neither is known.
     thickness: the median thickness of such parts and gaps; inf if they are wider than cells, or not
         known.
     spacing: of cells. advice: what to do.
@@ -144,7 +144,7 @@ class LostParts:
     within: float
     missing: FloatArray
     filled: FloatArray
-    others: FloatArray
+    unexplained: FloatArray
     thickness: float
     spacing: float
     advice: str
@@ -153,27 +153,27 @@ class LostParts:
     def of(
         cls,
         function: SignFunction,
-        known: PointsOnLevel,
+        level_points: PointsOnLevel,
         surface: TriangleMesh,
         tolerance: float,
         spacing: float,
     ) -> LostParts:
         """The lost parts of a mesh of the level set.
 
-        known: points on the level, near which the mesh should be.
+        level_points: points on the level, near which the mesh should be.
         spacing: of the cells of the mesh.
         """
         corner = surface.vertices[surface.faces]
-        distant = known.some(_are_farther(known.points, corner, tolerance))
+        distant = level_points.select(_are_farther(level_points.points, corner, tolerance))
         beyond = _are_farther(distant.points, corner, max(tolerance, _CELLS * spacing))
         within = _bound_of_distances(distant.points, corner) if len(distant.points) else tolerance
-        shown = distant.some(_spread(len(distant.points), _LOOKED_AT))
+        shown = distant.select(_spread(len(distant.points), _LOOKED_AT))
         thickness, is_inside = _thicknesses(function, shown, spacing)
         is_thin = np.isfinite(thickness)
         thickness = thickness[is_thin]
         return cls(
             len(distant.points),
-            len(known.points),
+            len(level_points.points),
             tolerance,
             int(beyond.sum()),
             within,
@@ -216,7 +216,7 @@ class LostParts:
         )
         if shown:
             return f"{text}; they are about {self.thickness:.2g} thick"
-        return f"{text}such as {point_text(self.others[0])}"
+        return f"{text}such as {point_text(self.unexplained[0])}"
 
 
 def _advice(field: Field) -> str:

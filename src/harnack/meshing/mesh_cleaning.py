@@ -54,14 +54,14 @@ _NEAR = (0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3)
 class CleanedMesh:
     """A closed mesh in which the valid triangles of the input come first, bit by bit.
 
-    kept: for each of the first faces, the index of the input face that it is, in order.
+    kept_faces: for each of the first faces, the index of the input face that it is, in order.
     turned: which of these faces are reversed.
     left_out: the number of input triangles that were removed, by reason.
     holes: the number of filled holes.
     """
 
     surface: TriangleMesh
-    kept: IntArray
+    kept_faces: IntArray
     turned: IntArray
     left_out: dict[str, int]
     holes: int

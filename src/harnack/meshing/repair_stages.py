@@ -270,12 +270,12 @@ class _Result:
         """0 if it does not differ: see `Difference`."""
         return 0.0 if self.difference is None else self.difference.badness
 
-    def finished(self, more: dict[str, Any], largest: bool) -> trimesh.Trimesh:
+    def finished(self, more_facts: dict[str, Any], largest: bool) -> trimesh.Trimesh:
         """The mesh, with what is known of it and of its parts; a warning if it differs."""
         from harnack.meshing.closed_mesh import ClosedMesh
 
         surface = self.surface
-        facts: dict[str, Any] = {**self.facts, **more, "differs": None}
+        facts: dict[str, Any] = {**self.facts, **more_facts, "differs": None}
         if self.difference is not None:
             facts["differs"] = dataclasses.asdict(self.difference)
             warnings.warn(
@@ -439,11 +439,11 @@ def _keep_valid(
     left_out = {"flat": made.left_out["flat"] + flat}
     return made.surface, {
         "stage": "cleaned",
-        "kept": len(made.kept),
+        "kept": len(made.kept_faces),
         "turned": _count_turned(intended, made),
         "left_out": made.left_out | left_out,
         "holes": made.holes,
-        "patches": len(made.surface.faces) - len(made.kept),
+        "patches": len(made.surface.faces) - len(made.kept_faces),
         "harmonic": 0,
     }
 
@@ -455,7 +455,7 @@ def _count_turned(intended: IntendedSolid, sound: CleanedMesh) -> int:
     )
     is_turned = np.zeros(len(turned_before), np.bool_)
     is_turned[sound.turned] = True
-    return int((is_turned ^ turned_before)[sound.kept].sum())
+    return int((is_turned ^ turned_before)[sound.kept_faces].sum())
 
 
 # Loose triangles joined.
@@ -472,7 +472,7 @@ def _weld_loose(
     corners = without_zero_area_faces(intended.vertices, intended.faces)
     vertices, faces, moved = weld_near_corners(*corners)
     made = clean_and_fill(vertices, faces, asked.report)
-    count = len(made.kept)
+    count = len(made.kept_faces)
     return made.surface, {
         "stage": "welded",
         "kept": 0,

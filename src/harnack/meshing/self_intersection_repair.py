@@ -157,10 +157,10 @@ class _Neighborhood:
         """The vertices that edges join to a vertex."""
         return set(self.faces[self.around(vertex)].ravel().tolist()) - {vertex}
 
-    def with_faces(self, gone: IntArray, new: IntArray) -> _Neighborhood:
-        """The neighborhood with the faces `gone`, by index, replaced by `new`."""
+    def with_faces(self, removed: IntArray, new: IntArray) -> _Neighborhood:
+        """The neighborhood with the faces `removed`, by index, replaced by `new`."""
         return dataclasses.replace(
-            self, faces=np.concatenate([np.delete(self.faces, gone, axis=0), new])
+            self, faces=np.concatenate([np.delete(self.faces, removed, axis=0), new])
         )
 
     def collapse_edge(self, a: int, b: int) -> tuple[IntArray, IntArray] | None:

@@ -66,15 +66,15 @@ def uses_sign_meshing(field: Field) -> bool:
     return isinstance(field, BatchedField | Blobs | HRBF)
 
 
-def cell_size_for_smoothing(field: Field, spacing: float, most: float, least: float) -> float:
+def cell_size_for_smoothing(field: Field, spacing: float, upper: float, lower: float) -> float:
     """The size of cells: `spacing`; or, where the surface of a cloud with noise is likely to have
-    details too small for these cells, smaller by factors between `least` and `most`."""
+    details too small for these cells, smaller by factors between `lower` and `upper`."""
     if (
         not isinstance(field, DipolePotential)
         or not 0 < field.smoothing < _UNRESOLVED_SMOOTHING * spacing
     ):
         return spacing
-    return min(max(_RESOLVED_SMOOTHING_LENGTHS * field.smoothing, least * spacing), most * spacing)
+    return min(max(_RESOLVED_SMOOTHING_LENGTHS * field.smoothing, lower * spacing), upper * spacing)
 
 
 def empty_surface_hint(field: Field) -> str:

@@ -252,7 +252,7 @@ def extract_from_signs(
         before = len(cut.points)
         check_triangle_limit(len(faces) + 2 * len(cut.points), function.most_faces)
         start, end = (flat[cut.ends[:, k]] for k in (0, 1))
-        feet = start + cut.share[:, None] * (end - start)
+        feet = start + cut.fraction[:, None] * (end - start)
         corner_feet = feet[cut.vertex_of_edge[cut.edges[cut.rows]] - len(x)]
         flat = np.concatenate([flat, feet, corner_feet.mean(axis=1)])
         x, faces = cut.applied(x, faces)
@@ -407,7 +407,7 @@ class _CreaseRefinement:
     edges: (m, 3) of all faces.
     vertex_of_edge: (k,) of edges, the index of the new vertex, or -1.
     ends: (c, 2) the ends of the edges that are split.
-    share: (c,) the fraction along each of these edges where it is split.
+    fraction: (c,) the fraction along each of these edges where it is split.
     corner_faces: (d, 3) faces with a new vertex within.
     rows: (d,) the indices of these faces.
     points, normals: of the new vertices, those of edges first.
@@ -417,7 +417,7 @@ class _CreaseRefinement:
     edges: IntArray
     vertex_of_edge: IntArray
     ends: IntArray
-    share: FloatArray
+    fraction: FloatArray
     corner_faces: IntArray
     rows: IntArray
     points: FloatArray
@@ -430,7 +430,7 @@ class _CreaseRefinement:
         function: SignFunction,
         x: FloatArray,
         normals: FloatArray,
-        bent: BoolArray,
+        is_creased: BoolArray,
         faces: IntArray,
         tolerance: float,
     ) -> _CreaseRefinement:
@@ -439,7 +439,7 @@ class _CreaseRefinement:
         planes, stay."""
         every = Edges.of(half_edges(faces))
         edges = every.edge_of_pair.reshape(3, -1).T
-        rows = np.flatnonzero((every.multiplicity == 2) & ~bent[every.vertices].any(axis=1))
+        rows = np.flatnonzero((every.multiplicity == 2) & ~is_creased[every.vertices].any(axis=1))
         ends = every.vertices[rows]
         one, other = normals[ends[:, 0]], normals[ends[:, 1]]
         a, b = x[ends[:, 0]], x[ends[:, 1]]
@@ -463,7 +463,7 @@ class _CreaseRefinement:
             )
         )
         on_crease = (total > _MIN_CREASE_ANGLE) & (angle > _CREASE_ANGLE_SHARE * total)
-        is_bent = np.concatenate([bent, on_crease])
+        is_bent = np.concatenate([is_creased, on_crease])
         new = vertex[edges]
         corner = np.flatnonzero((new >= 0).all(axis=1) & is_bent[np.maximum(new, 0)].all(axis=1))
         inner, inner_normal, corner = _crease_corners(function, x, normals, faces, corner)

@@ -57,9 +57,9 @@ class WallThickness:
         rows = rows[np.argsort(self.values[rows])]
         return self.vertices[self.faces[rows]].mean(axis=1)
 
-    def is_thinner(self, than: float) -> BoolArray:
-        """(m,) whether the wall is thinner than `than` at each face."""
-        return np.asarray(np.nan_to_num(self.values, nan=np.inf) < than)
+    def is_thinner(self, limit: float) -> BoolArray:
+        """(m,) whether the wall is thinner than `limit` at each face."""
+        return np.asarray(np.nan_to_num(self.values, nan=np.inf) < limit)
 
     def to_colored_mesh(self, low: float, high: float) -> trimesh.Trimesh:
         """The mesh with colors of faces: red up to `low`, through yellow, to gray from `high` on.

@@ -112,7 +112,7 @@ class _Sweep:
     """A polyline (n, 3) with a radius, and the number of points around it."""
 
     radius: float
-    around: int
+    segments: int
     points: FloatArray
 
     def surface(self) -> TriangleMesh | None:
@@ -144,7 +144,7 @@ class _Sweep:
 
     def _directions(self, frame: FloatArray) -> FloatArray:
         """(around, 3) unit vectors in the plane of a frame, at equal angles."""
-        angle = 2 * math.pi * np.arange(self.around) / self.around
+        angle = 2 * math.pi * np.arange(self.segments) / self.segments
         return np.cos(angle)[:, None] * frame[0] + np.sin(angle)[:, None] * frame[1]
 
     def _corner(
@@ -160,7 +160,7 @@ class _Sweep:
         across = across / sine
         angle = math.atan2(sine, cosine)
         component = directions @ across
-        step = 2 * math.pi / self.around
+        step = 2 * math.pi / self.segments
         count = math.ceil(angle / step)
         angles = np.array([0.5 * angle]) if count <= 1 else np.linspace(0.0, angle, count + 1)
         turned = directions + component[:, None] * (
@@ -172,7 +172,7 @@ class _Sweep:
     def _end(self, point: FloatArray, axis: FloatArray, frame: FloatArray, sign: int) -> FloatArray:
         """Rings from the pole of a half ball to its rim, or in the reverse order at the last
         point."""
-        count = math.ceil(0.25 * self.around)
+        count = math.ceil(0.25 * self.segments)
         angle = 0.5 * math.pi * np.arange(count + 1)[:, None, None] / count
         rings = np.cos(angle) * self._directions(frame) + sign * np.sin(angle) * axis
         return point + self.radius * (rings if sign > 0 else rings[::-1])
@@ -181,7 +181,7 @@ class _Sweep:
         """The mesh of faces between neighbors of rings (k, around, 3), without faces with equal
         corners. shift: the amount by which the indices around grow from the last ring to the first;
         None if the ends are poles."""
-        count, n = len(rings), self.around
+        count, n = len(rings), self.segments
         row, column = np.mgrid[: count - 1 if shift is None else count, :n].reshape(2, -1)
         moved = np.where(row == count - 1, shift or 0, 0)
         next_row = (row + 1) % count * n
@@ -220,7 +220,7 @@ class _Sweep:
         shift, twist = 0, 0.0
         if is_closed:
             mismatch = math.atan2(across[-1] @ np.cross(edges[0], first), across[-1] @ first)
-            step = 2 * math.pi / self.around
+            step = 2 * math.pi / self.segments
             shift = round(mismatch / step)
             twist = (mismatch - shift * step) / len(edges)
         frames = [np.stack([u, np.cross(edge, u)]) for u, edge in zip(across, edges, strict=False)]

@@ -145,10 +145,10 @@ class _FilmJob:
     arguments: dict[str, Any]
     variant: str
 
-    def frame(self, others: dict[str, Any]) -> TaskResult:
-        """The pixels of one picture. others: its other arguments."""
+    def frame(self, changes: dict[str, Any]) -> TaskResult:
+        """The pixels of one picture. changes: its arguments that differ from the film's."""
         set_variant(self.variant)
-        arguments = {**self.arguments, **others}
+        arguments = {**self.arguments, **changes}
         return {"shown": render(arguments.pop("surfaces"), **arguments).srgb}
 
 

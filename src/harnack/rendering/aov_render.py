@@ -120,18 +120,18 @@ class AovTask:
         return self._look_at(upload_indices(self.mi, self.order[start:stop]), self.mi.Vector2f(0.5))
 
     def look(
-        self, hands: RenderExecutor | None = None, advance: Callable[[float], None] | None = None
+        self, executor: RenderExecutor | None = None, advance: Callable[[float], None] | None = None
     ) -> AovBuffers:
         """The first hits of the rays through the middles of all pixels.
 
-        hands: executes the methods of a task like this one in place of this task.
+        executor: executes the methods of a task like this one in place of this task.
         advance: called with the fraction that has been finished since the last call.
         """
-        hands = LocalRenderExecutor(self) if hands is None else hands
+        executor = LocalRenderExecutor(self) if executor is None else executor
         width, height = self.size
         order = self.order
-        cut, parts = hands.split_range(width * height, _RAYS_A_BAND), list[AovBuffers]()
-        for (start, stop), part in zip(cut, hands.run_tasks("render_range", cut), strict=True):
+        cut, parts = executor.split_range(width * height, _RAYS_A_BAND), list[AovBuffers]()
+        for (start, stop), part in zip(cut, executor.run_tasks("render_range", cut), strict=True):
             parts.append(part)
             if advance is not None:
                 advance((stop - start) / (width * height))
@@ -339,14 +339,14 @@ def aov_picture(
     value_range: tuple[float, float] | None,
     bar: str | bool,
     spp: int,
-    hands: RenderExecutor | None = None,
+    executor: RenderExecutor | None = None,
 ) -> npt.NDArray[np.uint8]:
     """The picture (h, w, 3) of AOV buffers.
 
     value_range: of the scale, in place of the range of the numbers that are seen.
     bar: whether to put a color bar beside the picture, or its title.
     spp: rays of a pixel at an edge, for pictures that are averaged.
-    hands: as for `AovTask.look`.
+    executor: as for `AovTask.look`.
     """
     one = AOV_MODES[show]
     scale = None if one.scale is None else one.scale(view)
@@ -359,7 +359,7 @@ def aov_picture(
         scale = replace(scale, name=bar)
     picture = one.picture(view, scale)
     if one.is_averaged and spp > 1:
-        _antialias(viewer, view, picture, lambda part: one.picture(part, scale), spp, hands)
+        _antialias(viewer, view, picture, lambda part: one.picture(part, scale), spp, executor)
     if not bar:
         return picture
     numbers = np.asarray(one.numbers(view), dtype=np.float64)
@@ -375,16 +375,16 @@ def _antialias(
     picture: npt.NDArray[np.uint8],
     colors: Callable[[AovBuffers], npt.NDArray[np.uint8]],
     spp: int,
-    hands: RenderExecutor | None,
+    executor: RenderExecutor | None,
 ) -> None:
     """Make pixels that differ visibly from a neighbor, or that the edge of an isoline may pass
     through, the mean light of a grid of rays."""
     order = tiled_pixel_order(viewer.size)
     again = order[(edge_pixels(picture) | view.is_near_isoline).ravel()[order]]
     offsets = multijitter_offsets(spp)
-    hands = LocalRenderExecutor(viewer) if hands is None else hands
-    cut = hands.split_range(len(again), max(1, _RAYS_A_BAND // len(offsets)))
+    executor = LocalRenderExecutor(viewer) if executor is None else executor
+    cut = executor.split_range(len(again), max(1, _RAYS_A_BAND // len(offsets)))
     parts = [(again[start:stop], offsets) for start, stop in cut]
-    for (chosen, _), seen in zip(parts, hands.run_tasks("render_samples", parts), strict=True):
+    for (chosen, _), seen in zip(parts, executor.run_tasks("render_samples", parts), strict=True):
         light = srgb_to_linear(colors(seen) / 255)
         picture.reshape(-1, 3)[chosen] = to_uint8(linear_to_srgb(light.mean(axis=1)))

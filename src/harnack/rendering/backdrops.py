@@ -150,25 +150,25 @@ Backdrop = GroundBackdrop | GradientBackdrop | ImageBackdrop | None
 """None for a transparent picture."""
 
 
-def parse_backdrop(given: Any) -> Backdrop:
-    """What is to be behind the surfaces.
+def parse_backdrop(backdrop: Any) -> Backdrop:
+    """The backdrop that an argument describes.
 
     Raises:
         TypeError, ValueError: it is no backdrop; the message says what backdrops there are.
         FileFormatError: an image file that cannot be read.
     """
-    if isinstance(given, os.PathLike):
-        return ImageBackdrop(_read(Path(cast("os.PathLike[str]", given))))
-    if isinstance(given, np.ndarray) and given.ndim != 1:
-        return ImageBackdrop(_pixels(cast("npt.NDArray[Any]", given)))
-    if isinstance(given, str):
-        return _named(given)
-    if isinstance(given, list | tuple) and len(pair := cast("list[Any]", given)) == 2:
+    if isinstance(backdrop, os.PathLike):
+        return ImageBackdrop(_read(Path(cast("os.PathLike[str]", backdrop))))
+    if isinstance(backdrop, np.ndarray) and backdrop.ndim != 1:
+        return ImageBackdrop(_pixels(cast("npt.NDArray[Any]", backdrop)))
+    if isinstance(backdrop, str):
+        return _named(backdrop)
+    if isinstance(backdrop, list | tuple) and len(pair := cast("list[Any]", backdrop)) == 2:
         return GradientBackdrop(*(parse_color(one, "a color of the backdrop") for one in pair))
     try:
-        color = parse_color(given, "backdrop")
+        color = parse_color(backdrop, "backdrop")
     except TypeError:
-        raise TypeError(f"backdrop must be one of {_BACKDROP_HELP}, not {given!r}") from None
+        raise TypeError(f"backdrop must be one of {_BACKDROP_HELP}, not {backdrop!r}") from None
     return GradientBackdrop(color, color)
 
 
@@ -178,19 +178,19 @@ _BACKDROP_HELP = (
 )
 
 
-def _named(given: str) -> Backdrop:
-    if given in GROUNDS:
-        return GroundBackdrop(given)
-    if given == TRANSPARENT:
+def _named(name: str) -> Backdrop:
+    if name in GROUNDS:
+        return GroundBackdrop(name)
+    if name == TRANSPARENT:
         return None
-    if Path(given).suffix.lower() in IMAGE_FILES:
-        return ImageBackdrop(_read(Path(given)))
+    if Path(name).suffix.lower() in IMAGE_FILES:
+        return ImageBackdrop(_read(Path(name)))
     try:
-        color = parse_color(given, "backdrop")
+        color = parse_color(name, "backdrop")
     except ValueError:
         known = (*BACKDROPS, *NAMED_COLORS)
         raise ValueError(
-            f"backdrop must be one of {_BACKDROP_HELP}, not {given!r}{did_you_mean(given, known)}"
+            f"backdrop must be one of {_BACKDROP_HELP}, not {name!r}{did_you_mean(name, known)}"
         ) from None
     return GradientBackdrop(color, color)
 

@@ -72,11 +72,13 @@ class UnboundedSurfaceError(ValueError):
     reason: what is wrong. usual: a level of the same field whose surface has a box, if known.
     """
 
-    def __init__(self, reason: str, usual: float | None) -> None:
-        other = "" if usual is None else f", or choose another level, such as {usual:g}"
+    def __init__(self, reason: str, bounded_level: float | None) -> None:
+        other = (
+            "" if bounded_level is None else f", or choose another level, such as {bounded_level:g}"
+        )
         super().__init__(f"{reason}: give it a clip, such as a ball (harnack.Ball){other}")
         self.reason = reason
-        self.bounded_level = usual
+        self.bounded_level = bounded_level
 
 
 class NothingVisibleError(ValueError):

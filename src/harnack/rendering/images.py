@@ -140,10 +140,10 @@ class Picture(np.ndarray[Any, np.dtype[Any]]):
     _srgb: npt.NDArray[np.uint8] | None = None
 
     @classmethod
-    def of(cls, numbers: npt.NDArray[Any], shown: npt.NDArray[np.uint8]) -> Picture:
+    def of(cls, numbers: npt.NDArray[Any], pixels: npt.NDArray[np.uint8]) -> Picture:
         """Numbers, and the pixels (h, w), (h, w, 3) or (h, w, 4) that they are shown as."""
         picture = numbers.view(cls)
-        picture._srgb = shown
+        picture._srgb = pixels
         return picture
 
     def __array_finalize__(self, array: Any) -> None:

@@ -48,31 +48,31 @@ if TYPE_CHECKING:
 _PADDING = 1e-5
 
 
-def as_field(given: Any, what: str = "of") -> Field:
+def as_field(function: Any, name: str = "of") -> Field:
     """A function on space: a field, or what `harnack.expression` takes: a function of three
     coordinates, or a text such as "z".
 
     Raises:
         TypeError, ValueError: none of these, or a field with a function for each part.
     """
-    if isinstance(given, str):
+    if isinstance(function, str):
         try:
-            return expression(given)
+            return expression(function)
         except ValueError as error:
-            raise ValueError(f"{what.rstrip(',')}: {error}") from None
-    if isinstance(given, Field):
-        if given.has_patches:
+            raise ValueError(f"{name.rstrip(',')}: {error}") from None
+    if isinstance(function, Field):
+        if function.has_patches:
             raise ValueError(
-                f"{what} must be one function on space, and this {type(given).__name__} has one "
+                f"{name} must be one function on space, and this {type(function).__name__} has one "
                 "for each part"
             )
-        return given
-    if not callable(given):
+        return function
+    if not callable(function):
         raise TypeError(
-            f'{what} must be a text such as "z" or "x*y", a field, or a function of x, y and z, '
-            f"not {given!r}"
+            f'{name} must be a text such as "z" or "x*y", a field, or a function of x, y and z, '
+            f"not {function!r}"
         )
-    return expression(cast("Callable[[Any, Any, Any], Any]", given))
+    return expression(cast("Callable[[Any, Any, Any], Any]", function))
 
 
 def padded_domain(function: Field, size: float) -> Volume | None:
@@ -195,16 +195,16 @@ def _numbers(levels: Any) -> tuple[float, ...]:
     return tuple(given.tolist())
 
 
-def parse_isolines(given: Any) -> tuple[Isolines, ...]:
-    """`Isolines`, or several, as a tuple; empty for None.
+def parse_isolines(isolines: Any) -> tuple[Isolines, ...]:
+    """Isolines, or a list of them, as a tuple; empty for None.
 
     Raises:
         TypeError: anything else.
     """
-    if given is None:
+    if isolines is None:
         return ()
-    listed: bool = isinstance(given, list | tuple)
-    several: list[Any] = [*given] if listed else [given]
+    listed: bool = isinstance(isolines, list | tuple)
+    several: list[Any] = [*isolines] if listed else [isolines]
     for one in several:
         if not isinstance(one, Isolines):
             raise TypeError(

@@ -106,21 +106,21 @@ class PathRenderTask:
 
 
 def render_paths(
-    exposing: PathRenderTask, advance: Callable[[float], None], hands: RenderExecutor | None = None
+    task: PathRenderTask, advance: Callable[[float], None], executor: RenderExecutor | None = None
 ) -> PathRender:
     """Radiance of all pixels.
 
     advance: called with the fraction of the picture that has been finished since the last call.
-    hands: executes the method `render_range`, in place of `exposing` itself.
+    executor: executes the method `render_range`, in place of `task` itself.
     """
-    hands = LocalRenderExecutor(exposing) if hands is None else hands
-    width, height = exposing.size
-    features = exposing.features
+    executor = LocalRenderExecutor(task) if executor is None else executor
+    width, height = task.size
+    features = task.features
     image = np.empty((width * height, 10 if features else 4), dtype=np.float32)
     lost = 0
-    parts = hands.split_range(width * height, max(1, exposing.paths_a_band // exposing.spp))
+    parts = executor.split_range(width * height, max(1, task.paths_a_band // task.spp))
     for (start, stop), (means, gone) in zip(
-        parts, hands.run_tasks("render_range", parts), strict=True
+        parts, executor.run_tasks("render_range", parts), strict=True
     ):
         image[start:stop] = means
         lost += int(gone)
@@ -267,20 +267,20 @@ def load_denoiser() -> Any:
         raise ModuleNotFoundError(f"Open Image Denoise cannot be loaded: {wrong}") from None
 
 
-def denoise_image(found: PathRender) -> npt.NDArray[np.float32]:
+def denoise_image(render: PathRender) -> npt.NDArray[np.float32]:
     """The image of an exposure with features, (h, w, 4), without noise.
 
     Open Image Denoise, a neural network that runs on CPUs, takes the noise out. It guesses: the
     result looks clean and is close to what more samples would have shown, but none of its numbers
     is a mean of samples any more. What part of each pixel is covered stays as it is.
     """
-    if found.albedo is None or found.normal is None:
+    if render.albedo is None or render.normal is None:
         raise ValueError("an exposure without features cannot be denoised")
-    light = np.maximum(found.image[..., :3], 0)
-    features = (np.clip(found.albedo, 0, 1), np.clip(found.normal, -1, 1))
+    light = np.maximum(render.image[..., :3], 0)
+    features = (np.clip(render.albedo, 0, 1), np.clip(render.normal, -1, 1))
     parts = [np.ascontiguousarray(part, dtype=np.float32) for part in (light, *features)]
     clean = load_denoiser().denoise(parts[0], albedo=parts[1], normal=parts[2], hdr=True)
-    return np.concatenate([clean, found.image[..., 3:]], axis=-1)
+    return np.concatenate([clean, render.image[..., 3:]], axis=-1)
 
 
 # Rays through transparent solids.

@@ -180,7 +180,12 @@ def render(
 
 
 def _render_job(
-    job: RenderJob, hands: RenderExecutor, color_by: Any, progress: bool | Advance, *, alone: bool
+    job: RenderJob,
+    executor: RenderExecutor,
+    color_by: Any,
+    progress: bool | Advance,
+    *,
+    alone: bool,
 ) -> tuple[Image, npt.NDArray[np.uint8], list[str] | None]:
     """The numbers of a picture, its pixels, and the names of its channels if it has its own.
 
@@ -191,21 +196,22 @@ def _render_job(
         return _render_by_mitsuba(mi, job.scene, asked)
     if isinstance(drawing, AovTask):
         with progress_bar(
-            "rendering", progress and not isinstance(hands, LocalRenderExecutor)
+            "rendering", progress and not isinstance(executor, LocalRenderExecutor)
         ) as advance:
-            view = drawing.look(hands, advance)
+            view = drawing.look(executor, advance)
         bar = color_by if asked.color_bar is True and isinstance(color_by, str) else asked.color_bar
         samples = asked.spp or EDGE_SPP
-        shown = aov_picture(asked.show, drawing, view, asked.color_range, bar, samples, hands)
+        shown = aov_picture(asked.show, drawing, view, asked.color_range, bar, samples, executor)
         return AOV_MODES[asked.show].numbers(view), shown, None
     if isinstance(drawing, PathRenderTask) and alone and progress:
         drawing = _with_time_estimate(job, drawing, progress)
-        hands = LocalRenderExecutor(drawing) if isinstance(hands, LocalRenderExecutor) else hands
+        if isinstance(executor, LocalRenderExecutor):
+            executor = LocalRenderExecutor(drawing)
     with progress_bar("rendering", progress) as advance:
         if isinstance(drawing, ShadedTask):
-            image, lost = render_shaded(drawing, hands, advance)
+            image, lost = render_shaded(drawing, executor, advance)
         else:
-            found = render_paths(drawing, advance, hands)
+            found = render_paths(drawing, advance, executor)
             image, lost = denoise_image(found) if asked.denoise else found.image, found.lost
     _warn_of(lost, _LIT[asked.show])
     return *_composite_over_backdrop(mi, sensor, image, job.stage, asked.show), None

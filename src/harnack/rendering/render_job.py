@@ -80,7 +80,7 @@ class RenderJob:
         return build_studio(
             self.mi, on_stage, size=size, camera=asked.camera,
             backdrop=asked.backdrop, up="z" if asked.up is None else asked.up,
-            bare=asked.show in AOV_MODES, traced_light=asked.show == "path",
+            surfaces_only=asked.show in AOV_MODES, traced_light=asked.show == "path",
         )  # fmt: skip
 
     @functools.cached_property
@@ -150,17 +150,17 @@ class ClusterRenderExecutor:
     """Executes tasks on a cluster: its workers call the methods of a `RenderJob`, with the results
     that the task itself would return."""
 
-    crew: Executor
+    executor: Executor
     job: RenderJob
 
-    def split_range(self, count: int, most: int) -> list[tuple[int, int]]:
+    def split_range(self, count: int, max_size: int) -> list[tuple[int, int]]:
         """Ranges (start, stop) of a number that suits the workers."""
-        return self.crew.split_range(count, most)
+        return self.executor.split_range(count, max_size)
 
     def run_tasks(self, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
         """Results of the tasks, in order; several run at the same time."""
         drawing = self.job.task
-        for found in self.crew.run_tasks(self.job, step, parts):
+        for found in self.executor.run_tasks(self.job, step, parts):
             if isinstance(drawing, AovTask):
                 period = None if drawing.function is None else drawing.function.period
                 yield AovBuffers(**found, period=period, background=drawing.background)

@@ -60,35 +60,35 @@ NAMED_COLORS: Mapping[str, str] = MappingProxyType(
 _COLOR_HELP = 'a name of CSS such as "steelblue", "#4682b4", or three numbers from 0 to 1'
 
 
-def parse_color(given: Any, what: str) -> Color:
+def parse_color(color: Any, name: str) -> Color:
     """A color in sRGB, three numbers in [0, 1], as screens show them.
 
-    what: the color is of, for messages.
+    name: of the colored thing, for messages.
 
     Raises:
         TypeError: neither text nor three numbers.
         ValueError: no known name, or numbers outside of [0, 1].
     """
-    if isinstance(given, str):
-        return _from_text(given, what)
+    if isinstance(color, str):
+        return _from_text(color, name)
     try:
-        numbers = [float("" if isinstance(one, str | bool) else one) for one in given]
+        numbers = [float("" if isinstance(one, str | bool) else one) for one in color]
     except (TypeError, ValueError):
-        raise TypeError(f"{what} must be {_COLOR_HELP}, not {given!r}") from None
+        raise TypeError(f"{name} must be {_COLOR_HELP}, not {color!r}") from None
     if len(numbers) != 3:
-        raise TypeError(f"{what} must be {_COLOR_HELP}, not {given!r}")
+        raise TypeError(f"{name} must be {_COLOR_HELP}, not {color!r}")
     if not all(0 <= one <= 1 for one in numbers):
-        raise ValueError(f"{what} must be {_COLOR_HELP}, not {given!r}")
+        raise ValueError(f"{name} must be {_COLOR_HELP}, not {color!r}")
     return cast("Color", tuple(numbers))
 
 
-def _from_text(text: str, what: str) -> Color:
+def _from_text(text: str, name: str) -> Color:
     digits = NAMED_COLORS.get(text.strip().lower())
     if digits is None:
         found = re.fullmatch(r"#([0-9a-fA-F]{3}|[0-9a-fA-F]{6})", text.strip())
         if found is None:
             raise ValueError(
-                f"{what} must be {_COLOR_HELP}, not {text!r}{did_you_mean(text, NAMED_COLORS)}"
+                f"{name} must be {_COLOR_HELP}, not {text!r}{did_you_mean(text, NAMED_COLORS)}"
             )
         digits = found[1] if len(found[1]) == 6 else "".join(2 * digit for digit in found[1])
     red, green, blue = (int(digits[k : k + 2], 16) / 255 for k in (0, 2, 4))
@@ -218,18 +218,18 @@ class ColorScale:
         span = max(self.high - self.low, 1e-6 * abs(self.high), 1e-30)
         return self.colors_of((numbers - self.low) / span)
 
-    def ticks(self, most: int) -> list[tuple[float, str]]:
-        """At most `most` ticks, but at least two: numbers, and how they are written."""
+    def ticks(self, max_count: int) -> list[tuple[float, str]]:
+        """At most `max_count` ticks, but at least two: numbers, and how they are written."""
         period = 0.0 if self.period is None else self.period
         multiple = round(period / math.pi)
         if 0 < multiple <= _MOST_PI and math.isclose(period, multiple * math.pi, rel_tol=1e-6):
-            return _ticks_at_parts_of_pi(multiple, most)
+            return _ticks_at_parts_of_pi(multiple, max_count)
         if not self.high > self.low:
             return [(self.low, f"{self.low:.4g}")]
-        step = _step((self.high - self.low) / max(most - 1, 1))
+        step = _step((self.high - self.low) / max(max_count - 1, 1))
         first, last = self._multiples(step)
         if last - first < 1:  # one more than asked for, if that gives two
-            step = _step((self.high - self.low) / max(most + 1, 3))
+            step = _step((self.high - self.low) / max(max_count + 1, 3))
             first, last = self._multiples(step)
         if last - first < 1:  # no room for two nice numbers
             largest = max(abs(self.low), abs(self.high))
@@ -264,11 +264,11 @@ def _written(number: float, step: float, largest: float) -> str:
     return f"{mantissa.rstrip('0').rstrip('.') if '.' in mantissa else mantissa}e{int(exponent)}"
 
 
-def _ticks_at_parts_of_pi(multiple: int, most: int) -> list[tuple[float, str]]:
+def _ticks_at_parts_of_pi(multiple: int, max_count: int) -> list[tuple[float, str]]:
     """Ticks of 0 to `multiple` pi: at halves of pi, or at one, two, ... times pi."""
     halves = next(
         step for step in (1, 2, 4, 8, 16, 32)
-        if (2 * multiple) // step + 1 <= max(most, 2) or step >= 2 * multiple
+        if (2 * multiple) // step + 1 <= max(max_count, 2) or step >= 2 * multiple
     )  # fmt: skip
     return [(k * math.pi / 2, _as_pi(k)) for k in range(0, 2 * multiple + 1, halves)]
 

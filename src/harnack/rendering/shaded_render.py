@@ -344,18 +344,18 @@ class ShadedTask:
                 found |= si.shape == self.mi.ShapePtr(carrier)
         return found
 
-    def shade(self, seen: GBuffer, sky: Any) -> Any:
+    def shade(self, buffer: GBuffer, sky: Any) -> Any:
         """Radiance towards the eye, and whether there is anything."""
         key = 1.0
         if self.floor is not None:
-            key, above = self.floor.at(seen.position)
+            key, above = self.floor.at(buffer.position)
             sky = dr.minimum(sky, above)
-        lit = self.light.shade(seen.color, seen.normal, seen.eye, seen.glossy, sky, key)
-        light = dr.select(seen.met, seen.transmittance * lit, 0) + seen.light
-        return self.mi.Vector4f(*light, dr.select(seen.covered, self.mi.Float(1), 0))
+        lit = self.light.shade(buffer.color, buffer.normal, buffer.eye, buffer.glossy, sky, key)
+        light = dr.select(buffer.met, buffer.transmittance * lit, 0) + buffer.light
+        return self.mi.Vector4f(*light, dr.select(buffer.covered, self.mi.Float(1), 0))
 
     def refine_pixels(
-        self, chosen: IntArray, position: FloatArray, sky: FloatArray
+        self, indices: IntArray, position: FloatArray, sky: FloatArray
     ) -> tuple[npt.NDArray[np.float32], int]:
         """Means (n, 4) of samples in chosen pixels, and how many of them were lost.
 
@@ -363,25 +363,25 @@ class ShadedTask:
             (`neighborhood`).
         """
         mi, spp = self.mi, len(self.offsets)
-        lane = dr.arange(mi.UInt32, len(chosen) * spp)
+        lane = dr.arange(mi.UInt32, len(indices) * spp)
         many = dr.opaque(mi.UInt32, spp)
-        pixel = dr.gather(mi.UInt32, upload_indices(mi, chosen), lane // many)
+        pixel = dr.gather(mi.UInt32, upload_indices(mi, indices), lane // many)
         table = mi.Vector2f(*(upload_floats(mitsuba_backend(mi), one) for one in self.offsets.T))
         seen = self._look(pixel, dr.gather(mi.Vector2f, table, lane % many))
         color = self.shade(seen, _nearest_sky(mi, seen, lane // many, position, sky))
         dr.eval(color, seen.lost)
         return to_numpy(mean_of_blocks(color, spp)), int(dr.count(seen.lost)[0])
 
-    def neighborhood(self, chosen: IntArray, *arrays: Any) -> tuple[npt.NDArray[Any], ...]:
+    def neighborhood(self, indices: IntArray, *arrays: Any) -> tuple[npt.NDArray[Any], ...]:
         """Entries (n, 5, ...) of arrays of all pixels, counted by rows, at chosen pixels and their
         four neighbors; at the picture's border some are there twice."""
         columns, rows = self.size
-        x, y = chosen % columns, chosen // columns
+        x, y = indices % columns, indices // columns
         u = np.clip(x[:, None] + np.array([0, 1, -1, 0, 0]), 0, columns - 1)
         v = np.clip(y[:, None] + np.array([0, 0, 0, 1, -1]), 0, rows - 1)
         other = upload_indices(self.mi, (v * columns + u).ravel())
         found = [to_numpy(dr.gather(type(one), one, other)) for one in arrays]
-        return tuple(one.reshape(len(chosen), 5, *one.shape[1:]) for one in found)
+        return tuple(one.reshape(len(indices), 5, *one.shape[1:]) for one in found)
 
 
 def _nearest_sky(mi: Any, seen: GBuffer, row: Any, position: FloatArray, sky: FloatArray) -> Any:
@@ -400,19 +400,19 @@ def _nearest_sky(mi: Any, seen: GBuffer, row: Any, position: FloatArray, sky: Fl
 
 
 def render_shaded(
-    shading: ShadedTask, hands: RenderExecutor, advance: Callable[[float], None]
+    shading: ShadedTask, executor: RenderExecutor, advance: Callable[[float], None]
 ) -> tuple[npt.NDArray[np.float32], int]:
     """Linear sRGB radiance and, last, the part that something covers (h, w, 4); and how many rays
     ran out of steps.
 
-    hands: call methods of `shading`.
+    executor: call methods of `shading`.
     advance: told what part of the picture has been finished since the last call.
     """
     mi, order, size = shading.mi, shading.order, shading.size
     count = len(order)
     seen = GBuffer.nothing(mi, count)
-    parts = hands.split_range(count, _RAYS_A_BAND)
-    for (start, stop), part in zip(parts, hands.run_tasks("render_gbuffer", parts), strict=True):
+    parts = executor.split_range(count, _RAYS_A_BAND)
+    for (start, stop), part in zip(parts, executor.run_tasks("render_gbuffer", parts), strict=True):
         dr.scatter(seen, part, upload_indices(mi, order[start:stop]))
         dr.eval(seen)
         dr.sync_thread()
@@ -426,10 +426,10 @@ def render_shaded(
     edges = order[again[order]] if shading.refines else order[:0]
     pixels = image.reshape(-1, 4)
     at_once = max(1, _RAYS_A_BAND // max(1, len(shading.offsets)))
-    chosen = [edges[start:stop] for start, stop in hands.split_range(len(edges), at_once)]
+    chosen = [edges[start:stop] for start, stop in executor.split_range(len(edges), at_once)]
     around = ((one, *shading.neighborhood(one, seen.position, sky)) for one in chosen)
     for one, (color, gone) in zip(
-        chosen, hands.run_tasks("refine_pixels", list(around)), strict=True
+        chosen, executor.run_tasks("refine_pixels", list(around)), strict=True
     ):
         pixels[one] = color + shading.share_of_first * (pixels[one] - color)
         lost += int(gone)

@@ -43,8 +43,8 @@ def pixel_ranges(pixels: int, step: int) -> Iterator[tuple[int, int]]:
 class RenderExecutor(Protocol):
     """Interface to what executes the tasks of a render: this process, or a Dask cluster."""
 
-    def split_range(self, count: int, most: int) -> list[tuple[int, int]]:
-        """Ranges (start, stop) that cover range(count), each of at most `most` elements."""
+    def split_range(self, count: int, max_size: int) -> list[tuple[int, int]]:
+        """Ranges (start, stop) that cover range(count), each of at most `max_size` elements."""
         ...
 
     def run_tasks(self, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
@@ -59,9 +59,9 @@ class LocalRenderExecutor:
 
     drawing: Any
 
-    def split_range(self, count: int, most: int) -> list[tuple[int, int]]:
+    def split_range(self, count: int, max_size: int) -> list[tuple[int, int]]:
         """The fewest ranges possible."""
-        return list(pixel_ranges(count, most))
+        return list(pixel_ranges(count, max_size))
 
     def run_tasks(self, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
         """Results of the tasks, which are run one after the other."""
@@ -223,10 +223,10 @@ def two_sided_color(color: Any, other: Any, inside: Any) -> Any:
     return dr.select(inside & same, color * _like(color, _INSIDE), color)
 
 
-def hole_filling_tint(color: Any, mended: Any) -> Any:
+def hole_filling_tint(color: Any, is_filling: Any) -> Any:
     """The color, tinted where a level set closes a hole of a mesh."""
     tint = dr.select(color[0] > 1.6 * color[2], _like(color, _TEAL), _like(color, _AMBER))
-    return dr.select(mended, dr.lerp(color, tint, _MENDED), color)
+    return dr.select(is_filling, dr.lerp(color, tint, _MENDED), color)
 
 
 def _parameter(array: Any, numbers: Sequence[float]) -> Any:

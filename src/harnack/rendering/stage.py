@@ -236,14 +236,14 @@ def build_studio(
     camera: Camera,
     backdrop: Backdrop = _LIGHT,
     up: Any = "z",
-    bare: bool = False,
+    surfaces_only: bool = False,
     traced_light: bool = True,
 ) -> StudioScene:
     """Surfaces on the stage, seen in a picture of (width, height) pixels.
 
     up: the direction of the surfaces' coordinates that is up on the stage, as `rotation_to_z_up`
         takes it.
-    bare: only surfaces and camera, without ground and lights.
+    surfaces_only: only surfaces and camera, without ground and lights.
     traced_light: whether the picture follows light paths, and so needs whole materials.
     """
     backend = mitsuba_backend(mi)
@@ -278,7 +278,7 @@ def build_studio(
             isolines=one.isolines,
         )  # fmt: skip
     has_ground = False
-    if not bare:
+    if not surfaces_only:
         scene |= lights(mi, pose.azimuth)
         if isinstance(backdrop, GroundBackdrop) and pose.origin[2] > FLOOR_HEIGHT:
             has_ground = True  # from below, it would hide everything

@@ -44,9 +44,9 @@ _MIN_SMOOTH_FRACTION = 0.5
 _MIN_FRACTION_OFF_CREASES = 0.9
 
 
-def check_derivatives(field: Field, points: FloatArray, look: FieldSamples) -> None:
-    """Check gradient, Laplacian and Hessian at points (n, 3), where `look` has the samples of the
-    field.
+def check_derivatives(field: Field, points: FloatArray, samples: FieldSamples) -> None:
+    """Check gradient, Laplacian and Hessian at points (n, 3), where the samples of the field are
+    `samples`.
 
     Differences are taken within the field's domain; points too close to its border for that are
     left out.
@@ -54,26 +54,26 @@ def check_derivatives(field: Field, points: FloatArray, look: FieldSamples) -> N
     Raises:
         BrokenPromiseError: naming the point where they do not agree.
     """
-    h, inside = _spacing_within(field, points, _spacing(points, look))
+    h, inside = _spacing_within(field, points, _spacing(points, samples))
     if not inside.any():
         return
-    points, look, h = points[inside], look.subset(inside), h[inside]
-    has_ball = any(isinstance(one, HarmonicBall) for one in look.promises)
+    points, samples, h = points[inside], samples.subset(inside), h[inside]
+    has_ball = any(isinstance(one, HarmonicBall) for one in samples.promises)
     trials = [
-        list(_stencil_samples(field, points, look, q * h))
+        list(_stencil_samples(field, points, samples, q * h))
         for q in (_SPACING_FACTORS[:1] if has_ball else _SPACING_FACTORS)
     ]
-    limits = [np.add(*_limits(field, points, look, stencil)) for stencil in trials]
+    limits = [np.add(*_limits(field, points, samples, stencil)) for stencil in trials]
     stencil = _pick_spacing(trials, np.argmin(limits, axis=0))
-    _check_gradient(field, points, look, stencil)
-    _check_laplacian(points, look, trials)
+    _check_gradient(field, points, samples, stencil)
+    _check_laplacian(points, samples, trials)
     try:
-        _check_hessian(field, points, look, trials)
+        _check_hessian(field, points, samples, trials)
     except BrokenPromiseError:
         if not field.has_variable_accuracy:
             raise
         exact_trials = [_without_truncation(field, points, one) for one in trials]
-        _check_hessian(field, points, look, exact_trials)
+        _check_hessian(field, points, samples, exact_trials)
 
 
 def _spacing_within(

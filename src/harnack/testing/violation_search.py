@@ -40,24 +40,24 @@ class BrokenPromiseError(AssertionError):
 
 
 def require(
-    good: Any,
+    holds: Any,
     message: str,
     points: FloatArray,
     amount: FloatArray | None = None,
-    there: FloatArray | None = None,
+    shown_at: FloatArray | None = None,
 ) -> None:
-    """Raise BrokenPromiseError for the worst of the points (n, 3) at which `good` (n,) is false.
+    """Raise BrokenPromiseError for the worst of the points (n, 3) at which `holds` (n,) is false.
 
     amount: (n,) the size of the violation.
-    there: (n, 3) the points where it shows, if not at the points themselves.
+    shown_at: (n, 3) the points at which the violation shows, if not the points themselves.
     """
-    is_broken: BoolArray = ~np.asarray(good, dtype=np.bool_)
+    is_broken: BoolArray = ~np.asarray(holds, dtype=np.bool_)
     ids = np.flatnonzero(is_broken)
     if not ids.size:
         return
     worst = ids[0] if amount is None else ids[np.abs(amount[ids]).argmax()]
     size = "" if amount is None else f" (by {amount[worst]:.3g})"
-    at = "" if there is None else f", at {there[worst].tolist()}"
+    at = "" if shown_at is None else f", at {shown_at[worst].tolist()}"
     raise BrokenPromiseError(
         f"{message}{size}: point {points[worst].tolist()}{at}; {ids.size} of {len(points)} points"
     )
@@ -277,24 +277,24 @@ class _Candidates:
     reach: FloatArray
     violation_ratio: FloatArray
 
-    def best_of(self, others: _Candidates) -> tuple[_Candidates, BoolArray]:
-        """For each of these n pairs, the best of itself and its m of the n * m `others`; and (n,)
-        whether that is another."""
+    def best_of(self, candidates: _Candidates) -> tuple[_Candidates, BoolArray]:
+        """For each of these n pairs, the best of itself and its m of the n * m `candidates`; and
+        (n,) whether the best is a candidate."""
         n = len(self.p)
-        m = len(others.p) // n
-        best = np.arange(n) * m + others.violation_ratio.reshape(n, m).argmax(axis=1)
-        is_better = others.violation_ratio[best] > self.violation_ratio
+        m = len(candidates.p) // n
+        best = np.arange(n) * m + candidates.violation_ratio.reshape(n, m).argmax(axis=1)
+        is_better = candidates.violation_ratio[best] > self.violation_ratio
         mask = is_better[:, None]
         return _Candidates(
-            np.where(mask, others.p[best], self.p),
-            np.where(mask, others.w[best], self.w),
-            np.where(is_better, others.reach[best], self.reach),
-            np.where(is_better, others.violation_ratio[best], self.violation_ratio),
+            np.where(mask, candidates.p[best], self.p),
+            np.where(mask, candidates.w[best], self.w),
+            np.where(is_better, candidates.reach[best], self.reach),
+            np.where(is_better, candidates.violation_ratio[best], self.violation_ratio),
         ), is_better
 
 
 def search_violations(
-    field: Field, points: FloatArray, look: FieldSamples, number: int, rng: np.random.Generator
+    field: Field, points: FloatArray, samples: FieldSamples, number: int, rng: np.random.Generator
 ) -> None:
     """Search for points that violate a promise, the one with index `number` in
     `Sample.all_promises`.
@@ -306,7 +306,7 @@ def search_violations(
     random, and a move is kept if it raises the violation ratio. The step length grows after success
     and shrinks after failure.
 
-    points: (n, 3), and `look` the samples of the field there. The search starts from the points
+    points: (n, 3), and `samples` the samples of the field there. The search starts from the points
         with the smallest radius and from random points, with y towards the border of the ball:
         along the gradient, against it, and in random directions.
 
@@ -317,9 +317,9 @@ def search_violations(
     divisor = _PATH_COST_DIVISOR if search.needs_path else 1
     count = min(max(int(_PAIRS_OF_POINTS * len(points)), 6), _MOST_PAIRS) // divisor
     moves_each = _MOVES // divisor
-    order = np.argsort(np.broadcast_to(look.promises[number].radius, len(points)), kind="stable")
+    order = np.argsort(np.broadcast_to(samples.promises[number].radius, len(points)), kind="stable")
     rows = np.concatenate([order[: count // 3], rng.choice(len(points), count)])[:count]
-    steepest = look.gradient[rows]
+    steepest = samples.gradient[rows]
     length = np.linalg.norm(steepest, axis=1, keepdims=True)
     steepest = np.where(length > 0, steepest / np.maximum(length, 1e-300), [1.0, 0.0, 0.0])
     start_kind = np.arange(count)[:, None] % 3
@@ -351,7 +351,7 @@ def search_violations(
         best = search.pairs(best.p[is_violated], best.w[is_violated], samples=_FINAL_PATH_SAMPLES)
         y = best.p + best.reach[:, None] * best.w
         holds = ~(best.violation_ratio > 1 + _ALLOWED)
-        name = type(look.promises[number]).__name__
+        name = type(samples.promises[number]).__name__
         message = f"{name}: f leaves what is promised here, by this factor"
         require(holds, message, best.p, best.violation_ratio, y)
 

@@ -180,7 +180,7 @@ def _as_tensors(hits: Hits) -> Hits:
 def _trace(surface: TracedSurface, rays: RayBatch) -> Hits:
     """The hits, as Dr.Jit arrays; with derivatives if the rays came as such."""
     backend, o, d, count = rays.backend, rays.origin, rays.direction, rays.count
-    prepared = surface.for_rays(count).prepare(backend, many=count >= _MIN_RAYS_FOR_CELLS)
+    prepared = surface.for_rays(count).prepare(backend, many_rays=count >= _MIN_RAYS_FOR_CELLS)
     if not prepared.field.is_cheap and _are_scattered(backend, dr.detach(o), dr.detach(d)):
         prepared = replace(prepared, uses_ray_queue=True)
     with dr.suspend_grad():
@@ -336,7 +336,7 @@ def _positions(o: Vec3, d: Vec3, t: Real) -> Vec3:
 
 def _trace_on_device(surface: TracedSurface, rays: RayBatch) -> Hits:
     count = rays.count
-    prepared = surface.prepare(rays.backend, many=count >= _MIN_RAYS_FOR_CELLS)
+    prepared = surface.prepare(rays.backend, many_rays=count >= _MIN_RAYS_FOR_CELLS)
     lanes = {
         name: array + dr.zeros(type(array), count)
         for name, array in zip(("o", "d", "near", "far"), rays.arrays, strict=True)

@@ -158,13 +158,13 @@ def level_number(level: Any) -> float:
     return as_number(level, "level must be a number, or several, such as 0.5 or 2 * math.pi")
 
 
-def as_number(number: Any, wrong: str) -> float:
-    """A number as Python's; TypeError, which begins with `wrong`, for anything else."""
+def as_number(number: Any, message: str) -> float:
+    """A number as Python's; TypeError, which begins with `message`, for anything else."""
     check_no_derivatives("a level or setting that is no Dr.Jit number", number)
     try:
         return float("nothing" if isinstance(number, str | bool | np.bool_) else number)
     except (TypeError, ValueError):
-        raise TypeError(f"{wrong}, not {number!r}") from None
+        raise TypeError(f"{message}, not {number!r}") from None
 
 
 def _check_side(side: Any, levels: Sequence[Any]) -> Side | None:

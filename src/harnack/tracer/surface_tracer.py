@@ -323,14 +323,18 @@ class SurfaceTracer:
         )
 
     def refined_crossings(
-        self, o: Vec3, d: Vec3, found: Contact, active: Mask
+        self, o: Vec3, d: Vec3, contact: Contact, active: Mask
     ) -> tuple[Real, Vec3, Any]:
         """Roots of crossings, the gradients there, and the number of evaluations of f for them. The
-        roots of `found` are kept if f has jumps or no creases."""
+        roots of `contact` are kept if f has jumps or no creases."""
         if self.field.has_jumps or not self.field.has_creases:
-            return found.root, found.gradient, dr.zeros(self.backend.UInt32, dr.width(found.root))
+            return (
+                contact.root,
+                contact.gradient,
+                dr.zeros(self.backend.UInt32, dr.width(contact.root)),
+            )
         path = Ray(self.backend.Array3f(o), self.backend.Array3f(d), self.proofs)
-        return refine_crossing(self.field, self.levels, self.tolerance, path, found, active)
+        return refine_crossing(self.field, self.levels, self.tolerance, path, contact, active)
 
     def begin_march(
         self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask, *, crosses: bool

@@ -213,17 +213,17 @@ class TracedSurface:
         return self.memoize(key, lambda: largest_component_cells(*arguments))
 
     def prepare(
-        self, backend: Backend, *, crosses: bool = False, many: bool = True
+        self, backend: Backend, *, crosses: bool = False, many_rays: bool = True
     ) -> SurfaceTracer:
         """The tracer of this surface, with all data on a backend, for use in a recorded kernel.
 
         crosses: whether rays will look for crossings.
-        many: whether there will be so many rays that it pays to search for empty cells first.
+        many_rays: whether there will be so many rays that it pays to search for empty cells first.
         """
         if self.largest and crosses:
             raise ValueError(_FIRST_HITS_ONLY)
         volume, region = self.volume, None
-        occupied = self._occupied() if self.largest or (many and not crosses) else None
+        occupied = self._occupied() if self.largest or (many_rays and not crosses) else None
         if crosses or self.require_crossing:
             region = intersection_of([self.field.domain, self.clip, self.section])
         field, known_volume = self.evaluator(backend), None

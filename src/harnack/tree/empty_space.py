@@ -86,9 +86,9 @@ class BoxCells:
         half = 0.5 * self.size
         return BoxCells((self.corners[:, None] + _OCTANTS * half).reshape(-1, 3), half)
 
-    def subset(self, which: BoolArray) -> BoxCells:
+    def subset(self, mask: BoolArray) -> BoxCells:
         """The boxes where a mask (n,) is set."""
-        return BoxCells(self.corners[which], self.size)
+        return BoxCells(self.corners[mask], self.size)
 
     def is_proved_empty(self, clearance: Clearance, margin: float = 0.0) -> BoolArray:
         """(n,) whether the ball around each cell, enlarged on all sides by `margin` times its size,
@@ -104,14 +104,14 @@ def kdop_of_points(points: FloatArray, slack: float) -> ConvexHull:
     return _kdop_of_boxes(points, np.full(3, slack))
 
 
-def merge_kdops(one: ConvexHull, other: ConvexHull) -> ConvexHull:
+def merge_kdops(first: ConvexHull, second: ConvexHull) -> ConvexHull:
     """The smallest polytope with the normals of `BoxCells.bounding_kdop` that contains two such
     polytopes."""
     return ConvexHull(
-        one.normals,
-        np.maximum(one.offsets, other.offsets),
-        np.minimum(one.lower, other.lower),
-        np.maximum(one.upper, other.upper),
+        first.normals,
+        np.maximum(first.offsets, second.offsets),
+        np.minimum(first.lower, second.lower),
+        np.maximum(first.upper, second.upper),
     )
 
 
@@ -162,15 +162,16 @@ def refine_cells(
 
 
 def nonempty_cells(
-    lower: FloatArray, upper: FloatArray, clearance: Clearance, most: int, finest: int
+    lower: FloatArray, upper: FloatArray, clearance: Clearance, max_cells: int, max_rounds: int
 ) -> BoxCells:
     """The leaves of the octree of a box that are not proved empty; there are none if all of the box
     is proved empty.
 
-    most: the largest number of cells tested in a round. finest: the largest number of rounds.
+    max_cells: the largest number of cells tested in a round.
+    max_rounds: the largest number of rounds.
     """
     root = BoxCells(np.array(lower)[None], np.array(upper) - np.array(lower))
-    return refine_cells(root, clearance, most, finest).occupied
+    return refine_cells(root, clearance, max_cells, max_rounds).occupied
 
 
 # The part of the margin around an empty cell, in cells, that covers the rounding of positions.
@@ -304,14 +305,14 @@ class GridCell:
         """The chessboard distance, in cells, to the nearest occupied cell (`GridData`)."""
         return dr.gather(self.grid.backend.UInt32, self.grid.empty_distance, self.index)
 
-    def exit_distance(self, d: Vec3, around: Real = 1.0) -> Real:
-        """The length for which the path with direction d stays among the cells less than `around`
+    def exit_distance(self, d: Vec3, radius: Real = 1.0) -> Real:
+        """The length for which the path with direction d stays among the cells less than `radius`
         cells away, or in the margin around them; infinite in a direction in which the grid ends
         there."""
         length: Real = self.grid.backend.Float(dr.inf)
         beyond = self.grid.margin - _ROUNDING
         for k in range(3):
-            upper, lower = self.corner[k] + around, self.corner[k] + 1 - around
+            upper, lower = self.corner[k] + radius, self.corner[k] + 1 - radius
             rising = d[k] > 0
             gap = dr.select(
                 rising, upper - self.cell_coordinates[k], self.cell_coordinates[k] - lower

@@ -299,7 +299,7 @@ class TriangleTree:
         total, sure = traverse(self.tree, visit, start, active)
         return total, sure
 
-    def signed_crossings_vertical(self, x: Vec3, way: Real, active: Mask = True) -> Real:
+    def signed_crossings_vertical(self, x: Vec3, direction: Real, active: Mask = True) -> Real:
         """The sum of the signs of all crossings of rays from x upwards (way 1) or downwards (-1)
         along the z axis.
 
@@ -307,7 +307,7 @@ class TriangleTree:
         than for other directions.
         """
         real = self.tree.backend.Float
-        up, height = way > 0, way * x.z
+        up, height = direction > 0, direction * x.z
         pad = 4 * self.tree.backend.machine_epsilon * (1 + dr.max(dr.abs(x)))
         low_x, high_x, low_y, high_y = x.x - pad, x.x + pad, x.y - pad, x.y + pad
 
@@ -321,7 +321,7 @@ class TriangleTree:
 
         def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
             t, sign = signed_crossing(row, VerticalRayFrame(x))
-            return (state[0] + dr.select(active & (way * t > 0), sign, 0),)
+            return (state[0] + dr.select(active & (direction * t > 0), sign, 0),)
 
         return traverse(self.tree, visit, (real(0),), active)[0]
 

@@ -94,15 +94,18 @@ class PreparedBranchPoint:
 
     @classmethod
     def of(
-        cls, point: BranchPoint, number: Callable[[float], Real], made: Any
+        cls, point: BranchPoint, make_number: Callable[[float], Real], make_complex: Any
     ) -> PreparedBranchPoint:
         """The point on a backend.
 
-        number: makes a number of the backend.
-        made: makes a complex number of the backend from its two parts.
+        make_number: makes a number of the backend.
+        make_complex: makes a complex number of the backend from its two parts.
         """
-        at, value = (made(number(z.real), number(z.imag)) for z in (point.location, point.value))
-        return cls(at, point.power, number(point.constant), number(point.radius), value)
+        at, value = (
+            make_complex(make_number(z.real), make_number(z.imag))
+            for z in (point.location, point.value)
+        )
+        return cls(at, point.power, make_number(point.constant), make_number(point.radius), value)
 
 
 @dataclass(frozen=True)

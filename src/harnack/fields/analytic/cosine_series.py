@@ -350,10 +350,10 @@ class _CellCurvatures:
         bounds = upload_floats(backend, cells.bounds * (1 + _KERNEL_ROUNDING))
         return cls(backend, cells.count, _vector_parameters(backend, size / cells.count), bounds)
 
-    def curvature(self, share: Vec3) -> TaylorRemainder:
+    def curvature(self, fractions: Vec3) -> TaylorRemainder:
         """The bound of the cell in which a point lies, on a ball within the cell's neighbors;
-        share: the point as fractions of the box."""
-        position, index = share * float(self.count), self.backend.UInt32(0)
+        fractions: the point as fractions of the box."""
+        position, index = fractions * float(self.count), self.backend.UInt32(0)
         radius: Real = dr.inf
         for axis in (2, 1, 0):
             cell = clamp(dr.floor(position[axis]), 0, self.count - 1)

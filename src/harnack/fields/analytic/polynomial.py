@@ -100,13 +100,13 @@ class HarmonicPromises:
     rounding: HarmonicRounding
 
     @classmethod
-    def of(cls, weights: Weights, known: BallRange, *, is_divided: bool) -> HarmonicPromises:
+    def of(cls, weights: Weights, ranges: BallRange, *, is_divided: bool) -> HarmonicPromises:
         """The promises of a sum with these weights.
 
-        known: the ranges of the degrees.
+        ranges: the ranges of the degrees.
         is_divided: whether points are divided by a size other than 1 first.
         """
-        inner, outer = _best_radius(known, 0.0), _best_radius(known, 1.0)
+        inner, outer = _best_radius(ranges, 0.0), _best_radius(ranges, 1.0)
         order, axial, axis_share = order_on_axis(weights), None, 0.0
         if order > 2:
             nonconstant = {key: weight for key, weight in weights.items() if key[0] > 0}
@@ -115,12 +115,12 @@ class HarmonicPromises:
                 gradient_bound(nonconstant),
                 hessian_bound(nonconstant),
             )
-            lower, upper = known.by_degree(1.0)
-            max_value = max(upper - known.constant, known.constant - lower)
+            lower, upper = ranges.by_degree(1.0)
+            max_value = max(upper - ranges.constant, ranges.constant - lower)
             # If rho = axis_share r, both bounds of a single term are the same.
             axis_share = (max_value / float(axial[0](1.0, 1.0))) ** (1 / order)
         return cls(
-            known.with_spheres(weights, 1.01 * max(inner, 1.0 + outer)),
+            ranges.with_spheres(weights, 1.01 * max(inner, 1.0 + outer)),
             max(degree for degree, _ in weights),
             min((degree for degree, _ in weights if degree > 0), default=0),
             order,
@@ -232,9 +232,9 @@ class _SolidHarmonics(Field):
     over_relaxation = 1.6
 
     def __init__(
-        self, weights: Weights, known: BallRange, size: float, domain: Volume, axis: int = 2
+        self, weights: Weights, ranges: BallRange, size: float, domain: Volume, axis: int = 2
     ) -> None:
-        """A field of these weights, with the ranges `known`, for |p| <= size.
+        """A field of these weights, with these ranges of the degrees, for |p| <= size.
 
         axis: the coordinate of p that is the z of the solid harmonics; x and y follow it
             cyclically.
@@ -243,8 +243,8 @@ class _SolidHarmonics(Field):
         self._axis = axis
         self._weights = weights
         self._size = size
-        self._promises = HarmonicPromises.of(weights, known, is_divided=size != 1.0)
-        self.value_range = known.with_spheres(weights, 1.0).on_ball(1.0)
+        self._promises = HarmonicPromises.of(weights, ranges, is_divided=size != 1.0)
+        self.value_range = ranges.with_spheres(weights, 1.0).on_ball(1.0)
 
     @property
     def degree(self) -> int:

@@ -67,19 +67,19 @@ class Legendre:
     def __init__(self, z: Any, r2: Any) -> None:
         self.z = z
         self.r2 = r2
-        self._known: dict[tuple[int, int], Any] = {}
+        self._values: dict[tuple[int, int], Any] = {}
 
     def __call__(self, l: int, m: int) -> Any:  # noqa: E741
         """The value; 0.0 for l < m."""
         if l <= m:
             return 1.0 if l == m else 0.0
-        if (l, m) not in self._known:
+        if (l, m) not in self._values:
             below, below2 = self(l - 1, m), self(l - 2, m)
             q = (2 * l - 1) / (l - m) * (self.z * below)
             if l > m + 1:
                 q = q - (l + m - 1) / (l - m) * (self.r2 * below2)
-            self._known[l, m] = q
-        return self._known[l, m]
+            self._values[l, m] = q
+        return self._values[l, m]
 
 
 def evaluate(weights: Weights, x: Any, y: Any, z: Any) -> tuple[Any, tuple[Any, Any, Any]]:

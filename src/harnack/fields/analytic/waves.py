@@ -137,14 +137,14 @@ class _FactorRates:
 
     def __init__(self, p: Vec3) -> None:
         self._p = p
-        self._known: dict[Any, tuple[Real, Real]] = {}
+        self._sincos: dict[Any, tuple[Real, Real]] = {}
 
     def __call__(self, axis: int, factor: WaveFactor) -> tuple[Real, Real]:
         """The factor and its derivative along the axis."""
         key = (axis, factor.frequency, factor.phase)
-        if key not in self._known:
-            self._known[key] = sincos(_angle(factor.frequency * self._p[axis], factor.phase))
-        s, c = self._known[key]
+        if key not in self._sincos:
+            self._sincos[key] = sincos(_angle(factor.frequency * self._p[axis], factor.phase))
+        s, c = self._sincos[key]
         return (c, -factor.frequency * s) if factor.is_cosine else (s, factor.frequency * c)
 
 

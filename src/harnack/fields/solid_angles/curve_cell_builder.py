@@ -270,9 +270,9 @@ class _FarBounds:
         least, cubes, slope, tail, total = columns
         return cls(np.sqrt(least) * (1 - _SLACK), cubes * (1 + _SLACK), slope, tail, total)
 
-    def subset(self, which: BoolArray) -> _FarBounds:
+    def subset(self, mask: BoolArray) -> _FarBounds:
         """The sums at the centers that a mask selects."""
-        return _FarBounds(*(values[which] for values in vars(self).values()))
+        return _FarBounds(*(values[mask] for values in vars(self).values()))
 
 
 def _distances(

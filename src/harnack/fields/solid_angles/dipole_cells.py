@@ -110,13 +110,13 @@ class DipoleCells:
     size: int
 
     def sums(
-        self, x: Vec3, active: Mask, add: AddPrimitive, own: tuple[Any, ...]
+        self, x: Vec3, active: Mask, add: AddPrimitive, extra: tuple[Any, ...]
     ) -> tuple[SourceSums, tuple[Any, ...], Mask]:
         """The sums over all primitives at x, with gradients; the caller's own state; and the mask
         of the lanes on which the sums hold: the active lanes whose point lies in the cube.
 
         add: as for `Treecode.sums`, for near primitives.
-        own: the caller's own state, which `add` updates.
+        extra: the caller's own state, which `add` updates.
 
         Proof of the bounds on far primitives, D >= least from the center, at a point a from it: the
         distance to x is at least D - a >= D (1 - a/least), so that the sum of area/distance^4 is at
@@ -155,35 +155,35 @@ class DipoleCells:
         def runs(i: Any, *_: Any) -> Mask:
             return i < count
 
-        def step(i: Any, sums: Any, own: Any) -> tuple[Any, ...]:
+        def step(i: Any, sums: Any, extra: Any) -> tuple[Any, ...]:
             in_list = i < count
             primitive = self.primitives.read_record(
                 dr.gather(index, self.near, first + i, in_list), in_list
             )
-            new_sums, own = add(primitive, in_list, SourceSums.from_state(sums), own)
-            return i + 1, new_sums.to_state(), own
+            new_sums, extra = add(primitive, in_list, SourceSums.from_state(sums), extra)
+            return i + 1, new_sums.to_state(), extra
 
-        start = (index(0), far.to_state(), own)
-        _, state, own = dr.while_loop(start, runs, step, label="near primitives")
+        start = (index(0), far.to_state(), extra)
+        _, state, extra = dr.while_loop(start, runs, step, label="near primitives")
         sums, n = SourceSums.from_state(state), self.backend.Float(count)
         added = (_NEAR + 1) * self.backend.machine_epsilon * n * sums.s4 / inverse
         sums = dataclasses.replace(sums, gradient_truncation=sums.gradient_truncation + added)
-        return sums, own, active
+        return sums, extra, active
 
     def sums_with_tree(
         self, tree: Treecode, x: Vec3, detail: Real, add: tuple[AddPrimitive, AddPrimitive],
-        own: tuple[Any, ...], where: Mask = True,
+        extra: tuple[Any, ...], where: Mask = True,
     ) -> tuple[SourceSums, tuple[Any, ...]]:  # fmt: skip
         """The sums at x, with gradients, and the caller's own state: from the cells for details up
         to 1, and from the tree of the same primitives for larger details or outside of the cube.
 
         add: adds a near primitive to the sums of a cell, and to the sums of the tree.
-        own: the caller's own state.
+        extra: the caller's own state.
         """
         in_cell, in_tree = add
         lanes, tree_detail = self.backend.Bool(where), fmax(detail, self.backend.Float(1))
-        sums, state, is_valid = self.sums(x, lanes & (detail <= 1), in_cell, own)
-        tree_sums, tree_state = tree.sums(x, tree_detail, in_tree, own, lanes & ~is_valid)
+        sums, state, is_valid = self.sums(x, lanes & (detail <= 1), in_cell, extra)
+        tree_sums, tree_state = tree.sums(x, tree_detail, in_tree, extra, lanes & ~is_valid)
         pairs = zip(state, tree_state, strict=True)
         state = tuple(dr.select(is_valid, ours, theirs) for ours, theirs in pairs)
         return sums.select(~is_valid, tree_sums), state
@@ -376,7 +376,7 @@ def _octree(
             root.subset(backend, np.zeros(len(centers), np.int64)),
             to_vector3(backend, centers),
         )
-        counts = roots.primitives_of(packed, c, near, none_stay, None, far=False, most=limit)
+        counts = roots.primitives_of(packed, c, near, none_stay, None, far=False, max_count=limit)
         count = to_numpy(counts).astype(np.int64)
         is_leaf = np.broadcast_to(count <= most_near, len(centers)) | is_last
         levels.append(_CellLevel(centers, radius, is_leaf, count))

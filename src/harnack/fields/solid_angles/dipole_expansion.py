@@ -145,9 +145,9 @@ class DipoleExpansions:
             self.coefficients + other.coefficients, *sums, min_distance=min_distance
         )
 
-    def subset(self, which: IntArray) -> DipoleExpansions:
+    def subset(self, indices: IntArray) -> DipoleExpansions:
         """The sums of the balls with these indices; a ball may occur several times."""
-        return DipoleExpansions(*(values[which] for values in vars(self).values()))
+        return DipoleExpansions(*(values[indices] for values in vars(self).values()))
 
     @classmethod
     def concatenate(cls, parts: list[DipoleExpansions]) -> DipoleExpansions:
@@ -392,12 +392,12 @@ class PendingSources:
         put: WriteEntry | None,
         *,
         far: bool,
-        most: Any = None,
+        max_count: Any = None,
     ) -> Any:
         """The number of far primitives, of the list of primitives and of leaves that are not far,
         or with far = False the number of the other primitives; for `build_lists`. A primitive is
-        far if it is farther from c than `inner` and its reach. If there are more than `most`, not
-        all may be counted.
+        far if it is farther from c than `inner` and its reach. If there are more than `max_count`,
+        not all may be counted.
 
         A leaf that is far has no near primitives. A triangle's box lies in the ball of its node, so
         that the triangle's radius is at most the diameter of that ball: its centroid is farther
@@ -417,8 +417,8 @@ class PendingSources:
             if are_points and not far:  # only nodes whose ball comes near have near points
                 enters &= square <= dr.square(inner + node.head[4] * (1 + 1e-9) + 1e-12)
             enters &= node.is_leaf | (node.head[4] > smallest)
-            if most is not None:
-                enters &= state[0] <= most
+            if max_count is not None:
+                enters &= state[0] <= max_count
 
             def runs(slot: Any, *_: Any) -> Mask:
                 return enters & node.is_leaf & (slot < tree.leaf_size)

@@ -76,9 +76,9 @@ class EdgeExpansions:
         total = self.coefficients + other.coefficients
         return EdgeExpansions(total, error * _ROUNDED_UP, slope * _ROUNDED_UP)
 
-    def subset(self, which: Any) -> EdgeExpansions:
+    def subset(self, rows: Any) -> EdgeExpansions:
         """The sums of the balls that a mask or indices select."""
-        return EdgeExpansions(*(values[which] for values in vars(self).values()))
+        return EdgeExpansions(*(values[rows] for values in vars(self).values()))
 
     def to_octants(self, is_split: BoolArray, shifts: FloatArray, radius: float) -> EdgeExpansions:
         """The same cycles about the centers of the octants of the cells that are split; the balls

@@ -196,7 +196,7 @@ def _unit(vectors: FloatArray) -> FloatArray:
 def subtract_runs(
     before: EdgeRuns,
     edges: tuple[IntArray, IntArray],
-    kept: BoolArray,
+    is_kept: BoolArray,
     after: EdgeRuns,
     vertices: int,
 ) -> CellEdges:
@@ -204,13 +204,13 @@ def subtract_runs(
     `before`, sorted by cell.
 
     edges: the edges of the runs `before` (`EdgeRuns.edges`).
-    kept: for each of these edges, whether it is in a run of `after`.
+    is_kept: for each of these edges, whether it is in a run of `after`.
     vertices: the number of vertices.
 
     The edges refer to a table of points with the vertices first, then the apexes of `before`, then
     the apexes of `after`.
     """
-    remaining = np.flatnonzero(~kept)
+    remaining = np.flatnonzero(~is_kept)
     run, vertex = (part[remaining] for part in edges)
     closing = after.closing_edges(vertices + len(before.cell))
     return _merged(

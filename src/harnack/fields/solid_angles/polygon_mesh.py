@@ -277,9 +277,9 @@ class _FaceCells:
         at_high: BoolArray = self.corner > high - 1.25 * size
         return np.logical_or.reduce(at_low | at_high, axis=1)
 
-    def subset(self, chosen: BoolArray) -> _FaceCells:
+    def subset(self, mask: BoolArray) -> _FaceCells:
         """The cells selected by a mask (k,)."""
-        return _FaceCells(self.face[chosen], self.corner[chosen], self.depth[chosen])
+        return _FaceCells(self.face[mask], self.corner[mask], self.depth[mask])
 
     def split(self, sides: FloatArray) -> _FaceCells:
         """The eight octants of each cell."""
@@ -289,12 +289,12 @@ class _FaceCells:
         steps = np.tile(_CORNERS, (len(self.face), 1))
         return _FaceCells(face, np.repeat(self.corner, 8, axis=0) + steps * half, depth)
 
-    def joined(self, others: _FaceCells) -> _FaceCells:
+    def joined(self, other: _FaceCells) -> _FaceCells:
         """The cells of both operands."""
-        face = np.concatenate([self.face, others.face])
+        face = np.concatenate([self.face, other.face])
         order = np.argsort(face, kind="stable")
-        corner = np.concatenate([self.corner, others.corner])
-        return _FaceCells(face[order], corner[order], np.append(self.depth, others.depth)[order])
+        corner = np.concatenate([self.corner, other.corner])
+        return _FaceCells(face[order], corner[order], np.append(self.depth, other.depth)[order])
 
 
 def _are_empty(

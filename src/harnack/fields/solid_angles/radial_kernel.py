@@ -147,8 +147,8 @@ class RadialSums:
         )
         return RadialSums(sums, self.q2_d3 + q2_d3, self.q2_d4 + q2_d4)
 
-    def remainder(self, share: float, r: Real, growth: Real) -> Real:
-        """A bound of |f(y) - f(x) - grad f.(y-x)|/|y-x|^2 for |y-x| <= r, with r at most `share`
+    def remainder(self, fraction: float, r: Real, growth: Real) -> Real:
+        """A bound of |f(y) - f(x) - grad f.(y-x)|/|y-x|^2 for |y-x| <= r, with r at most `fraction`
         times the distance to the nearest dipole; growth: the growth of the kernel for r.
 
         Each term's second derivatives are at most |K^(3)| = 6 Q_3/(d_i-s)^4 at distance s from x,
@@ -156,14 +156,14 @@ class RadialSums:
         t/d_i = q it is at most growth Q_3 (3-2q)/(1-q)^2 t^2/d_i^4; (3-2q)/(1-q)^2 is convex, hence
         below its chord on [0, share].
         """
-        return (1 + SUM_MARGIN) * growth * self.sums.remainder(share, r)
+        return (1 + SUM_MARGIN) * growth * self.sums.remainder(fraction, r)
 
     def curvatures(
-        self, growth: Callable[[Real], Real], most: Real, size: Real
+        self, growth: Callable[[Real], Real], nearest: Real, size: Real
     ) -> tuple[TaylorRemainder, ...]:
-        """`remainder` as promises, in units of `size`; most: a lower bound of the distance to the
-        nearest dipole."""
-        radii = [(fraction, fraction * most) for fraction in _REACHES]
+        """`remainder` as promises, in units of `size`; nearest: a lower bound of the distance to
+        the nearest dipole."""
+        radii = [(fraction, fraction * nearest) for fraction in _REACHES]
         return tuple(
             TaylorRemainder(2 * self.remainder(fraction, r, growth(r)) / (size * size), r * size)
             for fraction, r in radii

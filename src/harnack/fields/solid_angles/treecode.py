@@ -312,14 +312,14 @@ class Treecode:
         return fmax(self.accuracy * detail, self.backend.Float(self.coarse_ratio))
 
     def sums(
-        self, x: Vec3, detail: Real, add: AddPrimitive, own: ExtraState = (), active: Mask = True,
+        self, x: Vec3, detail: Real, add: AddPrimitive, extra: ExtraState = (), active: Mask = True,
         derivatives: int = 1,
     ) -> tuple[SourceSums, ExtraState]:  # fmt: skip
         """All sums at points x, and the caller's own state.
 
         detail: the accuracy scale of `Field.at_accuracy`; infinity gives the direct sum.
         add: adds a primitive of a near leaf (`AddPrimitive`).
-        own: the caller's own state, which `add` updates.
+        extra: the caller's own state, which `add` updates.
         derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
         """
         free, closer = (
@@ -344,11 +344,11 @@ class Treecode:
             return sums.to_state(), state[1]
 
         def add_primitive(row: list[Real], active: Mask, state: ExtraState) -> ExtraState:
-            sums, own = add(row, active, SourceSums.from_state(state[0]), state[1])
-            return sums.to_state(), own
+            sums, extra = add(row, active, SourceSums.from_state(state[0]), state[1])
+            return sums.to_state(), extra
 
         far_off = _NO_SOURCE_DISTANCE * (1 + dr.max(dr.abs(x)))
-        start = (SourceSums.zero(self.backend, far_off, derivatives).to_state(), own)
+        start = (SourceSums.zero(self.backend, far_off, derivatives).to_state(), extra)
         state = traverse_clusters(self.tree, x, closer, add_cluster, add_primitive, start, active)
         sums, factor = (
             SourceSums.from_state(state[0]),
@@ -365,9 +365,9 @@ class Treecode:
         )
         return sums, state[1]
 
-    def values(self, sums: SourceSums, share: float, unit: Real, rounding: Real) -> PointValues:
+    def values(self, sums: SourceSums, scale: float, unit: Real, rounding: Real) -> PointValues:
         """`SourceSums.values` of sums over the tree."""
-        return sums.values(share, unit, rounding, _FAR_GRADIENT_ROUNDINGS)
+        return sums.values(scale, unit, rounding, _FAR_GRADIENT_ROUNDINGS)
 
     def _decay(self, inverse: Real) -> Real:
         """r^-(order + 3), to which the first term beyond the order is proportional."""

@@ -591,26 +591,26 @@ class _WindingOnInterval(Field):
 
     def __init__(
         self,
-        on: _WindingData,
+        data: _WindingData,
         frame: RayFrame,
         behind: JumpCrossing,
         offset: Real,
         detail: Real = 1.0,
     ) -> None:
-        self.has_variable_accuracy = on.winding.has_detail or on.cells is not None
-        self.coarsest_accuracy = on.winding.coarsest_detail
-        self._on, self._frame, self._detail = on, frame, on.backend.Float(detail)
+        self.has_variable_accuracy = data.winding.has_detail or data.cells is not None
+        self.coarsest_accuracy = data.winding.coarsest_detail
+        self._data, self._frame, self._detail = data, frame, data.backend.Float(detail)
         self._behind, self._offset = behind, offset
 
     @property
     def has_unknown_branch(self) -> bool:
-        return self._on.cells is not None
+        return self._data.cells is not None
 
     def at_accuracy(self, detail: Real) -> Field:
-        return _WindingOnInterval(self._on, self._frame, self._behind, self._offset, detail)
+        return _WindingOnInterval(self._data, self._frame, self._behind, self._offset, detail)
 
     def evaluate(self, p: Vec3) -> Sample:
-        data, frame = self._on, self._frame
+        data, frame = self._data, self._frame
         x, detail = data.to_unit(p), self._detail
         if data.cells is None:
             sample = data.winding.sample_interval(frame, x, self._behind, self._offset, detail)

@@ -52,24 +52,24 @@ class BoundaryRates:
 
     @classmethod
     def of(
-        cls, backend: Backend, mesh: WindingMesh, order: int, whole: TreeWinding
+        cls, backend: Backend, mesh: WindingMesh, order: int, tree: TreeWinding
     ) -> BoundaryRates:
         """The derivatives of the winding number of a mesh.
 
-        whole: a tree over the mesh's triangles, which is used if it has cells, and if caps would be
+        tree: a tree over the mesh's triangles, which is used if it has cells, and if caps would be
             no smaller, as for a soup.
         """
         if not len(mesh.singular_edges):
             return cls(None)
-        if whole.cells is not None:
-            return cls(whole)
+        if tree.cells is not None:
+            return cls(tree)
         if len(mesh.singular_edges) <= _FEW:
             return cls(LiftedEdges.upload(backend, mesh.unit_vertices, mesh.singular_edges))
         if len(mesh.singular_edges) > len(mesh.triangles):
-            return cls(whole)
+            return cls(tree)
         caps = caps_of(mesh)
         if caps.area > _SMALLER * mesh.area:
-            return cls(whole)
+            return cls(tree)
         return cls(TreeWinding.of(backend, caps, _ACCURACY, order))
 
     def at(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:

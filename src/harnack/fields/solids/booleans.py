@@ -336,18 +336,18 @@ class Complement(SolidOfField):
         return -x, -y, -z
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        return negated_look(self.field.sample_ray(path, t, ahead, back))
+        return negated_ray_sample(self.field.sample_ray(path, t, ahead, back))
 
 
-def negated_look(look: RaySample) -> RaySample:
+def negated_ray_sample(sample: RaySample) -> RaySample:
     """The ray sample of -f from that of f."""
     return RaySample(
-        negated_sample(look.sample),
-        tuple(NegatedEnclosure(enclosure) for enclosure in look.forward),
-        tuple(NegatedEnclosure(enclosure) for enclosure in look.backward),
-        -look.slope,
-        look.reach_growth,
-        look.slope_error,
+        negated_sample(sample.sample),
+        tuple(NegatedEnclosure(enclosure) for enclosure in sample.forward),
+        tuple(NegatedEnclosure(enclosure) for enclosure in sample.backward),
+        -sample.slope,
+        sample.reach_growth,
+        sample.slope_error,
     )
 
 

@@ -369,21 +369,21 @@ class _Octave:
     error: Real
     slope_error: Real
 
-    def jet(self, coordinates: list[Jet], starts: list[Jet], off: Real) -> Jet:
+    def jet(self, coordinates: list[Jet], starts: list[Jet], offset: Real) -> Jet:
         """The octave's jet, from jets of the coordinates and from their starts, which are within
-        `off` of the point.
+        `offset` of the point.
 
         Proof. Within m of the point the gradient differs from that at the point by at most bend m
         (mean value theorem), and derivatives along a path follow by the chain rule. The value is
         that at the start plus the integral of the slope.
         """
-        error = self.error + self.slope * off * (1 + 1e-5)
+        error = self.error + self.slope * offset * (1 + 1e-5)
         value = Interval(self.value - error, self.value + error)
         if coordinates[0].jet_at_start is None:
             # At points of space, not on pieces of length 0, the Hessian is known.
             is_point = len(coordinates[0].first_derivatives) > 1
-            return self._derivatives(coordinates, off, value, is_point=is_point)
-        start = self._derivatives(starts, off, value, is_point=False)
+            return self._derivatives(coordinates, offset, value, is_point=is_point)
+        start = self._derivatives(starts, offset, value, is_point=False)
         distances = [
             fmax(dr.abs(coordinate.value.upper - q), dr.abs(coordinate.value.lower - q))
             for coordinate, q in zip(coordinates, self.at, strict=True)

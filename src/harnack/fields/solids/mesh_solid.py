@@ -77,7 +77,7 @@ _ROUNDED_BY = 256.0
 _CLEAR_ROUNDINGS = 8.0
 
 
-def solid_of_mesh(given: Any) -> MeshSolid:
+def solid_of_mesh(source: Any) -> MeshSolid:
     """The solid that a mesh bounds. A mesh is anything with `vertices` and `faces`, a pair of
     these, or the path of a surface file.
 
@@ -86,17 +86,17 @@ def solid_of_mesh(given: Any) -> MeshSolid:
         FileFormatError: a file that cannot be read.
         TypeError: the argument is not a mesh.
     """
-    if isinstance(given, str | os.PathLike):
-        surface = read_geometry(cast("Any", given), "winding")
+    if isinstance(source, str | os.PathLike):
+        surface = read_geometry(cast("Any", source), "winding")
         if not isinstance(surface, LoadedMesh):
-            raise MeshError(f"{given}: it holds no faces, so it bounds no solid")
+            raise MeshError(f"{source}: it holds no faces, so it bounds no solid")
         faces = np.concatenate([surface.faces, surface.zero_area_faces])
         return MeshSolid(surface.vertices, faces)
-    mesh: Any = given
+    mesh: Any = source
     if hasattr(mesh, "vertices") and hasattr(mesh, "faces"):
         return MeshSolid(mesh.vertices, mesh.faces)
-    if isinstance(given, tuple | list) and len(cast("Any", given)) == 2:
-        vertices, faces = cast("Any", given)
+    if isinstance(source, tuple | list) and len(cast("Any", source)) == 2:
+        vertices, faces = cast("Any", source)
         return MeshSolid(vertices, faces)
     raise TypeError(
         "a mesh is a trimesh.Trimesh, a pair (vertices, faces), or the path of a file, not of type "
@@ -104,14 +104,14 @@ def solid_of_mesh(given: Any) -> MeshSolid:
     )
 
 
-def looks_like_mesh(given: Any) -> bool:
+def looks_like_mesh(value: Any) -> bool:
     """Whether an argument is meant as a mesh: it has the attributes of a mesh, is a pair, or is the
     name of a surface file."""
-    if isinstance(given, str | os.PathLike):
-        return Path(cast("Any", given)).suffix.lower() in GEOMETRY_SUFFIXES
-    if hasattr(given, "vertices") and hasattr(given, "faces"):
+    if isinstance(value, str | os.PathLike):
+        return Path(cast("Any", value)).suffix.lower() in GEOMETRY_SUFFIXES
+    if hasattr(value, "vertices") and hasattr(value, "faces"):
         return True
-    return isinstance(given, tuple | list) and len(cast("Any", given)) == 2
+    return isinstance(value, tuple | list) and len(cast("Any", value)) == 2
 
 
 @dataclass(frozen=True, eq=False)
