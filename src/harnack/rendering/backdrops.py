@@ -164,7 +164,7 @@ def parse_backdrop(given: Any) -> Backdrop:
     if isinstance(given, str):
         return _named(given)
     if isinstance(given, list | tuple) and len(pair := cast("list[Any]", given)) == 2:
-        return GradientBackdrop(*(parse_color(one, "a color of the backdrop") for one in pair))
+        return GradientBackdrop(*(parse_color(end, "a color of the backdrop") for end in pair))
     try:
         color = parse_color(given, "backdrop")
     except TypeError:
@@ -178,19 +178,19 @@ _BACKDROP_HELP = (
 )
 
 
-def _named(given: str) -> Backdrop:
-    if given in GROUNDS:
-        return GroundBackdrop(given)
-    if given == TRANSPARENT:
+def _named(name: str) -> Backdrop:
+    if name in GROUNDS:
+        return GroundBackdrop(name)
+    if name == TRANSPARENT:
         return None
-    if Path(given).suffix.lower() in IMAGE_FILES:
-        return ImageBackdrop(_read(Path(given)))
+    if Path(name).suffix.lower() in IMAGE_FILES:
+        return ImageBackdrop(_read(Path(name)))
     try:
-        color = parse_color(given, "backdrop")
+        color = parse_color(name, "backdrop")
     except ValueError:
         known = (*BACKDROPS, *NAMED_COLORS)
         raise ValueError(
-            f"backdrop must be one of {_BACKDROP_HELP}, not {given!r}{did_you_mean(given, known)}"
+            f"backdrop must be one of {_BACKDROP_HELP}, not {name!r}{did_you_mean(name, known)}"
         ) from None
     return GradientBackdrop(color, color)
 
@@ -236,10 +236,10 @@ def _read_bitmap(data: bytes) -> FloatImage:
 def _decoded(bitmap: Any) -> FloatImage:
     """The pixels of one of Mitsuba's bitmaps."""
     mi = load_mitsuba()
-    clear = bitmap.has_alpha()
-    kind = mi.Bitmap.PixelFormat.RGBA if clear else mi.Bitmap.PixelFormat.RGB
+    has_alpha = bitmap.has_alpha()
+    kind = mi.Bitmap.PixelFormat.RGBA if has_alpha else mi.Bitmap.PixelFormat.RGB
     pixels = np.array(bitmap.convert(kind, mi.Struct.Type.Float32, False), dtype=np.float32)
-    if clear:
+    if has_alpha:
         pixels = pixels[..., :3] * pixels[..., 3:] + (1 - pixels[..., 3:])
     return np.ascontiguousarray(pixels)
 
@@ -254,12 +254,12 @@ def _read_exr(data: bytes) -> FloatImage:
         path.write_bytes(data)
         with library.File(str(path)) as file:
             channels: dict[str, FloatImage] = {
-                name: np.array(one.pixels, dtype=np.float32)
-                for name, one in file.channels().items()
+                name: np.array(channel.pixels, dtype=np.float32)
+                for name, channel in file.channels().items()
             }
     if "RGBA" in channels:  # colors are multiplied by alpha
-        both = channels["RGBA"]
-        pixels = both[..., :3] + (1 - np.clip(both[..., 3:], 0, 1))
+        rgba = channels["RGBA"]
+        pixels = rgba[..., :3] + (1 - np.clip(rgba[..., 3:], 0, 1))
     elif "RGB" in channels:
         pixels = channels["RGB"]
     else:  # KeyError: no colors at all

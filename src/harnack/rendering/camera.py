@@ -141,24 +141,24 @@ class Camera:
         target = middle if self.target is None else to_world(np.array([self.target]))[0]
         if self.position is not None:
             origin = to_world(np.array([self.position]))[0]
-            away = origin - target
-            length = float(np.linalg.norm(away))
+            to_camera = origin - target
+            length = float(np.linalg.norm(to_camera))
             if not length > 0:
                 raise ValueError(
                     f"position {self.position} is in the middle of what is seen: say where to look "
                     "with a target (x, y, z)"
                 )
-            azimuth = math.degrees(math.atan2(away[1], away[0]))
-            elevation = math.degrees(math.asin(max(-1.0, min(1.0, away[2] / length))))
-            turned = replace(self, azimuth=azimuth, elevation=elevation, position=None)
+            azimuth = math.degrees(math.atan2(to_camera[1], to_camera[0]))
+            elevation = math.degrees(math.asin(max(-1.0, min(1.0, to_camera[2] / length))))
+            oriented = replace(self, azimuth=azimuth, elevation=elevation, position=None)
         else:
-            turned, length = self, None
+            oriented, length = self, None
             if self.distance is not None:
                 unit = np.diff(to_world(np.array([[0.0, 0, 0], [1, 0, 0]])), axis=0)
                 length = self.distance * float(np.linalg.norm(unit))
-        right, up, back = turned.axes()
-        seen = points - target
-        x, y, z = np.abs(seen @ right), np.abs(seen @ up), seen @ back
+        right, up, back = oriented.axes()
+        relative = points - target
+        x, y, z = np.abs(relative @ right), np.abs(relative @ up), relative @ back
         fov = self.fov_or_default
         if length is None:  # |across| <= slope (length - z) for all points
             slopes = self._slopes(size)
@@ -168,7 +168,7 @@ class Camera:
             fov = self._fov_to_frame(np.array([x, y]), length - z, size)
         else:
             fov = 2 * math.degrees(math.atan(math.tan(math.radians(fov) / 2) / self.zoom))
-        return CameraPose(target + length * back, target, up, fov, turned.azimuth_elevation[0])
+        return CameraPose(target + length * back, target, up, fov, oriented.azimuth_elevation[0])
 
     def _fov_to_frame(self, across: FloatArray, depth: FloatArray, size: tuple[int, int]) -> float:
         """The angle of view, in degrees, that frames points as far as `across` (2, n) from the

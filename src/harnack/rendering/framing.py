@@ -50,19 +50,22 @@ def rotation_to_z_up(up: Any) -> FloatArray:
                 f"{did_you_mean(up, UP_AXES)}"
             )
         axis = up.removeprefix("-")
-        over = np.diag([1.0, -1.0, -1.0]) if up.startswith("-") else np.eye(3)
-        return over @ _UPRIGHT[axis]
-    way = np.array(as_point(up, "up"))
-    if not way.any():
+        flip = np.diag([1.0, -1.0, -1.0]) if up.startswith("-") else np.eye(3)
+        return flip @ _UPRIGHT[axis]
+    vector = np.array(as_point(up, "up"))
+    if not vector.any():
         raise ValueError("up must be a vector that is not zero")
-    way, z = way / float(np.abs(way).max()), np.array([0.0, 0.0, 1.0])
-    way = way / float(np.linalg.norm(way))
+    vector, z = vector / float(np.abs(vector).max()), np.array([0.0, 0.0, 1.0])
+    vector = vector / float(np.linalg.norm(vector))
     # Turned the shortest way, about the axis at right angles to both.
-    across = np.cross(way, z)
-    if float(np.linalg.norm(across)) < 1e-12:
-        return rotation_to_z_up("z" if way[2] > 0 else "-z")
-    u = across / np.linalg.norm(across)
-    before, after = np.stack([u, np.cross(way, u), way]), np.stack([u, np.cross(z, u), z])
+    normal = np.cross(vector, z)
+    if float(np.linalg.norm(normal)) < 1e-12:
+        return rotation_to_z_up("z" if vector[2] > 0 else "-z")
+    u = normal / np.linalg.norm(normal)
+    before, after = (
+        np.stack([u, np.cross(vector, u), vector]),
+        np.stack([u, np.cross(z, u), z]),
+    )
     return after.T @ before
 
 
@@ -73,8 +76,8 @@ class UnboundedSurfaceError(ValueError):
     """
 
     def __init__(self, reason: str, usual: float | None) -> None:
-        other = "" if usual is None else f", or choose another level, such as {usual:g}"
-        super().__init__(f"{reason}: give it a clip, such as a ball (harnack.Ball){other}")
+        hint = "" if usual is None else f", or choose another level, such as {usual:g}"
+        super().__init__(f"{reason}: give it a clip, such as a ball (harnack.Ball){hint}")
         self.reason = reason
         self.bounded_level = usual
 
@@ -141,11 +144,11 @@ def visible_points(surface: TracedSurface, backend: Backend) -> FloatArray:
     check_drawable_size(ends)
     prepared = surface.evaluator(backend)
 
-    def found() -> FloatArray:
+    def find() -> FloatArray:
         return _find_visible_points(surface, backend, ends)
 
     if prepared is surface.field:  # it may have changed in place
-        return found()
+        return find()
     settings = (
         surface.level_values,
         surface.clip_volume,
@@ -154,7 +157,7 @@ def visible_points(surface: TracedSurface, backend: Backend) -> FloatArray:
         surface.max_steps,
     )
     return _VISIBLE_POINTS_CACHE.get(
-        prepared, (*settings, surface.enclosures, surface.over_relaxation), found
+        prepared, (*settings, surface.enclosures, surface.over_relaxation), find
     )
 
 
@@ -171,17 +174,17 @@ def check_drawable_size(ends: FloatArray) -> None:
 def check_offset(points: FloatArray) -> None:
     """Warn of surfaces, given by points (n, 3), that are blurred by the rounding of coordinates far
     from the origin, as those of maps; raise ValueError where nothing is left of them."""
-    size, far = float(np.ptp(points, axis=0).max()), float(np.abs(points).max())
-    if far <= _BLURRED * size or size == 0:
+    size, distance = float(np.ptp(points, axis=0).max()), float(np.abs(points).max())
+    if distance <= _BLURRED * size or size == 0:
         return
-    said = (
-        f"what is drawn is {size:.4g} long and {far:.4g} from the origin, and pictures are "
+    message = (
+        f"what is drawn is {size:.4g} long and {distance:.4g} from the origin, and pictures are "
         "computed in single precision: {}; move it to the origin: subtract its center from the "
         "points that it is made of (of formulas and shapes, moved(...) does so)"
     )
-    if far > _NOTHING_LEFT * size:
-        raise ValueError(said.format("too little is left of its coordinates"))
-    warnings.warn(said.format("its edges are blurred"), stacklevel=4)
+    if distance > _NOTHING_LEFT * size:
+        raise ValueError(message.format("too little is left of its coordinates"))
+    warnings.warn(message.format("its edges are blurred"), stacklevel=4)
 
 
 def _find_visible_points(surface: TracedSurface, backend: Backend, ends: FloatArray) -> FloatArray:
@@ -203,8 +206,8 @@ def _find_visible_points(surface: TracedSurface, backend: Backend, ends: FloatAr
     margin = 0.6 * float((ends[1] - ends[0]).max()) / _GRID
     lower = np.maximum(points.min(axis=0) - margin, ends[0])
     upper = np.minimum(points.max(axis=0) + margin, ends[1])
-    closer = _probe(surface, backend, lower, upper, _FINE_GRID)
-    return np.concatenate([points, closer])
+    finer_points = _probe(surface, backend, lower, upper, _FINE_GRID)
+    return np.concatenate([points, finer_points])
 
 
 def _point(corner: FloatArray) -> str:
@@ -220,14 +223,14 @@ def _probe(
     coarse = replace(surface, tolerance=HitTolerance(1e-3 * size))
     placed = PlacedSurface.of(coarse, Placement.identity(), backend)
     o, d, length = _rays(lower, upper, 0.01 * size, grid)
-    met = placed.intersect(
+    hits = placed.intersect(
         to_vector3(backend, o),
         to_vector3(backend, d),
         to_float(backend, length),
         backend.Bool(True),
     )
-    dr.eval(met.position, met.is_hit)  # separately, each would trace the rays again
-    points: FloatArray = to_numpy(met.position)[to_numpy(met.is_hit)]
+    dr.eval(hits.position, hits.is_hit)  # separately, each would trace the rays again
+    points: FloatArray = to_numpy(hits.position)[to_numpy(hits.is_hit)]
     return points.astype(np.float64)
 
 

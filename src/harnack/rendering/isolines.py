@@ -124,23 +124,23 @@ class Isolines:
     srgb: Color = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        put: dict[str, Any] = {
+        values: dict[str, Any] = {
             "function_field": as_field(self.function, "function, whose isolines are drawn,"),
             "srgb": parse_color(self.color, "color of isolines"),
         }
         for name in ("interval", "width"):
             if getattr(self, name) is not None:
-                put[name] = as_positive(getattr(self, name), f"{name} of isolines")
+                values[name] = as_positive(getattr(self, name), f"{name} of isolines")
         if self.levels is not None:
             if self.interval is not None:
                 raise ValueError("isolines have either levels or an interval, not both")
-            put["levels"] = _numbers(self.levels)
-        elif self.interval is None and put["function_field"].period is None:
+            values["levels"] = _numbers(self.levels)
+        elif self.interval is None and values["function_field"].period is None:
             raise ValueError(
                 "say which isolines: levels=[...], or interval= for all whole multiples of it"
             )
-        for name, value in put.items():
-            object.__setattr__(self, name, value)
+        for name, number in values.items():
+            object.__setattr__(self, name, number)
         self._exact_interval()
 
     def _exact_interval(self) -> float | None:
@@ -187,12 +187,12 @@ def _table(levels: tuple[float, ...], period: float | None) -> FloatArray:
 
 def _numbers(levels: Any) -> tuple[float, ...]:
     try:
-        given = np.atleast_1d(np.asarray("none" if isinstance(levels, str) else levels, float))
+        numbers = np.atleast_1d(np.asarray("none" if isinstance(levels, str) else levels, float))
     except (TypeError, ValueError):
         raise TypeError(f"levels of isolines must be numbers, not {levels!r}") from None
-    if given.ndim != 1 or not given.size or not np.isfinite(given).all():
+    if numbers.ndim != 1 or not numbers.size or not np.isfinite(numbers).all():
         raise ValueError(f"levels of isolines must be finite numbers, at least one, not {levels!r}")
-    return tuple(given.tolist())
+    return tuple(numbers.tolist())
 
 
 def parse_isolines(given: Any) -> tuple[Isolines, ...]:
@@ -204,14 +204,14 @@ def parse_isolines(given: Any) -> tuple[Isolines, ...]:
     if given is None:
         return ()
     listed: bool = isinstance(given, list | tuple)
-    several: list[Any] = [*given] if listed else [given]
-    for one in several:
-        if not isinstance(one, Isolines):
+    isolines: list[Any] = [*given] if listed else [given]
+    for element in isolines:
+        if not isinstance(element, Isolines):
             raise TypeError(
                 "isolines must be harnack.Isolines, or a list of them, such as "
-                f'hk.Isolines("z", interval=0.1), not {one!r}'
+                f'hk.Isolines("z", interval=0.1), not {element!r}'
             )
-    return tuple(several)
+    return tuple(isolines)
 
 
 @dataclass(frozen=True)
@@ -279,7 +279,7 @@ def isoline_index_at(
 
     index: the type of the numbers.
     """
-    found = index(0)
-    for number, one in enumerate(lines, start=1):
-        found = dr.select(one.contains(p, normal), index(number), found)
-    return found
+    line_index = index(0)
+    for number, isoline in enumerate(lines, start=1):
+        line_index = dr.select(isoline.contains(p, normal), index(number), line_index)
+    return line_index

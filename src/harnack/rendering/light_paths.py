@@ -91,17 +91,17 @@ class PathRenderTask:
             lane = dr.arange(mi.UInt32, (last - first) * spp)
             samples = dr.opaque(mi.UInt32, spp)
             pixel = lane // samples + dr.opaque(mi.UInt32, start + first)
-            found, waves = trace_samples(
+            results, wavelengths = trace_samples(
                 mi, self.scene, self.sensor, self.tracer, pixel, lane % samples, self.seed,
                 self.features,
             )  # fmt: skip
-            covered = dr.select(found.valid, mi.Float(1), 0)
-            means = [mi.Vector4f(*as_rgb(mi, found.light, waves), covered)]
-            if found.features is not None:
-                means += [as_rgb(mi, found.features.albedo, waves), found.features.normal]
-            means = [to_numpy(mean_of_blocks(one, spp)) for one in means]
+            covered = dr.select(results.valid, mi.Float(1), 0)
+            means = [mi.Vector4f(*as_rgb(mi, results.light, wavelengths), covered)]
+            if results.features is not None:
+                means += [as_rgb(mi, results.features.albedo, wavelengths), results.features.normal]
+            means = [to_numpy(mean_of_blocks(mean, spp)) for mean in means]
             rows.append(np.concatenate(means, axis=1))
-            lost += int(dr.count(found.lost)[0])
+            lost += int(dr.count(results.lost)[0])
         return np.concatenate(rows), lost
 
 
@@ -118,12 +118,12 @@ def render_paths(
     features = exposing.features
     image = np.empty((width * height, 10 if features else 4), dtype=np.float32)
     lost = 0
-    parts = hands.split_range(width * height, max(1, exposing.paths_a_band // exposing.spp))
-    for (start, stop), (means, gone) in zip(
-        parts, hands.run_tasks("render_range", parts), strict=True
+    ranges = hands.split_range(width * height, max(1, exposing.paths_a_band // exposing.spp))
+    for (start, stop), (means, lost_paths) in zip(
+        ranges, hands.run_tasks("render_range", ranges), strict=True
     ):
         image[start:stop] = means
-        lost += int(gone)
+        lost += int(lost_paths)
         advance((stop - start) / (width * height))
     image = image.reshape(height, width, -1)
     if not features:
@@ -138,13 +138,13 @@ def trace_samples(
     """Trace paths through samples of pixels. Returns their results, weighted by the sensor, and
     their wavelengths."""
     width, height = (int(n) for n in sensor.film().crop_size())
-    zero, own = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, _mixed(seed))
-    sampler = SobolSampler(mi, pixel, sample, own, zero)
-    place = film_positions(mi, pixel, _in_pixel(mi, sampler.next_2d()), (width, height))
-    ray, weight = _camera_ray(mi, sensor, sampler, place)
+    zero, hashed = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, _mixed(seed))
+    sampler = SobolSampler(mi, pixel, sample, hashed, zero)
+    position = film_positions(mi, pixel, _in_pixel(mi, sampler.next_2d()), (width, height))
+    ray, weight = _camera_ray(mi, sensor, sampler, position)
     dr.eval(ray, weight)
-    found = tracer.trace(scene, sampler, ray, mi.Bool(True), features)
-    return replace(found, light=found.light * weight), ray.wavelengths
+    results = tracer.trace(scene, sampler, ray, mi.Bool(True), features)
+    return replace(results, light=results.light * weight), ray.wavelengths
 
 
 def _mixed(seed: int) -> int:
@@ -209,12 +209,12 @@ class TimeEstimate:
     def __str__(self) -> str:
         seconds = round(self.picture)
         minutes, rest = divmod(seconds, 60)
-        hours, left = divmod(minutes, 60)
+        hours, rest_of_hour = divmod(minutes, 60)
         if seconds < 90:
             return f"{seconds} s"
         if minutes < 90:
             return f"{minutes} min {rest // 10 * 10} s" if minutes < 10 else f"{minutes} min"
-        return f"{hours} h {left} min"
+        return f"{hours} h {rest_of_hour} min"
 
 
 def estimate_time(
@@ -227,28 +227,28 @@ def estimate_time(
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     pixels = width * height
-    whole = pixels * spp
+    path_count = pixels * spp
 
     def seconds(count: int) -> float:
         # The golden ratio spreads any number of pixels evenly.
-        chosen = (np.arange(count) * 0.6180339887498949 % 1 * pixels).astype(np.int64)
-        pixel = upload_indices(mi, np.minimum(chosen, pixels - 1))
+        indices = (np.arange(count) * 0.6180339887498949 % 1 * pixels).astype(np.int64)
+        pixel = upload_indices(mi, np.minimum(indices, pixels - 1))
         sample = dr.opaque(mi.UInt32, 0, count)
         began = time.perf_counter()
-        found, _ = trace_samples(mi, scene, sensor, tracer, pixel, sample, 0, features)
-        dr.eval(found.light)
+        results, _ = trace_samples(mi, scene, sensor, tracer, pixel, sample, 0, features)
+        dr.eval(results.light)
         dr.sync_thread()
         return time.perf_counter() - began
 
     count, path = _FIRST, 0.0
-    if _MORE * count <= _PART * whole:
+    if _MORE * count <= _PART * path_count:
         seconds(count)  # compiles
-        first = before = seconds(count)
-        while _MORE * count <= _PART * whole and before < _ENOUGH * first:
-            after = seconds(_MORE * count)
-            path = max(after - before, 0.0) / ((_MORE - 1) * count)
-            count, before = _MORE * count, after
-    return TimeEstimate(path, whole * path)
+        first = shorter = seconds(count)
+        while _MORE * count <= _PART * path_count and shorter < _ENOUGH * first:
+            longer = seconds(_MORE * count)
+            path = max(longer - shorter, 0.0) / ((_MORE - 1) * count)
+            count, shorter = _MORE * count, longer
+    return TimeEstimate(path, path_count * path)
 
 
 def load_denoiser() -> Any:
@@ -278,8 +278,8 @@ def denoise_image(found: PathRender) -> npt.NDArray[np.float32]:
         raise ValueError("an exposure without features cannot be denoised")
     light = np.maximum(found.image[..., :3], 0)
     features = (np.clip(found.albedo, 0, 1), np.clip(found.normal, -1, 1))
-    parts = [np.ascontiguousarray(part, dtype=np.float32) for part in (light, *features)]
-    clean = load_denoiser().denoise(parts[0], albedo=parts[1], normal=parts[2], hdr=True)
+    arrays = [np.ascontiguousarray(array, dtype=np.float32) for array in (light, *features)]
+    clean = load_denoiser().denoise(arrays[0], albedo=arrays[1], normal=arrays[2], hdr=True)
     return np.concatenate([clean, found.image[..., 3:]], axis=-1)
 
 
@@ -331,43 +331,43 @@ class RefractionTracer:
         self.world, self.light = world, light
         self.hidden = world.mi.Bool(True) if hides_lights else None
         mi = world.mi
-        found = ((carrier, refractive_index(mi, carrier)) for carrier in world.proxies)
-        self.indices = tuple((carrier, index) for carrier, index in found if index is not None)
+        pairs = ((carrier, refractive_index(mi, carrier)) for carrier in world.proxies)
+        self.indices = tuple((carrier, index) for carrier, index in pairs if index is not None)
 
     def trace(self, ray: Any) -> RefractedHits:
         """The first opaque hits of camera rays, behind transparent solids."""
         mi, world = self.world.mi, self.world
         nothing = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray.d))
-        sight = RefractedHits(
+        hits = RefractedHits(
             ray, nothing, world.no_hit(nothing), mi.Spectrum(1), mi.Spectrum(0), mi.Float(0),
             mi.UInt32(0), dr.full(mi.Bool, True, dr.width(ray.d)),
         )  # fmt: skip
         if not self.indices:
             start = dr.zeros(mi.SurfaceInteraction3f)
-            sight.si, sight.first = world.intersect(ray, start, mi.Bool(True), self.hidden)
-            return sight
+            hits.si, hits.first = world.intersect(ray, start, mi.Bool(True), self.hidden)
+            return hits
 
-        def running(sight: RefractedHits) -> Mask:
-            return sight.active
+        def is_running(hits: RefractedHits) -> Mask:
+            return hits.active
 
-        def on(sight: RefractedHits) -> tuple[RefractedHits]:
-            return (self._through_boundary(sight),)
+        def cross(hits: RefractedHits) -> tuple[RefractedHits]:
+            return (self._through_boundary(hits),)
 
-        (sight,) = dr.while_loop((sight,), running, on, label="clear")
-        return sight
+        (hits,) = dr.while_loop((hits,), is_running, cross, label="clear")
+        return hits
 
     def _is_clear(self, si: Any) -> Mask:
         clear = self.world.mi.Bool(False)
-        for carrier, _ in self.indices:
-            clear |= si.shape == self.world.mi.ShapePtr(carrier)
+        for proxy, _ in self.indices:
+            clear |= si.shape == self.world.mi.ShapePtr(proxy)
         return clear
 
-    def _through_boundary(self, sight: RefractedHits) -> RefractedHits:
+    def _through_boundary(self, hits: RefractedHits) -> RefractedHits:
         """The next thing that rays hit and, where it is clear, the way behind it."""
-        mi, world, d = self.world.mi, self.world, sight.ray.d
-        si, first = world.intersect(sight.ray, sight.si, sight.active, self.hidden)
-        throughput = sight.throughput * transmittance(mi, world.proxies, sight.si, si, d)
-        boundaries = sight.interface_count + 1
+        mi, world, d = self.world.mi, self.world, hits.ray.d
+        si, first = world.intersect(hits.ray, hits.si, hits.active, self.hidden)
+        throughput = hits.throughput * transmittance(mi, world.proxies, hits.si, si, d)
+        boundaries = hits.interface_count + 1
         clear = (
             self._is_clear(si)
             & (first.isoline_index == 0)
@@ -375,30 +375,30 @@ class RefractionTracer:
             & (boundaries <= _MAX_INTERFACES)
         )
         index = mi.Float(1)
-        for carrier, own in self.indices:
-            index = dr.select(si.shape == mi.ShapePtr(carrier), own, index)
+        for proxy, value in self.indices:
+            index = dr.select(si.shape == mi.ShapePtr(proxy), value, index)
         normal = mi.Vector3f(si.n)
-        onward, reflected = refract(normal, d, index)
+        direction, reflected = refract(normal, d, index)
         outside = clear & (dr.dot(normal, d) < 0)
         gathered = dr.select(outside, throughput * self._reflected(si, d, index, reflected), 0)
-        part = dr.select(clear & (reflected < 1), 1 - reflected, 1)
-        way = spawn_ray(mi, si, first.ray_offset, onward)
+        transmitted = dr.select(clear & (reflected < 1), 1 - reflected, 1)
+        onward_ray = spawn_ray(mi, si, first.ray_offset, direction)
         return RefractedHits(
-            ray=dr.select(clear, way, sight.ray),
+            ray=dr.select(clear, onward_ray, hits.ray),
             si=si,
             first=first,
-            throughput=throughput * part,
-            reflected_light=sight.reflected_light + gathered,
-            path_length=sight.path_length + dr.select(clear, first.t, 0),
+            throughput=throughput * transmitted,
+            reflected_light=hits.reflected_light + gathered,
+            path_length=hits.path_length + dr.select(clear, first.t, 0),
             interface_count=boundaries,
-            active=sight.active & clear,
+            active=hits.active & clear,
         )
 
-    def _reflected(self, si: Any, d: Any, index: Any, share: Real) -> Any:
+    def _reflected(self, si: Any, d: Any, index: Any, fraction: Real) -> Any:
         """Light of the sky, and of the key light in a highlight, that boundaries send back."""
         mi = self.world.mi
         normal = mi.Vector3f(si.n)
-        back = d - 2 * dr.dot(normal, d) * normal
+        mirrored = d - 2 * dr.dot(normal, d) * normal
         straight = dr.square((index - 1) / (index + 1))
         black, one = dr.zeros(mi.Color3f), mi.Float(1)
         gloss = self.light.shade(black, normal, -d, mi.Bool(True), one) * (
@@ -407,7 +407,7 @@ class RefractionTracer:
         light = mi.Spectrum(gloss) if not mi.is_monochromatic else mi.Spectrum(mi.luminance(gloss))
         sky = self.world.scene.environment()
         if sky is not None:
-            seen = dr.zeros(mi.SurfaceInteraction3f)
-            seen.wi, seen.wavelengths = -back, si.wavelengths
-            light += share * sky.eval(seen)
+            interaction = dr.zeros(mi.SurfaceInteraction3f)
+            interaction.wi, interaction.wavelengths = -mirrored, si.wavelengths
+            light += fraction * sky.eval(interaction)
         return light

@@ -305,8 +305,8 @@ def refuse_others(verb: str, keywords: Mapping[str, Any]) -> None:
     for name in keywords:
         option = BY_NAME.get(name)
         if option is not None and verb not in option.verbs:
-            others = ", ".join(sorted(option.verbs))
-            raise TypeError(f"{verb} has no {name}: that is an option of {others}")
+            verbs = ", ".join(sorted(option.verbs))
+            raise TypeError(f"{verb} has no {name}: that is an option of {verbs}")
 
 
 def shows_options(verb: str) -> Callable[[_Function], _Function]:

@@ -65,22 +65,24 @@ class RenderJob:
         """The studio in which surfaces are drawn; None for a Mitsuba scene."""
         if not isinstance(self.surfaces, Field | Surface | TracedSurface | list | tuple):
             return None
-        asked, size = self.options, self.options.size or DEFAULT_SIZE
-        check_memory(asked.show, *size)
+        options, size = self.options, self.options.size or DEFAULT_SIZE
+        check_memory(options.show, *size)
         on_stage = studio_objects(
-            self.surfaces, asked.material, self.trace_options, self.shorthand,
-            boundary_radius=asked.boundary_radius, boundary_material=asked.boundary_material,
-            section_material=asked.section_material, isolines=asked.isolines,
-            thickness=asked.thickness,
+            self.surfaces, options.material, self.trace_options, self.shorthand,
+            boundary_radius=options.boundary_radius, boundary_material=options.boundary_material,
+            section_material=options.section_material, isolines=options.isolines,
+            thickness=options.thickness,
         )  # fmt: skip
         rays = size[0] * size[1]
-        if asked.show not in (*AOV_MODES, "shaded"):
-            rays *= _RAYS_A_PATH * (asked.spp or STUDIO_SPP)
-        on_stage = [replace(one, surface=one.surface.for_rays(rays)) for one in on_stage]
+        if options.show not in (*AOV_MODES, "shaded"):
+            rays *= _RAYS_A_PATH * (options.spp or STUDIO_SPP)
+        on_stage = [
+            replace(element, surface=element.surface.for_rays(rays)) for element in on_stage
+        ]
         return build_studio(
-            self.mi, on_stage, size=size, camera=asked.camera,
-            backdrop=asked.backdrop, up="z" if asked.up is None else asked.up,
-            bare=asked.show in AOV_MODES, traced_light=asked.show == "path",
+            self.mi, on_stage, size=size, camera=options.camera,
+            backdrop=options.backdrop, up="z" if options.up is None else options.up,
+            bare=options.show in AOV_MODES, traced_light=options.show == "path",
         )  # fmt: skip
 
     @functools.cached_property
@@ -95,29 +97,29 @@ class RenderJob:
     @functools.cached_property
     def task(self) -> AovTask | PathRenderTask | ShadedTask | None:
         """What can be drawn pixel by pixel; None for a scene that Mitsuba draws."""
-        mi, asked, stage = self.mi, self.options, self.stage
+        mi, options, stage = self.mi, self.options, self.stage
         scene = self.scene
         sensor = scene.sensors()[0]
-        if asked.show in AOV_MODES:
+        if options.show in AOV_MODES:
             placement = Placement.identity() if stage is None else stage.placement
-            viewer = AovTask.of(mi, scene, sensor, placement, asked.color_by)
-            if isinstance(asked.backdrop, GradientBackdrop):
-                viewer = replace(viewer, background=asked.backdrop.bottom)
+            viewer = AovTask.of(mi, scene, sensor, placement, options.color_by)
+            if isinstance(options.backdrop, GradientBackdrop):
+                viewer = replace(viewer, background=options.backdrop.bottom)
             return viewer
-        if asked.show == "shaded":
+        if options.show == "shaded":
             return ShadedTask(
-                mi, scene, sensor, spp=asked.spp or EDGE_SPP, cut_out=stage is not None,
-                on_floor=stage is not None and stage.has_ground, cones=asked.antialias == "cones",
+                mi, scene, sensor, spp=options.spp or EDGE_SPP, cut_out=stage is not None,
+                on_floor=stage is not None and stage.has_ground, cones=options.antialias == "cones",
             )  # fmt: skip
         tracer = equivalent_path_tracer(mi, scene)
         if tracer is None:
             return None
-        if asked.max_depth is not None:
-            tracer = tracer.with_depth(asked.max_depth)
-        spp = asked.spp or check_spp(
+        if options.max_depth is not None:
+            tracer = tracer.with_depth(options.max_depth)
+        spp = options.spp or check_spp(
             int(sensor.sampler().sample_count()), source=", which the scene's sampler asks for"
         )
-        return PathRenderTask(mi, scene, sensor, tracer, spp, asked.seed, asked.denoise)
+        return PathRenderTask(mi, scene, sensor, tracer, spp, options.seed, options.denoise)
 
     def _task_here(self) -> Any:
         """The task, after a worker may have worked in another variant."""
@@ -159,38 +161,38 @@ class ClusterRenderExecutor:
 
     def run_tasks(self, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
         """Results of the tasks, in order; several run at the same time."""
-        drawing = self.job.task
-        for found in self.crew.run_tasks(self.job, step, parts):
-            if isinstance(drawing, AovTask):
-                period = None if drawing.function is None else drawing.function.period
-                yield AovBuffers(**found, period=period, background=drawing.background)
+        task = self.job.task
+        for arrays in self.crew.run_tasks(self.job, step, parts):
+            if isinstance(task, AovTask):
+                period = None if task.function is None else task.function.period
+                yield AovBuffers(**arrays, period=period, background=task.background)
             elif step == "render_gbuffer":
-                yield GBuffer.from_numbers(self.job.mi, found)
+                yield GBuffer.from_numbers(self.job.mi, arrays)
             else:
-                yield found["means"], int(found["lost"])
+                yield arrays["means"], int(arrays["lost"])
 
 
-def _with_lost(found: tuple[Any, int]) -> TaskResult:
-    return {"means": found[0], "lost": np.array(found[1])}
+def _with_lost(result: tuple[Any, int]) -> TaskResult:
+    return {"means": result[0], "lost": np.array(result[1])}
 
 
 def _arrays_of(view: AovBuffers) -> TaskResult:
-    return {name: one for name, one in vars(view).items() if isinstance(one, np.ndarray)}
+    return {name: array for name, array in vars(view).items() if isinstance(array, np.ndarray)}
 
 
-def _loaded(mi: Any, what: Any, size: tuple[int, int] | None) -> Any:
-    if isinstance(what, mi.Scene):
+def _loaded(mi: Any, source: Any, size: tuple[int, int] | None) -> Any:
+    if isinstance(source, mi.Scene):
         if size is not None:
             raise ValueError("size: a loaded scene has its own; set film.size of its sensor")
-        scene = what
-    elif isinstance(what, Mapping):
-        scene = load_dict(mi, cast("Mapping[str, Any]", what))
-    elif isinstance(what, str | os.PathLike):
-        scene = load_scene_file(mi, cast("str | os.PathLike[str]", what))
+        scene = source
+    elif isinstance(source, Mapping):
+        scene = load_dict(mi, cast("Mapping[str, Any]", source))
+    elif isinstance(source, str | os.PathLike):
+        scene = load_scene_file(mi, cast("str | os.PathLike[str]", source))
     else:
         raise TypeError(
             "draw a field, a Surface, a list of them, or a Mitsuba scene, its dictionary or the "
-            f"path of its file, not what is {suggest_field(what)}"
+            f"path of its file, not what is {suggest_field(source)}"
         )
     if not scene.sensors():
         raise ValueError("the scene has no sensor to look through")

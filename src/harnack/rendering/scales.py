@@ -53,7 +53,7 @@ _NAMED = """
     yellowgreen=9acd32
 """
 NAMED_COLORS: Mapping[str, str] = MappingProxyType(
-    {name: number for name, _, number in (one.partition("=") for one in _NAMED.split())}
+    {name: number for name, _, number in (entry.partition("=") for entry in _NAMED.split())}
 )
 """Hexadecimal numbers by name."""
 
@@ -72,12 +72,12 @@ def parse_color(given: Any, what: str) -> Color:
     if isinstance(given, str):
         return _from_text(given, what)
     try:
-        numbers = [float("" if isinstance(one, str | bool) else one) for one in given]
+        numbers = [float("" if isinstance(number, str | bool) else number) for number in given]
     except (TypeError, ValueError):
         raise TypeError(f"{what} must be {_COLOR_HELP}, not {given!r}") from None
     if len(numbers) != 3:
         raise TypeError(f"{what} must be {_COLOR_HELP}, not {given!r}")
-    if not all(0 <= one <= 1 for one in numbers):
+    if not all(0 <= number <= 1 for number in numbers):
         raise ValueError(f"{what} must be {_COLOR_HELP}, not {given!r}")
     return cast("Color", tuple(numbers))
 
@@ -85,12 +85,12 @@ def parse_color(given: Any, what: str) -> Color:
 def _from_text(text: str, what: str) -> Color:
     digits = NAMED_COLORS.get(text.strip().lower())
     if digits is None:
-        found = re.fullmatch(r"#([0-9a-fA-F]{3}|[0-9a-fA-F]{6})", text.strip())
-        if found is None:
+        match = re.fullmatch(r"#([0-9a-fA-F]{3}|[0-9a-fA-F]{6})", text.strip())
+        if match is None:
             raise ValueError(
                 f"{what} must be {_COLOR_HELP}, not {text!r}{did_you_mean(text, NAMED_COLORS)}"
             )
-        digits = found[1] if len(found[1]) == 6 else "".join(2 * digit for digit in found[1])
+        digits = match[1] if len(match[1]) == 6 else "".join(2 * digit for digit in match[1])
     red, green, blue = (int(digits[k : k + 2], 16) / 255 for k in (0, 2, 4))
     return red, green, blue
 
@@ -243,10 +243,10 @@ class ColorScale:
         return math.ceil(self.low / step - 1e-9), math.floor(self.high / step + 1e-9)
 
 
-def _step(least: float) -> float:
+def _step(bound: float) -> float:
     """The smallest nice number that is not less than a positive one."""
-    power = 10.0 ** math.floor(math.log10(least))
-    return next(part * power for part in _NICE if part * power >= least * (1 - 1e-9))
+    power = 10.0 ** math.floor(math.log10(bound))
+    return next(part * power for part in _NICE if part * power >= bound * (1 - 1e-9))
 
 
 def _written(number: float, step: float, largest: float) -> str:
@@ -256,19 +256,19 @@ def _written(number: float, step: float, largest: float) -> str:
     """
     if number == 0:
         return "0"
-    below = math.floor(math.log10(step) + 1e-9)  # the place of the last digit
+    last_place = math.floor(math.log10(step) + 1e-9)  # the place of the last digit
     if step >= _SMALL and largest < _LARGE:
-        return f"{number:.{max(0, -below)}f}"
-    digits = max(0, math.floor(math.log10(abs(number)) + 1e-9) - below)
+        return f"{number:.{max(0, -last_place)}f}"
+    digits = max(0, math.floor(math.log10(abs(number)) + 1e-9) - last_place)
     mantissa, exponent = f"{number:.{digits}e}".split("e")
     return f"{mantissa.rstrip('0').rstrip('.') if '.' in mantissa else mantissa}e{int(exponent)}"
 
 
-def _ticks_at_parts_of_pi(multiple: int, most: int) -> list[tuple[float, str]]:
+def _ticks_at_parts_of_pi(multiple: int, max_count: int) -> list[tuple[float, str]]:
     """Ticks of 0 to `multiple` pi: at halves of pi, or at one, two, ... times pi."""
     halves = next(
         step for step in (1, 2, 4, 8, 16, 32)
-        if (2 * multiple) // step + 1 <= max(most, 2) or step >= 2 * multiple
+        if (2 * multiple) // step + 1 <= max(max_count, 2) or step >= 2 * multiple
     )  # fmt: skip
     return [(k * math.pi / 2, _as_pi(k)) for k in range(0, 2 * multiple + 1, halves)]
 
@@ -277,8 +277,8 @@ def _as_pi(halves: int) -> str:
     """The text of a number of halves of pi."""
     if halves == 0:
         return "0"
-    times, below = (halves // 2, "") if halves % 2 == 0 else (halves, "/2")
-    return f"{'' if times == 1 else f'{times} '}pi{below}"
+    factor, divisor = (halves // 2, "") if halves % 2 == 0 else (halves, "/2")
+    return f"{'' if factor == 1 else f'{factor} '}pi{divisor}"
 
 
 # A bar of colors beside a picture, with ticks at nice numbers.
@@ -320,17 +320,17 @@ def typeface_for(text: str, size: int) -> Any:
         ValueError: none has them.
     """
     _, _, typefaces = require_pillow()
-    own = typefaces.load_default(size)
+    default = typefaces.load_default(size)
     if text.isascii():
-        return own
+        return default
     for name in _TYPEFACES:
         try:
-            one = typefaces.truetype(name, size)
+            typeface = typefaces.truetype(name, size)
         except OSError:  # it is not installed
             continue
-        none = bytes(one.getmask(_NO_LETTER))
-        if all(letter == " " or bytes(one.getmask(letter)) != none for letter in text):
-            return one
+        no_letter = bytes(typeface.getmask(_NO_LETTER))
+        if all(letter == " " or bytes(typeface.getmask(letter)) != no_letter for letter in text):
+            return typeface
     raise ValueError(
         f"no typeface that was found here has all letters of {text!r}: install DejaVu Sans "
         "(Debian's fonts-dejavu-core), or write the title in plain ASCII letters"
@@ -343,7 +343,7 @@ def add_color_bar(pixels: Pixels, scale: ColorScale, background: Color) -> Pixel
     An end of the bar is pointed where the picture has numbers beyond it.
     background: behind the bar, sRGB in [0, 1].
     """
-    behind = tuple(round(255 * part) for part in background)
+    behind = tuple(round(255 * fraction) for fraction in background)
     ink = _ON_LIGHT if sum(background) > 1.5 else _ON_DARK
     images, drawings, _ = require_pillow()
     height = len(pixels)
@@ -353,12 +353,12 @@ def add_color_bar(pixels: Pixels, scale: ColorScale, background: Color) -> Pixel
     thick, gap = max(3, round(_WIDTH * height)), max(2, letters // 2)
     ticks = scale.ticks(max(2, min(6, length // (2 * letters))))
     room = max(font.getlength(text) for _, text in ticks)
-    wide = max(thick + gap + room, font.getlength(scale.name))
-    strip = images.new("RGB", (math.ceil(wide) + 2 * letters, height), behind)
+    width = max(thick + gap + room, font.getlength(scale.name))
+    strip = images.new("RGB", (math.ceil(width) + 2 * letters, height), behind)
     top = (height - length + letters) // 2
     draw = drawings.Draw(strip)
-    point = gap if any(scale.exceeded) else 0  # its height
-    title = max(0, top - gap - point)
+    tip = gap if any(scale.exceeded) else 0  # its height
+    title = max(0, top - gap - tip)
     draw.text((letters, title), scale.name, font=font, fill=ink, anchor="ls")
     values = scale.high - (np.arange(length) + 0.5) / length * (scale.high - scale.low)
     if scale.period is not None:  # the upper end is the lower one
@@ -366,19 +366,23 @@ def add_color_bar(pixels: Pixels, scale: ColorScale, background: Color) -> Pixel
     column = (scale.colors(values) * 255 + 0.5).astype(np.uint8)
     for row, color in enumerate(column):
         draw.line([(letters, top + row), (letters + thick - 1, top + row)], fill=tuple(color))
-    for is_passed, row, away, color in zip(
+    for is_passed, row, dy, color in zip(
         scale.exceeded,
         (top + length, top - 1),
-        (point, -point),
+        (tip, -tip),
         (column[-1], column[0]),
         strict=True,
     ):
         if is_passed:
-            ends = [(letters, row), (letters + thick - 1, row), (letters + thick // 2, row + away)]
+            ends = [
+                (letters, row),
+                (letters + thick - 1, row),
+                (letters + thick // 2, row + dy),
+            ]
             draw.polygon(ends, fill=tuple(color))
     for value, text in ticks:
-        part = (value - scale.low) / (scale.high - scale.low) if scale.high > scale.low else 0.5
-        y = top + round((1 - part) * (length - 1))
+        fraction = (value - scale.low) / (scale.high - scale.low) if scale.high > scale.low else 0.5
+        y = top + round((1 - fraction) * (length - 1))
         right = letters + thick
         draw.line([(right, y), (right + gap // 2, y)], fill=ink)
         draw.text((right + gap, y), text, font=font, fill=ink, anchor="lm")

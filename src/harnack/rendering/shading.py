@@ -191,8 +191,8 @@ class StudioLight:
         key, up = _parameter(normal, self.key), _parameter(normal, self.up)
         wrapped = dr.clip((dr.dot(normal, key) + _WRAP) / (1 + _WRAP), 0, 1)
         shown = (1 - _KEY_HIDDEN * (1 - visible)) * reached
-        share = 0.5 + 0.5 * dr.dot(normal, up)
-        sky = dr.lerp(_like(color, _BELOW), _like(color, _ABOVE), share) * visible
+        fraction = 0.5 + 0.5 * dr.dot(normal, up)
+        sky = dr.lerp(_like(color, _BELOW), _like(color, _ABOVE), fraction) * visible
         radiance = color * (_like(color, _KEY) * (wrapped * shown) + sky)
         half = dr.normalize(key + eye)
         # Where the light is below the horizon there is no highlight, and no edge to it either.
@@ -207,11 +207,11 @@ def reflectance(color: Any, painted: Any) -> Any:
 
     painted: mask of lines, which are of that reflectance, and black where it is 0.
     """
-    own = color
+    painted_color = color
     top = dr.max(color)
     metal = dr.square(color / top) * _METAL  # what is seen in a mirror has met it more than once
     color = dr.select(top > 1, metal, color)
-    return dr.select(painted, own, dr.select(top > 0, color, _like(color, _CLEAR)))
+    return dr.select(painted, painted_color, dr.select(top > 0, color, _like(color, _CLEAR)))
 
 
 def two_sided_color(color: Any, other: Any, inside: Any) -> Any:
@@ -281,8 +281,8 @@ class FloorShadow:
         mi = world.mi
         cell = (np.arange(_CELLS) + 0.5) / _CELLS * 2 * _REACH - _REACH
         y, x = np.meshgrid(cell, cell, indexing="ij")
-        seen = _visible_fractions(world, x, y, np.stack([_to_key(light.key), _to_sky()]))
-        image = np.stack([_blurred(part) for part in seen], axis=-1)
+        fractions = _visible_fractions(world, x, y, np.stack([_to_key(light.key), _to_sky()]))
+        image = np.stack([_blurred(fraction) for fraction in fractions], axis=-1)
         numbers = mi.Float(upload_floats(mitsuba_backend(mi), image.ravel()))
         tensor = mi.TensorXf(numbers, image.shape)
         return cls(mi, mi.Texture2f(tensor, wrap_mode=dr.WrapMode.Clamp))
@@ -309,8 +309,8 @@ def _visible_fractions(
     ray = mi.Ray3f(_vectors(mi.Point3f, o), _vectors(mi.Vector3f, d))
     ray.maxt = mi.Float(_FAR)
     free = to_numpy(~world.occluded(ray, mi.Bool(True)))
-    parts: FloatArray = free.reshape(d.shape[:-1]).mean(axis=-1)
-    return parts
+    fractions: FloatArray = free.reshape(d.shape[:-1]).mean(axis=-1)
+    return fractions
 
 
 def _vectors(kind: Any, rows: FloatArray) -> Any:
@@ -330,17 +330,17 @@ def _to_key(key: Any) -> FloatArray:
     axis = np.asarray(key, dtype=np.float64)
     u = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     u /= np.linalg.norm(u)
-    radius, turn = _SPREAD * np.sqrt(_square()[..., :1]), 2 * math.pi * _square()[..., 1:]
-    d = axis + radius * (np.cos(turn) * u + np.sin(turn) * np.cross(axis, u))
+    radius, angle = _SPREAD * np.sqrt(_square()[..., :1]), 2 * math.pi * _square()[..., 1:]
+    d = axis + radius * (np.cos(angle) * u + np.sin(angle) * np.cross(axis, u))
     d[..., 2] = np.maximum(d[..., 2], 0.05)  # the floor itself casts no shadow
     return d / np.linalg.norm(d, axis=-1, keepdims=True)
 
 
 def _to_sky() -> FloatArray:
     """Directions (16, rays, 3) to the sky, distributed with the cosine."""
-    s, turn = np.moveaxis(_square(), -1, 0)
+    s, angle = np.moveaxis(_square(), -1, 0)
     across = np.sqrt(s)
-    return np.stack([across * np.cos(2 * math.pi * turn), across * np.sin(2 * math.pi * turn),
+    return np.stack([across * np.cos(2 * math.pi * angle), across * np.sin(2 * math.pi * angle),
                      np.sqrt(np.maximum(1 - s, 1e-3))], axis=-1)  # fmt: skip
 
 
@@ -420,11 +420,13 @@ def _covering(mi: Any, image: FloatImage, size: tuple[int, int]) -> FloatImage:
     (width, height) pixels, as large as that."""
     height, width = image.shape[:2]
     scale = max(size[0] / width, size[1] / height)
-    part = [min(round(side / scale), own) for side, own in zip(size, (width, height), strict=True)]
-    columns, rows = (max(one, 1) for one in part)
+    extent = [
+        min(round(side / scale), full) for side, full in zip(size, (width, height), strict=True)
+    ]
+    columns, rows = (max(length, 1) for length in extent)
     left, top = (width - columns) // 2, (height - rows) // 2
-    cut = np.ascontiguousarray(image[top : top + rows, left : left + columns])
+    cropped = np.ascontiguousarray(image[top : top + rows, left : left + columns])
     if (columns, rows) == size:
-        return cut
-    bitmap = mi.Bitmap(cut).resample(mi.ScalarVector2u(*size), clamp=(0.0, np.inf))
+        return cropped
+    bitmap = mi.Bitmap(cropped).resample(mi.ScalarVector2u(*size), clamp=(0.0, np.inf))
     return np.array(bitmap, dtype=np.float32)

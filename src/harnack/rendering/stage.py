@@ -245,7 +245,9 @@ def build_studio(
     """
     backend = mitsuba_backend(mi)
     if camera.box is None:
-        points = np.concatenate([visible_points(one.surface, backend) for one in studio_objects])
+        points = np.concatenate(
+            [visible_points(element.surface, backend) for element in studio_objects]
+        )
     else:
         points = corners_of(np.array(camera.box.bounds()))
     placement = stage_placement(points, rotation_to_z_up(up))
@@ -259,20 +261,22 @@ def build_studio(
         },
         "sensor": _sensor(mi, pose, size),
     }
-    for k, one in enumerate(studio_objects):
-        surface = one.surface
+    for k, element in enumerate(studio_objects):
+        surface = element.surface
         if surface.tolerance is None:
-            close = _PATCH_TOLERANCE if surface.field.has_patches else _TOLERANCE
-            surface = replace(surface, tolerance=HitTolerance(close / placement.scale))
-        bsdf = one.material.bsdf(solid=surface.solid_range is not None, traced_light=traced_light)
-        cut = (
+            length = _PATCH_TOLERANCE if surface.field.has_patches else _TOLERANCE
+            surface = replace(surface, tolerance=HitTolerance(length / placement.scale))
+        bsdf = element.material.bsdf(
+            solid=surface.solid_range is not None, traced_light=traced_light
+        )
+        section = (
             None
-            if one.section_material is None
-            else one.section_material.bsdf(solid=True, traced_light=traced_light)
+            if element.section_material is None
+            else element.section_material.bsdf(solid=True, traced_light=traced_light)
         )
         scene[f"surface{k}"] = mitsuba_shape(
-            surface, bsdf=bsdf, to_world=placement.matrix, tint=one.material.tint, section_bsdf=cut,
-            isolines=one.isolines,
+            surface, bsdf=bsdf, to_world=placement.matrix, tint=element.material.tint,
+            section_bsdf=section, isolines=element.isolines,
         )  # fmt: skip
     has_ground = False
     if not bare:
@@ -300,28 +304,28 @@ def stage_placement(points: FloatArray, turned: FloatArray | None = None) -> Pla
     points = points @ turned.T
     lower, upper = points.min(axis=0), points.max(axis=0)
     scale = 2.0 / max(float(np.linalg.norm(upper - lower)), 1e-30)
-    foot = np.array([*(lower + upper)[:2] / 2, lower[2]])
-    return Placement(scale, turned, -scale * foot)
+    base_point = np.array([*(lower + upper)[:2] / 2, lower[2]])
+    return Placement(scale, turned, -scale * base_point)
 
 
 def _sensor(mi: Any, pose: CameraPose, size: tuple[int, int]) -> dict[str, Any]:
     # Rays begin near the stage, however far the camera is: their origins are rounded.
-    away = float(np.linalg.norm(pose.origin))
-    if away > _FARTHEST:
+    distance = float(np.linalg.norm(pose.origin))
+    if distance > _FARTHEST:
         raise ValueError(
-            f"the camera is {away:,.0f} times as far away as the surface is large; pictures are "
-            f"computed in single precision, which reaches to {_FARTHEST:,.0f} times"
+            f"the camera is {distance:,.0f} times as far away as the surface is large; pictures "
+            f"are computed in single precision, which reaches to {_FARTHEST:,.0f} times"
         )
-    look = mi.ScalarTransform4f().look_at(
+    to_world = mi.ScalarTransform4f().look_at(
         origin=pose.origin.tolist(), target=pose.target.tolist(), up=pose.up.tolist()
     )
     return {
         "type": "perspective",
         "fov": pose.fov,
         "fov_axis": "larger",
-        "near_clip": max(1e-3, _NEAR * (away // _NEAR - 1)),
+        "near_clip": max(1e-3, _NEAR * (distance // _NEAR - 1)),
         "far_clip": _FAR,
-        "to_world": look,
+        "to_world": to_world,
         "film": {
             "type": "hdrfilm",
             "width": size[0],
