@@ -172,13 +172,15 @@ def content_hash(thing: Any, what: str) -> str:
     return _hash_and_files(thing, what)[0]
 
 
-def _hash_and_files(value: Any, what: str, words: frozenset[str] = frozenset()) -> tuple[str, Any]:
+def _hash_and_files(
+    value: Any, purpose: str, words: frozenset[str] = frozenset()
+) -> tuple[str, Any]:
     """The content hash of an object, and the pickler that wrote it, which has noted files and
     packages."""
     try:
-        pickler = _written(_hashing_pickler, value, what, words, fast=True)
+        pickler = _written(_hashing_pickler, value, purpose, words, fast=True)
     except (RecursionError, TypeError, ValueError):  # an object that holds itself
-        pickler = _written(_hashing_pickler, value, what, words)
+        pickler = _written(_hashing_pickler, value, purpose, words)
     data = (
         f"{package_versions()} {sorted(pickler.others.items())}".encode() + pickler.file.getvalue()
     )
@@ -186,8 +188,8 @@ def _hash_and_files(value: Any, what: str, words: frozenset[str] = frozenset()) 
 
 
 def _written(
-    make_class: Callable[[Any], Any], value: Any, what: str, words: frozenset[str] = frozenset(), *,
-    fast: bool = False,
+    make_class: Callable[[Any], Any], value: Any, purpose: str,
+    words: frozenset[str] = frozenset(), *, fast: bool = False,
 ) -> Any:  # fmt: skip
     """A pickler of the class that `make_class` returns, after it has written an object into its
     `file`.
@@ -195,16 +197,16 @@ def _written(
     Which attributes of modules are needed is known only when all code was written. So the object is
     written again until no name is missing; this ends, since the code has finitely many names.
     """
-    cloudpickle = import_optional("cloudpickle", what)
+    cloudpickle = import_optional("cloudpickle", purpose)
     while True:
-        pickler = make_class(cloudpickle.Pickler)(what, words)
+        pickler = make_class(cloudpickle.Pickler)(purpose, words)
         pickler.fast = fast
         try:
             pickler.dump(value)
         except (pickle.PicklingError, TypeError, AttributeError) as error:
             raise TypeError(
-                f"{what}: it cannot be sent to another process or written down ({error}); make it "
-                "of arrays, numbers and the classes of this library"
+                f"{purpose}: it cannot be sent to another process or written down ({error}); make "
+                "it of arrays, numbers and the classes of this library"
             ) from error
         words = frozenset(pickler.words)
         if all(len(attributes_named(*module)) == len(attributes_named(module[0], words))

@@ -274,9 +274,9 @@ def _check_domain(field: Field, points: FloatArray) -> None:
         return
     outside = np.flatnonzero(~field.domain.contains_points(points))
     if outside.size:
-        more = f" and {outside.size - 1} more" if outside.size > 1 else ""
+        rest = f" and {outside.size - 1} more" if outside.size > 1 else ""
         raise ValueError(
-            f"points: entry {outside[0]}{more} outside the domain of {type(field).__name__}, where "
+            f"points: entry {outside[0]}{rest} outside the domain of {type(field).__name__}, where "
             "it promises nothing; leave such points out, or give the field a larger domain"
         )
 

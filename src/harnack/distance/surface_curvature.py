@@ -112,12 +112,14 @@ def curvature(
         return _refine_accuracy(backend, field, directly, points, prepared.has_variable_accuracy)
 
     def by_tree(p: Vec3, closer: Real) -> tuple[Real | Vec3, ...]:
-        at = field.values_at(p, 2, closer)
-        if at.gradient is None or at.hessian is None:
+        values = field.values_at(p, 2, closer)
+        if values.gradient is None or values.hessian is None:
             raise RuntimeError(f"{type(field).__name__}: values_at(x, 2) gave no derivatives")
-        rows = at.hessian.rows(backend.Array3f)
-        found = _Derivatives(backend, at.gradient, rows, at.gradient_error, at.hessian_error)
-        return found.curvatures()
+        rows = values.hessian.rows(backend.Array3f)
+        derivatives = _Derivatives(
+            backend, values.gradient, rows, values.gradient_error, values.hessian_error
+        )
+        return derivatives.curvatures()
 
     return _refine_accuracy(backend, field, by_tree, points, True)
 
@@ -138,22 +140,22 @@ def _refine_accuracy(
 
         return compute
 
-    *found, is_truncated = in_batches(backend, at(_ACCEPTANCE_FACTORS[0]), points)
+    *results, is_truncated = in_batches(backend, at(_ACCEPTANCE_FACTORS[0]), points)
     if not has_detail:
-        return CurvatureSamples(*found)
+        return CurvatureSamples(*results)
     x = np.asarray(points, np.float64)
     flat = _ACCURACY / _size(field, x)
     for closer in _ACCEPTANCE_FACTORS[1:]:
-        mean, error = found[0], found[3]
+        mean, error = results[0], results[3]
         with np.errstate(invalid="ignore"):
-            good = error <= np.maximum(_ACCURACY * np.abs(mean), flat)
-        rows = np.flatnonzero(~good & (is_truncated > 0))
+            is_accurate = error <= np.maximum(_ACCURACY * np.abs(mean), flat)
+        rows = np.flatnonzero(~is_accurate & (is_truncated > 0))
         if not rows.size:
             break
-        *closely, is_truncated[rows] = in_batches(backend, at(closer), x[rows])
-        for whole, part in zip(found, closely, strict=True):
-            whole[rows] = part
-    return CurvatureSamples(*found)
+        *refined, is_truncated[rows] = in_batches(backend, at(closer), x[rows])
+        for values, replacement in zip(results, refined, strict=True):
+            values[rows] = replacement
+    return CurvatureSamples(*results)
 
 
 def _size(field: Field, points: FloatArray) -> float:
@@ -309,7 +311,7 @@ def curvature_lines(
     if len(levels) > 1:
         raise ValueError(f"lines of curvature are of one level, not of {len(levels)}")
     if not is_one_of(family, get_args(Family)):
-        known = ", ".join(f'"{one}"' for one in get_args(Family))
+        known = ", ".join(f'"{name}"' for name in get_args(Family))
         hint = did_you_mean(family, get_args(Family))
         raise ValueError(f"unknown family {family!r}; choose one of {known}{hint}")
     step, length = as_positive(step, "step"), as_positive(length, "length")
@@ -320,9 +322,11 @@ def curvature_lines(
     if not len(start):
         return []
     # Data, so that another level, step or family compiles no other kernel.
-    most = 1.0 if family == "maximum" else 0.0
-    at, h, share = (dr.opaque(backend.Float, one) for one in (levels[0], step, most))
-    guide = _CurvatureLineTracer(backend, field.prepare(backend), at, h, share)
+    wants_largest = 1.0 if family == "maximum" else 0.0
+    at, h, largest = (
+        dr.opaque(backend.Float, number) for number in (levels[0], step, wants_largest)
+    )
+    guide = _CurvatureLineTracer(backend, field.prepare(backend), at, h, largest)
     with dr.suspend_grad():
         both = guide.follow(start, count)
     return [
@@ -362,18 +366,18 @@ class _CurvatureLineTracer:
         points = vector(*(dr.full(self.backend.Float, dr.nan, 2 * n * (count + 1)) for _ in "xyz"))
         dr.scatter(points, x, lane, is_known)
         dr.eval(points, x, direction, is_known)
-        most = dr.opaque(integer, count)
+        last = dr.opaque(integer, count)
 
         def body(state: _LineState) -> _LineState:
             x, direction, goes_on = self._advance(state)
             index = state.index + 1
             dr.scatter(points, x, index * (2 * n) + lane, state.active & goes_on)
-            return _LineState(x, direction, index, state.active & goes_on & (index < most))
+            return _LineState(x, direction, index, state.active & goes_on & (index < last))
 
         index = dr.zeros(integer, 2 * n)
         loop_while_active(_LineState(x, direction, index, is_known & True), body, "curvature lines")
-        found = to_numpy(points).reshape(count + 1, 2 * n, 3).astype(np.float64)
-        lines = [one[np.isfinite(one).all(axis=1)] for one in found.swapaxes(0, 1)]
+        array = to_numpy(points).reshape(count + 1, 2 * n, 3).astype(np.float64)
+        lines = [line[np.isfinite(line).all(axis=1)] for line in array.swapaxes(0, 1)]
         return lines[:n], lines[n:]
 
     def _advance(self, state: _LineState) -> tuple[Vec3, Vec3, Mask]:
@@ -388,19 +392,21 @@ class _CurvatureLineTracer:
         last, is_known = self._direction(end, fourth)
         return end, last, is_known & (dr.dot(first, last) > _MIN_STEP_COSINE)
 
-    def _direction(self, x: Vec3, before: Vec3 | None) -> tuple[Vec3, Mask]:
+    def _direction(self, x: Vec3, previous: Vec3 | None) -> tuple[Vec3, Mask]:
         """The principal direction that agrees with the one before, and whether there is one."""
         plane = TangentPlane.of(self.field.evaluate(x).gradient)
         eigen = SymmetricEigen2.of(*plane.restrict_hessian(self.field.hessian(x)))
         u, v = eigen.combination(self.largest, 1 - self.largest)
         direction = u * plane.u + v * plane.v
-        if before is not None:
-            direction = dr.select(dr.dot(direction, before) < 0, -direction, direction)
-        most = fmax(dr.abs(eigen.largest), dr.abs(eigen.smallest))
-        is_known = (eigen.largest - eigen.smallest > _UMBILIC * most) & dr.isfinite(
+        if previous is not None:
+            direction = dr.select(dr.dot(direction, previous) < 0, -direction, direction)
+        max_curvature = fmax(dr.abs(eigen.largest), dr.abs(eigen.smallest))
+        is_known = (eigen.largest - eigen.smallest > _UMBILIC * max_curvature) & dr.isfinite(
             dr.norm(direction)
         )
-        return direction, is_known & (most * self.step < _MAX_STEP_PER_RADIUS * plane.gradient_norm)
+        return direction, is_known & (
+            max_curvature * self.step < _MAX_STEP_PER_RADIUS * plane.gradient_norm
+        )
 
     def _on_surface(self, x: Vec3, steps: int) -> Vec3:
         """The point to which Newton's method along the gradient leads in `steps` steps."""

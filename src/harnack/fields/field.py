@@ -112,10 +112,10 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
     has_creases: bool = False
     """Whether the gradient may jump, as it does where the surfaces of a union meet."""
 
-    def __new__(cls, *given: Any, **named: Any) -> Self:
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         """Refuse arguments with derivatives enabled, unless the class defines `parameters`."""
         if cls.has_no_parameters():
-            check_no_derivatives(cls.__name__, given, named)
+            check_no_derivatives(cls.__name__, args, kwargs)
         return super().__new__(cls)
 
     def __init_subclass__(cls, **kwargs: Any) -> None:

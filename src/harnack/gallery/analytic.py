@@ -104,11 +104,11 @@ def _fitted_knot() -> list[Surface]:
     width = 0.15 * float(np.ptp(curve, axis=0).max()) / 2
 
     def density(x: FloatArray) -> FloatArray:
-        parts = [
-            np.exp(-((some[:, None] - curve) ** 2).sum(axis=2) / width**2) @ step
-            for some in np.array_split(x, len(x) // 4000 + 1)
+        sums = [
+            np.exp(-((batch[:, None] - curve) ** 2).sum(axis=2) / width**2) @ step
+            for batch in np.array_split(x, len(x) // 4000 + 1)
         ]
-        return np.concatenate(parts) / (width * math.sqrt(math.pi))
+        return np.concatenate(sums) / (width * math.sqrt(math.pi))
 
     low, high = curve.min(axis=0) - 2.6 * width, curve.max(axis=0) + 2.6 * width
     box = low.tolist(), high.tolist()

@@ -111,27 +111,27 @@ class GridShell:
 
         def lines(seeds: FloatArray) -> tuple[list[FloatArray], list[FloatArray]]:
             step = 0.25 * self.spacing
-            one, other = (
+            first, second = (
                 curvature_lines(field, seeds, step=step, length=100 * step, family=family,
                                 level=self.level, clip=above)
                 for family in _FAMILIES
             )  # fmt: skip
-            return one, other
+            return first, second
 
-        near = 0.3 * self.spacing
-        crossing = [
-            max(pair, key=lambda line: _relative_height(line, near))
-            for pair in zip(*lines(ground + near * rise), strict=True)
+        offset = 0.3 * self.spacing
+        candidates = [
+            max(pair, key=lambda line: _relative_height(line, offset))
+            for pair in zip(*lines(ground + offset * rise), strict=True)
         ]
-        kept = _drop_parallel_lines(crossing, 0.55 * self.spacing)
+        ribs = _drop_parallel_lines(candidates, 0.55 * self.spacing)
         # Along some of them, seeds of the other family.
-        spines = kept[:: max(1, len(kept) // 6)]
+        spines = ribs[:: max(1, len(ribs) // 6)]
         seeds = np.concatenate([spine[2:-2:2] for spine in spines])
-        along = [
+        crossing_lines = [
             min(pair, key=lambda line: min(_crossing_cosine(line, spine) for spine in spines))
             for pair in zip(*lines(seeds), strict=True)
         ]
-        return [*kept, *_drop_parallel_lines(along, 0.55 * self.spacing), *self._edges()]
+        return [*ribs, *_drop_parallel_lines(crossing_lines, 0.55 * self.spacing), *self._edges()]
 
     def _rims(self) -> tuple[FloatArray, FloatArray]:
         """Points (n, 2) of the rims, and unit vectors from there into the region."""
@@ -140,13 +140,13 @@ class GridShell:
         for a, b in zip(self.outline, np.roll(self.outline, -1, axis=0), strict=True):
             length = float(np.linalg.norm(b - a))
             count = max(1, round(length / self.spacing))
-            share = (np.arange(count)[:, None] + 0.5) / count
-            points.append(a + share * (b - a))
+            fraction = (np.arange(count)[:, None] + 0.5) / count
+            points.append(a + fraction * (b - a))
             inward.append(np.tile(np.array([a[1] - b[1], b[0] - a[0]]) / length, (count, 1)))
         for x, y, r in self.holes:
             count = max(8, round(2 * math.pi * r / self.spacing))
-            turn = 2 * math.pi * (np.arange(count) + 0.5) / count
-            out = np.column_stack([np.cos(turn), np.sin(turn)])
+            angle = 2 * math.pi * (np.arange(count) + 0.5) / count
+            out = np.column_stack([np.cos(angle), np.sin(angle)])
             points.append(np.array([x, y]) + r * out)
             inward.append(out)
         return np.concatenate(points), np.concatenate(inward)
@@ -184,8 +184,8 @@ def _drop_parallel_lines(lines: Sequence[FloatArray], gap: float) -> list[FloatA
         if len(line) < 3:
             continue
         if kept:
-            others = np.concatenate(kept)
-            nearest = np.linalg.norm(line[:, None] - others[None], axis=2).min(axis=1)
+            points = np.concatenate(kept)
+            nearest = np.linalg.norm(line[:, None] - points[None], axis=2).min(axis=1)
             if (nearest < gap).mean() > 0.6:
                 continue
         kept.append(line)
@@ -203,8 +203,8 @@ def _grid_shell_surfaces(shell: GridShell) -> list[Surface]:
 
 
 def _regular(sides: int) -> FloatArray:
-    turn = 2 * math.pi * (np.arange(sides) + 0.5) / sides
-    return np.column_stack([np.cos(turn), np.sin(turn)])
+    angle = 2 * math.pi * (np.arange(sides) + 0.5) / sides
+    return np.column_stack([np.cos(angle), np.sin(angle)])
 
 
 # The Great Court of the British Museum (Williams 2001), in units of half its width.

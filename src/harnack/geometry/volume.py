@@ -39,9 +39,9 @@ class Volume(abc.ABC):
     `a & b` is the intersection of two volumes, which is convex as well.
     """
 
-    def __new__(cls, *given: Any, **named: Any) -> Self:
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         """Refuses numbers with derivatives, which would be dropped."""
-        check_no_derivatives(cls.__name__, given, named)
+        check_no_derivatives(cls.__name__, args, kwargs)
         return super().__new__(cls)
 
     def __and__(self, other: object) -> Volume:

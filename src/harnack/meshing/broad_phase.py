@@ -312,10 +312,10 @@ def _beside(a: Corners, b: Corners, count: Real) -> Mask:
 def _opposite(a: Corners, b: Corners) -> Mask:
     """Whether a plane through the first corner, which is that of both, has the others of a and
     those of b on different sides, at right angles to the difference of their mean directions."""
-    edges = [one[k] - one[0] for one, k in itertools.product((a, b), (1, 2))]
+    edges = [corners[k] - corners[0] for corners, k in itertools.product((a, b), (1, 2))]
     mean = [dr.normalize(edges[k]) + dr.normalize(edges[k + 1]) for k in (0, 2)]
     m = dr.normalize(mean[1]) - dr.normalize(mean[0])
     rounding = ROUNDING * dr.norm(m)
     values = [(dr.dot(m, edge), rounding * dr.norm(edge) + _UNDERFLOW) for edge in edges]
-    (p, one), (q, two), (r, three), (s, four) = values
-    return (p < -one) & (q < -two) & (r > three) & (s > four)
+    (p, p_error), (q, q_error), (r, r_error), (s, s_error) = values
+    return (p < -p_error) & (q < -q_error) & (r > r_error) & (s > s_error)

@@ -368,8 +368,8 @@ def _collapse_midpoint(x: FloatArray, faces: IntArray, middle: int, ends: list[i
             continue
         moved = np.where(star == middle, end, star)
         is_kept = ~(star == end).any(axis=1)
-        one, other = _normals(x[star[is_kept]]), _normals(x[moved[is_kept]])
-        turned = float((one * other).sum(axis=1).min(initial=1.0))
+        before, after = _normals(x[star[is_kept]]), _normals(x[moved[is_kept]])
+        turned = float((before * after).sum(axis=1).min(initial=1.0))
         new_faces = np.concatenate([rest, moved[is_kept]])
         is_moved = np.arange(len(new_faces)) >= len(rest)
         candidates.append((len(intersecting_faces(x, new_faces, is_moved)), -turned, new_faces))
@@ -379,7 +379,7 @@ def _collapse_midpoint(x: FloatArray, faces: IntArray, middle: int, ends: list[i
             "subdivide the mesh there, or choose a smaller `cell_size`",
             x[[middle]],
         )
-    return min(candidates, key=lambda one: one[:2])[2]
+    return min(candidates, key=lambda candidate: candidate[:2])[2]
 
 
 def _normals(corners: FloatArray) -> FloatArray:

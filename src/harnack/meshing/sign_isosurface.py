@@ -441,9 +441,9 @@ class _CreaseRefinement:
         edges = every.edge_of_pair.reshape(3, -1).T
         rows = np.flatnonzero((every.multiplicity == 2) & ~bent[every.vertices].any(axis=1))
         ends = every.vertices[rows]
-        one, other = normals[ends[:, 0]], normals[ends[:, 1]]
+        first_normal, second_normal = normals[ends[:, 0]], normals[ends[:, 1]]
         a, b = x[ends[:, 0]], x[ends[:, 1]]
-        t, along, turned = _toward_tangent_planes(a, b, one, other)
+        t, along, turned = _toward_tangent_planes(a, b, first_normal, second_normal)
         long = row_norms(b - a)
         is_far = (
             (turned > _PARALLEL) & (row_norms(along) > tolerance) & (long > _SHORTEST * tolerance)
@@ -456,8 +456,8 @@ class _CreaseRefinement:
         vertex = np.full(len(every.vertices), -1, np.int64)
         vertex[rows] = len(x) + np.arange(len(rows))
         total, angle = (
-            np.arccos(np.clip(one, -1, 1))
-            for one in (
+            np.arccos(np.clip(cosine, -1, 1))
+            for cosine in (
                 row_dots(normals[ends[:, 0]], normals[ends[:, 1]]),
                 np.minimum(*(row_dots(normals[ends[:, k]], normal) for k in (0, 1))),
             )
