@@ -32,9 +32,9 @@ _FINDERS = frozenset(("vars", "dir", "__dict__", "getmembers"))
 # Functions that find modules whose names are not in an import statement.
 _IMPORTERS = frozenset(("import_module", "__import__"))
 # Attributes that a function may use of its module without naming it.
-_OF_EACH = ("__package__", "__name__", "__path__", "__file__")
+_MODULE_ATTRIBUTES = ("__package__", "__name__", "__path__", "__file__")
 # Attributes that belong to the process that imported a module.
-_OF_IMPORT = frozenset(("__builtins__", "__spec__", "__loader__", "__cached__"))
+_IMPORT_ATTRIBUTES = frozenset(("__builtins__", "__spec__", "__loader__", "__cached__"))
 # The attribute of a sent module that lists the names of the attributes that were not sent.
 _LEFT_OUT = "__left_out__"
 
@@ -66,7 +66,7 @@ class Namespace:
     @classmethod
     def of(cls, names: Mapping[str, Any]) -> Namespace:
         """The namespace of a module, from its attributes by name."""
-        return cls({key: names[key] for key in _OF_EACH if key in names})
+        return cls({key: names[key] for key in _MODULE_ATTRIBUTES if key in names})
 
     def __reduce__(self) -> Any:
         return sent_module, (self.known,)
@@ -87,7 +87,7 @@ def itself(module: SentModule) -> SentModule:
 def fill(module: SentModule, contents: tuple[Mapping[str, Any], frozenset[str]]) -> None:
     """Give a module its attributes, and the names of the attributes that are left out."""
     attributes, left_out = contents
-    vars(module).update(attributes, **{_LEFT_OUT: left_out - _OF_IMPORT})
+    vars(module).update(attributes, **{_LEFT_OUT: left_out - _IMPORT_ATTRIBUTES})
 
 
 def function_in(module: SentModule, code: CodeType, closure: Any) -> FunctionType:
@@ -101,7 +101,7 @@ def attributes_named(module: ModuleType, words: frozenset[str] | set[str]) -> di
     return {
         name: value
         for name, value in sorted(vars(module).items())
-        if (uses_all or name in words or name == "__getattr__") and name not in _OF_IMPORT
+        if (uses_all or name in words or name == "__getattr__") and name not in _IMPORT_ATTRIBUTES
     }
 
 

@@ -259,7 +259,7 @@ _UMBILIC = 1e-3
 # longer than this part of the least radius of curvature: what follows would be no line of the
 # surface but the step's.
 _MIN_STEP_COSINE, _MAX_STEP_PER_RADIUS = math.cos(math.radians(40)), 0.5
-_MOST_STEPS = 100_000
+_MAX_STEPS = 100_000
 
 
 @shows_keywords(*_HONORED_BY_LINES)
@@ -316,8 +316,8 @@ def curvature_lines(
         raise ValueError(f"unknown family {family!r}; choose one of {known}{hint}")
     step, length = as_positive(step, "step"), as_positive(length, "length")
     count = math.ceil(length / step)
-    if count > _MOST_STEPS:
-        raise ValueError(f"length/step asks for {count:,} steps: at most {_MOST_STEPS:,}")
+    if count > _MAX_STEPS:
+        raise ValueError(f"length/step asks for {count:,} steps: at most {_MAX_STEPS:,}")
     start = as_finite_vectors(seeds, "seeds")
     if not len(start):
         return []

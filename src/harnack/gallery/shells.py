@@ -208,7 +208,7 @@ def _regular(sides: int) -> FloatArray:
 
 
 # The Great Court of the British Museum (Williams 2001), in units of half its width.
-_UNIT = 36.625
+_HALF_WIDTH = 36.625
 _COURT = np.array([(-36.625, -51.125), (36.625, -51.125), (36.625, 46.025), (-36.625, 46.025)])
 _PAVILION = np.array(
     [(-1.6, -1), (0.2, -1.15), (1.7, -0.8), (1.9, 0.4), (0.6, 1.1), (-1.1, 1), (-1.9, 0.2)]
@@ -228,7 +228,7 @@ SHELLS = (
         "shell-court",
         "a grid shell over the Great Court of the British Museum (after the paper's Fig. 17)",
         lambda: _grid_shell_surfaces(
-            GridShell(_COURT / _UNIT, ((0.0, 0.0, 22.245 / _UNIT),), 1.2, 0.15, 0.008)
+            GridShell(_COURT / _HALF_WIDTH, ((0.0, 0.0, 22.245 / _HALF_WIDTH),), 1.2, 0.15, 0.008)
         ),
         ("porcelain", "copper"),
         Camera(azimuth=-60, elevation=34),

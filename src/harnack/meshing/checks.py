@@ -148,7 +148,7 @@ _PAIRS_AT_ONCE = 1 << 18
 # For more triangles than this a kernel lists the pairs, which takes 0.05 s to record.
 _MIN_FACES_FOR_KERNEL = 5_000
 # The largest number of triangles of a size that are compared with each other at once.
-_MOST_AT_ONCE = 1 << 19
+_MAX_AT_ONCE = 1 << 19
 
 
 def misoriented_faces(function: LevelFunction, vertices: FloatArray, faces: IntArray) -> IntArray:
@@ -279,7 +279,7 @@ def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
     for i, j in itertools.product(range(len(groups)), repeat=2):
         reach = float(radius[groups[i]].max() + radius[groups[j]].max())
         queries = groups[i][chosen[groups[i]]]
-        if i == j and len(queries) == len(groups[i]) <= _MOST_AT_ONCE:
+        if i == j and len(queries) == len(groups[i]) <= _MAX_AT_ONCE:
             table = trees[i].query_pairs(reach, output_type="ndarray")
             add(*groups[i][table.T])
             continue

@@ -190,7 +190,7 @@ def winding_around(corner: FloatArray, point: FloatArray) -> float:
 # Surfaces cut by volumes.
 
 # Vertices this near to a boundary, relative to the size, count as on it.
-_NEAR = 1e-9
+_ON_BOUNDARY = 1e-9
 # Vertices this near, relative to their shortest edge, are moved onto it: otherwise slivers remain.
 _SNAPPED = 0.25
 
@@ -242,7 +242,7 @@ def clip_to_volume(surface: TriangleMesh, volume: Volume) -> TriangleMesh:
 def _onto(vertices: FloatArray, box: Box) -> FloatArray:
     """The vertices, with those within rounding of a box's faces put onto them."""
     for end in box.bounds():
-        near = np.abs(vertices - end) <= _NEAR * (1 + np.abs(end))
+        near = np.abs(vertices - end) <= _ON_BOUNDARY * (1 + np.abs(end))
         vertices = np.where(near, end, vertices)
     return vertices
 
@@ -280,7 +280,7 @@ def _cut(surface: TriangleMesh, side: _ClipBoundary) -> TriangleMesh:
     if not len(faces):
         return surface
     vertices, h = _snap_to_boundary(surface, side)
-    h = np.where(np.abs(h) <= _NEAR * float(np.ptp(vertices, axis=0).max()), 0.0, h)
+    h = np.where(np.abs(h) <= _ON_BOUNDARY * float(np.ptp(vertices, axis=0).max()), 0.0, h)
     out = (h > 0)[faces]
     # Faces on the boundary with no corner inside are left out.
     keep = (h < 0)[faces].any(axis=1)

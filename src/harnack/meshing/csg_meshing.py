@@ -102,7 +102,7 @@ _CELLS_OF_OFFSET, _SECANTS = 6.0, 2
 _MANY_CELLS = 100_000
 # How far merging of coplanar triangles may move surfaces of offsets, in tolerances, the first value
 # that does no harm; and how far mending may move them, which is done after merging.
-_JOINED_WITHIN, _MENDED_WITHIN = (0.5, 0.25, 0.1), 0.5
+_JOIN_TOLERANCES, _REPAIR_TOLERANCE = (0.5, 0.25, 0.1), 0.5
 # Triangles of offsets are cut in three where their centers are farther off the level, in
 # tolerances; and how often.
 _FAR_OFF, _TIMES_CUT = 1.8, 2
@@ -393,11 +393,11 @@ class CsgMesher:
         surface = mesh_closed_surface(function, lattice, self.tolerance, self.report, as_cut=True)
         manifold = to_manifold(surface)
         self.levels += 1
-        for fraction in _JOINED_WITHIN:
+        for fraction in _JOIN_TOLERANCES:
             joined = from_manifold(without_short_edges(manifold, fraction * self.tolerance))
             joined = split_faces_off_level(function, joined, _FAR_OFF * self.tolerance, _TIMES_CUT)
             try:
-                surface = resolve_self_intersections(joined, _MENDED_WITHIN * self.tolerance)
+                surface = resolve_self_intersections(joined, _REPAIR_TOLERANCE * self.tolerance)
             except SelfIntersectionError:
                 continue
             break
@@ -515,11 +515,11 @@ class _DomainExtendedFunction(LevelFunction):
 # Cells across a solid, unless a spacing is given.
 _ACROSS = 24
 # How many sizes of cells are tried, and the ratio of each size to the one before.
-_MOST_ATTEMPTS = 3
-_SMALLER = 0.6
+_MAX_ATTEMPTS = 3
+_CELL_RATIO = 0.6
 # Where operands were cut by each other, slivers may pass through their neighbors by rounding: how
 # far the surface may be moved to remove them, in tolerances, in the order of the attempts.
-_SLIVERS_WITHIN = (1e-3, 1e-4, 0.0)
+_SLIVER_TOLERANCES = (1e-3, 1e-4, 0.0)
 # The margin around an extent, relative to its size.
 _MARGIN = 0.01
 
@@ -609,7 +609,7 @@ def mesh_solid(
     size = float((upper - lower).max())
     cells = size / _ACROSS if spacing is None else spacing
     error = 0.5 * tolerance.at(size)
-    attempts = _MOST_ATTEMPTS if spacing is None else 1
+    attempts = _MAX_ATTEMPTS if spacing is None else 1
     per_wave = CELLS_PER_WAVE if spacing is None else None
     uploads = EvaluatorCache()
     first: MeshingError | None = None
@@ -630,10 +630,10 @@ def mesh_solid(
             raise first from large  # the first error is the cause
         except (MissedPartsError, LocalizedMeshingError) as wrong:
             attempts, first = attempts - 1, first or wrong
-            if not attempts or not is_retry_promising(wrong, before, _SMALLER**attempts):
+            if not attempts or not is_retry_promising(wrong, before, _CELL_RATIO**attempts):
                 raise
             before = wrong
-            cells *= _SMALLER
+            cells *= _CELL_RATIO
             per_wave = CELLS_PER_WAVE * size / (_ACROSS * cells)
             if isinstance(wrong, LocalizedMeshingError):
                 error *= 0.5
@@ -688,12 +688,12 @@ def _apart(parts: TriangleMesh | _Assembly, tolerance: float) -> TriangleMesh:
             any fewer triangles cross when fewer slivers are removed.
     """
     raised: SelfIntersectionError | None = None
-    for factor in _SLIVERS_WITHIN if isinstance(parts, _Assembly) else (0.0,):
+    for factor in _SLIVER_TOLERANCES if isinstance(parts, _Assembly) else (0.0,):
         mesh = parts.without_slivers(factor * tolerance) if isinstance(parts, _Assembly) else parts
         if not len(mesh.faces):
             raise MeshingError("the solid is empty: no point of the box is inside")
         try:
-            return resolve_self_intersections(mesh, _MENDED_WITHIN * tolerance)
+            return resolve_self_intersections(mesh, _REPAIR_TOLERANCE * tolerance)
         except SelfIntersectionError as error:
             if not is_retry_promising(error, raised):
                 raise

@@ -152,14 +152,14 @@ def _filling(chain: list[int]) -> list[tuple[int, int, int]]:
 # The whole surface.
 
 # How often the mesh is computed again because finished triangles fail.
-_MOST_ATTEMPTS = 4
+_MAX_ATTEMPTS = 4
 # How often cells are made smaller where the first triangles fail, before they are made smaller
 # everywhere.
 _MOST_LOCAL = 4
 # Edges of a curve that are longer than this many cells are cut.
 _LONGEST = 2.5
 # How often edges of a curve that are too near to others are halved.
-_MOST_CUTS = 4
+_MAX_CUTS = 4
 # The ratio of the size of smaller cells everywhere to the size before.
 _SMALLER = 0.6
 
@@ -230,7 +230,7 @@ def mesh_spanning_curve(
     finer: tuple[RefinementBalls, ...] = ()
     best: SpanningMesh | None = None
     crossing = np.zeros(0, np.int64)
-    for attempt in range(_MOST_ATTEMPTS):
+    for attempt in range(_MAX_ATTEMPTS):
         first = _first_surface(task, spacing, attempts, finer)
         spacing, finer = first.spacing, first.finer
         faces = first.faces
@@ -250,7 +250,7 @@ def mesh_spanning_curve(
         failing = np.union1d(crossing, turned)
         if not len(failing):
             break
-        if attempt < _MOST_ATTEMPTS - 1:
+        if attempt < _MAX_ATTEMPTS - 1:
             report(f"{len(failing)} triangles fail: smaller cells there")
             finer = (*finer, RefinementBalls(vertices[faces[failing]].mean(axis=1), spacing))
     if best is None:
@@ -322,7 +322,7 @@ def _tetrahedralize(
 ) -> tuple[BoundaryCurve, TetrahedronPoints, Tetrahedra]:
     """Tetrahedra that have all edges of the curve, whose edges are cut where others are too
     near."""
-    for _ in range(_MOST_CUTS):
+    for _ in range(_MAX_CUTS):
         points = sample_delaunay_points(task.function, root, curve, task.walls, task.seed, finer)
         tets = delaunay(points.points)
         has_edge = tets.has_edges(curve.edges)

@@ -59,11 +59,11 @@ _LEVEL = 2 * math.pi
 _ACROSS = 24
 # How often edges of holes that are too near to others are halved for the tetrahedra; and the
 # largest number of pieces, in all and for each edge: so many arise where edges lie on each other.
-_MOST_CUTS, _MOST_PIECES, _MOST_PER_EDGE = 12, 20_000, 64
+_MAX_CUTS, _MAX_PIECES, _MAX_PER_EDGE = 12, 20_000, 64
 # How often patches that meet the mesh are computed again, with smaller cells.
-_MOST_MET = 1
+_MAX_RETRIES = 1
 # How far w may be from 1/2, modulo 1, at vertices of patches.
-_NEAR = 1e-6
+_MAX_LEVEL_ERROR = 1e-6
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ def _fill_all_holes(
         except LocalizedMeshingError as error:
             times_met += isinstance(error, _MeshIntersectionError)
             is_hopeless, before = not is_retry_promising(error, before), error
-            if last or is_hopeless or times_met > _MOST_MET:
+            if last or is_hopeless or times_met > _MAX_RETRIES:
                 location = ", ".join(f"{c:.4g}" for c in error.locations[0])
                 raise MeshingError(
                     f"{error} (cells were {cell:.3g} wide, and smaller in {len(error.locations)} "
@@ -263,11 +263,11 @@ def _patches(
     cut, middles = boundary, np.zeros((0, 2), np.int64)
     points = sample_delaunay_points(function, root, cut, None, seed, finer)
     tets = delaunay(points.points)
-    for _ in range(_MOST_CUTS):
+    for _ in range(_MAX_CUTS):
         lacks = ~tets.has_edges(cut.edges)
         if not lacks.any():
             break
-        if len(cut.edges) > min(_MOST_PIECES, _MOST_PER_EDGE * len(edges)):
+        if len(cut.edges) > min(_MAX_PIECES, _MAX_PER_EDGE * len(edges)):
             raise TriangleLimitError(
                 f"{len(edges):,} boundary edges of the mesh lie on others or next to them: cut to "
                 f"{len(cut.edges):,} pieces some are still too near to others for a patch that "
@@ -423,11 +423,11 @@ def _check(
     added = patches.vertices
     w = WindingNumber(vertices, faces).value(added, precision="double")
     gap = np.abs(w - np.floor(w) - 0.5)
-    if not (gap <= _NEAR).all():
+    if not (gap <= _MAX_LEVEL_ERROR).all():
         raise LocalizedMeshingError(
             f"the winding number is off 1/2 by {gap.max():.2g} at a vertex of the patches: choose "
             "a smaller `cell_size`",
-            added[gap > _NEAR],
+            added[gap > _MAX_LEVEL_ERROR],
         )
     is_patch = np.arange(len(together)) >= len(faces)
     met = intersecting_faces(x, together, is_patch)

@@ -34,7 +34,7 @@ __all__ = ["Difference", "IntendedSolid"]
 
 # The number of points at which winding numbers are compared: in the box around the mesh, and near
 # each surface.
-_IN_BOX, _NEAR = 2000, 1000
+_BOX_POINTS, _SURFACE_POINTS = 2000, 1000
 # The smallest and the largest distance of the points near a surface from it, and the margin of the
 # box, relative to the size.
 _NEAREST, _FARTHEST, _MARGIN = 2e-3, 0.1, 0.05
@@ -177,7 +177,7 @@ class IntendedSolid:
         corner = self.vertices[self.oriented]
         low, high = corner.min(axis=(0, 1)), corner.max(axis=(0, 1))
         margin = _MARGIN * self.size
-        box = rng.uniform(low - margin, high + margin, (_IN_BOX, 3))
+        box = rng.uniform(low - margin, high + margin, (_BOX_POINTS, 3))
         points = np.concatenate([box, _near(corner, self.size, rng)])
         return points, self.winding(points)
 
@@ -204,7 +204,7 @@ class IntendedSolid:
         """
         rng = np.random.default_rng(0)
         corner = self.vertices[self.oriented]
-        points, normals = _on_faces(corner, _NEAR, rng)
+        points, normals = _on_faces(corner, _SURFACE_POINTS, rng)
         away = _NEAREST * self.size * normals
         beside = self.winding(np.concatenate([points + away, points - away]))
         nothing = (beside.reshape(2, -1) < 0.5).all(axis=0)
@@ -314,7 +314,7 @@ def _on_faces(
 
 def _near(corner: FloatArray, size: float, rng: np.random.Generator) -> FloatArray:
     """Points on both sides of faces (m, 3, 3), at distances of all magnitudes."""
-    points, normals = _on_faces(corner, _NEAR, rng)
+    points, normals = _on_faces(corner, _SURFACE_POINTS, rng)
     heights = size * np.exp(rng.uniform(math.log(_NEAREST), math.log(_FARTHEST), len(points)))
     heights *= rng.choice((-1.0, 1.0), len(points))
     return points + heights[:, None] * normals

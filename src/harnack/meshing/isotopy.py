@@ -62,9 +62,9 @@ _HALVINGS = 5
 _TRIALS = 20
 _UNKNOWN = 1e200
 # The number of tetrahedra that are examined before all are.
-_FEW = 100
+_FIRST_EXAMINED = 100
 # The distance, in cells, beyond which tetrahedra are far from the curve.
-_FAR = 1.5
+_FAR_FROM_CURVE = 1.5
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def isotopy_of(
         on_walls = _regular_on_walls(function, corners, values, slopes, proved, walls)
     far = np.ones(len(index), np.bool_)
     if len(boundary.edges):
-        far = _distances(corners.mean(axis=1), boundary) > _FAR * spacing
+        far = _distances(corners.mean(axis=1), boundary) > _FAR_FROM_CURVE * spacing
     stars = ~proved & ~beside & far
     proved[stars] = _proved_by_stars(function, corners, index, slopes, np.flatnonzero(stars))
     proved &= on_walls
@@ -140,7 +140,7 @@ def isotopy_of(
 def _has_bounds(function: LevelFunction, corners: FloatArray) -> bool:
     """Whether changes of the gradient are bounded on any of a selection of tetrahedra (n, 4, 3); if
     not, all cut tetrahedra stay unproved, and no others need to be examined."""
-    sampled = corners[:: max(1, len(corners) // _FEW)]
+    sampled = corners[:: max(1, len(corners) // _FIRST_EXAMINED)]
     center, radius = _balls(sampled)
     return not len(sampled) or bool((function.gradient_bounds(center, radius)[1] < _UNKNOWN).any())
 

@@ -40,7 +40,7 @@ __all__ = ["collapse_slivers", "flip_edges", "least_angles", "relax_vertices"]
 # gradient.
 _GAIN = 0.01
 _FACING = 0.5
-_MOST_ROUNDS_OF_FLIPS = 12
+_MAX_ROUNDS_OF_FLIPS = 12
 # Triangles with a smaller angle, in radians, are slivers: 4 degrees.
 _SLIVER = 0.07
 # The smallest cosine between normals of the triangles around a contracted edge and the gradient.
@@ -61,7 +61,7 @@ def flip_edges(
     """
     refused = np.zeros(0, np.int64)
     boundary = edge_keys(boundary_edges(faces), len(vertices))
-    for _ in range(_MOST_ROUNDS_OF_FLIPS):
+    for _ in range(_MAX_ROUNDS_OF_FLIPS):
         pairs, quads = _quadrilaterals(faces)
         a, b, c, d = quads.T
         before = least_angles(vertices, faces)[pairs].min(axis=1)
@@ -209,7 +209,7 @@ def _is_good(
 Walls = tuple[FloatArray, FloatArray] | None
 # Triangles with a smaller angle are thin, in radians: 30 degrees.
 _THIN = 0.52
-_MOST_ROUNDS_OF_MOVES = 6
+_MAX_ROUNDS_OF_MOVES = 6
 # The fractions of the displacement to each aim that are tried.
 _PARTS = (1.0, 0.5)
 
@@ -229,7 +229,7 @@ def relax_vertices(
     fixed = np.zeros(len(vertices), np.bool_)
     fixed[boundary_edges(faces)] = True
     vertices = vertices.copy()
-    for _ in range(_MOST_ROUNDS_OF_MOVES):
+    for _ in range(_MAX_ROUNDS_OF_MOVES):
         angles = least_angles(vertices, faces)
         thin = np.unique(faces[angles < _THIN])
         stars = _VertexStars.of(faces, thin[~fixed[thin]], len(vertices))

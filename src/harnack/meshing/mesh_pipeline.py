@@ -78,7 +78,7 @@ _HONORED = (*SURFACE_OPTIONS, "tolerance")
 
 # Cells across the level set, unless a spacing is given; curves have their own length besides.
 _ACROSS = 24
-_MOST_ATTEMPTS = 4
+_MAX_ATTEMPTS = 4
 _ACROSS_BY_SIGNS, _ATTEMPTS_BY_SIGNS = 48, 2
 # Room around what has an extent, and around a curve whose surface has none, as a part of the size.
 _MARGIN = 0.01
@@ -609,7 +609,7 @@ def _mesh_level_set(field: Field, level: float | None, options: _MeshOptions) ->
     cells = size / _ACROSS if options.spacing is None else float(options.spacing)
     if options.spacing is None and field.min_wavelength is not None:
         cells = min(cells, field.min_wavelength / CELLS_PER_WAVE)
-    attempts = 1 if options.spacing is not None else _MOST_ATTEMPTS
+    attempts = 1 if options.spacing is not None else _MAX_ATTEMPTS
     if isinstance(field, SolidAngle):
         surface, facts = _mesh_spanning_curve(
             function, box, error, cells, attempts, options.seed, report

@@ -68,11 +68,11 @@ __all__ = ["repair"]
 
 # How many sizes of cells are tried for patches on which w is 1/2, if all triangles have to stay;
 # and if they need not, where there are no more open edges than that.
-_ATTEMPTS, _FEW_ATTEMPTS, _FEW_EDGES = 6, 1, 1000
+_ATTEMPTS, _OPTIONAL_ATTEMPTS, _MAX_OPTIONAL_EDGES = 6, 1, 1000
 # Cells across the mesh if all is made anew; larger ones by this factor, up to so many times, where
 # the surface is rough and has more triangles than that.
 _ACROSS_ANEW = 48
-_MOST_ANEW, _LARGER, _MOST_LARGER = 80_000, 1.4, 3
+_MOST_ANEW, _CELL_GROWTH, _MAX_GROWTHS = 80_000, 1.4, 3
 
 # Points lie in a plane if the least of their singular values is this part of the largest.
 _FLAT = 1e-9
@@ -407,12 +407,12 @@ def _of_bounded_size(
 ) -> trimesh.Trimesh:
     """Of larger cells where there would be too many triangles, as of noisy meshes: the time of
     checks grows with their number."""
-    for k in range(_MOST_LARGER):
+    for k in range(_MAX_GROWTHS):
         try:
-            return _by_signs(field, spacing * _LARGER**k, options, _MOST_ANEW)
+            return _by_signs(field, spacing * _CELL_GROWTH**k, options, _MOST_ANEW)
         except TriangleLimitError as error:
             options.report(f"{error}; so of larger cells")
-    return _by_signs(field, spacing * _LARGER**_MOST_LARGER, options)
+    return _by_signs(field, spacing * _CELL_GROWTH**_MAX_GROWTHS, options)
 
 
 def _by_signs(
@@ -550,11 +550,11 @@ def _kept_with(
     harmonic = HarmonicFilling(vertices[:0], faces[:0], True, 0.0, 0)
     if unfilled:
         edges = checked_boundary_edges(whole)
-        if options.keep is None and len(edges) > _FEW_EDGES:
+        if options.keep is None and len(edges) > _MAX_OPTIONAL_EDGES:
             raise MeshingError(
                 f"{len(unfilled):,} holes of {len(edges):,} edges have no smooth patch"
             )
-        attempts = _ATTEMPTS if options.keep == "all" else _FEW_ATTEMPTS
+        attempts = _ATTEMPTS if options.keep == "all" else _OPTIONAL_ATTEMPTS
         setup = HoleFillingOptions(
             options.tolerance, options.spacing, options.seed, attempts, options.report
         )

@@ -37,9 +37,9 @@ __all__ = ["resolve_local_intersections", "resolve_self_intersections"]
 
 # If there are more crossing triangles than this, or if their neighborhood is larger, they are no
 # slivers.
-_MOST, _MOST_AROUND = 400, 5_000
+_MAX_CROSSING_FACES, _MAX_NEIGHBORHOOD = 400, 5_000
 # The largest number of changes in one place, and the number of attempts for each.
-_MOST_CHANGES, _MOST_TRIED = 40, 80
+_MAX_CHANGES, _MAX_ATTEMPTS = 40, 80
 # New triangles with less than this fraction of the area that they cover may face backwards.
 _NOTHING = 1e-4
 
@@ -71,13 +71,13 @@ def resolve_local_intersections(
     length: how far the surface may be moved by one change; vertices stay where they are, or are
         removed.
     """
-    if not 0 < len(crossing) <= _MOST or length <= 0:
+    if not 0 < len(crossing) <= _MAX_CROSSING_FACES or length <= 0:
         return surface, len(crossing)
     vertices, faces = surface.vertices, surface.faces
     is_gone, pieces, crossing_count = np.zeros(len(faces), np.bool_), [faces[:0]], 0
     for rows, movable in _regions(vertices, faces, crossing):
         is_gone[rows] = True
-        if len(rows) > _MOST_AROUND:
+        if len(rows) > _MAX_NEIGHBORHOOD:
             pieces.append(faces[rows])
             crossing_count += int(np.isin(crossing, rows).sum())
             continue
@@ -198,7 +198,7 @@ def _reduce_crossings(patch: _Neighborhood, length: float) -> tuple[IntArray, in
     """The faces of a patch, by vertices of the mesh, after changes that let fewer cross; and the
     number that still cross."""
     crossing = patch.crossing()
-    for _ in range(_MOST_CHANGES):
+    for _ in range(_MAX_CHANGES):
         better = _best_change(patch, crossing, length) if len(crossing) else None
         if better is None:
             break
@@ -217,7 +217,7 @@ def _best_change(
     """
     for rows in (crossing, _touching(patch.faces, patch.faces[crossing])):
         for _, removed, new in sorted(_changes(patch, rows, length), key=lambda change: change[0])[
-            :_MOST_TRIED
+            :_MAX_ATTEMPTS
         ]:
             changed = patch.with_faces(removed, new)
             still_crossing = changed.crossing()

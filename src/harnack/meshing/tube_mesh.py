@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 
 __all__ = ["tube_manifold"]
 
-_MOST_VERTICES = 4_000_000
+_MAX_VERTICES = 4_000_000
 # The largest error of polylines, relative to the tolerance.
 _LEFT_OUT = 0.25
 # The smallest number of points around, also for wires far thinner than the tolerance.
-_LEAST_AROUND = 8
+_MIN_AROUND = 8
 # An edge leads back where the cosine of its turn is less than this above -1.
 _BACK = 1e-9
 
@@ -55,7 +55,7 @@ def tube_manifold(tube: Tube, level: float, tolerance: float) -> Manifold:
     if radius <= 0:
         return Manifold()
     step = math.sqrt(3 * tolerance / radius)
-    segments = max(_LEAST_AROUND, math.ceil(2 * math.pi / step))
+    segments = max(_MIN_AROUND, math.ceil(2 * math.pi / step))
     waiting = [
         _simpler(polyline, _LEFT_OUT * tolerance) for polyline in np.split(tube.points, tube.starts)
     ]
@@ -64,7 +64,7 @@ def tube_manifold(tube: Tube, level: float, tolerance: float) -> Manifold:
     while waiting:
         # Rings of a half ball at both ends, and at least one ring at each vertex between.
         minimum = segments * sum(len(polyline) + segments // 2 for polyline in waiting)
-        if vertices + minimum > _MOST_VERTICES:
+        if vertices + minimum > _MAX_VERTICES:
             raise MeshingError(
                 f"a tube within {tolerance:.3g} has more than {2 * (vertices + minimum):,} faces: "
                 "choose a larger `tolerance`"

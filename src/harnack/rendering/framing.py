@@ -126,7 +126,7 @@ _TILE = 8
 _SMALLEST, _LARGEST = 1e-15, 1e16
 # The distance of surfaces from the origin, in lengths of them, beyond which pixels at edges are
 # off, and that beyond which a third of all pixels may be (measured: boxes, curves, meshes, clouds).
-_BLURRED, _NOTHING_LEFT = 5e3, 1e5
+_MAX_SHARP_OFFSET, _MAX_OFFSET = 5e3, 1e5
 _VISIBLE_POINTS_CACHE: FieldCache[FloatArray] = FieldCache()
 
 
@@ -175,14 +175,14 @@ def check_offset(points: FloatArray) -> None:
     """Warn of surfaces, given by points (n, 3), that are blurred by the rounding of coordinates far
     from the origin, as those of maps; raise ValueError where nothing is left of them."""
     size, distance = float(np.ptp(points, axis=0).max()), float(np.abs(points).max())
-    if distance <= _BLURRED * size or size == 0:
+    if distance <= _MAX_SHARP_OFFSET * size or size == 0:
         return
     message = (
         f"what is drawn is {size:.4g} long and {distance:.4g} from the origin, and pictures are "
         "computed in single precision: {}; move it to the origin: subtract its center from the "
         "points that it is made of (of formulas and shapes, moved(...) does so)"
     )
-    if distance > _NOTHING_LEFT * size:
+    if distance > _MAX_OFFSET * size:
         raise ValueError(message.format("too little is left of its coordinates"))
     warnings.warn(message.format("its edges are blurred"), stacklevel=4)
 

@@ -86,12 +86,12 @@ def padded_domain(function: Field, size: float) -> Volume | None:
 
 
 # The width of a line unless one is given, as a part of the diagonal of the surface's box.
-_USUAL_WIDTH = 0.004
+_DEFAULT_WIDTH = 0.004
 # Where the part of the gradient along the surface is this much smaller than the gradient, it is
 # rounding, of the normal and of the position.
 _ROUNDING = 1e-4
 # How many lines an angle-valued function has unless asked otherwise.
-_USUAL_LINES = 12
+_DEFAULT_LINE_COUNT = 12
 # Tables of levels have at least so many entries, as kernels depend on the length's logarithm.
 _MIN_TABLE_LENGTH = 64
 
@@ -148,7 +148,7 @@ class Isolines:
         period = self.function_field.period
         if self.levels is not None or period is None:
             return self.interval
-        count = _USUAL_LINES if self.interval is None else round(period / self.interval)
+        count = _DEFAULT_LINE_COUNT if self.interval is None else round(period / self.interval)
         if self.interval is not None and abs(count * self.interval - period) > 1e-4 * period:
             raise ValueError(
                 f"the function has the period {period:.6g}, and an interval of {self.interval:g} "
@@ -159,7 +159,7 @@ class Isolines:
 
     def prepare(self, backend: Backend, size: float) -> PreparedIsolines:
         """The isolines on a backend. size: diagonal of the surface's box, for the default width."""
-        width = _USUAL_WIDTH * size if self.width is None else self.width
+        width = _DEFAULT_WIDTH * size if self.width is None else self.width
         step, period = self._exact_interval(), self.function_field.period
         volume = padded_domain(self.function_field, size)
         return PreparedIsolines(

@@ -185,13 +185,13 @@ def mean_of_blocks(color: Any, spp: int) -> Any:
 # How long a picture will take, told before it is begun.
 
 # Paths that are tried: at first, how many times as many next, and no more than this part of all.
-_FIRST, _MORE, _PART = 2**12, 4, 1 / 16
+_FIRST_TRIAL_PATHS, _TRIAL_GROWTH, _MAX_TRIAL_FRACTION = 2**12, 4, 1 / 16
 # Runs that take this many times as long as the first are long enough to be measured.
-_ENOUGH = 3.0
+_MIN_TIME_RATIO = 3.0
 # Seconds; of a picture that takes no longer the time is not told.
 MIN_REPORTED_SECONDS = 15.0
 # Seconds between two moves of the progress bar, and the fewest paths of a band.
-_BAND, _FEWEST = 4.0, 2**14
+_SECONDS_PER_BAND, _MIN_BAND_PATHS = 4.0, 2**14
 
 
 @dataclass(frozen=True)
@@ -204,7 +204,9 @@ class TimeEstimate:
     @property
     def paths_a_band(self) -> int:
         """The number of paths that take as long as a progress bar may stand still."""
-        return round(min(max(_BAND / max(self.path, 1e-9), _FEWEST), MAX_PATHS_PER_BATCH))
+        return round(
+            min(max(_SECONDS_PER_BAND / max(self.path, 1e-9), _MIN_BAND_PATHS), MAX_PATHS_PER_BATCH)
+        )
 
     def __str__(self) -> str:
         seconds = round(self.picture)
@@ -240,14 +242,17 @@ def estimate_time(
         dr.sync_thread()
         return time.perf_counter() - began
 
-    count, path = _FIRST, 0.0
-    if _MORE * count <= _PART * path_count:
+    count, path = _FIRST_TRIAL_PATHS, 0.0
+    if _TRIAL_GROWTH * count <= _MAX_TRIAL_FRACTION * path_count:
         seconds(count)  # compiles
         first = shorter = seconds(count)
-        while _MORE * count <= _PART * path_count and shorter < _ENOUGH * first:
-            longer = seconds(_MORE * count)
-            path = max(longer - shorter, 0.0) / ((_MORE - 1) * count)
-            count, shorter = _MORE * count, longer
+        while (
+            _TRIAL_GROWTH * count <= _MAX_TRIAL_FRACTION * path_count
+            and shorter < _MIN_TIME_RATIO * first
+        ):
+            longer = seconds(_TRIAL_GROWTH * count)
+            path = max(longer - shorter, 0.0) / ((_TRIAL_GROWTH - 1) * count)
+            count, shorter = _TRIAL_GROWTH * count, longer
     return TimeEstimate(path, path_count * path)
 
 

@@ -198,7 +198,7 @@ def without_traceback(message: str) -> str:
 # Clear matter: solids that light passes through, what they take away of it, how they bend it.
 
 # A solid whose index of refraction differs less from 1 does not bend light.
-_SAME = 1e-6
+_MIN_INDEX_DIFFERENCE = 1e-6
 
 
 def transmittance_texture(mi: Any, tint: Any) -> Any:
@@ -279,7 +279,7 @@ def refract(normal: Any, d: Any, index: Any) -> tuple[Any, Any]:
     perpendicular = (eta * cosine - inner) / dr.maximum(eta * cosine + inner, 1e-9)
     parallel = (cosine - eta * inner) / dr.maximum(cosine + eta * inner, 1e-9)
     reflected = dr.select(passes, 0.5 * (perpendicular * perpendicular + parallel * parallel), 1)
-    reflected = dr.select(dr.abs(index - 1) < _SAME, 0, reflected)
+    reflected = dr.select(dr.abs(index - 1) < _MIN_INDEX_DIFFERENCE, 0, reflected)
     refracted = eta * d + (eta * cosine - inner) * facing
     mirrored = d + 2 * cosine * facing
     return dr.normalize(dr.select(passes, refracted, mirrored)), reflected

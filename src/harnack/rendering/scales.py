@@ -176,9 +176,9 @@ Numbers = npt.NDArray[np.floating[Any]]
 # Steps between ticks, as parts of a power of ten.
 _NICE = (1.0, 2.0, 5.0, 10.0)
 # Where ticks are closer than this, or numbers as large, they are written with an exponent.
-_SMALL, _LARGE = 1e-5, 1e7
+_MIN_PLAIN_STEP, _MAX_PLAIN_NUMBER = 1e-5, 1e7
 # Periods up to so many times pi have ticks at parts of it.
-_MOST_PI = 16
+_MAX_PI_MULTIPLE = 16
 
 
 @dataclass(frozen=True)
@@ -222,7 +222,9 @@ class ColorScale:
         """At most `most` ticks, but at least two: numbers, and how they are written."""
         period = 0.0 if self.period is None else self.period
         multiple = round(period / math.pi)
-        if 0 < multiple <= _MOST_PI and math.isclose(period, multiple * math.pi, rel_tol=1e-6):
+        if 0 < multiple <= _MAX_PI_MULTIPLE and math.isclose(
+            period, multiple * math.pi, rel_tol=1e-6
+        ):
             return _ticks_at_parts_of_pi(multiple, most)
         if not self.high > self.low:
             return [(self.low, f"{self.low:.4g}")]
@@ -257,7 +259,7 @@ def _written(number: float, step: float, largest: float) -> str:
     if number == 0:
         return "0"
     last_place = math.floor(math.log10(step) + 1e-9)  # the place of the last digit
-    if step >= _SMALL and largest < _LARGE:
+    if step >= _MIN_PLAIN_STEP and largest < _MAX_PLAIN_NUMBER:
         return f"{number:.{max(0, -last_place)}f}"
     digits = max(0, math.floor(math.log10(abs(number)) + 1e-9) - last_place)
     mantissa, exponent = f"{number:.{digits}e}".split("e")
@@ -287,7 +289,7 @@ Pixels = npt.NDArray[np.uint8]
 
 # Heights of letters and bar, and the bar's width, as parts of the picture's height; and the least
 # height of letters, in pixels.
-_LETTERS, _BAR, _WIDTH, _LEAST = 1 / 28, 0.78, 1 / 22, 10
+_LETTER_HEIGHT, _BAR_HEIGHT, _BAR_WIDTH, _MIN_LETTER_HEIGHT = 1 / 28, 0.78, 1 / 22, 10
 # Files that Pillow finds by name where they are installed, and a letter that none of them has.
 _TYPEFACES = (
     "DejaVuSans.ttf", "NotoSans-Regular.ttf", "FreeSans.ttf", "LiberationSans-Regular.ttf",
@@ -347,10 +349,10 @@ def add_color_bar(pixels: Pixels, scale: ColorScale, background: Color) -> Pixel
     ink = _ON_LIGHT if sum(background) > 1.5 else _ON_DARK
     images, drawings, _ = require_pillow()
     height = len(pixels)
-    letters = max(_LEAST, round(_LETTERS * height))
+    letters = max(_MIN_LETTER_HEIGHT, round(_LETTER_HEIGHT * height))
     font = typeface_for(scale.name, letters)
-    length = max(2, min(round(_BAR * height), height - 4 * letters))
-    thick, gap = max(3, round(_WIDTH * height)), max(2, letters // 2)
+    length = max(2, min(round(_BAR_HEIGHT * height), height - 4 * letters))
+    thick, gap = max(3, round(_BAR_WIDTH * height)), max(2, letters // 2)
     ticks = scale.ticks(max(2, min(6, length // (2 * letters))))
     room = max(font.getlength(text) for _, text in ticks)
     width = max(thick + gap + room, font.getlength(scale.name))

@@ -149,9 +149,9 @@ _RIM = 0.45
 _CLEAR: Color = (0.52, 0.60, 0.64)
 _METAL = 0.78
 # The side of larger values of a surface that has one color for both.
-_INSIDE: Color = (0.52, 0.60, 0.74)
+_INNER_TINT: Color = (0.52, 0.60, 0.74)
 # Where a level set closes a hole of a mesh: this share of amber, or of teal on warm colors.
-_MENDED = 0.55
+_FILLING_TINT = 0.55
 _AMBER: Color = (0.92, 0.40, 0.06)
 _TEAL: Color = (0.05, 0.40, 0.46)
 
@@ -220,13 +220,13 @@ def two_sided_color(color: Any, other: Any, inside: Any) -> Any:
     inside: mask of what is seen from the side of larger values.
     """
     same = dr.max(dr.abs(color - other)) < 1e-4
-    return dr.select(inside & same, color * _like(color, _INSIDE), color)
+    return dr.select(inside & same, color * _like(color, _INNER_TINT), color)
 
 
 def hole_filling_tint(color: Any, mended: Any) -> Any:
     """The color, tinted where a level set closes a hole of a mesh."""
     tint = dr.select(color[0] > 1.6 * color[2], _like(color, _TEAL), _like(color, _AMBER))
-    return dr.select(mended, dr.lerp(color, tint, _MENDED), color)
+    return dr.select(mended, dr.lerp(color, tint, _FILLING_TINT), color)
 
 
 def _parameter(array: Any, numbers: Sequence[float]) -> Any:
@@ -251,7 +251,7 @@ _RAYS = 8
 _BLOCK = 4
 # The tangent of the angle that the key light seems wide, and the length of the rays.
 _SPREAD = 0.34
-_FAR = 3.5
+_SHADOW_RAY_LENGTH = 3.5
 # Weights of a cell and its neighbors along each axis: a block's cells count nearly alike.
 _BLUR = (0.05, 0.2, 0.25, 0.25, 0.2, 0.05)
 
@@ -307,7 +307,7 @@ def _visible_fractions(
     o = np.stack([x, y, np.zeros_like(x)], axis=-1)[:, :, None]
     o = np.broadcast_to(o, d.shape)
     ray = mi.Ray3f(_vectors(mi.Point3f, o), _vectors(mi.Vector3f, d))
-    ray.maxt = mi.Float(_FAR)
+    ray.maxt = mi.Float(_SHADOW_RAY_LENGTH)
     free = to_numpy(~world.occluded(ray, mi.Bool(True)))
     fractions: FloatArray = free.reshape(d.shape[:-1]).mean(axis=-1)
     return fractions

@@ -184,10 +184,11 @@ STUDIO_SPP = 64
 _TOLERANCE, _PATCH_TOLERANCE = 1e-4, 1e-5
 # The most light of one path, where white is 1.
 _CLAMP = 2.0
-# Rays begin at most twice _NEAR before the stage. Clip distances are literals of kernels: as whole
-# multiples they are the same for almost all cameras, whose pictures so share their kernels.
-_NEAR, _FAR = 60.0, 2e4
-_FARTHEST = 5e3
+# Rays begin at most twice _NEAR_CLIP_STEP before the stage. Clip distances are literals of kernels:
+# as whole multiples they are the same for almost all cameras, whose pictures so share their
+# kernels.
+_NEAR_CLIP_STEP, _FAR_CLIP = 60.0, 2e4
+_MAX_CAMERA_DISTANCE = 5e3
 _LIGHT = GroundBackdrop("light")
 
 
@@ -311,10 +312,10 @@ def stage_placement(points: FloatArray, turned: FloatArray | None = None) -> Pla
 def _sensor(mi: Any, pose: CameraPose, size: tuple[int, int]) -> dict[str, Any]:
     # Rays begin near the stage, however far the camera is: their origins are rounded.
     distance = float(np.linalg.norm(pose.origin))
-    if distance > _FARTHEST:
+    if distance > _MAX_CAMERA_DISTANCE:
         raise ValueError(
             f"the camera is {distance:,.0f} times as far away as the surface is large; pictures "
-            f"are computed in single precision, which reaches to {_FARTHEST:,.0f} times"
+            f"are computed in single precision, which reaches to {_MAX_CAMERA_DISTANCE:,.0f} times"
         )
     to_world = mi.ScalarTransform4f().look_at(
         origin=pose.origin.tolist(), target=pose.target.tolist(), up=pose.up.tolist()
@@ -323,8 +324,8 @@ def _sensor(mi: Any, pose: CameraPose, size: tuple[int, int]) -> dict[str, Any]:
         "type": "perspective",
         "fov": pose.fov,
         "fov_axis": "larger",
-        "near_clip": max(1e-3, _NEAR * (distance // _NEAR - 1)),
-        "far_clip": _FAR,
+        "near_clip": max(1e-3, _NEAR_CLIP_STEP * (distance // _NEAR_CLIP_STEP - 1)),
+        "far_clip": _FAR_CLIP,
         "to_world": to_world,
         "film": {
             "type": "hdrfilm",

@@ -41,13 +41,13 @@ if TYPE_CHECKING:
 
 __all__ = ["TubeNetwork"]
 
-_MOST_SEGMENTS = 1_000_000
+_MAX_SEGMENTS = 1_000_000
 # Segments in a group, and the number of segments from which on they are grouped.
-_GROUP, _MANY = 8, 64
+_GROUP_SIZE, _MIN_GROUPED = 8, 64
 # The inner knots of the piecewise linear bound, as fractions of the length asked for.
 _KNOTS = (0.125, 0.25, 0.5)
 # That length for a ray without an end, in multiples of the size of the tube and of coordinates.
-_FAR = 8.0
+_ENDLESS_LENGTH = 8.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +176,7 @@ class Tube(Solid):
         allowed = 1e-3 * wire if tolerance is None else as_positive(tolerance, "the tolerance")
         angle = 2 * math.pi * turns
         count = max(1.0, angle * math.sqrt(radius / (8.0 * allowed)))
-        if not count <= _MOST_SEGMENTS:
+        if not count <= _MAX_SEGMENTS:
             raise ValueError(f"{count:,.0f} segments: allow a larger tolerance")
         t = np.linspace(0.0, angle, math.ceil(count) + 1)
         y = np.sin(t) * (-radius if left_handed else radius)
@@ -207,7 +207,7 @@ class Tube(Solid):
         start, side = self.points[:-1][is_segment], np.diff(self.points, axis=0)[is_segment]
         rows = np.column_stack([start, side, 1.0 / np.sum(side * side, axis=1)])
         groups = None
-        if len(rows) >= _MANY:
+        if len(rows) >= _MIN_GROUPED:
             rows, balls = _grouped(rows)
             groups = RecordTable.upload(backend, balls)
         object.__setattr__(prepared, "_records", RecordTable.upload(backend, rows))
@@ -227,7 +227,7 @@ class Tube(Solid):
             return path.enclose(self.evaluate(p))
         if not hasattr(self, "_records"):
             return self.prepare(backend_of(p)).sample_ray(path, t, ahead, ahead)
-        far = _FAR * (max_norm(p) + self._parameter("_size"))
+        far = _ENDLESS_LENGTH * (max_norm(p) + self._parameter("_size"))
         length = dr.select(dr.isfinite(ahead), ahead, far)
         knots = (*(fraction * length for fraction in _KNOTS), ahead)
         sample, distance, bounds = self._sample_with_bounds(p, path.direction, knots)
@@ -290,12 +290,12 @@ class Tube(Solid):
 
 
 def _grouped(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The records of segments in groups of `_GROUP`, the last group padded with copies, and a
+    """The records of segments in groups of `_GROUP_SIZE`, the last group padded with copies, and a
     record of a ball (center, radius) around each group."""
-    padding = -len(rows) % _GROUP
+    padding = -len(rows) % _GROUP_SIZE
     rows = np.concatenate([rows, np.repeat(rows[-1:], padding, axis=0)])
     ends = np.concatenate([rows[:, :3], rows[:, :3] + rows[:, 3:6]], axis=1)
-    points = ends.reshape(-1, 2 * _GROUP, 3)
+    points = ends.reshape(-1, 2 * _GROUP_SIZE, 3)
     centers = 0.5 * (points.min(axis=1) + points.max(axis=1))
     radii = np.linalg.norm(points - centers[:, None], axis=2).max(axis=1)
     return rows, np.column_stack([centers, radii * (1 + 1e-5)])
@@ -341,12 +341,12 @@ def _visit_by_groups(
             )
 
         def each(j: Any, *inner: Any) -> tuple[Any, ...]:
-            return j + 1, *body(records.read_record(i * _GROUP + j), inner)
+            return j + 1, *body(records.read_record(i * _GROUP_SIZE + j), inner)
 
         def has_more(j: Any, *_: Any) -> Any:
             return j < last
 
-        last = dr.select(is_near, type(i)(_GROUP), type(i)(0))
+        last = dr.select(is_near, type(i)(_GROUP_SIZE), type(i)(0))
         visited = dr.while_loop((type(i)(0), *updated), has_more, each, label="tube")
         return i + 1, *visited[1:]
 
@@ -430,7 +430,7 @@ class TangentEnclosure(Enclosure):
 
 
 # Boxes are wider than the tubes by this fraction of their size.
-_SLACK = 1e-5
+_BOX_MARGIN = 1e-5
 # The radius on which second derivatives are bounded, as a fraction of the distance to the segment.
 _REACH = 0.5
 
@@ -470,7 +470,7 @@ class TubeNetwork(PatchField["_TubeBuffers"]):
         ends = self.points[self.segments]
         reach = (self.radius + level)[:, None]
         lower, upper = ends.min(axis=1) - reach, ends.max(axis=1) + reach
-        slack = _SLACK * (upper - lower).max(axis=1)[:, None]
+        slack = _BOX_MARGIN * (upper - lower).max(axis=1)[:, None]
         return lower - slack, upper + slack
 
     def evaluate(self, p: Vec3) -> NoReturn:
