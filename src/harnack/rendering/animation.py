@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 FILM_FILES = (".gif", ".mp4")
 _MAX_FRAMES = 10_000
-# What changes where surfaces are.
+# The options that change where surfaces are.
 _MOVING = frozenset((*SHORTHAND, "surfaces", "options", "boundary_radius", "thickness"))
 # The palette's last entry in a GIF, which stands for transparent.
 _CLEAR = 255
@@ -75,7 +75,7 @@ def animate(
     options: TraceOptions | None = None,
     **keywords: Any,
 ) -> Animation:
-    """Draw a film and write it to `path`; notebooks show what is returned.
+    """Draw a film and write it to `path`; notebooks show the returned `Animation`.
 
         hk.animate(field, "turntable.gif", orbit=360)
         hk.animate(lambda s: hk.fields.Morph(a, b, gap=0.2, w=0.2 * s), "morph.mp4")
@@ -86,16 +86,18 @@ def animate(
         in the last; with an orbit of 360 degrees, to just before 1, so that the film can be
         repeated.
     path: .gif (Pillow) or .mp4 (PyAV: `pip install harnack[film]`).
-    frames: number of pictures. fps: pictures a second; those of a GIF last whole hundredths.
+    frames: the number of pictures.
+    fps: pictures a second. In a GIF each picture lasts a whole number of hundredths of a second.
     orbit: degrees that the camera goes around its target during the film.
-    camera: as `render` takes it. What it does not say (target, distance, angle of view) is the same
-        for all pictures, and such that everything is always in view.
-    client, checkpoint: as `render` takes them; workers draw whole pictures, and a film with more of
-        them, or at another speed, draws only those that the folder does not have.
+    camera: as `render` takes it. Properties that it does not set (target, distance, angle of view)
+        are the same for all pictures, and such that everything is always in view.
+    client, checkpoint: as `render` takes them. Workers draw whole pictures; a film with more
+        pictures, or at another speed, draws only the pictures that the folder does not have.
     options, keywords: as `render` takes them, but for `chunks`; `show` is "shaded" by default.
 
-    Raises what `render` raises; ValueError for no or too many frames, and for another file type;
-    ModuleNotFoundError where Pillow or PyAV is missing. Nothing is written unless all is.
+    Raises the errors of `render`; ValueError for no or too many frames, and for another file type;
+    ModuleNotFoundError if Pillow or PyAV is missing. The file is written only if all pictures are
+    drawn.
     """
     target = check_film_path(path)
     arguments = complete_options("animate", keywords)
@@ -139,7 +141,8 @@ def animate(
 
 @dataclass(frozen=True)
 class _FilmJob:
-    """What all pictures of a film have in common, as arguments of `render`; Mitsuba's variant."""
+    """The arguments of `render` that all pictures of a film have in common, and Mitsuba's
+    variant."""
 
     arguments: dict[str, Any]
     variant: str
@@ -154,7 +157,7 @@ class _FilmJob:
 def _job(
     frames: list[dict[str, Any]], same: dict[str, Any]
 ) -> tuple[_FilmJob, list[tuple[dict[str, Any]]]]:
-    """The job of a film, and what each picture has of its own."""
+    """The job of a film, and the arguments that differ from picture to picture."""
     first = frames[0]
     varying = [name for name in first if any(frame[name] is not first[name] for frame in frames)]
     same = {**same, **{name: first[name] for name in first if name not in varying}}
@@ -185,8 +188,8 @@ def _value_at(value: Any, s: float) -> Any:
 def _cameras(
     moments: list[dict[str, Any]], steps: FloatArray, orbit: float, size: tuple[int, int]
 ) -> list[Camera]:
-    """The camera of each picture: all have one box, target, distance and angle of view, except
-    where they set their own."""
+    """The camera of each picture. All cameras have the same box, target, distance and angle of
+    view, except where they set their own."""
     given = [moment.get("camera") for moment in moments]
     cameras = [Camera() if camera is None else check_camera(camera) for camera in given]
     ups = [moment.get("up") for moment in moments]
@@ -224,7 +227,7 @@ def _cameras(
 
 
 def _orbited(camera: Camera, orbit: float, upright: FloatArray) -> Camera:
-    """The camera after it has gone around its target. stand: (3, 3), rotates up to z."""
+    """The camera after it has gone around its target. upright: (3, 3) rotation of up to z."""
     if camera.position is None:
         return replace(camera, azimuth=camera.azimuth_elevation[0] + orbit)
     c, s = math.cos(math.radians(orbit)), math.sin(math.radians(orbit))
@@ -235,7 +238,7 @@ def _orbited(camera: Camera, orbit: float, upright: FloatArray) -> Camera:
 
 
 def _points(moments: list[dict[str, Any]], steps: FloatArray) -> FloatArray:
-    """Points (n, 3) of all that is seen in a film."""
+    """Points (n, 3) of all surfaces that are seen in a film."""
     backend = mitsuba_backend(register())
     points: list[FloatArray] = []
     last: Any = None

@@ -53,12 +53,12 @@ _STATUS_COLORS = {
 class AovBuffers:
     """First hits of the rays through the middles of all pixels.
 
-    depth: (h, w) distance from the camera in the unit of the viewer's placement, inf without a hit.
-        Where the ray ran out of steps, how far it is proved free.
+    depth: (h, w) distance from the camera in the unit of the viewer's placement, inf without a hit;
+        for a ray out of steps, the distance up to which it is proved free.
     normal: (h, w, 3) unit, zero without a hit; of a level set it points to larger values.
     evaluations: (h, w) of all the scene's fields.
     status: (h, w) a `RayStatus`; shapes of Mitsuba count as hits.
-    isoline_color: (h, w, 3) color in sRGB of the isoline that is hit; NaN where none is.
+    isoline_color: (h, w, 3) color in sRGB of the isoline that is hit; NaN where no isoline is hit.
     is_near_isoline: (h, w) whether the edge of an isoline may pass through the pixel.
     value: (h, w) of a function at hits, NaN elsewhere; None without a function.
     period: of that function, if it is angle-valued.
@@ -116,7 +116,8 @@ class AovTask:
         return tiled_pixel_order(self.size)
 
     def render_range(self, start: int, stop: int) -> AovBuffers:
-        """The first hits of the rays through the middles of some pixels, (n,); `order` counts."""
+        """The first hits (n,) of the rays through the middles of a range of pixels, counted as in
+        `order`."""
         return self._look_at(upload_indices(self.mi, self.order[start:stop]), self.mi.Vector2f(0.5))
 
     def look(
@@ -198,7 +199,7 @@ class AovTask:
         return replace(view, value=value, period=self.function.period)
 
     def _line_color(self, si: Any, first: Any) -> Any:
-        """sRGB of the line that is met; NaN where none is."""
+        """The color in sRGB of the isoline that is hit; NaN where no isoline is hit."""
         mi = self.mi
         line_color = mi.Vector3f(dr.nan)
         for proxy in self.world.proxies:
@@ -213,7 +214,8 @@ class AovTask:
 
 
 def _map_arrays(change: Callable[..., Any], *views: AovBuffers) -> AovBuffers:
-    """A view whose arrays are made of those of the same name in others."""
+    """AOV buffers whose arrays are the results of `change` for the arrays of that name in all
+    views."""
     arrays = {
         name: change(*(getattr(view, name) for view in views))
         for name, value in vars(views[0]).items()
@@ -243,12 +245,12 @@ def status_picture(view: AovBuffers) -> npt.NDArray[np.uint8]:
 
 
 def depth_picture(view: AovBuffers, scale: ColorScale) -> npt.NDArray[np.uint8]:
-    """Depths of what is met as the colors of a scale."""
+    """Depths of hits as the colors of a scale."""
     return _of_surfaces(view, scale.colors(view.depth))
 
 
 def value_picture(view: AovBuffers, scale: ColorScale) -> npt.NDArray[np.uint8]:
-    """Values on what is met as the colors of a scale, gray where there is none; isolines on it."""
+    """Values at hits as the colors of a scale, gray where there is no value; with isolines."""
     value = value_of(view)
     picture = np.where(np.isnan(value)[..., None], _UNKNOWN, scale.colors(value))
     return _of_surfaces(view, np.where(np.isnan(view.isoline_color), picture, view.isoline_color))
@@ -278,14 +280,14 @@ def value_scale(view: AovBuffers) -> ColorScale:
 
 
 def value_of(view: AovBuffers) -> FloatArray:
-    """Values of the function that was asked for."""
+    """The values of the function at hits. Raises ValueError if there was no function."""
     if view.value is None:
         raise ValueError("values of no function were looked at")
     return view.value
 
 
 def _range(view: AovBuffers, numbers: FloatArray) -> tuple[float, float]:
-    """The least and the greatest finite number of what is met; (0, 1) where there is none."""
+    """The smallest and the largest finite number at hits; (0, 1) if there is no such number."""
     finite = numbers[(view.status == int(RayStatus.HIT)) & np.isfinite(numbers)]
     return (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
 

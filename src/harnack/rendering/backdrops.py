@@ -151,10 +151,10 @@ Backdrop = GroundBackdrop | GradientBackdrop | ImageBackdrop | None
 
 
 def parse_backdrop(given: Any) -> Backdrop:
-    """What is to be behind the surfaces.
+    """The backdrop that an option describes.
 
     Raises:
-        TypeError, ValueError: it is no backdrop; the message says what backdrops there are.
+        TypeError, ValueError: it is no backdrop; the message lists the backdrops.
         FileFormatError: an image file that cannot be read.
     """
     if isinstance(given, os.PathLike):

@@ -32,17 +32,17 @@ class Camera:
     azimuth, elevation: of the direction the camera looks from, in degrees; azimuth 0 is +x and
         90 is +y, elevation 90 is straight from above. By default -50 and 28.
     fov: the larger of the horizontal and vertical angle of view, in degrees. By default 26, or, of
-        a camera with a position or a distance, what frames the surface from there.
+        a camera with a position or a distance, the angle that frames the surface from there.
     zoom: 1 frames the surface tightly with a margin; more comes closer or, of a camera with a
         position or a distance, makes the angle of view smaller.
-    box: framed in place of what is to be seen, in the coordinates of the surfaces; it stands on the
+    box: a box to frame in place of the visible surfaces, in their coordinates; it stands on the
         ground. The pictures of a film, in which surfaces change, then fit each other, and nothing
         has to be traced to find the frame.
     position: (x, y, z), where the camera stands, in the coordinates of the surfaces, in place of
         azimuth and elevation.
     target: (x, y, z), the point in the middle of the picture, in the same coordinates; by default
         the middle of the framed box.
-    distance: from the target, in the same unit; by default what frames the surface.
+    distance: from the target, in the same unit; by default the one that frames the surface.
     """
 
     azimuth: float | None = None
@@ -128,7 +128,7 @@ class Camera:
         size: tuple[int, int],
         to_world: Callable[[FloatArray], FloatArray],
     ) -> CameraPose:
-        """Where the camera is in the world, to see points (n, 3) of the world.
+        """The camera in the world, placed to see points (n, 3) of the world.
 
         to_world: from the coordinates of the surfaces, a map of one scale for all axes.
         """

@@ -57,7 +57,7 @@ def rotation_to_z_up(up: Any) -> FloatArray:
         raise ValueError("up must be a vector that is not zero")
     vector, z = vector / float(np.abs(vector).max()), np.array([0.0, 0.0, 1.0])
     vector = vector / float(np.linalg.norm(vector))
-    # Turned the shortest way, about the axis at right angles to both.
+    # The shortest rotation is about the axis at right angles to both.
     normal = np.cross(vector, z)
     if float(np.linalg.norm(normal)) < 1e-12:
         return rotation_to_z_up("z" if vector[2] > 0 else "-z")
@@ -72,7 +72,8 @@ def rotation_to_z_up(up: Any) -> FloatArray:
 class UnboundedSurfaceError(ValueError):
     """A surface without a box around it cannot be drawn.
 
-    reason: what is wrong. usual: a level of the same field whose surface has a box, if known.
+    reason: the text of the error.
+    usual: a level of the same field whose surface has a box; None if no such level is known.
     """
 
     def __init__(self, reason: str, usual: float | None) -> None:
@@ -83,7 +84,7 @@ class UnboundedSurfaceError(ValueError):
 
 
 class NothingVisibleError(ValueError):
-    """A surface of which no ray hits anything: there is nothing to frame."""
+    """A surface that no ray hits: there is nothing to frame."""
 
 
 def bounding_box(surface: TracedSurface) -> FloatArray:
@@ -118,14 +119,16 @@ def _unbounded(surface: TracedSurface) -> UnboundedSurfaceError:
     return UnboundedSurfaceError(reason, usual if is_other else None)
 
 
-# Rays along a side of the grid on each of the six faces: of the box, then of the box of the hits.
+# The number of rays along a side of the grid on each of the six faces: of the box, and of the box
+# of the hits.
 _GRID, _FINE_GRID = 48, 32
 # Rays of one tile are followed together.
 _TILE = 8
 # Squares of lengths, divided by tolerances, stay far from the ends of single precision.
 _SMALLEST, _LARGEST = 1e-15, 1e16
-# The distance of surfaces from the origin, in lengths of them, beyond which pixels at edges are
-# off, and that beyond which a third of all pixels may be (measured: boxes, curves, meshes, clouds).
+# The distance of surfaces from the origin, in units of their size, beyond which pixels at edges are
+# wrong, and the one beyond which a third of all pixels may be wrong (measured: boxes, curves,
+# meshes, clouds).
 _MAX_SHARP_OFFSET, _MAX_OFFSET = 5e3, 1e5
 _VISIBLE_POINTS_CACHE: FieldCache[FloatArray] = FieldCache()
 
@@ -172,8 +175,8 @@ def check_drawable_size(ends: FloatArray) -> None:
 
 
 def check_offset(points: FloatArray) -> None:
-    """Warn of surfaces, given by points (n, 3), that are blurred by the rounding of coordinates far
-    from the origin, as those of maps; raise ValueError where nothing is left of them."""
+    """Warn of surfaces, represented by points (n, 3), that are blurred by the rounding of
+    coordinates far from the origin, as those of maps; raise ValueError if they are lost in it."""
     size, distance = float(np.ptp(points, axis=0).max()), float(np.abs(points).max())
     if distance <= _MAX_SHARP_OFFSET * size or size == 0:
         return
@@ -188,7 +191,7 @@ def check_offset(points: FloatArray) -> None:
 
 
 def _find_visible_points(surface: TracedSurface, backend: Backend, ends: FloatArray) -> FloatArray:
-    """Points found on a coarse grid, and on one around them."""
+    """The hits of rays of a coarse grid, and of a finer grid around these hits."""
     lower, upper = ends
     points = _probe(surface, backend, lower, upper, _GRID)
     if len(points) == 0:

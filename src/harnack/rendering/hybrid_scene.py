@@ -47,11 +47,11 @@ def surface_interaction(mi: Any, met: SurfaceHit, ray: Any, shape: Any) -> Any:
 
 
 def offset_origin(mi: Any, si: Any, clearance: Real, d: Vec3) -> Any:
-    """Where a ray in direction d starts so as not to meet the surface of `si` again.
+    """The origin of a ray in direction d that does not hit the surface of `si` again.
 
-    Off the surface along its normal on the side that the ray leaves to, as far as Mitsuba's own
-    rays do, (1 + |p|_max) RayEpsilon, but no less than `clearance`: within its tolerance of a
-    level set every point is a hit.
+    It is off the surface along the normal, on the side to which the ray leaves, as far as for
+    Mitsuba's own rays, (1 + |p|_max) RayEpsilon, but no less than `clearance`: within its tolerance
+    of a level set every point is a hit.
     """
     distance = dr.maximum((1 + dr.max(dr.abs(si.p))) * mi.math.RayEpsilon, clearance)
     return dr.fma(dr.mulsign(distance, dr.dot(si.n, d)), mi.Vector3f(si.n), si.p)
@@ -100,11 +100,10 @@ class HybridScene:
     ) -> tuple[Any, SurfaceHit]:
         """The first hit of rays, as a surface interaction and as a `SurfaceHit`.
 
-        start: the interaction that rays leave, not valid for rays that come from a camera. hidden:
-        rays that do not see shapes that shine; None for none.
+        start: the interaction that rays leave, not valid for rays that come from a camera.
+        hidden: mask of rays that do not see shapes that emit light; None for no such rays.
 
-        Where the hit is lost (the ray ran out of steps before anything that is known to be there)
-        the interaction is not valid.
+        For a ray out of steps the interaction is not valid.
         """
         mi = self.mi
         preliminary = self.scene.ray_intersect_preliminary(ray, active=active)
@@ -139,7 +138,7 @@ class HybridScene:
         return si, dr.select(ended, hit, scene_hit)
 
     def _skip_emitters(self, ray: Any, first: Any, active: Mask) -> Any:
-        """What rays hit of the scene behind the shapes that shine."""
+        """The first hits of rays with the scene behind the shapes that emit light."""
         mi = self.mi
 
         def is_emitter(hit: Any, active: Mask) -> Mask:
@@ -163,7 +162,7 @@ class HybridScene:
         return hit
 
     def no_hit(self, si: Any) -> SurfaceHit:
-        """The `SurfaceHit` of rays that hit nothing, given as many invalid interactions."""
+        """The `SurfaceHit` of rays that hit nothing. si: invalid interactions, one for each ray."""
         return self._of_scene(si, self.mi.Bool(False))
 
     def _of_scene(self, si: Any, active: Mask) -> SurfaceHit:
@@ -185,8 +184,10 @@ class HybridScene:
     def has_line_near(self, si: Any, ray: Any, d: Any, t: Any) -> Mask:
         """Whether the edge of an isoline may pass through the pixel of a ray with differentials.
 
-        d: the direction in which the ray arrives. t: the length of its way. Where neighboring rays
-        hit the tangent plane is found along d.
+        d: the direction in which the ray arrives.
+        t: the length of its path.
+
+        The points at which neighboring rays hit the tangent plane are computed along d.
         """
         mi, near = self.mi, self.mi.Bool(False)
         normal = mi.Vector3f(si.n)
@@ -204,7 +205,7 @@ class HybridScene:
         return near
 
     def occluded(self, ray: Any, active: Mask) -> Mask:
-        """Whether rays hit anything; those not proved to hit nothing count as hitting."""
+        """Whether rays hit anything; rays that are not proved to hit nothing count as hitting."""
         blocked = self.scene.ray_test(ray, active)
         for proxy in self.proxies:
             blocked |= self._placed(proxy).occludes(ray.o, ray.d, ray.maxt, active & ~blocked)

@@ -50,7 +50,7 @@ class SobolSampler:
 
     Methods are called as Mitsuba's. Each call takes the next dimension.
 
-    pixel, index: UInt32 of each path, what its sample is of and which one it is.
+    pixel, index: (UInt32) for each path its pixel, and the index of its sample in the pixel.
     seed: UInt32. dimension: UInt32, of the next call.
     """
 
@@ -61,7 +61,9 @@ class SobolSampler:
     dimension: Any
 
     def at_vertex(self, depth: Any, rows: Any) -> SobolSampler:
-        """The sampler for some of the paths, at their vertex number `depth`, counted from 0."""
+        """The sampler for a subset of the paths, at vertex `depth`, counted from 0.
+
+        rows: indices of the paths."""
         uint = self.mi.UInt32
         pixel, index = dr.gather(uint, self.pixel, rows), dr.gather(uint, self.index, rows)
         return SobolSampler(self.mi, pixel, index, self.seed, _CAMERA + _VERTEX * uint(depth))
@@ -96,7 +98,7 @@ def _hashed(uint: Any, x: Any) -> Any:
 
 
 def _owen(uint: Any, x: Any, seed: Any) -> Any:
-    """Owen's scrambling: each bit flipped or not as the bits above it say."""
+    """Owen's scrambling: whether a bit is flipped depends on the bits above it."""
     x = dr.brev(x) + seed
     for multiplier in _OWEN:
         x ^= x * uint(multiplier)
@@ -105,7 +107,7 @@ def _owen(uint: Any, x: Any, seed: Any) -> Any:
 
 PLUGIN = "harnack_path"
 INTEGRATOR = "HarnackPath"
-# What a ray that ran out of steps is drawn in: nothing in nature is this color.
+# The color of rays out of steps: nothing in nature has this color.
 OUT_OF_STEPS_COLOR = (1.0, 0.0, 1.0)
 
 _UNLIMITED = 2**32 - 1
@@ -253,8 +255,8 @@ class PathTracer:
     ) -> PathResults:
         """Trace the paths that begin with these camera rays, one for each of the sampler's lanes.
 
-        Paths go on vertex by vertex, all together, and those that have ended are left out: what
-        each part of a vertex needs is evaluated for the paths that need it (`backend.loops`).
+        All paths advance together, vertex by vertex, without the paths that have ended; each part
+        of a vertex is evaluated only for the paths that need it (`backend.loops`).
         """
         mi, world = self.mi, HybridScene.of(self.mi, scene, queued=True)
         width = dr.width(sampler.index)
@@ -295,8 +297,8 @@ class PathTracer:
         self, world: HybridScene, paths: _PathState, exist: Mask, sampler: SobolSampler, depth: int,
         results: PathResults,
     ) -> tuple[_PathState, Mask]:  # fmt: skip
-        """Finds the next vertex of paths, collects its light, and samples where to go on. Returns
-        the paths after it, and which of them go on."""
+        """Find the next vertex of paths, collect its light, and sample the next direction. Returns
+        the paths behind the vertex, and the mask of those that go on."""
         mi, vertex = self.mi, dr.opaque(self.mi.UInt32, depth)
         previous = paths.previous.interaction(mi)
         hidden = (vertex == 0) if self.hide_emitters else None
@@ -347,7 +349,7 @@ class PathTracer:
         dr.eval(active, light, outputs, *array_leaves(next_paths), *array_leaves(connection))
         blocked = world.occluded(connection.ray, connection.active)
         light += dr.select(connection.active & ~blocked, connection.light, 0)
-        # Each path has a place of its own, so that the order of sums is fixed.
+        # Each path has its own entry, so that the order of sums is fixed.
         dr.scatter_add(results.light, light, paths.number, exist, mode=dr.ReduceMode.NoConflicts)
         dr.eval(results.light)
         return next_paths, active
@@ -435,7 +437,7 @@ def integrator_class(variant: str) -> Any:
             return results.light, results.valid, []
 
         def take_lost(self) -> int:
-            """How many paths ran out of steps since the last call."""
+            """The number of paths that ran out of steps since the last call."""
             count = int(self.lost[0])
             self.lost = mi.UInt32(0)
             return count

@@ -1,6 +1,6 @@
 """Isolines: lines on a surface where another function takes given values.
 
-A line is what lies within half its width of the curve {g = level} on the surface. Its distance from
+A line is the set of points within half its width of the curve {g = level} on the surface. Its distance from
 a point is |g - level| / |grad_T g| to first order, with the part grad_T g of the gradient along the
 surface: lines are as wide where g rises gently as where it is steep. They are compared without the
 quotient, |g - level| < width/2 |grad_T g|, so that nothing is drawn where g is constant along the
@@ -49,11 +49,11 @@ _PADDING = 1e-5
 
 
 def as_field(given: Any, what: str = "of") -> Field:
-    """A function on space: a field, or what `harnack.expression` takes: a function of three
-    coordinates, or a text such as "z".
+    """A function on space as a field. It is a field; or an argument of `harnack.expression`: a
+    function of three coordinates, or a text such as "z".
 
     Raises:
-        TypeError, ValueError: none of these, or a field with a function for each part.
+        TypeError, ValueError: another argument, or a field with patches.
     """
     if isinstance(given, str):
         try:
@@ -76,23 +76,24 @@ def as_field(given: Any, what: str = "of") -> Field:
 
 
 def padded_domain(function: Field, size: float) -> Volume | None:
-    """Where a function is defined, with room for rounding; None for all of space.
+    """The volume in which a function is defined, with a margin for rounding; None for all of space.
 
-    size: of the surface on which it is evaluated.
+    size: the size of the surface on which the function is evaluated.
     """
     if function.domain is None or function.is_global:
         return None
     return function.domain.padded(_PADDING * size)
 
 
-# The width of a line unless one is given, as a part of the diagonal of the surface's box.
+# The default width of a line, as a fraction of the diagonal of the surface's box.
 _DEFAULT_WIDTH = 0.004
-# Where the part of the gradient along the surface is this much smaller than the gradient, it is
-# rounding, of the normal and of the position.
+# If the component of the gradient along the surface is smaller than this fraction of the gradient,
+# it is due to rounding of the normal and of the position.
 _ROUNDING = 1e-4
-# How many lines an angle-valued function has unless asked otherwise.
+# The default number of lines of an angle-valued function.
 _DEFAULT_LINE_COUNT = 12
-# Tables of levels have at least so many entries, as kernels depend on the length's logarithm.
+# Tables of levels have at least this many entries, as kernels depend on the logarithm of the
+# length.
 _MIN_TABLE_LENGTH = 64
 
 
@@ -144,7 +145,8 @@ class Isolines:
         self._exact_interval()
 
     def _exact_interval(self) -> float | None:
-        """The interval, exactly a part of the period if there is one; None for lines at levels."""
+        """The interval; exactly a fraction of the period, if there is a period. None for lines at
+        levels."""
         period = self.function_field.period
         if self.levels is not None or period is None:
             return self.interval
@@ -173,10 +175,10 @@ class Isolines:
 
 
 def _table(levels: tuple[float, ...], period: float | None) -> FloatArray:
-    """Levels in ascending order, of which the nearest is next to where a value belongs.
+    """Levels in ascending order, in which the nearest level is next to the place of a value.
 
-    Those of an angle-valued function lie in [0, period), with the last before them once more and
-    the first after them. The rest of the table, of 2^k - 1 entries, is infinite.
+    The levels of an angle-valued function lie in [0, period); a copy of the last precedes them and
+    a copy of the first follows them. The rest of the table, of 2^k - 1 entries, is infinite.
     """
     ordered = np.unique(np.array(levels) if period is None else np.mod(levels, period))
     if period is not None:
@@ -196,7 +198,7 @@ def _numbers(levels: Any) -> tuple[float, ...]:
 
 
 def parse_isolines(given: Any) -> tuple[Isolines, ...]:
-    """`Isolines`, or several, as a tuple; empty for None.
+    """`Isolines`, or a list of them, as a tuple; empty for None.
 
     Raises:
         TypeError: anything else.
@@ -245,7 +247,7 @@ class PreparedIsolines:
         return dr.abs(gap - self.half_width * norm(along)) < reach
 
     def _gap_and_gradient(self, p: Vec3, normal: Vec3) -> tuple[Real, Vec3]:
-        """How far g is from the nearest level, and its gradient along the surface."""
+        """The gap from g to the nearest level, and the gradient of g along the surface."""
         sample = self.function.evaluate(p)
         gradient = sample.gradient
         along = gradient - dr.dot(gradient, normal) * normal
@@ -274,8 +276,8 @@ class PreparedIsolines:
 def isoline_index_at(
     lines: tuple[PreparedIsolines, ...], p: Vec3, normal: Vec3, index: Any
 ) -> Index:
-    """The number of the isoline that points are on, counted from 1, the last one where several
-    overlap; 0 for none.
+    """The number of the isoline that points are on, counted from 1; the last isoline where they
+    overlap; 0 for no isoline.
 
     index: the type of the numbers.
     """

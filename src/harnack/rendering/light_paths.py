@@ -43,8 +43,8 @@ class PathRender:
     """Radiance of all pixels of a sensor.
 
     image: (h, w, 4) linear sRGB and, last, the fraction of the pixel that is covered.
-    lost: how many paths ran out of steps.
-    albedo, normal: means (h, w, 3) of what paths hit first, if asked for.
+    lost: the number of paths that ran out of steps.
+    albedo, normal: (h, w, 3) means of albedos and normals at first hits; None unless requested.
     """
 
     image: npt.NDArray[np.float32]
@@ -178,19 +178,20 @@ def as_rgb(mi: Any, radiance: Any, wavelengths: Any) -> Any:
 
 
 def mean_of_blocks(color: Any, spp: int) -> Any:
-    """The mean of each `spp` neighboring lanes."""
+    """The means over blocks of `spp` successive lanes."""
     return type(color)(*(dr.block_sum(channel, spp) / spp for channel in color))
 
 
-# How long a picture will take, told before it is begun.
+# Estimates of the time for a picture, before it is drawn.
 
-# Paths that are tried: at first, how many times as many next, and no more than this part of all.
+# Paths of trial runs: the number of the first run, the growth from run to run, and the largest
+# fraction of all paths.
 _FIRST_TRIAL_PATHS, _TRIAL_GROWTH, _MAX_TRIAL_FRACTION = 2**12, 4, 1 / 16
-# Runs that take this many times as long as the first are long enough to be measured.
+# Runs that take this many times as long as the first run are long enough to be measured.
 _MIN_TIME_RATIO = 3.0
-# Seconds; of a picture that takes no longer the time is not told.
+# In seconds: the time of a picture is reported only if it is longer.
 MIN_REPORTED_SECONDS = 15.0
-# Seconds between two moves of the progress bar, and the fewest paths of a band.
+# Seconds between two moves of the progress bar, and the smallest number of paths of a band.
 _SECONDS_PER_BAND, _MIN_BAND_PATHS = 4.0, 2**14
 
 
@@ -222,10 +223,11 @@ class TimeEstimate:
 def estimate_time(
     mi: Any, scene: Any, sensor: Any, tracer: PathTracer, *, spp: int, features: bool
 ) -> TimeEstimate:
-    """The pace of a picture, measured on a few paths all over it.
+    """The time for a picture, measured on a few paths all over it.
 
-    Starting costs the same however many paths there are, so what counts is how much longer four
-    times as many took. A picture of few paths is not measured, and its pace is 0.
+    The start of a run takes the same time for any number of paths, so the estimate is from the
+    additional time of four times as many paths. A picture of few paths is not measured, and its
+    estimate is 0.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     pixels = width * height
@@ -275,9 +277,9 @@ def load_denoiser() -> Any:
 def denoise_image(found: PathRender) -> npt.NDArray[np.float32]:
     """The image of an exposure with features, (h, w, 4), without noise.
 
-    Open Image Denoise, a neural network that runs on CPUs, takes the noise out. It guesses: the
-    result looks clean and is close to what more samples would have shown, but none of its numbers
-    is a mean of samples any more. What part of each pixel is covered stays as it is.
+    Open Image Denoise, a neural network that runs on CPUs, removes the noise. It guesses: the
+    result looks clean and is close to a picture with more samples, but none of its numbers is a
+    mean of samples any more. The covered fraction of each pixel is not changed.
     """
     if found.albedo is None or found.normal is None:
         raise ValueError("an exposure without features cannot be denoised")
@@ -290,7 +292,7 @@ def denoise_image(found: PathRender) -> npt.NDArray[np.float32]:
 
 # Rays through transparent solids.
 
-# Boundaries that a ray goes through; the next one is opaque.
+# The largest number of interfaces that a ray crosses; the next one is opaque.
 _MAX_INTERFACES = 32
 # The highlight of matter with this reflectance straight on is that of other glossy materials.
 _DEFAULT_REFLECTANCE = 0.04
@@ -368,7 +370,7 @@ class RefractionTracer:
         return clear
 
     def _through_boundary(self, hits: RefractedHits) -> RefractedHits:
-        """The next thing that rays hit and, where it is clear, the way behind it."""
+        """The rays at their next hit and, if it is on a transparent solid, refracted there."""
         mi, world, d = self.world.mi, self.world, hits.ray.d
         si, first = world.intersect(hits.ray, hits.si, hits.active, self.hidden)
         throughput = hits.throughput * transmittance(mi, world.proxies, hits.si, si, d)
@@ -400,7 +402,9 @@ class RefractionTracer:
         )
 
     def _reflected(self, si: Any, d: Any, index: Any, fraction: Real) -> Any:
-        """Light of the sky, and of the key light in a highlight, that boundaries send back."""
+        """The light of the sky, and of the key light in a highlight, that interfaces reflect.
+
+        fraction: the reflected fraction of the sky's light."""
         mi = self.world.mi
         normal = mi.Vector3f(si.n)
         mirrored = d - 2 * dr.dot(normal, d) * normal

@@ -68,7 +68,7 @@ def set_variant(variant: str) -> None:
 
 
 def mitsuba_backend(mi: Any) -> Backend:
-    """Our name for the arrays of the variant that is set."""
+    """The backend whose arrays are those of the variant that is set."""
     return backend_of(mi.Float(0))
 
 
@@ -82,7 +82,7 @@ _BYTE_ORDER_MARKS = {
 # Elements that name files: <include filename="..."/>, <string name="filename" value="..."/>.
 _NAMES_A_FILE = re.compile(r"<(include|string)\b([^<>]*)>")
 _ATTRIBUTE = re.compile(r"""\b(filename|value)\s*=\s*(?:"([^"]*)"|'([^']*)')""")
-# What an error of Mitsuba says besides what is wrong: places in its own source, Python's traceback.
+# Parts of Mitsuba's error messages besides the error: locations in its source, Python's traceback.
 _SOURCE_PLACE = re.compile(r"\[\w+\.(?:cpp|h):\d+\]\s*")
 _TRACEBACK = re.compile(r"Traceback \(most recent call last\):\n(?:[ \t]+.*\n)*(?:[\w.]+: )?")
 _REPEATED = re.compile(r"(?m)^(.*\n)(?:\1)+")
@@ -148,7 +148,7 @@ def check_scene_file(path: Path) -> None:
             )
         for element, name in _files_named(text):
             file = path.parent / name
-            # What is not found here may lie where the scene tells Mitsuba to look.
+            # A file that is not found here may lie in a folder that the scene names to Mitsuba.
             if file in checked or not _exists(file):
                 continue
             checked.add(file)
@@ -190,12 +190,12 @@ def _exists(path: Path) -> bool:
 
 
 def without_traceback(message: str) -> str:
-    """What an error of Mitsuba says is wrong, without Python's traceback and source lines."""
+    """The message of an error of Mitsuba, without Python's traceback and source lines."""
     message = _SOURCE_PLACE.sub("", _TRACEBACK.sub("", message))
     return _REPEATED.sub(r"\1", message).strip()
 
 
-# Clear matter: solids that light passes through, what they take away of it, how they bend it.
+# Transparent solids: their transmittance and refraction.
 
 # A solid whose index of refraction differs less from 1 does not bend light.
 _MIN_INDEX_DIFFERENCE = 1e-6
@@ -244,9 +244,10 @@ def is_inside(mi: Any, carrier: Any, start: Any, d: Any) -> Any:
 
 
 def transmittance(mi: Any, carriers: Any, start: Any, si: Any, d: Any) -> Any:
-    """What is left of light between interactions, along rays from `start` in directions d.
+    """The transmittance between interactions, along rays from `start` in directions d.
 
-    By Beer and Lambert's law the part tint^t is left of light that travels a length t in a solid.
+    By Beer and Lambert's law the fraction tint^t is left of light that travels a length t in a
+    solid.
     As going in and out of a solid alternate (`CappedSolid.intersect`), a ray that leaves a point of
     its boundary against the outward normal is inside up to the next thing that it hits.
     """

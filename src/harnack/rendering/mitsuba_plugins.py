@@ -1,4 +1,4 @@
-"""Plug-ins for Mitsuba: a shape, an integrator, and what stands in for Mitsuba's own integrators.
+"""Plug-ins for Mitsuba: a shape, an integrator, and replacements for Mitsuba's own integrators.
 
 Scene files can name them once they are registered (`register`); `mitsuba_shape` makes surfaces for
 scenes that are put together in Python.
@@ -146,14 +146,14 @@ def _with_settings(mi: Any, integrator: Any) -> PathTracer:
 
 
 def _sees_ours(integrator: Any) -> bool:
-    """Whether all that it finds comes from our integrator inside it: so do moments of its light,
-    but not the channels of `aov`."""
+    """Whether all light of an integrator comes from our integrator inside it, as for moments of its
+    light, but not for the channels of `aov`."""
     words = str(integrator)
     return INTEGRATOR in words and _CHANNELS not in words
 
 
 def _kind(integrator: Any) -> str:
-    """The name of its class in Mitsuba."""
+    """The name of an integrator's class in Mitsuba."""
     moments = "MomentIntegrator"  # says that it is a Scene
     kind = str(integrator).partition("[")[0]
     return moments if kind == "Scene" else kind
@@ -176,9 +176,9 @@ def register() -> Any:
 
 
 def register_surfaces(plugin: str, surface: Callable[[Any], TracedSurface]) -> Any:
-    """Make a shape known whose surfaces come from a function of `mitsuba.Properties`.
+    """Register a shape whose surfaces come from a function of `mitsuba.Properties`.
 
-    The function reads what it understands; `to_world` and BSDF are taken care of.
+    The function reads the properties that it knows; `to_world` and BSDF are read elsewhere.
     """
     mi = load_mitsuba()
 
@@ -271,10 +271,10 @@ def mitsuba_shape(
     bsdf: dictionary or BSDF object; gray diffuse, seen from both sides, if left out. Open
         surfaces have two sides: wrap one-sided BSDFs as {"type": "twosided", ...}.
     to_world: matrix (4, 4) or Mitsuba transform of moves, turns and one scale for all axes.
-    tint: of a solid of glass, what is left of red, green and blue light after one unit of length
-        in it, in the world: (1, 1, 1) for clear (Beer and Lambert).
+    tint: of a solid of glass, the fractions of red, green and blue light that are left after one
+        unit of length in it, in the world: (1, 1, 1) for clear glass (Beer and Lambert).
     section_bsdf: of the faces at which `section` cuts an opaque solid; by default that of the rest.
-    isolines: `harnack.Isolines` to draw on it, or several; later ones cover earlier ones.
+    isolines: `harnack.Isolines` to draw on it, or a list of them; later ones cover earlier ones.
     options, keywords: as `render` takes them: level, clip, tolerance, side, ... Glass needs a
         `side`.
 

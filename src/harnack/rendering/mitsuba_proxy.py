@@ -127,7 +127,8 @@ def from_properties(
 ) -> Any:
     """The shape of a surface with the `to_world` and the BSDF that a plug-in's properties hold.
 
-    tint: of a solid, what is left of light after one unit of length in it, in the world.
+    tint: of a solid, the fraction of light that is left after one unit of length in it, in the
+        world.
     section_bsdf: of the faces at which a section cuts a solid; None for the BSDF of the rest.
     isolines: to be drawn on the surface.
 

@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
     from harnack.tracer import TraceOptions
 
-# Modes with ground and lights, and what they trace.
+# Modes with ground and lights, and the name of the rays that they trace.
 _LIT = {"path": "light paths", "shaded": "rays"}
 _IN_AOV = (".R", ".G", ".B", ".A")
 Image = npt.NDArray[Any]
@@ -184,7 +184,8 @@ def _render_job(
 ) -> tuple[Image, npt.NDArray[np.uint8], list[str] | None]:
     """The numbers of a picture, its pixels, and the names of its channels if it has its own.
 
-    color_by: as it was set, the title of a color bar. alone: whether this process draws everything.
+    color_by: the option as it was set, the title of a color bar.
+    alone: whether this process draws everything.
     """
     mi, options, task, sensor = job.mi, job.options, job.task, job.scene.sensors()[0]
     if task is None:
@@ -218,7 +219,8 @@ def _render_job(
 def _with_time_estimate(
     job: RenderJob, task: PathRenderTask, progress: bool | Advance
 ) -> PathRenderTask:
-    """The same in bands after which a progress bar can move; says how long a long picture takes."""
+    """The task in bands after which a progress bar can move; prints the estimated time of a long
+    picture."""
     estimate = estimate_time(
         job.mi, job.scene, task.sensor, task.tracer, spp=task.spp,
         features=task.features,
@@ -272,7 +274,7 @@ def _warn_of(lost: int, kind: str) -> None:
 def _composite_over_backdrop(
     mi: Any, sensor: Any, image: Image, stage: StudioScene | None, show: str
 ) -> tuple[Image, npt.NDArray[np.uint8]]:
-    """The numbers of a picture, given as light and the part that is covered, and its pixels."""
+    """The numbers of a picture and its pixels. image: its light and the covered fraction."""
     if stage is None:
         has_alpha = mi.has_flag(sensor.film().flags(), mi.FilmFlags.Alpha)
         image = image if has_alpha else np.ascontiguousarray(image[..., :3])

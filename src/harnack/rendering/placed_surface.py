@@ -87,7 +87,7 @@ class Placement:
 
 @dataclass(frozen=True)
 class _HitPoint:
-    """Where a surface is hit, and its normal there."""
+    """A point at which a surface is hit, and the normal there."""
 
     position: Vec3
     normal: Vec3
@@ -134,7 +134,7 @@ class PlacedSurface:
         return cls(prepared, solid, scale, rows, vector(placement.translation), lines)
 
     def queued(self) -> PlacedSurface:
-        """The same, whose rays are traced without delay (`SurfaceTracer.uses_ray_queue`)."""
+        """This surface, its rays traced without delay (`SurfaceTracer.uses_ray_queue`)."""
         prepared = replace(self.prepared, uses_ray_queue=True)
         solid = None if self.solid is None else replace(self.solid, prepared=prepared)
         return replace(self, prepared=prepared, solid=solid)
@@ -142,7 +142,7 @@ class PlacedSurface:
     def intersect(
         self, o: Vec3, d: Vec3, t_max: Real, active: Mask, leaves: Real = 0.0
     ) -> SurfaceHit:
-        """Where rays of the world, |d| = 1, first hit it, in coordinates of the world.
+        """The first hits of rays of the world, |d| = 1, in coordinates of the world.
 
         leaves: of a ray that starts on this very surface, 1 or -1 for the side of the normal that
             it goes to; else 0.
@@ -180,7 +180,7 @@ class PlacedSurface:
     def has_line_near(self, position: Vec3, normal: Vec3, across: Vec3, down: Vec3) -> Mask:
         """Whether the edge of an isoline passes near points of the surface, in the world.
 
-        across, down: how far it is to the points that neighboring pixels show.
+        across, down: the vectors to the points that neighboring pixels show.
         """
         vector = self.prepared.backend.Array3f
         p = self._to_local(vector(position) - self.translation) / self.scale
@@ -192,7 +192,7 @@ class PlacedSurface:
         return near
 
     def occludes(self, o: Vec3, d: Vec3, t_max: Real, active: Mask) -> Mask:
-        """Whether rays of the world hit it; those not proved to miss it count as hitting it."""
+        """Whether rays of the world hit it; rays that are not proved to miss it count as hits."""
         o, d, t_max = self._local_ray(o, d, t_max)
         if self.solid is not None:
             return self.solid.occludes(o, d, t_max, active)

@@ -27,11 +27,11 @@ from harnack.rendering.studio_surfaces import studio_objects
 from harnack.tracer import Surface, TracedSurface, TraceOptions
 
 EDGE_SPP = 9
-# Light paths that a worker follows at a time: some hundred bytes each, of what may be a small
-# memory, and enough for all threads.
+# The number of light paths that a worker follows at a time. A path takes a few hundred bytes, and a
+# worker's memory may be small; the number is enough for all threads.
 _PATHS_A_BAND = 2**18
 DEFAULT_SIZE = (800, 600)
-# Rays of a path, shadow rays included, about.
+# The approximate number of rays of a path, including shadow rays.
 _RAYS_A_PATH = 3
 
 
@@ -96,7 +96,7 @@ class RenderJob:
 
     @functools.cached_property
     def task(self) -> AovTask | PathRenderTask | ShadedTask | None:
-        """What can be drawn pixel by pixel; None for a scene that Mitsuba draws."""
+        """The task that draws the picture pixel by pixel; None for a scene that Mitsuba draws."""
         mi, options, stage = self.mi, self.options, self.stage
         scene = self.scene
         sensor = scene.sensors()[0]
@@ -127,7 +127,7 @@ class RenderJob:
         return self.task
 
     def render_range(self, start: int, stop: int) -> TaskResult:
-        """As of the task: an `AovTask` or a `PathRenderTask`."""
+        """The result of the method of the task, an `AovTask` or a `PathRenderTask`."""
         task = self._task_here()
         if isinstance(task, AovTask):
             return _arrays_of(task.render_range(start, stop))
@@ -135,7 +135,7 @@ class RenderJob:
         return _with_lost(task.render_range(start, stop))
 
     def render_samples(self, *part: Any) -> TaskResult:
-        """As of `AovTask`."""
+        """The result of the method of the `AovTask`."""
         return _arrays_of(cast("AovTask", self._task_here()).render_samples(*part))
 
     def render_gbuffer(self, start: int, stop: int) -> TaskResult:

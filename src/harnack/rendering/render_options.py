@@ -245,7 +245,7 @@ Check = Callable[[Any, str], Any]
 
 
 def ignoring_mode(check: Callable[[Any], Any]) -> Check:
-    """A check that does not depend on what is shown."""
+    """A check that does not depend on the mode of the picture."""
     return lambda value, show: check(value)
 
 
@@ -255,7 +255,7 @@ def if_set(check: Callable[[Any], Any]) -> Check:
 
 
 def unchecked(value: Any, show: str) -> Any:
-    """No check: what uses the option checks it."""
+    """No check: the code that uses the option checks it."""
     del show
     return value
 

@@ -63,7 +63,7 @@ _COLOR_HELP = 'a name of CSS such as "steelblue", "#4682b4", or three numbers fr
 def parse_color(given: Any, what: str) -> Color:
     """A color in sRGB, three numbers in [0, 1], as screens show them.
 
-    what: the color is of, for messages.
+    what: the name of the colored thing, for messages.
 
     Raises:
         TypeError: neither text nor three numbers.
@@ -173,11 +173,12 @@ def gray_colormap(x: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
 # Scales: which number has which color, and where ticks stand.
 
 Numbers = npt.NDArray[np.floating[Any]]
-# Steps between ticks, as parts of a power of ten.
+# Steps between ticks, as multiples of a power of ten.
 _NICE = (1.0, 2.0, 5.0, 10.0)
-# Where ticks are closer than this, or numbers as large, they are written with an exponent.
+# Numbers are written with an exponent if ticks are closer than the first, or if numbers are as
+# large as the second.
 _MIN_PLAIN_STEP, _MAX_PLAIN_NUMBER = 1e-5, 1e7
-# Periods up to so many times pi have ticks at parts of it.
+# Periods up to this multiple of pi have ticks at fractions of pi.
 _MAX_PI_MULTIPLE = 16
 
 
@@ -185,8 +186,8 @@ _MAX_PI_MULTIPLE = 16
 class ColorScale:
     """Colors of numbers from `low` to `high`; numbers beyond an end have its color.
 
-    name: of what is shown, on color bars.
-    period: of numbers that count modulo `high` - `low` = period; None for others.
+    name: the name of the numbers, on color bars.
+    period: of numbers that count modulo `high` - `low` = period; None for other numbers.
     exceeded: whether numbers that are shown lie below `low`, and above `high`.
     """
 
@@ -203,7 +204,7 @@ class ColorScale:
         return cls(0.0, period, name, cyclic_colormap, period)
 
     def with_exceeded(self, numbers: Numbers) -> ColorScale:
-        """The same, for the bar of a picture that shows these."""
+        """This scale, for the bar of a picture that shows these numbers."""
         if self.period is not None or not numbers.size:
             return self
         slack = 1e-6 * max(abs(self.low), abs(self.high))
@@ -230,7 +231,7 @@ class ColorScale:
             return [(self.low, f"{self.low:.4g}")]
         step = _step((self.high - self.low) / max(most - 1, 1))
         first, last = self._multiples(step)
-        if last - first < 1:  # one more than asked for, if that gives two
+        if last - first < 1:  # one tick more than requested, if that gives two
             step = _step((self.high - self.low) / max(most + 1, 3))
             first, last = self._multiples(step)
         if last - first < 1:  # no room for two nice numbers
@@ -246,7 +247,7 @@ class ColorScale:
 
 
 def _step(bound: float) -> float:
-    """The smallest nice number that is not less than a positive one."""
+    """The smallest nice number that is at least the bound, a positive number."""
     power = 10.0 ** math.floor(math.log10(bound))
     return next(part * power for part in _NICE if part * power >= bound * (1 - 1e-9))
 
@@ -254,7 +255,7 @@ def _step(bound: float) -> float:
 def _written(number: float, step: float, largest: float) -> str:
     """A multiple of a nice step, with the digits that it needs.
 
-    largest: of all that are written.
+    largest: the largest of all numbers that are written.
     """
     if number == 0:
         return "0"
@@ -267,7 +268,7 @@ def _written(number: float, step: float, largest: float) -> str:
 
 
 def _ticks_at_parts_of_pi(multiple: int, max_count: int) -> list[tuple[float, str]]:
-    """Ticks of 0 to `multiple` pi: at halves of pi, or at one, two, ... times pi."""
+    """Ticks from 0 to `multiple` pi: at halves of pi, or at 1, 2, ... times pi."""
     halves = next(
         step for step in (1, 2, 4, 8, 16, 32)
         if (2 * multiple) // step + 1 <= max(max_count, 2) or step >= 2 * multiple
@@ -316,10 +317,10 @@ def require_pillow() -> tuple[Any, Any, Any]:
 
 def typeface_for(text: str, size: int) -> Any:
     """A typeface with all letters of a text: Pillow's own, which has plain ASCII letters, or the
-    first one found on this machine.
+    first of a list that is installed on this machine.
 
     Raises:
-        ValueError: none has them.
+        ValueError: no typeface has all letters.
     """
     _, _, typefaces = require_pillow()
     default = typefaces.load_default(size)

@@ -47,8 +47,8 @@ if TYPE_CHECKING:
 class ConeCoverage:
     """Finds pixels that surfaces may cover in part, by cones, so that no thin part is overlooked.
 
-    The ray through the middle of a pixel misses what is thinner than the pixel more often than not,
-    and so do those of its neighbors. The cone that holds the pixel does not.
+    The ray through the middle of a pixel mostly misses parts that are thinner than the pixel, and
+    so do the rays of its neighbors. The cone that holds the pixel does not miss them.
 
     Raises:
         ValueError: a field that jumps, such as the winding number of a mesh: it is constant on both
@@ -62,7 +62,8 @@ class ConeCoverage:
     def partly_covered(self, ray: Any, position: Any) -> Any:
         """Whether the cones of pixels are covered in part before the points that rays see.
 
-        ray: through the middles, with differentials. position: seen; NaN where nothing is.
+        ray: the rays through the middles, with differentials.
+        position: the points that they hit; NaN for no hit.
         """
         mi = self.mi
         distance = dr.norm(position - ray.o)
@@ -94,8 +95,8 @@ def _prepared(mi: Any, carrier: Any) -> tuple[PlacedSurface, Any]:
 
 
 def inner_and_outer_ball(volume: Volume | None, backend: Backend) -> tuple[Vec3, Real, Real] | None:
-    """The middle of a volume, and the radii about it of a ball in it and of one around it; None
-    where it has no end or no such ball was found."""
+    """The middle of a volume, the radius about it of a ball inside the volume, and the radius of a
+    ball around the volume; None if the volume is unbounded or no such ball was found."""
     if volume is None:
         return None
     lower, upper = (np.asarray(end, dtype=np.float64) for end in volume.bounds())
@@ -112,7 +113,8 @@ def inner_and_outer_ball(volume: Volume | None, backend: Backend) -> tuple[Vec3,
     return backend.Array3f(*numbers[:3]), numbers[3], numbers[4]
 
 
-# Directions across the picture, and taps along each, up to this share of its larger side.
+# The number of directions across the picture, and of taps along each; and the length that they
+# cover, as a fraction of the larger side of the picture.
 _DIRECTIONS = 16
 _TAPS = 8
 _REACH = 0.16
@@ -168,9 +170,9 @@ def ambient_visibility(
 
 # Rays of one band.
 _RAYS_A_BAND = 2**17
-# Where in its pixel the first ray goes through.
+# The coordinates in its pixel of the first ray.
 _MIDDLE = 0.5
-# The share of the time that is spent on the first rays, as the progress bar guesses.
+# The estimated fraction of the time that is spent on the first rays, for the progress bar.
 _FIRST_PASS_FRACTION = 0.6
 
 
@@ -261,7 +263,7 @@ class ShadedTask:
         self.order = tiled_pixel_order(self.size)
         self.finder = ConeCoverage(mi, world) if cones else None
         offsets = multijitter_offsets(spp)
-        traced = (offsets == _MIDDLE).all(axis=1)  # what a pixel's first ray has seen
+        traced = (offsets == _MIDDLE).all(axis=1)  # the offset of a pixel's first ray
         self.offsets, self.share_of_first = offsets[~traced], float(traced.mean())
         self.refines = spp > 1
         matrix = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
@@ -283,7 +285,7 @@ class ShadedTask:
         return gbuffer
 
     def _look(self, pixel: Any, offset: Any) -> GBuffer:
-        """What rays through places in pixels hit first."""
+        """The first hits of rays through points in pixels."""
         mi, scene = self.mi, self.world.scene
         ray, weight = self.ray(pixel, offset)
         hits = self.evaluate_with.trace(mi.Ray3f(ray))
@@ -303,7 +305,7 @@ class ShadedTask:
             mi, hits.throughput * emitted + weight * hits.reflected_light, ray.wavelengths
         )
         light = dr.select(lost, mi.Color3f(OUT_OF_STEPS_COLOR), light)
-        covered = hit | lost | (hits.interface_count > 1)  # what is clear covers, too
+        covered = hit | lost | (hits.interface_count > 1)  # transparent solids cover, too
         if self.cut_out:
             light = dr.select(covered, light, 0)
         transmittance = as_rgb(mi, hits.throughput, ray.wavelengths)
@@ -332,7 +334,7 @@ class ShadedTask:
         )
 
     def ray(self, pixel: Any, offset: Any) -> tuple[Any, Any]:
-        """Rays with differentials through places in pixels, and what their light is weighted by."""
+        """Rays with differentials through points in pixels, and the weights of their light."""
         mi = self.mi
         place = film_positions(mi, pixel, offset, self.size)
         return self.sensor.sample_ray_differential(
@@ -340,14 +342,14 @@ class ShadedTask:
         )
 
     def _reflectance(self, si: Any, side: int) -> Any:
-        """Reflectance of the side that is seen (1) or the other (-1), seen straight on."""
+        """The reflectance at normal incidence of the visible side (1) or the other side (-1)."""
         mi = self.mi
         straight = mi.SurfaceInteraction3f(si)
         straight.wi = mi.Vector3f(0, 0, dr.mulsign(mi.Float(side), si.wi.z))
         return si.bsdf().eval_diffuse_reflectance(straight, si.is_valid())
 
     def _is_open(self, si: Any) -> Any:
-        """Whether it is one of our surfaces, and an open one, of which both sides can be seen."""
+        """Whether interactions are on open surfaces of harnack, of which both sides can be seen."""
         is_open = self.mi.Bool(False)
         for carrier in self.world.proxies:
             surface = carrier.surface
@@ -356,7 +358,8 @@ class ShadedTask:
         return is_open
 
     def shade(self, seen: GBuffer, sky: Any) -> Any:
-        """Radiance towards the eye, and whether there is anything."""
+        """The radiance towards the eye, and 1 where anything but the environment is visible, else
+        0."""
         key = 1.0
         if self.floor is not None:
             key, above = self.floor.at(seen.position)
@@ -368,7 +371,9 @@ class ShadedTask:
     def refine_pixels(
         self, chosen: IntArray, position: FloatArray, sky: FloatArray
     ) -> tuple[npt.NDArray[np.float32], int]:
-        """Means (n, 4) of samples in chosen pixels, and how many of them were lost.
+        """The means (n, 4) of samples in pixels, and the number of samples out of steps.
+
+        chosen: (n,) the pixels, counted by rows.
 
         position, sky: seen by the pixels and their neighbors, (n, 5, 3) and (n, 5)
             (`neighborhood`).
@@ -385,7 +390,7 @@ class ShadedTask:
 
     def neighborhood(self, chosen: IntArray, *arrays: Any) -> tuple[npt.NDArray[Any], ...]:
         """Entries (n, 5, ...) of arrays of all pixels, counted by rows, at chosen pixels and their
-        four neighbors; at the picture's border some are there twice."""
+        four neighbors; at the picture's border a pixel is its own neighbor."""
         columns, rows = self.size
         x, y = chosen % columns, chosen // columns
         u = np.clip(x[:, None] + np.array([0, 1, -1, 0, 0]), 0, columns - 1)
@@ -396,8 +401,10 @@ class ShadedTask:
 
 
 def _nearest_sky(mi: Any, samples: GBuffer, row: Any, position: FloatArray, sky: FloatArray) -> Any:
-    """The visible sky of the pixel around whose point lies nearest to the sample; row: of the
-    sample's pixel among those that were chosen."""
+    """The visible sky of that pixel of a neighborhood whose point lies nearest to the sample.
+
+    row: the index of the sample's pixel among the chosen pixels.
+    position, sky: as for `ShadedTask.refine_pixels`."""
     nearest, value = mi.Float(dr.inf), mi.Float(1)
     for k in range(position.shape[1]):
         point = dr.gather(mi.Vector3f, _of_numbers(mi, mi.Vector3f, position[:, k]), row)
@@ -413,11 +420,11 @@ def _nearest_sky(mi: Any, samples: GBuffer, row: Any, position: FloatArray, sky:
 def render_shaded(
     shading: ShadedTask, hands: RenderExecutor, advance: Callable[[float], None]
 ) -> tuple[npt.NDArray[np.float32], int]:
-    """Linear sRGB radiance and, last, the part that something covers (h, w, 4); and how many rays
-    ran out of steps.
+    """The image (h, w, 4): linear sRGB radiance and, last, the covered fraction; and the number of
+    rays that ran out of steps.
 
-    hands: call methods of `shading`.
-    advance: told what part of the picture has been finished since the last call.
+    hands: calls the methods of `shading`.
+    advance: called with the fraction of the picture that has been finished since the last call.
     """
     mi, order, size = shading.mi, shading.order, shading.size
     count = len(order)

@@ -41,7 +41,7 @@ def pixel_ranges(pixels: int, step: int) -> Iterator[tuple[int, int]]:
 
 
 class RenderExecutor(Protocol):
-    """Interface to what executes the tasks of a render: this process, or a Dask cluster."""
+    """Interface to an executor of the tasks of a render: this process, or a Dask cluster."""
 
     def split_range(self, count: int, most: int) -> list[tuple[int, int]]:
         """Ranges (start, stop) that cover range(count), each of at most `most` elements."""
@@ -140,7 +140,7 @@ _BELOW: Color = (0.25, 0.225, 0.20)
 _TO_KEY = np.array([-0.52, 0.62, 0.59]) / np.linalg.norm([-0.52, 0.62, 0.59])
 # The key light reaches round to where its cosine is minus this.
 _WRAP = 0.25
-# How much of the key light is taken away where the whole hemisphere is hidden.
+# The fraction of the key light that is removed if the whole hemisphere is hidden.
 _KEY_HIDDEN = 0.6
 _HIGHLIGHT = 0.22
 _SHARPNESS = 60.0
@@ -150,7 +150,7 @@ _CLEAR: Color = (0.52, 0.60, 0.64)
 _METAL = 0.78
 # The side of larger values of a surface that has one color for both.
 _INNER_TINT: Color = (0.52, 0.60, 0.74)
-# Where a level set closes a hole of a mesh: this share of amber, or of teal on warm colors.
+# Where a level set closes a hole of a mesh: this fraction of amber, or of teal on warm colors.
 _FILLING_TINT = 0.55
 _AMBER: Color = (0.92, 0.40, 0.06)
 _TEAL: Color = (0.05, 0.40, 0.46)
@@ -203,13 +203,13 @@ class StudioLight:
 
 
 def reflectance(color: Any, painted: Any) -> Any:
-    """What a surface is drawn in, from the reflectance that its BSDF reports straight on.
+    """The color in which a surface is drawn, from the reflectance of its BSDF at normal incidence.
 
-    painted: mask of lines, which are of that reflectance, and black where it is 0.
+    painted: mask of isolines, which have this reflectance, and are black if it is 0.
     """
     painted_color = color
     top = dr.max(color)
-    metal = dr.square(color / top) * _METAL  # what is seen in a mirror has met it more than once
+    metal = dr.square(color / top) * _METAL  # light in a mirror is reflected more than once
     color = dr.select(top > 1, metal, color)
     return dr.select(painted, painted_color, dr.select(top > 0, color, _like(color, _CLEAR)))
 
@@ -217,7 +217,7 @@ def reflectance(color: Any, painted: Any) -> Any:
 def two_sided_color(color: Any, other: Any, inside: Any) -> Any:
     """The color of a side: the side of larger values is darker and cooler if both have one color.
 
-    inside: mask of what is seen from the side of larger values.
+    inside: mask of points that are seen from the side of larger values.
     """
     same = dr.max(dr.abs(color - other)) < 1e-4
     return dr.select(inside & same, color * _like(color, _INNER_TINT), color)
@@ -230,26 +230,29 @@ def hole_filling_tint(color: Any, mended: Any) -> Any:
 
 
 def _parameter(array: Any, numbers: Sequence[float]) -> Any:
-    """Numbers as a vector of the kind of another, which no kernel is compiled anew for."""
+    """Numbers as an array of the type of another array, as kernel parameters: other numbers compile
+    no other kernel."""
     vector = _like(array, numbers)
     dr.make_opaque(vector)
     return vector
 
 
 def _like(array: Any, numbers: Sequence[float]) -> Any:
-    """Numbers as an array of the kind of another."""
+    """Numbers as an array of the type of another array."""
     return type(array)(*numbers)
 
 
 # The floor's shadow.
 
-# Cells a side of a square of half this side, which holds what stands on the stage and its shadow.
+# The number of cells along a side of the shadow's square, and half its side; the square contains
+# all objects on the stage and their shadows.
 _CELLS = 64
 _REACH = 2.4
-# Rays of a cell to the key light and to the sky. Each of 4 x 4 neighboring cells has others.
+# The number of rays of a cell to the key light, and to the sky. In a block of 4 x 4 cells the rays
+# of all cells differ.
 _RAYS = 8
 _BLOCK = 4
-# The tangent of the angle that the key light seems wide, and the length of the rays.
+# The tangent of the angular radius of the key light, and the length of the rays.
 _SPREAD = 0.34
 _SHADOW_RAY_LENGTH = 3.5
 # Weights of a cell and its neighbors along each axis: a block's cells count nearly alike.
@@ -288,7 +291,7 @@ class FloorShadow:
         return cls(mi, mi.Texture2f(tensor, wrap_mode=dr.WrapMode.Clamp))
 
     def at(self, position: Any) -> tuple[Any, Any]:
-        """The parts of key light and sky that reach points of the floor; 1 for other points."""
+        """The fractions of key light and sky that reach points of the floor; 1 for other points."""
         mi = self.mi
         on_floor = position.z < 0.5 * FLOOR_HEIGHT
         place = mi.Point2f(position.x, position.y) / (2 * _REACH) + 0.5
@@ -299,8 +302,8 @@ class FloorShadow:
 def _visible_fractions(
     world: ShadowCaster, x: FloatArray, y: FloatArray, towards: FloatArray
 ) -> FloatArray:
-    """What parts (k, n, n) of directions (k, 16, rays, 3) are free, seen from points of the
-    floor."""
+    """The fractions (k, n, n) of directions (k, 16, rays, 3) that are free, from points (n, n) of
+    the floor."""
     mi = world.mi
     j, i = np.indices(x.shape)
     d = towards[:, (j % _BLOCK) * _BLOCK + i % _BLOCK]
@@ -357,9 +360,9 @@ def _framed(image: FloatArray, width: int) -> FloatArray:
     return np.pad(image, ((0, 0), (width, width)), constant_values=1.0)
 
 
-# What is behind the surfaces.
+# Backdrops.
 
-# How much darker the wall is straight above.
+# The fraction by which the wall is darker straight above.
 _DARKER = 0.45
 FloatImage = npt.NDArray[np.float32]
 
@@ -417,7 +420,7 @@ def backdrop_image(
 
 def _covering(mi: Any, image: FloatImage, size: tuple[int, int]) -> FloatImage:
     """The largest part of an image, around its middle, that has the shape of a picture of
-    (width, height) pixels, as large as that."""
+    (width, height) pixels, scaled to this size."""
     height, width = image.shape[:2]
     scale = max(size[0] / width, size[1] / height)
     extent = [

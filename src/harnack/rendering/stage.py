@@ -1,4 +1,4 @@
-"""A small photo studio: ground, lights and a camera that frames what stands there; its materials.
+"""A small photo studio: ground, lights and a camera that frames the surfaces; its materials.
 
 Surfaces are scaled to a stage of radius about 1 that stands on the ground z = 0, so that lights,
 shadows and tolerances of Mitsuba's rays suit every size.
@@ -177,12 +177,13 @@ def parse_material(material: Any, option: str = "material") -> Material:
         ) from None
 
 
-# Samples a pixel, if not said otherwise.
+# The default number of samples a pixel.
 STUDIO_SPP = 64
-# Tolerances of fitted surfaces, on the stage. Surfaces of many parts have edges inside the picture,
-# where two parts meet: hits within the tolerance of such an edge have the normal of neither.
+# Default tolerances, in the stage's unit: of surfaces, and of unions of patches. These have edges
+# inside the picture, where two patches meet: hits within the tolerance of such an edge have the
+# normal of neither.
 _TOLERANCE, _PATCH_TOLERANCE = 1e-4, 1e-5
-# The most light of one path, where white is 1.
+# The largest light of a path, where white is 1.
 _CLAMP = 2.0
 # Rays begin at most twice _NEAR_CLIP_STEP before the stage. Clip distances are literals of kernels:
 # as whole multiples they are the same for almost all cameras, whose pictures so share their
@@ -196,7 +197,7 @@ _LIGHT = GroundBackdrop("light")
 class StudioObject:
     """A surface on the stage, with its material.
 
-    surface: without a tolerance, it gets one that suits the size of what is drawn.
+    surface: if it has no tolerance, it gets one that suits the size of the drawn surfaces.
     section_material: the material of the faces at which a section cuts a solid; None for that of
         the rest.
     isolines: drawn on it.

@@ -134,7 +134,7 @@ def _thickened(surface: TracedSurface, thickness: float) -> TracedSurface:
         raise ValueError("thickness and largest: mesh the surface by hk.mesh(..., largest=True)")
     try:
         wall = mesh(surface.surface, thickness=thickness)
-        # Slivers whose area is lost in rounding say nothing of the inside.
+        # Triangles whose area is lost in rounding do not determine the inside.
         field = WindingNumber(*without_zero_area_faces(wall.vertices, wall.faces))
     except (MeshError, MeshingError) as wrong:
         raise ValueError(
@@ -152,7 +152,7 @@ def _thickened(surface: TracedSurface, thickness: float) -> TracedSurface:
 
 
 def _with_section_material(objects: list[StudioObject], material: Material) -> list[StudioObject]:
-    """The same, with a material for the faces at which sections cut solids."""
+    """The objects, with a material for the faces at which sections cut solids."""
 
     def has_faces(element: StudioObject) -> bool:
         return element.surface.section is not None and element.surface.solid_range is not None
@@ -169,7 +169,8 @@ def _with_section_material(objects: list[StudioObject], material: Material) -> l
 
 
 def _check_no_duplicates(surfaces: list[TracedSurface]) -> None:
-    """Raise ValueError for one surface that is there twice: which is seen would be an accident."""
+    """Raise ValueError if a surface is there twice: which of the two is seen would be an
+    accident."""
     for k, surface in enumerate(surfaces):
         for other in surfaces[:k]:
             same = _is_cut_alike(surface, other) and surface.solid_range == other.solid_range
@@ -192,7 +193,7 @@ def _shared_levels(first: TracedSurface, second: TracedSurface) -> bool:
 
 
 def _is_cut_alike(first: TracedSurface, second: TracedSurface) -> bool:
-    """Whether both are of the same field, in the same volume."""
+    """Whether two surfaces are of the same field, in the same volume."""
     same = first.field is second.field
     return same and first.clip == second.clip and first.section == second.section
 

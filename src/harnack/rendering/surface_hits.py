@@ -64,7 +64,7 @@ class SurfaceHit:
 def intersect_surface(
     prepared: SurfaceTracer, o: Vec3, d: Vec3, t_max: Real, active: Mask
 ) -> SurfaceHit:
-    """Where rays o + t d, |d| = 1, 0 <= t <= t_max, first hit the level set.
+    """The first hits of rays o + t d, |d| = 1, 0 <= t <= t_max, with the level set.
 
     One Newton step along the ray, one evaluation there, and one projection along its gradient take
     a hit from within tolerance to the surface. The proof tells which side of the surface the ray
@@ -88,7 +88,7 @@ def intersect_surface(
 
 @dataclass(frozen=True)
 class _MarchedRays:
-    """Rays, and where they ended."""
+    """Rays, and the ends of their marches."""
 
     o: Vec3
     d: Vec3
@@ -140,7 +140,7 @@ def _refine_hits(prepared: SurfaceTracer, rays: _MarchedRays) -> SurfaceHit:
     uncertainty = _uncertainty(prepared, sample.gradient, t, sample.value, sample.value_error)
     correction = prepared.levels.offset_to_nearest(sample.value) / length
     correction = dr.select(length > 0, dr.clip(correction, -reach, reach), 0)
-    if prepared.field.has_jumps:  # behind a sheet, the value says nothing about this surface
+    if prepared.field.has_jumps:  # behind a facet, the value does not concern this surface
         correction = dr.select(dr.abs(correction) * length <= dr.abs(gap), correction, 0)
     hit = SurfaceHit(
         t=dr.select(is_hit, t, trace.t),
@@ -185,7 +185,7 @@ def _sample_where(prepared: SurfaceTracer, p: Vec3, value: Real, d: Vec3, active
 def _on_sheet(
     prepared: SurfaceTracer, o: Vec3, d: Vec3, trace: MarchResult, hit: SurfaceHit
 ) -> SurfaceHit:
-    """Hits on sheets: t is exact to rounding, and so is the plane of the normal.
+    """Hits on facets: t is exact up to rounding, and so is the plane of the normal.
 
     The ray comes from the side of smaller values if it runs along the normal. The next ray keeps as
     far away as from a level set, and no less than several roundings of the position.
@@ -209,10 +209,11 @@ def _on_sheet(
 def _uncertainty(
     prepared: SurfaceTracer, gradient: Vec3, t: Real, f: Real, error: Real = 0.0
 ) -> Real:
-    """How far from the level a point may lie and still be a hit, to first order.
+    """The largest distance from the level, to first order, at which a point may be a hit.
 
-    That is the tolerance, or what rounding of f (`Sample.value_error`) amounts to if that is more;
-    the rounding of positions is far below what Mitsuba's rays keep off surfaces anyway.
+    It is the tolerance, or the distance that rounding of f (`Sample.value_error`) amounts to if
+    that is larger; the rounding of positions is far below the distance that Mitsuba's rays keep
+    from surfaces anyway.
     """
     gradient_norm = norm(gradient)
     t = dr.select(dr.isfinite(t), t, 0)
@@ -263,7 +264,7 @@ class CappedSolid:
     def intersect(
         self, o: Vec3, d: Vec3, t_max: Real, active: Mask, side: Real = 0.0
     ) -> SurfaceHit:
-        """Where rays o + t d, |d| = 1, 0 <= t <= t_max, first cross the boundary of the solid.
+        """The first crossings of rays o + t d, |d| = 1, 0 <= t <= t_max, with the boundary.
 
         side: of a ray that starts at the boundary, 1 if it goes out of the solid there, -1 if it
             goes in; else 0. Such a ray starts off the boundary by a clearance. Where the solid or a
@@ -310,7 +311,7 @@ class CappedSolid:
         return dr.select(capped, cap_hit, hit)
 
     def occludes(self, o: Vec3, d: Vec3, t_max: Real, active: Mask) -> Mask:
-        """Whether rays hit the boundary; those not proved to miss it count as hitting it."""
+        """Whether rays hit the boundary; rays that are not proved to miss it count as hits."""
         start, end = self.prepared.clip(o, d, self.prepared.backend.Float(0), t_max)
         enters = active & (start < end)
         start = dr.select(enters, start, 0)

@@ -145,7 +145,7 @@ class MarchState:
 
 @dataclass(frozen=True)
 class _TrialSample:
-    """The sample at the trial point of each ray, and what follows from it.
+    """The sample at the trial point of each ray, and quantities that are derived from it.
 
     t: ray parameter of the trial point.
     at_end: whether the ray (or the interval before the next facet) ends there.
@@ -421,7 +421,7 @@ class March:
         within = self.tolerance.value_tolerance(steepness, t)
         knows_gradient = (sample.gradient_error <= gradient_norm) | (steepness > 0)
         if self.hysteresis is not None:
-            if field.is_steep:  # or what f has to swing is more than it does
+            if field.is_steep:  # otherwise f would have to change by more than it does
                 reach = dr.fma(t, self.tolerance.per_length, self.tolerance.distance)
                 change = largest_change(field, path.point(t), sample.value, reach)
                 within = fmax(fmin(within, change), self.tolerance.value)
@@ -478,7 +478,7 @@ class March:
         that rounding. It does if the enclosures prove it along the ray, or if a sample of f lies on
         the other side of the level or at it (`steep.beyond`).
 
-        may_be: whether f may equal the level up to rounding.
+        touches: whether f may equal the level up to rounding.
         """
         sample, p = ray_sample.sample, path.point(t)
         tolerance = dr.fma(t, self.tolerance.per_length, self.tolerance.distance)
@@ -538,7 +538,7 @@ class March:
                 trial.unproved_length,
             )
             accepted |= knows_side & proved
-        is_known = dr.isfinite(trial.total_error)  # what is not known is not free
+        is_known = dr.isfinite(trial.total_error)  # without an error bound nothing is free
         if trial.steep is not None:  # values prove the next step
             is_known = is_known | (now.trial_step <= now.proved_step)
         if now.accuracy_scale is None or not field.has_variable_accuracy:
@@ -769,7 +769,7 @@ def _refined_accuracy(
 ) -> tuple[Real, Mask]:
     """The accuracy scale for a repeated sample, and whether the sample of this scale is too coarse.
 
-    detail, total_error, truncation: the accuracy scale, total error and truncation error of the
+    scale, total_error, truncation: the accuracy scale, total error and truncation error of the
         sample.
     gap: the gap from f to the nearest level.
     within: the value tolerance of a hit.
@@ -794,7 +794,8 @@ def _refined_accuracy(
 
 
 def _next_accuracy(scale: Real, gap: Real, truncation: Real, coarsest: float) -> Real:
-    """The accuracy scale of the next sample: 0 (coarsest) or at least 1, and never above `detail`,
-    the scale of this sample. truncation, gap: of this sample."""
+    """The accuracy scale of the next sample: 0 (coarsest) or at least 1, and never above `scale`,
+    the accuracy scale of this sample. truncation, gap: the truncation error and the level gap of
+    this sample."""
     target = scale * dr.power(truncation / (_COARSE_FRACTION * gap), 1 / _TRUNCATION_ORDER)
     return dr.select(target > coarsest, fmin(fmax(target, 1), scale), 0)

@@ -181,7 +181,7 @@ class PixelCones:
 
 def _next_step(height: Real, slope: Real, second: Real, longest: Real) -> Real:
     """The step to where the cone is predicted to be lowest, a radius behind the surface, or outside
-    of the cover, whichever comes first; bend: the second derivative of the height."""
+    of the cover, whichever comes first; second: the second derivative of the height."""
     real = cast("Any", type(height))
     to_behind = (height + 1 + _AIM_MARGIN) / fmax(-slope, real(_NEGLIGIBLE))
     lowest = dr.select(
