@@ -1,10 +1,10 @@
 """Isolines: lines on a surface where another function takes given values.
 
-A line is the set of points within half its width of the curve {g = level} on the surface. Its distance from
-a point is |g - level| / |grad_T g| to first order, with the part grad_T g of the gradient along the
-surface: lines are as wide where g rises gently as where it is steep. They are compared without the
-quotient, |g - level| < width/2 |grad_T g|, so that nothing is drawn where g is constant along the
-surface, whatever its value there.
+A line is the set of points within half its width of the curve {g = level} on the surface. Its
+distance from a point is |g - level| / |grad_T g| to first order, with the part grad_T g of the
+gradient along the surface: lines are as wide where g rises gently as where it is steep. They are
+compared without the quotient, |g - level| < width/2 |grad_T g|, so that nothing is drawn where g is
+constant along the surface, whatever its value there.
 
 Where g has a critical point on the surface, lines cannot widen without limit. Let its difference
 from the level be q(x) of degree n there, to leading order (2 at maxima, minima and saddles, where

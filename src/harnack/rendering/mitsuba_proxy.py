@@ -71,7 +71,7 @@ def _lined_class(variant: str) -> Any:
             self.m_flags = flags
 
         def _chosen(self, call: Callable[[Any, Mask], Any], si: Any, active: Mask) -> Any:
-            """The result of `ask(bsdf, mask)` for the BSDF that is seen in each lane."""
+            """The result of `call(bsdf, mask)` for the BSDF that is seen in each lane."""
             line = si.prim_index
             result = call(self.base, active & (line == 0))
             for number, paint in enumerate(self.paints, start=1):
