@@ -284,9 +284,9 @@ def _cacheless_pickler(base: Any) -> Callable[..., Any]:
                 return _cached_property, (obj.func, obj.attrname)
             reduce = functools.partial(base.reducer_override, self)
             if isinstance(obj, TypeVar):
-                return _without_number(_by_value(obj, base.dispatch_table[TypeVar]))
+                return _without_class_id(_by_value(obj, base.dispatch_table[TypeVar]))
             if isinstance(obj, type):
-                return _without_number(_by_value(obj, reduce))
+                return _without_class_id(_by_value(obj, reduce))
             if isinstance(obj, FunctionType):
                 return self.of_function(obj, _by_value(obj, reduce))
             obj_type: type = obj.__class__
@@ -323,7 +323,7 @@ def _cacheless_pickler(base: Any) -> Callable[..., Any]:
     return Lean
 
 
-def _without_number(reduced: Any) -> Any:
+def _without_class_id(reduced: Any) -> Any:
     """The recipe of a class without the id by which cloudpickle finds a class that it made before:
     it would replace the methods of that class."""
     if not isinstance(reduced, tuple):

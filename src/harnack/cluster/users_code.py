@@ -146,7 +146,7 @@ def refuse_imports_within(function: FunctionType) -> None:
                 text for text in _texts(code.co_consts) if text.replace(".", "_").isidentifier()
             ]
         for name in names:
-            if _is_a_users_root(name.partition(".")[0]):
+            if _is_users_root(name.partition(".")[0]):
                 raise TypeError(
                     f"{function.__qualname__} of the module {function.__module__} imports your "
                     f"module {name} when it is called, and which that is then cannot be told; "
@@ -173,7 +173,7 @@ def _imported(statement: tuple[int, str], package: str) -> str:
     return name
 
 
-def _is_a_users_root(root: str) -> bool:
+def _is_users_root(root: str) -> bool:
     module = sys.modules.get(root)
     if module is not None:
         return is_users(module)
@@ -183,7 +183,7 @@ def _is_a_users_root(root: str) -> bool:
     if spec is None or spec.origin in ("built-in", "frozen"):
         return False
     location = spec.origin or next(iter(spec.submodule_search_locations or ()), None)
-    return location is not None and _is_users_place(root, location)
+    return location is not None and _is_users_path(root, location)
 
 
 def is_users(module: ModuleType) -> bool:
@@ -192,17 +192,17 @@ def is_users(module: ModuleType) -> bool:
     root = name.partition(".")[0]
     if name == "__main__" or sys.modules.get(name) is not module:
         return True
-    location = _place(module)
+    location = _module_path(module)
     if location is None and root != name and (top := sys.modules.get(root)) is not None:
         return is_users(top)
     if location is None:  # one that is built in has a specification
         return getattr(module, "__spec__", None) is None
-    return _is_users_place(root, location)
+    return _is_users_path(root, location)
 
 
 def is_sent_itself(module: ModuleType) -> bool:
     """Whether a module is a user's and not a compiled one."""
-    location = _place(module)
+    location = _module_path(module)
     return is_users(module) and (
         location is None or location.endswith(_SOURCES) or not Path(location).suffix
     )
@@ -210,11 +210,11 @@ def is_sent_itself(module: ModuleType) -> bool:
 
 def compiled_file(module: ModuleType) -> str | None:
     """The file of a compiled module of a user; None for another module."""
-    path = _place(module)
+    path = _module_path(module)
     return path if path is not None and is_users(module) and not is_sent_itself(module) else None
 
 
-def _place(module: ModuleType) -> str | None:
+def _module_path(module: ModuleType) -> str | None:
     """The file or, of a package without one, the folder of a module."""
     attributes = vars(module)
     location = attributes.get("__file__") or next(iter(attributes.get("__path__", ())), None)
@@ -222,7 +222,7 @@ def _place(module: ModuleType) -> str | None:
 
 
 @functools.cache
-def _is_users_place(root: str, location: str) -> bool:
+def _is_users_path(root: str, location: str) -> bool:
     if root == "harnack":
         return False
     path = Path(location).resolve()
@@ -239,7 +239,7 @@ def _is_users_place(root: str, location: str) -> bool:
 def installed_version(root: str) -> str | None:
     """The version of the installed package that has a module; None for a part of Python, a user's
     module, and one that is in no package."""
-    if root in sys.stdlib_module_names or root in ("__main__", "harnack") or _is_a_users_root(root):
+    if root in sys.stdlib_module_names or root in ("__main__", "harnack") or _is_users_root(root):
         return None
     with suppress(importlib.metadata.PackageNotFoundError, ValueError):
         return importlib.metadata.version(root)

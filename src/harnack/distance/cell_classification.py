@@ -284,7 +284,7 @@ class CellClassifier:
         radius, start = _CUBE_CIRCUMRADIUS * cells.half, cells.center
         distance = np.full(len(cells), np.inf)
         if self._volume is not None:
-            distance, start = self._at(self._pulled_inside, cells.center)
+            distance, start = self._at(self._moved_into_domain, cells.center)
         surface_point, normal, spread, curvature = self._at(
             self._surface_point_and_plane, start, radius, cells.normal
         )
@@ -321,7 +321,7 @@ class CellClassifier:
     def _distance_outside(self, p: Vec3) -> tuple[Real]:
         return (self._volume.signed_distance(p),)
 
-    def _pulled_inside(self, p: Vec3) -> tuple[Real, Vec3]:
+    def _moved_into_domain(self, p: Vec3) -> tuple[Real, Vec3]:
         """A lower bound of the signed distance of p from the domain; and p, or a point of the
         boundary near p if p is outside."""
         assert self._volume is not None

@@ -115,7 +115,7 @@ class ClosestPointDescent:
         ) -> tuple[Any, ...]:
             # The rounding error of f takes as long as f itself, and is of no matter here.
             sample = dataclasses.replace(self.field.evaluate(y), value_error=0.0)
-            residual, at_y = self._place(y, sample)
+            residual, at_y = self._descent_state_at(y, sample)
             move, _ = self._step_along(x, at_y, real(1))
             step = -residual / lengths.safe_norm(at_y.gradient)
             first_step = dr.select(k == 0, dr.abs(step), first_step)
@@ -153,7 +153,7 @@ class ClosestPointDescent:
         be in any case.
         """
         sample = self.field.evaluate(y)
-        residual, at_y = self._place(y, sample)
+        residual, at_y = self._descent_state_at(y, sample)
         rows = self.field.hessian(y) if self.has_hessian else None
         _, is_minimum = self._step_along(x, at_y, self.backend.Float(1), rows)
         slope = lengths.safe_norm(at_y.gradient)
@@ -250,9 +250,9 @@ class ClosestPointDescent:
 
     def _evaluate(self, y: Vec3) -> tuple[Real, _DescentState]:
         """f - level at y, and the state at y."""
-        return self._place(y, self.field.evaluate(y))
+        return self._descent_state_at(y, self.field.evaluate(y))
 
-    def _place(self, y: Vec3, sample: Sample) -> tuple[Real, _DescentState]:
+    def _descent_state_at(self, y: Vec3, sample: Sample) -> tuple[Real, _DescentState]:
         real = self.backend.Float
         size = lengths.max_norm(y)
         epsilon, gradient_norm = self.backend.machine_epsilon, lengths.safe_norm(sample.gradient)

@@ -316,7 +316,7 @@ class _QueryEvaluator:
         start[rows] = self._nearest_face_points(points[rows])
         rows = rows[np.isnan(start[rows, 0])]
         if len(rows):
-            start[rows] = self._on_sheets(points[rows], start[rows])
+            start[rows] = self._closest_on_facets(points[rows], start[rows])
         return start
 
     def _nearest_face_points(self, points: FloatArray) -> FloatArray:
@@ -356,7 +356,7 @@ class _QueryEvaluator:
 
         return in_batches(prepared.backend, compute, points)[0]
 
-    def _on_sheets(self, points: FloatArray, start: FloatArray) -> FloatArray:
+    def _closest_on_facets(self, points: FloatArray, start: FloatArray) -> FloatArray:
         x = np.concatenate([points, np.nan_to_num(start)])
         search = JumpSurfaceSearch(
             self._prepared, max(float(np.abs(x).max(initial=0)), 1e-30), _MAX_JUMPS_EXAMINED

@@ -45,10 +45,10 @@ def _holes() -> list[Surface]:
     edge, *holes = example_curves.square_with_holes(24)
     s = np.linspace(0, 1, 10, endpoint=False)[:, None]
     fine = [(1 - s) * a + s * b for a, b in zip(edge, np.roll(edge, -1, axis=0), strict=True)]
-    return _curve([_bent(loop) for loop in (np.concatenate(fine), *holes)])
+    return _curve([_on_wave(loop) for loop in (np.concatenate(fine), *holes)])
 
 
-def _bent(loop: FloatArray) -> FloatArray:
+def _on_wave(loop: FloatArray) -> FloatArray:
     x, y, _ = loop.T
     return np.column_stack([x, y, 0.25 * np.sin(2.2 * x) + 0.2 * np.cos(2.0 * y)])
 

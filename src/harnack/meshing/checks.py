@@ -607,7 +607,7 @@ def points_off_level(
     directions /= np.maximum(row_norms(directions), 1e-300)[:, None]
     rows = np.flatnonzero(~(function.sample(points).distance <= tolerance))
     # Nearer points are tried as well: behind a cap there may be little of a solid.
-    for fraction, line in itertools.product((1.0, 0.25, 0.0625), (None, *_askew_lines())):
+    for fraction, line in itertools.product((1.0, 0.25, 0.0625), (None, *_generic_directions())):
         if not len(rows):
             break
         step = fraction * tolerance * (directions[rows] if line is None else line)
@@ -616,7 +616,7 @@ def points_off_level(
     return points[rows], len(points)
 
 
-def _askew_lines() -> FloatArray:
+def _generic_directions() -> FloatArray:
     """(13, 3) unit vectors along the axes and both kinds of diagonals of a cube, turned so that
     none of them is near to a plane of coordinates or to one of their diagonals."""
     directions = np.array(list(itertools.product((-1.0, 0.0, 1.0), repeat=3)))[14:]

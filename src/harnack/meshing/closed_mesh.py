@@ -100,7 +100,7 @@ def mesh_manifold(solid: MeshSolid) -> Manifold | None:
             return None
     first_union: Manifold | None = None
     for length in (0.0, _GROWTH * surface.size):
-        union = Manifold.batch_boolean([_grown(part, length) for part in parts], OpType.Add)
+        union = Manifold.batch_boolean([_grow_part(part, length) for part in parts], OpType.Add)
         if abs(union.surface_area() - surface.area) <= _SAME_AREA * surface.area:
             first_union = first_union or union
             boundary = from_manifold(union)
@@ -109,7 +109,7 @@ def mesh_manifold(solid: MeshSolid) -> Manifold | None:
     return first_union
 
 
-def _grown(part: Manifold, length: float) -> Manifold:
+def _grow_part(part: Manifold, length: float) -> Manifold:
     return part if length == 0 else to_manifold(grown(from_manifold(part), length))
 
 

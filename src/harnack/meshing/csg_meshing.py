@@ -177,7 +177,7 @@ class CsgMesher:
             reduced = drop_cancelled_operands(flatten_csg(solid), level)
             return Manifold() if reduced is None else self._joined(reduced, level)
         if isinstance(solid, Complement):  # -f <= c where f >= -c
-            return self._whole_box() - self.mesh_sublevel(solid.field, -level)
+            return self._box_manifold() - self.mesh_sublevel(solid.field, -level)
         if isinstance(solid, OffsetSolid):
             return self.mesh_sublevel(solid.field, level + solid.distance)
         if isinstance(solid, BandSolid):
@@ -204,7 +204,7 @@ class CsgMesher:
             return (mesh_manifold(solid) if level == 0 else None) or self._offset(solid, level)
         if isinstance(solid, Plane):
             x, y, z = solid.normal
-            return self._whole_box().trim_by_plane((-x, -y, -z), -(solid.distance + level))
+            return self._box_manifold().trim_by_plane((-x, -y, -z), -(solid.distance + level))
         return to_manifold(self.mesh_smooth_level(solid, level)[0])
 
     def _joined(self, solid: BooleanSolid, level: float) -> Manifold:
@@ -218,7 +218,7 @@ class CsgMesher:
             )
         cut = [k for k in numbers if isinstance(solid.parts[k], Complement)]
         parts = [self._part(solid, k, level) for k in numbers if k not in cut]
-        common = Manifold.batch_boolean(parts, OpType.Intersect) if parts else self._whole_box()
+        common = Manifold.batch_boolean(parts, OpType.Intersect) if parts else self._box_manifold()
         away = [self._part(solid, k, level) for k in cut]
         return Manifold.batch_boolean([common, *away], OpType.Subtract)
 
@@ -241,7 +241,7 @@ class CsgMesher:
         finally:
             self.intersected_with = previous
 
-    def _closed(self, function: LevelFunction, lattice: BccLattice) -> TriangleMesh:
+    def _closed_level_set(self, function: LevelFunction, lattice: BccLattice) -> TriangleMesh:
         """A level set in a box. If there are many cells, only those where the other operands may
         leave something are meshed. If there are few, all are meshed, so that copies of a surface
         are the same bit by bit; unless that fails, as it may where nothing is left: a function of
@@ -251,15 +251,19 @@ class CsgMesher:
             try:
                 return mesh_closed_surface(function, lattice, self.tolerance, self.report)
             except MeshingError as wrong:
-                elsewhere = self._elsewhere()
+                elsewhere = self._irrelevant_region()
                 if elsewhere is None:
                     raise
                 self.report(f"{wrong}; so only where the other parts leave something")
         return mesh_closed_surface(
-            function, lattice, self.tolerance, self.report, elsewhere=elsewhere or self._elsewhere()
+            function,
+            lattice,
+            self.tolerance,
+            self.report,
+            elsewhere=elsewhere or self._irrelevant_region(),
         )
 
-    def _elsewhere(self) -> IrrelevantRegion | None:
+    def _irrelevant_region(self) -> IrrelevantRegion | None:
         """The region where the other operands are proved to leave nothing; None if there are no
         other operands. The two sides of a wall have the same region."""
         if not self.intersected_with:
@@ -302,7 +306,7 @@ class CsgMesher:
         function = self.function(_underlying_field(field), level)
         self.report(f"level {level:g} of {type(field).__name__} in cells of {spacing:.3g}")
         lattice = BccLattice.covering_box(lower, upper, spacing, layers=2)
-        surface = self._closed(function, lattice)
+        surface = self._closed_level_set(function, lattice)
         self.evaluations += function.evaluations
         self.levels += 1
         return surface, is_whole
@@ -313,7 +317,7 @@ class CsgMesher:
             field, level, most_faces=self.most_faces, uploads=self.uploads
         )
 
-    def _whole_box(self) -> Manifold:
+    def _box_manifold(self) -> Manifold:
         pad = 1e-3 * (self.upper - self.lower)
         return box_manifold(self.lower - pad, self.upper + pad)
 
@@ -332,7 +336,7 @@ class CsgMesher:
                 self._check_wall(field, low, high)
             return self.mesh_sublevel(inside, high) - self.mesh_sublevel(inside, low)
         if 2 * half >= field.period:
-            return self._whole_box()
+            return self._box_manifold()
         if not isinstance(field, SolidAngle):
             raise MeshingError(
                 f"a solid around a level of {type(field).__name__}, which is angle-valued, cannot "

@@ -122,16 +122,16 @@ def _push_inward(
     max_height = np.full(len(ends), height)
     np.minimum.at(max_height, owner, _SHALLOW * shortest[inner])
     lift = 4 * fraction * (1 - fraction) * max_height[owner]
-    direction = _across(inward[inner], along)
+    direction = _unit_perpendicular(inward[inner], along)
     start = points + lift[:, None] * direction
     projected = newton_to_level(function, start, function.sample(start), 0.3 * lift, None)
     # Points keep their position along the edge and their distance from it: they turn about it.
-    turned = _across(projected - points, along)
+    turned = _unit_perpendicular(projected - points, along)
     is_close = (turned * direction).sum(axis=1) > 0.3
     return points + lift[:, None] * np.where(is_close[:, None], turned, direction)
 
 
-def _across(vectors: FloatArray, along: FloatArray) -> FloatArray:
+def _unit_perpendicular(vectors: FloatArray, along: FloatArray) -> FloatArray:
     """The unit vectors (k, 3) of the components of vectors at right angles to unit vectors."""
     part = vectors - (vectors * along).sum(axis=1)[:, None] * along
     return part / np.maximum(np.linalg.norm(part, axis=1), 1e-300)[:, None]

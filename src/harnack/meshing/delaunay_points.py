@@ -178,7 +178,7 @@ def sample_delaunay_points(
     jitter = rng.uniform(-1, 1, points.shape) * _JITTER * size[:, None]
     points = points + (jitter if walls is None else jitter * _off_walls(points, walls))
     samples = function.sample(points)
-    points, samples, is_on = _snapped(
+    points, samples, is_on = _snap_to_level(
         function, points, size, free[is_far], samples, boundary, walls
     )
     n = len(boundary.points)
@@ -266,7 +266,7 @@ def _off_walls(points: FloatArray, walls: tuple[FloatArray, FloatArray]) -> Floa
     return np.where(on, 0.0, 1.0)
 
 
-def _snapped(
+def _snap_to_level(
     function: LevelFunction,
     points: FloatArray,
     size: FloatArray,

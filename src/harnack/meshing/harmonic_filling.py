@@ -295,7 +295,7 @@ def _patches(
     _check_boundary(x, faces, boundary)
     is_fine = True
     try:
-        x, faces = _finished(function, x, faces, tolerance, report)
+        x, faces = _refine_and_smooth(function, x, faces, tolerance, report)
     except LocalizedMeshingError:
         if not last or len(intersecting_faces(x, faces)):
             raise
@@ -310,7 +310,7 @@ def _patches(
     return HarmonicFilling(x[inner], index[faces], is_fine, spacing, function.evaluations)
 
 
-def _finished(
+def _refine_and_smooth(
     function: LevelFunction,
     x: FloatArray,
     faces: IntArray,

@@ -99,14 +99,18 @@ def fill_holes(
         patched, new, owner, reasons = _patches(x, together, pending, by_angles, fairings)
         reasons |= _failures(patched, together, new, owner, len(x), winding)
         is_accepted = ~np.isin(owner, list(reasons))
-        x, together = _used(patched, np.concatenate([together, new[is_accepted]]), len(x))
+        x, together = _without_unused_vertices(
+            patched, np.concatenate([together, new[is_accepted]]), len(x)
+        )
         pending = [pending[k] for k in sorted(reasons)]
     counts = Counter(reasons.values())
     why = ", ".join(f"{count:,} {reason}" for reason, count in counts.items())
     return HoleFilling(x[len(vertices) :], together[len(faces) :], pending, why)
 
 
-def _used(x: FloatArray, faces: IntArray, input_count: int) -> tuple[FloatArray, IntArray]:
+def _without_unused_vertices(
+    x: FloatArray, faces: IntArray, input_count: int
+) -> tuple[FloatArray, IntArray]:
     """The vertices and faces, without new vertices that no face uses."""
     used = np.zeros(len(x), np.bool_)
     used[:input_count] = True
@@ -388,7 +392,7 @@ def _refine(
         x, new = _split_long_edges(x, new)
         if len(x) == count:
             break
-        x = _relaxed(x, new, input_count)
+        x = _at_neighbor_means(x, new, input_count)
     return x, _flipped(x[:, :3], new, fixed_edges)
 
 
@@ -419,7 +423,7 @@ def _mean_edge_lengths(x: FloatArray, faces: IntArray, rims: IntArray) -> FloatA
     return np.where(is_rim, total / np.maximum(count, 1), 0.0)
 
 
-def _relaxed(x: FloatArray, new: IntArray, input_count: int) -> FloatArray:
+def _at_neighbor_means(x: FloatArray, new: IntArray, input_count: int) -> FloatArray:
     """(n, 4) the vertices, with the rows of new vertices in the middle of their neighbors' rows."""
     ends = Edges.of(half_edges(new)).vertices
     weights = _graph_laplacian(ends, np.ones(len(ends)), len(x))

@@ -144,17 +144,17 @@ class IntendedSolid:
         if as_it_is or not len(rows):
             return cls(x, faces, is_turned, joined, [], welded.rounded)
         disagrees = against_neighbors(x, joined)
-        agreeing = _turned(joined, disagrees)
-        raw = _turned(raw[rows], disagrees)
+        agreeing = _turn_faces(joined, disagrees)
+        raw = _turn_faces(raw[rows], disagrees)
         step = 1 if volume_of(x, agreeing) >= 0 else -1  # most faces have their material inside
         parts = closed_parts(x, raw[:, ::step], agreeing[:, ::step])
         turned = _inside_out(x, agreeing, parts)
-        oriented = _turned(agreeing, turned)
+        oriented = _turn_faces(agreeing, turned)
         if turned.any() and not turned.all():
-            parts = closed_parts(x, _turned(raw, turned), oriented)
+            parts = closed_parts(x, _turn_faces(raw, turned), oriented)
         if not disagrees.any():  # otherwise no part is turned as a whole
             is_turned[rows] = turned
-        return cls(x, _turned(faces, is_turned), is_turned, oriented, parts, welded.rounded)
+        return cls(x, _turn_faces(faces, is_turned), is_turned, oriented, parts, welded.rounded)
 
     @functools.cached_property
     def size(self) -> float:
@@ -292,7 +292,7 @@ def _values(field: WindingNumber | None, points: FloatArray) -> FloatArray:
     return np.asarray(field.value(points, precision="double"))
 
 
-def _turned(faces: IntArray, which: BoolArray) -> IntArray:
+def _turn_faces(faces: IntArray, which: BoolArray) -> IntArray:
     """Faces (m, 3), with those of the mask `which` (m,) turned over."""
     return np.where(which[:, None], faces[:, ::-1], faces)
 

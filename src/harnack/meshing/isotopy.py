@@ -134,7 +134,9 @@ def isotopy_of(
     stars = ~proved & ~beside & far
     proved[stars] = _proved_by_stars(function, corners, index, slopes, np.flatnonzero(stars))
     proved &= on_walls
-    return IsotopyCoverage(_share(proved), _share(proved[far]), len(index), index[far & ~proved])
+    return IsotopyCoverage(
+        _proved_fraction(proved), _proved_fraction(proved[far]), len(index), index[far & ~proved]
+    )
 
 
 def _has_bounds(function: LevelFunction, corners: FloatArray) -> bool:
@@ -145,7 +147,7 @@ def _has_bounds(function: LevelFunction, corners: FloatArray) -> bool:
     return not len(sampled) or bool((function.gradient_bounds(center, radius)[1] < _UNKNOWN).any())
 
 
-def _share(proved: BoolArray) -> float:
+def _proved_fraction(proved: BoolArray) -> float:
     return float(proved.mean()) if len(proved) else 1.0
 
 
@@ -257,7 +259,7 @@ def _proved_empty(function: LevelFunction, corners: FloatArray) -> BoolArray:
         center, radius = _balls(pieces)
         undecided = function.clearance(center) <= radius * (1 + 1e-9)
         owner = np.concatenate([owner[undecided], owner[undecided]])
-        pieces = _halved(pieces[undecided])
+        pieces = _halve_simplices(pieces[undecided])
         if not len(pieces):
             break
     free = np.ones(len(corners), np.bool_)
@@ -306,11 +308,11 @@ def _proved_regular(
             proved[owner[undecided]] = False
             break
         owner = np.concatenate([owner[undecided], owner[undecided]])
-        pieces = _halved(pieces[undecided])
+        pieces = _halve_simplices(pieces[undecided])
     return proved
 
 
-def _halved(pieces: FloatArray) -> FloatArray:
+def _halve_simplices(pieces: FloatArray) -> FloatArray:
     """Simplices (2n, k, 3): both halves of each, cut at the middle of its longest edge."""
     pairs = list(itertools.combinations(range(pieces.shape[1]), 2))
     span = [np.linalg.norm(pieces[:, i] - pieces[:, j], axis=1) for i, j in pairs]

@@ -179,7 +179,7 @@ def collapse_slivers(
             if not _can_contract(faces[~is_removed], target, source):
                 continue
             new = np.where(faces[star[~beside]] == source, target, faces[star[~beside]])
-            if _is_good(function, vertices, new, tolerance):
+            if _are_valid_triangles(function, vertices, new, tolerance):
                 faces[star[~beside]] = new
                 is_removed[star[beside]] = True
                 break
@@ -194,7 +194,7 @@ def _can_contract(faces: IntArray, target: int, source: int) -> bool:
     return len(beside) == 2 and np.array_equal(common, np.setdiff1d(beside, [target, source]))
 
 
-def _is_good(
+def _are_valid_triangles(
     function: LevelFunction, vertices: FloatArray, new: IntArray, tolerance: float
 ) -> bool:
     corner = vertices[new]
@@ -236,7 +236,7 @@ def relax_vertices(
         if not len(stars.centers):
             break
         before = stars.least(angles[stars.face])
-        moved, after = _best_places(function, vertices, faces, stars, walls)
+        moved, after = _best_positions(function, vertices, faces, stars, walls)
         gain = after - before
         rows = _independent_moves(np.flatnonzero(gain > _GAIN), gain, stars, faces, len(vertices))
         rows = rows[_moves_stay_near(function, vertices, faces, stars, moved, rows, tolerance)]
@@ -280,7 +280,7 @@ class _VertexStars:
         return np.stack(sums, axis=1) / count[:, None]
 
 
-def _best_places(
+def _best_positions(
     function: LevelFunction,
     vertices: FloatArray,
     faces: IntArray,

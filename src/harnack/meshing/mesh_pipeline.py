@@ -273,7 +273,7 @@ def _mesh_from_signs(
     ends = _ends_by_signs(field, level, solid, is_thick)
     levels = tuple(end for end in ends if math.isfinite(end))
     if isinstance(field, WindingNumber) and field.is_of_sheets_alone(levels):
-        return _faces_alone(field, levels[0], solid, options)
+        return _input_faces_as_surface(field, levels[0], solid, options)
     volume, box = options.volume, _box(field, levels, options.volume)
     size = float((box.upper - box.lower).max())
     cells, attempts = _cells_by_signs(field, size, options.spacing)
@@ -376,7 +376,7 @@ def _cells_by_signs(field: Field, size: float, spacing: float | None) -> tuple[f
     return (detailed, attempts - 1) if detailed < cells else (cells, attempts)
 
 
-def _faces_alone(
+def _input_faces_as_surface(
     field: WindingNumber,
     level: float,
     solid: tuple[float, float] | bool,
@@ -717,7 +717,7 @@ def _box(field: Field, levels: tuple[float, ...], volume: Volume | None) -> _Mes
             "clip, such as a box (harnack.Box)"
         )
     if isinstance(field, SolidAngle):
-        return _around_curve(field, extent, volume)
+        return _box_of_spanned_surface(field, extent, volume)
     lower, upper = _bounds_of(extent if volume is None else volume)
     if volume is not None and extent is not None and extent != volume:
         # A little room, so that what touches its extent does not end there.
@@ -738,7 +738,9 @@ def _box(field: Field, levels: tuple[float, ...], volume: Volume | None) -> _Mes
     return _MeshingBox(lower, upper, volume is not None)
 
 
-def _around_curve(field: SolidAngle, extent: Volume | None, volume: Volume | None) -> _MeshingBox:
+def _box_of_spanned_surface(
+    field: SolidAngle, extent: Volume | None, volume: Volume | None
+) -> _MeshingBox:
     """Around the whole surface that a curve spans, which is cut later; or if that has no extent,
     around the curve and the volume."""
     if extent is not None:

@@ -284,7 +284,7 @@ class _RefinementMarks:
         cuts_off = np.zeros(len(faces), np.bool_)
         lone = np.flatnonzero(must_split & ~marked[edges].any(axis=1))
         if function.field.has_creases:
-            cuts_off[lone] = _turns(function, vertices[faces[lone]])
+            cuts_off[lone] = _turn_as_at_crease(function, vertices[faces[lone]])
         must_split &= ~cuts_off
         # For a face that is off the surface, the longest edge that may be cut.
         free = np.where(is_boundary[edges], 0.0, span[edges])
@@ -294,7 +294,7 @@ class _RefinementMarks:
         return cls(edges, ends, middle, span, samples, is_beyond, is_off, marked, cuts_off)
 
 
-def _turns(function: LevelFunction, corner: FloatArray) -> BoolArray:
+def _turn_as_at_crease(function: LevelFunction, corner: FloatArray) -> BoolArray:
     """(k,) whether normals at the corners (k, 3, 3) of faces turn as across a crease."""
     slope = function.sample(corner.reshape(-1, 3)).gradient
     normal = (slope / np.maximum(row_norms(slope), 1e-300)[:, None]).reshape(-1, 3, 3)

@@ -352,7 +352,7 @@ def _unite_bodies(
     vertices, faces = intended.vertices, intended.oriented
     if len(singular_edges(faces)[0]):
         raise MeshError("the mesh is not closed")
-    if _is_fine(vertices, faces):
+    if _is_free_of_overlaps(vertices, faces):
         raise MeshError("nothing of it passes through or lies in itself")
     facts = {"stage": "boolean_union", "kept": 0}
     slivers = 0.5 * options.tolerance.at(intended.size)
@@ -371,7 +371,7 @@ def _unite_bodies(
     return TriangleMesh(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64)), facts
 
 
-def _is_fine(vertices: FloatArray, faces: IntArray) -> bool:
+def _is_free_of_overlaps(vertices: FloatArray, faces: IntArray) -> bool:
     """Whether no triangles meet beyond what they share, and no part is in another's material."""
     try:
         _check_sides(TriangleMesh.without_unused_vertices(vertices, faces))
@@ -508,12 +508,12 @@ def _fill_only(
     loops = hole_loops(vertices, faces, edges)
     if options.patches == "smooth":
         try:
-            return _kept_with(vertices, faces, loops, options)
+            return _fill_all_holes(vertices, faces, loops, options)
         except MeshingError as error:
             if options.keep is None:
                 raise
             options.report(f"{error}; once more, with harmonic patches alone")
-    return _kept_with(vertices, faces, loops, dataclasses.replace(options, patches="harmonic"))
+    return _fill_all_holes(vertices, faces, loops, dataclasses.replace(options, patches="harmonic"))
 
 
 def _checked(intended: IntendedSolid) -> tuple[FloatArray, IntArray]:
@@ -531,7 +531,7 @@ def _checked(intended: IntendedSolid) -> tuple[FloatArray, IntArray]:
     return vertices, faces
 
 
-def _kept_with(
+def _fill_all_holes(
     vertices: FloatArray, faces: IntArray, loops: list[IntArray], options: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
     """The mesh with patches over its holes: smooth ones if asked for, and harmonic ones.

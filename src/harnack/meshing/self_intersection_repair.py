@@ -104,8 +104,8 @@ def _regions(
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
     corner = vertices[faces]
     lower, upper = corner.min(axis=1), corner.max(axis=1)
-    near = _touching(faces, faces[crossing])
-    second_ring = _touching(faces, faces[near])
+    near = _faces_with_corners_of(faces, faces[crossing])
+    second_ring = _faces_with_corners_of(faces, faces[near])
     pairs = half_edges(faces[second_ring])
     joined = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(vertices),) * 2)
     part = csgraph.connected_components(joined, directed=False)[1]
@@ -122,7 +122,7 @@ def _regions(
         yield rows, np.unique(faces[near[np.isin(near, rows)]])
 
 
-def _touching(faces: IntArray, targets: IntArray) -> IntArray:
+def _faces_with_corners_of(faces: IntArray, targets: IntArray) -> IntArray:
     """The indices of faces that have a corner in common with `targets`."""
     is_corner = np.zeros(int(faces.max()) + 1, np.bool_)
     is_corner[targets] = True
@@ -215,7 +215,7 @@ def _best_change(
     Changes that move the surface least are tried first: of edges of faces that cross, then of all
     edges at their corners.
     """
-    for rows in (crossing, _touching(patch.faces, patch.faces[crossing])):
+    for rows in (crossing, _faces_with_corners_of(patch.faces, patch.faces[crossing])):
         for _, removed, new in sorted(_changes(patch, rows, length), key=lambda change: change[0])[
             :_MAX_ATTEMPTS
         ]:
@@ -243,7 +243,7 @@ def _changes(
         change = patch.flip_edge(a, b)
         if change is not None and _keeps_orientation(patch, *change, length):
             c, d = (patch.vertices[change[1][0, k]] for k in (2, 1))
-            moved = _between(patch.vertices[a], patch.vertices[b], c, d)
+            moved = _line_distance(patch.vertices[a], patch.vertices[b], c, d)
             if moved <= length:
                 yield moved, *change
 
@@ -266,7 +266,7 @@ def _keeps_orientation(patch: _Neighborhood, rows: IntArray, new: IntArray, leng
     return bool(((after @ mean > 0) | (row_norms(after) <= _NOTHING * total)).all())
 
 
-def _between(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> float:
+def _line_distance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> float:
     """The distance between the line through a and b and the line through c and d."""
     across = np.cross(b - a, d - c)
     size = float(np.linalg.norm(across))

@@ -194,7 +194,7 @@ class SignFunction(LevelFunction):
         normal, is_on_sheet = np.zeros_like(low), np.zeros(len(low), np.bool_)
         if self.field.has_jumps:
             first, last = self._bisect(low, direction)
-            t, normal, is_on_sheet = self._on_sheets(low, direction, first, last)
+            t, normal, is_on_sheet = self._first_facet_crossing(low, direction, first, last)
             rows = np.flatnonzero(~is_on_sheet)
             t[rows] = self._roots(low[rows], direction[rows], first[rows], last[rows], 2)
         else:
@@ -257,7 +257,7 @@ class SignFunction(LevelFunction):
                 break
         return _secant(first, last, low, high)
 
-    def _on_sheets(
+    def _first_facet_crossing(
         self, start: FloatArray, direction: FloatArray, first: FloatArray, last: FloatArray
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
         """The fractions (n,) at which segments, between `first` and `last`, first cross a jump

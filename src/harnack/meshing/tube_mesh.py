@@ -57,7 +57,8 @@ def tube_manifold(tube: Tube, level: float, tolerance: float) -> Manifold:
     step = math.sqrt(3 * tolerance / radius)
     segments = max(_MIN_AROUND, math.ceil(2 * math.pi / step))
     waiting = [
-        _simpler(polyline, _LEFT_OUT * tolerance) for polyline in np.split(tube.points, tube.starts)
+        _simplify_polyline(polyline, _LEFT_OUT * tolerance)
+        for polyline in np.split(tube.points, tube.starts)
     ]
     parts: list[Manifold] = []
     vertices = 0
@@ -85,7 +86,7 @@ def _is_apart(surface: TriangleMesh) -> bool:
     return not len(intersecting_faces(surface.vertices, surface.faces))
 
 
-def _simpler(points: FloatArray, length: float) -> FloatArray:
+def _simplify_polyline(points: FloatArray, length: float) -> FloatArray:
     """A polyline (n, 3) without vertices that are within a length of the edges that replace them
     (Douglas and Peucker 1973). Proof that all of these edges are as near to the polyline: the
     points on an edge that are nearest to the replaced part of the polyline go from one of the
@@ -225,11 +226,12 @@ class _Sweep:
             twist = (mismatch - shift * step) / len(edges)
         frames = [np.stack([u, np.cross(edge, u)]) for u, edge in zip(across, edges, strict=False)]
         return [
-            (_spun(f, -twist * k), _spun(f, -twist * (k + 1))) for k, f in enumerate(frames)
+            (_rotate_frame(f, -twist * k), _rotate_frame(f, -twist * (k + 1)))
+            for k, f in enumerate(frames)
         ], shift
 
 
-def _spun(frame: FloatArray, angle: float) -> FloatArray:
+def _rotate_frame(frame: FloatArray, angle: float) -> FloatArray:
     """The frame, turned by an angle in its plane."""
     c, s = math.cos(angle), math.sin(angle)
     return np.stack([c * frame[0] + s * frame[1], c * frame[1] - s * frame[0]])

@@ -118,7 +118,9 @@ class AovTask:
     def render_range(self, start: int, stop: int) -> AovBuffers:
         """The first hits (n,) of the rays through the middles of a range of pixels, counted as in
         `order`."""
-        return self._look_at(upload_indices(self.mi, self.order[start:stop]), self.mi.Vector2f(0.5))
+        return self._trace_pixels(
+            upload_indices(self.mi, self.order[start:stop]), self.mi.Vector2f(0.5)
+        )
 
     def look(
         self, hands: RenderExecutor | None = None, advance: Callable[[float], None] | None = None
@@ -157,9 +159,9 @@ class AovTask:
         def by_pixels(array: Any) -> Any:
             return array.reshape(len(pixels), count, *array.shape[1:])
 
-        return _map_arrays(by_pixels, self._look_at(pixel, positions))
+        return _map_arrays(by_pixels, self._trace_pixels(pixel, positions))
 
-    def _look_at(self, pixel: Any, offset: Any) -> AovBuffers:
+    def _trace_pixels(self, pixel: Any, offset: Any) -> AovBuffers:
         """The first hits of rays through places in pixels, counted by rows: arrays (n,)."""
         mi, count = self.mi, dr.width(pixel)
         position = film_positions(mi, pixel, offset, self.size)

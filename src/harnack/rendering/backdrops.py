@@ -162,7 +162,7 @@ def parse_backdrop(given: Any) -> Backdrop:
     if isinstance(given, np.ndarray) and given.ndim != 1:
         return ImageBackdrop(_pixels(cast("npt.NDArray[Any]", given)))
     if isinstance(given, str):
-        return _named(given)
+        return _backdrop_from_text(given)
     if isinstance(given, list | tuple) and len(pair := cast("list[Any]", given)) == 2:
         return GradientBackdrop(*(parse_color(end, "a color of the backdrop") for end in pair))
     try:
@@ -178,7 +178,7 @@ _BACKDROP_HELP = (
 )
 
 
-def _named(name: str) -> Backdrop:
+def _backdrop_from_text(name: str) -> Backdrop:
     if name in GROUNDS:
         return GroundBackdrop(name)
     if name == TRANSPARENT:

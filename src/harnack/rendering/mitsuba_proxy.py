@@ -70,7 +70,7 @@ def _lined_class(variant: str) -> Any:
                 flags |= part.flags()
             self.m_flags = flags
 
-        def _chosen(self, call: Callable[[Any, Mask], Any], si: Any, active: Mask) -> Any:
+        def _select_bsdf(self, call: Callable[[Any, Mask], Any], si: Any, active: Mask) -> Any:
             """The result of `call(bsdf, mask)` for the BSDF that is seen in each lane."""
             line = si.prim_index
             result = call(self.base, active & (line == 0))
@@ -85,22 +85,26 @@ def _lined_class(variant: str) -> Any:
             def call(part: Any, on: Mask) -> tuple[Any, Any]:
                 return part.sample(ctx, si, sample1, sample2, on)
 
-            return self._chosen(call, si, active)
+            return self._select_bsdf(call, si, active)
 
         def eval(self, ctx: Any, si: Any, wo: Any, active: Mask = True) -> Any:
-            return self._chosen(lambda part, on: part.eval(ctx, si, wo, on), si, active)
+            return self._select_bsdf(lambda part, on: part.eval(ctx, si, wo, on), si, active)
 
         def pdf(self, ctx: Any, si: Any, wo: Any, active: Mask = True) -> Any:
-            return self._chosen(lambda part, on: part.pdf(ctx, si, wo, on), si, active)
+            return self._select_bsdf(lambda part, on: part.pdf(ctx, si, wo, on), si, active)
 
         def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Mask = True) -> tuple[Any, Any]:
-            return self._chosen(lambda part, on: part.eval_pdf(ctx, si, wo, on), si, active)
+            return self._select_bsdf(lambda part, on: part.eval_pdf(ctx, si, wo, on), si, active)
 
         def eval_diffuse_reflectance(self, si: Any, active: Mask = True) -> Any:
-            return self._chosen(lambda part, on: part.eval_diffuse_reflectance(si, on), si, active)
+            return self._select_bsdf(
+                lambda part, on: part.eval_diffuse_reflectance(si, on), si, active
+            )
 
         def eval_null_transmission(self, si: Any, active: Mask = True) -> Any:
-            return self._chosen(lambda part, on: part.eval_null_transmission(si, on), si, active)
+            return self._select_bsdf(
+                lambda part, on: part.eval_null_transmission(si, on), si, active
+            )
 
         def traverse(self, callback: Any) -> None:
             self.base.traverse(callback)

@@ -121,14 +121,14 @@ class RenderJob:
         )
         return PathRenderTask(mi, scene, sensor, tracer, spp, options.seed, options.denoise)
 
-    def _task_here(self) -> Any:
+    def _task_in_variant(self) -> Any:
         """The task, after a worker may have worked in another variant."""
         set_variant(self.variant)
         return self.task
 
     def render_range(self, start: int, stop: int) -> TaskResult:
         """The result of the method of the task, an `AovTask` or a `PathRenderTask`."""
-        task = self._task_here()
+        task = self._task_in_variant()
         if isinstance(task, AovTask):
             return _arrays_of(task.render_range(start, stop))
         task = replace(cast("PathRenderTask", task), paths_a_band=_PATHS_A_BAND)
@@ -136,15 +136,15 @@ class RenderJob:
 
     def render_samples(self, *part: Any) -> TaskResult:
         """The result of the method of the `AovTask`."""
-        return _arrays_of(cast("AovTask", self._task_here()).render_samples(*part))
+        return _arrays_of(cast("AovTask", self._task_in_variant()).render_samples(*part))
 
     def render_gbuffer(self, start: int, stop: int) -> TaskResult:
         """As of `ShadedTask`."""
-        return cast("ShadedTask", self._task_here()).render_gbuffer(start, stop).to_numpy()
+        return cast("ShadedTask", self._task_in_variant()).render_gbuffer(start, stop).to_numpy()
 
     def refine_pixels(self, *part: Any) -> TaskResult:
         """As of `ShadedTask`."""
-        return _with_lost(cast("ShadedTask", self._task_here()).refine_pixels(*part))
+        return _with_lost(cast("ShadedTask", self._task_in_variant()).refine_pixels(*part))
 
 
 @dataclass(frozen=True)

@@ -239,7 +239,7 @@ class ColorScale:
             digits = 2 + max(2, math.ceil(math.log10(largest / (self.high - self.low))))
             return [(end, f"{end:.{digits}g}") for end in (self.low, self.high)]
         largest = max(abs(first), abs(last)) * step
-        return [(k * step, _written(k * step, step, largest)) for k in range(first, last + 1)]
+        return [(k * step, _format_number(k * step, step, largest)) for k in range(first, last + 1)]
 
     def _multiples(self, step: float) -> tuple[int, int]:
         """The first and the last multiple of a step in the range."""
@@ -252,7 +252,7 @@ def _step(bound: float) -> float:
     return next(part * power for part in _NICE if part * power >= bound * (1 - 1e-9))
 
 
-def _written(number: float, step: float, largest: float) -> str:
+def _format_number(number: float, step: float, largest: float) -> str:
     """A multiple of a nice step, with the digits that it needs.
 
     largest: the largest of all numbers that are written.

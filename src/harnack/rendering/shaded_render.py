@@ -276,7 +276,7 @@ class ShadedTask:
         pixels."""
         mi = self.mi
         pixel = upload_indices(mi, self.order[start:stop])
-        gbuffer = self._look(pixel, mi.Vector2f(_MIDDLE))
+        gbuffer = self._trace_pixels(pixel, mi.Vector2f(_MIDDLE))
         dr.eval(gbuffer)
         if self.finder is not None:
             ray, _ = self.ray(pixel, mi.Vector2f(_MIDDLE))
@@ -284,7 +284,7 @@ class ShadedTask:
             dr.eval(gbuffer)
         return gbuffer
 
-    def _look(self, pixel: Any, offset: Any) -> GBuffer:
+    def _trace_pixels(self, pixel: Any, offset: Any) -> GBuffer:
         """The first hits of rays through points in pixels."""
         mi, scene = self.mi, self.world.scene
         ray, weight = self.ray(pixel, offset)
@@ -383,7 +383,7 @@ class ShadedTask:
         per_pixel = dr.opaque(mi.UInt32, spp)
         pixel = dr.gather(mi.UInt32, upload_indices(mi, chosen), lane // per_pixel)
         table = mi.Vector2f(*(upload_floats(mitsuba_backend(mi), axis) for axis in self.offsets.T))
-        gbuffer = self._look(pixel, dr.gather(mi.Vector2f, table, lane % per_pixel))
+        gbuffer = self._trace_pixels(pixel, dr.gather(mi.Vector2f, table, lane % per_pixel))
         color = self.shade(gbuffer, _nearest_sky(mi, gbuffer, lane // per_pixel, position, sky))
         dr.eval(color, gbuffer.lost)
         return to_numpy(mean_of_blocks(color, spp)), int(dr.count(gbuffer.lost)[0])

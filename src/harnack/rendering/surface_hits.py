@@ -157,7 +157,7 @@ def _refine_hits(prepared: SurfaceTracer, rays: _MarchedRays) -> SurfaceHit:
     )
     if not prepared.field.has_jumps:
         return hit
-    return dr.select(trace.at_jump, _on_sheet(prepared, o, d, trace, hit), hit)
+    return dr.select(trace.at_jump, _hit_on_facet(prepared, o, d, trace, hit), hit)
 
 
 def _sample_where(prepared: SurfaceTracer, p: Vec3, value: Real, d: Vec3, active: Mask) -> Sample:
@@ -182,7 +182,7 @@ def _sample_where(prepared: SurfaceTracer, p: Vec3, value: Real, d: Vec3, active
     return Sample(value, gradient, (), error, shading_normal=normal)
 
 
-def _on_sheet(
+def _hit_on_facet(
     prepared: SurfaceTracer, o: Vec3, d: Vec3, trace: MarchResult, hit: SurfaceHit
 ) -> SurfaceHit:
     """Hits on facets: t is exact up to rounding, and so is the plane of the normal.

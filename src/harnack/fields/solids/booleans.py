@@ -105,7 +105,7 @@ class BooleanSolid(Solid):
             return VolumeIntersection(bounded) if len(bounded) > 1 else next(iter(bounded), None)
         if len(bounded) < len(extents):
             return None
-        return _around(bounded)
+        return _enclosing_box(bounded)
 
     @property
     def is_steep(self) -> bool:
@@ -295,7 +295,7 @@ def lipschitz_of(sample: Sample) -> Lipschitz | None:
     return next(stated, None) or next((promise for promise in implied if promise is not None), None)
 
 
-def _around(volumes: list[Volume]) -> Volume | None:
+def _enclosing_box(volumes: list[Volume]) -> Volume | None:
     """A box around volumes; a volume itself if it is alone; None if they are unbounded."""
     corners = [volume.bounds() for volume in volumes]
     lower = np.min([volume for volume, _ in corners], axis=0)
