@@ -135,8 +135,8 @@ def _find_sorted(
         result = _search_smooth_part(job, smooth, x, InitialGuess(guess, near), tolerance, progress)
     result.closest = _with_singular_points(surface, x, job.remove_truncation(x, result.closest))
     distance = _length(x - result.closest)
-    # A foot nearer than the proof allows: either it is off the surface by rounding, or a promise of
-    # the field does not hold.
+    # If a foot is nearer than the proof allows, then either it is off the surface by rounding, or a
+    # promise of the field does not hold.
     is_short = distance < lower
     slack = np.zeros(len(x))
     slack[is_short] = 4 * job.level_uncertainty(result.closest[is_short])
@@ -209,8 +209,8 @@ def _search_smooth_part(
 def _with_singular_points(
     surface: TracedSurface, points: FloatArray, feet: FloatArray
 ) -> FloatArray:
-    """The feet (n, 3), or the nearest singular points where these are nearer: beside those the
-    surface is a tiny loop that descents do not see."""
+    """The feet (n, 3), or the nearest singular points where these are nearer: beside singular
+    points the surface may be a tiny loop that descents do not find."""
     singular = surface.field.singular_points
     if surface.clip_volume is not None and len(singular):
         singular = singular[surface.clip_volume.contains_points(singular)]
@@ -241,7 +241,7 @@ def _closest_on_mesh(
 
 
 def _with_mesh_points(points: FloatArray, start: FloatArray, mesh: LevelTriangles) -> FloatArray:
-    """The places (n, 3), or the nearest points of triangles where these are nearer."""
+    """The points `start` (n, 3), or the nearest points of triangles where these are nearer."""
     backend = choose_backend("double")
     nearest = mesh.upload(backend)
     (offset,) = in_batches(backend, lambda p: (nearest(p),), points)  # pyright: ignore
@@ -310,7 +310,7 @@ class _QueryEvaluator:
         return x, self._inside_domain_or_nan(start), above, lower, near
 
     def with_jump_points(self, points: FloatArray, start: FloatArray) -> FloatArray:
-        """The places (n, 3), or points of the surface on sheets where these are nearer."""
+        """The points `start` (n, 3), or points of the surface on facets where these are nearer."""
         distance, start = _length(points - start), start.copy()
         rows = np.flatnonzero(~(distance <= self.distance_to_jumps(points) * (1 + 1e-12)))
         start[rows] = self._nearest_face_points(points[rows])
@@ -320,8 +320,8 @@ class _QueryEvaluator:
         return start
 
     def _nearest_face_points(self, points: FloatArray) -> FloatArray:
-        """The nearest points (n, 3) of triangles that are the sheets, where the level lies between
-        the values of f on both sides right beside them; NaN elsewhere."""
+        """The nearest points (n, 3) of the triangles of a jump surface, where the level lies
+        between the values of f on both sides right beside them; NaN elsewhere."""
         mesh, prepared = self.surface.field.jump_mesh(), self._prepared
         feet = np.full_like(points, np.nan)
         if mesh is None or not len(points):
@@ -348,7 +348,7 @@ class _QueryEvaluator:
         return feet
 
     def distance_to_jumps(self, points: FloatArray) -> FloatArray:
-        """The distances (n,) to sheets, of the surface or not."""
+        """The distances (n,) to facets, whether these belong to the surface or not."""
         prepared = self._prepared
 
         def compute(p: Vec3) -> tuple[Real]:
@@ -461,8 +461,9 @@ class _QueryEvaluator:
         return vector(foot), type(x.x)(free), goes_on
 
     def _newton(self, p: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Vec3, Real, Mask, Mask]:
-        """By Newton's method: feet, NaN where there is none; where the search goes on; radii about
-        feet; whether it does go on, and whether it ends farther than `limit` away."""
+        """The results of Newton's method: feet, NaN if there is no foot; the points at which the
+        search goes on; radii about feet; whether the search goes on; and whether it ended farther
+        than `limit` away."""
         y, first_step, is_lost, is_far = self._descent.newton(p, start, self.backend.Float(limit))
         foot, is_found, free = self._descent.finish(p, y)
         reach = (safe_norm(p - start) + 2 * first_step) * (1 + 64 * self.backend.machine_epsilon)
@@ -482,8 +483,8 @@ class _QueryEvaluator:
         return dr.select(on_level, y, dr.nan), dr.select(is_found, self._descent.finish(p, y)[2], 0)
 
     def remove_truncation(self, points: FloatArray, feet: FloatArray) -> FloatArray:
-        """The feet (n, 3) moved onto the level of the field without what clusters leave out: by
-        Newton's method for the closest point, else straight to the level."""
+        """The feet (n, 3) moved onto the level of the field without truncation: by Newton's method
+        for the closest point, else straight to the level."""
         rows = np.flatnonzero(np.isfinite(feet[:, 0]))
         exact = self._exact
         if exact is None or not len(rows):
@@ -507,10 +508,10 @@ class _QueryEvaluator:
     ) -> FloatArray:
         """The feet (n, 3) on the level of the exact field, NaN where they are not found.
 
-        What clusters leave out hardly changes on the way, and costs as much as all of the field: so
-        it is computed at the foot, with its gradient, and Newton's method is that of the field with
-        clusters and this correction. Twice, as the foot moves by what is left out at first. What
-        remains is a short step to the level of the exact field.
+        The truncation of clusters hardly changes on the way, and computing it costs as much as the
+        exact field. So it is computed at the foot, with its gradient, and Newton's method is that
+        of the field with clusters and this correction. This is done twice, as the foot moves by the
+        first correction. A short step to the level of the exact field remains.
         """
         rough = self._descent
 
@@ -542,7 +543,8 @@ class _QueryEvaluator:
         return feet
 
     def level_uncertainty(self, feet: FloatArray) -> FloatArray:
-        """How far rounding and approximation may have moved the level at feet (n, 3)."""
+        """The distances by which rounding and approximation may have moved the level at feet
+        (n, 3)."""
         if not len(feet):
             return np.zeros(0)
 
@@ -553,8 +555,8 @@ class _QueryEvaluator:
 
 
 class _LinearlyShiftedField(Field):
-    """A field plus a linear function of the way from a point, other ones in each lane; its error is
-    what rounding does."""
+    """A field plus a linear function of the vector from a point, both different in each lane; its
+    error is the rounding error alone."""
 
     def __init__(self, field: Field, at: Vec3, value: Real, slope: Vec3) -> None:
         self._field, self._at, self._value, self._slope = field, at, value, slope

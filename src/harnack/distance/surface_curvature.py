@@ -38,7 +38,7 @@ _ACCURACY = 1e-3
 # cluster is expanded only if it is this many times farther away than usual; with infinity every
 # term is summed directly.
 _ACCEPTANCE_FACTORS = (1.0, 2.0, 4.0, 8.0, 16.0, math.inf)
-# In epsilons, of gradient and Hessian: what the arithmetic here may do.
+# The rounding errors of the arithmetic in this module, in epsilons of gradient and Hessian.
 _ROUNDING = 16.0
 
 
@@ -131,7 +131,7 @@ def _refine_accuracy(
     points: Any,
     has_detail: bool,
 ) -> CurvatureSamples:
-    """The curvatures, `computed` more closely where the error is too large and the field
+    """The curvatures; `computed` with higher accuracy where the error is too large, if the field
     `has_detail`."""
 
     def at(closer: float) -> Callable[[Vec3], tuple[Real | Vec3, ...]]:
@@ -337,7 +337,7 @@ def curvature_lines(
 
 @dataclass(frozen=True)
 class _LineState:
-    """Where lines are, by which way they came, and which of them go on."""
+    """The points that lines have reached, their directions there, and which lines go on."""
 
     x: Vec3
     direction: Vec3
@@ -381,7 +381,7 @@ class _CurvatureLineTracer:
         return lines[:n], lines[n:]
 
     def _advance(self, state: _LineState) -> tuple[Vec3, Vec3, Mask]:
-        """The next point, the direction there, and whether it is one of the line."""
+        """The next point, the direction there, and whether it is a point of the line."""
         x, h = state.x, self.step
         first = state.direction
         second, _ = self._direction(x + 0.5 * h * first, first)
@@ -393,7 +393,7 @@ class _CurvatureLineTracer:
         return end, last, is_known & (dr.dot(first, last) > _MIN_STEP_COSINE)
 
     def _direction(self, x: Vec3, previous: Vec3 | None) -> tuple[Vec3, Mask]:
-        """The principal direction that agrees with the one before, and whether there is one."""
+        """The principal direction that agrees with the previous one, and whether it is defined."""
         plane = TangentPlane.of(self.field.evaluate(x).gradient)
         eigen = SymmetricEigen2.of(*plane.restrict_hessian(self.field.hessian(x)))
         u, v = eigen.combination(self.largest, 1 - self.largest)

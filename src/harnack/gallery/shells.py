@@ -19,7 +19,7 @@ from harnack.geometry.polygon_meshes import cluster_into_polygons
 from harnack.rendering import Camera
 from harnack.tracer import Surface, TraceOptions
 
-# Edges of faces lie inside the picture: what is met within the tolerance of one has no normal.
+# Edges of faces lie inside the picture: hits within the tolerance of an edge have no normal.
 _PATCH_OPTIONS = TraceOptions(tolerance=1e-5)
 
 
@@ -80,10 +80,10 @@ class GridShell:
     family meet them at right angles: beams that can be built.
 
     outline: (n, 2), counter-clockwise.
-    holes: (x, y, radius) each.
-    angle: a, twice the angle at which it leaves the ground.
-    spacing: of the beams, on the outline and the holes.
-    thickness: radius of the beams.
+    holes: (x, y, radius) of each hole.
+    angle: a, twice the angle at which the shell leaves the ground.
+    spacing: the distance of the beams on the outline and the holes.
+    thickness: the radius of the beams.
     """
 
     outline: FloatArray
@@ -124,7 +124,7 @@ class GridShell:
             for pair in zip(*lines(ground + offset * rise), strict=True)
         ]
         ribs = _drop_parallel_lines(candidates, 0.55 * self.spacing)
-        # Along some of them, seeds of the other family.
+        # Seeds of the other family lie along a subset of these lines.
         spines = ribs[:: max(1, len(ribs) // 6)]
         seeds = np.concatenate([spine[2:-2:2] for spine in spines])
         crossing_lines = [
@@ -161,7 +161,7 @@ class GridShell:
 
 
 def _relative_height(line: FloatArray, reach: float) -> float:
-    """How far from its start, over the reach, a line gets: lines along a rim stay beside it."""
+    """The height range of a line, relative to the reach: lines along a rim stay beside it."""
     return float(line[:, 2].max() - line[:, 2].min()) / reach if len(line) else -1.0
 
 
@@ -177,8 +177,8 @@ def _crossing_cosine(line: FloatArray, other: FloatArray) -> float:
 
 
 def _drop_parallel_lines(lines: Sequence[FloatArray], gap: float) -> list[FloatArray]:
-    """The lines, longest first, that do not run beside one that was kept for most of their way;
-    of each, every second point."""
+    """The lines, longest first, without those that run beside a kept line for most of their length;
+    of each line, every second point."""
     kept: list[FloatArray] = []
     for line in sorted(lines, key=len, reverse=True):
         if len(line) < 3:

@@ -100,8 +100,9 @@ _CELLS_OF_OFFSET, _SECANTS = 6.0, 2
 # In lattices of more cells than this, the region where other operands leave nothing is computed at
 # once.
 _MANY_CELLS = 100_000
-# How far merging of coplanar triangles may move surfaces of offsets, in tolerances, the first value
-# that does no harm; and how far mending may move them, which is done after merging.
+# The distances, in tolerances, by which merging of coplanar triangles may move surfaces of offsets,
+# of which the first valid one is used; and the distance by which the repair of intersections may
+# move them after merging.
 _JOIN_TOLERANCES, _REPAIR_TOLERANCE = (0.5, 0.25, 0.1), 0.5
 # Triangles of offsets are cut in three where their centers are farther off the level, in
 # tolerances; and how often.

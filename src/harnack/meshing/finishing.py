@@ -162,8 +162,8 @@ def _hulls(surface: TriangleMesh, radius: float, tolerance: float, why: str) -> 
 
 # The cosine of the angle between normals from which on an edge is a crease.
 _CREASE = math.cos(math.radians(30))
-# How far simplification may move a surface, and how far mending may then, relative to the
-# tolerance.
+# The distances by which simplification may move a surface, in the order of the attempts, and the
+# distance by which the repair of intersections may then move it, relative to the tolerance.
 _SIMPLIFY_TOLERANCES, _REPAIR_TOLERANCE = (0.4, 0.2, 0.1), 0.05
 
 

@@ -60,9 +60,9 @@ _ACROSS = 24
 # How often edges of holes that are too near to others are halved for the tetrahedra; and the
 # largest number of pieces, in all and for each edge: so many arise where edges lie on each other.
 _MAX_CUTS, _MAX_PIECES, _MAX_PER_EDGE = 12, 20_000, 64
-# How often patches that meet the mesh are computed again, with smaller cells.
+# How often fillings that intersect the mesh are computed again, with smaller cells.
 _MAX_RETRIES = 1
-# How far w may be from 1/2, modulo 1, at vertices of patches.
+# The largest difference of w from 1/2, modulo 1, at vertices of fillings.
 _MAX_LEVEL_ERROR = 1e-6
 
 
@@ -134,7 +134,7 @@ def harmonic_patches(
 def _fill_all_holes(
     vertices: FloatArray, faces: IntArray, edges: IntArray, options: HoleFillingOptions
 ) -> HarmonicFilling:
-    """The patches that end at open edges; cells are made smaller where checks fail.
+    """The fillings that end at open edges; cells are made smaller where checks fail.
 
     Raises:
         MeshingError: as `harmonic_filling`.
@@ -250,7 +250,7 @@ def _patches(
 ) -> HarmonicFilling:
     """The level set, ending at the edges (k, 2) of the mesh.
 
-    last: whether this is the last attempt, in which patches that cannot be refined are accepted.
+    last: whether this is the last attempt, in which fillings that cannot be refined are accepted.
 
     Raises:
         MeshingError: as `mesh`; or Delaunay's tetrahedra lack an edge.
@@ -389,8 +389,8 @@ def _normals(corners: FloatArray) -> FloatArray:
 
 
 def _check_boundary(x: FloatArray, faces: IntArray, boundary: BoundaryCurve) -> None:
-    """Raise unless patches end at the boundary, and run each of its edges in the direction of the
-    mesh: patches are reversed afterwards."""
+    """Raise unless fillings end at the boundary, and run each of its edges in the direction of the
+    mesh: fillings are reversed afterwards."""
     directed = {(int(a), int(b)) for a, b in half_edges(faces)}
     rim = {(a, b) for a, b in directed if (b, a) not in directed}
     unmatched = rim ^ {(int(a), int(b)) for a, b in boundary.edges}
@@ -408,7 +408,7 @@ def _check(
     patches: HarmonicFilling,
     report: Callable[[str], None],
 ) -> None:
-    """Raise unless the mesh with its patches fulfills what `repair` promises.
+    """Raise unless the mesh with its fillings has the properties that `repair` promises.
 
     Raises:
         MeshingError: it does not.

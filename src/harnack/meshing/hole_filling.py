@@ -126,7 +126,7 @@ def _failures(
     input_count: int,
     winding: Winding,
 ) -> dict[int, str]:
-    """The reasons why patches fail, by loop. new: the faces of patches; owner: the loop of each."""
+    """The reasons why fillings fail, by loop. new: the faces of fillings; owner: their loops."""
     reasons: dict[int, str] = {}
     if not len(new):
         return reasons
@@ -526,7 +526,7 @@ def _cotangents(a: FloatArray, b: FloatArray, apex: FloatArray) -> FloatArray:
 
 
 def _loop_of_faces(new: IntArray, loops: list[IntArray], count: int) -> IntArray:
-    """(p,) the loop of each face of patches: faces are joined by edges to a face at their loop."""
+    """(p,) the loop of each face of fillings: faces are joined by edges to a face at their loop."""
     import scipy.sparse  # imported here: it takes half a second
     import scipy.sparse.csgraph as csgraph_module
 

@@ -293,7 +293,7 @@ def _values(field: WindingNumber | None, points: FloatArray) -> FloatArray:
 
 
 def _turn_faces(faces: IntArray, which: BoolArray) -> IntArray:
-    """Faces (m, 3), with those of the mask `which` (m,) turned over."""
+    """Faces (m, 3), with the faces of the mask `which` (m,) reversed."""
     return np.where(which[:, None], faces[:, ::-1], faces)
 
 

@@ -70,7 +70,7 @@ class CleanedMesh:
 def clean_and_fill(
     vertices: FloatArray, faces: IntArray, report: Callable[[str], None]
 ) -> CleanedMesh:
-    """The valid triangles of a mesh, with patches in place of all others and over holes.
+    """The valid triangles of a mesh, with hole fillings in place of all others and over holes.
 
     Raises:
         MeshingError: half of the triangles, or all, would be removed, or most of them are loose.

@@ -80,7 +80,7 @@ _HONORED = (*SURFACE_OPTIONS, "tolerance")
 _ACROSS = 24
 _MAX_ATTEMPTS = 4
 _ACROSS_BY_SIGNS, _ATTEMPTS_BY_SIGNS = 48, 2
-# Room around what has an extent, and around a curve whose surface has none, as a part of the size.
+# The margin around an extent, and around a curve whose surface has none, as a fraction of the size.
 _MARGIN = 0.01
 _ROOM = 0.05
 
@@ -131,7 +131,7 @@ def mesh(
     seed: of the small random moves that keep points in general position.
     max_triangles: of one level set, before anything is simplified; what would take more is not
         begun or given up, with a MeshingError. Cells are limited with them, to two millions.
-    progress: told what is being done.
+    progress: called with the name of each step of the work.
     options: a `TraceOptions`, of which meshes have the tolerance alone: the largest distance of
         triangles from the surface, sampled and not proved; None for 1e-3 of the longest side of the
         level set's box.
@@ -170,8 +170,8 @@ def mesh(
         flat: how many triangles were not fitted to creases, as they would pass through others;
         Where the triangles of a mesh were kept, made_by is "faces", and there is none of
         this.
-        cloud: of a `DipolePotential`, what it says of itself (`describe`), such as how many points
-            it has, what was estimated, and the smoothing and noise that were chosen and found.
+        cloud: of a `DipolePotential`, the result of `describe`, such as the number of points, the
+            estimated quantities, the chosen smoothing and the noise.
 
         Solids and thick surfaces have more: see `docs/printing.md`.
 
@@ -231,7 +231,7 @@ def mesh(
 
 @dataclass(frozen=True)
 class _MeshOptions:
-    """Arguments of `mesh`; volume: what the level set is cut by."""
+    """Arguments of `mesh`; volume: the volume by which the level set is cut."""
 
     volume: Volume | None
     tolerance: MeshTolerance
@@ -243,7 +243,7 @@ class _MeshOptions:
 
 @dataclass(frozen=True)
 class _RawMesh:
-    """A surface, its size, what is known of it, and the function that it is a level set of.
+    """A surface, its size, its metadata, and the function of which it is a level set.
 
     check_level: raises a MeshingError unless a surface is within the tolerance of the level.
     is_checked: whether that has been done, and the surface is known to be a manifold that does not
@@ -277,7 +277,7 @@ def _mesh_from_signs(
     volume, box = options.volume, _box(field, levels, options.volume)
     size = float((box.upper - box.lower).max())
     cells, attempts = _cells_by_signs(field, size, options.spacing)
-    # Where nothing ends at the box, its cells should not lie along what is symmetrical.
+    # If no surface ends at the box, its cells should not lie along symmetries of the field.
     room = np.zeros(3) if box.has_walls else size * np.array([0.0037, 0.0053, 0.0029])
     filled = box.lower - room, box.upper + 0.5 * room
     facts: list[dict[str, Any]] = []
@@ -382,10 +382,11 @@ def _input_faces_as_surface(
     solid: tuple[float, float] | bool,
     options: _MeshOptions,
 ) -> _RawMesh:
-    """The triangles of a mesh that is its own surface, as they are, but for what the volume cuts.
+    """The triangles of a mesh that is its own surface, unchanged except where the volume cuts them.
 
     Raises:
-        MeshingError: it is to be closed; nothing is left; it has too many triangles.
+        MeshingError: the surface has to be closed; nothing of it is left in the volume; it has too
+            many triangles.
     """
     if solid:
         raise MeshingError(
@@ -422,15 +423,15 @@ def _check_has_thickness(
 
 
 def _merge_facts(facts: list[dict[str, Any]]) -> dict[str, Any]:
-    """What is known of the surfaces at both ends of a solid."""
+    """The metadata of a solid from those of the surfaces at both ends."""
     sums = ("evaluations", "undecided", "flat", "far", "looked_at", "lost", "sought")
     larger = {key: max(entry[key] for entry in facts) for key in ("spacing", "within")}
     return {**facts[0], **larger, **{key: sum(entry[key] for entry in facts) for key in sums}}
 
 
 def _check_sign_accuracy(field: Field, facts: dict[str, Any], tolerance: float) -> bool:
-    """Whether more than a few vertices and centers of triangles are beyond the tolerance, which is
-    warned of.
+    """Whether more than a few vertices and centers of triangles are beyond the tolerance; warns of
+    it.
 
     Raises:
         MeshingError: some of them are nowhere near the level.
@@ -530,8 +531,8 @@ def _checked(field: Field) -> Field:
 
 
 def _volume(field: Field, clip: Volume | None, section: Volume | None) -> Volume | None:
-    """What the level sets are cut by: the clip, the domain where the field ends there or there is
-    no clip, and the section."""
+    """The volume by which level sets are cut: the intersection of the clip, the section, and the
+    domain if the field ends there or there is no clip."""
     ends = field.domain is not None and not (field.is_global and clip is not None)
     distinct = dict.fromkeys((clip, field.domain if ends else None, section))
     volumes = [volume for volume in distinct if volume is not None]

@@ -23,12 +23,13 @@ from harnack.meshing.self_intersection_repair import resolve_local_intersections
 
 __all__ = ["project_outliers"]
 
-# The largest number of locations that is mended; and how often faces may be cut, one after the
-# other.
+# The largest number of locations that are repaired, and the number of rounds in which faces may be
+# cut.
 _MAX_LOCATIONS, _MAX_ROUNDS = 100, 4
-# Edges of such faces are cut if their middle is farther off the level than this, in tolerances.
+# Edges of faces at outliers are cut if their middle is farther off the level than this, in
+# tolerances.
 _CUT_DISTANCE = 0.5
-# How far mending of intersections may move cut faces, in tolerances.
+# The largest distance by which the repair of intersections may move cut faces, in tolerances.
 _REPAIR_TOLERANCE = 0.25
 
 

@@ -66,15 +66,17 @@ if TYPE_CHECKING:
 
 __all__ = ["repair"]
 
-# How many sizes of cells are tried for patches on which w is 1/2, if all triangles have to stay;
-# and if they need not, where there are no more open edges than that.
+# The number of sizes of cells that are tried for harmonic fillings if all triangles have to stay;
+# and if they need not stay, where there are at most the third number of open edges.
 _ATTEMPTS, _OPTIONAL_ATTEMPTS, _MAX_OPTIONAL_EDGES = 6, 1, 1000
-# Cells across the mesh if all is made anew; larger ones by this factor, up to so many times, where
-# the surface is rough and has more triangles than that.
+# The number of cells across the mesh if it is remeshed. If the surface is rough and has more
+# triangles than the second number, cells are made larger by the third, at most as often as the
+# fourth says.
 _ACROSS_ANEW = 48
 _MOST_ANEW, _CELL_GROWTH, _MAX_GROWTHS = 80_000, 1.4, 3
 
-# Points lie in a plane if the least of their singular values is this part of the largest.
+# Points lie in a plane if the smallest of their singular values is below this fraction of the
+# largest.
 _FLAT = 1e-9
 
 Keep = Literal["all", "valid", "none"]
@@ -129,7 +131,7 @@ def repair(
     largest: keep only the body of the largest volume, with its cavities.
     cell_size: of cells before anything is refined, in the mesh's unit; None chooses.
     seed: of the small random moves that keep points in general position.
-    progress: told what is being done.
+    progress: called with the name of each step of the work.
     options: a `TraceOptions`, of which repairs have the tolerance alone: the largest distance of
         harmonic fillings and of remeshed triangles from the surface w = 1/2, a length, sampled and
         not proved. None is 1e-3 of the longest side of the box of the mesh and, for fillings, of
@@ -259,7 +261,7 @@ def _checked_settings(
 
 @dataclass(frozen=True)
 class _Result:
-    """What a stage made, and how that differs from what was given."""
+    """The result of a stage, and its difference from the intended solid; None for no difference."""
 
     surface: TriangleMesh
     facts: dict[str, Any]
@@ -271,7 +273,9 @@ class _Result:
         return 0.0 if self.difference is None else self.difference.badness
 
     def finished(self, more: dict[str, Any], largest: bool) -> trimesh.Trimesh:
-        """The mesh, with what is known of it and of its parts; a warning if it differs."""
+        """The mesh, with its metadata; with a warning if it differs from the intended solid.
+
+        more: further metadata."""
         from harnack.meshing.closed_mesh import ClosedMesh
 
         surface = self.surface
@@ -299,7 +303,7 @@ class _Result:
 
 
 def _count_of(surface: TriangleMesh, whole: TriangleMesh, first: int) -> int:
-    """How many of the first faces of a whole are in a surface that is a part of it."""
+    """The number of the first faces of a whole mesh that are in a surface that is a part of it."""
     corners = [mesh.vertices[mesh.faces].reshape(-1, 9) for mesh in (surface, whole)]
     rows = {row.tobytes() for row in corners[0]}
     return sum(row.tobytes() in rows for row in corners[1][:first])
@@ -372,7 +376,8 @@ def _unite_bodies(
 
 
 def _is_free_of_overlaps(vertices: FloatArray, faces: IntArray) -> bool:
-    """Whether no triangles meet beyond what they share, and no part is in another's material."""
+    """Whether no triangles meet except in common vertices and edges, and no part is in another's
+    material."""
     try:
         _check_sides(TriangleMesh.without_unused_vertices(vertices, faces))
     except MeshError:
@@ -380,7 +385,7 @@ def _is_free_of_overlaps(vertices: FloatArray, faces: IntArray) -> bool:
     return not len(nonmanifold_vertices(faces)) and not len(intersecting_faces(vertices, faces))
 
 
-# All made anew.
+# Remeshing.
 
 
 def _remesh(
@@ -405,8 +410,8 @@ def _remesh(
 def _of_bounded_size(
     field: WindingNumber, spacing: float, options: _RepairOptions
 ) -> trimesh.Trimesh:
-    """Of larger cells where there would be too many triangles, as of noisy meshes: the time of
-    checks grows with their number."""
+    """The mesh by signs, with larger cells if there would be too many triangles, as for noisy
+    meshes: the time of checks grows with their number."""
     for k in range(_MAX_GROWTHS):
         try:
             return _by_signs(field, spacing * _CELL_GROWTH**k, options, _MOST_ANEW)
@@ -424,13 +429,13 @@ def _by_signs(
     )  # fmt: skip
 
 
-# What is sound kept.
+# Valid triangles kept.
 
 
 def _keep_valid(
     intended: IntendedSolid, options: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The triangles that are sound, with patches.
+    """The valid triangles, with hole fillings.
 
     Raises:
         MeshError, MeshingError: as `repair`.
@@ -451,7 +456,7 @@ def _keep_valid(
 
 
 def _count_turned(intended: IntendedSolid, sound: CleanedMesh) -> int:
-    """How many of the triangles that were kept run the other way than those that were given."""
+    """The number of kept triangles whose orientation differs from that of the input triangles."""
     turned_before = np.delete(
         intended.is_turned, zero_area_faces(intended.vertices, intended.faces)
     )
@@ -466,7 +471,7 @@ def _count_turned(intended: IntendedSolid, sound: CleanedMesh) -> int:
 def _weld_loose(
     intended: IntendedSolid, options: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """Triangles with near corners joined, with patches; none is kept bit by bit.
+    """Triangles with near corners joined, with hole fillings; none is kept bit by bit.
 
     Raises:
         MeshError, MeshingError: as `repair`.
@@ -494,7 +499,7 @@ def _weld_loose(
 def _fill_only(
     intended: IntendedSolid, options: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The mesh with patches; all its triangles stay.
+    """The mesh with hole fillings; all its triangles stay.
 
     Raises:
         MeshError, MeshingError: as `repair`.
@@ -517,7 +522,7 @@ def _fill_only(
 
 
 def _checked(intended: IntendedSolid) -> tuple[FloatArray, IntArray]:
-    """Vertices and faces of a mesh all of which can be kept."""
+    """The vertices and faces of a mesh, if all of them can be kept; else MeshError."""
     vertices, faces = validate_mesh(intended.vertices, intended.faces)
     used = np.unique(faces)
     welded = weld_vertices(vertices[used])
@@ -534,7 +539,7 @@ def _checked(intended: IntendedSolid) -> tuple[FloatArray, IntArray]:
 def _fill_all_holes(
     vertices: FloatArray, faces: IntArray, loops: list[IntArray], options: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The mesh with patches over its holes: smooth ones if asked for, and harmonic ones.
+    """The mesh with its holes filled: by smooth fillings if requested, and by harmonic fillings.
 
     Raises:
         MeshingError: as `repair`.
