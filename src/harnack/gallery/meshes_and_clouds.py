@@ -23,16 +23,16 @@ def _cut_mesh() -> list[Surface]:
     vertices, faces = example_meshes.bumpy_sphere(6)
     middles = vertices[faces].mean(axis=1)
     middles /= np.linalg.norm(middles, axis=1, keepdims=True)
-    whole = (middles @ _spiral_directions(14).T < math.cos(0.27)).all(axis=1)
-    return [Surface(WindingNumber(vertices, faces[whole]))]
+    full = (middles @ _spiral_directions(14).T < math.cos(0.27)).all(axis=1)
+    return [Surface(WindingNumber(vertices, faces[full]))]
 
 
 def _spiral_directions(n: int) -> FloatArray:
     """n directions (n, 3), evenly spread."""
     k = np.arange(n)
-    z, turn = 1.0 - (2.0 * k + 1.0) / n, 2.0 * math.pi * _GOLDEN * k
-    across = np.sqrt(1.0 - z * z)
-    return np.column_stack([across * np.cos(turn), across * np.sin(turn), z])
+    z, angle = 1.0 - (2.0 * k + 1.0) / n, 2.0 * math.pi * _GOLDEN * k
+    radius = np.sqrt(1.0 - z * z)
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
 
 
 def _soup() -> list[Surface]:

@@ -26,10 +26,10 @@ _PATCH_OPTIONS = TraceOptions(tolerance=1e-5)
 def _exoskeleton() -> list[Surface]:
     """A wavy torus of some 150 patches, and tubes around their edges."""
     vertices, faces = example_meshes.torus_mesh(1.0, 0.45, 240, 108)
-    turn = np.arctan2(vertices[:, 1], vertices[:, 0])
-    ring = np.column_stack([np.cos(turn), np.sin(turn), 0.25 * np.sin(3 * turn)])
-    across = vertices - np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
-    wavy = ring + across * (1 + 0.25 * np.cos(3 * turn))[:, None]
+    angle = np.arctan2(vertices[:, 1], vertices[:, 0])
+    ring = np.column_stack([np.cos(angle), np.sin(angle), 0.25 * np.sin(3 * angle)])
+    across = vertices - np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    wavy = ring + across * (1 + 0.25 * np.cos(3 * angle))[:, None]
     mesh = PolygonMesh(*cluster_into_polygons(wavy, faces, 150, smoothing=12))
     tubes = TubeNetwork(mesh.vertices, mesh.edges, 0.011)
     return [Surface(mesh), Surface(tubes)]

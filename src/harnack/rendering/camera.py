@@ -113,9 +113,9 @@ class Camera:
         x, y, z = points @ right, points @ up, points @ back
         origin = np.zeros(3)
         distance = -math.inf
-        for across, axis, slope in zip((x, y), (right, up), self._slopes(size), strict=True):
+        for coordinate, axis, slope in zip((x, y), (right, up), self._slopes(size), strict=True):
             # |across - c| <= slope (distance - z) for all points.
-            high, low = (across + slope * z).max(), (across - slope * z).min()
+            high, low = (coordinate + slope * z).max(), (coordinate - slope * z).min()
             origin = origin + (high + low) / 2 * axis
             distance = max(distance, (high - low) / (2 * slope))
         middle = float(z.max() + z.min()) / 2
@@ -176,8 +176,10 @@ class Camera:
         if depth.min() <= 0:
             return _FOV_INSIDE
         shape = max(size) / np.array(size)
-        wide = (across / depth).max(axis=1) * shape
-        fov = 2 * math.degrees(math.atan(max(float(wide.max()), 1e-4) / _FILL_FRACTION / self.zoom))
+        slopes = (across / depth).max(axis=1) * shape
+        fov = 2 * math.degrees(
+            math.atan(max(float(slopes.max()), 1e-4) / _FILL_FRACTION / self.zoom)
+        )
         return min(fov, _WIDEST)
 
     @property

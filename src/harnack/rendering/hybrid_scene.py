@@ -67,9 +67,11 @@ def spawn_ray(mi: Any, si: Any, clearance: Real, d: Vec3) -> Any:
 def spawn_ray_to(mi: Any, si: Any, clearance: Real, target: Vec3) -> Any:
     """The ray from `si` to a target point, ending just before it."""
     o = offset_origin(mi, si, clearance, target - si.p)
-    way = target - o
-    length = dr.norm(way)
-    return mi.Ray3f(o, way / length, length * (1 - mi.math.ShadowEpsilon), si.time, si.wavelengths)
+    vector = target - o
+    length = dr.norm(vector)
+    return mi.Ray3f(
+        o, vector / length, length * (1 - mi.math.ShadowEpsilon), si.time, si.wavelengths
+    )
 
 
 @dataclass(frozen=True)

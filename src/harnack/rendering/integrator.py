@@ -82,8 +82,8 @@ class SobolSampler:
             _owen(uint, x, _hashed(uint, key + 1)),
             _owen(uint, dr.brev(y), _hashed(uint, key + 2)),
         )
-        below = 1 - dr.epsilon(mi.Float)
-        return mi.Point2f(*(dr.minimum(mi.Float(part) * 2.0**-32, below) for part in pair))
+        largest = 1 - dr.epsilon(mi.Float)
+        return mi.Point2f(*(dr.minimum(mi.Float(bits) * 2.0**-32, largest) for bits in pair))
 
     def next_1d(self, active: Any = True) -> Any:
         """Numbers in [0, 1)."""

@@ -159,13 +159,13 @@ def _in_pixel(mi: Any, sample: Any) -> Any:
     return mi.Vector2f(gauss) + 0.5
 
 
-def _camera_ray(mi: Any, sensor: Any, sampler: Any, place: Any) -> tuple[Any, Any]:
+def _camera_ray(mi: Any, sensor: Any, sampler: Any, position: Any) -> tuple[Any, Any]:
     time = sensor.shutter_open()
     if sensor.shutter_open_time() > 0:
         time = time + sampler.next_1d() * sensor.shutter_open_time()
     wavelength = sampler.next_1d() if mi.is_spectral else 0
     lens = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
-    return sensor.sample_ray(time, wavelength, place, lens)
+    return sensor.sample_ray(time, wavelength, position, lens)
 
 
 def as_rgb(mi: Any, radiance: Any, wavelengths: Any) -> Any:

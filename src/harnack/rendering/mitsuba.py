@@ -211,10 +211,10 @@ def transmittance_texture(mi: Any, tint: Any) -> Any:
         return None
     wrong = "tint is what is left of red, green and blue after one unit of length, in (0, 1]"
     try:
-        color = [float(part) for part in tint]
+        color = [float(channel) for channel in tint]
     except (TypeError, ValueError):
         raise TypeError(f"{wrong}, such as (0.9, 0.5, 0.1), not {tint!r}") from None
-    if len(color) != 3 or not all(0 < part <= 1 for part in color):
+    if len(color) != 3 or not all(0 < channel <= 1 for channel in color):
         raise ValueError(f"{wrong}, such as (0.9, 0.5, 0.1), not {tint!r}")
     if min(color) == 1:
         return None

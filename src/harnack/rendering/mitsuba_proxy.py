@@ -61,13 +61,13 @@ def _lined_class(variant: str) -> Any:
         def __init__(self, base: Any, paints: Sequence[Any]) -> None:
             mi.BSDF.__init__(self, mi.Properties())
             self.base, self.paints = base, tuple(paints)
-            parts = (base, *self.paints)
+            bsdfs = (base, *self.paints)
             self.m_components = [
-                part.flags(k) for part in parts for k in range(part.component_count())
+                bsdf.flags(k) for bsdf in bsdfs for k in range(bsdf.component_count())
             ]
             flags = 0
-            for part in parts:
-                flags |= part.flags()
+            for bsdf in bsdfs:
+                flags |= bsdf.flags()
             self.m_flags = flags
 
         def _select_bsdf(self, call: Callable[[Any, Mask], Any], si: Any, active: Mask) -> Any:
@@ -82,28 +82,28 @@ def _lined_class(variant: str) -> Any:
         def sample(
             self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Mask = True
         ) -> tuple[Any, Any]:
-            def call(part: Any, on: Mask) -> tuple[Any, Any]:
-                return part.sample(ctx, si, sample1, sample2, on)
+            def call(bsdf: Any, on: Mask) -> tuple[Any, Any]:
+                return bsdf.sample(ctx, si, sample1, sample2, on)
 
             return self._select_bsdf(call, si, active)
 
         def eval(self, ctx: Any, si: Any, wo: Any, active: Mask = True) -> Any:
-            return self._select_bsdf(lambda part, on: part.eval(ctx, si, wo, on), si, active)
+            return self._select_bsdf(lambda bsdf, on: bsdf.eval(ctx, si, wo, on), si, active)
 
         def pdf(self, ctx: Any, si: Any, wo: Any, active: Mask = True) -> Any:
-            return self._select_bsdf(lambda part, on: part.pdf(ctx, si, wo, on), si, active)
+            return self._select_bsdf(lambda bsdf, on: bsdf.pdf(ctx, si, wo, on), si, active)
 
         def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Mask = True) -> tuple[Any, Any]:
-            return self._select_bsdf(lambda part, on: part.eval_pdf(ctx, si, wo, on), si, active)
+            return self._select_bsdf(lambda bsdf, on: bsdf.eval_pdf(ctx, si, wo, on), si, active)
 
         def eval_diffuse_reflectance(self, si: Any, active: Mask = True) -> Any:
             return self._select_bsdf(
-                lambda part, on: part.eval_diffuse_reflectance(si, on), si, active
+                lambda bsdf, on: bsdf.eval_diffuse_reflectance(si, on), si, active
             )
 
         def eval_null_transmission(self, si: Any, active: Mask = True) -> Any:
             return self._select_bsdf(
-                lambda part, on: part.eval_null_transmission(si, on), si, active
+                lambda bsdf, on: bsdf.eval_null_transmission(si, on), si, active
             )
 
         def traverse(self, callback: Any) -> None:

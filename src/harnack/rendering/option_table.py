@@ -294,10 +294,10 @@ def refuse_unknown(verb: str, keywords: Mapping[str, Any]) -> None:
     refuse_others(verb, keywords)
     for name in keywords:
         if name not in BY_NAME:
-            known = [option.name for option in options_of(verb)]
+            names = [option.name for option in options_of(verb)]
             other_name = _OTHER_PROGRAMS_NAMES.get(name.lower())
-            hint = f"; did you mean {other_name}?" if other_name else did_you_mean(name, known)
-            raise TypeError(f"{verb} has no option {name!r}{hint}; it has {', '.join(known)}")
+            hint = f"; did you mean {other_name}?" if other_name else did_you_mean(name, names)
+            raise TypeError(f"{verb} has no option {name!r}{hint}; it has {', '.join(names)}")
 
 
 def refuse_others(verb: str, keywords: Mapping[str, Any]) -> None:

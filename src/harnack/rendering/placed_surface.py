@@ -70,8 +70,8 @@ class Placement:
     def apply(self, points: npt.ArrayLike) -> FloatArray:
         """Points (n, 3) of the surface, in the world."""
         local: FloatArray = np.asarray(points, dtype=np.float64)
-        turned: FloatArray = np.matmul(local, np.transpose(self.rotation))
-        return self.scale * turned + self.translation
+        rotated: FloatArray = np.matmul(local, np.transpose(self.rotation))
+        return self.scale * rotated + self.translation
 
     def apply_inverse(self, points: npt.ArrayLike) -> FloatArray:
         """Points (n, 3) of the world, in the surface's coordinates."""

@@ -97,12 +97,12 @@ def _from_text(text: str, what: str) -> Color:
 
 def linear_from_srgb(color: Color) -> Color:
     """A color in sRGB as linear sRGB, which light adds up in (IEC 61966-2-1)."""
-    red, green, blue = (_linear(part) for part in color)
+    red, green, blue = (_linear(channel) for channel in color)
     return red, green, blue
 
 
-def _linear(part: float) -> float:
-    return part / 12.92 if part <= 0.04045 else math.pow((part + 0.055) / 1.055, 2.4)
+def _linear(channel: float) -> float:
+    return channel / 12.92 if channel <= 0.04045 else math.pow((channel + 0.055) / 1.055, 2.4)
 
 
 # Color maps: numbers as colors.
@@ -249,7 +249,7 @@ class ColorScale:
 def _step(bound: float) -> float:
     """The smallest nice number that is at least the bound, a positive number."""
     power = 10.0 ** math.floor(math.log10(bound))
-    return next(part * power for part in _NICE if part * power >= bound * (1 - 1e-9))
+    return next(multiple * power for multiple in _NICE if multiple * power >= bound * (1 - 1e-9))
 
 
 def _format_number(number: float, step: float, largest: float) -> str:

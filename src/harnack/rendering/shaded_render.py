@@ -336,9 +336,9 @@ class ShadedTask:
     def ray(self, pixel: Any, offset: Any) -> tuple[Any, Any]:
         """Rays with differentials through points in pixels, and the weights of their light."""
         mi = self.mi
-        place = film_positions(mi, pixel, offset, self.size)
+        position = film_positions(mi, pixel, offset, self.size)
         return self.sensor.sample_ray_differential(
-            self.sensor.shutter_open(), 0.5, place, mi.Point2f(0.5)
+            self.sensor.shutter_open(), 0.5, position, mi.Point2f(0.5)
         )
 
     def _reflectance(self, si: Any, side: int) -> Any:

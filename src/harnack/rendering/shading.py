@@ -90,8 +90,8 @@ def upload_indices(mi: Any, pixels: IntArray) -> Any:
 
 def film_positions(mi: Any, pixel: Any, offset: Any, size: tuple[int, int]) -> Any:
     """Places on the film, in [0, 1]^2, of offsets in [0, 1]^2 within pixels counted by rows."""
-    place = mi.Vector2f(pixel % size[0], pixel // size[0]) + offset
-    return mi.Point2f(place / mi.ScalarVector2f(*size))
+    position = mi.Vector2f(pixel % size[0], pixel // size[0]) + offset
+    return mi.Point2f(position / mi.ScalarVector2f(*size))
 
 
 def grid_sample_count(spp: int) -> int:
@@ -324,8 +324,8 @@ def _square() -> FloatArray:
     """Places (16, rays, 2) in the unit square, spread evenly (Roberts 2018)."""
     k = np.arange(_BLOCK * _BLOCK * _RAYS)
     plastic = 1.32471795724474602596  # the real root of x^3 = x + 1
-    places = np.mod(0.5 + np.outer(k, [1 / plastic, 1 / plastic**2]), 1.0)
-    return places.reshape(_RAYS, _BLOCK * _BLOCK, 2).transpose(1, 0, 2)
+    points = np.mod(0.5 + np.outer(k, [1 / plastic, 1 / plastic**2]), 1.0)
+    return points.reshape(_RAYS, _BLOCK * _BLOCK, 2).transpose(1, 0, 2)
 
 
 def _to_key(key: Any) -> FloatArray:
@@ -380,13 +380,13 @@ def studio_wall(
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     pixel = dr.arange(mi.UInt32, width * height)
-    place = film_positions(mi, pixel, mi.Vector2f(0.5), (width, height))
-    ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, place, mi.Point2f(0.5))
+    position = film_positions(mi, pixel, mi.Vector2f(0.5), (width, height))
+    ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, position, mi.Point2f(0.5))
     rise = np.clip(to_numpy(ray.d)[:, 2], 0, 1) ** 0.7
-    far = distant_ground_radiance(ground.name, azimuth)
+    distant = distant_ground_radiance(ground.name, azimuth)
     if show == "shaded":
-        far = _far_shaded(mi, sensor, ground)
-    image = far * (1 - _DARKER * rise[:, None])
+        distant = _far_shaded(mi, sensor, ground)
+    image = distant * (1 - _DARKER * rise[:, None])
     return image.astype(np.float32).reshape(height, width, 3)
 
 

@@ -121,7 +121,7 @@ def _tinted(tint: Color, index: float = 1.5) -> Material:
 
 
 def _painted(color: Color) -> Material:
-    red, green, blue = (max(_WHITE * part, _BLACK) for part in color)
+    red, green, blue = (max(_WHITE * channel, _BLACK) for channel in color)
     return Material(_coated((red, green, blue), _PAINT))
 
 

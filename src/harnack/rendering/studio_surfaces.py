@@ -90,8 +90,8 @@ def studio_objects(
         drawn = [(listed[0], {**shorthand, "level": number}) for number in levels]
     if len(names) != len(drawn):
         count = max(len(listed), len(levels))
-        each = f" or {count}, one for each {'surface' if len(listed) > 1 else 'level'}"
-        raise ValueError(f"give one material{each if count > 1 else ''}, not {len(names)}")
+        hint = f" or {count}, one for each {'surface' if len(listed) > 1 else 'level'}"
+        raise ValueError(f"give one material{hint if count > 1 else ''}, not {len(names)}")
     objects: list[StudioObject] = []
     for (element, keywords), name in zip(drawn, names, strict=True):
         material = parse_material(name)
@@ -172,9 +172,9 @@ def _check_no_duplicates(surfaces: list[TracedSurface]) -> None:
     """Raise ValueError if a surface is there twice: which of the two is seen would be an
     accident."""
     for k, surface in enumerate(surfaces):
-        for other in surfaces[:k]:
-            same = _is_cut_alike(surface, other) and surface.solid_range == other.solid_range
-            if same and _shared_levels(surface, other):
+        for earlier in surfaces[:k]:
+            same = _is_cut_alike(surface, earlier) and surface.solid_range == earlier.solid_range
+            if same and _shared_levels(surface, earlier):
                 raise ValueError(
                     "a surface is drawn twice, and which is seen would be an accident. If levels "
                     "were meant for one field each: they are those of every field. Give one field "

@@ -226,9 +226,9 @@ def _uncertainty(
 
 def orient_normal(normal: Vec3, d: Vec3, side: Real) -> Vec3:
     """The normal, turned if need be such that side * (normal . d) > 0."""
-    along = dr.dot(normal, d)
-    turned = dr.normalize(normal + (side * _GRAZING - along) * d)
-    return dr.select(side * along >= _GRAZING, normal, turned)
+    cosine = dr.dot(normal, d)
+    tilted = dr.normalize(normal + (side * _GRAZING - cosine) * d)
+    return dr.select(side * cosine >= _GRAZING, normal, tilted)
 
 
 @dataclass(frozen=True)
@@ -277,10 +277,10 @@ class CappedSolid:
         enters = active & (start < end)
         start = dr.select(enters, start, 0)
         resolved = self.prepared.is_resolved(o, end)  # others run out of steps in `_meet_levels`
-        within = enters & resolved & self._contains(self._at(o, d, start))
-        inside = within & (start <= 0)
+        starts_inside = enters & resolved & self._contains(self._at(o, d, start))
+        inside = starts_inside & (start <= 0)
         slipped = active & resolved & (((side < 0) & ~inside) | ((side > 0) & inside))
-        entering = within & ~inside & ~slipped
+        entering = starts_inside & ~inside & ~slipped
         hit = self._meet_levels(o, d, t_max, active & ~entering & ~slipped)
         hit = replace(
             hit, evaluations=hit.evaluations + type(hit.evaluations)(dr.select(enters, 1, 0))
@@ -316,8 +316,8 @@ class CappedSolid:
         enters = active & (start < end)
         start = dr.select(enters, start, 0)
         resolved = self.prepared.is_resolved(o, end)
-        within = enters & resolved & self._contains(self._at(o, d, start))
-        capped = within & ((start > 0) | (end < t_max))
+        starts_inside = enters & resolved & self._contains(self._at(o, d, start))
+        capped = starts_inside & ((start > 0) | (end < t_max))
         return capped | self.prepared.occluded(o, d, 0, t_max, active & ~capped)
 
     def _meet_levels(self, o: Vec3, d: Vec3, t_max: Real, active: Mask) -> SurfaceHit:

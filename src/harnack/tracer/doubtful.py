@@ -114,14 +114,14 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
     side = dr.select(x > 0, backend.Float(1), -1)
 
     def body(now: _SearchState) -> _SearchState:
-        way = dr.select(now.way < 2, hits.normal, dr.select(now.way < 4, across, second))
-        way = dr.select((now.way & 1) == 0, way, -way)
+        direction = dr.select(now.way < 2, hits.normal, dr.select(now.way < 4, across, second))
+        direction = dr.select((now.way & 1) == 0, direction, -direction)
         length = dr.select(now.searches, _turning_point(now), now.distance)
-        sample = field.evaluate(dr.fma(type(way)(length), way, hits.position))
+        sample = field.evaluate(dr.fma(type(direction)(length), direction, hits.position))
         x, error, is_sure = offset_of(sample)
         above, below = now.above | (is_sure & (x > 0)), now.below | (is_sure & (x < 0))
-        slope = side * dr.dot(sample.gradient, way)
-        first_slope = side * dr.dot(at_hit.gradient, way)
+        slope = side * dr.dot(sample.gradient, direction)
+        first_slope = side * dr.dot(at_hit.gradient, direction)
         is_seen = (above & below) | (now.searches & (dr.abs(x) <= error))
         # Does f turn back from the level in this direction?
         turns = now.may_turn & ~now.searches & (now.way < 2)

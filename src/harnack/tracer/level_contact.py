@@ -302,8 +302,8 @@ class Hysteresis:
         period = levels.period
         spacing: Real = dr.inf if period is None else period
         for k, level in enumerate(levels.values):
-            for other in levels.values[:k]:
-                gap = dr.abs(level - other)
+            for earlier in levels.values[:k]:
+                gap = dr.abs(level - earlier)
                 if period is not None:
                     gap = gap - period * dr.floor(gap / period)
                     gap = fmin(gap, period - gap)
@@ -343,10 +343,10 @@ class Hysteresis:
         In contact the level counts as lying the fraction `part` of the band beyond its place, and
         steps end within the same fraction of half the way to the next level.
         """
-        x, far = -self.levels.offset_to_nearest(value), part * _MAX_APPROACH * self.spacing
+        x, far_gap = -self.levels.offset_to_nearest(value), part * _MAX_APPROACH * self.spacing
         band = part * band
-        below = dr.select(contact.side < 0, far, band)
-        above = dr.select(contact.side > 0, far, band)
+        below = dr.select(contact.side < 0, far_gap, band)
+        above = dr.select(contact.side > 0, far_gap, band)
         return LevelGaps(
             dr.select(contact.is_touching, fmax(below + x, 0), gaps.below),
             dr.select(contact.is_touching, fmax(above - x, 0), gaps.above),
@@ -439,8 +439,8 @@ class Hysteresis:
         else:
             is_above = dr.select(dr.abs(x) > point.total_error, x > 0, point.slope < 0)
         # 0 stays only for a ray of which every sample so far was near a level.
-        known = (now.side != 0) | ~point.is_near
-        return dr.select(known, dr.select(is_above, type(x)(1), -1), 0)
+        is_known = (now.side != 0) | ~point.is_near
+        return dr.select(is_known, dr.select(is_above, type(x)(1), -1), 0)
 
 
 @dataclass(frozen=True)

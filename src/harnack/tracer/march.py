@@ -487,8 +487,8 @@ class March:
         proved = gaps.nearest <= self.tolerance.value
         for enclosure in ray_sample.forward:
             proved |= enclosure.arrives(gaps, reach)
-        along = down_or_up(sample.gradient, gaps, path.direction)
-        ways = (along, safe_norm(sample.gradient)), (path.direction, ray_sample.slope)
+        toward = down_or_up(sample.gradient, gaps, path.direction)
+        ways = (toward, safe_norm(sample.gradient)), (path.direction, ray_sample.slope)
         unsure = is_near & ~proved
         passed, evaluations = beyond(
             self.backend,

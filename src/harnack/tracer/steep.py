@@ -187,12 +187,12 @@ def passes(levels: Levels, value: Real, low: Real, high: Real, gaps: LevelGaps) 
 def holds(levels: Levels, value: Real, low: Real, high: Real, gaps: LevelGaps) -> Mask:
     """Whether a level lies in a range; see `passes`."""
     if levels.period is not None:
-        held = (low - value <= -gaps.below) & (high - value >= -gaps.below)
-        return held | ((low - value <= gaps.above) & (high - value >= gaps.above))
-    held: Mask = value < value
+        is_held = (low - value <= -gaps.below) & (high - value >= -gaps.below)
+        return is_held | ((low - value <= gaps.above) & (high - value >= gaps.above))
+    is_held: Mask = value < value
     for level in levels.values:
-        held |= (low <= level) & (high >= level)
-    return held
+        is_held |= (low <= level) & (high >= level)
+    return is_held
 
 
 def beyond(
@@ -269,11 +269,11 @@ def beyond(
         gap = dr.select(dr.isfinite(nearest), nearest, dr.inf)
         now = _narrowed(now, distance, gap, is_search & ~is_side)
         passed |= now.passed
-        looks, sides = now.looks + 1, now.sides + dr.select(is_side, 1, 0)
+        samples, sides = now.looks + 1, now.sides + dr.select(is_side, 1, 0)
         active = (
-            now.active & ~passed & ((looks < _TRIAL_COUNT) | (searches & (sides < _SIDE_COUNT)))
+            now.active & ~passed & ((samples < _TRIAL_COUNT) | (searches & (sides < _SIDE_COUNT)))
         )
-        return replace(now, looks=looks, sides=sides, passed=passed, active=active)
+        return replace(now, looks=samples, sides=sides, passed=passed, active=active)
 
     begin = _SearchState(
         backend.UInt32(0), backend.UInt32(0), backend.Bool(False), backend.Bool(active),
