@@ -178,9 +178,9 @@ class Extrusion(Solid):
             sample = self.evaluate(p)
             min_norm = self._least_slope(sample)
             speed = _on(self, p)._speed(p, d, fmin(ahead, 2 * dr.abs(sample.value)))
-            look = path.enclose(replace(sample, ray_promises=(speed,)))
+            ray_sample = path.enclose(replace(sample, ray_promises=(speed,)))
             # The speed has no bound looking back.
-            return replace(look, backward=(), min_gradient_norm=min_norm)
+            return replace(ray_sample, backward=(), min_gradient_norm=min_norm)
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return path.enclose(self.evaluate(p))
         solid = _on(self, p)

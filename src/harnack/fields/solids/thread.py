@@ -157,16 +157,17 @@ class Thread(Solid):
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         del ahead, back
         p, d = path.point(t), path.direction
-        look = path.enclose(self.evaluate(p))
+        ray_sample = path.enclose(self.evaluate(p))
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
-            return look
+            return ray_sample
         numbers = cast("Any", self)
         cylinder = OutsideCylinderEnclosure(
-            look.sample.value, look.sample.value_error, dr.sqrt(dr.fma(p.x, p.x, p.y * p.y)),
+            ray_sample.sample.value, ray_sample.sample.value_error,
+            dr.sqrt(dr.fma(p.x, p.x, p.y * p.y)),
             dr.fma(p.x, d.x, p.y * d.y), dr.fma(d.x, d.x, d.y * d.y), 0 * p.x + numbers._most,
             0 * p.x + self.lipschitz,
         )  # fmt: skip
-        return replace(look, forward=(*look.forward, cylinder))
+        return replace(ray_sample, forward=(*ray_sample.forward, cylinder))
 
     def _height(self, z: Real) -> Real:
         """The polyline's r at z."""

@@ -77,21 +77,21 @@ class Tube(Solid):
         points = np.array(array, dtype=np.float64)
         check_finite(points, "point {} of a tube", ValueError)
         check_coordinate_size(points, ValueError)
-        parts: list[FloatArray] = []
+        pieces: list[FloatArray] = []
         if not isinstance(cast("Any", self.starts), tuple | list | np.ndarray):
             raise TypeError(f"starts must be indices of vertices, not {self.starts!r:.60}")
         starts = [as_integer_in_range(start, "each start", 0, len(points)) for start in self.starts]
         if not 0 <= as_real(self.flattening_error, "flattening_error") < math.inf:
             raise ValueError(f"flattening_error must be a length, not {self.flattening_error!r}")
-        for part in np.split(points, starts):
-            if len(part):
-                moves = np.any(part[1:] != part[:-1], axis=1)
-                part = part[np.concatenate([[True], moves])]
-            if len(part) < 2:
+        for piece in np.split(points, starts):
+            if len(piece):
+                moves = np.any(piece[1:] != piece[:-1], axis=1)
+                piece = piece[np.concatenate([[True], moves])]
+            if len(piece) < 2:
                 raise ValueError("a tube needs two points or more that differ: use Sphere for one")
-            parts.append(part)
-        points = np.concatenate(parts)
-        ends = np.cumsum([len(part) for part in parts])[:-1]
+            pieces.append(piece)
+        points = np.concatenate(pieces)
+        ends = np.cumsum([len(piece) for piece in pieces])[:-1]
         object.__setattr__(self, "starts", tuple(int(end) for end in ends))
         points.setflags(write=False)
         object.__setattr__(self, "points", points)
@@ -252,19 +252,19 @@ class Tube(Solid):
             nearest, x, y, z, size, *bounds = state
             from_start, side = p - vector(*row[:3]), vector(*row[3:6])
             t = clamp(dr.dot(from_start, side) * row[6], 0, 1)
-            away = dr.fma(side, -t, from_start)
-            distance = dr.norm(away)
+            offset = dr.fma(side, -t, from_start)
+            distance = dr.norm(offset)
             # The error of the vector is a few roundings of its terms.
             rounding = 8 * epsilon * (dr.norm(from_start) + dr.norm(side))
             if direction is not None:
-                slope = dr.dot(away, direction) / distance - rounding / distance * 2
+                slope = dr.dot(offset, direction) / distance - rounding / distance * 2
                 bounds = min_with_tangent(
                     bounds, knots, distance - rounding, slope, 4 * epsilon * distance, epsilon
                 )
             is_nearer = distance < nearest
             return (
                 dr.select(is_nearer, distance, nearest),
-                *(dr.select(is_nearer, a, b) for a, b in zip(away, (x, y, z), strict=True)),
+                *(dr.select(is_nearer, a, b) for a, b in zip(offset, (x, y, z), strict=True)),
                 fmax(rounding, size),
                 *bounds,
             )
@@ -277,8 +277,8 @@ class Tube(Solid):
         else:
             final = _visit_by_groups(p, direction, knots, records, groups, body, start)
         distance, error = final[0], final[4]
-        away = vector(*final[1:4])
-        gradient = dr.select(distance > 0, away / distance, vector(0))
+        offset = vector(*final[1:4])
+        gradient = dr.select(distance > 0, offset / distance, vector(0))
         value = distance - self._parameter("_radius")
         error = error + 4 * epsilon * (distance + self._parameter("_radius"))
         gradient_error = dr.select(distance > 0, fmin(4 * error / distance, 2), 2)
@@ -328,13 +328,13 @@ def _visit_by_groups(
 
     def visit(i: Any, *state: Any) -> tuple[Any, ...]:
         ball = groups.read_record(i)
-        away = p - vector(*ball[:3])
-        distance = dr.norm(away)
+        offset = p - vector(*ball[:3])
+        distance = dr.norm(offset)
         is_near = distance - ball[3] <= limit
         updated = list(state)
         if direction is not None:
             rounding = 8 * epsilon * (dr.norm(p) + distance + ball[3])
-            slope = dr.dot(away, direction) / distance - 2 * rounding / distance
+            slope = dr.dot(offset, direction) / distance - 2 * rounding / distance
             start = dr.select(is_near, dr.inf, distance - ball[3] - rounding)
             updated[5:] = min_with_tangent(
                 updated[5:], knots, start, slope, 4 * epsilon * distance, epsilon
@@ -420,8 +420,8 @@ class TangentEnclosure(Enclosure):
         is_free = gaps.below >= 0  # and not NaN
         for knot, next_bound in zip(self.knots, self.lower_bounds, strict=True):
             is_clear = next_bound >= -gaps.below
-            part = fmax((gaps.below + bound) / (bound - next_bound) * (knot - start), 0)
-            length = dr.select(is_clear, knot, fmin(start + part, knot))
+            clear_length = fmax((gaps.below + bound) / (bound - next_bound) * (knot - start), 0)
+            length = dr.select(is_clear, knot, fmin(start + clear_length, knot))
             total = dr.select(is_free, length, total)
             is_free &= is_clear
             start, bound = knot, next_bound
