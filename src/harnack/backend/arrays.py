@@ -327,8 +327,8 @@ def _check_same_backend(backend: Backend, array: Any, name: str) -> None:
 def _check_rows(is_bad: Any, kind: str, name: str) -> None:
     indices = np.flatnonzero(is_bad)
     if indices.size:
-        others = f" and {indices.size - 1} more" if indices.size > 1 else ""
-        raise ValueError(f"{name} has {kind} values: entry {indices[0]}{others}")
+        rest = f" and {indices.size - 1} more" if indices.size > 1 else ""
+        raise ValueError(f"{name} has {kind} values: entry {indices[0]}{rest}")
 
 
 def _cast(backend: Backend, values: npt.NDArray[Any], name: str) -> npt.NDArray[Any]:

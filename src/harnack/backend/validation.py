@@ -28,7 +28,7 @@ TRANSPOSE_ADVICE = "; transpose it"
 """Advice of `check_vectors` where an array (3, n) surely holds n vectors."""
 
 # Number of entries of a list, and of letters of a value, that `format_short` writes.
-_MOST_SHOWN, _MAX_TEXT_LENGTH = 4, 60
+_MAX_SHOWN, _MAX_TEXT_LENGTH = 4, 60
 
 MAX_COORDINATE = 1e100
 """Coordinates beyond this are refused: their squares would overflow soon."""
@@ -230,7 +230,7 @@ def format_short(value: Any) -> str:
         return f"<array {' x '.join(map(str, shape))}>"
     if isinstance(value, tuple | list):
         entries = cast("Sequence[Any]", value)
-        if len(entries) > _MOST_SHOWN:
+        if len(entries) > _MAX_SHOWN:
             return f"<{len(entries)} entries>"
         comma = "," if len(entries) == 1 else ""
         return f"({', '.join(map(format_short, entries))}{comma})"

@@ -33,20 +33,25 @@ def accepts_dask_arrays(*names: str) -> Callable[[Function], Function]:
     def decorate(function: Function) -> Function:
         signature = inspect.signature(function)
         variadic = next(
-            (name for name, one in signature.parameters.items() if one.kind is one.VAR_KEYWORD), ""
+            (
+                name
+                for name, parameter in signature.parameters.items()
+                if parameter.kind is parameter.VAR_KEYWORD
+            ),
+            "",
         )
 
         @functools.wraps(function)
-        def general(*args: Any, **kwargs: Any) -> Any:
+        def wrapper(*args: Any, **kwargs: Any) -> Any:
             if not any(map(is_dask_array, (*args, *kwargs.values()))):
                 return function(*args, **kwargs)
             arguments = signature.bind(*args, **kwargs).arguments
             # Methods take the place of `self` by position, and the rest by name.
-            rest = arguments.pop(next(iter(signature.parameters)))
+            first = arguments.pop(next(iter(signature.parameters)))
             named = {**arguments.pop(variadic, {}), **arguments}
-            return _map_blocks(functools.partial(general, rest), names, named)
+            return _map_blocks(functools.partial(wrapper, first), names, named)
 
-        return cast("Function", general)
+        return cast("Function", wrapper)
 
     return decorate
 
@@ -92,7 +97,7 @@ def _map_blocks(call: Callable[..., Any], names: tuple[str, ...], arguments: dic
 
 
 def _align_blocks(
-    dask_array: Any, lazy: dict[str, Any], others: Mapping[str, Any]
+    dask_array: Any, lazy: dict[str, Any], arguments: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Dask arrays, and other arrays with an entry for each of their rows, cut into the same blocks
     of rows.
@@ -110,7 +115,7 @@ def _align_blocks(
         )
     count = reference.shape[0]
     aligned = dict(lazy)
-    for name, array in others.items():
+    for name, array in arguments.items():
         shape = np.shape(array)
         if name not in lazy and shape not in ((), (3,)) and shape[0] == count:
             aligned[name] = dask_array.from_array(np.asarray(array), chunks=-1)

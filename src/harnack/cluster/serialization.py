@@ -172,13 +172,15 @@ def content_hash(value: Any, label: str) -> str:
     return _hash_and_files(value, label)[0]
 
 
-def _hash_and_files(value: Any, label: str, words: frozenset[str] = frozenset()) -> tuple[str, Any]:
+def _hash_and_files(
+    value: Any, purpose: str, words: frozenset[str] = frozenset()
+) -> tuple[str, Any]:
     """The content hash of an object, and the pickler that wrote it, which has noted files and
     packages."""
     try:
-        pickler = _written(_hashing_pickler, value, label, words, fast=True)
+        pickler = _written(_hashing_pickler, value, purpose, words, fast=True)
     except (RecursionError, TypeError, ValueError):  # an object that holds itself
-        pickler = _written(_hashing_pickler, value, label, words)
+        pickler = _written(_hashing_pickler, value, purpose, words)
     data = (
         f"{package_versions()} {sorted(pickler.packages.items())}".encode()
         + pickler.file.getvalue()
@@ -187,8 +189,8 @@ def _hash_and_files(value: Any, label: str, words: frozenset[str] = frozenset())
 
 
 def _written(
-    make_class: Callable[[Any], Any], value: Any, label: str, words: frozenset[str] = frozenset(),
-    *, fast: bool = False,
+    make_class: Callable[[Any], Any], value: Any, purpose: str,
+    words: frozenset[str] = frozenset(), *, fast: bool = False,
 ) -> Any:  # fmt: skip
     """A pickler of the class that `make_class` returns, after it has written an object into its
     `file`.
@@ -196,16 +198,16 @@ def _written(
     Which attributes of modules are needed is known only when all code was written. So the object is
     written again until no name is missing; this ends, since the code has finitely many names.
     """
-    cloudpickle = import_optional("cloudpickle", label)
+    cloudpickle = import_optional("cloudpickle", purpose)
     while True:
-        pickler = make_class(cloudpickle.Pickler)(label, words)
+        pickler = make_class(cloudpickle.Pickler)(purpose, words)
         pickler.fast = fast
         try:
             pickler.dump(value)
         except (pickle.PicklingError, TypeError, AttributeError) as error:
             raise TypeError(
-                f"{label}: it cannot be sent to another process or written down ({error}); make it "
-                "of arrays, numbers and the classes of this library"
+                f"{purpose}: it cannot be sent to another process or written down ({error}); make "
+                "it of arrays, numbers and the classes of this library"
             ) from error
         words = frozenset(pickler.words)
         if all(len(attributes_named(*module)) == len(attributes_named(module[0], words))
@@ -283,9 +285,9 @@ def _cacheless_pickler(base: Any) -> Callable[..., Any]:
                 return _cached_property, (obj.func, obj.attrname)
             reduce = functools.partial(base.reducer_override, self)
             if isinstance(obj, TypeVar):
-                return _without_number(_by_value(obj, base.dispatch_table[TypeVar]))
+                return _without_class_id(_by_value(obj, base.dispatch_table[TypeVar]))
             if isinstance(obj, type):
-                return _without_number(_by_value(obj, reduce))
+                return _without_class_id(_by_value(obj, reduce))
             if isinstance(obj, FunctionType):
                 return self.of_function(obj, _by_value(obj, reduce))
             obj_type: type = obj.__class__
@@ -322,7 +324,7 @@ def _cacheless_pickler(base: Any) -> Callable[..., Any]:
     return Lean
 
 
-def _without_number(reduced: Any) -> Any:
+def _without_class_id(reduced: Any) -> Any:
     """The recipe of a class without the id by which cloudpickle finds a class that it made before:
     it would replace the methods of that class."""
     if not isinstance(reduced, tuple):

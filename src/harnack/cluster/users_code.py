@@ -32,9 +32,9 @@ _FINDERS = frozenset(("vars", "dir", "__dict__", "getmembers"))
 # Functions that find modules whose names are not in an import statement.
 _IMPORTERS = frozenset(("import_module", "__import__"))
 # Attributes that a function may use of its module without naming it.
-_OF_EACH = ("__package__", "__name__", "__path__", "__file__")
+_MODULE_ATTRIBUTES = ("__package__", "__name__", "__path__", "__file__")
 # Attributes that belong to the process that imported a module.
-_OF_IMPORT = frozenset(("__builtins__", "__spec__", "__loader__", "__cached__"))
+_IMPORT_ATTRIBUTES = frozenset(("__builtins__", "__spec__", "__loader__", "__cached__"))
 # The attribute of a sent module that lists the names of the attributes that were not sent.
 _LEFT_OUT = "__left_out__"
 
@@ -66,7 +66,7 @@ class Namespace:
     @classmethod
     def of(cls, names: Mapping[str, Any]) -> Namespace:
         """The namespace of a module, from its attributes by name."""
-        return cls({key: names[key] for key in _OF_EACH if key in names})
+        return cls({key: names[key] for key in _MODULE_ATTRIBUTES if key in names})
 
     def __reduce__(self) -> Any:
         return sent_module, (self.attributes,)
@@ -87,7 +87,7 @@ def itself(module: SentModule) -> SentModule:
 def fill(module: SentModule, contents: tuple[Mapping[str, Any], frozenset[str]]) -> None:
     """Give a module its attributes, and the names of the attributes that are left out."""
     attributes, left_out = contents
-    vars(module).update(attributes, **{_LEFT_OUT: left_out - _OF_IMPORT})
+    vars(module).update(attributes, **{_LEFT_OUT: left_out - _IMPORT_ATTRIBUTES})
 
 
 def function_in(module: SentModule, code: CodeType, closure: Any) -> FunctionType:
@@ -101,7 +101,7 @@ def attributes_named(module: ModuleType, words: frozenset[str] | set[str]) -> di
     return {
         name: value
         for name, value in sorted(vars(module).items())
-        if (uses_all or name in words or name == "__getattr__") and name not in _OF_IMPORT
+        if (uses_all or name in words or name == "__getattr__") and name not in _IMPORT_ATTRIBUTES
     }
 
 
@@ -146,7 +146,7 @@ def refuse_imports_within(function: FunctionType) -> None:
                 text for text in _texts(code.co_consts) if text.replace(".", "_").isidentifier()
             ]
         for name in names:
-            if _is_a_users_root(name.partition(".")[0]):
+            if _is_users_root(name.partition(".")[0]):
                 raise TypeError(
                     f"{function.__qualname__} of the module {function.__module__} imports your "
                     f"module {name} when it is called, and which that is then cannot be told; "
@@ -173,7 +173,7 @@ def _imported(statement: tuple[int, str], package: str) -> str:
     return name
 
 
-def _is_a_users_root(root: str) -> bool:
+def _is_users_root(root: str) -> bool:
     module = sys.modules.get(root)
     if module is not None:
         return is_users(module)
@@ -183,7 +183,7 @@ def _is_a_users_root(root: str) -> bool:
     if spec is None or spec.origin in ("built-in", "frozen"):
         return False
     location = spec.origin or next(iter(spec.submodule_search_locations or ()), None)
-    return location is not None and _is_users_place(root, location)
+    return location is not None and _is_users_path(root, location)
 
 
 def is_users(module: ModuleType) -> bool:
@@ -192,17 +192,17 @@ def is_users(module: ModuleType) -> bool:
     root = name.partition(".")[0]
     if name == "__main__" or sys.modules.get(name) is not module:
         return True
-    location = _place(module)
+    location = _module_path(module)
     if location is None and root != name and (top := sys.modules.get(root)) is not None:
         return is_users(top)
     if location is None:  # one that is built in has a specification
         return getattr(module, "__spec__", None) is None
-    return _is_users_place(root, location)
+    return _is_users_path(root, location)
 
 
 def is_sent_itself(module: ModuleType) -> bool:
     """Whether a module is a user's and not a compiled one."""
-    location = _place(module)
+    location = _module_path(module)
     return is_users(module) and (
         location is None or location.endswith(_SOURCES) or not Path(location).suffix
     )
@@ -210,11 +210,11 @@ def is_sent_itself(module: ModuleType) -> bool:
 
 def compiled_file(module: ModuleType) -> str | None:
     """The file of a compiled module of a user; None for another module."""
-    path = _place(module)
+    path = _module_path(module)
     return path if path is not None and is_users(module) and not is_sent_itself(module) else None
 
 
-def _place(module: ModuleType) -> str | None:
+def _module_path(module: ModuleType) -> str | None:
     """The file or, of a package without one, the folder of a module."""
     attributes = vars(module)
     location = attributes.get("__file__") or next(iter(attributes.get("__path__", ())), None)
@@ -222,7 +222,7 @@ def _place(module: ModuleType) -> str | None:
 
 
 @functools.cache
-def _is_users_place(root: str, location: str) -> bool:
+def _is_users_path(root: str, location: str) -> bool:
     if root == "harnack":
         return False
     path = Path(location).resolve()
@@ -239,7 +239,7 @@ def _is_users_place(root: str, location: str) -> bool:
 def installed_version(root: str) -> str | None:
     """The version of the installed package that has a module; None for a part of Python, a user's
     module, and one that is in no package."""
-    if root in sys.stdlib_module_names or root in ("__main__", "harnack") or _is_a_users_root(root):
+    if root in sys.stdlib_module_names or root in ("__main__", "harnack") or _is_users_root(root):
         return None
     with suppress(importlib.metadata.PackageNotFoundError, ValueError):
         return importlib.metadata.version(root)

@@ -93,7 +93,7 @@ def _compute_tasks(client: Any, tasks: list[Any]) -> Iterator[None]:
             future.result()
             yield
     finally:
-        client.cancel([one for one in futures if one.status == "pending"])
+        client.cancel([running for running in futures if running.status == "pending"])
 
 
 def _open_or_create(zarr: Any, array: Any, target: Path) -> Any:

@@ -36,15 +36,15 @@ __all__ = ["CellClassifier", "ClipCurveDescent", "taylor_remainder"]
 _ROUNDS, _MAX_CURVE_CORRECTIONS = 80, 8
 # In epsilons, of coordinates: the depth inside the domain at which points of the clip curve are
 # put, the error of that depth, and their distance from the level.
-_DOMAIN_INSET, _MISS, _NEAR = 64.0, 48.0, 256.0
+_DOMAIN_INSET, _INSET_ERROR, _LEVEL_DISTANCE = 64.0, 48.0, 256.0
 # Fraction of the distance to another face at which steps end.
 _BEFORE = 0.999
 # States of a search at a corner of the domain: it turns into the other face, or has turned.
 _TURNING, _TURNED = 1, 2
-_LEAST_SHARE = 1e-9  # of a step: shorter steps are given up
-_LEAST_SLOPE = 0.05  # of (x - y) . t along the curve: steps are at most 20 times that product
-_SAME = 1e-6  # cosines of angles between normals of one face differ from one by less
-_LEAST_STEP = 1e-8  # of the distance: the relative error that remains is half its square
+_MIN_STEP_FRACTION = 1e-9  # of a step: shorter steps are given up
+_MIN_SLOPE = 0.05  # of (x - y) . t along the curve: steps are at most 20 times that product
+_SAME_NORMAL = 1e-6  # cosines of angles between normals of one face differ from one by less
+_MIN_STEP = 1e-8  # of the distance: the relative error that remains is half its square
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class ClipCurveDescent:
             trial = self._at(y)
             distance = safe_norm(x - y)
             reached = dr.isfinite(nearest)
-            new_face = dr.dot(trial.normal, normal) < 1 - _SAME
+            new_face = dr.dot(trial.normal, normal) < 1 - _SAME_NORMAL
             gap = fmax(wall_height - dr.dot(wall, best), 0)
             turns = (
                 (corner == _TURNING) & new_face & (distance < nearest + 8 * gap + 100 * trial.near)
@@ -96,7 +96,7 @@ class ClipCurveDescent:
             failed = ~accepted & ~corrects
             # On the curve, and nearer: the next step.
             slope = 1 - dr.dot(x - y, trial.second_derivative)
-            step = dr.dot(x - y, trial.tangent) / fmax(dr.abs(slope), _LEAST_SLOPE)
+            step = dr.dot(x - y, trial.tangent) / fmax(dr.abs(slope), _MIN_SLOPE)
             w = dr.select(accepted, clamp(step, -distance, distance), w)
             best, nearest = dr.select(accepted, y, best), dr.select(accepted, distance, nearest)
             tangent = dr.select(accepted, trial.tangent, tangent)
@@ -115,13 +115,15 @@ class ClipCurveDescent:
             is_limited = ~(is_free & ~crosses) & (limit < dr.abs(s))
             s = dr.select(is_limited, clamp(s, -limit, limit), s)
             target = dr.fma(vector(s), tangent, best) + vector(0.5 * s * s) * ddy
-            min_step = dr.select(is_limited, 0, _LEAST_STEP * nearest)
+            min_step = dr.select(is_limited, 0, _MIN_STEP * nearest)
             is_short = dr.abs(s) <= fmax(min_step, trial.near)
             corner = dr.select((corner == _TURNING) & ~corrects, _TURNED, corner)
             at_wall = is_short & is_limited & ~corrects & (corner == 0)
             corner = dr.select(at_wall, _TURNING, corner)
             target = dr.select(at_wall, dr.fma(vector(gap + 8 * trial.near), wall, best), target)
-            active &= (corrects | accepted | reached) & (factor > _LEAST_SHARE) & (k + 1 < _ROUNDS)
+            active &= (
+                (corrects | accepted | reached) & (factor > _MIN_STEP_FRACTION) & (k + 1 < _ROUNDS)
+            )
             active &= corrects | at_wall | ~is_short
             y, tries = (
                 dr.select(corrects, y + trial.correction, target),
@@ -154,7 +156,7 @@ class ClipCurveDescent:
         )
         offset = self.levels.offset_to_nearest(sample.value) / slope
         radius = dr.fma(
-            _NEAR * self.backend.machine_epsilon, size, real(sample.value_error) / slope
+            _LEVEL_DISTANCE * self.backend.machine_epsilon, size, real(sample.value_error) / slope
         )
         cosine = dr.dot(n, u)
         sine = 1 - cosine * cosine
@@ -172,7 +174,7 @@ class ClipCurveDescent:
         # Beside an edge of the domain the normal is another one ahead: no curvature.
         dn = dr.select(dr.abs(dn) * h < 1e-3, dn, 0)
         is_on = (dr.abs(offset) <= radius) & (
-            dr.abs(depth) <= _MISS * self.backend.machine_epsilon * size
+            dr.abs(depth) <= _INSET_ERROR * self.backend.machine_epsilon * size
         )
         return _ClipCurveState(
             is_on, radius, solution(offset, depth), t, solution(-du, -dn), n, depth
@@ -203,7 +205,7 @@ class _ClipCurveState:
 
 _STEPS = 6
 # More steps where Newton's steps shrink at a rate between these, as to a multiple root.
-_MORE_STEPS, _SHRINKS = 14, (0.4, 0.97)
+_MULTIPLE_ROOT_STEPS, _SHRINK_RATES = 14, (0.4, 0.97)
 # The radius of the ball around a cube of half size 1.
 _CUBE_CIRCUMRADIUS = 3**0.5 * (1 + 1e-9)
 # A surface point of a cell is on the level up to this fraction of the cell.
@@ -227,7 +229,7 @@ def multiplicity(step: Real, last: Real) -> Real:
     steps: at a root like that of u^m steps shrink by the factor 1 - 1/m, and a step m times as long
     as Newton's leads to the root. It is 1 where steps shrink faster, or hardly."""
     ratio = dr.abs(step) / last
-    is_slow = (ratio > _SHRINKS[0]) & (ratio < _SHRINKS[1])
+    is_slow = (ratio > _SHRINK_RATES[0]) & (ratio < _SHRINK_RATES[1])
     return dr.select(is_slow, 1 / (1 - ratio), 1)
 
 
@@ -282,7 +284,7 @@ class CellClassifier:
         radius, start = _CUBE_CIRCUMRADIUS * cells.half, cells.center
         distance = np.full(len(cells), np.inf)
         if self._volume is not None:
-            distance, start = self._at(self._pulled_inside, cells.center)
+            distance, start = self._at(self._moved_into_domain, cells.center)
         surface_point, normal, spread, curvature = self._at(
             self._surface_point_and_plane, start, radius, cells.normal
         )
@@ -319,7 +321,7 @@ class CellClassifier:
     def _distance_outside(self, p: Vec3) -> tuple[Real]:
         return (self._volume.signed_distance(p),)
 
-    def _pulled_inside(self, p: Vec3) -> tuple[Real, Vec3]:
+    def _moved_into_domain(self, p: Vec3) -> tuple[Real, Vec3]:
         """A lower bound of the signed distance of p from the domain; and p, or a point of the
         boundary near p if p is outside."""
         assert self._volume is not None
@@ -397,17 +399,17 @@ class CellClassifier:
             factor = dr.select(k >= _STEPS - 1, multiplicity(newton_step, last), 1)
             step = clamp(factor * newton_step, -radius, radius)
             valid = dr.isfinite(step) & (dr.norm(y - p) < 4 * radius)
-            shrinks = (k < _STEPS - 1) | (dr.abs(newton_step) < _SHRINKS[1] * last)
+            shrinks = (k < _STEPS - 1) | (dr.abs(newton_step) < _SHRINK_RATES[1] * last)
             # On a surface along which the gradient is 0 the last step was the last one.
             is_flat = (off_level == 0) & (slope == 0)
             last = dr.select(valid, dr.abs(newton_step), dr.select(is_flat, 0, dr.inf))
             y = dr.select(valid, dr.fma(vector(step / slope), sample.gradient + zero, y), y)
             valid &= shrinks & (last > 1e-9 * radius)
-            return y, last, dr.select(valid, k + 1, _MORE_STEPS)
+            return y, last, dr.select(valid, k + 1, _MULTIPLE_ROOT_STEPS)
 
         def is_active(y: Vec3, last: Real, k: Any) -> Mask:
             del y, last
-            return k < _MORE_STEPS
+            return k < _MULTIPLE_ROOT_STEPS
 
         start = (vector(p), real(dr.inf), count(0))
         y, last, _ = dr.while_loop(start, is_active, body, label="feet of cells")

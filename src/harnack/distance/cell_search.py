@@ -24,10 +24,15 @@ __all__ = ["DescentMethods", "InitialGuess", "SearchResult", "StoppingRule", "se
 
 # The number of cells before points are looked up in them: per point; at least; and for fields with
 # jump surfaces, which are searched in turn as well.
-_CELLS_PER_POINT, _EACH_TO_PROVE, _MIN_CELLS, _FEWEST_ON_SHEETS = 0.16, 0.25, 10_000, 1500
+_CELLS_PER_POINT, _PROOF_CELLS_PER_POINT, _MIN_CELLS, _MIN_JUMP_CELLS = 0.16, 0.25, 10_000, 1500
 # The largest number of cells, and the fraction of it where evaluations are as expensive as sums of
 # many terms.
-_MAX_CELLS, _MOST_TO_PROVE, _MOST_ON_SHEETS, _EXPENSIVE_FIELD_FACTOR = 60_000, 150_000, 20_000, 0.25
+_MAX_CELLS, _MAX_PROOF_CELLS, _MAX_JUMP_CELLS, _EXPENSIVE_FIELD_FACTOR = (
+    60_000,
+    150_000,
+    20_000,
+    0.25,
+)
 _MAX_SUBDIVISIONS = 40
 # The smallest number of cells in which the search for a point begins.
 _COARSE = 300
@@ -183,10 +188,10 @@ def _search_in_batches(
     """The nearest points in a cube, for a batch of the points at a time."""
     proofs = CellClassifier(surface)
     max_cells = _max_cells(surface, len(points), tolerance.prove)
-    cells_per_point = _EACH_TO_PROVE if tolerance.prove else _CELLS_PER_POINT
+    cells_per_point = _PROOF_CELLS_PER_POINT if tolerance.prove else _CELLS_PER_POINT
     min_cells = min(max(_MIN_CELLS, int(cells_per_point * len(points))), _MAX_CELLS, max_cells)
     if surface.field.has_jumps:
-        min_cells = _FEWEST_ON_SHEETS
+        min_cells = _MIN_JUMP_CELLS
     coarse, cells = _split(proofs, root, min_cells, progress)
     backend, trees = choose_backend("double"), None
     if len(cells):
@@ -214,8 +219,8 @@ def _search_in_batches(
 def _max_cells(surface: TracedSurface, count: int, is_proved: bool) -> int:
     """The largest number of cells."""
     if surface.field.has_jumps:
-        return _MOST_ON_SHEETS
-    limit = min(max(_MAX_CELLS, count // 2), _MOST_TO_PROVE) if is_proved else _MAX_CELLS
+        return _MAX_JUMP_CELLS
+    limit = min(max(_MAX_CELLS, count // 2), _MAX_PROOF_CELLS) if is_proved else _MAX_CELLS
     return int(limit * (_EXPENSIVE_FIELD_FACTOR if surface.field.has_variable_accuracy else 1.0))
 
 

@@ -28,13 +28,13 @@ if TYPE_CHECKING:
 __all__ = ["ClosestPointDescent"]
 
 _STEPS_DIRECT = 10
-_NEAR = 1e-11  # of the distance: the last step is expected to be shorter
+_LAST_STEP = 1e-11  # of the distance: the last step is expected to be shorter
 _STEPS_TO_LEVEL = 60
 _STEPS_ALONG = 60
 # Newton's method to a simple root takes fewer steps than this.
 _PATIENT = 16
 _MIN_STEP_FRACTION = 1e-7  # of a step: shorter steps are given up
-_LEAST_EIGENVALUE = (
+_MIN_EIGENVALUE = (
     0.05  # of B (`ClosestPointDescent.descend`): steps are no longer than 20 gradients
 )
 _INDEFINITE = -1e-3
@@ -115,7 +115,7 @@ class ClosestPointDescent:
         ) -> tuple[Any, ...]:
             # The rounding error of f takes as long as f itself, and is of no matter here.
             sample = dataclasses.replace(self.field.evaluate(y), value_error=0.0)
-            residual, at_y = self._place(y, sample)
+            residual, at_y = self._descent_state_at(y, sample)
             move, _ = self._step_along(x, at_y, real(1))
             step = -residual / lengths.safe_norm(at_y.gradient)
             first_step = dr.select(k == 0, dr.abs(step), first_step)
@@ -127,7 +127,7 @@ class ClosestPointDescent:
             is_far = dr.select(active, shrinks & (distance - 2 * length > limit), is_far)
             ahead = length * dr.square(length / last)
             is_near = (
-                shrinks & ~is_lost & (ahead <= dr.fma(_NEAR, distance, at_y.level_uncertainty))
+                shrinks & ~is_lost & (ahead <= dr.fma(_LAST_STEP, distance, at_y.level_uncertainty))
             )
             active &= ~is_far & dr.isfinite(length)
             y = dr.select(active, y + dr.select(is_lost, max_length / length, 1) * move, y)
@@ -153,7 +153,7 @@ class ClosestPointDescent:
         be in any case.
         """
         sample = self.field.evaluate(y)
-        residual, at_y = self._place(y, sample)
+        residual, at_y = self._descent_state_at(y, sample)
         rows = self.field.hessian(y) if self.has_hessian else None
         _, is_minimum = self._step_along(x, at_y, self.backend.Float(1), rows)
         slope = lengths.safe_norm(at_y.gradient)
@@ -250,9 +250,9 @@ class ClosestPointDescent:
 
     def _evaluate(self, y: Vec3) -> tuple[Real, _DescentState]:
         """f - level at y, and the state at y."""
-        return self._place(y, self.field.evaluate(y))
+        return self._descent_state_at(y, self.field.evaluate(y))
 
-    def _place(self, y: Vec3, sample: Sample) -> tuple[Real, _DescentState]:
+    def _descent_state_at(self, y: Vec3, sample: Sample) -> tuple[Real, _DescentState]:
         real = self.backend.Float
         size = lengths.max_norm(y)
         epsilon, gradient_norm = self.backend.machine_epsilon, lengths.safe_norm(sample.gradient)
@@ -357,8 +357,8 @@ class ClosestPointDescent:
         )
         is_saddle = is_normal & (eigen.smallest < _INDEFINITE)
         first, second = eigen.coordinates(tu, tv)
-        first = first / fmax(dr.abs(eigen.largest), _LEAST_EIGENVALUE)
-        second = second / fmax(dr.abs(eigen.smallest), _LEAST_EIGENVALUE)
+        first = first / fmax(dr.abs(eigen.largest), _MIN_EIGENVALUE)
+        second = second / fmax(dr.abs(eigen.smallest), _MIN_EIGENVALUE)
         second = dr.select(is_saddle, 0.5 * distance, second)
         length = dr.sqrt(dr.fma(first, first, second * second))
         limit = factor * dr.select(is_saddle, length, fmin(at_y.smooth_radius, distance))

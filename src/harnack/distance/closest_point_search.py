@@ -107,10 +107,10 @@ def find_closest(
     """
     x = as_finite_vectors(points, "points")
     order = to_numpy(morton_order(backend, upload_vectors(backend, x), _MORTON_BITS))
-    found = _find_sorted(backend, surface, levels, x[order], progress, is_proved)
-    back = np.empty_like(order)
-    back[order] = np.arange(len(order), dtype=order.dtype)
-    return ClosestPoints(*(part[back] for part in vars(found).values()))
+    result = _find_sorted(backend, surface, levels, x[order], progress, is_proved)
+    inverse = np.empty_like(order)
+    inverse[order] = np.arange(len(order), dtype=order.dtype)
+    return ClosestPoints(*(array[inverse] for array in vars(result).values()))
 
 
 def _find_sorted(
@@ -121,30 +121,30 @@ def _find_sorted(
     if mesh is not None and mesh.is_complete:
         return _closest_on_mesh(backend, surface, levels, mesh, points)
     job = _QueryEvaluator(backend, surface, levels)
-    x, start, above, lower, near = job.evaluate(points)
+    x, guess, above, lower, near = job.evaluate(points)
     if mesh is not None:
-        start = _with_mesh_points(x, start, mesh)
+        guess = _with_mesh_points(x, guess, mesh)
     if surface.field.has_jumps:
-        start = job.with_jump_points(x, start)
+        guess = job.with_jump_points(x, guess)
     tolerance = StoppingRule(_TOLERANCE * _size(surface, x), is_proved)
-    many = surface.field.for_ray_count(_SAMPLES_PER_POINT * len(x))
-    smooth = many.without_jumps() if surface.clip_volume is None else None
+    field = surface.field.for_ray_count(_SAMPLES_PER_POINT * len(x))
+    smooth = field.without_jumps() if surface.clip_volume is None else None
     if smooth is None:
-        found = search(surface, x, InitialGuess(start, near), job, tolerance, progress)
+        result = search(surface, x, InitialGuess(guess, near), job, tolerance, progress)
     else:
-        found = _search_smooth_part(job, smooth, x, InitialGuess(start, near), tolerance, progress)
-    found.closest = _with_singular_points(surface, x, job.remove_truncation(x, found.closest))
-    distance = _length(x - found.closest)
-    # A foot nearer than the proof allows: either it is off the surface by rounding, or a promise of
-    # the field does not hold.
-    short = distance < lower
+        result = _search_smooth_part(job, smooth, x, InitialGuess(guess, near), tolerance, progress)
+    result.closest = _with_singular_points(surface, x, job.remove_truncation(x, result.closest))
+    distance = _length(x - result.closest)
+    # If a foot is nearer than the proof allows, then either it is off the surface by rounding, or a
+    # promise of the field does not hold.
+    is_short = distance < lower
     slack = np.zeros(len(x))
-    slack[short] = 4 * job.level_uncertainty(found.closest[short])
+    slack[is_short] = 4 * job.level_uncertainty(result.closest[is_short])
     slack += _ROUNDING * backend.machine_epsilon * (np.abs(x).max(axis=1, initial=0.0) + lower)
     refused = distance < lower - slack
-    feet = np.where(refused[:, None], np.nan, found.closest)
+    feet = np.where(refused[:, None], np.nan, result.closest)
     distance = np.where(refused, np.nan, distance)
-    lower = np.fmin(np.maximum(lower, found.lower_bounds), distance)
+    lower = np.fmin(np.maximum(lower, result.lower_bounds), distance)
     return ClosestPoints(x, feet, distance, above, lower, refused)
 
 
@@ -169,40 +169,48 @@ def _search_smooth_part(
     not belong to the surface.
     """
     backend, surface = job.backend, job.surface
-    alone = replace(surface, field=smooth).with_call_cache(begins=True)
-    parts = _QueryEvaluator(backend, alone, alone.target_levels(backend))
-    near = parts.evaluate(points)[-1]
-    found = search(
-        alone, points, InitialGuess(known.feet, near, on_boundary=False), parts, tolerance, progress
+    smooth_surface = replace(surface, field=smooth).with_call_cache(begins=True)
+    evaluator = _QueryEvaluator(backend, smooth_surface, smooth_surface.target_levels(backend))
+    near = evaluator.evaluate(points)[-1]
+    result = search(
+        smooth_surface,
+        points,
+        InitialGuess(known.feet, near, on_boundary=False),
+        evaluator,
+        tolerance,
+        progress,
     )
-    sheets = job.distance_to_jumps(points)
+    to_jumps = job.distance_to_jumps(points)
     rounding = (
-        _ROUNDING * backend.machine_epsilon * (np.abs(points).max(axis=1, initial=0.0) + sheets)
+        _ROUNDING * backend.machine_epsilon * (np.abs(points).max(axis=1, initial=0.0) + to_jumps)
     )
-    lower = np.maximum(np.minimum(found.lower_bounds, sheets - rounding), 0)
-    away, feet = _length(points - known.feet), known.feet.copy()
+    lower = np.maximum(np.minimum(result.lower_bounds, to_jumps - rounding), 0)
+    to_known, feet = _length(points - known.feet), known.feet.copy()
     rows = np.flatnonzero(
-        _length(points - found.closest) < np.nan_to_num(away, nan=np.inf) - rounding
+        _length(points - result.closest) < np.nan_to_num(to_known, nan=np.inf) - rounding
     )
-    there = parts.remove_truncation(points[rows], found.closest[rows])
-    value = np.asarray(surface.field.value(there, precision="double"))
+    moved = evaluator.remove_truncation(points[rows], result.closest[rows])
+    value = np.asarray(surface.field.value(moved, precision="double"))
     is_level = np.abs(value[:, None] - surface.level_values).min(axis=1) < _LEVEL_MATCH
-    feet[rows[is_level]] = there[is_level]
-    is_known = _length(points - feet) <= sheets + rounding + tolerance.length
+    feet[rows[is_level]] = moved[is_level]
+    is_known = _length(points - feet) <= to_jumps + rounding + tolerance.length
     is_known[rows[~is_level]] = False
-    again = np.flatnonzero(~is_known)
-    if len(again):
-        rest = InitialGuess(feet[again], known.estimate[again])
-        others = search(surface, points[again], rest, job, tolerance, progress)
-        feet[again], lower[again] = others.closest, np.maximum(lower[again], others.lower_bounds)
+    unsure = np.flatnonzero(~is_known)
+    if len(unsure):
+        guess = InitialGuess(feet[unsure], known.estimate[unsure])
+        retried = search(surface, points[unsure], guess, job, tolerance, progress)
+        feet[unsure], lower[unsure] = (
+            retried.closest,
+            np.maximum(lower[unsure], retried.lower_bounds),
+        )
     return SearchResult(feet, lower)
 
 
 def _with_singular_points(
     surface: TracedSurface, points: FloatArray, feet: FloatArray
 ) -> FloatArray:
-    """The feet (n, 3), or the nearest singular points where these are nearer: beside those the
-    surface is a tiny loop that descents do not see."""
+    """The feet (n, 3), or the nearest singular points where these are nearer: beside singular
+    points the surface may be a tiny loop that descents do not find."""
     singular = surface.field.singular_points
     if surface.clip_volume is not None and len(singular):
         singular = singular[surface.clip_volume.contains_points(singular)]
@@ -211,9 +219,9 @@ def _with_singular_points(
     import scipy.spatial  # here: half a second that few need
 
     searching: Any = scipy.spatial
-    away, row = searching.cKDTree(singular).query(points)
-    nearer = ~(_length(points - feet) <= away)
-    return np.where(nearer[:, None], singular[row], feet)
+    distance, index = searching.cKDTree(singular).query(points)
+    is_nearer = ~(_length(points - feet) <= distance)
+    return np.where(is_nearer[:, None], singular[index], feet)
 
 
 def _closest_on_mesh(
@@ -221,24 +229,24 @@ def _closest_on_mesh(
 ) -> ClosestPoints:
     prepared, nearest = surface.evaluator(backend), mesh.upload(backend)
 
-    def look(p: Vec3) -> tuple[Real | Vec3, ...]:
+    def compute(p: Vec3) -> tuple[Real | Vec3, ...]:
         above = -levels.offset_to_nearest(prepared.evaluate(p).value)
         offset = nearest(p)
         return p, p + offset, safe_norm(offset), above
 
-    x, feet, distance, above = in_batches(backend, look, points)
+    x, feet, distance, above = in_batches(backend, compute, points)
     slack = _ROUNDING * backend.machine_epsilon * (np.abs(x).max(axis=1, initial=0.0) + mesh.size)
     lower = np.maximum(distance - slack, 0)
     return ClosestPoints(x, feet, distance, above, lower, np.zeros(len(x), np.bool_))
 
 
 def _with_mesh_points(points: FloatArray, start: FloatArray, mesh: LevelTriangles) -> FloatArray:
-    """The places (n, 3), or the nearest points of triangles where these are nearer."""
+    """The points `start` (n, 3), or the nearest points of triangles where these are nearer."""
     backend = choose_backend("double")
     nearest = mesh.upload(backend)
-    (way,) = in_batches(backend, lambda p: (nearest(p),), points)  # pyright: ignore
-    nearer = ~(_length(points - start) <= _length(way))
-    return np.where(nearer[:, None], points + way, start)
+    (offset,) = in_batches(backend, lambda p: (nearest(p),), points)  # pyright: ignore
+    is_nearer = ~(_length(points - start) <= _length(offset))
+    return np.where(is_nearer[:, None], points + offset, start)
 
 
 @dataclass(frozen=True)
@@ -302,18 +310,18 @@ class _QueryEvaluator:
         return x, self._inside_domain_or_nan(start), above, lower, near
 
     def with_jump_points(self, points: FloatArray, start: FloatArray) -> FloatArray:
-        """The places (n, 3), or points of the surface on sheets where these are nearer."""
-        away, start = _length(points - start), start.copy()
-        rows = np.flatnonzero(~(away <= self.distance_to_jumps(points) * (1 + 1e-12)))
+        """The points `start` (n, 3), or points of the surface on facets where these are nearer."""
+        distance, start = _length(points - start), start.copy()
+        rows = np.flatnonzero(~(distance <= self.distance_to_jumps(points) * (1 + 1e-12)))
         start[rows] = self._nearest_face_points(points[rows])
         rows = rows[np.isnan(start[rows, 0])]
         if len(rows):
-            start[rows] = self._on_sheets(points[rows], start[rows])
+            start[rows] = self._closest_on_facets(points[rows], start[rows])
         return start
 
     def _nearest_face_points(self, points: FloatArray) -> FloatArray:
-        """The nearest points (n, 3) of triangles that are the sheets, where the level lies between
-        the values of f on both sides right beside them; NaN elsewhere."""
+        """The nearest points (n, 3) of the triangles of a jump surface, where the level lies
+        between the values of f on both sides right beside them; NaN elsewhere."""
         mesh, prepared = self.surface.field.jump_mesh(), self._prepared
         feet = np.full_like(points, np.nan)
         if mesh is None or not len(points):
@@ -322,21 +330,25 @@ class _QueryEvaluator:
 
         def nearest(p: Vec3) -> tuple[Vec3, Any, Vec3]:
             none, always = (real(-1), index(NO_FACET)), prepared.backend.Bool(True)
-            found = prepared.field.nearest_facet(p, none, real(dr.inf), always)
-            return p + found.offset, found.facet, found.normal
+            closest = prepared.field.nearest_facet(p, none, real(dr.inf), always)
+            return p + closest.offset, closest.facet, closest.normal
 
-        y, sheet, normal = in_batches(prepared.backend, nearest, points)
-        corners = mesh[0][mesh[1][sheet.astype(np.int64)]]
+        y, facet, normal = in_batches(prepared.backend, nearest, points)
+        corners = mesh[0][mesh[1][facet.astype(np.int64)]]
         y_within = y + _WITHIN_FACE * (corners.mean(axis=1) - y)
-        way = _BESIDE_FACE * _size(self.surface, points) * normal
-        sides = [self.surface.field.value(y_within + k * way, precision="double") for k in (1, -1)]
+        offset = _BESIDE_FACE * _size(self.surface, points) * normal
+        sides = [
+            self.surface.field.value(y_within + k * offset, precision="double") for k in (1, -1)
+        ]
         low, high = np.minimum(*sides) + _LEVEL_MARGIN, np.maximum(*sides) - _LEVEL_MARGIN
-        on = np.any([(low < one) & (one < high) for one in self.surface.level_values], axis=0)
-        feet[on] = y[on]
+        inside = np.any(
+            [(low < level) & (level < high) for level in self.surface.level_values], axis=0
+        )
+        feet[inside] = y[inside]
         return feet
 
     def distance_to_jumps(self, points: FloatArray) -> FloatArray:
-        """The distances (n,) to sheets, of the surface or not."""
+        """The distances (n,) to facets, whether these belong to the surface or not."""
         prepared = self._prepared
 
         def compute(p: Vec3) -> tuple[Real]:
@@ -344,17 +356,17 @@ class _QueryEvaluator:
 
         return in_batches(prepared.backend, compute, points)[0]
 
-    def _on_sheets(self, points: FloatArray, start: FloatArray) -> FloatArray:
+    def _closest_on_facets(self, points: FloatArray, start: FloatArray) -> FloatArray:
         x = np.concatenate([points, np.nan_to_num(start)])
         search = JumpSurfaceSearch(
             self._prepared, max(float(np.abs(x).max(initial=0)), 1e-30), _MAX_JUMPS_EXAMINED
         )
 
-        def look(p: Vec3, foot: Vec3) -> tuple[Vec3]:
-            away = safe_norm(foot - p)
-            return (search.closest(p, dr.select(dr.isnan(away), dr.inf, away))[0],)
+        def compute(p: Vec3, foot: Vec3) -> tuple[Vec3]:
+            distance = safe_norm(foot - p)
+            return (search.closest(p, dr.select(dr.isnan(distance), dr.inf, distance))[0],)
 
-        (feet,) = in_batches(self._prepared.backend, look, points, start)
+        (feet,) = in_batches(self._prepared.backend, compute, points, start)
         return np.where(np.isnan(feet), start, feet)
 
     def _inside_domain_or_nan(self, feet: FloatArray) -> FloatArray:
@@ -371,10 +383,10 @@ class _QueryEvaluator:
         """`cell_search.DescentMethods`: by descent, or for fields with jumps by rays."""
         if self.surface.field.has_jumps:
 
-            def close(p: Vec3, start: Vec3) -> tuple[Vec3]:
+            def by_rays(p: Vec3, start: Vec3) -> tuple[Vec3]:
                 return (compass_search(self._prepared, p, start),)
 
-            return in_batches(self._prepared.backend, close, points, start)[0], np.zeros(
+            return in_batches(self._prepared.backend, by_rays, points, start)[0], np.zeros(
                 len(points)
             )
         is_far_off = (start == points).all(axis=1)
@@ -394,14 +406,14 @@ class _QueryEvaluator:
         if len(rows):
             feet[rows], free[rows] = in_batches(self.backend, self._descend, points[rows], y[rows])
         feet = self._inside_domain_or_nan(feet)
-        left, rim = np.flatnonzero(np.isnan(feet[:, 0]) & (is_far == 0)), self._rim
-        if rim is not None and len(left):  # out of the domain
+        missing, rim = np.flatnonzero(np.isnan(feet[:, 0]) & (is_far == 0)), self._rim
+        if rim is not None and len(missing):  # out of the domain
 
-            def along(p: Vec3, y: Vec3) -> tuple[Vec3]:
+            def along_rim(p: Vec3, y: Vec3) -> tuple[Vec3]:
                 return (rim.closest(p, y)[0],)
 
-            (there,) = in_batches(self.backend, along, points[left], start[left])
-            feet[left], free[left] = self._inside_domain_or_nan(there), 0
+            (on_rim,) = in_batches(self.backend, along_rim, points[missing], start[missing])
+            feet[missing], free[missing] = self._inside_domain_or_nan(on_rim), 0
         return feet, free
 
     def descend_from_boundary(
@@ -410,28 +422,30 @@ class _QueryEvaluator:
         """`cell_search.DescentMethods`."""
 
         def level_away(p: Vec3, b: Vec3, length_: Vec3) -> tuple[Real]:
-            way = p - b
-            sample = self._field.evaluate(b + length_.x / safe_norm(way) * way)
+            ray = p - b
+            sample = self._field.evaluate(b + length_.x / safe_norm(ray) * ray)
             return (
                 first_order_distance(self.levels.offset_to_nearest(sample.value), sample.gradient),
             )
 
-        def beside(p: Vec3, b: Vec3, length_: Vec3) -> tuple[Vec3]:
-            way = p - b
-            y = self._descent.newton_to_level(b + length_.x / safe_norm(way) * way)
-            towards = dr.dot(way, y - b) > -_MAX_OPPOSING_COSINE * safe_norm(way) * safe_norm(y - b)
-            return (dr.select(towards, y, dr.nan),)
+        def to_level(p: Vec3, b: Vec3, length_: Vec3) -> tuple[Vec3]:
+            ray = p - b
+            y = self._descent.newton_to_level(b + length_.x / safe_norm(ray) * ray)
+            ahead = dr.dot(ray, y - b) > -_MAX_OPPOSING_COSINE * safe_norm(ray) * safe_norm(y - b)
+            return (dr.select(ahead, y, dr.nan),)
 
         feet, free = np.full_like(points, np.nan), np.zeros(len(points))
         lengths = np.tile(aside[:, None], 3)
         if not len(points):
             return feet, free
         # Beside an edge f is the angle about it: to first order the level is as far as the arc.
-        (away,) = in_batches(self.backend, level_away, points, boundary, lengths)
-        rows = np.flatnonzero(~(np.abs(away) > _MAX_ARC_RADII * aside))
+        (gap,) = in_batches(self.backend, level_away, points, boundary, lengths)
+        rows = np.flatnonzero(~(np.abs(gap) > _MAX_ARC_RADII * aside))
         start = points[rows]
         if len(rows):
-            (start,) = in_batches(self.backend, beside, points[rows], boundary[rows], lengths[rows])
+            (start,) = in_batches(
+                self.backend, to_level, points[rows], boundary[rows], lengths[rows]
+            )
         rows, start = rows[~np.isnan(start[:, 0])], start[~np.isnan(start[:, 0])]
         if len(rows):
             feet[rows], free[rows] = in_batches(self.backend, self._descend, points[rows], start)
@@ -447,29 +461,30 @@ class _QueryEvaluator:
         return vector(foot), type(x.x)(free), goes_on
 
     def _newton(self, p: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Vec3, Real, Mask, Mask]:
-        """By Newton's method: feet, NaN where there is none; where the search goes on; radii about
-        feet; whether it does go on, and whether it ends farther than `limit` away."""
-        y, first, is_lost, is_far = self._descent.newton(p, start, self.backend.Float(limit))
-        foot, found, free = self._descent.finish(p, y)
-        most = (safe_norm(p - start) + 2 * first) * (1 + 64 * self.backend.machine_epsilon)
-        most = dr.fma(64 * self.backend.machine_epsilon, max_norm(y), most)
+        """The results of Newton's method: feet, NaN if there is no foot; the points at which the
+        search goes on; radii about feet; whether the search goes on; and whether it ended farther
+        than `limit` away."""
+        y, first_step, is_lost, is_far = self._descent.newton(p, start, self.backend.Float(limit))
+        foot, is_found, free = self._descent.finish(p, y)
+        reach = (safe_norm(p - start) + 2 * first_step) * (1 + 64 * self.backend.machine_epsilon)
+        reach = dr.fma(64 * self.backend.machine_epsilon, max_norm(y), reach)
         is_lost |= is_far
-        is_foot = found & ~is_lost & (safe_norm(p - foot) <= most)
-        return dr.select(is_foot, foot, dr.nan), y, free, ~(found | is_lost), is_far
+        is_foot = is_found & ~is_lost & (safe_norm(p - foot) <= reach)
+        return dr.select(is_foot, foot, dr.nan), y, free, ~(is_found | is_lost), is_far
 
     def _directly(self, p: Vec3, start: Vec3, limit: Vec3) -> tuple[Vec3, Vec3, Real, Real, Real]:
         """`_newton` with numbers for masks."""
         one, zero = self.backend.Float(1), self.backend.Float(0)
-        *found, goes_on, is_far = self._newton(p, start, limit.x)
-        return *found, dr.select(goes_on, one, zero), dr.select(is_far, one, zero)
+        *results, goes_on, is_far = self._newton(p, start, limit.x)
+        return *results, dr.select(goes_on, one, zero), dr.select(is_far, one, zero)
 
     def _descend(self, p: Vec3, start: Vec3) -> tuple[Vec3, Real]:
-        y, found, on_level = self._descent.descend(p, start)
-        return dr.select(on_level, y, dr.nan), dr.select(found, self._descent.finish(p, y)[2], 0)
+        y, is_found, on_level = self._descent.descend(p, start)
+        return dr.select(on_level, y, dr.nan), dr.select(is_found, self._descent.finish(p, y)[2], 0)
 
     def remove_truncation(self, points: FloatArray, feet: FloatArray) -> FloatArray:
-        """The feet (n, 3) moved onto the level of the field without what clusters leave out: by
-        Newton's method for the closest point, else straight to the level."""
+        """The feet (n, 3) moved onto the level of the field without truncation: by Newton's method
+        for the closest point, else straight to the level."""
         rows = np.flatnonzero(np.isfinite(feet[:, 0]))
         exact = self._exact
         if exact is None or not len(rows):
@@ -480,12 +495,12 @@ class _QueryEvaluator:
             return (dr.select(dr.isfinite(dr.squared_norm(y)), y, start),)
 
         feet = feet.copy()
-        there = self._corrected(exact, points[rows], feet[rows])
-        left = np.flatnonzero(np.isnan(there[:, 0]))
-        if len(left):
-            (there[left],) = in_batches(self.backend, to_level, feet[rows[left]])
-        inside = ~np.isnan(self._inside_domain_or_nan(there)[:, 0])
-        feet[rows[inside]] = there[inside]
+        corrected = self._corrected(exact, points[rows], feet[rows])
+        missing = np.flatnonzero(np.isnan(corrected[:, 0]))
+        if len(missing):
+            (corrected[missing],) = in_batches(self.backend, to_level, feet[rows[missing]])
+        inside = ~np.isnan(self._inside_domain_or_nan(corrected)[:, 0])
+        feet[rows[inside]] = corrected[inside]
         return feet
 
     def _corrected(
@@ -493,24 +508,26 @@ class _QueryEvaluator:
     ) -> FloatArray:
         """The feet (n, 3) on the level of the exact field, NaN where they are not found.
 
-        What clusters leave out hardly changes on the way, and costs as much as all of the field: so
-        it is computed at the foot, with its gradient, and Newton's method is that of the field with
-        clusters and this correction. Twice, as the foot moves by what is left out at first. What
-        remains is a short step to the level of the exact field.
+        The truncation of clusters hardly changes on the way, and computing it costs as much as the
+        exact field. So it is computed at the foot, with its gradient, and Newton's method is that
+        of the field with clusters and this correction. This is done twice, as the foot moves by the
+        first correction. A short step to the level of the exact field remains.
         """
         rough = self._descent
 
         def left_out(y: Vec3) -> tuple[Vec3, Vec3]:
-            one, other = exact.field.evaluate(y), rough.field.evaluate(y)
+            full, partial = exact.field.evaluate(y), rough.field.evaluate(y)
             vector = self.backend.Array3f
-            return vector(one.value - other.value), vector(one.gradient) - vector(other.gradient)
+            return vector(full.value - partial.value), vector(full.gradient) - vector(
+                partial.gradient
+            )
 
         def newton(p: Vec3, y: Vec3, value: Vec3, slope: Vec3) -> tuple[Vec3]:
             field = _LinearlyShiftedField(rough.field, y, value.x, slope)
-            descent = replace(rough, field=field)
-            end, _, is_lost, _ = descent.newton(p, y, self.backend.Float(dr.inf))
-            foot, found, _ = descent.finish(p, end)
-            return (dr.select(found & ~is_lost, foot, dr.nan),)
+            shifted = replace(rough, field=field)
+            end, _, is_lost, _ = shifted.newton(p, y, self.backend.Float(dr.inf))
+            foot, is_found, _ = shifted.finish(p, end)
+            return (dr.select(is_found & ~is_lost, foot, dr.nan),)
 
         def on_level(p: Vec3, y: Vec3) -> tuple[Vec3]:
             return (exact.last_step(p, y),)
@@ -518,15 +535,16 @@ class _QueryEvaluator:
         feet, rows = feet.copy(), np.arange(len(feet))
         for _ in range(_TRUNCATION_CORRECTIONS):
             if len(rows):
-                given = points[rows], feet[rows], *in_batches(self.backend, left_out, feet[rows])
-                (feet[rows],) = in_batches(self.backend, newton, *given)
+                inputs = points[rows], feet[rows], *in_batches(self.backend, left_out, feet[rows])
+                (feet[rows],) = in_batches(self.backend, newton, *inputs)
                 rows = rows[~np.isnan(feet[rows, 0])]
         if len(rows):
             (feet[rows],) = in_batches(self.backend, on_level, points[rows], feet[rows])
         return feet
 
     def level_uncertainty(self, feet: FloatArray) -> FloatArray:
-        """How far rounding and approximation may have moved the level at feet (n, 3)."""
+        """The distances by which rounding and approximation may have moved the level at feet
+        (n, 3)."""
         if not len(feet):
             return np.zeros(0)
 
@@ -537,8 +555,8 @@ class _QueryEvaluator:
 
 
 class _LinearlyShiftedField(Field):
-    """A field plus a linear function of the way from a point, other ones in each lane; its error is
-    what rounding does."""
+    """A field plus a linear function of the vector from a point, both different in each lane; its
+    error is the rounding error alone."""
 
     def __init__(self, field: Field, at: Vec3, value: Real, slope: Vec3) -> None:
         self._field, self._at, self._value, self._slope = field, at, value, slope

@@ -97,7 +97,7 @@ def signed_distance(
     field = traced.field
     if method == "closest_point":
         closest = _find("signed_distance", traced, backend, points, progress)
-        return _outwards(field) * np.copysign(closest.distance, closest.signed_value)
+        return _outward_sign(field) * np.copysign(closest.distance, closest.signed_value)
     if traced.clip_volume is not None and method != "lower_bound":
         raise TypeError(f'method="{method}" does not see clip and section: use "closest_point"')
     levels, prepared = traced.target_levels(backend), traced.evaluator(backend)
@@ -112,10 +112,10 @@ def signed_distance(
     if field.has_jumps and method != "lower_bound":
         to_sheet = find_closest(backend, traced, levels, x, teller(None)).distance
         result = np.copysign(np.fmin(to_sheet, np.abs(result)), result)
-    return _outwards(field) * result
+    return _outward_sign(field) * result
 
 
-def _outwards(field: Field) -> float:
+def _outward_sign(field: Field) -> float:
     """The factor that makes a distance in the direction of larger values negative inside."""
     return -1.0 if field.is_larger_inside else 1.0
 
@@ -274,9 +274,9 @@ def _check_domain(field: Field, points: FloatArray) -> None:
         return
     outside = np.flatnonzero(~field.domain.contains_points(points))
     if outside.size:
-        more = f" and {outside.size - 1} more" if outside.size > 1 else ""
+        rest = f" and {outside.size - 1} more" if outside.size > 1 else ""
         raise ValueError(
-            f"points: entry {outside[0]}{more} outside the domain of {type(field).__name__}, where "
+            f"points: entry {outside[0]}{rest} outside the domain of {type(field).__name__}, where "
             "it promises nothing; leave such points out, or give the field a larger domain"
         )
 

@@ -234,7 +234,7 @@ def _nearest_jump_by_differences(backend: Backend, field: Field, x: Vec3) -> Nea
 
 # Nearer points by rays.
 
-_MOST_RAYS = 600
+_MAX_RAYS = 600
 # Rays of a turn, which all have to fail before the next turn is narrower: rays to the intersections
 # of planes, then rays near the best direction, about 137.5 degrees apart, so that any number of
 # them is spread evenly, and no turn repeats the one before.
@@ -244,7 +244,7 @@ _INITIAL_STEP, _STEP_REDUCTION = 1.0, 0.25
 # Rays that leave in directions all over the sphere before that.
 _SPHERE_RAYS = 128
 # Planes whose normals are closer than this, as the sine of an angle, count as the same.
-_APART = 1e-3
+_MIN_NORMAL_SINE = 1e-3
 # In epsilons, of coordinates: the distance from a hit at which f is evaluated on both sides of the
 # level.
 _HIT_TEST_RADIUS = 1024.0
@@ -265,7 +265,10 @@ class _HitPlane:
 
     def is_apart(self, other: _HitPlane) -> Mask:
         """Whether both are planes, and not nearly parallel."""
-        return dr.squared_norm(dr.cross(self.normal, other.normal)) > _APART * _APART
+        return (
+            dr.squared_norm(dr.cross(self.normal, other.normal))
+            > _MIN_NORMAL_SINE * _MIN_NORMAL_SINE
+        )
 
     def nearest_on_line(self, other: _HitPlane) -> Vec3:
         """The shortest vector to the intersection of both planes; not finite if they are
@@ -395,7 +398,7 @@ def compass_search(surface: SurfaceTracer, x: Vec3, foot: Vec3) -> Vec3:
         step = dr.select(nearer & ~is_global & ~to_planes, fmin(2 * step, _INITIAL_STEP), new_step)
         angle = dr.select(nearer | to_planes | is_global, angle, angle + _GOLDEN)
         failed = dr.select(is_spent, count(0), failed)
-        active &= (step > backend.machine_epsilon**0.5) & (n + 1 < _MOST_RAYS)
+        active &= (step > backend.machine_epsilon**0.5) & (n + 1 < _MAX_RAYS)
         return d, t, foot, step, angle, failed, n + 1, active, *planes.parts()
 
     def is_active(*state: Any) -> Mask:

@@ -38,7 +38,7 @@ _ACCURACY = 1e-3
 # cluster is expanded only if it is this many times farther away than usual; with infinity every
 # term is summed directly.
 _ACCEPTANCE_FACTORS = (1.0, 2.0, 4.0, 8.0, 16.0, math.inf)
-# In epsilons, of gradient and Hessian: what the arithmetic here may do.
+# The rounding errors of the arithmetic in this module, in epsilons of gradient and Hessian.
 _ROUNDING = 16.0
 
 
@@ -112,12 +112,14 @@ def curvature(
         return _refine_accuracy(backend, field, directly, points, prepared.has_variable_accuracy)
 
     def by_tree(p: Vec3, closer: Real) -> tuple[Real | Vec3, ...]:
-        at = field.values_at(p, 2, closer)
-        if at.gradient is None or at.hessian is None:
+        values = field.values_at(p, 2, closer)
+        if values.gradient is None or values.hessian is None:
             raise RuntimeError(f"{type(field).__name__}: values_at(x, 2) gave no derivatives")
-        rows = at.hessian.rows(backend.Array3f)
-        found = _Derivatives(backend, at.gradient, rows, at.gradient_error, at.hessian_error)
-        return found.curvatures()
+        rows = values.hessian.rows(backend.Array3f)
+        derivatives = _Derivatives(
+            backend, values.gradient, rows, values.gradient_error, values.hessian_error
+        )
+        return derivatives.curvatures()
 
     return _refine_accuracy(backend, field, by_tree, points, True)
 
@@ -129,7 +131,7 @@ def _refine_accuracy(
     points: Any,
     has_detail: bool,
 ) -> CurvatureSamples:
-    """The curvatures, `computed` more closely where the error is too large and the field
+    """The curvatures; `computed` with higher accuracy where the error is too large, if the field
     `has_detail`."""
 
     def at(closer: float) -> Callable[[Vec3], tuple[Real | Vec3, ...]]:
@@ -138,22 +140,22 @@ def _refine_accuracy(
 
         return compute
 
-    *found, is_truncated = in_batches(backend, at(_ACCEPTANCE_FACTORS[0]), points)
+    *results, is_truncated = in_batches(backend, at(_ACCEPTANCE_FACTORS[0]), points)
     if not has_detail:
-        return CurvatureSamples(*found)
+        return CurvatureSamples(*results)
     x = np.asarray(points, np.float64)
     flat = _ACCURACY / _size(field, x)
     for closer in _ACCEPTANCE_FACTORS[1:]:
-        mean, error = found[0], found[3]
+        mean, error = results[0], results[3]
         with np.errstate(invalid="ignore"):
-            good = error <= np.maximum(_ACCURACY * np.abs(mean), flat)
-        rows = np.flatnonzero(~good & (is_truncated > 0))
+            is_accurate = error <= np.maximum(_ACCURACY * np.abs(mean), flat)
+        rows = np.flatnonzero(~is_accurate & (is_truncated > 0))
         if not rows.size:
             break
-        *closely, is_truncated[rows] = in_batches(backend, at(closer), x[rows])
-        for whole, part in zip(found, closely, strict=True):
-            whole[rows] = part
-    return CurvatureSamples(*found)
+        *refined, is_truncated[rows] = in_batches(backend, at(closer), x[rows])
+        for values, replacement in zip(results, refined, strict=True):
+            values[rows] = replacement
+    return CurvatureSamples(*results)
 
 
 def _size(field: Field, points: FloatArray) -> float:
@@ -257,7 +259,7 @@ _UMBILIC = 1e-3
 # longer than this part of the least radius of curvature: what follows would be no line of the
 # surface but the step's.
 _MIN_STEP_COSINE, _MAX_STEP_PER_RADIUS = math.cos(math.radians(40)), 0.5
-_MOST_STEPS = 100_000
+_MAX_STEPS = 100_000
 
 
 @shows_keywords(*_HONORED_BY_LINES)
@@ -309,20 +311,22 @@ def curvature_lines(
     if len(levels) > 1:
         raise ValueError(f"lines of curvature are of one level, not of {len(levels)}")
     if not is_one_of(family, get_args(Family)):
-        known = ", ".join(f'"{one}"' for one in get_args(Family))
+        known = ", ".join(f'"{name}"' for name in get_args(Family))
         hint = did_you_mean(family, get_args(Family))
         raise ValueError(f"unknown family {family!r}; choose one of {known}{hint}")
     step, length = as_positive(step, "step"), as_positive(length, "length")
     count = math.ceil(length / step)
-    if count > _MOST_STEPS:
-        raise ValueError(f"length/step asks for {count:,} steps: at most {_MOST_STEPS:,}")
+    if count > _MAX_STEPS:
+        raise ValueError(f"length/step asks for {count:,} steps: at most {_MAX_STEPS:,}")
     start = as_finite_vectors(seeds, "seeds")
     if not len(start):
         return []
     # Data, so that another level, step or family compiles no other kernel.
-    most = 1.0 if family == "maximum" else 0.0
-    at, h, share = (dr.opaque(backend.Float, one) for one in (levels[0], step, most))
-    guide = _CurvatureLineTracer(backend, field.prepare(backend), at, h, share)
+    wants_largest = 1.0 if family == "maximum" else 0.0
+    at, h, largest = (
+        dr.opaque(backend.Float, number) for number in (levels[0], step, wants_largest)
+    )
+    guide = _CurvatureLineTracer(backend, field.prepare(backend), at, h, largest)
     with dr.suspend_grad():
         both = guide.follow(start, count)
     return [
@@ -333,7 +337,7 @@ def curvature_lines(
 
 @dataclass(frozen=True)
 class _LineState:
-    """Where lines are, by which way they came, and which of them go on."""
+    """The points that lines have reached, their directions there, and which lines go on."""
 
     x: Vec3
     direction: Vec3
@@ -362,22 +366,22 @@ class _CurvatureLineTracer:
         points = vector(*(dr.full(self.backend.Float, dr.nan, 2 * n * (count + 1)) for _ in "xyz"))
         dr.scatter(points, x, lane, is_known)
         dr.eval(points, x, direction, is_known)
-        most = dr.opaque(integer, count)
+        last = dr.opaque(integer, count)
 
         def body(state: _LineState) -> _LineState:
             x, direction, goes_on = self._advance(state)
             index = state.index + 1
             dr.scatter(points, x, index * (2 * n) + lane, state.active & goes_on)
-            return _LineState(x, direction, index, state.active & goes_on & (index < most))
+            return _LineState(x, direction, index, state.active & goes_on & (index < last))
 
         index = dr.zeros(integer, 2 * n)
         loop_while_active(_LineState(x, direction, index, is_known & True), body, "curvature lines")
-        found = to_numpy(points).reshape(count + 1, 2 * n, 3).astype(np.float64)
-        lines = [one[np.isfinite(one).all(axis=1)] for one in found.swapaxes(0, 1)]
+        array = to_numpy(points).reshape(count + 1, 2 * n, 3).astype(np.float64)
+        lines = [line[np.isfinite(line).all(axis=1)] for line in array.swapaxes(0, 1)]
         return lines[:n], lines[n:]
 
     def _advance(self, state: _LineState) -> tuple[Vec3, Vec3, Mask]:
-        """The next point, the direction there, and whether it is one of the line."""
+        """The next point, the direction there, and whether it is a point of the line."""
         x, h = state.x, self.step
         first = state.direction
         second, _ = self._direction(x + 0.5 * h * first, first)
@@ -388,19 +392,21 @@ class _CurvatureLineTracer:
         last, is_known = self._direction(end, fourth)
         return end, last, is_known & (dr.dot(first, last) > _MIN_STEP_COSINE)
 
-    def _direction(self, x: Vec3, before: Vec3 | None) -> tuple[Vec3, Mask]:
-        """The principal direction that agrees with the one before, and whether there is one."""
+    def _direction(self, x: Vec3, previous: Vec3 | None) -> tuple[Vec3, Mask]:
+        """The principal direction that agrees with the previous one, and whether it is defined."""
         plane = TangentPlane.of(self.field.evaluate(x).gradient)
         eigen = SymmetricEigen2.of(*plane.restrict_hessian(self.field.hessian(x)))
         u, v = eigen.combination(self.largest, 1 - self.largest)
         direction = u * plane.u + v * plane.v
-        if before is not None:
-            direction = dr.select(dr.dot(direction, before) < 0, -direction, direction)
-        most = fmax(dr.abs(eigen.largest), dr.abs(eigen.smallest))
-        is_known = (eigen.largest - eigen.smallest > _UMBILIC * most) & dr.isfinite(
+        if previous is not None:
+            direction = dr.select(dr.dot(direction, previous) < 0, -direction, direction)
+        max_curvature = fmax(dr.abs(eigen.largest), dr.abs(eigen.smallest))
+        is_known = (eigen.largest - eigen.smallest > _UMBILIC * max_curvature) & dr.isfinite(
             dr.norm(direction)
         )
-        return direction, is_known & (most * self.step < _MAX_STEP_PER_RADIUS * plane.gradient_norm)
+        return direction, is_known & (
+            max_curvature * self.step < _MAX_STEP_PER_RADIUS * plane.gradient_norm
+        )
 
     def _on_surface(self, x: Vec3, steps: int) -> Vec3:
         """The point to which Newton's method along the gradient leads in `steps` steps."""

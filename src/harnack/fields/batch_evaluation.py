@@ -115,7 +115,7 @@ def map_batches(
                 )
             )
             dr.eval(*results)
-        parts.append(tuple(_spread(to_numpy(array), max(lanes, 1)) for array in results))
+        parts.append(tuple(_repeated(to_numpy(array), max(lanes, 1)) for array in results))
     if len(parts) == 1:
         return tuple(array[:n] for array in parts[0])
     return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
@@ -128,7 +128,7 @@ def _part(backend: Backend, vectors: Any, start: int, lanes: int) -> Vec3:
     return upload_vectors(backend, vectors[start : start + lanes], "points")
 
 
-def _spread(values: npt.NDArray[Any], n: int) -> npt.NDArray[Any]:
+def _repeated(values: npt.NDArray[Any], n: int) -> npt.NDArray[Any]:
     return values if len(values) == n else np.repeat(values, n, axis=0)
 
 

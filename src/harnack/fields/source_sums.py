@@ -327,9 +327,9 @@ class SourceSums:
 
     def remainder(self, b: float, r: Real) -> Real:
         """3 s4 + rise r s5 for r = b times the free distance, or less: see `sample`."""
-        return dr.fma(_rise(b) * r, self.s5, 3 * self.s4)
+        return dr.fma(_chord_slope(b) * r, self.s5, 3 * self.s4)
 
 
-def _rise(b: float) -> float:
+def _chord_slope(b: float) -> float:
     """The slope of the chord of phi over [0, b]: see `SourceSums.sample`."""
     return (4 - 3 * b) / (1 - b) ** 2

@@ -45,10 +45,10 @@ def _holes() -> list[Surface]:
     edge, *holes = example_curves.square_with_holes(24)
     s = np.linspace(0, 1, 10, endpoint=False)[:, None]
     fine = [(1 - s) * a + s * b for a, b in zip(edge, np.roll(edge, -1, axis=0), strict=True)]
-    return _curve([_bent(loop) for loop in (np.concatenate(fine), *holes)])
+    return _curve([_on_wave(loop) for loop in (np.concatenate(fine), *holes)])
 
 
-def _bent(loop: FloatArray) -> FloatArray:
+def _on_wave(loop: FloatArray) -> FloatArray:
     x, y, _ = loop.T
     return np.column_stack([x, y, 0.25 * np.sin(2.2 * x) + 0.2 * np.cos(2.0 * y)])
 
@@ -104,11 +104,11 @@ def _fitted_knot() -> list[Surface]:
     width = 0.15 * float(np.ptp(curve, axis=0).max()) / 2
 
     def density(x: FloatArray) -> FloatArray:
-        parts = [
-            np.exp(-((some[:, None] - curve) ** 2).sum(axis=2) / width**2) @ step
-            for some in np.array_split(x, len(x) // 4000 + 1)
+        sums = [
+            np.exp(-((batch[:, None] - curve) ** 2).sum(axis=2) / width**2) @ step
+            for batch in np.array_split(x, len(x) // 4000 + 1)
         ]
-        return np.concatenate(parts) / (width * math.sqrt(math.pi))
+        return np.concatenate(sums) / (width * math.sqrt(math.pi))
 
     low, high = curve.min(axis=0) - 2.6 * width, curve.max(axis=0) + 2.6 * width
     box = low.tolist(), high.tolist()

@@ -23,16 +23,16 @@ def _cut_mesh() -> list[Surface]:
     vertices, faces = example_meshes.bumpy_sphere(6)
     middles = vertices[faces].mean(axis=1)
     middles /= np.linalg.norm(middles, axis=1, keepdims=True)
-    whole = (middles @ _spiral_directions(14).T < math.cos(0.27)).all(axis=1)
-    return [Surface(WindingNumber(vertices, faces[whole]))]
+    full = (middles @ _spiral_directions(14).T < math.cos(0.27)).all(axis=1)
+    return [Surface(WindingNumber(vertices, faces[full]))]
 
 
 def _spiral_directions(n: int) -> FloatArray:
     """n directions (n, 3), evenly spread."""
     k = np.arange(n)
-    z, turn = 1.0 - (2.0 * k + 1.0) / n, 2.0 * math.pi * _GOLDEN * k
-    across = np.sqrt(1.0 - z * z)
-    return np.column_stack([across * np.cos(turn), across * np.sin(turn), z])
+    z, angle = 1.0 - (2.0 * k + 1.0) / n, 2.0 * math.pi * _GOLDEN * k
+    radius = np.sqrt(1.0 - z * z)
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
 
 
 def _soup() -> list[Surface]:
@@ -41,8 +41,8 @@ def _soup() -> list[Surface]:
     faces = example_meshes.remove_faces(faces, 0.1, seed=1)
     corners = vertices[faces]
     middle = corners.mean(axis=1, keepdims=True)
-    loose = (middle + 0.86 * (corners - middle)).reshape(-1, 3)
-    field = WindingNumber(loose, np.arange(len(loose)).reshape(-1, 3))
+    shrunk = (middle + 0.86 * (corners - middle)).reshape(-1, 3)
+    field = WindingNumber(shrunk, np.arange(len(shrunk)).reshape(-1, 3))
     return [Surface(field)]
 
 
@@ -53,8 +53,8 @@ def _cloud() -> list[Surface]:
         value, gradient = _tangle(points)
         points = points - 0.7 * (value / (gradient**2).sum(axis=1))[:, None] * gradient
     value, gradient = _tangle(points)
-    found = (np.abs(value) < 1e-9) & (np.abs(points) < 2.6).all(axis=1)
-    return [Surface(DipolePotential(points[found], gradient[found]))]
+    converged = (np.abs(value) < 1e-9) & (np.abs(points) < 2.6).all(axis=1)
+    return [Surface(DipolePotential(points[converged], gradient[converged]))]
 
 
 def _tangle(points: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -67,16 +67,16 @@ def _knot_cloud() -> list[Surface]:
     """Points on a tube around a trefoil, like the seeds of a sunflower."""
     n, count = 1200, 8000
     curve = example_curves.torus_knot(2, 3, n)
-    along = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    tangents = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
     k = np.arange(count)
-    at = k * n // count
-    turn = (2 * math.pi * _GOLDEN * k)[:, None]
-    u = np.cross(along[at], (0.0, 0.0, 1.0))
+    index = k * n // count
+    angle = (2 * math.pi * _GOLDEN * k)[:, None]
+    u = np.cross(tangents[index], (0.0, 0.0, 1.0))
     u /= np.linalg.norm(u, axis=1, keepdims=True)
-    normals = np.cos(turn) * u + np.sin(turn) * np.cross(along[at], u)
+    normals = np.cos(angle) * u + np.sin(angle) * np.cross(tangents[index], u)
     radius = 0.055 * float(np.ptp(curve))
-    return [Surface(DipolePotential(curve[at] + radius * normals, normals))]
+    return [Surface(DipolePotential(curve[index] + radius * normals, normals))]
 
 
 MESHES = (

@@ -56,8 +56,8 @@ def _nameplate() -> list[Surface]:
     letters = [np.reshape(loop, (-1, 2)) / 1000.0 - (0.0, 0.37) for loop in _WORD]
     # A little way into the plate, so that no faces coincide.
     raised = Extrusion(letters, 0.25).translated((0.0, 0.0, 0.15))
-    parts = (plate.translated((-1.8, 0.0, 0.0)), raised.translated((-1.8, 0.0, 0.0)))
-    return [Surface(one) for one in parts]
+    solids = (plate.translated((-1.8, 0.0, 0.0)), raised.translated((-1.8, 0.0, 0.0)))
+    return [Surface(solid) for solid in solids]
 
 
 def _bolt() -> list[Surface]:
@@ -65,8 +65,8 @@ def _bolt() -> list[Surface]:
     hexagon = outline.regular_polygon(6, 13.0 / math.sqrt(3.0))
     bolt = metric_thread("M8", 22.0) | Extrusion(hexagon, 5.3).translated((0.0, 0.0, -5.3))
     nut = Extrusion(hexagon, 6.5) - metric_thread("M8", 8.0, internal=True, clearance=0.05)
-    lying = nut.rotated(20.0).translated((-8.0, -14.0, -5.3))
-    return [Surface(one) for one in (bolt, lying)]
+    turned_nut = nut.rotated(20.0).translated((-8.0, -14.0, -5.3))
+    return [Surface(solid) for solid in (bolt, turned_nut)]
 
 
 OUTLINES = (

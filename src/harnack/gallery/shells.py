@@ -19,17 +19,17 @@ from harnack.geometry.polygon_meshes import cluster_into_polygons
 from harnack.rendering import Camera
 from harnack.tracer import Surface, TraceOptions
 
-# Edges of faces lie inside the picture: what is met within the tolerance of one has no normal.
+# Edges of faces lie inside the picture: hits within the tolerance of an edge have no normal.
 _PATCH_OPTIONS = TraceOptions(tolerance=1e-5)
 
 
 def _exoskeleton() -> list[Surface]:
     """A wavy torus of some 150 patches, and tubes around their edges."""
     vertices, faces = example_meshes.torus_mesh(1.0, 0.45, 240, 108)
-    turn = np.arctan2(vertices[:, 1], vertices[:, 0])
-    ring = np.column_stack([np.cos(turn), np.sin(turn), 0.25 * np.sin(3 * turn)])
-    across = vertices - np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
-    wavy = ring + across * (1 + 0.25 * np.cos(3 * turn))[:, None]
+    angle = np.arctan2(vertices[:, 1], vertices[:, 0])
+    ring = np.column_stack([np.cos(angle), np.sin(angle), 0.25 * np.sin(3 * angle)])
+    across = vertices - np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    wavy = ring + across * (1 + 0.25 * np.cos(3 * angle))[:, None]
     mesh = PolygonMesh(*cluster_into_polygons(wavy, faces, 150, smoothing=12))
     tubes = TubeNetwork(mesh.vertices, mesh.edges, 0.011)
     return [Surface(mesh), Surface(tubes)]
@@ -80,10 +80,10 @@ class GridShell:
     family meet them at right angles: beams that can be built.
 
     outline: (n, 2), counter-clockwise.
-    holes: (x, y, radius) each.
-    angle: a, twice the angle at which it leaves the ground.
-    spacing: of the beams, on the outline and the holes.
-    thickness: radius of the beams.
+    holes: (x, y, radius) of each hole.
+    angle: a, twice the angle at which the shell leaves the ground.
+    spacing: the distance of the beams on the outline and the holes.
+    thickness: the radius of the beams.
     """
 
     outline: FloatArray
@@ -111,27 +111,27 @@ class GridShell:
 
         def lines(seeds: FloatArray) -> tuple[list[FloatArray], list[FloatArray]]:
             step = 0.25 * self.spacing
-            one, other = (
+            first, second = (
                 curvature_lines(field, seeds, step=step, length=100 * step, family=family,
                                 level=self.level, clip=above)
                 for family in _FAMILIES
             )  # fmt: skip
-            return one, other
+            return first, second
 
-        near = 0.3 * self.spacing
-        crossing = [
-            max(pair, key=lambda line: _relative_height(line, near))
-            for pair in zip(*lines(ground + near * rise), strict=True)
+        offset = 0.3 * self.spacing
+        candidates = [
+            max(pair, key=lambda line: _relative_height(line, offset))
+            for pair in zip(*lines(ground + offset * rise), strict=True)
         ]
-        kept = _drop_parallel_lines(crossing, 0.55 * self.spacing)
-        # Along some of them, seeds of the other family.
-        spines = kept[:: max(1, len(kept) // 6)]
+        ribs = _drop_parallel_lines(candidates, 0.55 * self.spacing)
+        # Seeds of the other family lie along a subset of these lines.
+        spines = ribs[:: max(1, len(ribs) // 6)]
         seeds = np.concatenate([spine[2:-2:2] for spine in spines])
-        along = [
+        crossing_lines = [
             min(pair, key=lambda line: min(_crossing_cosine(line, spine) for spine in spines))
             for pair in zip(*lines(seeds), strict=True)
         ]
-        return [*kept, *_drop_parallel_lines(along, 0.55 * self.spacing), *self._edges()]
+        return [*ribs, *_drop_parallel_lines(crossing_lines, 0.55 * self.spacing), *self._edges()]
 
     def _rims(self) -> tuple[FloatArray, FloatArray]:
         """Points (n, 2) of the rims, and unit vectors from there into the region."""
@@ -140,13 +140,13 @@ class GridShell:
         for a, b in zip(self.outline, np.roll(self.outline, -1, axis=0), strict=True):
             length = float(np.linalg.norm(b - a))
             count = max(1, round(length / self.spacing))
-            share = (np.arange(count)[:, None] + 0.5) / count
-            points.append(a + share * (b - a))
+            fraction = (np.arange(count)[:, None] + 0.5) / count
+            points.append(a + fraction * (b - a))
             inward.append(np.tile(np.array([a[1] - b[1], b[0] - a[0]]) / length, (count, 1)))
         for x, y, r in self.holes:
             count = max(8, round(2 * math.pi * r / self.spacing))
-            turn = 2 * math.pi * (np.arange(count) + 0.5) / count
-            out = np.column_stack([np.cos(turn), np.sin(turn)])
+            angle = 2 * math.pi * (np.arange(count) + 0.5) / count
+            out = np.column_stack([np.cos(angle), np.sin(angle)])
             points.append(np.array([x, y]) + r * out)
             inward.append(out)
         return np.concatenate(points), np.concatenate(inward)
@@ -161,7 +161,7 @@ class GridShell:
 
 
 def _relative_height(line: FloatArray, reach: float) -> float:
-    """How far from its start, over the reach, a line gets: lines along a rim stay beside it."""
+    """The height range of a line, relative to the reach: lines along a rim stay beside it."""
     return float(line[:, 2].max() - line[:, 2].min()) / reach if len(line) else -1.0
 
 
@@ -177,15 +177,15 @@ def _crossing_cosine(line: FloatArray, other: FloatArray) -> float:
 
 
 def _drop_parallel_lines(lines: Sequence[FloatArray], gap: float) -> list[FloatArray]:
-    """The lines, longest first, that do not run beside one that was kept for most of their way;
-    of each, every second point."""
+    """The lines, longest first, without those that run beside a kept line for most of their length;
+    of each line, every second point."""
     kept: list[FloatArray] = []
     for line in sorted(lines, key=len, reverse=True):
         if len(line) < 3:
             continue
         if kept:
-            others = np.concatenate(kept)
-            nearest = np.linalg.norm(line[:, None] - others[None], axis=2).min(axis=1)
+            points = np.concatenate(kept)
+            nearest = np.linalg.norm(line[:, None] - points[None], axis=2).min(axis=1)
             if (nearest < gap).mean() > 0.6:
                 continue
         kept.append(line)
@@ -203,12 +203,12 @@ def _grid_shell_surfaces(shell: GridShell) -> list[Surface]:
 
 
 def _regular(sides: int) -> FloatArray:
-    turn = 2 * math.pi * (np.arange(sides) + 0.5) / sides
-    return np.column_stack([np.cos(turn), np.sin(turn)])
+    angle = 2 * math.pi * (np.arange(sides) + 0.5) / sides
+    return np.column_stack([np.cos(angle), np.sin(angle)])
 
 
 # The Great Court of the British Museum (Williams 2001), in units of half its width.
-_UNIT = 36.625
+_HALF_WIDTH = 36.625
 _COURT = np.array([(-36.625, -51.125), (36.625, -51.125), (36.625, 46.025), (-36.625, 46.025)])
 _PAVILION = np.array(
     [(-1.6, -1), (0.2, -1.15), (1.7, -0.8), (1.9, 0.4), (0.6, 1.1), (-1.1, 1), (-1.9, 0.2)]
@@ -228,7 +228,7 @@ SHELLS = (
         "shell-court",
         "a grid shell over the Great Court of the British Museum (after the paper's Fig. 17)",
         lambda: _grid_shell_surfaces(
-            GridShell(_COURT / _UNIT, ((0.0, 0.0, 22.245 / _UNIT),), 1.2, 0.15, 0.008)
+            GridShell(_COURT / _HALF_WIDTH, ((0.0, 0.0, 22.245 / _HALF_WIDTH),), 1.2, 0.15, 0.008)
         ),
         ("porcelain", "copper"),
         Camera(azimuth=-60, elevation=34),

@@ -131,7 +131,7 @@ BLOBS = (
 
 
 def _drawn(*solids: Solid) -> list[Surface]:
-    return [Surface(one) for one in solids]
+    return [Surface(solid) for solid in solids]
 
 
 def _carved() -> list[Surface]:
@@ -144,7 +144,7 @@ def _tori() -> list[Surface]:
     """Two tori of radii 1 and 0.1 blended with (power, radius) = (2, 0.5), (8, 0.5), (8, 0.2)."""
     link = Torus(1.0, 0.1).rotated(90, "x")
     pairs = [Torus(1.0, 0.1).blended(link, r, power=p) for p, r in ((2, 0.5), (8, 0.5), (8, 0.2))]
-    return _drawn(*(one.translated((0.0, 2.4 * k, 0.0)) for k, one in enumerate(pairs)))
+    return _drawn(*(pair.translated((0.0, 2.4 * k, 0.0)) for k, pair in enumerate(pairs)))
 
 
 # Cubic Bezier curves in the plane of the page, letter by letter: "harnack".

@@ -10,7 +10,7 @@ from harnack.backend import FloatArray
 
 __all__ = ["flatten_bezier"]
 
-_MOST_SEGMENTS = 1_000_000
+_MAX_SEGMENTS = 1_000_000
 
 
 def flatten_bezier(controls: FloatArray, tolerance: float) -> tuple[FloatArray, float]:
@@ -30,7 +30,7 @@ def flatten_bezier(controls: FloatArray, tolerance: float) -> tuple[FloatArray, 
         degree * (degree - 1) * float(np.linalg.norm(np.diff(controls, 2, axis=0), axis=1).max())
     )
     count = max(1.0, math.sqrt(second / (8.0 * tolerance)))
-    if not count <= _MOST_SEGMENTS:
+    if not count <= _MAX_SEGMENTS:
         raise ValueError(f"{count:,.0f} segments for one curve: allow a larger tolerance")
     count = math.ceil(count)
     t = np.linspace(0.0, 1.0, count + 1)[1:, None]

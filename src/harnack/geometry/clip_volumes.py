@@ -70,7 +70,7 @@ class PlaneTable:
     @classmethod
     def literal(cls, backend: Backend, rows: FloatArray) -> PlaneTable:
         """The planes (m, 4) as literals of the kernel."""
-        return cls(backend, rows, None, None, backend.Float(_reach(rows)))
+        return cls(backend, rows, None, None, backend.Float(_max_offset(rows)))
 
     @classmethod
     def upload(cls, backend: Backend, rows: FloatArray) -> PlaneTable:
@@ -79,7 +79,7 @@ class PlaneTable:
         count = len(rows) if len(rows) <= 8 else -(-len(rows) // 8) * 8
         filled = np.concatenate([rows, np.tile(_NO_CONSTRAINT, (count - len(rows), 1))])
         length = dr.opaque(backend.UInt32, count)
-        reach = dr.opaque(backend.Float, _reach(rows))
+        reach = dr.opaque(backend.Float, _max_offset(rows))
         return cls(backend, filled, upload_floats(backend, filled.ravel()), length, reach)
 
     def fold(
@@ -129,7 +129,7 @@ class PlaneTable:
 RoundingSlacks: TypeAlias = tuple[Real, Real]
 
 
-def _reach(rows: FloatArray) -> float:
+def _max_offset(rows: FloatArray) -> float:
     return float(np.abs(rows[:, 3]).max(initial=0.0))
 
 

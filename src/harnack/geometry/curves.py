@@ -204,7 +204,7 @@ def validate_loops(loops: LoopsLike, *, closed: bool = True) -> Loops:
     checked = [_validate_loop(part, name, closed) for (_, part), name in pairs]
     total = sum(len(loop) for loop in checked)
     if total > MAX_VERTICES:
-        raise TooManyVerticesError(_too_many("the curve", total))
+        raise TooManyVerticesError(_too_many_vertices("the curve", total))
     return tuple(checked)
 
 
@@ -228,7 +228,7 @@ def validate_curves(curves: Any) -> tuple[Loops, tuple[Circle, ...]]:
     ]
     total = sum(len(loop) for loop in loops)
     if total > MAX_VERTICES:
-        raise TooManyVerticesError(_too_many("the curve", total))
+        raise TooManyVerticesError(_too_many_vertices("the curve", total))
     return tuple(loops), circles
 
 
@@ -287,7 +287,7 @@ def _as_vertices(loop: Any, name: str) -> FloatArray:
     planar = "; append a column of zeros to a planar curve"
     check_vectors(array, name, CurveShapeError, planar=planar, transposed=TRANSPOSE_ADVICE)
     if len(array) > MAX_VERTICES:
-        raise TooManyVerticesError(_too_many(name, len(array)))
+        raise TooManyVerticesError(_too_many_vertices(name, len(array)))
     return np.array(array, dtype=np.float64, order="C")
 
 
@@ -323,7 +323,7 @@ def _check_edges(vertices: FloatArray, name: str, closed: bool) -> None:
         )
 
 
-def _too_many(name: str, count: int) -> str:
+def _too_many_vertices(name: str, count: int) -> str:
     return f"{name} has {count:,} vertices: at most {MAX_VERTICES:,} are accepted; resample it"
 
 

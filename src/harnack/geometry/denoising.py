@@ -304,7 +304,9 @@ def _agreeing_weight(
         offsets = points[index] - start[part, None]
         height = np.einsum("mi,mki->mk", n, offsets)
         weight = (
-            np.exp(-_DISTANCE_DECAY * _relative(_squared_tangential(offsets, height)))
+            np.exp(
+                -_DISTANCE_DECAY * _relative_to_row_maximum(_squared_tangential(offsets, height))
+            )
             * ~is_own[part]
         )
         cosine = np.einsum("mi,mki->mk", n, normals[index])
@@ -344,7 +346,7 @@ def _squared_tangential(offsets: FloatArray, height: FloatArray) -> FloatArray:
     return np.maximum(_squares(offsets) - height * height, 0.0)
 
 
-def _relative(square: FloatArray) -> FloatArray:
+def _relative_to_row_maximum(square: FloatArray) -> FloatArray:
     """(m, k) squared distances as parts of the largest in each row."""
     return square / np.maximum(square.max(axis=1, keepdims=True), 1e-300)
 
@@ -356,5 +358,7 @@ def _normal_weight(cosine: FloatArray, chord: float) -> FloatArray:
 def _weights(square: FloatArray, cosine: FloatArray, chord: float) -> FloatArray:
     """(m, k) weights of neighbors, whose sum is 1, by squared distances and by cosines between
     normals."""
-    weight = np.exp(-_DISTANCE_DECAY * _relative(square)) * _normal_weight(cosine, chord)
+    weight = np.exp(-_DISTANCE_DECAY * _relative_to_row_maximum(square)) * _normal_weight(
+        cosine, chord
+    )
     return weight / weight.sum(axis=1, keepdims=True)

@@ -74,13 +74,13 @@ def torus_mesh(major_radius: float, minor_radius: float, n: int, m: int) -> Mesh
 
 def remove_faces(faces: IntArray, fraction: float, seed: int) -> IntArray:
     """The faces (m, 3) without a random fraction of them, in their order: holes everywhere."""
-    return np.delete(faces, _chosen(faces, fraction, seed), axis=0)
+    return np.delete(faces, _random_faces(faces, fraction, seed), axis=0)
 
 
 def flip_faces(faces: IntArray, fraction: float, seed: int) -> IntArray:
     """The faces (m, 3), a random fraction of them reversed: w jumps the opposite way there."""
     flipped = faces.copy()
-    chosen = _chosen(faces, fraction, seed)
+    chosen = _random_faces(faces, fraction, seed)
     flipped[chosen] = faces[chosen][:, [0, 2, 1]]
     return flipped
 
@@ -94,11 +94,11 @@ def duplicate_faces(
     A duplicate makes w jump by 2 across that face, and a reversed duplicate by 0: a hole that is
     not seen.
     """
-    copies = faces[_chosen(faces, fraction, seed)]
+    copies = faces[_random_faces(faces, fraction, seed)]
     return np.concatenate([faces, copies[:, [0, 2, 1]] if flipped else copies])
 
 
-def _chosen(faces: IntArray, fraction: float, seed: int) -> IntArray:
+def _random_faces(faces: IntArray, fraction: float, seed: int) -> IntArray:
     """Distinct indices of a random fraction (rounded to a whole number) of the faces.
 
     Raises:

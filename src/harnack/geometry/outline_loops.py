@@ -25,7 +25,7 @@ MAX_EDGES = 200_000
 # Segments closer than this part of the outline's size count as touching.
 _TOUCH_TOLERANCE = 1e-12
 # Pairs of segments that are compared at once, and in all; with more, crossings are resolved unseen.
-_CHUNK, _MOST_PAIRS = 2_000_000, 100_000_000
+_CHUNK, _MAX_PAIRS = 2_000_000, 100_000_000
 # Coordinates are scaled to about this size for Clipper2, which rounds them to 1e-8.
 _CLIPPER_SIZE = 2.0**17
 
@@ -132,7 +132,7 @@ def _self_intersects(loops: list[FloatArray], tolerance: float) -> bool:
     order = np.argsort(lower[:, 0], kind="stable")
     last = cast("IntArray", lower[order, 0].searchsorted(upper[order, 0], side="right"))
     counts: IntArray = last - np.arange(1, len(order) + 1)
-    if int(counts.sum()) > _MOST_PAIRS:
+    if int(counts.sum()) > _MAX_PAIRS:
         return True
     begin = 0
     while begin < len(order):

@@ -132,14 +132,14 @@ class TangentVoronoi:
 
         zero = backend.Float(0) + 0 * scale
         start = index(0) + 0 * lane, zero, zero, zero > 1
-        condition = _below(lines)
+        condition = _while_below(lines)
         _, area, angle, is_rim = dr.while_loop(start, condition, step, label="lines")
         total = area + 0.5 * fmax(2 * math.pi - angle, 0)
         dr.eval(total, is_rim)
         return to_numpy(total), to_numpy(is_rim)
 
 
-def _below(count: Any) -> Callable[..., Mask]:
+def _while_below(count: Any) -> Callable[..., Mask]:
     """Whether a loop's first number is below the count."""
 
     def more(i: Any, *_: Any) -> Mask:
@@ -188,6 +188,8 @@ def _clip_bisectors(
         return i + 1, *new
 
     zero = backend.UInt32(0) + 0 * numbers[0]
-    final: tuple[Any, ...] = dr.while_loop((zero, *start), _below(lines), cut, label="other lines")
+    final: tuple[Any, ...] = dr.while_loop(
+        (zero, *start), _while_below(lines), cut, label="other lines"
+    )
     final = final[1:]
     return [(final[k], final[k + 1], final[k + 2]) for k in range(0, len(final), 3)]

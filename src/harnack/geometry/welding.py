@@ -22,7 +22,7 @@ __all__ = ["Welded", "connected_groups", "pairs_within", "rounding_of"]
 # The distance, in units in the last place of the largest coordinate, that rounding explains.
 _UNITS = 4
 # Rounding explains no distance that is more than this fraction of the shortest edge there.
-_OF_EDGES = 1e-3
+_MAX_EDGE_FRACTION = 1e-3
 
 
 def rounding_of(vertices: FloatArray) -> float:
@@ -90,7 +90,7 @@ def _joined_by_rounding(x: FloatArray, faces: IntArray, places: IntArray) -> Int
     edges = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).min(axis=1)
     for k in range(3):
         np.minimum.at(shortest, faces[:, k], edges)
-    pairs = pairs[distance <= _OF_EDGES * shortest[pairs].min(axis=1)]
+    pairs = pairs[distance <= _MAX_EDGE_FRACTION * shortest[pairs].min(axis=1)]
     while len(pairs):
         group = connected_groups(pairs, len(x))
         stands = np.unique(group, return_index=True)[1][group]

@@ -31,9 +31,9 @@ __all__ = ["BccLattice", "distinct_rows"]
 # The largest number of cells, which make about five million triangles; more are refused.
 MOST_CELLS = 2_000_000
 # Points of a lattice that has fewer than this are looked up in a table.
-_MOST_LISTED = 20_000_000
+_MAX_LISTED = 20_000_000
 # The largest number of cells in the first round of the octree.
-_MOST_ROOTS = 200_000
+_MAX_ROOTS = 200_000
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class BccLattice:
         while halvings < 3 and (self.counts >= 2 ** (halvings + 2)).all():
             halvings += 1
         blocks = -(-self.counts // 2**halvings)
-        while math.prod(blocks.tolist()) > _MOST_ROOTS and halvings < 12:
+        while math.prod(blocks.tolist()) > _MAX_ROOTS and halvings < 12:
             halvings += 1
             blocks = -(-self.counts // 2**halvings)
         grid = np.stack(np.meshgrid(*map(np.arange, blocks), indexing="ij"), axis=-1)
@@ -206,7 +206,7 @@ class BccLattice:
             keys_by_axis.append(face_keys)
         keys = [np.concatenate(column) for column in zip(*keys_by_axis, strict=True)]
         used = sorted_unique(np.concatenate(keys))
-        if math.prod(shape.tolist()) < _MOST_LISTED:
+        if math.prod(shape.tolist()) < _MAX_LISTED:
             index = np.zeros(math.prod(shape.tolist()), np.int64)
             index[used] = np.arange(len(used))
             first, second, *ring = (index[column] for column in keys)

@@ -26,11 +26,11 @@ __all__ = ["closed_parts", "mended_by_cuts", "nested", "united_parts", "volume_o
 
 # The smallest number of faces of a closed part; and the largest number of parts that are told from
 # the rest.
-_LEAST_FACES, _MOST_PARTS = 4, 200
+_MIN_FACES, _MAX_PARTS = 4, 200
 # The number of points of a part that are tested for lying in another part.
-_PLACES = 16
+_TEST_POINTS = 16
 # How far within the part these points are, relative to its size.
-_WITHIN = 1e-6
+_INSET = 1e-6
 # Relative to the size: faces that are nearer than the first lie on each other, and are moved into
 # each other by the second.
 _ON, _INTO = 1e-12, 1e-8
@@ -53,10 +53,10 @@ def closed_parts(x: FloatArray, raw: IntArray, joined: IntArray) -> list[IntArra
         remaining = np.flatnonzero(is_left)
         for rows in _pieces(x, faces[remaining]) if len(remaining) else ():
             rows = remaining[rows]
-            if len(rows) >= _LEAST_FACES and _is_closed(joined[rows]):
+            if len(rows) >= _MIN_FACES and _is_closed(joined[rows]):
                 parts.append(rows)
                 is_left[rows] = False
-    return parts if len(parts) <= _MOST_PARTS else []
+    return parts if len(parts) <= _MAX_PARTS else []
 
 
 def _pieces(x: FloatArray, faces: IntArray) -> list[IntArray]:
@@ -99,8 +99,8 @@ def nested(x: FloatArray, parts: list[IntArray]) -> list[list[int]]:
     sizes = np.abs(volumes)
     holders: list[list[int]] = []
     for i, (low, high) in enumerate(boxes):
-        within = _WITHIN * float((high - low).max())
-        sample = parts[i][:: max(1, len(parts[i]) // _PLACES)]
+        within = _INSET * float((high - low).max())
+        sample = parts[i][:: max(1, len(parts[i]) // _TEST_POINTS)]
         normals = _unit_normals(x[sample])
         points = x[sample].mean(axis=1) - math.copysign(within, volumes[i]) * normals
         containers = [
@@ -109,7 +109,7 @@ def nested(x: FloatArray, parts: list[IntArray]) -> list[list[int]]:
             if j != i
             and (lower <= low + within).all()
             and (upper >= high - within).all()
-            and sizes[j] > (1 + _WITHIN) * sizes[i]
+            and sizes[j] > (1 + _INSET) * sizes[i]
             and all(abs(winding_around(corners[j], point)) > 0.5 for point in points)
         ]
         holders.append(sorted(containers, key=lambda j: sizes[j]))

@@ -183,7 +183,7 @@ def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]]) -> Mask:
       None does: each edge without a shared corner has its ends strictly on one side of the other's
       plane, or passes two of its edges on different sides (`_edge_may_pierce`). In one plane all
       these signs are 0, and nothing is proved.
-    - *A line*, for triangles in one plane: `_beside`.
+    - *A line*, for triangles in one plane: `_separated_beside_edge`.
     """
     in_a = [shared[i][0] | shared[i][1] | shared[i][2] for i in range(3)]
     in_b = [shared[0][k] | shared[1][k] | shared[2][k] for k in range(3)]
@@ -202,7 +202,7 @@ def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]]) -> Mask:
             _shared_corners_first(first, in_first, common),
             _shared_corners_first(second, in_second, common),
         )
-        return ((common < 1.5) & ~passes) | _beside(*turned, common)
+        return ((common < 1.5) & ~passes) | _separated_beside_edge(*turned, common)
 
     def is_open(*numbers: Any) -> Mask:
         return numbers[12] < 0
@@ -268,7 +268,7 @@ def _shared_corners_first(of: Corners, shared: list[Mask], count: Real) -> Corne
     )  # type: ignore[return-value]
 
 
-def _beside(a: Corners, b: Corners, count: Real) -> Mask:
+def _separated_beside_edge(a: Corners, b: Corners, count: Real) -> Mask:
     """Whether a plane through an edge, at right angles to its triangle, has the triangles on its
     two sides; shared corners come first.
 
@@ -306,16 +306,16 @@ def _beside(a: Corners, b: Corners, count: Real) -> Mask:
                 is_beside = is_beside | (twice & behind & beyond[2])
             # Without a shared corner the edge itself is behind as well: m'.e = 0.
             is_beside = is_beside | (none & behind & beyond[0] & beyond[1] & beyond[2])
-    return is_beside | (once & _opposite(a, b))
+    return is_beside | (once & _separated_at_corner(a, b))
 
 
-def _opposite(a: Corners, b: Corners) -> Mask:
+def _separated_at_corner(a: Corners, b: Corners) -> Mask:
     """Whether a plane through the first corner, which is that of both, has the others of a and
     those of b on different sides, at right angles to the difference of their mean directions."""
-    edges = [one[k] - one[0] for one, k in itertools.product((a, b), (1, 2))]
+    edges = [corners[k] - corners[0] for corners, k in itertools.product((a, b), (1, 2))]
     mean = [dr.normalize(edges[k]) + dr.normalize(edges[k + 1]) for k in (0, 2)]
     m = dr.normalize(mean[1]) - dr.normalize(mean[0])
     rounding = ROUNDING * dr.norm(m)
     values = [(dr.dot(m, edge), rounding * dr.norm(edge) + _UNDERFLOW) for edge in edges]
-    (p, one), (q, two), (r, three), (s, four) = values
-    return (p < -one) & (q < -two) & (r > three) & (s > four)
+    (p, p_error), (q, q_error), (r, r_error), (s, s_error) = values
+    return (p < -p_error) & (q < -q_error) & (r > r_error) & (s > s_error)

@@ -148,7 +148,7 @@ _PAIRS_AT_ONCE = 1 << 18
 # For more triangles than this a kernel lists the pairs, which takes 0.05 s to record.
 _MIN_FACES_FOR_KERNEL = 5_000
 # The largest number of triangles of a size that are compared with each other at once.
-_MOST_AT_ONCE = 1 << 19
+_MAX_AT_ONCE = 1 << 19
 
 
 def misoriented_faces(function: LevelFunction, vertices: FloatArray, faces: IntArray) -> IntArray:
@@ -279,7 +279,7 @@ def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
     for i, j in itertools.product(range(len(groups)), repeat=2):
         reach = float(radius[groups[i]].max() + radius[groups[j]].max())
         queries = groups[i][chosen[groups[i]]]
-        if i == j and len(queries) == len(groups[i]) <= _MOST_AT_ONCE:
+        if i == j and len(queries) == len(groups[i]) <= _MAX_AT_ONCE:
             table = trees[i].query_pairs(reach, output_type="ndarray")
             add(*groups[i][table.T])
             continue
@@ -608,7 +608,7 @@ def points_off_level(
     directions /= np.maximum(row_norms(directions), 1e-300)[:, None]
     rows = np.flatnonzero(~(function.sample(points).distance <= tolerance))
     # Nearer points are tried as well: behind a cap there may be little of a solid.
-    for fraction, line in itertools.product((1.0, 0.25, 0.0625), (None, *_askew_lines())):
+    for fraction, line in itertools.product((1.0, 0.25, 0.0625), (None, *_generic_directions())):
         if not len(rows):
             break
         step = fraction * tolerance * (directions[rows] if line is None else line)
@@ -617,7 +617,7 @@ def points_off_level(
     return points[rows], len(points)
 
 
-def _askew_lines() -> FloatArray:
+def _generic_directions() -> FloatArray:
     """(13, 3) unit vectors along the axes and both kinds of diagonals of a cube, turned so that
     none of them is near to a plane of coordinates or to one of their diagonals."""
     directions = np.array(list(itertools.product((-1.0, 0.0, 1.0), repeat=3)))[14:]

@@ -190,7 +190,7 @@ def winding_around(corner: FloatArray, point: FloatArray) -> float:
 # Surfaces cut by volumes.
 
 # Vertices this near to a boundary, relative to the size, count as on it.
-_NEAR = 1e-9
+_ON_BOUNDARY = 1e-9
 # Vertices this near, relative to their shortest edge, are moved onto it: otherwise slivers remain.
 _SNAPPED = 0.25
 
@@ -229,20 +229,22 @@ def clip_to_volume(surface: TriangleMesh, volume: Volume) -> TriangleMesh:
             surface = clip_to_volume(surface, operand)
         return surface
     if isinstance(volume, Ball):
-        return _cut(surface, _ClipBoundary(np.array(volume.center), np.zeros(3), volume.radius))
+        return _cut_surface(
+            surface, _ClipBoundary(np.array(volume.center), np.zeros(3), volume.radius)
+        )
     if not isinstance(volume, Box | HalfSpace | ConvexHull):
         raise MeshingError(f"a {type(volume).__name__} cannot cut a mesh: give a box or a ball")
     for row in volume.planes():
-        surface = _cut(surface, _ClipBoundary(row[:3] * row[3], row[:3], None))
+        surface = _cut_surface(surface, _ClipBoundary(row[:3] * row[3], row[:3], None))
     if isinstance(volume, Box):
-        return TriangleMesh(_onto(surface.vertices, volume), surface.faces)
+        return TriangleMesh(_snap_to_box(surface.vertices, volume), surface.faces)
     return surface
 
 
-def _onto(vertices: FloatArray, box: Box) -> FloatArray:
+def _snap_to_box(vertices: FloatArray, box: Box) -> FloatArray:
     """The vertices, with those within rounding of a box's faces put onto them."""
     for end in box.bounds():
-        near = np.abs(vertices - end) <= _NEAR * (1 + np.abs(end))
+        near = np.abs(vertices - end) <= _ON_BOUNDARY * (1 + np.abs(end))
         vertices = np.where(near, end, vertices)
     return vertices
 
@@ -273,14 +275,14 @@ def _snap_to_boundary(surface: TriangleMesh, side: _ClipBoundary) -> tuple[Float
     return np.where(near[:, None], moved, x), np.where(near, 0.0, h)
 
 
-def _cut(surface: TriangleMesh, side: _ClipBoundary) -> TriangleMesh:
+def _cut_surface(surface: TriangleMesh, side: _ClipBoundary) -> TriangleMesh:
     """The part of the surface where heights are not positive. Heights are linear along edges,
     except above a sphere."""
     faces = surface.faces
     if not len(faces):
         return surface
     vertices, h = _snap_to_boundary(surface, side)
-    h = np.where(np.abs(h) <= _NEAR * float(np.ptp(vertices, axis=0).max()), 0.0, h)
+    h = np.where(np.abs(h) <= _ON_BOUNDARY * float(np.ptp(vertices, axis=0).max()), 0.0, h)
     out = (h > 0)[faces]
     # Faces on the boundary with no corner inside are left out.
     keep = (h < 0)[faces].any(axis=1)

@@ -42,12 +42,12 @@ __all__ = [
     "without_short_edges",
 ]
 
-_MOST_SEGMENTS = 2000
+_MAX_SEGMENTS = 2000
 # The areas of a union and of its parts may differ by the first, relative to the area. Otherwise,
 # and where triangles of the union cross, parts are grown, by the second, relative to the size; at
 # sharp corners by at most that over the third.
-_SAME_AREA, _GROWN, _LEAST_SLANT = 1e-6, 1e-9, 0.1
-_MOST_CELLS = 1_000_000
+_SAME_AREA, _GROWTH, _MIN_SLANT = 1e-6, 1e-9, 0.1
+_MAX_CELLS = 1_000_000
 
 
 def to_manifold(surface: TriangleMesh) -> Manifold:
@@ -99,8 +99,8 @@ def mesh_manifold(solid: MeshSolid) -> Manifold | None:
         if part.volume() <= 0 or len(intersecting_faces(boundary.vertices, boundary.faces)):
             return None
     first_union: Manifold | None = None
-    for length in (0.0, _GROWN * surface.size):
-        union = Manifold.batch_boolean([_grown(part, length) for part in parts], OpType.Add)
+    for length in (0.0, _GROWTH * surface.size):
+        union = Manifold.batch_boolean([_grow_part(part, length) for part in parts], OpType.Add)
         if abs(union.surface_area() - surface.area) <= _SAME_AREA * surface.area:
             first_union = first_union or union
             boundary = from_manifold(union)
@@ -109,7 +109,7 @@ def mesh_manifold(solid: MeshSolid) -> Manifold | None:
     return first_union
 
 
-def _grown(part: Manifold, length: float) -> Manifold:
+def _grow_part(part: Manifold, length: float) -> Manifold:
     return part if length == 0 else to_manifold(grown(from_manifold(part), length))
 
 
@@ -122,7 +122,7 @@ def grown(surface: TriangleMesh, length: float) -> TriangleMesh:
     slant = np.ones(len(normals))
     for k in range(3):
         np.minimum.at(slant, faces[:, k], row_dots(normals[faces[:, k]], mesh.face_normals))
-    return TriangleMesh(x + normals * (length / np.maximum(slant, _LEAST_SLANT))[:, None], faces)
+    return TriangleMesh(x + normals * (length / np.maximum(slant, _MIN_SLANT))[:, None], faces)
 
 
 def without_short_edges(solid: Manifold, length: float) -> Manifold:
@@ -175,7 +175,7 @@ def extruded_manifold(
     length = math.sqrt(6 * tolerance / bound)
     straight = section.extrude(height * scale)
     count = straight.surface_area() / (scale * length) ** 2
-    if count > _MOST_CELLS:
+    if count > _MAX_CELLS:
         raise MeshingError(
             f"a twisted outline within {tolerance:.3g} has about {4 * count:,.0f} faces: choose a "
             "larger `tolerance`"
@@ -199,7 +199,7 @@ def revolved_manifold(outline: Outline, tolerance: float) -> Manifold:
     """
     radius = max(float(loop[:, 0].max()) for loop in outline)
     segments = 4 * math.ceil(0.25 * math.pi * math.sqrt(radius / (2 * tolerance)))
-    if segments > _MOST_SEGMENTS:
+    if segments > _MAX_SEGMENTS:
         raise MeshingError(
             f"an outline of radius {radius:g} revolved within {tolerance:.3g} has {segments:,} "
             "segments around: choose a larger `tolerance`"
@@ -256,7 +256,7 @@ def _ball(ball: Ball, tolerance: float) -> Manifold:
 
     r = ball.radius
     segments = 4 * math.ceil(0.25 * 2 * math.pi * math.sqrt(r / (2 * tolerance)))
-    if segments > _MOST_SEGMENTS:
+    if segments > _MAX_SEGMENTS:
         raise MeshingError(
             f"a ball of radius {r:g} within {tolerance:.3g} has {2 * segments**2:,} faces: choose "
             "a larger `tolerance`"
@@ -268,11 +268,11 @@ def _ball(ball: Ball, tolerance: float) -> Manifold:
 # Closed files.
 
 # Readers such as trimesh merge points that are nearer than 1e-8 in the file's unit.
-_LEAST_STEP = 2.0**-26
+_MIN_STEP = 2.0**-26
 # In units of that distance larger coordinates are beyond the integers of readers.
 _LARGEST = 2.0**36
 # A part has to be at least this many steps long.
-_MOST_COARSE = 1e4
+_MIN_PART_STEPS = 1e4
 # Where the snapped mesh does not pass its checks, it is simplified within these numbers of steps.
 _SIMPLIFY_STEPS = (4, 32)
 # Where triangles cross, it is mended within this number of steps.
@@ -334,8 +334,8 @@ def _grid_spacing(x: FloatArray) -> float:
         MeshingError: it is too coarse for them.
     """
     largest, size = float(np.abs(x).max()), float(np.ptp(x, axis=0).max())
-    step = max(math.ldexp(1.0, math.frexp(largest)[1] - 24), _LEAST_STEP)
-    if size < _MOST_COARSE * step or not largest <= _LARGEST:
+    step = max(math.ldexp(1.0, math.frexp(largest)[1] - 24), _MIN_STEP)
+    if size < _MIN_PART_STEPS * step or not largest <= _LARGEST:
         raise MeshingError(
             f"the part is {size:.3g} long, at up to {largest:.3g} from the origin, where a file "
             f"tells points apart that are {step:.2g} from each other, up to {_LARGEST:.2g}: move "

@@ -100,9 +100,10 @@ _CELLS_OF_OFFSET, _SECANTS = 6.0, 2
 # In lattices of more cells than this, the region where other operands leave nothing is computed at
 # once.
 _MANY_CELLS = 100_000
-# How far merging of coplanar triangles may move surfaces of offsets, in tolerances, the first value
-# that does no harm; and how far mending may move them, which is done after merging.
-_JOINED_WITHIN, _MENDED_WITHIN = (0.5, 0.25, 0.1), 0.5
+# The distances, in tolerances, by which merging of coplanar triangles may move surfaces of offsets,
+# of which the first valid one is used; and the distance by which the repair of intersections may
+# move them after merging.
+_JOIN_TOLERANCES, _REPAIR_TOLERANCE = (0.5, 0.25, 0.1), 0.5
 # Triangles of offsets are cut in three where their centers are farther off the level, in
 # tolerances; and how often.
 _FAR_OFF, _TIMES_CUT = 1.8, 2
@@ -177,7 +178,7 @@ class CsgMesher:
             reduced = drop_cancelled_operands(flatten_csg(solid), level)
             return Manifold() if reduced is None else self._joined(reduced, level)
         if isinstance(solid, Complement):  # -f <= c where f >= -c
-            return self._whole_box() - self.mesh_sublevel(solid.field, -level)
+            return self._box_manifold() - self.mesh_sublevel(solid.field, -level)
         if isinstance(solid, OffsetSolid):
             return self.mesh_sublevel(solid.field, level + solid.distance)
         if isinstance(solid, BandSolid):
@@ -204,7 +205,7 @@ class CsgMesher:
             return (mesh_manifold(solid) if level == 0 else None) or self._offset(solid, level)
         if isinstance(solid, Plane):
             x, y, z = solid.normal
-            return self._whole_box().trim_by_plane((-x, -y, -z), -(solid.distance + level))
+            return self._box_manifold().trim_by_plane((-x, -y, -z), -(solid.distance + level))
         return to_manifold(self.mesh_smooth_level(solid, level)[0])
 
     def _joined(self, solid: BooleanSolid, level: float) -> Manifold:
@@ -218,7 +219,7 @@ class CsgMesher:
             )
         cut = [k for k in numbers if isinstance(solid.parts[k], Complement)]
         parts = [self._part(solid, k, level) for k in numbers if k not in cut]
-        common = Manifold.batch_boolean(parts, OpType.Intersect) if parts else self._whole_box()
+        common = Manifold.batch_boolean(parts, OpType.Intersect) if parts else self._box_manifold()
         away = [self._part(solid, k, level) for k in cut]
         return Manifold.batch_boolean([common, *away], OpType.Subtract)
 
@@ -241,7 +242,7 @@ class CsgMesher:
         finally:
             self.intersected_with = previous
 
-    def _closed(self, function: LevelFunction, lattice: BccLattice) -> TriangleMesh:
+    def _closed_level_set(self, function: LevelFunction, lattice: BccLattice) -> TriangleMesh:
         """A level set in a box. If there are many cells, only those where the other operands may
         leave something are meshed. If there are few, all are meshed, so that copies of a surface
         are the same bit by bit; unless that fails, as it may where nothing is left: a function of
@@ -251,7 +252,7 @@ class CsgMesher:
             try:
                 return mesh_closed_surface(function, lattice, self.tolerance, self.report)
             except MeshingError as wrong:
-                elsewhere = self._elsewhere()
+                elsewhere = self._irrelevant_region()
                 if elsewhere is None:
                     raise
                 self.report(f"{wrong}; so only where the other parts leave something")
@@ -260,10 +261,10 @@ class CsgMesher:
             lattice,
             self.tolerance,
             self.report,
-            irrelevant=elsewhere or self._elsewhere(),
+            irrelevant=elsewhere or self._irrelevant_region(),
         )
 
-    def _elsewhere(self) -> IrrelevantRegion | None:
+    def _irrelevant_region(self) -> IrrelevantRegion | None:
         """The region where the other operands are proved to leave nothing; None if there are no
         other operands. The two sides of a wall have the same region."""
         if not self.intersected_with:
@@ -306,7 +307,7 @@ class CsgMesher:
         function = self.function(_underlying_field(field), level)
         self.report(f"level {level:g} of {type(field).__name__} in cells of {spacing:.3g}")
         lattice = BccLattice.covering_box(lower, upper, spacing, layers=2)
-        surface = self._closed(function, lattice)
+        surface = self._closed_level_set(function, lattice)
         self.evaluations += function.evaluations
         self.levels += 1
         return surface, is_whole
@@ -317,7 +318,7 @@ class CsgMesher:
             field, level, most_faces=self.most_faces, uploads=self.uploads
         )
 
-    def _whole_box(self) -> Manifold:
+    def _box_manifold(self) -> Manifold:
         pad = 1e-3 * (self.upper - self.lower)
         return box_manifold(self.lower - pad, self.upper + pad)
 
@@ -336,7 +337,7 @@ class CsgMesher:
                 self._check_wall(field, low, high)
             return self.mesh_sublevel(inside, high) - self.mesh_sublevel(inside, low)
         if 2 * half >= field.period:
-            return self._whole_box()
+            return self._box_manifold()
         if not isinstance(field, SolidAngle):
             raise MeshingError(
                 f"a solid around a level of {type(field).__name__}, which is angle-valued, cannot "
@@ -397,11 +398,11 @@ class CsgMesher:
         surface = mesh_closed_surface(function, lattice, self.tolerance, self.report, as_cut=True)
         manifold = to_manifold(surface)
         self.levels += 1
-        for fraction in _JOINED_WITHIN:
+        for fraction in _JOIN_TOLERANCES:
             joined = from_manifold(without_short_edges(manifold, fraction * self.tolerance))
             joined = split_faces_off_level(function, joined, _FAR_OFF * self.tolerance, _TIMES_CUT)
             try:
-                surface = resolve_self_intersections(joined, _MENDED_WITHIN * self.tolerance)
+                surface = resolve_self_intersections(joined, _REPAIR_TOLERANCE * self.tolerance)
             except SelfIntersectionError:
                 continue
             break
@@ -519,11 +520,11 @@ class _DomainExtendedFunction(LevelFunction):
 # Cells across a solid, unless a spacing is given.
 _ACROSS = 24
 # How many sizes of cells are tried, and the ratio of each size to the one before.
-_MOST_ATTEMPTS = 3
-_SMALLER = 0.6
+_MAX_ATTEMPTS = 3
+_CELL_RATIO = 0.6
 # Where operands were cut by each other, slivers may pass through their neighbors by rounding: how
 # far the surface may be moved to remove them, in tolerances, in the order of the attempts.
-_SLIVERS_WITHIN = (1e-3, 1e-4, 0.0)
+_SLIVER_TOLERANCES = (1e-3, 1e-4, 0.0)
 # The margin around an extent, relative to its size.
 _MARGIN = 0.01
 
@@ -613,7 +614,7 @@ def mesh_solid(
     size = float((upper - lower).max())
     cells = size / _ACROSS if spacing is None else spacing
     error = 0.5 * tolerance.at(size)
-    attempts = _MOST_ATTEMPTS if spacing is None else 1
+    attempts = _MAX_ATTEMPTS if spacing is None else 1
     per_wave = CELLS_PER_WAVE if spacing is None else None
     uploads = EvaluatorCache()
     first: MeshingError | None = None
@@ -634,10 +635,10 @@ def mesh_solid(
             raise first from large  # the first error is the cause
         except (MissedPartsError, LocalizedMeshingError) as wrong:
             attempts, first = attempts - 1, first or wrong
-            if not attempts or not is_retry_promising(wrong, before, _SMALLER**attempts):
+            if not attempts or not is_retry_promising(wrong, before, _CELL_RATIO**attempts):
                 raise
             before = wrong
-            cells *= _SMALLER
+            cells *= _CELL_RATIO
             per_wave = CELLS_PER_WAVE * size / (_ACROSS * cells)
             if isinstance(wrong, LocalizedMeshingError):
                 error *= 0.5
@@ -692,12 +693,12 @@ def _apart(parts: TriangleMesh | _Assembly, tolerance: float) -> TriangleMesh:
             any fewer triangles cross when fewer slivers are removed.
     """
     raised: SelfIntersectionError | None = None
-    for factor in _SLIVERS_WITHIN if isinstance(parts, _Assembly) else (0.0,):
+    for factor in _SLIVER_TOLERANCES if isinstance(parts, _Assembly) else (0.0,):
         mesh = parts.without_slivers(factor * tolerance) if isinstance(parts, _Assembly) else parts
         if not len(mesh.faces):
             raise MeshingError("the solid is empty: no point of the box is inside")
         try:
-            return resolve_self_intersections(mesh, _MENDED_WITHIN * tolerance)
+            return resolve_self_intersections(mesh, _REPAIR_TOLERANCE * tolerance)
         except SelfIntersectionError as error:
             if not is_retry_promising(error, raised):
                 raise

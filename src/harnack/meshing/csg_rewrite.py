@@ -32,7 +32,7 @@ def factor_common_operands(union: BooleanSolid, level: float) -> Solid | None:
     sharing = [term for term in terms if common_key in term]
     other_terms = [_intersection(term.values()) for term in terms if common_key not in term]
     shared = {key for key in sharing[0] if all(key in term for term in sharing)}
-    common = [_placed(*factor) for key, factor in sharing[0].items() if key in shared]
+    common = [_at_level_zero(*factor) for key, factor in sharing[0].items() if key in shared]
     remainders = [[factor for key, factor in term.items() if key not in shared] for term in sharing]
     if all(remainders):
         common.append(_union([_intersection(remainder) for remainder in remainders]))
@@ -108,7 +108,7 @@ def _key(solid: Solid, level: float) -> Hashable:
     return id(solid), level
 
 
-def _placed(solid: Solid, level: float) -> Solid:
+def _at_level_zero(solid: Solid, level: float) -> Solid:
     """The solid as a solid of level 0."""
     if level == 0:
         return solid
@@ -118,7 +118,7 @@ def _placed(solid: Solid, level: float) -> Solid:
 
 
 def _intersection(factors: Iterable[SolidAtLevel]) -> Solid:
-    parts = tuple(_placed(*factor) for factor in factors)
+    parts = tuple(_at_level_zero(*factor) for factor in factors)
     return parts[0] if len(parts) == 1 else BooleanSolid(parts, is_union=False)
 
 

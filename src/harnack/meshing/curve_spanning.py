@@ -123,16 +123,16 @@ def _push_inward(
     max_height = np.full(len(ends), height)
     np.minimum.at(max_height, owner, _SHALLOW * shortest[inner])
     lift = 4 * fraction * (1 - fraction) * max_height[owner]
-    direction = _across(inward[inner], along)
+    direction = _unit_perpendicular(inward[inner], along)
     start = points + lift[:, None] * direction
     projected = newton_to_level(function, start, function.sample(start), 0.3 * lift, None)
     # Points keep their position along the edge and their distance from it: they turn about it.
-    turned = _across(projected - points, along)
+    turned = _unit_perpendicular(projected - points, along)
     is_close = (turned * direction).sum(axis=1) > 0.3
     return points + lift[:, None] * np.where(is_close[:, None], turned, direction)
 
 
-def _across(vectors: FloatArray, along: FloatArray) -> FloatArray:
+def _unit_perpendicular(vectors: FloatArray, along: FloatArray) -> FloatArray:
     """The unit vectors (k, 3) of the components of vectors at right angles to unit vectors."""
     part = vectors - (vectors * along).sum(axis=1)[:, None] * along
     return part / np.maximum(np.linalg.norm(part, axis=1), 1e-300)[:, None]
@@ -153,14 +153,14 @@ def _filling(chain: list[int]) -> list[tuple[int, int, int]]:
 # The whole surface.
 
 # How often the mesh is computed again because finished triangles fail.
-_MOST_ATTEMPTS = 4
+_MAX_ATTEMPTS = 4
 # How often cells are made smaller where the first triangles fail, before they are made smaller
 # everywhere.
 _MOST_LOCAL = 4
 # Edges of a curve that are longer than this many cells are cut.
 _LONGEST = 2.5
 # How often edges of a curve that are too near to others are halved.
-_MOST_CUTS = 4
+_MAX_CUTS = 4
 # The ratio of the size of smaller cells everywhere to the size before.
 _SMALLER = 0.6
 
@@ -231,7 +231,7 @@ def mesh_spanning_curve(
     finer: tuple[RefinementBalls, ...] = ()
     best: SpanningMesh | None = None
     crossing = np.zeros(0, np.int64)
-    for attempt in range(_MOST_ATTEMPTS):
+    for attempt in range(_MAX_ATTEMPTS):
         first = _first_surface(task, spacing, attempts, finer)
         spacing, finer = first.spacing, first.finer
         faces = first.faces
@@ -251,7 +251,7 @@ def mesh_spanning_curve(
         failing = np.union1d(crossing, turned)
         if not len(failing):
             break
-        if attempt < _MOST_ATTEMPTS - 1:
+        if attempt < _MAX_ATTEMPTS - 1:
             report(f"{len(failing)} triangles fail: smaller cells there")
             finer = (*finer, RefinementBalls(vertices[faces[failing]].mean(axis=1), spacing))
     if best is None:
@@ -323,7 +323,7 @@ def _tetrahedralize(
 ) -> tuple[BoundaryCurve, TetrahedronPoints, Tetrahedra]:
     """Tetrahedra that have all edges of the curve, whose edges are cut where others are too
     near."""
-    for _ in range(_MOST_CUTS):
+    for _ in range(_MAX_CUTS):
         points = sample_delaunay_points(task.function, root, curve, task.walls, task.seed, finer)
         tets = delaunay(points.points)
         has_edge = tets.has_edges(curve.edges)

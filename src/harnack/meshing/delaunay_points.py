@@ -33,7 +33,7 @@ __all__ = [
 _JITTER = 1e-3  # no five points on a sphere
 _SNAPPED = 0.3  # points this near to the level are moved onto it
 _MIN_CURVE_DISTANCE = 0.45  # no other points are so near to the curve
-_MOST_CELLS = 4_000_000
+_MAX_CELLS = 4_000_000
 # A step of Newton's method that is shorter than this, relative to the longest step, is the last.
 _CONVERGED = 1e-9
 # How often steps to a multiple root are continued as a geometric series, and the range of its
@@ -169,7 +169,7 @@ def sample_delaunay_points(
 
     Raises MemoryError for more than four million cells.
     """
-    tree = refine_cells(root[0], function.clearance, _MOST_CELLS, root[1])
+    tree = refine_cells(root[0], function.clearance, _MAX_CELLS, root[1])
     points, size = _corners_and_centers(tree, _finer_cells(function, tree.occupied, finer))
     free = _MIN_CURVE_DISTANCE * np.minimum(size, 2 * float(tree.occupied.size.max()))
     is_far = _is_far(points, free, boundary)
@@ -178,7 +178,7 @@ def sample_delaunay_points(
     jitter = rng.uniform(-1, 1, points.shape) * _JITTER * size[:, None]
     points = points + (jitter if walls is None else jitter * _off_walls(points, walls))
     samples = function.sample(points)
-    points, samples, is_on = _snapped(
+    points, samples, is_on = _snap_to_level(
         function, points, size, free[is_far], samples, boundary, walls
     )
     n = len(boundary.points)
@@ -266,7 +266,7 @@ def _off_walls(points: FloatArray, walls: tuple[FloatArray, FloatArray]) -> Floa
     return np.where(on, 0.0, 1.0)
 
 
-def _snapped(
+def _snap_to_level(
     function: LevelFunction,
     points: FloatArray,
     size: FloatArray,

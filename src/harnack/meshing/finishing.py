@@ -39,7 +39,7 @@ _TURNED = 1e-2
 _MOST_HULLS = 20_000
 # Half the thickness is beyond the reach if a side comes nearer to the surface than this fraction of
 # it.
-_NEAR = 0.98
+_REACH_FRACTION = 0.98
 
 
 def thicken(
@@ -125,7 +125,7 @@ def _reason_beyond_reach(
         # At most the neighbors of the vertex that a point was moved from are nearer to the point.
         away, nearest = tree.query(side, k=neighbor_count)
         pairs = np.stack([np.broadcast_to(vertex_ids[:, None], nearest.shape), nearest], axis=-1)
-        near = (away < _NEAR * half) & (pairs[..., 0] != pairs[..., 1])
+        near = (away < _REACH_FRACTION * half) & (pairs[..., 0] != pairs[..., 1])
         near_keys = sorted_unique(edge_keys(pairs[near], len(vertex_ids)))
         count = int((~np.isin(near_keys, neighbors)).sum())
         if count:
@@ -162,9 +162,9 @@ def _hulls(surface: TriangleMesh, radius: float, tolerance: float, why: str) -> 
 
 # The cosine of the angle between normals from which on an edge is a crease.
 _CREASE = math.cos(math.radians(30))
-# How far simplification may move a surface, and how far mending may then, relative to the
-# tolerance.
-_SIMPLER, _MENDED = (0.4, 0.2, 0.1), 0.05
+# The distances by which simplification may move a surface, in the order of the attempts, and the
+# distance by which the repair of intersections may then move it, relative to the tolerance.
+_SIMPLIFY_TOLERANCES, _REPAIR_TOLERANCE = (0.4, 0.2, 0.1), 0.05
 
 
 def check_options(spacing: Any, thickness: Any, seed: Any, max_triangles: Any) -> None:
@@ -211,12 +211,12 @@ def simplify_mesh(
     """
     facts = {"triangles_before_simplification": len(surface.faces)}
     solid = to_manifold(surface)
-    for part in _SIMPLER:
+    for part in _SIMPLIFY_TOLERANCES:
         simpler = from_manifold(without_short_edges(solid, part * tolerance))
         if not 0 < len(simpler.faces) < len(surface.faces):
             continue
         try:
-            simpler = resolve_self_intersections(simpler, _MENDED * tolerance)
+            simpler = resolve_self_intersections(simpler, _REPAIR_TOLERANCE * tolerance)
             check(simpler)
         except MeshingError:
             continue

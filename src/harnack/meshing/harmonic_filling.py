@@ -59,11 +59,11 @@ _LEVEL = 2 * math.pi
 _ACROSS = 24
 # How often edges of holes that are too near to others are halved for the tetrahedra; and the
 # largest number of pieces, in all and for each edge: so many arise where edges lie on each other.
-_MOST_CUTS, _MOST_PIECES, _MOST_PER_EDGE = 12, 20_000, 64
-# How often patches that meet the mesh are computed again, with smaller cells.
-_MOST_MET = 1
-# How far w may be from 1/2, modulo 1, at vertices of patches.
-_NEAR = 1e-6
+_MAX_CUTS, _MAX_PIECES, _MAX_PER_EDGE = 12, 20_000, 64
+# How often fillings that intersect the mesh are computed again, with smaller cells.
+_MAX_RETRIES = 1
+# The largest difference of w from 1/2, modulo 1, at vertices of fillings.
+_MAX_LEVEL_ERROR = 1e-6
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ def harmonic_patches(
 def _fill_all_holes(
     vertices: FloatArray, faces: IntArray, edges: IntArray, options: HoleFillingOptions
 ) -> HarmonicFilling:
-    """The patches that end at open edges; cells are made smaller where checks fail.
+    """The fillings that end at open edges; cells are made smaller where checks fail.
 
     Raises:
         MeshingError: as `harmonic_filling`.
@@ -159,7 +159,7 @@ def _fill_all_holes(
         except LocalizedMeshingError as error:
             times_met += isinstance(error, _MeshIntersectionError)
             is_hopeless, before = not is_retry_promising(error, before), error
-            if last or is_hopeless or times_met > _MOST_MET:
+            if last or is_hopeless or times_met > _MAX_RETRIES:
                 location = ", ".join(f"{c:.4g}" for c in error.locations[0])
                 raise MeshingError(
                     f"{error} (cells were {cell:.3g} wide, and smaller in {len(error.locations)} "
@@ -250,7 +250,7 @@ def _patches(
 ) -> HarmonicFilling:
     """The level set, ending at the edges (k, 2) of the mesh.
 
-    last: whether this is the last attempt, in which patches that cannot be refined are accepted.
+    last: whether this is the last attempt, in which fillings that cannot be refined are accepted.
 
     Raises:
         MeshingError: as `mesh`; or Delaunay's tetrahedra lack an edge.
@@ -263,11 +263,11 @@ def _patches(
     cut, middles = boundary, np.zeros((0, 2), np.int64)
     points = sample_delaunay_points(function, root, cut, None, seed, finer)
     tets = delaunay(points.points)
-    for _ in range(_MOST_CUTS):
+    for _ in range(_MAX_CUTS):
         lacks = ~tets.has_edges(cut.edges)
         if not lacks.any():
             break
-        if len(cut.edges) > min(_MOST_PIECES, _MOST_PER_EDGE * len(edges)):
+        if len(cut.edges) > min(_MAX_PIECES, _MAX_PER_EDGE * len(edges)):
             raise TriangleLimitError(
                 f"{len(edges):,} boundary edges of the mesh lie on others or next to them: cut to "
                 f"{len(cut.edges):,} pieces some are still too near to others for a patch that "
@@ -295,7 +295,7 @@ def _patches(
     _check_boundary(x, faces, boundary)
     is_fine = True
     try:
-        x, faces = _finished(function, x, faces, tolerance, report)
+        x, faces = _refine_and_smooth(function, x, faces, tolerance, report)
     except LocalizedMeshingError:
         if not last or len(intersecting_faces(x, faces)):
             raise
@@ -310,7 +310,7 @@ def _patches(
     return HarmonicFilling(x[inner], index[faces], is_fine, spacing, function.evaluations)
 
 
-def _finished(
+def _refine_and_smooth(
     function: LevelFunction,
     x: FloatArray,
     faces: IntArray,
@@ -368,8 +368,8 @@ def _collapse_midpoint(x: FloatArray, faces: IntArray, middle: int, ends: list[i
             continue
         moved = np.where(star == middle, end, star)
         is_kept = ~(star == end).any(axis=1)
-        one, other = _normals(x[star[is_kept]]), _normals(x[moved[is_kept]])
-        turned = float((one * other).sum(axis=1).min(initial=1.0))
+        before, after = _normals(x[star[is_kept]]), _normals(x[moved[is_kept]])
+        turned = float((before * after).sum(axis=1).min(initial=1.0))
         new_faces = np.concatenate([rest, moved[is_kept]])
         is_moved = np.arange(len(new_faces)) >= len(rest)
         candidates.append((len(intersecting_faces(x, new_faces, is_moved)), -turned, new_faces))
@@ -379,7 +379,7 @@ def _collapse_midpoint(x: FloatArray, faces: IntArray, middle: int, ends: list[i
             "subdivide the mesh there, or choose a smaller `cell_size`",
             x[[middle]],
         )
-    return min(candidates, key=lambda one: one[:2])[2]
+    return min(candidates, key=lambda candidate: candidate[:2])[2]
 
 
 def _normals(corners: FloatArray) -> FloatArray:
@@ -389,8 +389,8 @@ def _normals(corners: FloatArray) -> FloatArray:
 
 
 def _check_boundary(x: FloatArray, faces: IntArray, boundary: BoundaryCurve) -> None:
-    """Raise unless patches end at the boundary, and run each of its edges in the direction of the
-    mesh: patches are reversed afterwards."""
+    """Raise unless fillings end at the boundary, and run each of its edges in the direction of the
+    mesh: fillings are reversed afterwards."""
     directed = {(int(a), int(b)) for a, b in half_edges(faces)}
     rim = {(a, b) for a, b in directed if (b, a) not in directed}
     unmatched = rim ^ {(int(a), int(b)) for a, b in boundary.edges}
@@ -408,7 +408,7 @@ def _check(
     patches: HarmonicFilling,
     report: Callable[[str], None],
 ) -> None:
-    """Raise unless the mesh with its patches fulfills what `repair` promises.
+    """Raise unless the mesh with its fillings has the properties that `repair` promises.
 
     Raises:
         MeshingError: it does not.
@@ -423,11 +423,11 @@ def _check(
     added = patches.vertices
     w = WindingNumber(vertices, faces).value(added, precision="double")
     gap = np.abs(w - np.floor(w) - 0.5)
-    if not (gap <= _NEAR).all():
+    if not (gap <= _MAX_LEVEL_ERROR).all():
         raise LocalizedMeshingError(
             f"the winding number is off 1/2 by {gap.max():.2g} at a vertex of the patches: choose "
             "a smaller `cell_size`",
-            added[gap > _NEAR],
+            added[gap > _MAX_LEVEL_ERROR],
         )
     is_patch = np.arange(len(together)) >= len(faces)
     met = intersecting_faces(x, together, is_patch)

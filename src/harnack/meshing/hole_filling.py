@@ -38,21 +38,21 @@ from harnack.meshing.refinement import split_faces
 __all__ = ["HoleFilling", "fill_holes", "hole_loops"]
 
 # Loops of more edges are not filled: the time grows with the cube of their number.
-_MOST_IN_LOOP = 600
+_MAX_LOOP_EDGES = 600
 # The largest number of edges of a loop for which angles count, beyond which areas alone do; and the
 # number up to which angles always count.
-_MOST_BY_ANGLES, _ALWAYS_BY_ANGLES = 150, 10
+_MAX_ANGLE_EDGES, _ALWAYS_BY_ANGLES = 150, 10
 # Largest angles count as the same if their cosines differ by less than this.
 _SAME_TURN = 1e-9
 # Edges are split that are longer than this multiple of the usual length around the hole; and the
 # number of rounds.
 _LONG, _ROUNDS = 1.4, 10
-_MOST_CUT = 200_000
+_MAX_CUT = 200_000
 # Edges are flipped if the cotangents of the two opposite angles have a sum below this.
 _MAX_FLIP_COTANGENT_SUM = -1e-3
-_MOST_FLIPS = 12
+_MAX_FLIPS = 12
 # Cotangents are clamped to this range, so that every matrix is definite.
-_LEAST_COTANGENT, _MOST_COTANGENT = 0.02, 20.0
+_MIN_COTANGENT, _MAX_COTANGENT = 0.02, 20.0
 # The strategies in the order of the attempts: whether loops are triangulated by angles, and how
 # often the patch is faired, by the cotangents of the patch before.
 _STRATEGIES = ((True, 6), (False, 2), (True, 0), (False, 0))
@@ -99,14 +99,18 @@ def fill_holes(
         patched, new, owner, reasons = _patches(x, together, pending, by_angles, fairings)
         reasons |= _failures(patched, together, new, owner, len(x), winding)
         is_accepted = ~np.isin(owner, list(reasons))
-        x, together = _used(patched, np.concatenate([together, new[is_accepted]]), len(x))
+        x, together = _without_unused_vertices(
+            patched, np.concatenate([together, new[is_accepted]]), len(x)
+        )
         pending = [pending[k] for k in sorted(reasons)]
     counts = Counter(reasons.values())
     why = ", ".join(f"{count:,} {reason}" for reason, count in counts.items())
     return HoleFilling(x[len(vertices) :], together[len(faces) :], pending, why)
 
 
-def _used(x: FloatArray, faces: IntArray, input_count: int) -> tuple[FloatArray, IntArray]:
+def _without_unused_vertices(
+    x: FloatArray, faces: IntArray, input_count: int
+) -> tuple[FloatArray, IntArray]:
     """The vertices and faces, without new vertices that no face uses."""
     used = np.zeros(len(x), np.bool_)
     used[:input_count] = True
@@ -122,7 +126,7 @@ def _failures(
     input_count: int,
     winding: Winding,
 ) -> dict[int, str]:
-    """The reasons why patches fail, by loop. new: the faces of patches; owner: the loop of each."""
+    """The reasons why fillings fail, by loop. new: the faces of fillings; owner: their loops."""
     reasons: dict[int, str] = {}
     if not len(new):
         return reasons
@@ -224,11 +228,11 @@ def _patches(
     fixed_edges = np.array(sorted(used_edges), np.int64).reshape(-1, 2)
     patches, failed = list[IntArray](), dict[int, str]()
     for k, loop in enumerate(loops):
-        if len(loop) > _MOST_IN_LOOP:
-            failed[k] = f"of more than {_MOST_IN_LOOP} edges"
+        if len(loop) > _MAX_LOOP_EDGES:
+            failed[k] = f"of more than {_MAX_LOOP_EDGES} edges"
             continue
         polygon = loop[::-1].copy()
-        limit = _MOST_BY_ANGLES if by_angles else _ALWAYS_BY_ANGLES
+        limit = _MAX_ANGLE_EDGES if by_angles else _ALWAYS_BY_ANGLES
         plan = _min_dihedral_triangulation if len(polygon) <= limit else _min_area_triangulation
         triangles = plan(vertices, polygon, third, used_edges)
         if triangles is None:
@@ -388,7 +392,7 @@ def _refine(
         x, new = _split_long_edges(x, new)
         if len(x) == count:
             break
-        x = _relaxed(x, new, input_count)
+        x = _at_neighbor_means(x, new, input_count)
     return x, _flipped(x[:, :3], new, fixed_edges)
 
 
@@ -398,7 +402,7 @@ def _split_long_edges(x: FloatArray, new: IntArray) -> tuple[FloatArray, IntArra
     ends = x[edges.vertices]
     long = row_norms(ends[:, 0, :3] - ends[:, 1, :3]) > _LONG * ends[:, :, 3].mean(axis=1)
     rows = np.flatnonzero(long & (edges.multiplicity == 2))
-    if not len(rows) or len(new) > _MOST_CUT:
+    if not len(rows) or len(new) > _MAX_CUT:
         return x, new
     midpoint = np.full(len(edges.vertices), -1, np.int64)
     midpoint[rows] = len(x) + np.arange(len(rows))
@@ -419,7 +423,7 @@ def _mean_edge_lengths(x: FloatArray, faces: IntArray, rims: IntArray) -> FloatA
     return np.where(is_rim, total / np.maximum(count, 1), 0.0)
 
 
-def _relaxed(x: FloatArray, new: IntArray, input_count: int) -> FloatArray:
+def _at_neighbor_means(x: FloatArray, new: IntArray, input_count: int) -> FloatArray:
     """(n, 4) the vertices, with the rows of new vertices in the middle of their neighbors' rows."""
     ends = Edges.of(half_edges(new)).vertices
     weights = _graph_laplacian(ends, np.ones(len(ends)), len(x))
@@ -468,11 +472,11 @@ def _fair(x: FloatArray, faces: IntArray, new: IntArray, input_count: int) -> Fl
     double = np.maximum(row_norms(area_normals(x[triangles])), 1e-300)
     for k in range(3):  # the edge from corner k to k + 1 is opposite to corner k + 2
         u, w = (corner[:, j] - corner[:, k - 1] for j in (k, (k + 1) % 3))
-        cotangent = np.clip(row_dots(u, w) / double, -_MOST_COTANGENT, _MOST_COTANGENT)
+        cotangent = np.clip(row_dots(u, w) / double, -_MAX_COTANGENT, _MAX_COTANGENT)
         m = len(triangles)
         np.add.at(weight, edges.edge_of_pair[k * m : (k + 1) * m], 0.5 * cotangent)
         np.add.at(area, triangles[:, k], double / 6)
-    weight = np.maximum(weight, _LEAST_COTANGENT)
+    weight = np.maximum(weight, _MIN_COTANGENT)
     # Beside holes that remain open only new vertices count.
     is_rim[edges.vertices[edges.multiplicity != 2]] = False
     rows = np.flatnonzero(is_rim & (area > 0))
@@ -486,7 +490,7 @@ def _flipped(x: FloatArray, new: IntArray, fixed_edges: IntArray) -> IntArray:
     criterion), where the new edge does not exist yet and no triangle turns over."""
     new = new.copy()
     fixed_keys = edge_keys(fixed_edges, len(x))
-    for _ in range(_MOST_FLIPS):
+    for _ in range(_MAX_FLIPS):
         edges = Edges.of(half_edges(new))
         half = edges.paired_half_edges()
         f, g = half.T % len(new)
@@ -522,7 +526,7 @@ def _cotangents(a: FloatArray, b: FloatArray, apex: FloatArray) -> FloatArray:
 
 
 def _loop_of_faces(new: IntArray, loops: list[IntArray], count: int) -> IntArray:
-    """(p,) the loop of each face of patches: faces are joined by edges to a face at their loop."""
+    """(p,) the loop of each face of fillings: faces are joined by edges to a face at their loop."""
     import scipy.sparse  # imported here: it takes half a second
     import scipy.sparse.csgraph as csgraph_module
 

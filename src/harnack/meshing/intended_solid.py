@@ -34,7 +34,7 @@ __all__ = ["Difference", "IntendedSolid"]
 
 # The number of points at which winding numbers are compared: in the box around the mesh, and near
 # each surface.
-_IN_BOX, _NEAR = 2000, 1000
+_BOX_POINTS, _SURFACE_POINTS = 2000, 1000
 # The smallest and the largest distance of the points near a surface from it, and the margin of the
 # box, relative to the size.
 _NEAREST, _FARTHEST, _MARGIN = 2e-3, 0.1, 0.05
@@ -144,17 +144,17 @@ class IntendedSolid:
         if as_it_is or not len(rows):
             return cls(x, faces, is_turned, joined, [], welded.rounded)
         disagrees = against_neighbors(x, joined)
-        agreeing = _turned(joined, disagrees)
-        raw = _turned(raw[rows], disagrees)
+        agreeing = _turn_faces(joined, disagrees)
+        raw = _turn_faces(raw[rows], disagrees)
         step = 1 if volume_of(x, agreeing) >= 0 else -1  # most faces have their material inside
         parts = closed_parts(x, raw[:, ::step], agreeing[:, ::step])
         turned = _inside_out(x, agreeing, parts)
-        oriented = _turned(agreeing, turned)
+        oriented = _turn_faces(agreeing, turned)
         if turned.any() and not turned.all():
-            parts = closed_parts(x, _turned(raw, turned), oriented)
+            parts = closed_parts(x, _turn_faces(raw, turned), oriented)
         if not disagrees.any():  # otherwise no part is turned as a whole
             is_turned[rows] = turned
-        return cls(x, _turned(faces, is_turned), is_turned, oriented, parts, welded.rounded)
+        return cls(x, _turn_faces(faces, is_turned), is_turned, oriented, parts, welded.rounded)
 
     @functools.cached_property
     def size(self) -> float:
@@ -177,7 +177,7 @@ class IntendedSolid:
         corner = self.vertices[self.oriented]
         low, high = corner.min(axis=(0, 1)), corner.max(axis=(0, 1))
         margin = _MARGIN * self.size
-        box = rng.uniform(low - margin, high + margin, (_IN_BOX, 3))
+        box = rng.uniform(low - margin, high + margin, (_BOX_POINTS, 3))
         points = np.concatenate([box, _near(corner, self.size, rng)])
         return points, self.winding(points)
 
@@ -204,7 +204,7 @@ class IntendedSolid:
         """
         rng = np.random.default_rng(0)
         corner = self.vertices[self.oriented]
-        points, normals = _on_faces(corner, _NEAR, rng)
+        points, normals = _on_faces(corner, _SURFACE_POINTS, rng)
         away = _NEAREST * self.size * normals
         beside = self.winding(np.concatenate([points + away, points - away]))
         nothing = (beside.reshape(2, -1) < 0.5).all(axis=0)
@@ -292,8 +292,8 @@ def _values(field: WindingNumber | None, points: FloatArray) -> FloatArray:
     return np.asarray(field.value(points, precision="double"))
 
 
-def _turned(faces: IntArray, which: BoolArray) -> IntArray:
-    """Faces (m, 3), with those of the mask `which` (m,) turned over."""
+def _turn_faces(faces: IntArray, which: BoolArray) -> IntArray:
+    """Faces (m, 3), with the faces of the mask `which` (m,) reversed."""
     return np.where(which[:, None], faces[:, ::-1], faces)
 
 
@@ -314,7 +314,7 @@ def _on_faces(
 
 def _near(corner: FloatArray, size: float, rng: np.random.Generator) -> FloatArray:
     """Points on both sides of faces (m, 3, 3), at distances of all magnitudes."""
-    points, normals = _on_faces(corner, _NEAR, rng)
+    points, normals = _on_faces(corner, _SURFACE_POINTS, rng)
     heights = size * np.exp(rng.uniform(math.log(_NEAREST), math.log(_FARTHEST), len(points)))
     heights *= rng.choice((-1.0, 1.0), len(points))
     return points + heights[:, None] * normals

@@ -62,9 +62,9 @@ _HALVINGS = 5
 _TRIALS = 20
 _UNKNOWN = 1e200
 # The number of tetrahedra that are examined before all are.
-_FEW = 100
+_FIRST_EXAMINED = 100
 # The distance, in cells, beyond which tetrahedra are far from the curve.
-_FAR = 1.5
+_FAR_FROM_CURVE = 1.5
 
 
 @dataclass(frozen=True)
@@ -130,22 +130,24 @@ def isotopy_of(
         on_walls = _regular_on_walls(function, corners, values, slopes, proved, walls)
     far = np.ones(len(index), np.bool_)
     if len(boundary.edges):
-        far = _distances(corners.mean(axis=1), boundary) > _FAR * spacing
+        far = _distances(corners.mean(axis=1), boundary) > _FAR_FROM_CURVE * spacing
     stars = ~proved & ~beside & far
     proved[stars] = _proved_by_stars(function, corners, index, slopes, np.flatnonzero(stars))
     proved &= on_walls
-    return IsotopyCoverage(_share(proved), _share(proved[far]), len(index), index[far & ~proved])
+    return IsotopyCoverage(
+        _proved_fraction(proved), _proved_fraction(proved[far]), len(index), index[far & ~proved]
+    )
 
 
 def _has_bounds(function: LevelFunction, corners: FloatArray) -> bool:
     """Whether changes of the gradient are bounded on any of a selection of tetrahedra (n, 4, 3); if
     not, all cut tetrahedra stay unproved, and no others need to be examined."""
-    sampled = corners[:: max(1, len(corners) // _FEW)]
+    sampled = corners[:: max(1, len(corners) // _FIRST_EXAMINED)]
     center, radius = _balls(sampled)
     return not len(sampled) or bool((function.gradient_bounds(center, radius)[1] < _UNKNOWN).any())
 
 
-def _share(proved: BoolArray) -> float:
+def _proved_fraction(proved: BoolArray) -> float:
     return float(proved.mean()) if len(proved) else 1.0
 
 
@@ -257,7 +259,7 @@ def _proved_empty(function: LevelFunction, corners: FloatArray) -> BoolArray:
         center, radius = _balls(pieces)
         undecided = function.clearance(center) <= radius * (1 + 1e-9)
         owner = np.concatenate([owner[undecided], owner[undecided]])
-        pieces = _halved(pieces[undecided])
+        pieces = _halve_simplices(pieces[undecided])
         if not len(pieces):
             break
     free = np.ones(len(corners), np.bool_)
@@ -306,11 +308,11 @@ def _proved_regular(
             proved[owner[undecided]] = False
             break
         owner = np.concatenate([owner[undecided], owner[undecided]])
-        pieces = _halved(pieces[undecided])
+        pieces = _halve_simplices(pieces[undecided])
     return proved
 
 
-def _halved(pieces: FloatArray) -> FloatArray:
+def _halve_simplices(pieces: FloatArray) -> FloatArray:
     """Simplices (2n, k, 3): both halves of each, cut at the middle of its longest edge."""
     pairs = list(itertools.combinations(range(pieces.shape[1]), 2))
     span = [np.linalg.norm(pieces[:, i] - pieces[:, j], axis=1) for i, j in pairs]

@@ -32,12 +32,12 @@ __all__ = ["boundary_of_solid", "neighbors", "passes_itself"]
 _LEAF_SIZE = 4
 # Relative to the mesh's size: pieces thinner than the first are not tested for winding numbers
 # beside them; corners nearer than the second are joined.
-_THIN, _SAME = 1e-9, 1e-11
+_THIN, _JOIN_DISTANCE = 1e-9, 1e-11
 # Faces around an edge have the same direction if the angle between them, in full turns, is less
 # than this.
 _SAME_TURN = 1e-9
 # How often edges are halved at corners on them.
-_MOST_HALVINGS = 200
+_MAX_HALVINGS = 200
 
 
 def passes_itself(surface: TriangleMesh, number: IntArray) -> bool:
@@ -79,7 +79,7 @@ def boundary_of_solid(vertices: FloatArray, faces: IntArray) -> TriangleMesh:
     looks_in = (cut.front > cut.back)[bounds]
     pieces = np.where(looks_in[:, None, None], pieces[:, ::-1], pieces)
     points = np.concatenate([cut.vertices, pieces.reshape(-1, 3)])
-    group = connected_groups(pairs_within(points, _SAME), len(points))
+    group = connected_groups(pairs_within(points, _JOIN_DISTANCE), len(points))
     first = np.unique(group, return_index=True)[1][group]  # corners of the mesh come first
     joined = first[len(x) :].reshape(-1, 3)
     joined = joined[(joined != np.roll(joined, 1, axis=1)).all(axis=1)]
@@ -171,7 +171,7 @@ def _cut_at_corners(x: FloatArray, faces: IntArray) -> IntArray:
         MeshingError: they do not fit together.
     """
     edges, _ = singular_edges(faces)
-    for _ in range(_MOST_HALVINGS):
+    for _ in range(_MAX_HALVINGS):
         if not len(edges):
             return faces
         edges = np.unique(np.sort(edges, axis=1), axis=0)
@@ -212,7 +212,7 @@ def _corners_on(x: FloatArray, edges: IntArray) -> tuple[IntArray, BoolArray]:
     direction = (q - p)[row] / np.maximum(2 * half[row], 1e-300)[:, None]
     to = x[corner] - p[row]
     along = row_dots(to, direction)
-    is_on = row_norms(to - along[:, None] * direction) <= _SAME
+    is_on = row_norms(to - along[:, None] * direction) <= _JOIN_DISTANCE
     is_on &= (corner != edges[row, 0]) & (corner != edges[row, 1])
     is_on &= (along > 0) & (along < 2 * half[row])
     row, corner, offset = row[is_on], corner[is_on], np.abs(along - half[row])[is_on]

@@ -67,7 +67,7 @@ _MAX_SEED_DISTANCE, _MAX_SEED_MOVE, _MIN_MESH_DISTANCE, _MIN_WALL_DISTANCE = 1.0
 # as missed.
 _CLUSTER_DISTANCE, _MIN_MISSED_LENGTH = 1.0, 2.0
 # Parts thinner than this many cells are missed nearly everywhere; and the thinnest measured.
-_THIN, _LEAST = 0.25, 2.0**-7
+_THIN, _MIN_THICKNESS = 0.25, 2.0**-7
 # How near to the level, in cells, a point has to come by Newton's method.
 _ON = 1e-3
 # Newton's method may converge to a multiple root where the distance fell by at least this factor.
@@ -75,13 +75,19 @@ _SLOW = 0.7
 # The test for a function that touches its level: the number of points; how far beside them, in
 # cells, the function is evaluated; the number of golden sections and their ratio; and how near the
 # function comes to the level, relative to its values beside the point.
-_MOST_TRIED, _BESIDE, _SECTIONS, _GOLDEN, _TOUCHES = 60, 0.01, 40, 0.6180339887498949, 1e-8
+_MAX_TOUCH_TESTS, _SIDE_OFFSET, _SECTIONS, _GOLDEN, _TOUCHES = (
+    60,
+    0.01,
+    40,
+    0.6180339887498949,
+    1e-8,
+)
 # The largest fraction of vertices that may be farther from the level than the second, in cells:
 # where signs change by a jump.
-_MOST_JUMPS, _FAR = 0.04, 0.1
+_MAX_JUMP_FRACTION, _FAR_DISTANCE = 0.04, 0.1
 # A function that equals its level at a larger fraction of this number of points has no surface
 # there.
-_MOST_FLAT, _MOST_PROBES = 0.75, 2000
+_MAX_FLAT_FRACTION, _MAX_PROBES = 0.75, 2000
 # How far around a point, in cells, the function has to equal its level for the level set to be a
 # volume.
 _FLAT_AROUND = 0.25
@@ -91,7 +97,8 @@ class MissedPartsError(MeshingError):
     """A level set of which some parts lie between the points of a lattice.
 
     places: (k, 3) points of the longest part, on the level; thickness: (k,) of the part there, a
-        multiple of `_LEAST` cells: 0 where it is thinner, inf where it is thicker than a cell.
+        multiple of `_MIN_THICKNESS` cells: 0 where it is thinner, inf where it is thicker than a
+        cell.
     size: of cells.
     """
 
@@ -185,7 +192,7 @@ def _thickness(function: LevelFunction, x: FloatArray, size: float) -> FloatArra
     again."""
     slope = function.sample(x).gradient
     direction = slope / np.maximum(row_norms(slope), 1e-300)[:, None]
-    distances = size * 2.0 ** np.arange(round(math.log2(_LEAST)), 1)
+    distances = size * 2.0 ** np.arange(round(math.log2(_MIN_THICKNESS)), 1)
     sides: list[BoolArray] = []
     thickness = np.full(len(x), np.inf)
     for sign in (1.0, -1.0):
@@ -201,7 +208,7 @@ def _thickness(function: LevelFunction, x: FloatArray, size: float) -> FloatArra
 def _check_off_level_around(function: LevelFunction, part: FloatArray, reach: float) -> None:
     """Raise if the function equals its level, up to rounding, at most of the points (n, 3) and on
     all sides of them: such as max(x, 0), for which no cells are small enough."""
-    probes = part[:: -(-len(part) // _MOST_PROBES)]
+    probes = part[:: -(-len(part) // _MAX_PROBES)]
     offsets = reach * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     near_points = (probes[:, None] + offsets).reshape(-1, 3)
     is_flat = function.is_on_level(near_points).reshape(len(probes), -1).all(axis=1)
@@ -221,8 +228,8 @@ def _check_passes_level(function: LevelFunction, part: FloatArray, size: float) 
     Across such a point, on a line along the slope beside it, the function is on one side of the
     level, and where it comes nearest, by golden sections, it is as near as rounding allows.
     """
-    x = part[:: -(-len(part) // _MOST_TRIED)]
-    half = _BESIDE * size
+    x = part[:: -(-len(part) // _MAX_TOUCH_TESTS)]
+    half = _SIDE_OFFSET * size
     beside = function.sample((x[:, None] + half * np.eye(3)).reshape(-1, 3)).gradient.reshape(
         -1, 3, 3
     )
@@ -310,7 +317,7 @@ _SNAPPED = 0.25
 _BORDER = 2.0
 # The number of cells along an edge of a block.
 _BLOCK = 8
-_MOST_ROUNDS = 20
+_MAX_ROUNDS = 20
 
 
 @dataclass(frozen=True)
@@ -607,8 +614,8 @@ def _check_is_continuous(
     """Raise if at many vertices the sign of the function changes and the level is not near: the
     function jumps there, and refinement would never end."""
     x = vertices[np.unique(faces)]
-    is_far = function.sample(x).distance > _FAR * float(lattice.size.max())
-    if is_far.sum() > _MOST_JUMPS * len(x):
+    is_far = function.sample(x).distance > _FAR_DISTANCE * float(lattice.size.max())
+    if is_far.sum() > _MAX_JUMP_FRACTION * len(x):
         a, b, c = x[is_far][0]
         raise UnrefinableError(
             f"{type(function.field).__name__} changes its sign without coming to its level at "
@@ -623,11 +630,11 @@ def _check_off_level_at_most_points(
 ) -> None:
     """Raise if the function equals its level nearly everywhere, up to rounding: such as x - x, for
     which no cells are proved empty, however small they are."""
-    if len(points) <= _MOST_FLAT * 2 * math.prod(lattice.counts.tolist()):
+    if len(points) <= _MAX_FLAT_FRACTION * 2 * math.prod(lattice.counts.tolist()):
         return
-    probes = points[:: -(-len(points) // _MOST_PROBES)]
+    probes = points[:: -(-len(points) // _MAX_PROBES)]
     fraction = float(function.is_on_level(probes).mean())
-    if fraction > _MOST_FLAT:
+    if fraction > _MAX_FLAT_FRACTION:
         raise UnrefinableError(
             f"{type(function.field).__name__} is {function.level:g}, up to rounding, at "
             f"{fraction:.0%} of the points looked at: its level there is a volume and no surface; "
@@ -679,7 +686,7 @@ def _march(
     is_on |= is_wall
     touching, is_affected = np.zeros(0, np.int64), np.ones(len(points), np.bool_)
     rows = cut_rows = np.flatnonzero(_may_be_cut(samples.value, is_on, corners))
-    for _ in range(_MOST_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         sampled, tets = (
             TetrahedronPoints(points, is_on, samples),
             Tetrahedra.of(points, corners[rows]),

@@ -77,13 +77,13 @@ class PointsOnLevel:
         low = np.zeros((0, 3))
         high = low
         if isinstance(field, OrientedPoints | HRBF):
-            rows = _spread(len(field.points), _BY_AREA)
+            rows = _evenly_spaced_rows(len(field.points), _BY_AREA)
             smoothed = field.smoothing if isinstance(field, DipolePotential) else 0.0
             offset = max(tolerance, _SMOOTHED * smoothed) * field.normals[rows]
             offset /= np.maximum(row_norms(field.normals[rows]), 1e-300)[:, None]
             low, high = field.points[rows] - offset, field.points[rows] + offset
         elif isinstance(field, Blobs):
-            rows = _spread(len(field.centers), _BY_AREA)
+            rows = _evenly_spaced_rows(len(field.centers), _BY_AREA)
             offset = np.random.default_rng(0).normal(size=(len(rows), 3))
             offset *= ((field.radii * field.kernel.support)[rows] / row_norms(offset))[:, None]
             low, high = field.centers[rows], field.centers[rows] + offset
@@ -96,7 +96,7 @@ class PointsOnLevel:
         """Points on triangles (m, 3, 3) across which the function changes its sign."""
         normal = area_normals(corner)
         area = row_norms(normal)
-        rows = np.concatenate([_by_area(area), _spread(len(corner), _MIDDLES)])
+        rows = np.concatenate([_by_area(area), _evenly_spaced_rows(len(corner), _MIDDLES)])
         shares = np.random.default_rng(0).dirichlet((1.0, 1.0, 1.0), len(rows))
         shares[-min(len(corner), _MIDDLES) :] = 1 / 3
         points, normal = np.einsum("ki,kij->kj", shares, corner[rows]), normal[rows]
@@ -167,7 +167,7 @@ class LostParts:
         distant = level_points.select(_are_farther(level_points.points, corner, tolerance))
         beyond = _are_farther(distant.points, corner, max(tolerance, _CELLS * spacing))
         within = _bound_of_distances(distant.points, corner) if len(distant.points) else tolerance
-        shown = distant.select(_spread(len(distant.points), _LOOKED_AT))
+        shown = distant.select(_evenly_spaced_rows(len(distant.points), _LOOKED_AT))
         thickness, is_inside = _thicknesses(function, shown, spacing)
         is_thin = np.isfinite(thickness)
         thickness = thickness[is_thin]
@@ -236,7 +236,7 @@ def _by_area(area: FloatArray) -> IntArray:
     return np.searchsorted(ends, targets)
 
 
-def _spread(count: int, max_count: int) -> IntArray:
+def _evenly_spaced_rows(count: int, max_count: int) -> IntArray:
     """The indices of all rows, or of `max_count` rows, evenly spread."""
     return np.linspace(0, count - 1, min(count, max_count)).astype(np.int64)
 

@@ -42,12 +42,12 @@ __all__ = ["CleanedMesh", "against_neighbors", "clean_and_fill", "weld_near_corn
 
 # The largest number of rings around holes that are removed; and the largest fraction of all
 # triangles that may be.
-_MOST_RINGS, _MOST_LEFT_OUT = 6, 0.5
+_MAX_RINGS, _MAX_REMOVED_FRACTION = 6, 0.5
 # If the ratio of open edges to triangles is larger than this, the triangles are loose.
-_MOST_OPEN = 0.5
+_MAX_OPEN_RATIO = 0.5
 # Corners of loose triangles that are nearer than one of these distances, relative to the usual
 # edge, are joined.
-_NEAR = (0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3)
+_JOIN_DISTANCES = (0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3)
 
 
 @dataclass(frozen=True)
@@ -70,20 +70,20 @@ class CleanedMesh:
 def clean_and_fill(
     vertices: FloatArray, faces: IntArray, report: Callable[[str], None]
 ) -> CleanedMesh:
-    """The valid triangles of a mesh, with patches in place of all others and over holes.
+    """The valid triangles of a mesh, with hole fillings in place of all others and over holes.
 
     Raises:
         MeshingError: half of the triangles, or all, would be removed, or most of them are loose.
     """
     report("looking for triangles that are sound")
     state = _WorkingMesh.of(vertices, faces)
-    holes, why, min_faces = 0, "", _MOST_LEFT_OUT * len(state.faces)
-    for ring in range(_MOST_RINGS):
+    holes, why, min_faces = 0, "", _MAX_REMOVED_FRACTION * len(state.faces)
+    for ring in range(_MAX_RINGS):
         state = state.without_nonmanifold_edges()
         if not len(state.faces):
             raise MeshingError("none of its triangles is sound")
         edges = boundary_edges(state.faces)
-        if len(edges) > _MOST_OPEN * len(state.faces):
+        if len(edges) > _MAX_OPEN_RATIO * len(state.faces):
             raise MeshingError(f"{len(edges):,} edges of {len(state.faces):,} triangles are open")
         loops = hole_loops(state.vertices, state.faces, edges)
         report(f"{len(loops):,} holes" + f", {ring} rings wider in places" * (ring > 0))
@@ -95,7 +95,7 @@ def clean_and_fill(
         state = state.without_ring(failing)
         if (state.source_face >= 0).sum() < min_faces:
             raise MeshingError(f"half of the triangles would be left out: {why}")
-    raise MeshingError(f"holes cannot be filled, even {_MOST_RINGS} rings wider: {why}")
+    raise MeshingError(f"holes cannot be filled, even {_MAX_RINGS} rings wider: {why}")
 
 
 def weld_near_corners(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray, float]:
@@ -107,12 +107,12 @@ def weld_near_corners(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray
     """
     points, index = np.unique(vertices[faces].reshape(-1, 3), axis=0, return_inverse=True)
     corners = np.asarray(index, np.int64).reshape(-1, 3)
-    if len(boundary_edges(corners)) <= _MOST_OPEN * len(faces):
+    if len(boundary_edges(corners)) <= _MAX_OPEN_RATIO * len(faces):
         raise MeshingError("its triangles are not loose")
     at = points[corners]
     usual = float(np.median(row_norms((at - np.roll(at, 1, axis=1)).reshape(-1, 3))))
     candidates: list[tuple[int, FloatArray, IntArray, float]] = []
-    for part in _NEAR:
+    for part in _JOIN_DISTANCES:
         group = connected_groups(pairs_within(points, part * usual), len(points))
         count = np.bincount(group)[:, None]
         mean = np.stack([np.bincount(group, column) for column in points.T], axis=1) / count
@@ -122,7 +122,7 @@ def weld_near_corners(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray
         moved = float(row_norms(mean[group] - points).max())
         candidates.append((len(boundary_edges(proper)) + missing, mean, proper, moved))
     count, mean, proper, moved = min(candidates, key=lambda candidate: candidate[0])
-    if count > _MOST_OPEN * len(faces):
+    if count > _MAX_OPEN_RATIO * len(faces):
         raise MeshingError(
             f"triangles are loose, and {count:,} edges of {len(faces):,} stay open if near corners "
             "are joined"

@@ -40,7 +40,7 @@ __all__ = ["collapse_slivers", "flip_edges", "least_angles", "relax_vertices"]
 # gradient.
 _GAIN = 0.01
 _FACING = 0.5
-_MOST_ROUNDS_OF_FLIPS = 12
+_MAX_ROUNDS_OF_FLIPS = 12
 # Triangles with a smaller angle, in radians, are slivers: 4 degrees.
 _SLIVER = 0.07
 # The smallest cosine between normals of the triangles around a contracted edge and the gradient.
@@ -61,7 +61,7 @@ def flip_edges(
     """
     refused = np.zeros(0, np.int64)
     boundary = edge_keys(boundary_edges(faces), len(vertices))
-    for _ in range(_MOST_ROUNDS_OF_FLIPS):
+    for _ in range(_MAX_ROUNDS_OF_FLIPS):
         pairs, quads = _quadrilaterals(faces)
         a, b, c, d = quads.T
         before = least_angles(vertices, faces)[pairs].min(axis=1)
@@ -179,7 +179,7 @@ def collapse_slivers(
             if not _can_contract(faces[~is_removed], target, source):
                 continue
             new = np.where(faces[star[~beside]] == source, target, faces[star[~beside]])
-            if _is_good(function, vertices, new, tolerance):
+            if _are_valid_triangles(function, vertices, new, tolerance):
                 faces[star[~beside]] = new
                 is_removed[star[beside]] = True
                 break
@@ -194,7 +194,7 @@ def _can_contract(faces: IntArray, target: int, source: int) -> bool:
     return len(beside) == 2 and np.array_equal(common, np.setdiff1d(beside, [target, source]))
 
 
-def _is_good(
+def _are_valid_triangles(
     function: LevelFunction, vertices: FloatArray, new: IntArray, tolerance: float
 ) -> bool:
     corner = vertices[new]
@@ -209,7 +209,7 @@ def _is_good(
 Walls = tuple[FloatArray, FloatArray] | None
 # Triangles with a smaller angle are thin, in radians: 30 degrees.
 _THIN = 0.52
-_MOST_ROUNDS_OF_MOVES = 6
+_MAX_ROUNDS_OF_MOVES = 6
 # The fractions of the displacement to each aim that are tried.
 _PARTS = (1.0, 0.5)
 
@@ -229,14 +229,14 @@ def relax_vertices(
     fixed = np.zeros(len(vertices), np.bool_)
     fixed[boundary_edges(faces)] = True
     vertices = vertices.copy()
-    for _ in range(_MOST_ROUNDS_OF_MOVES):
+    for _ in range(_MAX_ROUNDS_OF_MOVES):
         angles = least_angles(vertices, faces)
         thin = np.unique(faces[angles < _THIN])
         stars = _VertexStars.of(faces, thin[~fixed[thin]], len(vertices))
         if not len(stars.centers):
             break
         before = stars.least(angles[stars.face])
-        moved, after = _best_places(function, vertices, faces, stars, walls)
+        moved, after = _best_positions(function, vertices, faces, stars, walls)
         gain = after - before
         rows = _independent_moves(np.flatnonzero(gain > _GAIN), gain, stars, faces, len(vertices))
         rows = rows[_moves_stay_near(function, vertices, faces, stars, moved, rows, tolerance)]
@@ -280,7 +280,7 @@ class _VertexStars:
         return np.stack(sums, axis=1) / count[:, None]
 
 
-def _best_places(
+def _best_positions(
     function: LevelFunction,
     vertices: FloatArray,
     faces: IntArray,

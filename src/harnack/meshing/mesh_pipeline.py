@@ -79,9 +79,9 @@ _HONORED = (*SURFACE_OPTIONS, "tolerance")
 
 # Cells across the level set, unless a spacing is given; curves have their own length besides.
 _ACROSS = 24
-_MOST_ATTEMPTS = 4
+_MAX_ATTEMPTS = 4
 _ACROSS_BY_SIGNS, _ATTEMPTS_BY_SIGNS = 48, 2
-# Room around what has an extent, and around a curve whose surface has none, as a part of the size.
+# The margin around an extent, and around a curve whose surface has none, as a fraction of the size.
 _MARGIN = 0.01
 _ROOM = 0.05
 
@@ -132,7 +132,7 @@ def mesh(
     seed: of the small random moves that keep points in general position.
     max_triangles: of one level set, before anything is simplified; what would take more is not
         begun or given up, with a MeshingError. Cells are limited with them, to two millions.
-    progress: told what is being done.
+    progress: called with the name of each step of the work.
     options: a `TraceOptions`, of which meshes have the tolerance alone: the largest distance of
         triangles from the surface, sampled and not proved; None for 1e-3 of the longest side of the
         level set's box.
@@ -171,8 +171,8 @@ def mesh(
         flat: how many triangles were not fitted to creases, as they would pass through others;
         Where the triangles of a mesh were kept, made_by is "faces", and there is none of
         this.
-        cloud: of a `DipolePotential`, what it says of itself (`describe`), such as how many points
-            it has, what was estimated, and the smoothing and noise that were chosen and found.
+        cloud: of a `DipolePotential`, the result of `describe`, such as the number of points, the
+            estimated quantities, the chosen smoothing and the noise.
 
         Solids and thick surfaces have more: see `docs/printing.md`.
 
@@ -192,47 +192,47 @@ def mesh(
     if simplify and not is_closed:
         raise ValueError('simplify is for closed meshes: give side="below" or thickness as well')
     volume = intersection_of([field.domain, target.clip, target.section])
-    asked = _MeshOptions(volume, accuracy, cell_size, seed, max_triangles, report)
+    settings = _MeshOptions(volume, accuracy, cell_size, seed, max_triangles, report)
     if uses_sign_meshing(field):
-        made = _mesh_from_signs(field, level, solid, thickness is not None, asked)
+        raw = _mesh_from_signs(field, level, solid, thickness is not None, settings)
     elif solid:
-        made = _mesh_solid(field, level, solid, asked)
+        raw = _mesh_solid(field, level, solid, settings)
     else:
-        made = _mesh_level_set(field, level, asked)
-    triangles, facts = made.surface, dict(made.facts)
+        raw = _mesh_level_set(field, level, settings)
+    triangles, facts = raw.surface, dict(raw.facts)
     if solid:
         facts["side"] = target.side or "below"
     else:
         triangles = largest_component(triangles) if largest else triangles
-        made.check_level(triangles)
-    tolerance = accuracy.at(made.size)
+        raw.check_level(triangles)
+    tolerance = accuracy.at(raw.size)
     if thickness is not None:
         report("thickening")
-        normals = vertex_normals(made.function, triangles)
-        triangles, more = thicken(triangles, normals, float(thickness), 0.5 * tolerance)
-        facts |= more
+        normals = vertex_normals(raw.function, triangles)
+        triangles, new_facts = thicken(triangles, normals, float(thickness), 0.5 * tolerance)
+        facts |= new_facts
     if largest and is_closed:
         triangles = largest_body(triangles)
 
-    def check(one: TriangleMesh) -> None:
+    def check(candidate: TriangleMesh) -> None:
         if solid:
-            made.check_level(one)
-        check_manifold(one.faces)
+            raw.check_level(candidate)
+        check_manifold(candidate.faces)
 
-    if not made.is_checked:
+    if not raw.is_checked:
         report("checking")
         check(triangles)
         check_no_self_intersection(triangles.vertices, triangles.faces)
     if simplify:
         report("simplifying")
-        triangles, more = simplify_mesh(triangles, tolerance, check)
-        facts |= more
+        triangles, new_facts = simplify_mesh(triangles, tolerance, check)
+        facts |= new_facts
     return to_trimesh(triangles, facts, is_closed)
 
 
 @dataclass(frozen=True)
 class _MeshOptions:
-    """Arguments of `mesh`; volume: what the level set is cut by."""
+    """Arguments of `mesh`; volume: the volume by which the level set is cut."""
 
     volume: Volume | None
     tolerance: MeshTolerance
@@ -244,7 +244,7 @@ class _MeshOptions:
 
 @dataclass(frozen=True)
 class _RawMesh:
-    """A surface, its size, what is known of it, and the function that it is a level set of.
+    """A surface, its size, its metadata, and the function of which it is a level set.
 
     check_level: raises a MeshingError unless a surface is within the tolerance of the level.
     is_checked: whether that has been done, and the surface is known to be a manifold that does not
@@ -264,7 +264,7 @@ def _mesh_from_signs(
     level: float | None,
     solid: tuple[float, float] | bool,
     is_thick: bool,
-    asked: _MeshOptions,
+    options: _MeshOptions,
 ) -> _RawMesh:
     """A level set by the signs of f, or the closed surface of a solid.
 
@@ -274,70 +274,72 @@ def _mesh_from_signs(
     ends = _ends_by_signs(field, level, solid, is_thick)
     levels = tuple(end for end in ends if math.isfinite(end))
     if isinstance(field, WindingNumber) and field.is_of_sheets_alone(levels):
-        return _faces_alone(field, levels[0], solid, asked)
-    volume, box = asked.volume, _box(field, levels, asked.volume)
+        return _input_faces_as_surface(field, levels[0], solid, options)
+    volume, box = options.volume, _box(field, levels, options.volume)
     size = float((box.upper - box.lower).max())
     if solid and _is_outside_inside(field, ends, box):
         box = _unlimited_box(field, volume)
-    cells, attempts = _cells_by_signs(field, size, asked.spacing)
-    # Where nothing ends at the box, its cells should not lie along what is symmetrical.
+    cells, attempts = _cells_by_signs(field, size, options.spacing)
+    # If no surface ends at the box, its cells should not lie along symmetries of the field.
     room = np.zeros(3) if box.has_walls else size * np.array([0.0037, 0.0053, 0.0029])
     filled = box.lower - room, box.upper + 0.5 * room
     facts: list[dict[str, Any]] = []
     losses: list[LostParts] = []
 
-    def function(one: float, side: float) -> SignFunction:
-        return SignFunction.of(field, one, filled, cells, side=side, most_faces=asked.most_faces)
+    def function(value: float, side: float) -> SignFunction:
+        return SignFunction.of(
+            field, value, filled, cells, side=side, most_faces=options.most_faces
+        )
 
     is_apart = False
 
-    def signed(one: float, side: float, closed: bool) -> TriangleMesh:
+    def signed(value: float, side: float, closed: bool) -> TriangleMesh:
         nonlocal is_apart
         try:
-            made, lost, more = mesh_from_signs(
-                function(one, side),
+            result, lost_parts, new_facts = mesh_from_signs(
+                function(value, side),
                 filled,
                 cells,
-                asked.tolerance.at(size),
+                options.tolerance.at(size),
                 attempts,
-                asked.report,
+                options.report,
                 closed=closed,
-                volume=asked.volume,
+                volume=options.volume,
             )
         except EmptySurfaceError as error:
             raise EmptySurfaceError(f"{error}{empty_surface_hint(field)}") from error
-        facts.append(more)
-        losses.append(lost)
-        is_apart = made.is_intersection_free
-        return made.surface
+        facts.append(new_facts)
+        losses.append(lost_parts)
+        is_apart = result.is_intersection_free
+        return result.surface
 
     if not solid:
-        made = signed(levels[0], 1.0, False)
+        surface = signed(levels[0], 1.0, False)
         if volume is not None and not (isinstance(volume, Box) and box.has_walls):
-            made, is_apart = clip_to_volume(made, volume), False
+            surface, is_apart = clip_to_volume(surface, volume), False
     elif volume is None and ends[1] == math.inf:
-        made = signed(levels[0], -1.0, False)
+        surface = signed(levels[0], -1.0, False)
     else:
-        whole = box_manifold(box.lower, box.upper)
+        manifold = box_manifold(box.lower, box.upper)
         if math.isfinite(ends[0]):
-            whole = to_manifold(signed(ends[0], -1.0, True))
+            manifold = to_manifold(signed(ends[0], -1.0, True))
         if math.isfinite(ends[1]):
-            whole = whole - to_manifold(signed(ends[1], -1.0, True))
+            manifold = manifold - to_manifold(signed(ends[1], -1.0, True))
         if field.has_jumps and len(levels) == 2:
-            _check_has_thickness(field, whole, ends, asked.tolerance.at(size))
+            _check_has_thickness(field, manifold, ends, options.tolerance.at(size))
         cut = volume or Box(tuple(box.lower.tolist()), tuple(box.upper.tolist()))
-        whole ^= volume_manifold(cut, box.lower, box.upper, 0.5 * asked.tolerance.at(size))
-        made, is_apart = from_manifold(whole), False
-    if not len(made.faces):
+        manifold ^= volume_manifold(cut, box.lower, box.upper, 0.5 * options.tolerance.at(size))
+        surface, is_apart = from_manifold(manifold), False
+    if not len(surface.faces):
         raise MeshingError("the level set is empty: it lies outside of the clip")
     if is_apart:
-        check_manifold(made.faces)
-    known = {"level": levels[0], **_merge_facts(facts)}
+        check_manifold(surface.faces)
+    mesh_facts = {"level": levels[0], **_merge_facts(facts)}
     if isinstance(field, DipolePotential):
-        known["cloud"] = field.describe()
-    is_told = _check_sign_accuracy(field, known, asked.tolerance.at(size))
-    _warn_of_lost(field, losses, is_told)
-    return _RawMesh(made, size, known, function(levels[0], 1.0), _accept, is_apart)
+        mesh_facts["cloud"] = field.describe()
+    was_warned = _check_sign_accuracy(field, mesh_facts, options.tolerance.at(size))
+    _warn_of_lost(field, losses, was_warned)
+    return _RawMesh(surface, size, mesh_facts, function(levels[0], 1.0), _accept, is_apart)
 
 
 def _ends_by_signs(
@@ -377,16 +379,17 @@ def _cells_by_signs(field: Field, size: float, spacing: float | None) -> tuple[f
     return (detailed, attempts - 1) if detailed < cells else (cells, attempts)
 
 
-def _faces_alone(
+def _input_faces_as_surface(
     field: WindingNumber,
     level: float,
     solid: tuple[float, float] | bool,
-    asked: _MeshOptions,
+    options: _MeshOptions,
 ) -> _RawMesh:
-    """The triangles of a mesh that is its own surface, as they are, but for what the volume cuts.
+    """The triangles of a mesh that is its own surface, unchanged except where the volume cuts them.
 
     Raises:
-        MeshingError: it is to be closed; nothing is left; it has too many triangles.
+        MeshingError: the surface has to be closed; nothing of it is left in the volume; it has too
+            many triangles.
     """
     if solid:
         raise MeshingError(
@@ -396,26 +399,26 @@ def _faces_alone(
     vertices, faces = field.mesh.vertices, field.mesh.faces
     size = float(np.ptp(vertices[faces].reshape(-1, 3), axis=0).max())
     surface = TriangleMesh.without_unused_vertices(vertices, faces)
-    if asked.volume is not None:
-        surface = clip_to_volume(surface, asked.volume)
+    if options.volume is not None:
+        surface = clip_to_volume(surface, options.volume)
     if not len(surface.faces):
         raise MeshingError("the level set is empty: it lies outside of the clip")
-    if len(surface.faces) > asked.most_faces:
+    if len(surface.faces) > options.most_faces:
         raise TriangleLimitError(
             f"{len(surface.faces):,} triangles of the mesh are its surface, and max_triangles is "
-            f"{asked.most_faces:,}: choose a larger `max_triangles`, or a smaller `clip`"
+            f"{options.most_faces:,}: choose a larger `max_triangles`, or a smaller `clip`"
         )
-    known = {"level": level, "made_by": "faces", "spacing": math.nan, "evaluations": 0}
-    function = LevelFunction(field, level, most_faces=asked.most_faces)
-    return _RawMesh(surface, size, known, function, _accept, False)
+    facts = {"level": level, "made_by": "faces", "spacing": math.nan, "evaluations": 0}
+    function = LevelFunction(field, level, most_faces=options.most_faces)
+    return _RawMesh(surface, size, facts, function, _accept, False)
 
 
 def _check_has_thickness(
-    field: Field, whole: Manifold, ends: tuple[float, float], tolerance: float
+    field: Field, manifold: Manifold, ends: tuple[float, float], tolerance: float
 ) -> None:
     """Raise if both levels are the same triangles, where the field jumps across them."""
-    if 2 * abs(whole.volume()) < tolerance * whole.surface_area():
-        low, high = (f"{one:g}" for one in ends)
+    if 2 * abs(manifold.volume()) < tolerance * manifold.surface_area():
+        low, high = (f"{end:g}" for end in ends)
         raise MeshingError(
             f"the part between the levels {low} and {high} of this {type(field).__name__} has no "
             f'thickness: it jumps across both at its triangles; for the inside give side="above"'
@@ -423,15 +426,15 @@ def _check_has_thickness(
 
 
 def _merge_facts(facts: list[dict[str, Any]]) -> dict[str, Any]:
-    """What is known of the surfaces at both ends of a solid."""
+    """The metadata of a solid from those of the surfaces at both ends."""
     sums = ("evaluations", "undecided", "flat", "far", "looked_at", "lost", "sought")
-    larger = {key: max(one[key] for one in facts) for key in ("spacing", "within")}
-    return {**facts[0], **larger, **{key: sum(one[key] for one in facts) for key in sums}}
+    larger = {key: max(entry[key] for entry in facts) for key in ("spacing", "within")}
+    return {**facts[0], **larger, **{key: sum(entry[key] for entry in facts) for key in sums}}
 
 
 def _check_sign_accuracy(field: Field, facts: dict[str, Any], tolerance: float) -> bool:
-    """Whether more than a few vertices and centers of triangles are beyond the tolerance, which is
-    warned of.
+    """Whether more than a few vertices and centers of triangles are beyond the tolerance; warns of
+    it.
 
     Raises:
         MeshingError: some of them are nowhere near the level.
@@ -501,12 +504,12 @@ def _level_and_solid(
 
 
 def _check_level(
-    function: LevelFunction, made: TriangleMesh, tolerance: float, volume: Volume | None
+    function: LevelFunction, surface: TriangleMesh, tolerance: float, volume: Volume | None
 ) -> None:
     """Raise unless a surface is within the tolerance of the level, and inside the volume."""
     if volume is not None:
-        check_inside(made.vertices, volume, tolerance)
-    check_near_level(function, made.vertices, made.faces, tolerance, volume)
+        check_inside(surface.vertices, volume, tolerance)
+    check_near_level(function, surface.vertices, surface.faces, tolerance, volume)
 
 
 def _checked(field: Field) -> Field:
@@ -534,82 +537,87 @@ def _mesh_solid(
     field: Field,
     level: float | None,
     solid: tuple[float, float] | Literal[True],
-    asked: _MeshOptions,
+    options: _MeshOptions,
 ) -> _RawMesh:
     """The closed surface of a solid that is put together from smooth levels."""
-    region = LevelFunction(*solid_and_level(field, solid, level), most_faces=asked.most_faces)
+    region = LevelFunction(*solid_and_level(field, solid, level), most_faces=options.most_faces)
     evaluations = [0]
 
     def angle_mesher(error: float, cells: float) -> AngleMesher:
         def mesh_angle(angle: SolidAngle, value: float) -> TriangleMesh:
             angle = cast("SolidAngle", _checked(angle))
             box = _box(angle, (value,), None)
-            function = LevelFunction(angle, value, most_faces=asked.most_faces)
-            made, facts = _mesh_spanning_curve(
-                function, box, error, cells, 1, asked.seed, asked.report
+            function = LevelFunction(angle, value, most_faces=options.most_faces)
+            surface, facts = _mesh_spanning_curve(
+                function, box, error, cells, 1, options.seed, options.report
             )
             evaluations[0] += facts["evaluations"]
-            return made
+            return surface
 
         return mesh_angle
 
-    def check_level(made: TriangleMesh, size: float) -> None:
-        _check_level(region, made, asked.tolerance.at(size), asked.volume)
+    def check_level(surface: TriangleMesh, size: float) -> None:
+        _check_level(region, surface, options.tolerance.at(size), options.volume)
 
-    def check(made: TriangleMesh, size: float) -> None:
-        check_manifold(made.faces, made.vertices)
-        check_level(made, size)
+    def check(surface: TriangleMesh, size: float) -> None:
+        check_manifold(surface.faces, surface.vertices)
+        check_level(surface, size)
 
-    made = mesh_solid(
+    solid_mesh = mesh_solid(
         cast("Solid", region.field),
         region.level,
-        asked.volume,
-        asked.tolerance,
-        asked.spacing,
+        options.volume,
+        options.tolerance,
+        options.spacing,
         angle_mesher,
-        asked.most_faces,
+        options.most_faces,
         check,
-        asked.report,
+        options.report,
     )
     facts = {
         "level": region.level,
-        "spacing": made.spacing,
-        "evaluations": made.evaluations + evaluations[0],
-        "surfaces_with_options": made.levels,
+        "spacing": solid_mesh.spacing,
+        "evaluations": solid_mesh.evaluations + evaluations[0],
+        "surfaces_with_options": solid_mesh.levels,
     }
     return _RawMesh(
-        made.surface, made.size, facts, region, lambda one: check_level(one, made.size), True
+        solid_mesh.surface,
+        solid_mesh.size,
+        facts,
+        region,
+        lambda surface: check_level(surface, solid_mesh.size),
+        True,
     )
 
 
-def _mesh_level_set(field: Field, level: float | None, asked: _MeshOptions) -> _RawMesh:
+def _mesh_level_set(field: Field, level: float | None, options: _MeshOptions) -> _RawMesh:
     """A level set of a function that is smooth nearly everywhere, or of an angle."""
     level = field.default_level if level is None else float(level)
-    function = LevelFunction(field, level, most_faces=asked.most_faces)
+    function = LevelFunction(field, level, most_faces=options.most_faces)
     field.validate_levels((level,))
-    volume, report = asked.volume, asked.report
+    volume, report = options.volume, options.report
     box = _box(field, (level,), volume)
     size = float((box.upper - box.lower).max())
-    error = 0.5 * asked.tolerance.at(size)
-    cells = size / _ACROSS if asked.spacing is None else float(asked.spacing)
-    if asked.spacing is None and field.min_wavelength is not None:
+    error = 0.5 * options.tolerance.at(size)
+    cells = size / _ACROSS if options.spacing is None else float(options.spacing)
+    if options.spacing is None and field.min_wavelength is not None:
         cells = min(cells, field.min_wavelength / CELLS_PER_WAVE)
-    attempts = 1 if asked.spacing is not None else _MOST_ATTEMPTS
+    attempts = 1 if options.spacing is not None else _MAX_ATTEMPTS
     if isinstance(field, SolidAngle):
-        made, facts = _mesh_spanning_curve(
-            function, box, error, cells, attempts, asked.seed, report
+        surface, facts = _mesh_spanning_curve(
+            function, box, error, cells, attempts, options.seed, report
         )
     else:
-        made, facts = _mesh_in_lattice(function, box, error, cells, attempts, report)
+        surface, facts = _mesh_in_lattice(function, box, error, cells, attempts, report)
     if volume is not None and not (isinstance(volume, Box) and box.has_walls):
-        made = clip_to_volume(made, volume)
-        if not len(made.faces):
+        surface = clip_to_volume(surface, volume)
+        if not len(surface.faces):
             raise MeshingError("the level set is empty: it lies outside of the clip")
 
-    def check_level(one: TriangleMesh) -> None:
-        _check_level(function, one, asked.tolerance.at(size), volume)
+    def check_level(triangles: TriangleMesh) -> None:
+        _check_level(function, triangles, options.tolerance.at(size), volume)
 
-    return _RawMesh(made, size, {"level": level, **facts}, function, check_level, False)
+    return _RawMesh(surface, size, {"level": level, **facts}, function, check_level, False)
 
 
 def _mesh_in_lattice(
@@ -621,23 +629,23 @@ def _mesh_in_lattice(
     report: Callable[[str], None],
 ) -> tuple[TriangleMesh, dict[str, Any]]:
     """The level set of a real-valued field in a box, in cells of a lattice."""
-    before: MeshingError | None = None
+    previous: MeshingError | None = None
     while True:
         report(f"cells of {spacing:.3g}")
         try:
             lattice = BccLattice.covering_box(box.lower, box.upper, spacing)
-            made, isotopy = mesh_open_surface(function, lattice, tolerance, report)
-            check_manifold(made.faces, made.vertices)
-            check_near_level(function, made.vertices, made.faces, 2 * tolerance, None)
-            check_no_self_intersection(made.vertices, made.faces)
+            surface, isotopy = mesh_open_surface(function, lattice, tolerance, report)
+            check_manifold(surface.faces, surface.vertices)
+            check_near_level(function, surface.vertices, surface.faces, 2 * tolerance, None)
+            check_no_self_intersection(surface.vertices, surface.faces)
             break
         except MeshingError as wrong:
             attempts -= 1
             if not attempts or not is_retry_promising(
-                wrong, before, CELL_REFINEMENT_FACTOR**attempts
+                wrong, previous, CELL_REFINEMENT_FACTOR**attempts
             ):
                 raise
-            before, spacing = wrong, CELL_REFINEMENT_FACTOR * spacing
+            previous, spacing = wrong, CELL_REFINEMENT_FACTOR * spacing
             report(f"{wrong}; so smaller cells")
     facts = {
         "spacing": spacing,
@@ -646,7 +654,7 @@ def _mesh_in_lattice(
         "integrated": 0,
         **isotopy.shares(),
     }
-    return made, facts
+    return surface, facts
 
 
 def _mesh_spanning_curve(
@@ -660,18 +668,18 @@ def _mesh_spanning_curve(
 ) -> tuple[TriangleMesh, dict[str, Any]]:
     """The level set of an angle, which ends at its curve."""
     ends = box.lower, box.upper
-    made = mesh_spanning_curve(
+    result = mesh_spanning_curve(
         function, spacing, attempts, ends, box.has_walls, seed, tolerance, report
     )
     facts = {
-        "spacing": made.spacing,
+        "spacing": result.spacing,
         "evaluations": function.evaluations,
-        "proved": made.crossings.proved,
-        "integrated": made.crossings.integrated_count,
-        **made.isotopy.shares(),
-        "turned": made.turned,
+        "proved": result.crossings.proved,
+        "integrated": result.crossings.integrated_count,
+        **result.isotopy.shares(),
+        "turned": result.turned,
     }
-    return TriangleMesh.without_unused_vertices(made.vertices, made.faces), facts
+    return TriangleMesh.without_unused_vertices(result.vertices, result.faces), facts
 
 
 @dataclass(frozen=True)
@@ -702,7 +710,7 @@ def _box(field: Field, levels: tuple[float, ...], volume: Volume | None) -> _Mes
             "clip, such as a box (harnack.Box)"
         )
     if isinstance(field, SolidAngle):
-        return _around_curve(field, extent, volume)
+        return _box_of_spanned_surface(field, extent, volume)
     lower, upper = _bounds_of(extent if volume is None else volume)
     if volume is not None and extent is not None and extent != volume:
         # A little room, so that what touches its extent does not end there.
@@ -753,7 +761,9 @@ def _unlimited_box(field: Field, volume: Volume | None) -> _MeshingBox:
     return _MeshingBox(*bounds, True)
 
 
-def _around_curve(field: SolidAngle, extent: Volume | None, volume: Volume | None) -> _MeshingBox:
+def _box_of_spanned_surface(
+    field: SolidAngle, extent: Volume | None, volume: Volume | None
+) -> _MeshingBox:
     """Around the whole surface that a curve spans, which is cut later; or if that has no extent,
     around the curve and the volume."""
     if extent is not None:

@@ -23,13 +23,14 @@ from harnack.meshing.self_intersection_repair import resolve_local_intersections
 
 __all__ = ["project_outliers"]
 
-# The largest number of locations that is mended; and how often faces may be cut, one after the
-# other.
-_MOST, _TIMES = 100, 4
-# Edges of such faces are cut if their middle is farther off the level than this, in tolerances.
-_FAR = 0.5
-# How far mending of intersections may move cut faces, in tolerances.
-_MENDED_WITHIN = 0.25
+# The largest number of locations that are repaired, and the number of rounds in which faces may be
+# cut.
+_MAX_LOCATIONS, _MAX_ROUNDS = 100, 4
+# Edges of faces at outliers are cut if their middle is farther off the level than this, in
+# tolerances.
+_CUT_DISTANCE = 0.5
+# The largest distance by which the repair of intersections may move cut faces, in tolerances.
+_REPAIR_TOLERANCE = 0.25
 
 
 def project_outliers(
@@ -49,11 +50,11 @@ def project_outliers(
     check: raises a MeshingError for a surface that is not near the level. It is called with the
         changed faces; whether these pass through other triangles is decided exactly.
     """
-    if len(places) > _MOST:
+    if len(places) > _MAX_LOCATIONS:
         return None
     vertices, faces = surface.vertices, surface.faces
     is_new = np.zeros(len(faces), np.bool_)
-    for _ in range(_TIMES):
+    for _ in range(_MAX_ROUNDS):
         changed = _project_and_split(
             function, TriangleMesh(vertices, faces), is_new, places, tolerance
         )
@@ -88,7 +89,7 @@ def _project_and_split(
         return None
     pairs = half_edges(faces[centers])
     middle = vertices[pairs].mean(axis=1)
-    pairs = pairs[function.sample(middle).distance > _FAR * tolerance]
+    pairs = pairs[function.sample(middle).distance > _CUT_DISTANCE * tolerance]
     count = len(vertices)
     keys = sorted_unique(edge_keys(pairs, count))
     ends = np.stack(np.divmod(keys, count), axis=1)
@@ -139,7 +140,9 @@ def _check_new_faces(
     crossing = nearby[intersecting_faces(vertices, faces[nearby])]
     if not len(crossing):
         return surface
-    mended, remaining = resolve_local_intersections(surface, crossing, _MENDED_WITHIN * tolerance)
+    mended, remaining = resolve_local_intersections(
+        surface, crossing, _REPAIR_TOLERANCE * tolerance
+    )
     if remaining:
         return None
     try:

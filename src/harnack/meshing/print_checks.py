@@ -82,7 +82,7 @@ class PrintCheck:
     @property
     def is_printable(self) -> bool:
         """Whether there is no error; there may be hints."""
-        return not _is_wrong(self.problems)
+        return not _has_errors(self.problems)
 
     def as_dict(self, most_places: int = 10) -> dict[str, Any]:
         """The result as a dictionary of plain numbers and texts, as JSON holds them."""
@@ -140,15 +140,15 @@ def check_print(
     )
     x, faces, rounded = _mesh_of(part)
     problems = _topology(x, faces)
-    is_closed = not _is_wrong(problems)
+    is_closed = not _has_errors(problems)
     shells = Shells.of(TriangleMesh(x, faces))
     crossings, touching = _contacts(x, faces, shells, is_closed)
     is_clear = is_closed and not crossings.count
     problems += [*_component_problems(shells, is_closed, is_clear), crossings, touching]
     if min_thickness is not None:
         problems += [
-            _thin_walls(x, faces, min_thickness, not _is_wrong(problems)),
-            _coarse(x, faces, min_thickness),
+            _thin_walls(x, faces, min_thickness, not _has_errors(problems)),
+            _coarse_face_problem(x, faces, min_thickness),
         ]
     low, high = x[faces].min(axis=(0, 1)), x[faces].max(axis=(0, 1))
     size = cast("tuple[float, float, float]", tuple((high - low).tolist()))
@@ -161,7 +161,7 @@ def check_print(
     return PrintCheck(tuple(reported), size, volume, len(faces), len(shells.volumes))
 
 
-def _is_wrong(problems: Sequence[PrintProblem]) -> bool:
+def _has_errors(problems: Sequence[PrintProblem]) -> bool:
     return any(problem.is_error and problem.count for problem in problems)
 
 
@@ -342,7 +342,7 @@ def _thin_walls(x: FloatArray, faces: IntArray, wall: float, is_solid: bool) -> 
     return _problem("thin walls", locations, text)
 
 
-def _coarse(x: FloatArray, faces: IntArray, wall: float) -> PrintProblem:
+def _coarse_face_problem(x: FloatArray, faces: IntArray, wall: float) -> PrintProblem:
     """The problem of faces so large that thin places beside their centers may be missed."""
     corner = x[faces]
     longest = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)

@@ -52,10 +52,10 @@ _BESIDE = 1.5
 _FROM_ENDS, _SAMPLES = 0.05, 33
 # The level is searched for up to this multiple of the displacement to where tangent planes meet;
 # and three planes meet in a point if the determinant of their normals is larger than the second.
-_BEYOND, _INDEPENDENT = 1.25, 0.1
+_SEARCH_EXTENSION, _INDEPENDENT = 1.25, 0.1
 # Edges shorter than this, relative to the tolerance, are never cut.
 _SHORTEST = 0.5
-_MOST_ROUNDS = 12
+_MAX_ROUNDS = 12
 # The number of edges and centers to be cut grows at first, and then falls. If it grows to this
 # multiple of its smallest value before, refinement will not end: the surface bends within any
 # triangle, as around each dipole of a cloud.
@@ -82,7 +82,7 @@ def refine(
         TriangleLimitError: it takes more triangles than the function allows.
     """
     smallest_count, before = math.inf, 0
-    for round_number in range(_MOST_ROUNDS):
+    for round_number in range(_MAX_ROUNDS):
         report(f"refining, round {round_number + 1}: {len(faces):,} triangles")
         marks = _RefinementMarks.of(function, vertices, faces, tolerance, walls, where)
         marked = marks.marked
@@ -203,7 +203,7 @@ def _level_along(
     """Points on the level from `start` (k, 3) along the displacements `along`, at most a little
     beyond their ends and no farther than `limit`; and whether the level is passed there."""
     along = along * np.minimum(1, limit / np.maximum(row_norms(along), 1e-300))[:, None]
-    low, high = np.zeros(len(start)), np.full(len(start), _BEYOND)
+    low, high = np.zeros(len(start)), np.full(len(start), _SEARCH_EXTENSION)
     passed = np.ones(len(start), np.bool_)
     parts = np.linspace(0, 1, _SAMPLES)
     for _ in range(2):
@@ -284,7 +284,7 @@ class _RefinementMarks:
         cuts_off = np.zeros(len(faces), np.bool_)
         lone = np.flatnonzero(must_split & ~marked[edges].any(axis=1))
         if function.field.has_creases:
-            cuts_off[lone] = _turns(function, vertices[faces[lone]])
+            cuts_off[lone] = _turn_as_at_crease(function, vertices[faces[lone]])
         must_split &= ~cuts_off
         # For a face that is off the surface, the longest edge that may be cut.
         free = np.where(is_boundary[edges], 0.0, span[edges])
@@ -294,7 +294,7 @@ class _RefinementMarks:
         return cls(edges, ends, middle, span, samples, is_beyond, is_off, marked, cuts_off)
 
 
-def _turns(function: LevelFunction, corner: FloatArray) -> BoolArray:
+def _turn_as_at_crease(function: LevelFunction, corner: FloatArray) -> BoolArray:
     """(k,) whether normals at the corners (k, 3, 3) of faces turn as across a crease."""
     slope = function.sample(corner.reshape(-1, 3)).gradient
     normal = (slope / np.maximum(row_norms(slope), 1e-300)[:, None]).reshape(-1, 3, 3)

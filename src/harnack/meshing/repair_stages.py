@@ -66,15 +66,17 @@ if TYPE_CHECKING:
 
 __all__ = ["repair"]
 
-# How many sizes of cells are tried for patches on which w is 1/2, if all triangles have to stay;
-# and if they need not, where there are no more open edges than that.
-_ATTEMPTS, _FEW_ATTEMPTS, _FEW_EDGES = 6, 1, 1000
-# Cells across the mesh if all is made anew; larger ones by this factor, up to so many times, where
-# the surface is rough and has more triangles than that.
+# The number of sizes of cells that are tried for harmonic fillings if all triangles have to stay;
+# and if they need not stay, where there are at most the third number of open edges.
+_ATTEMPTS, _OPTIONAL_ATTEMPTS, _MAX_OPTIONAL_EDGES = 6, 1, 1000
+# The number of cells across the mesh if it is remeshed. If the surface is rough and has more
+# triangles than the second number, cells are made larger by the third, at most as often as the
+# fourth says.
 _ACROSS_ANEW = 48
-_MOST_ANEW, _LARGER, _MOST_LARGER = 80_000, 1.4, 3
+_MOST_ANEW, _CELL_GROWTH, _MAX_GROWTHS = 80_000, 1.4, 3
 
-# Points lie in a plane if the least of their singular values is this part of the largest.
+# Points lie in a plane if the smallest of their singular values is below this fraction of the
+# largest.
 _FLAT = 1e-9
 
 Keep = Literal["all", "valid", "none"]
@@ -129,7 +131,7 @@ def repair(
     largest: keep only the body of the largest volume, with its cavities.
     cell_size: of cells before anything is refined, in the mesh's unit; None chooses.
     seed: of the small random moves that keep points in general position.
-    progress: told what is being done.
+    progress: called with the name of each step of the work.
     options: a `TraceOptions`, of which repairs have the tolerance alone: the largest distance of
         harmonic fillings and of remeshed triangles from the surface w = 1/2, a length, sampled and
         not proved. None is 1e-3 of the longest side of the box of the mesh and, for fillings, of
@@ -187,7 +189,7 @@ def repair(
     largest = flag(largest, "largest")
     keywords = {} if tolerance is None else {"tolerance": tolerance}
     accuracy = MeshTolerance.of(trace_options("repair", options, keywords, ("tolerance",)))
-    asked = _checked_settings(keep, filling, accuracy, cell_size, seed, teller(progress))
+    settings = _checked_settings(keep, filling, accuracy, cell_size, seed, teller(progress))
     _check_is_mesh(mesh)
     _check_encloses(mesh)
     intended = IntendedSolid.of(mesh, as_it_is=keep == "all")
@@ -202,20 +204,20 @@ def repair(
     reasons, results = list[str](), list[_Result]()
     for name in names:
         try:
-            surface, facts = stages[name](intended, asked)
+            surface, facts = stages[name](intended, settings)
         except (MeshError, MeshingError) as error:
             if name == names[-1] and not results:
                 raise
             reasons.append(str(error))
-            asked.report(f"{error}; so not all is kept")
+            settings.report(f"{error}; so not all is kept")
             continue
-        asked.report("comparing with what was given")
+        settings.report("comparing with what was given")
         away = 2 * accuracy.at(intended.size) + facts.get("moved", 0.0)
         results.append(_Result(surface, facts, intended.difference(surface, away)))
         if results[-1].difference is None:
             break
         reasons.append(f"the result of {facts['stage']} is another solid: {results[-1].difference}")
-        asked.report(f"{reasons[-1]}; so another way")
+        settings.report(f"{reasons[-1]}; so another way")
     best = min(results, key=lambda result: result.badness)
     moved = best.facts.get("moved", 0.0)
     if moved > 2 * accuracy.at(intended.size):
@@ -259,7 +261,7 @@ def _checked_settings(
 
 @dataclass(frozen=True)
 class _Result:
-    """What a stage made, and how that differs from what was given."""
+    """The result of a stage, and its difference from the intended solid; None for no difference."""
 
     surface: TriangleMesh
     facts: dict[str, Any]
@@ -271,7 +273,9 @@ class _Result:
         return 0.0 if self.difference is None else self.difference.badness
 
     def finished(self, more_facts: dict[str, Any], largest: bool) -> trimesh.Trimesh:
-        """The mesh, with what is known of it and of its parts; a warning if it differs."""
+        """The mesh, with its metadata; with a warning if it differs from the intended solid.
+
+        more_facts: further metadata."""
         from harnack.meshing.closed_mesh import ClosedMesh
 
         surface = self.surface
@@ -299,10 +303,10 @@ class _Result:
 
 
 def _count_of(surface: TriangleMesh, whole: TriangleMesh, first: int) -> int:
-    """How many of the first faces of a whole are in a surface that is a part of it."""
-    corners = [one.vertices[one.faces].reshape(-1, 9) for one in (surface, whole)]
-    there = {row.tobytes() for row in corners[0]}
-    return sum(row.tobytes() in there for row in corners[1][:first])
+    """The number of the first faces of a whole mesh that are in a surface that is a part of it."""
+    corners = [mesh.vertices[mesh.faces].reshape(-1, 9) for mesh in (surface, whole)]
+    rows = {row.tobytes() for row in corners[0]}
+    return sum(row.tobytes() in rows for row in corners[1][:first])
 
 
 def _check_is_mesh(mesh: Any) -> None:
@@ -341,7 +345,7 @@ def _check_encloses(mesh: Any) -> None:
 
 
 def _unite_bodies(
-    intended: IntendedSolid, asked: _RepairOptions
+    intended: IntendedSolid, options: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
     """The boundary of the solid that a closed mesh bounds which passes through itself, or of parts
     that touch.
@@ -352,27 +356,28 @@ def _unite_bodies(
     vertices, faces = intended.vertices, intended.oriented
     if len(singular_edges(faces)[0]):
         raise MeshError("the mesh is not closed")
-    if _is_fine(vertices, faces):
+    if _is_free_of_overlaps(vertices, faces):
         raise MeshError("nothing of it passes through or lies in itself")
     facts = {"stage": "boolean_union", "kept": 0}
-    slivers = 0.5 * asked.tolerance.at(intended.size)
+    slivers = 0.5 * options.tolerance.at(intended.size)
     if len(intended.parts) > 1 and sum(map(len, intended.parts)) == len(faces):
-        asked.report(f"uniting {len(intended.parts):,} parts")
+        options.report(f"uniting {len(intended.parts):,} parts")
         try:
             return united_parts(vertices, faces, intended.parts, slivers), facts
         except (MeshError, MeshingError) as error:
-            asked.report(f"{error}; so all at once")
-    asked.report("cutting faces along each other")
+            options.report(f"{error}; so all at once")
+    options.report("cutting faces along each other")
     try:
         return mended_by_cuts(vertices, faces, slivers), facts
     except MeshingError as error:
-        asked.report(f"{error}; so by cells")
-    made = mesh_of(MeshSolid(vertices, faces), progress=asked.report)
-    return TriangleMesh(np.asarray(made.vertices), np.asarray(made.faces, np.int64)), facts
+        options.report(f"{error}; so by cells")
+    mesh = mesh_of(MeshSolid(vertices, faces), progress=options.report)
+    return TriangleMesh(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64)), facts
 
 
-def _is_fine(vertices: FloatArray, faces: IntArray) -> bool:
-    """Whether no triangles meet beyond what they share, and no part is in another's material."""
+def _is_free_of_overlaps(vertices: FloatArray, faces: IntArray) -> bool:
+    """Whether no triangles meet except in common vertices and edges, and no part is in another's
+    material."""
     try:
         _check_sides(TriangleMesh.without_unused_vertices(vertices, faces))
     except MeshError:
@@ -380,76 +385,78 @@ def _is_fine(vertices: FloatArray, faces: IntArray) -> bool:
     return not len(nonmanifold_vertices(faces)) and not len(intersecting_faces(vertices, faces))
 
 
-# All made anew.
+# Remeshing.
 
 
-def _remesh(intended: IntendedSolid, asked: _RepairOptions) -> tuple[TriangleMesh, dict[str, Any]]:
+def _remesh(
+    intended: IntendedSolid, options: _RepairOptions
+) -> tuple[TriangleMesh, dict[str, Any]]:
     """The surface on which the winding number is 1/2, closed whatever the mesh is."""
     intended.check_encloses()
     corners = without_zero_area_faces(intended.vertices, intended.oriented)
     field = WindingNumber(*corners)
-    if asked.spacing is not None:
-        made = _by_signs(field, asked.spacing, asked)
+    if options.spacing is not None:
+        mesh = _by_signs(field, options.spacing, options)
     else:
         spacing = float(np.ptp(corners[0], axis=0).max()) / _ACROSS_ANEW
         try:
-            made = _of_bounded_size(field, spacing, asked)
+            mesh = _of_bounded_size(field, spacing, options)
         except MeshingError:
-            made = _by_signs(field, 0.6 * spacing, asked)
-    facts = made.metadata["harnack"] | {"stage": "remeshed", "kept": 0}
-    return TriangleMesh(np.asarray(made.vertices), np.asarray(made.faces, np.int64)), facts
+            mesh = _by_signs(field, 0.6 * spacing, options)
+    facts = mesh.metadata["harnack"] | {"stage": "remeshed", "kept": 0}
+    return TriangleMesh(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64)), facts
 
 
 def _of_bounded_size(
-    field: WindingNumber, spacing: float, asked: _RepairOptions
+    field: WindingNumber, spacing: float, options: _RepairOptions
 ) -> trimesh.Trimesh:
-    """Of larger cells where there would be too many triangles, as of noisy meshes: the time of
-    checks grows with their number."""
-    for k in range(_MOST_LARGER):
+    """The mesh by signs, with larger cells if there would be too many triangles, as for noisy
+    meshes: the time of checks grows with their number."""
+    for k in range(_MAX_GROWTHS):
         try:
-            return _by_signs(field, spacing * _LARGER**k, asked, _MOST_ANEW)
+            return _by_signs(field, spacing * _CELL_GROWTH**k, options, _MOST_ANEW)
         except TriangleLimitError as error:
-            asked.report(f"{error}; so of larger cells")
-    return _by_signs(field, spacing * _LARGER**_MOST_LARGER, asked)
+            options.report(f"{error}; so of larger cells")
+    return _by_signs(field, spacing * _CELL_GROWTH**_MAX_GROWTHS, options)
 
 
 def _by_signs(
-    field: WindingNumber, spacing: float, asked: _RepairOptions, most: int = 2_000_000
+    field: WindingNumber, spacing: float, options: _RepairOptions, max_triangles: int = 2_000_000
 ) -> trimesh.Trimesh:
     return mesh_of(
-        field, level=0.5, side="above", tolerance=asked.tolerance.length, cell_size=spacing,
-        max_triangles=most, progress=asked.report,
+        field, level=0.5, side="above", tolerance=options.tolerance.length, cell_size=spacing,
+        max_triangles=max_triangles, progress=options.report,
     )  # fmt: skip
 
 
-# What is sound kept.
+# Valid triangles kept.
 
 
 def _keep_valid(
-    intended: IntendedSolid, asked: _RepairOptions
+    intended: IntendedSolid, options: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The triangles that are sound, with patches.
+    """The valid triangles, with hole fillings.
 
     Raises:
         MeshError, MeshingError: as `repair`.
     """
     vertices, faces = without_zero_area_faces(intended.vertices, intended.faces)
-    made = clean_and_fill(vertices, faces, asked.report)
+    cleaned = clean_and_fill(vertices, faces, options.report)
     flat = len(intended.faces) - len(faces)
-    left_out = {"flat": made.left_out["flat"] + flat}
-    return made.surface, {
+    left_out = {"flat": cleaned.left_out["flat"] + flat}
+    return cleaned.surface, {
         "stage": "cleaned",
-        "kept": len(made.kept_faces),
-        "turned": _count_turned(intended, made),
-        "left_out": made.left_out | left_out,
-        "holes": made.holes,
-        "patches": len(made.surface.faces) - len(made.kept_faces),
+        "kept": len(cleaned.kept_faces),
+        "turned": _count_turned(intended, cleaned),
+        "left_out": cleaned.left_out | left_out,
+        "holes": cleaned.holes,
+        "patches": len(cleaned.surface.faces) - len(cleaned.kept_faces),
         "harmonic": 0,
     }
 
 
 def _count_turned(intended: IntendedSolid, sound: CleanedMesh) -> int:
-    """How many of the triangles that were kept run the other way than those that were given."""
+    """The number of kept triangles whose orientation differs from that of the input triangles."""
     turned_before = np.delete(
         intended.is_turned, zero_area_faces(intended.vertices, intended.faces)
     )
@@ -462,26 +469,26 @@ def _count_turned(intended: IntendedSolid, sound: CleanedMesh) -> int:
 
 
 def _weld_loose(
-    intended: IntendedSolid, asked: _RepairOptions
+    intended: IntendedSolid, options: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """Triangles with near corners joined, with patches; none is kept bit by bit.
+    """Triangles with near corners joined, with hole fillings; none is kept bit by bit.
 
     Raises:
         MeshError, MeshingError: as `repair`.
     """
     corners = without_zero_area_faces(intended.vertices, intended.faces)
     vertices, faces, moved = weld_near_corners(*corners)
-    made = clean_and_fill(vertices, faces, asked.report)
-    count = len(made.kept_faces)
-    return made.surface, {
+    cleaned = clean_and_fill(vertices, faces, options.report)
+    count = len(cleaned.kept_faces)
+    return cleaned.surface, {
         "stage": "welded",
         "kept": 0,
         "joined": count,
         "moved": moved,
-        "turned": len(made.turned),
-        "left_out": made.left_out | {"flat": len(intended.faces) - len(faces)},
-        "holes": made.holes,
-        "patches": len(made.surface.faces) - count,
+        "turned": len(cleaned.turned),
+        "left_out": cleaned.left_out | {"flat": len(intended.faces) - len(faces)},
+        "holes": cleaned.holes,
+        "patches": len(cleaned.surface.faces) - count,
         "harmonic": 0,
     }
 
@@ -490,9 +497,9 @@ def _weld_loose(
 
 
 def _fill_only(
-    intended: IntendedSolid, asked: _RepairOptions
+    intended: IntendedSolid, options: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The mesh with patches; all its triangles stay.
+    """The mesh with hole fillings; all its triangles stay.
 
     Raises:
         MeshError, MeshingError: as `repair`.
@@ -501,21 +508,21 @@ def _fill_only(
     if intended.is_turned.any():
         raise MeshError("a part of the mesh is inside out")
     edges = checked_boundary_edges(faces)
-    if asked.keep is None and len(crossing := intersecting_faces(vertices, faces)):
+    if options.keep is None and len(crossing := intersecting_faces(vertices, faces)):
         raise MeshError(f"{len(crossing):,} triangles of the mesh pass through others")
     loops = hole_loops(vertices, faces, edges)
-    if asked.patches == "smooth":
+    if options.patches == "smooth":
         try:
-            return _kept_with(vertices, faces, loops, asked)
+            return _fill_all_holes(vertices, faces, loops, options)
         except MeshingError as error:
-            if asked.keep is None:
+            if options.keep is None:
                 raise
-            asked.report(f"{error}; once more, with harmonic patches alone")
-    return _kept_with(vertices, faces, loops, dataclasses.replace(asked, patches="harmonic"))
+            options.report(f"{error}; once more, with harmonic patches alone")
+    return _fill_all_holes(vertices, faces, loops, dataclasses.replace(options, patches="harmonic"))
 
 
 def _checked(intended: IntendedSolid) -> tuple[FloatArray, IntArray]:
-    """Vertices and faces of a mesh all of which can be kept."""
+    """The vertices and faces of a mesh, if all of them can be kept; else MeshError."""
     vertices, faces = validate_mesh(intended.vertices, intended.faces)
     used = np.unique(faces)
     welded = weld_vertices(vertices[used])
@@ -529,46 +536,50 @@ def _checked(intended: IntendedSolid) -> tuple[FloatArray, IntArray]:
     return vertices, faces
 
 
-def _kept_with(
-    vertices: FloatArray, faces: IntArray, loops: list[IntArray], asked: _RepairOptions
+def _fill_all_holes(
+    vertices: FloatArray, faces: IntArray, loops: list[IntArray], options: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The mesh with patches over its holes: smooth ones if asked for, and harmonic ones.
+    """The mesh with its holes filled: by smooth fillings if requested, and by harmonic fillings.
 
     Raises:
         MeshingError: as `repair`.
     """
-    x, together, left = vertices, faces, loops
-    if loops and asked.patches == "smooth":
-        asked.report(f"filling {len(loops):,} holes")
+    x, whole, unfilled = vertices, faces, loops
+    if loops and options.patches == "smooth":
+        options.report(f"filling {len(loops):,} holes")
         field = WindingNumber(vertices, faces)
-        made = fill_holes(vertices, faces, loops, lambda p: field.value(p, precision="double"))
-        x, together = np.concatenate([x, made.vertices]), np.concatenate([faces, made.faces])
-        left = made.unfilled_loops
-        asked.report(f"{len(left):,} holes are left" + f": {made.reason}" * bool(left))
-    rest = HarmonicFilling(vertices[:0], faces[:0], True, 0.0, 0)
-    if left:
-        edges = checked_boundary_edges(together)
-        if asked.keep is None and len(edges) > _FEW_EDGES:
-            raise MeshingError(f"{len(left):,} holes of {len(edges):,} edges have no smooth patch")
-        attempts = _ATTEMPTS if asked.keep == "all" else _FEW_ATTEMPTS
-        how = HoleFillingOptions(asked.tolerance, asked.spacing, asked.seed, attempts, asked.report)
-        rest = harmonic_patches(x, together, edges, how)
-        x, together = np.concatenate([x, rest.vertices]), np.concatenate([together, rest.faces])
-    surface = TriangleMesh.without_unused_vertices(x, together)
-    if loops or asked.keep is None:
-        _check_touching(together)
-    if asked.keep is None:
+        filling = fill_holes(vertices, faces, loops, lambda p: field.value(p, precision="double"))
+        x, whole = np.concatenate([x, filling.vertices]), np.concatenate([faces, filling.faces])
+        unfilled = filling.unfilled_loops
+        options.report(f"{len(unfilled):,} holes are left" + f": {filling.reason}" * bool(unfilled))
+    harmonic = HarmonicFilling(vertices[:0], faces[:0], True, 0.0, 0)
+    if unfilled:
+        edges = checked_boundary_edges(whole)
+        if options.keep is None and len(edges) > _MAX_OPTIONAL_EDGES:
+            raise MeshingError(
+                f"{len(unfilled):,} holes of {len(edges):,} edges have no smooth patch"
+            )
+        attempts = _ATTEMPTS if options.keep == "all" else _OPTIONAL_ATTEMPTS
+        setup = HoleFillingOptions(
+            options.tolerance, options.spacing, options.seed, attempts, options.report
+        )
+        harmonic = harmonic_patches(x, whole, edges, setup)
+        x, whole = np.concatenate([x, harmonic.vertices]), np.concatenate([whole, harmonic.faces])
+    surface = TriangleMesh.without_unused_vertices(x, whole)
+    if loops or options.keep is None:
+        _check_touching(whole)
+    if options.keep is None:
         _check_sides(surface)
     return surface, {
         "stage": "filled",
         "kept": len(faces),
         "holes": len(loops),
-        "patches": len(together) - len(faces),
-        "harmonic": len(rest.faces),
-        "missing": rest.triangle_fill_count,
-        "refined": rest.is_refined,
-        "spacing": rest.spacing,
-        "evaluations": rest.evaluations,
+        "patches": len(whole) - len(faces),
+        "harmonic": len(harmonic.faces),
+        "missing": harmonic.triangle_fill_count,
+        "refined": harmonic.is_refined,
+        "spacing": harmonic.spacing,
+        "evaluations": harmonic.evaluations,
     }
 
 

@@ -37,9 +37,9 @@ __all__ = ["resolve_local_intersections", "resolve_self_intersections"]
 
 # If there are more crossing triangles than this, or if their neighborhood is larger, they are no
 # slivers.
-_MOST, _MOST_AROUND = 400, 5_000
+_MAX_CROSSING_FACES, _MAX_NEIGHBORHOOD = 400, 5_000
 # The largest number of changes in one place, and the number of attempts for each.
-_MOST_CHANGES, _MOST_TRIED = 40, 80
+_MAX_CHANGES, _MAX_ATTEMPTS = 40, 80
 # New triangles with less than this fraction of the area that they cover may face backwards.
 _NOTHING = 1e-4
 
@@ -71,13 +71,13 @@ def resolve_local_intersections(
     length: how far the surface may be moved by one change; vertices stay where they are, or are
         removed.
     """
-    if not 0 < len(crossing) <= _MOST or length <= 0:
+    if not 0 < len(crossing) <= _MAX_CROSSING_FACES or length <= 0:
         return surface, len(crossing)
     vertices, faces = surface.vertices, surface.faces
     is_gone, pieces, crossing_count = np.zeros(len(faces), np.bool_), [faces[:0]], 0
     for rows, movable in _regions(vertices, faces, crossing):
         is_gone[rows] = True
-        if len(rows) > _MOST_AROUND:
+        if len(rows) > _MAX_NEIGHBORHOOD:
             pieces.append(faces[rows])
             crossing_count += int(np.isin(crossing, rows).sum())
             continue
@@ -104,8 +104,8 @@ def _regions(
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
     corner = vertices[faces]
     lower, upper = corner.min(axis=1), corner.max(axis=1)
-    near = _touching(faces, faces[crossing])
-    second_ring = _touching(faces, faces[near])
+    near = _faces_with_corners_of(faces, faces[crossing])
+    second_ring = _faces_with_corners_of(faces, faces[near])
     pairs = half_edges(faces[second_ring])
     joined = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(vertices),) * 2)
     part = csgraph.connected_components(joined, directed=False)[1]
@@ -122,7 +122,7 @@ def _regions(
         yield rows, np.unique(faces[near[np.isin(near, rows)]])
 
 
-def _touching(faces: IntArray, targets: IntArray) -> IntArray:
+def _faces_with_corners_of(faces: IntArray, targets: IntArray) -> IntArray:
     """The indices of faces that have a corner in common with `targets`."""
     is_corner = np.zeros(int(faces.max()) + 1, np.bool_)
     is_corner[targets] = True
@@ -198,7 +198,7 @@ def _reduce_crossings(patch: _Neighborhood, length: float) -> tuple[IntArray, in
     """The faces of a patch, by vertices of the mesh, after changes that let fewer cross; and the
     number that still cross."""
     crossing = patch.crossing()
-    for _ in range(_MOST_CHANGES):
+    for _ in range(_MAX_CHANGES):
         better = _best_change(patch, crossing, length) if len(crossing) else None
         if better is None:
             break
@@ -215,9 +215,9 @@ def _best_change(
     Changes that move the surface least are tried first: of edges of faces that cross, then of all
     edges at their corners.
     """
-    for rows in (crossing, _touching(patch.faces, patch.faces[crossing])):
+    for rows in (crossing, _faces_with_corners_of(patch.faces, patch.faces[crossing])):
         for _, removed, new in sorted(_changes(patch, rows, length), key=lambda change: change[0])[
-            :_MOST_TRIED
+            :_MAX_ATTEMPTS
         ]:
             changed = patch.with_faces(removed, new)
             still_crossing = changed.crossing()
@@ -243,7 +243,7 @@ def _changes(
         change = patch.flip_edge(a, b)
         if change is not None and _keeps_orientation(patch, *change, length):
             c, d = (patch.vertices[change[1][0, k]] for k in (2, 1))
-            moved = _between(patch.vertices[a], patch.vertices[b], c, d)
+            moved = _line_distance(patch.vertices[a], patch.vertices[b], c, d)
             if moved <= length:
                 yield moved, *change
 
@@ -266,7 +266,7 @@ def _keeps_orientation(patch: _Neighborhood, rows: IntArray, new: IntArray, leng
     return bool(((after @ mean > 0) | (row_norms(after) <= _NOTHING * total)).all())
 
 
-def _between(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> float:
+def _line_distance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> float:
     """The distance between the line through a and b and the line through c and d."""
     across = np.cross(b - a, d - c)
     size = float(np.linalg.norm(across))

@@ -47,7 +47,7 @@ _HALVINGS, _STEPS = 4, 8
 # Values smaller than this, relative to those at the ends, need no further steps.
 _NEAR_ROOT = 1e-3
 # How far a segment is extended beyond both of its ends, relative to its remaining length.
-_BEYOND = 1e-6
+_SEGMENT_EXTENSION = 1e-6
 # Single precision is used where it distinguishes this many points along a cell.
 _STEPS_IN_CELL = 1000
 # Surfaces with a smoothing length below this, relative to a cell, have details that the cell does
@@ -57,7 +57,7 @@ _STEPS_IN_CELL = 1000
 _UNRESOLVED_SMOOTHING, _RESOLVED_SMOOTHING_LENGTHS = 0.3, 4.8
 # The largest number of points of a cloud at which its value is tested, and the fraction of the
 # level that it must reach.
-_MOST_PROBES, _LEAST_PART = 2000, 0.1
+_MAX_PROBES, _MIN_LEVEL_FRACTION = 2000, 0.1
 
 
 def uses_sign_meshing(field: Field) -> bool:
@@ -194,7 +194,7 @@ class SignFunction(LevelFunction):
         normal, is_on_sheet = np.zeros_like(low), np.zeros(len(low), np.bool_)
         if self.field.has_jumps:
             first, last = self._bisect(low, direction)
-            t, normal, is_on_sheet = self._on_sheets(low, direction, first, last)
+            t, normal, is_on_sheet = self._first_facet_crossing(low, direction, first, last)
             rows = np.flatnonzero(~is_on_sheet)
             t[rows] = self._roots(low[rows], direction[rows], first[rows], last[rows], 2)
         else:
@@ -257,7 +257,7 @@ class SignFunction(LevelFunction):
                 break
         return _secant(first, last, low, high)
 
-    def _on_sheets(
+    def _first_facet_crossing(
         self, start: FloatArray, direction: FloatArray, first: FloatArray, last: FloatArray
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
         """The fractions (n,) at which segments, between `first` and `last`, first cross a jump
@@ -266,7 +266,7 @@ class SignFunction(LevelFunction):
         field = self.field.prepare(backend)
         length = row_norms(direction)
         ray = direction / np.maximum(length, 1e-300)[:, None]
-        room = _BEYOND * (last - first)
+        room = _SEGMENT_EXTENSION * (last - first)
         origin = start + (first - room)[:, None] * direction
         reach = (last - first + 2 * room) * length
 
@@ -291,12 +291,12 @@ def _check_encloses(field: DipolePotential, level: float) -> None:
     """
     if field.smoothing or not field.is_estimated[1] or not level > 0:
         return
-    step = -(-len(field.points) // _MOST_PROBES)
+    step = -(-len(field.points) // _MAX_PROBES)
     value = float(np.median(field.value(field.points[::step], precision="double")))
-    if not value > _LEAST_PART * level:
+    if not value > _MIN_LEVEL_FRACTION * level:
         fault = (
-            "normals face inwards: turn them around, or mesh the level -2 pi"
-            if value < -_LEAST_PART * level
+            "normals face inwards: turn them around, or mesh level=-2 pi"
+            if value < -_MIN_LEVEL_FRACTION * level
             else "normals cancel each other, or the points lie in a plane"
         )
         raise MeshingError(

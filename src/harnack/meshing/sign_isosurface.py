@@ -65,7 +65,7 @@ __all__ = [
 _EDGE_END_MARGIN = 1e-4
 # The number of rounds in which edges are cut; and how often vertices of triangles that pass through
 # others are moved back.
-_ROUNDS, _MOST_REPAIRS = 2, 12
+_ROUNDS, _MAX_REPAIRS = 2, 12
 # A round that would cut more than this fraction of the edges that the last round cut, or of the
 # faces, is omitted: the surface is rough at every scale.
 _MAX_CUT_FRACTION = 0.5
@@ -94,9 +94,9 @@ MAX_OFF_LEVEL_FRACTION, CELL_REFINEMENT_FACTOR = 0.01, 0.6
 # The largest distance from the level, in cells, that is measured.
 _MAX_DISTANCE_CELLS = 4.0
 # The largest number of triangles at whose corners and centers distances are measured.
-_MOST_MEASURED = 20_000
+_MAX_MEASURED = 20_000
 # Meshes with more triangles are not computed again.
-_MOST_REMADE = 100_000
+_MAX_REMADE = 100_000
 # How far points at which the function is no number are moved, relative to a cell.
 _SINGULAR_POINT_SHIFT = 1e-3
 _MAX_GROWTH_ROUNDS = 20
@@ -165,7 +165,7 @@ def mesh_from_signs(
         may_help = far_count > MAX_OFF_LEVEL_FRACTION * count or (
             lost.matter and lost.are_mended_by(CELL_REFINEMENT_FACTOR)
         )
-        if attempts <= 0 or not may_help or len(mesh.surface.faces) > _MOST_REMADE:
+        if attempts <= 0 or not may_help or len(mesh.surface.faces) > _MAX_REMADE:
             break
         report(f"{far_count:,} of {count:,} vertices and centers are beyond the tolerance")
         if lost.matter:
@@ -204,7 +204,7 @@ def _distances(
         lower, upper = lattice.lower + 2 * lattice.size, lattice.upper - 2 * lattice.size
         faces = faces[((x[faces] > lower) & (x[faces] < upper)).all(axis=(1, 2))]
     surface = TriangleMesh.without_unused_vertices(
-        x, faces[:: -(-len(faces) // _MOST_MEASURED) or 1]
+        x, faces[:: -(-len(faces) // _MAX_MEASURED) or 1]
     )
     x, faces = surface.vertices, surface.faces
     off_level, count = points_off_level(function, x, faces, tolerance, None)
@@ -441,9 +441,9 @@ class _CreaseRefinement:
         edges = every.edge_of_pair.reshape(3, -1).T
         rows = np.flatnonzero((every.multiplicity == 2) & ~is_creased[every.vertices].any(axis=1))
         ends = every.vertices[rows]
-        one, other = normals[ends[:, 0]], normals[ends[:, 1]]
+        first_normal, second_normal = normals[ends[:, 0]], normals[ends[:, 1]]
         a, b = x[ends[:, 0]], x[ends[:, 1]]
-        t, along, turned = _toward_tangent_planes(a, b, one, other)
+        t, along, turned = _toward_tangent_planes(a, b, first_normal, second_normal)
         long = row_norms(b - a)
         is_far = (
             (turned > _PARALLEL) & (row_norms(along) > tolerance) & (long > _SHORTEST * tolerance)
@@ -456,8 +456,8 @@ class _CreaseRefinement:
         vertex = np.full(len(every.vertices), -1, np.int64)
         vertex[rows] = len(x) + np.arange(len(rows))
         total, angle = (
-            np.arccos(np.clip(one, -1, 1))
-            for one in (
+            np.arccos(np.clip(cosine, -1, 1))
+            for cosine in (
                 row_dots(normals[ends[:, 0]], normals[ends[:, 1]]),
                 np.minimum(*(row_dots(normals[ends[:, k]], normal) for k in (0, 1))),
             )
@@ -562,7 +562,7 @@ def _undo_until_valid(x: FloatArray, flat: FloatArray, faces: IntArray) -> tuple
     x = x.copy()
     total = 0
     upright = area_normals(flat[faces])
-    for _ in range(_MOST_REPAIRS):
+    for _ in range(_MAX_REPAIRS):
         moved = (x != flat).any(axis=1)
         turned = moved[faces].any(axis=1)
         turned[turned] = row_dots(area_normals(x[faces[turned]]), upright[turned]) <= 0
@@ -572,7 +572,7 @@ def _undo_until_valid(x: FloatArray, flat: FloatArray, faces: IntArray) -> tuple
         total += int(turned.sum())
     among: BoolArray = np.asarray((x != flat).any(axis=1)[faces].any(axis=1))
     failing = faces[:0, 0]
-    for _ in range(_MOST_REPAIRS):
+    for _ in range(_MAX_REPAIRS):
         failing = np.union1d(intersecting_faces(x, faces, among), _folded_faces(x, faces, among))
         if not len(failing):
             return x, total

@@ -23,7 +23,7 @@ __all__ = ["WallThickness", "wall_thickness"]
 _BELOW = 1e-6
 # The largest number of times that balls shrink; and the distance from the surface at which they
 # count as touching it.
-_MOST_ROUNDS, _TOUCHING = 30, 1e-6
+_MAX_ROUNDS, _TOUCHING = 30, 1e-6
 # Two points are opposite if the cosine between their normals is below this: walls beside an edge of
 # a part, at up to 120 degrees, are no thin places.
 _OPPOSITE = -0.5
@@ -131,7 +131,7 @@ def _medial_diameters(solid: MeshSolid, start: FloatArray, normal: FloatArray) -
     # Where that is already beyond the other side, the part is no thicker than the skipped length.
     width[~_is_within(solid, start - 2 * below * normal)] = 2 * below
     moving = np.arange(len(width))
-    for _ in range(_MOST_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         if not len(moving):
             break
         p, n, r = start[moving], normal[moving], 0.5 * width[moving]

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["thread_manifold"]
 
-_MOST_VERTICES = 4_000_000
+_MAX_VERTICES = 4_000_000
 
 
 def thread_manifold(thread: Thread, lower: float, upper: float, tolerance: float) -> Manifold:
@@ -40,7 +40,7 @@ def thread_manifold(thread: Thread, lower: float, upper: float, tolerance: float
     first = math.floor((lower - 3 * lead) / thread.pitch)
     periods = math.ceil((upper + 3 * lead) / thread.pitch) - first
     lines = periods * len(profile)
-    if lines * segments > _MOST_VERTICES:
+    if lines * segments > _MAX_VERTICES:
         raise MeshingError(
             f"a thread within {tolerance:.3g} has {2 * lines * segments:,} faces: choose a larger "
             "`tolerance`"

@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 
 __all__ = ["tube_manifold"]
 
-_MOST_VERTICES = 4_000_000
+_MAX_VERTICES = 4_000_000
 # The largest error of polylines, relative to the tolerance.
 _LEFT_OUT = 0.25
 # The smallest number of points around, also for wires far thinner than the tolerance.
-_LEAST_AROUND = 8
+_MIN_AROUND = 8
 # An edge leads back where the cosine of its turn is less than this above -1.
 _BACK = 1e-9
 
@@ -55,16 +55,17 @@ def tube_manifold(tube: Tube, level: float, tolerance: float) -> Manifold:
     if radius <= 0:
         return Manifold()
     step = math.sqrt(3 * tolerance / radius)
-    segments = max(_LEAST_AROUND, math.ceil(2 * math.pi / step))
+    segments = max(_MIN_AROUND, math.ceil(2 * math.pi / step))
     waiting = [
-        _simpler(polyline, _LEFT_OUT * tolerance) for polyline in np.split(tube.points, tube.starts)
+        _simplify_polyline(polyline, _LEFT_OUT * tolerance)
+        for polyline in np.split(tube.points, tube.starts)
     ]
     parts: list[Manifold] = []
     vertices = 0
     while waiting:
         # Rings of a half ball at both ends, and at least one ring at each vertex between.
         minimum = segments * sum(len(polyline) + segments // 2 for polyline in waiting)
-        if vertices + minimum > _MOST_VERTICES:
+        if vertices + minimum > _MAX_VERTICES:
             raise MeshingError(
                 f"a tube within {tolerance:.3g} has more than {2 * (vertices + minimum):,} faces: "
                 "choose a larger `tolerance`"
@@ -85,7 +86,7 @@ def _is_apart(surface: TriangleMesh) -> bool:
     return not len(intersecting_faces(surface.vertices, surface.faces))
 
 
-def _simpler(points: FloatArray, length: float) -> FloatArray:
+def _simplify_polyline(points: FloatArray, length: float) -> FloatArray:
     """A polyline (n, 3) without vertices that are within a length of the edges that replace them
     (Douglas and Peucker 1973). Proof that all of these edges are as near to the polyline: the
     points on an edge that are nearest to the replaced part of the polyline go from one of the
@@ -225,11 +226,12 @@ class _Sweep:
             twist = (mismatch - shift * step) / len(edges)
         frames = [np.stack([u, np.cross(edge, u)]) for u, edge in zip(across, edges, strict=False)]
         return [
-            (_spun(f, -twist * k), _spun(f, -twist * (k + 1))) for k, f in enumerate(frames)
+            (_rotate_frame(f, -twist * k), _rotate_frame(f, -twist * (k + 1)))
+            for k, f in enumerate(frames)
         ], shift
 
 
-def _spun(frame: FloatArray, angle: float) -> FloatArray:
+def _rotate_frame(frame: FloatArray, angle: float) -> FloatArray:
     """The frame, turned by an angle in its plane."""
     c, s = math.cos(angle), math.sin(angle)
     return np.stack([c * frame[0] + s * frame[1], c * frame[1] - s * frame[0]])

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 FILM_FILES = (".gif", ".mp4")
 _MAX_FRAMES = 10_000
-# What changes where surfaces are.
+# The options that change where surfaces are.
 _MOVING = frozenset((*SHORTHAND, "surfaces", "options", "boundary_radius", "thickness"))
 # The palette's last entry in a GIF, which stands for transparent.
 _CLEAR = 255
@@ -75,7 +75,7 @@ def animate(
     options: TraceOptions | None = None,
     **keywords: Any,
 ) -> Animation:
-    """Draw a film and write it to `path`; notebooks show what is returned.
+    """Draw a film and write it to `path`; notebooks show the returned `Animation`.
 
         hk.animate(field, "turntable.gif", orbit=360)
         hk.animate(lambda s: hk.fields.Morph(a, b, gap=0.2, w=0.2 * s), "morph.mp4")
@@ -86,16 +86,18 @@ def animate(
         in the last; with an orbit of 360 degrees, to just before 1, so that the film can be
         repeated.
     path: .gif (Pillow) or .mp4 (PyAV: `pip install harnack[film]`).
-    frames: number of pictures. fps: pictures a second; those of a GIF last whole hundredths.
+    frames: the number of pictures.
+    fps: pictures a second. In a GIF each picture lasts a whole number of hundredths of a second.
     orbit: degrees that the camera goes around its target during the film.
-    camera: as `render` takes it. What it does not say (target, distance, angle of view) is the same
-        for all pictures, and such that everything is always in view.
-    client, checkpoint: as `render` takes them; workers draw whole pictures, and a film with more of
-        them, or at another speed, draws only those that the folder does not have.
+    camera: as `render` takes it. Properties that it does not set (target, distance, angle of view)
+        are the same for all pictures, and such that everything is always in view.
+    client, checkpoint: as `render` takes them. Workers draw whole pictures; a film with more
+        pictures, or at another speed, draws only the pictures that the folder does not have.
     options, keywords: as `render` takes them, but for `chunks`; `show` is "shaded" by default.
 
-    Raises what `render` raises; ValueError for no or too many frames, and for another file type;
-    ModuleNotFoundError where Pillow or PyAV is missing. Nothing is written unless all is.
+    Raises the errors of `render`; ValueError for no or too many frames, and for another file type;
+    ModuleNotFoundError if Pillow or PyAV is missing. The file is written only if all pictures are
+    drawn.
     """
     target = check_film_path(path)
     arguments = complete_options("animate", keywords)
@@ -140,7 +142,8 @@ def animate(
 
 @dataclass(frozen=True)
 class _FilmJob:
-    """What all pictures of a film have in common, as arguments of `render`; Mitsuba's variant."""
+    """The arguments of `render` that all pictures of a film have in common, and Mitsuba's
+    variant."""
 
     arguments: dict[str, Any]
     variant: str
@@ -155,12 +158,12 @@ class _FilmJob:
 def _job(
     frames: list[dict[str, Any]], same: dict[str, Any]
 ) -> tuple[_FilmJob, list[tuple[dict[str, Any]]]]:
-    """The job of a film, and what each picture has of its own."""
+    """The job of a film, and the arguments that differ from picture to picture."""
     first = frames[0]
-    moving = [name for name in first if any(one[name] is not first[name] for one in frames)]
-    same = {**same, **{name: first[name] for name in first if name not in moving}}
+    varying = [name for name in first if any(frame[name] is not first[name] for frame in frames)]
+    same = {**same, **{name: first[name] for name in first if name not in varying}}
     return _FilmJob(same, register().variant()), [
-        ({name: one[name] for name in moving},) for one in frames
+        ({name: frame[name] for name in varying},) for frame in frames
     ]
 
 
@@ -190,65 +193,70 @@ def _is_function_of_s(value: Any) -> bool:
 def _cameras(
     moments: list[dict[str, Any]], steps: FloatArray, orbit: float, size: tuple[int, int]
 ) -> list[Camera]:
-    """The camera of each picture: all have one box, target, distance and angle of view, except
-    where they set their own."""
-    asked = [moment.get("camera") for moment in moments]
-    cameras = [Camera() if one is None else check_camera(one) for one in asked]
+    """The camera of each picture. All cameras have the same box, target, distance and angle of
+    view, except where they set their own."""
+    given = [moment.get("camera") for moment in moments]
+    cameras = [Camera() if camera is None else check_camera(camera) for camera in given]
     ups = [moment.get("up") for moment in moments]
-    stand = [rotation_to_z_up("z" if up is None else up) for up in ups]
-    boxes = [np.array(one.box.bounds()) for one in cameras if one.box is not None]
+    turns = [rotation_to_z_up("z" if up is None else up) for up in ups]
+    boxes = [np.array(camera.box.bounds()) for camera in cameras if camera.box is not None]
     points = np.concatenate(boxes or [_points(moments, steps)])
     ends = np.array([points.min(axis=0), points.max(axis=0)])
     if boxes:
         points = np.array(np.meshgrid(*ends.T)).reshape(3, -1).T
     box, middle = Box(*map(_as_point, ends)), _as_point(ends.mean(axis=0))
     framed = [
-        _orbited(replace(one, box=box, target=one.target or middle), orbit * s, way)
-        for one, s, way in zip(cameras, steps.tolist(), stand, strict=True)
+        _orbited(replace(camera, box=box, target=camera.target or middle), orbit * s, turn)
+        for camera, s, turn in zip(cameras, steps.tolist(), turns, strict=True)
     ]
-    free = [one.position is None and one.distance is None for one in framed]
+    free = [camera.position is None and camera.distance is None for camera in framed]
     poses = [
-        replace(one, zoom=1.0).pose(points @ way.T, size, lambda local, way=way: local @ way.T)
-        for one, way in zip(framed, stand, strict=True)
+        replace(camera, zoom=1.0).pose(
+            points @ turn.T, size, lambda local, turn=turn: local @ turn.T
+        )
+        for camera, turn in zip(framed, turns, strict=True)
     ]
-    away = [float(np.linalg.norm(pose.origin - pose.target)) for pose in poses]
-    farthest = max((one for one, is_free in zip(away, free, strict=True) if is_free), default=1.0)
+    distances = [float(np.linalg.norm(pose.origin - pose.target)) for pose in poses]
+    farthest = max(
+        (length for length, is_free in zip(distances, free, strict=True) if is_free), default=1.0
+    )
     widest = max(
         (p.fov for p, is_free in zip(poses, free, strict=True) if not is_free), default=1.0
     )
     return [
-        replace(one, distance=farthest / one.zoom, fov=one.fov_or_default, zoom=1.0) if is_free
-        else replace(one, fov=widest if one.fov is None else one.fov)
-        for one, is_free in zip(framed, free, strict=True)
-    ]  # fmt: skip
+        replace(camera, distance=farthest / camera.zoom, fov=camera.fov_or_default, zoom=1.0)
+        if is_free
+        else replace(camera, fov=widest if camera.fov is None else camera.fov)
+        for camera, is_free in zip(framed, free, strict=True)
+    ]
 
 
-def _orbited(camera: Camera, orbit: float, stand: FloatArray) -> Camera:
-    """The camera after it has gone around its target. stand: (3, 3), rotates up to z."""
+def _orbited(camera: Camera, orbit: float, upright: FloatArray) -> Camera:
+    """The camera after it has gone around its target. upright: (3, 3) rotation of up to z."""
     if camera.position is None:
         return replace(camera, azimuth=camera.azimuth_elevation[0] + orbit)
     c, s = math.cos(math.radians(orbit)), math.sin(math.radians(orbit))
-    around = stand.T @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ stand
+    rotation = upright.T @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ upright
     target = np.array(camera.target)
-    place = target + around @ (np.array(camera.position) - target)
-    return replace(camera, position=_as_point(place))
+    position = target + rotation @ (np.array(camera.position) - target)
+    return replace(camera, position=_as_point(position))
 
 
 def _points(moments: list[dict[str, Any]], steps: FloatArray) -> FloatArray:
-    """Points (n, 3) of all that is seen in a film."""
+    """Points (n, 3) of all surfaces that are seen in a film."""
     backend = mitsuba_backend(register())
-    seen: list[FloatArray] = []
+    points: list[FloatArray] = []
     last: Any = None
     for moment, s in zip(moments, steps.tolist(), strict=True):
-        rest = {name: value for name, value in moment.items() if name in _MOVING}
-        if last is not None and all(rest[name] is last[name] for name in rest):
+        settings = {name: value for name, value in moment.items() if name in _MOVING}
+        if last is not None and all(settings[name] is last[name] for name in settings):
             continue  # the same surfaces
-        last = rest
+        last = settings
         try:
-            seen += [visible_points(one, backend) for one in drawn_surfaces(**rest)]
+            points += [visible_points(surface, backend) for surface in drawn_surfaces(**settings)]
         except UnboundedSurfaceError as error:
             raise ValueError(f"at s = {s:g} of the film, {error}") from None
-    return np.concatenate(seen)
+    return np.concatenate(points)
 
 
 def _as_point(point: FloatArray) -> tuple[float, float, float]:
@@ -279,12 +287,12 @@ def _gif(path: Path, fps: float) -> Generator[Callable[[Pixels], None]]:
 
     def add(pixels: Pixels) -> None:
         opaque = Image.fromarray(np.ascontiguousarray(pixels[..., :3]))
-        chosen = opaque.quantize(_CLEAR, method=Image.Quantize.MEDIANCUT)
+        indexed = opaque.quantize(_CLEAR, method=Image.Quantize.MEDIANCUT)
         if pixels.shape[-1] == 4:  # a GIF has no partly transparent pixels
-            clear = Image.fromarray(np.where(pixels[..., 3] < 128, np.uint8(255), np.uint8(0)))
-            chosen.paste(_CLEAR, mask=clear)
-            chosen.info["transparency"] = _CLEAR
-        pictures.append(chosen)
+            mask = Image.fromarray(np.where(pixels[..., 3] < 128, np.uint8(255), np.uint8(0)))
+            indexed.paste(_CLEAR, mask=mask)
+            indexed.info["transparency"] = _CLEAR
+        pictures.append(indexed)
 
     yield add
     duration = 10 * max(2, round(100 / fps))

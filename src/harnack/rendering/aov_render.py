@@ -53,12 +53,12 @@ _STATUS_COLORS = {
 class AovBuffers:
     """First hits of the rays through the middles of all pixels.
 
-    depth: (h, w) distance from the camera in the unit of the viewer's placement, inf without a hit.
-        Where the ray ran out of steps, how far it is proved free.
+    depth: (h, w) distance from the camera in the unit of the viewer's placement, inf without a hit;
+        for a ray out of steps, the distance up to which it is proved free.
     normal: (h, w, 3) unit, zero without a hit; of a level set it points to larger values.
     evaluations: (h, w) of all the scene's fields.
     status: (h, w) a `RayStatus`; shapes of Mitsuba count as hits.
-    isoline_color: (h, w, 3) color in sRGB of the isoline that is hit; NaN where none is.
+    isoline_color: (h, w, 3) color in sRGB of the isoline that is hit; NaN where no isoline is hit.
     is_near_isoline: (h, w) whether the edge of an isoline may pass through the pixel.
     value: (h, w) of a function at hits, NaN elsewhere; None without a function.
     period: of that function, if it is angle-valued.
@@ -116,8 +116,11 @@ class AovTask:
         return tiled_pixel_order(self.size)
 
     def render_range(self, start: int, stop: int) -> AovBuffers:
-        """The first hits of the rays through the middles of some pixels, (n,); `order` counts."""
-        return self._look_at(upload_indices(self.mi, self.order[start:stop]), self.mi.Vector2f(0.5))
+        """The first hits (n,) of the rays through the middles of a range of pixels, counted as in
+        `order`."""
+        return self._trace_pixels(
+            upload_indices(self.mi, self.order[start:stop]), self.mi.Vector2f(0.5)
+        )
 
     def look(
         self, executor: RenderExecutor | None = None, advance: Callable[[float], None] | None = None
@@ -130,9 +133,11 @@ class AovTask:
         executor = LocalRenderExecutor(self) if executor is None else executor
         width, height = self.size
         order = self.order
-        cut, parts = executor.split_range(width * height, _RAYS_A_BAND), list[AovBuffers]()
-        for (start, stop), part in zip(cut, executor.run_tasks("render_range", cut), strict=True):
-            parts.append(part)
+        ranges, buffers = executor.split_range(width * height, _RAYS_A_BAND), list[AovBuffers]()
+        for (start, stop), buffer in zip(
+            ranges, executor.run_tasks("render_range", ranges), strict=True
+        ):
+            buffers.append(buffer)
             if advance is not None:
                 advance((stop - start) / (width * height))
 
@@ -141,7 +146,7 @@ class AovTask:
             image.reshape(height * width, *column[0].shape[1:])[order] = np.concatenate(column)
             return image
 
-        return _map_arrays(by_rows, *parts)
+        return _map_arrays(by_rows, *buffers)
 
     def render_samples(self, pixels: IntArray, offsets: FloatArray) -> AovBuffers:
         """The first hits of rays through points (m, 2) in each of n pixels, which are counted by
@@ -149,67 +154,70 @@ class AovTask:
         mi, count = self.mi, len(offsets)
         pixel = upload_indices(mi, np.repeat(pixels, count))
         table = np.tile(offsets, (len(pixels), 1)).T
-        places = mi.Vector2f(*(upload_floats(mitsuba_backend(mi), one) for one in table))
+        positions = mi.Vector2f(*(upload_floats(mitsuba_backend(mi), array) for array in table))
 
-        def by_pixels(one: Any) -> Any:
-            return one.reshape(len(pixels), count, *one.shape[1:])
+        def by_pixels(array: Any) -> Any:
+            return array.reshape(len(pixels), count, *array.shape[1:])
 
-        return _map_arrays(by_pixels, self._look_at(pixel, places))
+        return _map_arrays(by_pixels, self._trace_pixels(pixel, positions))
 
-    def _look_at(self, pixel: Any, offset: Any) -> AovBuffers:
+    def _trace_pixels(self, pixel: Any, offset: Any) -> AovBuffers:
         """The first hits of rays through places in pixels, counted by rows: arrays (n,)."""
         mi, count = self.mi, dr.width(pixel)
-        place = film_positions(mi, pixel, offset, self.size)
+        position = film_positions(mi, pixel, offset, self.size)
         ray, _ = self.sensor.sample_ray_differential(
-            self.sensor.shutter_open(), 0.5, place, mi.Point2f(0.5)
+            self.sensor.shutter_open(), 0.5, position, mi.Point2f(0.5)
         )
         none = dr.zeros(mi.SurfaceInteraction3f)
         si, first = self.world.intersect(mi.Ray3f(ray), none, mi.Bool(True))
-        lined, line = mi.Bool(False), mi.Vector3f(dr.nan)
+        near, color = mi.Bool(False), mi.Vector3f(dr.nan)
         if self.function is not None:
-            lined = first.is_hit & self.world.has_line_near(si, ray, ray.d, first.t)
-            line = self._line_color(si, first)
-        dr.eval(first, lined, line)
+            near = first.is_hit & self.world.has_line_near(si, ray, ray.d, first.t)
+            color = self._line_color(si, first)
+        dr.eval(first, near, color)
 
         def numbers(values: Any) -> Any:
             flat = to_numpy(values)
             return np.broadcast_to(flat, (count, *flat.shape[1:]))
 
-        met, lost = numbers(first.is_hit), numbers(first.is_out_of_steps)
-        status = np.where(met, int(RayStatus.HIT), int(RayStatus.MISS))
+        is_hit, is_lost = numbers(first.is_hit), numbers(first.is_out_of_steps)
+        status = np.where(is_hit, int(RayStatus.HIT), int(RayStatus.MISS))
         view = AovBuffers(
             depth=numbers(first.t) / self.placement.scale,
-            normal=np.where(met[:, None], numbers(first.normal), 0),
+            normal=np.where(is_hit[:, None], numbers(first.normal), 0),
             evaluations=numbers(first.evaluations).astype(np.int64),
-            status=np.where(lost, int(RayStatus.OUT_OF_STEPS), status),
-            isoline_color=numbers(line),
-            is_near_isoline=numbers(lined),
+            status=np.where(is_lost, int(RayStatus.OUT_OF_STEPS), status),
+            isoline_color=numbers(color),
+            is_near_isoline=numbers(near),
             background=self.background,
         )
         if self.function is None:
             return view
         value = np.full(count, np.nan, dtype=np.float32)
-        if met.any():
-            value[met] = _values(
-                self.function, self.placement.apply_inverse(numbers(first.position)[met])
+        if is_hit.any():
+            value[is_hit] = _values(
+                self.function, self.placement.apply_inverse(numbers(first.position)[is_hit])
             )
         return replace(view, value=value, period=self.function.period)
 
     def _line_color(self, si: Any, first: Any) -> Any:
-        """sRGB of the line that is met; NaN where none is."""
+        """The color in sRGB of the isoline that is hit; NaN where no isoline is hit."""
         mi = self.mi
-        found = mi.Vector3f(dr.nan)
-        for carrier in self.world.proxies:
-            own = first.is_hit & (si.shape == mi.ShapePtr(carrier))
-            if carrier.section_proxy is not None:
-                own |= first.is_hit & (si.shape == mi.ShapePtr(carrier.section_proxy))
-            for number, color in enumerate(carrier.line_colors, start=1):
-                found = dr.select(own & (first.isoline_index == number), mi.Vector3f(*color), found)
-        return found
+        line_color = mi.Vector3f(dr.nan)
+        for proxy in self.world.proxies:
+            is_there = first.is_hit & (si.shape == mi.ShapePtr(proxy))
+            if proxy.section_proxy is not None:
+                is_there |= first.is_hit & (si.shape == mi.ShapePtr(proxy.section_proxy))
+            for number, color in enumerate(proxy.line_colors, start=1):
+                line_color = dr.select(
+                    is_there & (first.isoline_index == number), mi.Vector3f(*color), line_color
+                )
+        return line_color
 
 
 def _map_arrays(change: Callable[..., Any], *views: AovBuffers) -> AovBuffers:
-    """A view whose arrays are made of those of the same name in others."""
+    """AOV buffers whose arrays are the results of `change` for the arrays of that name in all
+    views."""
     arrays = {
         name: change(*(getattr(view, name) for view in views))
         for name, value in vars(views[0]).items()
@@ -239,12 +247,12 @@ def status_picture(view: AovBuffers) -> npt.NDArray[np.uint8]:
 
 
 def depth_picture(view: AovBuffers, scale: ColorScale) -> npt.NDArray[np.uint8]:
-    """Depths of what is met as the colors of a scale."""
+    """Depths of hits as the colors of a scale."""
     return _of_surfaces(view, scale.colors(view.depth))
 
 
 def value_picture(view: AovBuffers, scale: ColorScale) -> npt.NDArray[np.uint8]:
-    """Values on what is met as the colors of a scale, gray where there is none; isolines on it."""
+    """Values at hits as the colors of a scale, gray where there is no value; with isolines."""
     value = value_of(view)
     picture = np.where(np.isnan(value)[..., None], _UNKNOWN, scale.colors(value))
     return _of_surfaces(view, np.where(np.isnan(view.isoline_color), picture, view.isoline_color))
@@ -274,27 +282,27 @@ def value_scale(view: AovBuffers) -> ColorScale:
 
 
 def value_of(view: AovBuffers) -> FloatArray:
-    """Values of the function that was asked for."""
+    """The values of the function at hits. Raises ValueError if there was no function."""
     if view.value is None:
         raise ValueError("values of no function were looked at")
     return view.value
 
 
 def _range(view: AovBuffers, numbers: FloatArray) -> tuple[float, float]:
-    """The least and the greatest finite number of what is met; (0, 1) where there is none."""
-    found = numbers[(view.status == int(RayStatus.HIT)) & np.isfinite(numbers)]
-    return (float(found.min()), float(found.max())) if found.size else (0.0, 1.0)
+    """The smallest and the largest finite number at hits; (0, 1) if there is no such number."""
+    finite = numbers[(view.status == int(RayStatus.HIT)) & np.isfinite(numbers)]
+    return (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
 
 
 def _of_surfaces(view: AovBuffers, picture: FloatArray) -> npt.NDArray[np.uint8]:
     """Colors where something is hit, over the background."""
-    met = (view.status == int(RayStatus.HIT))[..., None]
-    return _with_lost(view, np.where(met, picture, view.background))
+    is_hit = (view.status == int(RayStatus.HIT))[..., None]
+    return _with_lost(view, np.where(is_hit, picture, view.background))
 
 
 def _with_lost(view: AovBuffers, picture: FloatArray) -> npt.NDArray[np.uint8]:
-    lost = (view.status == int(RayStatus.OUT_OF_STEPS))[..., None]
-    return to_uint8(np.where(lost, OUT_OF_STEPS_COLOR, picture))
+    is_lost = (view.status == int(RayStatus.OUT_OF_STEPS))[..., None]
+    return to_uint8(np.where(is_lost, OUT_OF_STEPS_COLOR, picture))
 
 
 @dataclass(frozen=True)
@@ -348,21 +356,23 @@ def aov_picture(
     spp: rays of a pixel at an edge, for pictures that are averaged.
     executor: as for `AovTask.look`.
     """
-    one = AOV_MODES[show]
-    scale = None if one.scale is None else one.scale(view)
+    mode = AOV_MODES[show]
+    scale = None if mode.scale is None else mode.scale(view)
     if scale is None:
-        return one.picture(view, None)
+        return mode.picture(view, None)
     if value_range is not None:
-        map_of = viridis if scale.period is not None else scale.colors_of
-        scale = ColorScale(*value_range, scale.name, map_of)
+        colormap = viridis if scale.period is not None else scale.colors_of
+        scale = ColorScale(*value_range, scale.name, colormap)
     if isinstance(bar, str):
         scale = replace(scale, name=bar)
-    picture = one.picture(view, scale)
-    if one.is_averaged and spp > 1:
-        _antialias(viewer, view, picture, lambda part: one.picture(part, scale), spp, executor)
+    picture = mode.picture(view, scale)
+    if mode.is_averaged and spp > 1:
+        _antialias(
+            viewer, view, picture, lambda samples: mode.picture(samples, scale), spp, executor
+        )
     if not bar:
         return picture
-    numbers = np.asarray(one.numbers(view), dtype=np.float64)
+    numbers = np.asarray(mode.numbers(view), dtype=np.float64)
     if show != "evaluations":  # which rays that miss have, too
         numbers = numbers[view.status == int(RayStatus.HIT)]
     scale = scale.with_exceeded(numbers[np.isfinite(numbers)])
@@ -380,11 +390,11 @@ def _antialias(
     """Make pixels that differ visibly from a neighbor, or that the edge of an isoline may pass
     through, the mean light of a grid of rays."""
     order = tiled_pixel_order(viewer.size)
-    again = order[(edge_pixels(picture) | view.is_near_isoline).ravel()[order]]
+    edges = order[(edge_pixels(picture) | view.is_near_isoline).ravel()[order]]
     offsets = multijitter_offsets(spp)
     executor = LocalRenderExecutor(viewer) if executor is None else executor
-    cut = executor.split_range(len(again), max(1, _RAYS_A_BAND // len(offsets)))
-    parts = [(again[start:stop], offsets) for start, stop in cut]
-    for (chosen, _), seen in zip(parts, executor.run_tasks("render_samples", parts), strict=True):
-        light = srgb_to_linear(colors(seen) / 255)
-        picture.reshape(-1, 3)[chosen] = to_uint8(linear_to_srgb(light.mean(axis=1)))
+    ranges = executor.split_range(len(edges), max(1, _RAYS_A_BAND // len(offsets)))
+    calls = [(edges[start:stop], offsets) for start, stop in ranges]
+    for (rows, _), samples in zip(calls, executor.run_tasks("render_samples", calls), strict=True):
+        light = srgb_to_linear(colors(samples) / 255)
+        picture.reshape(-1, 3)[rows] = to_uint8(linear_to_srgb(light.mean(axis=1)))

@@ -151,10 +151,10 @@ Backdrop = GroundBackdrop | GradientBackdrop | ImageBackdrop | None
 
 
 def parse_backdrop(backdrop: Any) -> Backdrop:
-    """The backdrop that an argument describes.
+    """The backdrop that an option describes.
 
     Raises:
-        TypeError, ValueError: it is no backdrop; the message says what backdrops there are.
+        TypeError, ValueError: it is no backdrop; the message lists the backdrops.
         FileFormatError: an image file that cannot be read.
     """
     if isinstance(backdrop, os.PathLike):
@@ -162,9 +162,9 @@ def parse_backdrop(backdrop: Any) -> Backdrop:
     if isinstance(backdrop, np.ndarray) and backdrop.ndim != 1:
         return ImageBackdrop(_pixels(cast("npt.NDArray[Any]", backdrop)))
     if isinstance(backdrop, str):
-        return _named(backdrop)
+        return _backdrop_from_text(backdrop)
     if isinstance(backdrop, list | tuple) and len(pair := cast("list[Any]", backdrop)) == 2:
-        return GradientBackdrop(*(parse_color(one, "a color of the backdrop") for one in pair))
+        return GradientBackdrop(*(parse_color(end, "a color of the backdrop") for end in pair))
     try:
         color = parse_color(backdrop, "backdrop")
     except TypeError:
@@ -178,7 +178,7 @@ _BACKDROP_HELP = (
 )
 
 
-def _named(name: str) -> Backdrop:
+def _backdrop_from_text(name: str) -> Backdrop:
     if name in GROUNDS:
         return GroundBackdrop(name)
     if name == TRANSPARENT:
@@ -236,10 +236,10 @@ def _read_bitmap(data: bytes) -> FloatImage:
 def _decoded(bitmap: Any) -> FloatImage:
     """The pixels of one of Mitsuba's bitmaps."""
     mi = load_mitsuba()
-    clear = bitmap.has_alpha()
-    kind = mi.Bitmap.PixelFormat.RGBA if clear else mi.Bitmap.PixelFormat.RGB
+    has_alpha = bitmap.has_alpha()
+    kind = mi.Bitmap.PixelFormat.RGBA if has_alpha else mi.Bitmap.PixelFormat.RGB
     pixels = np.array(bitmap.convert(kind, mi.Struct.Type.Float32, False), dtype=np.float32)
-    if clear:
+    if has_alpha:
         pixels = pixels[..., :3] * pixels[..., 3:] + (1 - pixels[..., 3:])
     return np.ascontiguousarray(pixels)
 
@@ -254,12 +254,12 @@ def _read_exr(data: bytes) -> FloatImage:
         path.write_bytes(data)
         with library.File(str(path)) as file:
             channels: dict[str, FloatImage] = {
-                name: np.array(one.pixels, dtype=np.float32)
-                for name, one in file.channels().items()
+                name: np.array(channel.pixels, dtype=np.float32)
+                for name, channel in file.channels().items()
             }
     if "RGBA" in channels:  # colors are multiplied by alpha
-        both = channels["RGBA"]
-        pixels = both[..., :3] + (1 - np.clip(both[..., 3:], 0, 1))
+        rgba = channels["RGBA"]
+        pixels = rgba[..., :3] + (1 - np.clip(rgba[..., 3:], 0, 1))
     elif "RGB" in channels:
         pixels = channels["RGB"]
     else:  # KeyError: no colors at all

@@ -32,17 +32,17 @@ class Camera:
     azimuth, elevation: of the direction the camera looks from, in degrees; azimuth 0 is +x and
         90 is +y, elevation 90 is straight from above. By default -50 and 28.
     fov: the larger of the horizontal and vertical angle of view, in degrees. By default 26, or, of
-        a camera with a position or a distance, what frames the surface from there.
+        a camera with a position or a distance, the angle that frames the surface from there.
     zoom: 1 frames the surface tightly with a margin; more comes closer or, of a camera with a
         position or a distance, makes the angle of view smaller.
-    box: framed in place of what is to be seen, in the coordinates of the surfaces; it stands on the
+    box: a box to frame in place of the visible surfaces, in their coordinates; it stands on the
         ground. The pictures of a film, in which surfaces change, then fit each other, and nothing
         has to be traced to find the frame.
     position: (x, y, z), where the camera stands, in the coordinates of the surfaces, in place of
         azimuth and elevation.
     target: (x, y, z), the point in the middle of the picture, in the same coordinates; by default
         the middle of the framed box.
-    distance: from the target, in the same unit; by default what frames the surface.
+    distance: from the target, in the same unit; by default the one that frames the surface.
     """
 
     azimuth: float | None = None
@@ -113,9 +113,9 @@ class Camera:
         x, y, z = points @ right, points @ up, points @ back
         origin = np.zeros(3)
         distance = -math.inf
-        for across, axis, slope in zip((x, y), (right, up), self._slopes(size), strict=True):
+        for coordinate, axis, slope in zip((x, y), (right, up), self._slopes(size), strict=True):
             # |across - c| <= slope (distance - z) for all points.
-            high, low = (across + slope * z).max(), (across - slope * z).min()
+            high, low = (coordinate + slope * z).max(), (coordinate - slope * z).min()
             origin = origin + (high + low) / 2 * axis
             distance = max(distance, (high - low) / (2 * slope))
         middle = float(z.max() + z.min()) / 2
@@ -128,7 +128,7 @@ class Camera:
         size: tuple[int, int],
         to_world: Callable[[FloatArray], FloatArray],
     ) -> CameraPose:
-        """Where the camera is in the world, to see points (n, 3) of the world.
+        """The camera in the world, placed to see points (n, 3) of the world.
 
         to_world: from the coordinates of the surfaces, a map of one scale for all axes.
         """
@@ -141,24 +141,24 @@ class Camera:
         target = middle if self.target is None else to_world(np.array([self.target]))[0]
         if self.position is not None:
             origin = to_world(np.array([self.position]))[0]
-            away = origin - target
-            length = float(np.linalg.norm(away))
+            to_camera = origin - target
+            length = float(np.linalg.norm(to_camera))
             if not length > 0:
                 raise ValueError(
                     f"position {self.position} is in the middle of what is seen: say where to look "
                     "with a target (x, y, z)"
                 )
-            azimuth = math.degrees(math.atan2(away[1], away[0]))
-            elevation = math.degrees(math.asin(max(-1.0, min(1.0, away[2] / length))))
-            turned = replace(self, azimuth=azimuth, elevation=elevation, position=None)
+            azimuth = math.degrees(math.atan2(to_camera[1], to_camera[0]))
+            elevation = math.degrees(math.asin(max(-1.0, min(1.0, to_camera[2] / length))))
+            oriented = replace(self, azimuth=azimuth, elevation=elevation, position=None)
         else:
-            turned, length = self, None
+            oriented, length = self, None
             if self.distance is not None:
                 unit = np.diff(to_world(np.array([[0.0, 0, 0], [1, 0, 0]])), axis=0)
                 length = self.distance * float(np.linalg.norm(unit))
-        right, up, back = turned.axes()
-        seen = points - target
-        x, y, z = np.abs(seen @ right), np.abs(seen @ up), seen @ back
+        right, up, back = oriented.axes()
+        relative = points - target
+        x, y, z = np.abs(relative @ right), np.abs(relative @ up), relative @ back
         fov = self.fov_or_default
         if length is None:  # |across| <= slope (length - z) for all points
             slopes = self._slopes(size)
@@ -168,7 +168,7 @@ class Camera:
             fov = self._fov_to_frame(np.array([x, y]), length - z, size)
         else:
             fov = 2 * math.degrees(math.atan(math.tan(math.radians(fov) / 2) / self.zoom))
-        return CameraPose(target + length * back, target, up, fov, turned.azimuth_elevation[0])
+        return CameraPose(target + length * back, target, up, fov, oriented.azimuth_elevation[0])
 
     def _fov_to_frame(self, across: FloatArray, depth: FloatArray, size: tuple[int, int]) -> float:
         """The angle of view, in degrees, that frames points as far as `across` (2, n) from the
@@ -176,8 +176,10 @@ class Camera:
         if depth.min() <= 0:
             return _FOV_INSIDE
         shape = max(size) / np.array(size)
-        wide = (across / depth).max(axis=1) * shape
-        fov = 2 * math.degrees(math.atan(max(float(wide.max()), 1e-4) / _FILL_FRACTION / self.zoom))
+        slopes = (across / depth).max(axis=1) * shape
+        fov = 2 * math.degrees(
+            math.atan(max(float(slopes.max()), 1e-4) / _FILL_FRACTION / self.zoom)
+        )
         return min(fov, _WIDEST)
 
     @property

@@ -50,39 +50,44 @@ def rotation_to_z_up(up: Any) -> FloatArray:
                 f"{did_you_mean(up, UP_AXES)}"
             )
         axis = up.removeprefix("-")
-        over = np.diag([1.0, -1.0, -1.0]) if up.startswith("-") else np.eye(3)
-        return over @ _UPRIGHT[axis]
-    way = np.array(as_point(up, "up"))
-    if not way.any():
+        flip = np.diag([1.0, -1.0, -1.0]) if up.startswith("-") else np.eye(3)
+        return flip @ _UPRIGHT[axis]
+    vector = np.array(as_point(up, "up"))
+    if not vector.any():
         raise ValueError("up must be a vector that is not zero")
-    way, z = way / float(np.abs(way).max()), np.array([0.0, 0.0, 1.0])
-    way = way / float(np.linalg.norm(way))
-    # Turned the shortest way, about the axis at right angles to both.
-    across = np.cross(way, z)
-    if float(np.linalg.norm(across)) < 1e-12:
-        return rotation_to_z_up("z" if way[2] > 0 else "-z")
-    u = across / np.linalg.norm(across)
-    before, after = np.stack([u, np.cross(way, u), way]), np.stack([u, np.cross(z, u), z])
+    vector, z = vector / float(np.abs(vector).max()), np.array([0.0, 0.0, 1.0])
+    vector = vector / float(np.linalg.norm(vector))
+    # The shortest rotation is about the axis at right angles to both.
+    normal = np.cross(vector, z)
+    if float(np.linalg.norm(normal)) < 1e-12:
+        return rotation_to_z_up("z" if vector[2] > 0 else "-z")
+    u = normal / np.linalg.norm(normal)
+    before, after = (
+        np.stack([u, np.cross(vector, u), vector]),
+        np.stack([u, np.cross(z, u), z]),
+    )
     return after.T @ before
 
 
 class UnboundedSurfaceError(ValueError):
     """A surface without a box around it cannot be drawn.
 
-    reason: what is wrong. usual: a level of the same field whose surface has a box, if known.
+    reason: the text of the error.
+    bounded_level: a level of the same field whose surface has a box; None if no such level is
+        known.
     """
 
     def __init__(self, reason: str, bounded_level: float | None) -> None:
-        other = (
+        hint = (
             "" if bounded_level is None else f", or choose another level, such as {bounded_level:g}"
         )
-        super().__init__(f"{reason}: give it a clip, such as a ball (harnack.Ball){other}")
+        super().__init__(f"{reason}: give it a clip, such as a ball (harnack.Ball){hint}")
         self.reason = reason
         self.bounded_level = bounded_level
 
 
 class NothingVisibleError(ValueError):
-    """A surface of which no ray hits anything: there is nothing to frame."""
+    """A surface that no ray hits: there is nothing to frame."""
 
 
 def bounding_box(surface: TracedSurface) -> FloatArray:
@@ -117,15 +122,17 @@ def _unbounded(surface: TracedSurface) -> UnboundedSurfaceError:
     return UnboundedSurfaceError(reason, usual if is_other else None)
 
 
-# Rays along a side of the grid on each of the six faces: of the box, then of the box of the hits.
+# The number of rays along a side of the grid on each of the six faces: of the box, and of the box
+# of the hits.
 _GRID, _FINE_GRID = 48, 32
 # Rays of one tile are followed together.
 _TILE = 8
 # Squares of lengths, divided by tolerances, stay far from the ends of single precision.
 _SMALLEST, _LARGEST = 1e-15, 1e16
-# The distance of surfaces from the origin, in lengths of them, beyond which pixels at edges are
-# off, and that beyond which a third of all pixels may be (measured: boxes, curves, meshes, clouds).
-_BLURRED, _NOTHING_LEFT = 5e3, 1e5
+# The distance of surfaces from the origin, in units of their size, beyond which pixels at edges are
+# wrong, and the one beyond which a third of all pixels may be wrong (measured: boxes, curves,
+# meshes, clouds).
+_MAX_SHARP_OFFSET, _MAX_OFFSET = 5e3, 1e5
 _VISIBLE_POINTS_CACHE: FieldCache[FloatArray] = FieldCache()
 
 
@@ -143,11 +150,11 @@ def visible_points(surface: TracedSurface, backend: Backend) -> FloatArray:
     check_drawable_size(ends)
     prepared = surface.evaluator(backend)
 
-    def found() -> FloatArray:
+    def find() -> FloatArray:
         return _find_visible_points(surface, backend, ends)
 
     if prepared is surface.field:  # it may have changed in place
-        return found()
+        return find()
     settings = (
         surface.level_values,
         surface.clip_volume,
@@ -156,7 +163,7 @@ def visible_points(surface: TracedSurface, backend: Backend) -> FloatArray:
         surface.max_steps,
     )
     return _VISIBLE_POINTS_CACHE.get(
-        prepared, (*settings, surface.enclosures, surface.over_relaxation), found
+        prepared, (*settings, surface.enclosures, surface.over_relaxation), find
     )
 
 
@@ -171,23 +178,23 @@ def check_drawable_size(ends: FloatArray) -> None:
 
 
 def check_offset(points: FloatArray) -> None:
-    """Warn of surfaces, given by points (n, 3), that are blurred by the rounding of coordinates far
-    from the origin, as those of maps; raise ValueError where nothing is left of them."""
-    size, far = float(np.ptp(points, axis=0).max()), float(np.abs(points).max())
-    if far <= _BLURRED * size or size == 0:
+    """Warn of surfaces, represented by points (n, 3), that are blurred by the rounding of
+    coordinates far from the origin, as those of maps; raise ValueError if they are lost in it."""
+    size, distance = float(np.ptp(points, axis=0).max()), float(np.abs(points).max())
+    if distance <= _MAX_SHARP_OFFSET * size or size == 0:
         return
-    said = (
-        f"what is drawn is {size:.4g} long and {far:.4g} from the origin, and pictures are "
+    message = (
+        f"what is drawn is {size:.4g} long and {distance:.4g} from the origin, and pictures are "
         "computed in single precision: {}; move it to the origin: subtract its center from the "
         "points that it is made of (of a solid, translated(...) does so)"
     )
-    if far > _NOTHING_LEFT * size:
-        raise ValueError(said.format("too little is left of its coordinates"))
-    warnings.warn(said.format("its edges are blurred"), stacklevel=4)
+    if distance > _MAX_OFFSET * size:
+        raise ValueError(message.format("too little is left of its coordinates"))
+    warnings.warn(message.format("its edges are blurred"), stacklevel=4)
 
 
 def _find_visible_points(surface: TracedSurface, backend: Backend, ends: FloatArray) -> FloatArray:
-    """Points found on a coarse grid, and on one around them."""
+    """The hits of rays of a coarse grid, and of a finer grid around these hits."""
     lower, upper = ends
     points = _probe(surface, backend, lower, upper, _GRID)
     if len(points) == 0:
@@ -205,8 +212,8 @@ def _find_visible_points(surface: TracedSurface, backend: Backend, ends: FloatAr
     margin = 0.6 * float((ends[1] - ends[0]).max()) / _GRID
     lower = np.maximum(points.min(axis=0) - margin, ends[0])
     upper = np.minimum(points.max(axis=0) + margin, ends[1])
-    closer = _probe(surface, backend, lower, upper, _FINE_GRID)
-    return np.concatenate([points, closer])
+    finer_points = _probe(surface, backend, lower, upper, _FINE_GRID)
+    return np.concatenate([points, finer_points])
 
 
 def _point(corner: FloatArray) -> str:
@@ -222,14 +229,14 @@ def _probe(
     coarse = replace(surface, tolerance=HitTolerance(1e-3 * size))
     placed = PlacedSurface.of(coarse, Placement.identity(), backend)
     o, d, length = _rays(lower, upper, 0.01 * size, grid)
-    met = placed.intersect(
+    hits = placed.intersect(
         to_vector3(backend, o),
         to_vector3(backend, d),
         to_float(backend, length),
         backend.Bool(True),
     )
-    dr.eval(met.position, met.is_hit)  # separately, each would trace the rays again
-    points: FloatArray = to_numpy(met.position)[to_numpy(met.is_hit)]
+    dr.eval(hits.position, hits.is_hit)  # separately, each would trace the rays again
+    points: FloatArray = to_numpy(hits.position)[to_numpy(hits.is_hit)]
     return points.astype(np.float64)
 
 

@@ -47,11 +47,11 @@ def surface_interaction(mi: Any, met: SurfaceHit, ray: Any, shape: Any) -> Any:
 
 
 def offset_origin(mi: Any, si: Any, clearance: Real, d: Vec3) -> Any:
-    """Where a ray in direction d starts so as not to meet the surface of `si` again.
+    """The origin of a ray in direction d that does not hit the surface of `si` again.
 
-    Off the surface along its normal on the side that the ray leaves to, as far as Mitsuba's own
-    rays do, (1 + |p|_max) RayEpsilon, but no less than `clearance`: within its tolerance of a
-    level set every point is a hit.
+    It is off the surface along the normal, on the side to which the ray leaves, as far as for
+    Mitsuba's own rays, (1 + |p|_max) RayEpsilon, but no less than `clearance`: within its tolerance
+    of a level set every point is a hit.
     """
     distance = dr.maximum((1 + dr.max(dr.abs(si.p))) * mi.math.RayEpsilon, clearance)
     return dr.fma(dr.mulsign(distance, dr.dot(si.n, d)), mi.Vector3f(si.n), si.p)
@@ -67,9 +67,11 @@ def spawn_ray(mi: Any, si: Any, clearance: Real, d: Vec3) -> Any:
 def spawn_ray_to(mi: Any, si: Any, clearance: Real, target: Vec3) -> Any:
     """The ray from `si` to a target point, ending just before it."""
     o = offset_origin(mi, si, clearance, target - si.p)
-    way = target - o
-    length = dr.norm(way)
-    return mi.Ray3f(o, way / length, length * (1 - mi.math.ShadowEpsilon), si.time, si.wavelengths)
+    vector = target - o
+    length = dr.norm(vector)
+    return mi.Ray3f(
+        o, vector / length, length * (1 - mi.math.ShadowEpsilon), si.time, si.wavelengths
+    )
 
 
 @dataclass(frozen=True)
@@ -100,11 +102,10 @@ class HybridScene:
     ) -> tuple[Any, SurfaceHit]:
         """The first hit of rays, as a surface interaction and as a `SurfaceHit`.
 
-        start: the interaction that rays leave, not valid for rays that come from a camera. hidden:
-        rays that do not see shapes that shine; None for none.
+        start: the interaction that rays leave, not valid for rays that come from a camera.
+        hidden: mask of rays that do not see shapes that emit light; None for no such rays.
 
-        Where the hit is lost (the ray ran out of steps before anything that is known to be there)
-        the interaction is not valid.
+        For a ray out of steps the interaction is not valid.
         """
         mi = self.mi
         preliminary = self.scene.ray_intersect_preliminary(ray, active=active)
@@ -113,57 +114,57 @@ class HybridScene:
         limit = dr.minimum(preliminary.t, ray.maxt)
         if self.queued:
             dr.eval(preliminary, limit)
-        ours, whose = self.no_hit(dr.zeros(mi.SurfaceInteraction3f)), dr.zeros(mi.ShapePtr)
-        for carrier in self.proxies:
-            shape = mi.ShapePtr(carrier)
+        hit, hit_shape = self.no_hit(dr.zeros(mi.SurfaceInteraction3f)), dr.zeros(mi.ShapePtr)
+        for proxy in self.proxies:
+            shape = mi.ShapePtr(proxy)
             side = dr.sign(dr.dot(start.n, ray.d))
-            own = start.shape == shape
-            if carrier.section_proxy is not None:
-                own |= start.shape == mi.ShapePtr(carrier.section_proxy)
-            leaves = dr.select(start.is_valid() & own, side, 0)
-            met = self._placed(carrier).intersect(ray.o, ray.d, limit, active, leaves)
-            evaluations = ours.evaluations + met.evaluations
-            event = met.is_hit | met.is_out_of_steps
-            ours = replace(dr.select(event, met, ours), evaluations=evaluations)
-            whose = dr.select(event, shape, whose)
-            if carrier.section_proxy is not None:
-                whose = dr.select(
-                    event & met.is_on_section, mi.ShapePtr(carrier.section_proxy), whose
+            from_it = start.shape == shape
+            if proxy.section_proxy is not None:
+                from_it |= start.shape == mi.ShapePtr(proxy.section_proxy)
+            leaves = dr.select(start.is_valid() & from_it, side, 0)
+            new = self._placed(proxy).intersect(ray.o, ray.d, limit, active, leaves)
+            evaluations = hit.evaluations + new.evaluations
+            ended = new.is_hit | new.is_out_of_steps
+            hit = replace(dr.select(ended, new, hit), evaluations=evaluations)
+            hit_shape = dr.select(ended, shape, hit_shape)
+            if proxy.section_proxy is not None:
+                hit_shape = dr.select(
+                    ended & new.is_on_section, mi.ShapePtr(proxy.section_proxy), hit_shape
                 )
-            limit = dr.select(event, met.t, limit)
-        event: Mask = ours.is_hit | ours.is_out_of_steps
-        others = active & ~event
-        si = preliminary.compute_surface_interaction(ray, mi.RayFlags.All, others)
-        first = replace(self._of_scene(si, active), evaluations=ours.evaluations)
-        si = dr.select(event, surface_interaction(mi, ours, ray, whose), si)
-        return si, dr.select(event, ours, first)
+            limit = dr.select(ended, new.t, limit)
+        ended: Mask = hit.is_hit | hit.is_out_of_steps
+        missed = active & ~ended
+        si = preliminary.compute_surface_interaction(ray, mi.RayFlags.All, missed)
+        scene_hit = replace(self._of_scene(si, active), evaluations=hit.evaluations)
+        si = dr.select(ended, surface_interaction(mi, hit, ray, hit_shape), si)
+        return si, dr.select(ended, hit, scene_hit)
 
     def _skip_emitters(self, ray: Any, first: Any, active: Mask) -> Any:
-        """What rays hit of the scene behind the shapes that shine."""
+        """The first hits of rays with the scene behind the shapes that emit light."""
         mi = self.mi
 
-        def shines(found: Any, active: Mask) -> Mask:
-            return active & found.is_valid() & found.shape.is_emitter()
+        def is_emitter(hit: Any, active: Mask) -> Mask:
+            return active & hit.is_valid() & hit.shape.is_emitter()
 
-        def on(found: Any, active: Mask) -> tuple[Any, Mask]:
-            past = found.t * (1 + mi.math.RayEpsilon) + mi.math.RayEpsilon
-            rest = mi.Ray3f(ray)
-            rest.o = dr.fma(mi.Vector3f(past), ray.d, ray.o)
-            rest.maxt = ray.maxt - past
-            after = self.scene.ray_intersect_preliminary(rest, active=active)
-            after.t += past
-            return dr.select(active, after, found), shines(after, active)
+        def skip(hit: Any, active: Mask) -> tuple[Any, Mask]:
+            distance = hit.t * (1 + mi.math.RayEpsilon) + mi.math.RayEpsilon
+            rest_ray = mi.Ray3f(ray)
+            rest_ray.o = dr.fma(mi.Vector3f(distance), ray.d, ray.o)
+            rest_ray.maxt = ray.maxt - distance
+            next_hit = self.scene.ray_intersect_preliminary(rest_ray, active=active)
+            next_hit.t += distance
+            return dr.select(active, next_hit, hit), is_emitter(next_hit, active)
 
-        def running(found: Any, active: Mask) -> Mask:
-            del found
+        def is_running(hit: Any, active: Mask) -> Mask:
+            del hit
             return active
 
         loop: Any = dr.while_loop
-        found, _ = loop((first, shines(first, active)), running, on, label="behind lights")
-        return found
+        hit, _ = loop((first, is_emitter(first, active)), is_running, skip, label="behind lights")
+        return hit
 
     def no_hit(self, si: Any) -> SurfaceHit:
-        """The `SurfaceHit` of rays that hit nothing, given as many invalid interactions."""
+        """The `SurfaceHit` of rays that hit nothing. si: invalid interactions, one for each ray."""
         return self._of_scene(si, self.mi.Bool(False))
 
     def _of_scene(self, si: Any, active: Mask) -> SurfaceHit:
@@ -185,27 +186,29 @@ class HybridScene:
     def has_line_near(self, si: Any, ray: Any, d: Any, t: Any) -> Mask:
         """Whether the edge of an isoline may pass through the pixel of a ray with differentials.
 
-        d: the direction in which the ray arrives. t: the length of its way. Where neighboring rays
-        hit the tangent plane is found along d.
+        d: the direction in which the ray arrives.
+        t: the length of its path.
+
+        The points at which neighboring rays hit the tangent plane are computed along d.
         """
         mi, near = self.mi, self.mi.Bool(False)
         normal = mi.Vector3f(si.n)
         facing = dr.dot(normal, d)
 
         def to_neighbor(o: Any, along: Any) -> Any:
-            way = o + t * along - ray.o - t * ray.d
-            return way - d * (dr.dot(way, normal) / facing)
+            offset = o + t * along - ray.o - t * ray.d
+            return offset - d * (dr.dot(offset, normal) / facing)
 
         across, down = to_neighbor(ray.o_x, ray.d_x), to_neighbor(ray.o_y, ray.d_y)
-        for carrier in self.proxies:
-            if carrier.placed.isolines:
-                found = carrier.placed.has_line_near(si.p, normal, across, down)
-                near |= (si.shape == mi.ShapePtr(carrier)) & found
+        for proxy in self.proxies:
+            if proxy.placed.isolines:
+                is_near = proxy.placed.has_line_near(si.p, normal, across, down)
+                near |= (si.shape == mi.ShapePtr(proxy)) & is_near
         return near
 
     def occluded(self, ray: Any, active: Mask) -> Mask:
-        """Whether rays hit anything; those not proved to hit nothing count as hitting."""
+        """Whether rays hit anything; rays that are not proved to hit nothing count as hitting."""
         blocked = self.scene.ray_test(ray, active)
-        for carrier in self.proxies:
-            blocked |= self._placed(carrier).occludes(ray.o, ray.d, ray.maxt, active & ~blocked)
+        for proxy in self.proxies:
+            blocked |= self._placed(proxy).occludes(ray.o, ray.d, ray.maxt, active & ~blocked)
         return blocked

@@ -50,7 +50,7 @@ class SobolSampler:
 
     Methods are called as Mitsuba's. Each call takes the next dimension.
 
-    pixel, index: UInt32 of each path, what its sample is of and which one it is.
+    pixel, index: (UInt32) for each path its pixel, and the index of its sample in the pixel.
     seed: UInt32. dimension: UInt32, of the next call.
     """
 
@@ -61,7 +61,9 @@ class SobolSampler:
     dimension: Any
 
     def at_vertex(self, depth: Any, rows: Any) -> SobolSampler:
-        """The sampler for some of the paths, at their vertex number `depth`, counted from 0."""
+        """The sampler for a subset of the paths, at vertex `depth`, counted from 0.
+
+        rows: indices of the paths."""
         uint = self.mi.UInt32
         pixel, index = dr.gather(uint, self.pixel, rows), dr.gather(uint, self.index, rows)
         return SobolSampler(self.mi, pixel, index, self.seed, _CAMERA + _VERTEX * uint(depth))
@@ -80,8 +82,8 @@ class SobolSampler:
             _owen(uint, x, _hashed(uint, key + 1)),
             _owen(uint, dr.brev(y), _hashed(uint, key + 2)),
         )
-        below = 1 - dr.epsilon(mi.Float)
-        return mi.Point2f(*(dr.minimum(mi.Float(part) * 2.0**-32, below) for part in pair))
+        largest = 1 - dr.epsilon(mi.Float)
+        return mi.Point2f(*(dr.minimum(mi.Float(bits) * 2.0**-32, largest) for bits in pair))
 
     def next_1d(self, active: Any = True) -> Any:
         """Numbers in [0, 1)."""
@@ -96,7 +98,7 @@ def _hashed(uint: Any, x: Any) -> Any:
 
 
 def _owen(uint: Any, x: Any, seed: Any) -> Any:
-    """Owen's scrambling: each bit flipped or not as the bits above it say."""
+    """Owen's scrambling: whether a bit is flipped depends on the bits above it."""
     x = dr.brev(x) + seed
     for multiplier in _OWEN:
         x ^= x * uint(multiplier)
@@ -105,7 +107,7 @@ def _owen(uint: Any, x: Any, seed: Any) -> Any:
 
 PLUGIN = "harnack_path"
 INTEGRATOR = "HarnackPath"
-# What a ray that ran out of steps is drawn in: nothing in nature is this color.
+# The color of rays out of steps: nothing in nature has this color.
 OUT_OF_STEPS_COLOR = (1.0, 0.0, 1.0)
 
 _UNLIMITED = 2**32 - 1
@@ -253,19 +255,19 @@ class PathTracer:
     ) -> PathResults:
         """Trace the paths that begin with these camera rays, one for each of the sampler's lanes.
 
-        Paths go on vertex by vertex, all together, and those that have ended are left out: what
-        each part of a vertex needs is evaluated for the paths that need it (`backend.loops`).
+        All paths advance together, vertex by vertex, without the paths that have ended; each part
+        of a vertex is evaluated only for the paths that need it (`backend.loops`).
         """
         mi, world = self.mi, HybridScene.of(self.mi, scene, queued=True)
         width = dr.width(sampler.index)
-        found = PathResults(
+        results = PathResults(
             dr.zeros(mi.Spectrum, width), dr.zeros(mi.Bool, width), dr.zeros(mi.Bool, width)
         )
         if features:
-            found.features = DenoisingFeatures(
+            results.features = DenoisingFeatures(
                 dr.zeros(mi.Spectrum, width), dr.zeros(mi.Vector3f, width)
             )
-            dr.make_opaque(found.features.albedo, found.features.normal)
+            dr.make_opaque(results.features.albedo, results.features.normal)
         paths = _PathState(
             number=dr.arange(mi.UInt32, width),
             ray=mi.Ray3f(dr.detach(ray)),
@@ -278,41 +280,41 @@ class PathTracer:
             was_diffused=mi.Bool(False),
         )
         paths = broadcast_copy(paths, width, mi.UInt32)
-        dr.make_opaque(found.light, found.valid, found.lost)
-        going_on, depth = mi.Bool(active) & dr.full(mi.Bool, True, width), 0
+        dr.make_opaque(results.light, results.valid, results.lost)
+        goes_on, depth = mi.Bool(active) & dr.full(mi.Bool, True, width), 0
         while True:
-            rows, count = active_lanes(going_on)
+            rows, count = active_lanes(goes_on)
             if not count:
-                return found
+                return results
             paths = gather_record(paths, rows)
             active = dr.arange(mi.UInt32, len(rows)) < dr.opaque(mi.UInt32, count)
             # No number is a literal, so that all vertices run the same kernels.
             dr.make_opaque(active, *array_leaves(paths))
-            paths, going_on = self._vertex(world, paths, active, sampler, depth, found)
+            paths, goes_on = self._vertex(world, paths, active, sampler, depth, results)
             depth += 1
 
     def _vertex(
         self, world: HybridScene, paths: _PathState, exist: Mask, sampler: SobolSampler, depth: int,
-        found: PathResults,
+        results: PathResults,
     ) -> tuple[_PathState, Mask]:  # fmt: skip
-        """Finds the next vertex of paths, collects its light, and samples where to go on. Returns
-        the paths after it, and which of them go on."""
-        mi, here = self.mi, dr.opaque(self.mi.UInt32, depth)
-        before = paths.previous.interaction(mi)
-        hidden = (here == 0) if self.hide_emitters else None
-        si, met = world.intersect(paths.ray, before, exist, hidden)
-        numbers = sampler.at_vertex(here, paths.number)
-        left = transmittance(mi, world.proxies, before, si, paths.ray.d)
-        paths = replace(paths, throughput=paths.throughput * left)
-        shows = exist & ~met.is_out_of_steps & (here < self._deepest)
+        """Find the next vertex of paths, collect its light, and sample the next direction. Returns
+        the paths behind the vertex, and the mask of those that go on."""
+        mi, vertex = self.mi, dr.opaque(self.mi.UInt32, depth)
+        previous = paths.previous.interaction(mi)
+        hidden = (vertex == 0) if self.hide_emitters else None
+        si, hit = world.intersect(paths.ray, previous, exist, hidden)
+        numbers = sampler.at_vertex(vertex, paths.number)
+        remaining = transmittance(mi, world.proxies, previous, si, paths.ray.d)
+        paths = replace(paths, throughput=paths.throughput * remaining)
+        shows = exist & ~hit.is_out_of_steps & (vertex < self._deepest)
         if hidden is not None:
             shows &= ~hidden
         light = self._emitted(world.scene, paths, si, shows)
-        shown = paths.throughput * mi.Spectrum(self.lost_color.eval(si, met.is_out_of_steps))
-        light += dr.select(met.is_out_of_steps, shown, 0)
-        active = si.is_valid() & (here + 1 < self._deepest)
+        lost_light = paths.throughput * mi.Spectrum(self.lost_color.eval(si, hit.is_out_of_steps))
+        light += dr.select(hit.is_out_of_steps, lost_light, 0)
+        active = si.is_valid() & (vertex + 1 < self._deepest)
         bsdf = si.bsdf()
-        connection = self._connection(world, paths, si, met.ray_offset, numbers, active)
+        connection = self._connection(world, paths, si, hit.ray_offset, numbers, active)
 
         sample, weight = bsdf.sample(
             mi.BSDFContext(), si, numbers.next_1d(), numbers.next_2d(), active
@@ -323,13 +325,13 @@ class PathTracer:
         brightest = dr.max(throughput)
         active &= brightest > 0
         # Russian roulette, without the factor eta^-2 that radiance takes on in glass.
-        keep = dr.minimum(brightest * eta * eta, 0.95)
-        in_roulette = here + 1 >= self._first_roulette
-        active &= ~in_roulette | (numbers.next_1d() < keep)
-        onward = _PathState(
+        survival = dr.minimum(brightest * eta * eta, 0.95)
+        in_roulette = vertex + 1 >= self._first_roulette
+        active &= ~in_roulette | (numbers.next_1d() < survival)
+        next_paths = _PathState(
             number=paths.number,
-            ray=spawn_ray(mi, si, met.ray_offset, si.to_world(sample.wo)),
-            throughput=dr.select(in_roulette, throughput / keep, throughput),
+            ray=spawn_ray(mi, si, hit.ray_offset, si.to_world(sample.wo)),
+            throughput=dr.select(in_roulette, throughput / survival, throughput),
             eta=eta,
             previous=_Vertex.of(si),
             pdf=sample.pdf,
@@ -337,28 +339,28 @@ class PathTracer:
             is_diffused=paths.is_diffused | ~delta,
             was_diffused=paths.is_diffused,
         )
-        first = (here == 0) & (si.is_valid() | met.is_out_of_steps)
-        dr.scatter(found.valid, mi.Bool(True), paths.number, first)
-        dr.scatter(found.lost, mi.Bool(True), paths.number, met.is_out_of_steps)
-        if found.features is not None:
-            found.features.record(mi, si, paths.number, first & si.is_valid())
+        is_first = (vertex == 0) & (si.is_valid() | hit.is_out_of_steps)
+        dr.scatter(results.valid, mi.Bool(True), paths.number, is_first)
+        dr.scatter(results.lost, mi.Bool(True), paths.number, hit.is_out_of_steps)
+        if results.features is not None:
+            results.features.record(mi, si, paths.number, is_first & si.is_valid())
         # In one kernel, so that nothing about vertices is computed twice.
-        noted = (found.valid, found.lost, found.features)
-        dr.eval(active, light, noted, *array_leaves(onward), *array_leaves(connection))
+        outputs = (results.valid, results.lost, results.features)
+        dr.eval(active, light, outputs, *array_leaves(next_paths), *array_leaves(connection))
         blocked = world.occluded(connection.ray, connection.active)
         light += dr.select(connection.active & ~blocked, connection.light, 0)
-        # Each path has a place of its own, so that the order of sums is fixed.
-        dr.scatter_add(found.light, light, paths.number, exist, mode=dr.ReduceMode.NoConflicts)
-        dr.eval(found.light)
-        return onward, active
+        # Each path has its own entry, so that the order of sums is fixed.
+        dr.scatter_add(results.light, light, paths.number, exist, mode=dr.ReduceMode.NoConflicts)
+        dr.eval(results.light)
+        return next_paths, active
 
     def _emitted(self, scene: Any, paths: _PathState, si: Any, active: Mask) -> Any:
         """Light that a vertex, or the environment behind no vertex, sends along the ray."""
-        mi, before = self.mi, paths.previous.interaction(self.mi)
-        found = mi.DirectionSample3f(scene, si, before)
-        other = scene.pdf_emitter_direction(before, found, active & ~paths.delta)
-        weight = _power_heuristic(paths.pdf, other)
-        light = paths.throughput * weight * found.emitter.eval(si, active)
+        mi, previous = self.mi, paths.previous.interaction(self.mi)
+        direction = mi.DirectionSample3f(scene, si, previous)
+        emitter_pdf = scene.pdf_emitter_direction(previous, direction, active & ~paths.delta)
+        weight = _power_heuristic(paths.pdf, emitter_pdf)
+        light = paths.throughput * weight * direction.emitter.eval(si, active)
         return dr.select(active, self._clamped(light, paths.was_diffused), 0)
 
     def _clamped(self, light: Any, indirect: Mask) -> Any:
@@ -384,9 +386,9 @@ class PathTracer:
         active &= light.pdf > 0
         scattered, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(light.d), active)
         active &= dr.max(scattered) > 0
-        share = dr.select(light.delta, 1, _power_heuristic(light.pdf, pdf))
-        found = self._clamped(paths.throughput * scattered * weight * share, paths.is_diffused)
-        return _LightConnection(spawn_ray_to(mi, si, clearance, light.p), found, active)
+        fraction = dr.select(light.delta, 1, _power_heuristic(light.pdf, pdf))
+        sent = self._clamped(paths.throughput * scattered * weight * fraction, paths.is_diffused)
+        return _LightConnection(spawn_ray_to(mi, si, clearance, light.p), sent, active)
 
 
 def _power_heuristic(a: Real, b: Real) -> Real:
@@ -430,12 +432,12 @@ def integrator_class(variant: str) -> Any:
             self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Mask = True
         ) -> tuple[Any, Mask, list[Any]]:
             del medium
-            found = self.tracer.trace(scene, _sobol_from(mi, sampler), ray, active)
-            self.lost = self.lost + dr.count(found.lost)
-            return found.light, found.valid, []
+            results = self.tracer.trace(scene, _sobol_from(mi, sampler), ray, active)
+            self.lost = self.lost + dr.count(results.lost)
+            return results.light, results.valid, []
 
         def take_lost(self) -> int:
-            """How many paths ran out of steps since the last call."""
+            """The number of paths that ran out of steps since the last call."""
             count = int(self.lost[0])
             self.lost = mi.UInt32(0)
             return count

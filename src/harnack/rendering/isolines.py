@@ -1,10 +1,10 @@
 """Isolines: lines on a surface where another function takes given values.
 
-A line is what lies within half its width of the curve {g = level} on the surface. Its distance from
-a point is |g - level| / |grad_T g| to first order, with the part grad_T g of the gradient along the
-surface: lines are as wide where g rises gently as where it is steep. They are compared without the
-quotient, |g - level| < width/2 |grad_T g|, so that nothing is drawn where g is constant along the
-surface, whatever its value there.
+A line is the set of points within half its width of the curve {g = level} on the surface. Its
+distance from a point is |g - level| / |grad_T g| to first order, with the part grad_T g of the
+gradient along the surface: lines are as wide where g rises gently as where it is steep. They are
+compared without the quotient, |g - level| < width/2 |grad_T g|, so that nothing is drawn where g is
+constant along the surface, whatever its value there.
 
 Where g has a critical point on the surface, lines cannot widen without limit. Let its difference
 from the level be q(x) of degree n there, to leading order (2 at maxima, minima and saddles, where
@@ -48,12 +48,12 @@ if TYPE_CHECKING:
 _PADDING = 1e-5
 
 
-def as_field(function: Any, name: str = "of") -> Field:
-    """A function on space: a field, or what `harnack.expression` takes: a function of three
-    coordinates, or a text such as "z".
+def as_field(function: Any, name: str = "color_by") -> Field:
+    """A function on space as a field. It is a field; or an argument of `harnack.expression`: a
+    function of three coordinates, or a text such as "z".
 
     Raises:
-        TypeError, ValueError: none of these, or a field with a function for each part.
+        TypeError, ValueError: another argument, or a field with patches.
     """
     if isinstance(function, str):
         try:
@@ -76,23 +76,24 @@ def as_field(function: Any, name: str = "of") -> Field:
 
 
 def padded_domain(function: Field, size: float) -> Volume | None:
-    """Where a function is defined, with room for rounding; None for all of space.
+    """The volume in which a function is defined, with a margin for rounding; None for all of space.
 
-    size: of the surface on which it is evaluated.
+    size: the size of the surface on which the function is evaluated.
     """
     if function.domain is None or function.is_global:
         return None
     return function.domain.padded(_PADDING * size)
 
 
-# The width of a line unless one is given, as a part of the diagonal of the surface's box.
-_USUAL_WIDTH = 0.004
-# Where the part of the gradient along the surface is this much smaller than the gradient, it is
-# rounding, of the normal and of the position.
+# The default width of a line, as a fraction of the diagonal of the surface's box.
+_DEFAULT_WIDTH = 0.004
+# If the component of the gradient along the surface is smaller than this fraction of the gradient,
+# it is due to rounding of the normal and of the position.
 _ROUNDING = 1e-4
-# How many lines an angle-valued function has unless asked otherwise.
-_USUAL_LINES = 12
-# Tables of levels have at least so many entries, as kernels depend on the length's logarithm.
+# The default number of lines of an angle-valued function.
+_DEFAULT_LINE_COUNT = 12
+# Tables of levels have at least this many entries, as kernels depend on the logarithm of the
+# length.
 _MIN_TABLE_LENGTH = 64
 
 
@@ -124,31 +125,32 @@ class Isolines:
     srgb: Color = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        put: dict[str, Any] = {
+        values: dict[str, Any] = {
             "function_field": as_field(self.function, "function, whose isolines are drawn,"),
             "srgb": parse_color(self.color, "color of isolines"),
         }
         for name in ("interval", "width"):
             if getattr(self, name) is not None:
-                put[name] = as_positive(getattr(self, name), f"{name} of isolines")
+                values[name] = as_positive(getattr(self, name), f"{name} of isolines")
         if self.levels is not None:
             if self.interval is not None:
                 raise ValueError("isolines have either levels or an interval, not both")
-            put["levels"] = _numbers(self.levels)
-        elif self.interval is None and put["function_field"].period is None:
+            values["levels"] = _numbers(self.levels)
+        elif self.interval is None and values["function_field"].period is None:
             raise ValueError(
                 "say which isolines: levels=[...], or interval= for all whole multiples of it"
             )
-        for name, value in put.items():
-            object.__setattr__(self, name, value)
+        for name, number in values.items():
+            object.__setattr__(self, name, number)
         self._exact_interval()
 
     def _exact_interval(self) -> float | None:
-        """The interval, exactly a part of the period if there is one; None for lines at levels."""
+        """The interval; exactly a fraction of the period, if there is a period. None for lines at
+        levels."""
         period = self.function_field.period
         if self.levels is not None or period is None:
             return self.interval
-        count = _USUAL_LINES if self.interval is None else round(period / self.interval)
+        count = _DEFAULT_LINE_COUNT if self.interval is None else round(period / self.interval)
         if self.interval is not None and abs(count * self.interval - period) > 1e-4 * period:
             raise ValueError(
                 f"the function has the period {period:.6g}, and an interval of {self.interval:g} "
@@ -159,7 +161,7 @@ class Isolines:
 
     def prepare(self, backend: Backend, size: float) -> PreparedIsolines:
         """The isolines on a backend. size: diagonal of the surface's box, for the default width."""
-        width = _USUAL_WIDTH * size if self.width is None else self.width
+        width = _DEFAULT_WIDTH * size if self.width is None else self.width
         step, period = self._exact_interval(), self.function_field.period
         volume = padded_domain(self.function_field, size)
         return PreparedIsolines(
@@ -173,10 +175,10 @@ class Isolines:
 
 
 def _table(levels: tuple[float, ...], period: float | None) -> FloatArray:
-    """Levels in ascending order, of which the nearest is next to where a value belongs.
+    """Levels in ascending order, in which the nearest level is next to the place of a value.
 
-    Those of an angle-valued function lie in [0, period), with the last before them once more and
-    the first after them. The rest of the table, of 2^k - 1 entries, is infinite.
+    The levels of an angle-valued function lie in [0, period); a copy of the last precedes them and
+    a copy of the first follows them. The rest of the table, of 2^k - 1 entries, is infinite.
     """
     ordered = np.unique(np.array(levels) if period is None else np.mod(levels, period))
     if period is not None:
@@ -187,31 +189,31 @@ def _table(levels: tuple[float, ...], period: float | None) -> FloatArray:
 
 def _numbers(levels: Any) -> tuple[float, ...]:
     try:
-        given = np.atleast_1d(np.asarray("none" if isinstance(levels, str) else levels, float))
+        numbers = np.atleast_1d(np.asarray("none" if isinstance(levels, str) else levels, float))
     except (TypeError, ValueError):
         raise TypeError(f"levels of isolines must be numbers, not {levels!r}") from None
-    if given.ndim != 1 or not given.size or not np.isfinite(given).all():
+    if numbers.ndim != 1 or not numbers.size or not np.isfinite(numbers).all():
         raise ValueError(f"levels of isolines must be finite numbers, at least one, not {levels!r}")
-    return tuple(given.tolist())
+    return tuple(numbers.tolist())
 
 
 def parse_isolines(isolines: Any) -> tuple[Isolines, ...]:
-    """Isolines, or a list of them, as a tuple; empty for None.
+    """`Isolines`, or a list of them, as a tuple; empty for None.
 
     Raises:
         TypeError: anything else.
     """
     if isolines is None:
         return ()
-    listed: bool = isinstance(isolines, list | tuple)
-    several: list[Any] = [*isolines] if listed else [isolines]
-    for one in several:
-        if not isinstance(one, Isolines):
+    is_list: bool = isinstance(isolines, list | tuple)
+    elements: list[Any] = [*isolines] if is_list else [isolines]
+    for element in elements:
+        if not isinstance(element, Isolines):
             raise TypeError(
                 "isolines must be harnack.Isolines, or a list of them, such as "
-                f'hk.Isolines("z", interval=0.1), not {one!r}'
+                f'hk.Isolines("z", interval=0.1), not {element!r}'
             )
-    return tuple(several)
+    return tuple(elements)
 
 
 @dataclass(frozen=True)
@@ -245,7 +247,7 @@ class PreparedIsolines:
         return dr.abs(gap - self.half_width * norm(along)) < reach
 
     def _gap_and_gradient(self, p: Vec3, normal: Vec3) -> tuple[Real, Vec3]:
-        """How far g is from the nearest level, and its gradient along the surface."""
+        """The gap from g to the nearest level, and the gradient of g along the surface."""
         sample = self.function.evaluate(p)
         gradient = sample.gradient
         along = gradient - dr.dot(gradient, normal) * normal
@@ -274,12 +276,12 @@ class PreparedIsolines:
 def isoline_index_at(
     lines: tuple[PreparedIsolines, ...], p: Vec3, normal: Vec3, index: Any
 ) -> Index:
-    """The number of the isoline that points are on, counted from 1, the last one where several
-    overlap; 0 for none.
+    """The number of the isoline that points are on, counted from 1; the last isoline where they
+    overlap; 0 for no isoline.
 
     index: the type of the numbers.
     """
-    found = index(0)
-    for number, one in enumerate(lines, start=1):
-        found = dr.select(one.contains(p, normal), index(number), found)
-    return found
+    line_index = index(0)
+    for number, isoline in enumerate(lines, start=1):
+        line_index = dr.select(isoline.contains(p, normal), index(number), line_index)
+    return line_index

@@ -43,8 +43,8 @@ class PathRender:
     """Radiance of all pixels of a sensor.
 
     image: (h, w, 4) linear sRGB and, last, the fraction of the pixel that is covered.
-    lost: how many paths ran out of steps.
-    albedo, normal: means (h, w, 3) of what paths hit first, if asked for.
+    lost: the number of paths that ran out of steps.
+    albedo, normal: (h, w, 3) means of albedos and normals at first hits; None unless requested.
     """
 
     image: npt.NDArray[np.float32]
@@ -91,17 +91,17 @@ class PathRenderTask:
             lane = dr.arange(mi.UInt32, (last - first) * spp)
             samples = dr.opaque(mi.UInt32, spp)
             pixel = lane // samples + dr.opaque(mi.UInt32, start + first)
-            found, waves = trace_samples(
+            results, wavelengths = trace_samples(
                 mi, self.scene, self.sensor, self.tracer, pixel, lane % samples, self.seed,
                 self.features,
             )  # fmt: skip
-            covered = dr.select(found.valid, mi.Float(1), 0)
-            means = [mi.Vector4f(*as_rgb(mi, found.light, waves), covered)]
-            if found.features is not None:
-                means += [as_rgb(mi, found.features.albedo, waves), found.features.normal]
-            means = [to_numpy(mean_of_blocks(one, spp)) for one in means]
+            covered = dr.select(results.valid, mi.Float(1), 0)
+            means = [mi.Vector4f(*as_rgb(mi, results.light, wavelengths), covered)]
+            if results.features is not None:
+                means += [as_rgb(mi, results.features.albedo, wavelengths), results.features.normal]
+            means = [to_numpy(mean_of_blocks(mean, spp)) for mean in means]
             rows.append(np.concatenate(means, axis=1))
-            lost += int(dr.count(found.lost)[0])
+            lost += int(dr.count(results.lost)[0])
         return np.concatenate(rows), lost
 
 
@@ -118,12 +118,12 @@ def render_paths(
     features = task.features
     image = np.empty((width * height, 10 if features else 4), dtype=np.float32)
     lost = 0
-    parts = executor.split_range(width * height, max(1, task.paths_a_band // task.spp))
-    for (start, stop), (means, gone) in zip(
-        parts, executor.run_tasks("render_range", parts), strict=True
+    ranges = executor.split_range(width * height, max(1, task.paths_a_band // task.spp))
+    for (start, stop), (means, lost_paths) in zip(
+        ranges, executor.run_tasks("render_range", ranges), strict=True
     ):
         image[start:stop] = means
-        lost += int(gone)
+        lost += int(lost_paths)
         advance((stop - start) / (width * height))
     image = image.reshape(height, width, -1)
     if not features:
@@ -138,13 +138,13 @@ def trace_samples(
     """Trace paths through samples of pixels. Returns their results, weighted by the sensor, and
     their wavelengths."""
     width, height = (int(n) for n in sensor.film().crop_size())
-    zero, own = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, _mixed(seed))
-    sampler = SobolSampler(mi, pixel, sample, own, zero)
-    place = film_positions(mi, pixel, _in_pixel(mi, sampler.next_2d()), (width, height))
-    ray, weight = _camera_ray(mi, sensor, sampler, place)
+    zero, hashed = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, _mixed(seed))
+    sampler = SobolSampler(mi, pixel, sample, hashed, zero)
+    position = film_positions(mi, pixel, _in_pixel(mi, sampler.next_2d()), (width, height))
+    ray, weight = _camera_ray(mi, sensor, sampler, position)
     dr.eval(ray, weight)
-    found = tracer.trace(scene, sampler, ray, mi.Bool(True), features)
-    return replace(found, light=found.light * weight), ray.wavelengths
+    results = tracer.trace(scene, sampler, ray, mi.Bool(True), features)
+    return replace(results, light=results.light * weight), ray.wavelengths
 
 
 def _mixed(seed: int) -> int:
@@ -159,13 +159,13 @@ def _in_pixel(mi: Any, sample: Any) -> Any:
     return mi.Vector2f(gauss) + 0.5
 
 
-def _camera_ray(mi: Any, sensor: Any, sampler: Any, place: Any) -> tuple[Any, Any]:
+def _camera_ray(mi: Any, sensor: Any, sampler: Any, position: Any) -> tuple[Any, Any]:
     time = sensor.shutter_open()
     if sensor.shutter_open_time() > 0:
         time = time + sampler.next_1d() * sensor.shutter_open_time()
     wavelength = sampler.next_1d() if mi.is_spectral else 0
     lens = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
-    return sensor.sample_ray(time, wavelength, place, lens)
+    return sensor.sample_ray(time, wavelength, position, lens)
 
 
 def as_rgb(mi: Any, radiance: Any, wavelengths: Any) -> Any:
@@ -178,20 +178,21 @@ def as_rgb(mi: Any, radiance: Any, wavelengths: Any) -> Any:
 
 
 def mean_of_blocks(color: Any, spp: int) -> Any:
-    """The mean of each `spp` neighboring lanes."""
+    """The means over blocks of `spp` successive lanes."""
     return type(color)(*(dr.block_sum(channel, spp) / spp for channel in color))
 
 
-# How long a picture will take, told before it is begun.
+# Estimates of the time for a picture, before it is drawn.
 
-# Paths that are tried: at first, how many times as many next, and no more than this part of all.
-_FIRST, _MORE, _PART = 2**12, 4, 1 / 16
-# Runs that take this many times as long as the first are long enough to be measured.
-_ENOUGH = 3.0
-# Seconds; of a picture that takes no longer the time is not told.
+# Paths of trial runs: the number of the first run, the growth from run to run, and the largest
+# fraction of all paths.
+_FIRST_TRIAL_PATHS, _TRIAL_GROWTH, _MAX_TRIAL_FRACTION = 2**12, 4, 1 / 16
+# Runs that take this many times as long as the first run are long enough to be measured.
+_MIN_TIME_RATIO = 3.0
+# In seconds: the time of a picture is reported only if it is longer.
 MIN_REPORTED_SECONDS = 15.0
-# Seconds between two moves of the progress bar, and the fewest paths of a band.
-_BAND, _FEWEST = 4.0, 2**14
+# Seconds between two moves of the progress bar, and the smallest number of paths of a band.
+_SECONDS_PER_BAND, _MIN_BAND_PATHS = 4.0, 2**14
 
 
 @dataclass(frozen=True)
@@ -204,51 +205,57 @@ class TimeEstimate:
     @property
     def paths_a_band(self) -> int:
         """The number of paths that take as long as a progress bar may stand still."""
-        return round(min(max(_BAND / max(self.path, 1e-9), _FEWEST), MAX_PATHS_PER_BATCH))
+        return round(
+            min(max(_SECONDS_PER_BAND / max(self.path, 1e-9), _MIN_BAND_PATHS), MAX_PATHS_PER_BATCH)
+        )
 
     def __str__(self) -> str:
         seconds = round(self.picture)
         minutes, rest = divmod(seconds, 60)
-        hours, left = divmod(minutes, 60)
+        hours, rest_of_hour = divmod(minutes, 60)
         if seconds < 90:
             return f"{seconds} s"
         if minutes < 90:
             return f"{minutes} min {rest // 10 * 10} s" if minutes < 10 else f"{minutes} min"
-        return f"{hours} h {left} min"
+        return f"{hours} h {rest_of_hour} min"
 
 
 def estimate_time(
     mi: Any, scene: Any, sensor: Any, tracer: PathTracer, *, spp: int, features: bool
 ) -> TimeEstimate:
-    """The pace of a picture, measured on a few paths all over it.
+    """The time for a picture, measured on a few paths all over it.
 
-    Starting costs the same however many paths there are, so what counts is how much longer four
-    times as many took. A picture of few paths is not measured, and its pace is 0.
+    The start of a run takes the same time for any number of paths, so the estimate is from the
+    additional time of four times as many paths. A picture of few paths is not measured, and its
+    estimate is 0.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     pixels = width * height
-    whole = pixels * spp
+    path_count = pixels * spp
 
     def seconds(count: int) -> float:
         # The golden ratio spreads any number of pixels evenly.
-        chosen = (np.arange(count) * 0.6180339887498949 % 1 * pixels).astype(np.int64)
-        pixel = upload_indices(mi, np.minimum(chosen, pixels - 1))
+        indices = (np.arange(count) * 0.6180339887498949 % 1 * pixels).astype(np.int64)
+        pixel = upload_indices(mi, np.minimum(indices, pixels - 1))
         sample = dr.opaque(mi.UInt32, 0, count)
         began = time.perf_counter()
-        found, _ = trace_samples(mi, scene, sensor, tracer, pixel, sample, 0, features)
-        dr.eval(found.light)
+        results, _ = trace_samples(mi, scene, sensor, tracer, pixel, sample, 0, features)
+        dr.eval(results.light)
         dr.sync_thread()
         return time.perf_counter() - began
 
-    count, path = _FIRST, 0.0
-    if _MORE * count <= _PART * whole:
+    count, path = _FIRST_TRIAL_PATHS, 0.0
+    if _TRIAL_GROWTH * count <= _MAX_TRIAL_FRACTION * path_count:
         seconds(count)  # compiles
-        first = before = seconds(count)
-        while _MORE * count <= _PART * whole and before < _ENOUGH * first:
-            after = seconds(_MORE * count)
-            path = max(after - before, 0.0) / ((_MORE - 1) * count)
-            count, before = _MORE * count, after
-    return TimeEstimate(path, whole * path)
+        first = shorter = seconds(count)
+        while (
+            _TRIAL_GROWTH * count <= _MAX_TRIAL_FRACTION * path_count
+            and shorter < _MIN_TIME_RATIO * first
+        ):
+            longer = seconds(_TRIAL_GROWTH * count)
+            path = max(longer - shorter, 0.0) / ((_TRIAL_GROWTH - 1) * count)
+            count, shorter = _TRIAL_GROWTH * count, longer
+    return TimeEstimate(path, path_count * path)
 
 
 def load_denoiser() -> Any:
@@ -270,22 +277,22 @@ def load_denoiser() -> Any:
 def denoise_image(render: PathRender) -> npt.NDArray[np.float32]:
     """The image of an exposure with features, (h, w, 4), without noise.
 
-    Open Image Denoise, a neural network that runs on CPUs, takes the noise out. It guesses: the
-    result looks clean and is close to what more samples would have shown, but none of its numbers
-    is a mean of samples any more. What part of each pixel is covered stays as it is.
+    Open Image Denoise, a neural network that runs on CPUs, removes the noise. It guesses: the
+    result looks clean and is close to a picture with more samples, but none of its numbers is a
+    mean of samples any more. The covered fraction of each pixel is not changed.
     """
     if render.albedo is None or render.normal is None:
         raise ValueError("an exposure without features cannot be denoised")
     light = np.maximum(render.image[..., :3], 0)
     features = (np.clip(render.albedo, 0, 1), np.clip(render.normal, -1, 1))
-    parts = [np.ascontiguousarray(part, dtype=np.float32) for part in (light, *features)]
-    clean = load_denoiser().denoise(parts[0], albedo=parts[1], normal=parts[2], hdr=True)
+    arrays = [np.ascontiguousarray(array, dtype=np.float32) for array in (light, *features)]
+    clean = load_denoiser().denoise(arrays[0], albedo=arrays[1], normal=arrays[2], hdr=True)
     return np.concatenate([clean, render.image[..., 3:]], axis=-1)
 
 
 # Rays through transparent solids.
 
-# Boundaries that a ray goes through; the next one is opaque.
+# The largest number of interfaces that a ray crosses; the next one is opaque.
 _MAX_INTERFACES = 32
 # The highlight of matter with this reflectance straight on is that of other glossy materials.
 _DEFAULT_REFLECTANCE = 0.04
@@ -331,43 +338,43 @@ class RefractionTracer:
         self.world, self.light = world, light
         self.hidden = world.mi.Bool(True) if hides_lights else None
         mi = world.mi
-        found = ((carrier, refractive_index(mi, carrier)) for carrier in world.proxies)
-        self.indices = tuple((carrier, index) for carrier, index in found if index is not None)
+        pairs = ((carrier, refractive_index(mi, carrier)) for carrier in world.proxies)
+        self.indices = tuple((carrier, index) for carrier, index in pairs if index is not None)
 
     def trace(self, ray: Any) -> RefractedHits:
         """The first opaque hits of camera rays, behind transparent solids."""
         mi, world = self.world.mi, self.world
         nothing = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray.d))
-        sight = RefractedHits(
+        hits = RefractedHits(
             ray, nothing, world.no_hit(nothing), mi.Spectrum(1), mi.Spectrum(0), mi.Float(0),
             mi.UInt32(0), dr.full(mi.Bool, True, dr.width(ray.d)),
         )  # fmt: skip
         if not self.indices:
             start = dr.zeros(mi.SurfaceInteraction3f)
-            sight.si, sight.first = world.intersect(ray, start, mi.Bool(True), self.hidden)
-            return sight
+            hits.si, hits.first = world.intersect(ray, start, mi.Bool(True), self.hidden)
+            return hits
 
-        def running(sight: RefractedHits) -> Mask:
-            return sight.active
+        def is_running(hits: RefractedHits) -> Mask:
+            return hits.active
 
-        def on(sight: RefractedHits) -> tuple[RefractedHits]:
-            return (self._through_boundary(sight),)
+        def cross(hits: RefractedHits) -> tuple[RefractedHits]:
+            return (self._through_boundary(hits),)
 
-        (sight,) = dr.while_loop((sight,), running, on, label="clear")
-        return sight
+        (hits,) = dr.while_loop((hits,), is_running, cross, label="clear")
+        return hits
 
     def _is_clear(self, si: Any) -> Mask:
         clear = self.world.mi.Bool(False)
-        for carrier, _ in self.indices:
-            clear |= si.shape == self.world.mi.ShapePtr(carrier)
+        for proxy, _ in self.indices:
+            clear |= si.shape == self.world.mi.ShapePtr(proxy)
         return clear
 
-    def _through_boundary(self, sight: RefractedHits) -> RefractedHits:
-        """The next thing that rays hit and, where it is clear, the way behind it."""
-        mi, world, d = self.world.mi, self.world, sight.ray.d
-        si, first = world.intersect(sight.ray, sight.si, sight.active, self.hidden)
-        throughput = sight.throughput * transmittance(mi, world.proxies, sight.si, si, d)
-        boundaries = sight.interface_count + 1
+    def _through_boundary(self, hits: RefractedHits) -> RefractedHits:
+        """The rays at their next hit and, if it is on a transparent solid, refracted there."""
+        mi, world, d = self.world.mi, self.world, hits.ray.d
+        si, first = world.intersect(hits.ray, hits.si, hits.active, self.hidden)
+        throughput = hits.throughput * transmittance(mi, world.proxies, hits.si, si, d)
+        boundaries = hits.interface_count + 1
         clear = (
             self._is_clear(si)
             & (first.isoline_index == 0)
@@ -375,30 +382,32 @@ class RefractionTracer:
             & (boundaries <= _MAX_INTERFACES)
         )
         index = mi.Float(1)
-        for carrier, own in self.indices:
-            index = dr.select(si.shape == mi.ShapePtr(carrier), own, index)
+        for proxy, value in self.indices:
+            index = dr.select(si.shape == mi.ShapePtr(proxy), value, index)
         normal = mi.Vector3f(si.n)
-        onward, reflected = refract(normal, d, index)
+        direction, reflected = refract(normal, d, index)
         outside = clear & (dr.dot(normal, d) < 0)
         gathered = dr.select(outside, throughput * self._reflected(si, d, index, reflected), 0)
-        part = dr.select(clear & (reflected < 1), 1 - reflected, 1)
-        way = spawn_ray(mi, si, first.ray_offset, onward)
+        transmitted = dr.select(clear & (reflected < 1), 1 - reflected, 1)
+        onward_ray = spawn_ray(mi, si, first.ray_offset, direction)
         return RefractedHits(
-            ray=dr.select(clear, way, sight.ray),
+            ray=dr.select(clear, onward_ray, hits.ray),
             si=si,
             first=first,
-            throughput=throughput * part,
-            reflected_light=sight.reflected_light + gathered,
-            path_length=sight.path_length + dr.select(clear, first.t, 0),
+            throughput=throughput * transmitted,
+            reflected_light=hits.reflected_light + gathered,
+            path_length=hits.path_length + dr.select(clear, first.t, 0),
             interface_count=boundaries,
-            active=sight.active & clear,
+            active=hits.active & clear,
         )
 
-    def _reflected(self, si: Any, d: Any, index: Any, share: Real) -> Any:
-        """Light of the sky, and of the key light in a highlight, that boundaries send back."""
+    def _reflected(self, si: Any, d: Any, index: Any, fraction: Real) -> Any:
+        """The light of the sky, and of the key light in a highlight, that interfaces reflect.
+
+        fraction: the reflected fraction of the sky's light."""
         mi = self.world.mi
         normal = mi.Vector3f(si.n)
-        back = d - 2 * dr.dot(normal, d) * normal
+        mirrored = d - 2 * dr.dot(normal, d) * normal
         straight = dr.square((index - 1) / (index + 1))
         black, one = dr.zeros(mi.Color3f), mi.Float(1)
         gloss = self.light.shade(black, normal, -d, mi.Bool(True), one) * (
@@ -407,7 +416,7 @@ class RefractionTracer:
         light = mi.Spectrum(gloss) if not mi.is_monochromatic else mi.Spectrum(mi.luminance(gloss))
         sky = self.world.scene.environment()
         if sky is not None:
-            seen = dr.zeros(mi.SurfaceInteraction3f)
-            seen.wi, seen.wavelengths = -back, si.wavelengths
-            light += share * sky.eval(seen)
+            interaction = dr.zeros(mi.SurfaceInteraction3f)
+            interaction.wi, interaction.wavelengths = -mirrored, si.wavelengths
+            light += fraction * sky.eval(interaction)
         return light

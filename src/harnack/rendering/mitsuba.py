@@ -39,12 +39,13 @@ def load_mitsuba() -> Any:
     """
     mi = importlib.import_module("mitsuba")
     if mi.variant() is None:
-        wanted = f"{choose_backend().name}_ad_rgb"
-        if wanted not in mi.variants():
+        variant = f"{choose_backend().name}_ad_rgb"
+        if variant not in mi.variants():
             raise RuntimeError(
-                f"this Mitsuba has no variant {wanted}: set HARNACK_BACKEND=llvm to draw on the CPU"
+                f"this Mitsuba has no variant {variant}: set HARNACK_BACKEND=llvm to draw on the "
+                "CPU"
             )
-        mi.set_variant(wanted)
+        mi.set_variant(variant)
     elif _USABLE.fullmatch(mi.variant()) is None:
         raise RuntimeError(
             f"the Mitsuba variant is {mi.variant()}, and surfaces are traced with Dr.Jit arrays "
@@ -67,7 +68,7 @@ def set_variant(variant: str) -> None:
 
 
 def mitsuba_backend(mi: Any) -> Backend:
-    """Our name for the arrays of the variant that is set."""
+    """The backend whose arrays are those of the variant that is set."""
     return backend_of(mi.Float(0))
 
 
@@ -81,7 +82,7 @@ _BYTE_ORDER_MARKS = {
 # Elements that name files: <include filename="..."/>, <string name="filename" value="..."/>.
 _NAMES_A_FILE = re.compile(r"<(include|string)\b([^<>]*)>")
 _ATTRIBUTE = re.compile(r"""\b(filename|value)\s*=\s*(?:"([^"]*)"|'([^']*)')""")
-# What an error of Mitsuba says besides what is wrong: places in its own source, Python's traceback.
+# Parts of Mitsuba's error messages besides the error: locations in its source, Python's traceback.
 _SOURCE_PLACE = re.compile(r"\[\w+\.(?:cpp|h):\d+\]\s*")
 _TRACEBACK = re.compile(r"Traceback \(most recent call last\):\n(?:[ \t]+.*\n)*(?:[\w.]+: )?")
 _REPEATED = re.compile(r"(?m)^(.*\n)(?:\1)+")
@@ -135,7 +136,7 @@ def check_scene_file(path: Path) -> None:
             "there is no such file; Mitsuba scenes are .xml files, and scenes of the gallery are "
             "drawn by harnack.gallery.SCENES[name].render()"
         )
-    seen = {path}
+    checked = {path}
     waiting = [path]
     total = 0
     while waiting:
@@ -147,10 +148,10 @@ def check_scene_file(path: Path) -> None:
             )
         for element, name in _files_named(text):
             file = path.parent / name
-            # What is not found here may lie where the scene tells Mitsuba to look.
-            if file in seen or not _exists(file):
+            # A file that is not found here may lie in a folder that the scene names to Mitsuba.
+            if file in checked or not _exists(file):
                 continue
-            seen.add(file)
+            checked.add(file)
             if element == "include":
                 waiting.append(file)
             elif not file.is_file() and not file.is_dir():
@@ -189,15 +190,15 @@ def _exists(path: Path) -> bool:
 
 
 def without_traceback(message: str) -> str:
-    """What an error of Mitsuba says is wrong, without Python's traceback and source lines."""
+    """The message of an error of Mitsuba, without Python's traceback and source lines."""
     message = _SOURCE_PLACE.sub("", _TRACEBACK.sub("", message))
     return _REPEATED.sub(r"\1", message).strip()
 
 
-# Clear matter: solids that light passes through, what they take away of it, how they bend it.
+# Transparent solids: their transmittance and refraction.
 
 # A solid whose index of refraction differs less from 1 does not bend light.
-_SAME = 1e-6
+_MIN_INDEX_DIFFERENCE = 1e-6
 
 
 def transmittance_texture(mi: Any, tint: Any) -> Any:
@@ -210,10 +211,10 @@ def transmittance_texture(mi: Any, tint: Any) -> Any:
         return None
     wrong = "tint is what is left of red, green and blue after one unit of length, in (0, 1]"
     try:
-        color = [float(part) for part in tint]
+        color = [float(channel) for channel in tint]
     except (TypeError, ValueError):
         raise TypeError(f"{wrong}, such as (0.9, 0.5, 0.1), not {tint!r}") from None
-    if len(color) != 3 or not all(0 < part <= 1 for part in color):
+    if len(color) != 3 or not all(0 < channel <= 1 for channel in color):
         raise ValueError(f"{wrong}, such as (0.9, 0.5, 0.1), not {tint!r}")
     if min(color) == 1:
         return None
@@ -224,15 +225,15 @@ def refractive_index(mi: Any, carrier: Any) -> Any:
     """The index of refraction of a transparent solid, relative to its surroundings, as a kernel
     parameter; None for opaque shapes, and for shapes that are no solids."""
     bsdf = carrier.bsdf()
-    passes = (mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.GlossyTransmission)
+    flags = (mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.GlossyTransmission)
     if carrier.surface.solid_range is None or not any(
-        mi.has_flag(bsdf.flags(), one) for one in passes
+        mi.has_flag(bsdf.flags(), flag) for flag in flags
     ):
         return None
-    named = mi.traverse(bsdf)
-    for name, _ in named:
+    parameters = mi.traverse(bsdf)
+    for name, _ in parameters:
         if name == "eta":
-            return dr.opaque(mi.Float, float(np.ravel(named[name])[0]))
+            return dr.opaque(mi.Float, float(np.ravel(parameters[name])[0]))
     return None
 
 
@@ -243,21 +244,22 @@ def is_inside(mi: Any, carrier: Any, start: Any, d: Any) -> Any:
 
 
 def transmittance(mi: Any, carriers: Any, start: Any, si: Any, d: Any) -> Any:
-    """What is left of light between interactions, along rays from `start` in directions d.
+    """The transmittance between interactions, along rays from `start` in directions d.
 
-    By Beer and Lambert's law the part tint^t is left of light that travels a length t in a solid.
+    By Beer and Lambert's law the fraction tint^t is left of light that travels a length t in a
+    solid.
     As going in and out of a solid alternate (`CappedSolid.intersect`), a ray that leaves a point of
     its boundary against the outward normal is inside up to the next thing that it hits.
     """
-    left = mi.Spectrum(1)
+    remaining = mi.Spectrum(1)
     for carrier in carriers:
         if carrier.tint is None:
             continue
         inside = is_inside(mi, carrier, start, d) & si.is_valid()
         # The spectrum of a reflectance of that color, at the ray's wavelengths.
-        once = mi.Spectrum(carrier.tint.eval(si, inside))
-        left *= dr.select(inside, dr.power(dr.maximum(once, 1e-6), si.t), 1)
-    return left
+        per_unit = mi.Spectrum(carrier.tint.eval(si, inside))
+        remaining *= dr.select(inside, dr.power(dr.maximum(per_unit, 1e-6), si.t), 1)
+    return remaining
 
 
 def refract(normal: Any, d: Any, index: Any) -> tuple[Any, Any]:
@@ -275,10 +277,10 @@ def refract(normal: Any, d: Any, index: Any) -> tuple[Any, Any]:
     inner = 1 - eta * eta * (1 - cosine * cosine)
     passes = inner > 0
     inner = dr.sqrt(dr.maximum(inner, 0))
-    across = (eta * cosine - inner) / dr.maximum(eta * cosine + inner, 1e-9)
-    within = (cosine - eta * inner) / dr.maximum(cosine + eta * inner, 1e-9)
-    reflected = dr.select(passes, 0.5 * (across * across + within * within), 1)
-    reflected = dr.select(dr.abs(index - 1) < _SAME, 0, reflected)
-    through = eta * d + (eta * cosine - inner) * facing
-    away = d + 2 * cosine * facing
-    return dr.normalize(dr.select(passes, through, away)), reflected
+    perpendicular = (eta * cosine - inner) / dr.maximum(eta * cosine + inner, 1e-9)
+    parallel = (cosine - eta * inner) / dr.maximum(cosine + eta * inner, 1e-9)
+    reflected = dr.select(passes, 0.5 * (perpendicular * perpendicular + parallel * parallel), 1)
+    reflected = dr.select(dr.abs(index - 1) < _MIN_INDEX_DIFFERENCE, 0, reflected)
+    refracted = eta * d + (eta * cosine - inner) * facing
+    mirrored = d + 2 * cosine * facing
+    return dr.normalize(dr.select(passes, refracted, mirrored)), reflected

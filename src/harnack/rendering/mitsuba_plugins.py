@@ -1,4 +1,4 @@
-"""Plug-ins for Mitsuba: a shape, an integrator, and what stands in for Mitsuba's own integrators.
+"""Plug-ins for Mitsuba: a shape, an integrator, and replacements for Mitsuba's own integrators.
 
 Scene files can name them once they are registered (`register`); `mitsuba_shape` makes surfaces for
 scenes that are put together in Python.
@@ -110,25 +110,25 @@ def equivalent_path_tracer(mi: Any, scene: Any) -> PathTracer | None:
     integrator = scene.integrator()
     if integrator is None:
         return PathTracer(mi)
-    own = getattr(integrator, "tracer", None)
-    ours = sum(is_proxy(shape) for shape in scene.shapes())
+    tracer = getattr(integrator, "tracer", None)
+    count = sum(is_proxy(shape) for shape in scene.shapes())
     has_medium = any(shape.is_medium_transition() for shape in scene.shapes())
     has_medium |= any(sensor.get_medium() is not None for sensor in scene.sensors())
-    if isinstance(own, PathTracer):
+    if isinstance(tracer, PathTracer):
         if has_medium:
             warnings.warn(f"{PLUGIN} follows no light in media: they are left out", stacklevel=5)
-        return own
+        return tracer
     kind = _kind(integrator)
     follows_paths = kind == _PATHS or (kind.startswith(_IN_MEDIA) and not has_medium)
     if follows_paths:
         return _with_settings(mi, integrator)
-    if not ours or _sees_ours(integrator):
+    if not count or _sees_ours(integrator):
         return None
     if kind == _DIRECT:
         return PathTracer(mi, 2, hide_emitters=bool(integrator.hide_emitters))
     wrong = "light in its media" if kind.startswith(_IN_MEDIA) else f"what {kind} asks for"
     raise ValueError(
-        f"{ours} of the scene's shapes are level sets of harnack, which Mitsuba's own integrators "
+        f"{count} of the scene's shapes are level sets of harnack, which Mitsuba's own integrators "
         f"cannot see, and {wrong} is not found by paths alone. Take the integrator "
         f'{{"type": "{PLUGIN}"}} (or path, direct, volpath without media); depths and normals are '
         'drawn by show="depth" and show="normal"'
@@ -138,22 +138,22 @@ def equivalent_path_tracer(mi: Any, scene: Any) -> PathTracer | None:
 def _with_settings(mi: Any, integrator: Any) -> PathTracer:
     """A path tracer with the settings of one of Mitsuba's, which shows them in its text alone."""
     words = str(integrator)
-    found = {name: int(n) for name, n in re.findall(r"(max_depth|rr_depth) = (\d+)", words)}
-    depth = found.get("max_depth", 2**32 - 1)
+    depths = {name: int(n) for name, n in re.findall(r"(max_depth|rr_depth) = (\d+)", words)}
+    depth = depths.get("max_depth", 2**32 - 1)
     return PathTracer(
-        mi, -1 if depth >= 2**31 else depth, found["rr_depth"], bool(integrator.hide_emitters)
+        mi, -1 if depth >= 2**31 else depth, depths["rr_depth"], bool(integrator.hide_emitters)
     )
 
 
 def _sees_ours(integrator: Any) -> bool:
-    """Whether all that it finds comes from our integrator inside it: so do moments of its light,
-    but not the channels of `aov`."""
+    """Whether all light of an integrator comes from our integrator inside it, as for moments of its
+    light, but not for the channels of `aov`."""
     words = str(integrator)
     return INTEGRATOR in words and _CHANNELS not in words
 
 
 def _kind(integrator: Any) -> str:
-    """The name of its class in Mitsuba."""
+    """The name of an integrator's class in Mitsuba."""
     moments = "MomentIntegrator"  # says that it is a Scene
     kind = str(integrator).partition("[")[0]
     return moments if kind == "Scene" else kind
@@ -176,16 +176,16 @@ def register() -> Any:
 
 
 def register_surfaces(plugin: str, surface: Callable[[Any], TracedSurface]) -> Any:
-    """Make a shape known whose surfaces come from a function of `mitsuba.Properties`.
+    """Register a shape whose surfaces come from a function of `mitsuba.Properties`.
 
-    The function reads what it understands; `to_world` and BSDF are taken care of.
+    The function reads the properties that it knows; `to_world` and BSDF are read elsewhere.
     """
     mi = load_mitsuba()
 
-    def made(props: Any) -> Any:
+    def make_shape(props: Any) -> Any:
         return mitsuba_proxy.from_properties(mi, props, surface(props).with_call_cache())
 
-    mi.register_shape(plugin, made)
+    mi.register_shape(plugin, make_shape)
     return mi
 
 
@@ -271,10 +271,10 @@ def mitsuba_shape(
     bsdf: dictionary or BSDF object; gray diffuse, seen from both sides, if left out. Open
         surfaces have two sides: wrap one-sided BSDFs as {"type": "twosided", ...}.
     to_world: matrix (4, 4) or Mitsuba transform of moves, turns and one scale for all axes.
-    tint: of a solid of glass, what is left of red, green and blue light after one unit of length
-        in it, in the world: (1, 1, 1) for clear (Beer and Lambert).
+    tint: of a solid of glass, the fractions of red, green and blue light that are left after one
+        unit of length in it, in the world: (1, 1, 1) for clear glass (Beer and Lambert).
     section_bsdf: of the faces at which `section` cuts an opaque solid; by default that of the rest.
-    isolines: `harnack.Isolines` to draw on it, or several; later ones cover earlier ones.
+    isolines: `harnack.Isolines` to draw on it, or a list of them; later ones cover earlier ones.
     options, keywords: as `render` takes them: level, clip, tolerance, side, ... Glass needs a
         `side`.
 
@@ -307,25 +307,25 @@ def _section_bsdf(mi: Any, surface: TracedSurface, bsdf: Any, section_bsdf: Any)
             "section_bsdf is of the faces of a solid on its section: give a section, such as a "
             'half-space, and side="below" or side="above" as well'
         )
-    made = as_bsdf(mi, section_bsdf)
-    for one in (bsdf, made):
-        if mi.has_flag(one.flags(), mi.BSDFFlags.Transmission):
+    loaded = as_bsdf(mi, section_bsdf)
+    for material in (bsdf, loaded):
+        if mi.has_flag(material.flags(), mi.BSDFFlags.Transmission):
             raise ValueError(
                 "the faces of a cut have a material of their own on opaque solids only"
             )
-    return made
+    return loaded
 
 
 def as_bsdf(mi: Any, bsdf: Any) -> Any:
     """A BSDF object, from one, its dictionary, or None."""
     if bsdf is None:
         bsdf = {"type": "twosided", "nested": {"type": "diffuse"}}
-    made: Any = bsdf
+    loaded: Any = bsdf
     if isinstance(bsdf, Mapping):
-        made = load_dict(mi, cast("Mapping[str, Any]", bsdf))
-    if not isinstance(made, mi.BSDF):
+        loaded = load_dict(mi, cast("Mapping[str, Any]", bsdf))
+    if not isinstance(loaded, mi.BSDF):
         raise TypeError(
             "bsdf must be a BSDF or its dictionary, such as harnack.rendering.MATERIALS['gold']"
-            f".front, not {type(made).__name__}"
+            f".front, not {type(loaded).__name__}"
         )
-    return made
+    return loaded

@@ -61,49 +61,49 @@ def _lined_class(variant: str) -> Any:
         def __init__(self, base: Any, paints: Sequence[Any]) -> None:
             mi.BSDF.__init__(self, mi.Properties())
             self.base, self.paints = base, tuple(paints)
-            parts = (base, *self.paints)
+            bsdfs = (base, *self.paints)
             self.m_components = [
-                part.flags(k) for part in parts for k in range(part.component_count())
+                bsdf.flags(k) for bsdf in bsdfs for k in range(bsdf.component_count())
             ]
             flags = 0
-            for part in parts:
-                flags |= part.flags()
+            for bsdf in bsdfs:
+                flags |= bsdf.flags()
             self.m_flags = flags
 
-        def _chosen(self, ask: Callable[[Any, Mask], Any], si: Any, active: Mask) -> Any:
-            """The result of `ask(bsdf, mask)` for the BSDF that is seen in each lane."""
+        def _select_bsdf(self, call: Callable[[Any, Mask], Any], si: Any, active: Mask) -> Any:
+            """The result of `call(bsdf, mask)` for the BSDF that is seen in each lane."""
             line = si.prim_index
-            found = ask(self.base, active & (line == 0))
+            result = call(self.base, active & (line == 0))
             for number, paint in enumerate(self.paints, start=1):
-                here = line == number
-                found = dr.select(here, ask(paint, active & here), found)
-            return found
+                on = line == number
+                result = dr.select(on, call(paint, active & on), result)
+            return result
 
         def sample(
             self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Mask = True
         ) -> tuple[Any, Any]:
-            def ask(part: Any, here: Mask) -> tuple[Any, Any]:
-                return part.sample(ctx, si, sample1, sample2, here)
+            def call(bsdf: Any, on: Mask) -> tuple[Any, Any]:
+                return bsdf.sample(ctx, si, sample1, sample2, on)
 
-            return self._chosen(ask, si, active)
+            return self._select_bsdf(call, si, active)
 
         def eval(self, ctx: Any, si: Any, wo: Any, active: Mask = True) -> Any:
-            return self._chosen(lambda part, here: part.eval(ctx, si, wo, here), si, active)
+            return self._select_bsdf(lambda bsdf, on: bsdf.eval(ctx, si, wo, on), si, active)
 
         def pdf(self, ctx: Any, si: Any, wo: Any, active: Mask = True) -> Any:
-            return self._chosen(lambda part, here: part.pdf(ctx, si, wo, here), si, active)
+            return self._select_bsdf(lambda bsdf, on: bsdf.pdf(ctx, si, wo, on), si, active)
 
         def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Mask = True) -> tuple[Any, Any]:
-            return self._chosen(lambda part, here: part.eval_pdf(ctx, si, wo, here), si, active)
+            return self._select_bsdf(lambda bsdf, on: bsdf.eval_pdf(ctx, si, wo, on), si, active)
 
         def eval_diffuse_reflectance(self, si: Any, active: Mask = True) -> Any:
-            return self._chosen(
-                lambda part, here: part.eval_diffuse_reflectance(si, here), si, active
+            return self._select_bsdf(
+                lambda bsdf, on: bsdf.eval_diffuse_reflectance(si, on), si, active
             )
 
         def eval_null_transmission(self, si: Any, active: Mask = True) -> Any:
-            return self._chosen(
-                lambda part, here: part.eval_null_transmission(si, here), si, active
+            return self._select_bsdf(
+                lambda bsdf, on: bsdf.eval_null_transmission(si, on), si, active
             )
 
         def traverse(self, callback: Any) -> None:
@@ -131,7 +131,8 @@ def from_properties(
 ) -> Any:
     """The shape of a surface with the `to_world` and the BSDF that a plug-in's properties hold.
 
-    tint: of a solid, what is left of light after one unit of length in it, in the world.
+    tint: of a solid, the fraction of light that is left after one unit of length in it, in the
+        world.
     section_bsdf: of the faces at which a section cuts a solid; None for the BSDF of the rest.
     isolines: to be drawn on the surface.
 
@@ -145,25 +146,25 @@ def from_properties(
     placement = Placement.identity()
     if "to_world" in props:
         placement = Placement.of(as_matrix(props["to_world"]))
-    for one in isolines:
-        if one.function_field is surface.field and surface.solid_range is None:
+    for isoline in isolines:
+        if isoline.function_field is surface.field and surface.solid_range is None:
             raise ValueError(
                 f"isolines of {surface.field!r} on its own level set: it is constant there. Draw "
                 "those of another function, or a solid, whose caps show them"
             )
     if isolines:
-        colors = [one.srgb for one in isolines]
+        colors = [isoline.srgb for isoline in isolines]
         props["bsdf"] = isoline_bsdf(mi, props["bsdf"], colors)
         section_bsdf = None if section_bsdf is None else isoline_bsdf(mi, section_bsdf, colors)
-    if any("MeshAttribute" in _bsdf_text(one) for one in (props.get("bsdf", None), section_bsdf)):
+    if any("MeshAttribute" in _bsdf_text(bsdf) for bsdf in (props.get("bsdf", None), section_bsdf)):
         raise ValueError(
             "a mesh_attribute belongs to vertices or faces, which a level set has not: take a "
             "texture of uv, which are x and y in the world, or draw the mesh of harnack.mesh(field)"
         )
-    made = _carrier_class(mi.variant())(props, surface, placement, tint, section_bsdf, isolines)
-    if made.emitter() is not None or made.is_medium_transition():
+    shape = _carrier_class(mi.variant())(props, surface, placement, tint, section_bsdf, isolines)
+    if shape.emitter() is not None or shape.is_medium_transition():
         raise ValueError("surfaces that are traced can neither emit light nor bound a medium")
-    return made
+    return shape
 
 
 def _bsdf_text(bsdf: Any) -> str:
@@ -202,7 +203,7 @@ def _carrier_class(variant: str) -> Any:
             self.section_proxy = None if cut_bsdf is None else _bsdf_holder(mi, cut_bsdf)
             backend, size = mitsuba_backend(mi), float(np.linalg.norm(np.diff(ends, axis=0)))
             self.placed = PlacedSurface.of(surface, placement, backend, isolines, size)
-            self.line_colors = tuple(one.srgb for one in isolines)
+            self.line_colors = tuple(isoline.srgb for isoline in isolines)
             params = mi.traverse(self)
             corners = np.concatenate(placement.world_bounds(ends))
             params["vertex_positions"] = upload_floats(backend, corners)

@@ -315,11 +315,11 @@ def refuse_unknown(verb: str, keywords: Mapping[str, Any]) -> None:
     refuse_others(verb, keywords)
     for name in keywords:
         if name not in BY_NAME:
-            known = [option.name for option in options_of(verb)]
+            names = [option.name for option in options_of(verb)]
             other_name = _OTHER_PROGRAMS_NAMES.get(name.lower())
-            hint = f"; did you mean {other_name}?" if other_name else did_you_mean(name, known)
+            hint = f"; did you mean {other_name}?" if other_name else did_you_mean(name, names)
             raise TypeError(
-                f"{verb} has no option {name!r}{hint or '; it has ' + ', '.join(known)}"
+                f"{verb} has no option {name!r}{hint or '; it has ' + ', '.join(names)}"
             )
 
 
@@ -328,8 +328,8 @@ def refuse_others(verb: str, keywords: Mapping[str, Any]) -> None:
     for name in keywords:
         option = BY_NAME.get(name)
         if option is not None and verb not in option.verbs:
-            others = ", ".join(sorted(option.verbs))
-            raise TypeError(f"{verb} has no {name}: that is an option of {others}")
+            verbs = ", ".join(sorted(option.verbs))
+            raise TypeError(f"{verb} has no {name}: that is an option of {verbs}")
 
 
 def shows_options(verb: str) -> Callable[[_Function], _Function]:

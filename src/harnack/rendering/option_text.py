@@ -19,13 +19,13 @@ from harnack.rendering.isolines import Isolines
 from harnack.rendering.scales import parse_color
 from harnack.rendering.stage import parse_material
 
-# Of what was typed, this much is repeated in messages.
+# The number of characters of an argument that messages repeat.
 _SHOWN = 60
 _AXES = ("x", "y", "z", "-x", "-y", "-z")
 
 
 def quoted(text: str) -> str:
-    """The beginning of what was typed, in quotes."""
+    """The beginning of an argument, in quotes."""
     return repr(text if len(text) <= _SHOWN else text[:_SHOWN] + "...")
 
 

@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
     from harnack.tracer import TraceOptions
 
-# Modes with ground and lights, and what they trace.
+# Modes with ground and lights, and the name of the rays that they trace.
 _LIT = {"path": "light paths", "shaded": "rays"}
 _IN_AOV = (".R", ".G", ".B", ".A")
 Image = npt.NDArray[Any]
@@ -189,47 +189,54 @@ def _render_job(
 ) -> tuple[Image, npt.NDArray[np.uint8], list[str] | None]:
     """The numbers of a picture, its pixels, and the names of its channels if it has its own.
 
-    color_by: as it was set, the title of a color bar. alone: whether this process draws everything.
+    color_by: the option as it was set, the title of a color bar.
+    alone: whether this process draws everything.
     """
-    mi, asked, drawing, sensor = job.mi, job.options, job.task, job.scene.sensors()[0]
-    if drawing is None:
-        return _render_by_mitsuba(mi, job.scene, asked)
-    if isinstance(drawing, AovTask):
+    mi, options, task, sensor = job.mi, job.options, job.task, job.scene.sensors()[0]
+    if task is None:
+        return _render_by_mitsuba(mi, job.scene, options)
+    if isinstance(task, AovTask):
         with progress_bar(
             "rendering", progress and not isinstance(executor, LocalRenderExecutor)
         ) as advance:
-            view = drawing.look(executor, advance)
-        bar = color_by if asked.color_bar is True and isinstance(color_by, str) else asked.color_bar
-        samples = asked.spp or EDGE_SPP
-        shown = aov_picture(asked.show, drawing, view, asked.color_range, bar, samples, executor)
-        return AOV_MODES[asked.show].numbers(view), shown, None
-    if isinstance(drawing, PathRenderTask) and alone and progress:
-        drawing = _with_time_estimate(job, drawing, progress)
-        if isinstance(executor, LocalRenderExecutor):
-            executor = LocalRenderExecutor(drawing)
+            view = task.look(executor, advance)
+        bar = (
+            color_by
+            if options.color_bar is True and isinstance(color_by, str)
+            else options.color_bar
+        )
+        samples = options.spp or EDGE_SPP
+        shown = aov_picture(options.show, task, view, options.color_range, bar, samples, executor)
+        return AOV_MODES[options.show].numbers(view), shown, None
+    if isinstance(task, PathRenderTask) and alone and progress:
+        task = _with_time_estimate(job, task, progress)
+        executor = (
+            LocalRenderExecutor(task) if isinstance(executor, LocalRenderExecutor) else executor
+        )
     with progress_bar("rendering", progress) as advance:
-        if isinstance(drawing, ShadedTask):
-            image, lost = render_shaded(drawing, executor, advance)
+        if isinstance(task, ShadedTask):
+            image, lost = render_shaded(task, executor, advance)
         else:
-            found = render_paths(drawing, advance, executor)
-            image, lost = denoise_image(found) if asked.denoise else found.image, found.lost
-    _warn_of(lost, _LIT[asked.show])
-    return *_composite_over_backdrop(mi, sensor, image, job.stage, asked.show), None
+            paths = render_paths(task, advance, executor)
+            image, lost = denoise_image(paths) if options.denoise else paths.image, paths.lost
+    _warn_of(lost, _LIT[options.show])
+    return *_composite_over_backdrop(mi, sensor, image, job.stage, options.show), None
 
 
 def _with_time_estimate(
-    job: RenderJob, drawing: PathRenderTask, progress: bool | Advance
+    job: RenderJob, task: PathRenderTask, progress: bool | Advance
 ) -> PathRenderTask:
-    """The same in bands after which a progress bar can move; says how long a long picture takes."""
-    pace = estimate_time(
-        job.mi, job.scene, drawing.sensor, drawing.tracer, spp=drawing.spp,
-        features=drawing.features,
+    """The task in bands after which a progress bar can move; prints the estimated time of a long
+    picture."""
+    estimate = estimate_time(
+        job.mi, job.scene, task.sensor, task.tracer, spp=task.spp,
+        features=task.features,
     )  # fmt: skip
-    if progress is True and pace.picture > MIN_REPORTED_SECONDS:
+    if progress is True and estimate.picture > MIN_REPORTED_SECONDS:
         Console(stderr=True, highlight=False).print(
-            f"this picture will take about {pace}, with {drawing.spp} samples a pixel"
+            f"this picture will take about {estimate}, with {task.spp} samples a pixel"
         )
-    return replace(drawing, paths_a_band=pace.paths_a_band)
+    return replace(task, paths_a_band=estimate.paths_a_band)
 
 
 def _is_of_studio(surfaces: Any) -> bool:
@@ -249,41 +256,41 @@ def _check_can_be_sent(surfaces: Any, task: Any) -> None:
 
 
 def _render_by_mitsuba(
-    mi: Any, scene: Any, asked: RenderOptions
+    mi: Any, scene: Any, options: RenderOptions
 ) -> tuple[Image, npt.NDArray[np.uint8], list[str]]:
     """The numbers (h, w, n) of a scene without our surfaces, with all channels of its own
     integrator, the pixels of the first of them, and the names of all."""
-    for name, given in (("max_depth", asked.max_depth is not None), ("denoise", asked.denoise)):
-        if given:
+    for name, used in (("max_depth", options.max_depth is not None), ("denoise", options.denoise)):
+        if used:
             raise ValueError(f"{name}: Mitsuba draws this scene, by an integrator of its own")
-    image = np.array(mi.render(scene, spp=asked.spp or 0, seed=asked.seed))
+    image = np.array(mi.render(scene, spp=options.spp or 0, seed=options.seed))
     # Pictures inside an `aov` are the first channels, and come once.
     names = [name for name in scene.integrator().aov_names() if name[-2:] not in _IN_AOV]
-    basic = image.shape[-1] - len(names)
-    names = [*{1: "Y", 2: "YA"}.get(basic, "RGBA"[:basic]), *names]
-    return image, tone_map(image[..., :basic] if basic >= 3 else image[..., 0]), names
+    count = image.shape[-1] - len(names)
+    names = [*{1: "Y", 2: "YA"}.get(count, "RGBA"[:count]), *names]
+    return image, tone_map(image[..., :count] if count >= 3 else image[..., 0]), names
 
 
-def _warn_of(lost: int, what: str) -> None:
+def _warn_of(lost: int, kind: str) -> None:
     if lost:
         warnings.warn(
-            f"{lost} {what} ran out of steps and are drawn magenta; raise max_steps", stacklevel=3
+            f"{lost} {kind} ran out of steps and are drawn magenta; raise max_steps", stacklevel=3
         )
 
 
 def _composite_over_backdrop(
     mi: Any, sensor: Any, image: Image, stage: StudioScene | None, show: str
 ) -> tuple[Image, npt.NDArray[np.uint8]]:
-    """The numbers of a picture, given as light and the part that is covered, and its pixels."""
+    """The numbers of a picture and its pixels. image: its light and the covered fraction."""
     if stage is None:
         has_alpha = mi.has_flag(sensor.film().flags(), mi.FilmFlags.Alpha)
         image = image if has_alpha else np.ascontiguousarray(image[..., :3])
         return image, tone_map(image)
     if stage.backdrop is None:
         return image, tone_map(image)
-    light, free = image[..., :3], 1 - image[..., 3:]
+    light, uncovered = image[..., :3], 1 - image[..., 3:]
     if isinstance(stage.backdrop, GroundBackdrop):
-        image = light + free * studio_wall(mi, sensor, stage.backdrop, stage.azimuth, show)
+        image = light + uncovered * studio_wall(mi, sensor, stage.backdrop, stage.azimuth, show)
         return image, tone_map(image)
     behind = backdrop_image(mi, stage.backdrop, (image.shape[1], image.shape[0]))
-    return light + free * behind, tone_map(image, behind)
+    return light + uncovered * behind, tone_map(image, behind)

@@ -52,8 +52,8 @@ class Placement:
         linear = matrix[:3, :3]
         scale = float(np.cbrt(abs(np.linalg.det(linear))))
         gram: FloatArray = np.matmul(linear, np.transpose(linear))
-        close = scale > 0 and np.allclose(gram, scale**2 * np.eye(3), atol=1e-4 * scale**2)
-        if not close or not np.allclose(matrix[3], (0, 0, 0, 1)):
+        is_similar = scale > 0 and np.allclose(gram, scale**2 * np.eye(3), atol=1e-4 * scale**2)
+        if not is_similar or not np.allclose(matrix[3], (0, 0, 0, 1)):
             raise ValueError(
                 "to_world must be made of translations, rotations, mirrors and one scale for all "
                 f"axes, and this one is not:\n{matrix}"
@@ -70,8 +70,8 @@ class Placement:
     def apply(self, points: npt.ArrayLike) -> FloatArray:
         """Points (n, 3) of the surface, in the world."""
         local: FloatArray = np.asarray(points, dtype=np.float64)
-        turned: FloatArray = np.matmul(local, np.transpose(self.rotation))
-        return self.scale * turned + self.translation
+        rotated: FloatArray = np.matmul(local, np.transpose(self.rotation))
+        return self.scale * rotated + self.translation
 
     def apply_inverse(self, points: npt.ArrayLike) -> FloatArray:
         """Points (n, 3) of the world, in the surface's coordinates."""
@@ -87,7 +87,7 @@ class Placement:
 
 @dataclass(frozen=True)
 class _HitPoint:
-    """Where a surface is hit, and its normal there."""
+    """A point at which a surface is hit, and the normal there."""
 
     position: Vec3
     normal: Vec3
@@ -130,11 +130,11 @@ class PlacedSurface:
         solid = None if surface.solid_range is None else CappedSolid.of(surface, prepared)
         rows = tuple(vector(row) for row in placement.rotation)
         scale = dr.opaque(backend.Float, placement.scale)
-        lines = tuple(one.prepare(backend, size) for one in isolines)
+        lines = tuple(isoline.prepare(backend, size) for isoline in isolines)
         return cls(prepared, solid, scale, rows, vector(placement.translation), lines)
 
     def queued(self) -> PlacedSurface:
-        """The same, whose rays are traced without delay (`SurfaceTracer.uses_ray_queue`)."""
+        """This surface, its rays traced without delay (`SurfaceTracer.uses_ray_queue`)."""
         prepared = replace(self.prepared, uses_ray_queue=True)
         solid = None if self.solid is None else replace(self.solid, prepared=prepared)
         return replace(self, prepared=prepared, solid=solid)
@@ -142,55 +142,57 @@ class PlacedSurface:
     def intersect(
         self, o: Vec3, d: Vec3, t_max: Real, active: Mask, leaves: Real = 0.0
     ) -> SurfaceHit:
-        """Where rays of the world, |d| = 1, first hit it, in coordinates of the world.
+        """The first hits of rays of the world, |d| = 1, in coordinates of the world.
 
         leaves: of a ray that starts on this very surface, 1 or -1 for the side of the normal that
             it goes to; else 0.
         """
         o, d, t_max = self._local_ray(o, d, t_max)
         if self.solid is not None:
-            met = self.solid.intersect(o, d, t_max, active, leaves)
+            hit = self.solid.intersect(o, d, t_max, active, leaves)
         else:
-            met = intersect_surface(self.prepared, o, d, t_max, active)
+            hit = intersect_surface(self.prepared, o, d, t_max, active)
         if self.isolines:
-            met = replace(met, isoline_index=self._line(met))
-        position = self.scale * self._to_world(met.position) + self.translation
+            hit = replace(hit, isoline_index=self._line(hit))
+        position = self.scale * self._to_world(hit.position) + self.translation
         return replace(
-            met,
-            t=self.scale * met.t,
+            hit,
+            t=self.scale * hit.t,
             position=position,
-            normal=self._to_world(met.normal),
-            ray_offset=self.scale * met.ray_offset,
+            normal=self._to_world(hit.normal),
+            ray_offset=self.scale * hit.ray_offset,
         )
 
-    def _line(self, met: SurfaceHit) -> Index:
+    def _line(self, hit: SurfaceHit) -> Index:
         """The number of the isoline at hits in the surface's coordinates."""
         index = self.prepared.backend.UInt32
 
-        def numbers(spot: _HitPoint) -> _IsolineIndex:
-            return _IsolineIndex(isoline_index_at(self.isolines, spot.position, spot.normal, index))
+        def numbers(point: _HitPoint) -> _IsolineIndex:
+            return _IsolineIndex(
+                isoline_index_at(self.isolines, point.position, point.normal, index)
+            )
 
-        spot, none = _HitPoint(met.position, met.normal), _IsolineIndex(index(0))
+        point, none = _HitPoint(hit.position, hit.normal), _IsolineIndex(index(0))
         if self.prepared.uses_ray_queue:
-            return compute_on_active(met.is_hit, numbers, spot, none).isoline_index
-        return dr.select(met.is_hit, numbers(spot).isoline_index, 0)
+            return compute_on_active(hit.is_hit, numbers, point, none).isoline_index
+        return dr.select(hit.is_hit, numbers(point).isoline_index, 0)
 
     def has_line_near(self, position: Vec3, normal: Vec3, across: Vec3, down: Vec3) -> Mask:
         """Whether the edge of an isoline passes near points of the surface, in the world.
 
-        across, down: how far it is to the points that neighboring pixels show.
+        across, down: the vectors to the points that neighboring pixels show.
         """
         vector = self.prepared.backend.Array3f
         p = self._to_local(vector(position) - self.translation) / self.scale
         n = self._to_local(vector(normal))
-        u, v = (self._to_local(vector(one)) / self.scale for one in (across, down))
+        u, v = (self._to_local(vector(step)) / self.scale for step in (across, down))
         near = self.prepared.backend.Bool(False)
-        for one in self.isolines:
-            near |= one.edge_is_near(p, n, u, v)
+        for isoline in self.isolines:
+            near |= isoline.edge_is_near(p, n, u, v)
         return near
 
     def occludes(self, o: Vec3, d: Vec3, t_max: Real, active: Mask) -> Mask:
-        """Whether rays of the world hit it; those not proved to miss it count as hitting it."""
+        """Whether rays of the world hit it; rays that are not proved to miss it count as hits."""
         o, d, t_max = self._local_ray(o, d, t_max)
         if self.solid is not None:
             return self.solid.occludes(o, d, t_max, active)

@@ -27,11 +27,11 @@ from harnack.rendering.studio_surfaces import studio_objects
 from harnack.tracer import Surface, TracedSurface, TraceOptions
 
 EDGE_SPP = 9
-# Light paths that a worker follows at a time: some hundred bytes each, of what may be a small
-# memory, and enough for all threads.
+# The number of light paths that a worker follows at a time. A path takes a few hundred bytes, and a
+# worker's memory may be small; the number is enough for all threads.
 _PATHS_A_BAND = 2**18
 DEFAULT_SIZE = (800, 600)
-# Rays of a path, shadow rays included, about.
+# The approximate number of rays of a path, including shadow rays.
 _RAYS_A_PATH = 3
 
 
@@ -65,22 +65,24 @@ class RenderJob:
         """The studio in which surfaces are drawn; None for a Mitsuba scene."""
         if not isinstance(self.surfaces, Field | Surface | TracedSurface | list | tuple):
             return None
-        asked, size = self.options, self.options.size or DEFAULT_SIZE
-        check_memory(asked.show, *size)
+        options, size = self.options, self.options.size or DEFAULT_SIZE
+        check_memory(options.show, *size)
         on_stage = studio_objects(
-            self.surfaces, asked.material, self.trace_options, self.shorthand,
-            boundary_radius=asked.boundary_radius, boundary_material=asked.boundary_material,
-            section_material=asked.section_material, isolines=asked.isolines,
-            thickness=asked.thickness,
+            self.surfaces, options.material, self.trace_options, self.shorthand,
+            boundary_radius=options.boundary_radius, boundary_material=options.boundary_material,
+            section_material=options.section_material, isolines=options.isolines,
+            thickness=options.thickness,
         )  # fmt: skip
         rays = size[0] * size[1]
-        if asked.show not in (*AOV_MODES, "shaded"):
-            rays *= _RAYS_A_PATH * (asked.spp or STUDIO_SPP)
-        on_stage = [replace(one, surface=one.surface.for_rays(rays)) for one in on_stage]
+        if options.show not in (*AOV_MODES, "shaded"):
+            rays *= _RAYS_A_PATH * (options.spp or STUDIO_SPP)
+        on_stage = [
+            replace(element, surface=element.surface.for_rays(rays)) for element in on_stage
+        ]
         return build_studio(
-            self.mi, on_stage, size=size, camera=asked.camera,
-            backdrop=asked.backdrop, up="z" if asked.up is None else asked.up,
-            surfaces_only=asked.show in AOV_MODES, traced_light=asked.show == "path",
+            self.mi, on_stage, size=size, camera=options.camera,
+            backdrop=options.backdrop, up="z" if options.up is None else options.up,
+            surfaces_only=options.show in AOV_MODES, traced_light=options.show == "path",
         )  # fmt: skip
 
     @functools.cached_property
@@ -94,55 +96,55 @@ class RenderJob:
 
     @functools.cached_property
     def task(self) -> AovTask | PathRenderTask | ShadedTask | None:
-        """What can be drawn pixel by pixel; None for a scene that Mitsuba draws."""
-        mi, asked, stage = self.mi, self.options, self.stage
+        """The task that draws the picture pixel by pixel; None for a scene that Mitsuba draws."""
+        mi, options, stage = self.mi, self.options, self.stage
         scene = self.scene
         sensor = scene.sensors()[0]
-        if asked.show in AOV_MODES:
+        if options.show in AOV_MODES:
             placement = Placement.identity() if stage is None else stage.placement
-            viewer = AovTask.of(mi, scene, sensor, placement, asked.color_by)
-            if isinstance(asked.backdrop, GradientBackdrop):
-                viewer = replace(viewer, background=asked.backdrop.bottom)
+            viewer = AovTask.of(mi, scene, sensor, placement, options.color_by)
+            if isinstance(options.backdrop, GradientBackdrop):
+                viewer = replace(viewer, background=options.backdrop.bottom)
             return viewer
-        if asked.show == "shaded":
+        if options.show == "shaded":
             return ShadedTask(
-                mi, scene, sensor, spp=asked.spp or EDGE_SPP, cut_out=stage is not None,
-                on_floor=stage is not None and stage.has_ground, cones=asked.antialias == "cones",
+                mi, scene, sensor, spp=options.spp or EDGE_SPP, cut_out=stage is not None,
+                on_floor=stage is not None and stage.has_ground, cones=options.antialias == "cones",
             )  # fmt: skip
         tracer = equivalent_path_tracer(mi, scene)
         if tracer is None:
             return None
-        if asked.max_depth is not None:
-            tracer = tracer.with_depth(asked.max_depth)
-        spp = asked.spp or check_spp(
+        if options.max_depth is not None:
+            tracer = tracer.with_depth(options.max_depth)
+        spp = options.spp or check_spp(
             int(sensor.sampler().sample_count()), source=", which the scene's sampler asks for"
         )
-        return PathRenderTask(mi, scene, sensor, tracer, spp, asked.seed, asked.denoise)
+        return PathRenderTask(mi, scene, sensor, tracer, spp, options.seed, options.denoise)
 
-    def _task_here(self) -> Any:
+    def _task_in_variant(self) -> Any:
         """The task, after a worker may have worked in another variant."""
         set_variant(self.variant)
         return self.task
 
     def render_range(self, start: int, stop: int) -> TaskResult:
-        """As of the task: an `AovTask` or a `PathRenderTask`."""
-        task = self._task_here()
+        """The result of the method of the task, an `AovTask` or a `PathRenderTask`."""
+        task = self._task_in_variant()
         if isinstance(task, AovTask):
             return _arrays_of(task.render_range(start, stop))
         task = replace(cast("PathRenderTask", task), paths_a_band=_PATHS_A_BAND)
         return _with_lost(task.render_range(start, stop))
 
     def render_samples(self, *part: Any) -> TaskResult:
-        """As of `AovTask`."""
-        return _arrays_of(cast("AovTask", self._task_here()).render_samples(*part))
+        """The result of the method of the `AovTask`."""
+        return _arrays_of(cast("AovTask", self._task_in_variant()).render_samples(*part))
 
     def render_gbuffer(self, start: int, stop: int) -> TaskResult:
         """As of `ShadedTask`."""
-        return cast("ShadedTask", self._task_here()).render_gbuffer(start, stop).to_numpy()
+        return cast("ShadedTask", self._task_in_variant()).render_gbuffer(start, stop).to_numpy()
 
     def refine_pixels(self, *part: Any) -> TaskResult:
         """As of `ShadedTask`."""
-        return _with_lost(cast("ShadedTask", self._task_here()).refine_pixels(*part))
+        return _with_lost(cast("ShadedTask", self._task_in_variant()).refine_pixels(*part))
 
 
 @dataclass(frozen=True)
@@ -159,38 +161,38 @@ class ClusterRenderExecutor:
 
     def run_tasks(self, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
         """Results of the tasks, in order; several run at the same time."""
-        drawing = self.job.task
-        for found in self.executor.run_tasks(self.job, step, parts):
-            if isinstance(drawing, AovTask):
-                period = None if drawing.function is None else drawing.function.period
-                yield AovBuffers(**found, period=period, background=drawing.background)
+        task = self.job.task
+        for arrays in self.executor.run_tasks(self.job, step, parts):
+            if isinstance(task, AovTask):
+                period = None if task.function is None else task.function.period
+                yield AovBuffers(**arrays, period=period, background=task.background)
             elif step == "render_gbuffer":
-                yield GBuffer.from_numbers(self.job.mi, found)
+                yield GBuffer.from_numbers(self.job.mi, arrays)
             else:
-                yield found["means"], int(found["lost"])
+                yield arrays["means"], int(arrays["lost"])
 
 
-def _with_lost(found: tuple[Any, int]) -> TaskResult:
-    return {"means": found[0], "lost": np.array(found[1])}
+def _with_lost(result: tuple[Any, int]) -> TaskResult:
+    return {"means": result[0], "lost": np.array(result[1])}
 
 
 def _arrays_of(view: AovBuffers) -> TaskResult:
-    return {name: one for name, one in vars(view).items() if isinstance(one, np.ndarray)}
+    return {name: array for name, array in vars(view).items() if isinstance(array, np.ndarray)}
 
 
-def _loaded(mi: Any, what: Any, size: tuple[int, int] | None) -> Any:
-    if isinstance(what, mi.Scene):
+def _loaded(mi: Any, source: Any, size: tuple[int, int] | None) -> Any:
+    if isinstance(source, mi.Scene):
         if size is not None:
             raise ValueError("size: a loaded scene has its own; set film.size of its sensor")
-        scene = what
-    elif isinstance(what, Mapping):
-        scene = load_dict(mi, cast("Mapping[str, Any]", what))
-    elif isinstance(what, str | os.PathLike):
-        scene = load_scene_file(mi, cast("str | os.PathLike[str]", what))
+        scene = source
+    elif isinstance(source, Mapping):
+        scene = load_dict(mi, cast("Mapping[str, Any]", source))
+    elif isinstance(source, str | os.PathLike):
+        scene = load_scene_file(mi, cast("str | os.PathLike[str]", source))
     else:
         raise TypeError(
             "draw a field, a Surface, a list of them, or a Mitsuba scene, its dictionary or the "
-            f"path of its file, not what is {suggest_field(what)}"
+            f"path of its file, not what is {suggest_field(source)}"
         )
     if not scene.sensors():
         raise ValueError("the scene has no sensor to look through")

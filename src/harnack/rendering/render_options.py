@@ -30,7 +30,7 @@ _MAX_CHUNKS = 1_000_000
 _MAX_INTEGER = 2**31 - 1
 # Peak memory in bytes per pixel, measured at 2048 x 2048 and 4096 x 4096, rounded up.
 _BYTES = {"path": 50, "shaded": 280, "value": 240}
-_BYTES_OF_VIEWS = 130
+_AOV_BYTES = 130
 
 
 def check_max_depth(max_depth: Any, show: str) -> int | None:
@@ -245,7 +245,7 @@ Check = Callable[[Any, str], Any]
 
 
 def ignoring_mode(check: Callable[[Any], Any]) -> Check:
-    """A check that does not depend on what is shown."""
+    """A check that does not depend on the mode of the picture."""
     return lambda value, show: check(value)
 
 
@@ -255,7 +255,7 @@ def if_set(check: Callable[[Any], Any]) -> Check:
 
 
 def unchecked(value: Any, show: str) -> Any:
-    """No check: what uses the option checks it."""
+    """No check: the code that uses the option checks it."""
     del show
     return value
 
@@ -274,7 +274,7 @@ def refuse_studio_options(options: Mapping[str, Any]) -> None:
 
 def check_memory(show: str, width: int, height: int) -> None:
     """Raise ValueError for a picture that does not fit into this machine's memory."""
-    needed = width * height * _BYTES.get(show, _BYTES_OF_VIEWS)
+    needed = width * height * _BYTES.get(show, _AOV_BYTES)
     if width * height > 2**30 or needed > _memory():
         raise ValueError(
             f"a picture of {width}x{height} pixels needs about {needed / 1e9:,.0f} GB of memory, "

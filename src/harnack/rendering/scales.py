@@ -53,7 +53,7 @@ _NAMED = """
     yellowgreen=9acd32
 """
 NAMED_COLORS: Mapping[str, str] = MappingProxyType(
-    {name: number for name, _, number in (one.partition("=") for one in _NAMED.split())}
+    {name: number for name, _, number in (entry.partition("=") for entry in _NAMED.split())}
 )
 """Hexadecimal numbers by name."""
 
@@ -72,12 +72,12 @@ def parse_color(color: Any, name: str) -> Color:
     if isinstance(color, str):
         return _from_text(color, name)
     try:
-        numbers = [float("" if isinstance(one, str | bool) else one) for one in color]
+        numbers = [float("" if isinstance(number, str | bool) else number) for number in color]
     except (TypeError, ValueError):
         raise TypeError(f"{name} must be {_COLOR_HELP}, not {color!r}") from None
     if len(numbers) != 3:
         raise TypeError(f"{name} must be {_COLOR_HELP}, not {color!r}")
-    if not all(0 <= one <= 1 for one in numbers):
+    if not all(0 <= number <= 1 for number in numbers):
         raise ValueError(f"{name} must be {_COLOR_HELP}, not {color!r}")
     return cast("Color", tuple(numbers))
 
@@ -85,24 +85,24 @@ def parse_color(color: Any, name: str) -> Color:
 def _from_text(text: str, name: str) -> Color:
     digits = NAMED_COLORS.get(text.strip().lower())
     if digits is None:
-        found = re.fullmatch(r"#([0-9a-fA-F]{3}|[0-9a-fA-F]{6})", text.strip())
-        if found is None:
+        match = re.fullmatch(r"#([0-9a-fA-F]{3}|[0-9a-fA-F]{6})", text.strip())
+        if match is None:
             raise ValueError(
                 f"{name} must be {_COLOR_HELP}, not {text!r}{did_you_mean(text, NAMED_COLORS)}"
             )
-        digits = found[1] if len(found[1]) == 6 else "".join(2 * digit for digit in found[1])
+        digits = match[1] if len(match[1]) == 6 else "".join(2 * digit for digit in match[1])
     red, green, blue = (int(digits[k : k + 2], 16) / 255 for k in (0, 2, 4))
     return red, green, blue
 
 
 def linear_from_srgb(color: Color) -> Color:
     """A color in sRGB as linear sRGB, which light adds up in (IEC 61966-2-1)."""
-    red, green, blue = (_linear(part) for part in color)
+    red, green, blue = (_linear(channel) for channel in color)
     return red, green, blue
 
 
-def _linear(part: float) -> float:
-    return part / 12.92 if part <= 0.04045 else math.pow((part + 0.055) / 1.055, 2.4)
+def _linear(channel: float) -> float:
+    return channel / 12.92 if channel <= 0.04045 else math.pow((channel + 0.055) / 1.055, 2.4)
 
 
 # Color maps: numbers as colors.
@@ -173,20 +173,21 @@ def gray_colormap(x: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
 # Scales: which number has which color, and where ticks stand.
 
 Numbers = npt.NDArray[np.floating[Any]]
-# Steps between ticks, as parts of a power of ten.
+# Steps between ticks, as multiples of a power of ten.
 _NICE = (1.0, 2.0, 5.0, 10.0)
-# Where ticks are closer than this, or numbers as large, they are written with an exponent.
-_SMALL, _LARGE = 1e-5, 1e7
-# Periods up to so many times pi have ticks at parts of it.
-_MOST_PI = 16
+# Numbers are written with an exponent if ticks are closer than the first, or if numbers are as
+# large as the second.
+_MIN_PLAIN_STEP, _MAX_PLAIN_NUMBER = 1e-5, 1e7
+# Periods up to this multiple of pi have ticks at fractions of pi.
+_MAX_PI_MULTIPLE = 16
 
 
 @dataclass(frozen=True)
 class ColorScale:
     """Colors of numbers from `low` to `high`; numbers beyond an end have its color.
 
-    name: of what is shown, on color bars.
-    period: of numbers that count modulo `high` - `low` = period; None for others.
+    name: the name of the numbers, on color bars.
+    period: of numbers that count modulo `high` - `low` = period; None for other numbers.
     exceeded: whether numbers that are shown lie below `low`, and above `high`.
     """
 
@@ -203,7 +204,7 @@ class ColorScale:
         return cls(0.0, period, name, cyclic_colormap, period)
 
     def with_exceeded(self, numbers: Numbers) -> ColorScale:
-        """The same, for the bar of a picture that shows these."""
+        """This scale, for the bar of a picture that shows these numbers."""
         if self.period is not None or not numbers.size:
             return self
         slack = 1e-6 * max(abs(self.low), abs(self.high))
@@ -222,13 +223,15 @@ class ColorScale:
         """At most `max_count` ticks, but at least two: numbers, and how they are written."""
         period = 0.0 if self.period is None else self.period
         multiple = round(period / math.pi)
-        if 0 < multiple <= _MOST_PI and math.isclose(period, multiple * math.pi, rel_tol=1e-6):
+        if 0 < multiple <= _MAX_PI_MULTIPLE and math.isclose(
+            period, multiple * math.pi, rel_tol=1e-6
+        ):
             return _ticks_at_parts_of_pi(multiple, max_count)
         if not self.high > self.low:
             return [(self.low, f"{self.low:.4g}")]
         step = _step((self.high - self.low) / max(max_count - 1, 1))
         first, last = self._multiples(step)
-        if last - first < 1:  # one more than asked for, if that gives two
+        if last - first < 1:  # one tick more than requested, if that gives two
             step = _step((self.high - self.low) / max(max_count + 1, 3))
             first, last = self._multiples(step)
         if last - first < 1:  # no room for two nice numbers
@@ -236,36 +239,36 @@ class ColorScale:
             digits = 2 + max(2, math.ceil(math.log10(largest / (self.high - self.low))))
             return [(end, f"{end:.{digits}g}") for end in (self.low, self.high)]
         largest = max(abs(first), abs(last)) * step
-        return [(k * step, _written(k * step, step, largest)) for k in range(first, last + 1)]
+        return [(k * step, _format_number(k * step, step, largest)) for k in range(first, last + 1)]
 
     def _multiples(self, step: float) -> tuple[int, int]:
         """The first and the last multiple of a step in the range."""
         return math.ceil(self.low / step - 1e-9), math.floor(self.high / step + 1e-9)
 
 
-def _step(least: float) -> float:
-    """The smallest nice number that is not less than a positive one."""
-    power = 10.0 ** math.floor(math.log10(least))
-    return next(part * power for part in _NICE if part * power >= least * (1 - 1e-9))
+def _step(bound: float) -> float:
+    """The smallest nice number that is at least the bound, a positive number."""
+    power = 10.0 ** math.floor(math.log10(bound))
+    return next(multiple * power for multiple in _NICE if multiple * power >= bound * (1 - 1e-9))
 
 
-def _written(number: float, step: float, largest: float) -> str:
+def _format_number(number: float, step: float, largest: float) -> str:
     """A multiple of a nice step, with the digits that it needs.
 
-    largest: of all that are written.
+    largest: the largest of all numbers that are written.
     """
     if number == 0:
         return "0"
-    below = math.floor(math.log10(step) + 1e-9)  # the place of the last digit
-    if step >= _SMALL and largest < _LARGE:
-        return f"{number:.{max(0, -below)}f}"
-    digits = max(0, math.floor(math.log10(abs(number)) + 1e-9) - below)
+    last_place = math.floor(math.log10(step) + 1e-9)  # the place of the last digit
+    if step >= _MIN_PLAIN_STEP and largest < _MAX_PLAIN_NUMBER:
+        return f"{number:.{max(0, -last_place)}f}"
+    digits = max(0, math.floor(math.log10(abs(number)) + 1e-9) - last_place)
     mantissa, exponent = f"{number:.{digits}e}".split("e")
     return f"{mantissa.rstrip('0').rstrip('.') if '.' in mantissa else mantissa}e{int(exponent)}"
 
 
 def _ticks_at_parts_of_pi(multiple: int, max_count: int) -> list[tuple[float, str]]:
-    """Ticks of 0 to `multiple` pi: at halves of pi, or at one, two, ... times pi."""
+    """Ticks from 0 to `multiple` pi: at halves of pi, or at 1, 2, ... times pi."""
     halves = next(
         step for step in (1, 2, 4, 8, 16, 32)
         if (2 * multiple) // step + 1 <= max(max_count, 2) or step >= 2 * multiple
@@ -277,8 +280,8 @@ def _as_pi(halves: int) -> str:
     """The text of a number of halves of pi."""
     if halves == 0:
         return "0"
-    times, below = (halves // 2, "") if halves % 2 == 0 else (halves, "/2")
-    return f"{'' if times == 1 else f'{times} '}pi{below}"
+    factor, divisor = (halves // 2, "") if halves % 2 == 0 else (halves, "/2")
+    return f"{'' if factor == 1 else f'{factor} '}pi{divisor}"
 
 
 # A bar of colors beside a picture, with ticks at nice numbers.
@@ -287,7 +290,7 @@ Pixels = npt.NDArray[np.uint8]
 
 # Heights of letters and bar, and the bar's width, as parts of the picture's height; and the least
 # height of letters, in pixels.
-_LETTERS, _BAR, _WIDTH, _LEAST = 1 / 28, 0.78, 1 / 22, 10
+_LETTER_HEIGHT, _BAR_HEIGHT, _BAR_WIDTH, _MIN_LETTER_HEIGHT = 1 / 28, 0.78, 1 / 22, 10
 # Files that Pillow finds by name where they are installed, and a letter that none of them has.
 _TYPEFACES = (
     "DejaVuSans.ttf", "NotoSans-Regular.ttf", "FreeSans.ttf", "LiberationSans-Regular.ttf",
@@ -314,23 +317,23 @@ def require_pillow() -> tuple[Any, Any, Any]:
 
 def typeface_for(text: str, size: int) -> Any:
     """A typeface with all letters of a text: Pillow's own, which has plain ASCII letters, or the
-    first one found on this machine.
+    first of a list that is installed on this machine.
 
     Raises:
-        ValueError: none has them.
+        ValueError: no typeface has all letters.
     """
     _, _, typefaces = require_pillow()
-    own = typefaces.load_default(size)
+    default = typefaces.load_default(size)
     if text.isascii():
-        return own
+        return default
     for name in _TYPEFACES:
         try:
-            one = typefaces.truetype(name, size)
+            typeface = typefaces.truetype(name, size)
         except OSError:  # it is not installed
             continue
-        none = bytes(one.getmask(_NO_LETTER))
-        if all(letter == " " or bytes(one.getmask(letter)) != none for letter in text):
-            return one
+        no_letter = bytes(typeface.getmask(_NO_LETTER))
+        if all(letter == " " or bytes(typeface.getmask(letter)) != no_letter for letter in text):
+            return typeface
     raise ValueError(
         f"no typeface that was found here has all letters of {text!r}: install DejaVu Sans "
         "(Debian's fonts-dejavu-core), or write the title in plain ASCII letters"
@@ -343,22 +346,22 @@ def add_color_bar(pixels: Pixels, scale: ColorScale, background: Color) -> Pixel
     An end of the bar is pointed where the picture has numbers beyond it.
     background: behind the bar, sRGB in [0, 1].
     """
-    behind = tuple(round(255 * part) for part in background)
+    behind = tuple(round(255 * fraction) for fraction in background)
     ink = _ON_LIGHT if sum(background) > 1.5 else _ON_DARK
     images, drawings, _ = require_pillow()
     height = len(pixels)
-    letters = max(_LEAST, round(_LETTERS * height))
+    letters = max(_MIN_LETTER_HEIGHT, round(_LETTER_HEIGHT * height))
     font = typeface_for(scale.name, letters)
-    length = max(2, min(round(_BAR * height), height - 4 * letters))
-    thick, gap = max(3, round(_WIDTH * height)), max(2, letters // 2)
+    length = max(2, min(round(_BAR_HEIGHT * height), height - 4 * letters))
+    thick, gap = max(3, round(_BAR_WIDTH * height)), max(2, letters // 2)
     ticks = scale.ticks(max(2, min(6, length // (2 * letters))))
     room = max(font.getlength(text) for _, text in ticks)
-    wide = max(thick + gap + room, font.getlength(scale.name))
-    strip = images.new("RGB", (math.ceil(wide) + 2 * letters, height), behind)
+    width = max(thick + gap + room, font.getlength(scale.name))
+    strip = images.new("RGB", (math.ceil(width) + 2 * letters, height), behind)
     top = (height - length + letters) // 2
     draw = drawings.Draw(strip)
-    point = gap if any(scale.exceeded) else 0  # its height
-    title = max(0, top - gap - point)
+    tip = gap if any(scale.exceeded) else 0  # its height
+    title = max(0, top - gap - tip)
     draw.text((letters, title), scale.name, font=font, fill=ink, anchor="ls")
     values = scale.high - (np.arange(length) + 0.5) / length * (scale.high - scale.low)
     if scale.period is not None:  # the upper end is the lower one
@@ -366,19 +369,23 @@ def add_color_bar(pixels: Pixels, scale: ColorScale, background: Color) -> Pixel
     column = (scale.colors(values) * 255 + 0.5).astype(np.uint8)
     for row, color in enumerate(column):
         draw.line([(letters, top + row), (letters + thick - 1, top + row)], fill=tuple(color))
-    for is_passed, row, away, color in zip(
+    for is_passed, row, dy, color in zip(
         scale.exceeded,
         (top + length, top - 1),
-        (point, -point),
+        (tip, -tip),
         (column[-1], column[0]),
         strict=True,
     ):
         if is_passed:
-            ends = [(letters, row), (letters + thick - 1, row), (letters + thick // 2, row + away)]
+            ends = [
+                (letters, row),
+                (letters + thick - 1, row),
+                (letters + thick // 2, row + dy),
+            ]
             draw.polygon(ends, fill=tuple(color))
     for value, text in ticks:
-        part = (value - scale.low) / (scale.high - scale.low) if scale.high > scale.low else 0.5
-        y = top + round((1 - part) * (length - 1))
+        fraction = (value - scale.low) / (scale.high - scale.low) if scale.high > scale.low else 0.5
+        y = top + round((1 - fraction) * (length - 1))
         right = letters + thick
         draw.line([(right, y), (right + gap // 2, y)], fill=ink)
         draw.text((right + gap, y), text, font=font, fill=ink, anchor="lm")

@@ -47,8 +47,8 @@ if TYPE_CHECKING:
 class ConeCoverage:
     """Finds pixels that surfaces may cover in part, by cones, so that no thin part is overlooked.
 
-    The ray through the middle of a pixel misses what is thinner than the pixel more often than not,
-    and so do those of its neighbors. The cone that holds the pixel does not.
+    The ray through the middle of a pixel mostly misses parts that are thinner than the pixel, and
+    so do the rays of its neighbors. The cone that holds the pixel does not miss them.
 
     Raises:
         ValueError: a field that jumps, such as the winding number of a mesh: it is constant on both
@@ -62,17 +62,18 @@ class ConeCoverage:
     def partly_covered(self, ray: Any, position: Any) -> Any:
         """Whether the cones of pixels are covered in part before the points that rays see.
 
-        ray: through the middles, with differentials. position: seen; NaN where nothing is.
+        ray: the rays through the middles, with differentials.
+        position: the points that they hit; NaN for no hit.
         """
         mi = self.mi
-        away = dr.norm(position - ray.o)
-        t = dr.select(dr.isfinite(away), away, dr.largest(mi.Float))
+        distance = dr.norm(position - ray.o)
+        t = dr.select(dr.isfinite(distance), distance, dr.largest(mi.Float))
         x, y = ray.d_x - ray.d, ray.d_y - ray.d
         radius = 0.5 * dr.maximum(dr.norm(x + y), dr.norm(x - y))  # half the longer diagonal
-        found = dr.zeros(mi.Bool, dr.width(ray.d))
-        for placed, around in self.placed:
-            found |= placed.covers_in_part(ray.o, ray.d, radius, t, around)
-        return found
+        is_covered = dr.zeros(mi.Bool, dr.width(ray.d))
+        for placed, balls in self.placed:
+            is_covered |= placed.covers_in_part(ray.o, ray.d, radius, t, balls)
+        return is_covered
 
 
 def _prepared(mi: Any, carrier: Any) -> tuple[PlacedSurface, Any]:
@@ -94,8 +95,8 @@ def _prepared(mi: Any, carrier: Any) -> tuple[PlacedSurface, Any]:
 
 
 def inner_and_outer_ball(volume: Volume | None, backend: Backend) -> tuple[Vec3, Real, Real] | None:
-    """The middle of a volume, and the radii about it of a ball in it and of one around it; None
-    where it has no end or no such ball was found."""
+    """The middle of a volume, the radius about it of a ball inside the volume, and the radius of a
+    ball around the volume; None if the volume is unbounded or no such ball was found."""
     if volume is None:
         return None
     lower, upper = (np.asarray(end, dtype=np.float64) for end in volume.bounds())
@@ -103,8 +104,8 @@ def inner_and_outer_ball(volume: Volume | None, backend: Backend) -> tuple[Vec3,
         return None
     middle = (0.5 * (lower + upper)).tolist()
     # Not half the box: other volumes have faces that lie nearer to its middle.
-    there = choose_backend("double").Array3f(*middle)
-    depth = -float(to_numpy(volume.signed_distance(there))[0]) * (1 - 1e-6)
+    center = choose_backend("double").Array3f(*middle)
+    depth = -float(to_numpy(volume.signed_distance(center))[0]) * (1 - 1e-6)
     if not depth > 0:
         return None
     size = 0.5 * float(np.linalg.norm(upper - lower))
@@ -112,7 +113,8 @@ def inner_and_outer_ball(volume: Volume | None, backend: Backend) -> tuple[Vec3,
     return backend.Array3f(*numbers[:3]), numbers[3], numbers[4]
 
 
-# Directions across the picture, and taps along each, up to this share of its larger side.
+# The number of directions across the picture, and of taps along each; and the length that they
+# cover, as a fraction of the larger side of the picture.
 _DIRECTIONS = 16
 _TAPS = 8
 _REACH = 0.16
@@ -140,37 +142,37 @@ def ambient_visibility(
 
     def tap(k: int, direction: Any) -> Any:
         """The sine of the elevation of a tap, faded with its distance; 0 if nothing is there."""
-        far = 1.0 + reach * ((k + 0.5) / _TAPS) ** 2
-        u, v = x + far * direction.x, y + far * direction.y
+        distance = 1.0 + reach * ((k + 0.5) / _TAPS) ** 2
+        u, v = x + distance * direction.x, y + distance * direction.y
         inside = (u >= 0) & (v >= 0) & (u <= columns - 1) & (v <= rows - 1)
-        other = mi.UInt32(dr.round(v)) * columns + mi.UInt32(dr.round(u))
-        way = dr.gather(mi.Vector3f, position, other, inside) - position
-        length = dr.norm(way)
+        pixel = mi.UInt32(dr.round(v)) * columns + mi.UInt32(dr.round(u))
+        offset = dr.gather(mi.Vector3f, position, pixel, inside) - position
+        length = dr.norm(offset)
         fade = dr.maximum(1 - dr.square(length / radius), 0)
-        height = dr.dot(way, normal) / length - 0.06  # facets and rounding stay below that
+        height = dr.dot(offset, normal) / length - 0.06  # facets and rounding stay below that
         return dr.select(inside & (height > 0), height * fade, 0)
 
-    def along(way: Any, hidden: Any) -> tuple[Any, Any]:
-        s, c = dr.sincos((mi.Float(way) + 0.5) * (dr.two_pi / _DIRECTIONS))
+    def add_direction(turn: Any, hidden: Any) -> tuple[Any, Any]:
+        s, c = dr.sincos((mi.Float(turn) + 0.5) * (dr.two_pi / _DIRECTIONS))
         highest = mi.Float(0)
         for k in range(_TAPS):
             highest = dr.maximum(highest, tap(k, mi.Vector2f(c, s)))
-        return way + 1, hidden + dr.square(highest)
+        return turn + 1, hidden + dr.square(highest)
 
-    def more(way: Any, hidden: Any) -> Any:
+    def is_running(turn: Any, hidden: Any) -> Any:
         del hidden
-        return way < _DIRECTIONS
+        return turn < _DIRECTIONS
 
     start = (mi.UInt32(0), dr.zeros(mi.Float, count))
-    _, hidden = dr.while_loop(start, more, along, label="visible sky")
+    _, hidden = dr.while_loop(start, is_running, add_direction, label="visible sky")
     return 1 - hidden / _DIRECTIONS
 
 
 # Rays of one band.
 _RAYS_A_BAND = 2**17
-# Where in its pixel the first ray goes through.
+# The coordinates in its pixel of the first ray.
 _MIDDLE = 0.5
-# The share of the time that is spent on the first rays, as the progress bar guesses.
+# The estimated fraction of the time that is spent on the first rays, for the progress bar.
 _FIRST_PASS_FRACTION = 0.6
 
 
@@ -229,7 +231,7 @@ def _of_numbers(mi: Any, kind: Any, numbers: npt.NDArray[Any]) -> Any:
     if dr.is_mask_v(kind):
         return kind(np.ascontiguousarray(numbers))
     columns = numbers.reshape(len(numbers), -1).T
-    return kind(*(upload_floats(mitsuba_backend(mi), one) for one in columns))
+    return kind(*(upload_floats(mitsuba_backend(mi), column) for column in columns))
 
 
 class ShadedTask:
@@ -261,7 +263,7 @@ class ShadedTask:
         self.order = tiled_pixel_order(self.size)
         self.finder = ConeCoverage(mi, world) if cones else None
         offsets = multijitter_offsets(spp)
-        traced = (offsets == _MIDDLE).all(axis=1)  # what a pixel's first ray has seen
+        traced = (offsets == _MIDDLE).all(axis=1)  # the offset of a pixel's first ray
         self.offsets, self.share_of_first = offsets[~traced], float(traced.mean())
         self.refines = spp > 1
         matrix = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
@@ -274,78 +276,90 @@ class ShadedTask:
         pixels."""
         mi = self.mi
         pixel = upload_indices(mi, self.order[start:stop])
-        seen = self._look(pixel, mi.Vector2f(_MIDDLE))
-        dr.eval(seen)
+        gbuffer = self._trace_pixels(pixel, mi.Vector2f(_MIDDLE))
+        dr.eval(gbuffer)
         if self.finder is not None:
             ray, _ = self.ray(pixel, mi.Vector2f(_MIDDLE))
-            seen.needs_refinement |= self.finder.partly_covered(ray, seen.position)
-            dr.eval(seen)
-        return seen
+            gbuffer.needs_refinement |= self.finder.partly_covered(ray, gbuffer.position)
+            dr.eval(gbuffer)
+        return gbuffer
 
-    def _look(self, pixel: Any, offset: Any) -> GBuffer:
-        """What rays through places in pixels hit first."""
+    def _trace_pixels(self, pixel: Any, offset: Any) -> GBuffer:
+        """The first hits of rays through points in pixels."""
         mi, scene = self.mi, self.world.scene
         ray, weight = self.ray(pixel, offset)
-        sight = self.evaluate_with.trace(mi.Ray3f(ray))
-        si, first = sight.si, sight.first
+        hits = self.evaluate_with.trace(mi.Ray3f(ray))
+        si, first = hits.si, hits.first
         lost = first.is_out_of_steps | dr.zeros(mi.Bool, dr.width(pixel))
-        met = first.is_hit & ~lost
-        inside, open_surface = si.wi.z > 0, self._is_open(si)
-        color, other = (self._reflectance(si, side) * weight for side in (1, -1))
-        color, other = (as_rgb(mi, c, ray.wavelengths) for c in (color, other))
+        hit = first.is_hit & ~lost
+        inside, is_open = si.wi.z > 0, self._is_open(si)
+        color, back = (self._reflectance(si, side) * weight for side in (1, -1))
+        color, back = (as_rgb(mi, c, ray.wavelengths) for c in (color, back))
         painted = first.isoline_index > 0
-        color, other = reflectance(color, painted), reflectance(other, painted)
+        color, back = reflectance(color, painted), reflectance(back, painted)
         plain = ~painted  # lines have their own color
-        color = two_sided_color(color, other, inside & open_surface & plain)
+        color = two_sided_color(color, back, inside & is_open & plain)
         color = hole_filling_tint(color, first.is_hole_filling & plain)
-        shone = si.emitter(scene).eval(si, ~lost) * weight
+        emitted = si.emitter(scene).eval(si, ~lost) * weight
         light = as_rgb(
-            mi, sight.throughput * shone + weight * sight.reflected_light, ray.wavelengths
+            mi, hits.throughput * emitted + weight * hits.reflected_light, ray.wavelengths
         )
         light = dr.select(lost, mi.Color3f(OUT_OF_STEPS_COLOR), light)
-        covered = met | lost | (sight.interface_count > 1)  # what is clear covers, too
+        covered = hit | lost | (hits.interface_count > 1)  # transparent solids cover, too
         if self.cut_out:
             light = dr.select(covered, light, 0)
-        through = as_rgb(mi, sight.throughput, ray.wavelengths)
-        d = sight.ray.d
+        transmittance = as_rgb(mi, hits.throughput, ray.wavelengths)
+        d = hits.ray.d
         normal = mi.Vector3f(dr.mulsign(mi.Vector3f(si.n), -dr.dot(si.n, d)))
-        t = dr.select(met, sight.path_length + first.t, 0)
+        t = dr.select(hit, hits.path_length + first.t, 0)
         width = dr.norm(ray.o_x + t * ray.d_x - ray.o - t * ray.d)
         flags = si.bsdf().flags()
         glossy = mi.has_flag(flags, mi.BSDFFlags.Glossy) | mi.has_flag(flags, mi.BSDFFlags.Delta)
         glossy &= plain
-        lined = met & self.world.has_line_near(si, ray, d, t)
-        position = dr.select(met, mi.Vector3f(si.p), dr.nan)
+        near = hit & self.world.has_line_near(si, ray, d, t)
+        position = dr.select(hit, mi.Vector3f(si.p), dr.nan)
         return GBuffer(
-            position, normal, -d, width, color, light, through, glossy, met, lost, covered, lined
+            position,
+            normal,
+            -d,
+            width,
+            color,
+            light,
+            transmittance,
+            glossy,
+            hit,
+            lost,
+            covered,
+            near,
         )
 
     def ray(self, pixel: Any, offset: Any) -> tuple[Any, Any]:
-        """Rays with differentials through places in pixels, and what their light is weighted by."""
+        """Rays with differentials through points in pixels, and the weights of their light."""
         mi = self.mi
-        place = film_positions(mi, pixel, offset, self.size)
+        position = film_positions(mi, pixel, offset, self.size)
         return self.sensor.sample_ray_differential(
-            self.sensor.shutter_open(), 0.5, place, mi.Point2f(0.5)
+            self.sensor.shutter_open(), 0.5, position, mi.Point2f(0.5)
         )
 
     def _reflectance(self, si: Any, side: int) -> Any:
-        """Reflectance of the side that is seen (1) or the other (-1), seen straight on."""
+        """The reflectance at normal incidence of the visible side (1) or the other side (-1)."""
         mi = self.mi
         straight = mi.SurfaceInteraction3f(si)
         straight.wi = mi.Vector3f(0, 0, dr.mulsign(mi.Float(side), si.wi.z))
         return si.bsdf().eval_diffuse_reflectance(straight, si.is_valid())
 
     def _is_open(self, si: Any) -> Any:
-        """Whether it is one of our surfaces, and an open one, of which both sides can be seen."""
-        found = self.mi.Bool(False)
+        """Whether interactions are on open surfaces of harnack, of which both sides can be seen."""
+        is_open = self.mi.Bool(False)
         for carrier in self.world.proxies:
             surface = carrier.surface
             if surface.solid_range is None and not isinstance(surface.field, Solid):
-                found |= si.shape == self.mi.ShapePtr(carrier)
-        return found
+                is_open |= si.shape == self.mi.ShapePtr(carrier)
+        return is_open
 
     def shade(self, buffer: GBuffer, sky: Any) -> Any:
-        """Radiance towards the eye, and whether there is anything."""
+        """The radiance towards the eye, and 1 where anything but the environment is visible, else
+        0."""
         key = 1.0
         if self.floor is not None:
             key, above = self.floor.at(buffer.position)
@@ -357,81 +371,86 @@ class ShadedTask:
     def refine_pixels(
         self, indices: IntArray, position: FloatArray, sky: FloatArray
     ) -> tuple[npt.NDArray[np.float32], int]:
-        """Means (n, 4) of samples in chosen pixels, and how many of them were lost.
+        """The means (n, 4) of samples in pixels, and the number of samples out of steps.
 
+        indices: (n,) of the pixels, counted by rows.
         position, sky: seen by the pixels and their neighbors, (n, 5, 3) and (n, 5)
             (`neighborhood`).
         """
         mi, spp = self.mi, len(self.offsets)
         lane = dr.arange(mi.UInt32, len(indices) * spp)
-        many = dr.opaque(mi.UInt32, spp)
-        pixel = dr.gather(mi.UInt32, upload_indices(mi, indices), lane // many)
-        table = mi.Vector2f(*(upload_floats(mitsuba_backend(mi), one) for one in self.offsets.T))
-        seen = self._look(pixel, dr.gather(mi.Vector2f, table, lane % many))
-        color = self.shade(seen, _nearest_sky(mi, seen, lane // many, position, sky))
-        dr.eval(color, seen.lost)
-        return to_numpy(mean_of_blocks(color, spp)), int(dr.count(seen.lost)[0])
+        per_pixel = dr.opaque(mi.UInt32, spp)
+        pixel = dr.gather(mi.UInt32, upload_indices(mi, indices), lane // per_pixel)
+        table = mi.Vector2f(*(upload_floats(mitsuba_backend(mi), axis) for axis in self.offsets.T))
+        gbuffer = self._trace_pixels(pixel, dr.gather(mi.Vector2f, table, lane % per_pixel))
+        color = self.shade(gbuffer, _nearest_sky(mi, gbuffer, lane // per_pixel, position, sky))
+        dr.eval(color, gbuffer.lost)
+        return to_numpy(mean_of_blocks(color, spp)), int(dr.count(gbuffer.lost)[0])
 
     def neighborhood(self, indices: IntArray, *arrays: Any) -> tuple[npt.NDArray[Any], ...]:
         """Entries (n, 5, ...) of arrays of all pixels, counted by rows, at chosen pixels and their
-        four neighbors; at the picture's border some are there twice."""
+        four neighbors; at the picture's border a pixel is its own neighbor."""
         columns, rows = self.size
         x, y = indices % columns, indices // columns
         u = np.clip(x[:, None] + np.array([0, 1, -1, 0, 0]), 0, columns - 1)
         v = np.clip(y[:, None] + np.array([0, 0, 0, 1, -1]), 0, rows - 1)
-        other = upload_indices(self.mi, (v * columns + u).ravel())
-        found = [to_numpy(dr.gather(type(one), one, other)) for one in arrays]
-        return tuple(one.reshape(len(indices), 5, *one.shape[1:]) for one in found)
+        rows_of_five = upload_indices(self.mi, (v * columns + u).ravel())
+        gathered = [to_numpy(dr.gather(type(array), array, rows_of_five)) for array in arrays]
+        return tuple(array.reshape(len(indices), 5, *array.shape[1:]) for array in gathered)
 
 
-def _nearest_sky(mi: Any, seen: GBuffer, row: Any, position: FloatArray, sky: FloatArray) -> Any:
-    """The visible sky of the pixel around whose point lies nearest to the sample; row: of the
-    sample's pixel among those that were chosen."""
-    nearest, found = mi.Float(dr.inf), mi.Float(1)
+def _nearest_sky(mi: Any, samples: GBuffer, row: Any, position: FloatArray, sky: FloatArray) -> Any:
+    """The visible sky of that pixel of a neighborhood whose point lies nearest to the sample.
+
+    row: the index of the sample's pixel among the chosen pixels.
+    position, sky: as for `ShadedTask.refine_pixels`."""
+    nearest, value = mi.Float(dr.inf), mi.Float(1)
     for k in range(position.shape[1]):
-        there = dr.gather(mi.Vector3f, _of_numbers(mi, mi.Vector3f, position[:, k]), row)
-        away = dr.norm(there - seen.position)
-        nearer = away < nearest  # not where NaN: nothing is there
-        nearest = dr.select(nearer, away, nearest)
-        found = dr.select(
-            nearer, dr.gather(mi.Float, _of_numbers(mi, mi.Float, sky[:, k]), row), found
+        point = dr.gather(mi.Vector3f, _of_numbers(mi, mi.Vector3f, position[:, k]), row)
+        length = dr.norm(point - samples.position)
+        closer = length < nearest  # not where NaN: nothing is there
+        nearest = dr.select(closer, length, nearest)
+        value = dr.select(
+            closer, dr.gather(mi.Float, _of_numbers(mi, mi.Float, sky[:, k]), row), value
         )
-    return found
+    return value
 
 
 def render_shaded(
     shading: ShadedTask, executor: RenderExecutor, advance: Callable[[float], None]
 ) -> tuple[npt.NDArray[np.float32], int]:
-    """Linear sRGB radiance and, last, the part that something covers (h, w, 4); and how many rays
-    ran out of steps.
+    """The image (h, w, 4): linear sRGB radiance and, last, the covered fraction; and the number of
+    rays that ran out of steps.
 
-    executor: call methods of `shading`.
-    advance: told what part of the picture has been finished since the last call.
+    executor: calls the methods of `shading`.
+    advance: called with the fraction of the picture that has been finished since the last call.
     """
     mi, order, size = shading.mi, shading.order, shading.size
     count = len(order)
-    seen = GBuffer.nothing(mi, count)
-    parts = executor.split_range(count, _RAYS_A_BAND)
-    for (start, stop), part in zip(parts, executor.run_tasks("render_gbuffer", parts), strict=True):
-        dr.scatter(seen, part, upload_indices(mi, order[start:stop]))
-        dr.eval(seen)
+    gbuffer = GBuffer.nothing(mi, count)
+    ranges = executor.split_range(count, _RAYS_A_BAND)
+    for (start, stop), buffer in zip(
+        ranges, executor.run_tasks("render_gbuffer", ranges), strict=True
+    ):
+        dr.scatter(gbuffer, buffer, upload_indices(mi, order[start:stop]))
+        dr.eval(gbuffer)
         dr.sync_thread()
         advance(_FIRST_PASS_FRACTION * (stop - start) / count)
-    sky = ambient_visibility(mi, seen.position, seen.normal, seen.width, size)
+    sky = ambient_visibility(mi, gbuffer.position, gbuffer.normal, gbuffer.width, size)
     dr.eval(sky)
-    image = to_numpy(shading.shade(seen, sky)).reshape(*size[::-1], 4)
-    lost = int(dr.count(seen.lost)[0])
-    again = edge_pixels(tone_map(image[..., :3] + (1 - image[..., 3:]))).ravel()
-    again |= to_numpy(seen.needs_refinement)
-    edges = order[again[order]] if shading.refines else order[:0]
+    image = to_numpy(shading.shade(gbuffer, sky)).reshape(*size[::-1], 4)
+    lost = int(dr.count(gbuffer.lost)[0])
+    is_edge = edge_pixels(tone_map(image[..., :3] + (1 - image[..., 3:]))).ravel()
+    is_edge |= to_numpy(gbuffer.needs_refinement)
+    edges = order[is_edge[order]] if shading.refines else order[:0]
     pixels = image.reshape(-1, 4)
-    at_once = max(1, _RAYS_A_BAND // max(1, len(shading.offsets)))
-    chosen = [edges[start:stop] for start, stop in executor.split_range(len(edges), at_once)]
-    around = ((one, *shading.neighborhood(one, seen.position, sky)) for one in chosen)
-    for one, (color, gone) in zip(
-        chosen, executor.run_tasks("refine_pixels", list(around)), strict=True
+    limit = max(1, _RAYS_A_BAND // max(1, len(shading.offsets)))
+    batches = [edges[start:stop] for start, stop in executor.split_range(len(edges), limit)]
+    calls = ((batch, *shading.neighborhood(batch, gbuffer.position, sky)) for batch in batches)
+    for batch, (color, batch_lost) in zip(
+        batches, executor.run_tasks("refine_pixels", list(calls)), strict=True
     ):
-        pixels[one] = color + shading.share_of_first * (pixels[one] - color)
-        lost += int(gone)
-        advance((1 - _FIRST_PASS_FRACTION) * len(one) / len(edges))
+        pixels[batch] = color + shading.share_of_first * (pixels[batch] - color)
+        lost += int(batch_lost)
+        advance((1 - _FIRST_PASS_FRACTION) * len(batch) / len(edges))
     return image, lost

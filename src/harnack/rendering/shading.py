@@ -41,7 +41,7 @@ def pixel_ranges(pixels: int, step: int) -> Iterator[tuple[int, int]]:
 
 
 class RenderExecutor(Protocol):
-    """Interface to what executes the tasks of a render: this process, or a Dask cluster."""
+    """Interface to an executor of the tasks of a render: this process, or a Dask cluster."""
 
     def split_range(self, count: int, max_size: int) -> list[tuple[int, int]]:
         """Ranges (start, stop) that cover range(count), each of at most `max_size` elements."""
@@ -90,8 +90,8 @@ def upload_indices(mi: Any, pixels: IntArray) -> Any:
 
 def film_positions(mi: Any, pixel: Any, offset: Any, size: tuple[int, int]) -> Any:
     """Places on the film, in [0, 1]^2, of offsets in [0, 1]^2 within pixels counted by rows."""
-    place = mi.Vector2f(pixel % size[0], pixel // size[0]) + offset
-    return mi.Point2f(place / mi.ScalarVector2f(*size))
+    position = mi.Vector2f(pixel % size[0], pixel // size[0]) + offset
+    return mi.Point2f(position / mi.ScalarVector2f(*size))
 
 
 def grid_sample_count(spp: int) -> int:
@@ -140,7 +140,7 @@ _BELOW: Color = (0.25, 0.225, 0.20)
 _TO_KEY = np.array([-0.52, 0.62, 0.59]) / np.linalg.norm([-0.52, 0.62, 0.59])
 # The key light reaches round to where its cosine is minus this.
 _WRAP = 0.25
-# How much of the key light is taken away where the whole hemisphere is hidden.
+# The fraction of the key light that is removed if the whole hemisphere is hidden.
 _KEY_HIDDEN = 0.6
 _HIGHLIGHT = 0.22
 _SHARPNESS = 60.0
@@ -149,9 +149,9 @@ _RIM = 0.45
 _CLEAR: Color = (0.52, 0.60, 0.64)
 _METAL = 0.78
 # The side of larger values of a surface that has one color for both.
-_INSIDE: Color = (0.52, 0.60, 0.74)
-# Where a level set closes a hole of a mesh: this share of amber, or of teal on warm colors.
-_MENDED = 0.55
+_INNER_TINT: Color = (0.52, 0.60, 0.74)
+# Where a level set closes a hole of a mesh: this fraction of amber, or of teal on warm colors.
+_FILLING_TINT = 0.55
 _AMBER: Color = (0.92, 0.40, 0.06)
 _TEAL: Color = (0.05, 0.40, 0.46)
 
@@ -191,8 +191,8 @@ class StudioLight:
         key, up = _parameter(normal, self.key), _parameter(normal, self.up)
         wrapped = dr.clip((dr.dot(normal, key) + _WRAP) / (1 + _WRAP), 0, 1)
         shown = (1 - _KEY_HIDDEN * (1 - visible)) * reached
-        share = 0.5 + 0.5 * dr.dot(normal, up)
-        sky = dr.lerp(_like(color, _BELOW), _like(color, _ABOVE), share) * visible
+        fraction = 0.5 + 0.5 * dr.dot(normal, up)
+        sky = dr.lerp(_like(color, _BELOW), _like(color, _ABOVE), fraction) * visible
         radiance = color * (_like(color, _KEY) * (wrapped * shown) + sky)
         half = dr.normalize(key + eye)
         # Where the light is below the horizon there is no highlight, and no edge to it either.
@@ -203,55 +203,58 @@ class StudioLight:
 
 
 def reflectance(color: Any, painted: Any) -> Any:
-    """What a surface is drawn in, from the reflectance that its BSDF reports straight on.
+    """The color in which a surface is drawn, from the reflectance of its BSDF at normal incidence.
 
-    painted: mask of lines, which are of that reflectance, and black where it is 0.
+    painted: mask of isolines, which have this reflectance, and are black if it is 0.
     """
-    own = color
+    painted_color = color
     top = dr.max(color)
-    metal = dr.square(color / top) * _METAL  # what is seen in a mirror has met it more than once
+    metal = dr.square(color / top) * _METAL  # light in a mirror is reflected more than once
     color = dr.select(top > 1, metal, color)
-    return dr.select(painted, own, dr.select(top > 0, color, _like(color, _CLEAR)))
+    return dr.select(painted, painted_color, dr.select(top > 0, color, _like(color, _CLEAR)))
 
 
 def two_sided_color(color: Any, other: Any, inside: Any) -> Any:
     """The color of a side: the side of larger values is darker and cooler if both have one color.
 
-    inside: mask of what is seen from the side of larger values.
+    inside: mask of points that are seen from the side of larger values.
     """
     same = dr.max(dr.abs(color - other)) < 1e-4
-    return dr.select(inside & same, color * _like(color, _INSIDE), color)
+    return dr.select(inside & same, color * _like(color, _INNER_TINT), color)
 
 
 def hole_filling_tint(color: Any, is_filling: Any) -> Any:
     """The color, tinted where a level set closes a hole of a mesh."""
     tint = dr.select(color[0] > 1.6 * color[2], _like(color, _TEAL), _like(color, _AMBER))
-    return dr.select(is_filling, dr.lerp(color, tint, _MENDED), color)
+    return dr.select(is_filling, dr.lerp(color, tint, _FILLING_TINT), color)
 
 
 def _parameter(array: Any, numbers: Sequence[float]) -> Any:
-    """Numbers as a vector of the kind of another, which no kernel is compiled anew for."""
+    """Numbers as an array of the type of another array, as kernel parameters: other numbers compile
+    no other kernel."""
     vector = _like(array, numbers)
     dr.make_opaque(vector)
     return vector
 
 
 def _like(array: Any, numbers: Sequence[float]) -> Any:
-    """Numbers as an array of the kind of another."""
+    """Numbers as an array of the type of another array."""
     return type(array)(*numbers)
 
 
 # The floor's shadow.
 
-# Cells a side of a square of half this side, which holds what stands on the stage and its shadow.
+# The number of cells along a side of the shadow's square, and half its side; the square contains
+# all objects on the stage and their shadows.
 _CELLS = 64
 _REACH = 2.4
-# Rays of a cell to the key light and to the sky. Each of 4 x 4 neighboring cells has others.
+# The number of rays of a cell to the key light, and to the sky. In a block of 4 x 4 cells the rays
+# of all cells differ.
 _RAYS = 8
 _BLOCK = 4
-# The tangent of the angle that the key light seems wide, and the length of the rays.
+# The tangent of the angular radius of the key light, and the length of the rays.
 _SPREAD = 0.34
-_FAR = 3.5
+_SHADOW_RAY_LENGTH = 3.5
 # Weights of a cell and its neighbors along each axis: a block's cells count nearly alike.
 _BLUR = (0.05, 0.2, 0.25, 0.25, 0.2, 0.05)
 
@@ -281,14 +284,14 @@ class FloorShadow:
         mi = world.mi
         cell = (np.arange(_CELLS) + 0.5) / _CELLS * 2 * _REACH - _REACH
         y, x = np.meshgrid(cell, cell, indexing="ij")
-        seen = _visible_fractions(world, x, y, np.stack([_to_key(light.key), _to_sky()]))
-        image = np.stack([_blurred(part) for part in seen], axis=-1)
+        fractions = _visible_fractions(world, x, y, np.stack([_to_key(light.key), _to_sky()]))
+        image = np.stack([_blurred(fraction) for fraction in fractions], axis=-1)
         numbers = mi.Float(upload_floats(mitsuba_backend(mi), image.ravel()))
         tensor = mi.TensorXf(numbers, image.shape)
         return cls(mi, mi.Texture2f(tensor, wrap_mode=dr.WrapMode.Clamp))
 
     def at(self, position: Any) -> tuple[Any, Any]:
-        """The parts of key light and sky that reach points of the floor; 1 for other points."""
+        """The fractions of key light and sky that reach points of the floor; 1 for other points."""
         mi = self.mi
         on_floor = position.z < 0.5 * FLOOR_HEIGHT
         place = mi.Point2f(position.x, position.y) / (2 * _REACH) + 0.5
@@ -299,18 +302,18 @@ class FloorShadow:
 def _visible_fractions(
     world: ShadowCaster, x: FloatArray, y: FloatArray, towards: FloatArray
 ) -> FloatArray:
-    """What parts (k, n, n) of directions (k, 16, rays, 3) are free, seen from points of the
-    floor."""
+    """The fractions (k, n, n) of directions (k, 16, rays, 3) that are free, from points (n, n) of
+    the floor."""
     mi = world.mi
     j, i = np.indices(x.shape)
     d = towards[:, (j % _BLOCK) * _BLOCK + i % _BLOCK]
     o = np.stack([x, y, np.zeros_like(x)], axis=-1)[:, :, None]
     o = np.broadcast_to(o, d.shape)
     ray = mi.Ray3f(_vectors(mi.Point3f, o), _vectors(mi.Vector3f, d))
-    ray.maxt = mi.Float(_FAR)
+    ray.maxt = mi.Float(_SHADOW_RAY_LENGTH)
     free = to_numpy(~world.occluded(ray, mi.Bool(True)))
-    parts: FloatArray = free.reshape(d.shape[:-1]).mean(axis=-1)
-    return parts
+    fractions: FloatArray = free.reshape(d.shape[:-1]).mean(axis=-1)
+    return fractions
 
 
 def _vectors(kind: Any, rows: FloatArray) -> Any:
@@ -321,8 +324,8 @@ def _square() -> FloatArray:
     """Places (16, rays, 2) in the unit square, spread evenly (Roberts 2018)."""
     k = np.arange(_BLOCK * _BLOCK * _RAYS)
     plastic = 1.32471795724474602596  # the real root of x^3 = x + 1
-    places = np.mod(0.5 + np.outer(k, [1 / plastic, 1 / plastic**2]), 1.0)
-    return places.reshape(_RAYS, _BLOCK * _BLOCK, 2).transpose(1, 0, 2)
+    points = np.mod(0.5 + np.outer(k, [1 / plastic, 1 / plastic**2]), 1.0)
+    return points.reshape(_RAYS, _BLOCK * _BLOCK, 2).transpose(1, 0, 2)
 
 
 def _to_key(key: Any) -> FloatArray:
@@ -330,17 +333,17 @@ def _to_key(key: Any) -> FloatArray:
     axis = np.asarray(key, dtype=np.float64)
     u = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     u /= np.linalg.norm(u)
-    radius, turn = _SPREAD * np.sqrt(_square()[..., :1]), 2 * math.pi * _square()[..., 1:]
-    d = axis + radius * (np.cos(turn) * u + np.sin(turn) * np.cross(axis, u))
+    radius, angle = _SPREAD * np.sqrt(_square()[..., :1]), 2 * math.pi * _square()[..., 1:]
+    d = axis + radius * (np.cos(angle) * u + np.sin(angle) * np.cross(axis, u))
     d[..., 2] = np.maximum(d[..., 2], 0.05)  # the floor itself casts no shadow
     return d / np.linalg.norm(d, axis=-1, keepdims=True)
 
 
 def _to_sky() -> FloatArray:
     """Directions (16, rays, 3) to the sky, distributed with the cosine."""
-    s, turn = np.moveaxis(_square(), -1, 0)
+    s, angle = np.moveaxis(_square(), -1, 0)
     across = np.sqrt(s)
-    return np.stack([across * np.cos(2 * math.pi * turn), across * np.sin(2 * math.pi * turn),
+    return np.stack([across * np.cos(2 * math.pi * angle), across * np.sin(2 * math.pi * angle),
                      np.sqrt(np.maximum(1 - s, 1e-3))], axis=-1)  # fmt: skip
 
 
@@ -357,9 +360,9 @@ def _framed(image: FloatArray, width: int) -> FloatArray:
     return np.pad(image, ((0, 0), (width, width)), constant_values=1.0)
 
 
-# What is behind the surfaces.
+# Backdrops.
 
-# How much darker the wall is straight above.
+# The fraction by which the wall is darker straight above.
 _DARKER = 0.45
 FloatImage = npt.NDArray[np.float32]
 
@@ -377,13 +380,13 @@ def studio_wall(
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     pixel = dr.arange(mi.UInt32, width * height)
-    place = film_positions(mi, pixel, mi.Vector2f(0.5), (width, height))
-    ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, place, mi.Point2f(0.5))
+    position = film_positions(mi, pixel, mi.Vector2f(0.5), (width, height))
+    ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, position, mi.Point2f(0.5))
     rise = np.clip(to_numpy(ray.d)[:, 2], 0, 1) ** 0.7
-    far = distant_ground_radiance(ground.name, azimuth)
+    distant = distant_ground_radiance(ground.name, azimuth)
     if show == "shaded":
-        far = _far_shaded(mi, sensor, ground)
-    image = far * (1 - _DARKER * rise[:, None])
+        distant = _far_shaded(mi, sensor, ground)
+    image = distant * (1 - _DARKER * rise[:, None])
     return image.astype(np.float32).reshape(height, width, 3)
 
 
@@ -417,14 +420,16 @@ def backdrop_image(
 
 def _covering(mi: Any, image: FloatImage, size: tuple[int, int]) -> FloatImage:
     """The largest part of an image, around its middle, that has the shape of a picture of
-    (width, height) pixels, as large as that."""
+    (width, height) pixels, scaled to this size."""
     height, width = image.shape[:2]
     scale = max(size[0] / width, size[1] / height)
-    part = [min(round(side / scale), own) for side, own in zip(size, (width, height), strict=True)]
-    columns, rows = (max(one, 1) for one in part)
+    extent = [
+        min(round(side / scale), full) for side, full in zip(size, (width, height), strict=True)
+    ]
+    columns, rows = (max(length, 1) for length in extent)
     left, top = (width - columns) // 2, (height - rows) // 2
-    cut = np.ascontiguousarray(image[top : top + rows, left : left + columns])
+    cropped = np.ascontiguousarray(image[top : top + rows, left : left + columns])
     if (columns, rows) == size:
-        return cut
-    bitmap = mi.Bitmap(cut).resample(mi.ScalarVector2u(*size), clamp=(0.0, np.inf))
+        return cropped
+    bitmap = mi.Bitmap(cropped).resample(mi.ScalarVector2u(*size), clamp=(0.0, np.inf))
     return np.array(bitmap, dtype=np.float32)

@@ -1,4 +1,4 @@
-"""A small photo studio: ground, lights and a camera that frames what stands there; its materials.
+"""A small photo studio: ground, lights and a camera that frames the surfaces; its materials.
 
 Surfaces are scaled to a stage of radius about 1 that stands on the ground z = 0, so that lights,
 shadows and tolerances of Mitsuba's rays suit every size.
@@ -124,7 +124,7 @@ def _tinted(tint: Color, index: float = 1.5) -> Material:
 
 
 def _painted(color: Color) -> Material:
-    red, green, blue = (max(_WHITE * part, _BLACK) for part in color)
+    red, green, blue = (max(_WHITE * channel, _BLACK) for channel in color)
     return Material(_coated((red, green, blue), _PAINT))
 
 
@@ -180,17 +180,19 @@ def parse_material(material: Any, option: str = "material") -> Material:
         ) from None
 
 
-# Samples a pixel, if not said otherwise.
+# The default number of samples a pixel.
 STUDIO_SPP = 64
-# Tolerances of fitted surfaces, on the stage. Surfaces of many parts have edges inside the picture,
-# where two parts meet: hits within the tolerance of such an edge have the normal of neither.
+# Default tolerances, in the stage's unit: of surfaces, and of unions of patches. These have edges
+# inside the picture, where two patches meet: hits within the tolerance of such an edge have the
+# normal of neither.
 _TOLERANCE, _PATCH_TOLERANCE = 1e-4, 1e-5
-# The most light of one path, where white is 1.
+# The largest light of a path, where white is 1.
 _CLAMP = 2.0
-# Rays begin at most twice _NEAR before the stage. Clip distances are literals of kernels: as whole
-# multiples they are the same for almost all cameras, whose pictures so share their kernels.
-_NEAR, _FAR = 60.0, 2e4
-_FARTHEST = 5e3
+# Rays begin at most twice _NEAR_CLIP_STEP before the stage. Clip distances are literals of kernels:
+# as whole multiples they are the same for almost all cameras, whose pictures so share their
+# kernels.
+_NEAR_CLIP_STEP, _FAR_CLIP = 60.0, 2e4
+_MAX_CAMERA_DISTANCE = 5e3
 _LIGHT = GroundBackdrop("light")
 
 
@@ -198,7 +200,7 @@ _LIGHT = GroundBackdrop("light")
 class StudioObject:
     """A surface on the stage, with its material.
 
-    surface: without a tolerance, it gets one that suits the size of what is drawn.
+    surface: if it has no tolerance, it gets one that suits the size of the drawn surfaces.
     section_material: the material of the faces at which a section cuts a solid; None for that of
         the rest.
     isolines: drawn on it.
@@ -248,7 +250,9 @@ def build_studio(
     """
     backend = mitsuba_backend(mi)
     if camera.box is None:
-        points = np.concatenate([visible_points(one.surface, backend) for one in studio_objects])
+        points = np.concatenate(
+            [visible_points(element.surface, backend) for element in studio_objects]
+        )
     else:
         points = corners_of(np.array(camera.box.bounds()))
     placement = stage_placement(points, rotation_to_z_up(up))
@@ -262,20 +266,22 @@ def build_studio(
         },
         "sensor": _sensor(mi, pose, size),
     }
-    for k, one in enumerate(studio_objects):
-        surface = one.surface
+    for k, element in enumerate(studio_objects):
+        surface = element.surface
         if surface.tolerance is None:
-            close = _PATCH_TOLERANCE if surface.field.has_patches else _TOLERANCE
-            surface = replace(surface, tolerance=HitTolerance(close / placement.scale))
-        bsdf = one.material.bsdf(solid=surface.solid_range is not None, traced_light=traced_light)
-        cut = (
+            length = _PATCH_TOLERANCE if surface.field.has_patches else _TOLERANCE
+            surface = replace(surface, tolerance=HitTolerance(length / placement.scale))
+        bsdf = element.material.bsdf(
+            solid=surface.solid_range is not None, traced_light=traced_light
+        )
+        section = (
             None
-            if one.section_material is None
-            else one.section_material.bsdf(solid=True, traced_light=traced_light)
+            if element.section_material is None
+            else element.section_material.bsdf(solid=True, traced_light=traced_light)
         )
         scene[f"surface{k}"] = mitsuba_shape(
-            surface, bsdf=bsdf, to_world=placement.matrix, tint=one.material.tint, section_bsdf=cut,
-            isolines=one.isolines,
+            surface, bsdf=bsdf, to_world=placement.matrix, tint=element.material.tint,
+            section_bsdf=section, isolines=element.isolines,
         )  # fmt: skip
     has_ground = False
     if not surfaces_only:
@@ -303,28 +309,28 @@ def stage_placement(points: FloatArray, turned: FloatArray | None = None) -> Pla
     points = points @ turned.T
     lower, upper = points.min(axis=0), points.max(axis=0)
     scale = 2.0 / max(float(np.linalg.norm(upper - lower)), 1e-30)
-    foot = np.array([*(lower + upper)[:2] / 2, lower[2]])
-    return Placement(scale, turned, -scale * foot)
+    base_point = np.array([*(lower + upper)[:2] / 2, lower[2]])
+    return Placement(scale, turned, -scale * base_point)
 
 
 def _sensor(mi: Any, pose: CameraPose, size: tuple[int, int]) -> dict[str, Any]:
     # Rays begin near the stage, however far the camera is: their origins are rounded.
-    away = float(np.linalg.norm(pose.origin))
-    if away > _FARTHEST:
+    distance = float(np.linalg.norm(pose.origin))
+    if distance > _MAX_CAMERA_DISTANCE:
         raise ValueError(
-            f"the camera is {away:,.0f} times as far away as the surface is large; pictures are "
-            f"computed in single precision, which reaches to {_FARTHEST:,.0f} times"
+            f"the camera is {distance:,.0f} times as far away as the surface is large; pictures "
+            f"are computed in single precision, which reaches to {_MAX_CAMERA_DISTANCE:,.0f} times"
         )
-    look = mi.ScalarTransform4f().look_at(
+    to_world = mi.ScalarTransform4f().look_at(
         origin=pose.origin.tolist(), target=pose.target.tolist(), up=pose.up.tolist()
     )
     return {
         "type": "perspective",
         "fov": pose.fov,
         "fov_axis": "larger",
-        "near_clip": max(1e-3, _NEAR * (away // _NEAR - 1)),
-        "far_clip": _FAR,
-        "to_world": look,
+        "near_clip": max(1e-3, _NEAR_CLIP_STEP * (distance // _NEAR_CLIP_STEP - 1)),
+        "far_clip": _FAR_CLIP,
+        "to_world": to_world,
         "film": {
             "type": "hdrfilm",
             "width": size[0],

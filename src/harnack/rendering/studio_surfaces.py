@@ -87,8 +87,8 @@ def studio_objects(
         drawn = [(listed[0], {**shorthand, "level": number}) for number in levels]
     if len(names) != len(drawn):
         count = max(len(listed), len(levels))
-        each = f" or {count}, one for each {'surface' if len(listed) > 1 else 'level'}"
-        raise ValueError(f"give one material{each if count > 1 else ''}, not {len(names)}")
+        hint = f" or {count}, one for each {'surface' if len(listed) > 1 else 'level'}"
+        raise ValueError(f"give one material{hint if count > 1 else ''}, not {len(names)}")
     objects: list[StudioObject] = []
     for (element, keywords), name in zip(drawn, names, strict=True):
         material = parse_material(name)
@@ -131,7 +131,7 @@ def _thickened(surface: TracedSurface, thickness: float) -> TracedSurface:
         raise ValueError("thickness and largest exclude each other here: mesh the surface first")
     try:
         wall = mesh(surface.surface, thickness=thickness)
-        # Slivers whose area is lost in rounding say nothing of the inside.
+        # Triangles whose area is lost in rounding do not determine the inside.
         field = WindingNumber(*without_zero_area_faces(wall.vertices, wall.faces))
     except (MeshError, MeshingError) as wrong:
         raise ValueError(
@@ -149,7 +149,7 @@ def _thickened(surface: TracedSurface, thickness: float) -> TracedSurface:
 
 
 def _with_section_material(objects: list[StudioObject], material: Material) -> list[StudioObject]:
-    """The same, with a material for the faces at which sections cut solids."""
+    """The objects, with a material for the faces at which sections cut solids."""
 
     def has_faces(element: StudioObject) -> bool:
         return element.surface.section is not None and element.surface.solid_range is not None
@@ -167,11 +167,12 @@ def _with_section_material(objects: list[StudioObject], material: Material) -> l
 
 
 def _check_no_duplicates(surfaces: list[TracedSurface]) -> None:
-    """Raise ValueError for one surface that is there twice: which is seen would be an accident."""
-    for k, one in enumerate(surfaces):
-        for other in surfaces[:k]:
-            same = _is_cut_alike(one, other) and one.solid_range == other.solid_range
-            if same and _shared_levels(one, other):
+    """Raise ValueError if a surface is there twice: which of the two is seen would be an
+    accident."""
+    for k, surface in enumerate(surfaces):
+        for earlier in surfaces[:k]:
+            same = _is_cut_alike(surface, earlier) and surface.solid_range == earlier.solid_range
+            if same and _shared_levels(surface, earlier):
                 raise ValueError(
                     "a surface is drawn twice, and which is seen would be an accident. If levels "
                     "were meant for one field each: they are those of every field. Give one field "
@@ -179,37 +180,37 @@ def _check_no_duplicates(surfaces: list[TracedSurface]) -> None:
                 )
 
 
-def _shared_levels(one: TracedSurface, other: TracedSurface) -> bool:
+def _shared_levels(first: TracedSurface, second: TracedSurface) -> bool:
     """Whether two level sets of a field share a level, modulo its period."""
-    period = one.field.period
-    apart = np.subtract.outer(one.level_values, other.level_values)
+    period = first.field.period
+    gaps = np.subtract.outer(first.level_values, second.level_values)
     if period is not None:
-        apart -= period * np.round(apart / period)
-    largest = max(1.0, *(abs(level) for level in (*one.level_values, *other.level_values)))
-    return bool((np.abs(apart) <= 1e-9 * largest).any())
+        gaps -= period * np.round(gaps / period)
+    largest = max(1.0, *(abs(level) for level in (*first.level_values, *second.level_values)))
+    return bool((np.abs(gaps) <= 1e-9 * largest).any())
 
 
-def _is_cut_alike(one: TracedSurface, other: TracedSurface) -> bool:
-    """Whether both are of the same field, in the same volume."""
-    same = one.field is other.field
-    return same and one.clip == other.clip and one.section == other.section
+def _is_cut_alike(first: TracedSurface, second: TracedSurface) -> bool:
+    """Whether two surfaces are of the same field, in the same volume."""
+    same = first.field is second.field
+    return same and first.clip == second.clip and first.section == second.section
 
 
 def _boundary_tubes(
-    made: list[StudioObject], radius: Any, material: Material
+    objects: list[StudioObject], radius: Any, material: Material
 ) -> list[StudioObject]:
     """Tubes around the curves at which surfaces end."""
     if isinstance(radius, bool) or not isinstance(radius, Real) or not 0 < float(radius) < math.inf:
         raise ValueError(f"boundary_radius is a length, such as 0.03, not {radius!r}")
     tubes: list[StudioObject] = []
-    for k, one in enumerate(made):
-        curves = one.surface.field.boundary_curves
-        if any(_is_cut_alike(one.surface, other.surface) for other in made[:k]):
+    for k, element in enumerate(objects):
+        curves = element.surface.field.boundary_curves
+        if any(_is_cut_alike(element.surface, earlier.surface) for earlier in objects[:k]):
             continue  # another level of the same
         if curves:
             closed = [np.vstack([curve, curve[:1]]) for curve in curves]
             tube = traced_surface(
-                Tube.from_polylines(closed, float(radius)), clip=one.surface.clip_volume
+                Tube.from_polylines(closed, float(radius)), clip=element.surface.clip_volume
             )
             tubes.append(StudioObject(tube, material))
     if not tubes:

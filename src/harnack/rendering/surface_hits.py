@@ -64,7 +64,7 @@ class SurfaceHit:
 def intersect_surface(
     prepared: SurfaceTracer, o: Vec3, d: Vec3, t_max: Real, active: Mask
 ) -> SurfaceHit:
-    """Where rays o + t d, |d| = 1, 0 <= t <= t_max, first hit the level set.
+    """The first hits of rays o + t d, |d| = 1, 0 <= t <= t_max, with the level set.
 
     One Newton step along the ray, one evaluation there, and one projection along its gradient take
     a hit from within tolerance to the surface. The proof tells which side of the surface the ray
@@ -80,7 +80,7 @@ def intersect_surface(
         return _refine_hits(prepared, _MarchedRays(o, d, trace))
     return compute_on_active(
         trace.status == int(RayStatus.HIT),
-        lambda ended: _refine_hits(prepared, ended),
+        lambda rays: _refine_hits(prepared, rays),
         _MarchedRays(o, d, trace),
         _no_hit(prepared, trace),
     )
@@ -88,7 +88,7 @@ def intersect_surface(
 
 @dataclass(frozen=True)
 class _MarchedRays:
-    """Rays, and where they ended."""
+    """Rays, and the ends of their marches."""
 
     o: Vec3
     d: Vec3
@@ -114,50 +114,50 @@ def _no_hit(prepared: SurfaceTracer, trace: MarchResult) -> SurfaceHit:
     )
 
 
-def _refine_hits(prepared: SurfaceTracer, ended: _MarchedRays) -> SurfaceHit:
+def _refine_hits(prepared: SurfaceTracer, rays: _MarchedRays) -> SurfaceHit:
     """The `SurfaceHit` of rays, with hits refined."""
-    vector, o, d, trace = prepared.backend.Array3f, ended.o, ended.d, ended.trace
+    vector, o, d, trace = prepared.backend.Array3f, rays.o, rays.d, rays.trace
     prepared = prepared.hit_surface(trace)
-    met = trace.status == int(RayStatus.HIT)
-    smooth = met & ~trace.at_jump if prepared.field.has_jumps else met
+    is_hit = trace.status == int(RayStatus.HIT)
+    is_smooth = is_hit & ~trace.at_jump if prepared.field.has_jumps else is_hit
     gap = prepared.levels.offset_to_nearest(trace.value)
     slope = dr.dot(trace.gradient, d)
     reach = _MAX_REFINEMENT * _uncertainty(prepared, trace.gradient, trace.t, trace.value)
-    step = dr.select(smooth & (slope != 0), dr.clip(gap / slope, -reach, reach), 0)
+    step = dr.select(is_smooth & (slope != 0), dr.clip(gap / slope, -reach, reach), 0)
     # gap > 0: the level is above, so the ray comes from the side of smaller values.
     side = dr.select(gap > 0, prepared.backend.Float(1), -1)
     if trace.side is not None:  # hits at crossings are at a root
         step, side = dr.zeros(type(step)), trace.side
-    t = dr.maximum(dr.select(met, trace.t, 0) + step, 0)
+    t = dr.maximum(dr.select(is_hit, trace.t, 0) + step, 0)
     p = dr.fma(vector(t), d, o)
     if prepared.field.has_jumps:
-        sample = _sample_where(prepared, p, trace.value, d, smooth)
+        sample = _sample_where(prepared, p, trace.value, d, is_smooth)
     else:
         sample = prepared.sample(p)
     length = norm(sample.gradient)
     normal = dr.select(length > 0, sample.gradient / length, -d)
     shading = normal if sample.shading_normal is None else sample.shading_normal
     uncertainty = _uncertainty(prepared, sample.gradient, t, sample.value, sample.value_error)
-    rest = prepared.levels.offset_to_nearest(sample.value) / length
-    rest = dr.select(length > 0, dr.clip(rest, -reach, reach), 0)
-    if prepared.field.has_jumps:  # behind a sheet, the value says nothing about this surface
-        rest = dr.select(dr.abs(rest) * length <= dr.abs(gap), rest, 0)
+    correction = prepared.levels.offset_to_nearest(sample.value) / length
+    correction = dr.select(length > 0, dr.clip(correction, -reach, reach), 0)
+    if prepared.field.has_jumps:  # behind a facet, the value does not concern this surface
+        correction = dr.select(dr.abs(correction) * length <= dr.abs(gap), correction, 0)
     hit = SurfaceHit(
-        t=dr.select(met, t, trace.t),
-        is_hit=met,
+        t=dr.select(is_hit, t, trace.t),
+        is_hit=is_hit,
         is_out_of_steps=trace.status == int(RayStatus.OUT_OF_STEPS),
-        position=dr.fma(vector(rest), normal, p),
+        position=dr.fma(vector(correction), normal, p),
         normal=orient_normal(shading, d, side),
         ray_offset=RAY_OFFSET * uncertainty,
         value=sample.value,
-        evaluations=trace.evaluations + dr.select(smooth, prepared.backend.UInt32(1), 0),
-        is_hole_filling=smooth & prepared.field.has_jumps,
+        evaluations=trace.evaluations + dr.select(is_smooth, prepared.backend.UInt32(1), 0),
+        is_hole_filling=is_smooth & prepared.field.has_jumps,
         is_on_section=prepared.backend.Bool(False),
         isoline_index=prepared.backend.UInt32(0),
     )
     if not prepared.field.has_jumps:
         return hit
-    return dr.select(trace.at_jump, _on_sheet(prepared, o, d, trace, hit), hit)
+    return dr.select(trace.at_jump, _hit_on_facet(prepared, o, d, trace, hit), hit)
 
 
 def _sample_where(prepared: SurfaceTracer, p: Vec3, value: Real, d: Vec3, active: Mask) -> Sample:
@@ -182,10 +182,10 @@ def _sample_where(prepared: SurfaceTracer, p: Vec3, value: Real, d: Vec3, active
     return Sample(value, gradient, (), error, shading_normal=normal)
 
 
-def _on_sheet(
+def _hit_on_facet(
     prepared: SurfaceTracer, o: Vec3, d: Vec3, trace: MarchResult, hit: SurfaceHit
 ) -> SurfaceHit:
-    """Hits on sheets: t is exact to rounding, and so is the plane of the normal.
+    """Hits on facets: t is exact up to rounding, and so is the plane of the normal.
 
     The ray comes from the side of smaller values if it runs along the normal. The next ray keeps as
     far away as from a level set, and no less than several roundings of the position.
@@ -209,23 +209,26 @@ def _on_sheet(
 def _uncertainty(
     prepared: SurfaceTracer, gradient: Vec3, t: Real, f: Real, error: Real = 0.0
 ) -> Real:
-    """How far from the level a point may lie and still be a hit, to first order.
+    """The largest distance from the level, to first order, at which a point may be a hit.
 
-    That is the tolerance, or what rounding of f (`Sample.value_error`) amounts to if that is more;
-    the rounding of positions is far below what Mitsuba's rays keep off surfaces anyway.
+    It is the tolerance, or the distance that rounding of f (`Sample.value_error`) amounts to if
+    that is larger; the rounding of positions is far below the distance that Mitsuba's rays keep
+    from surfaces anyway.
     """
     gradient_norm = norm(gradient)
     t = dr.select(dr.isfinite(t), t, 0)
     rounding = 2 * (error + 8 * prepared.backend.machine_epsilon * dr.abs(f))
-    close = dr.maximum(prepared.tolerance.value_tolerance(gradient_norm, t), rounding)
-    return dr.select(gradient_norm > 0, close / gradient_norm, prepared.tolerance.distance)
+    value_tolerance = dr.maximum(prepared.tolerance.value_tolerance(gradient_norm, t), rounding)
+    return dr.select(
+        gradient_norm > 0, value_tolerance / gradient_norm, prepared.tolerance.distance
+    )
 
 
 def orient_normal(normal: Vec3, d: Vec3, side: Real) -> Vec3:
     """The normal, turned if need be such that side * (normal . d) > 0."""
-    along = dr.dot(normal, d)
-    turned = dr.normalize(normal + (side * _GRAZING - along) * d)
-    return dr.select(side * along >= _GRAZING, normal, turned)
+    cosine = dr.dot(normal, d)
+    tilted = dr.normalize(normal + (side * _GRAZING - cosine) * d)
+    return dr.select(side * cosine >= _GRAZING, normal, tilted)
 
 
 @dataclass(frozen=True)
@@ -261,7 +264,7 @@ class CappedSolid:
     def intersect(
         self, o: Vec3, d: Vec3, t_max: Real, active: Mask, side: Real = 0.0
     ) -> SurfaceHit:
-        """Where rays o + t d, |d| = 1, 0 <= t <= t_max, first cross the boundary of the solid.
+        """The first crossings of rays o + t d, |d| = 1, 0 <= t <= t_max, with the boundary.
 
         side: of a ray that starts at the boundary, 1 if it goes out of the solid there, -1 if it
             goes in; else 0. Such a ray starts off the boundary by a clearance. Where the solid or a
@@ -271,18 +274,18 @@ class CappedSolid:
         """
         zero = self.prepared.backend.Float(0)
         start, end = self.prepared.clip(o, d, zero, t_max)
-        through = active & (start < end)
-        start = dr.select(through, start, 0)
-        known = self.prepared.is_resolved(o, end)  # others run out of steps in `_meet_levels`
-        within = through & known & self._contains(self._at(o, d, start))
-        inside = within & (start <= 0)
-        slipped = active & known & (((side < 0) & ~inside) | ((side > 0) & inside))
-        entering = within & ~inside & ~slipped
-        met = self._meet_levels(o, d, t_max, active & ~entering & ~slipped)
-        met = replace(
-            met, evaluations=met.evaluations + type(met.evaluations)(dr.select(through, 1, 0))
+        enters = active & (start < end)
+        start = dr.select(enters, start, 0)
+        resolved = self.prepared.is_resolved(o, end)  # others run out of steps in `_meet_levels`
+        starts_inside = enters & resolved & self._contains(self._at(o, d, start))
+        inside = starts_inside & (start <= 0)
+        slipped = active & resolved & (((side < 0) & ~inside) | ((side > 0) & inside))
+        entering = starts_inside & ~inside & ~slipped
+        hit = self._meet_levels(o, d, t_max, active & ~entering & ~slipped)
+        hit = replace(
+            hit, evaluations=hit.evaluations + type(hit.evaluations)(dr.select(enters, 1, 0))
         )
-        leaving = inside & ~slipped & ~met.is_hit & ~met.is_out_of_steps & (end < t_max)
+        leaving = inside & ~slipped & ~hit.is_hit & ~hit.is_out_of_steps & (end < t_max)
         capped = entering | leaving | slipped
         t = dr.select(capped & ~slipped, dr.select(leaving, end, start), 0)
         position = self._at(o, d, t)
@@ -292,37 +295,37 @@ class CappedSolid:
             cap = orient_normal(self.prepared.volume.outward_normal(position), d, outwards)
             normal = dr.select(slipped, normal, cap)
         clearance = zero + RAY_OFFSET * self.prepared.tolerance.distance
-        cut = met.is_on_section
+        on_section = hit.is_on_section
         if self.prepared.section is not None:
             first, last = self.prepared.section.clip(o, d, zero, t_max)
-            cut = dr.select(leaving, last <= end, entering & (first >= start))
-        crossed = replace(
-            met,
+            on_section = dr.select(leaving, last <= end, entering & (first >= start))
+        cap_hit = replace(
+            hit,
             t=t,
             is_hit=capped,
             position=position,
             normal=normal,
             ray_offset=clearance,
-            is_on_section=cut,
+            is_on_section=on_section,
         )
-        return dr.select(capped, crossed, met)
+        return dr.select(capped, cap_hit, hit)
 
     def occludes(self, o: Vec3, d: Vec3, t_max: Real, active: Mask) -> Mask:
-        """Whether rays hit the boundary; those not proved to miss it count as hitting it."""
+        """Whether rays hit the boundary; rays that are not proved to miss it count as hits."""
         start, end = self.prepared.clip(o, d, self.prepared.backend.Float(0), t_max)
-        through = active & (start < end)
-        start = dr.select(through, start, 0)
-        known = self.prepared.is_resolved(o, end)
-        within = through & known & self._contains(self._at(o, d, start))
-        capped = within & ((start > 0) | (end < t_max))
+        enters = active & (start < end)
+        start = dr.select(enters, start, 0)
+        resolved = self.prepared.is_resolved(o, end)
+        starts_inside = enters & resolved & self._contains(self._at(o, d, start))
+        capped = starts_inside & ((start > 0) | (end < t_max))
         return capped | self.prepared.occluded(o, d, 0, t_max, active & ~capped)
 
     def _meet_levels(self, o: Vec3, d: Vec3, t_max: Real, active: Mask) -> SurfaceHit:
         """The first level set inside the volume, its normal turned out of the solid."""
-        met = intersect_surface(self.prepared, o, d, t_max, active)
-        at_low = dr.abs(met.value - self.low) < dr.abs(met.value - self.high)
-        normal = dr.select(at_low, -met.normal, met.normal)
-        return replace(met, normal=normal)
+        hit = intersect_surface(self.prepared, o, d, t_max, active)
+        at_low = dr.abs(hit.value - self.low) < dr.abs(hit.value - self.high)
+        normal = dr.select(at_low, -hit.normal, hit.normal)
+        return replace(hit, normal=normal)
 
     def _at(self, o: Vec3, d: Vec3, t: Real) -> Vec3:
         t = dr.select(dr.isfinite(t), t, 0)

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 # Newton steps that bring a hit from the tolerance to rounding before the derivative is taken; and
 # for sums over trees, which are then evaluated without truncation.
-_NEWTON_STEPS, _POLISH_OF_SUMS = 4, 3
+_NEWTON_STEPS, _NEWTON_STEPS_OF_SUMS = 4, 3
 
 
 # Fields without Dr.Jit numbers, which are checked only once (until an attribute is set).
@@ -113,7 +113,7 @@ def attach_derivatives(
         steps = _NEWTON_STEPS
         if prepared.field.has_variable_accuracy:
             # Truncation is as large as the tolerance, and its derivative may be much larger.
-            steps = _POLISH_OF_SUMS
+            steps = _NEWTON_STEPS_OF_SUMS
             detail = dr.select(hit, backend.Float(EXACT), 0)
             prepared = replace(prepared, field=prepared.field.at_accuracy(detail))
         for _ in range(steps):

@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 # The search distance grows by the first factor in each round, up to the second number times the
 # size of coordinates. A side of the level is sure only if f is within this fraction of the period
 # of the level, so that a jump from one period to the next is no change of sides.
-_FARTHER, _FARTHEST = 1.25, 1 / 16
-_OF_PERIOD = 0.25
+_DISTANCE_GROWTH, _MAX_DISTANCE_FRACTION = 1.25, 1 / 16
+_MAX_PERIOD_FRACTION = 0.25
 # The number of directions from a hit: both along the gradient, and both along two axes across it.
-_WAYS = 6
+_DIRECTION_COUNT = 6
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Doubtful:
 
 
 @dataclass(frozen=True)
-class _Looking:
+class _SearchState:
     """The state of the search around a hit.
 
     distance: the distance of the next sample.
@@ -92,7 +92,7 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
     at_hit = field.evaluate(hits.position)
     level = at_hit.value + levels.offset_to_nearest(at_hit.value)
     period = levels.period
-    farthest = fmax(_FARTHEST * hits.size, hits.distance)
+    farthest = fmax(_MAX_DISTANCE_FRACTION * hits.size, hits.distance)
     smallest = 4 * backend.machine_epsilon * hits.size
 
     def offset_of(sample: Any) -> tuple[Real, Real, Mask]:
@@ -104,7 +104,7 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
         if period is None:
             return x, error, dr.abs(x) > error
         x = x - period * dr.round(x / period)
-        return x, error, (dr.abs(x) > error) & (dr.abs(x) < _OF_PERIOD * period)
+        return x, error, (dr.abs(x) > error) & (dr.abs(x) < _MAX_PERIOD_FRACTION * period)
 
     normal, vector = hits.normal, backend.Array3f
     axis = dr.select(dr.abs(normal.x) < 0.6, vector(1, 0, 0), vector(0, 1, 0))
@@ -113,15 +113,15 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
     x, _, is_sure = offset_of(at_hit)
     side = dr.select(x > 0, backend.Float(1), -1)
 
-    def body(now: _Looking) -> _Looking:
-        way = dr.select(now.way < 2, hits.normal, dr.select(now.way < 4, across, second))
-        way = dr.select((now.way & 1) == 0, way, -way)
-        length = dr.select(now.searches, _between(now), now.distance)
-        sample = field.evaluate(dr.fma(type(way)(length), way, hits.position))
+    def body(now: _SearchState) -> _SearchState:
+        direction = dr.select(now.way < 2, hits.normal, dr.select(now.way < 4, across, second))
+        direction = dr.select((now.way & 1) == 0, direction, -direction)
+        length = dr.select(now.searches, _turning_point(now), now.distance)
+        sample = field.evaluate(dr.fma(type(direction)(length), direction, hits.position))
         x, error, is_sure = offset_of(sample)
         above, below = now.above | (is_sure & (x > 0)), now.below | (is_sure & (x < 0))
-        slope = side * dr.dot(sample.gradient, way)
-        first_slope = side * dr.dot(at_hit.gradient, way)
+        slope = side * dr.dot(sample.gradient, direction)
+        first_slope = side * dr.dot(at_hit.gradient, direction)
         is_seen = (above & below) | (now.searches & (dr.abs(x) <= error))
         # Does f turn back from the level in this direction?
         turns = now.may_turn & ~now.searches & (now.way < 2)
@@ -132,10 +132,10 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
         high = dr.select(is_high, length, now.high)
         goes_on = turns | (now.searches & (high - low > smallest))
         stays = goes_on & ~is_seen
-        way_index = dr.select(stays, now.way, (now.way + 1) % _WAYS)
+        way_index = dr.select(stays, now.way, (now.way + 1) % _DIRECTION_COUNT)
         is_round = ~stays & (way_index == 0)
-        distance = dr.select(is_round & ~is_seen, _FARTHER * now.distance, now.distance)
-        return _Looking(
+        distance = dr.select(is_round & ~is_seen, _DISTANCE_GROWTH * now.distance, now.distance)
+        return _SearchState(
             distance=distance,
             way=way_index,
             above=above,
@@ -152,7 +152,7 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
         )
 
     zero, yes, no = backend.Float(0), backend.Bool(True), backend.Bool(False)
-    begin = _Looking(
+    begin = _SearchState(
         hits.distance, backend.UInt32(0), is_sure & (x > 0), is_sure & (x < 0), zero, zero, zero,
         zero, no, yes, backend.UInt32(0), no, yes,
     )  # fmt: skip
@@ -160,7 +160,7 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
     return dr.select(end.seen, end.distance, dr.inf)
 
 
-def _between(now: _Looking) -> Real:
+def _turning_point(now: _SearchState) -> Real:
     """The length at which f may turn back: by the secant through the slopes and by bisection, in
     turns."""
     fraction = now.low_slope / (now.low_slope - now.high_slope)

@@ -49,7 +49,7 @@ _MAX_TURN, _MAX_STRAY, _SAMPLED_RAYS = 0.15, 0.7, 4096
 # distance is then multiplied by the third number, as where this many sheets of the surface meet. If
 # the first-order distance is more than the fourth number times the tolerance, the surface is
 # searched for instead, which takes a kernel.
-_PART, _OF_POINTS, _SHEETS, _LARGE = 0.5, 64, 3, 8
+_DOUBT_FRACTION, _DOUBT_ROUNDINGS, _SHEET_COUNT, _SEARCH_TOLERANCES = 0.5, 64, 3, 8
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,7 @@ def _trace(surface: TracedSurface, rays: RayBatch) -> Hits:
     with dr.suspend_grad():
         end, hits, doubt = _first_hits(prepared, *(dr.detach(array) for array in rays.arrays))
         if doubt is not None:
-            hits = _with_seen_distances(prepared, hits, doubt)
+            hits = _with_searched_distances(prepared, hits, doubt)
     if not rays.is_numpy and needs_derivatives(prepared, o, d):
         t, normal = attach_derivatives(prepared, o, d, end, hits.normal)
         normal, value, uncertainty = (
@@ -229,7 +229,7 @@ def _are_scattered(backend: Backend, o: Vec3, d: Vec3) -> bool:
 
 def _first_hits(
     prepared: SurfaceTracer, o: Vec3, d: Vec3, near: Real, far: Real
-) -> tuple[MarchResult, Hits, _Doubt | None]:
+) -> tuple[MarchResult, Hits, _DistanceDoubt | None]:
     """Ends of rays, the same as `Hits`, without derivatives, and the doubt about the hits; None if
     no hit can be doubtful."""
     backend = prepared.backend
@@ -249,8 +249,8 @@ def _first_hits(
     doubt = None
     # Other hits are at a root, or were tested on the other side of the level.
     if end.side is None and not prepared.field.is_steep:
-        doubt = _Doubt.of(prepared, o, end.t, length, uncertainty)
-        farther = _SHEETS * doubt.distance - doubt.tolerance
+        doubt = _DistanceDoubt.of(prepared, o, end.t, length, uncertainty)
+        farther = _SHEET_COUNT * doubt.distance - doubt.tolerance
         uncertainty = dr.select(doubt.is_doubtful, farther, uncertainty)
     position = _positions(o, d, end.t)
     hits = Hits(end.t, position, normal, end.value, end.evaluations, end.status, index, uncertainty)
@@ -261,7 +261,7 @@ def _first_hits(
 
 
 @dataclass(frozen=True)
-class _Doubt:
+class _DistanceDoubt:
     """How far the surface may be from hits because of rounding.
 
     size: a bound of the coordinates up to the hit.
@@ -278,17 +278,19 @@ class _Doubt:
     @classmethod
     def of(
         cls, prepared: SurfaceTracer, o: Vec3, t: Real, steepness: Real, uncertainty: Real
-    ) -> _Doubt:
+    ) -> _DistanceDoubt:
         """The doubt about hits. steepness: |grad f| there. uncertainty: to first order."""
         t = dr.select(dr.isfinite(t), t, 0)
         size = max_norm(o) + t
         tolerance = prepared.tolerance.value_tolerance(steepness, t) / steepness
-        limit = fmax(_PART * tolerance, _OF_POINTS * prepared.backend.machine_epsilon * size)
+        limit = fmax(
+            _DOUBT_FRACTION * tolerance, _DOUBT_ROUNDINGS * prepared.backend.machine_epsilon * size
+        )
         return cls(size, tolerance, tolerance + uncertainty, uncertainty > limit)
 
 
 @dataclass(frozen=True)
-class _Around:
+class _SearchedHits:
     """Hits around which the surface is searched for, and the index of the patch of each."""
 
     around: Doubtful
@@ -296,32 +298,35 @@ class _Around:
 
 
 @dataclass(frozen=True)
-class _Lengths:
+class _SearchDistance:
     """A length for each hit."""
 
     length: Real
 
 
-def _with_seen_distances(prepared: SurfaceTracer, hits: Hits, doubt: _Doubt) -> Hits:
+def _with_searched_distances(prepared: SurfaceTracer, hits: Hits, doubt: _DistanceDoubt) -> Hits:
     """The hits, with large uncertainties replaced by distances within which the surface was seen.
     All arrays are evaluated. If there is no large uncertainty, nothing else is computed."""
     backend, field = prepared.backend, prepared.field
-    is_far = doubt.is_doubtful & (doubt.distance > _LARGE * doubt.tolerance)
+    is_far = doubt.is_doubtful & (doubt.distance > _SEARCH_TOLERANCES * doubt.tolerance)
     has_far = dr.zeros(backend.UInt32, 1)
     dr.scatter(has_far, 1, 0, is_far)
     dr.eval(has_far, *vars(hits).values())
     if not has_far[0]:
         return hits
 
-    def search(hit: _Around) -> _Lengths:
+    def search(hit: _SearchedHits) -> _SearchDistance:
         sampled = field
         if field.has_patches:
             sampled = field.patch(dr.reinterpret_array(backend.UInt32, hit.part))
-        return _Lengths(seen_distance(backend, sampled, prepared.levels, hit.around))
+        return _SearchDistance(seen_distance(backend, sampled, prepared.levels, hit.around))
 
     doubtful = Doubtful(hits.position, hits.normal, doubt.size, doubt.distance)
     searched = compute_on_active(
-        is_far, search, _Around(doubtful, hits.primitive_index), _Lengths(doubt.distance)
+        is_far,
+        search,
+        _SearchedHits(doubtful, hits.primitive_index),
+        _SearchDistance(doubt.distance),
     )
     uncertainty = dr.select(is_far, searched.length - doubt.tolerance, hits.uncertainty)
     return replace(hits, uncertainty=uncertainty)

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 _COINCIDENT_ROUNDINGS, _MIN_COSINE, _MIN_SINE = 2.0, 0.999, 1 / 64
 # If this distance of coincidence is more than this fraction of the ray, facets that face each other
 # at the same point may be the two sides of a wall.
-_COARSE = 1e-4
+_COARSE_FRACTION = 1e-4
 
 
 @dataclass(frozen=True)
@@ -271,7 +271,7 @@ class JumpTracer:
         normal = dr.select(up, total.normal_up, dr.select(down, total.normal_down, first.normal))
         behind = JumpCrossing(total.t, total.last, first.jump, first.normal)
         unclear = total.folded & (total.jump == 0)
-        unclear &= tolerance > _COARSE * (self.end - self.start)
+        unclear &= tolerance > _COARSE_FRACTION * (self.end - self.start)
         return JumpCrossing(first.t, facet, real(total.jump), normal), behind, unclear
 
     def _next(self, behind: JumpCrossing, end: Real, active: Mask) -> JumpCrossing:

@@ -27,7 +27,7 @@ __all__ = ["CELLS_ACROSS", "largest_component_cells"]
 CELLS_ACROSS = 128
 # Centers more than the first number of cells away from the surface, to first order, are far from
 # it; the cells do not separate components if more than the second number of them are far.
-_FAR, _MOST_FAR = 4.0, 0.5
+_FAR_CELLS, _MAX_FAR_FRACTION = 4.0, 0.5
 
 _Ends: TypeAlias = tuple[float, float]
 _CELLS: FieldCache[OccupancyGrid] = FieldCache()
@@ -105,10 +105,10 @@ def _refuse_if_unproved(
     if not len(centers):
         return
     gap, slope, value = _samples(field, levels)(centers)
-    far = gap > _FAR * cells.cell_size * slope
+    far = gap > _FAR_CELLS * cells.cell_size * slope
     if solid is not None:
         far &= ~((value >= solid[0]) & (value <= solid[1]))
-    if far.sum() > _MOST_FAR * len(far):
+    if far.sum() > _MAX_FAR_FRACTION * len(far):
         raise ValueError(
             f"largest: with {round(max(cells.shape))} cells along the longest side, most cells of "
             f"this {type(field).__name__} could not be proved empty, so that its components cannot "

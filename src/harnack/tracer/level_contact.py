@@ -161,7 +161,7 @@ _MAX_BAND_OF_SPACING = 0.25
 _MAX_APPROACH = 0.5
 # A crossing is complete where f is beyond the level by this fraction of the band. The rest is the
 # gap that a ray in contact always has.
-_CROSSED = 0.5
+_CROSSED_FRACTION = 0.5
 # In contact, trials aim at where f is beyond the level by this fraction of the band: there the
 # crossing is complete, and it is clear on which side of the level f is.
 CONTACT_AIM = 0.75
@@ -171,7 +171,7 @@ CONTACT_TOLERANCE = 0.5
 # before, unless the step is at most the second number times the tolerance long.
 _MIN_BAND_RATIO, _SHORT_STEP = 0.25, 4.0
 # The number of iterations of the search for the root of a cubic.
-_ROUNDS = 4
+_ROOT_ITERATIONS = 4
 
 
 @dataclass(frozen=True)
@@ -302,8 +302,8 @@ class Hysteresis:
         period = levels.period
         spacing: Real = dr.inf if period is None else period
         for k, level in enumerate(levels.values):
-            for other in levels.values[:k]:
-                gap = dr.abs(level - other)
+            for earlier in levels.values[:k]:
+                gap = dr.abs(level - earlier)
                 if period is not None:
                     gap = gap - period * dr.floor(gap / period)
                     gap = fmin(gap, period - gap)
@@ -343,10 +343,10 @@ class Hysteresis:
         In contact the level counts as lying the fraction `part` of the band beyond its place, and
         steps end within the same fraction of half the way to the next level.
         """
-        x, far = -self.levels.offset_to_nearest(value), part * _MAX_APPROACH * self.spacing
+        x, far_gap = -self.levels.offset_to_nearest(value), part * _MAX_APPROACH * self.spacing
         band = part * band
-        below = dr.select(contact.side < 0, far, band)
-        above = dr.select(contact.side > 0, far, band)
+        below = dr.select(contact.side < 0, far_gap, band)
+        above = dr.select(contact.side > 0, far_gap, band)
         return LevelGaps(
             dr.select(contact.is_touching, fmax(below + x, 0), gaps.below),
             dr.select(contact.is_touching, fmax(above - x, 0), gaps.above),
@@ -374,7 +374,7 @@ class Hysteresis:
         # Is f far enough beyond the level to have crossed it, or has it left the band?
         is_first = (now.side == 0) & ~touching
         stays = (is_first & self.is_free_before) | (seen.is_end & self.is_free_after)
-        least_offset = dr.select(stays, 0, _CROSSED * seen.band)
+        least_offset = dr.select(stays, 0, _CROSSED_FRACTION * seen.band)
         is_off = dr.abs(x) > fmax(least_offset, seen.total_error)
         crosses = active & touching & is_off & (side * x < 0)
         settles = active & is_off & (side == 0)
@@ -409,7 +409,7 @@ class Hysteresis:
         behind = x + ahead.jump
         passes = active & (side * x > 0) & (side * behind <= 0)
         begins = active & ~now.is_touching & (dr.abs(behind) <= seen.band)
-        is_off = dr.abs(behind) > fmax(_CROSSED * seen.band, seen.total_error)
+        is_off = dr.abs(behind) > fmax(_CROSSED_FRACTION * seen.band, seen.total_error)
         crosses = active & is_off & (side * behind < 0)
         side = dr.select(is_off, dr.select(behind > 0, one, -1), side)
         at_facet = passes | begins
@@ -439,8 +439,8 @@ class Hysteresis:
         else:
             is_above = dr.select(dr.abs(x) > point.total_error, x > 0, point.slope < 0)
         # 0 stays only for a ray of which every sample so far was near a level.
-        known = (now.side != 0) | ~point.is_near
-        return dr.select(known, dr.select(is_above, type(x)(1), -1), 0)
+        is_known = (now.side != 0) | ~point.is_near
+        return dr.select(is_known, dr.select(is_above, type(x)(1), -1), 0)
 
 
 @dataclass(frozen=True)
@@ -505,7 +505,7 @@ def cubic_root(start: Real, end: Real, slope: Real, end_slope: Real) -> Any:
     c = slope + end_slope - 2 * (end - start)
     low, high = type(start)(0), type(start)(1)
     u = start / (start - end)
-    for _ in range(_ROUNDS):
+    for _ in range(_ROOT_ITERATIONS):
         value = dr.fma(dr.fma(dr.fma(c, u, b), u, slope), u, start)
         rate = dr.fma(dr.fma(3 * c, u, 2 * b), u, slope)
         before = (value > 0) == (start > 0)

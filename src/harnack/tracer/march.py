@@ -54,9 +54,9 @@ if TYPE_CHECKING:
 _REFINE_BELOW, _TRUNCATION_OF_GAP, _TRUNCATION_OF_ALLOWED = 2.0, 0.25, 0.85
 # The truncation error that is allowed at a hit: the first number times the tolerance, less the
 # second times the rounding error; or the third times the rounding error if that is larger.
-_TRUNCATION_OF_TOLERANCE, _LESS_ROUNDINGS, _TRUNCATION_OF_ROUNDING = 0.4, 0.55, 0.6
+_TRUNCATION_OF_TOLERANCE, _ROUNDING_DEDUCTION, _TRUNCATION_OF_ROUNDING = 0.4, 0.55, 0.6
 # The next sample may be so coarse that its truncation error is this fraction of the level gap.
-_COARSEN = 0.2
+_COARSE_FRACTION = 0.2
 # Trial steps are this fraction of the length at which f is predicted to reach a level: predicted by
 # a parabola, or by the slope alone.
 _TRIAL_AIM, _AIM_BY_SLOPE = 0.999, 0.99
@@ -67,7 +67,7 @@ _LARGEST_UNCERTAINTY = 1 / 16
 # larger numbers overflow.
 _MISS_EXPONENT = 0.47
 # The fraction of the level gap that is reserved for the growth of a cone during a step.
-_WIDENING = 0.1
+_GROWTH_FRACTION = 0.1
 # The accuracy scale of a repeated sample is larger by these factors at least and at most.
 _REFINEMENT_LIMITS = 1.25, 16.0
 # Truncation falls as this power of the accuracy scale; beyond the largest scale there is none.
@@ -145,13 +145,13 @@ class MarchState:
 
 @dataclass(frozen=True)
 class _TrialSample:
-    """The sample at the trial point of each ray, and what follows from it.
+    """The sample at the trial point of each ray, and quantities that are derived from it.
 
     t: ray parameter of the trial point.
     at_end: whether the ray (or the interval before the next facet) ends there.
     coordinate_size: a bound of the absolute values of the coordinates there.
     unproved_length: the length before the point that no step has proved yet.
-    look: the sample of the field there, with its enclosures.
+    on_ray: the sample of the field there, with its enclosures.
     gradient_norm: the length of the gradient there.
     gaps: from f to the levels on both sides; in contact, to the levels as the hysteresis places
         them.
@@ -166,14 +166,14 @@ class _TrialSample:
     passes_branch_level, needs_branch: the masks of `BranchTracker.gaps`; None if the sample knows
         its branch on all lanes.
     steep: bounds that rest on values of f; None for fields whose slopes are bounded.
-    looks: the number of further evaluations of f, beyond the trial point.
+    extra_evaluations: the number of further evaluations of f, beyond the trial point.
     """
 
     t: Real
     at_end: Mask
     coordinate_size: Real
     unproved_length: Real
-    look: RaySample
+    on_ray: RaySample
     gradient_norm: Real
     gaps: LevelGaps
     total_error: Real
@@ -186,12 +186,12 @@ class _TrialSample:
     passes_branch_level: Mask | None = None
     needs_branch: Mask | None = None
     steep: SteepPlace | None = None
-    looks: Any = 0
+    extra_evaluations: Any = 0
 
     @property
     def value(self) -> Real:
         """f at the points."""
-        return self.look.sample.value
+        return self.on_ray.sample.value
 
     def gaps_after_jump(self, behind: LevelGaps) -> LevelGaps:
         """The level gaps behind a facet for a field with unknown branch. A jump does not change the
@@ -339,7 +339,9 @@ class March:
 
         # The step from the trial point.
         proved = self._proved_step(trial, gaps_ahead, contact)
-        next_step = self._next_trial_step(proved, trial.look, aim_gaps, now, path, trial.is_smooth)
+        next_step = self._next_trial_step(
+            proved, trial.on_ray, aim_gaps, now, path, trial.is_smooth
+        )
         forward = proved
         if self.occupied is not None:
             forward, next_step = self._skip_empty_cells(
@@ -350,9 +352,9 @@ class March:
         is_free = self._is_free(now, trial, end, accepted, proved_step, contact)
         if jump is not None:
             is_free = dr.select(jump.has_crossing, jump.at_crossing, is_free)
-        evaluations = now.evaluations + 1 + trial.looks
+        evaluations = now.evaluations + 1 + trial.extra_evaluations
         status = self._status(is_hit, is_free)
-        gradient = dr.select(accepted, trial.look.sample.gradient, now.gradient)
+        gradient = dr.select(accepted, trial.on_ray.sample.gradient, now.gradient)
         if jump is not None:
             status, gradient = jump.mark(status, gradient)
         proved_to = dr.select(accepted, trial.t, now.proved_to)
@@ -419,7 +421,7 @@ class March:
         within = self.tolerance.value_tolerance(steepness, t)
         knows_gradient = (sample.gradient_error <= gradient_norm) | (steepness > 0)
         if self.hysteresis is not None:
-            if field.is_steep:  # or what f has to swing is more than it does
+            if field.is_steep:  # otherwise f would have to change by more than it does
                 reach = dr.fma(t, self.tolerance.per_length, self.tolerance.distance)
                 change = largest_change(field, path.point(t), sample.value, reach)
                 within = fmax(fmin(within, change), self.tolerance.value)
@@ -433,7 +435,7 @@ class March:
         if steep is not None:
             touches = steep.is_level
             is_near = (is_near | touches) & now.active & dr.isfinite(total_error)
-            is_near, evaluations = self._is_there(
+            is_near, evaluations = self._confirms_level(
                 field, path, t, ray_sample, gaps, size, is_near, touches
             )
         return _TrialSample(
@@ -441,7 +443,7 @@ class March:
             at_end=t == end,
             coordinate_size=size,
             unproved_length=unproved,
-            look=ray_sample,
+            on_ray=ray_sample,
             gradient_norm=gradient_norm,
             gaps=gaps,
             total_error=total_error,
@@ -454,10 +456,10 @@ class March:
             passes_branch_level=passes_level,
             needs_branch=is_unsure,
             steep=steep,
-            looks=evaluations,
+            extra_evaluations=evaluations,
         )
 
-    def _is_there(
+    def _confirms_level(
         self,
         field: Field,
         path: Ray,
@@ -476,7 +478,7 @@ class March:
         that rounding. It does if the enclosures prove it along the ray, or if a sample of f lies on
         the other side of the level or at it (`steep.beyond`).
 
-        may_be: whether f may equal the level up to rounding.
+        touches: whether f may equal the level up to rounding.
         """
         sample, p = ray_sample.sample, path.point(t)
         tolerance = dr.fma(t, self.tolerance.per_length, self.tolerance.distance)
@@ -485,8 +487,8 @@ class March:
         proved = gaps.nearest <= self.tolerance.value
         for enclosure in ray_sample.forward:
             proved |= enclosure.arrives(gaps, reach)
-        along = down_or_up(sample.gradient, gaps, path.direction)
-        ways = (along, safe_norm(sample.gradient)), (path.direction, ray_sample.slope)
+        toward = down_or_up(sample.gradient, gaps, path.direction)
+        ways = (toward, safe_norm(sample.gradient)), (path.direction, ray_sample.slope)
         unsure = is_near & ~proved
         passed, evaluations = beyond(
             self.backend,
@@ -508,7 +510,7 @@ class March:
         """The same sample with gaps to the levels as the hysteresis places them. The band includes
         all rounding of f, or a ray would stick in a crease."""
         band = hysteresis.band(
-            trial.value_tolerance, trial.total_error - trial.look.sample.truncation_error
+            trial.value_tolerance, trial.total_error - trial.on_ray.sample.truncation_error
         )
         may_pass = trial.accepts_unknown_side & ~contact.is_touching
         if self.levels.period is not None:  # here only the value tells the side of a level
@@ -531,15 +533,17 @@ class March:
         if self.over_relaxation > 1:
             knows_side = trial.accepts_unknown_side | (trial.gaps.nearest > trial.total_error)
             proved = any_is_free(
-                trial.look.backward, trial.gaps.reduced_by(trial.total_error), trial.unproved_length
+                trial.on_ray.backward,
+                trial.gaps.reduced_by(trial.total_error),
+                trial.unproved_length,
             )
             accepted |= knows_side & proved
-        is_known = dr.isfinite(trial.total_error)  # what is not known is not free
+        is_known = dr.isfinite(trial.total_error)  # without an error bound nothing is free
         if trial.steep is not None:  # values prove the next step
             is_known = is_known | (now.trial_step <= now.proved_step)
         if now.accuracy_scale is None or not field.has_variable_accuracy:
             return accepted & is_known, now.accuracy_scale, self.backend.Bool(False)
-        truncation, coarsest = trial.look.sample.truncation_error, field.coarsest_accuracy
+        truncation, coarsest = trial.on_ray.sample.truncation_error, field.coarsest_accuracy
         deciding = self._deciding_gap(trial.value, ahead, trial.at_end)
         accuracy = fmax(now.accuracy_scale, coarsest)
         finer, too_coarse = _refined_accuracy(
@@ -575,7 +579,7 @@ class March:
             trial.total_error > trial.value_tolerance, fmax(trial.excess, now.tolerance_excess), 0
         )
         point = AcceptedPoint(
-            trial.t, value, trial.look.sample.gradient, trial.look.slope, previous, excess,
+            trial.t, value, trial.on_ray.sample.gradient, trial.on_ray.slope, previous, excess,
             trial.total_error, trial.is_near, trial.band, is_last,
         )  # fmt: skip
         contact, crosses = hysteresis.update(contact, accepted, point)
@@ -591,12 +595,12 @@ class March:
 
     def _proved_step(self, trial: _TrialSample, gaps: LevelGaps, contact: Contact | None) -> Real:
         """The length from the trial point that is proved free of levels with these gaps."""
-        growth = _WIDENING * trial.gaps.nearest
+        growth = _GROWTH_FRACTION * trial.gaps.nearest
         if self.cone_radius is not None:
             gaps = gaps.reduced_by(growth)
-        forward = longest_free_length(trial.look.forward, gaps.reduced_by(trial.total_error))
+        forward = longest_free_length(trial.on_ray.forward, gaps.reduced_by(trial.total_error))
         if self.cone_radius is not None:
-            slope, smallest = trial.look.slope, float(dr.smallest(self.backend.Float))
+            slope, smallest = trial.on_ray.slope, float(dr.smallest(self.backend.Float))
             widening = fmax(self.cone_radius * trial.gradient_norm, smallest)
             leaving = dr.select(trial.gaps.below <= trial.gaps.above, slope, -slope)
             endless = (forward == dr.inf) & (leaving >= widening)
@@ -643,7 +647,7 @@ class March:
         # After a step of zero, the next enclosures need reach only a third as far: bisection.
         candidate = fmin(now.enclosure_reach, end - trial.t)
         shorter = dr.select(dr.isfinite(candidate), candidate / 3, 1 + 16 * trial.coordinate_size)
-        reach = dr.select(proved > 0, trial.look.reach_growth * proved, shorter)
+        reach = dr.select(proved > 0, trial.on_ray.reach_growth * proved, shorter)
         if now.contact is not None and contact is not None:  # off the surface: the whole ray again
             leaves = now.contact.is_touching & ~contact.is_touching
             reach = dr.select(leaves | is_hit, end - trial.t, reach)
@@ -765,7 +769,7 @@ def _refined_accuracy(
 ) -> tuple[Real, Mask]:
     """The accuracy scale for a repeated sample, and whether the sample of this scale is too coarse.
 
-    detail, total_error, truncation: the accuracy scale, total error and truncation error of the
+    scale, total_error, truncation: the accuracy scale, total error and truncation error of the
         sample.
     gap: the gap from f to the nearest level.
     within: the value tolerance of a hit.
@@ -778,7 +782,7 @@ def _refined_accuracy(
     """
     rounding = total_error - truncation
     allowed = fmax(
-        _TRUNCATION_OF_TOLERANCE * within - _LESS_ROUNDINGS * rounding,
+        _TRUNCATION_OF_TOLERANCE * within - _ROUNDING_DEDUCTION * rounding,
         _TRUNCATION_OF_ROUNDING * rounding,
     )
     too_coarse = (
@@ -790,7 +794,8 @@ def _refined_accuracy(
 
 
 def _next_accuracy(scale: Real, gap: Real, truncation: Real, coarsest: float) -> Real:
-    """The accuracy scale of the next sample: 0 (coarsest) or at least 1, and never above `detail`,
-    the scale of this sample. truncation, gap: of this sample."""
-    target = scale * dr.power(truncation / (_COARSEN * gap), 1 / _TRUNCATION_ORDER)
+    """The accuracy scale of the next sample: 0 (coarsest) or at least 1, and never above `scale`,
+    the accuracy scale of this sample. truncation, gap: the truncation error and the level gap of
+    this sample."""
+    target = scale * dr.power(truncation / (_COARSE_FRACTION * gap), 1 / _TRUNCATION_ORDER)
     return dr.select(target > coarsest, fmin(fmax(target, 1), scale), 0)

@@ -34,16 +34,16 @@ if TYPE_CHECKING:
 # A passage through the cover begins within the first number of radii outside of it, and ends the
 # second number of radii off the surface. Steps are aimed the third number of radii farther than the
 # end, or than a radius behind the surface.
-_WITHIN, _AWAY, _BEYOND = 0.02, 1.1, 0.05
+_START_MARGIN, _END_HEIGHT, _AIM_MARGIN = 0.02, 1.1, 0.05
 # The first number for approximate fields, whose samples cost more the more exact they are.
-_WITHIN_APPROXIMATE = 0.25
+_START_MARGIN_APPROXIMATE = 0.25
 # Steps of a passage: the shortest step and the longest first step, in radii; the longest of the
 # other steps, as a multiple of the step before.
-_SHORTEST, _FIRST, _LONGER = 0.25, 32.0, 4.0
+_MIN_STEP, _MAX_FIRST_STEP, _MAX_STEP_RATIO = 0.25, 32.0, 4.0
 # Samples of a passage; a cone that has none left counts as covered in part.
 _MAX_SAMPLES = 48
 # A number below any slope or second derivative that matters, in radii.
-_NONE = 1e-12
+_NEGLIGIBLE = 1e-12
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,9 @@ class PixelCones:
         state = MarchState.at(
             backend, start, end, active, has_detail=prepared.field.has_variable_accuracy
         )  # fmt: skip
-        margin = _WITHIN_APPROXIMATE if prepared.field.has_variable_accuracy else _WITHIN
+        margin = (
+            _START_MARGIN_APPROXIMATE if prepared.field.has_variable_accuracy else _START_MARGIN
+        )
         tolerance = PreparedHitTolerance(real(0), margin * self.radius, real(0))
         options = prepared.levels, tolerance, prepared.max_steps, prepared.over_relaxation
         march = March(backend, *options, cone_radius=self.radius)
@@ -121,15 +123,17 @@ class PixelCones:
         def body(last: _CoverState) -> _CoverState:
             t = last.t + last.step
             height, slope = sample_at(t)
-            step = _next_step(height, slope, (slope - last.slope) / last.step, _LONGER * last.step)
+            step = _next_step(
+                height, slope, (slope - last.slope) / last.step, _MAX_STEP_RATIO * last.step
+            )
             count = last.sample_count + 1
-            off = (height >= _AWAY) & (slope >= 0)
+            off = (height >= _END_HEIGHT) & (slope >= 0)
             over = (height <= -1) | off | (count >= _MAX_SAMPLES) | (t >= t_end)
-            step = fmax(step, _SHORTEST * self.radius * t)
+            step = fmax(step, _MIN_STEP * self.radius * t)
             return _CoverState(t, height, slope, step, count, last.active & ~over)
 
         height, slope = self._height(now.value, now.gradient, begin, side, level)
-        first = _next_step(height, slope, real(0), _FIRST * self.radius * begin)
+        first = _next_step(height, slope, real(0), _MAX_FIRST_STEP * self.radius * begin)
         none = backend.UInt32(0)
         passage = _CoverState(begin, height, slope, first, none, is_hit & (height > -1))
         passage = loop_while_active(passage, body, "harnack cover")
@@ -177,11 +181,13 @@ class PixelCones:
 
 def _next_step(height: Real, slope: Real, second: Real, longest: Real) -> Real:
     """The step to where the cone is predicted to be lowest, a radius behind the surface, or outside
-    of the cover, whichever comes first; bend: the second derivative of the height."""
+    of the cover, whichever comes first; second: the second derivative of the height."""
     real = cast("Any", type(height))
-    to_behind = (height + 1 + _BEYOND) / fmax(-slope, real(_NONE))
-    lowest = dr.select(second > _NONE, (1 + _BEYOND) * -slope / fmax(second, real(_NONE)), dr.inf)
-    rest = fmax(_AWAY + _BEYOND - height, real(0))
+    to_behind = (height + 1 + _AIM_MARGIN) / fmax(-slope, real(_NEGLIGIBLE))
+    lowest = dr.select(
+        second > _NEGLIGIBLE, (1 + _AIM_MARGIN) * -slope / fmax(second, real(_NEGLIGIBLE)), dr.inf
+    )
+    rest = fmax(_END_HEIGHT + _AIM_MARGIN - height, real(0))
     root = dr.sqrt(slope * slope + 2 * fmax(second, real(0)) * rest)
-    outward = 2 * rest / fmax(slope + root, real(_NONE))
+    outward = 2 * rest / fmax(slope + root, real(_NEGLIGIBLE))
     return fmin(dr.select(slope < 0, fmin(to_behind, lowest), outward), longest)

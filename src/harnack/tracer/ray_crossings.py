@@ -306,9 +306,9 @@ def trace_crossings(
         end = refuse_derivative(prepared, o, d, "traced_to", end)
     position = dr.select(dr.isfinite(t), dr.fma(backend.Array3f(t), d, o), dr.nan)
     side = backend.Int32(found.side)
-    sheet = dr.reinterpret_array(backend.Int32, found.sheet)  # NO_FACET becomes -1
+    index = dr.reinterpret_array(backend.Int32, found.sheet)  # NO_FACET becomes -1
     of_rays = found.count, end, found.status, found.evaluations
-    hits = RayCrossings(t, position, normal, sheet, side, *of_rays)
+    hits = RayCrossings(t, position, normal, index, side, *of_rays)
     dr.eval(*vars(hits).values())
     return hits
 

@@ -33,13 +33,13 @@ if TYPE_CHECKING:
 # A level may be the value of f up to rounding if its gap is at most the first number times the
 # change of f by rounding on that side, and f changes on the other side by at most the second number
 # times as much.
-_SLACK, _FAR = 1.25, 8.0
+_GAP_FACTOR, _MAX_ASYMMETRY = 1.25, 8.0
 # The number of points that are sampled without a search, the number of points after a search, the
 # largest number of samples before these, and the golden section of the search.
-_TRIALS, _SIDES, _MOST_LOOKS, _SECTION = 5, 7, 100, 0.381966
+_TRIAL_COUNT, _SIDE_COUNT, _MAX_SAMPLES, _GOLDEN_SECTION = 5, 7, 100, 0.381966
 # The range of f on a box around a point is about the range of its values if f is continuous this
 # many times as far: for x y/(x^2 + y^2), which is at most 1/2, it is then within 0.502.
-_CLEAR = 1024.0
+_CONTINUITY_FACTOR = 1024.0
 
 
 def values_between(field: Field, p: Vec3, q: Vec3, slack: Real | None = None) -> Values | None:
@@ -123,7 +123,9 @@ class SteepPlace:
         far = dr.select(is_below, above, below)
         # Steps that are shorter than a rounding of t do not advance the ray. Beside a pole f
         # changes far more on the other side.
-        is_level = (gaps.nearest <= near) | ((gaps.nearest <= _SLACK * near) & (far <= _FAR * near))
+        is_level = (gaps.nearest <= near) | (
+            (gaps.nearest <= _GAP_FACTOR * near) & (far <= _MAX_ASYMMETRY * near)
+        )
         error = near if gaps.is_one_sided else fmax(near, far)
         error = dr.select(valid & dr.isfinite(error), error, dr.inf)
         is_free = on_path.nowhere
@@ -145,7 +147,7 @@ class SteepPlace:
 
 
 @dataclass(frozen=True)
-class _Looking:
+class _SearchState:
     """The state of the test `beyond`.
 
     looks, sides: the number of samples, and of the samples after the search.
@@ -185,12 +187,12 @@ def passes(levels: Levels, value: Real, low: Real, high: Real, gaps: LevelGaps) 
 def holds(levels: Levels, value: Real, low: Real, high: Real, gaps: LevelGaps) -> Mask:
     """Whether a level lies in a range; see `passes`."""
     if levels.period is not None:
-        held = (low - value <= -gaps.below) & (high - value >= -gaps.below)
-        return held | ((low - value <= gaps.above) & (high - value >= gaps.above))
-    held: Mask = value < value
+        is_held = (low - value <= -gaps.below) & (high - value >= -gaps.below)
+        return is_held | ((low - value <= gaps.above) & (high - value >= gaps.above))
+    is_held: Mask = value < value
     for level in levels.values:
-        held |= (low <= level) & (high >= level)
-    return held
+        is_held |= (low <= level) & (high >= level)
+    return is_held
 
 
 def beyond(
@@ -228,17 +230,17 @@ def beyond(
     epsilon = float(dr.epsilon(backend.Float))
     shortest = 4 * epsilon * reach
 
-    def body(now: _Looking) -> _Looking:
+    def body(now: _SearchState) -> _SearchState:
         is_first, is_far = now.looks < 3, (now.looks == 2) | (now.looks == 4)
-        is_search = now.looks >= _TRIALS
-        is_side = is_search & ((now.high - now.low <= shortest) | (now.looks >= _MOST_LOOKS))
+        is_search = now.looks >= _TRIAL_COUNT
+        is_side = is_search & ((now.high - now.low <= shortest) | (now.looks >= _MAX_SAMPLES))
         is_behind = is_side & (now.sides == 0)
         direction = dr.select(is_first | (is_search & ~is_behind), ways[0][0], ways[1][0])
         slope = dr.abs(dr.select(is_first, ways[0][1], ways[1][1]))
         factor = dr.select(now.looks == 0, backend.Float(1), 2)
         distance = dr.select(is_far, reach, fmin(factor * gaps.nearest / slope, reach))
         behind, ahead = now.inner - now.low, now.high - now.inner
-        section = now.inner + _SECTION * dr.select(ahead >= behind, ahead, -behind)
+        section = now.inner + _GOLDEN_SECTION * dr.select(ahead >= behind, ahead, -behind)
         section = dr.select(is_behind, -reach, dr.select(is_side, now.inner, section))
         distance = dr.select(is_search, section, distance)
         side = dr.select((now.sides & 1) == 0, 0.5 * reach, -0.5 * reach)
@@ -249,7 +251,9 @@ def beyond(
         half = type(p)(*(dr.select(shortest > epsilon * dr.abs(x), shortest, 0) for x in q))
         at_q = values_between(field, q - half, q + half)
         between = values_between(field, p, q)
-        around_q = values_between(field, q - _CLEAR * half, q + _CLEAR * half)
+        around_q = values_between(
+            field, q - _CONTINUITY_FACTOR * half, q + _CONTINUITY_FACTOR * half
+        )
         if at_q is None or between is None or around_q is None:
             with without_alternatives():
                 low = high = field.evaluate(q).value
@@ -265,11 +269,13 @@ def beyond(
         gap = dr.select(dr.isfinite(nearest), nearest, dr.inf)
         now = _narrowed(now, distance, gap, is_search & ~is_side)
         passed |= now.passed
-        looks, sides = now.looks + 1, now.sides + dr.select(is_side, 1, 0)
-        active = now.active & ~passed & ((looks < _TRIALS) | (searches & (sides < _SIDES)))
-        return replace(now, looks=looks, sides=sides, passed=passed, active=active)
+        samples, sides = now.looks + 1, now.sides + dr.select(is_side, 1, 0)
+        active = (
+            now.active & ~passed & ((samples < _TRIAL_COUNT) | (searches & (sides < _SIDE_COUNT)))
+        )
+        return replace(now, looks=samples, sides=sides, passed=passed, active=active)
 
-    begin = _Looking(
+    begin = _SearchState(
         backend.UInt32(0), backend.UInt32(0), backend.Bool(False), backend.Bool(active),
         backend.Float(0), backend.Float(reach), backend.Float(0), backend.Float(gaps.nearest),
     )  # fmt: skip
@@ -277,7 +283,7 @@ def beyond(
     return end.passed, end.looks
 
 
-def _narrowed(now: _Looking, length: Real, gap: Real, is_search: Mask) -> _Looking:
+def _narrowed(now: _SearchState, length: Real, gap: Real, is_search: Mask) -> _SearchState:
     """The state of the search after a sample at another length, with its gap to a level."""
     nearer, is_farther = gap <= now.least, length > now.inner
     end, is_low = dr.select(nearer, now.inner, length), nearer == is_farther

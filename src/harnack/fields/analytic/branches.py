@@ -26,7 +26,7 @@ Complex = Any
 # not underflow.
 _MIN_DISTANCE = 1e-12
 # About the smallest number whose square, and the inverse of that, exist in single precision.
-_LEAST_SQUARED = 1e-18
+_MIN_SQUARED = 1e-18
 # The distance to the nearest singular point, if there is none.
 _NO_POINT = 2.0
 # Bounds of second derivatives are multiplied by this factor, for the rounding of logarithms and
@@ -322,7 +322,7 @@ class PowerProduct(Branches):
         unit = 4 * float(dr.epsilon(z.real))
         for a, alpha in zip(self._centers(z), self.exponents, strict=True):
             if alpha > 0 and alpha.is_integer():
-                min_distance = _LEAST_SQUARED + unit * fmax(dr.abs(a.real), dr.abs(a.imag))
+                min_distance = _MIN_SQUARED + unit * fmax(dr.abs(a.real), dr.abs(a.imag))
                 moved = type(z)(a.real + min_distance, a.imag)
                 z = dr.select(abs(z - a) < min_distance, moved, z)
         return z

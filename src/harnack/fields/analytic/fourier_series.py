@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 
 __all__ = ["FourierSeries", "SurfaceDisplacement"]
 
-_MOST_TERMS = 24
+_MAX_TERMS = 24
 # The default number of samples along a side for each term, and its minimum; the largest number of
 # samples in all.
-_SAMPLES, _LEAST_SAMPLES, _MOST_SAMPLES = 4, 64, 1 << 25
+_SAMPLES, _MIN_SAMPLES, _MAX_SAMPLES = 4, 64, 1 << 25
 # The number of points at which the error of a fit is measured; the number of Newton steps that move
 # them to the surface, and their tolerance.
 _CHECK_POINTS, _NEWTON_STEPS, _CONVERGED = 20_000, 12, 1e-9
@@ -138,10 +138,10 @@ class FourierSeries(Field):
         space = _finite_box(box)
         lower, upper = space.bounds()
         if callable(function):
-            chosen = tuple(max(_SAMPLES * n, _LEAST_SAMPLES) for n in numbers)
+            chosen = tuple(max(_SAMPLES * n, _MIN_SAMPLES) for n in numbers)
             shape = _as_triple(chosen if samples is None else samples, "samples")
-            if math.prod(shape) > _MOST_SAMPLES:
-                raise ValueError(f"{shape} samples are too many: at most {_MOST_SAMPLES} in all")
+            if math.prod(shape) > _MAX_SAMPLES:
+                raise ValueError(f"{shape} samples are too many: at most {_MAX_SAMPLES} in all")
             _check_samples(numbers, shape)
             grid = _values(function, midpoints(lower, upper, shape)).reshape(shape)
         else:
@@ -309,9 +309,9 @@ def _as_triple(numbers: Any, name: str) -> tuple[int, int, int]:
 
 
 def _check_terms(terms: tuple[int, ...]) -> None:
-    if min(terms) < 1 or max(terms) > _MOST_TERMS:
+    if min(terms) < 1 or max(terms) > _MAX_TERMS:
         raise ValueError(
-            f"terms must be 1 to {_MOST_TERMS} along each axis, not {tuple(terms)}: an evaluation "
+            f"terms must be 1 to {_MAX_TERMS} along each axis, not {tuple(terms)}: an evaluation "
             "takes about 2 K^3 products. Fit a smaller box or a smoother function instead"
         )
 

@@ -46,15 +46,15 @@ __all__ = ["HypersphericalHarmonic"]
 # Constants are increased by this fraction for the roundings of float32.
 _ROUNDING = 1e-5
 # Radii of the balls on which the Hessian is bounded, in units of sqrt(1 + |p|^2).
-_SHARES = _NEAR, _WIDE = 0.2, 0.6
+_SHARES = _SMALL_RADIUS, _LARGE_RADIUS = 0.2, 0.6
 # Near zeros of high order: the chord of the ball on the sphere, in units of the distance to the
 # zero over (order - 2); the largest radius, in units of sqrt(1 + |p|^2); and the radius of a ball
 # in space whose image lies within a chord, in units of the chord times 1 + |p|^2.
-_BESIDE, _MOST_BESIDE, _OF_CHORD = 0.5, 0.3, 0.349
+_ZERO_CHORD, _MAX_ZERO_RADIUS, _BALL_OF_CHORD = 0.5, 0.3, 0.349
 # A factor that covers terms of second order in the unit roundoff, and the rounding of the bounds.
 _SECOND_ORDER = 1.05
 # Roundings, in units of u: the relative rounding of 1/(1 + |p|^2), and the rounding of w.
-_OF_SCALE, _OF_HEIGHT = 6.0, 13.0
+_SCALE_ROUNDINGS, _HEIGHT_ROUNDINGS = 6.0, 13.0
 
 
 @dataclass(frozen=True)
@@ -188,8 +188,10 @@ class HypersphericalHarmonic(Field):
         square = dr.squared_norm(p)
         value, gradient, error, gradient_error = self._values(p, 1 + square)
         promises = (*self._remainder_near_zero(p, square), *self._curvatures(square))
-        slope = self.degree * (self._range.high - self._range.low) * (1 + _ROUNDING)
-        lipschitz = Lipschitz(slope / self._min_square(square, _WIDE), self._reach(square, _WIDE))
+        slope = self.degree * (self._known.high - self._known.low) * (1 + _ROUNDING)
+        lipschitz = Lipschitz(
+            slope / self._min_square(square, _LARGE_RADIUS), self._reach(square, _LARGE_RADIUS)
+        )
         return Sample(
             value, gradient, promises, error, gradient_error, alternative_promises=(lipschitz,)
         )
@@ -199,8 +201,9 @@ class HypersphericalHarmonic(Field):
 
         With s = 1/total, y = 2 s p, w = 1 - 2 s, f = sum of S(y) C(w): since S is homogeneous of
         degree j, grad f = 2 s (sum of C grad S + p S (2 s C' - j C)). To first order in u: y is off
-        by `_OF_SCALE` of its size, all coordinates alike, and by two roundings of each coordinate
-        (`is_divided`); w by `_OF_HEIGHT`; S, grad S and C by the errors of their recurrences.
+        by `_SCALE_ROUNDINGS` of its size, all coordinates alike, and by two roundings of each
+        coordinate (`is_divided`); w by `_HEIGHT_ROUNDINGS`; S, grad S and C by the errors of their
+        recurrences.
         """
         s = 1 / total
         y, w, size = 2 * s * p, 1 - 2 * s, dr.norm(p)
@@ -218,14 +221,14 @@ class HypersphericalHarmonic(Field):
             outer = outer + harmonic * radial
             # Rounding.
             upper, slope_max = term.value(rho, r), term.gradient(rho, r)
-            value_off = term.rounding.value(rho, r) + _OF_SCALE * term.j * upper
+            value_off = term.rounding.value(rho, r) + _SCALE_ROUNDINGS * term.j * upper
             slope_off = (
                 term.rounding.gradient(rho, r)
-                + (_OF_SCALE * max(term.j - 1, 0) + roundings) * slope_max
+                + (_SCALE_ROUNDINGS * max(term.j - 1, 0) + roundings) * slope_max
             )
-            c_off = dr.fma(_OF_HEIGHT, dr.abs(first), gegenbauer_rounding(term.n, term.k))
+            c_off = dr.fma(_HEIGHT_ROUNDINGS, dr.abs(first), gegenbauer_rounding(term.n, term.k))
             next_off = 2 * term.k * gegenbauer_rounding(term.n - 1, term.k + 1)
-            first_off = dr.fma(_OF_HEIGHT, dr.abs(second), next_off)
+            first_off = dr.fma(_HEIGHT_ROUNDINGS, dr.abs(second), next_off)
             radial_off = 2 * s * dr.fma(8.0, dr.abs(first), first_off)
             radial_off = radial_off + term.j * (c_off + 3 * dr.abs(c))
             c = dr.abs(c)
@@ -268,16 +271,16 @@ class HypersphericalHarmonic(Field):
             return ()
         y = (2 / (1 + square)) * p
         r, rho = dr.norm(y), dr.norm(type(y)(y.x, y.y, 0))
-        chord = _BESIDE / (by_center - 2) * r
+        chord = _ZERO_CHORD / (by_center - 2) * r
         if by_axis > 2:
-            chord = fmin(chord, _BESIDE / (by_axis - 2) * rho)
-        lower = self._min_square(square, _MOST_BESIDE)
+            chord = fmin(chord, _ZERO_CHORD / (by_axis - 2) * rho)
+        lower = self._min_square(square, _MAX_ZERO_RADIUS)
         root = dr.rcp(dr.sqrt(lower))
         second_max = 0 * square
         for term in self._orders:
             first, second = term.largest(rho + chord, r + chord)
             second_max = second_max + 4 * root * root * root * dr.fma(root, second, first)
-        radius = fmin(_OF_CHORD * chord * (1 + square), _MOST_BESIDE * dr.sqrt(1 + square))
+        radius = fmin(_BALL_OF_CHORD * chord * (1 + square), _MAX_ZERO_RADIUS * dr.sqrt(1 + square))
         return (TaylorRemainder(second_max * (1 + _ROUNDING), radius),)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:

@@ -107,8 +107,8 @@ class Lobes(Field):
             raise ValueError(f"part must be one of {', '.join(_PARTS)}, not {sign!r}")
         self.scale, self.part = scale, sign
         self._size: Any = self.scale
-        (first, *others) = self.weights
-        if others:
+        (first, *further) = self.weights
+        if further:
             bounds = BallRange.of(self.weights).with_spheres(self.weights, 1.0).on_ball(1.0)
         else:
             weight = self.weights[first]

@@ -101,7 +101,10 @@ def make_branches(
     if function == "asin":
         _refuse_settings('"asin"', argument=argument)
         return ArcSine()
-    inner = {complex(a): _whole(n) for a, n in ({0: 1} if argument is None else argument).items()}
+    inner = {
+        complex(a): _nonzero_integer(n)
+        for a, n in ({0: 1} if argument is None else argument).items()
+    }
     if function == "log":
         if not inner:
             raise ValueError("argument: give at least one zero or pole, such as {1: 1, -1: -1}")
@@ -158,7 +161,7 @@ def _fraction(value: Any) -> Fraction:
     return fraction
 
 
-def _whole(value: Any) -> int:
+def _nonzero_integer(value: Any) -> int:
     """A nonzero integer. Raises TypeError or ValueError for other values."""
     number = _fraction(value)
     if number.denominator != 1 or number == 0:

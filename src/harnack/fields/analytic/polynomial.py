@@ -55,7 +55,7 @@ _RADII = np.geomspace(0.1, 8.0, 200)
 # Radii of the balls on which the Hessian is bounded, by experiment: a smaller and a larger radius
 # in units of |p|/(l-2), and the smallest value of the larger radius; near an axis of high order m,
 # in units of rho/(m-2).
-_NEAR, _WIDE, _LEAST, _BESIDE_AXIS = 0.4, 0.75, 0.1, 0.5
+_SMALL_RADIUS, _LARGE_RADIUS, _MIN_LARGE_RADIUS, _AXIS_RADIUS = 0.4, 0.75, 0.1, 0.5
 # The distance to a zero of high order counts as at least this, so that no ball has the radius 0.
 _ORIGIN = 1e-9
 
@@ -147,9 +147,9 @@ class HarmonicPromises:
         radii = [dr.inf]  # where the Hessian is constant
         if self.degree > 2:
             scale = r / (self.degree - 2)
-            radii = [_NEAR * scale, fmax(_WIDE * scale, _LEAST)]
+            radii = [_SMALL_RADIUS * scale, fmax(_LARGE_RADIUS * scale, _MIN_LARGE_RADIUS)]
             if self.axial is not None:
-                radii.insert(0, fmin(rho * (_BESIDE_AXIS / (self.order - 2)), radii[0]))
+                radii.insert(0, fmin(rho * (_AXIS_RADIUS / (self.order - 2)), radii[0]))
         return [TaylorRemainder(self._curvature(rho, r, radius), radius) for radius in radii]
 
     def _curvature(self, rho: Real, r: Real, radius: Real) -> Real:
@@ -167,7 +167,7 @@ class HarmonicPromises:
         else None."""
         if self.lowest_degree < 3:
             return None
-        radius = fmax(r * (_WIDE / (self.degree - 2)), _LEAST)
+        radius = fmax(r * (_LARGE_RADIUS / (self.degree - 2)), _MIN_LARGE_RADIUS)
         constant = self.ball_range.gradient(r + radius)
         if self.axial is not None:
             constant = fmin(constant, self.axial[1](rho + radius, r + radius))

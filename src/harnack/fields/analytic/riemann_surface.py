@@ -209,7 +209,7 @@ class RiemannSurface(Field):
         return abs(self.height) * self.branches.max_abs(middle, reach)
 
     def evaluate(self, p: Vec3) -> Sample:
-        local = self._place(p)
+        local = self._point_branches(p)
         sample = self._sample(local)
         clearance = self.branches.clearance(local.z)
         radius = _DISK * fmin(clearance, _LONGEST)
@@ -252,7 +252,7 @@ class RiemannSurface(Field):
         p, d = path.point(t), path.direction
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return path.enclose(self.evaluate(p))
-        local = self._place(p)
+        local = self._point_branches(p)
         sample = self._sample(local)
         slope = local.sign * local.nearest.slope(d)
         projection = complex_of(d.x, d.y)
@@ -336,7 +336,7 @@ class RiemannSurface(Field):
             values.append(_BranchValue(phi, x, y, side))
         return values + neighbors
 
-    def _place(self, p: Vec3) -> _PointBranches:
+    def _point_branches(self, p: Vec3) -> _PointBranches:
         """All branches at a point, with the bounds of their errors."""
         rounding = self._rounding(p)
         z = self.branches.move_off_singularities(complex_of(p.x, p.y), rounding)

@@ -235,7 +235,7 @@ class WaveRounding:
     @classmethod
     def of(cls, terms: Sequence[Term]) -> WaveRounding:
         """The rounding of the operations of `evaluate_terms`."""
-        common = [_common(terms, axis) for axis in range(3)]
+        common = [_shared_frequency(terms, axis) for axis in range(3)]
         value, gradient, total_slopes, second = ([0.0] * 4 for _ in range(4))
         sizes, slopes, seconds = 0.0, 0.0, 0.0
         for n, term in enumerate(terms):
@@ -290,7 +290,7 @@ def _vector(term: Term) -> tuple[float, ...]:
     return tuple(factor.frequency for _, factor in term.factors)
 
 
-def _common(terms: Sequence[Term], axis: int) -> float | None:
+def _shared_frequency(terms: Sequence[Term], axis: int) -> float | None:
     """The |frequency| that all terms share along an axis; None if there are several."""
     frequencies: set[float] = set()
     for term in terms:

@@ -97,7 +97,7 @@ def value_at(kernel: BlobKernel, backend: Backend, p: Vec3, for_each: ForEach) -
 
     def body(row: list[Real], state: State) -> State:
         inverse, amplitude = row[6], row[7]
-        v = _from(p, row) * inverse
+        v = _vector_to_center(p, row) * inverse
         return _add_value(kernel, v, inverse, amplitude, state)
 
     state = for_each(body, tuple(real(0) for _ in range(_VALUE_STATE_SIZE)))
@@ -126,7 +126,7 @@ def sum_along(
     def body(row: list[Real], state: State) -> State:
         start, sums = state[:_VALUE_STATE_SIZE], list(state[_VALUE_STATE_SIZE:])
         inverse, amplitude = row[6], row[7]
-        v = _from(p, row) * inverse
+        v = _vector_to_center(p, row) * inverse
         start = _add_value(kernel, v, inverse, amplitude, start)
 
         t = dr.dot(v, d)
@@ -150,7 +150,7 @@ def sum_along(
             b = clamp(positions[k + 1], -chord.half_length, chord.half_length)
             first_b, second_b = kernel.derivatives(height, inside, b)
             slopes = _slopes(chord, a, b, first_a, first_b)
-            bends = _bends(chord, a, b, second_a, second_b)
+            bends = _second_derivative_range(chord, a, b, second_a, second_b)
             if jumps:
                 bends = _with_jumps(bends, inside, margin, positions[k], positions[k + 1])
             for index, (lower, upper), scale in ((0, slopes, slope_scale), (2, bends, bend_scale)):
@@ -195,7 +195,7 @@ def hessian_at(kernel: BlobKernel, backend: Backend, p: Vec3, for_each: ForEach)
 
     def body(row: list[Real], state: State) -> State:
         inverse, amplitude = row[6], row[7]
-        v = _from(p, row) * inverse
+        v = _vector_to_center(p, row) * inverse
         q = dr.dot(v, v)
         scale = amplitude * inverse * inverse
         diagonal = 2 * scale * kernel.profile(q)[1]
@@ -247,7 +247,7 @@ def _value(kernel: BlobKernel, backend: Backend, state: State) -> SumValue:
     return SumValue(value, backend.Array3f(x, y, z), error, gradient_error)
 
 
-def _from(p: Vec3, row: list[Real]) -> Vec3:
+def _vector_to_center(p: Vec3, row: list[Real]) -> Vec3:
     """The vector from p to the center of a blob."""
     return type(p)(*((row[k] - p[k]) + row[3 + k] for k in range(3)))
 
@@ -260,7 +260,9 @@ def _slopes(chord: ChordProfile, a: Real, b: Real, at_a: Real, at_b: Real) -> tu
     return lower, dr.select(rises, chord.steepest, fmax(at_a, at_b))
 
 
-def _bends(chord: ChordProfile, a: Real, b: Real, at_a: Real, at_b: Real) -> tuple[Real, Real]:
+def _second_derivative_range(
+    chord: ChordProfile, a: Real, b: Real, at_a: Real, at_b: Real
+) -> tuple[Real, Real]:
     """The range of the second derivative between a and b."""
     center = (a <= 0) & (b >= 0)
     right = (a <= chord.max_curvature_position) & (b >= chord.max_curvature_position)

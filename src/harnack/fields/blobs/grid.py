@@ -31,7 +31,7 @@ _MARGIN = 1 / 4
 _AT_ONCE = 4_000_000
 # The maximal number of cells, and of entries of all lists for each blob; beyond these, cells become
 # larger.
-_MOST_CELLS, _MOST_ENTRIES = 1 << 24, 200.0
+_MAX_CELLS, _MAX_ENTRIES = 1 << 24, 200.0
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class CellLists(GridData):
             origin = origin.astype(np.float64)
             counts = np.ceil((upper + 2 * margin - origin) / size)
             entries = float(((2 * supports / size + 1.1) ** 3).sum())
-            too_large = counts.prod() > _MOST_CELLS or entries > _MOST_ENTRIES * len(supports)
+            too_large = counts.prod() > _MAX_CELLS or entries > _MAX_ENTRIES * len(supports)
             if not too_large or counts.max() == 1:
                 break
             size *= 1.25

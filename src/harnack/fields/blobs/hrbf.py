@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 
 # The maximal number of points: the linear system has four unknowns for each point.
-_MOST_POINTS = 5000
+_MAX_POINTS = 5000
 # The domain is the box around the points, with this fraction of its size added on each side.
 _MARGIN = 0.25
 
@@ -374,8 +374,8 @@ def _checked(points: Any, normals: Any) -> tuple[FloatArray, FloatArray]:
     """
     x = as_real_array(points, "points").astype(np.float64)
     check_vectors(x, "points")
-    if not 2 <= len(x) <= _MOST_POINTS:
-        raise ValueError(f"points: {len(x):,} given, but 2 to {_MOST_POINTS:,} can be used")
+    if not 2 <= len(x) <= _MAX_POINTS:
+        raise ValueError(f"points: {len(x):,} given, but 2 to {_MAX_POINTS:,} can be used")
     check_finite(x, "point {}", ValueError)
     check_coordinate_size(x, ValueError)
     n = as_real_array(normals, "normals").astype(np.float64)

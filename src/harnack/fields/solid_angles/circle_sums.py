@@ -342,7 +342,7 @@ class CircleSet:
             # All points of the circle are equally far from the axis: any direction in the plane is
             # right.
             length = dr.norm(relative.outward)
-            perpendicular = dr.normalize(_across(vector, relative.normal))
+            perpendicular = dr.normalize(_perpendicular(vector, relative.normal))
             radial = dr.select(length > 0, relative.outward / length, perpendicular)
             point = dr.fma(vector(relative.a), radial, vector(*row[:3]))
             square = dr.squared_norm(x - point)
@@ -366,7 +366,7 @@ class CircleSet:
         return _RelativeCircle(a, normal, outward, UnitCircle.at(dr.norm(outward) / a, height / a))
 
 
-def _across(vector: Any, n: Vec3) -> Vec3:
+def _perpendicular(vector: Any, n: Vec3) -> Vec3:
     """A vector at right angles to n whose length is not small."""
     is_flat = dr.abs(n.z) < 0.7
     return dr.select(is_flat, vector(-n.y, n.x, 0), vector(0, -n.z, n.y))

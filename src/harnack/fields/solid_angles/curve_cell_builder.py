@@ -55,7 +55,7 @@ _GRID_STEP = 2.0**-8
 # than this fraction count as far as well.
 _SLACK = 1e-3
 # The largest number of records of near edges, so that single precision holds their indices.
-_MOST_RECORDS = 2**24
+_MAX_RECORDS = 2**24
 
 
 def build_curve_cells(
@@ -138,7 +138,7 @@ class _CurveCellBuilder:
             split = np.flatnonzero(~is_leaf)
             self.nodes.append(encode_nodes(is_leaf, self.leaves - int(is_leaf.sum()), splits))
             splits += len(split)
-            if self.size > most_bytes or self.near_record_count >= _MOST_RECORDS:
+            if self.size > most_bytes or self.near_record_count >= _MAX_RECORDS:
                 return False
             if not len(split):
                 break

@@ -57,10 +57,10 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
     from harnack.tree import BalancedTree
 
-# Cells pay from `_PAYS` rays per point and `_LEAST_RAYS` rays on, and up to `_MOST_POINTS` points:
+# Cells pay from `_PAYS` rays per point and `_LEAST_RAYS` rays on, and up to `_MAX_POINTS` points:
 # to build them takes as long as to trace about 6 rays per point without them. Smaller cells, in
 # which a ray takes two thirds of the time, pay from `_FINER_PAYS` rays per point on.
-_PAYS, _LEAST_RAYS, _MOST_POINTS = 7, 100_000, 200_000
+_PAYS, _LEAST_RAYS, _MAX_POINTS = 7, 100_000, 200_000
 _FINER_PAYS = 60
 # A point counts as near if the squared distance is less than this fraction of its area.
 _SINGLE_POINT = 0.04
@@ -217,8 +217,8 @@ _VALUES, _TRACED = 2.0, 4.0
 # The smallest smoothing length, as a fraction of half the size of the cloud; the largest number of
 # points from which the level is computed; the smallest valid level, as a fraction of 2 pi if areas
 # are estimated, and as a number otherwise.
-_LEAST_SMOOTHING, _MAX_LEVEL_SAMPLES = 1e-5, 10_000
-_LEAST_PART, _LEAST_LEVEL = 0.1, 1e-3
+_MIN_SMOOTHING, _MAX_LEVEL_SAMPLES = 1e-5, 10_000
+_MIN_PART, _MIN_LEVEL = 0.1, 1e-3
 # A tenth of the points may be off a smoothed surface by this fraction of the cloud's longest side.
 _FAR_OF_SIZE = 0.04
 
@@ -349,18 +349,18 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
     def _median_level(self) -> float:
         """The median of the smoothed sum at the points, or at a sample of the points if there are
         many."""
-        if not _LEAST_SMOOTHING <= self.smoothing / self._size <= 1:
+        if not _MIN_SMOOTHING <= self.smoothing / self._size <= 1:
             raise ValueError(
                 f"smoothing={self.smoothing:g} is a length in the unit of the points, whose cloud "
                 f"is about {2 * self._size:.2g} across: give one between "
-                f"{_LEAST_SMOOTHING * self._size:.2g} and {self._size:.2g}, such as the length of "
+                f"{_MIN_SMOOTHING * self._size:.2g} and {self._size:.2g}, such as the length of "
                 "the noise"
             )
         samples = self.points[:: -(-len(self.points) // _MAX_LEVEL_SAMPLES)]
         values = np.asarray(self.value(samples, precision="double"))
         level = float(np.median(values))
         # Areas from the user may stand for other things than a surface.
-        min_level = _LEAST_PART * 2 * math.pi if self.is_estimated[1] else _LEAST_LEVEL
+        min_level = _MIN_PART * 2 * math.pi if self.is_estimated[1] else _MIN_LEVEL
         if not abs(level) >= min_level:
             raise CloudError(
                 f"the smoothed sum is {level:.2g} at the points, where it should be about 2 pi: "
@@ -472,7 +472,7 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         return 1.001 * (float(np.abs(unit).max()) + reach)
 
     def cells_pay_from(self) -> float:
-        is_small = len(self.points) <= _MOST_POINTS and not self.smoothing
+        is_small = len(self.points) <= _MAX_POINTS and not self.smoothing
         return max(_LEAST_RAYS, _PAYS * len(self.points)) if is_small else math.inf
 
     def finer_cells_pay_from(self) -> float:

@@ -69,7 +69,7 @@ if TYPE_CHECKING:
 # Factors k of `dipole_expansion`, by experiment: for cells that are not split, and for cells that
 # are, whose far primitives count in all cells inside them. The second factor is larger, as each
 # level of cells adds to the truncation.
-_NEAR, _SHARED = 2.5, 4.0
+_NEAR, _SHARED_FACTOR = 2.5, 4.0
 # Nodes of the tree with a radius up to this fraction of the radius of a cell's ball are left to the
 # cells inside it.
 _SMALL_NODE_RATIO = 0.35
@@ -277,7 +277,9 @@ def build_cells(
         pending: list[PendingSources] = []
         for cells in _chunks(split):
             inner, c = sources.subset(double, cells), to_vector3(double, level.centers[cells])
-            sums, rest = inner.split_far(packed, c, radius, _SHARED, _SMALL_NODE_RATIO * radius)
+            sums, rest = inner.split_far(
+                packed, c, radius, _SHARED_FACTOR, _SMALL_NODE_RATIO * radius
+            )
             split_sums.append(sums.plus(parents.of(cells)))
             pending.append(rest)
         if len(split):

@@ -96,9 +96,9 @@ class EdgeRuns:
         cell = 8 * parent[repeated] + np.repeat(np.arange(8), count)
         order = np.argsort(cell, kind="stable")
         rows = np.flatnonzero(is_chosen)[repeated[order]]
-        return self._some(rows, cell[order])
+        return self._select_runs(rows, cell[order])
 
-    def _some(self, rows: IntArray, cell: IntArray) -> EdgeRuns:
+    def _select_runs(self, rows: IntArray, cell: IntArray) -> EdgeRuns:
         """The runs at these rows, of the cells `cell`."""
         return EdgeRuns(
             cell, self.first[rows], self.count[rows], self.is_whole[rows], self.apex[rows]

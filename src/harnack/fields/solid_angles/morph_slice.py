@@ -285,7 +285,7 @@ MOST_POINTS = 4_000_000
 
 _SMALLEST_LEVEL = 1e-6
 # The largest number of cells that are tested in one round for an extent.
-_MOST_CELLS = 40_000
+_MAX_CELLS = 40_000
 # The number of cells of the grid along its longest side, by experiment.
 _ACROSS = 128
 
@@ -406,7 +406,7 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
             reach = 1.0001 * self._size * math.sqrt(weight / min(abs(level) for level in levels))
             low, high = self._box
             self._extents[levels] = tight_extent(
-                self, levels, low - reach, high + reach, _MOST_CELLS
+                self, levels, low - reach, high + reach, _MAX_CELLS
             )
         return self._extents[levels]
 

@@ -257,8 +257,8 @@ def _leaves(
     def sum_up(source: _DipolePrimitive, *parts: Real) -> tuple[Any, ...]:
         for dipole in source.dipoles:
             offsets = [(weight, point - center) for weight, point in dipole.points]
-            more = _powers(dr.norm(dipole.normal), offsets) + _flat(
-                _spread_out(dipole.normal, offsets)
+            more = _powers(dr.norm(dipole.normal), offsets) + _as_real_list(
+                _spread_dipole_moments(dipole.normal, offsets)
             )
             parts = tuple(a + b for a, b in zip(parts, more, strict=True))
         return parts
@@ -295,7 +295,7 @@ def _powers(area: Real, points: Sequence[tuple[float, Vec3]]) -> list[Real]:
     return total
 
 
-def _spread_out(normal: Vec3, points: Sequence[tuple[float, Vec3]]) -> Pairs:
+def _spread_dipole_moments(normal: Vec3, points: Sequence[tuple[float, Vec3]]) -> Pairs:
     """The moments of a dipole that is spread over points with weights."""
     means: Pairs = {}
     for weight, d in points:
@@ -305,7 +305,7 @@ def _spread_out(normal: Vec3, points: Sequence[tuple[float, Vec3]]) -> Pairs:
     return dipole_moments(means, normal.x, normal.y, normal.z)
 
 
-def _flat(moments: Pairs) -> list[Any]:
+def _as_real_list(moments: Pairs) -> list[Any]:
     """Real and imaginary parts, in the order of `_PARTS`."""
     return [moments[l, m][part] for l, m, part in _PARTS]
 
@@ -334,7 +334,7 @@ def _parents(
     pairs: Pairs = dict.fromkeys(MOMENT_KEYS, (0.0, 0.0))
     for (l, m, part), values in zip(_PARTS, parts, strict=True):
         pairs[l, m] = (pairs[l, m][0], values) if part else (values, 0.0)
-    shifted = _flat(
+    shifted = _as_real_list(
         multipole_to_multipole(pairs, *(upload_floats(backend, column) for column in shift.T))
     )
     dr.eval(*shifted)
@@ -345,13 +345,15 @@ def _parents(
     dr.eval(*sums)
     second, third, fourth = (
         column.reshape(count, arity, *column.shape[1:]).sum(axis=1)
-        for column in _moved(below, shift)
+        for column in _shifted_moments(below, shift)
     )
     radius, moments = _bounding_radius(center, low, high), _moments_of(sums)
     return NodeMoments(center, radius, area, second, third, fourth, moments), sums
 
 
-def _moved(level: NodeMoments, s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _shifted_moments(
+    level: NodeMoments, s: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Second, third and fourth moments about center - s, that is, with d + s for d. About its own
     center a node's first moment is 0."""
     a, square = level.area[:, None], (s * s).sum(axis=1)

@@ -33,12 +33,12 @@ _ROUNDING = 1e-7
 # Centers of triangles are within this fraction of the longest edge from the surface; of triangles
 # that `mesh` makes within a twentieth.
 _FLAT = 0.1
-# Of at most `_MOST` vertices and centers, the fraction `_NEARLY_ALL` has to be near the surface;
-# the first `_FIRST` points decide most meshes.
-_MOST, _NEARLY_ALL, _FIRST = 400, 0.99, 1
-# At `_COUNTED` points the sum over all triangles is compared, within the fraction `_SAME` of a
-# turn.
-_COUNTED, _SAME = 8, 0.25
+# Of at most `_MAX_POINTS` vertices and centers, the fraction `_MIN_NEAR_FRACTION` has to be near
+# the surface; the first `_FIRST_POINTS` points decide most meshes.
+_MAX_POINTS, _MIN_NEAR_FRACTION, _FIRST_POINTS = 400, 0.99, 1
+# At `_COMPARED_POINTS` points the sum over all triangles is compared, within the fraction
+# `_MAX_WINDING_DIFFERENCE` of a turn.
+_COMPARED_POINTS, _MAX_WINDING_DIFFERENCE = 8, 0.25
 _AT_ONCE = 1 << 20
 # The apex of the triangles of all edges: a direction that edges are not likely to have.
 _APEX: FloatArray = np.array([0.3017, 0.5043, 0.8091]) / math.sqrt(
@@ -66,7 +66,7 @@ def lies_on_own_level(mesh: WindingMesh, level: float) -> bool:
     edges = x[mesh.singular_edges]
     corners = mesh.corners
     is_filled = inner.any()
-    points = _some(x[inner] if is_filled else corners.mean(axis=1), _MOST)
+    points = _evenly_spaced_rows(x[inner] if is_filled else corners.mean(axis=1), _MAX_POINTS)
     # In units in which the mesh has a size of one to two.
     limit = 2 * _ON_SURFACE if is_filled else _ROUNDING
 
@@ -74,19 +74,26 @@ def lies_on_own_level(mesh: WindingMesh, level: float) -> bool:
         gap, distance = _offsets(edges, queries, level)
         return (distance if is_filled else gap) < limit
 
-    if not is_on(points[:_FIRST]).all() or np.mean(is_on(points)) < _NEARLY_ALL:
+    if not is_on(points[:_FIRST_POINTS]).all() or np.mean(is_on(points)) < _MIN_NEAR_FRACTION:
         return False
-    corners = _some(corners, _MOST)
+    corners = _evenly_spaced_rows(corners, _MAX_POINTS)
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     _, far = _offsets(edges, corners.mean(axis=1), level)
-    if np.mean(far < _FLAT * longest) < _NEARLY_ALL:
+    if np.mean(far < _FLAT * longest) < _MIN_NEAR_FRACTION:
         return False
     # The mean of w on both sides, where w is the level, and the level plus or minus 1.
-    mean = np.array([_mean_winding(mesh.corners, point) for point in _some(points, _COUNTED)])
-    return any(bool((np.abs(mean - level - side) < _SAME).all()) for side in (-0.5, 0.5))
+    mean = np.array(
+        [
+            _mean_winding(mesh.corners, point)
+            for point in _evenly_spaced_rows(points, _COMPARED_POINTS)
+        ]
+    )
+    return any(
+        bool((np.abs(mean - level - side) < _MAX_WINDING_DIFFERENCE).all()) for side in (-0.5, 0.5)
+    )
 
 
-def _some(rows: FloatArray, max_count: int) -> FloatArray:
+def _evenly_spaced_rows(rows: FloatArray, max_count: int) -> FloatArray:
     """At most `max_count` rows, evenly spaced."""
     return rows[:: -(-len(rows) // max_count)]
 

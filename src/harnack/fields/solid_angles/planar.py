@@ -44,9 +44,9 @@ __all__ = ["PlanarRegion", "planar_region"]
 
 # All relative to the size of the curves.
 _FLAT = 1e-12  # the largest distance of a vertex from the plane
-_APART = 1e-6  # the least distance of two loops
+_MIN_LOOP_DISTANCE = 1e-6  # the least distance of two loops
 _TILT = 1e-6  # the largest slope of a loop's own plane, relative to the size of the loop
-_MOST_VERTICES = 2048  # the tests take quadratic time
+_MAX_VERTICES = 2048  # the tests take quadratic time
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ def planar_region(loops: Loops, circles: Sequence[Circle]) -> PlanarRegion | Non
     to each other than 1e-6 of it, have winding numbers other than 0 and 1 (or 0 and -1), or have
     more than 2048 vertices.
     """
-    if sum(map(len, loops)) > _MOST_VERTICES or len(loops) + len(circles) > _MOST_VERTICES // 8:
+    if sum(map(len, loops)) > _MAX_VERTICES or len(loops) + len(circles) > _MAX_VERTICES // 8:
         return None
     plane = _plane_of(loops, circles)
     if plane is None:
@@ -193,11 +193,11 @@ def _plane_of(
 
 
 def _are_separated(first: _PlanarLoop, second: _PlanarLoop) -> bool:
-    """Whether two loops are at least _APART from each other."""
+    """Whether two loops are at least _MIN_LOOP_DISTANCE from each other."""
     if first.radius > 0 and second.radius > 0:
         distance = float(np.linalg.norm(first.points[0] - second.points[0]))
         outer_gap = distance - (first.radius + second.radius)
-        return max(outer_gap, abs(first.radius - second.radius) - distance) >= _APART
+        return max(outer_gap, abs(first.radius - second.radius) - distance) >= _MIN_LOOP_DISTANCE
     if second.radius > 0:
         first, second = second, first
     p, q = second.points, np.roll(second.points, -1, axis=0)
@@ -206,13 +206,16 @@ def _are_separated(first: _PlanarLoop, second: _PlanarLoop) -> bool:
         fraction = np.clip((offset * e).sum(axis=1) / (e * e).sum(axis=1), 0, 1)
         nearest = float(np.linalg.norm(offset - fraction[:, None] * e, axis=1).min())
         farthest = float(np.linalg.norm(offset, axis=1).max())
-        return nearest - first.radius >= _APART or first.radius - farthest >= _APART
+        return (
+            nearest - first.radius >= _MIN_LOOP_DISTANCE
+            or first.radius - farthest >= _MIN_LOOP_DISTANCE
+        )
     edges_a, edges_b = (
         _embed_in_space(x.points, np.roll(x.points, -1, axis=0)) for x in (first, second)
     )
     for a, b in zip(*edges_a, strict=True):
         repeated = (np.broadcast_to(end, edges_b[0].shape) for end in (a, b))
-        if not segment_distance_lower_bound(*repeated, *edges_b).min() >= _APART:
+        if not segment_distance_lower_bound(*repeated, *edges_b).min() >= _MIN_LOOP_DISTANCE:
             return False
     return True
 

@@ -49,7 +49,7 @@ PERIOD = 4 * math.pi
 # The number of edges of a record, which is fixed so that all meshes share kernels.
 EDGES_PER_RECORD = 4
 # Records are counted in floats; single precision holds no larger integers without gaps.
-_MOST_RECORDS = 2**24
+_MAX_RECORDS = 2**24
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class FaceLoops:
         counts = np.bincount(faces.face_of_loop, -(-faces.loop_sizes // EDGES_PER_RECORD)).astype(
             np.int64
         )
-        if counts.sum() >= _MOST_RECORDS:
+        if counts.sum() >= _MAX_RECORDS:
             raise ValueError(
                 f"{len(x):,} corners of faces are too many: cut the mesh into parts, and give "
                 "them as a list to draw"
@@ -185,8 +185,8 @@ class FaceSolidAngle(Field):
 
 
 # All cells are split `_MIN_DEPTH` times, cells at the sides of a box up to `_MAX_DEPTH` times; in
-# at most `_ROUNDS` rounds, and for at most `_MOST_PAIRS` pairs of an edge and a cell.
-_MIN_DEPTH, _MAX_DEPTH, _ROUNDS, _MOST_PAIRS = 2, 7, 24, 30_000_000
+# at most `_ROUNDS` rounds, and for at most `_MAX_PAIRS` pairs of an edge and a cell.
+_MIN_DEPTH, _MAX_DEPTH, _ROUNDS, _MAX_PAIRS = 2, 7, 24, 30_000_000
 # Boxes are enlarged by this fraction of the size of a face.
 _SLACK = 1e-4
 _CORNERS = np.array(list(itertools.product((0, 1), repeat=3)), dtype=np.float64)
@@ -235,7 +235,7 @@ def _carve_boxes(
             rows = np.searchsorted(carved, cells.face)
             is_split = cells.touch(low[rows], high[rows], sides) & (cells.depth < _MAX_DEPTH)
         pairs += 8 * int(corners[cells.face[is_split]].sum())
-        if not is_split.any() or pairs > _MOST_PAIRS:
+        if not is_split.any() or pairs > _MAX_PAIRS:
             break
         octants = cells.subset(is_split).split(sides)
         size = octants.sizes(sides)

@@ -63,7 +63,7 @@ _BALL_SHRINKAGE = 0.1
 _MIN_ACCEPTANCE = 1.5
 # For the default level: the number of pairs of a point and a dipole, and the largest and the
 # smallest number of points.
-_PAIRS, _MOST_PROBES, _LEAST_PROBES = 8_000_000, 512, 24
+_PAIRS, _MAX_PROBES, _MIN_PROBES = 8_000_000, 512, 24
 
 
 class YukawaKernel(RadialKernel):
@@ -178,7 +178,7 @@ def mean_at_dipoles(rows: FloatArray, kappa: float) -> float:
     """The mean of w over the dipoles, or a sample of them, weighted, each without the dipoles at
     its own position."""
     n = len(rows)
-    count = min(n, max(_LEAST_PROBES, min(_MOST_PROBES, _PAIRS // n)))
+    count = min(n, max(_MIN_PROBES, min(_MAX_PROBES, _PAIRS // n)))
     probes = np.unique(np.linspace(0, n - 1, count).astype(np.int64))
     x, y, z, *moment = np.ascontiguousarray(rows[:, :6].T)
     values: list[float] = []
@@ -196,9 +196,9 @@ def mean_at_dipoles(rows: FloatArray, kappa: float) -> float:
 MethodName = Literal["auto", "sum", "tree"]
 
 # The largest number of dipoles for which the direct sum is faster than a tree.
-_MOST_SUMMED = 2000
+_MAX_SUMMED = 2000
 # The largest number of cells that are tested in one round for an extent.
-_MOST_CELLS = 4096
+_MAX_CELLS = 4096
 _SMALLEST_LEVEL = 1e-20
 # Nearer to a dipole than `_ON_DIPOLE` roundings w may be any number up to `_ANY_LEVEL`.
 _ON_DIPOLE, _ANY_LEVEL = 32, 1e5
@@ -277,7 +277,7 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
             areas = estimate_areas(points, normals)
         self._set_points(*validate_cloud(points, normals, areas))
         self.length, self.accuracy = float(length), float(accuracy)
-        is_small = len(self.points) <= _MOST_SUMMED
+        is_small = len(self.points) <= _MAX_SUMMED
         self.method: Literal["sum", "tree"] = (
             ("sum" if is_small else "tree") if method == "auto" else method
         )
@@ -430,7 +430,7 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
             low, high = (reach, high) if inside else (low, reach)
         reach = 1.001 * high * self._size
         lower, upper = self.points.min(axis=0) - reach, self.points.max(axis=0) + reach
-        return tight_extent(self, levels, lower, upper, _MOST_CELLS)
+        return tight_extent(self, levels, lower, upper, _MAX_CELLS)
 
     def describe(self) -> dict[str, Any]:
         return {

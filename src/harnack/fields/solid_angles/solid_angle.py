@@ -71,14 +71,14 @@ _PERIOD = 4 * math.pi
 # Levels nearer than this to a multiple of 4 pi count as such a multiple.
 _LEVEL_MARGIN = 1e-9 * _PERIOD
 # The largest number of pairs of a cell and a vertex in one round for an extent.
-_MOST_PAIRS = 3_000_000
+_MAX_PAIRS = 3_000_000
 # Sides of the polygons that stand for circles where a boundary is drawn.
 _SIDES = 256
 # Cells pay if the number of rays times the number of edges is at least `_PAYS`, and there are at
-# least `_LEAST_RAYS` rays and `_LEAST_EDGES` edges. To trace these takes five times as long as to
+# least `_LEAST_RAYS` rays and `_MIN_EDGES` edges. To trace these takes five times as long as to
 # build the cells of a knot; the cells of a tangle of a thousand edges take ten times as long as
 # those of a knot.
-_PAYS, _LEAST_RAYS, _LEAST_EDGES = 2.5e8, 1e6, 48
+_PAYS, _LEAST_RAYS, _MIN_EDGES = 2.5e8, 1e6, 48
 # The largest number of planes of the extent of a curve in convex position with cells, by
 # experiment: with hundreds, clipping rays takes longer than the march.
 _MAX_PLANES = 48
@@ -532,7 +532,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         loops = [*self._net_loops, *self._net_circles]
         proved = self._without_cells if self.lift_bound_option != "paper" else SolidAngle(loops)
         vertices = sum(map(len, self._net_loops)) + 3 * len(self._net_circles)
-        return tight_extent(proved, levels, lower, upper, max(8, _MOST_PAIRS // vertices))
+        return tight_extent(proved, levels, lower, upper, max(8, _MAX_PAIRS // vertices))
 
     def with_cells(self, cells: bool = True) -> Self:
         field = super().with_cells(cells)
@@ -542,7 +542,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
     def cells_pay_from(self) -> float:
         edges = sum(map(len, self._net_loops))
         is_fixed = not self._differentiable_loops and self.lift_bound_option != "paper"
-        never_pays = not is_fixed or edges < _LEAST_EDGES
+        never_pays = not is_fixed or edges < _MIN_EDGES
         return math.inf if never_pays else max(_LEAST_RAYS, _PAYS / edges)
 
     def describe(self) -> dict[str, Any]:

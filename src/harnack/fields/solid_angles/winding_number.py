@@ -65,7 +65,7 @@ __all__ = ["WindingModuloOne", "winding_box", "winding_cells", "winding_extent"]
 
 # The largest number of cells that are tested in one round for an extent, and the number of times
 # that the box is halved.
-_MOST_CELLS = 20_000
+_MAX_CELLS = 20_000
 _FINEST = 6
 # The number of cells of the grid along its longest side, by experiment.
 _CELLS_ACROSS = 192
@@ -143,7 +143,7 @@ def winding_extent(
     corners = mesh.vertices[mesh.faces].reshape(-1, 3)
     lower, upper = box.bounds()
     return tight_extent(
-        WindingModuloOne(winding), levels, lower, upper, _MOST_CELLS, _FINEST, corners
+        WindingModuloOne(winding), levels, lower, upper, _MAX_CELLS, _FINEST, corners
     )
 
 
@@ -176,12 +176,12 @@ MethodName = Literal["auto", "exact", "tree"]
 
 # Up to this number of boundary edges the exact method is used: an edge costs about a nanosecond, a
 # tree two to three microseconds.
-_MOST_EDGES = 2048
+_MAX_EXACT_EDGES = 2048
 # With fewer edges samples cost so little that cells do not pay.
-_FEW_EDGES = 64
-# Cells pay from `_PAYS` rays per edge and `_LEAST_RAYS` rays on, for at most `_MOST_IN_CELLS`
+_MIN_CELL_EDGES = 64
+# Cells pay from `_PAYS` rays per edge and `_LEAST_RAYS` rays on, for at most `_MAX_CELL_EDGES`
 # edges.
-_PAYS, _LEAST_RAYS, _MOST_IN_CELLS = 3.0, 5e3, 100_000
+_PAYS, _LEAST_RAYS, _MAX_CELL_EDGES = 3.0, 5e3, 100_000
 # With more edges than `_SOUP_RATIO` times the triangles the mesh is a soup, whose cells sum over
 # near triangles, not edges; they pay from `_SOUP_PAYS` rays per triangle on, for at most
 # `_MOST_OF_SOUP` triangles.
@@ -264,7 +264,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
             raise ValueError(f"accuracy must lie between 1.5 and 100, not {accuracy}")
         order = as_integer_in_range(order, "order", 0, 2)
         self._mesh = WindingMesh.of(vertices, faces)
-        has_few_edges = len(self.mesh.singular_edges) <= _MOST_EDGES
+        has_few_edges = len(self.mesh.singular_edges) <= _MAX_EXACT_EDGES
         self._method: Literal["exact", "tree"] = (
             ("exact" if has_few_edges else "tree") if method == "auto" else method
         )
@@ -417,13 +417,13 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         if self._is_soup:
             is_small = triangles <= _MOST_OF_SOUP
             return max(_LEAST_RAYS, _SOUP_PAYS * triangles) if is_small else math.inf
-        pays = _FEW_EDGES <= edges <= _MOST_IN_CELLS
+        pays = _MIN_CELL_EDGES <= edges <= _MAX_CELL_EDGES
         return max(_LEAST_RAYS, _PAYS * edges) if pays else math.inf
 
     def occupied_cells(self, levels: tuple[float, ...]) -> OccupancyGrid | None:
         """Cells by `winding_cells`, if there are many edges, for the exact method or with FMM
         cells."""
-        is_small = len(self.mesh.singular_edges) < _FEW_EDGES
+        is_small = len(self.mesh.singular_edges) < _MIN_CELL_EDGES
         if (
             is_small
             or self.is_of_sheets_alone(levels)

@@ -206,7 +206,7 @@ class TreeWinding:
         return LiftedSums(sums, LiftedProduct(*product)).total()
 
     def _near_sums(
-        self, x: Vec3, detail: Real, adder: Callable[[Real], AddPrimitive], own: tuple[Any, ...],
+        self, x: Vec3, detail: Real, adder: Callable[[Real], AddPrimitive], state: tuple[Any, ...],
         where: Mask, derivatives: int = 1,
     ) -> tuple[SourceSums, tuple[Any, ...]]:  # fmt: skip
         """The sums, and the caller's own state, by the cells if there are cells, the detail is at
@@ -216,10 +216,10 @@ class TreeWinding:
         """
         if self.cells is None or derivatives == 2:
             add = adder(self.clusters.acceptance_ratio(detail))
-            return self.clusters.sums(x, detail, add, own, where, derivatives=derivatives)
+            return self.clusters.sums(x, detail, add, state, where, derivatives=derivatives)
         acceptance = self.clusters.acceptance_ratio(fmax(detail, self.backend.Float(1)))
         adders = adder(self.backend.Float(TRIANGLE_RATIO)), adder(acceptance)
-        return self.cells.sums_with_tree(self.clusters, x, detail, adders, own, where)
+        return self.cells.sums_with_tree(self.clusters, x, detail, adders, state, where)
 
     def crossings_ahead(self, frame: RayFrame, t: Real, active: Mask) -> Real:
         """0: this method does not count crossings along rays, as every sum gives all of w."""

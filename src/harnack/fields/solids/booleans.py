@@ -76,79 +76,87 @@ class BooleanSolid(Solid):
     is_union: bool
 
     def __post_init__(self) -> None:
-        domains = list(dict.fromkeys(part.domain for part in self.parts if part.domain is not None))
+        domains = list(
+            dict.fromkeys(operand.domain for operand in self.parts if operand.domain is not None)
+        )
         domain = None
         if domains:
             domain = domains[0] if len(domains) == 1 else VolumeIntersection(domains)
         object.__setattr__(self, "domain", domain)
         object.__setattr__(
-            self, "has_variable_accuracy", any(part.has_variable_accuracy for part in self.parts)
+            self,
+            "has_variable_accuracy",
+            any(operand.has_variable_accuracy for operand in self.parts),
         )
-        coarsest = min((part.coarsest_accuracy for part in self.parts), default=1.0)
+        coarsest = min((operand.coarsest_accuracy for operand in self.parts), default=1.0)
         object.__setattr__(self, "coarsest_accuracy", coarsest)
         # An operand that proves nothing looking back would refuse all longer steps.
         object.__setattr__(
-            self, "over_relaxation", min(part.over_relaxation for part in self.parts)
+            self, "over_relaxation", min(operand.over_relaxation for operand in self.parts)
         )
         object.__setattr__(self, "min_wavelength", min_wavelength(self.parts))
-        constants = [part.lipschitz for part in self.parts]
-        all_known = all(part is not None for part in constants)
+        constants = [operand.lipschitz for operand in self.parts]
+        all_known = all(constant is not None for constant in constants)
         object.__setattr__(self, "lipschitz", max(constants) if all_known else None)
 
     def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
-        return BooleanSolid(tuple(part.map_operands(change) for part in self.parts), self.is_union)
+        return BooleanSolid(
+            tuple(operand.map_operands(change) for operand in self.parts), self.is_union
+        )
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
-        extents = [part.sublevel_extent(level, above=above) for part in self.parts]
-        bounded = [part for part in extents if part is not None]
+        extents = [operand.sublevel_extent(level, above=above) for operand in self.parts]
+        bounded = [extent for extent in extents if extent is not None]
         if self.is_union == above:
             return VolumeIntersection(bounded) if len(bounded) > 1 else next(iter(bounded), None)
         if len(bounded) < len(extents):
             return None
-        return _around(bounded)
+        return _enclosing_box(bounded)
 
     @property
     def is_steep(self) -> bool:
-        return any(part.is_steep for part in self.parts)
+        return any(operand.is_steep for operand in self.parts)
 
     def prepare(self, backend: Backend) -> Solid:
-        return self._of([part.prepare(backend) for part in self.parts])
+        return self._of([operand.prepare(backend) for operand in self.parts])
 
     def at_accuracy(self, detail: Real) -> Field:
-        return self._of([part.at_accuracy(detail) for part in self.parts])
+        return self._of([operand.at_accuracy(detail) for operand in self.parts])
 
     def for_ray_count(self, count: int) -> Field:
-        def make(parts: list[Any]) -> Solid:
-            return BooleanSolid(tuple(parts), self.is_union)
+        def make(operands: list[Any]) -> Solid:
+            return BooleanSolid(tuple(operands), self.is_union)
 
         return self._for_rays(self.parts, count, make)
 
-    def _of(self, parts: list[Field]) -> Solid:
+    def _of(self, operands: list[Field]) -> Solid:
         """The same combination of other operands, which need not be solids."""
         combination = copy.copy(self)
-        object.__setattr__(combination, "parts", tuple(parts))
+        object.__setattr__(combination, "parts", tuple(operands))
         return combination
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        values = [part.formula(x, y, z) for part in self.parts]
+        values = [operand.formula(x, y, z) for operand in self.parts]
         if len(values) == 1:
             return values[0]
         return minimum(*values) if self.is_union else maximum(*values)
 
     def evaluate(self, p: Vec3) -> Sample:
-        samples = [part.evaluate(p) for part in self.parts]
+        samples = [operand.evaluate(p) for operand in self.parts]
         return self._combine_samples(samples, max_norm(p))[0]
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         extreme: Any = None
         rows: Any = None
-        for part in self.parts:
-            value, part_rows = part.evaluate(p).value, part.hessian(p)
+        for operand in self.parts:
+            value, operand_rows = operand.evaluate(p).value, operand.hessian(p)
             if rows is None:
-                extreme, rows = value, part_rows
+                extreme, rows = value, operand_rows
                 continue
             is_chosen = (value < extreme) if self.is_union else (value > extreme)
-            rows = tuple(dr.select(is_chosen, a, b) for a, b in zip(part_rows, rows, strict=True))
+            rows = tuple(
+                dr.select(is_chosen, a, b) for a, b in zip(operand_rows, rows, strict=True)
+            )
             extreme = dr.select(is_chosen, value, extreme)
         return rows
 
@@ -160,12 +168,12 @@ class BooleanSolid(Solid):
         sign = -1.0 if self.is_union else 1.0
         total_error = value_error_bound(sample, safe_norm(sample.gradient), size)
         count, max_first, max_second = 0 * p.x, 0 * p.x, 0 * p.x
-        for part in self.parts:
-            operand = part.evaluate(p)
-            error = value_error_bound(operand, safe_norm(operand.gradient), size)
-            is_open = ~(sign * (sample.value - operand.value) > error + total_error)
+        for operand in self.parts:
+            operand_sample = operand.evaluate(p)
+            error = value_error_bound(operand_sample, safe_norm(operand_sample.gradient), size)
+            is_open = ~(sign * (sample.value - operand_sample.value) > error + total_error)
             count = count + dr.select(is_open, 1.0, 0.0)
-            first, second = part.derivative_errors(p, operand)
+            first, second = operand.derivative_errors(p, operand_sample)
             # NaN is kept, as it bounds nothing.
             max_first = dr.select(is_open & ~(first <= max_first), first, max_first)
             max_second = dr.select(is_open & ~(second <= max_second), second, max_second)
@@ -174,17 +182,19 @@ class BooleanSolid(Solid):
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         """The ray sample of the combination, from those of all operands, by `MaximumEnclosure`."""
-        looks = [operand.sample_ray(path, t, ahead, back) for operand in self.parts]
+        ray_samples = [operand.sample_ray(path, t, ahead, back) for operand in self.parts]
         size = max_norm(path.origin) + t
-        sample, below, extreme = self._combine_samples([operand.sample for operand in looks], size)
-        slope, slope_error = looks[-1].slope, looks[-1].slope_error_bound
-        for look in looks[:-1]:
-            is_chosen = look.sample.value == extreme
-            slope = dr.select(is_chosen, look.slope, slope)
-            slope_error = dr.select(is_chosen, look.slope_error_bound, slope_error)
-        front = self._enclosures([operand.forward for operand in looks], below)
-        behind = self._enclosures([operand.backward for operand in looks], below)
-        growth = max(operand.reach_growth for operand in looks)
+        sample, below, extreme = self._combine_samples(
+            [ray_sample.sample for ray_sample in ray_samples], size
+        )
+        slope, slope_error = ray_samples[-1].slope, ray_samples[-1].slope_error_bound
+        for ray_sample in ray_samples[:-1]:
+            is_chosen = ray_sample.sample.value == extreme
+            slope = dr.select(is_chosen, ray_sample.slope, slope)
+            slope_error = dr.select(is_chosen, ray_sample.slope_error_bound, slope_error)
+        front = self._enclosures([ray_sample.forward for ray_sample in ray_samples], below)
+        behind = self._enclosures([ray_sample.backward for ray_sample in ray_samples], below)
+        growth = max(ray_sample.reach_growth for ray_sample in ray_samples)
         return RaySample(sample, front, behind, slope, growth, slope_error)
 
     def _enclosures(
@@ -283,7 +293,8 @@ class BooleanSolid(Solid):
 def min_wavelength(parts: Iterable[Solid]) -> float | None:
     """The smallest `Field.min_wavelength` of any of the fields; None if no field has it."""
     return min(
-        (part.min_wavelength for part in parts if part.min_wavelength is not None), default=None
+        (operand.min_wavelength for operand in parts if operand.min_wavelength is not None),
+        default=None,
     )
 
 
@@ -295,7 +306,7 @@ def lipschitz_of(sample: Sample) -> Lipschitz | None:
     return next(stated, None) or next((promise for promise in implied if promise is not None), None)
 
 
-def _around(volumes: list[Volume]) -> Volume | None:
+def _enclosing_box(volumes: list[Volume]) -> Volume | None:
     """A box around volumes; a volume itself if it is alone; None if they are unbounded."""
     corners = [volume.bounds() for volume in volumes]
     lower = np.min([volume for volume, _ in corners], axis=0)
@@ -428,12 +439,12 @@ class BlendedSolid(FormulaSolid):
                 bound = "above 0" if least == 0.0 else f"of at least {least:g}"
                 raise ValueError(f"{name} must be a number {bound}, not {value!r}")
             object.__setattr__(self, name, float(value))
-        for part in self.parts:
-            if not isinstance(part, Solid):  # pyright: ignore[reportUnnecessaryIsInstance]
-                raise TypeError(not_a_solid(part))
-            part.formula(*probe_jets())  # raises TypeError for a solid without a formula
-        constants = [part.lipschitz for part in self.parts]
-        all_known = all(part is not None for part in constants)
+        for operand in self.parts:
+            if not isinstance(operand, Solid):  # pyright: ignore[reportUnnecessaryIsInstance]
+                raise TypeError(not_a_solid(operand))
+            operand.formula(*probe_jets())  # raises TypeError for a solid without a formula
+        constants = [operand.lipschitz for operand in self.parts]
+        all_known = all(constant is not None for constant in constants)
         lipschitz = 2 ** (1 / self.power) * max(constants) * (1 + 1e-6) if all_known else None
         object.__setattr__(self, "lipschitz", lipschitz)
         object.__setattr__(self, "min_wavelength", min_wavelength(self.parts))
@@ -464,14 +475,14 @@ class BlendedSolid(FormulaSolid):
         return self.radius - (self.radius - level) / 2 ** (1 / self.power) * (1 - 1e-9)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        a, b = (part.formula(x, y, z) for part in self.parts)
+        a, b = (operand.formula(x, y, z) for operand in self.parts)
         blend = blend_union if self.is_union else blend_intersection
         return blend(a, b, self.radius, self.power)
 
     def prepare(self, backend: Backend) -> Solid:
         prepared = copy.copy(self)
-        parts = tuple(part.prepare(backend) for part in self.parts)
-        object.__setattr__(prepared, "parts", parts)
+        operands = tuple(operand.prepare(backend) for operand in self.parts)
+        object.__setattr__(prepared, "parts", operands)
         # The power stays a literal: the ranges of x^p depend on the kind of number that p is.
         object.__setattr__(prepared, "radius", prepare_value(self.radius, backend))
         return prepared

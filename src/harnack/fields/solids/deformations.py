@@ -133,7 +133,7 @@ class Twist(Deformation):
         u, v, w = _axis_last((x, y, z), self.axis)
         angle = w * self.rate
         c, s = cos(angle), sin(angle)
-        return _turned_back((u * c + v * s, v * c - u * s, w), self.axis)
+        return _restore_axes((u * c + v * s, v * c - u * s, w), self.axis)
 
     def volume(self, volume: Volume | None) -> Volume | None:
         cylinder = _cylinder(volume, self.axis)
@@ -197,7 +197,7 @@ class Taper(Deformation):
         (a, r), (b, s) = self.start, self.end
         fraction = minimum(maximum((w - a) * (1.0 / (b - a)), 0.0), 1.0)
         inverse = 1.0 / (fraction * (s - r) + r)
-        return _turned_back((u * inverse, v * inverse, w), self.axis)
+        return _restore_axes((u * inverse, v * inverse, w), self.axis)
 
     def volume(self, volume: Volume | None) -> Volume | None:
         cylinder = _cylinder(volume, self.axis)
@@ -231,7 +231,7 @@ def _axis_last(p: tuple[Any, Any, Any], axis: str) -> tuple[Any, Any, Any]:
     return p[(k + 1) % 3], p[(k + 2) % 3], p[k]
 
 
-def _turned_back(p: tuple[Any, Any, Any], axis: str) -> tuple[Any, Any, Any]:
+def _restore_axes(p: tuple[Any, Any, Any], axis: str) -> tuple[Any, Any, Any]:
     """The coordinates in the order x, y, z, from `_axis_last`'s order."""
     k = AXES[axis]
     x, y, z = (p[(i - k - 1) % 3] for i in range(3))

@@ -140,7 +140,7 @@ class Extrusion(Solid):
             for a, b in zip(x.first_derivatives, y.first_derivatives, strict=True)
         ]
         gradient = cast("Any", type(p))(*(zero + component.midpoint for component in slopes))
-        stretch, radius = solid._stretch(p)
+        stretch, radius = solid._local_lipschitz_ball(p)
         error = (
             sum((component.radius for component in slopes), zero) + side.gradient_error * stretch
         )
@@ -178,9 +178,9 @@ class Extrusion(Solid):
             sample = self.evaluate(p)
             min_norm = self._least_slope(sample)
             speed = _on(self, p)._speed(p, d, fmin(ahead, 2 * dr.abs(sample.value)))
-            look = path.enclose(replace(sample, ray_promises=(speed,)))
+            ray_sample = path.enclose(replace(sample, ray_promises=(speed,)))
             # The speed has no bound looking back.
-            return replace(look, backward=(), min_gradient_norm=min_norm)
+            return replace(ray_sample, backward=(), min_gradient_norm=min_norm)
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return path.enclose(self.evaluate(p))
         solid = _on(self, p)
@@ -233,7 +233,7 @@ class Extrusion(Solid):
         (promise,) = sample.promises
         return _MIN_GRADIENT / (max(1.0, self.taper) * cast("Lipschitz", promise).constant)
 
-    def _stretch(self, p: Vec3) -> tuple[Real, Real]:
+    def _local_lipschitz_ball(self, p: Vec3) -> tuple[Real, Real]:
         """A Lipschitz constant of `_local` on a ball about p, and the radius of that ball."""
         taper, twist = cast("Any", self)._tapering, cast("Any", self)._turning
         constant, radius = 0 * p.x + 1, 0 * p.x + dr.inf
@@ -297,26 +297,26 @@ class ExtrusionEnclosure(Enclosure):
             self.value - end_distance + self.error,
             self.value - self.side.value + self.error,
         )
-        down = fmax(gaps.below, self._fall(gaps.below - below))
+        down = fmax(gaps.below, self._length_of_fall(gaps.below - below))
         aside = gaps.below - beside
         down = fmax(dr.select(aside > 0, self.side.free_length(LevelGaps(aside, inf)), 0), down)
         inside = self.value + gaps.above + self.error <= 0  # also for unrounded numbers
         error = 2 * self.error
         up = fmin(
-            self._rise(gaps.above + below - error),
+            self._length_of_rise(gaps.above + below - error),
             self.side.free_length(LevelGaps(inf, fmax(gaps.above + beside - error, 0))),
         )
         up = fmax(gaps.above, dr.select(inside, up, 0))
         is_valid = (gaps.below >= 0) & (gaps.above >= 0)
         return dr.select(is_valid, fmin(down, up) * (1 - 1e-6), 0)
 
-    def _fall(self, gap: Real) -> Real:
+    def _length_of_fall(self, gap: Real) -> Real:
         """A length on which w stays less than `gap` below its value."""
         is_unreached = (self.height * self.rate >= 0) | (gap > dr.abs(self.height))
         length = dr.select(is_unreached, dr.inf, gap / dr.abs(self.rate))
         return dr.select((gap > 0) & (length >= 0), length, 0)
 
-    def _rise(self, gap: Real) -> Real:
+    def _length_of_rise(self, gap: Real) -> Real:
         """A length on which w stays less than `gap` above its value."""
         is_falling = self.height * self.rate < 0
         path = gap + dr.select(is_falling, 2 * dr.abs(self.height), 0)

@@ -365,17 +365,19 @@ class BandSolid(SolidOfField):
         return dr.select(is_clear, first_error, dr.inf), dr.select(is_clear, second_error, dr.inf)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        look = self.field.sample_ray(path, t, ahead, back)
-        sample, offset = self._fold_sample(look.sample)
+        ray_sample = self.field.sample_ray(path, t, ahead, back)
+        sample, offset = self._fold_sample(ray_sample.sample)
 
         def folded(enclosures: tuple[Enclosure, ...]) -> tuple[Enclosure, ...]:
             return tuple(
                 FoldedEnclosure(enclosure, offset, self.field.period) for enclosure in enclosures
             )
 
-        slope = dr.mulsign(look.slope, offset)
-        ahead_, back_ = folded(look.forward), folded(look.backward)
-        return RaySample(sample, ahead_, back_, slope, look.reach_growth, look.slope_error)
+        slope = dr.mulsign(ray_sample.slope, offset)
+        ahead_, back_ = folded(ray_sample.forward), folded(ray_sample.backward)
+        return RaySample(
+            sample, ahead_, back_, slope, ray_sample.reach_growth, ray_sample.slope_error
+        )
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         if not isinstance(self.field, Formula | Solid):

@@ -26,7 +26,7 @@ Quaternion = tuple[float, float, float, float]
 _RADII = (0.8, 0.6, 0.45, 0.3, 0.15)
 # Iterates beyond this absolute value have escaped; from there on only the logarithms of later
 # iterates are computed.
-_FAR = {"single": 1e4, "double": 1e8}
+_ESCAPE_RADIUS = {"single": 1e4, "double": 1e8}
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ class Julia(Solid):
         c, size, b = self._parameter("_c"), self._parameter("_size"), self._parameter("_b")
         real = cast("Any", type(p.x))
         is_single = dr.type_v(real) == dr.VarType.Float32
-        escape = _FAR["single" if is_single else "double"]
+        escape = _ESCAPE_RADIUS["single" if is_single else "double"]
         epsilon = 2 * float(dr.epsilon(real))
         zero, ones = 0 * p.x, 0 * p.x + 1
         q = [p.x, p.y, p.z, zero + self._parameter("_slice")]

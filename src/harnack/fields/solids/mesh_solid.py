@@ -209,13 +209,13 @@ class MeshSolid(Solid):
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         del ahead, back
-        look = path.enclose(self.evaluate(path.point(t)))
+        ray_sample = path.enclose(self.evaluate(path.point(t)))
         return RaySample(
-            look.sample,
-            look.forward,
-            look.backward,
-            look.slope,
-            look.reach_growth,
+            ray_sample.sample,
+            ray_sample.forward,
+            ray_sample.backward,
+            ray_sample.slope,
+            ray_sample.reach_growth,
             min_gradient_norm=_STEEP,
         )
 

@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from harnack.geometry.outline_loops import Outline
 
 # The number of edges from which on they are read by chains.
-_MANY = 48
+_MIN_CHAINED = 48
 # The inner knots of the bound along a line, as fractions of the length asked for; and that length,
 # in multiples of coordinates, for a ray without an end.
 _KNOTS = (0.0625, 0.125, 0.25, 0.5)
-_FAR = 8.0
+_ENDLESS_LENGTH = 8.0
 _ROUNDINGS = 4.0
 
 
@@ -104,7 +104,7 @@ class OutlineEdges:
         start, end, square, loop = (start[keep], end[keep], square[keep], loop[keep])
         rows = np.column_stack([start, end, 1.0 / square])
         chains = None
-        if len(rows) >= _MANY:
+        if len(rows) >= _MIN_CHAINED:
             chains = RecordTable.upload(backend, _chains(start, end, loop))
         size = float(np.linalg.norm(start, axis=1).max())
         x, y, size = (dr.opaque(backend.Float, number) for number in (*map(float, center), size))
@@ -113,7 +113,9 @@ class OutlineEdges:
     def knots(self, x: Real, y: Real, ahead: Real) -> tuple[Real, ...]:
         """The lengths at which the distance along a line is bounded; the last is the length asked
         for."""
-        max_length = _FAR * (fmax(dr.abs(x), dr.abs(y)) + self.size + dr.abs(self.center[0]))
+        max_length = _ENDLESS_LENGTH * (
+            fmax(dr.abs(x), dr.abs(y)) + self.size + dr.abs(self.center[0])
+        )
         length = dr.select(dr.isfinite(ahead), ahead, max_length)
         return (*(fraction * length for fraction in _KNOTS), ahead)
 

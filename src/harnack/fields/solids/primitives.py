@@ -264,8 +264,7 @@ class Torus(FormulaSolid):
 
 @dataclass(frozen=True)
 class Cuboid(FormulaSolid):
-    """The box |x| <= a/2, |y| <= b/2, |z| <= c/2 of sides (a, b, c), with edges rounded by
-    `radius`.
+    """The box |x| <= a/2, |y| <= b/2, |z| <= c/2 of sides (a, b, c), its edges rounded by `radius`.
 
     f is the signed distance: that of the box smaller by the radius (`orthogonal_intersection`),
     less the radius.

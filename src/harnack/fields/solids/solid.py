@@ -248,13 +248,13 @@ class Solid(Field):
         return TransientCache()
 
     def _for_rays(
-        self, parts: Sequence[Field], count: int, make: Callable[[list[Field]], Solid]
+        self, operands: Sequence[Field], count: int, make: Callable[[list[Field]], Solid]
     ) -> Field:
         """This solid, or the same combination of its parts as they are for this number of rays
         (`Field.for_ray_count`). The combination is cached, so that nothing is prepared twice."""
-        variants = [part.for_ray_count(count) for part in parts]
+        variants = [operand.for_ray_count(count) for operand in operands]
         key = tuple(map(id, variants))  # of objects that the solid keeps alive
-        if key == tuple(map(id, parts)):
+        if key == tuple(map(id, operands)):
             return self
         if key not in self._ray_count_variants:
             self._ray_count_variants[key] = make(variants)

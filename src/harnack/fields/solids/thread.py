@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
     from harnack.geometry import Volume
 
-_MOST_POINTS = 32
-_MOST_STARTS = 32
+_MAX_POINTS = 32
+_MAX_STARTS = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,14 +76,14 @@ class Thread(Solid):
         set_frozen(
             self,
             "starts",
-            as_integer_in_range(self.starts, "the starts of a thread", 1, _MOST_STARTS),
+            as_integer_in_range(self.starts, "the starts of a thread", 1, _MAX_STARTS),
         )
         if not isinstance(self.left_handed, bool):  # pyright: ignore[reportUnnecessaryIsInstance]
             raise TypeError(f"left_handed must be True or False, not {self.left_handed!r}")
         array = as_real_array(self.profile, "the profile of a thread")
-        if array.ndim != 2 or array.shape[1] != 2 or not 1 <= len(array) <= _MOST_POINTS:
+        if array.ndim != 2 or array.shape[1] != 2 or not 1 <= len(array) <= _MAX_POINTS:
             raise ValueError(
-                f"the profile of a thread has shape (n, 2), n from 1 to {_MOST_POINTS}, "
+                f"the profile of a thread has shape (n, 2), n from 1 to {_MAX_POINTS}, "
                 f"not {array.shape}"
             )
         points = np.array(array, dtype=np.float64)
@@ -157,16 +157,17 @@ class Thread(Solid):
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         del ahead, back
         p, d = path.point(t), path.direction
-        look = path.enclose(self.evaluate(p))
+        ray_sample = path.enclose(self.evaluate(p))
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
-            return look
+            return ray_sample
         numbers = cast("Any", self)
         cylinder = OutsideCylinderEnclosure(
-            look.sample.value, look.sample.value_error, dr.sqrt(dr.fma(p.x, p.x, p.y * p.y)),
+            ray_sample.sample.value, ray_sample.sample.value_error,
+            dr.sqrt(dr.fma(p.x, p.x, p.y * p.y)),
             dr.fma(p.x, d.x, p.y * d.y), dr.fma(d.x, d.x, d.y * d.y), 0 * p.x + numbers._most,
             0 * p.x + self.lipschitz,
         )  # fmt: skip
-        return replace(look, forward=(*look.forward, cylinder))
+        return replace(ray_sample, forward=(*ray_sample.forward, cylinder))
 
     def _height(self, z: Real) -> Real:
         """The polyline's r at z."""
@@ -261,7 +262,7 @@ COARSE_PITCHES: Mapping[str, float] = MappingProxyType(
 )  # fmt: skip
 _NAME = re.compile(r"M(\d{1,4}(?:\.\d{1,3})?)(?:\s*[xX]\s*(\d{1,3}(?:\.\d{1,3})?))?")
 # As a fraction of the pitch. A larger clearance would leave next to nothing of the crests.
-_MOST_CLEARANCE = 0.1
+_MAX_CLEARANCE = 0.1
 
 
 @no_derivatives
@@ -301,9 +302,9 @@ def metric_thread(
     clearance = as_finite(clearance, "the clearance of a thread")
     internal = flag(internal, "internal")
     left_handed = flag(left_handed, "left_handed")
-    if not 0 <= clearance <= _MOST_CLEARANCE * pitch:
+    if not 0 <= clearance <= _MAX_CLEARANCE * pitch:
         raise ValueError(
-            f"the clearance of {name} must be from 0 to {_MOST_CLEARANCE * pitch:g}, a tenth of "
+            f"the clearance of {name} must be from 0 to {_MAX_CLEARANCE * pitch:g}, a tenth of "
             f"its pitch, not {clearance:g}"
         )
     depth = 0.625 * math.sqrt(0.75) * pitch

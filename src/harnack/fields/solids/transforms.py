@@ -246,18 +246,22 @@ class TransformedSolid(SolidOfField):
         direction = vector(*numbers.local_direction(d.x, d.y, d.z))
         speed = safe_norm(direction)
         inner_ray = Ray(vector(*numbers.local(o.x, o.y, o.z)), direction / speed, path.proofs)
-        look = self.field.sample_ray(inner_ray, t * speed, ahead * speed, back * speed)
-        sample = self._image(look.sample, self._size(o, t))
+        ray_sample = self.field.sample_ray(inner_ray, t * speed, ahead * speed, back * speed)
+        sample = self._image(ray_sample.sample, self._size(o, t))
 
         def stretched(enclosures: tuple[Any, ...]) -> tuple[Any, ...]:
             return tuple(
                 ScaledEnclosure(enclosure, speed, numbers.factor) for enclosure in enclosures
             )
 
-        slope = look.slope * speed * numbers.factor
-        ahead_, back_ = stretched(look.forward), stretched(look.backward)
-        error = None if look.slope_error is None else look.slope_error * speed * numbers.factor
-        return RaySample(sample, ahead_, back_, slope, look.reach_growth, error)
+        slope = ray_sample.slope * speed * numbers.factor
+        ahead_, back_ = stretched(ray_sample.forward), stretched(ray_sample.backward)
+        error = (
+            None
+            if ray_sample.slope_error is None
+            else ray_sample.slope_error * speed * numbers.factor
+        )
+        return RaySample(sample, ahead_, back_, slope, ray_sample.reach_growth, error)
 
     def _size(self, p: Vec3, t: Real) -> Real:
         """A bound of the terms in the sums that are the local coordinates of p + t d."""

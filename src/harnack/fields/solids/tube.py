@@ -41,13 +41,13 @@ if TYPE_CHECKING:
 
 __all__ = ["TubeNetwork"]
 
-_MOST_SEGMENTS = 1_000_000
+_MAX_SEGMENTS = 1_000_000
 # Segments in a group, and the number of segments from which on they are grouped.
-_GROUP, _MANY = 8, 64
+_GROUP_SIZE, _MIN_GROUPED = 8, 64
 # The inner knots of the piecewise linear bound, as fractions of the length asked for.
 _KNOTS = (0.125, 0.25, 0.5)
 # That length for a ray without an end, in multiples of the size of the tube and of coordinates.
-_FAR = 8.0
+_ENDLESS_LENGTH = 8.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,21 +77,21 @@ class Tube(Solid):
         points = np.array(array, dtype=np.float64)
         check_finite(points, "point {} of a tube", ValueError)
         check_coordinate_size(points, ValueError)
-        parts: list[FloatArray] = []
+        pieces: list[FloatArray] = []
         if not isinstance(cast("Any", self.starts), tuple | list | np.ndarray):
             raise TypeError(f"starts must be indices of vertices, not {self.starts!r:.60}")
         starts = [as_integer_in_range(start, "each start", 0, len(points)) for start in self.starts]
         if not 0 <= as_real(self.flattening_error, "flattening_error") < math.inf:
             raise ValueError(f"flattening_error must be a length, not {self.flattening_error!r}")
-        for part in np.split(points, starts):
-            if len(part):
-                moves = np.any(part[1:] != part[:-1], axis=1)
-                part = part[np.concatenate([[True], moves])]
-            if len(part) < 2:
+        for piece in np.split(points, starts):
+            if len(piece):
+                moves = np.any(piece[1:] != piece[:-1], axis=1)
+                piece = piece[np.concatenate([[True], moves])]
+            if len(piece) < 2:
                 raise ValueError("a tube needs two points or more that differ: use Sphere for one")
-            parts.append(part)
-        points = np.concatenate(parts)
-        ends = np.cumsum([len(part) for part in parts])[:-1]
+            pieces.append(piece)
+        points = np.concatenate(pieces)
+        ends = np.cumsum([len(piece) for piece in pieces])[:-1]
         object.__setattr__(self, "starts", tuple(int(end) for end in ends))
         points.setflags(write=False)
         object.__setattr__(self, "points", points)
@@ -176,7 +176,7 @@ class Tube(Solid):
         allowed = 1e-3 * wire if tolerance is None else as_positive(tolerance, "the tolerance")
         angle = 2 * math.pi * turns
         count = max(1.0, angle * math.sqrt(radius / (8.0 * allowed)))
-        if not count <= _MOST_SEGMENTS:
+        if not count <= _MAX_SEGMENTS:
             raise ValueError(f"{count:,.0f} segments: allow a larger tolerance")
         t = np.linspace(0.0, angle, math.ceil(count) + 1)
         y = np.sin(t) * (-radius if left_handed else radius)
@@ -207,7 +207,7 @@ class Tube(Solid):
         start, side = self.points[:-1][is_segment], np.diff(self.points, axis=0)[is_segment]
         rows = np.column_stack([start, side, 1.0 / np.sum(side * side, axis=1)])
         groups = None
-        if len(rows) >= _MANY:
+        if len(rows) >= _MIN_GROUPED:
             rows, balls = _grouped(rows)
             groups = RecordTable.upload(backend, balls)
         object.__setattr__(prepared, "_records", RecordTable.upload(backend, rows))
@@ -227,7 +227,7 @@ class Tube(Solid):
             return path.enclose(self.evaluate(p))
         if not hasattr(self, "_records"):
             return self.prepare(backend_of(p)).sample_ray(path, t, ahead, ahead)
-        far = _FAR * (max_norm(p) + self._parameter("_size"))
+        far = _ENDLESS_LENGTH * (max_norm(p) + self._parameter("_size"))
         length = dr.select(dr.isfinite(ahead), ahead, far)
         knots = (*(fraction * length for fraction in _KNOTS), ahead)
         sample, distance, bounds = self._sample_with_bounds(p, path.direction, knots)
@@ -252,19 +252,19 @@ class Tube(Solid):
             nearest, x, y, z, size, *bounds = state
             from_start, side = p - vector(*row[:3]), vector(*row[3:6])
             t = clamp(dr.dot(from_start, side) * row[6], 0, 1)
-            away = dr.fma(side, -t, from_start)
-            distance = dr.norm(away)
+            offset = dr.fma(side, -t, from_start)
+            distance = dr.norm(offset)
             # The error of the vector is a few roundings of its terms.
             rounding = 8 * epsilon * (dr.norm(from_start) + dr.norm(side))
             if direction is not None:
-                slope = dr.dot(away, direction) / distance - rounding / distance * 2
+                slope = dr.dot(offset, direction) / distance - rounding / distance * 2
                 bounds = min_with_tangent(
                     bounds, knots, distance - rounding, slope, 4 * epsilon * distance, epsilon
                 )
             is_nearer = distance < nearest
             return (
                 dr.select(is_nearer, distance, nearest),
-                *(dr.select(is_nearer, a, b) for a, b in zip(away, (x, y, z), strict=True)),
+                *(dr.select(is_nearer, a, b) for a, b in zip(offset, (x, y, z), strict=True)),
                 fmax(rounding, size),
                 *bounds,
             )
@@ -277,8 +277,8 @@ class Tube(Solid):
         else:
             final = _visit_by_groups(p, direction, knots, records, groups, body, start)
         distance, error = final[0], final[4]
-        away = vector(*final[1:4])
-        gradient = dr.select(distance > 0, away / distance, vector(0))
+        offset = vector(*final[1:4])
+        gradient = dr.select(distance > 0, offset / distance, vector(0))
         value = distance - self._parameter("_radius")
         error = error + 4 * epsilon * (distance + self._parameter("_radius"))
         gradient_error = dr.select(distance > 0, fmin(4 * error / distance, 2), 2)
@@ -290,12 +290,12 @@ class Tube(Solid):
 
 
 def _grouped(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The records of segments in groups of `_GROUP`, the last group padded with copies, and a
+    """The records of segments in groups of `_GROUP_SIZE`, the last group padded with copies, and a
     record of a ball (center, radius) around each group."""
-    padding = -len(rows) % _GROUP
+    padding = -len(rows) % _GROUP_SIZE
     rows = np.concatenate([rows, np.repeat(rows[-1:], padding, axis=0)])
     ends = np.concatenate([rows[:, :3], rows[:, :3] + rows[:, 3:6]], axis=1)
-    points = ends.reshape(-1, 2 * _GROUP, 3)
+    points = ends.reshape(-1, 2 * _GROUP_SIZE, 3)
     centers = 0.5 * (points.min(axis=1) + points.max(axis=1))
     radii = np.linalg.norm(points - centers[:, None], axis=2).max(axis=1)
     return rows, np.column_stack([centers, radii * (1 + 1e-5)])
@@ -328,25 +328,25 @@ def _visit_by_groups(
 
     def visit(i: Any, *state: Any) -> tuple[Any, ...]:
         ball = groups.read_record(i)
-        away = p - vector(*ball[:3])
-        distance = dr.norm(away)
+        offset = p - vector(*ball[:3])
+        distance = dr.norm(offset)
         is_near = distance - ball[3] <= limit
         updated = list(state)
         if direction is not None:
             rounding = 8 * epsilon * (dr.norm(p) + distance + ball[3])
-            slope = dr.dot(away, direction) / distance - 2 * rounding / distance
+            slope = dr.dot(offset, direction) / distance - 2 * rounding / distance
             start = dr.select(is_near, dr.inf, distance - ball[3] - rounding)
             updated[5:] = min_with_tangent(
                 updated[5:], knots, start, slope, 4 * epsilon * distance, epsilon
             )
 
         def each(j: Any, *inner: Any) -> tuple[Any, ...]:
-            return j + 1, *body(records.read_record(i * _GROUP + j), inner)
+            return j + 1, *body(records.read_record(i * _GROUP_SIZE + j), inner)
 
         def has_more(j: Any, *_: Any) -> Any:
             return j < last
 
-        last = dr.select(is_near, type(i)(_GROUP), type(i)(0))
+        last = dr.select(is_near, type(i)(_GROUP_SIZE), type(i)(0))
         visited = dr.while_loop((type(i)(0), *updated), has_more, each, label="tube")
         return i + 1, *visited[1:]
 
@@ -420,8 +420,8 @@ class TangentEnclosure(Enclosure):
         is_free = gaps.below >= 0  # and not NaN
         for knot, next_bound in zip(self.knots, self.lower_bounds, strict=True):
             is_clear = next_bound >= -gaps.below
-            part = fmax((gaps.below + bound) / (bound - next_bound) * (knot - start), 0)
-            length = dr.select(is_clear, knot, fmin(start + part, knot))
+            clear_length = fmax((gaps.below + bound) / (bound - next_bound) * (knot - start), 0)
+            length = dr.select(is_clear, knot, fmin(start + clear_length, knot))
             total = dr.select(is_free, length, total)
             is_free &= is_clear
             start, bound = knot, next_bound
@@ -430,7 +430,7 @@ class TangentEnclosure(Enclosure):
 
 
 # Boxes are wider than the tubes by this fraction of their size.
-_SLACK = 1e-5
+_BOX_MARGIN = 1e-5
 # The radius on which second derivatives are bounded, as a fraction of the distance to the segment.
 _REACH = 0.5
 
@@ -470,7 +470,7 @@ class TubeNetwork(PatchField["_TubeBuffers"]):
         ends = self.points[self.segments]
         reach = (self.radius + level)[:, None]
         lower, upper = ends.min(axis=1) - reach, ends.max(axis=1) + reach
-        slack = _SLACK * (upper - lower).max(axis=1)[:, None]
+        slack = _BOX_MARGIN * (upper - lower).max(axis=1)[:, None]
         return lower - slack, upper + slack
 
     def evaluate(self, p: Vec3) -> NoReturn:
