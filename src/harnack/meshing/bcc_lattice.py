@@ -30,10 +30,10 @@ __all__ = ["BccLattice", "distinct_rows"]
 
 # The largest number of cells, which make about five million triangles; more are refused.
 MOST_CELLS = 2_000_000
-# Points of a lattice that has fewer than this are looked up in a table.
-_MOST_LISTED = 20_000_000
-# The largest number of cells in the first round of the octree.
-_MOST_ROOTS = 200_000
+# In lattices of fewer points than this, the index of a point is looked up in a table.
+_MAX_TABLE_SIZE = 20_000_000
+# The largest number of cells from which octrees start.
+_MAX_ROOT_CELLS = 200_000
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class BccLattice:
         while halvings < 3 and (self.counts >= 2 ** (halvings + 2)).all():
             halvings += 1
         blocks = -(-self.counts // 2**halvings)
-        while math.prod(blocks.tolist()) > _MOST_ROOTS and halvings < 12:
+        while math.prod(blocks.tolist()) > _MAX_ROOT_CELLS and halvings < 12:
             halvings += 1
             blocks = -(-self.counts // 2**halvings)
         grid = np.stack(np.meshgrid(*map(np.arange, blocks), indexing="ij"), axis=-1)
@@ -192,34 +192,34 @@ class BccLattice:
             lower = 2 * cells
             lower[:, axis] += 2
             face = np.concatenate([2 * cells, lower])
-            face = _key_rows(sorted_unique(_keys(face, shape)), shape)
+            face = _lattice_coordinates(sorted_unique(_flat_indices(face, shape)), shape)
             plane_axes = [k for k in range(3) if k != axis]
             face_keys: list[IntArray] = []
             for side in (-1, 1):
                 center = face + 1
                 center[:, axis] = np.clip(face[:, axis] + side, 0, shape[axis] - 1)
-                face_keys.append(_keys(center, shape))
+                face_keys.append(_flat_indices(center, shape))
             for i, j in ((0, 0), (2, 0), (2, 2), (0, 2)):
                 corner = face.copy()
                 corner[:, plane_axes] += [i, j]
-                face_keys.append(_keys(corner, shape))
+                face_keys.append(_flat_indices(corner, shape))
             keys_by_axis.append(face_keys)
         keys = [np.concatenate(column) for column in zip(*keys_by_axis, strict=True)]
         used = sorted_unique(np.concatenate(keys))
-        if math.prod(shape.tolist()) < _MOST_LISTED:
+        if math.prod(shape.tolist()) < _MAX_TABLE_SIZE:
             index = np.zeros(math.prod(shape.tolist()), np.int64)
             index[used] = np.arange(len(used))
             first, second, *ring = (index[column] for column in keys)
         else:
             first, second, *ring = (np.searchsorted(used, column) for column in keys)
         corners = [np.stack([first, second, ring[k - 1], ring[k]], axis=1) for k in range(4)]
-        return _key_rows(used, shape), np.concatenate(corners)
+        return _lattice_coordinates(used, shape), np.concatenate(corners)
 
 
 def distinct_rows(rows: IntArray) -> IntArray:
     """The unique rows of nonnegative integers (n, 3), sorted."""
     shape = rows.max(axis=0, initial=0) + 1
-    return _key_rows(sorted_unique(_keys(rows, shape)), shape)
+    return _lattice_coordinates(sorted_unique(_flat_indices(rows, shape)), shape)
 
 
 def triangle_limit_error(cells: float, most: int) -> TriangleLimitError:
@@ -231,10 +231,13 @@ def triangle_limit_error(cells: float, most: int) -> TriangleLimitError:
     )
 
 
-def _keys(coordinates: IntArray, shape: IntArray) -> IntArray:
+def _flat_indices(coordinates: IntArray, shape: IntArray) -> IntArray:
+    """(n,) a unique integer for each point with integer coordinates (n, 3): its index in a
+    flattened array of the shape `shape` (3,)."""
     return (coordinates[:, 0] * shape[1] + coordinates[:, 1]) * shape[2] + coordinates[:, 2]
 
 
-def _key_rows(keys: IntArray, shape: IntArray) -> IntArray:
+def _lattice_coordinates(keys: IntArray, shape: IntArray) -> IntArray:
+    """The coordinates (n, 3) that `_flat_indices` turned into the integers `keys` (n,)."""
     xy, z = np.divmod(keys, shape[2])
     return np.stack([*np.divmod(xy, shape[1]), z], axis=1)

@@ -171,7 +171,8 @@ class Shells:
 
 
 def _component_of_faces(surface: TriangleMesh) -> IntArray:
-    """(m,) the number of the connected component of each face."""
+    """(m,) the number of the connected component that each face belongs to. Faces are connected by
+    common vertices."""
     import scipy.sparse  # imported here: it takes half a second
     import scipy.sparse.csgraph as csgraph_module
 
@@ -189,32 +190,39 @@ def winding_around(corner: FloatArray, point: FloatArray) -> float:
 
 # Surfaces cut by volumes.
 
-# Vertices this near to a boundary, relative to the size, count as on it.
-_NEAR = 1e-9
-# Vertices this near, relative to their shortest edge, are moved onto it: otherwise slivers remain.
-_SNAPPED = 0.25
+# Vertices that are no farther from a boundary than this, relative to the size, count as on it.
+_ON_BOUNDARY = 1e-9
+# Vertices that are nearer to a boundary than this are moved onto it, or slivers would remain:
+# a fraction of the vertex's shortest edge.
+_SNAP_DISTANCE = 0.25
 
 
 @dataclass(frozen=True)
 class _ClipBoundary:
-    """One side of a volume's boundary: a plane normal.x = offset, or a sphere."""
+    """A plane or a sphere that bounds a volume.
+
+    center: (3,) a point of the plane, or the center of the sphere.
+    normal: (3,) the plane's unit normal, outwards; unused for a sphere.
+    radius: of the sphere; None for a plane.
+    """
 
     center: FloatArray
     normal: FloatArray
     radius: float | None
 
     def heights(self, x: FloatArray) -> FloatArray:
-        """(n,) signed distances of points (n, 3) from the boundary, negative inside."""
+        """(n,) signed distances of points `x` (n, 3) from the boundary, negative inside of the
+        volume."""
         if self.radius is None:
             return (x - self.center) @ self.normal
         return np.linalg.norm(x - self.center, axis=1) - self.radius
 
     def slopes(self, x: FloatArray) -> FloatArray:
-        """(n, 3) the gradients of these distances."""
+        """(n, 3) the gradients at points `x` (n, 3) of the signed distance from the boundary."""
         if self.radius is None:
             return np.broadcast_to(self.normal, x.shape)
-        away = x - self.center
-        return away / np.maximum(np.linalg.norm(away, axis=1), 1e-300)[:, None]
+        from_center = x - self.center
+        return from_center / np.maximum(np.linalg.norm(from_center, axis=1), 1e-300)[:, None]
 
 
 def clip_to_volume(surface: TriangleMesh, volume: Volume) -> TriangleMesh:
@@ -235,94 +243,103 @@ def clip_to_volume(surface: TriangleMesh, volume: Volume) -> TriangleMesh:
     for row in volume.planes():
         surface = _cut(surface, _ClipBoundary(row[:3] * row[3], row[:3], None))
     if isinstance(volume, Box):
-        return TriangleMesh(_onto(surface.vertices, volume), surface.faces)
+        return TriangleMesh(_snap_to_box(surface.vertices, volume), surface.faces)
     return surface
 
 
-def _onto(vertices: FloatArray, box: Box) -> FloatArray:
-    """The vertices, with those within rounding of a box's faces put onto them."""
+def _snap_to_box(vertices: FloatArray, box: Box) -> FloatArray:
+    """The vertices (n, 3); those within rounding of a face of the box are put onto it."""
     for end in box.bounds():
-        near = np.abs(vertices - end) <= _NEAR * (1 + np.abs(end))
+        near = np.abs(vertices - end) <= _ON_BOUNDARY * (1 + np.abs(end))
         vertices = np.where(near, end, vertices)
     return vertices
 
 
 def _snap_to_boundary(surface: TriangleMesh, side: _ClipBoundary) -> tuple[FloatArray, FloatArray]:
-    """The vertices, and their heights. Vertices near the side are moved onto it within the
-    surface's tangent plane, except those of the surface's boundary and those that would have to
-    move far."""
+    """The vertices (n, 3), some of them moved onto the boundary `side`, and their signed distances
+    (n,) from it.
+
+    Vertices are moved in the surface's tangent plane, if that takes less than a quarter of their
+    shortest edge. Vertices on the boundary edges of the surface itself are not moved.
+    """
     x, faces = surface.vertices, surface.faces
     corner = x[faces]
-    edges = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).min(axis=1)
-    normal = area_normals(corner)
-    shortest, mean = np.full(len(x), np.inf), np.zeros_like(x)
+    shortest_of_face = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).min(axis=1)
+    normals = area_normals(corner)
+    shortest_edge, vertex_normals = np.full(len(x), np.inf), np.zeros_like(x)
     for k in range(3):
-        np.minimum.at(shortest, faces[:, k], edges)
-        np.add.at(mean, faces[:, k], normal)
-    mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-300)[:, None]
+        np.minimum.at(shortest_edge, faces[:, k], shortest_of_face)
+        np.add.at(vertex_normals, faces[:, k], normals)
+    vertex_normals /= np.maximum(np.linalg.norm(vertex_normals, axis=1), 1e-300)[:, None]
     h = side.heights(x)
     moved = x
     for _ in range(4):
         slope = side.slopes(moved)
-        along = slope - (slope * mean).sum(axis=1)[:, None] * mean
-        square = np.maximum((along * along).sum(axis=1), 1e-3)
-        moved = moved - (side.heights(moved) / square)[:, None] * along
-    near = np.linalg.norm(moved - x, axis=1) < _SNAPPED * shortest
-    near &= np.abs(side.heights(moved)) <= 1e-9 * shortest
-    near[np.unique(boundary_edges(faces))] = False
-    return np.where(near[:, None], moved, x), np.where(near, 0.0, h)
+        tangential = slope - (slope * vertex_normals).sum(axis=1)[:, None] * vertex_normals
+        squared_length = np.maximum((tangential * tangential).sum(axis=1), 1e-3)
+        moved = moved - (side.heights(moved) / squared_length)[:, None] * tangential
+    is_snapped = np.linalg.norm(moved - x, axis=1) < _SNAP_DISTANCE * shortest_edge
+    is_snapped &= np.abs(side.heights(moved)) <= 1e-9 * shortest_edge
+    is_snapped[np.unique(boundary_edges(faces))] = False
+    return np.where(is_snapped[:, None], moved, x), np.where(is_snapped, 0.0, h)
 
 
 def _cut(surface: TriangleMesh, side: _ClipBoundary) -> TriangleMesh:
-    """The part of the surface where heights are not positive. Heights are linear along edges,
-    except above a sphere."""
+    """The part of a surface whose signed distance `h` from the boundary `side` is not positive.
+    Along edges the distance counts as linear; from a sphere it is exact (`_sphere_cuts`)."""
     faces = surface.faces
     if not len(faces):
         return surface
     vertices, h = _snap_to_boundary(surface, side)
-    h = np.where(np.abs(h) <= _NEAR * float(np.ptp(vertices, axis=0).max()), 0.0, h)
-    out = (h > 0)[faces]
+    h = np.where(np.abs(h) <= _ON_BOUNDARY * float(np.ptp(vertices, axis=0).max()), 0.0, h)
+    is_out = (h > 0)[faces]
     # Faces on the boundary with no corner inside are left out.
-    keep = (h < 0)[faces].any(axis=1)
-    mixed = keep & out.any(axis=1)
-    pairs = np.concatenate([faces[mixed][:, [k, (k + 1) % 3]] for k in range(3)])
-    crossing = pairs[h[pairs[:, 0]] * h[pairs[:, 1]] < 0]
-    keys = np.unique(edge_keys(crossing, len(vertices)))
+    is_kept = (h < 0)[faces].any(axis=1)
+    mixed = is_kept & is_out.any(axis=1)
+    edges = np.concatenate([faces[mixed][:, [k, (k + 1) % 3]] for k in range(3)])
+    crossed = edges[h[edges[:, 0]] * h[edges[:, 1]] < 0]
+    keys = np.unique(edge_keys(crossed, len(vertices)))
     a, b = keys // len(vertices), keys % len(vertices)
     fraction = (h[a] / (h[a] - h[b]))[:, None]
     points = vertices[a] + fraction * (vertices[b] - vertices[a])
     if side.radius is not None:
-        points = _on_sphere(vertices[a], vertices[b], side.center, side.radius)
-    first = len(vertices)
+        points = _sphere_cuts(vertices[a], vertices[b], side.center, side.radius)
+    first_new = len(vertices)
 
-    def at(i: IntArray, j: IntArray) -> IntArray:
-        """The vertex where edges from i to j meet the boundary; i itself if it lies on the
-        boundary."""
+    def crossing(i: IntArray, j: IntArray) -> IntArray:
+        """The vertices where edges from i to j, both (k,), meet the boundary; i itself where it
+        lies on the boundary."""
         index = np.searchsorted(keys, edge_keys(np.column_stack([i, j]), len(vertices)))
-        return np.where(h[i] == 0, i, first + index)
+        return np.where(h[i] == 0, i, first_new + index)
 
-    parts = [faces[keep & ~out.any(axis=1)]]
+    pieces = [faces[is_kept & ~is_out.any(axis=1)]]
     rows = faces[mixed]
-    number = out[mixed].sum(axis=1)
+    number = is_out[mixed].sum(axis=1)
     for k in range(3):
         order = [k, (k + 1) % 3, (k + 2) % 3]
-        tri = rows[(number == 1) & out[mixed][:, k]][:, order]  # a is outside
-        x, y = at(tri[:, 1], tri[:, 0]), at(tri[:, 2], tri[:, 0])
-        parts += [np.stack([tri[:, 1], tri[:, 2], x], axis=1), np.stack([tri[:, 2], y, x], axis=1)]
-        tip = rows[(number == 2) & ~out[mixed][:, k]][:, order]  # a is inside
-        parts.append(np.stack([tip[:, 0], at(tip[:, 0], tip[:, 1]), at(tip[:, 0], tip[:, 2])], 1))
-    new = np.concatenate(parts)
-    proper = (new != np.roll(new, 1, axis=1)).all(axis=1)
-    return TriangleMesh.without_unused_vertices(np.concatenate([vertices, points]), new[proper])
+        tri = rows[(number == 1) & is_out[mixed][:, k]][:, order]  # the first corner is outside
+        p, q = (crossing(tri[:, 1], tri[:, 0]), crossing(tri[:, 2], tri[:, 0]))
+        pieces += [np.stack([tri[:, 1], tri[:, 2], p], axis=1), np.stack([tri[:, 2], q, p], axis=1)]
+        tip = rows[(number == 2) & ~is_out[mixed][:, k]][:, order]  # the first corner is inside
+        pieces.append(
+            np.stack([tip[:, 0], crossing(tip[:, 0], tip[:, 1]), crossing(tip[:, 0], tip[:, 2])], 1)
+        )
+    new = np.concatenate(pieces)
+    is_proper = (new != np.roll(new, 1, axis=1)).all(axis=1)
+    return TriangleMesh.without_unused_vertices(np.concatenate([vertices, points]), new[is_proper])
 
 
-def _on_sphere(a: FloatArray, b: FloatArray, center: FloatArray, radius: float) -> FloatArray:
-    """The points where segments from a to b (n, 3), of which one end is inside, pass through the
-    sphere."""
-    inside = np.linalg.norm(a - center, axis=1) < np.linalg.norm(b - center, axis=1)
-    start, end = np.where(inside[:, None], a, b), np.where(inside[:, None], b, a)
+def _sphere_cuts(a: FloatArray, b: FloatArray, center: FloatArray, radius: float) -> FloatArray:
+    """The points (n, 3) where segments from `a` to `b` pass through a sphere. a, b: (n, 3); of each
+    segment one end is inside of the sphere.
+
+    A point is o + t d from the center, with o the offset of the inner end, d the direction to the
+    other end, and t^2 d.d + 2 t o.d = radius^2 - o.o = room.
+    """
+    is_a_in = np.linalg.norm(a - center, axis=1) < np.linalg.norm(b - center, axis=1)
+    start, end = np.where(is_a_in[:, None], a, b), np.where(is_a_in[:, None], b, a)
     o, d = start - center, end - start
-    dd, od = (d * d).sum(axis=1), (o * d).sum(axis=1)
+    dd, od = ((d * d).sum(axis=1), (o * d).sum(axis=1))
     room = np.maximum(radius**2 - (o * o).sum(axis=1), 0)
     fraction = room / (od + np.sqrt(od * od + dd * room))
     return start + fraction[:, None] * d
