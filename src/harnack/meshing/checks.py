@@ -67,8 +67,10 @@ SignArray = npt.NDArray[np.int8]
 
 # Exact signs.
 
+# The unit roundoff.
 _UNIT = 2.0**-53
-# Shewchuk's bounds of the rounding of both determinants, over the sum of their terms' magnitudes.
+# Shewchuk's bounds of the rounding errors of both determinants, relative to the sum of the absolute
+# values of their terms.
 _ORIENT3D_ERROR, _ORIENT2D_ERROR = (7 + 56 * _UNIT) * _UNIT, (3 + 16 * _UNIT) * _UNIT
 # A bound of the error by underflow, for coordinates of order one.
 _UNDERFLOW = 1e-290
@@ -102,7 +104,7 @@ def orient2d(a: FloatArray, b: FloatArray, c: FloatArray) -> SignArray:
 
 
 def _scaled(points: FloatArray) -> FloatArray:
-    """Points times a power of two, so that the largest coordinate is of order one."""
+    """The points times a power of two that makes the largest coordinate of order one."""
     largest = float(np.abs(points).max(initial=0.0))
     return points if largest == 0 else np.ldexp(points, -int(np.frexp(largest)[1]))
 
@@ -110,8 +112,15 @@ def _scaled(points: FloatArray) -> FloatArray:
 def _signs_with_fallback(
     value: FloatArray, error: FloatArray, zero: BoolArray, points: FloatArray, exact: Any
 ) -> SignArray:
-    """The signs of values that are known up to errors, or known to be 0; where errors leave a sign
-    undecided, `exact` computes it from the points."""
+    """(n,) the signs of numbers that are known up to an error. Where the error leaves a sign
+    undecided, it is computed exactly.
+
+    value: (n,) the approximate numbers.
+    error: (n,) bounds of their errors.
+    zero: (n,) mask of the numbers that are known to be 0.
+    points: (n, k, d) the points that determine each number.
+    exact: computes the numbers without rounding from points as `_integers` returns them.
+    """
     signs: SignArray = np.sign(value).astype(np.int8)
     signs[zero] = 0
     open_rows = np.flatnonzero(~zero & (np.abs(value) <= error + _UNDERFLOW))
@@ -121,7 +130,7 @@ def _signs_with_fallback(
 
 
 def _integers(points: FloatArray) -> Any:
-    """Points times a power of two, as Python's integers."""
+    """The points, all times the same power of two, as an array of Python's integers."""
     mantissa, exponent = np.frexp(points)
     mantissas = np.ldexp(mantissa, 53).astype(np.int64).astype(object)
     used = mantissa != 0
@@ -130,12 +139,16 @@ def _integers(points: FloatArray) -> Any:
 
 
 def _orient3d_exact(points: Any) -> Any:
+    """(n,) det(a - d, b - d, c - d) without rounding, for integer points (n, 4, 3): a, b, c, d in
+    each row."""
     rows = points[:, :3] - points[:, 3:]
     (ax, ay, az), (bx, by, bz), (cx, cy, cz) = (rows[:, k].T for k in range(3))
     return (bx * cy - cx * by) * az + (cx * ay - ax * cy) * bz + (ax * by - bx * ay) * cz
 
 
 def _orient2d_exact(points: Any) -> Any:
+    """(n,) det(a - c, b - c) without rounding, for integer points (n, 3, 2): a, b, c in each
+    row."""
     rows = points[:, :2] - points[:, 2:]
     (ax, ay), (bx, by) = (rows[:, k].T for k in range(2))
     return ax * by - ay * bx
@@ -147,8 +160,8 @@ _EDGES = ((0, 1), (1, 2), (2, 0))
 _PAIRS_AT_ONCE = 1 << 18
 # For more triangles than this a kernel lists the pairs, which takes 0.05 s to record.
 _MIN_FACES_FOR_KERNEL = 5_000
-# The largest number of triangles of a size that are compared with each other at once.
-_MOST_AT_ONCE = 1 << 19
+# Up to this many triangles of similar size are compared with each other at once.
+_MAX_AT_ONCE = 1 << 19
 
 
 def misoriented_faces(function: LevelFunction, vertices: FloatArray, faces: IntArray) -> IntArray:
@@ -181,7 +194,7 @@ def intersecting_faces(
         first, second = faces[pairs[:, 0]], faces[pairs[:, 1]]
         meet = np.zeros(len(pairs), np.bool_)
         rows = np.flatnonzero((heights[0] == 0).all(axis=1) & (heights[1] == 0).all(axis=1))
-        meet[rows] = _overlap(vertices[first[rows]], vertices[second[rows]])
+        meet[rows] = _share_area(vertices[first[rows]], vertices[second[rows]])
         both = np.all([(h.min(axis=1) < 0) & (h.max(axis=1) > 0) for h in heights], axis=0)
         rows = np.flatnonzero(both)
         meet[rows] = _edge_pierces(vertices, first[rows], second[rows], heights[0][rows])
@@ -219,14 +232,14 @@ def touching_pairs(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, Flo
             for i, j in ((0, 0), (1, 1), (2, 2), *_EDGES):
                 rows = np.flatnonzero((shared == 0) & (height[:, i] == 0) & (height[:, j] == 0))
                 p, q = (vertices[faces[of[rows], k]] for k in (i, j))
-                add(pairs[rows], _is_on(vertices[faces[plane[rows]]], p, q), p, q)
+                add(pairs[rows], _segments_meet(vertices[faces[plane[rows]]], p, q), p, q)
             is_common = same.any(axis=1 + order)  # of the corners of `of`
             for i in range(3):
                 rows = np.flatnonzero((shared == 1) & ~is_common[:, i] & (height[:, i] == 0))
                 apex = same.any(axis=2 - order)[rows].argmax(axis=1)[:, None]
                 turned = np.take_along_axis(faces[plane[rows]], (apex + np.arange(3)) % 3, axis=1)
                 p = vertices[faces[of[rows], i]]
-                add(pairs[rows], _is_between(vertices[turned], p), p, p)
+                add(pairs[rows], _is_in_angle(vertices[turned], p), p, p)
     both = np.concatenate([*batches, np.zeros((0, 2), np.int64)])
     _, first = np.unique(both, axis=0, return_index=True)
     return both[first], np.concatenate([*contacts, np.zeros((0, 3))])[first]
@@ -235,8 +248,13 @@ def touching_pairs(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, Flo
 def _pairs_in_doubt(
     vertices: FloatArray, faces: IntArray, among: BoolArray | None
 ) -> Generator[tuple[IntArray, tuple[SignArray, SignArray]]]:
-    """Pairs (k, 2) of faces that are not proved apart, in batches, and the `_heights` of the second
-    over the first and of the first over the second."""
+    """Generate, in batches, the pairs (k, 2) of faces that are not proved apart. With each batch
+    come two arrays (k, 3) of `_side_signs`: of the second faces' corners for the planes of the
+    first faces, and of the first faces' corners for the planes of the second faces.
+
+    among: (m,) mask of chosen faces; pairs without a chosen face are left out. None if all are
+        chosen.
+    """
     face_count = len(faces) if among is None else int(among.sum())
     by_kernel = face_count > _MIN_FACES_FOR_KERNEL
     near = near_pairs(vertices, faces, among) if by_kernel else _near_pairs(vertices[faces], among)
@@ -245,15 +263,18 @@ def _pairs_in_doubt(
         if not by_kernel:
             pairs = pairs[~_are_separated(vertices, faces, pairs)]
         first, second = faces[pairs[:, 0]], faces[pairs[:, 1]]
-        yield pairs, (_heights(vertices, first, second), _heights(vertices, second, first))
+        yield pairs, (_side_signs(vertices, first, second), _side_signs(vertices, second, first))
 
 
 def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
-    """Pairs (k, 2) of triangles (m, 3, 3) whose boxes overlap, each once; given a mask, only pairs
-    with a chosen triangle.
+    """Pairs (k, 2) of triangles (m, 3, 3) whose bounding boxes overlap, each once.
 
-    Triangles of one size (up to a factor of 2) are compared at a time, with triangles that are no
-    larger: so a large triangle is compared only with the small triangles near it.
+    among: (m,) mask of chosen triangles; pairs without a chosen triangle are left out. None if all
+        are chosen.
+
+    Triangles are grouped by size, up to a factor of 2, and each group is compared with each group,
+    itself included, at distances up to the sum of the largest sizes in both. So a large triangle is
+    compared only with the small triangles near it.
     """
     import scipy.spatial  # imported here: it takes half a second
 
@@ -262,8 +283,8 @@ def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
     chosen = np.ones(len(corner), np.bool_) if among is None else among
     if not chosen.any():
         return np.zeros((0, 2), np.int64)
-    ends = lower[chosen].min(axis=0), upper[chosen].max(axis=0)
-    near = (lower <= ends[1]).all(axis=1) & (upper >= ends[0]).all(axis=1)
+    chosen_bounds = lower[chosen].min(axis=0), upper[chosen].max(axis=0)
+    near = (lower <= chosen_bounds[1]).all(axis=1) & (upper >= chosen_bounds[0]).all(axis=1)
     center = 0.5 * (lower + upper)
     radius = 0.5 * row_norms(upper - lower)
     octave = np.floor(np.log2(np.maximum(radius, 1e-300)))
@@ -271,87 +292,94 @@ def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
     trees = [searching.cKDTree(center[rows]) for rows in groups]
     batches: list[IntArray] = []
 
-    def add(first: IntArray, second: IntArray) -> None:
+    def add_if_overlapping(first: IntArray, second: IntArray) -> None:
+        """Append those of the pairs `first`, `second`, both (k,), whose boxes overlap."""
         keep = (lower[first] <= upper[second]).all(axis=1)
         keep &= (lower[second] <= upper[first]).all(axis=1)
         batches.append(np.column_stack([first[keep], second[keep]]))
 
     for i, j in itertools.product(range(len(groups)), repeat=2):
-        reach = float(radius[groups[i]].max() + radius[groups[j]].max())
+        max_distance = float(radius[groups[i]].max() + radius[groups[j]].max())
         queries = groups[i][chosen[groups[i]]]
-        if i == j and len(queries) == len(groups[i]) <= _MOST_AT_ONCE:
-            table = trees[i].query_pairs(reach, output_type="ndarray")
-            add(*groups[i][table.T])
+        if i == j and len(queries) == len(groups[i]) <= _MAX_AT_ONCE:
+            table = trees[i].query_pairs(max_distance, output_type="ndarray")
+            add_if_overlapping(*groups[i][table.T])
             continue
         step = max(1, _PAIRS_AT_ONCE // 64)
         for start in range(0, len(queries), step):
             rows = queries[start : start + step]
             query_tree = searching.cKDTree(center[rows])
-            table = query_tree.sparse_distance_matrix(trees[j], reach, output_type="ndarray")
+            table = query_tree.sparse_distance_matrix(trees[j], max_distance, output_type="ndarray")
             first, second = rows[table["i"]], groups[j][table["j"]]
-            once = (first < second) | ~chosen[second]  # two chosen triangles are listed once
-            add(first[once], second[once])
+            is_new = (first < second) | ~chosen[second]  # two chosen triangles are listed once
+            add_if_overlapping(first[is_new], second[is_new])
     return np.concatenate(batches).astype(np.int64)
 
 
 def _are_separated(vertices: FloatArray, faces: IntArray, pairs: IntArray) -> BoolArray:
-    """(k,) whether two faces are proved to share nothing but common vertices: the plane of one face
-    has all vertices of the other that are not common strictly on one side. False where rounding
-    leaves it undecided.
+    """(k,) whether the two faces of each pair (k, 2) are proved to have nothing but common vertices
+    in common. That is proved if the plane of one face has all vertices of the other face that are
+    not common strictly on one side. False where rounding leaves it undecided.
 
-    See `broad_phase.ROUNDING` for the error of heights.
+    See `broad_phase.ROUNDING` for the error of the determinants, here `height`, whose signs tell
+    the sides.
     """
     apart = np.zeros(len(pairs), np.bool_)
     for first, second in (pairs.T, pairs.T[::-1]):
         rows = np.flatnonzero(~apart)
-        plane, of = faces[first[rows]], faces[second[rows]]
-        a = vertices[plane[:, 0]]
-        u, v = vertices[plane[:, 1]] - a, vertices[plane[:, 2]] - a
+        base, other = faces[first[rows]], faces[second[rows]]
+        a = vertices[base[:, 0]]
+        u, v = vertices[base[:, 1]] - a, vertices[base[:, 2]] - a
         normal = np.cross(u, v)
         error_scale = ROUNDING * (row_norms(u) * row_norms(v))
         above, below = np.ones(len(rows), np.bool_), np.ones(len(rows), np.bool_)
         for k in range(3):
-            offset = vertices[of[:, k]] - a
+            offset = vertices[other[:, k]] - a
             height, error = row_dots(normal, offset), error_scale * row_norms(offset) + _UNDERFLOW
-            shared = (of[:, k, None] == plane).any(axis=1)
+            shared = (other[:, k, None] == base).any(axis=1)
             above &= shared | (height > error)
             below &= shared | (height < -error)
         # A face that shares all its corners is the same face.
-        is_other = (of[:, :, None] != plane[:, None]).all(axis=2).any(axis=1)
+        is_other = (other[:, :, None] != base[:, None]).all(axis=2).any(axis=1)
         apart[rows] = (above | below) & is_other
     return apart
 
 
-def _heights(vertices: FloatArray, plane: IntArray, of: IntArray) -> SignArray:
-    """(k, 3) the signs that tell on which sides of the planes of faces (k, 3) the corners of other
-    faces lie; 0 on a plane."""
-    a, b, c = (vertices[plane[:, i]] for i in range(3))
-    signs = np.zeros((len(of), 3), np.int8)
+def _side_signs(vertices: FloatArray, base: IntArray, other: IntArray) -> SignArray:
+    """(k, 3) for each corner of the faces `other` (k, 3), on which side of the plane of the face
+    `base` (k, 3) it lies, exactly: 1 below, from where the corners of `base` run clockwise, -1
+    above, and 0 on the plane. Corners that both faces share get 0."""
+    a, b, c = (vertices[base[:, i]] for i in range(3))
+    signs = np.zeros((len(other), 3), np.int8)
     for i in range(3):
-        rows = np.flatnonzero((of[:, i, None] != plane).all(axis=1))
-        signs[rows, i] = orient3d(a[rows], b[rows], c[rows], vertices[of[rows, i]])
+        rows = np.flatnonzero((other[:, i, None] != base).all(axis=1))
+        signs[rows, i] = orient3d(a[rows], b[rows], c[rows], vertices[other[rows, i]])
     return signs
 
 
 def _edge_pierces(
-    vertices: FloatArray, through: IntArray, of: IntArray, heights: SignArray
+    vertices: FloatArray, pierced: IntArray, piercing: IntArray, sides: SignArray
 ) -> BoolArray:
-    """(k,) whether an edge of the faces `of` (k, 3) passes through the faces `through`: its line
-    passes all three edges on one side, or touches them. heights: the sides of the planes of
-    `through` that the corners of `of` are on."""
-    pierces = np.zeros(len(of), np.bool_)
+    """(k,) whether an edge of the face `piercing` passes through the face `pierced`, both (k, 3),
+    or touches its boundary. It does if the edge's ends are strictly on the two sides of the plane
+    of `pierced`, and its line passes all three edges of `pierced` on the same side or touches them.
+
+    sides: (k, 3) the `_side_signs` of the corners of `piercing` for the planes of `pierced`.
+    """
+    pierces = np.zeros(len(piercing), np.bool_)
     for i, j in _EDGES:
-        rows = np.flatnonzero((heights[:, i] * heights[:, j] < 0) & ~pierces)
-        p, q = vertices[of[rows, i]], vertices[of[rows, j]]
-        x = [vertices[through[rows, k]] for k in range(3)]
+        rows = np.flatnonzero((sides[:, i] * sides[:, j] < 0) & ~pierces)
+        p, q = vertices[piercing[rows, i]], vertices[piercing[rows, j]]
+        x = [vertices[pierced[rows, k]] for k in range(3)]
         orientations = np.stack([orient3d(p, q, x[k], x[m]) for k, m in _EDGES])
         pierces[rows] = (orientations >= 0).all(axis=0) | (orientations <= 0).all(axis=0)
     return pierces
 
 
-def _overlap(first: FloatArray, second: FloatArray) -> BoolArray:
-    """(k,) whether triangles (k, 3, 3) in one plane have an area in common; they are projected
-    along the axis in which they are thinnest."""
+def _share_area(first: FloatArray, second: FloatArray) -> BoolArray:
+    """(k,) whether triangles `first` and `second` (k, 3, 3), two and two in one plane, have an area
+    in common. They do unless the line of an edge separates them (separating axes). They are
+    projected to two dimensions along the coordinate axis that is nearest to their normal."""
     normal = np.abs(area_normals(first))
     axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
     flat = [np.take_along_axis(t, axes[:, None].repeat(3, axis=1), axis=2) for t in (first, second)]
@@ -364,9 +392,11 @@ def _overlap(first: FloatArray, second: FloatArray) -> BoolArray:
     return overlaps
 
 
-def _is_on(triangle: FloatArray, p: FloatArray, q: FloatArray) -> BoolArray:
-    """(k,) whether segments from p to q (k, 3) meet triangles (k, 3, 3) in whose planes they are:
-    unless the line of an edge or of the segment has them on its two sides (separating axes)."""
+def _segments_meet(triangle: FloatArray, p: FloatArray, q: FloatArray) -> BoolArray:
+    """(k,) whether segments from `p` to `q` (k, 3) meet the triangles (k, 3, 3) in whose planes
+    they lie. They do unless the line of an edge of the triangle, or that of the segment, has the
+    triangle and the segment on its two sides (separating axes). False for triangles without an
+    area."""
     normal = np.abs(area_normals(triangle))
     axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
     a = np.take_along_axis(triangle, axes[:, None].repeat(3, axis=1), axis=2)
@@ -380,9 +410,10 @@ def _is_on(triangle: FloatArray, p: FloatArray, q: FloatArray) -> BoolArray:
     return is_on & ~((side > 0).all(axis=0) | (side < 0).all(axis=0))
 
 
-def _is_between(triangle: FloatArray, p: FloatArray) -> BoolArray:
-    """(k,) whether the directions from the first corners of triangles (k, 3, 3) to points in their
-    planes lie between the directions to the two other corners, or along one of them."""
+def _is_in_angle(triangle: FloatArray, p: FloatArray) -> BoolArray:
+    """(k,) whether points `p` (k, 3), each in the plane of its triangle (k, 3, 3), lie in the angle
+    of the triangle at its first corner, its two sides included. False for triangles without an
+    area."""
     normal = np.abs(area_normals(triangle))
     axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
     a = np.take_along_axis(triangle, axes[:, None].repeat(3, axis=1), axis=2)
@@ -627,6 +658,8 @@ def _askew_lines() -> FloatArray:
 def _is_positive(
     function: LevelFunction, points: FloatArray, volume: Volume | None
 ) -> npt.NDArray[np.bool_]:
+    """(n,) whether points (n, 3) count as outside: the function is positive or not a number there,
+    or the point lies outside of the volume."""
     is_positive = ~(function.sample(points).value <= 0)
     return is_positive if volume is None else is_positive | ~volume.contains_points(points)
 
@@ -651,8 +684,14 @@ def nonmanifold_vertices(faces: IntArray) -> IntArray:
 
 
 def _vertex_fans(faces: IntArray, edges: Edges) -> tuple[int, IntArray]:
-    """The number of fans of faces, joined by edges, that all vertices have together, and (3m,) the
-    fan that each corner of a face belongs to. edges: of `half_edges`."""
+    """Group the corners of faces (m, 3) into fans. A fan is a maximal set of faces around a vertex
+    that are joined to each other by edges at that vertex.
+
+    edges: the `Edges` of `half_edges(faces)`.
+
+    Returns the number of fans of all vertices together, and (3m,) the index of the fan that each
+    corner of a face belongs to, face by face.
+    """
     import scipy.sparse  # imported here: it takes half a second
     import scipy.sparse.csgraph as csgraph_module
 

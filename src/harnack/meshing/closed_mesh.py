@@ -42,12 +42,14 @@ __all__ = [
     "without_short_edges",
 ]
 
-_MOST_SEGMENTS = 2000
+# The largest number of segments around a ball or a solid of revolution.
+_MAX_SEGMENTS = 2000
 # The areas of a union and of its parts may differ by the first, relative to the area. Otherwise,
-# and where triangles of the union cross, parts are grown, by the second, relative to the size; at
-# sharp corners by at most that over the third.
-_SAME_AREA, _GROWN, _LEAST_SLANT = 1e-6, 1e-9, 0.1
-_MOST_CELLS = 1_000_000
+# and where triangles of the union cross, the faces of parts are moved outwards by the second,
+# relative to the size. At sharp corners vertices are moved by at most that divided by the third.
+_AREA_TOLERANCE, _GROWTH, _MIN_SLANT = 1e-6, 1e-9, 0.1
+# The largest number of squares of the permitted edge on a twisted outline.
+_MAX_CELLS = 1_000_000
 
 
 def to_manifold(surface: TriangleMesh) -> Manifold:
@@ -99,9 +101,9 @@ def mesh_manifold(solid: MeshSolid) -> Manifold | None:
         if part.volume() <= 0 or len(intersecting_faces(boundary.vertices, boundary.faces)):
             return None
     first_union: Manifold | None = None
-    for length in (0.0, _GROWN * surface.size):
-        union = Manifold.batch_boolean([_grown(part, length) for part in parts], OpType.Add)
-        if abs(union.surface_area() - surface.area) <= _SAME_AREA * surface.area:
+    for length in (0.0, _GROWTH * surface.size):
+        union = Manifold.batch_boolean([_grown_part(part, length) for part in parts], OpType.Add)
+        if abs(union.surface_area() - surface.area) <= _AREA_TOLERANCE * surface.area:
             first_union = first_union or union
             boundary = from_manifold(union)
             if not len(intersecting_faces(boundary.vertices, boundary.faces)):
@@ -109,7 +111,9 @@ def mesh_manifold(solid: MeshSolid) -> Manifold | None:
     return first_union
 
 
-def _grown(part: Manifold, length: float) -> Manifold:
+def _grown_part(part: Manifold, length: float) -> Manifold:
+    """The part, its faces moved outwards by a length (`grown`); the same part if the length is
+    0."""
     return part if length == 0 else to_manifold(grown(from_manifold(part), length))
 
 
@@ -122,7 +126,7 @@ def grown(surface: TriangleMesh, length: float) -> TriangleMesh:
     slant = np.ones(len(normals))
     for k in range(3):
         np.minimum.at(slant, faces[:, k], row_dots(normals[faces[:, k]], mesh.face_normals))
-    return TriangleMesh(x + normals * (length / np.maximum(slant, _LEAST_SLANT))[:, None], faces)
+    return TriangleMesh(x + normals * (length / np.maximum(slant, _MIN_SLANT))[:, None], faces)
 
 
 def without_short_edges(solid: Manifold, length: float) -> Manifold:
@@ -164,7 +168,7 @@ def extruded_manifold(
     Raises:
         MeshingError: so fine that it has millions of faces.
     """
-    section, scale = _section(outline)
+    section, scale = _cross_section(outline)
     inverse_scale = (1 / scale, 1 / scale, 1 / scale)
     if twist == 0:
         return section.extrude(height * scale, 0, 0.0, (taper, taper)).scale(inverse_scale)
@@ -175,7 +179,7 @@ def extruded_manifold(
     length = math.sqrt(6 * tolerance / bound)
     straight = section.extrude(height * scale)
     count = straight.surface_area() / (scale * length) ** 2
-    if count > _MOST_CELLS:
+    if count > _MAX_CELLS:
         raise MeshingError(
             f"a twisted outline within {tolerance:.3g} has about {4 * count:,.0f} faces: choose a "
             "larger `tolerance`"
@@ -199,17 +203,17 @@ def revolved_manifold(outline: Outline, tolerance: float) -> Manifold:
     """
     radius = max(float(loop[:, 0].max()) for loop in outline)
     segments = 4 * math.ceil(0.25 * math.pi * math.sqrt(radius / (2 * tolerance)))
-    if segments > _MOST_SEGMENTS:
+    if segments > _MAX_SEGMENTS:
         raise MeshingError(
             f"an outline of radius {radius:g} revolved within {tolerance:.3g} has {segments:,} "
             "segments around: choose a larger `tolerance`"
         )
-    section, scale = _section(outline)
+    section, scale = _cross_section(outline)
     return section.revolve(max(16, segments)).scale((1 / scale, 1 / scale, 1 / scale))
 
 
-def _section(outline: Outline) -> tuple[CrossSection, float]:
-    """The cross-section of an outline, times a scale for which it is not rounded
+def _cross_section(outline: Outline) -> tuple[CrossSection, float]:
+    """The cross-section of an outline times a scale for which it is not rounded
     (`scale_for_clipper`), and that scale."""
     from manifold3d import CrossSection
 
@@ -243,20 +247,29 @@ def volume_manifold(
             manifold = manifold.trim_by_plane((-x, -y, -z), -h)
         return manifold
     if isinstance(volume, Ball):
-        return manifold ^ _ball(volume, tolerance)
+        return manifold ^ _ball_manifold(volume, tolerance)
     raise MeshingError(f"a {type(volume).__name__} cannot cut a mesh: give a box or a ball")
 
 
-def _ball(ball: Ball, tolerance: float) -> Manifold:
-    """A geodesic polyhedron of n segments around. The octahedron's faces are cut into equilateral
-    triangles and blown up: an edge is at most sqrt(3) times as long as the mean of those along its
-    sides, r pi/(2 n/4), and a circle through its corners of radius edge/sqrt(3) has a sagitta of
-    half its square over r."""
+def _ball_manifold(ball: Ball, tolerance: float) -> Manifold:
+    """A geodesic polyhedron whose vertices lie on the sphere and whose faces are within `tolerance`
+    of it.
+
+    Proof. Let n be the number of segments around, and r the radius. The octahedron's faces are
+    divided into equilateral triangles, whose vertices are then moved onto the sphere. The mean
+    length of edges along a side of the octahedron is (r pi/2)/(n/4) = 2 pi r/n, and all edges are
+    at most sqrt(3) times as long. So the circle through the corners of a triangle has a radius of
+    at most edge/sqrt(3) <= 2 pi r/n, and the triangle is at most half of the square of that radius,
+    over r, from the sphere.
+
+    Raises:
+        MeshingError: so fine that it has millions of faces.
+    """
     from manifold3d import Manifold
 
     r = ball.radius
     segments = 4 * math.ceil(0.25 * 2 * math.pi * math.sqrt(r / (2 * tolerance)))
-    if segments > _MOST_SEGMENTS:
+    if segments > _MAX_SEGMENTS:
         raise MeshingError(
             f"a ball of radius {r:g} within {tolerance:.3g} has {2 * segments**2:,} faces: choose "
             "a larger `tolerance`"
@@ -268,14 +281,16 @@ def _ball(ball: Ball, tolerance: float) -> Manifold:
 # Closed files.
 
 # Readers such as trimesh merge points that are nearer than 1e-8 in the file's unit.
-_LEAST_STEP = 2.0**-26
-# In units of that distance larger coordinates are beyond the integers of readers.
+_MIN_STEP = 2.0**-26
+# Coordinates may be at most this large: divided by that distance, larger ones are beyond the
+# integers of readers.
 _LARGEST = 2.0**36
-# A part has to be at least this many steps long.
-_MOST_COARSE = 1e4
-# Where the snapped mesh does not pass its checks, it is simplified within these numbers of steps.
+# A part has to be at least this many steps of the grid long.
+_MIN_STEPS_ACROSS = 1e4
+# If the mesh on the grid does not pass its checks, it is simplified, moving it by up to this many
+# steps of the grid; the numbers are tried in turn.
 _SIMPLIFY_STEPS = (4, 32)
-# Where triangles cross, it is mended within this number of steps.
+# Where triangles cross, the mesh is mended, moving it by up to this many steps of the grid.
 _REPAIR_STEPS = 32
 
 
@@ -327,15 +342,16 @@ class ClosedMesh(trimesh.Trimesh):
 
 
 def _grid_spacing(x: FloatArray) -> float:
-    """The distance between neighbors of the grid that points are rounded to: a power of two, of
-    which single precision, with its 24 bits, holds all multiples as large as the points.
+    """The spacing of the grid to which vertices `x` (n, 3) are rounded. It is a power of two, and
+    so large that single precision, which has 24 bits, holds all multiples of it up to the largest
+    coordinate.
 
     Raises:
-        MeshingError: it is too coarse for them.
+        MeshingError: the grid is too coarse for the part, or coordinates are too large.
     """
     largest, size = float(np.abs(x).max()), float(np.ptp(x, axis=0).max())
-    step = max(math.ldexp(1.0, math.frexp(largest)[1] - 24), _LEAST_STEP)
-    if size < _MOST_COARSE * step or not largest <= _LARGEST:
+    step = max(math.ldexp(1.0, math.frexp(largest)[1] - 24), _MIN_STEP)
+    if size < _MIN_STEPS_ACROSS * step or not largest <= _LARGEST:
         raise MeshingError(
             f"the part is {size:.3g} long, at up to {largest:.3g} from the origin, where a file "
             f"tells points apart that are {step:.2g} from each other, up to {_LARGEST:.2g}: move "
@@ -345,8 +361,13 @@ def _grid_spacing(x: FloatArray) -> float:
 
 
 def _quantize(mesh: trimesh.Trimesh, step: float) -> trimesh.Trimesh:
-    """The mesh with vertices on the grid; if that does not pass its checks, mended where it fails,
-    or simplified."""
+    """The mesh with its vertices rounded to the grid of spacing `step`. If triangles cross then,
+    the mesh is mended there; if it still does not pass its checks, it is simplified. A mesh with
+    colors or textures is neither mended nor simplified.
+
+    Raises:
+        MeshingError: nothing makes the mesh on the grid closed and free of intersections.
+    """
     original = TriangleMesh(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64))
     x, faces, is_kept = _merge_on_grid(original, step)
     is_plain = not cast("Any", mesh.visual).defined
@@ -372,8 +393,8 @@ def _quantize(mesh: trimesh.Trimesh, step: float) -> trimesh.Trimesh:
 
 
 def _simplify_until_valid(original: TriangleMesh, step: float) -> TriangleMesh | None:
-    """The mesh on the grid without slivers, simplified by manifold3d; None if that does not help
-    either."""
+    """The mesh on the grid of spacing `step`, simplified by manifold3d, without slivers and without
+    triangles that cross; None if no simplification leads to that."""
     for steps in _SIMPLIFY_STEPS:
         simpler = from_manifold(without_short_edges(to_manifold(original), steps * step))
         x, faces, is_kept = _merge_on_grid(simpler, step)
@@ -388,8 +409,12 @@ def _simplify_until_valid(original: TriangleMesh, step: float) -> TriangleMesh |
 
 
 def _merge_on_grid(surface: TriangleMesh, step: float) -> tuple[FloatArray, IntArray, BoolArray]:
-    """The vertices on the grid; the faces, between the first of the vertices at each point; and
-    which faces still have three corners."""
+    """Round the vertices of a surface to the grid of spacing `step`, and join those that coincide.
+
+    Returns the rounded vertices (n, 3), coinciding ones included; the faces (m, 3), in which the
+    first of the vertices at each point stands for all of them; and a mask (m,) of the faces that
+    still have three different corners.
+    """
     grid = np.round(surface.vertices / step)
     x = grid * step
     # Vertices at the same point, by their coordinates one after the other.
@@ -405,12 +430,13 @@ def _merge_on_grid(surface: TriangleMesh, step: float) -> tuple[FloatArray, IntA
 def _resolve_after_rounding(
     rounded: TriangleMesh, original: TriangleMesh, length: float
 ) -> TriangleMesh | None:
-    """The rounded surface mended where triangles cross, moved by no more than a length; None if
-    none cross, or if mending does not help and triangles of the original cross too, as those of a
-    repaired mesh may.
+    """The rounded surface, mended where triangles cross; mending moves it by no more than `length`.
+    None if no triangles cross; and if mending fails and triangles of the original surface cross
+    too, as those of a repaired mesh may.
 
     Raises:
-        LocalizedMeshingError: it is not closed, or triangles cross.
+        LocalizedMeshingError: the rounded surface is not closed; or mending fails, although no
+            triangles of the original surface cross.
     """
     check_manifold(rounded.faces, rounded.vertices)
     try:

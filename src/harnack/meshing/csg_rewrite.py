@@ -32,7 +32,7 @@ def factor_common_operands(union: BooleanSolid, level: float) -> Solid | None:
     sharing = [term for term in terms if common_key in term]
     other_terms = [_intersection(term.values()) for term in terms if common_key not in term]
     shared = {key for key in sharing[0] if all(key in term for term in sharing)}
-    common = [_placed(*factor) for key, factor in sharing[0].items() if key in shared]
+    common = [_with_level_zero(*factor) for key, factor in sharing[0].items() if key in shared]
     remainders = [[factor for key, factor in term.items() if key not in shared] for term in sharing]
     if all(remainders):
         common.append(_union([_intersection(remainder) for remainder in remainders]))
@@ -72,7 +72,8 @@ def drop_cancelled_operands(solid: BooleanSolid, level: float) -> BooleanSolid |
 
 
 def _factors(solid: Solid, level: float) -> list[SolidAtLevel]:
-    """Solids and levels whose intersection is the set where a solid is at most a level."""
+    """Solids with levels; {solid <= level} is the intersection of the sets {factor <= its
+    level}."""
     if isinstance(solid, BooleanSolid) and not solid.is_union:
         return [factor for part in solid.parts for factor in _factors(part, level)]
     if isinstance(solid, OffsetSolid):
@@ -91,13 +92,15 @@ def _factors(solid: Solid, level: float) -> list[SolidAtLevel]:
 
 
 def _image(solid: Solid, of: TransformedSolid, level: float) -> SolidAtLevel:
+    """The image of {solid <= level} under the affine map of `of`: a solid and its level."""
     if isinstance(solid, Complement):
         return Complement(TransformedSolid(solid.field, of.map)), level * of.map.value_factor
     return TransformedSolid(solid, of.map), level * of.map.value_factor
 
 
 def _key(solid: Solid, level: float) -> Hashable:
-    """A key that is equal for equal sets of points of the same field."""
+    """A key for {solid <= level}: sets with equal keys are equal sets of points, made of the same
+    field object."""
     if isinstance(solid, Complement):
         return "complement", _key(solid.field, -level)
     if isinstance(solid, OffsetSolid):
@@ -108,8 +111,8 @@ def _key(solid: Solid, level: float) -> Hashable:
     return id(solid), level
 
 
-def _placed(solid: Solid, level: float) -> Solid:
-    """The solid as a solid of level 0."""
+def _with_level_zero(solid: Solid, level: float) -> Solid:
+    """A solid f for which {f <= 0} is {solid <= level}."""
     if level == 0:
         return solid
     if isinstance(solid, Complement):
@@ -118,13 +121,15 @@ def _placed(solid: Solid, level: float) -> Solid:
 
 
 def _intersection(factors: Iterable[SolidAtLevel]) -> Solid:
-    parts = tuple(_placed(*factor) for factor in factors)
+    """The intersection of the sets {solid <= level}, as a solid of level 0; with one factor that
+    solid alone."""
+    parts = tuple(_with_level_zero(*factor) for factor in factors)
     return parts[0] if len(parts) == 1 else BooleanSolid(parts, is_union=False)
 
 
 def _union(parts: Sequence[Solid]) -> Solid:
-    """The union of solids. If there are complements, it is the complement of an intersection, so
-    that no solid has to be cut away from all of space."""
+    """The union of solids. If there are complements among them, it is written as the complement of
+    an intersection, so that no solid has to be cut away from all of space."""
     if any(isinstance(operand, Complement) for operand in parts):
         return Complement(BooleanSolid(tuple(~operand for operand in parts), is_union=False))
     return BooleanSolid(tuple(parts), is_union=True)
