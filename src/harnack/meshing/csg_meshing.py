@@ -94,18 +94,18 @@ __all__ = [
     "solid_value_range",
 ]
 
-# The size of cells for offsets of meshes, in tolerances; and the number of secant steps for roots
-# on their edges.
-_CELLS_OF_OFFSET, _SECANTS = 6.0, 2
-# In lattices of more cells than this, the region where other operands leave nothing is computed at
-# once.
+# For offsets of meshes: the size of cells, in tolerances; and the number of secant steps that find
+# the level on an edge of a cell.
+_OFFSET_CELLS, _SECANT_STEPS = 6.0, 2
+# In lattices of at least this many cells, cells are left out at once in which the other operands
+# of an intersection leave nothing.
 _MANY_CELLS = 100_000
-# How far merging of coplanar triangles may move surfaces of offsets, in tolerances, the first value
-# that does no harm; and how far mending may move them, which is done after merging.
-_JOINED_WITHIN, _MENDED_WITHIN = (0.5, 0.25, 0.1), 0.5
-# Triangles of offsets are cut in three where their centers are farther off the level, in
-# tolerances; and how often.
-_FAR_OFF, _TIMES_CUT = 1.8, 2
+# How far surfaces of offsets may be moved, in tolerances: by merging coplanar triangles, tried in
+# this order until the result can be mended; and by the mending of crossing triangles afterwards.
+_MERGED_WITHIN, _MENDED_WITHIN = (0.5, 0.25, 0.1), 0.5
+# Triangles of offsets are cut in three if their centers are farther from the level than the first,
+# in tolerances; the second is the number of rounds.
+_FAR_OFF, _SPLITS = 1.8, 2
 
 # Meshes the level set of an angle, which ends at its curve: field, level -> vertices and faces.
 AngleMesher = Callable[[SolidAngle, float], TriangleMesh]
@@ -175,17 +175,17 @@ class CsgMesher:
             if apart is not None:
                 return self.mesh_sublevel(apart, 0.0)
             reduced = drop_cancelled_operands(flatten_csg(solid), level)
-            return Manifold() if reduced is None else self._joined(reduced, level)
+            return Manifold() if reduced is None else self._mesh_boolean(reduced, level)
         if isinstance(solid, Complement):  # -f <= c where f >= -c
             return self._whole_box() - self.mesh_sublevel(solid.field, -level)
         if isinstance(solid, OffsetSolid):
             return self.mesh_sublevel(solid.field, level + solid.distance)
         if isinstance(solid, BandSolid):
-            return self._wall(solid, level)
+            return self._mesh_wall(solid, level)
         if isinstance(solid, SublevelSolid) and isinstance(solid.field, Solid):
             return self.mesh_sublevel(solid.field, level)
         if isinstance(solid, TransformedSolid) and not is_single_level_set(solid.field):
-            return self._image(solid, level)
+            return self._mesh_transformed(solid, level)
         if isinstance(solid, Cuboid) and solid.radius == 0 and level <= 0:
             half = 0.5 * np.array(solid.sides) + level
             return box_manifold(-half, half) if (half > 0).all() else Manifold()
@@ -201,67 +201,72 @@ class CsgMesher:
         if isinstance(solid, Tube):
             return tube_manifold(solid, level, self.tolerance)
         if isinstance(solid, MeshSolid):
-            return (mesh_manifold(solid) if level == 0 else None) or self._offset(solid, level)
+            return (mesh_manifold(solid) if level == 0 else None) or self._mesh_offset(solid, level)
         if isinstance(solid, Plane):
             x, y, z = solid.normal
             return self._whole_box().trim_by_plane((-x, -y, -z), -(solid.distance + level))
         return to_manifold(self.mesh_smooth_level(solid, level)[0])
 
-    def _joined(self, solid: BooleanSolid, level: float) -> Manifold:
-        """The mesh of a union, or of an intersection, from which complements are cut away."""
+    def _mesh_boolean(self, solid: BooleanSolid, level: float) -> Manifold:
+        """The mesh of {solid <= level}, of a union or an intersection. Complements in an
+        intersection are meshed as the solids that are cut away."""
         from manifold3d import Manifold, OpType
 
-        numbers = range(len(solid.parts))
+        indices = range(len(solid.parts))
         if solid.is_union:
             return Manifold.batch_boolean(
-                [self._part(solid, k, level) for k in numbers], OpType.Add
+                [self._mesh_operand(solid, k, level) for k in indices], OpType.Add
             )
-        cut = [k for k in numbers if isinstance(solid.parts[k], Complement)]
-        parts = [self._part(solid, k, level) for k in numbers if k not in cut]
+        complements = [k for k in indices if isinstance(solid.parts[k], Complement)]
+        parts = [self._mesh_operand(solid, k, level) for k in indices if k not in complements]
         common = Manifold.batch_boolean(parts, OpType.Intersect) if parts else self._whole_box()
-        away = [self._part(solid, k, level) for k in cut]
-        return Manifold.batch_boolean([common, *away], OpType.Subtract)
+        cut_away = [self._mesh_operand(solid, k, level) for k in complements]
+        return Manifold.batch_boolean([common, *cut_away], OpType.Subtract)
 
-    def _part(self, solid: BooleanSolid, number: int, level: float) -> Manifold:
-        """The mesh of one operand of a union or an intersection: in an intersection only where the
-        other operands may leave something of it (`IntersectedOperands`). For a complement in an
-        intersection, the solid that is cut away."""
+    def _mesh_operand(self, solid: BooleanSolid, number: int, level: float) -> Manifold:
+        """The mesh of operand `number` of a union or an intersection; for a complement in an
+        intersection, the mesh of the solid that is cut away. In an intersection the operand need be
+        meshed only where the other operands may leave something of it (`IntersectedOperands`)."""
         previous, part = self.intersected_with, solid.parts[number]
         if not solid.is_union:
-            beside = [operand for operand in solid.parts if operand is not part]
+            others = [operand for operand in solid.parts if operand is not part]
             if isinstance(part, Complement):
                 self.intersected_with = tuple(
-                    (operand, level) for operand in beside if _has_no_complement(operand)
+                    (operand, level) for operand in others if _is_complement_free(operand)
                 )
                 part, level = part.field, -level
             else:
-                self.intersected_with = (*previous, *((operand, level) for operand in beside))
+                self.intersected_with = (*previous, *((operand, level) for operand in others))
         try:
             return self.mesh_sublevel(part, level)
         finally:
             self.intersected_with = previous
 
-    def _closed(self, function: LevelFunction, lattice: BccLattice) -> TriangleMesh:
-        """A level set in a box. If there are many cells, only those where the other operands may
-        leave something are meshed. If there are few, all are meshed, so that copies of a surface
-        are the same bit by bit; unless that fails, as it may where nothing is left: a function of
-        the angle about an axis jumps there, and other functions have no value beyond a surface."""
-        elsewhere: IrrelevantRegion | None = None
+    def _mesh_level_set(self, function: LevelFunction, lattice: BccLattice) -> TriangleMesh:
+        """The level set of `function` in the cells of `lattice`, as a closed mesh.
+
+        If there are many cells, those in which the other operands are proved to leave nothing are
+        left out. If there are few, all are meshed, so that copies of a surface are the same bit by
+        bit. Should that fail, cells are left out as well: a function may jump where nothing is
+        left, as the angle about an axis does, or have no value beyond a surface.
+        """
+        region: IrrelevantRegion | None = None
         if math.prod(lattice.counts.tolist()) < _MANY_CELLS:
             try:
                 return mesh_closed_surface(function, lattice, self.tolerance, self.report)
-            except MeshingError as wrong:
-                elsewhere = self._elsewhere()
-                if elsewhere is None:
+            except MeshingError as error:
+                region = self._empty_region()
+                if region is None:
                     raise
-                self.report(f"{wrong}; so only where the other parts leave something")
+                self.report(f"{error}; so only where the other parts leave something")
         return mesh_closed_surface(
-            function, lattice, self.tolerance, self.report, elsewhere=elsewhere or self._elsewhere()
+            function, lattice, self.tolerance, self.report, elsewhere=region or self._empty_region()
         )
 
-    def _elsewhere(self) -> IrrelevantRegion | None:
-        """The region where the other operands are proved to leave nothing; None if there are no
-        other operands. The two sides of a wall have the same region."""
+    def _empty_region(self) -> IrrelevantRegion | None:
+        """The region in which the other operands, `intersected_with`, are proved to leave nothing;
+        None if there are no other operands. Both sides of a wall use the region computed for the
+        first."""
         if not self.intersected_with:
             return None
         if (
@@ -272,11 +277,13 @@ class CsgMesher:
         functions = [self.function(solid, level) for solid, level in self.intersected_with]
 
         def clearance(points: FloatArray) -> FloatArray:
-            lengths = np.zeros(len(points))
+            """(n,) for each point (n, 3) the radius of a ball about it in which some operand is
+            proved to leave nothing; 0 if none is."""
+            radii = np.zeros(len(points))
             for solid in functions:
                 outside = np.flatnonzero(solid.values(points) > 0)
-                lengths[outside] = np.maximum(lengths[outside], solid.clearance(points[outside]))
-            return lengths
+                radii[outside] = np.maximum(radii[outside], solid.clearance(points[outside]))
+            return radii
 
         region = IrrelevantRegion(clearance)
         self.irrelevant_region_cache = self.intersected_with, region
@@ -285,7 +292,7 @@ class CsgMesher:
     def mesh_smooth_level(self, field: Field, level: float) -> tuple[TriangleMesh, bool]:
         """The boundary of {f <= level} as one level set, and whether it is the whole boundary: if
         not, it is closed outside of the box in a way that has no meaning."""
-        hull = _hull(field, level)
+        hull = _finite_extent(field, level)
         lower, upper = self.lower, self.upper
         is_whole = False
         if hull is not None:
@@ -302,7 +309,7 @@ class CsgMesher:
         function = self.function(_underlying_field(field), level)
         self.report(f"level {level:g} of {type(field).__name__} in cells of {spacing:.3g}")
         lattice = BccLattice.covering_box(lower, upper, spacing, layers=2)
-        surface = self._closed(function, lattice)
+        surface = self._mesh_level_set(function, lattice)
         self.evaluations += function.evaluations
         self.levels += 1
         return surface, is_whole
@@ -314,11 +321,18 @@ class CsgMesher:
         )
 
     def _whole_box(self) -> Manifold:
+        """A box that is a little larger than the meshed one, which stands for all of space."""
         pad = 1e-3 * (self.upper - self.lower)
         return box_manifold(self.lower - pad, self.upper + pad)
 
-    def _wall(self, wall: BandSolid, level: float) -> Manifold:
-        """The mesh of the points where a field is within half_width + level of the wall's level."""
+    def _mesh_wall(self, wall: BandSolid, level: float) -> Manifold:
+        """The mesh of the points where the wall's field is within half_width + level of the wall's
+        own level.
+
+        Raises:
+            MeshingError: the wall is thinner than the tolerance, or its field has a period and is
+                no solid angle.
+        """
         from manifold3d import Manifold
 
         half = wall.half_width + level
@@ -329,7 +343,7 @@ class CsgMesher:
         if field.period is None:
             inside = SublevelSolid(field)
             if not isinstance(field, Solid):
-                self._check_wall(field, low, high)
+                self._check_wall_thickness(field, low, high)
             return self.mesh_sublevel(inside, high) - self.mesh_sublevel(inside, low)
         if 2 * half >= field.period:
             return self._whole_box()
@@ -340,8 +354,11 @@ class CsgMesher:
             )
         return to_manifold(self._between_angle_levels(field, low, high))
 
-    def _check_wall(self, field: Field, low: float, high: float) -> None:
-        """Raise if a wall is thinner than both of its sides' tolerance: they would meet."""
+    def _check_wall_thickness(self, field: Field, low: float, high: float) -> None:
+        """Raise MeshingError if the wall {low <= field <= high} is about as thin as the tolerance
+        of both of its sides together: they would meet. The thickness is (high - low) over the
+        median length of the gradient, near the wall in a coarse lattice.
+        """
         lattice = BccLattice.covering_box(
             self.lower, self.upper, float((self.upper - self.lower).max()) / 8
         )
@@ -360,8 +377,12 @@ class CsgMesher:
             )
 
     def _between_angle_levels(self, field: SolidAngle, low: float, high: float) -> TriangleMesh:
-        """The surface around the points between two levels of an angle: both levels end at the same
-        vertices, those of the curve."""
+        """The closed surface around the points between two levels of an angle. The surfaces of both
+        levels end at the same vertices, those of the curve.
+
+        Raises:
+            MeshingError: they do not.
+        """
         inner, outer = self.mesh_angle(field, low), self.mesh_angle(field, high)
         count = sum(map(len, field.loops))
         if not np.array_equal(inner.vertices[:count], outer.vertices[:count]):
@@ -372,30 +393,31 @@ class CsgMesher:
         self.levels += 2
         return TriangleMesh(vertices, np.concatenate([outer.faces, index[inner.faces][:, ::-1]]))
 
-    def _offset(self, solid: MeshSolid, level: float) -> Manifold:
-        """The points within a distance of a mesh, or deeper inside than that distance.
+    def _mesh_offset(self, solid: MeshSolid, level: float) -> Manifold:
+        """The mesh of {solid <= level}: the points within the distance `level` of a meshed solid,
+        or if `level` is negative those deeper inside than -level.
 
         Offsets of meshes have creases wherever the mesh has, too many for cells to be refined
-        beside them. So cells are small at once; and since f is a distance, it is linear along their
-        edges except at creases. Then triangles that are nearly in a plane are merged, triangles
-        across a crease are cut, and triangles that pass through each other are mended. Parts
-        thinner than a cell, such as the tip of a knife edge, may be left out: points of them are
-        less than a cell from the level.
+        beside them. So cells are small from the beginning; and since f is a distance, it is linear
+        along their edges except at creases. Then triangles that are nearly in a plane are merged,
+        triangles across a crease are cut, and triangles that pass through each other are mended.
+        Parts thinner than a cell, such as the tip of a knife edge, may be left out: their points
+        are less than a cell from the level.
         """
-        lower, upper = (np.array(end) for end in _finite_hull(solid, level))
+        lower, upper = (np.array(end) for end in _sublevel_bounds(solid, level))
         if not (lower < upper).all():
             return to_manifold(TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64)))
-        cells = min(self.spacing, _CELLS_OF_OFFSET * self.tolerance)
+        cells = min(self.spacing, _OFFSET_CELLS * self.tolerance)
         self.smallest_cell = min(self.smallest_cell, cells)
-        function = dataclasses.replace(self.function(solid, level), secant_steps=_SECANTS)
+        function = dataclasses.replace(self.function(solid, level), secant_steps=_SECANT_STEPS)
         self.report(f"level {level:g} of a mesh in cells of {cells:.3g}")
         lattice = BccLattice.covering_box(lower - cells, upper + cells, cells, layers=2)
         surface = mesh_closed_surface(function, lattice, self.tolerance, self.report, as_cut=True)
         manifold = to_manifold(surface)
         self.levels += 1
-        for fraction in _JOINED_WITHIN:
+        for fraction in _MERGED_WITHIN:
             joined = from_manifold(without_short_edges(manifold, fraction * self.tolerance))
-            joined = split_faces_off_level(function, joined, _FAR_OFF * self.tolerance, _TIMES_CUT)
+            joined = split_faces_off_level(function, joined, _FAR_OFF * self.tolerance, _SPLITS)
             try:
                 surface = resolve_self_intersections(joined, _MENDED_WITHIN * self.tolerance)
             except SelfIntersectionError:
@@ -404,8 +426,9 @@ class CsgMesher:
         self.evaluations += function.evaluations
         return to_manifold(surface)
 
-    def _image(self, solid: TransformedSolid, level: float) -> Manifold:
-        """The image of a solid's mesh under an affine map."""
+    def _mesh_transformed(self, solid: TransformedSolid, level: float) -> Manifold:
+        """The mesh of a transformed solid: that of the original, in the box mapped back, under the
+        affine map."""
         matrix, offset = np.array(solid.map.matrix), np.array(solid.map.translation_vector)
         ends = np.stack([self.lower, self.upper])
         corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -429,12 +452,13 @@ class CsgMesher:
         return manifold.transform(np.column_stack([matrix, offset]))
 
 
-def _has_no_complement(solid: Solid) -> bool:
-    """Whether a solid has no complement among its operands, as it is meshed."""
+def _is_complement_free(solid: Solid) -> bool:
+    """Whether no complement is meshed for a solid: neither it nor its operands are complements or
+    walls."""
     if isinstance(solid, BooleanSolid):
-        return all(_has_no_complement(operand) for operand in solid.parts)
+        return all(_is_complement_free(operand) for operand in solid.parts)
     if isinstance(solid, TransformedSolid | OffsetSolid):
-        return _has_no_complement(solid.field)
+        return _is_complement_free(solid.field)
     return not isinstance(solid, Complement | BandSolid)
 
 
@@ -448,14 +472,15 @@ def is_single_level_set(solid: Solid) -> bool:
     return not isinstance(solid, BooleanSolid | Complement | OffsetSolid | BandSolid | with_edges)
 
 
-def _finite_hull(solid: MeshSolid, level: float) -> tuple[FloatArray, FloatArray]:
+def _sublevel_bounds(solid: MeshSolid, level: float) -> tuple[FloatArray, FloatArray]:
+    """The lower and upper corners (3,) of a box that contains {solid <= level}."""
     low, high = cast("Volume", solid.sublevel_extent(level)).bounds()
     return np.array(low), np.array(high)
 
 
-def _hull(field: Field, level: float) -> Volume | None:
-    """A volume that holds {f <= level}, if it has bounds. A domain does not count: a surface that
-    ends there is cut by it."""
+def _finite_extent(field: Field, level: float) -> Volume | None:
+    """A volume with finite bounds that contains {f <= level}; None if no such volume is known. The
+    field's domain does not count, since a surface that ends there is cut by it."""
     if isinstance(field, Solid):
         extent = field.sublevel_extent(level)
     else:
@@ -475,10 +500,11 @@ def _underlying_field(field: Field) -> Field:
 
 @dataclass
 class _DomainExtendedFunction(LevelFunction):
-    """A field continued beyond its domain as it is at the domain's closest point.
+    """A field, continued beyond its domain: outside of the domain it has the value of the closest
+    point of the domain.
 
-    The closest points of two points are no farther from each other than the two are, so that the
-    clearance of the closest point of p holds around p.
+    Proof that the clearance of p's closest point is a clearance of p: the closest points of two
+    points are no farther from each other than the two points are.
     """
 
     def sample(self, points: FloatArray) -> LevelSamples:
@@ -491,6 +517,11 @@ class _DomainExtendedFunction(LevelFunction):
         return super().clearance(self._closest(points))
 
     def _closest(self, points: FloatArray) -> FloatArray:
+        """The closest points (n, 3) of the field's domain.
+
+        Raises:
+            MeshingError: points lie outside of a domain that is neither a box nor a ball.
+        """
         domain = self.field.domain
         if domain is None or self.field.is_global:
             return points
@@ -512,13 +543,14 @@ class _DomainExtendedFunction(LevelFunction):
 
 # Solids cut by volumes.
 
-# Cells across a solid, unless a spacing is given.
-_ACROSS = 24
+# The number of cells across a solid, unless a spacing is given.
+_CELLS_ACROSS = 24
 # How many sizes of cells are tried, and the ratio of each size to the one before.
-_MOST_ATTEMPTS = 3
-_SMALLER = 0.6
-# Where operands were cut by each other, slivers may pass through their neighbors by rounding: how
-# far the surface may be moved to remove them, in tolerances, in the order of the attempts.
+_MAX_ATTEMPTS = 3
+_CELL_SIZE_RATIO = 0.6
+# Where operands were cut by each other, slivers may pass through their neighbors by rounding. They
+# are removed by moving the surface by up to the first length, in tolerances; if that fails by the
+# next.
 _SLIVERS_WITHIN = (1e-3, 1e-4, 0.0)
 # The margin around an extent, relative to its size.
 _MARGIN = 0.01
@@ -607,9 +639,9 @@ def mesh_solid(
     """
     lower, upper = _bounds(solid, level, volume)
     size = float((upper - lower).max())
-    cells = size / _ACROSS if spacing is None else spacing
+    cells = size / _CELLS_ACROSS if spacing is None else spacing
     error = 0.5 * tolerance.at(size)
-    attempts = _MOST_ATTEMPTS if spacing is None else 1
+    attempts = _MAX_ATTEMPTS if spacing is None else 1
     per_wave = CELLS_PER_WAVE if spacing is None else None
     uploads = EvaluatorCache()
     first: MeshingError | None = None
@@ -620,9 +652,9 @@ def mesh_solid(
             most_faces, report, uploads=uploads,
         )  # fmt: skip
         try:
-            surface = _apart(_assemble(mesher, solid, level, volume), error)
+            surface = _without_crossings(_mesh_in_volume(mesher, solid, level, volume), error)
             report("checking")
-            surface = _checked(mesher, solid, level, surface, size, check)
+            surface = _check_and_mend(mesher, solid, level, surface, size, check)
             break
         except TriangleLimitError as large:
             if first is None:
@@ -630,11 +662,11 @@ def mesh_solid(
             raise first from large  # the first error is the cause
         except (MissedPartsError, LocalizedMeshingError) as wrong:
             attempts, first = attempts - 1, first or wrong
-            if not attempts or not is_retry_promising(wrong, before, _SMALLER**attempts):
+            if not attempts or not is_retry_promising(wrong, before, _CELL_SIZE_RATIO**attempts):
                 raise
             before = wrong
-            cells *= _SMALLER
-            per_wave = CELLS_PER_WAVE * size / (_ACROSS * cells)
+            cells *= _CELL_SIZE_RATIO
+            per_wave = CELLS_PER_WAVE * size / (_CELLS_ACROSS * cells)
             if isinstance(wrong, LocalizedMeshingError):
                 error *= 0.5
             report(f"{wrong}; so cells of {cells:.3g}")
@@ -643,7 +675,7 @@ def mesh_solid(
     )
 
 
-def _checked(
+def _check_and_mend(
     mesher: CsgMesher,
     solid: Solid,
     level: float,
@@ -651,22 +683,26 @@ def _checked(
     size: float,
     check: Callable[[TriangleMesh, float], None],
 ) -> TriangleMesh:
-    """The checked surface, moved nearer to the level in a few places if necessary.
+    """The surface, if it passes the check. If it fails only because a few places are too far from
+    the level, the surface with these places moved nearer to the level.
+
+    size: the size of the solid's box, which `check` needs.
+    check: as in `mesh_solid`.
 
     Raises:
-        MeshingError: it fails the check.
+        MeshingError: another check fails, or moving does not help.
     """
     try:
         check(surface, size)
-    except OffLevelError as far:
-        mended = project_outliers(
-            mesher.function(solid, level), surface, far.locations, 2 * mesher.tolerance,
+    except OffLevelError as error:
+        moved = project_outliers(
+            mesher.function(solid, level), surface, error.locations, 2 * mesher.tolerance,
             lambda candidate: check(candidate, size),
         )  # fmt: skip
-        if mended is None:
+        if moved is None:
             raise
-        check_manifold(mended.faces, mended.vertices)  # the whole mesh: `check` saw new faces only
-        return mended
+        check_manifold(moved.faces, moved.vertices)  # the whole mesh: `check` saw new faces only
+        return moved
     return surface
 
 
@@ -676,16 +712,18 @@ def apart_of(whole: Manifold, tolerance: float) -> TriangleMesh:
     Raises:
         MeshingError: it is empty, or triangles cross.
     """
-    return _apart(_Assembly(whole), tolerance)
+    return _without_crossings(_Assembly(whole), tolerance)
 
 
-def _apart(parts: TriangleMesh | _Assembly, tolerance: float) -> TriangleMesh:
-    """The surface, none of whose triangles pass through each other; for assembled parts it is
-    mended, or without slivers.
+def _without_crossings(parts: TriangleMesh | _Assembly, tolerance: float) -> TriangleMesh:
+    """The surface, mended where triangles pass through each other. Slivers of assembled parts are
+    removed first: if mending then fails, fewer are removed and it is tried again.
+
+    tolerance: a length; mending moves the surface by at most half of it.
 
     Raises:
-        MeshingError: it is empty; a SelfIntersectionError if mending does not help, or if hardly
-            any fewer triangles cross when fewer slivers are removed.
+        MeshingError: the surface is empty; a SelfIntersectionError if mending does not help, or if
+            hardly any fewer triangles cross when fewer slivers are removed.
     """
     raised: SelfIntersectionError | None = None
     for factor in _SLIVERS_WITHIN if isinstance(parts, _Assembly) else (0.0,):
@@ -703,30 +741,32 @@ def _apart(parts: TriangleMesh | _Assembly, tolerance: float) -> TriangleMesh:
 
 @dataclass(frozen=True)
 class _Assembly:
-    """Assembled parts, in a volume or in all of space."""
+    """A solid made by Boolean operations of meshes, and the volume that it was cut by; None for all
+    of space."""
 
     whole: Manifold
     volume: Volume | None = None
 
     def without_slivers(self, length: float) -> TriangleMesh:
-        """The surface without short edges and slivers, whose removal moves it by up to a length,
-        and without bodies that are only rounding error."""
+        """The surface without short edges and slivers, whose removal moves it by up to `length`,
+        and without components that are only rounding error."""
         simpler = without_short_edges(self.whole, length) if length > 0 else self.whole
         surface = drop_degenerate_components(from_manifold(simpler))
-        return surface if self.volume is None else _on_box(surface, self.volume)
+        return surface if self.volume is None else _snap_to_boxes(surface, self.volume)
 
 
-def _assemble(
+def _mesh_in_volume(
     mesher: CsgMesher, solid: Solid, level: float, volume: Volume | None
 ) -> TriangleMesh | _Assembly:
-    """The boundary of the solid in the volume."""
+    """The boundary of {solid <= level} in the volume; None stands for all of space. It is a mesh if
+    it is one whole level set, else an assembly of the meshes of operands."""
     if volume is None and is_single_level_set(solid):
         return mesher.mesh_smooth_level(solid, level)[0]
     lower, upper = mesher.lower, mesher.upper
     manifold = mesher.mesh_sublevel(solid, level)
     mesher.report("putting the parts together")
     if volume is None:
-        volume = Box(_point(lower), _point(upper))
+        volume = Box(_as_tuple(lower), _as_tuple(upper))
         ends = np.array(manifold.bounding_box(), np.float64)
         if (ends[:3] > lower).all() and (ends[3:] < upper).all():
             return _Assembly(manifold, volume)
@@ -735,10 +775,11 @@ def _assemble(
 
 
 def _bounds(solid: Solid, level: float, volume: Volume | None) -> tuple[FloatArray, FloatArray]:
-    """A box that holds the solid within the volume.
+    """The lower and upper corners (3,) of a box that contains the part of {solid <= level} in the
+    volume.
 
     Raises:
-        MeshingError: there is none.
+        MeshingError: there is no finite box, or it is empty.
     """
     lower, upper = np.full(3, -np.inf), np.full(3, np.inf)
     if volume is not None:
@@ -760,12 +801,14 @@ def _bounds(solid: Solid, level: float, volume: Volume | None) -> tuple[FloatArr
     return lower, upper
 
 
-def _point(x: FloatArray) -> tuple[float, float, float]:
+def _as_tuple(x: FloatArray) -> tuple[float, float, float]:
+    """The coordinates of a point (3,) as three floats."""
     return float(x[0]), float(x[1]), float(x[2])
 
 
-def _on_box(surface: TriangleMesh, volume: Volume) -> TriangleMesh:
-    """The surface, with vertices within rounding of a box's faces put onto them."""
+def _snap_to_boxes(surface: TriangleMesh, volume: Volume) -> TriangleMesh:
+    """The surface, with vertices within rounding of a face of a box put onto it. The boxes are
+    `volume` itself, or those that it is the intersection of."""
     boxes = volume.volumes if isinstance(volume, VolumeIntersection) else (volume,)
     vertices = surface.vertices
     for box in boxes:
