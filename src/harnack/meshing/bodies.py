@@ -1,5 +1,5 @@
-"""Closed components of meshes: which faces form them, how they are nested, and the solid that they
-bound."""
+"""Closed components of meshes: the faces that form them, how components are nested, and the solid
+that they bound."""
 
 from __future__ import annotations
 
@@ -39,13 +39,16 @@ _GROWTH = 1e-9
 
 
 def closed_parts(x: FloatArray, raw: IntArray, joined: IntArray) -> list[IntArray]:
-    """The closed components of a mesh, as indices of faces: those that run along every edge as
-    often in one direction as in the other.
+    """The closed components of a mesh, each as an array of indices of faces. A component is closed
+    if its faces run every edge as often in one direction as in the other. Empty if there are more
+    than 200 such components.
 
-    raw: (m, 3) faces as in the input: components that touch are told apart if they have vertices of
-        their own.
-    joined: (m, 3) the same faces, with one vertex for all at the same position. Here the two faces
-        at an edge belong together; at an edge of more faces, those with the material between them.
+    x: (n, 3) the vertices.
+    raw: (m, 3) the faces as in the input. Components that touch are told apart here if each has
+        vertices of its own.
+    joined: (m, 3) the same faces, with one vertex for all vertices at the same position. Components
+        that `raw` does not close are looked for here. Faces are connected at edges: the two faces
+        at an edge; at an edge of more faces, those that have the material between them.
     """
     parts: list[IntArray] = []
     is_left = np.ones(len(raw), np.bool_)
@@ -87,7 +90,7 @@ def _runs_edges_both_ways(faces: IntArray) -> bool:
 
 
 def volume_of(x: FloatArray, faces: IntArray) -> float:
-    """The signed volume of a closed mesh, negative if it is inside out."""
+    """The signed volume of a closed mesh with faces (m, 3); negative if it is inside out."""
     corner = x[faces] - x[faces].mean(axis=(0, 1))
     return (
         float(row_dots(corner[:, 0], area_normals(corner)).sum()) / 6
@@ -95,9 +98,12 @@ def volume_of(x: FloatArray, faces: IntArray) -> float:
 
 
 def nested(x: FloatArray, parts: list[IntArray]) -> list[list[int]]:
-    """For each closed component, given by its faces (k, 3), the indices of the components that
-    contain all of it, the smallest first. Components may touch: each is tested at points a little
-    within it."""
+    """For each closed component, the indices of the components that contain all of it, the smallest
+    first. Components may touch, since each is tested at points a little inside of it.
+
+    x: (n, 3) the vertices.
+    parts: the faces (k, 3) of each component.
+    """
     corners = [x[part] for part in parts]
     boxes = [(corner.min(axis=(0, 1)), corner.max(axis=(0, 1))) for corner in corners]
     volumes = [volume_of(x, part) for part in parts]
@@ -122,10 +128,11 @@ def nested(x: FloatArray, parts: list[IntArray]) -> list[list[int]]:
 
 
 def mended_by_cuts(x: FloatArray, faces: IntArray, within: float) -> TriangleMesh:
-    """The boundary of the points around which a closed mesh winds at least once, by pieces of its
-    faces (`boundary_of_solid`).
+    """The boundary of the points around which a closed mesh winds at least once. Faces are cut
+    where they cross, and the boundary is made of the pieces (`boundary_of_solid`).
 
-    within: a length, by which slivers that arise where faces cross may be moved.
+    faces: (m, 3).
+    within: a length; slivers, which arise where faces cross, may be moved by up to it.
 
     Raises:
         MeshingError: nothing is left, or pieces do not fit together.
@@ -138,18 +145,19 @@ def mended_by_cuts(x: FloatArray, faces: IntArray, within: float) -> TriangleMes
 def united_parts(
     x: FloatArray, faces: IntArray, parts: list[IntArray], within: float
 ) -> TriangleMesh:
-    """The boundary of the points around which closed components wind at least once, in all. They
-    may intersect, touch and contain each other, and wind clockwise.
+    """The boundary of the points around which closed components, all together, wind at least once.
+    Components may touch, contain and intersect each other, and wind clockwise.
 
-    Proof. Let L_k be the points around which the components so far wind at least k times. With
-    another component P, L_k becomes the union of L_k and of the intersection of L_(k-1) with P if P
-    winds counter-clockwise around its points; if P winds clockwise, it becomes the union of L_(k+1)
-    and of the points of L_k outside of P. The components that wind clockwise come last, so that all
-    sets but L_0, which is all of space, are bounded.
+    Proof. Let L_k be the points around which the components so far wind at least k times. Add
+    another component, and let P be the set of points inside of it. If it winds counter-clockwise,
+    L_k becomes the union of L_k with the intersection of L_(k-1) and P. If it winds clockwise, L_k
+    becomes the union of L_(k+1) with the points of L_k outside of P. Components that wind clockwise
+    are added last, so that all sets but L_0, which is all of space, are bounded.
 
+    x: (n, 3) the vertices.
     faces: (m, 3).
-    parts: indices of the faces of each component.
-    within: a length by which slivers at intersections may be moved.
+    parts: for each component the indices of its faces.
+    within: a length; slivers at intersections may be moved by up to it.
 
     Raises:
         MeshError: a component intersects itself.

@@ -55,10 +55,11 @@ _UNDERFLOW = 1e-290
 
 def near_pairs(vertices: FloatArray, faces: IntArray, among: BoolArray | None) -> IntArray:
     """Pairs (k, 2) of faces (m, 3) that may have more in common than the vertices that they share,
-    each once; all others are proved not to (`_are_apart`).
+    each pair once. All other pairs are proved to have no more in common (`_are_apart`).
 
-    vertices: (n, 3), finite.
-    among: (m,) mask of chosen faces; pairs without a chosen face are left out.
+    vertices: (n, 3), all finite.
+    among: (m,) mask of chosen faces; pairs without a chosen face are left out. None if all are
+        chosen.
     """
     chosen = np.ones(len(faces), np.bool_) if among is None else among
     batches = [np.zeros((0, 2), np.int64)]

@@ -1,5 +1,5 @@
-"""Selects components of meshes (the largest one, or the largest body with its cavities), and cuts
-open surfaces at planes and spheres (`clip_to_volume`)."""
+"""Connected components of meshes, such as the largest one, or the largest body with its cavities;
+and open surfaces cut at planes and spheres (`clip_to_volume`)."""
 
 from __future__ import annotations
 
@@ -42,17 +42,18 @@ def largest_component(surface: TriangleMesh) -> TriangleMesh:
 
 
 def largest_body(surface: TriangleMesh) -> TriangleMesh:
-    """The body with the largest volume of a closed surface: an outer shell and the shells of its
-    cavities, which are turned inwards, so that their volume is negative.
+    """The body with the largest volume of a closed surface: an outer shell, and the shells of its
+    cavities, which are turned inwards and so have a negative volume.
 
-    Proof. Shells are closed, connected and do not meet. Let the surface bound a set. A shell that
-    is turned inwards has the set around it, and that part of the set has an outer shell. Of the
-    shells that hold the cavity, this is the innermost and smallest one: another shell in between
-    would be outside of the part, with nothing of the set between both. Whether a shell holds a
-    point is told by its winding number there, which is an integer.
+    Proof that each cavity is given to the right outer shell. Shells are closed, connected, and do
+    not meet; the surface bounds a set. Around a shell that is turned inwards there is a connected
+    part of the set, and that part has an outer shell. Of all outer shells around the cavity, this
+    is the innermost and so the smallest one: another shell in between would lie outside of the
+    part, with nothing of the set between the two. Whether a point is inside a shell is decided by
+    the shell's winding number there, which is an integer.
 
     Raises:
-        MeshingError: a cavity that lies in no shell.
+        MeshingError: a cavity lies in no shell.
     """
     shells = Shells.of(surface)
     bodies = shells.volumes.copy()
@@ -72,8 +73,8 @@ def largest_body(surface: TriangleMesh) -> TriangleMesh:
 
 
 def drop_degenerate_components(surface: TriangleMesh) -> TriangleMesh:
-    """Remove the connected components of a closed surface that are only rounding error, such as the
-    remainder of a solid minus itself."""
+    """The closed surface without those connected components that are only rounding error, such as
+    the remainder of a solid minus itself."""
     x, faces = surface.vertices, surface.faces
     if not len(faces):
         return surface
@@ -96,8 +97,9 @@ def drop_degenerate_components(surface: TriangleMesh) -> TriangleMesh:
 
 
 def component_facts(surface: TriangleMesh) -> list[dict[str, Any]]:
-    """A dictionary for each connected component of a closed surface, largest first: faces, the
-    number of its faces; volume, which is negative for a cavity; center, of its bounding box."""
+    """A dictionary for each connected component of a closed surface, the largest first. Its entries
+    are `faces`, the number of faces; `volume`, which is negative for a cavity; and `center`, that
+    of the bounding box."""
     shells, facts = Shells.of(surface), list[dict[str, Any]]()
     counts = np.bincount(shells.component_of_face)
     for k in np.argsort(-np.abs(shells.volumes), kind="stable"):
@@ -108,21 +110,22 @@ def component_facts(surface: TriangleMesh) -> list[dict[str, Any]]:
 
 
 def faces_to_flip(surface: TriangleMesh) -> npt.NDArray[np.bool_]:
-    """(m,) which faces of a closed surface to turn over so that no component is inside out: those
-    of components of negative volume that lie in no other component, and so are no cavities."""
+    """(m,) mask of the faces of a closed surface that have to be turned over so that no component
+    is inside out. These are the faces of components that have a negative volume and lie in no other
+    component, so that they are no cavities."""
     shells = Shells.of(surface)
-    inwards = (shells.volumes < 0) & (shells.nesting_depths() == 0)
-    return inwards[shells.component_of_face]
+    is_inside_out = (shells.volumes < 0) & (shells.nesting_depths() == 0)
+    return is_inside_out[shells.component_of_face]
 
 
 @dataclass(frozen=True)
 class Shells:
-    """The connected components of a closed surface.
+    """The connected components of a closed surface with faces (m, 3).
 
     component_of_face: (m,) the component that each face belongs to.
-    volumes: (k,) signed volumes of components, negative for those turned inwards.
-    lower, upper: (k, 3) their bounding boxes.
-    corners: (m, 3, 3) of the faces.
+    volumes: (k,) the signed volumes of the components, negative for those that are turned inwards.
+    lower, upper: (k, 3) the corners of their bounding boxes.
+    corners: (m, 3, 3) the corners of the faces.
     """
 
     component_of_face: IntArray
@@ -133,6 +136,7 @@ class Shells:
 
     @classmethod
     def of(cls, surface: TriangleMesh) -> Shells:
+        """The components of a surface."""
         number = np.unique(_component_of_faces(surface), return_inverse=True)[1]
         corners = surface.vertices[surface.faces]
         away = corners[:, 0] - surface.vertices[surface.faces].mean(axis=(0, 1))
@@ -145,13 +149,15 @@ class Shells:
         return cls(number, volumes, lower, upper, corners)
 
     def winding_number(self, around: Any, part: Any) -> float:
-        """The winding number of the component `around` at a point of the component `part`."""
+        """The winding number of the component with index `around` at a point of the component with
+        index `part`."""
         point = self.corners[np.argmax(self.component_of_face == part)].mean(axis=0)
         return winding_around(self.corners[self.component_of_face == around], point)
 
     def nesting_depths(self) -> IntArray:
-        """(k,) how often all other components wind around each component, at a point of it: more
-        than 0 where it is in their material, if no two meet."""
+        """(k,) for each component, how often all other components together wind around a point of
+        it. If no two components meet, it is more than 0 for components inside the material of
+        others."""
         depth = np.zeros(len(self.volumes), np.int64)
         for k in range(len(depth)) if len(depth) > 1 else ():
             point = self.corners[np.argmax(self.component_of_face == k)].mean(axis=0)
@@ -162,12 +168,16 @@ class Shells:
         return depth
 
     def bound(self) -> npt.NDArray[np.bool_]:
-        """(m,) which faces bound the points that all components together wind around at least once,
-        if no two meet: across a component the winding number changes by one from its value outside,
-        so that these components are turned outwards and have a winding number of 0 around them, or
-        inwards and have a winding number of 1."""
-        does = self.nesting_depths() == np.where(self.volumes > 0, 0, 1)
-        return does[self.component_of_face]
+        """(m,) mask of the faces that bound the set of points around which all components together
+        wind at least once. No two components may meet.
+
+        Proof. The winding number just outside of a component is that of the other components, and
+        just inside it is larger by one, or for a component that is turned inwards smaller by one.
+        So the faces of a component bound the set if it is turned outwards and its nesting depth is
+        0, or turned inwards and its nesting depth is 1.
+        """
+        is_boundary = self.nesting_depths() == np.where(self.volumes > 0, 0, 1)
+        return is_boundary[self.component_of_face]
 
 
 def _component_of_faces(surface: TriangleMesh) -> IntArray:
@@ -184,7 +194,7 @@ def _component_of_faces(surface: TriangleMesh) -> IntArray:
 
 
 def winding_around(corner: FloatArray, point: FloatArray) -> float:
-    """The winding number of triangles (m, 3, 3) around a point."""
+    """The winding number of triangles (m, 3, 3) around a point (3,)."""
     return float(solid_angles(corner, point).sum()) / (4 * math.pi)
 
 
@@ -226,11 +236,12 @@ class _ClipBoundary:
 
 
 def clip_to_volume(surface: TriangleMesh, volume: Volume) -> TriangleMesh:
-    """The part of a surface in a volume. Its new boundary lies on planes exactly, and on chords of
-    spheres; vertices inside keep their order and come first.
+    """The part of a surface inside of a volume. The edges along which it is cut lie exactly on
+    planes; for a sphere they are chords. Vertices inside keep their order and come first.
 
     Raises:
-        MeshingError: another kind of volume.
+        MeshingError: the volume is neither a box, a ball, a half-space, a convex hull nor an
+            intersection of such volumes.
     """
     if isinstance(volume, VolumeIntersection):
         for operand in volume.volumes:

@@ -30,15 +30,16 @@ __all__ = [
 ]
 
 # All relative to the size of a cell, by experiment.
-_JITTER = 1e-3  # no five points on a sphere
-_SNAPPED = 0.3  # points this near to the level are moved onto it
-_MIN_CURVE_DISTANCE = 0.45  # no other points are so near to the curve
-_MOST_CELLS = 4_000_000
+_JITTER = 1e-3  # the largest random move, so that no five points are on a sphere
+_SNAP_DISTANCE = 0.3  # points that are nearer to the level are moved onto it
+_MIN_CURVE_DISTANCE = 0.45  # points that are not on the curve are farther from it
+# The largest number of cells of the octree.
+_MAX_CELLS = 4_000_000
 # A step of Newton's method that is shorter than this, relative to the longest step, is the last.
 _CONVERGED = 1e-9
-# How often steps to a multiple root are continued as a geometric series, and the range of its
-# rates.
-_SERIES, _RATES = 4, (0.4, 0.97)
+# How often steps to a multiple root are continued as a geometric series, and the range of ratios of
+# a step to the one before for which they are.
+_SERIES_STEPS, _RATE_RANGE = 4, (0.4, 0.97)
 _CORNERS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
 
 
@@ -169,8 +170,8 @@ def sample_delaunay_points(
 
     Raises MemoryError for more than four million cells.
     """
-    tree = refine_cells(root[0], function.clearance, _MOST_CELLS, root[1])
-    points, size = _corners_and_centers(tree, _finer_cells(function, tree.occupied, finer))
+    tree = refine_cells(root[0], function.clearance, _MAX_CELLS, root[1])
+    points, size = _corners_and_centers(tree, _subdivided_cells(function, tree.occupied, finer))
     free = _MIN_CURVE_DISTANCE * np.minimum(size, 2 * float(tree.occupied.size.max()))
     is_far = _is_far(points, free, boundary)
     points, size = points[is_far], size[is_far]
@@ -178,7 +179,7 @@ def sample_delaunay_points(
     jitter = rng.uniform(-1, 1, points.shape) * _JITTER * size[:, None]
     points = points + (jitter if walls is None else jitter * _off_walls(points, walls))
     samples = function.sample(points)
-    points, samples, is_on = _snapped(
+    points, samples, is_on = _move_onto_level(
         function, points, size, free[is_far], samples, boundary, walls
     )
     n = len(boundary.points)
@@ -194,17 +195,20 @@ def sample_delaunay_points(
     )
 
 
-def _finer_cells(
+def _subdivided_cells(
     function: LevelFunction, leaves: BoxCells, finer: tuple[RefinementBalls, ...]
 ) -> list[BoxCells]:
-    """The cells that leaves are split into, smallest first, without cells that are proved empty."""
+    """The cells that leaves of the octree are split into, smallest first. A leaf is split once,
+    into octants, if it meets a ball of the first entry of `finer`; the octants again if they meet
+    one of the second; and so on. Cells that are proved empty are left out, and so are leaves that
+    are not split."""
     pool = [leaves]
     for balls in finer:
-        split: list[BoxCells] = []
+        octants: list[BoxCells] = []
         for cells in pool:
-            halves = cells.subset(balls.meet(cells.centers, cells.half_diagonal)).octants()
-            split.append(halves.subset(~halves.is_proved_empty(function.clearance)))
-        pool += split
+            parts = cells.subset(balls.meet(cells.centers, cells.half_diagonal)).octants()
+            octants.append(parts.subset(~parts.is_proved_empty(function.clearance)))
+        pool += octants
     nonempty = [cells for cells in pool[1:] if len(cells.corners)]
     return sorted(nonempty, key=lambda cells: float(cells.size.max()))
 
@@ -212,8 +216,12 @@ def _finer_cells(
 def _corners_and_centers(
     tree: RefinedCells, finer: list[BoxCells]
 ) -> tuple[FloatArray, FloatArray]:
-    """Points (n, 3), each once: corners of all cells, and centers of leaves and of cells in
-    `finer`; and the size (n,) of the smallest cell at each."""
+    """Points (n, 3), each once: the corners of all cells of the octree and of `finer`, and the
+    centers of its leaves and of `finer`. Also (n,) the edge of the smallest cell that has each
+    point as its corner or center.
+
+    finer: cells that leaves were split into, smallest first.
+    """
     leaves = [*finer, tree.occupied]
     points = [cells.centers for cells in leaves]
     sizes = [np.full(len(cells.corners), float(cells.size.max())) for cells in leaves]
@@ -227,13 +235,13 @@ def _corners_and_centers(
     steps: FloatArray = (x - x.min(axis=0)) / (0.25 * leaves[0].size)
     keys = np.rint(steps).astype(np.int64)
     # Of equal points the first, which is that of the smallest cell.
-    first: IntArray = np.sort(np.unique(keys, axis=0, return_index=True)[1])
-    return x[first], size[first]
+    kept: IntArray = np.sort(np.unique(keys, axis=0, return_index=True)[1])
+    return x[kept], size[kept]
 
 
 def _is_far(points: FloatArray, free: FloatArray, boundary: BoundaryCurve) -> BoolArray:
-    """(n,) whether points are farther from the curve than `free` (n,), and outside of the balls
-    with its edges as diameters."""
+    """(n,) whether points (n, 3) are far enough from the curve: farther than `free` (n,), and
+    outside of the balls that have the curve's edges as diameters."""
     if not len(boundary.edges):
         return np.ones(len(points), np.bool_)
     import scipy.spatial  # imported here: it takes half a second
@@ -241,7 +249,7 @@ def _is_far(points: FloatArray, free: FloatArray, boundary: BoundaryCurve) -> Bo
     searching: Any = scipy.spatial
     a, b = (boundary.points[boundary.edges[:, k]] for k in (0, 1))
     middle, half = 0.5 * (a + b), 0.5 * row_norms(b - a)
-    near = np.full(len(points), np.inf)
+    distance = np.full(len(points), np.inf)
     is_far = np.ones(len(points), np.bool_)
     # Curves may have edges of any lengths: edges of one size are examined at a time.
     octave = np.floor(np.log2(half))
@@ -250,23 +258,27 @@ def _is_far(points: FloatArray, free: FloatArray, boundary: BoundaryCurve) -> Bo
         neighbor_count = min(8, len(rows))
         nearest: IntArray = searching.cKDTree(middle[rows]).query(points, k=neighbor_count)[1]
         index = rows[nearest.reshape(len(points), neighbor_count)]
-        e, w = (b - a)[index], points[:, None] - a[index]
-        fraction = np.clip((w * e).sum(axis=2) / (e * e).sum(axis=2), 0, 1)
-        gap = np.linalg.norm(w - fraction[..., None] * e, axis=2)
-        away = np.linalg.norm(points[:, None] - middle[index], axis=2)
-        near = np.minimum(near, gap.min(axis=1))
-        is_far &= (away > 1.1 * half[index]).all(axis=1)
-    return is_far & (near > free)
+        edge, offset = (b - a)[index], points[:, None] - a[index]
+        fraction = np.clip((offset * edge).sum(axis=2) / (edge * edge).sum(axis=2), 0, 1)
+        gaps = np.linalg.norm(offset - fraction[..., None] * edge, axis=2)
+        from_middle = np.linalg.norm(points[:, None] - middle[index], axis=2)
+        distance = np.minimum(distance, gaps.min(axis=1))
+        is_far &= (from_middle > 1.1 * half[index]).all(axis=1)
+    return is_far & (distance > free)
 
 
 def _off_walls(points: FloatArray, walls: tuple[FloatArray, FloatArray]) -> FloatArray:
-    """(n, 3): 0 in directions in which a point on a face of the box would leave it, else 1."""
+    """(n, 3) for each point and axis, 0 if the point is on a face of the box across that axis, so
+    that a move along the axis would take it off the face; else 1.
+
+    walls: the lower and upper corners (3,) of the box.
+    """
     margin = 1e-9 * (walls[1] - walls[0])
-    on = (np.abs(points - walls[0]) <= margin) | (np.abs(points - walls[1]) <= margin)
-    return np.where(on, 0.0, 1.0)
+    is_on_face = (np.abs(points - walls[0]) <= margin) | (np.abs(points - walls[1]) <= margin)
+    return np.where(is_on_face, 0.0, 1.0)
 
 
-def _snapped(
+def _move_onto_level(
     function: LevelFunction,
     points: FloatArray,
     size: FloatArray,
@@ -275,15 +287,24 @@ def _snapped(
     boundary: BoundaryCurve,
     walls: tuple[FloatArray, FloatArray] | None,
 ) -> tuple[FloatArray, LevelSamples, BoolArray]:
-    """The points, with points near the level moved onto it; their samples; and which are on the
-    level."""
-    near = np.flatnonzero(samples.distance < _SNAPPED * size)
+    """Move points that are near the level set onto it.
+
+    size: (n,) of the cells at the points.
+    free: (n,) the smallest permitted distances from the boundary curve.
+    samples: of the function at the points.
+    walls: a box; points on its faces stay on them. None if there is none.
+
+    Returns the points (n, 3); their samples; and a mask (n,) of those that are on the level. Points
+    stay where they are if Newton's method does not converge, or would move them far or too near to
+    the curve.
+    """
+    near = np.flatnonzero(samples.distance < _SNAP_DISTANCE * size)
     moved = newton_to_level(function, points[near], samples.select(near), 0.25 * size[near], walls)
     new_samples = function.sample(moved)
     apart = row_norms(moved - points[near])
     steep = row_norms(new_samples.gradient)
     converged = np.abs(new_samples.value) < 1e-9 * np.maximum(steep * size[near], 1e-300)
-    converged &= (apart < 1.5 * _SNAPPED * size[near]) & _is_far(moved, free[near], boundary)
+    converged &= (apart < 1.5 * _SNAP_DISTANCE * size[near]) & _is_far(moved, free[near], boundary)
     rows = near[converged]
     points, is_on = points.copy(), np.zeros(len(points), np.bool_)
     points[rows], is_on[rows] = moved[converged], True
@@ -328,14 +349,14 @@ def to_multiple_roots(
     Newton's steps shrink only by 1 - 1/m: each step goes to the limit of the geometric series of
     two of Newton's steps."""
     x = points
-    for k in range(_SERIES):
+    for k in range(_SERIES_STEPS):
         first = newton_to_level(
             function, x, samples if k == 0 else function.sample(x), longest, None, steps=1
         )
         second = newton_to_level(function, first, function.sample(first), longest, None, steps=1)
         before, after = row_norms(first - x), row_norms(second - first)
         ratio = after / np.maximum(before, 1e-300)
-        is_slow = (ratio > _RATES[0]) & (ratio < _RATES[1])
-        factor = np.where(is_slow, 1 / (1 - np.minimum(ratio, _RATES[1])), 1.0)
+        is_slow = (ratio > _RATE_RANGE[0]) & (ratio < _RATE_RANGE[1])
+        factor = np.where(is_slow, 1 / (1 - np.minimum(ratio, _RATE_RANGE[1])), 1.0)
         x = first + factor[:, None] * (second - first)
     return x

@@ -33,13 +33,14 @@ if TYPE_CHECKING:
 
 __all__ = ["check_options", "simplify_mesh", "thicken", "to_trimesh", "vertex_normals"]
 
-# The fraction of the area that may turn over on the two sides: slivers.
-_TURNED = 1e-2
+# The largest fraction of the area whose triangles may turn over when they are moved to a side. So
+# few are slivers.
+_MAX_TURNED_AREA = 1e-2
 # The largest number of triangles whose hulls are computed.
-_MOST_HULLS = 20_000
-# Half the thickness is beyond the reach if a side comes nearer to the surface than this fraction of
-# it.
-_NEAR = 0.98
+_MAX_HULLS = 20_000
+# A part is too thick if points of a side come nearer to the surface than this fraction of half of
+# the thickness.
+_MIN_SIDE_DISTANCE = 0.98
 
 
 def thicken(
@@ -64,34 +65,39 @@ def thicken(
     """
     area = 0.5 * float(np.linalg.norm(area_normals(surface.vertices[surface.faces]), axis=1).sum())
     facts: dict[str, Any] = {"thickness": thickness, "area": area}
-    why = _reason_beyond_reach(surface, normals, thickness)
+    why = _why_too_thick(surface, normals, thickness)
     if why is None:
-        part = _offset(surface, normals, thickness)
+        part = _offset_part(surface, normals, thickness)
         crossing = intersecting_faces(part.vertices, part.faces)
         if not len(crossing):
             return part, {**facts, "thickened_by": "offset"}
         why = f"{len(crossing)} triangles of the two sides pass through each other"
-    return _hulls(surface, 0.5 * thickness, tolerance, why), {
+    return _hull_union(surface, 0.5 * thickness, tolerance, why), {
         **facts, "thickened_by": "hulls of balls", "why": why
     }  # fmt: skip
 
 
-def _offset(surface: TriangleMesh, normals: FloatArray, thickness: float) -> TriangleMesh:
-    """The closed surface of both sides and of walls along the boundary."""
+def _offset_part(surface: TriangleMesh, normals: FloatArray, thickness: float) -> TriangleMesh:
+    """The closed surface that consists of both sides, each half of the thickness from the surface,
+    and of walls along its boundary, straight between the sides.
+
+    normals: (n, 3) unit normals at the vertices.
+    """
     n = len(surface.vertices)
-    move = 0.5 * thickness * normals / _normal_cosines(surface, normals)[:, None]
+    offset = 0.5 * thickness * normals / _normal_cosines(surface, normals)[:, None]
     a, b = boundary_edges(surface.faces).T
     # A face of the upper side runs the boundary edge from a to b, so the wall runs it from b to a.
     walls = [np.stack([b, a, a + n], axis=1), np.stack([b, a + n, b + n], axis=1)]
-    vertices = np.concatenate([surface.vertices + move, surface.vertices - move])
+    vertices = np.concatenate([surface.vertices + offset, surface.vertices - offset])
     return TriangleMesh(
         vertices, np.concatenate([surface.faces, surface.faces[:, ::-1] + n, *walls])
     )
 
 
 def _normal_cosines(surface: TriangleMesh, normals: FloatArray) -> FloatArray:
-    """(n,) area-weighted mean cosine between a vertex normal and the adjacent face normals, clipped
-    to [0.7, 1]. A vertex offset of thickness / cosine moves the faces by the thickness."""
+    """(n,) the mean cosine of the angles between a vertex normal and the normals of the faces
+    there, weighted by the faces' areas, and clipped to [0.7, 1]. A move of a vertex by thickness /
+    cosine along its normal moves the faces by about the thickness."""
     cross = area_normals(surface.vertices[surface.faces])
     total, area = np.zeros(len(normals)), np.zeros(len(normals))
     size = np.linalg.norm(cross, axis=1)
@@ -102,11 +108,15 @@ def _normal_cosines(surface: TriangleMesh, normals: FloatArray) -> FloatArray:
     return np.clip(total / np.maximum(area, 1e-300), 0.7, 1.0)
 
 
-def _reason_beyond_reach(
-    surface: TriangleMesh, normals: FloatArray, thickness: float
-) -> str | None:
-    """The reason why half of the thickness exceeds the surface's reach; None if nothing shows
-    that."""
+def _why_too_thick(surface: TriangleMesh, normals: FloatArray, thickness: float) -> str | None:
+    """Why half of the thickness is larger than the surface's reach, in words; None if nothing shows
+    that. The reach is the largest distance up to which points have a single closest point on the
+    surface.
+
+    It is shown by triangles that turn over when their vertices are moved along their normals to a
+    side, or by points of a side that are nearer to the surface than they should be: near a vertex
+    that is not joined by an edge to the one that the point was moved from.
+    """
     import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial
@@ -120,51 +130,57 @@ def _reason_beyond_reach(
     for sign in (1, -1):
         side = surface.vertices + sign * half * normals
         turned = (area_normals(side[surface.faces]) * flat).sum(axis=1) <= 0
-        if areas[turned].sum() > _TURNED * areas.sum():  # a smaller area is slivers
+        if areas[turned].sum() > _MAX_TURNED_AREA * areas.sum():  # a smaller area is slivers
             return f"{turned.sum()} triangles turn over: the surface bends more than 1/{half:.3g}"
         # At most the neighbors of the vertex that a point was moved from are nearer to the point.
-        away, nearest = tree.query(side, k=neighbor_count)
+        distances, nearest = tree.query(side, k=neighbor_count)
         pairs = np.stack([np.broadcast_to(vertex_ids[:, None], nearest.shape), nearest], axis=-1)
-        near = (away < _NEAR * half) & (pairs[..., 0] != pairs[..., 1])
-        near_keys = sorted_unique(edge_keys(pairs[near], len(vertex_ids)))
+        is_too_near = (distances < _MIN_SIDE_DISTANCE * half) & (pairs[..., 0] != pairs[..., 1])
+        near_keys = sorted_unique(edge_keys(pairs[is_too_near], len(vertex_ids)))
         count = int((~np.isin(near_keys, neighbors)).sum())
         if count:
             return f"{count} points of a side are nearer to another place than to their own"
     return None
 
 
-def _hulls(surface: TriangleMesh, radius: float, tolerance: float, why: str) -> TriangleMesh:
-    """The union of the hulls of three balls around the corners of each triangle.
+def _hull_union(surface: TriangleMesh, radius: float, tolerance: float, why: str) -> TriangleMesh:
+    """The union of the convex hulls of three balls around the corners of each triangle.
 
-    Balls are polyhedra with corners on the sphere, so that the part lies inside of the exact one,
-    by at most `tolerance` or a tenth of the radius.
+    Balls are polyhedra with their corners on the sphere, so that the union lies inside of that for
+    exact balls: by at most the larger of `tolerance` and a tenth of the radius, unless that would
+    need more than 16 segments around.
+
+    why: the reason why hulls are needed, for the message.
+
+    Raises:
+        MeshingError: there are too many triangles.
     """
     from manifold3d import Manifold, OpType
 
-    if len(surface.faces) > _MOST_HULLS:
+    if len(surface.faces) > _MAX_HULLS:
         raise MeshingError(
             f"{2 * radius:.3g} is thicker than the surface's reach allows ({why}), and there are "
             f"{len(surface.faces):,} triangles, too many for a union of as many hulls: choose a "
             "larger `tolerance`, or a smaller thickness"
         )
-    allowed = max(tolerance, 0.1 * radius)
-    segments = int(np.clip(4 * np.ceil(np.pi / 2 * np.sqrt(radius / (2 * allowed))), 8, 16))
+    max_error = max(tolerance, 0.1 * radius)
+    segments = int(np.clip(4 * np.ceil(np.pi / 2 * np.sqrt(radius / (2 * max_error))), 8, 16))
     mesh = Manifold.sphere(radius, segments).to_mesh64()
     ball = np.array(mesh.vert_properties, np.float64)[:, :3]
-    parts = [
+    hulls = [
         Manifold.hull_points(np.ascontiguousarray((corners[:, None] + ball).reshape(-1, 3)))
         for corners in surface.vertices[surface.faces]
     ]
-    return from_manifold(Manifold.batch_boolean(parts, OpType.Add))
+    return from_manifold(Manifold.batch_boolean(hulls, OpType.Add))
 
 
 # Simplification and metadata.
 
-# The cosine of the angle between normals from which on an edge is a crease.
-_CREASE = math.cos(math.radians(30))
-# How far simplification may move a surface, and how far mending may then, relative to the
-# tolerance.
-_SIMPLER, _MENDED = (0.4, 0.2, 0.1), 0.05
+# An edge is a crease if the cosine of the angle between its faces' normals is below this.
+_CREASE_COSINE = math.cos(math.radians(30))
+# How far simplification may move a surface, tried in this order, and how far mending may move it
+# afterwards; relative to the tolerance.
+_SIMPLIFIED_WITHIN, _MENDED_WITHIN = (0.4, 0.2, 0.1), 0.05
 
 
 def check_options(spacing: Any, thickness: Any, seed: Any, most: Any) -> None:
@@ -211,12 +227,12 @@ def simplify_mesh(
     """
     facts = {"triangles_before_simplification": len(surface.faces)}
     solid = to_manifold(surface)
-    for part in _SIMPLER:
+    for part in _SIMPLIFIED_WITHIN:
         simpler = from_manifold(without_short_edges(solid, part * tolerance))
         if not 0 < len(simpler.faces) < len(surface.faces):
             continue
         try:
-            simpler = resolve_self_intersections(simpler, _MENDED * tolerance)
+            simpler = resolve_self_intersections(simpler, _MENDED_WITHIN * tolerance)
             check(simpler)
         except MeshingError:
             continue
@@ -252,16 +268,17 @@ def to_trimesh(surface: TriangleMesh, facts: dict[str, Any], is_closed: bool) ->
         **facts,
         "euler_characteristic": euler_characteristic(surface.faces, edges),
         "boundary": boundary,
-        "creases": _creases(surface, edges),
+        "creases": _crease_count(surface, edges),
     }
     return mesh
 
 
-def _creases(surface: TriangleMesh, edges: Edges) -> int:
-    """The number of edges whose two faces have normals more than 30 degrees apart."""
+def _crease_count(surface: TriangleMesh, edges: Edges) -> int:
+    """The number of edges whose two faces have normals more than 30 degrees apart. edges: the
+    `Edges` of the surface's `half_edges`."""
     normals = _unit_normals(surface.vertices, surface.faces)
     pairs = edges.paired_half_edges() % len(surface.faces)
-    return int((row_dots(normals[pairs[:, 0]], normals[pairs[:, 1]]) < _CREASE).sum())
+    return int((row_dots(normals[pairs[:, 0]], normals[pairs[:, 1]]) < _CREASE_COSINE).sum())
 
 
 def _unit_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
