@@ -1,15 +1,15 @@
 """Checks that every mesh of a level set has to pass, with exact predicates.
 
-The predicates are signs of determinants: on which side of a plane, or of a line in a plane, points
-lie. Determinants are computed in floating point, with a bound of their rounding error (Shewchuk,
-Adaptive Precision Floating-Point Arithmetic and Fast Robust Geometric Predicates, 1997). Where that
-leaves the sign undecided, it is computed in integers: all coordinates are integers times one power
-of two.
+The predicates are signs of determinants. They tell on which side of a plane a point lies, or on
+which side of a line in a plane. A determinant is computed in floating point, with a bound of its
+rounding error (Shewchuk, Adaptive Precision Floating-Point Arithmetic and Fast Robust Geometric
+Predicates, 1997). Where that leaves the sign undecided, it is computed in integers: all coordinates
+are integers times the same power of two.
 
-Every mesh that `mesh` returns has passed checks: vertices and middles of triangles by samples of
-the field, faces that pass through each other by exact predicates, the number of triangles by a
-limit. The largest body is chosen by signed volumes and by the nesting of shells (`clipping`). Files
-hold single precision, to which vertices are snapped before the last check.
+Every mesh that `mesh` returns has passed checks: vertices and centers of triangles are tested by
+samples of the field, faces that pass through each other are found by exact predicates, and the
+number of triangles has a limit. The largest body is chosen by signed volumes and by the nesting of
+shells (`clipping`). Files hold single precision; vertices are rounded to it before the last check.
 """
 
 from __future__ import annotations
@@ -77,8 +77,9 @@ _UNDERFLOW = 1e-290
 
 
 def orient3d(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> SignArray:
-    """(n,) signs of det(a - d, b - d, c - d), points (n, 3): 1 where d sees a, b, c run clockwise,
-    0 where the four points are in one plane."""
+    """(n,) the signs of det(a - d, b - d, c - d) for points (n, 3), exactly. The sign is 1 if a, b,
+    c run clockwise as seen from d, -1 if they run counter-clockwise, and 0 if the four points are
+    in one plane."""
     together = _scaled(np.stack([a, b, c, d], axis=1))
     rows = together[:, :3] - together[:, 3:]
     (ax, ay, az), (bx, by, bz), (cx, cy, cz) = (rows[:, k].T for k in range(3))
@@ -93,8 +94,8 @@ def orient3d(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> Sign
 
 
 def orient2d(a: FloatArray, b: FloatArray, c: FloatArray) -> SignArray:
-    """(n,) signs of det(a - c, b - c), points (n, 2): 1 where a, b, c run counter-clockwise, 0
-    where they are in one line."""
+    """(n,) the signs of det(a - c, b - c) for points (n, 2), exactly. The sign is 1 if a, b, c run
+    counter-clockwise, -1 if they run clockwise, and 0 if they are in one line."""
     together = _scaled(np.stack([a, b, c], axis=1))
     rows = together[:, :2] - together[:, 2:]
     (ax, ay), (bx, by) = (rows[:, k].T for k in range(2))
@@ -165,8 +166,9 @@ _MAX_AT_ONCE = 1 << 19
 
 
 def misoriented_faces(function: LevelFunction, vertices: FloatArray, faces: IntArray) -> IntArray:
-    """Indices of faces whose normal does not point to where the function grows, judged at their
-    center."""
+    """Indices of the faces whose normal does not point to the side where the function is larger:
+    the normal, by the right-hand rule, has no positive dot product with the function's gradient at
+    the face's center."""
     corner = vertices[faces]
     normal = area_normals(corner)
     slope = function.sample(corner.mean(axis=1)).gradient
@@ -176,18 +178,20 @@ def misoriented_faces(function: LevelFunction, vertices: FloatArray, faces: IntA
 def intersecting_faces(
     vertices: FloatArray, faces: IntArray, among: BoolArray | None = None
 ) -> IntArray:
-    """Indices of faces (m, 3) that meet other faces in more than shared corners and edges, decided
-    exactly: faces that an edge of another face passes through, faces that lie on another face in
-    their plane, and the other faces of such pairs.
+    """Indices of the faces (m, 3) that meet another face in more than corners and edges that both
+    share, decided exactly. Two kinds of pairs are found: an edge of one face passes through the
+    other face, or both faces lie in one plane and overlap.
 
-    Two triangles in different planes meet beyond their common corners if and only if an edge of one
-    passes through the other, with its ends on both sides of that one's plane, or ends on it:
-    corners that lie on other triangles are not searched for, since edges beyond them would pass
-    through. Two triangles in one plane overlap unless the line of an edge has them on its two sides
-    (separating axes), whatever they share: faces that are there twice, or folded back onto their
-    neighbors, do. Only pairs whose boxes overlap are tested.
+    Two triangles in different planes meet beyond their shared corners only if an edge of one passes
+    through the other, with its ends on both sides of the other's plane, or ends on it. Ends on
+    other triangles are not looked for: if the surface goes on behind such an end, one of its edges
+    passes through. Two triangles in one plane overlap, whatever they share, unless the line of an
+    edge has them on its two sides (separating axes). So faces that occur twice, or are folded back
+    onto their neighbors, are found. Only pairs whose bounding boxes overlap are tested.
 
-    among: (m,) mask of chosen faces; pairs without a chosen face are not tested.
+    vertices: (n, 3).
+    among: (m,) mask of chosen faces; pairs without a chosen face are not tested. None if all are
+        chosen.
     """
     crossing_faces: list[IntArray] = []
     for pairs, heights in _pairs_in_doubt(vertices, faces, among):
@@ -204,21 +208,26 @@ def intersecting_faces(
 
 
 def touching_pairs(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, FloatArray]:
-    """Pairs (k, 2) of faces (m, 3) that touch, decided exactly: one has a corner or an edge on the
-    other, beyond a corner that they share. Also (k, 3) the corner on the other face, or the middle
-    of the edge.
+    """Pairs (k, 2) of faces (m, 3) that touch, decided exactly. They touch if a corner or an edge
+    of one face lies on the other face; a corner that both share does not count. Also (k, 3) the
+    place: that corner, or the middle of that edge.
 
-    If all of a face lies on another, so do its edges. Where edges meet between their ends, and lie
-    in neither face's plane, `intersecting_faces` has the pair. It also has the pairs that share two
-    corners, which have no more in common unless they overlap in one plane. If two faces share one
-    corner, their planes meet in a line through it, or are equal: each face has a segment from the
-    corner on that line, and where these lie along each other an edge passes through a face, or the
-    shorter one is an edge at the corner, and in the other's plane.
+    No pair is missed that `intersecting_faces` does not have. If all of a face lies on another, so
+    do its edges. If edges meet between their ends, and neither lies in the plane of the other face,
+    an edge passes through a face. Faces that share two corners have no more in common unless they
+    overlap in one plane. If two faces share one corner, and their planes differ, the planes meet in
+    a line through that corner, on which each face has a segment that begins at the corner. If both
+    segments run the same way, either an edge passes through a face; or the shorter segment is an
+    edge at the corner that lies in the other face's plane.
+
+    vertices: (n, 3).
     """
     batches: list[IntArray] = []
     contacts: list[FloatArray] = []
 
     def add(pairs: IntArray, on: BoolArray, p: FloatArray, q: FloatArray) -> None:
+        """List those pairs (k, 2) that the mask `on` selects, with the points midway between p and
+        q (k, 3)."""
         batches.append(pairs[on])
         contacts.append(0.5 * (p + q)[on])
 
@@ -430,7 +439,8 @@ class MeshingError(ValueError):
     """A level set could not be meshed; the message says why, and a remedy."""
 
     def may_be_fixed_by(self, smaller: float) -> bool:
-        """Whether cells `smaller` times as large as those that failed may help."""
+        """Whether smaller cells may help: cells whose size is `smaller` times that of the cells
+        that failed."""
         del smaller
         return True
 
@@ -440,7 +450,10 @@ class EmptySurfaceError(MeshingError):
 
 
 class LocalizedMeshingError(MeshingError):
-    """A check failed at known locations (k, 3), so that smaller cells there may be enough."""
+    """A check failed at known locations, so that smaller cells there may be enough.
+
+    locations: (k, 3) points.
+    """
 
     def __init__(self, message: str, places: FloatArray) -> None:
         super().__init__(message)
@@ -452,7 +465,11 @@ class OffLevelError(LocalizedMeshingError):
 
 
 class SelfIntersectionError(LocalizedMeshingError):
-    """Triangles pass through each other. faces: their indices. places: their centers."""
+    """Triangles pass through each other.
+
+    faces: (k,) the indices of these triangles.
+    locations: (k, 3) their centers.
+    """
 
     def __init__(self, message: str, places: FloatArray, faces: IntArray) -> None:
         super().__init__(message, places)
@@ -460,7 +477,7 @@ class SelfIntersectionError(LocalizedMeshingError):
 
 
 class UnrefinableError(MeshingError):
-    """An error against which smaller cells do not help."""
+    """An error that smaller cells do not fix."""
 
     def may_be_fixed_by(self, smaller: float) -> bool:
         del smaller
@@ -471,19 +488,21 @@ class TriangleLimitError(UnrefinableError):
     """The mesh would have more triangles than allowed, and was not begun."""
 
 
-# The largest number of failures for which smaller cells are tried again, and the largest ratio to
-# the number of failures before.
+# Smaller cells are tried again if there are no more failures than the first, or than the second
+# times the number of failures before.
 _MAX_FAILURES_FOR_RETRY, _REQUIRED_FAILURE_REDUCTION = 20, 0.5
 
 
 def is_retry_promising(
     now: MeshingError, before: MeshingError | None, smallest: float = 1.0
 ) -> bool:
-    """Whether another attempt with smaller cells is promising, after one or two sizes of cells
-    failed. It is not if the number of failures hardly decreased since the previous attempt: along a
-    pole, or where jump surfaces cross, cells of every size fail.
+    """Whether it is worthwhile to try smaller cells after an attempt failed. It is not if smaller
+    cells cannot help, or if there are many failures and hardly fewer than in the attempt before:
+    along a pole, or where jump surfaces cross, cells of every size fail.
 
-    smallest: the smallest cell allowed, relative to the cells that failed now.
+    now: the error of the last attempt.
+    before: the error of the attempt before it, or None.
+    smallest: the size of the smallest cells allowed, relative to the cells that failed now.
     """
     if not now.may_be_fixed_by(smallest):
         return False
@@ -495,24 +514,28 @@ def is_retry_promising(
 
 
 def euler_characteristic(faces: IntArray, edges: Edges | None = None) -> int:
-    """The Euler characteristic: the number of used vertices, minus that of edges, plus that of
-    faces. edges: of `half_edges`, if they are known."""
+    """The Euler characteristic of faces (m, 3): the number of vertices that they use, minus the
+    number of edges, plus the number of faces.
+
+    edges: the `Edges` of `half_edges(faces)`, if they are known.
+    """
     vertices = int(np.count_nonzero(np.bincount(faces.ravel())))
     edges = edges or Edges.of(half_edges(faces))
     return vertices - len(edges.vertices) + len(faces)
 
 
 def check_manifold(faces: IntArray, vertices: FloatArray | None = None) -> None:
-    """Raise unless every edge has one or two faces, which run it in opposite directions, and the
-    faces around every vertex are joined by edges.
+    """Raise unless faces (m, 3) form a manifold: every edge has one or two faces, two faces run
+    their edge in opposite directions, and the faces around every vertex are joined by edges.
 
     vertices: (n, 3), for the locations of failures.
 
     Raises:
-        MeshingError: the mesh is no manifold; a LocalizedMeshingError if vertices are given.
+        MeshingError: the faces are no manifold; a LocalizedMeshingError if vertices are given.
     """
 
     def fail(message: str, where: IntArray) -> Never:
+        """Raise the error; `where` has the indices of the vertices at which the check failed."""
         if vertices is None:
             raise MeshingError(message)
         raise LocalizedMeshingError(message, vertices[where])
@@ -572,7 +595,8 @@ def check_triangle_limit(expected: float, most: int) -> None:
 
 
 def check_inside(vertices: FloatArray, volume: Volume, slack: float) -> None:
-    """Raise if a vertex lies outside of a volume padded by `slack`."""
+    """Raise MeshingError if a vertex (n, 3) lies farther than the length `slack` outside of a
+    volume."""
     out = ~volume.padded(slack).contains_points(vertices)
     if out.any():
         raise MeshingError(
@@ -588,18 +612,23 @@ def check_near_level(
     tolerance: float,
     volume: Volume | None,
 ) -> None:
-    """Raise unless vertices and centers of faces are within `tolerance` of the level, by samples of
-    the function.
+    """Raise unless all vertices (n, 3) and all centers of faces (m, 3) are within `tolerance`, a
+    length, of the level. That is decided by samples of the function.
 
-    A point counts as within the tolerance if the gradient says so, |f|/|grad f| <= tolerance; or if
-    f changes its sign between two points at that distance from it or nearer, along the normal of
-    the face or one of 13 other lines, for then a continuous f has its level between them. These
-    lines are askew, since many parts have faces in planes of coordinates, where rounding decides
-    the sign; and every cone of 28 degrees about its axis has one of their directions in it, as the
-    corner of a cube has (35 degrees). A solid is cut at the volume's boundary: to be outside of the
-    volume counts as a positive sign. Boundary vertices of an angle's level set are on its curve,
-    where it has no value, and are left out; and triangles smaller than half of the tolerance are as
-    near as their corners.
+    A point passes if |f|/|grad f| <= tolerance, by the gradient. It passes as well if f has
+    different signs at two points on a line through it, on both sides of it and at the same distance
+    of at most the tolerance: a continuous f then has its level between them. Fourteen lines are
+    tried: the normal of the face, or the mean normal at the vertex, and 13 fixed lines. These are
+    askew to the axes, since many parts have faces in coordinate planes, where rounding would decide
+    the sign. Every cone of 28 degrees about its axis contains one of their directions; the corner
+    of a cube contains a cone of 35 degrees.
+
+    volume: a solid is cut at the boundary of this volume, so that f counts as positive outside of
+        it. None if there is no such volume.
+
+    Not tested are the boundary vertices of an angle's level set, which are on its curve, where the
+    angle has no value; and the centers of triangles whose edges are all no longer than half of the
+    tolerance, since their corners are tested.
 
     Raises:
         OffLevelError: points are farther from the level; they are its locations.
@@ -621,8 +650,9 @@ def points_off_level(
     tolerance: float,
     volume: Volume | None,
 ) -> tuple[FloatArray, int]:
-    """The vertices and centers of faces (k, 3) that are not within `tolerance` of the level, as
-    `check_near_level` decides it; and the number of points that were tested."""
+    """The vertices and centers of faces that are not within `tolerance` of the level, (k, 3), and
+    the number of points that were tested. `check_near_level` says which points are tested, and
+    how."""
     corner = vertices[faces]
     normal = area_normals(corner)
     longest = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
@@ -648,8 +678,8 @@ def points_off_level(
 
 
 def _askew_lines() -> FloatArray:
-    """(13, 3) unit vectors along the axes and both kinds of diagonals of a cube, turned so that
-    none of them is near to a plane of coordinates or to one of their diagonals."""
+    """(13, 3) unit vectors along the axes and the face and space diagonals of a cube that is turned
+    so that none of them is near to a coordinate plane or to a plane's diagonal."""
     directions = np.array(list(itertools.product((-1.0, 0.0, 1.0), repeat=3)))[14:]
     frame: FloatArray = np.linalg.qr([[7, 7, -3], [3, -16, -7], [19, 7, -13]])[0]
     return (directions / row_norms(directions)[:, None]) @ frame
@@ -670,8 +700,9 @@ def point_text(x: FloatArray) -> str:
 
 
 def nonmanifold_vertices(faces: IntArray) -> IntArray:
-    """Vertices, by index, at which faces (m, 3) are not a manifold: the ends of edges with more
-    than two faces, and vertices with more than one fan of faces."""
+    """Indices of the vertices at which faces (m, 3) are not a manifold: the ends of edges that have
+    more than two faces, and vertices with more than one fan of faces. A fan is a set of faces
+    around a vertex that are joined by edges."""
     pairs, count = half_edges(faces), int(faces.max(initial=-1)) + 1
     edges = Edges.of(pairs)
     overused = np.unique(pairs[edges.multiplicity[edges.edge_of_pair] > 2])

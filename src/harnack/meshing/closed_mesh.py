@@ -1,5 +1,5 @@
-"""Closed meshes: conversion to and from manifold3d's solids, clip volumes as such solids, and
-export to files that are closed as well."""
+"""Closed meshes: their conversion to and from manifold3d's solids, other shapes as such solids, and
+their export to files that are closed as well."""
 
 from __future__ import annotations
 
@@ -53,10 +53,10 @@ _MAX_CELLS = 1_000_000
 
 
 def to_manifold(surface: TriangleMesh) -> Manifold:
-    """The solid of a closed mesh, whose faces run counter-clockwise seen from outside.
+    """The solid that a closed mesh bounds; its faces run counter-clockwise as seen from outside.
 
     Raises:
-        MeshingError: it is not closed.
+        MeshingError: the mesh is not closed.
     """
     from manifold3d import Error, Manifold, Mesh64
 
@@ -73,12 +73,14 @@ def to_manifold(surface: TriangleMesh) -> Manifold:
 
 
 def mesh_manifold(solid: MeshSolid) -> Manifold | None:
-    """The mesh of a `MeshSolid`; if it crosses itself the union of its parts, or None where a part
-    crosses itself or is a cavity.
+    """The solid of a `MeshSolid`. If its mesh intersects itself, that is the union of the
+    components of the mesh; None if a component intersects itself or is a cavity.
 
-    Parts in contact up to rounding would be left with gaps as thin as that, which have an area, or
-    pass through each other: if the union has more than the boundary of the solid, or triangles of
-    it cross, parts are grown by a tiny length first.
+    Components that are in contact only up to rounding would leave gaps of that thickness, with
+    walls that add to the area, or pass through each other. So if the area of the union differs from
+    that of the solid's boundary, or if triangles of the union cross, the faces of all components
+    are first moved outwards by a tiny length. If that does not help either, the first union of the
+    right area is returned, or None.
 
     Raises:
         MeshingError: more than two faces meet at an edge.
@@ -118,21 +120,21 @@ def _grown_part(part: Manifold, length: float) -> Manifold:
 
 
 def grown(surface: TriangleMesh, length: float) -> TriangleMesh:
-    """A closed surface offset outwards: vertices are moved so that faces move by about a length.
-    Components that touch, up to rounding, then overlap."""
+    """A closed surface, offset outwards: vertices are moved along their normals, so that faces move
+    by about `length`. Components that touch up to rounding overlap then."""
     x, faces = surface.vertices, surface.faces
     mesh = trimesh.Trimesh(x, faces, process=False)
     normals = np.array(mesh.vertex_normals)
-    slant = np.ones(len(normals))
+    cosine = np.ones(len(normals))
     for k in range(3):
-        np.minimum.at(slant, faces[:, k], row_dots(normals[faces[:, k]], mesh.face_normals))
-    return TriangleMesh(x + normals * (length / np.maximum(slant, _MIN_SLANT))[:, None], faces)
+        np.minimum.at(cosine, faces[:, k], row_dots(normals[faces[:, k]], mesh.face_normals))
+    return TriangleMesh(x + normals * (length / np.maximum(cosine, _MIN_SLANT))[:, None], faces)
 
 
 def without_short_edges(solid: Manifold, length: float) -> Manifold:
-    """A solid without short edges and slivers, whose removal moves its surface by up to a length;
-    or the solid itself, if its volume would change by more than that explains: where slivers are as
-    thin as rounding, manifold3d has been seen to lose a part."""
+    """A solid without short edges and slivers; removing these moves its surface by up to `length`.
+    If the volume changes by more than such moves explain, the solid is returned as it is:
+    manifold3d may lose a part where slivers are as thin as rounding."""
     simpler = solid.simplify(length)
     max_change = 2 * length * solid.surface_area()
     return simpler if abs(simpler.volume() - solid.volume()) <= max_change else solid
@@ -146,7 +148,7 @@ def from_manifold(manifold: Manifold) -> TriangleMesh:
 
 
 def box_manifold(lower: FloatArray, upper: FloatArray) -> Manifold:
-    """The box between two corners (3,)."""
+    """The box between two corners (3,) as a solid."""
     from manifold3d import Manifold
 
     x, y, z = (float(v) for v in upper - lower)
@@ -157,16 +159,19 @@ def box_manifold(lower: FloatArray, upper: FloatArray) -> Manifold:
 def extruded_manifold(
     outline: Outline, height: float, twist: float, taper: float, tolerance: float
 ) -> Manifold:
-    """The outline over 0 <= z <= height, its end turned by `twist` degrees and scaled by `taper`.
+    """The outline over 0 <= z <= height as a solid. Its end is turned by `twist` degrees and scaled
+    by the factor `taper`.
 
-    Without a twist the faces are flat, and exact. Otherwise the vertices lie on the surface, and
-    faces within `tolerance` of it. Proof: a triangle of edges of L at most, mapped, is within M
-    L^2/6 of the mapped triangle, where M bounds second derivatives of the map along lines (it lies
-    within L/sqrt(3) of a point). For turning by a and scaling by k within a unit of length, at
-    distances up to R from the axis, with q = max(1, taper), M = q (a + a^2 R) + k (1 + 2 a R).
+    Without a twist the faces are flat, and exact. With a twist the vertices lie on the surface, and
+    faces are within `tolerance` of it. Proof: let a triangle have edges of at most L, let a map
+    take it to the curved surface, and let M bound the second derivatives of the map along lines.
+    Each point of the triangle is within L/sqrt(3) of one of its corners, and so the mapped triangle
+    is within M L^2/6 of the flat triangle between the mapped corners. Let the map turn by the angle
+    a and change the scale by k within a unit of length, at distances up to R from the axis; then M
+    = q (a + a^2 R) + k (1 + 2 a R), with q = max(1, taper).
 
     Raises:
-        MeshingError: so fine that it has millions of faces.
+        MeshingError: the tolerance is so small that there are millions of faces.
     """
     section, scale = _cross_section(outline)
     inverse_scale = (1 / scale, 1 / scale, 1 / scale)
@@ -186,6 +191,8 @@ def extruded_manifold(
         )
 
     def mapped(points: FloatArray) -> FloatArray:
+        """Points (n, 3) of the straight extrusion, turned and scaled in proportion to their
+        height."""
         z = points[:, 2] / scale
         factor, c, s = 1 + growth * z, np.cos(rate * z), np.sin(rate * z)
         x, y = factor * points[:, 0], factor * points[:, 1]
@@ -195,11 +202,12 @@ def extruded_manifold(
 
 
 def revolved_manifold(outline: Outline, tolerance: float) -> Manifold:
-    """The outline in (r, z) about the z axis, its vertices on the surface and its faces within
-    `tolerance` of it: n segments around leave a sagitta of r (1 - cos(pi/n)) <= r (pi/n)^2/2.
+    """The outline in the (r, z) plane, revolved about the z axis, as a solid. Vertices lie on the
+    surface, and faces are within `tolerance` of it: between n segments around, the largest distance
+    of a chord from its arc is r (1 - cos(pi/n)) <= r (pi/n)^2/2.
 
     Raises:
-        MeshingError: so fine that it has millions of faces.
+        MeshingError: the tolerance is so small that there are too many segments.
     """
     radius = max(float(loop[:, 0].max()) for loop in outline)
     segments = 4 * math.ceil(0.25 * math.pi * math.sqrt(radius / (2 * tolerance)))
@@ -224,11 +232,12 @@ def _cross_section(outline: Outline) -> tuple[CrossSection, float]:
 def volume_manifold(
     volume: Volume, lower: FloatArray, upper: FloatArray, tolerance: float
 ) -> Manifold:
-    """The part of a volume in a box: polytopes as they are, balls as polyhedra whose vertices lie
-    on the sphere and whose faces are within `tolerance` of it.
+    """The part of a volume in the box from `lower` to `upper`, as a solid. Polytopes are exact; a
+    ball becomes a polyhedron whose vertices lie on the sphere and whose faces are within
+    `tolerance` of it.
 
     Raises:
-        MeshingError: another volume, or a ball so fine that it has millions of faces.
+        MeshingError: the volume is of another kind, or a ball would have millions of faces.
     """
     from manifold3d import Manifold
 
@@ -295,14 +304,14 @@ _REPAIR_STEPS = 32
 
 
 class ClosedMesh(trimesh.Trimesh):
-    """A trimesh.Trimesh whose `export` writes a closed file if the mesh is closed, or raises a
+    """A trimesh.Trimesh whose `export` writes a closed file if the mesh is closed, or else raises a
     MeshingError.
 
-    Files hold single precision, in which the ends of short edges coincide and slivers flip.
-    Vertices are rounded to a grid that single precision holds, edges without a length are
-    contracted, and it is checked that the result is closed and does not intersect itself. The mesh
-    itself stays as it is, in double precision; meshes that are not closed are written by trimesh as
-    they are. It is displayed as the trimesh.Trimesh that it is, since it may be open.
+    Files hold single precision, in which the ends of short edges coincide and slivers flip. So
+    vertices are rounded to a grid that single precision holds, and edges without a length are
+    contracted; then it is checked that the result is closed and does not intersect itself. The mesh
+    in memory stays in double precision, unchanged. A mesh that is not closed is written as trimesh
+    writes it. Its repr is that of a trimesh.Trimesh, since it may be open.
     """
 
     def __repr__(self) -> str:
@@ -310,7 +319,7 @@ class ClosedMesh(trimesh.Trimesh):
 
     @classmethod
     def of(cls, mesh: trimesh.Trimesh) -> ClosedMesh:
-        """A copy of any mesh."""
+        """A copy of any mesh as a ClosedMesh."""
         copied = trimesh.Trimesh.copy(mesh)
         copied.__class__ = cls
         return cast("ClosedMesh", copied)
@@ -321,12 +330,12 @@ class ClosedMesh(trimesh.Trimesh):
         return copied
 
     def export(self, file_obj: Any = None, file_type: str | None = None, **options: Any) -> Any:
-        """Write the mesh as trimesh.Trimesh.export does. Metadata is not written: its arrays fit in
-        no file.
+        """Write the mesh as trimesh.Trimesh.export does. Metadata is not written: no file format
+        holds its arrays.
 
         Raises:
-            MeshingError: the mesh is closed, and would not be in the file: components that touch,
-                or that are too small or too far from the origin for single precision.
+            MeshingError: the mesh is closed, but would not be in the file: components touch, or the
+                mesh is too small or too far from the origin for single precision.
         """
         written = trimesh.Trimesh.copy(self)
         written.metadata.clear()

@@ -1,17 +1,18 @@
-"""Meshes solids: closed meshes of smooth level sets, cut by volumes and combined by Boolean
+"""Meshes of solids: closed meshes of smooth level sets, cut by volumes and combined by Boolean
 operations.
 
 A solid is the set of points where a function is at most a level. A wall |g| <= w is not meshed as
-{|g| - w = 0}, of which marching cubes makes hundreds of pieces where cells are thicker than the
-wall. It is {g <= w} minus {g <= -w}, two smooth surfaces which do not meet, in a box a little
-larger than the clip; and it is cut by the clip itself. Unions, intersections and complements
-likewise are those of the operands' meshes, so that the creases where operands meet are edges of the
-mesh. Creases of a single function, such as a cylinder's, are chamfered within the tolerance.
+the level set {|g| = w}, which marching cubes breaks into hundreds of pieces if cells are thicker
+than the wall. It is meshed as {g <= w} minus {g <= -w}, with two smooth surfaces that do not meet,
+in a box a little larger than the clip; the result is then cut by the clip. Likewise unions,
+intersections and complements are made of the meshes of their operands, so that the creases where
+operands meet are edges of the mesh. Creases of a single function, such as a cylinder's, are
+chamfered within the tolerance.
 
-Offsets of meshes are left as cells cut them: they have creases everywhere, beside which moved and
-refined triangles intersected each other. They get small cells, and manifold3d merges coplanar
-triangles. The few triangles of the whole mesh that are then too far off the level are cut there
-(`outlier_projection`).
+Offsets of meshes are meshed differently, without moving vertices and refining triangles: they have
+creases everywhere, beside which moved and refined triangles would intersect each other. Their cells
+are small, and manifold3d merges coplanar triangles afterwards. If a few triangles of the whole mesh
+are still too far from the level, these are cut (`outlier_projection`).
 """
 
 from __future__ import annotations
@@ -112,38 +113,41 @@ AngleMesher = Callable[[SolidAngle, float], TriangleMesh]
 
 
 IntersectedOperands: TypeAlias = tuple[tuple[Solid, float], ...]
-"""Solids, with levels, that the meshed solid will be intersected with; where one is proved empty,
-nothing need be meshed.
+"""Solids, with levels, that the meshed solid will be intersected with. Where one of these solids is
+proved to have no points, nothing need be meshed.
 
-Proof for a tree of unions, intersections and complements. Inside a complement, only operands
-without complements are passed on, from the intersection that has the complement as an operand;
-elsewhere, the operands of all enclosing intersections. (1) Omit nothing inside complements. Unions
-and intersections are monotone, so every meshed node is a subset of its true solid. At a point where
-something is omitted, an operand of an enclosing intersection is truly empty, so is its mesh, so is
-the intersection: correct. (2) Omit inside complements too. At such a point, a complement-free
-operand of the intersection that contains the complement is truly empty, and by (1) its mesh is;
-again the intersection is correctly empty.
+Proof for a tree of unions, intersections and complements. Outside of complements, these are the
+operands of all intersections around the meshed solid. Inside a complement, they are only the
+operands without complements of the intersection that the complement is an operand of. "Omitted"
+means: not meshed, and so left empty. (1) Let nothing inside complements be omitted. Unions and
+intersections are monotone, so the mesh of every node is a subset of its true solid. At a point
+where something is omitted, an operand of an intersection around it truly has no points. So its mesh
+has none, and neither has the mesh of the intersection, which is correct. (2) Now let parts inside
+complements be omitted too. At such a point, an operand without complements of the intersection that
+contains the complement truly has no points. By (1) its mesh has none, so the mesh of the
+intersection is correct there as well.
 """
 
 
 @dataclass
 class CsgMesher:
-    """Meshes solids in a box from `lower` to `upper`, (3,) each.
+    """Meshes solids in the box from `lower` to `upper`, (3,) each.
 
-    tolerance: a length, at the midpoints of edges and the centers of faces.
+    tolerance: a length, for midpoints of edges and centers of faces.
     spacing: the largest size of cells.
     per_wave: the smallest number of cells along a wave (`Field.min_wavelength`); None for no such
         limit.
-    mesh_angle: meshes level sets of angles, which end at a curve.
+    mesh_angle: meshes a level set of an angle, which ends at a curve.
     most_faces: the largest number of triangles of each level set.
+    report: receives messages about the progress.
     evaluations: the number of evaluations of fields so far, in points.
-    levels: number of level sets meshed so far.
-    smallest_cell: the smallest spacing of these level sets.
+    levels: the number of level sets meshed so far.
+    smallest_cell: the smallest size of cells used for them.
     uploads: the prepared fields that were meshed so far.
-    intersected_with: solids that everything meshed next is intersected with (see
-        `IntersectedOperands`).
-    irrelevant_region_cache: the operands and the region of the last call that computed where other
-        operands leave nothing.
+    intersected_with: the solids that everything meshed next is intersected with
+        (`IntersectedOperands`).
+    irrelevant_region_cache: the operands, and the region in which they leave nothing, of the last
+        call that computed such a region.
     """
 
     lower: FloatArray
@@ -162,8 +166,8 @@ class CsgMesher:
     irrelevant_region_cache: tuple[IntersectedOperands, IrrelevantRegion] | None = None
 
     def mesh_sublevel(self, solid: Solid, level: float) -> Manifold:
-        """The points of the box where a solid's function is at most `level`; the result outside of
-        the box has no meaning.
+        """The points of the box where the function of `solid` is at most `level`. Outside of the
+        box the result has no meaning.
 
         Raises:
             MeshingError: a part cannot be meshed.
@@ -290,8 +294,9 @@ class CsgMesher:
         return region
 
     def mesh_smooth_level(self, field: Field, level: float) -> tuple[TriangleMesh, bool]:
-        """The boundary of {f <= level} as one level set, and whether it is the whole boundary: if
-        not, it is closed outside of the box in a way that has no meaning."""
+        """The boundary of {f <= level}, meshed as one level set. Also whether it is the whole
+        boundary: if not, it was closed outside of the box, in a way that has no meaning.
+        """
         hull = _finite_extent(field, level)
         lower, upper = self.lower, self.upper
         is_whole = False
@@ -463,7 +468,7 @@ def _is_complement_free(solid: Solid) -> bool:
 
 
 def is_single_level_set(solid: Solid) -> bool:
-    """Whether a solid is meshed as one level set."""
+    """Whether a solid is meshed as one level set, not by Boolean operations or with exact edges."""
     if isinstance(solid, SublevelSolid):
         return not isinstance(solid.field, Solid) or is_single_level_set(solid.field)
     if isinstance(solid, TransformedSolid):
@@ -560,10 +565,10 @@ _MARGIN = 0.01
 class SolidMeshResult:
     """The closed mesh of a solid.
 
-    spacing: of cells.
-    evaluations: of fields, in points.
-    levels: number of level sets it was made of.
-    size: of its box, to which tolerances relate.
+    spacing: the smallest size of cells.
+    evaluations: the number of evaluations of fields, in points.
+    levels: the number of level sets that it was made of.
+    size: the longest edge of the solid's box; tolerances relate to it.
     """
 
     surface: TriangleMesh
@@ -574,11 +579,16 @@ class SolidMeshResult:
 
 
 def solid_and_level(field: Field, solid: Any, level: float | None) -> tuple[Solid, float]:
-    """The solid that the argument `solid` describes, (low, high) or True, and its level.
+    """The solid that the argument `solid` of `mesh` describes, and its level: {solid <= level} is
+    meant.
+
+    solid: True if the field itself is a solid, or values (low, high), between which the field is
+        inside the solid.
+    level: for a field that is a solid; None for its default level.
 
     Raises:
-        ValueError: it describes no solid, or levels that no solid has.
-        TypeError: it is neither.
+        ValueError: the argument describes no solid, or levels that no solid has.
+        TypeError: it is neither True nor a pair of numbers.
     """
     if solid is True and isinstance(field, Solid):
         level = field.default_level if level is None else as_finite(level, "level")
@@ -594,7 +604,8 @@ def solid_and_level(field: Field, solid: Any, level: float | None) -> tuple[Soli
 
 
 def solid_value_range(field: Field, solid: Any, level: float | None) -> tuple[float, float]:
-    """The values (low, high) between which a solid lies, from the argument that describes it.
+    """The values (low, high) of the field between which a solid lies, from the argument that
+    describes it.
 
     Raises:
         ValueError, TypeError: as `solid_and_level`.
@@ -622,20 +633,27 @@ def mesh_solid(
     check: Callable[[TriangleMesh, float], None],
     report: Callable[[str], None],
 ) -> SolidMeshResult:
-    """The boundary of the points of a volume where a solid's function is at most `level`.
+    """The boundary of {solid <= level} in a volume: the points where the solid's function is at
+    most the level.
 
     volume: None for all of space.
-    angle_mesher: makes, for a tolerance and a spacing, both lengths, a function that meshes level
-        sets of angles.
+    tolerance: how far triangles may be from the surface.
+    spacing: the size of cells, or None; only without it smaller cells are tried if an attempt
+        fails.
+    angle_mesher: given a tolerance and a size of cells, both lengths, returns a function that
+        meshes level sets of angles.
     most_faces: the largest number of triangles of a level set.
-    check: checks a surface, none of whose triangles pass through each other, of a size; last, that
-        it is near the level. Where it is not, in a few places, these are mended
-        (`project_outliers`); where another check fails in known places, or mending is not enough,
-        smaller cells are tried, and half the tolerance: beside a thin part triangles within the
-        tolerance may be anywhere.
+    check: called with a surface, none of whose triangles pass through each other, and the size of
+        the solid's box; raises if the surface fails its checks, the last of which is that it is
+        near the level.
+    report: receives messages about the progress.
+
+    If a few places are too far from the level, these are mended (`project_outliers`). If mending is
+    not enough, or another check fails in known places, smaller cells are tried, and half of the
+    tolerance: beside a thin part, triangles within the tolerance may be anywhere.
 
     Raises:
-        MeshingError: it has no bounds; it is empty; a part cannot be meshed.
+        MeshingError: the solid has no bounds, or is empty, or a part cannot be meshed.
     """
     lower, upper = _bounds(solid, level, volume)
     size = float((upper - lower).max())
@@ -707,10 +725,13 @@ def _check_and_mend(
 
 
 def apart_of(whole: Manifold, tolerance: float) -> TriangleMesh:
-    """The surface of the assembled parts, none of whose triangles pass through each other.
+    """The surface of a solid made by Boolean operations; triangles that pass through each other are
+    mended.
+
+    tolerance: a length; mending moves the surface by at most half of it.
 
     Raises:
-        MeshingError: it is empty, or triangles cross.
+        MeshingError: the solid is empty, or mending does not help.
     """
     return _without_crossings(_Assembly(whole), tolerance)
 

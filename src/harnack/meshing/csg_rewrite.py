@@ -19,12 +19,13 @@ from harnack.fields.solids.transforms import TransformedSolid
 __all__ = ["drop_cancelled_operands", "factor_common_operands", "flatten_csg"]
 
 SolidAtLevel: TypeAlias = tuple[Solid, float]
-"""A solid's function and a level: the points where it is at most that."""
+"""A solid f and a level: they stand for the points where f is at most the level."""
 
 
 def factor_common_operands(union: BooleanSolid, level: float) -> Solid | None:
-    """Rewrite the solid {union <= level} as {another solid <= 0} with common operands factored out:
-    (A & B) | (A & C) as A & (B | C). None if no two operands have anything in common."""
+    """Factor common operands out of a union: (A & B) | (A & C) becomes A & (B | C). Returns a solid
+    f such that {f <= 0} is {union <= level}; None if no two operands of the union have anything in
+    common."""
     terms = [{_key(*factor): factor for factor in _factors(part, level)} for part in union.parts]
     common_key, times = Counter(key for term in terms for key in term).most_common(1)[0]
     if times < 2:
@@ -41,8 +42,9 @@ def factor_common_operands(union: BooleanSolid, level: float) -> Solid | None:
 
 
 def flatten_csg(solid: BooleanSolid) -> BooleanSolid:
-    """Flatten nested operations of the same kind, unions in a union or intersections in an
-    intersection: everything that is cut away from an operand is then cut away at once."""
+    """The solid with nested operations of the same kind made one, unions in a union or
+    intersections in an intersection. Everything that is cut away from an operand is then cut away
+    at once."""
     parts: list[Solid] = []
     for operand in solid.parts:
         if isinstance(operand, BooleanSolid) and operand.is_union == solid.is_union:
@@ -53,9 +55,12 @@ def flatten_csg(solid: BooleanSolid) -> BooleanSolid:
 
 
 def drop_cancelled_operands(solid: BooleanSolid, level: float) -> BooleanSolid | None:
-    """Rewrite (A | C) - C as A - C among the operands of an intersection: C has nothing but its
-    boundary in common with its complement. Returns None if nothing is left; a union is returned as
-    it is."""
+    """In an intersection, drop what is cut away from its unions anyway: (A | C) - C becomes A - C,
+    since C and its complement have only their boundary in common. Returns None if nothing is left
+    of a union. A solid that is a union itself is returned as it is.
+
+    level: {solid <= level} is meant.
+    """
     if solid.is_union:
         return solid
     cut = {_key(term.field, -level) for term in solid.parts if isinstance(term, Complement)}
