@@ -182,12 +182,12 @@ def intersecting_faces(
     share, decided exactly. Two kinds of pairs are found: an edge of one face passes through the
     other face, or both faces lie in one plane and overlap.
 
-    Two triangles in different planes meet beyond their shared corners only if an edge of one passes
-    through the other, with its ends on both sides of the other's plane, or ends on it. Ends on
-    other triangles are not looked for: if the surface goes on behind such an end, one of its edges
-    passes through. Two triangles in one plane overlap, whatever they share, unless the line of an
-    edge has them on its two sides (separating axes). So faces that occur twice, or are folded back
-    onto their neighbors, are found. Only pairs whose bounding boxes overlap are tested.
+    Two triangles in different planes meet beyond their shared corners if and only if an edge of one
+    passes through the other, with its ends on both sides of the other's plane, or ends on it. Ends
+    on other triangles are not looked for: if the surface goes on behind such an end, one of its
+    edges passes through. Two triangles in one plane overlap, whatever they share, unless the line
+    of an edge has them on its two sides (separating axes). So faces that occur twice, or are folded
+    back onto their neighbors, are found. Only pairs whose bounding boxes overlap are tested.
 
     vertices: (n, 3).
     among: (m,) mask of chosen faces; pairs without a chosen face are not tested. None if all are

@@ -47,7 +47,7 @@ _MAX_SEGMENTS = 2000
 # The areas of a union and of its parts may differ by the first, relative to the area. Otherwise,
 # and where triangles of the union cross, the faces of parts are moved outwards by the second,
 # relative to the size. At sharp corners vertices are moved by at most that divided by the third.
-_AREA_TOLERANCE, _GROWTH, _MIN_SLANT = 1e-6, 1e-9, 0.1
+_AREA_TOLERANCE, _GROWTH, _MIN_COSINE = 1e-6, 1e-9, 0.1
 # The largest number of squares of the permitted edge on a twisted outline.
 _MAX_CELLS = 1_000_000
 
@@ -128,7 +128,7 @@ def grown(surface: TriangleMesh, length: float) -> TriangleMesh:
     cosine = np.ones(len(normals))
     for k in range(3):
         np.minimum.at(cosine, faces[:, k], row_dots(normals[faces[:, k]], mesh.face_normals))
-    return TriangleMesh(x + normals * (length / np.maximum(cosine, _MIN_SLANT))[:, None], faces)
+    return TriangleMesh(x + normals * (length / np.maximum(cosine, _MIN_COSINE))[:, None], faces)
 
 
 def without_short_edges(solid: Manifold, length: float) -> Manifold:
@@ -165,10 +165,10 @@ def extruded_manifold(
     Without a twist the faces are flat, and exact. With a twist the vertices lie on the surface, and
     faces are within `tolerance` of it. Proof: let a triangle have edges of at most L, let a map
     take it to the curved surface, and let M bound the second derivatives of the map along lines.
-    Each point of the triangle is within L/sqrt(3) of one of its corners, and so the mapped triangle
-    is within M L^2/6 of the flat triangle between the mapped corners. Let the map turn by the angle
-    a and change the scale by k within a unit of length, at distances up to R from the axis; then M
-    = q (a + a^2 R) + k (1 + 2 a R), with q = max(1, taper).
+    The triangle lies in a ball of radius L/sqrt(3), so that linear interpolation of the map between
+    the corners errs by at most M/2 times the square of that radius, M L^2/6. Let the map turn by
+    the angle a and change the scale by k within a unit of length, at distances up to R from the
+    axis; then M = q (a + a^2 R) + k (1 + 2 a R), with q = max(1, taper).
 
     Raises:
         MeshingError: the tolerance is so small that there are millions of faces.

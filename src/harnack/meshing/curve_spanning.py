@@ -1,7 +1,7 @@
-"""Triangles of an angle's level set that end at its curve, in Delaunay's tetrahedra.
+"""Meshes of an angle's level set that ends at a curve, made from Delaunay's tetrahedra.
 
-Where a check fails in known places, cells are made smaller there alone and the mesh is computed
-again. Where that does not help, or the places are not known, cells are made smaller everywhere.
+If a check fails in known places, cells are made smaller there alone and the mesh is computed again.
+If that does not help, or the places are not known, cells are made smaller everywhere.
 """
 
 from __future__ import annotations
@@ -59,18 +59,20 @@ def restore_curve_edges(
     cut: int,
     height: float,
 ) -> tuple[FloatArray, IntArray]:
-    """Restore edges of the boundary curve that were subdivided for the tetrahedra, so that only the
-    first `kept` vertices, those of the curve, are on the boundary. Returns vertices and faces.
+    """Restore the edges of the boundary curve that were subdivided for the tetrahedra, so that of
+    the vertices (n, 3) only the first `kept`, those of the curve, are on the boundary. Returns
+    vertices and faces.
 
     Long edges of a curve are subdivided so that cells near them need not be as large. The extra
-    points are moved off the edge into the surface, by at most the tolerance, and the gap is filled:
-    the mesh then ends at the given curve. The filling triangles are thin, unavoidably: the surface
-    twists about the edge, and a triangle along all of it is within the tolerance only if its height
-    is about the tolerance.
+    points are moved off their edge into the surface, by at most `height`, and the gap beside the
+    edge is filled with triangles, so that the mesh ends at the given curve. These triangles are
+    thin, unavoidably: the surface twists about the edge, and a triangle along all of the edge is
+    within the tolerance only if its height is about the tolerance.
 
-    kept, cut: vertices before `kept` are those of the curve; from there to `cut` they are the extra
-        points on its edges.
-    height: how far the extra points are moved, at most.
+    faces: (m, 3).
+    kept, cut: the vertices before index `kept` are those of the curve; from there to index `cut`
+        they are the extra points on its edges.
+    height: the largest distance by which extra points are moved.
     """
     if cut == kept:
         return vertices, faces
@@ -183,9 +185,9 @@ class SpanningMesh:
     vertices: (n, 3).
     faces: (m, 3).
     curve: the boundary curve, with its edges as subdivided.
-    spacing: of cells.
-    finer: where cells were smaller.
-    crossings: of the edges of tetrahedra.
+    spacing: the size of cells.
+    finer: balls in which cells were halved; once more for each entry.
+    crossings: how often the level set crosses edges of the tetrahedra.
     isotopy: on how many tetrahedra the topology is proved.
     turned: how many faces are turned over.
     """
@@ -229,12 +231,15 @@ def mesh_spanning_curve(
     report: Callable[[str], None],
 ) -> SpanningMesh:
     """The mesh of an angle's level set within the tolerance, none of whose triangles pass through
-    each other; where triangles do, or are turned over, cells are made smaller and the mesh is
-    computed again.
+    each other. If triangles do, or are turned over, cells are made smaller there and the mesh is
+    computed again; triangles that are still turned over at the end are counted in the result.
 
-    attempts: the number of spacings that are tried, each smaller than the spacing before.
-    box: the box that cells fill. has_walls: whether the surface may end at its faces.
+    attempts: the number of sizes of cells that are tried, each smaller than the one before.
+    box: the lower and upper corners (3,) of the box that cells fill.
+    has_walls: whether the surface may end at the faces of the box.
+    seed: of the random moves of points.
     tolerance: a length.
+    report: receives messages about the progress.
 
     Raises:
         MeshingError: no mesh passes the checks.

@@ -1,10 +1,10 @@
-"""The points of a Delaunay triangulation around a level set: those of an octree around it, and the
-boundary curve it ends on.
+"""The points of a Delaunay triangulation around a level set: the corners and centers of the cells
+of an octree around it, and the points of the boundary curve at which the level set ends.
 
-Vertices of the curve are points as they are. Other points keep so far from it that no point lies in
-the ball with an edge of the curve as diameter, so that every edge of the curve is an edge of the
-Delaunay triangulation (Gabriel's condition). Points near the level set are moved onto it: most
-slivers go.
+The vertices of the curve are points of the triangulation. All other points are kept so far from the
+curve that no point lies in a ball that has an edge of the curve as its diameter. So every edge of
+the curve is an edge of the Delaunay triangulation (Gabriel's condition). Points near the level set
+are moved onto it, which removes most slivers.
 """
 
 from __future__ import annotations
@@ -55,21 +55,23 @@ class RefinementBalls:
     radius: float
 
     def meet(self, centers: FloatArray, radii: FloatArray | float) -> BoolArray:
-        """(k,) whether balls about points (k, 3) meet any of these balls."""
+        """(k,) whether the balls with these centers (k, 3) and radii (k,), or one radius, meet any
+        of the balls."""
         if not len(centers):
             return np.zeros(0, np.bool_)
         import scipy.spatial  # imported here: it takes half a second
 
         searching: Any = scipy.spatial
-        apart: FloatArray = searching.cKDTree(self.points).query(centers)[0]
-        return apart < self.radius + radii
+        distance: FloatArray = searching.cKDTree(self.points).query(centers)[0]
+        return distance < self.radius + radii
 
 
 @dataclass(frozen=True)
 class BoundaryCurve:
-    """The curve that a level set ends on.
+    """The curve at which a level set ends.
 
-    points: (n, 3). edges: (n, 2) indices of points, in the direction in which the curve is run.
+    points: (n, 3).
+    edges: (n, 2) indices of the two points of each edge, in the direction in which the curve runs.
     """
 
     points: FloatArray
@@ -77,8 +79,9 @@ class BoundaryCurve:
 
     @classmethod
     def of(cls, loops: tuple[FloatArray, ...], longest: float) -> BoundaryCurve:
-        """A curve of closed loops, their vertices first and in their order; edges longer than
-        `longest` are divided into equal parts."""
+        """The curve that consists of closed loops (k, 3). Its points are first the vertices of the
+        loops, in their order; then those that divide edges longer than `longest` into equal
+        parts."""
         points = [*loops]
         inner_points: list[FloatArray] = []
         edges: list[tuple[int, int]] = []
@@ -96,8 +99,8 @@ class BoundaryCurve:
         return cls(np.concatenate([*points, *inner_points, np.zeros((0, 3))]), pairs)
 
     def split(self, which: BoolArray) -> BoundaryCurve:
-        """The curve with the midpoints of the edges that the mask `which` (k,) selects as
-        additional points."""
+        """The curve, with those edges halved that the mask `which` (k,) selects. Their midpoints
+        are additional points, after all others."""
         a, b = self.edges[which].T
         middle = len(self.points) + np.arange(len(a))
         points = np.concatenate([self.points, 0.5 * (self.points[a] + self.points[b])])
@@ -105,7 +108,7 @@ class BoundaryCurve:
         return BoundaryCurve(points, np.concatenate([self.edges[~which], halves]))
 
     def split_near(self, places: RefinementBalls, longest: float) -> BoundaryCurve:
-        """The curve with edges that meet the balls `places` divided until they are no longer than
+        """The curve, with edges that meet the balls `places` halved until they are no longer than
         `longest`."""
         curve = self
         while True:
@@ -122,8 +125,8 @@ class TetrahedronPoints:
     """The points of a triangulation, with the function's samples.
 
     points: (n, 3), those of the boundary curve first.
-    is_on_level: (n,) whether they are on the level; those of the curve are.
-    samples: at all points; those of the curve are 0.
+    is_on_level: (n,) whether points are on the level; those of the curve count as on it.
+    samples: of f - level at all points; 0 at those of the curve.
     """
 
     points: FloatArray
@@ -134,10 +137,11 @@ class TetrahedronPoints:
 def box_cells(
     lower: FloatArray, upper: FloatArray, spacing: float, exact: bool
 ) -> tuple[BoxCells, int]:
-    """Cells that fill a box, and how many times they are to be subdivided to be no larger than
+    """Cells that fill a box, and how many times they are to be halved until they are no larger than
     `spacing`.
 
-    exact: whether the box itself is filled; else cubes fill a box that may be larger.
+    exact: whether the cells fill the box exactly; otherwise they are cubes, which fill a box that
+        may be larger.
     """
     size = upper - lower
     finest = max(1, math.ceil(math.log2(float(size.max()) / spacing)))
@@ -163,12 +167,18 @@ def sample_delaunay_points(
     seed: int,
     finer: tuple[RefinementBalls, ...] = (),
 ) -> TetrahedronPoints:
-    """Points for the tetrahedra: see the module's docstring.
+    """The points of the tetrahedra, with samples of the function. The module's docstring says how
+    they are chosen.
 
-    walls: a box; points on its faces stay on them. finer: where leaves of the octree are split
-        again, once for each entry that they meet.
+    root: cells that fill the box, and how many times they are to be halved.
+    boundary: the curve at which the level set ends.
+    walls: the lower and upper corners of a box; points on its faces stay on them. None if there is
+        none.
+    seed: of the random moves of points.
+    finer: balls; cells of the octree are halved again, once for each entry that they meet.
 
-    Raises MemoryError for more than four million cells.
+    Raises:
+        MemoryError: there are more than four million cells.
     """
     tree = refine_cells(root[0], function.clearance, _MAX_CELLS, root[1])
     points, size = _corners_and_centers(tree, _subdivided_cells(function, tree.occupied, finer))
@@ -319,10 +329,18 @@ def newton_to_level(
     walls: tuple[FloatArray, FloatArray] | None,
     steps: int = 5,
 ) -> FloatArray:
-    """Points (n, 3) after steps of Newton's method along the gradient towards the level, each no
-    longer than `longest` (n,). Points on walls stay on them. Points are no longer moved after a
-    step so short that the next step, of the order of its square, would be lost in rounding; and
-    where there is no finite step, as beside a pole."""
+    """Points (n, 3), moved towards the level by steps of Newton's method along the gradient.
+
+    samples: of the function at the points.
+    longest: (n,) the largest length of each step.
+    walls: the lower and upper corners of a box; points on its faces stay on them, and no point
+        leaves it. None if there is none.
+    steps: the largest number of steps.
+
+    A point is no longer moved after a step so short that the next step, of the order of its square,
+    would be lost in rounding. It is not moved either where there is no finite step, as beside a
+    pole.
+    """
     x, rows = points.copy(), np.arange(len(points))
     for k in range(steps):
         current = x[rows]
@@ -345,9 +363,14 @@ def newton_to_level(
 def to_multiple_roots(
     function: LevelFunction, points: FloatArray, samples: LevelSamples, longest: FloatArray
 ) -> FloatArray:
-    """Points (n, 3) after steps towards the level where f - level is a power u^m, for which
-    Newton's steps shrink only by 1 - 1/m: each step goes to the limit of the geometric series of
-    two of Newton's steps."""
+    """Points (n, 3), moved towards a level set on which f - level has a multiple root: f - level =
+    u^m with m > 1 for some function u. There Newton's steps converge only linearly, each being 1 -
+    1/m times the one before. So two of Newton's steps are computed, and the points are moved to the
+    limit of the geometric series that they begin. This is done a few times.
+
+    samples: of the function at the points.
+    longest: (n,) the largest length of each of Newton's steps.
+    """
     x = points
     for k in range(_SERIES_STEPS):
         first = newton_to_level(

@@ -1,4 +1,4 @@
-"""Finishes meshes: thickening, simplification, and facts in their metadata."""
+"""The last steps of meshing: thickening, simplification, and facts for the meshes' metadata."""
 
 from __future__ import annotations
 
@@ -46,22 +46,25 @@ _MIN_SIDE_DISTANCE = 0.98
 def thicken(
     surface: TriangleMesh, normals: FloatArray, thickness: float, tolerance: float
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """A closed part of a given thickness around a surface, and facts about it: `thickened_by` is
-    "offset" or "hulls of balls".
+    """A closed part of a given thickness around a surface, and facts about it. The fact
+    `thickened_by` is "offset" or "hulls of balls".
 
-    Where the surface's reach is larger than half of the thickness t (no point that near has two
-    closest points), the part is the surface moved by t/2 to both sides along its normals, and walls
-    along its boundary: straight between the sides, so that the boundary stays where it is. Its
-    volume is area x t up to the second order: (K t^2/12) of it, K the Gaussian curvature. Where
-    that makes triangles turn over, or come nearer to the surface than t/2, or pass through each
-    other, the part is the union of the convex hulls of three balls around the corners of each
-    triangle: all points within t/2, with a round boundary.
+    Let t be the thickness, and let the surface's reach be the largest distance up to which points
+    have a single closest point on it. If the reach is larger than t/2, the part consists of the
+    surface moved by t/2 to both sides along its normals, and of walls along its boundary, straight
+    between the sides, so that the boundary stays where it is. To second order its volume is area
+    times t, plus K t^2/12 of that, with the Gaussian curvature K. If triangles turn over in this
+    way, or come nearer to the surface than t/2, or pass through each other, the part is instead the
+    union of the convex hulls of three balls around the corners of each triangle: all points within
+    t/2 of the surface, with a round boundary.
 
-    normals: (n, 3), of unit length, on the side from which faces run counter-clockwise.
-    tolerance: of the balls' polyhedra, and of the surface's triangles, a length.
+    normals: (n, 3) unit normals at the vertices, on the side from which faces run
+        counter-clockwise.
+    thickness: t, a length.
+    tolerance: of the balls' polyhedra and of the surface's triangles, a length.
 
     Raises:
-        MeshingError: the part is far thicker than triangles are large, of which there are too many.
+        MeshingError: hulls are needed, and there are too many triangles.
     """
     area = 0.5 * float(np.linalg.norm(area_normals(surface.vertices[surface.faces]), axis=1).sum())
     facts: dict[str, Any] = {"thickness": thickness, "area": area}
@@ -184,7 +187,9 @@ _SIMPLIFIED_WITHIN, _MENDED_WITHIN = (0.4, 0.2, 0.1), 0.05
 
 
 def check_options(spacing: Any, thickness: Any, seed: Any, most: Any) -> None:
-    """Raise ValueError or TypeError for numbers out of range."""
+    """Raise ValueError or TypeError unless options of `mesh` are in their ranges: `cell_size` and
+    `thickness` positive or None, `seed` a nonnegative integer, `max_triangles` a positive
+    integer."""
     for name, value in (("cell_size", spacing), ("thickness", thickness)):
         if value is not None and not 0 < as_real(value, name) < math.inf:
             raise ValueError(f"{name} must be a positive length, not {value!r}")
@@ -193,8 +198,10 @@ def check_options(spacing: Any, thickness: Any, seed: Any, most: Any) -> None:
 
 
 def vertex_normals(function: LevelFunction, surface: TriangleMesh) -> FloatArray:
-    """Unit normals (n, 3) at vertices: along the gradient of the field, and where it has none, as
-    at the curve that a surface ends on, the mean of the faces there by area."""
+    """(n, 3) unit normals at the vertices of a surface. They point along the gradient of the field.
+    Where the field has no gradient, as at a curve at which the surface ends, or where the gradient
+    is far from the direction of the faces, they are the mean of the normals of the faces there,
+    weighted by area."""
     corner = surface.vertices[surface.faces]
     normal = area_normals(corner)
     mean = np.zeros_like(surface.vertices)
@@ -215,15 +222,15 @@ def vertex_normals(function: LevelFunction, surface: TriangleMesh) -> FloatArray
 def simplify_mesh(
     surface: TriangleMesh, tolerance: float, check: Callable[[TriangleMesh], None]
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """A closed surface with fewer triangles, or as it is where that cannot be.
+    """A closed surface with fewer triangles, or the same surface if that fails; and facts about it.
 
-    The method is manifold3d's simplification, which keeps some of the vertices. It moves the
-    surface by less than a fraction of the tolerance, half of which is for all other errors. Where
-    triangles then pass through each other they are mended; where that fails, or the check does, a
-    smaller fraction is tried.
+    manifold3d simplifies the surface, which keeps some of its vertices and moves the surface by
+    less than a fraction of the tolerance; half of the tolerance is for all other errors. Triangles
+    that then pass through each other are mended. If mending or the check fails, a smaller fraction
+    is tried.
 
-
-    check: checks a surface none of whose triangles pass through each other.
+    check: raises MeshingError if a surface, none of whose triangles pass through each other, fails
+        its checks.
     """
     facts = {"triangles_before_simplification": len(surface.faces)}
     solid = to_manifold(surface)
@@ -241,11 +248,13 @@ def simplify_mesh(
 
 
 def to_trimesh(surface: TriangleMesh, facts: dict[str, Any], is_closed: bool) -> trimesh.Trimesh:
-    """Convert a manifold surface (`check_manifold`) to a trimesh.Trimesh with facts about it in its
-    metadata. A mesh without a boundary is oriented so that its volume is positive.
+    """Convert a manifold surface (`check_manifold`) to a trimesh.Trimesh, with facts about it in
+    its metadata. A mesh without a boundary is oriented so that its volume is positive.
+
+    is_closed: whether the mesh has to be closed.
 
     Raises:
-        MeshingError: `is_closed`, but the mesh is not closed or has no positive volume.
+        MeshingError: the mesh has to be closed, but is not, or has no positive volume.
     """
     from harnack.meshing.closed_mesh import ClosedMesh
 

@@ -1,10 +1,10 @@
-"""Harmonic hole fillings: surfaces on which the winding number of a mesh is 1/2, which fill all
-holes at once.
+"""Harmonic hole fillings. They lie on surfaces on which the winding number of a mesh is 1/2, and
+fill all holes at once.
 
-The 1/2 level of the winding number w modulo 1 is the 2 pi level of the solid angle of the boundary
-edges (`geometry.chains`), a smooth surface that ends at them. It is meshed with these very edges in
-it, and joined to the mesh by index. It joins the boundary loops of a gap, where `hole_filling`
-closes each loop by itself.
+Let w be the winding number. Its level 1/2, modulo 1, is the level 2 pi of the solid angle of the
+boundary edges (`geometry.chains`): a smooth surface that ends at these edges. It is meshed so that
+it has these very edges, and joined to the mesh by the indices of their vertices. It connects the
+boundary loops of one gap, whereas `hole_filling` closes each loop by itself.
 """
 
 from __future__ import annotations
@@ -72,9 +72,10 @@ class HoleFillingOptions:
 
     tolerance: how far fillings may be from the surface, relative to the size of the box around all
         holes.
-    spacing: the initial size of cells, or None.
-    seed: of random moves.
-    attempts: how many sizes of cells are tried.
+    spacing: the size of cells at first, a length; None for a 24th of that box.
+    seed: of the random moves of points.
+    attempts: how many times the fillings are computed, with smaller cells where checks failed.
+    report: receives messages about the progress.
     """
 
     tolerance: MeshTolerance
@@ -86,11 +87,14 @@ class HoleFillingOptions:
 
 @dataclass(frozen=True)
 class HarmonicFilling:
-    """The vertices and faces that harmonic filling adds to a mesh.
+    """The vertices and faces that a harmonic filling adds to a mesh.
 
-    vertices: (k, 3).
-    faces: (p, 3); indices below the number of the mesh's vertices are of these.
+    vertices: (k, 3) the new vertices.
+    faces: (p, 3). Indices below the number of the mesh's vertices stand for vertices of the mesh,
+        the following ones for new vertices.
     is_refined: whether the faces were refined to the tolerance.
+    spacing: the size of cells.
+    evaluations: the number of evaluations of the solid angle, in points.
     triangle_fill_count: how many of the faces are single triangles that fill holes of three edges.
     """
 
@@ -105,9 +109,12 @@ class HarmonicFilling:
 def harmonic_patches(
     vertices: FloatArray, faces: IntArray, edges: IntArray, asked: HoleFillingOptions
 ) -> HarmonicFilling:
-    """Fill the holes of a mesh by harmonic fillings that end at its boundary edges (k, 2), in the
-    direction of its faces; or, where that fails, by triangles in holes of three edges, and harmonic
-    fillings of the other holes.
+    """Fill the holes of a mesh by harmonic fillings that end at its boundary edges. If that fails,
+    holes of three edges are filled by triangles, and the others by harmonic fillings.
+
+    vertices: (n, 3) of the mesh.
+    faces: (m, 3) of the mesh.
+    edges: (k, 2) its boundary edges, in the direction of its faces.
 
     Raises:
         MeshingError: fillings could not be computed, or intersect the mesh or each other.
@@ -187,10 +194,10 @@ class _MeshIntersectionError(LocalizedMeshingError):
 
 
 def checked_boundary_edges(faces: IntArray) -> IntArray:
-    """(k, 2) the edges with one face, in its direction.
+    """(k, 2) the edges that have a single face, in the direction of that face.
 
     Raises:
-        MeshError: an edge of more than two faces, or of two that have it in the same direction.
+        MeshError: an edge has more than two faces, or two that run it in the same direction.
     """
     pairs = half_edges(faces)
     edges = Edges.of(pairs)
@@ -215,9 +222,11 @@ def checked_boundary_edges(faces: IntArray) -> IntArray:
 
 
 def triangle_fills(vertices: FloatArray, faces: IntArray, edges: IntArray) -> IntArray:
-    """The triangles (k, 3) that fill holes of three edges, where they intersect no others.
+    """(k, 3) triangles that fill holes of three edges; those that would intersect other triangles
+    are left out.
 
-    edges: (n, 2) boundary edges, in the direction of the faces.
+    vertices, faces: of the mesh.
+    edges: (n, 2) its boundary edges, in the direction of the faces.
     """
     leads: dict[int, set[int]] = defaultdict(set)
     for a, b in edges.tolist():
