@@ -43,7 +43,7 @@ _FACE_INDEX, _IS_CHOSEN = 6, 7
 _LEAF_SIZE = 8
 # The number of triangles that walk the tree at once, and the smallest number of pairs that there is
 # room for.
-_WALK_SIZE, _MIN_PAIR_CAPACITY = 1 << 17, 1 << 22
+_WALK_SIZE, _PAIRS_AT_ONCE = 1 << 17, 1 << 22
 # A bound of the rounding of a product of three vectors, or of two, whose components are differences
 # of coordinates, relative to the product of their lengths: at most seven roundings of up to six
 # terms, whose sum is at most 1.16 times that product, and four of three terms, whose sum is at most
@@ -70,7 +70,7 @@ def near_pairs(vertices: FloatArray, faces: IntArray, among: BoolArray | None) -
     scaled = np.ldexp(vertices, -int(np.frexp(largest)[1])) if largest else vertices
     boxes, pairs = _FaceBoxTree.of(scaled[faces], chosen), _PairTests.of(scaled, faces)
     rows = boxes.order[chosen[boxes.order]]
-    room = max(_MIN_PAIR_CAPACITY, len(faces))
+    room = max(_PAIRS_AT_ONCE, len(faces))
     pending = [rows[start : start + _WALK_SIZE] for start in range(0, len(rows), _WALK_SIZE)]
     while pending:
         batch = pending.pop()

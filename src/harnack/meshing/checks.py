@@ -80,28 +80,28 @@ def orient3d(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> Sign
     """(n,) the signs of det(a - d, b - d, c - d) for points (n, 3), exactly. The sign is 1 if a, b,
     c run clockwise as seen from d, -1 if they run counter-clockwise, and 0 if the four points are
     in one plane."""
-    together = _scaled(np.stack([a, b, c, d], axis=1))
-    rows = together[:, :3] - together[:, 3:]
-    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = (rows[:, k].T for k in range(3))
+    points = _scaled(np.stack([a, b, c, d], axis=1))
+    edges = points[:, :3] - points[:, 3:]
+    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = (edges[:, k].T for k in range(3))
     terms = [(bx * cy, cx * by, az), (cx * ay, ax * cy, bz), (ax * by, bx * ay, cz)]
-    value = sum((plus - minus) * height for plus, minus, height in terms)
-    size = sum((np.abs(plus) + np.abs(minus)) * np.abs(height) for plus, minus, height in terms)
+    value = sum((plus - minus) * third for plus, minus, third in terms)
+    magnitude = sum((np.abs(plus) + np.abs(minus)) * np.abs(third) for plus, minus, third in terms)
     # A difference of doubles is 0 where they are equal, and only there.
-    flat = (rows == 0).all(axis=1).any(axis=1)
+    is_zero = (edges == 0).all(axis=1).any(axis=1)
     return _signs_with_fallback(
-        np.asarray(value), _ORIENT3D_ERROR * np.asarray(size), flat, together, _orient3d_exact
+        np.asarray(value), _ORIENT3D_ERROR * np.asarray(magnitude), is_zero, points, _orient3d_exact
     )
 
 
 def orient2d(a: FloatArray, b: FloatArray, c: FloatArray) -> SignArray:
     """(n,) the signs of det(a - c, b - c) for points (n, 2), exactly. The sign is 1 if a, b, c run
     counter-clockwise, -1 if they run clockwise, and 0 if they are in one line."""
-    together = _scaled(np.stack([a, b, c], axis=1))
-    rows = together[:, :2] - together[:, 2:]
-    (ax, ay), (bx, by) = (rows[:, k].T for k in range(2))
+    points = _scaled(np.stack([a, b, c], axis=1))
+    edges = points[:, :2] - points[:, 2:]
+    (ax, ay), (bx, by) = (edges[:, k].T for k in range(2))
     value, size = ax * by - ay * bx, np.abs(ax * by) + np.abs(ay * bx)
-    flat = (rows == 0).all(axis=1).any(axis=1)
-    return _signs_with_fallback(value, _ORIENT2D_ERROR * size, flat, together, _orient2d_exact)
+    is_zero = (edges == 0).all(axis=1).any(axis=1)
+    return _signs_with_fallback(value, _ORIENT2D_ERROR * size, is_zero, points, _orient2d_exact)
 
 
 def _scaled(points: FloatArray) -> FloatArray:
@@ -194,15 +194,15 @@ def intersecting_faces(
         chosen.
     """
     crossing_faces: list[IntArray] = []
-    for pairs, heights in _pairs_in_doubt(vertices, faces, among):
+    for pairs, sides in _pairs_in_doubt(vertices, faces, among):
         first, second = faces[pairs[:, 0]], faces[pairs[:, 1]]
         meet = np.zeros(len(pairs), np.bool_)
-        rows = np.flatnonzero((heights[0] == 0).all(axis=1) & (heights[1] == 0).all(axis=1))
+        rows = np.flatnonzero((sides[0] == 0).all(axis=1) & (sides[1] == 0).all(axis=1))
         meet[rows] = _share_area(vertices[first[rows]], vertices[second[rows]])
-        both = np.all([(h.min(axis=1) < 0) & (h.max(axis=1) > 0) for h in heights], axis=0)
-        rows = np.flatnonzero(both)
-        meet[rows] = _edge_pierces(vertices, first[rows], second[rows], heights[0][rows])
-        meet[rows] |= _edge_pierces(vertices, second[rows], first[rows], heights[1][rows])
+        may_cross = np.all([(s.min(axis=1) < 0) & (s.max(axis=1) > 0) for s in sides], axis=0)
+        rows = np.flatnonzero(may_cross)
+        meet[rows] = _edge_pierces(vertices, first[rows], second[rows], sides[0][rows])
+        meet[rows] |= _edge_pierces(vertices, second[rows], first[rows], sides[1][rows])
         crossing_faces.append(pairs[meet].ravel())
     return np.unique(np.concatenate([*crossing_faces, np.zeros(0, np.int64)]))
 
@@ -225,33 +225,33 @@ def touching_pairs(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, Flo
     batches: list[IntArray] = []
     contacts: list[FloatArray] = []
 
-    def add(pairs: IntArray, on: BoolArray, p: FloatArray, q: FloatArray) -> None:
-        """List those pairs (k, 2) that the mask `on` selects, with the points midway between p and
-        q (k, 3)."""
-        batches.append(pairs[on])
-        contacts.append(0.5 * (p + q)[on])
+    def add(pairs: IntArray, touches: BoolArray, p: FloatArray, q: FloatArray) -> None:
+        """List those pairs (k, 2) that the mask `touches` selects, with the points midway between
+        the points p and q (k, 3)."""
+        batches.append(pairs[touches])
+        contacts.append(0.5 * (p + q)[touches])
 
     for pairs, heights in _pairs_in_doubt(vertices, faces, None):
-        same = faces[pairs[:, 0], :, None] == faces[pairs[:, 1]][:, None]
-        shared = same.sum(axis=(1, 2))
-        for order, ((plane, of), height) in enumerate(
+        is_same = faces[pairs[:, 0], :, None] == faces[pairs[:, 1]][:, None]
+        shared_count = is_same.sum(axis=(1, 2))
+        for order, ((base, other), sides) in enumerate(
             zip((pairs.T, pairs.T[::-1]), heights, strict=True)
         ):
             # A corner is an edge from itself to itself.
             for i, j in ((0, 0), (1, 1), (2, 2), *_EDGES):
-                rows = np.flatnonzero((shared == 0) & (height[:, i] == 0) & (height[:, j] == 0))
-                p, q = (vertices[faces[of[rows], k]] for k in (i, j))
-                add(pairs[rows], _segments_meet(vertices[faces[plane[rows]]], p, q), p, q)
-            is_common = same.any(axis=1 + order)  # of the corners of `of`
+                rows = np.flatnonzero((shared_count == 0) & (sides[:, i] == 0) & (sides[:, j] == 0))
+                p, q = (vertices[faces[other[rows], k]] for k in (i, j))
+                add(pairs[rows], _segments_meet(vertices[faces[base[rows]]], p, q), p, q)
+            is_common = is_same.any(axis=1 + order)  # for the corners of the other faces
             for i in range(3):
-                rows = np.flatnonzero((shared == 1) & ~is_common[:, i] & (height[:, i] == 0))
-                apex = same.any(axis=2 - order)[rows].argmax(axis=1)[:, None]
-                turned = np.take_along_axis(faces[plane[rows]], (apex + np.arange(3)) % 3, axis=1)
-                p = vertices[faces[of[rows], i]]
+                rows = np.flatnonzero((shared_count == 1) & ~is_common[:, i] & (sides[:, i] == 0))
+                apex = is_same.any(axis=2 - order)[rows].argmax(axis=1)[:, None]
+                turned = np.take_along_axis(faces[base[rows]], (apex + np.arange(3)) % 3, axis=1)
+                p = vertices[faces[other[rows], i]]
                 add(pairs[rows], _is_in_angle(vertices[turned], p), p, p)
-    both = np.concatenate([*batches, np.zeros((0, 2), np.int64)])
-    _, first = np.unique(both, axis=0, return_index=True)
-    return both[first], np.concatenate([*contacts, np.zeros((0, 3))])[first]
+    all_pairs = np.concatenate([*batches, np.zeros((0, 2), np.int64)])
+    _, first = np.unique(all_pairs, axis=0, return_index=True)
+    return all_pairs[first], np.concatenate([*contacts, np.zeros((0, 3))])[first]
 
 
 def _pairs_in_doubt(

@@ -81,18 +81,18 @@ def drop_degenerate_components(surface: TriangleMesh) -> TriangleMesh:
     part = _component_of_faces(surface)
     count = np.bincount(part)
     corner = x[faces]
-    middle = (
+    center = (
         np.stack([np.bincount(part, c) for c in corner.mean(axis=1).T], axis=1) / count[:, None]
     )
-    corner = corner - middle[part][:, None]
+    corner = corner - center[part][:, None]
     normal = area_normals(corner)
     # Six times the volume and twice the area.
     volume = np.abs(np.bincount(part, (corner[:, 0] * normal).sum(axis=1)))
     area = np.bincount(part, np.linalg.norm(normal, axis=1))
-    is_film = 2 * volume <= 3 * _DEGENERATE_THICKNESS * float(np.abs(x).max()) * area
-    if not is_film.any():
+    is_thin = 2 * volume <= 3 * _DEGENERATE_THICKNESS * float(np.abs(x).max()) * area
+    if not is_thin.any():
         return surface
-    rest = faces[~is_film[part]]
+    rest = faces[~is_thin[part]]
     return TriangleMesh.without_unused_vertices(x, rest) if len(rest) else TriangleMesh(x[:0], rest)
 
 
@@ -139,9 +139,9 @@ class Shells:
         """The components of a surface."""
         number = np.unique(_component_of_faces(surface), return_inverse=True)[1]
         corners = surface.vertices[surface.faces]
-        away = corners[:, 0] - surface.vertices[surface.faces].mean(axis=(0, 1))
+        offset = corners[:, 0] - surface.vertices[surface.faces].mean(axis=(0, 1))
         volumes = (
-            np.bincount(number, row_dots(area_normals(surface.vertices[surface.faces]), away)) / 6
+            np.bincount(number, row_dots(area_normals(surface.vertices[surface.faces]), offset)) / 6
         )
         lower, upper = np.full((len(volumes), 3), np.inf), np.full((len(volumes), 3), -np.inf)
         np.minimum.at(lower, number, corners.min(axis=1))

@@ -169,7 +169,7 @@ def _triangulate_gap(chain: list[int]) -> list[tuple[int, int, int]]:
 _MAX_ATTEMPTS = 4
 # How often cells are made smaller in places where the first triangles fail, before they are made
 # smaller everywhere.
-_MAX_LOCAL_ATTEMPTS = 4
+_MOST_LOCAL = 4
 # Edges of the curve are divided into pieces no longer than this many cells.
 _MAX_EDGE_CELLS = 2.5
 # How often edges of the curve that are missing among those of the tetrahedra are halved.
@@ -302,7 +302,7 @@ def _mesh_with_retries(
     task.report(f"cells of {spacing:.3g}")
     balls = finer
     try:
-        for trial in range(_MAX_LOCAL_ATTEMPTS):
+        for trial in range(_MOST_LOCAL):
             try:
                 return _mesh_in_cells(task, spacing, balls)
             except LocalizedMeshingError as error:

@@ -312,8 +312,8 @@ def _move_onto_level(
     moved = newton_to_level(function, points[near], samples.select(near), 0.25 * size[near], walls)
     new_samples = function.sample(moved)
     apart = row_norms(moved - points[near])
-    steep = row_norms(new_samples.gradient)
-    converged = np.abs(new_samples.value) < 1e-9 * np.maximum(steep * size[near], 1e-300)
+    slope = row_norms(new_samples.gradient)
+    converged = np.abs(new_samples.value) < 1e-9 * np.maximum(slope * size[near], 1e-300)
     converged &= (apart < 1.5 * _SNAP_DISTANCE * size[near]) & _is_far(moved, free[near], boundary)
     rows = near[converged]
     points, is_on = points.copy(), np.zeros(len(points), np.bool_)

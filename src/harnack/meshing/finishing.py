@@ -37,7 +37,7 @@ __all__ = ["check_options", "simplify_mesh", "thicken", "to_trimesh", "vertex_no
 # few are slivers.
 _MAX_TURNED_AREA = 1e-2
 # The largest number of triangles whose hulls are computed.
-_MAX_HULLS = 20_000
+_MOST_HULLS = 20_000
 # A part is too thick if points of a side come nearer to the surface than this fraction of half of
 # the thickness.
 _MIN_SIDE_DISTANCE = 0.98
@@ -102,13 +102,13 @@ def _normal_cosines(surface: TriangleMesh, normals: FloatArray) -> FloatArray:
     there, weighted by the faces' areas, and clipped to [0.7, 1]. A move of a vertex by thickness /
     cosine along its normal moves the faces by about the thickness."""
     cross = area_normals(surface.vertices[surface.faces])
-    total, area = np.zeros(len(normals)), np.zeros(len(normals))
+    cosines, areas = np.zeros(len(normals)), np.zeros(len(normals))
     size = np.linalg.norm(cross, axis=1)
     for k in range(3):
         rows = surface.faces[:, k]
-        total += np.bincount(rows, (cross * normals[rows]).sum(axis=1), minlength=len(normals))
-        area += np.bincount(rows, size, minlength=len(normals))
-    return np.clip(total / np.maximum(area, 1e-300), 0.7, 1.0)
+        cosines += np.bincount(rows, (cross * normals[rows]).sum(axis=1), minlength=len(normals))
+        areas += np.bincount(rows, size, minlength=len(normals))
+    return np.clip(cosines / np.maximum(areas, 1e-300), 0.7, 1.0)
 
 
 def _why_too_thick(surface: TriangleMesh, normals: FloatArray, thickness: float) -> str | None:
@@ -160,7 +160,7 @@ def _hull_union(surface: TriangleMesh, radius: float, tolerance: float, why: str
     """
     from manifold3d import Manifold, OpType
 
-    if len(surface.faces) > _MAX_HULLS:
+    if len(surface.faces) > _MOST_HULLS:
         raise MeshingError(
             f"{2 * radius:.3g} is thicker than the surface's reach allows ({why}), and there are "
             f"{len(surface.faces):,} triangles, too many for a union of as many hulls: choose a "

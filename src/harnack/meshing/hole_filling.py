@@ -537,37 +537,45 @@ def _graph_laplacian(ends: IntArray, weight: FloatArray, count: int) -> Any:
 
 def _fair_patches(x: FloatArray, faces: IntArray, new: IntArray, input_count: int) -> FloatArray:
     """(n, 3) the vertices, with those from `input_count` on moved so that the patches and the faces
-    around them bend least: the integral of the squared Laplacian of the position is smallest.
+    around them bend least: the sum over vertices of the squared Laplacian of the position, times
+    the vertex's area, is smallest. Vertices of patches count in the sum, except those at edges that
+    remain open.
 
-    faces: (m, 3) of the mesh. new: (p, 3) of patches.
+    faces: (m, 3) of the mesh.
+    new: (p, 3) of patches.
     """
-    is_rim = np.zeros(len(x), np.bool_)
-    is_rim[new] = True
-    triangles = np.concatenate([faces[is_rim[faces].any(axis=1)], new])
+    counts = np.zeros(len(x), np.bool_)
+    counts[new] = True
+    triangles = np.concatenate([faces[counts[faces].any(axis=1)], new])
     edges = Edges.of(half_edges(triangles))
     corner = x[triangles]
     weight = np.zeros(len(edges.vertices))
     area = np.zeros(len(x))
-    double = np.maximum(row_norms(area_normals(x[triangles])), 1e-300)
+    twice_area = np.maximum(row_norms(area_normals(x[triangles])), 1e-300)
     for k in range(3):  # the edge from corner k to k + 1 is opposite to corner k + 2
         u, w = (corner[:, j] - corner[:, k - 1] for j in (k, (k + 1) % 3))
-        cotangent = np.clip(row_dots(u, w) / double, -_MAX_COTANGENT, _MAX_COTANGENT)
+        cotangent = np.clip(row_dots(u, w) / twice_area, -_MAX_COTANGENT, _MAX_COTANGENT)
         m = len(triangles)
         np.add.at(weight, edges.edge_of_pair[k * m : (k + 1) * m], 0.5 * cotangent)
-        np.add.at(area, triangles[:, k], double / 6)
+        np.add.at(area, triangles[:, k], twice_area / 6)
     weight = np.maximum(weight, _MIN_WEIGHT)
     # Beside holes that remain open only new vertices count.
-    is_rim[edges.vertices[edges.multiplicity != 2]] = False
-    rows = np.flatnonzero(is_rim & (area > 0))
+    counts[edges.vertices[edges.multiplicity != 2]] = False
+    rows = np.flatnonzero(counts & (area > 0))
     laplacian = _graph_laplacian(edges.vertices, weight, len(x))[rows]
-    scale = 1 / np.sqrt(np.maximum(area[rows], 1e-300))
-    return _solve_least_squares(laplacian.multiply(scale[:, None]).tocsr(), x, input_count)
+    row_scale = 1 / np.sqrt(np.maximum(area[rows], 1e-300))
+    return _solve_least_squares(laplacian.multiply(row_scale[:, None]).tocsr(), x, input_count)
 
 
 def _flip_edges(x: FloatArray, new: IntArray, fixed_edges: IntArray) -> IntArray:
     """The faces of patches (p, 3) with edges flipped so that the angles opposite to them become
     small (Delaunay's criterion). An edge is flipped only if the new edge does not exist yet and no
     triangle turns over.
+
+    The edge from a to b of the faces f, with the third corner c, and g, with the third corner d, is
+    replaced by the edge from c to d. An edge is flipped if the sum of the cotangents of the angles
+    at c and d is negative enough, the smallest sums first; each face takes part in one flip per
+    round.
 
     x: (n, 3) all vertices.
     fixed_edges: (t, 2) the existing edges of the mesh.
@@ -576,20 +584,20 @@ def _flip_edges(x: FloatArray, new: IntArray, fixed_edges: IntArray) -> IntArray
     fixed_keys = edge_keys(fixed_edges, len(x))
     for _ in range(_FLIP_ROUNDS):
         edges = Edges.of(half_edges(new))
-        half = edges.paired_half_edges()
-        f, g = half.T % len(new)
-        k, j = half.T // len(new)
+        paired = edges.paired_half_edges()
+        f, g = paired.T % len(new)
+        k, j = paired.T // len(new)
         a, b, c, d = new[f, k], new[f, (k + 1) % 3], new[f, (k + 2) % 3], new[g, (j + 2) % 3]
         key = edge_keys(np.column_stack([c, d]), len(x))
-        gain = _cotangents(x[a], x[b], x[c]) + _cotangents(x[a], x[b], x[d])
-        is_flippable = (gain < _MAX_FLIP_COTANGENT_SUM) & (c != d)
+        cotangents = _cotangents(x[a], x[b], x[c]) + _cotangents(x[a], x[b], x[d])
+        is_flippable = (cotangents < _MAX_FLIP_COTANGENT_SUM) & (c != d)
         is_flippable &= ~np.isin(key, fixed_keys) & ~np.isin(key, edge_keys(edges.vertices, len(x)))
         before = area_normals(x[new])
         mean = before[f] + before[g]
         for triangle in ((a, d, c), (d, b, c)):
             is_flippable &= row_dots(area_normals(x[np.column_stack(triangle)]), mean) > 0
         rows = np.flatnonzero(is_flippable)
-        rows = rows[np.argsort(gain[rows])]
+        rows = rows[np.argsort(cotangents[rows])]
         rows = rows[np.sort(np.unique(key[rows], return_index=True)[1])]
         best = np.full(len(new), len(rows))
         for side in (f, g):
