@@ -91,10 +91,9 @@ def _runs_edges_both_ways(faces: IntArray) -> bool:
 
 def volume_of(x: FloatArray, faces: IntArray) -> float:
     """The signed volume of a closed mesh with faces (m, 3); negative if it is inside out."""
+    # Relative to the center, so that rounding errors are relative to the size of the mesh.
     corner = x[faces] - x[faces].mean(axis=(0, 1))
-    return (
-        float(row_dots(corner[:, 0], area_normals(corner)).sum()) / 6
-    )  # the same as the size of its corners
+    return float(row_dots(corner[:, 0], area_normals(corner)).sum()) / 6
 
 
 def nested(x: FloatArray, parts: list[IntArray]) -> list[list[int]]:
@@ -110,16 +109,16 @@ def nested(x: FloatArray, parts: list[IntArray]) -> list[list[int]]:
     sizes = np.abs(volumes)
     holders: list[list[int]] = []
     for i, (low, high) in enumerate(boxes):
-        within = _TEST_DEPTH * float((high - low).max())
+        depth = _TEST_DEPTH * float((high - low).max())
         sample = parts[i][:: max(1, len(parts[i]) // _TEST_POINTS)]
         normals = _unit_normals(x[sample])
-        points = x[sample].mean(axis=1) - math.copysign(within, volumes[i]) * normals
+        points = x[sample].mean(axis=1) - math.copysign(depth, volumes[i]) * normals
         containers = [
             j
             for j, (lower, upper) in enumerate(boxes)
             if j != i
-            and (lower <= low + within).all()
-            and (upper >= high - within).all()
+            and (lower <= low + depth).all()
+            and (upper >= high - depth).all()
             and sizes[j] > (1 + _TEST_DEPTH) * sizes[i]
             and all(abs(winding_around(corners[j], point)) > 0.5 for point in points)
         ]
@@ -226,9 +225,9 @@ def _union_of_components(components: list[TriangleMesh], within: float) -> Trian
     """
     from manifold3d import Manifold
 
-    # sets[k]: points around which the components so far wind at least k + 1 times.
     bodies = [_manifold_of_component(shell) for shell in components]
     clockwise = [body for body, is_outward in bodies if not is_outward]
+    # sets[k]: the points around which the components so far wind at least k + 1 times.
     sets = [Manifold() for _ in range(len(clockwise) + 1)]
     for solid in (body for body, is_outward in bodies if is_outward):
         shared = [sets[k] ^ solid for k in range(len(sets) - 1)]

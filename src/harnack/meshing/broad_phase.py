@@ -86,6 +86,7 @@ def near_pairs(vertices: FloatArray, faces: IntArray, among: BoolArray | None) -
 class _FaceBoxTree:
     """The bounding boxes of faces in a tree.
 
+    tree: on the device; its primitives are the boxes.
     records: (m, 8) for each face the lower and the upper corner of its box, the face's index, and 1
         if it is chosen, else 0.
     order: (m,) indices of the faces, leaf by leaf.

@@ -480,6 +480,7 @@ class UnrefinableError(MeshingError):
     """An error that smaller cells do not fix."""
 
     def may_be_fixed_by(self, smaller: float) -> bool:
+        """False: no cells are small enough."""
         del smaller
         return False
 

@@ -412,11 +412,11 @@ class CsgMesher:
         lower, upper = (np.array(end) for end in _sublevel_bounds(solid, level))
         if not (lower < upper).all():
             return to_manifold(TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64)))
-        cells = min(self.spacing, _OFFSET_CELLS * self.tolerance)
-        self.smallest_cell = min(self.smallest_cell, cells)
+        cell_size = min(self.spacing, _OFFSET_CELLS * self.tolerance)
+        self.smallest_cell = min(self.smallest_cell, cell_size)
         function = dataclasses.replace(self.function(solid, level), secant_steps=_SECANT_STEPS)
-        self.report(f"level {level:g} of a mesh in cells of {cells:.3g}")
-        lattice = BccLattice.covering_box(lower - cells, upper + cells, cells, layers=2)
+        self.report(f"level {level:g} of a mesh in cells of {cell_size:.3g}")
+        lattice = BccLattice.covering_box(lower - cell_size, upper + cell_size, cell_size, layers=2)
         surface = mesh_closed_surface(function, lattice, self.tolerance, self.report, as_cut=True)
         manifold = to_manifold(surface)
         self.levels += 1
@@ -432,8 +432,8 @@ class CsgMesher:
         return to_manifold(surface)
 
     def _mesh_transformed(self, solid: TransformedSolid, level: float) -> Manifold:
-        """The mesh of a transformed solid: that of the original, in the box mapped back, under the
-        affine map."""
+        """The mesh of a transformed solid: the original is meshed in the box that is mapped back,
+        and the mesh is then mapped by the affine map."""
         matrix, offset = np.array(solid.map.matrix), np.array(solid.map.translation_vector)
         ends = np.stack([self.lower, self.upper])
         corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -657,8 +657,8 @@ def mesh_solid(
     """
     lower, upper = _bounds(solid, level, volume)
     size = float((upper - lower).max())
-    cells = size / _CELLS_ACROSS if spacing is None else spacing
-    error = 0.5 * tolerance.at(size)
+    cell_size = size / _CELLS_ACROSS if spacing is None else spacing
+    max_error = 0.5 * tolerance.at(size)
     attempts = _MAX_ATTEMPTS if spacing is None else 1
     per_wave = CELLS_PER_WAVE if spacing is None else None
     uploads = EvaluatorCache()
@@ -666,30 +666,30 @@ def mesh_solid(
     before: MeshingError | None = None
     while True:
         mesher = CsgMesher(
-            lower, upper, error, cells, per_wave, angle_mesher(error, cells),
+            lower, upper, max_error, cell_size, per_wave, angle_mesher(max_error, cell_size),
             most_faces, report, uploads=uploads,
         )  # fmt: skip
         try:
-            surface = _without_crossings(_mesh_in_volume(mesher, solid, level, volume), error)
+            surface = _without_crossings(_mesh_in_volume(mesher, solid, level, volume), max_error)
             report("checking")
             surface = _check_and_mend(mesher, solid, level, surface, size, check)
             break
-        except TriangleLimitError as large:
+        except TriangleLimitError as too_large:
             if first is None:
                 raise
-            raise first from large  # the first error is the cause
-        except (MissedPartsError, LocalizedMeshingError) as wrong:
-            attempts, first = attempts - 1, first or wrong
-            if not attempts or not is_retry_promising(wrong, before, _CELL_SIZE_RATIO**attempts):
+            raise first from too_large  # the first error is the cause
+        except (MissedPartsError, LocalizedMeshingError) as failure:
+            attempts, first = attempts - 1, first or failure
+            if not attempts or not is_retry_promising(failure, before, _CELL_SIZE_RATIO**attempts):
                 raise
-            before = wrong
-            cells *= _CELL_SIZE_RATIO
-            per_wave = CELLS_PER_WAVE * size / (_CELLS_ACROSS * cells)
-            if isinstance(wrong, LocalizedMeshingError):
-                error *= 0.5
-            report(f"{wrong}; so cells of {cells:.3g}")
+            before = failure
+            cell_size *= _CELL_SIZE_RATIO
+            per_wave = CELLS_PER_WAVE * size / (_CELLS_ACROSS * cell_size)
+            if isinstance(failure, LocalizedMeshingError):
+                max_error *= 0.5
+            report(f"{failure}; so cells of {cell_size:.3g}")
     return SolidMeshResult(
-        surface, min(cells, mesher.smallest_cell), mesher.evaluations, mesher.levels, size
+        surface, min(cell_size, mesher.smallest_cell), mesher.evaluations, mesher.levels, size
     )
 
 

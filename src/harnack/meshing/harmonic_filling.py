@@ -154,29 +154,29 @@ def _fill_all_holes(
     loops = singular_loops(edges, np.ones(len(edges), np.int64))
     function = LevelFunction(SolidAngle([vertices[loop] for loop in loops]), _LEVEL)
     size = float(np.ptp(vertices[np.unique(edges)], axis=0).max())
-    cell = size / _CELLS_ACROSS if options.spacing is None else float(options.spacing)
+    width = size / _CELLS_ACROSS if options.spacing is None else float(options.spacing)
     report, tolerance = options.report, options.tolerance.within(size)
     finer: tuple[RefinementBalls, ...] = ()
-    meetings, seed, previous = 0, options.seed, None
+    mesh_hits, seed, previous = 0, options.seed, None
     for attempt in range(options.attempts):
         is_last = attempt == options.attempts - 1
-        report(f"cells of {cell:.3g}" + ", smaller in places" * bool(finer))
+        report(f"cells of {width:.3g}" + ", smaller in places" * bool(finer))
         try:
             patches = _mesh_patches(
-                function, vertices, edges, cell, finer, tolerance, seed, is_last, report
+                function, vertices, edges, width, finer, tolerance, seed, is_last, report
             )
             _check_filled_mesh(vertices, faces, patches, report)
         except LocalizedMeshingError as error:
-            meetings += isinstance(error, _MeshIntersectionError)
+            mesh_hits += isinstance(error, _MeshIntersectionError)
             is_hopeless, previous = not is_retry_promising(error, previous), error
-            if is_last or is_hopeless or meetings > _MAX_MESH_RETRIES:
+            if is_last or is_hopeless or mesh_hits > _MAX_MESH_RETRIES:
                 location = ", ".join(f"{c:.4g}" for c in error.locations[0])
                 raise MeshingError(
-                    f"{error} (cells were {cell:.3g} wide, and smaller in {len(error.locations)} "
+                    f"{error} (cells were {width:.3g} wide, and smaller in {len(error.locations)} "
                     f"places, such as near ({location}))"
                 ) from None
             report(f"{error} ({len(error.locations)} places)")
-            finer = (*finer, RefinementBalls(error.locations, 2 * cell * 0.5 ** len(finer)))
+            finer = (*finer, RefinementBalls(error.locations, 2 * width * 0.5 ** len(finer)))
         except TriangleLimitError:
             raise
         except MeshingError as error:  # a point lies where the function is too inaccurate
@@ -400,8 +400,8 @@ def _collapse_midpoint(x: FloatArray, faces: IntArray, middle: int, ends: list[i
             continue
         moved = np.where(star == middle, end, star)
         is_kept = ~(star == end).any(axis=1)
-        before, after = _unit_normals(x[star[is_kept]]), _unit_normals(x[moved[is_kept]])
-        cosine = float((before * after).sum(axis=1).min(initial=1.0))
+        one, other = _unit_normals(x[star[is_kept]]), _unit_normals(x[moved[is_kept]])
+        cosine = float((one * other).sum(axis=1).min(initial=1.0))
         new_faces = np.concatenate([others, moved[is_kept]])
         is_moved = np.arange(len(new_faces)) >= len(others)
         candidates.append((len(intersecting_faces(x, new_faces, is_moved)), -cosine, new_faces))
@@ -411,7 +411,7 @@ def _collapse_midpoint(x: FloatArray, faces: IntArray, middle: int, ends: list[i
             "subdivide the mesh there, or choose a smaller `cell_size`",
             x[[middle]],
         )
-    return min(candidates, key=lambda before: before[:2])[2]
+    return min(candidates, key=lambda one: one[:2])[2]
 
 
 def _unit_normals(corners: FloatArray) -> FloatArray:
