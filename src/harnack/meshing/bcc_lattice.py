@@ -1,16 +1,19 @@
 """A body-centered lattice: tetrahedra that fill cells of a box without a Delaunay triangulation.
 
-Its points are the corners and the centers of equal cells, and where a cell lies on the box, the
-centers of its faces there. Two centers on both sides of a face make four tetrahedra with the four
-edges of the face; at the box, where the outer center is that of the face itself, half as large
-ones. So the tetrahedra fill the box, and those at the faces of some cells contain these cells. In
-cubes their dihedral angles are 60 and 90 degrees (Labelle and Shewchuk 2007).
+The box is divided into equal cells. The points of the lattice are the corners and the centers of
+all cells, and the centers of those faces of cells that lie on the boundary of the box. A face
+between two cells belongs to four tetrahedra, one for each of its edges: the corners of such a
+tetrahedron are the two ends of the edge and the centers of the two cells. At the boundary of the
+box, the center of the face takes the place of the missing center, and tetrahedra are half as large.
+So the tetrahedra fill the box, and the tetrahedra at all faces of a cell together contain the cell.
+If the cells are cubes, dihedral angles are 60 and 90 degrees (Labelle and Shewchuk 2007).
 
-Cells that are proved empty need none. Proof. Let the level set meet chosen cells only, and let a
-tetrahedron at a face of a chosen cell have its other apex in a cell that is not chosen: that cell
-holds no level, so its center and the corners of the face, which it has too, are on one side. Of the
-faces of the tetrahedron only those with the chosen cell's center and a corner of another side are
-crossed, and the tetrahedron behind such a face belongs to a face of the chosen cell as well.
+Cells that are proved empty need no tetrahedra. Proof. Let the level set meet chosen cells only, and
+let a tetrahedron at a face of a chosen cell have its other apex in a cell that is not chosen. That
+cell holds no level, so its center and all of its corners, also those of the face, are on one side
+of the level. Then the level crosses only such faces of the tetrahedron as contain the center of the
+chosen cell. The tetrahedron behind such a face belongs to a face of the chosen cell as well, so the
+surface goes on there.
 """
 
 from __future__ import annotations
@@ -30,22 +33,23 @@ __all__ = ["BccLattice", "distinct_rows"]
 
 # The largest number of cells, which make about five million triangles; more are refused.
 MOST_CELLS = 2_000_000
-# Points of a lattice that has fewer than this are looked up in a table.
-_MAX_LISTED = 20_000_000
-# The largest number of cells in the first round of the octree.
-_MAX_ROOTS = 200_000
+# In lattices of fewer points than this, the index of a point is looked up in a table.
+_MAX_TABLE_SIZE = 20_000_000
+# The largest number of cells from which octrees start.
+_MAX_ROOT_CELLS = 200_000
 
 
 @dataclass(frozen=True)
 class BccLattice:
     """A body-centered lattice that fills a box.
 
-    lower: (3,) the corner of the box.
+    lower: (3,) the lower corner of the box.
     size: (3,) the edges of each cell.
-    counts: (3,) the number of cells along each side of the box.
+    counts: (3,) the number of cells along each axis.
 
-    Points are given by integer coordinates (n, 3) in units of half a cell: even if they are corners
-    of cells, odd if they are centers; centers of faces on the box have one even coordinate.
+    Points are given by integer coordinates (n, 3), from the lower corner in units of half a cell:
+    even numbers for corners of cells, odd ones for centers. The center of a face on the boundary of
+    the box has one even coordinate.
     """
 
     lower: FloatArray
@@ -56,11 +60,12 @@ class BccLattice:
     def covering_box(
         cls, lower: FloatArray, upper: FloatArray, spacing: float, layers: int = 0
     ) -> BccLattice:
-        """A lattice whose cells fill a box and are as nearly cubes of edge `spacing` as possible,
-        with `layers` more cells around it.
+        """A lattice whose cells fill a box; they are as nearly cubes of edge `spacing` as possible.
+
+        layers: how many layers of cells are added around the box.
 
         Raises:
-            MeshingError: a box without volume.
+            MeshingError: the box has no volume.
         """
         sides = upper - lower
         if not (sides > 0).all():
@@ -86,8 +91,10 @@ class BccLattice:
         return ((coordinates == 0) | (coordinates == 2 * self.counts)).any(axis=1)
 
     def nonempty_cells(self, clearance: Clearance, most_faces: int) -> IntArray:
-        """(n, 3) indices of the cells that are not proved empty, by octrees over blocks of them.
+        """(n, 3) indices of the cells that are not proved empty. They are found by octrees, each of
+        which subdivides a block of cells.
 
+        clearance: the radius of a ball about each point that is proved to hold no level.
         most_faces: the largest number of triangles; a cell makes about three.
 
         Raises:
@@ -101,7 +108,7 @@ class BccLattice:
         while halvings < 3 and (self.counts >= 2 ** (halvings + 2)).all():
             halvings += 1
         blocks = -(-self.counts // 2**halvings)
-        while math.prod(blocks.tolist()) > _MAX_ROOTS and halvings < 12:
+        while math.prod(blocks.tolist()) > _MAX_ROOT_CELLS and halvings < 12:
             halvings += 1
             blocks = -(-self.counts // 2**halvings)
         grid = np.stack(np.meshgrid(*map(np.arange, blocks), indexing="ij"), axis=-1)
@@ -119,36 +126,43 @@ class BccLattice:
         return index[(index < self.counts).all(axis=1)]
 
     def relevant_cells(
-        self, clearance: Clearance, cells: IntArray, values: Clearance, most_faces: int
+        self, clearance: Clearance, matter: IntArray, values: Clearance, most_faces: int
     ) -> tuple[IntArray, BoolArray]:
-        """Indices (n, 3) of the relevant cells to mesh, and a mask (counts) of all relevant cells.
+        """Choose the cells to be meshed. The surface matters only in relevant cells; all points of
+        irrelevant cells, also those that they share with relevant cells, count as positive.
 
-        Chosen are cells that may hold the level set, and cells with a nonpositive center next to an
-        irrelevant cell. Irrelevant cells count as positive, with all of their points. Then every
-        tetrahedron with corners of both signs belongs to a chosen cell: the center of a cell not
-        chosen has the sign of its relevant corners, and if one corner is irrelevant all are
-        positive.
+        Two kinds of relevant cells are chosen: cells that may hold the level set; and cells that
+        have an irrelevant neighbor and a center at which the function is not positive. Then every
+        tetrahedron with corners of both signs belongs to a chosen cell: the center of a cell that
+        is not chosen has the sign of its relevant corners, and if one of its corners is irrelevant
+        all of these are positive.
 
-        cells: (k, 3) indices of the relevant cells (`nonempty_cells`).
-        values: of the function.
+        clearance: returns (n,) the radius of a ball about each point that is proved to hold no
+            level.
+        matter: (k, 3) indices of the relevant cells (`nonempty_cells`).
+        values: returns (n,) the function's values at points.
+        most_faces: the largest number of triangles.
+
+        Returns the indices (n, 3) of the chosen cells, and a mask of all relevant cells, of the
+        shape `counts`.
 
         Raises:
             MeshingError: too many cells are chosen.
         """
-        does = np.zeros(tuple(self.counts.tolist()), np.bool_)
-        does[tuple(cells.T)] = True
-        centers = self.points(2 * cells + 1)
+        is_relevant = np.zeros(tuple(self.counts.tolist()), np.bool_)
+        is_relevant[tuple(matter.T)] = True
+        centers = self.points(2 * matter + 1)
         half_diagonal = 0.5 * float(np.linalg.norm(self.size))
         chosen = clearance(centers) <= half_diagonal * (1 + 1e-9)
-        rim = np.flatnonzero(~chosen & ~self.interior_cells(does)[tuple(cells.T)])
-        chosen[rim[values(centers[rim]) <= 0]] = True
+        at_rim = np.flatnonzero(~chosen & ~self.interior_cells(is_relevant)[tuple(matter.T)])
+        chosen[at_rim[values(centers[at_rim]) <= 0]] = True
         if int(chosen.sum()) > min(MOST_CELLS, most_faces):
             raise triangle_limit_error(float(chosen.sum()), min(MOST_CELLS, most_faces))
-        return cells[chosen], does
+        return matter[chosen], is_relevant
 
     def interior_cells(self, cells: BoolArray) -> BoolArray:
-        """A mask, of the shape `counts`, of the cells in `cells` all of whose neighbors in the
-        lattice are in `cells` as well."""
+        """A mask, of the shape `counts`, of the cells in the mask `cells` whose neighbors are all
+        in `cells` as well. Neighbors share a corner; there are none outside of the box."""
         padded = np.pad(cells, 1, constant_values=True)
         inner = cells.copy()
         for shift in itertools.product((0, 1, 2), repeat=3):
@@ -156,13 +170,14 @@ class BccLattice:
         return inner
 
     def cell_indices(self, points: FloatArray) -> IntArray:
-        """(n, 3) indices of the cells that points lie in, or that are nearest to them."""
+        """(n, 3) indices of the cells that points (n, 3) lie in; of the nearest cells for points
+        outside of the box."""
         index = np.floor((points - self.lower) / self.size).astype(np.int64)
         return np.clip(index, 0, self.counts - 1)
 
     def touches_cells(self, coordinates: IntArray, cells: BoolArray) -> BoolArray:
-        """(n,) whether points, given by lattice coordinates, are corners or centers of cells in the
-        mask `cells`, of the shape `counts`."""
+        """(n,) whether points, given by lattice coordinates (n, 3), are corners or centers of cells
+        in the mask `cells`, which has the shape `counts`."""
         padded = np.pad(cells, 1)
         touches = np.zeros(len(coordinates), np.bool_)
         for offset in itertools.product((-1, 0), repeat=3):
@@ -172,7 +187,7 @@ class BccLattice:
         return touches
 
     def outer_cells(self) -> IntArray:
-        """(n, 3) indices of the cells at the faces of the box."""
+        """(n, 3) indices of the cells that have a face on the boundary of the box."""
         layers: list[IntArray] = []
         for axis in range(3):
             ends = self.counts.copy()
@@ -184,57 +199,67 @@ class BccLattice:
         return distinct_rows(np.concatenate(layers))
 
     def tetrahedra(self, cells: IntArray) -> tuple[IntArray, IntArray]:
-        """The tetrahedra at all faces of cells (k, 3): the lattice coordinates (n, 3) of their
-        points, and (m, 4) the indices of the four corners of each."""
+        """The tetrahedra at all faces of the cells with indices (k, 3).
+
+        Returns the lattice coordinates (n, 3) of their corners, each point once, and for each
+        tetrahedron the indices (m, 4) of its corners among these points.
+        """
         shape = 2 * self.counts + 1
         keys_by_axis: list[list[IntArray]] = []  # of each face: centers, then corners in turn
         for axis in range(3):
             lower = 2 * cells
             lower[:, axis] += 2
             face = np.concatenate([2 * cells, lower])
-            face = _key_rows(sorted_unique(_keys(face, shape)), shape)
+            face = _lattice_coordinates(sorted_unique(_flat_indices(face, shape)), shape)
             plane_axes = [k for k in range(3) if k != axis]
             face_keys: list[IntArray] = []
             for side in (-1, 1):
                 center = face + 1
                 center[:, axis] = np.clip(face[:, axis] + side, 0, shape[axis] - 1)
-                face_keys.append(_keys(center, shape))
+                face_keys.append(_flat_indices(center, shape))
             for i, j in ((0, 0), (2, 0), (2, 2), (0, 2)):
                 corner = face.copy()
                 corner[:, plane_axes] += [i, j]
-                face_keys.append(_keys(corner, shape))
+                face_keys.append(_flat_indices(corner, shape))
             keys_by_axis.append(face_keys)
         keys = [np.concatenate(column) for column in zip(*keys_by_axis, strict=True)]
         used = sorted_unique(np.concatenate(keys))
-        if math.prod(shape.tolist()) < _MAX_LISTED:
+        if math.prod(shape.tolist()) < _MAX_TABLE_SIZE:
             index = np.zeros(math.prod(shape.tolist()), np.int64)
             index[used] = np.arange(len(used))
             first, second, *ring = (index[column] for column in keys)
         else:
             first, second, *ring = (np.searchsorted(used, column) for column in keys)
         corners = [np.stack([first, second, ring[k - 1], ring[k]], axis=1) for k in range(4)]
-        return _key_rows(used, shape), np.concatenate(corners)
+        return _lattice_coordinates(used, shape), np.concatenate(corners)
 
 
 def distinct_rows(rows: IntArray) -> IntArray:
-    """The unique rows of nonnegative integers (n, 3), sorted."""
+    """The unique rows of an array (n, 3) of nonnegative integers, sorted."""
     shape = rows.max(axis=0, initial=0) + 1
-    return _key_rows(sorted_unique(_keys(rows, shape)), shape)
+    return _lattice_coordinates(sorted_unique(_flat_indices(rows, shape)), shape)
 
 
-def triangle_limit_error(cells: float, max_cells: int) -> TriangleLimitError:
-    """The error for too many cells."""
+def triangle_limit_error(cells: float, most: int) -> TriangleLimitError:
+    """The error for a mesh of too many cells.
+
+    cells: about how many cells hold the surface.
+    most: the largest number of cells.
+    """
     return TriangleLimitError(
         f"about {cells:.1e} cells hold the surface, which makes some {3 * cells:.0e} triangles; "
-        f"at most {max_cells:,} cells are made (max_triangles, and never more than {MOST_CELLS:,})"
-        ": choose a larger `cell_size` or `tolerance`, or a smaller `clip`"
+        f"at most {most:,} cells are made (max_triangles, and never more than {MOST_CELLS:,}): "
+        "choose a larger `cell_size` or `tolerance`, or a smaller `clip`"
     )
 
 
-def _keys(coordinates: IntArray, shape: IntArray) -> IntArray:
+def _flat_indices(coordinates: IntArray, shape: IntArray) -> IntArray:
+    """(n,) a unique integer for each point with integer coordinates (n, 3): its index in a
+    flattened array of the shape `shape` (3,)."""
     return (coordinates[:, 0] * shape[1] + coordinates[:, 1]) * shape[2] + coordinates[:, 2]
 
 
-def _key_rows(keys: IntArray, shape: IntArray) -> IntArray:
+def _lattice_coordinates(keys: IntArray, shape: IntArray) -> IntArray:
+    """The coordinates (n, 3) that `_flat_indices` turned into the integers `keys` (n,)."""
     xy, z = np.divmod(keys, shape[2])
     return np.stack([*np.divmod(xy, shape[1]), z], axis=1)

@@ -1,5 +1,5 @@
-"""Closed components of meshes: which faces form them, how they are nested, and the solid that they
-bound."""
+"""Closed components of meshes: the faces that form them, how components are nested, and the solid
+that they bound."""
 
 from __future__ import annotations
 
@@ -24,43 +24,51 @@ if TYPE_CHECKING:
 
 __all__ = ["closed_parts", "mended_by_cuts", "nested", "united_parts", "volume_of"]
 
-# The smallest number of faces of a closed part; and the largest number of parts that are told from
-# the rest.
+# The smallest number of faces of a closed component; and the largest number of components: if there
+# are more, `closed_parts` returns none.
 _MIN_FACES, _MAX_PARTS = 4, 200
-# The number of points of a part that are tested for lying in another part.
+# About how many points of a component are tested for lying in another component.
 _TEST_POINTS = 16
-# How far within the part these points are, relative to its size.
-_INSET = 1e-6
-# Relative to the size: faces that are nearer than the first lie on each other, and are moved into
-# each other by the second.
-_ON, _INTO = 1e-12, 1e-8
-# How far parts whose union crosses itself are grown, relative to the size.
-_GROWN = 1e-9
+# How deep inside of the component these points are, relative to its size.
+_TEST_DEPTH = 1e-6
+# Faces in contact: parallel faces that are no farther apart than the first count as in contact, and
+# one of them is moved into the other's component by the second. Both are relative to the size.
+_CONTACT_DISTANCE, _OVERLAP = 1e-12, 1e-8
+# How far components whose union crosses itself are moved outwards, relative to the size.
+_GROWTH = 1e-9
 
 
 def closed_parts(x: FloatArray, raw: IntArray, joined: IntArray) -> list[IntArray]:
-    """The closed components of a mesh, as indices of faces: those that run along every edge as
-    often in one direction as in the other.
+    """The closed components of a mesh, each as an array of indices of faces. A component is closed
+    if its faces run every edge as often in one direction as in the other. Empty if there are more
+    than 200 such components.
 
-    raw: (m, 3) faces as in the input: components that touch are told apart if they have vertices of
-        their own.
-    joined: (m, 3) the same faces, with one vertex for all at the same position. Here the two faces
-        at an edge belong together; at an edge of more faces, those with the material between them.
+    x: (n, 3) the vertices.
+    raw: (m, 3) the faces as in the input. Components that touch are told apart here if each has
+        vertices of its own.
+    joined: (m, 3) the same faces, with one vertex for all vertices at the same position. Components
+        that `raw` does not close are looked for here. Faces are connected at edges: the two faces
+        at an edge; at an edge of more faces, those that have the material between them.
     """
     parts: list[IntArray] = []
     is_left = np.ones(len(raw), np.bool_)
     for faces in (raw, joined):
         remaining = np.flatnonzero(is_left)
-        for rows in _pieces(x, faces[remaining]) if len(remaining) else ():
+        for rows in _connected_groups(x, faces[remaining]) if len(remaining) else ():
             rows = remaining[rows]
-            if len(rows) >= _MIN_FACES and _is_closed(joined[rows]):
+            if len(rows) >= _MIN_FACES and _runs_edges_both_ways(joined[rows]):
                 parts.append(rows)
                 is_left[rows] = False
     return parts if len(parts) <= _MAX_PARTS else []
 
 
-def _pieces(x: FloatArray, faces: IntArray) -> list[IntArray]:
-    """The groups of faces, by index, that belong together at edges."""
+def _connected_groups(x: FloatArray, faces: IntArray) -> list[IntArray]:
+    """The connected groups of faces (m, 3), each as an array of indices of faces. Two faces are
+    connected if they belong together at an edge (`neighbors`): the two faces at an edge of two
+    faces; and at an edge of more faces, each two that have the material between them.
+
+    x: (n, 3) the vertices.
+    """
     import scipy.sparse  # imported here: it takes half a second
     import scipy.sparse.csgraph as csgraph_module
 
@@ -68,48 +76,50 @@ def _pieces(x: FloatArray, faces: IntArray) -> list[IntArray]:
     m = len(faces)
     first, second = neighbors(x, faces).T % m
     graph = sparse.coo_matrix((np.ones(len(first)), (first, second)), shape=(m, m))
-    piece = np.asarray(csgraph.connected_components(graph, directed=False)[1], np.int64)
-    order = np.argsort(piece, kind="stable")
-    return np.split(order, np.flatnonzero(np.diff(piece[order])) + 1)
+    group = np.asarray(csgraph.connected_components(graph, directed=False)[1], np.int64)
+    order = np.argsort(group, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(group[order])) + 1)
 
 
-def _is_closed(faces: IntArray) -> bool:
-    """Whether every edge is run as often in one direction as in the other."""
+def _runs_edges_both_ways(faces: IntArray) -> bool:
+    """Whether the faces (m, 3) run every edge as often in one direction as in the other."""
     pairs = half_edges(faces)
-    count = int(pairs.max()) + 1
-    forward_keys, backward_keys = (np.sort(pairs @ weights) for weights in ((count, 1), (1, count)))
+    n = int(pairs.max()) + 1
+    forward_keys, backward_keys = (np.sort(pairs @ weights) for weights in ((n, 1), (1, n)))
     return bool((forward_keys == backward_keys).all())
 
 
 def volume_of(x: FloatArray, faces: IntArray) -> float:
-    """The signed volume of a closed mesh, negative if it is inside out."""
+    """The signed volume of a closed mesh with faces (m, 3); negative if it is inside out."""
+    # Relative to the center, so that rounding errors are relative to the size of the mesh.
     corner = x[faces] - x[faces].mean(axis=(0, 1))
-    return (
-        float(row_dots(corner[:, 0], area_normals(corner)).sum()) / 6
-    )  # the same as the size of its corners
+    return float(row_dots(corner[:, 0], area_normals(corner)).sum()) / 6
 
 
 def nested(x: FloatArray, parts: list[IntArray]) -> list[list[int]]:
-    """For each closed component, given by its faces (k, 3), the indices of the components that
-    contain all of it, the smallest first. Components may touch: each is tested at points a little
-    within it."""
+    """For each closed component, the indices of the components that contain all of it, the smallest
+    first. Components may touch, since each is tested at points a little inside of it.
+
+    x: (n, 3) the vertices.
+    parts: the faces (k, 3) of each component.
+    """
     corners = [x[part] for part in parts]
     boxes = [(corner.min(axis=(0, 1)), corner.max(axis=(0, 1))) for corner in corners]
     volumes = [volume_of(x, part) for part in parts]
     sizes = np.abs(volumes)
     holders: list[list[int]] = []
     for i, (low, high) in enumerate(boxes):
-        within = _INSET * float((high - low).max())
+        depth = _TEST_DEPTH * float((high - low).max())
         sample = parts[i][:: max(1, len(parts[i]) // _TEST_POINTS)]
         normals = _unit_normals(x[sample])
-        points = x[sample].mean(axis=1) - math.copysign(within, volumes[i]) * normals
+        points = x[sample].mean(axis=1) - math.copysign(depth, volumes[i]) * normals
         containers = [
             j
             for j, (lower, upper) in enumerate(boxes)
             if j != i
-            and (lower <= low + within).all()
-            and (upper >= high - within).all()
-            and sizes[j] > (1 + _INSET) * sizes[i]
+            and (lower <= low + depth).all()
+            and (upper >= high - depth).all()
+            and sizes[j] > (1 + _TEST_DEPTH) * sizes[i]
             and all(abs(winding_around(corners[j], point)) > 0.5 for point in points)
         ]
         holders.append(sorted(containers, key=lambda j: sizes[j]))
@@ -117,10 +127,11 @@ def nested(x: FloatArray, parts: list[IntArray]) -> list[list[int]]:
 
 
 def mended_by_cuts(x: FloatArray, faces: IntArray, within: float) -> TriangleMesh:
-    """The boundary of the points around which a closed mesh winds at least once, by pieces of its
-    faces (`boundary_of_solid`).
+    """The boundary of the points around which a closed mesh winds at least once. Faces are cut
+    where they cross, and the boundary is made of the pieces (`boundary_of_solid`).
 
-    within: a length, by which slivers that arise where faces cross may be moved.
+    faces: (m, 3).
+    within: a length; slivers, which arise where faces cross, may be moved by up to it.
 
     Raises:
         MeshingError: nothing is left, or pieces do not fit together.
@@ -133,92 +144,112 @@ def mended_by_cuts(x: FloatArray, faces: IntArray, within: float) -> TriangleMes
 def united_parts(
     x: FloatArray, faces: IntArray, parts: list[IntArray], within: float
 ) -> TriangleMesh:
-    """The boundary of the points around which closed components wind at least once, in all. They
-    may intersect, touch and contain each other, and wind clockwise.
+    """The boundary of the points around which closed components, all together, wind at least once.
+    Components may touch, contain and intersect each other, and wind clockwise.
 
-    Proof. Let L_k be the points around which the components so far wind at least k times. With
-    another component P, L_k becomes the union of L_k and of the intersection of L_(k-1) with P if P
-    winds counter-clockwise around its points; if P winds clockwise, it becomes the union of L_(k+1)
-    and of the points of L_k outside of P. The components that wind clockwise come last, so that all
-    sets but L_0, which is all of space, are bounded.
+    Proof. Let L_k be the points around which the components so far wind at least k times. Add
+    another component, and let P be the set of points inside of it. If it winds counter-clockwise,
+    L_k becomes the union of L_k with the intersection of L_(k-1) and P. If it winds clockwise, L_k
+    becomes the union of L_(k+1) with the points of L_k outside of P. Components that wind clockwise
+    are added last, so that all sets but L_0, which is all of space, are bounded.
 
+    x: (n, 3) the vertices.
     faces: (m, 3).
-    parts: indices of the faces of each component.
-    within: a length by which slivers at intersections may be moved.
+    parts: for each component the indices of its faces.
+    within: a length; slivers at intersections may be moved by up to it.
 
     Raises:
         MeshError: a component intersects itself.
         MeshingError: a component is no manifold; or nothing is left.
     """
     shells = [TriangleMesh.without_unused_vertices(x, faces[rows]) for rows in parts]
-    shells = _overlapping(shells)
+    shells = _make_overlap(shells)
     try:
-        return _united(shells, within)
+        return _union_of_components(shells, within)
     except SelfIntersectionError:  # parts touch up to rounding, along an edge
-        size = _GROWN * float(np.ptp(x[faces], axis=(0, 1)).max())
+        size = _GROWTH * float(np.ptp(x[faces], axis=(0, 1)).max())
         signs = [math.copysign(1, volume_of(shell.vertices, shell.faces)) for shell in shells]
-        return _united(
+        return _union_of_components(
             [grown(shell, s * size) for shell, s in zip(shells, signs, strict=True)], within
         )
 
 
-def _overlapping(shells: list[TriangleMesh]) -> list[TriangleMesh]:
-    """The parts, with faces that lie on those of an earlier part, up to rounding, moved into that
-    part by a tiny length: where the two are in one plane, but not to the last bit, gaps without a
-    width would be left."""
-    corners = [shell.vertices[shell.faces] for shell in shells]
+def _make_overlap(parts: list[TriangleMesh]) -> list[TriangleMesh]:
+    """The components, moved where they are in contact only up to rounding, so that they overlap
+    there. Otherwise their union would have gaps without a width.
+
+    A face counts as in contact with an earlier component if it is parallel to one of its faces,
+    faces the opposite way, and is a distance away from its plane that is not 0 but at most
+    `_CONTACT_DISTANCE`. The face's vertices are then moved along its normal, into the earlier
+    component, by `_OVERLAP`. Both lengths are relative to the size of all components.
+    """
+    corners = [shell.vertices[shell.faces] for shell in parts]
     size = float(np.ptp(np.concatenate(corners), axis=(0, 1)).max())
     planes = [_unit_normals(corner) for corner in corners]
-    lows = [corner.min(axis=1) - _ON * size for corner in corners]
-    highs = [corner.max(axis=1) + _ON * size for corner in corners]
-    moved = [shells[0]]
-    for k in range(1, len(shells)):
-        x, faces = shells[k].vertices.copy(), shells[k].faces
+    lows = [corner.min(axis=1) - _CONTACT_DISTANCE * size for corner in corners]
+    highs = [corner.max(axis=1) + _CONTACT_DISTANCE * size for corner in corners]
+    moved = [parts[0]]
+    for k in range(1, len(parts)):
+        x, faces = parts[k].vertices.copy(), parts[k].faces
         for j in range(k):
             low, high = lows[k].min(axis=0), highs[k].max(axis=0)
             near = np.flatnonzero(((lows[j] <= high) & (highs[j] >= low)).all(axis=1))
             for face in range(len(faces)) if len(near) else ():
                 normal = planes[k][face]
-                on = near[row_norms(planes[j][near] + normal) <= _ON]
-                is_met = (lows[j][on] <= highs[k][face]) & (highs[j][on] >= lows[k][face])
-                on = on[is_met.all(axis=1)]
-                height = np.abs((corners[j][on] - corners[k][face, 0]) @ normal)
-                height = height.max(axis=1, initial=0.0)
-                if ((height > 0) & (height <= _ON * size)).any():
-                    x[faces[face]] = shells[k].vertices[faces[face]] + _INTO * size * normal
+                facing = near[row_norms(planes[j][near] + normal) <= _CONTACT_DISTANCE]
+                is_met = (lows[j][facing] <= highs[k][face]) & (highs[j][facing] >= lows[k][face])
+                facing = facing[is_met.all(axis=1)]
+                gap = np.abs((corners[j][facing] - corners[k][face, 0]) @ normal)
+                gap = gap.max(axis=1, initial=0.0)
+                if ((gap > 0) & (gap <= _CONTACT_DISTANCE * size)).any():
+                    x[faces[face]] = parts[k].vertices[faces[face]] + _OVERLAP * size * normal
         moved.append(TriangleMesh(x, faces))
     return moved
 
 
 def _unit_normals(corner: FloatArray) -> FloatArray:
+    """(m, 3) unit normals of triangles `corner` (m, 3, 3); 0 for triangles without an area."""
     normal = area_normals(corner)
     return normal / np.maximum(row_norms(normal), 1e-300)[:, None]
 
 
-def _united(shells: list[TriangleMesh], within: float) -> TriangleMesh:
-    """As `united_parts`, for parts whose faces do not lie on each other up to rounding."""
+def _union_of_components(components: list[TriangleMesh], within: float) -> TriangleMesh:
+    """The boundary of the points around which the components wind at least once, as `united_parts`
+    describes it. The components must not be in contact up to rounding (`_make_overlap`).
+
+    within: a length by which slivers at intersections may be moved.
+
+    Raises:
+        MeshError: a component intersects itself.
+        MeshingError: the union is no manifold, or empty.
+    """
     from manifold3d import Manifold
 
-    bodies = [_manifold_of_part(shell) for shell in shells]
-    clockwise = [body for body, is_body in bodies if not is_body]
-    levels = [Manifold() for _ in range(len(clockwise) + 1)]
-    for part in (body for body, is_body in bodies if is_body):
-        shared = [levels[k] ^ part for k in range(len(levels) - 1)]
-        levels = [levels[0] + part, *(a + b for a, b in zip(levels[1:], shared, strict=True))]
-    for part in clockwise:
-        levels = [next_level + (level - part) for level, next_level in itertools.pairwise(levels)]
-    surface = apart_of(levels[0], within)
+    bodies = [_manifold_of_component(shell) for shell in components]
+    clockwise = [body for body, is_outward in bodies if not is_outward]
+    # sets[k]: the points around which the components so far wind at least k + 1 times.
+    sets = [Manifold() for _ in range(len(clockwise) + 1)]
+    for solid in (body for body, is_outward in bodies if is_outward):
+        shared = [sets[k] ^ solid for k in range(len(sets) - 1)]
+        sets = [sets[0] + solid, *(a + b for a, b in zip(sets[1:], shared, strict=True))]
+    for solid in clockwise:
+        sets = [after + (before - solid) for before, after in itertools.pairwise(sets)]
+    surface = apart_of(sets[0], within)
     check_manifold(surface.faces, surface.vertices)
     return surface
 
 
-def _manifold_of_part(shell: TriangleMesh) -> tuple[Manifold, bool]:
-    """The body that a closed part bounds, and whether the part winds counter-clockwise around
-    it."""
-    is_body = volume_of(shell.vertices, shell.faces) > 0
-    if len(crossing := intersecting_faces(shell.vertices, shell.faces)):
+def _manifold_of_component(component: TriangleMesh) -> tuple[Manifold, bool]:
+    """The body that a closed component bounds, and whether the component's faces look outwards, so
+    that it winds counter-clockwise around the points of the body.
+
+    Raises:
+        MeshError: the component intersects itself.
+    """
+    is_outward = volume_of(component.vertices, component.faces) > 0
+    if len(crossing := intersecting_faces(component.vertices, component.faces)):
         raise MeshError(f"{len(crossing):,} triangles of a part pass through others of it")
-    if passes_itself(shell, np.zeros(len(shell.faces), np.int64)):
+    if passes_itself(component, np.zeros(len(component.faces), np.int64)):
         raise MeshError("a part passes through itself along edges that lie on faces")
-    faces = shell.faces if is_body else shell.faces[:, ::-1]
-    return to_manifold(TriangleMesh(shell.vertices, faces)), is_body
+    faces = component.faces if is_outward else component.faces[:, ::-1]
+    return to_manifold(TriangleMesh(component.vertices, faces)), is_outward

@@ -38,12 +38,12 @@ if TYPE_CHECKING:
 
 __all__ = ["ROUNDING", "near_pairs"]
 
-# Columns of a record behind the box: the face's number, and whether it is chosen.
-_NUMBER, _CHOSEN = 6, 7
+# Columns of a box's record, after its two corners: the face's index, and whether it is chosen.
+_FACE_INDEX, _IS_CHOSEN = 6, 7
 _LEAF_SIZE = 8
 # The number of triangles that walk the tree at once, and the smallest number of pairs that there is
 # room for.
-_ROWS_AT_ONCE, _PAIRS_AT_ONCE = 1 << 17, 1 << 22
+_WALK_SIZE, _PAIRS_AT_ONCE = 1 << 17, 1 << 22
 # A bound of the rounding of a product of three vectors, or of two, whose components are differences
 # of coordinates, relative to the product of their lengths: at most seven roundings of up to six
 # terms, whose sum is at most 1.16 times that product, and four of three terms, whose sum is at most
@@ -53,14 +53,15 @@ ROUNDING = 16 * 2.0**-52
 _UNDERFLOW = 1e-290
 
 
-def near_pairs(vertices: FloatArray, faces: IntArray, mask: BoolArray | None) -> IntArray:
+def near_pairs(vertices: FloatArray, faces: IntArray, among: BoolArray | None) -> IntArray:
     """Pairs (k, 2) of faces (m, 3) that may have more in common than the vertices that they share,
-    each once; all others are proved not to (`_are_apart`).
+    each pair once. All other pairs are proved to have no more in common (`_are_apart`).
 
-    vertices: (n, 3), finite.
-    mask: (m,) mask of chosen faces; pairs without a chosen face are left out.
+    vertices: (n, 3), all finite.
+    among: (m,) mask of chosen faces; pairs without a chosen face are left out. None if all are
+        chosen.
     """
-    chosen = np.ones(len(faces), np.bool_) if mask is None else mask
+    chosen = np.ones(len(faces), np.bool_) if among is None else among
     batches = [np.zeros((0, 2), np.int64)]
     if not chosen.any():
         return batches[0]
@@ -70,7 +71,7 @@ def near_pairs(vertices: FloatArray, faces: IntArray, mask: BoolArray | None) ->
     boxes, pairs = _FaceBoxTree.of(scaled[faces], chosen), _PairTests.of(scaled, faces)
     rows = boxes.order[chosen[boxes.order]]
     room = max(_PAIRS_AT_ONCE, len(faces))
-    pending = [rows[start : start + _ROWS_AT_ONCE] for start in range(0, len(rows), _ROWS_AT_ONCE)]
+    pending = [rows[start : start + _WALK_SIZE] for start in range(0, len(rows), _WALK_SIZE)]
     while pending:
         batch = pending.pop()
         listed = boxes.overlapping(batch, room)
@@ -83,58 +84,76 @@ def near_pairs(vertices: FloatArray, faces: IntArray, mask: BoolArray | None) ->
 
 @dataclass(frozen=True)
 class _FaceBoxTree:
-    """The boxes of faces in a tree. records: (m, 8), a row for each box; order: the indices of the
-    faces, leaf by leaf."""
+    """The bounding boxes of faces in a tree.
+
+    tree: on the device; its primitives are the boxes.
+    records: (m, 8) for each face the lower and the upper corner of its box, the face's index, and 1
+        if it is chosen, else 0.
+    order: (m,) indices of the faces, leaf by leaf.
+    """
 
     tree: PackedTree
     records: FloatArray
     order: IntArray
 
     @classmethod
-    def of(cls, corners: FloatArray, mask: BoolArray) -> _FaceBoxTree:
+    def of(cls, corners: FloatArray, chosen: BoolArray) -> _FaceBoxTree:
+        """The tree of triangles `corners` (m, 3, 3). chosen: (m,) mask of the chosen ones."""
         a, b, c = (corners[:, k] for k in range(3))
         lower, upper = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
         hierarchy = build_balanced_tree(0.5 * (lower + upper), leaf_size=_LEAF_SIZE)
-        numbers = np.column_stack([np.arange(len(corners)), mask]).astype(np.float64)
+        numbers = np.column_stack([np.arange(len(corners)), chosen]).astype(np.float64)
         records = np.concatenate([lower, upper, numbers], axis=1)
-        placed = hierarchy.values_in_slots(records)
-        placed[hierarchy.leaf_slots == NO_PRIMITIVE, _NUMBER] = -1.0
-        levels = node_boxes(hierarchy, lower, upper)
+        slots = hierarchy.values_in_slots(records)
+        slots[hierarchy.leaf_slots == NO_PRIMITIVE, _FACE_INDEX] = -1.0
+        boxes = node_boxes(hierarchy, lower, upper)
         order = hierarchy.leaf_slots[hierarchy.leaf_slots != NO_PRIMITIVE]
-        return cls(pack_tree(choose_backend("double"), hierarchy, levels, placed), records, order)
+        return cls(pack_tree(choose_backend("double"), hierarchy, boxes, slots), records, order)
 
-    def overlapping(self, rows: IntArray, limit: int) -> tuple[Any, Any] | None:
-        """The pairs of a face in `rows` and any face whose boxes overlap, as two lists, in no
-        order; None if there are more than `limit`."""
+    def overlapping(self, rows: IntArray, room: int) -> tuple[Any, Any] | None:
+        """The pairs of a face in `rows` and any other face whose boxes overlap. A pair of two
+        chosen faces is listed once.
+
+        rows: (k,) indices of chosen faces.
+        room: the largest number of pairs that can be stored.
+
+        Returns two index arrays on the device, of the first and of the second faces of the pairs,
+        in no order; or None if there are more than `room` pairs.
+        """
         backend = self.tree.backend
         real, vector, integer = backend.Float, backend.Array3f, backend.UInt32
         columns = [real(np.ascontiguousarray(column)) for column in self.records[rows].T]
-        low, high, own_number = vector(*columns[:3]), vector(*columns[3:6]), columns[_NUMBER]
-        number, max_count = dr.zeros(integer, 1), dr.opaque(integer, limit)
-        column, partners = dr.zeros(integer, limit), dr.zeros(integer, limit)
+        low, high, own_index = vector(*columns[:3]), vector(*columns[3:6]), columns[_FACE_INDEX]
+        pair_count, max_count = dr.zeros(integer, 1), dr.opaque(integer, room)
+        column, partners = dr.zeros(integer, room), dr.zeros(integer, room)
 
         def overlap(row: Any) -> Mask:
+            """Whether the box in the record `row` overlaps the lane's own box."""
             return dr.all((vector(*row[:3]) <= high) & (vector(*row[3:6]) >= low))
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
-            near = overlap(node.head)
-            return near, for_each_primitive(node, near & node.is_leaf, put, state)
+            """Descend where the node's box overlaps the lane's own box; in a leaf, list its
+            faces."""
+            is_near = overlap(node.head)
+            return is_near, for_each_primitive(node, is_near & node.is_leaf, add_pair, state)
 
-        def put(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-            with_number = row[_NUMBER]
+        def add_pair(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
+            """List the pair of the lane's own face and the face of `row`, if their boxes
+            overlap."""
+            index = row[_FACE_INDEX]
             # Two chosen faces are listed once.
-            once = (with_number > own_number) | ((row[_CHOSEN] == 0) & (with_number >= 0))
-            met = active & once & overlap(row)
-            slot = dr.scatter_inc(number, integer(0), met)
-            has_room = met & (slot < max_count)
-            dr.scatter(column, integer(own_number), slot, has_room)
-            dr.scatter(partners, integer(with_number), slot, has_room)
+            is_new = (index > own_index) | ((row[_IS_CHOSEN] == 0) & (index >= 0))
+            is_pair = active & is_new & overlap(row)
+            slot = dr.scatter_inc(pair_count, integer(0), is_pair)
+            has_room = is_pair & (slot < max_count)
+            dr.scatter(column, integer(own_index), slot, has_room)
+            dr.scatter(partners, integer(index), slot, has_room)
             return state
 
         traverse(self.tree, visit, (real(0),))
-        dr.eval(number, column, partners)
-        count = int(to_numpy(number)[0])
-        if count > limit:
+        dr.eval(pair_count, column, partners)
+        count = int(to_numpy(pair_count)[0])
+        if count > room:
             return None
         listed = dr.arange(integer, count)
         return dr.gather(integer, column, listed), dr.gather(integer, partners, listed)
@@ -142,90 +161,109 @@ class _FaceBoxTree:
 
 @dataclass(frozen=True)
 class _PairTests:
-    """Tests of pairs of faces. points: the records of the vertices. corners: the three columns of
-    the faces."""
+    """Proofs that pairs of faces are apart.
+
+    points: the record table of the vertices.
+    corners: three index arrays on the device: the first, second and third vertices of all faces.
+    """
 
     points: RecordTable
     corners: tuple[Any, Any, Any]
 
     @classmethod
     def of(cls, vertices: FloatArray, faces: IntArray) -> _PairTests:
+        """Upload vertices (n, 3) and faces (m, 3)."""
         backend = choose_backend("double")
         a, b, c = (backend.UInt32(np.ascontiguousarray(column, np.uint32)) for column in faces.T)
         return cls(RecordTable.upload(backend, vertices), (a, b, c))
 
-    def unseparated(self, first: Any, second: Any) -> IntArray:
-        """(k, 2) the pairs that are not proved apart, in order."""
+    def unseparated(self, one: Any, other: Any) -> IntArray:
+        """(k, 2) the pairs of faces that are not proved apart, sorted.
+
+        one, other: index arrays on the device, of the first and of the second faces of all pairs.
+        """
         backend = self.points.backend
-        names = [[dr.gather(backend.UInt32, k, i) for k in self.corners] for i in (first, second)]
+        vertex_ids = [[dr.gather(backend.UInt32, k, i) for k in self.corners] for i in (one, other)]
         triangles = [
-            tuple(backend.Array3f(*self.points.read_record(name)[:3]) for name in three)
-            for three in names
+            tuple(backend.Array3f(*self.points.read_record(name)[:3]) for name in ids)
+            for ids in vertex_ids
         ]
-        shared = [[name == another for another in names[1]] for name in names[0]]
+        shared = [[name == another for another in vertex_ids[1]] for name in vertex_ids[0]]
         a, b = cast("tuple[Corners, Corners]", triangles)
         rows = dr.compress(~_are_apart(a, b, shared))
-        pairs = [to_numpy(dr.gather(backend.UInt32, i, rows)) for i in (first, second)]
-        unsorted = np.stack(pairs, axis=1).astype(np.int64)
-        return unsorted[np.lexsort(unsorted.T[::-1])]
+        pairs = [to_numpy(dr.gather(backend.UInt32, i, rows)) for i in (one, other)]
+        unsorted_pairs = np.stack(pairs, axis=1).astype(np.int64)
+        return unsorted_pairs[np.lexsort(unsorted_pairs.T[::-1])]
 
 
 def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]]) -> Mask:
-    """Whether two triangles have nothing in common but the corners they share, proved.
+    """Whether two triangles are proved to have nothing in common but the corners that they share.
 
-    shared: whether corner i of a is corner k of b.
+    shared: shared[i][k] is whether corner i of `a` is the same vertex as corner k of `b`.
+
+    Each of three conditions proves it:
 
     - *A plane*: all corners of one triangle that are not shared lie strictly on one side of the
-      other's plane (`_sides`). Points of the first triangle on that plane are then combinations of
-      shared corners.
-    - *Edges*, where at most one corner is shared: triangles in different planes meet in a segment
-      on the line of both planes, whose ends lie on edges that pass through the other triangle.
-      None does: each edge without a shared corner has its ends strictly on one side of the other's
-      plane, or passes two of its edges on different sides (`_edge_may_pierce`). In one plane all
-      these signs are 0, and nothing is proved.
-    - *A line*, for triangles in one plane: `_separated_beside_edge`.
+      other triangle's plane (`_sides`). Points of the first triangle on that plane are then
+      combinations of shared corners.
+    - *Edges*, if at most one corner is shared: two triangles in different planes meet in a segment
+      on the line that the planes have in common. Each end of the segment lies on an edge of one
+      triangle that passes through the other triangle. There is no such edge if every edge without a
+      shared corner has both ends strictly on one side of the other triangle's plane, or if the line
+      of the edge passes two edges of the other triangle on different sides (`_edge_may_pierce`).
+      For triangles in one plane all these signs are 0, and nothing is proved.
+    - *A line*, for triangles in one plane: see `_are_beside_edge`.
     """
-    in_a = [shared[i][0] | shared[i][1] | shared[i][2] for i in range(3)]
-    in_b = [shared[0][k] | shared[1][k] | shared[2][k] for k in range(3)]
+    is_shared_a = [shared[i][0] | shared[i][1] | shared[i][2] for i in range(3)]
+    is_shared_b = [shared[0][k] | shared[1][k] | shared[2][k] for k in range(3)]
     real = cast("Any", type(a[0].x))
-    count: Real = sum((dr.select(first, real(1), real(0)) for first in in_a), real(0))
-    of_b, of_a = _sides(a, b), _sides(b, a)
-    by_plane = _on_one_side(of_b, in_b) | _on_one_side(of_a, in_a)
-    by_plane &= count < 2.5
+    shared_count: Real = sum((dr.select(first, real(1), real(0)) for first in is_shared_a), real(0))
+    sides_of_b, sides_of_a = _sides(a, b), _sides(b, a)
+    by_plane = _on_one_side(sides_of_b, is_shared_b) | _on_one_side(sides_of_a, is_shared_a)
+    by_plane &= shared_count < 2.5
 
     def by_edges_or_line(*numbers: Any) -> Mask:
+        """The second and the third condition. numbers: the corners of `a` and `b`, for each corner
+        whether it is shared, and the number of shared corners."""
         first, second = cast("tuple[Corners, Corners]", (numbers[:3], numbers[3:6]))
-        in_first, in_second, common = list(numbers[6:9]), list(numbers[9:12]), numbers[12]
-        passes = _edge_may_pierce(first, second, _sides(first, second), in_second)
-        passes |= _edge_may_pierce(second, first, _sides(second, first), in_first)
-        turned = (
-            _shared_corners_first(first, in_first, common),
-            _shared_corners_first(second, in_second, common),
+        in_first, in_second, count = (list(numbers[6:9]), list(numbers[9:12]), numbers[12])
+        may_pierce = _edge_may_pierce(first, second, _sides(first, second), in_second)
+        may_pierce |= _edge_may_pierce(second, first, _sides(second, first), in_first)
+        reordered = (
+            _shared_corners_first(first, in_first, count),
+            _shared_corners_first(second, in_second, count),
         )
-        return ((common < 1.5) & ~passes) | _separated_beside_edge(*turned, common)
+        return ((count < 1.5) & ~may_pierce) | _are_beside_edge(*reordered, count)
 
-    def is_open(*numbers: Any) -> Mask:
+    def never(*numbers: Any) -> Mask:
+        """False in all lanes: where the first condition holds, nothing more need be computed."""
         return numbers[12] < 0
 
-    numbers = (*a, *b, *in_a, *in_b, count)
-    return by_plane | dr.if_stmt(numbers, ~by_plane, by_edges_or_line, is_open)
+    numbers = (*a, *b, *is_shared_a, *is_shared_b, shared_count)
+    return by_plane | dr.if_stmt(numbers, ~by_plane, by_edges_or_line, never)
 
 
-def _sides(plane: Corners, of: Corners) -> list[tuple[Mask, Mask]]:
-    """For each corner of the triangle `of`, whether it is strictly above the plane of the triangle
-    `plane`, and whether strictly below it; neither where rounding leaves it undecided."""
-    u, v = plane[1] - plane[0], plane[2] - plane[0]
+def _sides(base: Corners, triangle: Corners) -> list[tuple[Mask, Mask]]:
+    """For each corner of `triangle` two masks: whether it is proved to be above the plane of the
+    triangle `base`, and whether below it. Above is the side to which the normal of `base` points,
+    by the right-hand rule. Both are False where rounding leaves the side undecided."""
+    u, v = base[1] - base[0], base[2] - base[0]
     normal = dr.cross(u, v)
     error_scale = ROUNDING * dr.norm(u) * dr.norm(v)
     sides: list[tuple[Mask, Mask]] = []
-    for corner in of:
-        offset = corner - plane[0]
-        height, error = dr.dot(normal, offset), error_scale * dr.norm(offset) + _UNDERFLOW
-        sides.append((height > error, height < -error))
+    for corner in triangle:
+        offset = corner - base[0]
+        determinant, error = dr.dot(normal, offset), error_scale * dr.norm(offset) + _UNDERFLOW
+        sides.append((determinant > error, determinant < -error))
     return sides
 
 
 def _on_one_side(sides: list[tuple[Mask, Mask]], shared: list[Mask]) -> Mask:
+    """Whether all corners of a triangle that are not shared are above a plane, or all below it.
+
+    sides: of the corners, from `_sides`.
+    shared: whether each corner is shared with the other triangle.
+    """
     above, below = (
         (sides[0][k] | shared[0]) & (sides[1][k] | shared[1]) & (sides[2][k] | shared[2])
         for k in range(2)
@@ -234,88 +272,104 @@ def _on_one_side(sides: list[tuple[Mask, Mask]], shared: list[Mask]) -> Mask:
 
 
 def _edge_may_pierce(
-    through: Corners, of: Corners, sides: list[tuple[Mask, Mask]], shared: list[Mask]
+    pierced: Corners, piercing: Corners, sides: list[tuple[Mask, Mask]], shared: list[Mask]
 ) -> Mask:
-    """Whether an edge of a triangle without shared corners may pass through another: unless both
-    ends are strictly on one side of its plane, or the line of the edge has two edges of it on
-    different sides of itself."""
+    """Whether an edge of the triangle `piercing` may pass through the triangle `pierced`. Edges
+    with a shared corner are not considered.
+
+    An edge is proved not to if both of its ends are strictly on one side of the plane of `pierced`,
+    or if its line passes one edge of `pierced` on the left and another on the right.
+
+    sides: of the corners of `piercing` (`_sides`).
+    shared: whether each corner of `piercing` is shared.
+    """
     pierces = False
     for i, j in ((0, 1), (1, 2), (2, 0)):
-        stays = (sides[i][0] & sides[j][0]) | (sides[i][1] & sides[j][1]) | shared[i] | shared[j]
-        direction = of[j] - of[i]
-        to = [corner - of[i] for corner in through]
-        length, lengths = dr.norm(direction), [dr.norm(offset) for offset in to]
+        misses = (sides[i][0] & sides[j][0]) | (sides[i][1] & sides[j][1]) | shared[i] | shared[j]
+        direction = piercing[j] - piercing[i]
+        offsets = [corner - piercing[i] for corner in pierced]
+        length, lengths = dr.norm(direction), [dr.norm(offset) for offset in offsets]
         left, right = False, False
         for k, m in ((0, 1), (1, 2), (2, 0)):
-            value = dr.dot(direction, dr.cross(to[k], to[m]))
+            value = dr.dot(direction, dr.cross(offsets[k], offsets[m]))
             error = ROUNDING * length * lengths[k] * lengths[m] + _UNDERFLOW
-            left, right = left | (value > error), right | (value < -error)
-        pierces = pierces | ~(stays | (left & right))
+            left, right = (left | (value > error), right | (value < -error))
+        pierces = pierces | ~(misses | (left & right))
     return pierces
 
 
-def _shared_corners_first(of: Corners, shared: list[Mask], count: Real) -> Corners:
-    """The corners in another order: shared corners first."""
-    once = count < 1.5
+def _shared_corners_first(tri: Corners, shared: list[Mask], count: Real) -> Corners:
+    """The corners of the triangle `tri`, turned cyclically so that shared corners come first.
+
+    shared: whether each corner is shared.
+    count: how many are, from 0 to 2; with three or none the order has no meaning.
+    """
+    is_single = count < 1.5
     # A single shared corner comes first; with two, the corner that is not shared comes last.
-    from_second = dr.select(once, shared[1], ~shared[0])
-    from_third = dr.select(once, shared[2], ~shared[1])
-    none = count < 0.5
-    from_second, from_third = from_second & ~none, from_third & ~none
+    from_second = dr.select(is_single, shared[1], ~shared[0])
+    from_third = dr.select(is_single, shared[2], ~shared[1])
+    has_none = count < 0.5
+    from_second, from_third = from_second & ~has_none, from_third & ~has_none
     return tuple(
-        dr.select(from_second, of[(k + 1) % 3], dr.select(from_third, of[(k + 2) % 3], of[k]))
+        dr.select(from_second, tri[(k + 1) % 3], dr.select(from_third, tri[(k + 2) % 3], tri[k]))
         for k in range(3)
     )  # type: ignore[return-value]
 
 
-def _separated_beside_edge(a: Corners, b: Corners, count: Real) -> Mask:
-    """Whether a plane through an edge, at right angles to its triangle, has the triangles on its
-    two sides; shared corners come first.
+def _are_beside_edge(a: Corners, b: Corners, shared_count: Real) -> Mask:
+    """Whether two triangles are proved to lie on two sides of a plane that contains an edge of one
+    of them and is at right angles to that triangle. Shared corners come first in `a` and `b`;
+    shared_count is how many there are.
 
-    m is any vector, and m' = m - (m.e/|e|^2) e, for an edge e, exactly: so m'.e = 0, and m'.x is
-    m.x up to |m.e| |x|/|e|, which is rounding if m was made at right angles to e.
-    - No shared corner: m.x is less on one triangle than on the other (separating axes).
-    - One, the origin: m' < 0 or = 0 on e, < 0 at the other corner of e's triangle and > 0 at both
-      corners of the other. Points of both have m' = 0, so of the latter only the origin. Or m < 0
-      at both corners of one and m > 0 at those of the other: m along the difference of the
-      directions of their middles.
-    - Two: e is between them, m' < 0 at the last corner of one, and > 0 at that of the other. Points
-      of both have m' = 0: they lie on e.
+    Proof. All vectors start at the first end of the edge e. Let m be the vector as it was computed,
+    nearly at right angles to e, and m' = m - (m.e/|e|^2) e without rounding. Then m'.e = 0 exactly,
+    and for a vector x, m'.x differs from m.x by at most |m.e| |x|/|e|, which is only rounding.
+    - No shared corner: m'.x <= 0 on the triangle of e, and m'.x > 0 on the other triangle (a
+      separating axis).
+    - One shared corner, where e starts: m'.x = 0 on e, m'.x < 0 at the third corner of the triangle
+      of e, and m'.x > 0 at the two other corners of the other triangle. So points of both triangles
+      have m'.x = 0, and the shared corner is the only such point of the other triangle. Or see
+      `_are_opposite_at_corner`.
+    - Two shared corners, the ends of e: m'.x < 0 at the last corner of one triangle and > 0 at that
+      of the other. So points of both have m'.x = 0, and lie on e.
     """
-    none, once = count < 0.5, (count > 0.5) & (count < 1.5)
-    twice = (count > 1.5) & (count < 2.5)
+    has_none, has_one = shared_count < 0.5, (shared_count > 0.5) & (shared_count < 1.5)
+    has_two = (shared_count > 1.5) & (shared_count < 2.5)
     is_beside = False
     for first, second in ((a, b), (b, a)):
         for i, j, k in ((0, 1, 2), (0, 2, 1), (1, 2, 0)):
             origin = first[i]
             e, x = first[j] - origin, first[k] - origin
             m = dr.fma(e, dr.dot(x, e) / dr.squared_norm(e), -x)
-            size, length = dr.norm(m), dr.norm(e)
-            dot_error = 1.01 * (dr.abs(dr.dot(m, e)) + ROUNDING * size * length) / length
-            rounding = ROUNDING * size + dot_error
+            m_length, e_length = dr.norm(m), dr.norm(e)
+            dot_error = 1.01 * (dr.abs(dr.dot(m, e)) + ROUNDING * m_length * e_length) / e_length
+            rounding = ROUNDING * m_length + dot_error
 
-            def past(to: Vec3, m: Vec3 = m, rounding: Real = rounding) -> tuple[Mask, Mask]:
-                value, error = dr.dot(m, to), rounding * dr.norm(to) + _UNDERFLOW
+            def sides_of(offset: Vec3, m: Vec3 = m, rounding: Real = rounding) -> tuple[Mask, Mask]:
+                """Whether m'.offset is proved positive, and whether it is proved negative."""
+                value, error = dr.dot(m, offset), rounding * dr.norm(offset) + _UNDERFLOW
                 return value > error, value < -error
 
-            behind = past(x)[1]
-            beyond = [past(corner - origin)[0] for corner in second]
+            behind = sides_of(x)[1]
+            beyond = [sides_of(corner - origin)[0] for corner in second]
             if i == 0:
-                is_beside = is_beside | (once & behind & beyond[1] & beyond[2])
+                is_beside = is_beside | (has_one & behind & beyond[1] & beyond[2])
             if (i, j) == (0, 1):
-                is_beside = is_beside | (twice & behind & beyond[2])
+                is_beside = is_beside | (has_two & behind & beyond[2])
             # Without a shared corner the edge itself is behind as well: m'.e = 0.
-            is_beside = is_beside | (none & behind & beyond[0] & beyond[1] & beyond[2])
-    return is_beside | (once & _separated_at_corner(a, b))
+            is_beside = is_beside | (has_none & behind & beyond[0] & beyond[1] & beyond[2])
+    return is_beside | (has_one & _are_opposite_at_corner(a, b))
 
 
-def _separated_at_corner(a: Corners, b: Corners) -> Mask:
-    """Whether a plane through the first corner, which is that of both, has the others of a and
-    those of b on different sides, at right angles to the difference of their mean directions."""
-    edges = [corners[k] - corners[0] for corners, k in itertools.product((a, b), (1, 2))]
-    mean = [dr.normalize(edges[k]) + dr.normalize(edges[k + 1]) for k in (0, 2)]
-    m = dr.normalize(mean[1]) - dr.normalize(mean[0])
-    rounding = ROUNDING * dr.norm(m)
-    values = [(dr.dot(m, edge), rounding * dr.norm(edge) + _UNDERFLOW) for edge in edges]
-    (p, p_error), (q, q_error), (r, r_error), (s, s_error) = values
-    return (p < -p_error) & (q < -q_error) & (r > r_error) & (s > s_error)
+def _are_opposite_at_corner(a: Corners, b: Corners) -> Mask:
+    """Whether a plane through the first corner, which both triangles share, is proved to have the
+    other corners of `a` on one side and those of `b` on the other. For each triangle, the mean
+    direction is the sum of the unit vectors along both edges at that corner. The plane is at right
+    angles to the difference of the two triangles' unit mean directions."""
+    edges = [one[k] - one[0] for one, k in itertools.product((a, b), (1, 2))]
+    mean_directions = [dr.normalize(edges[k]) + dr.normalize(edges[k + 1]) for k in (0, 2)]
+    plane_normal = dr.normalize(mean_directions[1]) - dr.normalize(mean_directions[0])
+    rounding = ROUNDING * dr.norm(plane_normal)
+    values = [(dr.dot(plane_normal, edge), rounding * dr.norm(edge) + _UNDERFLOW) for edge in edges]
+    (p, one), (q, two), (r, three), (s, four) = values
+    return (p < -one) & (q < -two) & (r > three) & (s > four)

@@ -1,15 +1,15 @@
 """Checks that every mesh of a level set has to pass, with exact predicates.
 
-The predicates are signs of determinants: on which side of a plane, or of a line in a plane, points
-lie. Determinants are computed in floating point, with a bound of their rounding error (Shewchuk,
-Adaptive Precision Floating-Point Arithmetic and Fast Robust Geometric Predicates, 1997). Where that
-leaves the sign undecided, it is computed in integers: all coordinates are integers times one power
-of two.
+The predicates are signs of determinants. They tell on which side of a plane a point lies, or on
+which side of a line in a plane. A determinant is computed in floating point, with a bound of its
+rounding error (Shewchuk, Adaptive Precision Floating-Point Arithmetic and Fast Robust Geometric
+Predicates, 1997). Where that leaves the sign undecided, it is computed in integers: all coordinates
+are integers times the same power of two.
 
-Every mesh that `mesh` returns has passed checks: vertices and middles of triangles by samples of
-the field, faces that pass through each other by exact predicates, the number of triangles by a
-limit. The largest body is chosen by signed volumes and by the nesting of shells (`clipping`). Files
-hold single precision, to which vertices are snapped before the last check.
+Every mesh that `mesh` returns has passed checks: vertices and centers of triangles are tested by
+samples of the field, faces that pass through each other are found by exact predicates, and the
+number of triangles has a limit. The largest body is chosen by signed volumes and by the nesting of
+shells (`clipping`). Files hold single precision; vertices are rounded to it before the last check.
 """
 
 from __future__ import annotations
@@ -67,42 +67,45 @@ SignArray = npt.NDArray[np.int8]
 
 # Exact signs.
 
+# The unit roundoff.
 _UNIT = 2.0**-53
-# Shewchuk's bounds of the rounding of both determinants, over the sum of their terms' magnitudes.
+# Shewchuk's bounds of the rounding errors of both determinants, relative to the sum of the absolute
+# values of their terms.
 _ORIENT3D_ERROR, _ORIENT2D_ERROR = (7 + 56 * _UNIT) * _UNIT, (3 + 16 * _UNIT) * _UNIT
 # A bound of the error by underflow, for coordinates of order one.
 _UNDERFLOW = 1e-290
 
 
 def orient3d(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> SignArray:
-    """(n,) signs of det(a - d, b - d, c - d), points (n, 3): 1 where d sees a, b, c run clockwise,
-    0 where the four points are in one plane."""
-    together = _scaled(np.stack([a, b, c, d], axis=1))
-    rows = together[:, :3] - together[:, 3:]
-    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = (rows[:, k].T for k in range(3))
+    """(n,) the signs of det(a - d, b - d, c - d) for points (n, 3), exactly. The sign is 1 if a, b,
+    c run clockwise as seen from d, -1 if they run counter-clockwise, and 0 if the four points are
+    in one plane."""
+    points = _scaled(np.stack([a, b, c, d], axis=1))
+    edges = points[:, :3] - points[:, 3:]
+    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = (edges[:, k].T for k in range(3))
     terms = [(bx * cy, cx * by, az), (cx * ay, ax * cy, bz), (ax * by, bx * ay, cz)]
-    value = sum((plus - minus) * height for plus, minus, height in terms)
-    size = sum((np.abs(plus) + np.abs(minus)) * np.abs(height) for plus, minus, height in terms)
+    value = sum((plus - minus) * third for plus, minus, third in terms)
+    magnitude = sum((np.abs(plus) + np.abs(minus)) * np.abs(third) for plus, minus, third in terms)
     # A difference of doubles is 0 where they are equal, and only there.
-    flat = (rows == 0).all(axis=1).any(axis=1)
+    is_zero = (edges == 0).all(axis=1).any(axis=1)
     return _signs_with_fallback(
-        np.asarray(value), _ORIENT3D_ERROR * np.asarray(size), flat, together, _orient3d_exact
+        np.asarray(value), _ORIENT3D_ERROR * np.asarray(magnitude), is_zero, points, _orient3d_exact
     )
 
 
 def orient2d(a: FloatArray, b: FloatArray, c: FloatArray) -> SignArray:
-    """(n,) signs of det(a - c, b - c), points (n, 2): 1 where a, b, c run counter-clockwise, 0
-    where they are in one line."""
-    together = _scaled(np.stack([a, b, c], axis=1))
-    rows = together[:, :2] - together[:, 2:]
-    (ax, ay), (bx, by) = (rows[:, k].T for k in range(2))
+    """(n,) the signs of det(a - c, b - c) for points (n, 2), exactly. The sign is 1 if a, b, c run
+    counter-clockwise, -1 if they run clockwise, and 0 if they are in one line."""
+    points = _scaled(np.stack([a, b, c], axis=1))
+    edges = points[:, :2] - points[:, 2:]
+    (ax, ay), (bx, by) = (edges[:, k].T for k in range(2))
     value, size = ax * by - ay * bx, np.abs(ax * by) + np.abs(ay * bx)
-    flat = (rows == 0).all(axis=1).any(axis=1)
-    return _signs_with_fallback(value, _ORIENT2D_ERROR * size, flat, together, _orient2d_exact)
+    is_zero = (edges == 0).all(axis=1).any(axis=1)
+    return _signs_with_fallback(value, _ORIENT2D_ERROR * size, is_zero, points, _orient2d_exact)
 
 
 def _scaled(points: FloatArray) -> FloatArray:
-    """Points times a power of two, so that the largest coordinate is of order one."""
+    """The points times a power of two that makes the largest coordinate of order one."""
     largest = float(np.abs(points).max(initial=0.0))
     return points if largest == 0 else np.ldexp(points, -int(np.frexp(largest)[1]))
 
@@ -110,8 +113,15 @@ def _scaled(points: FloatArray) -> FloatArray:
 def _signs_with_fallback(
     value: FloatArray, error: FloatArray, zero: BoolArray, points: FloatArray, exact: Any
 ) -> SignArray:
-    """The signs of values that are known up to errors, or known to be 0; where errors leave a sign
-    undecided, `exact` computes it from the points."""
+    """(n,) the signs of numbers that are known up to an error. Where the error leaves a sign
+    undecided, it is computed exactly.
+
+    value: (n,) the approximate numbers.
+    error: (n,) bounds of their errors.
+    zero: (n,) mask of the numbers that are known to be 0.
+    points: (n, k, d) the points that determine each number.
+    exact: computes the numbers without rounding from points as `_integers` returns them.
+    """
     signs: SignArray = np.sign(value).astype(np.int8)
     signs[zero] = 0
     open_rows = np.flatnonzero(~zero & (np.abs(value) <= error + _UNDERFLOW))
@@ -121,7 +131,7 @@ def _signs_with_fallback(
 
 
 def _integers(points: FloatArray) -> Any:
-    """Points times a power of two, as Python's integers."""
+    """The points, all times the same power of two, as an array of Python's integers."""
     mantissa, exponent = np.frexp(points)
     mantissas = np.ldexp(mantissa, 53).astype(np.int64).astype(object)
     used = mantissa != 0
@@ -130,12 +140,16 @@ def _integers(points: FloatArray) -> Any:
 
 
 def _orient3d_exact(points: Any) -> Any:
+    """(n,) det(a - d, b - d, c - d) without rounding, for integer points (n, 4, 3): a, b, c, d in
+    each row."""
     rows = points[:, :3] - points[:, 3:]
     (ax, ay, az), (bx, by, bz), (cx, cy, cz) = (rows[:, k].T for k in range(3))
     return (bx * cy - cx * by) * az + (cx * ay - ax * cy) * bz + (ax * by - bx * ay) * cz
 
 
 def _orient2d_exact(points: Any) -> Any:
+    """(n,) det(a - c, b - c) without rounding, for integer points (n, 3, 2): a, b, c in each
+    row."""
     rows = points[:, :2] - points[:, 2:]
     (ax, ay), (bx, by) = (rows[:, k].T for k in range(2))
     return ax * by - ay * bx
@@ -147,13 +161,14 @@ _EDGES = ((0, 1), (1, 2), (2, 0))
 _PAIRS_AT_ONCE = 1 << 18
 # For more triangles than this a kernel lists the pairs, which takes 0.05 s to record.
 _MIN_FACES_FOR_KERNEL = 5_000
-# The largest number of triangles of a size that are compared with each other at once.
+# Up to this many triangles of similar size are compared with each other at once.
 _MAX_AT_ONCE = 1 << 19
 
 
 def misoriented_faces(function: LevelFunction, vertices: FloatArray, faces: IntArray) -> IntArray:
-    """Indices of faces whose normal does not point to where the function grows, judged at their
-    center."""
+    """Indices of the faces whose normal does not point to the side where the function is larger:
+    the normal, by the right-hand rule, has no positive dot product with the function's gradient at
+    the face's center."""
     corner = vertices[faces]
     normal = area_normals(corner)
     slope = function.sample(corner.mean(axis=1)).gradient
@@ -161,82 +176,94 @@ def misoriented_faces(function: LevelFunction, vertices: FloatArray, faces: IntA
 
 
 def intersecting_faces(
-    vertices: FloatArray, faces: IntArray, mask: BoolArray | None = None
+    vertices: FloatArray, faces: IntArray, among: BoolArray | None = None
 ) -> IntArray:
-    """Indices of faces (m, 3) that meet other faces in more than shared corners and edges, decided
-    exactly: faces that an edge of another face passes through, faces that lie on another face in
-    their plane, and the other faces of such pairs.
+    """Indices of the faces (m, 3) that meet another face in more than corners and edges that both
+    share, decided exactly. Two kinds of pairs are found: an edge of one face passes through the
+    other face, or both faces lie in one plane and overlap.
 
-    Two triangles in different planes meet beyond their common corners if and only if an edge of one
-    passes through the other, with its ends on both sides of that one's plane, or ends on it:
-    corners that lie on other triangles are not searched for, since edges beyond them would pass
-    through. Two triangles in one plane overlap unless the line of an edge has them on its two sides
-    (separating axes), whatever they share: faces that are there twice, or folded back onto their
-    neighbors, do. Only pairs whose boxes overlap are tested.
+    Two triangles in different planes meet beyond their shared corners if and only if an edge of one
+    passes through the other, with its ends on both sides of the other's plane, or ends on it. Ends
+    on other triangles are not looked for: if the surface goes on behind such an end, one of its
+    edges passes through. Two triangles in one plane overlap, whatever they share, unless the line
+    of an edge has them on its two sides (separating axes). So faces that occur twice, or are folded
+    back onto their neighbors, are found. Only pairs whose bounding boxes overlap are tested.
 
-    mask: (m,) mask of chosen faces; pairs without a chosen face are not tested.
+    vertices: (n, 3).
+    among: (m,) mask of chosen faces; pairs without a chosen face are not tested. None if all are
+        chosen.
     """
     crossing_faces: list[IntArray] = []
-    for pairs, heights in _pairs_in_doubt(vertices, faces, mask):
+    for pairs, sides in _pairs_in_doubt(vertices, faces, among):
         first, second = faces[pairs[:, 0]], faces[pairs[:, 1]]
         meet = np.zeros(len(pairs), np.bool_)
-        rows = np.flatnonzero((heights[0] == 0).all(axis=1) & (heights[1] == 0).all(axis=1))
-        meet[rows] = _overlap(vertices[first[rows]], vertices[second[rows]])
-        both = np.all([(h.min(axis=1) < 0) & (h.max(axis=1) > 0) for h in heights], axis=0)
-        rows = np.flatnonzero(both)
-        meet[rows] = _edge_pierces(vertices, first[rows], second[rows], heights[0][rows])
-        meet[rows] |= _edge_pierces(vertices, second[rows], first[rows], heights[1][rows])
+        rows = np.flatnonzero((sides[0] == 0).all(axis=1) & (sides[1] == 0).all(axis=1))
+        meet[rows] = _share_area(vertices[first[rows]], vertices[second[rows]])
+        may_cross = np.all([(s.min(axis=1) < 0) & (s.max(axis=1) > 0) for s in sides], axis=0)
+        rows = np.flatnonzero(may_cross)
+        meet[rows] = _edge_pierces(vertices, first[rows], second[rows], sides[0][rows])
+        meet[rows] |= _edge_pierces(vertices, second[rows], first[rows], sides[1][rows])
         crossing_faces.append(pairs[meet].ravel())
     return np.unique(np.concatenate([*crossing_faces, np.zeros(0, np.int64)]))
 
 
 def touching_pairs(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, FloatArray]:
-    """Pairs (k, 2) of faces (m, 3) that touch, decided exactly: one has a corner or an edge on the
-    other, beyond a corner that they share. Also (k, 3) the corner on the other face, or the middle
-    of the edge.
+    """Pairs (k, 2) of faces (m, 3) that touch, decided exactly. They touch if a corner or an edge
+    of one face lies on the other face; a corner that both share does not count. Also (k, 3) the
+    place: that corner, or the middle of that edge.
 
-    If all of a face lies on another, so do its edges. Where edges meet between their ends, and lie
-    in neither face's plane, `intersecting_faces` has the pair. It also has the pairs that share two
-    corners, which have no more in common unless they overlap in one plane. If two faces share one
-    corner, their planes meet in a line through it, or are equal: each face has a segment from the
-    corner on that line, and where these lie along each other an edge passes through a face, or the
-    shorter one is an edge at the corner, and in the other's plane.
+    No pair is missed that `intersecting_faces` does not have. If all of a face lies on another, so
+    do its edges. If edges meet between their ends, and neither lies in the plane of the other face,
+    an edge passes through a face. Faces that share two corners have no more in common unless they
+    overlap in one plane. If two faces share one corner, and their planes differ, the planes meet in
+    a line through that corner, on which each face has a segment that begins at the corner. If both
+    segments run the same way, either an edge passes through a face; or the shorter segment is an
+    edge at the corner that lies in the other face's plane.
+
+    vertices: (n, 3).
     """
     batches: list[IntArray] = []
     contacts: list[FloatArray] = []
 
-    def add(pairs: IntArray, on: BoolArray, p: FloatArray, q: FloatArray) -> None:
-        batches.append(pairs[on])
-        contacts.append(0.5 * (p + q)[on])
+    def add(pairs: IntArray, touches: BoolArray, p: FloatArray, q: FloatArray) -> None:
+        """List those pairs (k, 2) that the mask `touches` selects, with the points midway between
+        the points p and q (k, 3)."""
+        batches.append(pairs[touches])
+        contacts.append(0.5 * (p + q)[touches])
 
     for pairs, heights in _pairs_in_doubt(vertices, faces, None):
-        same = faces[pairs[:, 0], :, None] == faces[pairs[:, 1]][:, None]
-        shared = same.sum(axis=(1, 2))
-        for order, ((plane, of), height) in enumerate(
+        is_same = faces[pairs[:, 0], :, None] == faces[pairs[:, 1]][:, None]
+        shared_count = is_same.sum(axis=(1, 2))
+        for order, ((base, other), sides) in enumerate(
             zip((pairs.T, pairs.T[::-1]), heights, strict=True)
         ):
             # A corner is an edge from itself to itself.
             for i, j in ((0, 0), (1, 1), (2, 2), *_EDGES):
-                rows = np.flatnonzero((shared == 0) & (height[:, i] == 0) & (height[:, j] == 0))
-                p, q = (vertices[faces[of[rows], k]] for k in (i, j))
-                add(pairs[rows], _is_on(vertices[faces[plane[rows]]], p, q), p, q)
-            is_common = same.any(axis=1 + order)  # of the corners of `of`
+                rows = np.flatnonzero((shared_count == 0) & (sides[:, i] == 0) & (sides[:, j] == 0))
+                p, q = (vertices[faces[other[rows], k]] for k in (i, j))
+                add(pairs[rows], _segments_meet(vertices[faces[base[rows]]], p, q), p, q)
+            is_common = is_same.any(axis=1 + order)  # for the corners of the other faces
             for i in range(3):
-                rows = np.flatnonzero((shared == 1) & ~is_common[:, i] & (height[:, i] == 0))
-                apex = same.any(axis=2 - order)[rows].argmax(axis=1)[:, None]
-                turned = np.take_along_axis(faces[plane[rows]], (apex + np.arange(3)) % 3, axis=1)
-                p = vertices[faces[of[rows], i]]
-                add(pairs[rows], _is_between(vertices[turned], p), p, p)
-    both = np.concatenate([*batches, np.zeros((0, 2), np.int64)])
-    _, first = np.unique(both, axis=0, return_index=True)
-    return both[first], np.concatenate([*contacts, np.zeros((0, 3))])[first]
+                rows = np.flatnonzero((shared_count == 1) & ~is_common[:, i] & (sides[:, i] == 0))
+                apex = is_same.any(axis=2 - order)[rows].argmax(axis=1)[:, None]
+                turned = np.take_along_axis(faces[base[rows]], (apex + np.arange(3)) % 3, axis=1)
+                p = vertices[faces[other[rows], i]]
+                add(pairs[rows], _is_in_angle(vertices[turned], p), p, p)
+    all_pairs = np.concatenate([*batches, np.zeros((0, 2), np.int64)])
+    _, first = np.unique(all_pairs, axis=0, return_index=True)
+    return all_pairs[first], np.concatenate([*contacts, np.zeros((0, 3))])[first]
 
 
 def _pairs_in_doubt(
     vertices: FloatArray, faces: IntArray, among: BoolArray | None
 ) -> Generator[tuple[IntArray, tuple[SignArray, SignArray]]]:
-    """Pairs (k, 2) of faces that are not proved apart, in batches, and the `_heights` of the second
-    over the first and of the first over the second."""
+    """Generate, in batches, the pairs (k, 2) of faces that are not proved apart. With each batch
+    come two arrays (k, 3) of `_side_signs`: of the second faces' corners for the planes of the
+    first faces, and of the first faces' corners for the planes of the second faces.
+
+    among: (m,) mask of chosen faces; pairs without a chosen face are left out. None if all are
+        chosen.
+    """
     face_count = len(faces) if among is None else int(among.sum())
     by_kernel = face_count > _MIN_FACES_FOR_KERNEL
     near = near_pairs(vertices, faces, among) if by_kernel else _near_pairs(vertices[faces], among)
@@ -245,15 +272,18 @@ def _pairs_in_doubt(
         if not by_kernel:
             pairs = pairs[~_are_separated(vertices, faces, pairs)]
         first, second = faces[pairs[:, 0]], faces[pairs[:, 1]]
-        yield pairs, (_heights(vertices, first, second), _heights(vertices, second, first))
+        yield pairs, (_side_signs(vertices, first, second), _side_signs(vertices, second, first))
 
 
 def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
-    """Pairs (k, 2) of triangles (m, 3, 3) whose boxes overlap, each once; given a mask, only pairs
-    with a chosen triangle.
+    """Pairs (k, 2) of triangles (m, 3, 3) whose bounding boxes overlap, each once.
 
-    Triangles of one size (up to a factor of 2) are compared at a time, with triangles that are no
-    larger: so a large triangle is compared only with the small triangles near it.
+    among: (m,) mask of chosen triangles; pairs without a chosen triangle are left out. None if all
+        are chosen.
+
+    Triangles are grouped by size, up to a factor of 2, and each group is compared with each group,
+    itself included, at distances up to the sum of the largest sizes in both. So a large triangle is
+    compared only with the small triangles near it.
     """
     import scipy.spatial  # imported here: it takes half a second
 
@@ -262,8 +292,8 @@ def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
     chosen = np.ones(len(corner), np.bool_) if among is None else among
     if not chosen.any():
         return np.zeros((0, 2), np.int64)
-    ends = lower[chosen].min(axis=0), upper[chosen].max(axis=0)
-    near = (lower <= ends[1]).all(axis=1) & (upper >= ends[0]).all(axis=1)
+    chosen_bounds = lower[chosen].min(axis=0), upper[chosen].max(axis=0)
+    near = (lower <= chosen_bounds[1]).all(axis=1) & (upper >= chosen_bounds[0]).all(axis=1)
     center = 0.5 * (lower + upper)
     radius = 0.5 * row_norms(upper - lower)
     octave = np.floor(np.log2(np.maximum(radius, 1e-300)))
@@ -271,87 +301,94 @@ def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
     trees = [searching.cKDTree(center[rows]) for rows in groups]
     batches: list[IntArray] = []
 
-    def add(first: IntArray, second: IntArray) -> None:
+    def add_if_overlapping(first: IntArray, second: IntArray) -> None:
+        """Append those of the pairs `first`, `second`, both (k,), whose boxes overlap."""
         keep = (lower[first] <= upper[second]).all(axis=1)
         keep &= (lower[second] <= upper[first]).all(axis=1)
         batches.append(np.column_stack([first[keep], second[keep]]))
 
     for i, j in itertools.product(range(len(groups)), repeat=2):
-        reach = float(radius[groups[i]].max() + radius[groups[j]].max())
+        max_distance = float(radius[groups[i]].max() + radius[groups[j]].max())
         queries = groups[i][chosen[groups[i]]]
         if i == j and len(queries) == len(groups[i]) <= _MAX_AT_ONCE:
-            table = trees[i].query_pairs(reach, output_type="ndarray")
-            add(*groups[i][table.T])
+            table = trees[i].query_pairs(max_distance, output_type="ndarray")
+            add_if_overlapping(*groups[i][table.T])
             continue
         step = max(1, _PAIRS_AT_ONCE // 64)
         for start in range(0, len(queries), step):
             rows = queries[start : start + step]
             query_tree = searching.cKDTree(center[rows])
-            table = query_tree.sparse_distance_matrix(trees[j], reach, output_type="ndarray")
+            table = query_tree.sparse_distance_matrix(trees[j], max_distance, output_type="ndarray")
             first, second = rows[table["i"]], groups[j][table["j"]]
-            once = (first < second) | ~chosen[second]  # two chosen triangles are listed once
-            add(first[once], second[once])
+            is_new = (first < second) | ~chosen[second]  # two chosen triangles are listed once
+            add_if_overlapping(first[is_new], second[is_new])
     return np.concatenate(batches).astype(np.int64)
 
 
 def _are_separated(vertices: FloatArray, faces: IntArray, pairs: IntArray) -> BoolArray:
-    """(k,) whether two faces are proved to share nothing but common vertices: the plane of one face
-    has all vertices of the other that are not common strictly on one side. False where rounding
-    leaves it undecided.
+    """(k,) whether the two faces of each pair (k, 2) are proved to have nothing but common vertices
+    in common. That is proved if the plane of one face has all vertices of the other face that are
+    not common strictly on one side. False where rounding leaves it undecided.
 
-    See `broad_phase.ROUNDING` for the error of heights.
+    See `broad_phase.ROUNDING` for the error of the determinants, here `height`, whose signs tell
+    the sides.
     """
     apart = np.zeros(len(pairs), np.bool_)
     for first, second in (pairs.T, pairs.T[::-1]):
         rows = np.flatnonzero(~apart)
-        plane, of = faces[first[rows]], faces[second[rows]]
-        a = vertices[plane[:, 0]]
-        u, v = vertices[plane[:, 1]] - a, vertices[plane[:, 2]] - a
+        base, other = faces[first[rows]], faces[second[rows]]
+        a = vertices[base[:, 0]]
+        u, v = vertices[base[:, 1]] - a, vertices[base[:, 2]] - a
         normal = np.cross(u, v)
         error_scale = ROUNDING * (row_norms(u) * row_norms(v))
         above, below = np.ones(len(rows), np.bool_), np.ones(len(rows), np.bool_)
         for k in range(3):
-            offset = vertices[of[:, k]] - a
+            offset = vertices[other[:, k]] - a
             height, error = row_dots(normal, offset), error_scale * row_norms(offset) + _UNDERFLOW
-            shared = (of[:, k, None] == plane).any(axis=1)
+            shared = (other[:, k, None] == base).any(axis=1)
             above &= shared | (height > error)
             below &= shared | (height < -error)
         # A face that shares all its corners is the same face.
-        is_other = (of[:, :, None] != plane[:, None]).all(axis=2).any(axis=1)
+        is_other = (other[:, :, None] != base[:, None]).all(axis=2).any(axis=1)
         apart[rows] = (above | below) & is_other
     return apart
 
 
-def _heights(vertices: FloatArray, plane: IntArray, of: IntArray) -> SignArray:
-    """(k, 3) the signs that tell on which sides of the planes of faces (k, 3) the corners of other
-    faces lie; 0 on a plane."""
-    a, b, c = (vertices[plane[:, i]] for i in range(3))
-    signs = np.zeros((len(of), 3), np.int8)
+def _side_signs(vertices: FloatArray, base: IntArray, other: IntArray) -> SignArray:
+    """(k, 3) for each corner of the faces `other` (k, 3), on which side of the plane of the face
+    `base` (k, 3) it lies, exactly: 1 below, from where the corners of `base` run clockwise, -1
+    above, and 0 on the plane. Corners that both faces share get 0."""
+    a, b, c = (vertices[base[:, i]] for i in range(3))
+    signs = np.zeros((len(other), 3), np.int8)
     for i in range(3):
-        rows = np.flatnonzero((of[:, i, None] != plane).all(axis=1))
-        signs[rows, i] = orient3d(a[rows], b[rows], c[rows], vertices[of[rows, i]])
+        rows = np.flatnonzero((other[:, i, None] != base).all(axis=1))
+        signs[rows, i] = orient3d(a[rows], b[rows], c[rows], vertices[other[rows, i]])
     return signs
 
 
 def _edge_pierces(
-    vertices: FloatArray, through: IntArray, of: IntArray, heights: SignArray
+    vertices: FloatArray, pierced: IntArray, piercing: IntArray, sides: SignArray
 ) -> BoolArray:
-    """(k,) whether an edge of the faces `of` (k, 3) passes through the faces `through`: its line
-    passes all three edges on one side, or touches them. heights: the sides of the planes of
-    `through` that the corners of `of` are on."""
-    pierces = np.zeros(len(of), np.bool_)
+    """(k,) whether an edge of the face `piercing` passes through the face `pierced`, both (k, 3),
+    or touches its boundary. It does if the edge's ends are strictly on the two sides of the plane
+    of `pierced`, and its line passes all three edges of `pierced` on the same side or touches them.
+
+    sides: (k, 3) the `_side_signs` of the corners of `piercing` for the planes of `pierced`.
+    """
+    pierces = np.zeros(len(piercing), np.bool_)
     for i, j in _EDGES:
-        rows = np.flatnonzero((heights[:, i] * heights[:, j] < 0) & ~pierces)
-        p, q = vertices[of[rows, i]], vertices[of[rows, j]]
-        x = [vertices[through[rows, k]] for k in range(3)]
+        rows = np.flatnonzero((sides[:, i] * sides[:, j] < 0) & ~pierces)
+        p, q = vertices[piercing[rows, i]], vertices[piercing[rows, j]]
+        x = [vertices[pierced[rows, k]] for k in range(3)]
         orientations = np.stack([orient3d(p, q, x[k], x[m]) for k, m in _EDGES])
         pierces[rows] = (orientations >= 0).all(axis=0) | (orientations <= 0).all(axis=0)
     return pierces
 
 
-def _overlap(first: FloatArray, second: FloatArray) -> BoolArray:
-    """(k,) whether triangles (k, 3, 3) in one plane have an area in common; they are projected
-    along the axis in which they are thinnest."""
+def _share_area(first: FloatArray, second: FloatArray) -> BoolArray:
+    """(k,) whether triangles `first` and `second` (k, 3, 3), two and two in one plane, have an area
+    in common. They do unless the line of an edge separates them (separating axes). They are
+    projected to two dimensions along the coordinate axis that is nearest to their normal."""
     normal = np.abs(area_normals(first))
     axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
     flat = [np.take_along_axis(t, axes[:, None].repeat(3, axis=1), axis=2) for t in (first, second)]
@@ -364,9 +401,11 @@ def _overlap(first: FloatArray, second: FloatArray) -> BoolArray:
     return overlaps
 
 
-def _is_on(triangle: FloatArray, p: FloatArray, q: FloatArray) -> BoolArray:
-    """(k,) whether segments from p to q (k, 3) meet triangles (k, 3, 3) in whose planes they are:
-    unless the line of an edge or of the segment has them on its two sides (separating axes)."""
+def _segments_meet(triangle: FloatArray, p: FloatArray, q: FloatArray) -> BoolArray:
+    """(k,) whether segments from `p` to `q` (k, 3) meet the triangles (k, 3, 3) in whose planes
+    they lie. They do unless the line of an edge of the triangle, or that of the segment, has the
+    triangle and the segment on its two sides (separating axes). False for triangles without an
+    area."""
     normal = np.abs(area_normals(triangle))
     axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
     a = np.take_along_axis(triangle, axes[:, None].repeat(3, axis=1), axis=2)
@@ -380,9 +419,10 @@ def _is_on(triangle: FloatArray, p: FloatArray, q: FloatArray) -> BoolArray:
     return is_on & ~((side > 0).all(axis=0) | (side < 0).all(axis=0))
 
 
-def _is_between(triangle: FloatArray, p: FloatArray) -> BoolArray:
-    """(k,) whether the directions from the first corners of triangles (k, 3, 3) to points in their
-    planes lie between the directions to the two other corners, or along one of them."""
+def _is_in_angle(triangle: FloatArray, p: FloatArray) -> BoolArray:
+    """(k,) whether points `p` (k, 3), each in the plane of its triangle (k, 3, 3), lie in the angle
+    of the triangle at its first corner, its two sides included. False for triangles without an
+    area."""
     normal = np.abs(area_normals(triangle))
     axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
     a = np.take_along_axis(triangle, axes[:, None].repeat(3, axis=1), axis=2)
@@ -399,7 +439,8 @@ class MeshingError(ValueError):
     """A level set could not be meshed; the message says why, and a remedy."""
 
     def may_be_fixed_by(self, smaller: float) -> bool:
-        """Whether cells `smaller` times as large as those that failed may help."""
+        """Whether smaller cells may help: cells whose size is `smaller` times that of the cells
+        that failed."""
         del smaller
         return True
 
@@ -409,7 +450,10 @@ class EmptySurfaceError(MeshingError):
 
 
 class LocalizedMeshingError(MeshingError):
-    """A check failed at known locations (k, 3), so that smaller cells there may be enough."""
+    """A check failed at known locations, so that smaller cells there may be enough.
+
+    locations: (k, 3) points.
+    """
 
     def __init__(self, message: str, places: FloatArray) -> None:
         super().__init__(message)
@@ -421,7 +465,11 @@ class OffLevelError(LocalizedMeshingError):
 
 
 class SelfIntersectionError(LocalizedMeshingError):
-    """Triangles pass through each other. faces: their indices. places: their centers."""
+    """Triangles pass through each other.
+
+    faces: (k,) the indices of these triangles.
+    locations: (k, 3) their centers.
+    """
 
     def __init__(self, message: str, places: FloatArray, faces: IntArray) -> None:
         super().__init__(message, places)
@@ -429,9 +477,10 @@ class SelfIntersectionError(LocalizedMeshingError):
 
 
 class UnrefinableError(MeshingError):
-    """An error against which smaller cells do not help."""
+    """An error that smaller cells do not fix."""
 
     def may_be_fixed_by(self, smaller: float) -> bool:
+        """False: no cells are small enough."""
         del smaller
         return False
 
@@ -440,19 +489,21 @@ class TriangleLimitError(UnrefinableError):
     """The mesh would have more triangles than allowed, and was not begun."""
 
 
-# The largest number of failures for which smaller cells are tried again, and the largest ratio to
-# the number of failures before.
+# Smaller cells are tried again if there are no more failures than the first, or than the second
+# times the number of failures before.
 _MAX_FAILURES_FOR_RETRY, _REQUIRED_FAILURE_REDUCTION = 20, 0.5
 
 
 def is_retry_promising(
     now: MeshingError, before: MeshingError | None, smallest: float = 1.0
 ) -> bool:
-    """Whether another attempt with smaller cells is promising, after one or two sizes of cells
-    failed. It is not if the number of failures hardly decreased since the previous attempt: along a
-    pole, or where jump surfaces cross, cells of every size fail.
+    """Whether it is worthwhile to try smaller cells after an attempt failed. It is not if smaller
+    cells cannot help, or if there are many failures and hardly fewer than in the attempt before:
+    along a pole, or where jump surfaces cross, cells of every size fail.
 
-    smallest: the smallest cell allowed, relative to the cells that failed now.
+    now: the error of the last attempt.
+    before: the error of the attempt before it, or None.
+    smallest: the size of the smallest cells allowed, relative to the cells that failed now.
     """
     if not now.may_be_fixed_by(smallest):
         return False
@@ -464,24 +515,28 @@ def is_retry_promising(
 
 
 def euler_characteristic(faces: IntArray, edges: Edges | None = None) -> int:
-    """The Euler characteristic: the number of used vertices, minus that of edges, plus that of
-    faces. edges: of `half_edges`, if they are known."""
+    """The Euler characteristic of faces (m, 3): the number of vertices that they use, minus the
+    number of edges, plus the number of faces.
+
+    edges: the `Edges` of `half_edges(faces)`, if they are known.
+    """
     vertices = int(np.count_nonzero(np.bincount(faces.ravel())))
     edges = edges or Edges.of(half_edges(faces))
     return vertices - len(edges.vertices) + len(faces)
 
 
 def check_manifold(faces: IntArray, vertices: FloatArray | None = None) -> None:
-    """Raise unless every edge has one or two faces, which run it in opposite directions, and the
-    faces around every vertex are joined by edges.
+    """Raise unless faces (m, 3) form a manifold: every edge has one or two faces, two faces run
+    their edge in opposite directions, and the faces around every vertex are joined by edges.
 
     vertices: (n, 3), for the locations of failures.
 
     Raises:
-        MeshingError: the mesh is no manifold; a LocalizedMeshingError if vertices are given.
+        MeshingError: the faces are no manifold; a LocalizedMeshingError if vertices are given.
     """
 
     def fail(message: str, where: IntArray) -> Never:
+        """Raise the error; `where` has the indices of the vertices at which the check failed."""
         if vertices is None:
             raise MeshingError(message)
         raise LocalizedMeshingError(message, vertices[where])
@@ -531,18 +586,18 @@ def check_no_self_intersection(vertices: FloatArray, faces: IntArray) -> None:
         )
 
 
-def check_triangle_limit(expected: float, max_triangles: int) -> None:
+def check_triangle_limit(expected: float, most: int) -> None:
     """Raise TriangleLimitError if more triangles are expected than may be made."""
-    if expected > max_triangles:
+    if expected > most:
         raise TriangleLimitError(
-            f"the mesh takes about {expected:.2g} triangles, and max_triangles is "
-            f"{max_triangles:,}: choose a larger `tolerance` or `cell_size`, a smaller `clip`, "
-            "or a larger `max_triangles`"
+            f"the mesh takes about {expected:.2g} triangles, and max_triangles is {most:,}: choose "
+            "a larger `tolerance` or `cell_size`, a smaller `clip`, or a larger `max_triangles`"
         )
 
 
 def check_inside(vertices: FloatArray, volume: Volume, slack: float) -> None:
-    """Raise if a vertex lies outside of a volume padded by `slack`."""
+    """Raise MeshingError if a vertex (n, 3) lies farther than the length `slack` outside of a
+    volume."""
     out = ~volume.padded(slack).contains_points(vertices)
     if out.any():
         raise MeshingError(
@@ -558,18 +613,23 @@ def check_near_level(
     tolerance: float,
     volume: Volume | None,
 ) -> None:
-    """Raise unless vertices and centers of faces are within `tolerance` of the level, by samples of
-    the function.
+    """Raise unless all vertices (n, 3) and all centers of faces (m, 3) are within `tolerance`, a
+    length, of the level. That is decided by samples of the function.
 
-    A point counts as within the tolerance if the gradient says so, |f|/|grad f| <= tolerance; or if
-    f changes its sign between two points at that distance from it or nearer, along the normal of
-    the face or one of 13 other lines, for then a continuous f has its level between them. These
-    lines are askew, since many parts have faces in planes of coordinates, where rounding decides
-    the sign; and every cone of 28 degrees about its axis has one of their directions in it, as the
-    corner of a cube has (35 degrees). A solid is cut at the volume's boundary: to be outside of the
-    volume counts as a positive sign. Boundary vertices of an angle's level set are on its curve,
-    where it has no value, and are left out; and triangles smaller than half of the tolerance are as
-    near as their corners.
+    A point passes if |f|/|grad f| <= tolerance, by the gradient. It passes as well if f has
+    different signs at two points on a line through it, on both sides of it and at the same distance
+    of at most the tolerance: a continuous f then has its level between them. Fourteen lines are
+    tried: the normal of the face, or the mean normal at the vertex, and 13 fixed lines. These are
+    askew to the axes, since many parts have faces in coordinate planes, where rounding would decide
+    the sign. Every cone of 28 degrees about its axis contains one of their directions; the corner
+    of a cube contains a cone of 35 degrees.
+
+    volume: a solid is cut at the boundary of this volume, so that f counts as positive outside of
+        it. None if there is no such volume.
+
+    Not tested are the boundary vertices of an angle's level set, which are on its curve, where the
+    angle has no value; and the centers of triangles whose edges are all no longer than half of the
+    tolerance, since their corners are tested.
 
     Raises:
         OffLevelError: points are farther from the level; they are its locations.
@@ -591,8 +651,9 @@ def points_off_level(
     tolerance: float,
     volume: Volume | None,
 ) -> tuple[FloatArray, int]:
-    """The vertices and centers of faces (k, 3) that are not within `tolerance` of the level, as
-    `check_near_level` decides it; and the number of points that were tested."""
+    """The vertices and centers of faces that are not within `tolerance` of the level, (k, 3), and
+    the number of points that were tested. `check_near_level` says which points are tested, and
+    how."""
     corner = vertices[faces]
     normal = area_normals(corner)
     longest = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
@@ -608,7 +669,7 @@ def points_off_level(
     directions /= np.maximum(row_norms(directions), 1e-300)[:, None]
     rows = np.flatnonzero(~(function.sample(points).distance <= tolerance))
     # Nearer points are tried as well: behind a cap there may be little of a solid.
-    for fraction, line in itertools.product((1.0, 0.25, 0.0625), (None, *_generic_directions())):
+    for fraction, line in itertools.product((1.0, 0.25, 0.0625), (None, *_askew_lines())):
         if not len(rows):
             break
         step = fraction * tolerance * (directions[rows] if line is None else line)
@@ -617,9 +678,9 @@ def points_off_level(
     return points[rows], len(points)
 
 
-def _generic_directions() -> FloatArray:
-    """(13, 3) unit vectors along the axes and both kinds of diagonals of a cube, turned so that
-    none of them is near to a plane of coordinates or to one of their diagonals."""
+def _askew_lines() -> FloatArray:
+    """(13, 3) unit vectors along the axes and the face and space diagonals of a cube that is turned
+    so that none of them is near to a coordinate plane or to a plane's diagonal."""
     directions = np.array(list(itertools.product((-1.0, 0.0, 1.0), repeat=3)))[14:]
     frame: FloatArray = np.linalg.qr([[7, 7, -3], [3, -16, -7], [19, 7, -13]])[0]
     return (directions / row_norms(directions)[:, None]) @ frame
@@ -628,6 +689,8 @@ def _generic_directions() -> FloatArray:
 def _is_positive(
     function: LevelFunction, points: FloatArray, volume: Volume | None
 ) -> npt.NDArray[np.bool_]:
+    """(n,) whether points (n, 3) count as outside: the function is positive or not a number there,
+    or the point lies outside of the volume."""
     is_positive = ~(function.sample(points).value <= 0)
     return is_positive if volume is None else is_positive | ~volume.contains_points(points)
 
@@ -638,8 +701,9 @@ def point_text(x: FloatArray) -> str:
 
 
 def nonmanifold_vertices(faces: IntArray) -> IntArray:
-    """Vertices, by index, at which faces (m, 3) are not a manifold: the ends of edges with more
-    than two faces, and vertices with more than one fan of faces."""
+    """Indices of the vertices at which faces (m, 3) are not a manifold: the ends of edges that have
+    more than two faces, and vertices with more than one fan of faces. A fan is a set of faces
+    around a vertex that are joined by edges."""
     pairs, count = half_edges(faces), int(faces.max(initial=-1)) + 1
     edges = Edges.of(pairs)
     overused = np.unique(pairs[edges.multiplicity[edges.edge_of_pair] > 2])
@@ -652,8 +716,14 @@ def nonmanifold_vertices(faces: IntArray) -> IntArray:
 
 
 def _vertex_fans(faces: IntArray, edges: Edges) -> tuple[int, IntArray]:
-    """The number of fans of faces, joined by edges, that all vertices have together, and (3m,) the
-    fan that each corner of a face belongs to. edges: of `half_edges`."""
+    """Group the corners of faces (m, 3) into fans. A fan is a maximal set of faces around a vertex
+    that are joined to each other by edges at that vertex.
+
+    edges: the `Edges` of `half_edges(faces)`.
+
+    Returns the number of fans of all vertices together, and (3m,) the index of the fan that each
+    corner of a face belongs to, face by face.
+    """
     import scipy.sparse  # imported here: it takes half a second
     import scipy.sparse.csgraph as csgraph_module
 

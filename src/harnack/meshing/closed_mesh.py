@@ -1,5 +1,5 @@
-"""Closed meshes: conversion to and from manifold3d's solids, clip volumes as such solids, and
-export to files that are closed as well."""
+"""Closed meshes: their conversion to and from manifold3d's solids, other shapes as such solids, and
+their export to files that are closed as well."""
 
 from __future__ import annotations
 
@@ -42,19 +42,21 @@ __all__ = [
     "without_short_edges",
 ]
 
+# The largest number of segments around a ball or a solid of revolution.
 _MAX_SEGMENTS = 2000
 # The areas of a union and of its parts may differ by the first, relative to the area. Otherwise,
-# and where triangles of the union cross, parts are grown, by the second, relative to the size; at
-# sharp corners by at most that over the third.
-_SAME_AREA, _GROWTH, _MIN_SLANT = 1e-6, 1e-9, 0.1
+# and where triangles of the union cross, the faces of parts are moved outwards by the second,
+# relative to the size. At sharp corners vertices are moved by at most that divided by the third.
+_AREA_TOLERANCE, _GROWTH, _MIN_COSINE = 1e-6, 1e-9, 0.1
+# The largest number of squares of the permitted edge on a twisted outline.
 _MAX_CELLS = 1_000_000
 
 
 def to_manifold(surface: TriangleMesh) -> Manifold:
-    """The solid of a closed mesh, whose faces run counter-clockwise seen from outside.
+    """The solid that a closed mesh bounds; its faces run counter-clockwise as seen from outside.
 
     Raises:
-        MeshingError: it is not closed.
+        MeshingError: the mesh is not closed.
     """
     from manifold3d import Error, Manifold, Mesh64
 
@@ -71,12 +73,14 @@ def to_manifold(surface: TriangleMesh) -> Manifold:
 
 
 def mesh_manifold(solid: MeshSolid) -> Manifold | None:
-    """The mesh of a `MeshSolid`; if it crosses itself the union of its parts, or None where a part
-    crosses itself or is a cavity.
+    """The solid of a `MeshSolid`. If its mesh intersects itself, that is the union of the
+    components of the mesh; None if a component intersects itself or is a cavity.
 
-    Parts in contact up to rounding would be left with gaps as thin as that, which have an area, or
-    pass through each other: if the union has more than the boundary of the solid, or triangles of
-    it cross, parts are grown by a tiny length first.
+    Components that are in contact only up to rounding would leave gaps of that thickness, with
+    walls that add to the area, or pass through each other. So if the area of the union differs from
+    that of the solid's boundary, or if triangles of the union cross, the faces of all components
+    are first moved outwards by a tiny length. If that does not help either, the first union of the
+    right area is returned, or None.
 
     Raises:
         MeshingError: more than two faces meet at an edge.
@@ -100,8 +104,8 @@ def mesh_manifold(solid: MeshSolid) -> Manifold | None:
             return None
     first_union: Manifold | None = None
     for length in (0.0, _GROWTH * surface.size):
-        union = Manifold.batch_boolean([_grow_part(part, length) for part in parts], OpType.Add)
-        if abs(union.surface_area() - surface.area) <= _SAME_AREA * surface.area:
+        union = Manifold.batch_boolean([_grown_part(part, length) for part in parts], OpType.Add)
+        if abs(union.surface_area() - surface.area) <= _AREA_TOLERANCE * surface.area:
             first_union = first_union or union
             boundary = from_manifold(union)
             if not len(intersecting_faces(boundary.vertices, boundary.faces)):
@@ -109,26 +113,28 @@ def mesh_manifold(solid: MeshSolid) -> Manifold | None:
     return first_union
 
 
-def _grow_part(part: Manifold, length: float) -> Manifold:
+def _grown_part(part: Manifold, length: float) -> Manifold:
+    """The part, its faces moved outwards by a length (`grown`); the same part if the length is
+    0."""
     return part if length == 0 else to_manifold(grown(from_manifold(part), length))
 
 
 def grown(surface: TriangleMesh, length: float) -> TriangleMesh:
-    """A closed surface offset outwards: vertices are moved so that faces move by about a length.
-    Components that touch, up to rounding, then overlap."""
+    """A closed surface, offset outwards: vertices are moved along their normals, so that faces move
+    by about `length`. Components that touch up to rounding overlap then."""
     x, faces = surface.vertices, surface.faces
     mesh = trimesh.Trimesh(x, faces, process=False)
     normals = np.array(mesh.vertex_normals)
-    slant = np.ones(len(normals))
+    cosine = np.ones(len(normals))
     for k in range(3):
-        np.minimum.at(slant, faces[:, k], row_dots(normals[faces[:, k]], mesh.face_normals))
-    return TriangleMesh(x + normals * (length / np.maximum(slant, _MIN_SLANT))[:, None], faces)
+        np.minimum.at(cosine, faces[:, k], row_dots(normals[faces[:, k]], mesh.face_normals))
+    return TriangleMesh(x + normals * (length / np.maximum(cosine, _MIN_COSINE))[:, None], faces)
 
 
 def without_short_edges(solid: Manifold, length: float) -> Manifold:
-    """A solid without short edges and slivers, whose removal moves its surface by up to a length;
-    or the solid itself, if its volume would change by more than that explains: where slivers are as
-    thin as rounding, manifold3d has been seen to lose a part."""
+    """A solid without short edges and slivers; removing these moves its surface by up to `length`.
+    If the volume changes by more than such moves explain, the solid is returned as it is:
+    manifold3d may lose a part where slivers are as thin as rounding."""
     simpler = solid.simplify(length)
     max_change = 2 * length * solid.surface_area()
     return simpler if abs(simpler.volume() - solid.volume()) <= max_change else solid
@@ -142,7 +148,7 @@ def from_manifold(manifold: Manifold) -> TriangleMesh:
 
 
 def box_manifold(lower: FloatArray, upper: FloatArray) -> Manifold:
-    """The box between two corners (3,)."""
+    """The box between two corners (3,) as a solid."""
     from manifold3d import Manifold
 
     x, y, z = (float(v) for v in upper - lower)
@@ -153,18 +159,21 @@ def box_manifold(lower: FloatArray, upper: FloatArray) -> Manifold:
 def extruded_manifold(
     outline: Outline, height: float, twist: float, taper: float, tolerance: float
 ) -> Manifold:
-    """The outline over 0 <= z <= height, its end turned by `twist` degrees and scaled by `taper`.
+    """The outline over 0 <= z <= height as a solid. Its end is turned by `twist` degrees and scaled
+    by the factor `taper`.
 
-    Without a twist the faces are flat, and exact. Otherwise the vertices lie on the surface, and
-    faces within `tolerance` of it. Proof: a triangle of edges of L at most, mapped, is within M
-    L^2/6 of the mapped triangle, where M bounds second derivatives of the map along lines (it lies
-    within L/sqrt(3) of a point). For turning by a and scaling by k within a unit of length, at
-    distances up to R from the axis, with q = max(1, taper), M = q (a + a^2 R) + k (1 + 2 a R).
+    Without a twist the faces are flat, and exact. With a twist the vertices lie on the surface, and
+    faces are within `tolerance` of it. Proof: let a triangle have edges of at most L, let a map
+    take it to the curved surface, and let M bound the second derivatives of the map along lines.
+    The triangle lies in a ball of radius L/sqrt(3), so that linear interpolation of the map between
+    the corners errs by at most M/2 times the square of that radius, M L^2/6. Let the map turn by
+    the angle a and change the scale by k within a unit of length, at distances up to R from the
+    axis; then M = q (a + a^2 R) + k (1 + 2 a R), with q = max(1, taper).
 
     Raises:
-        MeshingError: so fine that it has millions of faces.
+        MeshingError: the tolerance is so small that there are millions of faces.
     """
-    section, scale = _section(outline)
+    section, scale = _cross_section(outline)
     inverse_scale = (1 / scale, 1 / scale, 1 / scale)
     if twist == 0:
         return section.extrude(height * scale, 0, 0.0, (taper, taper)).scale(inverse_scale)
@@ -182,6 +191,8 @@ def extruded_manifold(
         )
 
     def mapped(points: FloatArray) -> FloatArray:
+        """Points (n, 3) of the straight extrusion, turned and scaled in proportion to their
+        height."""
         z = points[:, 2] / scale
         factor, c, s = 1 + growth * z, np.cos(rate * z), np.sin(rate * z)
         x, y = factor * points[:, 0], factor * points[:, 1]
@@ -191,11 +202,12 @@ def extruded_manifold(
 
 
 def revolved_manifold(outline: Outline, tolerance: float) -> Manifold:
-    """The outline in (r, z) about the z axis, its vertices on the surface and its faces within
-    `tolerance` of it: n segments around leave a sagitta of r (1 - cos(pi/n)) <= r (pi/n)^2/2.
+    """The outline in the (r, z) plane, revolved about the z axis, as a solid. Vertices lie on the
+    surface, and faces are within `tolerance` of it: between n segments around, the largest distance
+    of a chord from its arc is r (1 - cos(pi/n)) <= r (pi/n)^2/2.
 
     Raises:
-        MeshingError: so fine that it has millions of faces.
+        MeshingError: the tolerance is so small that there are too many segments.
     """
     radius = max(float(loop[:, 0].max()) for loop in outline)
     segments = 4 * math.ceil(0.25 * math.pi * math.sqrt(radius / (2 * tolerance)))
@@ -204,12 +216,12 @@ def revolved_manifold(outline: Outline, tolerance: float) -> Manifold:
             f"an outline of radius {radius:g} revolved within {tolerance:.3g} has {segments:,} "
             "segments around: choose a larger `tolerance`"
         )
-    section, scale = _section(outline)
+    section, scale = _cross_section(outline)
     return section.revolve(max(16, segments)).scale((1 / scale, 1 / scale, 1 / scale))
 
 
-def _section(outline: Outline) -> tuple[CrossSection, float]:
-    """The cross-section of an outline, times a scale for which it is not rounded
+def _cross_section(outline: Outline) -> tuple[CrossSection, float]:
+    """The cross-section of an outline times a scale for which it is not rounded
     (`scale_for_clipper`), and that scale."""
     from manifold3d import CrossSection
 
@@ -220,11 +232,12 @@ def _section(outline: Outline) -> tuple[CrossSection, float]:
 def volume_manifold(
     volume: Volume, lower: FloatArray, upper: FloatArray, tolerance: float
 ) -> Manifold:
-    """The part of a volume in a box: polytopes as they are, balls as polyhedra whose vertices lie
-    on the sphere and whose faces are within `tolerance` of it.
+    """The part of a volume in the box from `lower` to `upper`, as a solid. Polytopes are exact; a
+    ball becomes a polyhedron whose vertices lie on the sphere and whose faces are within
+    `tolerance` of it.
 
     Raises:
-        MeshingError: another volume, or a ball so fine that it has millions of faces.
+        MeshingError: the volume is of another kind, or a ball would have millions of faces.
     """
     from manifold3d import Manifold
 
@@ -243,15 +256,24 @@ def volume_manifold(
             manifold = manifold.trim_by_plane((-x, -y, -z), -h)
         return manifold
     if isinstance(volume, Ball):
-        return manifold ^ _ball(volume, tolerance)
+        return manifold ^ _ball_manifold(volume, tolerance)
     raise MeshingError(f"a {type(volume).__name__} cannot cut a mesh: give a box or a ball")
 
 
-def _ball(ball: Ball, tolerance: float) -> Manifold:
-    """A geodesic polyhedron of n segments around. The octahedron's faces are cut into equilateral
-    triangles and blown up: an edge is at most sqrt(3) times as long as the mean of those along its
-    sides, r pi/(2 n/4), and a circle through its corners of radius edge/sqrt(3) has a sagitta of
-    half its square over r."""
+def _ball_manifold(ball: Ball, tolerance: float) -> Manifold:
+    """A geodesic polyhedron whose vertices lie on the sphere and whose faces are within `tolerance`
+    of it.
+
+    Proof. Let n be the number of segments around, and r the radius. The octahedron's faces are
+    divided into equilateral triangles, whose vertices are then moved onto the sphere. The mean
+    length of edges along a side of the octahedron is (r pi/2)/(n/4) = 2 pi r/n, and all edges are
+    at most sqrt(3) times as long. So the circle through the corners of a triangle has a radius of
+    at most edge/sqrt(3) <= 2 pi r/n, and the triangle is at most half of the square of that radius,
+    over r, from the sphere.
+
+    Raises:
+        MeshingError: so fine that it has millions of faces.
+    """
     from manifold3d import Manifold
 
     r = ball.radius
@@ -269,25 +291,27 @@ def _ball(ball: Ball, tolerance: float) -> Manifold:
 
 # Readers such as trimesh merge points that are nearer than 1e-8 in the file's unit.
 _MIN_STEP = 2.0**-26
-# In units of that distance larger coordinates are beyond the integers of readers.
+# Coordinates may be at most this large: divided by that distance, larger ones are beyond the
+# integers of readers.
 _LARGEST = 2.0**36
-# A part has to be at least this many steps long.
-_MIN_PART_STEPS = 1e4
-# Where the snapped mesh does not pass its checks, it is simplified within these numbers of steps.
+# A part has to be at least this many steps of the grid long.
+_MIN_STEPS_ACROSS = 1e4
+# If the mesh on the grid does not pass its checks, it is simplified, moving it by up to this many
+# steps of the grid; the numbers are tried in turn.
 _SIMPLIFY_STEPS = (4, 32)
-# Where triangles cross, it is mended within this number of steps.
+# Where triangles cross, the mesh is mended, moving it by up to this many steps of the grid.
 _REPAIR_STEPS = 32
 
 
 class ClosedMesh(trimesh.Trimesh):
-    """A trimesh.Trimesh whose `export` writes a closed file if the mesh is closed, or raises a
+    """A trimesh.Trimesh whose `export` writes a closed file if the mesh is closed, or else raises a
     MeshingError.
 
-    Files hold single precision, in which the ends of short edges coincide and slivers flip.
-    Vertices are rounded to a grid that single precision holds, edges without a length are
-    contracted, and it is checked that the result is closed and does not intersect itself. The mesh
-    itself stays as it is, in double precision; meshes that are not closed are written by trimesh as
-    they are. It is displayed as the trimesh.Trimesh that it is, since it may be open.
+    Files hold single precision, in which the ends of short edges coincide and slivers flip. So
+    vertices are rounded to a grid that single precision holds, and edges without a length are
+    contracted; then it is checked that the result is closed and does not intersect itself. The mesh
+    in memory stays in double precision, unchanged. A mesh that is not closed is written as trimesh
+    writes it. Its repr is that of a trimesh.Trimesh, since it may be open.
     """
 
     def __repr__(self) -> str:
@@ -295,7 +319,7 @@ class ClosedMesh(trimesh.Trimesh):
 
     @classmethod
     def of(cls, mesh: trimesh.Trimesh) -> ClosedMesh:
-        """A copy of any mesh."""
+        """A copy of any mesh as a ClosedMesh."""
         copied = trimesh.Trimesh.copy(mesh)
         copied.__class__ = cls
         return cast("ClosedMesh", copied)
@@ -306,12 +330,12 @@ class ClosedMesh(trimesh.Trimesh):
         return copied
 
     def export(self, file_obj: Any = None, file_type: str | None = None, **options: Any) -> Any:
-        """Write the mesh as trimesh.Trimesh.export does. Metadata is not written: its arrays fit in
-        no file.
+        """Write the mesh as trimesh.Trimesh.export does. Metadata is not written: no file format
+        holds its arrays.
 
         Raises:
-            MeshingError: the mesh is closed, and would not be in the file: components that touch,
-                or that are too small or too far from the origin for single precision.
+            MeshingError: the mesh is closed, but would not be in the file: components touch, or the
+                mesh is too small or too far from the origin for single precision.
         """
         written = trimesh.Trimesh.copy(self)
         written.metadata.clear()
@@ -327,15 +351,16 @@ class ClosedMesh(trimesh.Trimesh):
 
 
 def _grid_spacing(x: FloatArray) -> float:
-    """The distance between neighbors of the grid that points are rounded to: a power of two, of
-    which single precision, with its 24 bits, holds all multiples as large as the points.
+    """The spacing of the grid to which vertices `x` (n, 3) are rounded. It is a power of two, and
+    so large that single precision, which has 24 bits, holds all multiples of it up to the largest
+    coordinate.
 
     Raises:
-        MeshingError: it is too coarse for them.
+        MeshingError: the grid is too coarse for the part, or coordinates are too large.
     """
     largest, size = float(np.abs(x).max()), float(np.ptp(x, axis=0).max())
     step = max(math.ldexp(1.0, math.frexp(largest)[1] - 24), _MIN_STEP)
-    if size < _MIN_PART_STEPS * step or not largest <= _LARGEST:
+    if size < _MIN_STEPS_ACROSS * step or not largest <= _LARGEST:
         raise MeshingError(
             f"the part is {size:.3g} long, at up to {largest:.3g} from the origin, where a file "
             f"tells points apart that are {step:.2g} from each other, up to {_LARGEST:.2g}: move "
@@ -345,8 +370,13 @@ def _grid_spacing(x: FloatArray) -> float:
 
 
 def _quantize(mesh: trimesh.Trimesh, step: float) -> trimesh.Trimesh:
-    """The mesh with vertices on the grid; if that does not pass its checks, mended where it fails,
-    or simplified."""
+    """The mesh with its vertices rounded to the grid of spacing `step`. If triangles cross then,
+    the mesh is mended there; if it still does not pass its checks, it is simplified. A mesh with
+    colors or textures is neither mended nor simplified.
+
+    Raises:
+        MeshingError: nothing makes the mesh on the grid closed and free of intersections.
+    """
     original = TriangleMesh(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64))
     x, faces, is_kept = _merge_on_grid(original, step)
     is_plain = not cast("Any", mesh.visual).defined
@@ -372,8 +402,8 @@ def _quantize(mesh: trimesh.Trimesh, step: float) -> trimesh.Trimesh:
 
 
 def _simplify_until_valid(original: TriangleMesh, step: float) -> TriangleMesh | None:
-    """The mesh on the grid without slivers, simplified by manifold3d; None if that does not help
-    either."""
+    """The mesh on the grid of spacing `step`, simplified by manifold3d, without slivers and without
+    triangles that cross; None if no simplification leads to that."""
     for steps in _SIMPLIFY_STEPS:
         simpler = from_manifold(without_short_edges(to_manifold(original), steps * step))
         x, faces, is_kept = _merge_on_grid(simpler, step)
@@ -388,8 +418,12 @@ def _simplify_until_valid(original: TriangleMesh, step: float) -> TriangleMesh |
 
 
 def _merge_on_grid(surface: TriangleMesh, step: float) -> tuple[FloatArray, IntArray, BoolArray]:
-    """The vertices on the grid; the faces, between the first of the vertices at each point; and
-    which faces still have three corners."""
+    """Round the vertices of a surface to the grid of spacing `step`, and join those that coincide.
+
+    Returns the rounded vertices (n, 3), coinciding ones included; the faces (m, 3), in which the
+    first of the vertices at each point stands for all of them; and a mask (m,) of the faces that
+    still have three different corners.
+    """
     grid = np.round(surface.vertices / step)
     x = grid * step
     # Vertices at the same point, by their coordinates one after the other.
@@ -405,12 +439,13 @@ def _merge_on_grid(surface: TriangleMesh, step: float) -> tuple[FloatArray, IntA
 def _resolve_after_rounding(
     rounded: TriangleMesh, original: TriangleMesh, length: float
 ) -> TriangleMesh | None:
-    """The rounded surface mended where triangles cross, moved by no more than a length; None if
-    none cross, or if mending does not help and triangles of the original cross too, as those of a
-    repaired mesh may.
+    """The rounded surface, mended where triangles cross; mending moves it by no more than `length`.
+    None if no triangles cross; and if mending fails and triangles of the original surface cross
+    too, as those of a repaired mesh may.
 
     Raises:
-        LocalizedMeshingError: it is not closed, or triangles cross.
+        LocalizedMeshingError: the rounded surface is not closed; or mending fails, although no
+            triangles of the original surface cross.
     """
     check_manifold(rounded.faces, rounded.vertices)
     try:

@@ -1,17 +1,18 @@
-"""Meshes solids: closed meshes of smooth level sets, cut by volumes and combined by Boolean
+"""Meshes of solids: closed meshes of smooth level sets, cut by volumes and combined by Boolean
 operations.
 
 A solid is the set of points where a function is at most a level. A wall |g| <= w is not meshed as
-{|g| - w = 0}, of which marching cubes makes hundreds of pieces where cells are thicker than the
-wall. It is {g <= w} minus {g <= -w}, two smooth surfaces which do not meet, in a box a little
-larger than the clip; and it is cut by the clip itself. Unions, intersections and complements
-likewise are those of the operands' meshes, so that the creases where operands meet are edges of the
-mesh. Creases of a single function, such as a cylinder's, are chamfered within the tolerance.
+the level set {|g| = w}, which marching cubes breaks into hundreds of pieces if cells are thicker
+than the wall. It is meshed as {g <= w} minus {g <= -w}, with two smooth surfaces that do not meet,
+in a box a little larger than the clip; the result is then cut by the clip. Likewise unions,
+intersections and complements are made of the meshes of their operands, so that the creases where
+operands meet are edges of the mesh. Creases of a single function, such as a cylinder's, are
+chamfered within the tolerance.
 
-Offsets of meshes are left as cells cut them: they have creases everywhere, beside which moved and
-refined triangles intersected each other. They get small cells, and manifold3d merges coplanar
-triangles. The few triangles of the whole mesh that are then too far off the level are cut there
-(`outlier_projection`).
+Offsets of meshes are meshed differently, without moving vertices and refining triangles: they have
+creases everywhere, beside which moved and refined triangles would intersect each other. Their cells
+are small, and manifold3d merges coplanar triangles afterwards. If a few triangles of the whole mesh
+are still too far from the level, these are cut (`outlier_projection`).
 """
 
 from __future__ import annotations
@@ -94,57 +95,59 @@ __all__ = [
     "solid_value_range",
 ]
 
-# The size of cells for offsets of meshes, in tolerances; and the number of secant steps for roots
-# on their edges.
-_CELLS_OF_OFFSET, _SECANTS = 6.0, 2
-# In lattices of more cells than this, the region where other operands leave nothing is computed at
-# once.
+# For offsets of meshes: the size of cells, in tolerances; and the number of secant steps that find
+# the level on an edge of a cell.
+_OFFSET_CELLS, _SECANT_STEPS = 6.0, 2
+# In lattices of at least this many cells, cells are left out at once in which the other operands
+# of an intersection leave nothing.
 _MANY_CELLS = 100_000
-# The distances, in tolerances, by which merging of coplanar triangles may move surfaces of offsets,
-# of which the first valid one is used; and the distance by which the repair of intersections may
-# move them after merging.
-_JOIN_TOLERANCES, _REPAIR_TOLERANCE = (0.5, 0.25, 0.1), 0.5
-# Triangles of offsets are cut in three where their centers are farther off the level, in
-# tolerances; and how often.
-_FAR_OFF, _TIMES_CUT = 1.8, 2
+# How far surfaces of offsets may be moved, in tolerances: by merging coplanar triangles, tried in
+# this order until the result can be mended; and by the mending of crossing triangles afterwards.
+_MERGED_WITHIN, _MENDED_WITHIN = (0.5, 0.25, 0.1), 0.5
+# Triangles of offsets are cut in three if their centers are farther from the level than the first,
+# in tolerances; the second is the number of rounds.
+_FAR_OFF, _SPLITS = 1.8, 2
 
 # Meshes the level set of an angle, which ends at its curve: field, level -> vertices and faces.
 AngleMesher = Callable[[SolidAngle, float], TriangleMesh]
 
 
 IntersectedOperands: TypeAlias = tuple[tuple[Solid, float], ...]
-"""Solids, with levels, that the meshed solid will be intersected with; where one is proved empty,
-nothing need be meshed.
+"""Solids, with levels, that the meshed solid will be intersected with. Where one of these solids is
+proved to have no points, nothing need be meshed.
 
-Proof for a tree of unions, intersections and complements. Inside a complement, only operands
-without complements are passed on, from the intersection that has the complement as an operand;
-elsewhere, the operands of all enclosing intersections. (1) Omit nothing inside complements. Unions
-and intersections are monotone, so every meshed node is a subset of its true solid. At a point where
-something is omitted, an operand of an enclosing intersection is truly empty, so is its mesh, so is
-the intersection: correct. (2) Omit inside complements too. At such a point, a complement-free
-operand of the intersection that contains the complement is truly empty, and by (1) its mesh is;
-again the intersection is correctly empty.
+Proof for a tree of unions, intersections and complements. Outside of complements, these are the
+operands of all intersections around the meshed solid. Inside a complement, they are only the
+operands without complements of the intersection that the complement is an operand of. "Omitted"
+means: not meshed, and so left empty. (1) Let nothing inside complements be omitted. Unions and
+intersections are monotone, so the mesh of every node is a subset of its true solid. At a point
+where something is omitted, an operand of an intersection around it truly has no points. So its mesh
+has none, and neither has the mesh of the intersection, which is correct. (2) Now let parts inside
+complements be omitted too. At such a point, an operand without complements of the intersection that
+contains the complement truly has no points. By (1) its mesh has none, so the mesh of the
+intersection is correct there as well.
 """
 
 
 @dataclass
 class CsgMesher:
-    """Meshes solids in a box from `lower` to `upper`, (3,) each.
+    """Meshes solids in the box from `lower` to `upper`, (3,) each.
 
-    tolerance: a length, at the midpoints of edges and the centers of faces.
+    tolerance: a length, for midpoints of edges and centers of faces.
     spacing: the largest size of cells.
     per_wave: the smallest number of cells along a wave (`Field.min_wavelength`); None for no such
         limit.
-    mesh_angle: meshes level sets of angles, which end at a curve.
+    mesh_angle: meshes a level set of an angle, which ends at a curve.
     most_faces: the largest number of triangles of each level set.
+    report: receives messages about the progress.
     evaluations: the number of evaluations of fields so far, in points.
-    levels: number of level sets meshed so far.
-    smallest_cell: the smallest spacing of these level sets.
+    levels: the number of level sets meshed so far.
+    smallest_cell: the smallest size of cells used for them.
     uploads: the prepared fields that were meshed so far.
-    intersected_with: solids that everything meshed next is intersected with (see
-        `IntersectedOperands`).
-    irrelevant_region_cache: the operands and the region of the last call that computed where other
-        operands leave nothing.
+    intersected_with: the solids that everything meshed next is intersected with
+        (`IntersectedOperands`).
+    irrelevant_region_cache: the operands, and the region in which they leave nothing, of the last
+        call that computed such a region.
     """
 
     lower: FloatArray
@@ -163,8 +166,8 @@ class CsgMesher:
     irrelevant_region_cache: tuple[IntersectedOperands, IrrelevantRegion] | None = None
 
     def mesh_sublevel(self, solid: Solid, level: float) -> Manifold:
-        """The points of the box where a solid's function is at most `level`; the result outside of
-        the box has no meaning.
+        """The points of the box where the function of `solid` is at most `level`. Outside of the
+        box the result has no meaning.
 
         Raises:
             MeshingError: a part cannot be meshed.
@@ -176,17 +179,17 @@ class CsgMesher:
             if apart is not None:
                 return self.mesh_sublevel(apart, 0.0)
             reduced = drop_cancelled_operands(flatten_csg(solid), level)
-            return Manifold() if reduced is None else self._joined(reduced, level)
+            return Manifold() if reduced is None else self._mesh_boolean(reduced, level)
         if isinstance(solid, Complement):  # -f <= c where f >= -c
-            return self._box_manifold() - self.mesh_sublevel(solid.field, -level)
+            return self._whole_box() - self.mesh_sublevel(solid.field, -level)
         if isinstance(solid, OffsetSolid):
             return self.mesh_sublevel(solid.field, level + solid.distance)
         if isinstance(solid, BandSolid):
-            return self._wall(solid, level)
+            return self._mesh_wall(solid, level)
         if isinstance(solid, SublevelSolid) and isinstance(solid.field, Solid):
             return self.mesh_sublevel(solid.field, level)
         if isinstance(solid, TransformedSolid) and not is_single_level_set(solid.field):
-            return self._image(solid, level)
+            return self._mesh_transformed(solid, level)
         if isinstance(solid, Cuboid) and solid.radius == 0 and level <= 0:
             half = 0.5 * np.array(solid.sides) + level
             return box_manifold(-half, half) if (half > 0).all() else Manifold()
@@ -202,71 +205,76 @@ class CsgMesher:
         if isinstance(solid, Tube):
             return tube_manifold(solid, level, self.tolerance)
         if isinstance(solid, MeshSolid):
-            return (mesh_manifold(solid) if level == 0 else None) or self._offset(solid, level)
+            return (mesh_manifold(solid) if level == 0 else None) or self._mesh_offset(solid, level)
         if isinstance(solid, Plane):
             x, y, z = solid.normal
-            return self._box_manifold().trim_by_plane((-x, -y, -z), -(solid.distance + level))
+            return self._whole_box().trim_by_plane((-x, -y, -z), -(solid.distance + level))
         return to_manifold(self.mesh_smooth_level(solid, level)[0])
 
-    def _joined(self, solid: BooleanSolid, level: float) -> Manifold:
-        """The mesh of a union, or of an intersection, from which complements are cut away."""
+    def _mesh_boolean(self, solid: BooleanSolid, level: float) -> Manifold:
+        """The mesh of {solid <= level}, of a union or an intersection. Complements in an
+        intersection are meshed as the solids that are cut away."""
         from manifold3d import Manifold, OpType
 
-        numbers = range(len(solid.parts))
+        indices = range(len(solid.parts))
         if solid.is_union:
             return Manifold.batch_boolean(
-                [self._part(solid, k, level) for k in numbers], OpType.Add
+                [self._mesh_operand(solid, k, level) for k in indices], OpType.Add
             )
-        cut = [k for k in numbers if isinstance(solid.parts[k], Complement)]
-        parts = [self._part(solid, k, level) for k in numbers if k not in cut]
-        common = Manifold.batch_boolean(parts, OpType.Intersect) if parts else self._box_manifold()
-        away = [self._part(solid, k, level) for k in cut]
-        return Manifold.batch_boolean([common, *away], OpType.Subtract)
+        complements = [k for k in indices if isinstance(solid.parts[k], Complement)]
+        parts = [self._mesh_operand(solid, k, level) for k in indices if k not in complements]
+        common = Manifold.batch_boolean(parts, OpType.Intersect) if parts else self._whole_box()
+        cut_away = [self._mesh_operand(solid, k, level) for k in complements]
+        return Manifold.batch_boolean([common, *cut_away], OpType.Subtract)
 
-    def _part(self, solid: BooleanSolid, number: int, level: float) -> Manifold:
-        """The mesh of one operand of a union or an intersection: in an intersection only where the
-        other operands may leave something of it (`IntersectedOperands`). For a complement in an
-        intersection, the solid that is cut away."""
+    def _mesh_operand(self, solid: BooleanSolid, number: int, level: float) -> Manifold:
+        """The mesh of operand `number` of a union or an intersection; for a complement in an
+        intersection, the mesh of the solid that is cut away. In an intersection the operand need be
+        meshed only where the other operands may leave something of it (`IntersectedOperands`)."""
         previous, part = self.intersected_with, solid.parts[number]
         if not solid.is_union:
-            beside = [operand for operand in solid.parts if operand is not part]
+            others = [operand for operand in solid.parts if operand is not part]
             if isinstance(part, Complement):
                 self.intersected_with = tuple(
-                    (operand, level) for operand in beside if _has_no_complement(operand)
+                    (operand, level) for operand in others if _is_complement_free(operand)
                 )
                 part, level = part.field, -level
             else:
-                self.intersected_with = (*previous, *((operand, level) for operand in beside))
+                self.intersected_with = (*previous, *((operand, level) for operand in others))
         try:
             return self.mesh_sublevel(part, level)
         finally:
             self.intersected_with = previous
 
-    def _closed_level_set(self, function: LevelFunction, lattice: BccLattice) -> TriangleMesh:
-        """A level set in a box. If there are many cells, only those where the other operands may
-        leave something are meshed. If there are few, all are meshed, so that copies of a surface
-        are the same bit by bit; unless that fails, as it may where nothing is left: a function of
-        the angle about an axis jumps there, and other functions have no value beyond a surface."""
-        elsewhere: IrrelevantRegion | None = None
+    def _mesh_level_set(self, function: LevelFunction, lattice: BccLattice) -> TriangleMesh:
+        """The level set of `function` in the cells of `lattice`, as a closed mesh.
+
+        If there are many cells, those in which the other operands are proved to leave nothing are
+        left out. If there are few, all are meshed, so that copies of a surface are the same bit by
+        bit. Should that fail, cells are left out as well: a function may jump where nothing is
+        left, as the angle about an axis does, or have no value beyond a surface.
+        """
+        region: IrrelevantRegion | None = None
         if math.prod(lattice.counts.tolist()) < _MANY_CELLS:
             try:
                 return mesh_closed_surface(function, lattice, self.tolerance, self.report)
-            except MeshingError as wrong:
-                elsewhere = self._irrelevant_region()
-                if elsewhere is None:
+            except MeshingError as error:
+                region = self._empty_region()
+                if region is None:
                     raise
-                self.report(f"{wrong}; so only where the other parts leave something")
+                self.report(f"{error}; so only where the other parts leave something")
         return mesh_closed_surface(
             function,
             lattice,
             self.tolerance,
             self.report,
-            irrelevant=elsewhere or self._irrelevant_region(),
+            irrelevant=region or self._empty_region(),
         )
 
-    def _irrelevant_region(self) -> IrrelevantRegion | None:
-        """The region where the other operands are proved to leave nothing; None if there are no
-        other operands. The two sides of a wall have the same region."""
+    def _empty_region(self) -> IrrelevantRegion | None:
+        """The region in which the other operands, `intersected_with`, are proved to leave nothing;
+        None if there are no other operands. Both sides of a wall use the region computed for the
+        first."""
         if not self.intersected_with:
             return None
         if (
@@ -277,20 +285,23 @@ class CsgMesher:
         functions = [self.function(solid, level) for solid, level in self.intersected_with]
 
         def clearance(points: FloatArray) -> FloatArray:
-            lengths = np.zeros(len(points))
+            """(n,) for each point (n, 3) the radius of a ball about it in which some operand is
+            proved to leave nothing; 0 if none is."""
+            radii = np.zeros(len(points))
             for solid in functions:
                 outside = np.flatnonzero(solid.values(points) > 0)
-                lengths[outside] = np.maximum(lengths[outside], solid.clearance(points[outside]))
-            return lengths
+                radii[outside] = np.maximum(radii[outside], solid.clearance(points[outside]))
+            return radii
 
         region = IrrelevantRegion(clearance)
         self.irrelevant_region_cache = self.intersected_with, region
         return region
 
     def mesh_smooth_level(self, field: Field, level: float) -> tuple[TriangleMesh, bool]:
-        """The boundary of {f <= level} as one level set, and whether it is the whole boundary: if
-        not, it is closed outside of the box in a way that has no meaning."""
-        hull = _hull(field, level)
+        """The boundary of {f <= level}, meshed as one level set. Also whether it is the whole
+        boundary: if not, it was closed outside of the box, in a way that has no meaning.
+        """
+        hull = _finite_extent(field, level)
         lower, upper = self.lower, self.upper
         is_whole = False
         if hull is not None:
@@ -307,7 +318,7 @@ class CsgMesher:
         function = self.function(_underlying_field(field), level)
         self.report(f"level {level:g} of {type(field).__name__} in cells of {spacing:.3g}")
         lattice = BccLattice.covering_box(lower, upper, spacing, layers=2)
-        surface = self._closed_level_set(function, lattice)
+        surface = self._mesh_level_set(function, lattice)
         self.evaluations += function.evaluations
         self.levels += 1
         return surface, is_whole
@@ -318,12 +329,19 @@ class CsgMesher:
             field, level, most_faces=self.most_faces, uploads=self.uploads
         )
 
-    def _box_manifold(self) -> Manifold:
+    def _whole_box(self) -> Manifold:
+        """A box that is a little larger than the meshed one, which stands for all of space."""
         pad = 1e-3 * (self.upper - self.lower)
         return box_manifold(self.lower - pad, self.upper + pad)
 
-    def _wall(self, wall: BandSolid, level: float) -> Manifold:
-        """The mesh of the points where a field is within half_width + level of the wall's level."""
+    def _mesh_wall(self, wall: BandSolid, level: float) -> Manifold:
+        """The mesh of the points where the wall's field is within half_width + level of the wall's
+        own level.
+
+        Raises:
+            MeshingError: the wall is thinner than the tolerance, or its field has a period and is
+                no solid angle.
+        """
         from manifold3d import Manifold
 
         half = wall.half_width + level
@@ -334,10 +352,10 @@ class CsgMesher:
         if field.period is None:
             inside = SublevelSolid(field)
             if not isinstance(field, Solid):
-                self._check_wall(field, low, high)
+                self._check_wall_thickness(field, low, high)
             return self.mesh_sublevel(inside, high) - self.mesh_sublevel(inside, low)
         if 2 * half >= field.period:
-            return self._box_manifold()
+            return self._whole_box()
         if not isinstance(field, SolidAngle):
             raise MeshingError(
                 f"a solid around a level of {type(field).__name__}, which is angle-valued, cannot "
@@ -345,8 +363,11 @@ class CsgMesher:
             )
         return to_manifold(self._between_angle_levels(field, low, high))
 
-    def _check_wall(self, field: Field, low: float, high: float) -> None:
-        """Raise if a wall is thinner than both of its sides' tolerance: they would meet."""
+    def _check_wall_thickness(self, field: Field, low: float, high: float) -> None:
+        """Raise MeshingError if the wall {low <= field <= high} is about as thin as the tolerance
+        of both of its sides together: they would meet. The thickness is (high - low) over the
+        median length of the gradient, near the wall in a coarse lattice.
+        """
         lattice = BccLattice.covering_box(
             self.lower, self.upper, float((self.upper - self.lower).max()) / 8
         )
@@ -365,8 +386,12 @@ class CsgMesher:
             )
 
     def _between_angle_levels(self, field: SolidAngle, low: float, high: float) -> TriangleMesh:
-        """The surface around the points between two levels of an angle: both levels end at the same
-        vertices, those of the curve."""
+        """The closed surface around the points between two levels of an angle. The surfaces of both
+        levels end at the same vertices, those of the curve.
+
+        Raises:
+            MeshingError: they do not.
+        """
         inner, outer = self.mesh_angle(field, low), self.mesh_angle(field, high)
         count = sum(map(len, field.loops))
         if not np.array_equal(inner.vertices[:count], outer.vertices[:count]):
@@ -377,40 +402,42 @@ class CsgMesher:
         self.levels += 2
         return TriangleMesh(vertices, np.concatenate([outer.faces, index[inner.faces][:, ::-1]]))
 
-    def _offset(self, solid: MeshSolid, level: float) -> Manifold:
-        """The points within a distance of a mesh, or deeper inside than that distance.
+    def _mesh_offset(self, solid: MeshSolid, level: float) -> Manifold:
+        """The mesh of {solid <= level}: the points within the distance `level` of a meshed solid,
+        or if `level` is negative those deeper inside than -level.
 
         Offsets of meshes have creases wherever the mesh has, too many for cells to be refined
-        beside them. So cells are small at once; and since f is a distance, it is linear along their
-        edges except at creases. Then triangles that are nearly in a plane are merged, triangles
-        across a crease are cut, and triangles that pass through each other are mended. Parts
-        thinner than a cell, such as the tip of a knife edge, may be left out: points of them are
-        less than a cell from the level.
+        beside them. So cells are small from the beginning; and since f is a distance, it is linear
+        along their edges except at creases. Then triangles that are nearly in a plane are merged,
+        triangles across a crease are cut, and triangles that pass through each other are mended.
+        Parts thinner than a cell, such as the tip of a knife edge, may be left out: their points
+        are less than a cell from the level.
         """
-        lower, upper = (np.array(end) for end in _finite_hull(solid, level))
+        lower, upper = (np.array(end) for end in _sublevel_bounds(solid, level))
         if not (lower < upper).all():
             return to_manifold(TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64)))
-        cells = min(self.spacing, _CELLS_OF_OFFSET * self.tolerance)
-        self.smallest_cell = min(self.smallest_cell, cells)
-        function = dataclasses.replace(self.function(solid, level), secant_steps=_SECANTS)
-        self.report(f"level {level:g} of a mesh in cells of {cells:.3g}")
-        lattice = BccLattice.covering_box(lower - cells, upper + cells, cells, layers=2)
+        cell_size = min(self.spacing, _OFFSET_CELLS * self.tolerance)
+        self.smallest_cell = min(self.smallest_cell, cell_size)
+        function = dataclasses.replace(self.function(solid, level), secant_steps=_SECANT_STEPS)
+        self.report(f"level {level:g} of a mesh in cells of {cell_size:.3g}")
+        lattice = BccLattice.covering_box(lower - cell_size, upper + cell_size, cell_size, layers=2)
         surface = mesh_closed_surface(function, lattice, self.tolerance, self.report, as_cut=True)
         manifold = to_manifold(surface)
         self.levels += 1
-        for fraction in _JOIN_TOLERANCES:
+        for fraction in _MERGED_WITHIN:
             joined = from_manifold(without_short_edges(manifold, fraction * self.tolerance))
-            joined = split_faces_off_level(function, joined, _FAR_OFF * self.tolerance, _TIMES_CUT)
+            joined = split_faces_off_level(function, joined, _FAR_OFF * self.tolerance, _SPLITS)
             try:
-                surface = resolve_self_intersections(joined, _REPAIR_TOLERANCE * self.tolerance)
+                surface = resolve_self_intersections(joined, _MENDED_WITHIN * self.tolerance)
             except SelfIntersectionError:
                 continue
             break
         self.evaluations += function.evaluations
         return to_manifold(surface)
 
-    def _image(self, solid: TransformedSolid, level: float) -> Manifold:
-        """The image of a solid's mesh under an affine map."""
+    def _mesh_transformed(self, solid: TransformedSolid, level: float) -> Manifold:
+        """The mesh of a transformed solid: the original is meshed in the box that is mapped back,
+        and the mesh is then mapped by the affine map."""
         matrix, offset = np.array(solid.map.matrix), np.array(solid.map.translation_vector)
         ends = np.stack([self.lower, self.upper])
         corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -434,17 +461,18 @@ class CsgMesher:
         return manifold.transform(np.column_stack([matrix, offset]))
 
 
-def _has_no_complement(solid: Solid) -> bool:
-    """Whether a solid has no complement among its operands, as it is meshed."""
+def _is_complement_free(solid: Solid) -> bool:
+    """Whether no complement is meshed for a solid: neither it nor its operands are complements or
+    walls."""
     if isinstance(solid, BooleanSolid):
-        return all(_has_no_complement(operand) for operand in solid.parts)
+        return all(_is_complement_free(operand) for operand in solid.parts)
     if isinstance(solid, TransformedSolid | OffsetSolid):
-        return _has_no_complement(solid.field)
+        return _is_complement_free(solid.field)
     return not isinstance(solid, Complement | BandSolid)
 
 
 def is_single_level_set(solid: Solid) -> bool:
-    """Whether a solid is meshed as one level set."""
+    """Whether a solid is meshed as one level set, not by Boolean operations or with exact edges."""
     if isinstance(solid, SublevelSolid):
         return not isinstance(solid.field, Solid) or is_single_level_set(solid.field)
     if isinstance(solid, TransformedSolid):
@@ -453,14 +481,15 @@ def is_single_level_set(solid: Solid) -> bool:
     return not isinstance(solid, BooleanSolid | Complement | OffsetSolid | BandSolid | with_edges)
 
 
-def _finite_hull(solid: MeshSolid, level: float) -> tuple[FloatArray, FloatArray]:
+def _sublevel_bounds(solid: MeshSolid, level: float) -> tuple[FloatArray, FloatArray]:
+    """The lower and upper corners (3,) of a box that contains {solid <= level}."""
     low, high = cast("Volume", solid.sublevel_extent(level)).bounds()
     return np.array(low), np.array(high)
 
 
-def _hull(field: Field, level: float) -> Volume | None:
-    """A volume that holds {f <= level}, if it has bounds. A domain does not count: a surface that
-    ends there is cut by it."""
+def _finite_extent(field: Field, level: float) -> Volume | None:
+    """A volume with finite bounds that contains {f <= level}; None if no such volume is known. The
+    field's domain does not count, since a surface that ends there is cut by it."""
     if isinstance(field, Solid):
         extent = field.sublevel_extent(level)
     else:
@@ -480,10 +509,11 @@ def _underlying_field(field: Field) -> Field:
 
 @dataclass
 class _DomainExtendedFunction(LevelFunction):
-    """A field continued beyond its domain as it is at the domain's closest point.
+    """A field, continued beyond its domain: outside of the domain it has the value of the closest
+    point of the domain.
 
-    The closest points of two points are no farther from each other than the two are, so that the
-    clearance of the closest point of p holds around p.
+    Proof that the clearance of p's closest point is a clearance of p: the closest points of two
+    points are no farther from each other than the two points are.
     """
 
     def sample(self, points: FloatArray) -> LevelSamples:
@@ -496,6 +526,11 @@ class _DomainExtendedFunction(LevelFunction):
         return super().clearance(self._closest(points))
 
     def _closest(self, points: FloatArray) -> FloatArray:
+        """The closest points (n, 3) of the field's domain.
+
+        Raises:
+            MeshingError: points lie outside of a domain that is neither a box nor a ball.
+        """
         domain = self.field.domain
         if domain is None or self.field.is_global:
             return points
@@ -517,14 +552,15 @@ class _DomainExtendedFunction(LevelFunction):
 
 # Solids cut by volumes.
 
-# Cells across a solid, unless a spacing is given.
-_ACROSS = 24
+# The number of cells across a solid, unless a spacing is given.
+_CELLS_ACROSS = 24
 # How many sizes of cells are tried, and the ratio of each size to the one before.
 _MAX_ATTEMPTS = 3
-_CELL_RATIO = 0.6
-# Where operands were cut by each other, slivers may pass through their neighbors by rounding: how
-# far the surface may be moved to remove them, in tolerances, in the order of the attempts.
-_SLIVER_TOLERANCES = (1e-3, 1e-4, 0.0)
+_CELL_SIZE_RATIO = 0.6
+# Where operands were cut by each other, slivers may pass through their neighbors by rounding. They
+# are removed by moving the surface by up to the first length, in tolerances; if that fails by the
+# next.
+_SLIVERS_WITHIN = (1e-3, 1e-4, 0.0)
 # The margin around an extent, relative to its size.
 _MARGIN = 0.01
 
@@ -533,10 +569,10 @@ _MARGIN = 0.01
 class SolidMeshResult:
     """The closed mesh of a solid.
 
-    spacing: of cells.
-    evaluations: of fields, in points.
-    levels: number of level sets it was made of.
-    size: of its box, to which tolerances relate.
+    spacing: the smallest size of cells.
+    evaluations: the number of evaluations of fields, in points.
+    levels: the number of level sets that it was made of.
+    size: the longest edge of the solid's box; tolerances relate to it.
     """
 
     surface: TriangleMesh
@@ -547,11 +583,16 @@ class SolidMeshResult:
 
 
 def solid_and_level(field: Field, solid: Any, level: float | None) -> tuple[Solid, float]:
-    """The solid that the argument `solid` describes, (low, high) or True, and its level.
+    """The solid that the argument `solid` of `mesh` describes, and its level: {solid <= level} is
+    meant.
+
+    solid: True if the field itself is a solid, or values (low, high), between which the field is
+        inside the solid.
+    level: for a field that is a solid; None for its default level.
 
     Raises:
-        ValueError: it describes no solid, or levels that no solid has.
-        TypeError: it is neither.
+        ValueError: the argument describes no solid, or levels that no solid has.
+        TypeError: it is neither True nor a pair of numbers.
     """
     if solid is True and isinstance(field, Solid):
         level = field.default_level if level is None else as_finite(level, "level")
@@ -567,7 +608,8 @@ def solid_and_level(field: Field, solid: Any, level: float | None) -> tuple[Soli
 
 
 def solid_value_range(field: Field, solid: Any, level: float | None) -> tuple[float, float]:
-    """The values (low, high) between which a solid lies, from the argument that describes it.
+    """The values (low, high) of the field between which a solid lies, from the argument that
+    describes it.
 
     Raises:
         ValueError, TypeError: as `solid_and_level`.
@@ -595,25 +637,32 @@ def mesh_solid(
     check: Callable[[TriangleMesh, float], None],
     report: Callable[[str], None],
 ) -> SolidMeshResult:
-    """The boundary of the points of a volume where a solid's function is at most `level`.
+    """The boundary of {solid <= level} in a volume: the points where the solid's function is at
+    most the level.
 
     volume: None for all of space.
-    angle_mesher: makes, for a tolerance and a spacing, both lengths, a function that meshes level
-        sets of angles.
+    tolerance: how far triangles may be from the surface.
+    spacing: the size of cells, or None; only without it smaller cells are tried if an attempt
+        fails.
+    angle_mesher: given a tolerance and a size of cells, both lengths, returns a function that
+        meshes level sets of angles.
     most_faces: the largest number of triangles of a level set.
-    check: checks a surface, none of whose triangles pass through each other, of a size; last, that
-        it is near the level. Where it is not, in a few places, these are mended
-        (`project_outliers`); where another check fails in known places, or mending is not enough,
-        smaller cells are tried, and half the tolerance: beside a thin part triangles within the
-        tolerance may be anywhere.
+    check: called with a surface, none of whose triangles pass through each other, and the size of
+        the solid's box; raises if the surface fails its checks, the last of which is that it is
+        near the level.
+    report: receives messages about the progress.
+
+    If a few places are too far from the level, these are mended (`project_outliers`). If mending is
+    not enough, or another check fails in known places, smaller cells are tried, and half of the
+    tolerance: beside a thin part, triangles within the tolerance may be anywhere.
 
     Raises:
-        MeshingError: it has no bounds; it is empty; a part cannot be meshed.
+        MeshingError: the solid has no bounds, or is empty, or a part cannot be meshed.
     """
     lower, upper = _bounds(solid, level, volume)
     size = float((upper - lower).max())
-    cells = size / _ACROSS if spacing is None else spacing
-    error = 0.5 * tolerance.at(size)
+    cell_size = size / _CELLS_ACROSS if spacing is None else spacing
+    max_error = 0.5 * tolerance.at(size)
     attempts = _MAX_ATTEMPTS if spacing is None else 1
     per_wave = CELLS_PER_WAVE if spacing is None else None
     uploads = EvaluatorCache()
@@ -621,34 +670,34 @@ def mesh_solid(
     before: MeshingError | None = None
     while True:
         mesher = CsgMesher(
-            lower, upper, error, cells, per_wave, angle_mesher(error, cells),
+            lower, upper, max_error, cell_size, per_wave, angle_mesher(max_error, cell_size),
             most_faces, report, uploads=uploads,
         )  # fmt: skip
         try:
-            surface = _apart(_assemble(mesher, solid, level, volume), error)
+            surface = _without_crossings(_mesh_in_volume(mesher, solid, level, volume), max_error)
             report("checking")
-            surface = _checked(mesher, solid, level, surface, size, check)
+            surface = _check_and_mend(mesher, solid, level, surface, size, check)
             break
-        except TriangleLimitError as large:
+        except TriangleLimitError as too_large:
             if first is None:
                 raise
-            raise first from large  # the first error is the cause
-        except (MissedPartsError, LocalizedMeshingError) as wrong:
-            attempts, first = attempts - 1, first or wrong
-            if not attempts or not is_retry_promising(wrong, before, _CELL_RATIO**attempts):
+            raise first from too_large  # the first error is the cause
+        except (MissedPartsError, LocalizedMeshingError) as failure:
+            attempts, first = attempts - 1, first or failure
+            if not attempts or not is_retry_promising(failure, before, _CELL_SIZE_RATIO**attempts):
                 raise
-            before = wrong
-            cells *= _CELL_RATIO
-            per_wave = CELLS_PER_WAVE * size / (_ACROSS * cells)
-            if isinstance(wrong, LocalizedMeshingError):
-                error *= 0.5
-            report(f"{wrong}; so cells of {cells:.3g}")
+            before = failure
+            cell_size *= _CELL_SIZE_RATIO
+            per_wave = CELLS_PER_WAVE * size / (_CELLS_ACROSS * cell_size)
+            if isinstance(failure, LocalizedMeshingError):
+                max_error *= 0.5
+            report(f"{failure}; so cells of {cell_size:.3g}")
     return SolidMeshResult(
-        surface, min(cells, mesher.smallest_cell), mesher.evaluations, mesher.levels, size
+        surface, min(cell_size, mesher.smallest_cell), mesher.evaluations, mesher.levels, size
     )
 
 
-def _checked(
+def _check_and_mend(
     mesher: CsgMesher,
     solid: Solid,
     level: float,
@@ -656,49 +705,58 @@ def _checked(
     size: float,
     check: Callable[[TriangleMesh, float], None],
 ) -> TriangleMesh:
-    """The checked surface, moved nearer to the level in a few places if necessary.
+    """The surface, if it passes the check. If it fails only because a few places are too far from
+    the level, the surface with these places moved nearer to the level.
+
+    size: the size of the solid's box, which `check` needs.
+    check: as in `mesh_solid`.
 
     Raises:
-        MeshingError: it fails the check.
+        MeshingError: another check fails, or moving does not help.
     """
     try:
         check(surface, size)
-    except OffLevelError as far:
-        mended = project_outliers(
-            mesher.function(solid, level), surface, far.locations, 2 * mesher.tolerance,
+    except OffLevelError as error:
+        moved = project_outliers(
+            mesher.function(solid, level), surface, error.locations, 2 * mesher.tolerance,
             lambda candidate: check(candidate, size),
         )  # fmt: skip
-        if mended is None:
+        if moved is None:
             raise
-        check_manifold(mended.faces, mended.vertices)  # the whole mesh: `check` saw new faces only
-        return mended
+        check_manifold(moved.faces, moved.vertices)  # the whole mesh: `check` saw new faces only
+        return moved
     return surface
 
 
-def apart_of(manifold: Manifold, tolerance: float) -> TriangleMesh:
-    """The surface of the assembled parts, none of whose triangles pass through each other.
+def apart_of(whole: Manifold, tolerance: float) -> TriangleMesh:
+    """The surface of a solid made by Boolean operations; triangles that pass through each other are
+    mended.
+
+    tolerance: a length; mending moves the surface by at most half of it.
 
     Raises:
-        MeshingError: it is empty, or triangles cross.
+        MeshingError: the solid is empty, or mending does not help.
     """
-    return _apart(_Assembly(manifold), tolerance)
+    return _without_crossings(_Assembly(whole), tolerance)
 
 
-def _apart(parts: TriangleMesh | _Assembly, tolerance: float) -> TriangleMesh:
-    """The surface, none of whose triangles pass through each other; for assembled parts it is
-    mended, or without slivers.
+def _without_crossings(parts: TriangleMesh | _Assembly, tolerance: float) -> TriangleMesh:
+    """The surface, mended where triangles pass through each other. Slivers of assembled parts are
+    removed first: if mending then fails, fewer are removed and it is tried again.
+
+    tolerance: a length; mending moves the surface by at most half of it.
 
     Raises:
-        MeshingError: it is empty; a SelfIntersectionError if mending does not help, or if hardly
-            any fewer triangles cross when fewer slivers are removed.
+        MeshingError: the surface is empty; a SelfIntersectionError if mending does not help, or if
+            hardly any fewer triangles cross when fewer slivers are removed.
     """
     raised: SelfIntersectionError | None = None
-    for factor in _SLIVER_TOLERANCES if isinstance(parts, _Assembly) else (0.0,):
+    for factor in _SLIVERS_WITHIN if isinstance(parts, _Assembly) else (0.0,):
         mesh = parts.without_slivers(factor * tolerance) if isinstance(parts, _Assembly) else parts
         if not len(mesh.faces):
             raise MeshingError("the solid is empty: no point of the box is inside")
         try:
-            return resolve_self_intersections(mesh, _REPAIR_TOLERANCE * tolerance)
+            return resolve_self_intersections(mesh, _MENDED_WITHIN * tolerance)
         except SelfIntersectionError as error:
             if not is_retry_promising(error, raised):
                 raise
@@ -708,30 +766,32 @@ def _apart(parts: TriangleMesh | _Assembly, tolerance: float) -> TriangleMesh:
 
 @dataclass(frozen=True)
 class _Assembly:
-    """Assembled parts, in a volume or in all of space."""
+    """A solid made by Boolean operations of meshes, and the volume that it was cut by; None for all
+    of space."""
 
-    manifold: Manifold
+    whole: Manifold
     volume: Volume | None = None
 
     def without_slivers(self, length: float) -> TriangleMesh:
-        """The surface without short edges and slivers, whose removal moves it by up to a length,
-        and without bodies that are only rounding error."""
-        simpler = without_short_edges(self.manifold, length) if length > 0 else self.manifold
+        """The surface without short edges and slivers, whose removal moves it by up to `length`,
+        and without components that are only rounding error."""
+        simpler = without_short_edges(self.whole, length) if length > 0 else self.whole
         surface = drop_degenerate_components(from_manifold(simpler))
-        return surface if self.volume is None else _on_box(surface, self.volume)
+        return surface if self.volume is None else _snap_to_boxes(surface, self.volume)
 
 
-def _assemble(
+def _mesh_in_volume(
     mesher: CsgMesher, solid: Solid, level: float, volume: Volume | None
 ) -> TriangleMesh | _Assembly:
-    """The boundary of the solid in the volume."""
+    """The boundary of {solid <= level} in the volume; None stands for all of space. It is a mesh if
+    it is one whole level set, else an assembly of the meshes of operands."""
     if volume is None and is_single_level_set(solid):
         return mesher.mesh_smooth_level(solid, level)[0]
     lower, upper = mesher.lower, mesher.upper
     manifold = mesher.mesh_sublevel(solid, level)
     mesher.report("putting the parts together")
     if volume is None:
-        volume = Box(_point(lower), _point(upper))
+        volume = Box(_as_tuple(lower), _as_tuple(upper))
         ends = np.array(manifold.bounding_box(), np.float64)
         if (ends[:3] > lower).all() and (ends[3:] < upper).all():
             return _Assembly(manifold, volume)
@@ -740,10 +800,11 @@ def _assemble(
 
 
 def _bounds(solid: Solid, level: float, volume: Volume | None) -> tuple[FloatArray, FloatArray]:
-    """A box that holds the solid within the volume.
+    """The lower and upper corners (3,) of a box that contains the part of {solid <= level} in the
+    volume.
 
     Raises:
-        MeshingError: there is none.
+        MeshingError: there is no finite box, or it is empty.
     """
     lower, upper = np.full(3, -np.inf), np.full(3, np.inf)
     if volume is not None:
@@ -765,12 +826,14 @@ def _bounds(solid: Solid, level: float, volume: Volume | None) -> tuple[FloatArr
     return lower, upper
 
 
-def _point(x: FloatArray) -> tuple[float, float, float]:
+def _as_tuple(x: FloatArray) -> tuple[float, float, float]:
+    """The coordinates of a point (3,) as three floats."""
     return float(x[0]), float(x[1]), float(x[2])
 
 
-def _on_box(surface: TriangleMesh, volume: Volume) -> TriangleMesh:
-    """The surface, with vertices within rounding of a box's faces put onto them."""
+def _snap_to_boxes(surface: TriangleMesh, volume: Volume) -> TriangleMesh:
+    """The surface, with vertices within rounding of a face of a box put onto it. The boxes are
+    `volume` itself, or those that it is the intersection of."""
     boxes = volume.volumes if isinstance(volume, VolumeIntersection) else (volume,)
     vertices = surface.vertices
     for box in boxes:

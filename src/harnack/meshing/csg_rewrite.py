@@ -19,12 +19,13 @@ from harnack.fields.solids.transforms import TransformedSolid
 __all__ = ["drop_cancelled_operands", "factor_common_operands", "flatten_csg"]
 
 SolidAtLevel: TypeAlias = tuple[Solid, float]
-"""A solid's function and a level: the points where it is at most that."""
+"""A solid f and a level: they stand for the points where f is at most the level."""
 
 
 def factor_common_operands(union: BooleanSolid, level: float) -> Solid | None:
-    """Rewrite the solid {union <= level} as {another solid <= 0} with common operands factored out:
-    (A & B) | (A & C) as A & (B | C). None if no two operands have anything in common."""
+    """Factor common operands out of a union: (A & B) | (A & C) becomes A & (B | C). Returns a solid
+    f such that {f <= 0} is {union <= level}; None if no two operands of the union have anything in
+    common."""
     terms = [{_key(*factor): factor for factor in _factors(part, level)} for part in union.parts]
     common_key, times = Counter(key for term in terms for key in term).most_common(1)[0]
     if times < 2:
@@ -32,7 +33,7 @@ def factor_common_operands(union: BooleanSolid, level: float) -> Solid | None:
     sharing = [term for term in terms if common_key in term]
     other_terms = [_intersection(term.values()) for term in terms if common_key not in term]
     shared = {key for key in sharing[0] if all(key in term for term in sharing)}
-    common = [_at_level_zero(*factor) for key, factor in sharing[0].items() if key in shared]
+    common = [_with_level_zero(*factor) for key, factor in sharing[0].items() if key in shared]
     remainders = [[factor for key, factor in term.items() if key not in shared] for term in sharing]
     if all(remainders):
         common.append(_union([_intersection(remainder) for remainder in remainders]))
@@ -41,8 +42,9 @@ def factor_common_operands(union: BooleanSolid, level: float) -> Solid | None:
 
 
 def flatten_csg(solid: BooleanSolid) -> BooleanSolid:
-    """Flatten nested operations of the same kind, unions in a union or intersections in an
-    intersection: everything that is cut away from an operand is then cut away at once."""
+    """The solid with nested operations of the same kind made one, unions in a union or
+    intersections in an intersection. Everything that is cut away from an operand is then cut away
+    at once."""
     parts: list[Solid] = []
     for operand in solid.parts:
         if isinstance(operand, BooleanSolid) and operand.is_union == solid.is_union:
@@ -53,9 +55,12 @@ def flatten_csg(solid: BooleanSolid) -> BooleanSolid:
 
 
 def drop_cancelled_operands(solid: BooleanSolid, level: float) -> BooleanSolid | None:
-    """Rewrite (A | C) - C as A - C among the operands of an intersection: C has nothing but its
-    boundary in common with its complement. Returns None if nothing is left; a union is returned as
-    it is."""
+    """In an intersection, drop what is cut away from its unions anyway: (A | C) - C becomes A - C,
+    since C and its complement have only their boundary in common. Returns None if nothing is left
+    of a union. A solid that is a union itself is returned as it is.
+
+    level: {solid <= level} is meant.
+    """
     if solid.is_union:
         return solid
     cut = {_key(term.field, -level) for term in solid.parts if isinstance(term, Complement)}
@@ -72,7 +77,8 @@ def drop_cancelled_operands(solid: BooleanSolid, level: float) -> BooleanSolid |
 
 
 def _factors(solid: Solid, level: float) -> list[SolidAtLevel]:
-    """Solids and levels whose intersection is the set where a solid is at most a level."""
+    """Solids with levels; {solid <= level} is the intersection of the sets {factor <= its
+    level}."""
     if isinstance(solid, BooleanSolid) and not solid.is_union:
         return [factor for part in solid.parts for factor in _factors(part, level)]
     if isinstance(solid, OffsetSolid):
@@ -91,13 +97,15 @@ def _factors(solid: Solid, level: float) -> list[SolidAtLevel]:
 
 
 def _image(solid: Solid, of: TransformedSolid, level: float) -> SolidAtLevel:
+    """The image of {solid <= level} under the affine map of `of`: a solid and its level."""
     if isinstance(solid, Complement):
         return Complement(TransformedSolid(solid.field, of.map)), level * of.map.value_factor
     return TransformedSolid(solid, of.map), level * of.map.value_factor
 
 
 def _key(solid: Solid, level: float) -> Hashable:
-    """A key that is equal for equal sets of points of the same field."""
+    """A key for {solid <= level}: sets with equal keys are equal sets of points, made of the same
+    field object."""
     if isinstance(solid, Complement):
         return "complement", _key(solid.field, -level)
     if isinstance(solid, OffsetSolid):
@@ -108,8 +116,8 @@ def _key(solid: Solid, level: float) -> Hashable:
     return id(solid), level
 
 
-def _at_level_zero(solid: Solid, level: float) -> Solid:
-    """The solid as a solid of level 0."""
+def _with_level_zero(solid: Solid, level: float) -> Solid:
+    """A solid f for which {f <= 0} is {solid <= level}."""
     if level == 0:
         return solid
     if isinstance(solid, Complement):
@@ -118,13 +126,15 @@ def _at_level_zero(solid: Solid, level: float) -> Solid:
 
 
 def _intersection(factors: Iterable[SolidAtLevel]) -> Solid:
-    parts = tuple(_at_level_zero(*factor) for factor in factors)
+    """The intersection of the sets {solid <= level}, as a solid of level 0; with one factor that
+    solid alone."""
+    parts = tuple(_with_level_zero(*factor) for factor in factors)
     return parts[0] if len(parts) == 1 else BooleanSolid(parts, is_union=False)
 
 
 def _union(parts: Sequence[Solid]) -> Solid:
-    """The union of solids. If there are complements, it is the complement of an intersection, so
-    that no solid has to be cut away from all of space."""
+    """The union of solids. If there are complements among them, it is written as the complement of
+    an intersection, so that no solid has to be cut away from all of space."""
     if any(isinstance(operand, Complement) for operand in parts):
         return Complement(BooleanSolid(tuple(~operand for operand in parts), is_union=False))
     return BooleanSolid(tuple(parts), is_union=True)

@@ -1,7 +1,7 @@
-"""Triangles of an angle's level set that end at its curve, in Delaunay's tetrahedra.
+"""Meshes of an angle's level set that ends at a curve, made from Delaunay's tetrahedra.
 
-Where a check fails in known places, cells are made smaller there alone and the mesh is computed
-again. Where that does not help, or the places are not known, cells are made smaller everywhere.
+If a check fails in known places, cells are made smaller there alone and the mesh is computed again.
+If that does not help, or the places are not known, cells are made smaller everywhere.
 """
 
 from __future__ import annotations
@@ -47,52 +47,53 @@ from harnack.tree.empty_space import BoxCells
 
 __all__ = ["SpanningMesh", "mesh_spanning_curve", "restore_curve_edges"]
 
-# The largest move of a point, relative to the edges of triangles beside it.
-_SHALLOW = 0.1
+# Points on edges of the curve are moved by at most this fraction of the shortest edge at them.
+_MAX_MOVE = 0.1
 
 
 def restore_curve_edges(
     function: LevelFunction,
     vertices: FloatArray,
     faces: IntArray,
-    curve_count: int,
+    kept: int,
     cut: int,
     height: float,
 ) -> tuple[FloatArray, IntArray]:
-    """Restore edges of the boundary curve that were subdivided for the tetrahedra, so that only the
-    first `curve_count` vertices, the vertices of the curve, are on the boundary. Returns vertices
-    and faces.
+    """Restore the edges of the boundary curve that were subdivided for the tetrahedra, so that of
+    the vertices (n, 3) only the first `kept`, those of the curve, are on the boundary. Returns
+    vertices and faces.
 
     Long edges of a curve are subdivided so that cells near them need not be as large. The extra
-    points are moved off the edge into the surface, by at most the tolerance, and the gap is filled:
-    the mesh then ends at the given curve. The filling triangles are thin, unavoidably: the surface
-    twists about the edge, and a triangle along all of it is within the tolerance only if its height
-    is about the tolerance.
+    points are moved off their edge into the surface, by at most `height`, and the gap beside the
+    edge is filled with triangles, so that the mesh ends at the given curve. These triangles are
+    thin, unavoidably: the surface twists about the edge, and a triangle along all of the edge is
+    within the tolerance only if its height is about the tolerance.
 
-    curve_count, cut: vertices before `curve_count` are the vertices of the curve; from there to
-        `cut` they are the extra points on its edges.
-    height: how far the extra points are moved, at most.
+    faces: (m, 3).
+    kept, cut: the vertices before index `kept` are those of the curve; from there to index `cut`
+        they are the extra points on its edges.
+    height: the largest distance by which extra points are moved.
     """
-    if cut == curve_count:
+    if cut == kept:
         return vertices, faces
     successor = dict(boundary_edges(faces).tolist())
     chains: list[list[int]] = []
-    for start in range(curve_count):
+    for start in range(kept):
         chain = [start]
         while (vertex := successor.get(chain[-1])) is not None:
             chain.append(vertex)
-            if vertex < curve_count:
+            if vertex < kept:
                 break
         if len(chain) > 2:
             chains.append(chain)
     inner = np.array([vertex for chain in chains for vertex in chain[1:-1]], np.int64)
     if not len(inner):
         return vertices, faces
-    owner = np.repeat(np.arange(len(chains)), [len(path) - 2 for path in chains])
+    chain_of_point = np.repeat(np.arange(len(chains)), [len(path) - 2 for path in chains])
     ends = np.array([(path[0], path[-1]) for path in chains], np.int64)
     vertices = vertices.copy()
-    vertices[inner] = _push_inward(function, vertices, faces, inner, owner, ends, height)
-    gaps = [face for chain in chains for face in _filling(chain)]
+    vertices[inner] = _push_inward(function, vertices, faces, inner, chain_of_point, ends, height)
+    gaps = [face for chain in chains for face in _triangulate_gap(chain)]
     return vertices, np.concatenate([faces, np.array(gaps, np.int64)])
 
 
@@ -101,68 +102,80 @@ def _push_inward(
     vertices: FloatArray,
     faces: IntArray,
     inner: IntArray,
-    owner: IntArray,
+    edge: IntArray,
     ends: IntArray,
     height: float,
 ) -> FloatArray:
-    """(n, 3) the vertices, with the points `inner` (k,) moved off their edges and onto the surface.
-    owner: (k,) the edge of each point; ends: (m, 2) the ends of the edges. The heights over an edge
-    are one parabola, so that its filling lies below the chain."""
+    """All vertices (n, 3), after the extra points on edges of the curve were moved off their edges
+    and onto the surface.
+
+    inner: (k,) indices of the extra points.
+    edge: (k,) index of the edge that each of them is on.
+    ends: (m, 2) the two vertices at the ends of each edge.
+    height: the largest distance from the edge, a length.
+
+    Over each edge the distances of its points from it form a parabola, so that the triangles that
+    fill the gap lie below the chain of points. A point is first moved into the surface, along the
+    mean direction to its neighbors at right angles to the edge. It is then turned about the edge
+    towards the level set: it keeps its position along the edge and its distance from it.
+    """
     points = vertices[inner]
     a, along = vertices[ends[:, 0]], vertices[ends[:, 1]] - vertices[ends[:, 0]]
     length = np.linalg.norm(along, axis=1)
-    along, a = (along / length[:, None])[owner], a[owner]
-    fraction = ((points - a) * along).sum(axis=1) / length[owner]
-    inward, shortest = np.zeros_like(vertices), np.full(len(vertices), np.inf)
+    along, a = (along / length[:, None])[edge], a[edge]
+    fraction = ((points - a) * along).sum(axis=1) / length[edge]
+    inwards, shortest = np.zeros_like(vertices), np.full(len(vertices), np.inf)
     for k in range(3):
         corner, second, third = (faces[:, (k + j) % 3] for j in range(3))
-        np.add.at(inward, corner, vertices[second] + vertices[third] - 2 * vertices[corner])
+        np.add.at(inwards, corner, vertices[second] + vertices[third] - 2 * vertices[corner])
         for end in (second, third):
             span = np.linalg.norm(vertices[end] - vertices[corner], axis=1)
             np.minimum.at(shortest, corner, span)
-    max_height = np.full(len(ends), height)
-    np.minimum.at(max_height, owner, _SHALLOW * shortest[inner])
-    lift = 4 * fraction * (1 - fraction) * max_height[owner]
-    direction = _unit_perpendicular(inward[inner], along)
+    max_lift = np.full(len(ends), height)
+    np.minimum.at(max_lift, edge, _MAX_MOVE * shortest[inner])
+    lift = 4 * fraction * (1 - fraction) * max_lift[edge]
+    direction = _unit_perpendicular(inwards[inner], along)
     start = points + lift[:, None] * direction
     projected = newton_to_level(function, start, function.sample(start), 0.3 * lift, None)
     # Points keep their position along the edge and their distance from it: they turn about it.
-    turned = _unit_perpendicular(projected - points, along)
-    is_close = (turned * direction).sum(axis=1) > 0.3
-    return points + lift[:, None] * np.where(is_close[:, None], turned, direction)
+    toward = _unit_perpendicular(projected - points, along)
+    is_close = (toward * direction).sum(axis=1) > 0.3
+    return points + lift[:, None] * np.where(is_close[:, None], toward, direction)
 
 
 def _unit_perpendicular(vectors: FloatArray, along: FloatArray) -> FloatArray:
-    """The unit vectors (k, 3) of the components of vectors at right angles to unit vectors."""
+    """The unit vectors (k, 3) along the components of `vectors` (k, 3) at right angles to the unit
+    vectors `along` (k, 3)."""
     part = vectors - (vectors * along).sum(axis=1)[:, None] * along
     return part / np.maximum(np.linalg.norm(part, axis=1), 1e-300)[:, None]
 
 
-def _filling(chain: list[int]) -> list[tuple[int, int, int]]:
-    """Triangles between the edge from the first to the last point of a chain, and the chain."""
+def _triangulate_gap(chain: list[int]) -> list[tuple[int, int, int]]:
+    """Triangles between a chain of points, given by their indices, and the straight edge between
+    the ends of the chain."""
     if len(chain) < 3:
         return []
     middle = len(chain) // 2
     return [
         (chain[0], chain[-1], chain[middle]),
-        *_filling(chain[: middle + 1]),
-        *_filling(chain[middle:]),
+        *_triangulate_gap(chain[: middle + 1]),
+        *_triangulate_gap(chain[middle:]),
     ]
 
 
 # The whole surface.
 
-# How often the mesh is computed again because finished triangles fail.
+# How often the mesh is computed, each time with smaller cells where finished triangles failed.
 _MAX_ATTEMPTS = 4
-# How often cells are made smaller where the first triangles fail, before they are made smaller
-# everywhere.
+# How often cells are made smaller in places where the first triangles fail, before they are made
+# smaller everywhere.
 _MOST_LOCAL = 4
-# Edges of a curve that are longer than this many cells are cut.
-_LONGEST = 2.5
-# How often edges of a curve that are too near to others are halved.
-_MAX_CUTS = 4
+# Edges of the curve are divided into pieces no longer than this many cells.
+_MAX_EDGE_CELLS = 2.5
+# How often edges of the curve that are missing among those of the tetrahedra are halved.
+_MAX_HALVINGS = 4
 # The ratio of the size of smaller cells everywhere to the size before.
-_SMALLER = 0.6
+_CELL_SIZE_RATIO = 0.6
 
 
 @dataclass(frozen=True)
@@ -172,9 +185,9 @@ class SpanningMesh:
     vertices: (n, 3).
     faces: (m, 3).
     curve: the boundary curve, with its edges as subdivided.
-    spacing: of cells.
-    finer: where cells were smaller.
-    crossings: of the edges of tetrahedra.
+    spacing: the size of cells.
+    finer: balls in which cells were halved; once more for each entry.
+    crossings: how often the level set crosses edges of the tetrahedra.
     isotopy: on how many tetrahedra the topology is proved.
     turned: how many faces are turned over.
     """
@@ -193,8 +206,10 @@ class SpanningMesh:
 class _SpanningInput:
     """The function and the box in which its level set is meshed.
 
-    lower, upper: (3,) the box.
-    walls: the same box, if the surface may end at its faces, or None.
+    lower, upper: (3,) the corners of the box.
+    walls: the same corners, if the surface may end at the faces of the box; else None.
+    seed: of the random moves of points.
+    report: receives messages about the progress.
     """
 
     function: LevelFunction
@@ -216,12 +231,15 @@ def mesh_spanning_curve(
     report: Callable[[str], None],
 ) -> SpanningMesh:
     """The mesh of an angle's level set within the tolerance, none of whose triangles pass through
-    each other; where triangles do, or are turned over, cells are made smaller and the mesh is
-    computed again.
+    each other. If triangles do, or are turned over, cells are made smaller there and the mesh is
+    computed again; triangles that are still turned over at the end are counted in the result.
 
-    attempts: the number of spacings that are tried, each smaller than the spacing before.
-    box: the box that cells fill. has_walls: whether the surface may end at its faces.
+    attempts: the number of sizes of cells that are tried, each smaller than the one before.
+    box: the lower and upper corners (3,) of the box that cells fill.
+    has_walls: whether the surface may end at the faces of the box.
+    seed: of the random moves of points.
     tolerance: a length.
+    report: receives messages about the progress.
 
     Raises:
         MeshingError: no mesh passes the checks.
@@ -232,7 +250,7 @@ def mesh_spanning_curve(
     best: SpanningMesh | None = None
     crossing = np.zeros(0, np.int64)
     for attempt in range(_MAX_ATTEMPTS):
-        first = _first_surface(task, spacing, attempts, finer)
+        first = _mesh_with_retries(task, spacing, attempts, finer)
         spacing, finer = first.spacing, first.finer
         faces = first.faces
         check_estimated_triangles(function, first.vertices, faces, tolerance)
@@ -240,7 +258,7 @@ def mesh_spanning_curve(
         vertices, faces = refine(function, vertices, faces, tolerance, walls, report)
         vertices, faces = improve(function, vertices, faces, tolerance, walls, report)
         turned = misoriented_faces(function, vertices, faces)
-        curve_count = sum(map(len, _loops(function)))
+        curve_count = sum(map(len, _curve_loops(function)))
         vertices, faces = restore_curve_edges(
             function, vertices, faces, curve_count, len(first.curve.points), tolerance
         )
@@ -262,42 +280,52 @@ def mesh_spanning_curve(
     return best
 
 
-def _loops(function: LevelFunction) -> tuple[FloatArray, ...]:
+def _curve_loops(function: LevelFunction) -> tuple[FloatArray, ...]:
+    """The loops (k, 3) of the curve at which the function's angle is discontinuous, without edges
+    that are run in both directions."""
     assert isinstance(function.field, SolidAngle)
     return cancel_opposite_edges(function.field.loops)
 
 
-def _first_surface(
+def _mesh_with_retries(
     task: _SpanningInput, spacing: float, attempts: int, finer: tuple[RefinementBalls, ...]
 ) -> SpanningMesh:
-    """The mesh in cells of that spacing, smaller where necessary; or where that fails, in smaller
-    cells everywhere."""
+    """The mesh in cells of the size `spacing`, which are made smaller in places where a check
+    fails. If that does not help, or the places are not known, the mesh in smaller cells everywhere.
+
+    attempts: how many sizes of cells may be tried.
+    finer: balls in which cells are halved from the beginning.
+
+    Raises:
+        MeshingError: no attempt succeeds.
+    """
     task.report(f"cells of {spacing:.3g}")
-    local = finer
+    balls = finer
     try:
         for trial in range(_MOST_LOCAL):
             try:
-                return _in_cells(task, spacing, local)
+                return _mesh_in_cells(task, spacing, balls)
             except LocalizedMeshingError as error:
                 task.report(f"{len(error.locations)} places fail: smaller cells there")
-                local = (*local, RefinementBalls(error.locations, spacing * 0.5**trial))
-        return _in_cells(task, spacing, local)
+                balls = (*balls, RefinementBalls(error.locations, spacing * 0.5**trial))
+        return _mesh_in_cells(task, spacing, balls)
     except MeshingError:
         if attempts == 1:
             raise
-    return _first_surface(task, _SMALLER * spacing, attempts - 1, finer)
+    return _mesh_with_retries(task, _CELL_SIZE_RATIO * spacing, attempts - 1, finer)
 
 
-def _in_cells(
+def _mesh_in_cells(
     task: _SpanningInput, spacing: float, finer: tuple[RefinementBalls, ...]
 ) -> SpanningMesh:
-    """The mesh in cells of that spacing, split in the balls `finer`, and its proved isotopy.
+    """The first triangles of the mesh, in cells of the size `spacing`, and how many tetrahedra have
+    a proved isotopy. Cells are halved once more in each entry of `finer` that they meet.
 
     Raises:
-        MeshingError: checks that fail, or edges of the curve that are in no tetrahedron.
+        MeshingError: a check fails, or edges of the curve are in no tetrahedron.
     """
     function, walls = task.function, task.walls
-    curve = BoundaryCurve.of(_loops(function), _LONGEST * spacing)
+    curve = BoundaryCurve.of(_curve_loops(function), _MAX_EDGE_CELLS * spacing)
     for k, balls in enumerate(finer):  # balls on long edges leave no room for points
         curve = curve.split_near(balls, spacing * 0.5**k)
     margin = 0.5 * spacing if walls is None else 0.0
@@ -321,9 +349,18 @@ def _tetrahedralize(
     curve: BoundaryCurve,
     finer: tuple[RefinementBalls, ...],
 ) -> tuple[BoundaryCurve, TetrahedronPoints, Tetrahedra]:
-    """Tetrahedra that have all edges of the curve, whose edges are cut where others are too
-    near."""
-    for _ in range(_MAX_CUTS):
+    """A tetrahedral mesh that contains every edge of the curve. Edges that are missing, since other
+    points are too near to them, are halved, and it is computed again.
+
+    root: cells that fill the box, and how many times they are to be subdivided.
+    finer: balls in which cells are halved once more.
+
+    Returns the curve with its edges as subdivided, the points with samples, and the tetrahedra.
+
+    Raises:
+        MeshingError: edges of the curve are missing after all halvings.
+    """
+    for _ in range(_MAX_HALVINGS):
         points = sample_delaunay_points(task.function, root, curve, task.walls, task.seed, finer)
         tets = delaunay(points.points)
         has_edge = tets.has_edges(curve.edges)
@@ -339,13 +376,16 @@ def _check_boundary(
     curve: BoundaryCurve,
     walls: tuple[FloatArray, FloatArray] | None,
 ) -> None:
+    """Raise LocalizedMeshingError unless the boundary edges of the faces are the edges of the
+    curve. Boundary edges on the faces of the box are left out if the surface may end there
+    (`walls`)."""
     edges = boundary_edges(faces)
     count = max(int(faces.max()) + 1, len(curve.points))
     if walls is not None:  # the surface ends there as well
         margin = 1e-9 * (walls[1] - walls[0])
-        near = np.minimum(np.abs(vertices - walls[0]), np.abs(vertices - walls[1]))
-        on = np.asarray((near <= margin).any(axis=1))
-        edges = edges[~on[edges].all(axis=1)]
+        distances = np.minimum(np.abs(vertices - walls[0]), np.abs(vertices - walls[1]))
+        is_on_wall = np.asarray((distances <= margin).any(axis=1))
+        edges = edges[~is_on_wall[edges].all(axis=1)]
     unmatched = np.setxor1d(edge_keys(edges, count), edge_keys(curve.edges, count))
     if len(unmatched):
         ends = np.stack(np.divmod(unmatched, count), axis=1)

@@ -1,10 +1,10 @@
-"""The points of a Delaunay triangulation around a level set: those of an octree around it, and the
-boundary curve it ends on.
+"""The points of a Delaunay triangulation around a level set: the corners and centers of the cells
+of an octree around it, and the points of the boundary curve at which the level set ends.
 
-Vertices of the curve are points as they are. Other points keep so far from it that no point lies in
-the ball with an edge of the curve as diameter, so that every edge of the curve is an edge of the
-Delaunay triangulation (Gabriel's condition). Points near the level set are moved onto it: most
-slivers go.
+The vertices of the curve are points of the triangulation. All other points are kept so far from the
+curve that no point lies in a ball that has an edge of the curve as its diameter. So every edge of
+the curve is an edge of the Delaunay triangulation (Gabriel's condition). Points near the level set
+are moved onto it, which removes most slivers.
 """
 
 from __future__ import annotations
@@ -30,15 +30,16 @@ __all__ = [
 ]
 
 # All relative to the size of a cell, by experiment.
-_JITTER = 1e-3  # no five points on a sphere
-_SNAPPED = 0.3  # points this near to the level are moved onto it
-_MIN_CURVE_DISTANCE = 0.45  # no other points are so near to the curve
+_JITTER = 1e-3  # the largest random move, so that no five points are on a sphere
+_SNAP_DISTANCE = 0.3  # points that are nearer to the level are moved onto it
+_MIN_CURVE_DISTANCE = 0.45  # points that are not on the curve are farther from it
+# The largest number of cells of the octree.
 _MAX_CELLS = 4_000_000
 # A step of Newton's method that is shorter than this, relative to the longest step, is the last.
 _CONVERGED = 1e-9
-# How often steps to a multiple root are continued as a geometric series, and the range of its
-# rates.
-_SERIES, _RATES = 4, (0.4, 0.97)
+# How often steps to a multiple root are continued as a geometric series, and the range of ratios of
+# a step to the one before for which they are.
+_SERIES_STEPS, _RATE_RANGE = 4, (0.4, 0.97)
 _CORNERS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
 
 
@@ -54,21 +55,23 @@ class RefinementBalls:
     radius: float
 
     def meet(self, centers: FloatArray, radii: FloatArray | float) -> BoolArray:
-        """(k,) whether balls about points (k, 3) meet any of these balls."""
+        """(k,) whether the balls with these centers (k, 3) and radii (k,), or one radius, meet any
+        of the balls."""
         if not len(centers):
             return np.zeros(0, np.bool_)
         import scipy.spatial  # imported here: it takes half a second
 
         searching: Any = scipy.spatial
-        apart: FloatArray = searching.cKDTree(self.points).query(centers)[0]
-        return apart < self.radius + radii
+        distance: FloatArray = searching.cKDTree(self.points).query(centers)[0]
+        return distance < self.radius + radii
 
 
 @dataclass(frozen=True)
 class BoundaryCurve:
-    """The curve that a level set ends on.
+    """The curve at which a level set ends.
 
-    points: (n, 3). edges: (n, 2) indices of points, in the direction in which the curve is run.
+    points: (n, 3).
+    edges: (n, 2) indices of the two points of each edge, in the direction in which the curve runs.
     """
 
     points: FloatArray
@@ -76,8 +79,9 @@ class BoundaryCurve:
 
     @classmethod
     def of(cls, loops: tuple[FloatArray, ...], longest: float) -> BoundaryCurve:
-        """A curve of closed loops, their vertices first and in their order; edges longer than
-        `longest` are divided into equal parts."""
+        """The curve that consists of closed loops (k, 3). Its points are first the vertices of the
+        loops, in their order; then those that divide edges longer than `longest` into equal
+        parts."""
         points = [*loops]
         inner_points: list[FloatArray] = []
         edges: list[tuple[int, int]] = []
@@ -94,17 +98,17 @@ class BoundaryCurve:
         pairs = np.array(edges, np.int64).reshape(-1, 2)
         return cls(np.concatenate([*points, *inner_points, np.zeros((0, 3))]), pairs)
 
-    def split(self, mask: BoolArray) -> BoundaryCurve:
-        """The curve with the midpoints of the edges that the mask `mask` (k,) selects as
-        additional points."""
-        a, b = self.edges[mask].T
+    def split(self, which: BoolArray) -> BoundaryCurve:
+        """The curve, with those edges halved that the mask `which` (k,) selects. Their midpoints
+        are additional points, after all others."""
+        a, b = self.edges[which].T
         middle = len(self.points) + np.arange(len(a))
         points = np.concatenate([self.points, 0.5 * (self.points[a] + self.points[b])])
         halves = np.concatenate([np.stack([a, middle], axis=1), np.stack([middle, b], axis=1)])
-        return BoundaryCurve(points, np.concatenate([self.edges[~mask], halves]))
+        return BoundaryCurve(points, np.concatenate([self.edges[~which], halves]))
 
     def split_near(self, places: RefinementBalls, longest: float) -> BoundaryCurve:
-        """The curve with edges that meet the balls `places` divided until they are no longer than
+        """The curve, with edges that meet the balls `places` halved until they are no longer than
         `longest`."""
         curve = self
         while True:
@@ -121,8 +125,8 @@ class TetrahedronPoints:
     """The points of a triangulation, with the function's samples.
 
     points: (n, 3), those of the boundary curve first.
-    is_on_level: (n,) whether they are on the level; those of the curve are.
-    samples: at all points; those of the curve are 0.
+    is_on_level: (n,) whether points are on the level; those of the curve count as on it.
+    samples: of f - level at all points; 0 at those of the curve.
     """
 
     points: FloatArray
@@ -133,10 +137,11 @@ class TetrahedronPoints:
 def box_cells(
     lower: FloatArray, upper: FloatArray, spacing: float, exact: bool
 ) -> tuple[BoxCells, int]:
-    """Cells that fill a box, and how many times they are to be subdivided to be no larger than
+    """Cells that fill a box, and how many times they are to be halved until they are no larger than
     `spacing`.
 
-    exact: whether the box itself is filled; else cubes fill a box that may be larger.
+    exact: whether the cells fill the box exactly; otherwise they are cubes, which fill a box that
+        may be larger.
     """
     size = upper - lower
     finest = max(1, math.ceil(math.log2(float(size.max()) / spacing)))
@@ -162,15 +167,21 @@ def sample_delaunay_points(
     seed: int,
     finer: tuple[RefinementBalls, ...] = (),
 ) -> TetrahedronPoints:
-    """Points for the tetrahedra: see the module's docstring.
+    """The points of the tetrahedra, with samples of the function. The module's docstring says how
+    they are chosen.
 
-    walls: a box; points on its faces stay on them. finer: where leaves of the octree are split
-        again, once for each entry that they meet.
+    root: cells that fill the box, and how many times they are to be halved.
+    boundary: the curve at which the level set ends.
+    walls: the lower and upper corners of a box; points on its faces stay on them. None if there is
+        none.
+    seed: of the random moves of points.
+    finer: balls; cells of the octree are halved again, once for each entry that they meet.
 
-    Raises MemoryError for more than four million cells.
+    Raises:
+        MemoryError: there are more than four million cells.
     """
     tree = refine_cells(root[0], function.clearance, _MAX_CELLS, root[1])
-    points, size = _corners_and_centers(tree, _finer_cells(function, tree.occupied, finer))
+    points, size = _corners_and_centers(tree, _subdivided_cells(function, tree.occupied, finer))
     free = _MIN_CURVE_DISTANCE * np.minimum(size, 2 * float(tree.occupied.size.max()))
     is_far = _is_far(points, free, boundary)
     points, size = points[is_far], size[is_far]
@@ -178,7 +189,7 @@ def sample_delaunay_points(
     jitter = rng.uniform(-1, 1, points.shape) * _JITTER * size[:, None]
     points = points + (jitter if walls is None else jitter * _off_walls(points, walls))
     samples = function.sample(points)
-    points, samples, is_on = _snap_to_level(
+    points, samples, is_on = _move_onto_level(
         function, points, size, free[is_far], samples, boundary, walls
     )
     n = len(boundary.points)
@@ -194,17 +205,20 @@ def sample_delaunay_points(
     )
 
 
-def _finer_cells(
+def _subdivided_cells(
     function: LevelFunction, leaves: BoxCells, finer: tuple[RefinementBalls, ...]
 ) -> list[BoxCells]:
-    """The cells that leaves are split into, smallest first, without cells that are proved empty."""
+    """The cells that leaves of the octree are split into, smallest first. A leaf is split once,
+    into octants, if it meets a ball of the first entry of `finer`; the octants again if they meet
+    one of the second; and so on. Cells that are proved empty are left out, and so are leaves that
+    are not split."""
     pool = [leaves]
     for balls in finer:
-        split: list[BoxCells] = []
+        octants: list[BoxCells] = []
         for cells in pool:
-            halves = cells.subset(balls.meet(cells.centers, cells.half_diagonal)).octants()
-            split.append(halves.subset(~halves.is_proved_empty(function.clearance)))
-        pool += split
+            parts = cells.subset(balls.meet(cells.centers, cells.half_diagonal)).octants()
+            octants.append(parts.subset(~parts.is_proved_empty(function.clearance)))
+        pool += octants
     nonempty = [cells for cells in pool[1:] if len(cells.corners)]
     return sorted(nonempty, key=lambda cells: float(cells.size.max()))
 
@@ -212,8 +226,12 @@ def _finer_cells(
 def _corners_and_centers(
     tree: RefinedCells, finer: list[BoxCells]
 ) -> tuple[FloatArray, FloatArray]:
-    """Points (n, 3), each once: corners of all cells, and centers of leaves and of cells in
-    `finer`; and the size (n,) of the smallest cell at each."""
+    """Points (n, 3), each once: the corners of all cells of the octree and of `finer`, and the
+    centers of its leaves and of `finer`. Also (n,) the edge of the smallest cell that has each
+    point as its corner or center.
+
+    finer: cells that leaves were split into, smallest first.
+    """
     leaves = [*finer, tree.occupied]
     points = [cells.centers for cells in leaves]
     sizes = [np.full(len(cells.corners), float(cells.size.max())) for cells in leaves]
@@ -227,13 +245,13 @@ def _corners_and_centers(
     steps: FloatArray = (x - x.min(axis=0)) / (0.25 * leaves[0].size)
     keys = np.rint(steps).astype(np.int64)
     # Of equal points the first, which is that of the smallest cell.
-    first: IntArray = np.sort(np.unique(keys, axis=0, return_index=True)[1])
-    return x[first], size[first]
+    kept: IntArray = np.sort(np.unique(keys, axis=0, return_index=True)[1])
+    return x[kept], size[kept]
 
 
 def _is_far(points: FloatArray, free: FloatArray, boundary: BoundaryCurve) -> BoolArray:
-    """(n,) whether points are farther from the curve than `free` (n,), and outside of the balls
-    with its edges as diameters."""
+    """(n,) whether points (n, 3) are far enough from the curve: farther than `free` (n,), and
+    outside of the balls that have the curve's edges as diameters."""
     if not len(boundary.edges):
         return np.ones(len(points), np.bool_)
     import scipy.spatial  # imported here: it takes half a second
@@ -241,7 +259,7 @@ def _is_far(points: FloatArray, free: FloatArray, boundary: BoundaryCurve) -> Bo
     searching: Any = scipy.spatial
     a, b = (boundary.points[boundary.edges[:, k]] for k in (0, 1))
     middle, half = 0.5 * (a + b), 0.5 * row_norms(b - a)
-    near = np.full(len(points), np.inf)
+    distance = np.full(len(points), np.inf)
     is_far = np.ones(len(points), np.bool_)
     # Curves may have edges of any lengths: edges of one size are examined at a time.
     octave = np.floor(np.log2(half))
@@ -250,23 +268,27 @@ def _is_far(points: FloatArray, free: FloatArray, boundary: BoundaryCurve) -> Bo
         neighbor_count = min(8, len(rows))
         nearest: IntArray = searching.cKDTree(middle[rows]).query(points, k=neighbor_count)[1]
         index = rows[nearest.reshape(len(points), neighbor_count)]
-        e, w = (b - a)[index], points[:, None] - a[index]
-        fraction = np.clip((w * e).sum(axis=2) / (e * e).sum(axis=2), 0, 1)
-        gap = np.linalg.norm(w - fraction[..., None] * e, axis=2)
-        away = np.linalg.norm(points[:, None] - middle[index], axis=2)
-        near = np.minimum(near, gap.min(axis=1))
-        is_far &= (away > 1.1 * half[index]).all(axis=1)
-    return is_far & (near > free)
+        edge, offset = (b - a)[index], points[:, None] - a[index]
+        fraction = np.clip((offset * edge).sum(axis=2) / (edge * edge).sum(axis=2), 0, 1)
+        gaps = np.linalg.norm(offset - fraction[..., None] * edge, axis=2)
+        from_middle = np.linalg.norm(points[:, None] - middle[index], axis=2)
+        distance = np.minimum(distance, gaps.min(axis=1))
+        is_far &= (from_middle > 1.1 * half[index]).all(axis=1)
+    return is_far & (distance > free)
 
 
 def _off_walls(points: FloatArray, walls: tuple[FloatArray, FloatArray]) -> FloatArray:
-    """(n, 3): 0 in directions in which a point on a face of the box would leave it, else 1."""
+    """(n, 3) for each point and axis, 0 if the point is on a face of the box across that axis, so
+    that a move along the axis would take it off the face; else 1.
+
+    walls: the lower and upper corners (3,) of the box.
+    """
     margin = 1e-9 * (walls[1] - walls[0])
-    on = (np.abs(points - walls[0]) <= margin) | (np.abs(points - walls[1]) <= margin)
-    return np.where(on, 0.0, 1.0)
+    is_on_face = (np.abs(points - walls[0]) <= margin) | (np.abs(points - walls[1]) <= margin)
+    return np.where(is_on_face, 0.0, 1.0)
 
 
-def _snap_to_level(
+def _move_onto_level(
     function: LevelFunction,
     points: FloatArray,
     size: FloatArray,
@@ -275,15 +297,24 @@ def _snap_to_level(
     boundary: BoundaryCurve,
     walls: tuple[FloatArray, FloatArray] | None,
 ) -> tuple[FloatArray, LevelSamples, BoolArray]:
-    """The points, with points near the level moved onto it; their samples; and which are on the
-    level."""
-    near = np.flatnonzero(samples.distance < _SNAPPED * size)
+    """Move points that are near the level set onto it.
+
+    size: (n,) of the cells at the points.
+    free: (n,) the smallest permitted distances from the boundary curve.
+    samples: of the function at the points.
+    walls: a box; points on its faces stay on them. None if there is none.
+
+    Returns the points (n, 3); their samples; and a mask (n,) of those that are on the level. Points
+    stay where they are if Newton's method does not converge, or would move them far or too near to
+    the curve.
+    """
+    near = np.flatnonzero(samples.distance < _SNAP_DISTANCE * size)
     moved = newton_to_level(function, points[near], samples.select(near), 0.25 * size[near], walls)
     new_samples = function.sample(moved)
     apart = row_norms(moved - points[near])
-    steep = row_norms(new_samples.gradient)
-    converged = np.abs(new_samples.value) < 1e-9 * np.maximum(steep * size[near], 1e-300)
-    converged &= (apart < 1.5 * _SNAPPED * size[near]) & _is_far(moved, free[near], boundary)
+    slope = row_norms(new_samples.gradient)
+    converged = np.abs(new_samples.value) < 1e-9 * np.maximum(slope * size[near], 1e-300)
+    converged &= (apart < 1.5 * _SNAP_DISTANCE * size[near]) & _is_far(moved, free[near], boundary)
     rows = near[converged]
     points, is_on = points.copy(), np.zeros(len(points), np.bool_)
     points[rows], is_on[rows] = moved[converged], True
@@ -298,10 +329,18 @@ def newton_to_level(
     walls: tuple[FloatArray, FloatArray] | None,
     steps: int = 5,
 ) -> FloatArray:
-    """Points (n, 3) after steps of Newton's method along the gradient towards the level, each no
-    longer than `longest` (n,). Points on walls stay on them. Points are no longer moved after a
-    step so short that the next step, of the order of its square, would be lost in rounding; and
-    where there is no finite step, as beside a pole."""
+    """Points (n, 3), moved towards the level by steps of Newton's method along the gradient.
+
+    samples: of the function at the points.
+    longest: (n,) the largest length of each step.
+    walls: the lower and upper corners of a box; points on its faces stay on them, and no point
+        leaves it. None if there is none.
+    steps: the largest number of steps.
+
+    A point is no longer moved after a step so short that the next step, of the order of its square,
+    would be lost in rounding. It is not moved either where there is no finite step, as beside a
+    pole.
+    """
     x, rows = points.copy(), np.arange(len(points))
     for k in range(steps):
         current = x[rows]
@@ -324,18 +363,23 @@ def newton_to_level(
 def to_multiple_roots(
     function: LevelFunction, points: FloatArray, samples: LevelSamples, longest: FloatArray
 ) -> FloatArray:
-    """Points (n, 3) after steps towards the level where f - level is a power u^m, for which
-    Newton's steps shrink only by 1 - 1/m: each step goes to the limit of the geometric series of
-    two of Newton's steps."""
+    """Points (n, 3), moved towards a level set on which f - level has a multiple root: f - level =
+    u^m with m > 1 for some function u. There Newton's steps converge only linearly, each being 1 -
+    1/m times the one before. So two of Newton's steps are computed, and the points are moved to the
+    limit of the geometric series that they begin. This is done a few times.
+
+    samples: of the function at the points.
+    longest: (n,) the largest length of each of Newton's steps.
+    """
     x = points
-    for k in range(_SERIES):
+    for k in range(_SERIES_STEPS):
         first = newton_to_level(
             function, x, samples if k == 0 else function.sample(x), longest, None, steps=1
         )
         second = newton_to_level(function, first, function.sample(first), longest, None, steps=1)
         before, after = row_norms(first - x), row_norms(second - first)
         ratio = after / np.maximum(before, 1e-300)
-        is_slow = (ratio > _RATES[0]) & (ratio < _RATES[1])
-        factor = np.where(is_slow, 1 / (1 - np.minimum(ratio, _RATES[1])), 1.0)
+        is_slow = (ratio > _RATE_RANGE[0]) & (ratio < _RATE_RANGE[1])
+        factor = np.where(is_slow, 1 / (1 - np.minimum(ratio, _RATE_RANGE[1])), 1.0)
         x = first + factor[:, None] * (second - first)
     return x

@@ -1,5 +1,5 @@
-"""Unique edges of triangles and tetrahedra, by integer keys; row-wise products and norms; normals
-and distances of triangles.
+"""Edges of triangles and tetrahedra, found by integer keys; products and norms of rows; normals of
+triangles, and distances from them.
 
 `row_dots` and `row_norms` are here because numpy's own sums along an axis of length three are slow.
 """
@@ -30,19 +30,20 @@ __all__ = [
 
 
 def row_dots(a: FloatArray, b: FloatArray) -> FloatArray:
-    """(n,) dot products of the rows (n, 3) of a and b, in a third of the time of (a *
-    b).sum(axis=1)."""
+    """(n,) the dot product of each row of `a` with the same row of `b`, both (n, 3): in a third of
+    the time of (a * b).sum(axis=1)."""
     return np.einsum("ij,ij->i", a, b)
 
 
 def area_normals(corners: FloatArray) -> FloatArray:
-    """(m, 3) normals of triangles (m, 3, 3) by the right-hand rule, twice as long as their
+    """(m, 3) normals of triangles (m, 3, 3) by the right-hand rule; their lengths are twice the
     areas."""
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 def row_norms(vectors: FloatArray) -> FloatArray:
-    """(n,) lengths of rows (n, 3), in a third of the time of np.linalg.norm(vectors, axis=1)."""
+    """(n,) the lengths of rows (n, 3), in a third of the time of np.linalg.norm(vectors,
+    axis=1)."""
     return np.sqrt(row_dots(vectors, vectors))
 
 
@@ -50,14 +51,16 @@ IntArray = npt.NDArray[np.int64]
 
 
 def distance_from_triangles(point: FloatArray, corner: FloatArray) -> float:
-    """The distance (at most) of a point from triangles (k, 3, 3)."""
+    """An upper bound of the distance of a point (3,) from the nearest of triangles (k, 3, 3), equal
+    to it but for rounding; infinity if there are no triangles."""
     return float(distances_from_triangles(point, corner).min(initial=np.inf))
 
 
 def distances_from_triangles(points: FloatArray, corner: FloatArray) -> FloatArray:
-    """(k,) the distance (at most) of each of k points (k, 3), or of a single point (3,), from the
-    triangle of the same index (k, 3, 3): from its plane where the projection of the point is within
-    the triangle, and from its edges."""
+    """(k,) an upper bound of the distance of each of k points (k, 3), or of a single point (3,),
+    from the triangle (k, 3, 3) of the same index; it is equal to the distance but for rounding. It
+    is the smallest distance from the triangle's edges, and from its plane if the projection of the
+    point is in the triangle."""
     distance = np.full(len(corner), np.inf)
     for k in range(3):
         start, edge = corner[:, k], corner[:, k - 1] - corner[:, k]
@@ -80,10 +83,10 @@ def distances_from_triangles(points: FloatArray, corner: FloatArray) -> FloatArr
 class Edges:
     """The unique edges among n pairs of points.
 
-    vertices: (k, 2) the endpoints of the k edges, the lower index first, in sorted order.
-    edge_of_pair: (n,) the edge that each pair is.
+    vertices: (k, 2) the two ends of each of the k edges, the lower index first; edges are sorted.
+    edge_of_pair: (n,) the index of the edge that each pair is.
     multiplicity: (k,) the number of pairs that are the edge.
-    pairs_by_edge: (n,) indices of the pairs, edge by edge.
+    pairs_by_edge: (n,) the indices of all pairs, ordered by the edges that they are.
     """
 
     vertices: IntArray
@@ -93,20 +96,22 @@ class Edges:
 
     @classmethod
     def of(cls, pairs: IntArray) -> Edges:
-        """The unique edges among pairs (n, 2) of points, of either direction."""
+        """The unique edges among pairs (n, 2) of indices of points; the two orders of a pair are
+        one edge."""
         count = int(pairs.max(initial=-1)) + 1
         keys, index, uses, order = unique_with_inverse(edge_keys(pairs, count))
         return cls(np.stack(np.divmod(keys, max(count, 1)), axis=1), index, uses, order)
 
     def paired_half_edges(self) -> IntArray:
-        """(j, 2) for each edge that occurs exactly twice, the indices of its two occurrences."""
+        """(j, 2) for each edge that occurs exactly twice, the indices of the two pairs."""
         return self.pairs_by_edge[np.repeat(self.multiplicity == 2, self.multiplicity)].reshape(
             -1, 2
         )
 
 
 def edge_keys(pairs: IntArray, count: int) -> IntArray:
-    """(k,) a key for each pair (k, 2) of `count` points, the same in either order."""
+    """(k,) an integer for each pair (k, 2) of indices below `count`: the same for both orders of a
+    pair, and different for different pairs."""
     first, second = pairs.T
     return np.minimum(first, second) * count + np.maximum(first, second)
 
@@ -118,21 +123,23 @@ def half_edges(faces: IntArray) -> IntArray:
 
 
 def boundary_edges(faces: IntArray) -> IntArray:
-    """(k, 2) boundary edges, which have a single face, in the direction of that face."""
+    """(k, 2) the edges that have a single face, among faces (m, 3); each in the direction of its
+    face."""
     pairs = half_edges(faces)
     edges = Edges.of(pairs)
     return pairs[edges.multiplicity[edges.edge_of_pair] == 1]
 
 
 def sorted_unique(keys: IntArray) -> IntArray:
-    """The sorted unique values of integers (n,): several times as fast as `np.unique`."""
+    """The sorted unique values of integers (n,), several times as fast as `np.unique`."""
     keys = np.sort(keys)
     return keys[np.flatnonzero(np.diff(keys, prepend=keys[:1] - 1))]
 
 
 def unique_with_inverse(keys: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-    """Sorted unique values (k,) of nonnegative integers (n,), the inverse (n,), the counts (k,) and
-    the sorting permutation (n,): `np.unique`, in a third of the time."""
+    """What `np.unique` computes for nonnegative integers (n,), in a third of the time: the sorted
+    unique values (k,), for each integer the index (n,) of its value, the number (k,) of integers
+    with each value, and the permutation (n,) that sorts the integers."""
     bits = len(keys).bit_length()
     if int(keys.max(initial=0)) >> (62 - bits):
         order = np.argsort(keys, kind="stable")

@@ -1,4 +1,4 @@
-"""Finishes meshes: thickening, simplification, and facts in their metadata."""
+"""The last steps of meshing: thickening, simplification, and facts for the meshes' metadata."""
 
 from __future__ import annotations
 
@@ -33,80 +33,93 @@ if TYPE_CHECKING:
 
 __all__ = ["check_options", "simplify_mesh", "thicken", "to_trimesh", "vertex_normals"]
 
-# The fraction of the area that may turn over on the two sides: slivers.
-_TURNED = 1e-2
+# The largest fraction of the area whose triangles may turn over when they are moved to a side. So
+# few are slivers.
+_MAX_TURNED_AREA = 1e-2
 # The largest number of triangles whose hulls are computed.
 _MOST_HULLS = 20_000
-# Half the thickness is beyond the reach if a side comes nearer to the surface than this fraction of
-# it.
-_REACH_FRACTION = 0.98
+# A part is too thick if points of a side come nearer to the surface than this fraction of half of
+# the thickness.
+_MIN_SIDE_DISTANCE = 0.98
 
 
 def thicken(
     surface: TriangleMesh, normals: FloatArray, thickness: float, tolerance: float
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """A closed part of a given thickness around a surface, and facts about it: `thickened_by` is
-    "offset" or "hulls of balls".
+    """A closed part of a given thickness around a surface, and facts about it. The fact
+    `thickened_by` is "offset" or "hulls of balls".
 
-    Where the surface's reach is larger than half of the thickness t (no point that near has two
-    closest points), the part is the surface moved by t/2 to both sides along its normals, and walls
-    along its boundary: straight between the sides, so that the boundary stays where it is. Its
-    volume is area x t up to the second order: (K t^2/12) of it, K the Gaussian curvature. Where
-    that makes triangles turn over, or come nearer to the surface than t/2, or pass through each
-    other, the part is the union of the convex hulls of three balls around the corners of each
-    triangle: all points within t/2, with a round boundary.
+    Let t be the thickness, and let the surface's reach be the largest distance up to which points
+    have a single closest point on it. If the reach is larger than t/2, the part consists of the
+    surface moved by t/2 to both sides along its normals, and of walls along its boundary, straight
+    between the sides, so that the boundary stays where it is. To second order its volume is area
+    times t, plus K t^2/12 of that, with the Gaussian curvature K. If triangles turn over in this
+    way, or come nearer to the surface than t/2, or pass through each other, the part is instead the
+    union of the convex hulls of three balls around the corners of each triangle: all points within
+    t/2 of the surface, with a round boundary.
 
-    normals: (n, 3), of unit length, on the side from which faces run counter-clockwise.
-    tolerance: of the balls' polyhedra, and of the surface's triangles, a length.
+    normals: (n, 3) unit normals at the vertices, on the side from which faces run
+        counter-clockwise.
+    thickness: t, a length.
+    tolerance: of the balls' polyhedra and of the surface's triangles, a length.
 
     Raises:
-        MeshingError: the part is far thicker than triangles are large, of which there are too many.
+        MeshingError: hulls are needed, and there are too many triangles.
     """
     area = 0.5 * float(np.linalg.norm(area_normals(surface.vertices[surface.faces]), axis=1).sum())
     facts: dict[str, Any] = {"thickness": thickness, "area": area}
-    why = _reason_beyond_reach(surface, normals, thickness)
+    why = _why_too_thick(surface, normals, thickness)
     if why is None:
-        part = _offset(surface, normals, thickness)
+        part = _offset_part(surface, normals, thickness)
         crossing = intersecting_faces(part.vertices, part.faces)
         if not len(crossing):
             return part, {**facts, "thickened_by": "offset"}
         why = f"{len(crossing)} triangles of the two sides pass through each other"
-    return _hulls(surface, 0.5 * thickness, tolerance, why), {
+    return _hull_union(surface, 0.5 * thickness, tolerance, why), {
         **facts, "thickened_by": "hulls of balls", "why": why
     }  # fmt: skip
 
 
-def _offset(surface: TriangleMesh, normals: FloatArray, thickness: float) -> TriangleMesh:
-    """The closed surface of both sides and of walls along the boundary."""
+def _offset_part(surface: TriangleMesh, normals: FloatArray, thickness: float) -> TriangleMesh:
+    """The closed surface that consists of both sides, each half of the thickness from the surface,
+    and of walls along its boundary, straight between the sides.
+
+    normals: (n, 3) unit normals at the vertices.
+    """
     n = len(surface.vertices)
-    move = 0.5 * thickness * normals / _normal_cosines(surface, normals)[:, None]
+    offset = 0.5 * thickness * normals / _normal_cosines(surface, normals)[:, None]
     a, b = boundary_edges(surface.faces).T
     # A face of the upper side runs the boundary edge from a to b, so the wall runs it from b to a.
     walls = [np.stack([b, a, a + n], axis=1), np.stack([b, a + n, b + n], axis=1)]
-    vertices = np.concatenate([surface.vertices + move, surface.vertices - move])
+    vertices = np.concatenate([surface.vertices + offset, surface.vertices - offset])
     return TriangleMesh(
         vertices, np.concatenate([surface.faces, surface.faces[:, ::-1] + n, *walls])
     )
 
 
 def _normal_cosines(surface: TriangleMesh, normals: FloatArray) -> FloatArray:
-    """(n,) area-weighted mean cosine between a vertex normal and the adjacent face normals, clipped
-    to [0.7, 1]. A vertex offset of thickness / cosine moves the faces by the thickness."""
+    """(n,) the mean cosine of the angles between a vertex normal and the normals of the faces
+    there, weighted by the faces' areas, and clipped to [0.7, 1]. A move of a vertex by thickness /
+    cosine along its normal moves the faces by about the thickness."""
     cross = area_normals(surface.vertices[surface.faces])
-    total, area = np.zeros(len(normals)), np.zeros(len(normals))
+    cosines, areas = np.zeros(len(normals)), np.zeros(len(normals))
     size = np.linalg.norm(cross, axis=1)
     for k in range(3):
         rows = surface.faces[:, k]
-        total += np.bincount(rows, (cross * normals[rows]).sum(axis=1), minlength=len(normals))
-        area += np.bincount(rows, size, minlength=len(normals))
-    return np.clip(total / np.maximum(area, 1e-300), 0.7, 1.0)
+        cosines += np.bincount(rows, (cross * normals[rows]).sum(axis=1), minlength=len(normals))
+        areas += np.bincount(rows, size, minlength=len(normals))
+    return np.clip(cosines / np.maximum(areas, 1e-300), 0.7, 1.0)
 
 
-def _reason_beyond_reach(
-    surface: TriangleMesh, normals: FloatArray, thickness: float
-) -> str | None:
-    """The reason why half of the thickness exceeds the surface's reach; None if nothing shows
-    that."""
+def _why_too_thick(surface: TriangleMesh, normals: FloatArray, thickness: float) -> str | None:
+    """Why half of the thickness is larger than the surface's reach, in words; None if nothing shows
+    that. The reach is the largest distance up to which points have a single closest point on the
+    surface.
+
+    It is shown by triangles that turn over when their vertices are moved along their normals to a
+    side, or by points of a side that are nearer to the surface than they should be: near a vertex
+    that is not joined by an edge to the one that the point was moved from.
+    """
     import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial
@@ -120,24 +133,30 @@ def _reason_beyond_reach(
     for sign in (1, -1):
         side = surface.vertices + sign * half * normals
         turned = (area_normals(side[surface.faces]) * flat).sum(axis=1) <= 0
-        if areas[turned].sum() > _TURNED * areas.sum():  # a smaller area is slivers
+        if areas[turned].sum() > _MAX_TURNED_AREA * areas.sum():  # a smaller area is slivers
             return f"{turned.sum()} triangles turn over: the surface bends more than 1/{half:.3g}"
         # At most the neighbors of the vertex that a point was moved from are nearer to the point.
-        away, nearest = tree.query(side, k=neighbor_count)
+        distances, nearest = tree.query(side, k=neighbor_count)
         pairs = np.stack([np.broadcast_to(vertex_ids[:, None], nearest.shape), nearest], axis=-1)
-        near = (away < _REACH_FRACTION * half) & (pairs[..., 0] != pairs[..., 1])
-        near_keys = sorted_unique(edge_keys(pairs[near], len(vertex_ids)))
+        is_too_near = (distances < _MIN_SIDE_DISTANCE * half) & (pairs[..., 0] != pairs[..., 1])
+        near_keys = sorted_unique(edge_keys(pairs[is_too_near], len(vertex_ids)))
         count = int((~np.isin(near_keys, neighbors)).sum())
         if count:
             return f"{count} points of a side are nearer to another place than to their own"
     return None
 
 
-def _hulls(surface: TriangleMesh, radius: float, tolerance: float, why: str) -> TriangleMesh:
-    """The union of the hulls of three balls around the corners of each triangle.
+def _hull_union(surface: TriangleMesh, radius: float, tolerance: float, why: str) -> TriangleMesh:
+    """The union of the convex hulls of three balls around the corners of each triangle.
 
-    Balls are polyhedra with corners on the sphere, so that the part lies inside of the exact one,
-    by at most `tolerance` or a tenth of the radius.
+    Balls are polyhedra with their corners on the sphere, so that the union lies inside of that for
+    exact balls: by at most the larger of `tolerance` and a tenth of the radius, unless that would
+    need more than 16 segments around.
+
+    why: the reason why hulls are needed, for the message.
+
+    Raises:
+        MeshingError: there are too many triangles.
     """
     from manifold3d import Manifold, OpType
 
@@ -147,38 +166,42 @@ def _hulls(surface: TriangleMesh, radius: float, tolerance: float, why: str) -> 
             f"{len(surface.faces):,} triangles, too many for a union of as many hulls: choose a "
             "larger `tolerance`, or a smaller thickness"
         )
-    allowed = max(tolerance, 0.1 * radius)
-    segments = int(np.clip(4 * np.ceil(np.pi / 2 * np.sqrt(radius / (2 * allowed))), 8, 16))
+    max_error = max(tolerance, 0.1 * radius)
+    segments = int(np.clip(4 * np.ceil(np.pi / 2 * np.sqrt(radius / (2 * max_error))), 8, 16))
     mesh = Manifold.sphere(radius, segments).to_mesh64()
     ball = np.array(mesh.vert_properties, np.float64)[:, :3]
-    parts = [
+    hulls = [
         Manifold.hull_points(np.ascontiguousarray((corners[:, None] + ball).reshape(-1, 3)))
         for corners in surface.vertices[surface.faces]
     ]
-    return from_manifold(Manifold.batch_boolean(parts, OpType.Add))
+    return from_manifold(Manifold.batch_boolean(hulls, OpType.Add))
 
 
 # Simplification and metadata.
 
-# The cosine of the angle between normals from which on an edge is a crease.
-_CREASE = math.cos(math.radians(30))
-# The distances by which simplification may move a surface, in the order of the attempts, and the
-# distance by which the repair of intersections may then move it, relative to the tolerance.
-_SIMPLIFY_TOLERANCES, _REPAIR_TOLERANCE = (0.4, 0.2, 0.1), 0.05
+# An edge is a crease if the cosine of the angle between its faces' normals is below this.
+_CREASE_COSINE = math.cos(math.radians(30))
+# How far simplification may move a surface, tried in this order, and how far mending may move it
+# afterwards; relative to the tolerance.
+_SIMPLIFIED_WITHIN, _MENDED_WITHIN = (0.4, 0.2, 0.1), 0.05
 
 
-def check_options(spacing: Any, thickness: Any, seed: Any, max_triangles: Any) -> None:
-    """Raise ValueError or TypeError for numbers out of range."""
+def check_options(spacing: Any, thickness: Any, seed: Any, most: Any) -> None:
+    """Raise ValueError or TypeError unless options of `mesh` are in their ranges: `cell_size` and
+    `thickness` positive or None, `seed` a nonnegative integer, `max_triangles` a positive
+    integer."""
     for name, value in (("cell_size", spacing), ("thickness", thickness)):
         if value is not None and not 0 < as_real(value, name) < math.inf:
             raise ValueError(f"{name} must be a positive length, not {value!r}")
     as_integer_in_range(seed, "seed", 0, 2**63 - 1)
-    as_integer_in_range(max_triangles, "max_triangles", 1, 2**63 - 1)
+    as_integer_in_range(most, "max_triangles", 1, 2**63 - 1)
 
 
 def vertex_normals(function: LevelFunction, surface: TriangleMesh) -> FloatArray:
-    """Unit normals (n, 3) at vertices: along the gradient of the field, and where it has none, as
-    at the curve that a surface ends on, the mean of the faces there by area."""
+    """(n, 3) unit normals at the vertices of a surface. They point along the gradient of the field.
+    Where the field has no gradient, as at a curve at which the surface ends, or where the gradient
+    is far from the direction of the faces, they are the mean of the normals of the faces there,
+    weighted by area."""
     corner = surface.vertices[surface.faces]
     normal = area_normals(corner)
     mean = np.zeros_like(surface.vertices)
@@ -199,24 +222,24 @@ def vertex_normals(function: LevelFunction, surface: TriangleMesh) -> FloatArray
 def simplify_mesh(
     surface: TriangleMesh, tolerance: float, check: Callable[[TriangleMesh], None]
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """A closed surface with fewer triangles, or as it is where that cannot be.
+    """A closed surface with fewer triangles, or the same surface if that fails; and facts about it.
 
-    The method is manifold3d's simplification, which keeps some of the vertices. It moves the
-    surface by less than a fraction of the tolerance, half of which is for all other errors. Where
-    triangles then pass through each other they are mended; where that fails, or the check does, a
-    smaller fraction is tried.
+    manifold3d simplifies the surface, which keeps some of its vertices and moves the surface by
+    less than a fraction of the tolerance; half of the tolerance is for all other errors. Triangles
+    that then pass through each other are mended. If mending or the check fails, a smaller fraction
+    is tried.
 
-
-    check: checks a surface none of whose triangles pass through each other.
+    check: raises MeshingError if a surface, none of whose triangles pass through each other, fails
+        its checks.
     """
     facts = {"triangles_before_simplification": len(surface.faces)}
     solid = to_manifold(surface)
-    for part in _SIMPLIFY_TOLERANCES:
+    for part in _SIMPLIFIED_WITHIN:
         simpler = from_manifold(without_short_edges(solid, part * tolerance))
         if not 0 < len(simpler.faces) < len(surface.faces):
             continue
         try:
-            simpler = resolve_self_intersections(simpler, _REPAIR_TOLERANCE * tolerance)
+            simpler = resolve_self_intersections(simpler, _MENDED_WITHIN * tolerance)
             check(simpler)
         except MeshingError:
             continue
@@ -225,11 +248,13 @@ def simplify_mesh(
 
 
 def to_trimesh(surface: TriangleMesh, facts: dict[str, Any], is_closed: bool) -> trimesh.Trimesh:
-    """Convert a manifold surface (`check_manifold`) to a trimesh.Trimesh with facts about it in its
-    metadata. A mesh without a boundary is oriented so that its volume is positive.
+    """Convert a manifold surface (`check_manifold`) to a trimesh.Trimesh, with facts about it in
+    its metadata. A mesh without a boundary is oriented so that its volume is positive.
+
+    is_closed: whether the mesh has to be closed.
 
     Raises:
-        MeshingError: `is_closed`, but the mesh is not closed or has no positive volume.
+        MeshingError: the mesh has to be closed, but is not, or has no positive volume.
     """
     from harnack.meshing.closed_mesh import ClosedMesh
 
@@ -252,16 +277,17 @@ def to_trimesh(surface: TriangleMesh, facts: dict[str, Any], is_closed: bool) ->
         **facts,
         "euler_characteristic": euler_characteristic(surface.faces, edges),
         "boundary": boundary,
-        "creases": _creases(surface, edges),
+        "creases": _crease_count(surface, edges),
     }
     return mesh
 
 
-def _creases(surface: TriangleMesh, edges: Edges) -> int:
-    """The number of edges whose two faces have normals more than 30 degrees apart."""
+def _crease_count(surface: TriangleMesh, edges: Edges) -> int:
+    """The number of edges whose two faces have normals more than 30 degrees apart. edges: the
+    `Edges` of the surface's `half_edges`."""
     normals = _unit_normals(surface.vertices, surface.faces)
     pairs = edges.paired_half_edges() % len(surface.faces)
-    return int((row_dots(normals[pairs[:, 0]], normals[pairs[:, 1]]) < _CREASE).sum())
+    return int((row_dots(normals[pairs[:, 0]], normals[pairs[:, 1]]) < _CREASE_COSINE).sum())
 
 
 def _unit_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:

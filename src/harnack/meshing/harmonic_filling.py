@@ -1,10 +1,10 @@
-"""Harmonic hole fillings: surfaces on which the winding number of a mesh is 1/2, which fill all
-holes at once.
+"""Harmonic hole fillings. They lie on surfaces on which the winding number of a mesh is 1/2, and
+fill all holes at once.
 
-The 1/2 level of the winding number w modulo 1 is the 2 pi level of the solid angle of the boundary
-edges (`geometry.chains`), a smooth surface that ends at them. It is meshed with these very edges in
-it, and joined to the mesh by index. It joins the boundary loops of a gap, where `hole_filling`
-closes each loop by itself.
+Let w be the winding number. Its level 1/2, modulo 1, is the level 2 pi of the solid angle of the
+boundary edges (`geometry.chains`): a smooth surface that ends at these edges. It is meshed so that
+it has these very edges, and joined to the mesh by the indices of their vertices. It connects the
+boundary loops of one gap, whereas `hole_filling` closes each loop by itself.
 """
 
 from __future__ import annotations
@@ -55,15 +55,15 @@ __all__ = [
 ]
 
 _LEVEL = 2 * math.pi
-# The initial number of cells across the holes.
-_ACROSS = 24
-# How often edges of holes that are too near to others are halved for the tetrahedra; and the
+# The initial number of cells across the box around all holes.
+_CELLS_ACROSS = 24
+# How often edges of holes that are missing among those of the tetrahedra are halved; and the
 # largest number of pieces, in all and for each edge: so many arise where edges lie on each other.
-_MAX_CUTS, _MAX_PIECES, _MAX_PER_EDGE = 12, 20_000, 64
-# How often fillings that intersect the mesh are computed again, with smaller cells.
-_MAX_RETRIES = 1
-# The largest difference of w from 1/2, modulo 1, at vertices of fillings.
-_MAX_LEVEL_ERROR = 1e-6
+_MAX_HALVINGS, _MAX_PIECES, _MAX_PIECES_PER_EDGE = 12, 20_000, 64
+# How often patches that intersect the mesh are computed again, with smaller cells.
+_MAX_MESH_RETRIES = 1
+# How far the winding number may be from 1/2, modulo 1, at vertices of patches.
+_MAX_WINDING_ERROR = 1e-6
 
 
 @dataclass(frozen=True)
@@ -72,9 +72,10 @@ class HoleFillingOptions:
 
     tolerance: how far fillings may be from the surface, relative to the size of the box around all
         holes.
-    spacing: the initial size of cells, or None.
-    seed: of random moves.
-    attempts: how many sizes of cells are tried.
+    spacing: the size of cells at first, a length; None for a 24th of that box.
+    seed: of the random moves of points.
+    attempts: how many times the fillings are computed, with smaller cells where checks failed.
+    report: receives messages about the progress.
     """
 
     tolerance: MeshTolerance
@@ -86,11 +87,14 @@ class HoleFillingOptions:
 
 @dataclass(frozen=True)
 class HarmonicFilling:
-    """The vertices and faces that harmonic filling adds to a mesh.
+    """The vertices and faces that a harmonic filling adds to a mesh.
 
-    vertices: (k, 3).
-    faces: (p, 3); indices below the number of the mesh's vertices are of these.
+    vertices: (k, 3) the new vertices.
+    faces: (p, 3). Indices below the number of the mesh's vertices stand for vertices of the mesh,
+        the following ones for new vertices.
     is_refined: whether the faces were refined to the tolerance.
+    spacing: the size of cells.
+    evaluations: the number of evaluations of the solid angle, in points.
     triangle_fill_count: how many of the faces are single triangles that fill holes of three edges.
     """
 
@@ -103,26 +107,29 @@ class HarmonicFilling:
 
 
 def harmonic_patches(
-    vertices: FloatArray, faces: IntArray, edges: IntArray, options: HoleFillingOptions
+    vertices: FloatArray, faces: IntArray, edges: IntArray, asked: HoleFillingOptions
 ) -> HarmonicFilling:
-    """Fill the holes of a mesh by harmonic fillings that end at its boundary edges (k, 2), in the
-    direction of its faces; or, where that fails, by triangles in holes of three edges, and harmonic
-    fillings of the other holes.
+    """Fill the holes of a mesh by harmonic fillings that end at its boundary edges. If that fails,
+    holes of three edges are filled by triangles, and the others by harmonic fillings.
+
+    vertices: (n, 3) of the mesh.
+    faces: (m, 3) of the mesh.
+    edges: (k, 2) its boundary edges, in the direction of its faces.
 
     Raises:
         MeshingError: fillings could not be computed, or intersect the mesh or each other.
     """
     try:
-        return _fill_all_holes(vertices, faces, edges, options)
+        return _fill_all_holes(vertices, faces, edges, asked)
     except MeshingError as error:
         missing = triangle_fills(vertices, faces, edges)
         if not len(missing):
             raise
         first = error
-    options.report(f"once more, with triangles in {len(missing):,} holes of three edges")
+    asked.report(f"once more, with triangles in {len(missing):,} holes of three edges")
     together = np.concatenate([faces, missing])
     try:
-        filling = _fill_all_holes(vertices, together, checked_boundary_edges(together), options)
+        filling = _fill_all_holes(vertices, together, checked_boundary_edges(together), asked)
     except MeshingError as error:
         raise MeshingError(
             f"{first}; and with triangles in {len(missing):,} holes of three edges: {error}"
@@ -134,43 +141,46 @@ def harmonic_patches(
 def _fill_all_holes(
     vertices: FloatArray, faces: IntArray, edges: IntArray, options: HoleFillingOptions
 ) -> HarmonicFilling:
-    """The fillings that end at open edges; cells are made smaller where checks fail.
+    """The harmonic filling of all holes: patches that end at the boundary edges (k, 2). Where a
+    check fails, they are computed again with smaller cells there.
+
+    faces: (m, 3) of the mesh.
 
     Raises:
-        MeshingError: as `harmonic_filling`.
+        MeshingError: as `harmonic_patches`.
     """
     if not len(edges):
         return HarmonicFilling(vertices[:0], faces[:0], True, 0.0, 0)
     loops = singular_loops(edges, np.ones(len(edges), np.int64))
     function = LevelFunction(SolidAngle([vertices[loop] for loop in loops]), _LEVEL)
     size = float(np.ptp(vertices[np.unique(edges)], axis=0).max())
-    cell = size / _ACROSS if options.spacing is None else float(options.spacing)
+    width = size / _CELLS_ACROSS if options.spacing is None else float(options.spacing)
     report, tolerance = options.report, options.tolerance.within(size)
     finer: tuple[RefinementBalls, ...] = ()
-    times_met, seed, before = 0, options.seed, None
+    mesh_hits, seed, previous = 0, options.seed, None
     for attempt in range(options.attempts):
-        last = attempt == options.attempts - 1
-        report(f"cells of {cell:.3g}" + ", smaller in places" * bool(finer))
+        is_last = attempt == options.attempts - 1
+        report(f"cells of {width:.3g}" + ", smaller in places" * bool(finer))
         try:
-            patches = _patches(
-                function, vertices, edges, cell, finer, tolerance, seed, last, report
+            patches = _mesh_patches(
+                function, vertices, edges, width, finer, tolerance, seed, is_last, report
             )
-            _check(vertices, faces, patches, report)
+            _check_filled_mesh(vertices, faces, patches, report)
         except LocalizedMeshingError as error:
-            times_met += isinstance(error, _MeshIntersectionError)
-            is_hopeless, before = not is_retry_promising(error, before), error
-            if last or is_hopeless or times_met > _MAX_RETRIES:
+            mesh_hits += isinstance(error, _MeshIntersectionError)
+            is_hopeless, previous = not is_retry_promising(error, previous), error
+            if is_last or is_hopeless or mesh_hits > _MAX_MESH_RETRIES:
                 location = ", ".join(f"{c:.4g}" for c in error.locations[0])
                 raise MeshingError(
-                    f"{error} (cells were {cell:.3g} wide, and smaller in {len(error.locations)} "
+                    f"{error} (cells were {width:.3g} wide, and smaller in {len(error.locations)} "
                     f"places, such as near ({location}))"
                 ) from None
             report(f"{error} ({len(error.locations)} places)")
-            finer = (*finer, RefinementBalls(error.locations, 2 * cell * 0.5 ** len(finer)))
+            finer = (*finer, RefinementBalls(error.locations, 2 * width * 0.5 ** len(finer)))
         except TriangleLimitError:
             raise
         except MeshingError as error:  # a point lies where the function is too inaccurate
-            if last:
+            if is_last:
                 raise
             report(f"{error}; once more, with points moved at random in another way")
             seed += 1
@@ -184,10 +194,10 @@ class _MeshIntersectionError(LocalizedMeshingError):
 
 
 def checked_boundary_edges(faces: IntArray) -> IntArray:
-    """(k, 2) the edges with one face, in its direction.
+    """(k, 2) the edges that have a single face, in the direction of that face.
 
     Raises:
-        MeshError: an edge of more than two faces, or of two that have it in the same direction.
+        MeshError: an edge has more than two faces, or two that run it in the same direction.
     """
     pairs = half_edges(faces)
     edges = Edges.of(pairs)
@@ -212,9 +222,11 @@ def checked_boundary_edges(faces: IntArray) -> IntArray:
 
 
 def triangle_fills(vertices: FloatArray, faces: IntArray, edges: IntArray) -> IntArray:
-    """The triangles (k, 3) that fill holes of three edges, where they intersect no others.
+    """(k, 3) triangles that fill holes of three edges; those that would intersect other triangles
+    are left out.
 
-    edges: (n, 2) boundary edges, in the direction of the faces.
+    vertices, faces: of the mesh.
+    edges: (n, 2) its boundary edges, in the direction of the faces.
     """
     leads: dict[int, set[int]] = defaultdict(set)
     for a, b in edges.tolist():
@@ -230,14 +242,14 @@ def triangle_fills(vertices: FloatArray, faces: IntArray, edges: IntArray) -> In
                 break
     triangles = np.array(fills, np.int64).reshape(-1, 3)
     corners = vertices[triangles]
-    triangles = triangles[np.linalg.norm(_normals(corners), axis=1) > 0]
+    triangles = triangles[np.linalg.norm(_unit_normals(corners), axis=1) > 0]
     together = np.concatenate([faces, triangles])
     is_new = np.arange(len(together)) >= len(faces)
     met = np.setdiff1d(intersecting_faces(vertices, together, is_new), np.arange(len(faces)))
     return np.delete(triangles, met - len(faces), axis=0)
 
 
-def _patches(
+def _mesh_patches(
     function: LevelFunction,
     vertices: FloatArray,
     edges: IntArray,
@@ -245,61 +257,70 @@ def _patches(
     finer: tuple[RefinementBalls, ...],
     tolerance: float,
     seed: int,
-    last: bool,
+    is_last: bool,
     report: Callable[[str], None],
 ) -> HarmonicFilling:
-    """The level set, ending at the edges (k, 2) of the mesh.
+    """The level set of the function that ends at the boundary edges (k, 2) of the mesh, as a
+    filling.
 
-    last: whether this is the last attempt, in which fillings that cannot be refined are accepted.
+    The edges are edges of Delaunay's tetrahedra; those that are missing there are halved first, and
+    their midpoints are removed from the patches afterwards.
+
+    vertices: (n, 3) of the mesh.
+    spacing: the size of cells; they are halved in each entry of `finer` that they meet.
+    tolerance: a length.
+    seed: of the random moves of points.
+    is_last: whether this is the last attempt, in which patches are accepted that cannot be refined.
 
     Raises:
-        MeshingError: as `mesh`; or Delaunay's tetrahedra lack an edge.
+        MeshingError: no patch ends at the edges, or a check of `mesh` fails; a TriangleLimitError
+            if edges are cut into too many pieces.
     """
     rim, rim_edges = np.unique(edges, return_inverse=True)
     boundary = BoundaryCurve(vertices[rim], rim_edges.reshape(-1, 2))
-    hull: Any = function.field.extent((_LEVEL,))
-    lower, upper = (np.array(end, np.float64) for end in hull.bounds())
+    extent: Any = function.field.extent((_LEVEL,))
+    lower, upper = (np.array(end, np.float64) for end in extent.bounds())
     root = box_cells(lower - 0.5 * spacing, upper + 0.5 * spacing, spacing, exact=False)
-    cut, middles = boundary, np.zeros((0, 2), np.int64)
-    points = sample_delaunay_points(function, root, cut, None, seed, finer)
+    curve, halved = boundary, np.zeros((0, 2), np.int64)
+    points = sample_delaunay_points(function, root, curve, None, seed, finer)
     tets = delaunay(points.points)
-    for _ in range(_MAX_CUTS):
-        lacks = ~tets.has_edges(cut.edges)
+    for _ in range(_MAX_HALVINGS):
+        lacks = ~tets.has_edges(curve.edges)
         if not lacks.any():
             break
-        if len(cut.edges) > min(_MAX_PIECES, _MAX_PER_EDGE * len(edges)):
+        if len(curve.edges) > min(_MAX_PIECES, _MAX_PIECES_PER_EDGE * len(edges)):
             raise TriangleLimitError(
                 f"{len(edges):,} boundary edges of the mesh lie on others or next to them: cut to "
-                f"{len(cut.edges):,} pieces some are still too near to others for a patch that "
+                f"{len(curve.edges):,} pieces some are still too near to others for a patch that "
                 "ends at them; join or remove the triangles there"
             )
-        middles = np.concatenate([middles, cut.edges[lacks]])
-        cut = cut.split(lacks)
-        points = sample_delaunay_points(function, root, cut, None, seed, finer)
+        halved = np.concatenate([halved, curve.edges[lacks]])
+        curve = curve.split(lacks)
+        points = sample_delaunay_points(function, root, curve, None, seed, finer)
         tets = delaunay(points.points)
-    lacks = ~tets.has_edges(cut.edges)
+    lacks = ~tets.has_edges(curve.edges)
     if lacks.any():
         raise LocalizedMeshingError(
             f"{int(lacks.sum())} boundary edges of the mesh are too near to others for a patch "
             "that ends at them: subdivide the mesh there, or choose a smaller `cell_size`",
-            cut.points[cut.edges[lacks]].mean(axis=1),
+            curve.points[curve.edges[lacks]].mean(axis=1),
         )
     report(f"{len(points.points):,} points, {len(tets.corners):,} tetrahedra")
     x, faces = extract_triangles(function, points, tets, count_crossings(function, points, tets))
-    for k, ends in reversed(list(enumerate(middles.tolist(), start=len(rim)))):
+    for k, ends in reversed(list(enumerate(halved.tolist(), start=len(rim)))):
         faces = _collapse_midpoint(x, faces, k, ends)
     if not len(faces):
         raise LocalizedMeshingError(
             "no patch was found: choose a smaller `cell_size`", boundary.points
         )
     _check_boundary(x, faces, boundary)
-    is_fine = True
+    is_refined = True
     try:
-        x, faces = _refine_and_smooth(function, x, faces, tolerance, report)
+        x, faces = _refine_patches(function, x, faces, tolerance, report)
     except LocalizedMeshingError:
-        if not last or len(intersecting_faces(x, faces)):
+        if not is_last or len(intersecting_faces(x, faces)):
             raise
-        is_fine = False
+        is_refined = False
     # Faces of level sets are seen from where w is greater, those of meshes from outside.
     faces = faces[:, ::-1]
     used = np.unique(faces)
@@ -307,21 +328,27 @@ def _patches(
     index = np.full(len(x), -1, np.int64)
     index[: len(rim)] = rim
     index[inner] = len(vertices) + np.arange(len(inner))
-    return HarmonicFilling(x[inner], index[faces], is_fine, spacing, function.evaluations)
+    return HarmonicFilling(x[inner], index[faces], is_refined, spacing, function.evaluations)
 
 
-def _refine_and_smooth(
+def _refine_patches(
     function: LevelFunction,
     x: FloatArray,
     faces: IntArray,
     tolerance: float,
     report: Callable[[str], None],
 ) -> tuple[FloatArray, IntArray]:
-    """Vertices and faces of patches refined to the tolerance: smoothed and improved, or only
-    smoothed, or as they are, whichever first does not pass through itself.
+    """The vertices and faces of patches, refined to the tolerance. Three ways are tried, and the
+    first whose result does not pass through itself is taken: smoothing, refining and improving;
+    smoothing before and after refining; refining alone.
+
+    x: (n, 3) the vertices of the patches.
+    tolerance: a length.
 
     Raises:
-        MeshingError: all do, as small triangles turn over each other beside sharp corners of holes.
+        LocalizedMeshingError: all results pass through themselves, as small triangles do that turn
+            over each other beside sharp corners of holes; or triangles do not come near the
+            surface.
     """
     failed = x[:0]
     for mode in ("improving", "smoothing", "refining alone"):
@@ -339,61 +366,67 @@ def _refine_and_smooth(
             finer, split = improve(function, finer, split, 0.5 * tolerance, None, report)
         elif mode == "smoothing":
             finer = smooth(function, finer, split, None)
-        met = finer[split[intersecting_faces(finer, split)]].mean(axis=1)
-        failed = np.concatenate([met, finer[_new_singular(faces, split)]])
+        centers = finer[split[intersecting_faces(finer, split)]].mean(axis=1)
+        failed = np.concatenate([centers, finer[_new_nonmanifold_vertices(faces, split)]])
         if not len(failed):
             return finer, split
     raise LocalizedMeshingError("the patches meet each other: choose a smaller `cell_size`", failed)
 
 
-def _new_singular(before: IntArray, after: IntArray) -> IntArray:
-    """The vertices at which faces are no longer a manifold; holes may touch in other vertices."""
+def _new_nonmanifold_vertices(before: IntArray, after: IntArray) -> IntArray:
+    """The vertices at which faces are a manifold before, but not after. Vertices in which holes
+    touch are no manifold before either."""
     return np.setdiff1d(nonmanifold_vertices(after), nonmanifold_vertices(before))
 
 
 def _collapse_midpoint(x: FloatArray, faces: IntArray, middle: int, ends: list[int]) -> IntArray:
-    """The faces after a vertex in the middle of a boundary edge was moved to one of the edge's
-    ends: the end for which fewer faces intersect or, if the numbers are equal, for which the faces
-    around it are turned less.
+    """The faces after the vertex `middle`, which halves a boundary edge, was merged with one end of
+    that edge. Of the two ends the one is taken for which fewer faces intersect or, if the numbers
+    are equal, the one for which the faces around the vertex are turned less.
+
+    x: (n, 3) the vertices.
+    ends: the two vertices at the ends of the edge.
 
     Raises:
-        MeshingError: both ends would join more than the two faces at the edge.
+        LocalizedMeshingError: merging with either end would join other faces than those at the
+            edge.
     """
     in_star = (faces == middle).any(axis=1)
-    star, rest = faces[in_star], faces[~in_star]
+    star, others = faces[in_star], faces[~in_star]
     candidates: list[tuple[int, float, IntArray]] = []
     for end in ends:
-        joined = (faces == end).any(axis=1)
-        if len(np.intersect1d(star, faces[joined])) != 3:  # these two, and the face's third corner
+        at_end = (faces == end).any(axis=1)
+        if len(np.intersect1d(star, faces[at_end])) != 3:  # these two, and the face's third corner
             continue
         moved = np.where(star == middle, end, star)
         is_kept = ~(star == end).any(axis=1)
-        before, after = _normals(x[star[is_kept]]), _normals(x[moved[is_kept]])
-        turned = float((before * after).sum(axis=1).min(initial=1.0))
-        new_faces = np.concatenate([rest, moved[is_kept]])
-        is_moved = np.arange(len(new_faces)) >= len(rest)
-        candidates.append((len(intersecting_faces(x, new_faces, is_moved)), -turned, new_faces))
+        one, other = _unit_normals(x[star[is_kept]]), _unit_normals(x[moved[is_kept]])
+        cosine = float((one * other).sum(axis=1).min(initial=1.0))
+        new_faces = np.concatenate([others, moved[is_kept]])
+        is_moved = np.arange(len(new_faces)) >= len(others)
+        candidates.append((len(intersecting_faces(x, new_faces, is_moved)), -cosine, new_faces))
     if not candidates:
         raise LocalizedMeshingError(
             "boundary edges of the mesh are too near to others for patches that end at them: "
             "subdivide the mesh there, or choose a smaller `cell_size`",
             x[[middle]],
         )
-    return min(candidates, key=lambda candidate: candidate[:2])[2]
+    return min(candidates, key=lambda one: one[:2])[2]
 
 
-def _normals(corners: FloatArray) -> FloatArray:
+def _unit_normals(corners: FloatArray) -> FloatArray:
     """Unit normals of triangles (m, 3, 3), 0 for triangles without an area."""
     normal = area_normals(corners)
     return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
 
 
 def _check_boundary(x: FloatArray, faces: IntArray, boundary: BoundaryCurve) -> None:
-    """Raise unless fillings end at the boundary, and run each of its edges in the direction of the
-    mesh: fillings are reversed afterwards."""
+    """Raise LocalizedMeshingError unless the boundary edges of the patches are those of `boundary`,
+    run in the same direction. The patches are turned over afterwards, so that they run each edge
+    against the mesh's faces."""
     directed = {(int(a), int(b)) for a, b in half_edges(faces)}
-    rim = {(a, b) for a, b in directed if (b, a) not in directed}
-    unmatched = rim ^ {(int(a), int(b)) for a, b in boundary.edges}
+    open_edges = {(a, b) for a, b in directed if (b, a) not in directed}
+    unmatched = open_edges ^ {(int(a), int(b)) for a, b in boundary.edges}
     if unmatched:
         raise LocalizedMeshingError(
             "the patches do not end at the edges of the holes: cells are too large for them; "
@@ -402,16 +435,19 @@ def _check_boundary(x: FloatArray, faces: IntArray, boundary: BoundaryCurve) -> 
         )
 
 
-def _check(
+def _check_filled_mesh(
     vertices: FloatArray,
     faces: IntArray,
     patches: HarmonicFilling,
     report: Callable[[str], None],
 ) -> None:
-    """Raise unless the mesh with its fillings has the properties that `repair` promises.
+    """Check the mesh together with its patches: it is a manifold; at the patches' vertices the
+    winding number of the mesh is 1/2 modulo 1; and the patches intersect neither the mesh nor each
+    other.
 
     Raises:
-        MeshingError: it does not.
+        LocalizedMeshingError: a check fails; a _MeshIntersectionError if patches intersect the
+            mesh.
     """
     report("checking the patches")
     x = np.concatenate([vertices, patches.vertices])
@@ -423,11 +459,11 @@ def _check(
     added = patches.vertices
     w = WindingNumber(vertices, faces).value(added, precision="double")
     gap = np.abs(w - np.floor(w) - 0.5)
-    if not (gap <= _MAX_LEVEL_ERROR).all():
+    if not (gap <= _MAX_WINDING_ERROR).all():
         raise LocalizedMeshingError(
             f"the winding number is off 1/2 by {gap.max():.2g} at a vertex of the patches: choose "
             "a smaller `cell_size`",
-            added[gap > _MAX_LEVEL_ERROR],
+            added[gap > _MAX_WINDING_ERROR],
         )
     is_patch = np.arange(len(together)) >= len(faces)
     met = intersecting_faces(x, together, is_patch)

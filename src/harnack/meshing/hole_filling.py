@@ -1,16 +1,17 @@
-"""Fills the holes of a mesh smoothly, each bounded by a loop of boundary edges.
+"""Fills the holes of a mesh smoothly. Each hole is bounded by a loop of boundary edges.
 
-A filling begins as the triangulation of its loop that has the smallest dihedral angles with the
-faces around it (Liepa, Filling Holes in Meshes, 2003) or, for long loops, the smallest area
-(Barequet and Sharir 1995), which may cut through a tube where the other goes around it. Edges are
-split and flipped until triangles are as large as those around the hole. Then the filling is faired,
-to bend as little as possible: the sum of squared Laplacians of positions, over the new vertices and
-those of the loop, is minimized, while all vertices of the mesh stay (Botsch and Kobbelt 2004). So
-it continues the surface around it, tangents included. Laplacians are those of the filling before;
-repeated, with long edges split, this converges to surfaces whose mean curvature is harmonic, such
-as spheres and cylinders.
+A filling begins as a triangulation of its loop: the one that has the smallest dihedral angles, also
+with the faces around the loop (Liepa, Filling Holes in Meshes, 2003); or, for long loops, the one
+with the smallest area (Barequet and Sharir 1995). The two may differ: the smallest area may cut
+through a tube where the smallest angles go around it. Edges are split and flipped until triangles
+are as large as those around the hole. Then the filling is faired, so that it bends as little as
+possible: the sum of squared Laplacians of positions, over the new vertices and those of the loop,
+is minimized, while all vertices of the mesh stay (Botsch and Kobbelt 2004). So the filling
+continues the surface around it, tangents included. The weights of the Laplacians are computed from
+the filling before this step. Repeated, with long edges split in between, fairing converges to
+surfaces whose mean curvature is harmonic, such as spheres and cylinders.
 
-Nothing is proved about such fillings. Fillings that pass the checks of `fill_holes` are returned.
+Nothing is proved about such fillings. `fill_holes` checks them and returns those that pass.
 """
 
 from __future__ import annotations
@@ -39,22 +40,25 @@ __all__ = ["HoleFilling", "fill_holes", "hole_loops"]
 
 # Loops of more edges are not filled: the time grows with the cube of their number.
 _MAX_LOOP_EDGES = 600
-# The largest number of edges of a loop for which angles count, beyond which areas alone do; and the
-# number up to which angles always count.
-_MAX_ANGLE_EDGES, _ALWAYS_BY_ANGLES = 150, 10
-# Largest angles count as the same if their cosines differ by less than this.
-_SAME_TURN = 1e-9
+# Loops of up to so many edges are triangulated by angles, and longer ones by areas; and loops of up
+# to so many edges are triangulated by angles even in attempts that go by areas.
+_MAX_BY_ANGLES, _ALWAYS_BY_ANGLES = 150, 10
+# Two angles count as equal if their cosines differ by no more than this.
+_EQUAL_COSINES = 1e-9
 # Edges are split that are longer than this multiple of the usual length around the hole; and the
-# number of rounds.
-_LONG, _ROUNDS = 1.4, 10
-_MAX_CUT = 200_000
+# largest number of rounds of splitting.
+_LONG_RATIO, _SPLIT_ROUNDS = 1.4, 10
+# Patches of more faces than this are not split any more.
+_MAX_FACES_TO_SPLIT = 200_000
 # Edges are flipped if the cotangents of the two opposite angles have a sum below this.
 _MAX_FLIP_COTANGENT_SUM = -1e-3
-_MAX_FLIPS = 12
-# Cotangents are clamped to this range, so that every matrix is definite.
-_MIN_COTANGENT, _MAX_COTANGENT = 0.02, 20.0
+# The largest number of rounds of flipping.
+_FLIP_ROUNDS = 12
+# The smallest weight of an edge, and the largest absolute value of a cotangent, so that every
+# matrix is definite. The weight is half of the sum of the two cotangents.
+_MIN_WEIGHT, _MAX_COTANGENT = 0.02, 20.0
 # The strategies in the order of the attempts: whether loops are triangulated by angles, and how
-# often the patch is faired, by the cotangents of the patch before.
+# often the patch is faired, each time with the cotangents of the patch before.
 _STRATEGIES = ((True, 6), (False, 2), (True, 0), (False, 0))
 # The largest deviation of the mesh's winding number from 1/2 modulo 1 on a patch.
 _MAX_WINDING_DEVIATION = 0.36
@@ -67,9 +71,10 @@ class HoleFilling:
     """The vertices and faces added to a mesh by filling its holes.
 
     vertices: (k, 3) new vertices.
-    faces: (p, 3) of the fillings; indices below the number of the mesh's vertices are of these.
-    unfilled_loops: loops whose fillings failed, each an array of vertices.
-    reason: why these failed, in words.
+    faces: (p, 3) the faces of the fillings. Indices below the number of the mesh's vertices stand
+        for vertices of the mesh, the following ones for new vertices.
+    unfilled_loops: the loops whose fillings failed, each an array of indices of vertices.
+    reason: why these failed, in words, with the number of loops for each reason.
     """
 
     vertices: FloatArray
@@ -84,11 +89,12 @@ def fill_holes(
     """Fill holes, each bounded by a loop of boundary edges (`hole_loops`).
 
     A filling is accepted if its triangles have positive area and intersect no other triangle, and
-    if the mesh's winding number at its vertices and centers is near 1/2 modulo 1. The latter fails
-    where a loop bounds no hole of its own: two loops bound one gap, or another component stands in
-    it. Failed loops are tried again with the minimum-area triangulation, then without fairing.
+    if the mesh's winding number at its vertices and at the centers of its faces is near 1/2 modulo
+    1. The latter fails if a loop does not bound a hole by itself: two loops bound one gap, or
+    another component stands in the hole. Loops that fail are tried again with the triangulation of
+    smallest area, then without fairing.
 
-    winding: the winding number of the mesh at points.
+    winding: returns the winding number (k,) of the mesh at points (k, 3).
     """
     x, together = vertices, faces
     pending: list[IntArray] = loops
@@ -96,29 +102,26 @@ def fill_holes(
     for by_angles, fairings in _STRATEGIES:
         if not pending:
             break
-        patched, new, owner, reasons = _patches(x, together, pending, by_angles, fairings)
-        reasons |= _failures(patched, together, new, owner, len(x), winding)
+        patched, new, owner, reasons = _make_patches(x, together, pending, by_angles, fairings)
+        reasons |= _failure_reasons(patched, together, new, owner, len(x), winding)
         is_accepted = ~np.isin(owner, list(reasons))
-        x, together = _without_unused_vertices(
-            patched, np.concatenate([together, new[is_accepted]]), len(x)
-        )
+        x, together = _drop_unused(patched, np.concatenate([together, new[is_accepted]]), len(x))
         pending = [pending[k] for k in sorted(reasons)]
     counts = Counter(reasons.values())
     why = ", ".join(f"{count:,} {reason}" for reason, count in counts.items())
     return HoleFilling(x[len(vertices) :], together[len(faces) :], pending, why)
 
 
-def _without_unused_vertices(
-    x: FloatArray, faces: IntArray, input_count: int
-) -> tuple[FloatArray, IntArray]:
-    """The vertices and faces, without new vertices that no face uses."""
+def _drop_unused(x: FloatArray, faces: IntArray, input_count: int) -> tuple[FloatArray, IntArray]:
+    """The vertices (n, 3) and faces, without vertices that no face uses. The first `input_count`
+    vertices, those of the mesh, are kept in any case."""
     used = np.zeros(len(x), np.bool_)
     used[:input_count] = True
     used[faces] = True
     return x[used], (np.cumsum(used) - 1)[faces]
 
 
-def _failures(
+def _failure_reasons(
     x: FloatArray,
     faces: IntArray,
     new: IntArray,
@@ -126,21 +129,28 @@ def _failures(
     input_count: int,
     winding: Winding,
 ) -> dict[int, str]:
-    """The reasons why fillings fail, by loop. new: the faces of fillings; owner: their loops."""
+    """The reasons why patches fail, by the indices of their loops.
+
+    x: (n, 3) all vertices; the first `input_count` are those of the mesh.
+    faces: (m, 3) of the mesh.
+    new: (p, 3) the faces of all patches.
+    owner: (p,) the index of the loop whose patch each of these belongs to.
+    winding: the winding number of the mesh at points (k, 3).
+    """
     reasons: dict[int, str] = {}
     if not len(new):
         return reasons
-    loop_of = np.zeros(len(x), np.int64)
-    loop_of[new] = owner[:, None]
-    loops = np.concatenate([owner, loop_of[input_count:]])
+    vertex_loop = np.zeros(len(x), np.int64)
+    vertex_loop[new] = owner[:, None]
+    loops = np.concatenate([owner, vertex_loop[input_count:]])
     w = winding(np.concatenate([x[new].mean(axis=1), x[input_count:]]))
     is_off = ~(np.abs(w - np.floor(w) - 0.5) <= _MAX_WINDING_DEVIATION)
     reasons |= dict.fromkeys(loops[is_off].tolist(), "not where the winding number is near 1/2")
     together = np.concatenate([faces, new])
     is_new = np.arange(len(together)) >= len(faces)
-    met = intersecting_faces(x, together, is_new)
+    crossing = intersecting_faces(x, together, is_new)
     reasons |= dict.fromkeys(
-        owner[met[is_new[met]] - len(faces)].tolist(), "passing through other triangles"
+        owner[crossing[is_new[crossing]] - len(faces)].tolist(), "passing through other triangles"
     )
     flat = row_norms(area_normals(x[new])) == 0
     return reasons | dict.fromkeys(owner[flat].tolist(), "with triangles without an area")
@@ -150,11 +160,11 @@ def _failures(
 
 
 def hole_loops(vertices: FloatArray, faces: IntArray, edges: IntArray) -> list[IntArray]:
-    """The loops of open edges (k, 2), in the direction of their faces, each without a repeated
-    vertex.
+    """The loops that boundary edges (k, 2) form, each an array of indices of vertices without
+    repetition. Edges and loops run in the direction of the faces at the edges.
 
-    Where several holes meet at a vertex, a loop goes on with the edge that bounds the same gap
-    between faces, as seen along the normal there.
+    If several holes meet at a vertex, a loop goes on with the edge that bounds the same gap between
+    the faces around the vertex, as seen along the normal there.
     """
     leaving: defaultdict[int, list[int]] = defaultdict(list)
     arriving: defaultdict[int, list[int]] = defaultdict(list)
@@ -191,14 +201,21 @@ def hole_loops(vertices: FloatArray, faces: IntArray, edges: IntArray) -> list[I
 def _match_loop_edges(
     x: FloatArray, v: int, normal: FloatArray, starts: list[int], ends: list[int]
 ) -> list[int]:
-    """For each edge from a start to v, the end to which its loop goes on: the next end
-    counter-clockwise, since faces are to the left of their edges and holes to the right."""
+    """The vertices with which loops go on at the vertex `v`, one for each vertex in `starts`.
+    Coming from a start, it is the next end counter-clockwise, seen from where the normal points:
+    faces are to the left of their edges, and holes to the right.
+
+    normal: (3,) of the surface at v, of any length.
+    starts, ends: the vertices from which boundary edges lead to v, and those to which they lead
+        from v.
+    """
     axis = np.eye(3)[np.abs(normal).argmin()]
     unit_normal = normal / max(float(np.linalg.norm(normal)), 1e-300)
     u = np.cross(unit_normal, axis)
     w = np.cross(unit_normal, u)
 
     def angle(k: int) -> float:
+        """The angle in radians, about the normal at v, of the direction to the vertex k."""
         direction = x[k] - x[v]
         return float(np.arctan2(direction @ w, direction @ u))
 
@@ -214,15 +231,22 @@ def _match_loop_edges(
 # Triangulations of loops.
 
 
-def _patches(
+def _make_patches(
     vertices: FloatArray,
     faces: IntArray,
     loops: list[IntArray],
     by_angles: bool,
     fairings: int,
 ) -> tuple[FloatArray, IntArray, IntArray, dict[int, str]]:
-    """All vertices, those of patches last; the faces of patches; the loop of each face; and the
-    reasons why loops have no patch, by loop."""
+    """Triangulate all loops, refine the triangulations, and fair them.
+
+    by_angles: whether loops are triangulated by angles.
+    fairings: how often patches are faired.
+
+    Returns all vertices (n, 3), those of patches last; the faces (p, 3) of patches; (p,) the index
+    of the loop that each face belongs to; and, by the indices of their loops, the reasons why loops
+    have no patch.
+    """
     third = _opposite_corners(faces, np.unique(np.concatenate(loops)), len(vertices))
     used_edges = {(min(edge), max(edge)) for edge in third}
     fixed_edges = np.array(sorted(used_edges), np.int64).reshape(-1, 2)
@@ -232,9 +256,9 @@ def _patches(
             failed[k] = f"of more than {_MAX_LOOP_EDGES} edges"
             continue
         polygon = loop[::-1].copy()
-        limit = _MAX_ANGLE_EDGES if by_angles else _ALWAYS_BY_ANGLES
-        plan = _min_dihedral_triangulation if len(polygon) <= limit else _min_area_triangulation
-        triangles = plan(vertices, polygon, third, used_edges)
+        limit = _MAX_BY_ANGLES if by_angles else _ALWAYS_BY_ANGLES
+        method = _min_dihedral_triangulation if len(polygon) <= limit else _min_area_triangulation
+        triangles = method(vertices, polygon, third, used_edges)
         if triangles is None:
             failed[k] = "between edges that are joined already"
             continue
@@ -242,33 +266,42 @@ def _patches(
         patches.append(triangles)
     if not patches:
         return vertices, faces[:0], np.zeros(0, np.int64), failed
-    sized, new = _refine(vertices, faces, np.concatenate(patches), fixed_edges)
-    for rounds_left in range(fairings if len(sized) > len(vertices) else 0, 0, -1):
-        sized[:, :3] = _fair(sized[:, :3], faces, new, len(vertices))
-        new = _flipped(sized[:, :3], new, fixed_edges)
+    x, new = _refine_patches(vertices, faces, np.concatenate(patches), fixed_edges)
+    for rounds_left in range(fairings if len(x) > len(vertices) else 0, 0, -1):
+        x[:, :3] = _fair_patches(x[:, :3], faces, new, len(vertices))
+        new = _flip_edges(x[:, :3], new, fixed_edges)
         if rounds_left > 2:
-            sized, new = _split_long_edges(sized, new)
-            new = _flipped(sized[:, :3], new, fixed_edges)
-    return sized[:, :3], new, _loop_of_faces(new, loops, len(sized)), failed
+            x, new = _split_long_edges(x, new)
+            new = _flip_edges(x[:, :3], new, fixed_edges)
+    return x[:, :3], new, _loop_of_faces(new, loops, len(x)), failed
 
 
 def _opposite_corners(faces: IntArray, rims: IntArray, count: int) -> dict[tuple[int, int], int]:
-    """The third corners of faces, by their directed edges between some vertices."""
+    """The third corner of the face at each directed edge between two of the vertices `rims`; faces
+    run the edge in that direction.
+
+    count: the number of vertices of the mesh.
+    """
     is_rim = np.zeros(count, np.bool_)
     is_rim[rims] = True
     directed = half_edges(faces)
-    near = is_rim[directed].all(axis=1)
-    third = np.roll(faces, 1, axis=1).T.ravel()[near].tolist()
-    ends = directed[near].tolist()
+    is_kept = is_rim[directed].all(axis=1)
+    third = np.roll(faces, 1, axis=1).T.ravel()[is_kept].tolist()
+    ends = directed[is_kept].tolist()
     return {(a, b): c for (a, b), c in zip(ends, third, strict=True)}
 
 
 def _forbidden_diagonals(polygon: IntArray, used_edges: set[tuple[int, int]]) -> BoolArray:
-    """(n, n) which diagonals of a polygon are already edges."""
+    """(n, n) for each pair of a polygon's vertices, by their positions in it, whether an edge joins
+    them already, so that no diagonal may. False for the polygon's own edges.
+
+    polygon: (n,) indices of vertices.
+    used_edges: all edges, the lower index first.
+    """
     n = len(polygon)
     barred = np.zeros((n, n), np.bool_)
     position = {v: k for k, v in enumerate(polygon.tolist())}
-    for a, b in used_edges if n * n > len(used_edges) else _pairs(polygon, used_edges):
+    for a, b in used_edges if n * n > len(used_edges) else _used_pairs(polygon, used_edges):
         if a in position and b in position:
             barred[position[a], position[b]] = barred[position[b], position[a]] = True
     k = np.arange(n)
@@ -276,8 +309,9 @@ def _forbidden_diagonals(polygon: IntArray, used_edges: set[tuple[int, int]]) ->
     return barred
 
 
-def _pairs(polygon: IntArray, used_edges: set[tuple[int, int]]) -> list[tuple[int, int]]:
-    """The pairs of a polygon's vertices that are already edges."""
+def _used_pairs(polygon: IntArray, used_edges: set[tuple[int, int]]) -> list[tuple[int, int]]:
+    """The pairs of a polygon's vertices, the lower index first, that are among the edges
+    `used_edges`."""
     ordered = sorted(polygon.tolist())
     return [(a, b) for i, a in enumerate(ordered) for b in ordered[i + 1 :] if (a, b) in used_edges]
 
@@ -289,12 +323,19 @@ def _min_area_triangulation(
     used_edges: set[tuple[int, int]],
 ) -> IntArray | None:
     """The triangulation (n - 2, 3) of a polygon with the smallest area; None if existing edges
-    exclude every triangulation."""
+    exclude every triangulation. By dynamic programming: cost[i, k] is the smallest area for the
+    vertices from position i to position k.
+
+    x: (m, 3) all vertices.
+    polygon: (n,) indices of vertices.
+    third: unused; there for calls like those of `_min_dihedral_triangulation`.
+    used_edges: edges that exist already; they are no diagonals.
+    """
     n, corner = len(polygon), x[polygon]
     if n == 3:
         return polygon[None]
     cost = np.where(_forbidden_diagonals(polygon, used_edges), np.inf, 0.0)
-    middle = np.zeros((n, n), np.int64)
+    apex = np.zeros((n, n), np.int64)
     for d in range(2, n):
         i = np.arange(n - d)[:, None]
         m = i + np.arange(1, d)
@@ -305,20 +346,24 @@ def _min_area_triangulation(
         best = total.argmin(axis=1)
         rows = np.arange(n - d)
         cost[rows, rows + d] += total[rows, best]
-        middle[rows, rows + d] = m[rows, best]
+        apex[rows, rows + d] = m[rows, best]
     if not np.isfinite(cost[0, n - 1]):
         return None
-    return polygon[_triangles_of_plan(middle, n)]
+    return polygon[_triangles_from_apexes(apex, n)]
 
 
-def _triangles_of_plan(middle: IntArray, n: int) -> IntArray:
-    """The triangles of a plan: middle[i, k] is the third corner of the triangle at the diagonal
-    from i to k, on the side of the corners between them."""
+def _triangles_from_apexes(apex: IntArray, n: int) -> IntArray:
+    """The triangles (n - 2, 3) of a triangulated polygon of n points, by the positions of their
+    corners.
+
+    apex: (n, n) at [i, k] the position, between i and k, of the third corner of the triangle at the
+        diagonal from i to k.
+    """
     triangles, todo = list[tuple[int, int, int]](), [(0, n - 1)]
     while todo:
         i, k = todo.pop()
         if k - i > 1:
-            m = int(middle[i, k])
+            m = int(apex[i, k])
             triangles.append((i, m, k))
             todo += [(i, m), (m, k)]
     return np.array(triangles, np.int64)
@@ -330,8 +375,19 @@ def _min_dihedral_triangulation(
     third: dict[tuple[int, int], int],
     used_edges: set[tuple[int, int]],
 ) -> IntArray | None:
-    """The triangulation of a polygon whose largest angle between neighbors, including those around
-    the polygon, is smallest; of equal angles the one with the smallest area (Liepa 2003)."""
+    """The triangulation (n - 2, 3) of a polygon whose largest angle between the normals of
+    neighbors is smallest, faces around the polygon included; of equal ones that with the smallest
+    area (Liepa 2003). None if existing edges exclude every triangulation.
+
+    By dynamic programming over the vertices from position i to position k: turn[i, k] is minus the
+    cosine of the largest angle, area[i, k] twice the area, and beside[i, k] the normal of the
+    triangle at the diagonal, or of the face outside of the polygon's edge.
+
+    x: (m, 3) all vertices.
+    polygon: (n,) indices of vertices.
+    third: the third corner of the face at each directed edge (`_opposite_corners`).
+    used_edges: edges that exist already; they are no diagonals.
+    """
     n, corner = len(polygon), x[polygon]
     if n == 3:
         return polygon[None]
@@ -341,14 +397,14 @@ def _min_dihedral_triangulation(
         a, b = int(polygon[k]), int(polygon[(k + 1) % n])
         if (b, a) in third:
             face = np.array([[b, a, third[b, a]]])
-            beside[k, (k + 1) % n] = _unit(area_normals(x[face]))[0]
+            beside[k, (k + 1) % n] = _normalized(area_normals(x[face]))[0]
     turn, area = np.full((n, n), -1.0), np.zeros((n, n))
-    middle = np.zeros((n, n), np.int64)
+    apex = np.zeros((n, n), np.int64)
     for d in range(2, n):
         i = np.arange(n - d)[:, None]
         m, k = i + np.arange(1, d), i + d
         cross = np.cross(corner[m] - corner[i], corner[k] - corner[i])
-        normals = _unit(cross)
+        normals = _normalized(cross)
         sides = [beside[i, m], beside[m, k]]
         if d == n - 1:
             sides.append(np.broadcast_to(beside[k, i], normals.shape))
@@ -357,19 +413,19 @@ def _min_dihedral_triangulation(
         worst = np.maximum.reduce([*turns, turn[i, m], turn[m, k]])
         size = area[i, m] + area[m, k] + np.sqrt((cross**2).sum(axis=2))
         smallest = worst.min(axis=1, keepdims=True)
-        best = np.where(worst <= smallest + _SAME_TURN, size, np.inf).argmin(axis=1)
+        best = np.where(worst <= smallest + _EQUAL_COSINES, size, np.inf).argmin(axis=1)
         rows = np.arange(n - d)
         bar = barred[rows, rows + d] if d < n - 1 else np.zeros(1, np.bool_)
         turn[rows, rows + d] = np.where(bar, np.inf, worst[rows, best])
         area[rows, rows + d] = size[rows, best]
-        middle[rows, rows + d] = m[rows, best]
+        apex[rows, rows + d] = m[rows, best]
         beside[rows, rows + d] = normals[rows, best]
     if not np.isfinite(turn[0, n - 1]):
         return None
-    return polygon[_triangles_of_plan(middle, n)]
+    return polygon[_triangles_from_apexes(apex, n)]
 
 
-def _unit(vectors: FloatArray) -> FloatArray:
+def _normalized(vectors: FloatArray) -> FloatArray:
     """(..., 3) vectors scaled to length 1; 0 stays 0."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300)
 
@@ -377,32 +433,42 @@ def _unit(vectors: FloatArray) -> FloatArray:
 # Finer triangles.
 
 
-def _refine(
+def _refine_patches(
     vertices: FloatArray, faces: IntArray, new: IntArray, fixed_edges: IntArray
 ) -> tuple[FloatArray, IntArray]:
-    """All vertices (n, 4), new vertices last, each with the usual length of edges there; and
-    patches of triangles about as large as those around them, with the smallest area.
+    """Split and flip edges until the triangles of patches are about as large as those around them;
+    new vertices are moved to the middle of their neighbors.
 
-    fixed_edges: (t, 2) the existing edges.
+    new: (p, 3) the faces of patches.
+    fixed_edges: (t, 2) the existing edges of the mesh, which no flip may make again.
+
+    Returns all vertices (n, 4), new ones last, with the usual length of edges there in the last
+    column; and the faces of patches.
     """
     input_count = len(vertices)
     x = np.column_stack([vertices, _mean_edge_lengths(vertices, faces, np.unique(new))])
-    for _ in range(_ROUNDS):
-        new, count = _flipped(x[:, :3], new, fixed_edges), len(x)
+    for _ in range(_SPLIT_ROUNDS):
+        new, count = _flip_edges(x[:, :3], new, fixed_edges), len(x)
         x, new = _split_long_edges(x, new)
         if len(x) == count:
             break
-        x = _at_neighbor_means(x, new, input_count)
-    return x, _flipped(x[:, :3], new, fixed_edges)
+        x = _relax_new_vertices(x, new, input_count)
+    return x, _flip_edges(x[:, :3], new, fixed_edges)
 
 
 def _split_long_edges(x: FloatArray, new: IntArray) -> tuple[FloatArray, IntArray]:
-    """Vertices (n, 4) and triangles, with edges that are too long cut in the middle."""
+    """Split inner edges of patches in the middle that are longer than `_LONG_RATIO` times the
+    mean of the usual lengths at their ends.
+
+    x: (n, 4) vertices, with the usual length of edges in the last column; new vertices get the mean
+        of the values at both ends.
+    new: (p, 3) the faces of patches.
+    """
     edges = Edges.of(half_edges(new))
     ends = x[edges.vertices]
-    long = row_norms(ends[:, 0, :3] - ends[:, 1, :3]) > _LONG * ends[:, :, 3].mean(axis=1)
-    rows = np.flatnonzero(long & (edges.multiplicity == 2))
-    if not len(rows) or len(new) > _MAX_CUT:
+    is_long = row_norms(ends[:, 0, :3] - ends[:, 1, :3]) > _LONG_RATIO * ends[:, :, 3].mean(axis=1)
+    rows = np.flatnonzero(is_long & (edges.multiplicity == 2))
+    if not len(rows) or len(new) > _MAX_FACES_TO_SPLIT:
         return x, new
     midpoint = np.full(len(edges.vertices), -1, np.int64)
     midpoint[rows] = len(x) + np.arange(len(rows))
@@ -411,40 +477,49 @@ def _split_long_edges(x: FloatArray, new: IntArray) -> tuple[FloatArray, IntArra
 
 
 def _mean_edge_lengths(x: FloatArray, faces: IntArray, rims: IntArray) -> FloatArray:
-    """(n,) the mean length of a vertex's edges, at the vertices `rims`; 0 at others."""
+    """(n,) the mean length of the edges at each of the vertices `rims` (indices); 0 at other
+    vertices."""
     is_rim = np.zeros(len(x), np.bool_)
     is_rim[rims] = True
     edges = Edges.of(half_edges(faces[is_rim[faces].any(axis=1)])).vertices
-    long = row_norms(x[edges[:, 0]] - x[edges[:, 1]])
+    lengths = row_norms(x[edges[:, 0]] - x[edges[:, 1]])
     total, count = (
         np.bincount(edges.ravel(), np.repeat(weights, 2), minlength=len(x))
-        for weights in (long, np.ones(len(long)))
+        for weights in (lengths, np.ones(len(lengths)))
     )
     return np.where(is_rim, total / np.maximum(count, 1), 0.0)
 
 
-def _at_neighbor_means(x: FloatArray, new: IntArray, input_count: int) -> FloatArray:
-    """(n, 4) the vertices, with the rows of new vertices in the middle of their neighbors' rows."""
+def _relax_new_vertices(x: FloatArray, new: IntArray, input_count: int) -> FloatArray:
+    """(n, 4) the rows of `x`, with those from `input_count` on replaced so that each is the mean of
+    its neighbors' rows in the graph of the patches' edges."""
     ends = Edges.of(half_edges(new)).vertices
-    weights = _graph_laplacian(ends, np.ones(len(ends)), len(x))
-    return _solve_least_squares(weights[input_count:], x, input_count)
+    laplacian = _graph_laplacian(ends, np.ones(len(ends)), len(x))
+    return _solve_least_squares(laplacian[input_count:], x, input_count)
 
 
-def _solve_least_squares(rows: Any, x: FloatArray, input_count: int) -> FloatArray:
-    """All rows, with those from `input_count` on chosen so that a linear map of all is nearest to
-    0."""
+def _solve_least_squares(matrix: Any, x: FloatArray, input_count: int) -> FloatArray:
+    """`x` (n, d) with the rows from `input_count` on replaced so that the sum of squares of matrix
+    @ x is smallest.
+
+    matrix: (k, n) sparse.
+    """
     import scipy.sparse.linalg as linalg  # imported here: it takes half a second
 
     solver = cast("Any", linalg)
-    inner, fixed = rows[:, input_count:], rows[:, :input_count]
-    after = x.copy()
-    right = inner.T @ (fixed @ x[:input_count])
-    after[input_count:] = -solver.splu((inner.T @ inner).tocsc()).solve(np.asarray(right))
-    return after
+    free, fixed = matrix[:, input_count:], matrix[:, :input_count]
+    solution = x.copy()
+    right = free.T @ (fixed @ x[:input_count])
+    solution[input_count:] = -solver.splu((free.T @ free).tocsc()).solve(np.asarray(right))
+    return solution
 
 
 def _graph_laplacian(ends: IntArray, weight: FloatArray, count: int) -> Any:
-    """The Laplacian of a graph with these edges (k, 2), as a sparse matrix."""
+    """The Laplacian (count, count) of a graph, as a sparse matrix: -weight for each edge, and at
+    each vertex the sum of the weights of its edges.
+
+    ends: (k, 2) the vertices of each edge. weight: (k,). count: the number of vertices.
+    """
     import scipy.sparse  # imported here: it takes half a second
 
     sparse = cast("Any", scipy.sparse)
@@ -460,52 +535,69 @@ def _graph_laplacian(ends: IntArray, weight: FloatArray, count: int) -> Any:
     ).tocsr()
 
 
-def _fair(x: FloatArray, faces: IntArray, new: IntArray, input_count: int) -> FloatArray:
-    """The vertices, with new vertices where the patches and the faces around them bend least."""
-    is_rim = np.zeros(len(x), np.bool_)
-    is_rim[new] = True
-    triangles = np.concatenate([faces[is_rim[faces].any(axis=1)], new])
+def _fair_patches(x: FloatArray, faces: IntArray, new: IntArray, input_count: int) -> FloatArray:
+    """(n, 3) the vertices, with those from `input_count` on moved so that the patches and the faces
+    around them bend least: the sum over vertices of the squared Laplacian of the position, times
+    the vertex's area, is smallest. Vertices of patches count in the sum, except those at edges that
+    remain open.
+
+    faces: (m, 3) of the mesh.
+    new: (p, 3) of patches.
+    """
+    counts = np.zeros(len(x), np.bool_)
+    counts[new] = True
+    triangles = np.concatenate([faces[counts[faces].any(axis=1)], new])
     edges = Edges.of(half_edges(triangles))
     corner = x[triangles]
     weight = np.zeros(len(edges.vertices))
     area = np.zeros(len(x))
-    double = np.maximum(row_norms(area_normals(x[triangles])), 1e-300)
+    twice_area = np.maximum(row_norms(area_normals(x[triangles])), 1e-300)
     for k in range(3):  # the edge from corner k to k + 1 is opposite to corner k + 2
         u, w = (corner[:, j] - corner[:, k - 1] for j in (k, (k + 1) % 3))
-        cotangent = np.clip(row_dots(u, w) / double, -_MAX_COTANGENT, _MAX_COTANGENT)
+        cotangent = np.clip(row_dots(u, w) / twice_area, -_MAX_COTANGENT, _MAX_COTANGENT)
         m = len(triangles)
         np.add.at(weight, edges.edge_of_pair[k * m : (k + 1) * m], 0.5 * cotangent)
-        np.add.at(area, triangles[:, k], double / 6)
-    weight = np.maximum(weight, _MIN_COTANGENT)
+        np.add.at(area, triangles[:, k], twice_area / 6)
+    weight = np.maximum(weight, _MIN_WEIGHT)
     # Beside holes that remain open only new vertices count.
-    is_rim[edges.vertices[edges.multiplicity != 2]] = False
-    rows = np.flatnonzero(is_rim & (area > 0))
+    counts[edges.vertices[edges.multiplicity != 2]] = False
+    rows = np.flatnonzero(counts & (area > 0))
     laplacian = _graph_laplacian(edges.vertices, weight, len(x))[rows]
-    scale = 1 / np.sqrt(np.maximum(area[rows], 1e-300))
-    return _solve_least_squares(laplacian.multiply(scale[:, None]).tocsr(), x, input_count)
+    row_scale = 1 / np.sqrt(np.maximum(area[rows], 1e-300))
+    return _solve_least_squares(laplacian.multiply(row_scale[:, None]).tocsr(), x, input_count)
 
 
-def _flipped(x: FloatArray, new: IntArray, fixed_edges: IntArray) -> IntArray:
-    """Triangles with edges flipped so that angles opposite to them are small (Delaunay's
-    criterion), where the new edge does not exist yet and no triangle turns over."""
+def _flip_edges(x: FloatArray, new: IntArray, fixed_edges: IntArray) -> IntArray:
+    """The faces of patches (p, 3) with edges flipped so that the angles opposite to them become
+    small (Delaunay's criterion). An edge is flipped only if the new edge does not exist yet and no
+    triangle turns over.
+
+    The edge from a to b of the faces f, with the third corner c, and g, with the third corner d, is
+    replaced by the edge from c to d. An edge is flipped if the sum of the cotangents of the angles
+    at c and d is negative enough, the smallest sums first; each face takes part in one flip per
+    round.
+
+    x: (n, 3) all vertices.
+    fixed_edges: (t, 2) the existing edges of the mesh.
+    """
     new = new.copy()
     fixed_keys = edge_keys(fixed_edges, len(x))
-    for _ in range(_MAX_FLIPS):
+    for _ in range(_FLIP_ROUNDS):
         edges = Edges.of(half_edges(new))
-        half = edges.paired_half_edges()
-        f, g = half.T % len(new)
-        k, j = half.T // len(new)
+        paired = edges.paired_half_edges()
+        f, g = paired.T % len(new)
+        k, j = paired.T // len(new)
         a, b, c, d = new[f, k], new[f, (k + 1) % 3], new[f, (k + 2) % 3], new[g, (j + 2) % 3]
         key = edge_keys(np.column_stack([c, d]), len(x))
-        gain = _cotangents(x[a], x[b], x[c]) + _cotangents(x[a], x[b], x[d])
-        is_flippable = (gain < _MAX_FLIP_COTANGENT_SUM) & (c != d)
+        cotangents = _cotangents(x[a], x[b], x[c]) + _cotangents(x[a], x[b], x[d])
+        is_flippable = (cotangents < _MAX_FLIP_COTANGENT_SUM) & (c != d)
         is_flippable &= ~np.isin(key, fixed_keys) & ~np.isin(key, edge_keys(edges.vertices, len(x)))
         before = area_normals(x[new])
         mean = before[f] + before[g]
         for triangle in ((a, d, c), (d, b, c)):
             is_flippable &= row_dots(area_normals(x[np.column_stack(triangle)]), mean) > 0
         rows = np.flatnonzero(is_flippable)
-        rows = rows[np.argsort(gain[rows])]
+        rows = rows[np.argsort(cotangents[rows])]
         rows = rows[np.sort(np.unique(key[rows], return_index=True)[1])]
         best = np.full(len(new), len(rows))
         for side in (f, g):
@@ -520,13 +612,18 @@ def _flipped(x: FloatArray, new: IntArray, fixed_edges: IntArray) -> IntArray:
 
 
 def _cotangents(a: FloatArray, b: FloatArray, apex: FloatArray) -> FloatArray:
-    """(k,) the cotangents of the angles at `apex` between points a and b."""
+    """(k,) the cotangents of the angles at points `apex` between the directions to `a` and to `b`,
+    all (k, 3)."""
     u, w = a - apex, b - apex
     return row_dots(u, w) / np.maximum(row_norms(np.cross(u, w)), 1e-300)
 
 
 def _loop_of_faces(new: IntArray, loops: list[IntArray], count: int) -> IntArray:
-    """(p,) the loop of each face of fillings: faces are joined by edges to a face at their loop."""
+    """(p,) the index of the loop whose patch each face belongs to. The faces of a patch are joined
+    by edges, and one of them is at the first edge of the loop.
+
+    count: the number of vertices.
+    """
     import scipy.sparse  # imported here: it takes half a second
     import scipy.sparse.csgraph as csgraph_module
 
