@@ -38,22 +38,24 @@ _IN_BOX, _NEAR = 2000, 1000
 # The smallest and the largest distance of the points near a surface from it, and the margin of the
 # box, relative to the size.
 _NEAREST, _FARTHEST, _MARGIN = 2e-3, 0.1, 0.05
-# The winding number is clearly above or below 1/2 if it differs by more than smooth patches need.
-_CLEARLY = 0.36
+# The winding number is clearly above or below 1/2 if it differs from 1/2 by more than this: smooth
+# patches over holes stay within it.
+_WINDING_MARGIN = 0.36
 # The largest relative difference of volumes of closed meshes that bound their solid once.
-_VOLUME = 0.01
-# A mesh winds counter-clockwise if the signed volumes of cones to its middle sum to this fraction
-# of the sum of their magnitudes.
-_PLAINLY = 0.5
+_VOLUME_TOLERANCE = 0.01
+# Each face and the middle of the mesh span a tetrahedron. The mesh winds counter-clockwise if the
+# sum of the signed volumes is more than this fraction of the sum of their magnitudes.
+_OUTWARD_SHARE = 0.5
 # The distance of points next to faces from these, relative to the size.
 _BESIDE = 1e-6
-# The number of differing points that are tested again, and the number that are listed.
-_LOOKED_AT, _LISTED = 40, 10
+# The largest number of differing points whose distances from the surfaces are computed, and the
+# largest number that a `Difference` lists.
+_MAX_RETESTED, _MAX_LISTED = 40, 10
 # The number of points of each closed part that are tested for where the part lies and what became
 # of it.
-_PLACES = 16
+_SAMPLES_PER_PART = 16
 # A mesh is an open sheet if at least this fraction of its area has nothing inside.
-_OPEN = 0.4
+_OPEN_SHARE = 0.4
 
 
 @dataclass(frozen=True)
@@ -103,11 +105,13 @@ class Difference:
 class IntendedSolid:
     """A mesh whose corners are joined and that is not inside out.
 
-    vertices: (n, 3). faces: (m, 3); is_turned: (m,) which of them were turned over.
-    oriented: (k, 3) faces that agree with their neighbors where that is possible. parts: the closed
-        parts of these faces, which may touch, cross or lie in each other (`closed_parts`).
-    rounded: the number of corners that were joined with others, apart by rounding.
-    """
+    vertices, faces: (n, 3), (m, 3) the mesh.
+    is_turned: (m,) the mask of the faces whose orientation was reversed.
+    oriented: (k, 3) faces that agree in orientation with their neighbors where that is possible.
+    parts: for each closed part of `oriented`, the indices of its faces. Parts may touch, cross or
+        lie in each other (`closed_parts`).
+    rounded: the number of corners that were joined with others because only rounding separated
+        them."""
 
     vertices: FloatArray
     faces: IntArray
@@ -172,7 +176,7 @@ class IntendedSolid:
 
     @functools.cached_property
     def samples(self) -> tuple[FloatArray, FloatArray]:
-        """Points in the box and near the faces, and winding numbers there."""
+        """Points (k, 3) in the box and near the faces, and the winding numbers (k,) there."""
         rng = np.random.default_rng(0)
         corner = self.vertices[self.oriented]
         low, high = corner.min(axis=(0, 1)), corner.max(axis=(0, 1))
@@ -183,9 +187,11 @@ class IntendedSolid:
 
     @functools.cached_property
     def beside(self) -> tuple[FloatArray, FloatArray]:
-        """Points next to faces of closed parts, on both sides, and winding numbers there: the parts
-        may be so small or thin that no other points are in them."""
-        chosen = [self.oriented[part[:: max(1, len(part) // _PLACES)]] for part in self.parts]
+        """Points (k, 3) next to faces of closed parts, on both sides, and the winding numbers (k,)
+        there. A closed part may be so small or thin that no other test points are in it."""
+        chosen = [
+            self.oriented[part[:: max(1, len(part) // _SAMPLES_PER_PART)]] for part in self.parts
+        ]
         if not chosen:
             return np.zeros((0, 3)), np.zeros(0)
         corner = self.vertices[np.concatenate(chosen)]
@@ -209,7 +215,7 @@ class IntendedSolid:
         beside = self.winding(np.concatenate([points + away, points - away]))
         nothing = (beside.reshape(2, -1) < 0.5).all(axis=0)
         fraction = float(nothing.mean())
-        if fraction > _OPEN:
+        if fraction > _OPEN_SHARE:
             raise MeshError(
                 f"the mesh is an open sheet: {fraction:.0%} of its area have nothing inside, on "
                 "neither side, so that most of it would be lost; give it a thickness first, in the "
@@ -217,10 +223,10 @@ class IntendedSolid:
             )
 
     def difference(self, surface: TriangleMesh, away: float) -> Difference | None:
-        """The difference of a closed surface from the input, at points farther than `away` from
-        both, and next to closed parts and farther than that from the surface; None if there is
-        none.
-        """
+        """The difference of a closed surface from the input, or None if there is none.
+
+        It is measured at points that are farther than `away` (a length) from both, and at points
+        next to closed parts that are farther than `away` from the surface."""
         points, w = self.samples
         corner = surface.vertices[surface.faces]
         near_surface = _near(corner, self.size, np.random.default_rng(1))
@@ -239,11 +245,14 @@ class IntendedSolid:
             return None
         missing, added = missing + lost, added + filled
         fraction = (missing + added) / (len(points) + len(beside))
-        return Difference(fraction, distant[:_LISTED], missing, added, volumes)
+        return Difference(fraction, distant[:_MAX_LISTED], missing, added, volumes)
 
     def _volumes(self, surface: TriangleMesh, away: float) -> tuple[float, float] | None:
-        """The volumes of the surface and the mesh if they differ, for a closed mesh that winds
-        around no point twice or clockwise."""
+        """The volumes of the surface and of the mesh, or None if they agree.
+
+        They are compared only for a closed mesh that winds around no point twice or clockwise; for
+        other meshes the result is None. Volumes agree if they differ by less than 1 %, or by less than
+        `away` (a length) times the area of the surface."""
         _, w = self.samples
         if self.field is None or len(self.field.mesh.singular_edges):
             return None
@@ -254,32 +263,44 @@ class IntendedSolid:
             volume_of(self.vertices, self.oriented),
         )
         area = 0.5 * float(row_norms(area_normals(surface.vertices[surface.faces])).sum())
-        allowed = max(_VOLUME * abs(intended), away * area)
+        allowed = max(_VOLUME_TOLERANCE * abs(intended), away * area)
         return (new, intended) if abs(new - intended) > allowed else None
 
 
 def _on_other_side(
     points: FloatArray,
-    w: FloatArray,
+    windings: FloatArray,
     field: WindingNumber | None,
-    corner: FloatArray,
+    triangles: FloatArray,
     away: float,
 ) -> tuple[int, int, FloatArray]:
-    """The number of points with winding numbers w clearly above 1/2 that are outside of the result;
-    the number of points clearly below that are inside; and, of a selection of both, the points that
-    are farther than `away` from triangles (m, 3, 3). If there are no such points, both numbers are
-    0."""
+    """Count points on the wrong side of the result of a repair.
+
+    windings: the winding numbers (n,) of the input at `points` (n, 3).
+    field: the winding number of the result.
+    triangles: (m, 3, 3). A point counts only as evidence if it is farther than `away` from them.
+
+    Returns:
+        The number of points outside of the result whose winding numbers are clearly above 1/2; the
+        number of points inside whose winding numbers are clearly below; and, among a selection of
+        all these points, those (k, 3) farther than `away` from the triangles. If there are none of
+        the last, both numbers are 0.
+    """
     inside = _values(field, points) > 0.5
-    missing, added = ~inside & (w > 0.5 + _CLEARLY), inside & (w < 0.5 - _CLEARLY)
+    missing, added = (
+        ~inside & (windings > 0.5 + _WINDING_MARGIN),
+        inside & (windings < 0.5 - _WINDING_MARGIN),
+    )
     rows = np.flatnonzero(missing | added)
-    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _LOOKED_AT)).astype(int)]
-    distant = rows[[distance_from_triangles(points[k], corner) > away for k in rows]]
+    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _MAX_RETESTED)).astype(int)]
+    distant = rows[[distance_from_triangles(points[k], triangles) > away for k in rows]]
     if not len(distant):
         return 0, 0, np.zeros((0, 3))
     return int(missing.sum()), int(added.sum()), points[distant]
 
 
 def _winding_number(x: FloatArray, faces: IntArray) -> WindingNumber | None:
+    """The winding number of a mesh, or None if all faces cancel or have no area."""
     try:
         return WindingNumber(*without_zero_area_faces(x, faces))
     except MeshError:  # all faces cancel, or have no area
@@ -287,50 +308,54 @@ def _winding_number(x: FloatArray, faces: IntArray) -> WindingNumber | None:
 
 
 def _values(field: WindingNumber | None, points: FloatArray) -> FloatArray:
+    """The values (k,) of a winding number at points (k, 3); 0 if `field` is None."""
     if field is None:
         return np.zeros(len(points))
     return np.asarray(field.value(points, precision="double"))
 
 
-def _turned(faces: IntArray, which: BoolArray) -> IntArray:
-    """Faces (m, 3), with those of the mask `which` (m,) turned over."""
-    return np.where(which[:, None], faces[:, ::-1], faces)
+def _turned(faces: IntArray, is_turned: BoolArray) -> IntArray:
+    """Faces (m, 3), with the orientation reversed where the mask (m,) is set."""
+    return np.where(is_turned[:, None], faces[:, ::-1], faces)
 
 
 # Points.
 
 
 def _on_faces(
-    corner: FloatArray, count: int, rng: np.random.Generator
+    triangles: FloatArray, count: int, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Points (k, 3) spread over faces (m, 3, 3) by area, and unit normals there."""
-    normal = area_normals(corner)
+    """Random points (count, 3) on triangles (m, 3, 3), uniform by area, and the unit normals
+    (count, 3) of their triangles."""
+    normal = area_normals(triangles)
     area = row_norms(normal)
-    rows = rng.choice(len(corner), count, p=area / area.sum())
+    chosen = rng.choice(len(triangles), count, p=area / area.sum())
     shares = rng.dirichlet((1.0, 1.0, 1.0), count)
-    points = np.einsum("ki,kij->kj", shares, corner[rows])
-    return points, normal[rows] / area[rows, None]
+    points = np.einsum("ki,kij->kj", shares, triangles[chosen])
+    return points, normal[chosen] / area[chosen, None]
 
 
-def _near(corner: FloatArray, size: float, rng: np.random.Generator) -> FloatArray:
-    """Points on both sides of faces (m, 3, 3), at distances of all magnitudes."""
-    points, normals = _on_faces(corner, _NEAR, rng)
-    heights = size * np.exp(rng.uniform(math.log(_NEAREST), math.log(_FARTHEST), len(points)))
-    heights *= rng.choice((-1.0, 1.0), len(points))
-    return points + heights[:, None] * normals
+def _near(triangles: FloatArray, size: float, rng: np.random.Generator) -> FloatArray:
+    """Random points (k, 3) on both sides of triangles (m, 3, 3). The logarithm of their distance
+    from the triangle is uniform between `_NEAREST` and `_FARTHEST` times `size`."""
+    points, normals = _on_faces(triangles, _NEAR, rng)
+    offsets = size * np.exp(rng.uniform(math.log(_NEAREST), math.log(_FARTHEST), len(points)))
+    offsets *= rng.choice((-1.0, 1.0), len(points))
+    return points + offsets[:, None] * normals
 
 
 # Parts that are inside out.
 
 
 def _inside_out(x: FloatArray, faces: IntArray, parts: list[IntArray]) -> BoolArray:
-    """(m,) which faces to turn over for the input not to be inside out. parts: the closed parts.
+    """(m,) the mask of the faces to reverse so that the input is not inside out.
 
-    A part is turned with the outermost part that it lies in. So are the faces that are not closed;
-    where these lie in no part they are turned by themselves, together with the parts that lie in
-    them.
-    """
-    turned, is_rest = np.zeros(len(faces), np.bool_), np.ones(len(faces), np.bool_)
+    parts: for each closed part, the indices of its faces.
+
+    A closed part is reversed together with the outermost part that contains it. The faces that
+    belong to no closed part are reversed with the largest closed part that contains them. If none
+    does, they are judged by themselves, and the closed parts inside them are reversed with them."""
+    is_inside_out, is_rest = np.zeros(len(faces), np.bool_), np.ones(len(faces), np.bool_)
     for rows in parts:
         is_rest[rows] = False
     open_faces = faces[is_rest]
@@ -343,31 +368,32 @@ def _inside_out(x: FloatArray, faces: IntArray, parts: list[IntArray]) -> BoolAr
         if not any(holds_rest) and _lies_in(x, closed[outermost], open_faces):
             is_with_rest[parts[k]] = True
         else:
-            turned[parts[k]] = volumes[outermost] < 0
+            is_inside_out[parts[k]] = volumes[outermost] < 0
     if any(holds_rest):
         sizes = np.where(holds_rest, np.abs(volumes), 0)
-        turned[is_rest] = volumes[int(sizes.argmax())] < 0
+        is_inside_out[is_rest] = volumes[int(sizes.argmax())] < 0
     elif len(open_faces) and _winds_clockwise(x, open_faces):
-        turned |= is_with_rest
-    return turned
+        is_inside_out |= is_with_rest
+    return is_inside_out
 
 
-def _lies_in(x: FloatArray, part: IntArray, container: IntArray) -> bool:
-    """Whether the faces `container` wind around points of the faces `part`: all of a selection."""
-    if not len(part) or not len(container):
+def _lies_in(x: FloatArray, faces: IntArray, container: IntArray) -> bool:
+    """Whether the mesh `container` (k, 3) winds around the center of each of a selection of `faces`
+    (m, 3). Both index the vertices x."""
+    if not len(faces) or not len(container):
         return False
-    centers = x[part[:: max(1, len(part) // _PLACES)]].mean(axis=1)
+    centers = x[faces[:: max(1, len(faces) // _SAMPLES_PER_PART)]].mean(axis=1)
     return bool((np.abs(_values(_winding_number(x, container), centers)) > 0.5).all())
 
 
 def _winds_clockwise(x: FloatArray, faces: IntArray) -> bool:
     """Whether a mesh winds around more points clockwise than counter-clockwise."""
     rng = np.random.default_rng(0)
-    corner = x[faces]
-    size = float(np.ptp(corner, axis=(0, 1)).max())
-    middle: FloatArray = corner.mean(axis=(0, 1))
-    cones = row_dots(corner[:, 0] - middle, area_normals(corner))
-    if float(cones.sum()) > _PLAINLY * float(np.abs(cones).sum()):
+    triangles = x[faces]
+    size = float(np.ptp(triangles, axis=(0, 1)).max())
+    middle: FloatArray = triangles.mean(axis=(0, 1))
+    volumes = row_dots(triangles[:, 0] - middle, area_normals(triangles))
+    if float(volumes.sum()) > _OUTWARD_SHARE * float(np.abs(volumes).sum()):
         return False  # nearly all faces look away from the middle
-    w = _values(_winding_number(x, faces), _near(corner, size, rng))
+    w = _values(_winding_number(x, faces), _near(triangles, size, rng))
     return bool((w < -0.5).sum() > (w > 0.5).sum())
