@@ -251,7 +251,7 @@ class IntendedSolid:
         """The volumes of the surface and of the mesh, or None if they agree.
 
         They are compared only for a closed mesh that winds around no point twice or clockwise; for
-        other meshes the result is None. Volumes agree if they differ by less than 1 %, or by less than
+        other meshes the result is None. Volumes agree if they differ by at most 1 %, or by at most
         `away` (a length) times the area of the surface."""
         _, w = self.samples
         if self.field is None or len(self.field.mesh.singular_edges):
@@ -278,7 +278,7 @@ def _on_other_side(
 
     windings: the winding numbers (n,) of the input at `points` (n, 3).
     field: the winding number of the result.
-    triangles: (m, 3, 3). A point counts only as evidence if it is farther than `away` from them.
+    triangles: (m, 3, 3). Points within `away` of them are no evidence, as stated below.
 
     Returns:
         The number of points outside of the result whose winding numbers are clearly above 1/2; the
