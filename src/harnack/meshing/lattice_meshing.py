@@ -77,13 +77,7 @@ _SLOW_CONVERGENCE = 0.7
 # The test for a function that touches its level: the largest number of points; how far beside
 # them, in cells, the function is evaluated; the number of golden sections and their ratio; and how
 # close to the level the function has to come, relative to its values beside the point.
-_MAX_TOUCH_TESTS, _TOUCH_OFFSET, _SECTIONS, _GOLDEN, _TOUCH_TOLERANCE = (
-    60,
-    0.01,
-    40,
-    0.6180339887498949,
-    1e-8,
-)
+_MAX_TRIED, _TOUCH_OFFSET, _SECTIONS, _GOLDEN, _TOUCHING = 60, 0.01, 40, 0.6180339887498949, 1e-8
 # A function jumps if more than the first, a fraction of the vertices, are farther than the second,
 # in cells, from the level set.
 _MAX_JUMP_SHARE, _JUMP_DISTANCE = 0.04, 0.1
@@ -239,7 +233,7 @@ def _check_passes_level(function: LevelFunction, points: FloatArray, size: float
     The function touches its level if both ends of the line have values on the same side of the
     level, and its value closest to the level, found by golden sections, is as close to it as
     rounding allows."""
-    x = points[:: -(-len(points) // _MAX_TOUCH_TESTS)]
+    x = points[:: -(-len(points) // _MAX_TRIED)]
     offset = _TOUCH_OFFSET * size
     gradients = function.sample((x[:, None] + offset * np.eye(3)).reshape(-1, 3)).gradient.reshape(
         -1, 3, 3
@@ -247,8 +241,9 @@ def _check_passes_level(function: LevelFunction, points: FloatArray, size: float
     steepest = gradients[np.arange(len(x)), (gradients**2).sum(axis=2).argmax(axis=1)]
     direction = steepest / np.maximum(row_norms(steepest), 1e-300)[:, None]
 
-    def along(left: FloatArray) -> FloatArray:
-        return function.values(x + left[:, None] * direction)
+    def along(position: FloatArray) -> FloatArray:
+        """The function at x + position * direction; position: (k,) lengths."""
+        return function.values(x + position[:, None] * direction)
 
     low, high = np.full(len(x), -offset), np.full(len(x), offset)
     sign_of_point = np.sign(along(low))
@@ -256,13 +251,10 @@ def _check_passes_level(function: LevelFunction, points: FloatArray, size: float
     smallest = end_value.copy()
     for _ in range(_SECTIONS):
         left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-        value_left, value_right = sign_of_point * along(left), sign_of_point * along(right)
-        smallest = np.minimum(smallest, np.minimum(value_left, value_right))
-        low, high = (
-            np.where(value_left > value_right, left, low),
-            np.where(value_left > value_right, high, right),
-        )
-    touches = (end_value > 0) & (smallest >= 0) & (smallest <= _TOUCH_TOLERANCE * end_value)
+        f_left, f_right = sign_of_point * along(left), sign_of_point * along(right)
+        smallest = np.minimum(smallest, np.minimum(f_left, f_right))
+        low, high = np.where(f_left > f_right, left, low), np.where(f_left > f_right, high, right)
+    touches = (end_value > 0) & (smallest >= 0) & (smallest <= _TOUCHING * end_value)
     if touches.mean() > 0.5:
         a, b, c = x[touches][0]
         name, level = type(function.field).__name__, function.level
@@ -630,12 +622,12 @@ def _sample_lattice(
     samples = LevelSamples(np.full(count, 10 * OUTSIDE_VALUE), np.ones((count, 3)), np.zeros(count))
     points = points[~is_irrelevant]
     samples = samples.replaced(~is_irrelevant, function.sample(points))
-    is_not_finite = ~np.isfinite(samples.value[~is_irrelevant])
-    if is_not_finite.any():
-        x, y, z = points[is_not_finite][0]
+    failing = ~np.isfinite(samples.value[~is_irrelevant])
+    if failing.any():
+        x, y, z = points[failing][0]
         advice = ", or a smaller `cell_size`: it is asked for three cells around other parts"
         raise UnrefinableError(
-            f"{type(function.field).__name__} has no finite value at {is_not_finite.sum():,} points, such "
+            f"{type(function.field).__name__} has no finite value at {failing.sum():,} points, such "
             f"as ({x:.4g}, {y:.4g}, {z:.4g}): choose a `clip` where it has"
             + (advice if is_irrelevant.any() else "")
         )
@@ -648,13 +640,13 @@ def _check_is_continuous(
 ) -> None:
     """Raise if many vertices are far from the level set. The signs change at all vertices, so the
     function jumps at these, and refinement would never end."""
-    used_vertices = vertices[np.unique(faces)]
-    is_far = function.sample(used_vertices).distance > _JUMP_DISTANCE * float(lattice.size.max())
-    if is_far.sum() > _MAX_JUMP_SHARE * len(used_vertices):
-        a, b, c = used_vertices[is_far][0]
+    used = vertices[np.unique(faces)]
+    is_far = function.sample(used).distance > _JUMP_DISTANCE * float(lattice.size.max())
+    if is_far.sum() > _MAX_JUMP_SHARE * len(used):
+        a, b, c = used[is_far][0]
         raise UnrefinableError(
             f"{type(function.field).__name__} changes its sign without coming to its level at "
-            f"{is_far.sum():,} of {len(used_vertices):,} places, such as ({a:.4g}, {b:.4g}, {c:.4g}): it jumps "
+            f"{is_far.sum():,} of {len(used):,} places, such as ({a:.4g}, {b:.4g}, {c:.4g}): it jumps "
             "there, as at the cut of atan2 or a pole; choose a `clip` without it, or write it "
             "otherwise, such as with the sine of an angle"
         )
