@@ -241,19 +241,19 @@ def _check_passes_level(function: LevelFunction, points: FloatArray, size: float
     steepest = gradients[np.arange(len(x)), (gradients**2).sum(axis=2).argmax(axis=1)]
     direction = steepest / np.maximum(row_norms(steepest), 1e-300)[:, None]
 
-    def along(position: FloatArray) -> FloatArray:
-        """The function at x + position * direction; position: (k,) lengths."""
-        return function.values(x + position[:, None] * direction)
+    def along(s: FloatArray) -> FloatArray:
+        """The function on the lines at the signed distances s (k,) from the points x."""
+        return function.values(x + s[:, None] * direction)
 
     low, high = np.full(len(x), -offset), np.full(len(x), offset)
     sign_of_point = np.sign(along(low))
     end_value = np.minimum(sign_of_point * along(low), sign_of_point * along(high))
     smallest = end_value.copy()
     for _ in range(_SECTIONS):
-        left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-        f_left, f_right = sign_of_point * along(left), sign_of_point * along(right)
+        s, t = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+        f_left, f_right = sign_of_point * along(s), sign_of_point * along(t)
         smallest = np.minimum(smallest, np.minimum(f_left, f_right))
-        low, high = np.where(f_left > f_right, left, low), np.where(f_left > f_right, high, right)
+        low, high = np.where(f_left > f_right, s, low), np.where(f_left > f_right, high, t)
     touches = (end_value > 0) & (smallest >= 0) & (smallest <= _TOUCHING * end_value)
     if touches.mean() > 0.5:
         a, b, c = x[touches][0]
@@ -622,12 +622,12 @@ def _sample_lattice(
     samples = LevelSamples(np.full(count, 10 * OUTSIDE_VALUE), np.ones((count, 3)), np.zeros(count))
     points = points[~is_irrelevant]
     samples = samples.replaced(~is_irrelevant, function.sample(points))
-    failing = ~np.isfinite(samples.value[~is_irrelevant])
-    if failing.any():
-        x, y, z = points[failing][0]
+    fails = ~np.isfinite(samples.value[~is_irrelevant])
+    if fails.any():
+        x, y, z = points[fails][0]
         advice = ", or a smaller `cell_size`: it is asked for three cells around other parts"
         raise UnrefinableError(
-            f"{type(function.field).__name__} has no finite value at {failing.sum():,} points, such "
+            f"{type(function.field).__name__} has no finite value at {fails.sum():,} points, such "
             f"as ({x:.4g}, {y:.4g}, {z:.4g}): choose a `clip` where it has"
             + (advice if is_irrelevant.any() else "")
         )
@@ -640,13 +640,13 @@ def _check_is_continuous(
 ) -> None:
     """Raise if many vertices are far from the level set. The signs change at all vertices, so the
     function jumps at these, and refinement would never end."""
-    used = vertices[np.unique(faces)]
-    is_far = function.sample(used).distance > _JUMP_DISTANCE * float(lattice.size.max())
-    if is_far.sum() > _MAX_JUMP_SHARE * len(used):
-        a, b, c = used[is_far][0]
+    x = vertices[np.unique(faces)]
+    is_far = function.sample(x).distance > _JUMP_DISTANCE * float(lattice.size.max())
+    if is_far.sum() > _MAX_JUMP_SHARE * len(x):
+        a, b, c = x[is_far][0]
         raise UnrefinableError(
             f"{type(function.field).__name__} changes its sign without coming to its level at "
-            f"{is_far.sum():,} of {len(used):,} places, such as ({a:.4g}, {b:.4g}, {c:.4g}): it jumps "
+            f"{is_far.sum():,} of {len(x):,} places, such as ({a:.4g}, {b:.4g}, {c:.4g}): it jumps "
             "there, as at the cut of atan2 or a pole; choose a `clip` without it, or write it "
             "otherwise, such as with the sine of an angle"
         )

@@ -54,17 +54,17 @@ class LevelSamples:
 
     def replaced(self, rows: Any, others: LevelSamples) -> LevelSamples:
         """A copy in which the samples at points `rows` (indices or a mask) are `others`."""
-        value, gradient, radius = (
+        value, gradient, reach = (
             self.value.copy(),
             self.gradient.copy(),
             self.quarter_period_radius.copy(),
         )
-        value[rows], gradient[rows], radius[rows] = (
+        value[rows], gradient[rows], reach[rows] = (
             others.value,
             others.gradient,
             others.quarter_period_radius,
         )
-        return LevelSamples(value, gradient, radius)
+        return LevelSamples(value, gradient, reach)
 
     @property
     def distance(self) -> FloatArray:
@@ -116,7 +116,7 @@ class LevelFunction:
         return self.field.period
 
     def relative_to_level(self, value: FloatArray) -> FloatArray:
-        """(n,) f - level for values (n,) of f; for an angle, the difference of smallest magnitude."""
+        """(n,) f - level for values (n,) of f; for an angle, that of the smallest magnitude."""
         difference = value - self.level
         if self.period is None:
             return difference

@@ -193,7 +193,7 @@ class LostParts:
 
     @property
     def matter(self) -> bool:
-        """Whether the points off the mesh are more than the creases and corners of any mesh cause."""
+        """Whether more points are off the mesh than creases and corners cause for any mesh."""
         return self.beyond > 0 or self.far > _ALLOWED_SHARE * self.looked_at
 
     @property

@@ -299,29 +299,27 @@ def _sides(points: TetrahedronPoints, tets: Tetrahedra, crossings: EdgeCrossings
     is_on = points.is_on_level[tets.corners]
     rows = np.arange(len(is_on))
     first = np.argmin(is_on, axis=1)
-    levels_between = np.zeros(is_on.shape, np.int64)
+    count = np.zeros(is_on.shape, np.int64)
 
-    def signed_crossings(i: int, j: int, rows: IntArray) -> IntArray:
-        """The crossings (k,) along the edges from corner i to corner j of tetrahedra `rows` (k,)."""
+    def crossed(i: int, j: int, rows: IntArray) -> IntArray:
+        """The signed crossings (k,) of the edges from corner i to corner j of tetrahedra `rows`."""
         edge, sign = tets.edge_between(i, j, rows)
         return sign * crossings.count[edge]
 
     for i, j in itertools.permutations(range(4), 2):
         chosen = rows[(first == i) & ~is_on[:, j]]
-        levels_between[chosen, j] = signed_crossings(i, j, chosen)
-    is_inconsistent = np.zeros(len(rows), np.bool_)
+        count[chosen, j] = crossed(i, j, chosen)
+    is_wrong = np.zeros(len(rows), np.bool_)
     for i, j in _PAIRS:
         chosen = rows[~is_on[:, i] & ~is_on[:, j]]
-        is_inconsistent[chosen] |= levels_between[chosen, j] - levels_between[
-            chosen, i
-        ] != signed_crossings(i, j, chosen)
-    if is_inconsistent.any():
+        is_wrong[chosen] |= count[chosen, j] - count[chosen, i] != crossed(i, j, chosen)
+    if is_wrong.any():
         raise LocalizedMeshingError(
             "crossings of the level set do not agree around a triangle: the curve passes "
             "through it; choose a smaller `cell_size`",
-            _mean(points.points, tets.corners[is_inconsistent]),
+            _mean(points.points, tets.corners[is_wrong]),
         )
-    return levels_between
+    return count
 
 
 def _roots(
@@ -345,13 +343,13 @@ def _roots(
         value = np.remainder(value, function.period)
         value = value - np.where(crossings.count[edges] > 0, function.period, 0)
 
-    def lifted_values(t: FloatArray, *parameters: FloatArray) -> FloatArray:
-        """f - level at fractions t of edges. parameters: the start (3 arrays), the direction (3),
+    def lifted_values(t: FloatArray, *args: FloatArray) -> FloatArray:
+        """f - level at fractions t of edges. args: the start (3 arrays), the direction (3),
         the value at the start and the change along the edge, for each edge. Values of an angle are
         moved by the whole number of periods that brings them nearest to the middle of the change.
         """
         origin, edge, start, rise = (
-            np.stack(parameters[0:3], axis=-1), np.stack(parameters[3:6], axis=-1), parameters[6], parameters[7]
+            np.stack(args[0:3], axis=-1), np.stack(args[3:6], axis=-1), args[6], args[7]
         )  # fmt: skip
         locations = (origin + t[..., None] * edge).reshape(-1, 3)
         wrapped = function.values(locations).reshape(t.shape)
@@ -372,40 +370,34 @@ def _roots(
 def _illinois(
     function: LevelFunction,
     start: FloatArray,
-    direction: FloatArray,
-    value_left: FloatArray,
-    value_right: FloatArray,
+    edge: FloatArray,
+    f_left: FloatArray,
+    f_right: FloatArray,
 ) -> FloatArray:
     """(r,) the fractions of edges at which they meet the level set, by a few secant steps.
 
-    start, direction: (r, 3) one end of each edge, and the vector to the other.
-    value_left, value_right: (r,) the values at these ends.
+    start, edge: (r, 3) one end of each edge, and the vector to the other.
+    f_left, f_right: (r,) the values at these ends.
 
     If the root is on the same side of the secant's root twice or more in a row, the value at the
     end that stays is halved (the Illinois method)."""
     left, right = np.zeros(len(start)), np.ones(len(start))
-    is_rising = value_right > value_left
-    value_left, value_right = (
-        np.where(is_rising, value_left, -value_left),
-        np.where(is_rising, value_right, -value_right),
+    is_rising = f_right > f_left
+    f_left, f_right = (
+        np.where(is_rising, f_left, -f_left),
+        np.where(is_rising, f_right, -f_right),
     )
     repeats = np.zeros(len(start), np.int64)
-    fraction = value_left / (value_left - value_right)
+    fraction = f_left / (f_left - f_right)
     for _ in range(function.secant_steps):
-        value = function.values(start + fraction[:, None] * direction)
+        value = function.values(start + fraction[:, None] * edge)
         value = np.where(is_rising, value, -value)
         is_positive = value > 0
         repeats = np.where(is_positive, np.maximum(repeats, 0) + 1, np.minimum(repeats, 0) - 1)
-        value_left = np.where(
-            is_positive, np.where(repeats > 1, 0.5 * value_left, value_left), value
-        )
-        value_right = np.where(
-            is_positive, value, np.where(repeats < -1, 0.5 * value_right, value_right)
-        )
+        f_left = np.where(is_positive, np.where(repeats > 1, 0.5 * f_left, f_left), value)
+        f_right = np.where(is_positive, value, np.where(repeats < -1, 0.5 * f_right, f_right))
         left, right = np.where(is_positive, left, fraction), np.where(is_positive, fraction, right)
-        fraction = left + (right - left) * value_left / np.minimum(
-            value_left - value_right, -1e-300
-        )
+        fraction = left + (right - left) * f_left / np.minimum(f_left - f_right, -1e-300)
     return np.clip(fraction, _MIN_END_DISTANCE, 1 - _MIN_END_DISTANCE)
 
 
@@ -469,22 +461,20 @@ def _faces_on_the_level(
     if not len(face):
         return np.zeros((0, 3), np.int64), np.zeros((0, 3))
     middle = _mean(points.points, face)
-    (before, value_before), (behind, value_behind) = (
+    (before, f_before), (behind, f_behind) = (
         _side_sample(function, points, tets, row) for row in (first, second)
     )
     if function.period is None:
-        count = (value_behind > 0).astype(np.int64) - (value_before > 0)
+        count = (f_behind > 0).astype(np.int64) - (f_before > 0)
     else:
         period = function.period
         value = function.values(middle)
         change = sum(
             sign
             * _integrate_change(function.field, side, middle, _wrap(value - start, period), period)
-            for sign, side, start in ((1, before, value_before), (-1, behind, value_behind))
+            for sign, side, start in ((1, before, f_before), (-1, behind, f_behind))
         )
-        difference = (
-            np.remainder(value_before, period) + change - np.remainder(value_behind, period)
-        )
+        difference = np.remainder(f_before, period) + change - np.remainder(f_behind, period)
         count = np.round(difference / period).astype(np.int64)
     rise = (behind - before) * np.sign(count)[:, None]
     return face[count != 0], rise[count != 0]
@@ -496,16 +486,16 @@ def _wrap(change: FloatArray, period: float) -> FloatArray:
 
 
 def _side_sample(
-    function: LevelFunction, points: TetrahedronPoints, tets: Tetrahedra, face_rows: IntArray
+    function: LevelFunction, points: TetrahedronPoints, tets: Tetrahedra, table: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """A point (n, 3) inside of or at the fourth corner of a tetrahedron, and the function (n,)
-    there.
+    """Points (n, 3) in tetrahedra at faces, and the function (n,) there.
 
-    face_rows: (n, 5) the three corners of a face, the index of a tetrahedron with this face, and which
-        of its corners is the fourth one. If that corner is on the level, the tetrahedron's center
-        is used instead."""
-    corners = tets.corners[face_rows[:, 3]]
-    apex = corners[np.arange(len(face_rows)), face_rows[:, 4]]
+    table: (n, 5) the three corners of each face, the index of a tetrahedron with this face, and
+        which of its corners is not on the face.
+
+    The point is that corner or, if it is on the level too, the center of the tetrahedron."""
+    corners = tets.corners[table[:, 3]]
+    apex = corners[np.arange(len(table)), table[:, 4]]
     side_points, value = points.points[apex], points.samples.value[apex]
     is_on = np.flatnonzero(points.is_on_level[apex])
     side_points[is_on] = points.points[corners[is_on]].mean(axis=1)
