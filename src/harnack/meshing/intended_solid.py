@@ -40,7 +40,7 @@ _IN_BOX, _NEAR = 2000, 1000
 _NEAREST, _FARTHEST, _MARGIN = 2e-3, 0.1, 0.05
 # The winding number is clearly above or below 1/2 if it differs from 1/2 by more than this: smooth
 # patches over holes stay within it.
-_WINDING_MARGIN = 0.36
+_CLEARANCE = 0.36
 # The largest relative difference of volumes of closed meshes that bound their solid once.
 _VOLUME_TOLERANCE = 0.01
 # Each face and the middle of the mesh span a tetrahedron. The mesh winds counter-clockwise if the
@@ -53,7 +53,7 @@ _BESIDE = 1e-6
 _MAX_RETESTED, _MAX_LISTED = 40, 10
 # The number of points of each closed part that are tested for where the part lies and what became
 # of it.
-_SAMPLES_PER_PART = 16
+_PART_SAMPLES = 16
 # A mesh is an open sheet if at least this fraction of its area has nothing inside.
 _OPEN_SHARE = 0.4
 
@@ -189,9 +189,7 @@ class IntendedSolid:
     def beside(self) -> tuple[FloatArray, FloatArray]:
         """Points (k, 3) next to faces of closed parts, on both sides, and the winding numbers (k,)
         there. A closed part may be so small or thin that no other test points are in it."""
-        chosen = [
-            self.oriented[part[:: max(1, len(part) // _SAMPLES_PER_PART)]] for part in self.parts
-        ]
+        chosen = [self.oriented[part[:: max(1, len(part) // _PART_SAMPLES)]] for part in self.parts]
         if not chosen:
             return np.zeros((0, 3)), np.zeros(0)
         corner = self.vertices[np.concatenate(chosen)]
@@ -269,14 +267,14 @@ class IntendedSolid:
 
 def _on_other_side(
     points: FloatArray,
-    windings: FloatArray,
+    w: FloatArray,
     field: WindingNumber | None,
     triangles: FloatArray,
     away: float,
 ) -> tuple[int, int, FloatArray]:
     """Count points on the wrong side of the result of a repair.
 
-    windings: the winding numbers (n,) of the input at `points` (n, 3).
+    w: the winding numbers (n,) of the input at `points` (n, 3).
     field: the winding number of the result.
     triangles: (m, 3, 3). Points within `away` of them are no evidence, as stated below.
 
@@ -287,10 +285,7 @@ def _on_other_side(
         the last, both numbers are 0.
     """
     inside = _values(field, points) > 0.5
-    missing, added = (
-        ~inside & (windings > 0.5 + _WINDING_MARGIN),
-        inside & (windings < 0.5 - _WINDING_MARGIN),
-    )
+    missing, added = (~inside & (w > 0.5 + _CLEARANCE), inside & (w < 0.5 - _CLEARANCE))
     rows = np.flatnonzero(missing | added)
     rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _MAX_RETESTED)).astype(int)]
     distant = rows[[distance_from_triangles(points[k], triangles) > away for k in rows]]
@@ -382,7 +377,7 @@ def _lies_in(x: FloatArray, faces: IntArray, container: IntArray) -> bool:
     (m, 3). Both index the vertices x."""
     if not len(faces) or not len(container):
         return False
-    centers = x[faces[:: max(1, len(faces) // _SAMPLES_PER_PART)]].mean(axis=1)
+    centers = x[faces[:: max(1, len(faces) // _PART_SAMPLES)]].mean(axis=1)
     return bool((np.abs(_values(_winding_number(x, container), centers)) > 0.5).all())
 
 

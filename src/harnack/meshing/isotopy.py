@@ -139,9 +139,7 @@ def isotopy_of(
     stars = ~proved & ~beside & far
     proved[stars] = _proved_by_stars(function, corners, index, slopes, np.flatnonzero(stars))
     proved &= on_walls
-    return IsotopyCoverage(
-        _fraction(proved), _fraction(proved[far]), len(index), index[far & ~proved]
-    )
+    return IsotopyCoverage(_share(proved), _share(proved[far]), len(index), index[far & ~proved])
 
 
 def _has_bounds(function: LevelFunction, corners: FloatArray) -> bool:
@@ -152,7 +150,7 @@ def _has_bounds(function: LevelFunction, corners: FloatArray) -> bool:
     return not len(tried) or bool((function.gradient_bounds(center, radius)[1] < _NO_BOUND).any())
 
 
-def _fraction(proved: BoolArray) -> float:
+def _share(proved: BoolArray) -> float:
     """The fraction of a mask that is set; 1 for an empty mask."""
     return float(proved.mean()) if len(proved) else 1.0
 
@@ -199,15 +197,11 @@ def _linear_gradients(
     slope: FloatArray = np.linalg.solve(edges[rows], rise[..., None])[..., 0].astype(np.float64)
     owners, slopes = [rows], [slope]
     rows = np.flatnonzero(has_volume & on_level)
-    point_count = int(index.max(initial=0)) + 1
-    mesh_keys = _triple_keys(faces[(faces < point_count).all(axis=1)], point_count)
+    count = int(index.max(initial=0)) + 1
+    keys = _triple_keys(faces[(faces < count).all(axis=1)], count)
     triples = np.array([np.delete(np.arange(4), k) for k in range(4)])
     in_mesh = np.stack(
-        [
-            np.isin(_triple_keys(index[rows][:, triple], point_count), mesh_keys)
-            for triple in triples
-        ],
-        axis=1,
+        [np.isin(_triple_keys(index[rows][:, triple], count), keys) for triple in triples], axis=1
     )
     sign = np.sign(function.values(corners[rows].mean(axis=1)))
     has_two = in_mesh.sum(axis=1) == 2
@@ -235,43 +229,43 @@ def _proved_by_stars(
     corners: FloatArray,
     index: IntArray,
     slopes: _LinearGradients,
-    candidates: IntArray,
+    rows: IntArray,
 ) -> BoolArray:
-    """(k,) whether (c) is proved for the tetrahedra with indices `candidates` (k,).
+    """(k,) whether (c) is proved for the tetrahedra with indices `rows` (k,).
 
     corners, index: (m, 4, 3), (m, 4) of all tetrahedra. slopes: the gradients of F on them.
 
     For each corner, the vector n of (c) is computed as by a perceptron: it starts as the sum of all
     unit gradients of F around the corner; then the gradients whose product with n is not positive
     are added again, for a few rounds."""
-    vertices = np.unique(index[candidates])
-    vertex_of_point = np.full(int(index.max(initial=0)) + 1, -1, np.int64)
-    vertex_of_point[vertices] = np.arange(len(vertices))
+    vertices = np.unique(index[rows])
+    number = np.full(int(index.max(initial=0)) + 1, -1, np.int64)
+    number[vertices] = np.arange(len(vertices))
     # Pairs of a corner and a tetrahedron around it; then pairs of a corner and a gradient there.
-    tetrahedron, corner = np.nonzero(vertex_of_point[index] >= 0)
-    vertex_of_pair = vertex_of_point[index[tetrahedron, corner]]
-    entry, corner_of_entry = np.nonzero(vertex_of_point[index[slopes.owner]] >= 0)
-    vertex = vertex_of_point[index[slopes.owner[entry], corner_of_entry]]
+    tetrahedron, corner = np.nonzero(number[index] >= 0)
+    star = number[index[tetrahedron, corner]]
+    entry, corner_of_entry = np.nonzero(number[index[slopes.owner]] >= 0)
+    vertex = number[index[slopes.owner[entry], corner_of_entry]]
     units = slopes.slope[entry]
     units = units / np.maximum(np.linalg.norm(units, axis=1), 1e-300)[:, None]
-    directions = np.zeros((len(vertices), 3))
-    np.add.at(directions, vertex, units)
+    n = np.zeros((len(vertices), 3))
+    np.add.at(n, vertex, units)
     for _ in range(_MAX_PERCEPTRON_ROUNDS):
-        is_short = (directions[vertex] * units).sum(axis=1) <= 0
+        is_short = (n[vertex] * units).sum(axis=1) <= 0
         if not is_short.any():
             break
-        np.add.at(directions, vertex[is_short], units[is_short])
+        np.add.at(n, vertex[is_short], units[is_short])
     is_proved = np.ones(len(vertices), np.bool_)
-    is_proved[vertex[(directions[vertex] * units).sum(axis=1) <= 1e-9]] = False
+    is_proved[vertex[(n[vertex] * units).sum(axis=1) <= 1e-9]] = False
     has_slope = np.bincount(slopes.owner, minlength=len(index)) > 0
-    is_proved[vertex_of_pair[~has_slope[tetrahedron]]] = False
-    tried = np.flatnonzero(is_proved[vertex_of_pair])
+    is_proved[star[~has_slope[tetrahedron]]] = False
+    tried = np.flatnonzero(is_proved[star])
     start = np.zeros(len(tried))
     is_regular = _proved_regular(
-        function, corners[tetrahedron[tried]], start, directions[vertex_of_pair[tried]], np.ones(3)
+        function, corners[tetrahedron[tried]], start, n[star[tried]], np.ones(3)
     )
-    is_proved[vertex_of_pair[tried[~is_regular]]] = False
-    return np.asarray(is_proved[vertex_of_point[index[candidates]]].all(axis=1), np.bool_)
+    is_proved[star[tried[~is_regular]]] = False
+    return np.asarray(is_proved[number[index[rows]]].all(axis=1), np.bool_)
 
 
 def _proved_empty(function: LevelFunction, corners: FloatArray) -> BoolArray:
@@ -295,16 +289,16 @@ def _proved_empty(function: LevelFunction, corners: FloatArray) -> BoolArray:
 def _proved_regular(
     function: LevelFunction,
     corners: FloatArray,
-    first_values: FloatArray,
+    start: FloatArray,
     slope: FloatArray,
     free: FloatArray,
 ) -> BoolArray:
     """(n,) whether (a) or (b) is proved on all of simplices (n, k, 3), by halving them.
 
-    first_values: (n,) the values of F at the first corners.
+    start: (n,) the values of F at the first corners.
     slope: (n, 3) grad F, or in (c) the vector n.
     free: (3,) 1 for coordinates in which points may move, 0 for those that a wall fixes."""
-    owner, first_corner = np.arange(len(corners)), corners[:, 0]
+    owner, first = np.arange(len(corners)), corners[:, 0]
     pieces, proved = corners, np.ones(len(corners), np.bool_)
     half_period = np.inf if function.period is None else 0.499 * function.period
     for halving in range(_HALVINGS + 1):
@@ -319,17 +313,13 @@ def _proved_regular(
             break
         projected = slope[owner] * free
         gradient_length = np.linalg.norm(samples.gradient, axis=1)
-        largest_change = (gradient_length + change) * radius
+        moved = (gradient_length + change) * radius
         product = (samples.gradient * projected).sum(axis=1)
         is_regular = product > change * np.linalg.norm(projected, axis=1) * (1 + 1e-9)
-        is_within_half_period = np.abs(samples.value) + largest_change < half_period
-        linear_values = first_values[owner, None] + (
-            (pieces - first_corner[owner, None]) * slope[owner, None]
-        ).sum(2)
+        is_within_half_period = np.abs(samples.value) + moved < half_period
+        linear = start[owner, None] + ((pieces - first[owner, None]) * slope[owner, None]).sum(2)
         sign = np.sign(samples.value)
-        is_regular |= (np.abs(samples.value) > largest_change) & (
-            linear_values * sign[:, None] > 0
-        ).all(axis=1)
+        is_regular |= (np.abs(samples.value) > moved) & (linear * sign[:, None] > 0).all(axis=1)
         if halving == 0:
             proved &= is_within_half_period
         undecided = ~is_regular & proved[owner]
@@ -359,43 +349,39 @@ def _regular_on_walls(
     corners: FloatArray,
     values: FloatArray,
     slopes: _LinearGradients,
-    is_candidate: BoolArray,
+    rows: BoolArray,
     walls: tuple[FloatArray, FloatArray],
 ) -> BoolArray:
     """(n,) whether (b) is proved for the projections onto the walls of the box.
 
-    is_candidate: (n,) the mask of the tetrahedra whose faces, edges and corners in walls are
+    rows: (n,) the mask of the tetrahedra whose faces, edges and corners in walls are
         tested.
     walls: the lower and the upper corner (3,) of the box.
 
-    Tetrahedra that are not candidates count as proved if they have no corner on a wall, else as not
+    Tetrahedra that are not in `rows` count as proved if they have no corner on a wall, else as not
     proved."""
     tolerance = 1e-9 * (walls[1] - walls[0])
-    on_wall = np.stack(
-        [np.abs(corners - wall) <= tolerance for wall in walls], axis=-1
-    )  # (n, 4, 3, 2)
-    proved = is_candidate | ~on_wall.any(axis=(1, 2, 3))
+    on = np.stack([np.abs(corners - wall) <= tolerance for wall in walls], axis=-1)  # (n, 4, 3, 2)
+    proved = rows | ~on.any(axis=(1, 2, 3))
     planes = list(itertools.product(range(3), range(2)))
     for count in (1, 2):  # in corners of the box no point moves, and nothing is required
         for planes_chosen in itertools.combinations(planes, count):
             axes = [axis for axis, _ in planes_chosen]
             if len(set(axes)) < count:
                 continue
-            in_planes = np.all([on_wall[:, :, axis, side] for axis, side in planes_chosen], axis=0)
+            in_planes = np.all([on[:, :, axis, side] for axis, side in planes_chosen], axis=0)
             free = np.ones(3)
             free[axes] = 0.0
             corner_count = in_planes.sum(axis=1)
             for k in range(1, 4):
-                entry = np.flatnonzero(((corner_count == k) & is_candidate)[slopes.owner])
+                entry = np.flatnonzero(((corner_count == k) & rows)[slopes.owner])
                 if not len(entry):
                     continue
                 owner = slopes.owner[entry]
                 columns = np.argsort(~in_planes[owner], axis=1, kind="stable")[:, :k]
-                lower_simplices = np.take_along_axis(corners[owner], columns[..., None], axis=1)
-                first_values = np.take_along_axis(values[owner], columns[:, :1], axis=1)[:, 0]
-                is_regular = _proved_regular(
-                    function, lower_simplices, first_values, slopes.slope[entry], free
-                )
+                part = np.take_along_axis(corners[owner], columns[..., None], axis=1)
+                start = np.take_along_axis(values[owner], columns[:, :1], axis=1)[:, 0]
+                is_regular = _proved_regular(function, part, start, slopes.slope[entry], free)
                 proved[owner[~is_regular]] = False
     return proved
 

@@ -726,11 +726,11 @@ def _march(
     points, samples, is_on = _snap_points(function, points, samples, is_fixed, lattice, walls)
     is_on |= is_wall
     touching, is_affected = np.zeros(0, np.int64), np.ones(len(points), np.bool_)
-    examined = cut_rows = np.flatnonzero(_may_be_cut(samples.value, is_on, corners))
+    rows = cut_rows = np.flatnonzero(_may_be_cut(samples.value, is_on, corners))
     for _ in range(_MOST_ROUNDS):
         sampled, tets = (
             TetrahedronPoints(points, is_on, samples),
-            Tetrahedra.of(points, corners[examined]),
+            Tetrahedra.of(points, corners[rows]),
         )
         crossings = count_crossings(function, sampled, tets)
         # The positions of vertices on edges do not matter for whether parts touch.
@@ -745,31 +745,28 @@ def _march(
         samples = samples.replaced(touching, original_samples.select(touching))
         # Parts may touch anew only at points beside these: they are examined with all of their
         # tetrahedra.
-        is_moved_back, is_affected = (
-            np.zeros(len(points), np.bool_),
-            np.zeros(len(points), np.bool_),
-        )
-        is_moved_back[touching] = True
-        is_affected[corners[_have_any(is_moved_back, corners)]] = True
+        near, is_affected = (np.zeros(len(points), np.bool_), np.zeros(len(points), np.bool_))
+        near[touching] = True
+        is_affected[corners[_have_any(near, corners)]] = True
         affected = np.flatnonzero(_have_any(is_affected, corners))
-        examined = affected[_may_be_cut(samples.value, is_on, corners[affected])]
-        cut_rows = np.concatenate([cut_rows, examined])
+        rows = affected[_may_be_cut(samples.value, is_on, corners[affected])]
+        cut_rows = np.concatenate([cut_rows, rows])
     else:
         raise MeshingError(
             f"sheets of the level set touch at {len(touching)} places: choose a smaller `cell_size`"
         )
     # Other tetrahedra have the same points as before.
-    examined = sorted_unique(cut_rows)
-    examined = examined[_may_be_cut(samples.value, is_on, corners[examined])]
+    rows = sorted_unique(cut_rows)
+    rows = rows[_may_be_cut(samples.value, is_on, corners[rows])]
     sampled, tets = (
         TetrahedronPoints(points, is_on, samples),
-        Tetrahedra.of(points, corners[examined]),
+        Tetrahedra.of(points, corners[rows]),
     )
     crossings = count_crossings(function, sampled, tets)
     vertices, faces = extract_triangles(function, sampled, tets, crossings)
     crossed: BoolArray = np.asarray((crossings.count[tets.edges] != 0).any(axis=1))
     ends = tets.ends[np.flatnonzero(crossings.count)]
-    return _InitialMesh(vertices, faces, sampled, examined, crossed, ends)
+    return _InitialMesh(vertices, faces, sampled, rows, crossed, ends)
 
 
 def _middles(low: FloatArray, high: FloatArray) -> FloatArray:
@@ -833,11 +830,9 @@ def _may_be_cut(value: FloatArray, is_on: BoolArray, corners: IntArray) -> BoolA
     code_sum = np.zeros(len(corners), np.uint8)
     for column in corners.T:
         code_sum += code[column]
-    cut_by_sum = np.zeros(4 * _ON_LEVEL + 1, np.bool_)
+    cut = np.zeros(4 * _ON_LEVEL + 1, np.bool_)
     for above, below in itertools.product(range(5), repeat=2):
         on = 4 - above - below
         if on >= 0:
-            cut_by_sum[above * _ABOVE + below * _BELOW + on * _ON_LEVEL] = (
-                above and below
-            ) or on >= 3
-    return cut_by_sum[code_sum]
+            cut[above * _ABOVE + below * _BELOW + on * _ON_LEVEL] = (above and below) or on >= 3
+    return cut[code_sum]

@@ -288,8 +288,10 @@ def _bound_of_distances(points: FloatArray, triangles: FloatArray) -> float:
     return float(tree.query(points)[0].max())
 
 
-def _are_farther(points: FloatArray, triangles: FloatArray, distance: float) -> BoolArray:
-    """(n,) whether points (n, 3) are farther than `distance` from all triangles (m, 3, 3).
+def _are_farther(points: FloatArray, corner: FloatArray, distance: float) -> BoolArray:
+    """(n,) whether points (n, 3) are farther than `distance` from all triangles.
+
+    corner: (m, 3, 3) the corners of the triangles.
 
     A triangle within the distance has its center within the sum of the distance and the triangle's
     radius around its center. Triangles whose radii differ by less than a factor of 2 are searched
@@ -300,8 +302,8 @@ def _are_farther(points: FloatArray, triangles: FloatArray, distance: float) -> 
     is_far = np.ones(len(points), np.bool_)
     if not len(points):
         return is_far
-    center = triangles.mean(axis=1)
-    radius = np.stack([row_norms(triangles[:, k] - center) for k in range(3)]).max(axis=0)
+    center = corner.mean(axis=1)
+    radius = np.stack([row_norms(corner[:, k] - center) for k in range(3)]).max(axis=0)
     exponent = np.ceil(np.log2(np.maximum(radius, distance))).astype(np.int64)
     for k in np.unique(exponent).tolist():
         remaining, rows = np.flatnonzero(is_far), np.flatnonzero(exponent == k)
@@ -310,13 +312,6 @@ def _are_farther(points: FloatArray, triangles: FloatArray, distance: float) -> 
         counts = np.array([len(indices) for indices in near], np.int64)
         if not counts.sum():
             continue
-        point_index, triangle = (
-            np.repeat(remaining, counts),
-            rows[np.concatenate(near).astype(np.int64)],
-        )
-        is_far[
-            point_index[
-                distances_from_triangles(points[point_index], triangles[triangle]) <= distance
-            ]
-        ] = False
+        query, face = (np.repeat(remaining, counts), rows[np.concatenate(near).astype(np.int64)])
+        is_far[query[distances_from_triangles(points[query], corner[face]) <= distance]] = False
     return is_far

@@ -368,36 +368,29 @@ def _roots(
 
 
 def _illinois(
-    function: LevelFunction,
-    start: FloatArray,
-    edge: FloatArray,
-    f_left: FloatArray,
-    f_right: FloatArray,
+    function: LevelFunction, p: FloatArray, edge: FloatArray, low: FloatArray, high: FloatArray
 ) -> FloatArray:
     """(r,) the fractions of edges at which they meet the level set, by a few secant steps.
 
-    start, edge: (r, 3) one end of each edge, and the vector to the other.
-    f_left, f_right: (r,) the values at these ends.
+    p, edge: (r, 3) one end of each edge, and the vector to the other.
+    low, high: (r,) the values at these ends.
 
     If the root is on the same side of the secant's root twice or more in a row, the value at the
     end that stays is halved (the Illinois method)."""
-    left, right = np.zeros(len(start)), np.ones(len(start))
-    is_rising = f_right > f_left
-    f_left, f_right = (
-        np.where(is_rising, f_left, -f_left),
-        np.where(is_rising, f_right, -f_right),
-    )
-    repeats = np.zeros(len(start), np.int64)
-    fraction = f_left / (f_left - f_right)
+    left, right = np.zeros(len(p)), np.ones(len(p))
+    up = high > low
+    low, high = (np.where(up, low, -low), np.where(up, high, -high))
+    repeats = np.zeros(len(p), np.int64)
+    fraction = low / (low - high)
     for _ in range(function.secant_steps):
-        value = function.values(start + fraction[:, None] * edge)
-        value = np.where(is_rising, value, -value)
+        value = function.values(p + fraction[:, None] * edge)
+        value = np.where(up, value, -value)
         is_positive = value > 0
         repeats = np.where(is_positive, np.maximum(repeats, 0) + 1, np.minimum(repeats, 0) - 1)
-        f_left = np.where(is_positive, np.where(repeats > 1, 0.5 * f_left, f_left), value)
-        f_right = np.where(is_positive, value, np.where(repeats < -1, 0.5 * f_right, f_right))
+        low = np.where(is_positive, np.where(repeats > 1, 0.5 * low, low), value)
+        high = np.where(is_positive, value, np.where(repeats < -1, 0.5 * high, high))
         left, right = np.where(is_positive, left, fraction), np.where(is_positive, fraction, right)
-        fraction = left + (right - left) * f_left / np.minimum(f_left - f_right, -1e-300)
+        fraction = left + (right - left) * low / np.minimum(low - high, -1e-300)
     return np.clip(fraction, _MIN_END_DISTANCE, 1 - _MIN_END_DISTANCE)
 
 
