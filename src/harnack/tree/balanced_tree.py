@@ -163,15 +163,13 @@ def _split(rows: IntArray, positions: FloatArray) -> tuple[IntArray, FloatArray]
     """
     count, width = rows.shape
     half, middle = (width + 1) // 2, width // 2
-    longest_axis = positions[_box_sizes(positions).argmax(axis=0), np.arange(count)]
-    order = cast("IntArray", np.argpartition(longest_axis, middle, axis=1))
-    with_empty = np.flatnonzero(np.isnan(longest_axis[:, -1]))
-    column = (order[with_empty] == width - 1).argmax(
-        axis=1
-    )  # the empty slot: somewhere on the right
-    order[with_empty, column], order[with_empty, -1] = order[with_empty, -1], width - 1
+    key = positions[_box_sizes(positions).argmax(axis=0), np.arange(count)]
+    order = cast("IntArray", np.argpartition(key, middle, axis=1))
+    short = np.flatnonzero(np.isnan(key[:, -1]))
+    at = (order[short] == width - 1).argmax(axis=1)  # the empty slot: somewhere on the right
+    order[short, at], order[short, -1] = order[short, -1], width - 1
     if width % 2:  # m points of 2m on either side, the empty slot on the left
-        order[with_empty, -1], order[with_empty, middle] = order[with_empty, middle], width - 1
+        order[short, -1], order[short, middle] = order[short, middle], width - 1
     order += np.arange(0, rows.size, width, dtype=np.int64)[:, None]
     return _halves(rows, order, half, NO_PRIMITIVE), np.stack(
         [_halves(coordinate, order, half, np.nan) for coordinate in positions]

@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Mask
 
 WriteEntry: TypeAlias = "Callable[[Any, Any, Mask], None]"
-"""Called with a position, an entry and a mask: writes the entry at that position of the list of each
-lane in the mask."""
+"""Called with a position, an entry and a mask: writes the entry into the list of each lane."""
 
 
 _TOO_LONG = "more than 2^31 entries of lists: cut the input in parts"

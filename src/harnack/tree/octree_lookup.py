@@ -104,7 +104,7 @@ class OctreeLookup:
             return node >= 0
 
         def step(node: Any, bit: Any) -> tuple[Any, Any]:
-            """Go to the child that contains the point; the bits of its coordinates at `bit` choose
+            """Go to the child that contains the point: bit number `bit` of its coordinates chooses
             it."""
             octant = ((ix >> bit) & 1) * 4 + ((iy >> bit) & 1) * 2 + ((iz >> bit) & 1)
             return dr.gather(integer, self.encoded_nodes, index(node) + octant), bit - 1
