@@ -97,8 +97,8 @@ def _normals(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _candidates(corners: FloatArray, normals: FloatArray, heights: FloatArray) -> IntArray:
-    """The indices (k,) of triangles in whose plane other triangles may lie. The lower of two
-    triangles in one plane is always among them.
+    """The indices (k,) of triangles in whose plane other triangles may lie. Of two triangles in one
+    plane, the one with the smaller height is always among them.
 
     corners: (m, 3, 3). normals: (m, 3) unit normals. heights: (m,) over the longest edges.
 
@@ -106,8 +106,8 @@ def _candidates(corners: FloatArray, normals: FloatArray, heights: FloatArray) -
     turned so that its first coordinate that is larger than 0.3 in magnitude is positive. For two
     triangles in one plane these points differ only by rounding and by the effect of moving corners
     by `_IN_PLANE`, divided by the smaller of the triangles' heights. R^4 is divided into cells. So
-    a triangle alone in its cell can share its plane with another one only if its point is as near
-    as that to a wall of the cell."""
+    a triangle alone in its cell can share its plane with another one only if its point is that near
+    to a wall of the cell, or a coordinate of its normal that near to 0.3 in magnitude."""
     excess = np.abs(normals) - 0.3
     first = np.take_along_axis(normals, (excess > 0).argmax(axis=1)[:, None], axis=1)
     normals = np.where(first < 0, -normals, normals)
@@ -158,7 +158,8 @@ def _next_in_plane(
     lane's face, overlaps it and is at least as large. NO_TRIANGLE if there is none.
 
     corners, face: the corners and the number of the lane's face.
-    sizes: the sizes of all faces; of two faces with equal sizes the later one counts as larger."""
+    sizes: the heights of all faces over their longest edges; of two faces with equal heights the
+        later one counts as larger."""
     backend = tree.tree.backend
     real, index, vector = backend.Float, backend.UInt32, backend.Array3f
     a, b, c = corners

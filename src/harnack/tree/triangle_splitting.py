@@ -192,12 +192,12 @@ def _next_foreign_crossing(
         """Go to the next crossing; the lane stays active while its face has one of the two
         vertices."""
         t, n, _, _ = tree.next_crossing(frame, (t, n), end, active, _COINCIDENT)
-        has_hit = active & (n != NO_TRIANGLE)
-        corners = [dr.gather(index, vertex, n, has_hit) for vertex in corner]
+        hit = active & (n != NO_TRIANGLE)
+        corners = [dr.gather(index, vertex, n, hit) for vertex in corner]
         return (
             t,
             n,
-            has_hit & dr.any([(vertex == ends[0]) | (vertex == ends[1]) for vertex in corners]),
+            hit & dr.any([(vertex == ends[0]) | (vertex == ends[1]) for vertex in corners]),
         )
 
     def is_running(t: Any, n: Any, active: Any) -> Any:
@@ -216,38 +216,36 @@ def _cut_up(pieces: FloatArray, rows: IntArray, knives: FloatArray) -> tuple[Flo
         not only its plane, meets the piece.
 
     In each round every piece is cut by one of the knives that meet it, the one in the middle of its
-    list. The new pieces are then tested against the remaining knives of the list, about half of
-    which meet each of them.
+    list, and the new pieces share the other knives of the list: so the number of knives of a piece
+    falls by about half.
 
     Returns:
         The pieces (j, 3, 3), and the index (j,) of the triangle that each is a piece of.
     """
     done: list[FloatArray] = []
     owners: list[IntArray] = []
-    knife, triangle_of = np.arange(len(knives)), np.arange(len(pieces))
+    knife, source = np.arange(len(knives)), np.arange(len(pieces))
     while True:
-        heights = _heights(pieces[rows], knives[knife])
-        heights[np.abs(heights) < _COINCIDENT] = 0
-        meets = (heights.max(axis=1) > 0) & (heights.min(axis=1) < 0)
-        meets[meets] = _cut_meets_triangle(
-            pieces[rows[meets]], heights[meets], knives[knife[meets]]
-        )
-        rows, knife, heights = rows[meets], knife[meets], heights[meets]
+        height = _heights(pieces[rows], knives[knife])
+        height[np.abs(height) < _COINCIDENT] = 0
+        meets = (height.max(axis=1) > 0) & (height.min(axis=1) < 0)
+        meets[meets] = _cut_meets_triangle(pieces[rows[meets]], height[meets], knives[knife[meets]])
+        rows, knife, height = rows[meets], knife[meets], height[meets]
         is_cut = np.zeros(len(pieces), np.bool_)
         is_cut[rows] = True
         done.append(pieces[~is_cut])
-        owners.append(triangle_of[~is_cut])
+        owners.append(source[~is_cut])
         if not len(rows):
             return np.concatenate(done), np.concatenate(owners)
         order = np.argsort(rows, kind="stable")
-        rows, knife, heights = rows[order], knife[order], heights[order]
+        rows, knife, height = rows[order], knife[order], height[order]
         owner, first, count = np.unique(rows, return_index=True, return_counts=True)
         middle = first + count // 2
         remaining = np.ones(len(rows), np.bool_)
         remaining[middle] = False
-        pieces, triangle_of = (
-            _pieces_at_plane(pieces[owner], heights[middle]),
-            np.tile(triangle_of[owner], 3),
+        pieces, source = (
+            _pieces_at_plane(pieces[owner], height[middle]),
+            np.tile(source[owner], 3),
         )
         targets = np.searchsorted(owner, rows[remaining])
         rows = (targets[:, None] + len(owner) * np.arange(3)).ravel()

@@ -374,7 +374,9 @@ def corners_of(row: list[Real], vector: Any) -> tuple[Vec3, Vec3, Vec3]:
 
 
 def normal_of(row: list[Real], vector: Any) -> Vec3:
-    """A normal of the triangle of a record by the right-hand rule, of any length. vector: its type."""
+    """A normal of the triangle of a record by the right-hand rule, of any length.
+
+    vector: the type of the normal."""
     p, q, r = corners_of(row, vector)
     return row[PARITY_COLUMN] * dr.cross(q - p, r - p)
 
@@ -454,8 +456,7 @@ def _crossing_depth(
     an area over the edge's length.
 
     If the ray is within `close` of an edge or a vertex, it passes through all triangles there at
-    the depth of that edge or vertex, the same bits for all: the jumps of the winding number w
-    across them are at exactly the same t."""
+    the depth of that edge or vertex, the same bits for all: the jumps of the winding number across them are at exactly the same t."""
     (a, b, c), (ab, bc, ac) = corners, areas
     squares = _square(a, b), _square(b, c), _square(a, c)
     is_first = (squares[0] >= squares[1]) & (squares[0] >= squares[2])
