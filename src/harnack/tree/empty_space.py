@@ -50,7 +50,7 @@ __all__ = [
 ]
 
 Clearance: TypeAlias = Callable[[FloatArray], FloatArray]
-"""A function from points (n, 3) to lengths (n,): a set has no point nearer than that to each point."""
+"""A function from points (n, 3) to lengths (n,): no point of a set is nearer than that to them."""
 
 _OCTANTS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
 
@@ -175,7 +175,7 @@ def nonempty_cells(
     return refine_cells(root, clearance, most, finest).occupied
 
 
-# A part of the margin around an empty cell that is reserved for the rounding of positions; in cells.
+# The part of the margin around an empty cell that is reserved for rounding, in cells.
 _ROUNDING_SHARE = 1 / 64
 
 
@@ -350,9 +350,9 @@ def round_to_short_float(size: float) -> float:
     return math.ldexp(round(mantissa * 4096), exponent - 12)
 
 
-# `EmptySpaceGrid.margin` of the grids; and how often cubes are halved down to cells, so that the first
-# cubes are 2^_OCTREE_ROUNDS cells wide.
-_GRID_MARGIN, _OCTREE_ROUNDS = 1 / 16, 3
+# `EmptySpaceGrid.margin` of the grids; and how often cubes are halved down to cells, so that the
+# first cubes are 2^_ROUNDS cells wide.
+_MARGIN, _ROUNDS = 1 / 16, 3
 
 
 @dataclass(frozen=True)
@@ -376,18 +376,16 @@ class OccupancyGrid(GridData):
         cell = max(float((upper - lower).max()) / across, float(np.spacing(reach)))
         cell = round_to_short_float(cell)
         # For rounding the corner down, and for the margin beyond the box.
-        room = (_GRID_MARGIN + 1e-3) * cell
+        room = (_MARGIN + 1e-3) * cell
         origin = np.nextafter((lower - room).astype(np.float32), np.float32(-np.inf))
         origin = origin.astype(np.float64)
-        side = cell * 2**_OCTREE_ROUNDS
+        side = cell * 2**_ROUNDS
         nx, ny, nz = (int(count) for count in np.ceil((upper + room - origin) / side))
         indices = np.indices((nx, ny, nz)).reshape(3, -1).T
         roots = BoxCells(origin + side * indices, np.full(3, side))
-        roots = roots.subset(~roots.is_proved_empty(clearance, _GRID_MARGIN))
-        cells = refine_cells(
-            roots, clearance, np.iinfo(np.int64).max, _OCTREE_ROUNDS, _GRID_MARGIN
-        ).occupied
-        nx, ny, nz = (count << _OCTREE_ROUNDS for count in (nx, ny, nz))
+        roots = roots.subset(~roots.is_proved_empty(clearance, _MARGIN))
+        cells = refine_cells(roots, clearance, np.iinfo(np.int64).max, _ROUNDS, _MARGIN).occupied
+        nx, ny, nz = (count << _ROUNDS for count in (nx, ny, nz))
         empty = np.ones((nz, ny, nx), np.bool_)
         x, y, z = np.round((cells.corners - origin) / cell).astype(np.int64).T
         empty[z, y, x] = False
@@ -413,12 +411,12 @@ class OccupancyGrid(GridData):
         halves = BoxCells(
             self.origin + self.cell_size * indices, np.full(3, self.cell_size)
         ).octants()
-        full[full] = ~halves.is_proved_empty(clearance, 2 * _GRID_MARGIN).reshape(-1, 8).all(axis=1)
+        full[full] = ~halves.is_proved_empty(clearance, 2 * _MARGIN).reshape(-1, 8).all(axis=1)
         return replace(self, empty_distance=distance_to_occupied(~full))
 
     def upload(self, backend: Backend) -> EmptySpaceGrid:
         """The grid on a backend."""
-        return EmptySpaceGrid(*EmptySpaceGrid.upload_layout(backend, self), _GRID_MARGIN)
+        return EmptySpaceGrid(*EmptySpaceGrid.upload_layout(backend, self), _MARGIN)
 
 
 # Cells that share a face, an edge or a corner are neighbors.

@@ -456,7 +456,8 @@ def _crossing_depth(
     an area over the edge's length.
 
     If the ray is within `close` of an edge or a vertex, it passes through all triangles there at
-    the depth of that edge or vertex, the same bits for all: the jumps of the winding number across them are at exactly the same t."""
+    the depth of that edge or vertex, the same bits for all: the jumps of the winding number
+    across them are at exactly the same t."""
     (a, b, c), (ab, bc, ac) = corners, areas
     squares = _square(a, b), _square(b, c), _square(a, c)
     is_first = (squares[0] >= squares[1]) & (squares[0] >= squares[2])
