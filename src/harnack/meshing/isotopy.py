@@ -242,8 +242,8 @@ def _proved_by_stars(
     number = np.full(int(index.max(initial=0)) + 1, -1, np.int64)
     number[vertices] = np.arange(len(vertices))
     # Pairs of a corner and a tetrahedron around it; then pairs of a corner and a gradient there.
-    tetrahedron, corner = np.nonzero(number[index] >= 0)
-    star = number[index[tetrahedron, corner]]
+    tet, corner = np.nonzero(number[index] >= 0)
+    star = number[index[tet, corner]]
     entry, corner_of_entry = np.nonzero(number[index[slopes.owner]] >= 0)
     vertex = number[index[slopes.owner[entry], corner_of_entry]]
     units = slopes.slope[entry]
@@ -258,13 +258,11 @@ def _proved_by_stars(
     is_proved = np.ones(len(vertices), np.bool_)
     is_proved[vertex[(n[vertex] * units).sum(axis=1) <= 1e-9]] = False
     has_slope = np.bincount(slopes.owner, minlength=len(index)) > 0
-    is_proved[star[~has_slope[tetrahedron]]] = False
+    is_proved[star[~has_slope[tet]]] = False
     tried = np.flatnonzero(is_proved[star])
     start = np.zeros(len(tried))
-    is_regular = _proved_regular(
-        function, corners[tetrahedron[tried]], start, n[star[tried]], np.ones(3)
-    )
-    is_proved[star[tried[~is_regular]]] = False
+    fine = _proved_regular(function, corners[tet[tried]], start, n[star[tried]], np.ones(3))
+    is_proved[star[tried[~fine]]] = False
     return np.asarray(is_proved[number[index[rows]]].all(axis=1), np.bool_)
 
 

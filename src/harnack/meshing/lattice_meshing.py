@@ -758,10 +758,7 @@ def _march(
     # Other tetrahedra have the same points as before.
     rows = sorted_unique(cut_rows)
     rows = rows[_may_be_cut(samples.value, is_on, corners[rows])]
-    sampled, tets = (
-        TetrahedronPoints(points, is_on, samples),
-        Tetrahedra.of(points, corners[rows]),
-    )
+    sampled, tets = TetrahedronPoints(points, is_on, samples), Tetrahedra.of(points, corners[rows])
     crossings = count_crossings(function, sampled, tets)
     vertices, faces = extract_triangles(function, sampled, tets, crossings)
     crossed: BoolArray = np.asarray((crossings.count[tets.edges] != 0).any(axis=1))

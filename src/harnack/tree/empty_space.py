@@ -105,12 +105,14 @@ class BoxCells:
 
 
 def kdop_of_points(points: FloatArray, slack: float) -> ConvexHull:
-    """The 26-sided polytope (`BoxCells.bounding_kdop`) around points (n, 3), enlarged by `slack`."""
+    """The 26-sided polytope (`BoxCells.bounding_kdop`) around points (n, 3), enlarged by
+    `slack`."""
     return _kdop_of_boxes(points, np.full(3, slack))
 
 
 def merge_kdops(one: ConvexHull, other: ConvexHull) -> ConvexHull:
-    """The smallest 26-sided polytope (`BoxCells.bounding_kdop`) that contains two such polytopes."""
+    """The smallest 26-sided polytope (`BoxCells.bounding_kdop`) that contains two such
+    polytopes."""
     return ConvexHull(
         one.normals,
         np.maximum(one.offsets, other.offsets),

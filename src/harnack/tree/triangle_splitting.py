@@ -194,11 +194,7 @@ def _next_foreign_crossing(
         t, n, _, _ = tree.next_crossing(frame, (t, n), end, active, _COINCIDENT)
         hit = active & (n != NO_TRIANGLE)
         corners = [dr.gather(index, vertex, n, hit) for vertex in corner]
-        return (
-            t,
-            n,
-            hit & dr.any([(vertex == ends[0]) | (vertex == ends[1]) for vertex in corners]),
-        )
+        return t, n, hit & dr.any([(vertex == ends[0]) | (vertex == ends[1]) for vertex in corners])
 
     def is_running(t: Any, n: Any, active: Any) -> Any:
         del t, n
@@ -243,10 +239,7 @@ def _cut_up(pieces: FloatArray, rows: IntArray, knives: FloatArray) -> tuple[Flo
         middle = first + count // 2
         remaining = np.ones(len(rows), np.bool_)
         remaining[middle] = False
-        pieces, source = (
-            _pieces_at_plane(pieces[owner], height[middle]),
-            np.tile(source[owner], 3),
-        )
+        pieces, source = _pieces_at_plane(pieces[owner], height[middle]), np.tile(source[owner], 3)
         targets = np.searchsorted(owner, rows[remaining])
         rows = (targets[:, None] + len(owner) * np.arange(3)).ravel()
         knife = np.repeat(knife[remaining], 3)
