@@ -25,9 +25,9 @@ __all__ = ["project_outliers"]
 
 # The largest number of locations that is mended; and how often faces may be cut, one after the
 # other.
-_MOST, _TIMES = 100, 4
+_MAX_OUTLIERS, _MAX_ROUNDS = 100, 4
 # Edges of such faces are cut if their middle is farther off the level than this, in tolerances.
-_FAR = 0.5
+_MAX_MIDPOINT_DISTANCE = 0.5
 # How far mending of intersections may move cut faces, in tolerances.
 _MENDED_WITHIN = 0.25
 
@@ -49,11 +49,11 @@ def project_outliers(
     check: raises a MeshingError for a surface that is not near the level. It is called with the
         changed faces; whether these pass through other triangles is decided exactly.
     """
-    if len(places) > _MOST:
+    if len(places) > _MAX_OUTLIERS:
         return None
     vertices, faces = surface.vertices, surface.faces
     is_new = np.zeros(len(faces), np.bool_)
-    for _ in range(_TIMES):
+    for _ in range(_MAX_ROUNDS):
         changed = _project_and_split(
             function, TriangleMesh(vertices, faces), is_new, places, tolerance
         )
@@ -78,17 +78,27 @@ def _project_and_split(
     points: FloatArray,
     tolerance: float,
 ) -> tuple[tuple[FloatArray, IntArray], BoolArray] | None:
-    """Vertices and faces with the vertices at `points` moved onto the level and the faces with a
-    center at `points` cut; and (m,) which faces are new, including those of `is_new`. None if a
-    point is neither a vertex nor a center, or too far from the level."""
+    """Move vertices at `points` onto the level set, and cut the faces with a center at `points`.
+
+    Such a face is cut at the midpoints of its edges that are off the level set by more than half of
+    the tolerance, or at its center if there are none. The new vertices are moved onto the level
+    set.
+
+    is_new: (m,) the mask of the faces that earlier calls made.
+
+    Returns:
+        The vertices and the faces; and the mask of the new faces, including those of `is_new` that
+        are left and the faces at moved vertices. None if a point is neither a vertex nor a center,
+        or would be moved by more than two tolerances.
+    """
     vertices, faces = surface.vertices, surface.faces
     corners = _rows_at(points, vertices)
     centers = _rows_at(points, vertices[faces].mean(axis=1))
     if len(corners) + len(centers) < len(points):
         return None
     pairs = half_edges(faces[centers])
-    middle = vertices[pairs].mean(axis=1)
-    pairs = pairs[function.sample(middle).distance > _FAR * tolerance]
+    midpoints = vertices[pairs].mean(axis=1)
+    pairs = pairs[function.sample(midpoints).distance > _MAX_MIDPOINT_DISTANCE * tolerance]
     count = len(vertices)
     keys = sorted_unique(edge_keys(pairs, count))
     ends = np.stack(np.divmod(keys, count), axis=1)
@@ -132,8 +142,13 @@ def _check_new_faces(
     tolerance: float,
     check: Callable[[TriangleMesh], None],
 ) -> TriangleMesh | None:
-    """The surface if its new faces (m,) pass through no others; otherwise mended there, and then
-    checked as a whole; None if that does not help."""
+    """Check that the new faces pass through no others, and mend the surface if they do.
+
+    is_new: (m,) the mask of the new faces.
+
+    Returns:
+        The surface, if nothing crosses; the mended surface, if `check` accepts it; else None.
+    """
     vertices, faces = surface.vertices, surface.faces
     nearby = _in_boxes_of(vertices[faces], np.flatnonzero(is_new))
     crossing = nearby[intersecting_faces(vertices, faces[nearby])]
@@ -149,17 +164,18 @@ def _check_new_faces(
     return mended
 
 
-def _in_boxes_of(corner: FloatArray, rows: IntArray) -> IntArray:
-    """The indices of triangles (m, 3, 3) whose box meets that of a triangle in `rows`."""
-    lower, upper = corner.min(axis=1), corner.max(axis=1)
-    meets = np.zeros(len(corner), np.bool_)
+def _in_boxes_of(triangles: FloatArray, rows: IntArray) -> IntArray:
+    """The indices of the triangles whose bounding box meets that of one of the triangles `rows`.
+    triangles: (m, 3, 3)."""
+    lower, upper = triangles.min(axis=1), triangles.max(axis=1)
+    meets = np.zeros(len(triangles), np.bool_)
     for row in rows.tolist():
         meets |= (lower <= upper[row]).all(axis=1) & (upper >= lower[row]).all(axis=1)
     return np.flatnonzero(meets)
 
 
 def _rows_at(targets: FloatArray, points: FloatArray) -> IntArray:
-    """The indices of points that are equal to a target."""
+    """The indices of the points (n, 3) that are equal to one of the targets (k, 3), bit by bit."""
     rows = np.flatnonzero(np.isin(points[:, 0], targets[:, 0]))
     same = (points[rows, None] == targets).all(axis=2).any(axis=1)
     return rows[same]

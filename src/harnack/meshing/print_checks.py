@@ -31,16 +31,16 @@ from harnack.meshing.thickness import wall_thickness
 __all__ = ["PrintCheck", "PrintProblem", "check_print"]
 
 # A part is tiny if it is no longer than this, relative to the whole.
-_TINY = 0.01
+_TINY_SHARE = 0.01
 # Sizes in millimeters beyond which another unit is likely.
 _SMALLEST, _LARGEST = 1.0, 2000.0
 _INCH = 25.4
-# The relative error of a part of exactly the least thickness, or the bed's size: files hold single
-# precision, and thickness is measured to that.
+# A part may be thinner than the smallest thickness, or larger than the build volume, by this
+# relative error: files hold single precision, and thickness is measured with that accuracy.
 _ROUNDING = 1e-6
-# Faces longer than this, in least thicknesses, may hide thin places beside their centers.
-_COARSE = 5.0
-# The words for one and for several, in the texts of messages.
+# Faces longer than this, in smallest thicknesses, may hide thin places beside their centers.
+_MAX_FACE_LENGTH = 5.0
+# In the texts of messages, {one|several} has the words for a single problem and for several.
 _WORDS = re.compile(r"\{([^{}|]*)\|([^{}|]*)\}")
 
 
@@ -82,7 +82,7 @@ class PrintCheck:
     @property
     def is_printable(self) -> bool:
         """Whether there is no error; there may be hints."""
-        return not _is_wrong(self.problems)
+        return not _has_errors(self.problems)
 
     def as_dict(self, most_places: int = 10) -> dict[str, Any]:
         """The result as a dictionary of plain numbers and texts, as JSON holds them."""
@@ -140,19 +140,19 @@ def check_print(
     )
     x, faces, rounded = _mesh_of(part)
     problems = _topology(x, faces)
-    is_closed = not _is_wrong(problems)
+    is_closed = not _has_errors(problems)
     shells = Shells.of(TriangleMesh(x, faces))
     crossings, touching = _contacts(x, faces, shells, is_closed)
     is_clear = is_closed and not crossings.count
     problems += [*_component_problems(shells, is_closed, is_clear), crossings, touching]
     if min_thickness is not None:
         problems += [
-            _thin_walls(x, faces, min_thickness, not _is_wrong(problems)),
-            _coarse(x, faces, min_thickness),
+            _thin_walls(x, faces, min_thickness, not _has_errors(problems)),
+            _coarse_faces(x, faces, min_thickness),
         ]
     low, high = x[faces].min(axis=(0, 1)), x[faces].max(axis=(0, 1))
     size = cast("tuple[float, float, float]", tuple((high - low).tolist()))
-    problems += _of_size(size, sides)
+    problems += _size_problems(size, sides)
     problems.append(rounded)
     reported = sorted(
         (entry for entry in problems if entry.count), key=lambda entry: not entry.is_error
@@ -161,13 +161,18 @@ def check_print(
     return PrintCheck(tuple(reported), size, volume, len(faces), len(shells.volumes))
 
 
-def _is_wrong(problems: Sequence[PrintProblem]) -> bool:
+def _has_errors(problems: Sequence[PrintProblem]) -> bool:
+    """Whether there is a problem that is an error, not only a hint."""
     return any(problem.is_error and problem.count for problem in problems)
 
 
 def _mesh_of(part: Any) -> tuple[FloatArray, IntArray, PrintProblem]:
-    """Vertices; faces, between the vertices at one place or apart by rounding, including faces of
-    zero area; and a hint with the number of corners that were apart."""
+    """Read a mesh, and join its vertices that are at one place or apart by rounding.
+
+    Returns:
+        The vertices; the faces between joined vertices, including faces without an area; and a hint
+        with the number of vertices that were apart by rounding.
+    """
     if isinstance(part, str | os.PathLike):
         read = read_geometry(cast("Any", part), "winding")
         if not isinstance(read, LoadedMesh):
@@ -195,17 +200,19 @@ def _mesh_of(part: Any) -> tuple[FloatArray, IntArray, PrintProblem]:
     return x, welded.index[faces], note
 
 
-def _problem(kind: str, where: FloatArray, text: str, *, is_fatal: bool = True) -> PrintProblem:
-    """A problem with its message. text: with {} for the number, and the words for one and for
-    several as {one|several}."""
-    count = len(where)
-    near = "" if not count else f", {'' if count == 1 else 'such as '}at {point_text(where[0])}"
+def _problem(kind: str, locations: FloatArray, text: str, *, is_fatal: bool = True) -> PrintProblem:
+    """A problem at some locations (k, 3), with its message.
+
+    text: has {} for the number, and words that depend on it as {one|several}."""
+    count = len(locations)
+    near = "" if not count else f", {'' if count == 1 else 'such as '}at {point_text(locations[0])}"
     text = _WORDS.sub(lambda pair: pair[1 if count == 1 else 2], text)
-    return PrintProblem(kind, count, where, text.format(f"{count:,}") + near, is_fatal)
+    return PrintProblem(kind, count, locations, text.format(f"{count:,}") + near, is_fatal)
 
 
 def _topology(x: FloatArray, faces: IntArray) -> list[PrintProblem]:
-    """The problems of edges, sides, duplicates and faces without an area."""
+    """The problems of edges, of orientation, of duplicate faces, of vertices where parts touch and
+    of faces without an area."""
     flat = zero_area_faces(x, faces)
     vanished = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
     used = faces[~vanished]
@@ -254,9 +261,12 @@ def _topology(x: FloatArray, faces: IntArray) -> list[PrintProblem]:
 
 
 def _component_problems(shells: Shells, is_closed: bool, is_clear: bool) -> list[PrintProblem]:
-    """The problems of components: inside out, inside others, cavities, loose and tiny parts.
-    is_clear: whether the mesh is closed and no faces pass through each other, so that a part is
-    inside another as a whole or not at all."""
+    """The problems of components: those that are inside out, inside others, loose or tiny, and
+        cavities.
+
+    is_closed: whether the mesh is closed.
+    is_clear: whether also no faces pass through each other, so that a component is inside another
+        one as a whole or not at all."""
     volumes, none = shells.volumes, np.zeros(len(shells.volumes), np.bool_)
     middle = 0.5 * (shells.lower + shells.upper)
     length = (shells.upper - shells.lower).max(axis=1)
@@ -264,7 +274,7 @@ def _component_problems(shells: Shells, is_closed: bool, is_clear: bool) -> list
     is_hollow = (volumes < 0) & (depth > 0)
     is_nested = (volumes > 0) & (depth > 0) & is_clear
     inside_out = (volumes < 0) & ~is_hollow if is_closed else none
-    is_tiny = (length < _TINY * length.max()) & ~is_hollow
+    is_tiny = (length < _TINY_SHARE * length.max()) & ~is_hollow
     loose = middle[~is_hollow]
     return [
         _problem(
@@ -295,12 +305,10 @@ def _component_problems(shells: Shells, is_closed: bool, is_clear: bool) -> list
 def _contacts(
     x: FloatArray, faces: IntArray, shells: Shells, is_closed: bool
 ) -> tuple[PrintProblem, PrintProblem]:
-    """The problems of faces that pass through or lie on others, and of faces that only touch
-    others.
+    """Two problems: faces that pass through or lie on others, and faces that only touch others.
 
-    Faces without an area close gaps between corners and edges that lie on each other: for a part
-    with such faces, contacts with itself are not reported.
-    """
+    Faces without an area close gaps between corners and edges that lie on each other. So for a
+    component with such faces, contacts with itself are not reported."""
     is_flat = np.zeros(len(faces), np.bool_)
     is_flat[zero_area_faces(x, faces)] = True
     is_plain = np.isin(shells.component_of_face, shells.component_of_face[is_flat], invert=True)
@@ -331,6 +339,8 @@ def _contacts(
 
 
 def _thin_walls(x: FloatArray, faces: IntArray, wall: float, is_solid: bool) -> PrintProblem:
+    """The problem of walls thinner than `wall`, a length; if the mesh bounds no solid, that they
+    could not be measured."""
     if not is_solid:
         # The name differs from that of walls that were measured to be thin.
         why = "how thick walls are is not known before the rest is mended"
@@ -342,17 +352,21 @@ def _thin_walls(x: FloatArray, faces: IntArray, wall: float, is_solid: bool) -> 
     return _problem("thin walls", locations, text)
 
 
-def _coarse(x: FloatArray, faces: IntArray, wall: float) -> PrintProblem:
-    """The problem of faces so large that thin places beside their centers may be missed."""
+def _coarse_faces(x: FloatArray, faces: IntArray, wall: float) -> PrintProblem:
+    """The problem of faces so long, relative to the smallest thickness `wall`, that thin places
+    beside their centers may be missed."""
     corner = x[faces]
     longest = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
-    centers = corner[longest > _COARSE * wall].mean(axis=1)
-    text = f"{{}} {{triangle is|triangles are}} longer than {_COARSE:g} walls, and thickness is "
+    centers = corner[longest > _MAX_FACE_LENGTH * wall].mean(axis=1)
+    text = f"{{}} {{triangle is|triangles are}} longer than {_MAX_FACE_LENGTH:g} walls, and thickness is "
     text += "measured at centers"
     return _problem("walls measured coarsely", centers, text, is_fatal=False)
 
 
-def _of_size(size: tuple[float, float, float], bed: list[float] | None) -> list[PrintProblem]:
+def _size_problems(size: tuple[float, float, float], bed: list[float] | None) -> list[PrintProblem]:
+    """The problems of the size: a likely other unit, and a part that does not fit.
+
+    size: (x, y, z) of the part. bed: (x, y, z) of the space that it has to fit in; None for any."""
     longest, nowhere = max(size), np.zeros((0, 3))
     text = " x ".join(f"{length:.4g}" for length in size)
     problems: list[PrintProblem] = []
