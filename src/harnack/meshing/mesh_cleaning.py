@@ -164,17 +164,13 @@ class _WorkingMesh:
         rows = np.delete(rows, crossing)
         return cls(vertices, joined[rows], rows, np.zeros(len(rows), np.bool_), counts)
 
-    def keep_faces(self, is_kept: BoolArray, reason: str) -> _WorkingMesh:
-        """The mesh with only the faces where the mask `is_kept` (m,) is set. Input faces that are
+    def keep_faces(self, kept: BoolArray, reason: str) -> _WorkingMesh:
+        """The mesh with only the faces where the mask `kept` (m,) is set. Input faces that are
         removed are counted under `reason`."""
-        removed = int((~is_kept & (self.source_face >= 0)).sum())
+        removed = int((~kept & (self.source_face >= 0)).sum())
         counts = self.counts | {reason: self.counts[reason] + removed}
         return _WorkingMesh(
-            self.vertices,
-            self.faces[is_kept],
-            self.source_face[is_kept],
-            self.is_turned[is_kept],
-            counts,
+            self.vertices, self.faces[kept], self.source_face[kept], self.is_turned[kept], counts
         )
 
     def without_nonmanifold_edges(self) -> _WorkingMesh:
@@ -286,19 +282,17 @@ class _WorkingMesh:
         return CleanedMesh(surface, source[source >= 0], turned, counts, holes)
 
 
-def _pieces(edges: Edges, face_count: int) -> IntArray:
+def _pieces(edges: Edges, count: int) -> IntArray:
     """(m,) the number of the piece that each face belongs to. Faces belong to one piece if a chain
     of faces connects them, in which neighbors share an edge of exactly two faces.
 
-    edges: of all `half_edges`. face_count: the number of faces, m."""
+    edges: of all `half_edges`. count: the number of faces, m."""
     import scipy.sparse  # imported here: it takes half a second
     import scipy.sparse.csgraph as csgraph_module
 
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
-    first, second = edges.paired_half_edges().T % face_count
-    adjacency = sparse.coo_matrix(
-        (np.ones(len(first)), (first, second)), shape=(face_count, face_count)
-    )
+    first, second = edges.paired_half_edges().T % count
+    adjacency = sparse.coo_matrix((np.ones(len(first)), (first, second)), shape=(count, count))
     return np.asarray(csgraph.connected_components(adjacency, directed=False)[1], np.int64)
 
 

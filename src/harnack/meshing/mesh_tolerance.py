@@ -45,6 +45,6 @@ class MeshTolerance:
         return length
 
     def within(self, size: float) -> float:
-        """The tolerance for a component of this size. It is at most 0.4 of the size, so that a
-        component smaller than the tolerance of the mesh does not vanish within it."""
+        """The tolerance for a part of a surface, of this size. Unlike `at` it does not fail if the
+        part is smaller than the tolerance that was given: the result is at most 0.4 of the size."""
         return self.at(size) if self.length is None else min(self.length, 0.4 * size)

@@ -39,7 +39,7 @@ _INCH = 25.4
 # relative error: files hold single precision, and thickness is measured with that accuracy.
 _ROUNDING = 1e-6
 # Faces longer than this, in smallest thicknesses, may hide thin places beside their centers.
-_MAX_FACE_LENGTH = 5.0
+_COARSE = 5.0
 # In the texts of messages, {one|several} has the words for a single problem and for several.
 _WORDS = re.compile(r"\{([^{}|]*)\|([^{}|]*)\}")
 
@@ -357,8 +357,8 @@ def _coarse_faces(x: FloatArray, faces: IntArray, wall: float) -> PrintProblem:
     beside their centers may be missed."""
     corner = x[faces]
     longest = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
-    centers = corner[longest > _MAX_FACE_LENGTH * wall].mean(axis=1)
-    text = f"{{}} {{triangle is|triangles are}} longer than {_MAX_FACE_LENGTH:g} walls, and thickness is "
+    centers = corner[longest > _COARSE * wall].mean(axis=1)
+    text = f"{{}} {{triangle is|triangles are}} longer than {_COARSE:g} walls, and thickness is "
     text += "measured at centers"
     return _problem("walls measured coarsely", centers, text, is_fatal=False)
 
