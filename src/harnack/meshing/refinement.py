@@ -42,14 +42,14 @@ Walls = tuple[FloatArray, FloatArray] | None
 Where = Callable[[FloatArray], BoolArray] | None
 # Across a crease normals turn by at least this angle; and by this fraction of the angle between the
 # middle of an edge and one of its ends.
-_CREASE_ANGLE, _CREASE_SHARE = math.radians(20), 0.75
+_CREASE_ANGLE, _TURN_SHARE = math.radians(20), 0.75
 # A vertex within this distance, relative to the tolerance, counts as on the surface.
 _ON_SURFACE = 1e-5
 # The largest distance of a crease from the middle of an edge, relative to the edge.
-_MAX_CREASE_OFFSET = 1.5
+_MAX_OFFSET = 1.5
 # A point on a crease is not used if it is nearer to an end of the edge than this fraction of the
 # edge; and the number of samples of the search for it, which is done twice.
-_MIN_END_SHARE, _SAMPLES = 0.05, 33
+_FROM_ENDS, _SAMPLES = 0.05, 33
 # The level set is searched for up to this multiple of the displacement to the point where tangent
 # planes meet; and three planes meet in a point if the determinant of their unit normals is larger
 # than the second.
@@ -161,37 +161,29 @@ def _project_to_creases(
     that angle between the moved middle and one of the ends; on a smooth surface they turn by about
     half of it there."""
     used, index = np.unique(ends, return_inverse=True)
-    gradient = function.sample(vertices[used]).gradient
-    end_normals = (gradient / np.maximum(row_norms(gradient), 1e-300)[:, None])[
-        index.reshape(-1, 2)
-    ]
-    normal = function.sample(moved).gradient
-    normal = normal / np.maximum(row_norms(normal), 1e-300)[:, None]
-    n_a, n_b = end_normals[:, 0], end_normals[:, 1]
+    slope = function.sample(vertices[used]).gradient
+    at_ends = (slope / np.maximum(row_norms(slope), 1e-300)[:, None])[index.reshape(-1, 2)]
+    n = function.sample(moved).gradient
+    n = n / np.maximum(row_norms(n), 1e-300)[:, None]
+    n_a, n_b = at_ends[:, 0], at_ends[:, 1]
     cosine = row_dots(n_a, n_b)
-    angle = np.arccos(np.clip(np.minimum(row_dots(n_a, normal), row_dots(n_b, normal)), -1, 1))
-    end_angle = np.arccos(np.clip(cosine, -1, 1))
+    angle = np.arccos(np.clip(np.minimum(row_dots(n_a, n), row_dots(n_b, n)), -1, 1))
+    total = np.arccos(np.clip(cosine, -1, 1))
     rows = np.flatnonzero(
-        (end_angle > _CREASE_ANGLE) & (angle > _CREASE_SHARE * end_angle) & (1 - cosine**2 > 0.01)
+        (total > _CREASE_ANGLE) & (angle > _TURN_SHARE * total) & (1 - cosine**2 > 0.01)
     )
     if not len(rows):
         return moved
     n_a, n_b, cosine = n_a[rows], n_b[rows], cosine[rows]
     a, b = (vertices[ends[rows, k]] for k in (0, 1))
     middle, span = 0.5 * (a + b), row_norms(b - a)
-    offset_a, offset_b = row_dots(n_a, a - middle), row_dots(n_b, b - middle)
-    weights = np.stack([offset_a - cosine * offset_b, offset_b - cosine * offset_a]) / (
-        1 - cosine**2
-    )
+    h_a, h_b = row_dots(n_a, a - middle), row_dots(n_b, b - middle)
+    weights = np.stack([h_a - cosine * h_b, h_b - cosine * h_a]) / (1 - cosine**2)
     direction = weights[0][:, None] * n_a + weights[1][:, None] * n_b
-    projected, is_found = _level_along(
-        function, middle, direction, _MAX_CREASE_OFFSET * span, walls
-    )
-    is_found &= (
-        np.minimum(row_norms(projected - a), row_norms(projected - b)) > _MIN_END_SHARE * span
-    )
+    projected, found = _level_along(function, middle, direction, _MAX_OFFSET * span, walls)
+    found &= np.minimum(row_norms(projected - a), row_norms(projected - b)) > _FROM_ENDS * span
     moved = moved.copy()
-    moved[rows[is_found]] = projected[is_found]
+    moved[rows[found]] = projected[found]
     return moved
 
 
@@ -206,65 +198,50 @@ def _crease_corners(
     does not, or if normals are not independent, it is the center, moved onto the level set."""
     corner = vertices[faces]
     center = corner.mean(axis=1)
-    longest_edge = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(
-        axis=0
-    )
-    moved = newton_to_level(function, center, function.sample(center), 0.5 * longest_edge, walls)
-    gradient = function.sample(corner.reshape(-1, 3)).gradient
-    normal = (gradient / np.maximum(row_norms(gradient), 1e-300)[:, None]).reshape(-1, 3, 3)
-    independent = np.flatnonzero(np.abs(np.linalg.det(normal)) > _INDEPENDENT)
-    plane_offsets = (normal * (corner - center[:, None])).sum(axis=2)
+    span = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
+    moved = newton_to_level(function, center, function.sample(center), 0.5 * span, walls)
+    slope = function.sample(corner.reshape(-1, 3)).gradient
+    normal = (slope / np.maximum(row_norms(slope), 1e-300)[:, None]).reshape(-1, 3, 3)
+    rows = np.flatnonzero(np.abs(np.linalg.det(normal)) > _INDEPENDENT)
+    offsets = (normal * (corner - center[:, None])).sum(axis=2)
     solve: Any = np.linalg.solve
-    direction: FloatArray = solve(normal[independent], plane_offsets[independent][:, :, None])[
-        :, :, 0
-    ]
-    crossing, is_found = _level_along(
-        function,
-        center[independent],
-        direction,
-        _MAX_CREASE_OFFSET * longest_edge[independent],
-        walls,
+    direction: FloatArray = solve(normal[rows], offsets[rows][:, :, None])[:, :, 0]
+    crossing, found = _level_along(
+        function, center[rows], direction, _MAX_OFFSET * span[rows], walls
     )
-    moved[independent[is_found]] = crossing[is_found]
+    moved[rows[found]] = crossing[found]
     return moved
 
 
 def _level_along(
-    function: LevelFunction,
-    start: FloatArray,
-    displacement: FloatArray,
-    max_length: FloatArray,
-    walls: Walls,
+    function: LevelFunction, start: FloatArray, along: FloatArray, limit: FloatArray, walls: Walls
 ) -> tuple[FloatArray, BoolArray]:
     """Search for the level set along segments from `start` (k, 3).
 
-    displacement: (k, 3) from start to end of each segment, shortened to at most `max_length` (k,).
-        The search goes on for a quarter of the length beyond the end.
+    along: (k, 3) the displacements from start to end, which are shortened to at most `limit` (k,),
+        a length. The search goes on for a quarter of that beyond the end.
 
     Returns:
         The first crossing (k, 3) on each segment, and the mask (k,) of segments that cross the
         level. Where there is none, the point has no meaning.
     """
-    displacement = (
-        displacement
-        * np.minimum(1, max_length / np.maximum(row_norms(displacement), 1e-300))[:, None]
-    )
+    along = along * np.minimum(1, limit / np.maximum(row_norms(along), 1e-300))[:, None]
     low, high = np.zeros(len(start)), np.full(len(start), _SEARCH_LENGTH)
-    is_found = np.ones(len(start), np.bool_)
+    found = np.ones(len(start), np.bool_)
     fractions = np.linspace(0, 1, _SAMPLES)
     for _ in range(2):
         t = low[:, None] + (high - low)[:, None] * fractions
-        x = start[:, None] + t[:, :, None] * displacement[:, None]
+        x = start[:, None] + t[:, :, None] * along[:, None]
         x = x if walls is None else np.clip(x, *walls)
         is_above = (function.sample(x.reshape(-1, 3)).value > 0).reshape(t.shape)
         passes = is_above[:, 1:] != is_above[:, :-1]
-        is_found &= passes.any(axis=1)
+        found &= passes.any(axis=1)
         first = passes.argmax(axis=1)[:, None]
         low, high = (np.take_along_axis(t, first + k, axis=1)[:, 0] for k in (0, 1))
-    crossing = start + low[:, None] * displacement
+    crossing = start + low[:, None] * along
     crossing = crossing if walls is None else np.clip(crossing, *walls)
-    max_step = 4 * (high - low) * row_norms(displacement)
-    return newton_to_level(function, crossing, function.sample(crossing), max_step, walls), is_found
+    max_step = 4 * (high - low) * row_norms(along)
+    return newton_to_level(function, crossing, function.sample(crossing), max_step, walls), found
 
 
 def unrefined_midpoints(
@@ -346,8 +323,8 @@ class _RefinementMarks:
 def _normals_turn(function: LevelFunction, corner: FloatArray) -> BoolArray:
     """(k,) whether normals at two corners of a face differ by the angle of a crease. corner: (k, 3,
     3)."""
-    gradient = function.sample(corner.reshape(-1, 3)).gradient
-    normal = (gradient / np.maximum(row_norms(gradient), 1e-300)[:, None]).reshape(-1, 3, 3)
+    slope = function.sample(corner.reshape(-1, 3)).gradient
+    normal = (slope / np.maximum(row_norms(slope), 1e-300)[:, None]).reshape(-1, 3, 3)
     cosines = [row_dots(normal[:, k], normal[:, k - 1]) for k in range(3)]
     return np.min(cosines, axis=0) < math.cos(_CREASE_ANGLE)
 

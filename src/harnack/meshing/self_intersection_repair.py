@@ -41,7 +41,7 @@ _MAX_CROSSING, _MAX_NEIGHBORHOOD = 400, 5_000
 # The largest number of changes in one place, and the number of attempts for each.
 _MAX_CHANGES, _MAX_ATTEMPTS = 40, 80
 # New triangles with less than this fraction of the area that they cover may face backwards.
-_NEGLIGIBLE_AREA = 1e-4
+_NO_AREA = 1e-4
 
 
 def resolve_self_intersections(surface: TriangleMesh, length: float) -> TriangleMesh:
@@ -267,23 +267,20 @@ def _keeps_orientation(patch: _Neighborhood, rows: IntArray, new: IntArray, leng
     """Whether faces `rows` may be replaced by the faces `new` (k, 3).
 
     No new face, except slivers, may face against the mean normal of the old faces. And the volume
-    between new and old faces may be at most what the old ones would sweep if they moved by half of
+    between new and old faces may be at most what the old ones would sweep if they moved by
     `length`. That a moved vertex is near the new faces would not be enough: it tells nothing about
     old faces that are folded, as at a thin spike."""
     before, after = patch.vertices[patch.faces[rows]], patch.vertices[new]
-    old_normal, new_normal = area_normals(before), area_normals(after)
-    mean = old_normal.sum(axis=0)
-    total = float(row_norms(old_normal).sum())
+    old, new_area = area_normals(before), area_normals(after)
+    mean = old.sum(axis=0)
+    total = float(row_norms(old).sum())
     origin = before[0, 0]
     volume = (
-        row_dots(after[:, 0] - origin, new_normal).sum()
-        - row_dots(before[:, 0] - origin, old_normal).sum()
+        row_dots(after[:, 0] - origin, new_area).sum() - row_dots(before[:, 0] - origin, old).sum()
     )
     if abs(float(volume)) / 6 > length * total / 2:
         return False
-    return bool(
-        ((new_normal @ mean > 0) | (row_norms(new_normal) <= _NEGLIGIBLE_AREA * total)).all()
-    )
+    return bool(((new_area @ mean > 0) | (row_norms(new_area) <= _NO_AREA * total)).all())
 
 
 def _line_distance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> float:
