@@ -42,11 +42,11 @@ Walls = tuple[FloatArray, FloatArray] | None
 Where = Callable[[FloatArray], BoolArray] | None
 # Across a crease normals turn by at least this angle; and by this fraction of the angle between the
 # middle of an edge and one of its ends.
-_CREASE_ANGLE, _TURN_SHARE = math.radians(20), 0.75
+_CREASE, _TURN_SHARE = math.radians(20), 0.75
 # A vertex within this distance, relative to the tolerance, counts as on the surface.
 _ON_SURFACE = 1e-5
 # The largest distance of a crease from the middle of an edge, relative to the edge.
-_MAX_OFFSET = 1.5
+_OFFSET = 1.5
 # A point on a crease is not used if it is nearer to an end of the edge than this fraction of the
 # edge; and the number of samples of the search for it, which is done twice.
 _FROM_ENDS, _SAMPLES = 0.05, 33
@@ -170,7 +170,7 @@ def _project_to_creases(
     angle = np.arccos(np.clip(np.minimum(row_dots(n_a, n), row_dots(n_b, n)), -1, 1))
     total = np.arccos(np.clip(cosine, -1, 1))
     rows = np.flatnonzero(
-        (total > _CREASE_ANGLE) & (angle > _TURN_SHARE * total) & (1 - cosine**2 > 0.01)
+        (total > _CREASE) & (angle > _TURN_SHARE * total) & (1 - cosine**2 > 0.01)
     )
     if not len(rows):
         return moved
@@ -180,7 +180,7 @@ def _project_to_creases(
     h_a, h_b = row_dots(n_a, a - middle), row_dots(n_b, b - middle)
     weights = np.stack([h_a - cosine * h_b, h_b - cosine * h_a]) / (1 - cosine**2)
     direction = weights[0][:, None] * n_a + weights[1][:, None] * n_b
-    projected, found = _level_along(function, middle, direction, _MAX_OFFSET * span, walls)
+    projected, found = _level_along(function, middle, direction, _OFFSET * span, walls)
     found &= np.minimum(row_norms(projected - a), row_norms(projected - b)) > _FROM_ENDS * span
     moved = moved.copy()
     moved[rows[found]] = projected[found]
@@ -206,9 +206,7 @@ def _crease_corners(
     offsets = (normal * (corner - center[:, None])).sum(axis=2)
     solve: Any = np.linalg.solve
     direction: FloatArray = solve(normal[rows], offsets[rows][:, :, None])[:, :, 0]
-    crossing, found = _level_along(
-        function, center[rows], direction, _MAX_OFFSET * span[rows], walls
-    )
+    crossing, found = _level_along(function, center[rows], direction, _OFFSET * span[rows], walls)
     moved[rows[found]] = crossing[found]
     return moved
 
@@ -326,7 +324,7 @@ def _normals_turn(function: LevelFunction, corner: FloatArray) -> BoolArray:
     slope = function.sample(corner.reshape(-1, 3)).gradient
     normal = (slope / np.maximum(row_norms(slope), 1e-300)[:, None]).reshape(-1, 3, 3)
     cosines = [row_dots(normal[:, k], normal[:, k - 1]) for k in range(3)]
-    return np.min(cosines, axis=0) < math.cos(_CREASE_ANGLE)
+    return np.min(cosines, axis=0) < math.cos(_CREASE)
 
 
 def _edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:

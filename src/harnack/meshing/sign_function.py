@@ -250,17 +250,12 @@ class SignFunction(LevelFunction):
         return first, last
 
     def _roots(
-        self,
-        start: FloatArray,
-        direction: FloatArray,
-        first: FloatArray,
-        last: FloatArray,
-        steps: int,
+        self, start: FloatArray, edge: FloatArray, first: FloatArray, last: FloatArray, steps: int
     ) -> FloatArray:
         """(n,) the fractions of segments at which the function is 0, between the fractions `first`
         and `last`.
 
-        start, direction: (n, 3) one end of each segment, and the vector to the other.
+        start, edge: (n, 3) one end of each segment, and the vector to the other.
         steps: the largest number of evaluations.
 
         The root of the secant and the middle of the interval are tried in turn, so that every
@@ -269,20 +264,17 @@ class SignFunction(LevelFunction):
         if not len(start):
             return first
         first, last = first.copy(), last.copy()
-        low, high = (self.values(start + t[:, None] * direction) for t in (first, last))
+        low, high = (self.values(start + t[:, None] * edge) for t in (first, last))
         small_value = _NEAR_ROOT * np.minimum(np.abs(low), np.abs(high))
         rows = np.arange(len(start))
         for k in range(steps):
             ends = first[rows], last[rows]
             t = 0.5 * (ends[0] + ends[1]) if k % 2 else _secant(*ends, low[rows], high[rows])
-            value = self.values(start[rows] + t[:, None] * direction[rows])
-            is_positive = value > 0
-            first[rows], last[rows] = (
-                np.where(is_positive, ends[0], t),
-                np.where(is_positive, t, ends[1]),
-            )
-            low[rows] = np.where(is_positive, low[rows], value)
-            high[rows] = np.where(is_positive, value, high[rows])
+            value = self.values(start[rows] + t[:, None] * edge[rows])
+            is_up = value > 0
+            first[rows], last[rows] = np.where(is_up, ends[0], t), np.where(is_up, t, ends[1])
+            low[rows] = np.where(is_up, low[rows], value)
+            high[rows] = np.where(is_up, value, high[rows])
             rows = rows[~(np.abs(value) <= small_value[rows])]
             if not len(rows):
                 break
