@@ -63,31 +63,32 @@ __all__ = [
 # The smallest distance of vertices from the ends of edges, relative to the edge, so that all
 # triangles have an area.
 _EDGE_END_MARGIN = 1e-4
-# The number of rounds in which edges are cut; and how often vertices of triangles that pass through
-# others are moved back.
+# The largest number of rounds in which edges are cut; and of rounds in which vertices of triangles
+# that pass through others are moved back.
 _ROUNDS, _MOST_REPAIRS = 2, 12
 # A round that would cut more than this fraction of the edges that the last round cut, or of the
 # faces, is omitted: the surface is rough at every scale.
 _MAX_CUT_FRACTION = 0.5
 # Neighbors lie on each other if the cosine between their normals is less than this.
-_FOLDED = -0.99999
-# Slivers and flat places are simplified within the first, relative to the tolerance, and the
-# second, relative to a cell.
+_FOLD_COSINE = -0.99999
+# Slivers and flat places are simplified by at most the first, relative to the tolerance, and by at
+# most the second, relative to a cell.
 _SIMPLIFY_TOLERANCE, _SIMPLIFY_CELL_FRACTION = 0.5, 0.05
 # Edges shorter than this, in tolerances, are not cut.
 _SHORTEST = 4.0
 # An edge is cut no nearer to its ends than this, relative to its length.
 _FROM_CORNERS = 0.1
-# Across a crease normals turn by at least this angle, and by this fraction of it between two
-# points.
+# Across a crease normals turn by at least this angle; and by this fraction of the angle between the
+# point on the crease and one of the ends of the edge.
 _MIN_CREASE_ANGLE, _CREASE_ANGLE_SHARE = math.radians(2), 0.75
-# The level is searched for from before the middle of an edge to behind the place where tangent
-# planes meet, relative to the displacement between these; which is clamped to the third, in lengths
-# of the edge.
-_BEFORE, _BEHIND, _BESIDE = 0.3, 1.3, 1.0
-# Tangent planes with nearly equal normals meet anywhere; three of them meet in a point if the
-# determinant of their normals is larger than the second.
-_PARALLEL, _INDEPENDENT = 1e-4, 0.1
+# The level set is searched for on the line from an edge to the point where tangent planes meet. The
+# search begins before the edge and ends after that point, by the first and up to the second of the
+# displacement between them. The displacement is clamped to the third, in lengths of the edge.
+_BEFORE, _AFTER, _OFFSET = 0.3, 1.3, 1.0
+# Two tangent planes meet in a line if the squared sine of the angle between them is larger than the
+# first; three of them meet in a point if the determinant of their unit normals is larger than the
+# second.
+_MIN_SQUARE, _INDEPENDENT = 1e-4, 0.1
 # The largest fraction of vertices and centers that may be beyond the tolerance before cells are
 # made smaller; and the ratio of smaller cells to the cells before.
 MAX_OFF_LEVEL_FRACTION, CELL_REFINEMENT_FACTOR = 0.01, 0.6
@@ -106,12 +107,12 @@ _MAX_GROWTH_ROUNDS = 20
 class SignIsosurface:
     """A mesh extracted from signs.
 
-    points: number of lattice points.
-    undecided: the number of lattice points where the error bound exceeds |f - level|, so that the
-        sign is undecided.
-    unfitted: number of triangles moved back from creases.
-    is_intersection_free: whether the absence of self-intersections was checked exactly.
-    """
+    surface: the mesh.
+    points: the number of lattice points.
+    undecided: the number of lattice points whose sign is not certain, because the error bound of f
+        is not smaller than |f - level|.
+    unfitted: the number of triangles that were moved back from creases.
+    is_intersection_free: whether it was checked exactly that no triangles intersect."""
 
     surface: TriangleMesh
     points: int
@@ -195,10 +196,16 @@ def _distances(
     lattice: BccLattice,
     closed: bool,
 ) -> tuple[int, int, float]:
-    """The number of vertices and centers of faces that are farther from the level than the
-    tolerance, the number of all, and a distance within which all of them are, up to a factor of 2.
-    Of large meshes every second face is tested, or every third and so on. Faces that close the mesh
-    at the box are to be cut away, and left out."""
+    """How many vertices and centers of faces are off the level set.
+
+    Of large meshes every second face is tested, or every third and so on. If the mesh is `closed`,
+    faces in the two outermost layers of cells are left out: they are to be cut away.
+
+    Returns:
+        The number of these points that are farther than `tolerance` from the level set; the number
+        of points that were tested; and a distance within which all of them are, too large by up to
+        a factor of 2, or inf if some are farther than 4 cells.
+    """
     x, faces = surface.vertices, surface.faces
     if closed:
         lower, upper = lattice.lower + 2 * lattice.size, lattice.upper - 2 * lattice.size
@@ -211,8 +218,8 @@ def _distances(
     within, farther = tolerance, off_level
     while len(farther) and within < _MAX_DISTANCE_CELLS * float(lattice.size.max()):
         within *= 2
-        alone = np.zeros((0, 3), np.int64)
-        farther, _ = points_off_level(function, farther, alone, within, None)
+        no_faces = np.zeros((0, 3), np.int64)
+        farther, _ = points_off_level(function, farther, no_faces, within, None)
     return len(off_level), count, within if not len(farther) else math.inf
 
 
@@ -226,13 +233,13 @@ def extract_from_signs(
 ) -> SignIsosurface:
     """The boundary of the points of a lattice's box at which a function is not positive.
 
-    tolerance: how far edges may be from the surface, by the normals at their ends, before they are
-        cut.
-    closed: whether the function counts as positive beyond the box; otherwise the surface ends on
-        the box.
+    tolerance: a length. Edges are split that are farther from the surface, judged by the normals at
+        their ends.
+    closed: whether the function counts as positive outside of the box, so that the surface is
+        closed; otherwise it ends on the box.
 
     Raises:
-        MeshingError: there is no surface, there are too many cells, or values are no numbers.
+        MeshingError: there is no surface, there are too many cells, or values are not finite.
     """
     first = _march(function, lattice, closed, report)
     x, faces, normals, is_apart = _collapse_slivers(
@@ -269,8 +276,11 @@ def extract_from_signs(
 
 @dataclass(frozen=True)
 class _RawIsosurface:
-    """Vertices (n, 3) on the level, normals there, and faces (m, 3); the number of points of the
-    lattice, and the number of these that are undecided."""
+    """A mesh as tetrahedra cut it.
+
+    vertices: (n, 3), on the level set. normals: (n, 3) of the level set there. faces: (m, 3).
+    points: the number of points of the lattice.
+    undecided: the number of these points whose sign is not certain."""
 
     vertices: FloatArray
     normals: FloatArray
@@ -282,11 +292,18 @@ class _RawIsosurface:
 def _march(
     function: SignFunction, lattice: BccLattice, closed: bool, report: Callable[[str], None]
 ) -> _RawIsosurface:
-    """The triangles of all tetrahedra whose corners differ.
+    """The mesh of all tetrahedra with corners of both signs.
 
-    Cells that are proved empty are left out. Where values are known up to an error, or proofs
-    depend on rounding, signs may differ at the corner of such a cell, and the surface would end
-    there: then its neighbors are added, until the surface does not end.
+    closed: whether the function counts as positive on the box's faces, so that the mesh is closed.
+
+    Cells that are proved empty are left out. Where values have errors, or proofs depend on
+    rounding, signs may nevertheless differ at the corners of such a cell, and the surface would end
+    there. Then the cells around the open edges are added, until the surface ends on the box only.
+
+    Raises:
+        EmptySurfaceError: there is no surface. MeshingError: too many cells, values that are not
+            finite,
+            or a surface that still ends after 20 rounds.
     """
     cells = lattice.nonempty_cells(function.clearance, function.most_faces)
     if closed:
@@ -307,6 +324,8 @@ def _march(
         normals: list[FloatArray] = []
 
         def roots(low: FloatArray, high: FloatArray, normals: Any = normals) -> FloatArray:
+            """Where edges from `low` to `high` (k, 3) meet the level set, not too near to their
+            ends. The normals there are appended to `normals`."""
             x, normal = function.crossings(low, high)
             normals.append(normal)
             edge = high - low
@@ -320,15 +339,15 @@ def _march(
         ends = boundary_edges(faces)
         middle = x[ends].mean(axis=1)
         margin = 1e-9 * lattice.size
-        inner = (middle > lattice.lower + margin) & (middle < lattice.upper - margin)
-        open_middles = middle[inner.all(axis=1)]
+        is_inside = (middle > lattice.lower + margin) & (middle < lattice.upper - margin)
+        open_middles = middle[is_inside.all(axis=1)]
         if not len(open_middles):
             return _RawIsosurface(
                 x, normals[0], faces, len(points), function.count_undecided(points, value)
             )
-        index = np.floor((open_middles - lattice.lower) / lattice.size).astype(np.int64)
+        cell_index = np.floor((open_middles - lattice.lower) / lattice.size).astype(np.int64)
         offsets = np.array(list(itertools.product((-1, 0, 1), repeat=3)))
-        neighbors = np.clip((index[:, None] + offsets).reshape(-1, 3), 0, lattice.counts - 1)
+        neighbors = np.clip((cell_index[:, None] + offsets).reshape(-1, 3), 0, lattice.counts - 1)
         cells = distinct_rows(np.concatenate([cells, neighbors]))
     raise LocalizedMeshingError(
         "signs differ at the corners of ever more cells that are proved empty: values of "
@@ -338,30 +357,39 @@ def _march(
 
 
 def _collapse_slivers(
-    marched: _RawIsosurface, tolerance: float
+    raw: _RawIsosurface, tolerance: float
 ) -> tuple[FloatArray, IntArray, FloatArray, bool]:
-    """Vertices, faces and normals, with short edges contracted, and without vertices whose faces
-    lie in a plane, within a tolerance (manifold3d); unchanged if the surface is open, or if
-    triangles would pass through each other. And whether the absence of intersections was checked:
-    triangles as the tetrahedra cut them do not intersect, up to rounding."""
+    """Simplify a mesh, by at most `tolerance` (a length): short edges are contracted, and vertices
+    whose faces lie in a plane are removed.
+
+    It is unchanged if the surface is open, or if triangles would pass through each other.
+
+    Returns:
+        Vertices, faces and normals of vertices; and whether it was checked that no triangles
+        intersect. Triangles as the tetrahedra cut them do not intersect, up to rounding.
+    """
     import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial
-    x, faces = marched.vertices, marched.faces
+    x, faces = raw.vertices, raw.faces
     if len(boundary_edges(faces)):
-        return x, faces, marched.normals, False
+        return x, faces, raw.normals, False
     simpler = from_manifold(without_short_edges(to_manifold(TriangleMesh(x, faces)), tolerance))
     away, nearest = searching.cKDTree(x).query(simpler.vertices)
     if not len(simpler.faces) or away.any():
-        return x, faces, marched.normals, False
+        return x, faces, raw.normals, False
     if len(intersecting_faces(simpler.vertices, simpler.faces)):
-        return x, faces, marched.normals, False
-    return simpler.vertices, simpler.faces, marched.normals[nearest], True
+        return x, faces, raw.normals, False
+    return simpler.vertices, simpler.faces, raw.normals[nearest], True
 
 
 def _finite_values(function: SignFunction, points: FloatArray, size: FloatArray) -> FloatArray:
-    """The values of the function at points, or a little beside them where they are no numbers, as
-    at a dipole."""
+    """The values (n,) of the function at points (n, 3). Where a value is not finite, as at a
+    dipole, the function is evaluated a little beside the point. size: (3,) of a cell.
+
+    Raises:
+        MeshingError: some values are still not finite.
+    """
     value = function.values(points)
     for k in (1, 2):
         fails = np.flatnonzero(~np.isfinite(value))
@@ -385,7 +413,15 @@ def _triangles(
     corners: IntArray,
     roots: Callable[[FloatArray, FloatArray], FloatArray],
 ) -> tuple[FloatArray, IntArray]:
-    """Vertices within edges of tetrahedra (m, 4), and faces between them."""
+    """The triangles of tetrahedra with corners of both signs.
+
+    points, value: (n, 3), (n,) points and the function there; 0 counts as negative.
+    corners: (m, 4) of the tetrahedra. roots: from the two ends of edges to where they meet the
+        level.
+
+    Returns:
+        The vertices (k, 3), which lie within edges of tetrahedra, and the faces (j, 3).
+    """
     above = value > 0
     up = above[corners].sum(axis=1)
     tets = Tetrahedra.of(points, corners[(up > 0) & (up < 4)])
@@ -404,15 +440,13 @@ def _triangles(
 class _CreaseRefinement:
     """The places at which edges and faces are split to follow creases.
 
-    edges: (m, 3) of all faces.
-    vertex_of_edge: (k,) of edges, the index of the new vertex, or -1.
+    edges: (m, 3) the edges of all faces, by index.
+    vertex_of_edge: (k,) the index of the new vertex of each edge; -1 for edges that are not split.
     ends: (c, 2) the ends of the edges that are split.
-    share: (c,) the fraction along each of these edges where it is split.
-    corner_faces: (d, 3) faces with a new vertex within.
-    rows: (d,) the indices of these faces.
-    points, normals: of the new vertices, those of edges first.
-    is_on_crease: which new vertices are on a crease.
-    """
+    share: (c,) the fraction of each of these edges at which it is split.
+    corner_faces: (d, 3) the faces that also get a new vertex within. rows: (d,) their indices.
+    points, normals: (c + d, 3) of the new vertices, those of edges first.
+    is_on_crease: (c + d,) which new vertices are on a crease."""
 
     edges: IntArray
     vertex_of_edge: IntArray
@@ -434,9 +468,14 @@ class _CreaseRefinement:
         faces: IntArray,
         tolerance: float,
     ) -> _CreaseRefinement:
-        """The splits of edges that are farther from the surface than the tolerance, judged by where
-        the tangent planes of their ends meet; edges on a crease, whose ends have two tangent
-        planes, stay."""
+        """Choose the edges and faces to split.
+
+        bent: (n,) which vertices are on a crease. They have two tangent planes, and their edges
+            stay.
+
+        An edge is split if the line in which the tangent planes of its ends meet is farther from it
+        than `tolerance`, and if the level set is found in that direction. A face gets a vertex
+        within if all of its edges are split at a crease."""
         every = Edges.of(half_edges(faces))
         edges = every.edge_of_pair.reshape(3, -1).T
         rows = np.flatnonzero((every.multiplicity == 2) & ~bent[every.vertices].any(axis=1))
@@ -446,11 +485,11 @@ class _CreaseRefinement:
         t, along, turned = _toward_tangent_planes(a, b, one, other)
         long = row_norms(b - a)
         is_far = (
-            (turned > _PARALLEL) & (row_norms(along) > tolerance) & (long > _SHORTEST * tolerance)
+            (turned > _MIN_SQUARE) & (row_norms(along) > tolerance) & (long > _SHORTEST * tolerance)
         )
         rows, along, t = rows[is_far], along[is_far], t[is_far]
         foot, span = a[is_far] + t[:, None] * (b - a)[is_far], long[is_far]
-        points, normal, passed = _level_along(function, foot, along, _BESIDE * span)
+        points, normal, passed = _level_along(function, foot, along, _OFFSET * span)
         rows, points, normal, t = rows[passed], points[passed], normal[passed], t[passed]
         ends = every.vertices[rows]
         vertex = np.full(len(every.vertices), -1, np.int64)
@@ -474,7 +513,7 @@ class _CreaseRefinement:
         )  # fmt: skip
 
     def applied(self, x: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
-        """The finer mesh."""
+        """The vertices and faces of the finer mesh."""
         vertices = np.concatenate([x, self.points])
         middle = self.vertex_of_edge[self.edges]
         is_other = np.ones(len(faces), np.bool_)
@@ -491,9 +530,15 @@ class _CreaseRefinement:
 def _toward_tangent_planes(
     a: FloatArray, b: FloatArray, n_a: FloatArray, n_b: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The points where edges from a to b (k, 3) come nearest to the line in which the planes
-    through their ends with normals `n_a` and `n_b` meet: the fraction (k,) of the edge, and the
-    displacement (k, 3) from there to the line; also the square of the sine between the normals.
+    """From where on an edge, and how far, a point has to move to reach the intersection of the
+    tangent planes at its ends.
+
+    a, b: (k, 3) the ends of edges. n_a, n_b: (k, 3) unit normals of the planes through them, which
+    meet in a line.
+
+    Returns:
+        The fraction (k,) of the edge at which it is nearest to the line; the displacement (k, 3)
+        from there to the line; and the squared sine (k,) of the angle between the normals.
 
     Edges of a plane triangulation pass over such a line in order, and so do these points.
     """
@@ -516,11 +561,18 @@ def _toward_tangent_planes(
 def _level_along(
     function: SignFunction, start: FloatArray, along: FloatArray, limit: FloatArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Points of the level between a little before `start` (k, 3) and a little behind start + along,
-    no farther than `limit`; normals there; and whether the function has different signs at both
-    ends."""
+    """Search for the level set along segments from `start` (k, 3).
+
+    along: (k, 3) the displacements from start to end, which are shortened to at most `limit` (k,),
+        a length. The search begins a little before the start and ends a little beyond the end.
+
+    Returns:
+        The points (k, 3) where segments meet the level set, and normals (k, 3) there; and the mask
+        (k,) of segments at whose ends the function has different signs. Other points have no
+        meaning.
+    """
     along = along * np.minimum(1, limit / np.maximum(row_norms(along), 1e-300))[:, None]
-    near, end = start - _BEFORE * along, start + _BEHIND * along
+    near, end = start - _BEFORE * along, start + _AFTER * along
     is_positive = function.values(near) > 0
     changes_sign = is_positive != (function.values(end) > 0)
     rows = np.flatnonzero(changes_sign)
@@ -534,67 +586,83 @@ def _level_along(
 def _crease_corners(
     function: SignFunction, x: FloatArray, normals: FloatArray, faces: IntArray, rows: IntArray
 ) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Points on the level where the tangent planes at the corners of the faces `rows` meet;
-    normals; and the faces, by index, that have such a point."""
+    """New vertices within faces that cut off a corner of the level set.
+
+    rows: (k,) the indices of the faces. Where the normals at the vertices of a face are
+    independent, their tangent planes meet in a point. The new vertex is where the line from the
+    face's center to that point passes the level.
+
+    Returns:
+        The new vertices (j, 3); the normals (j, 3) there; and the indices (j,) of the faces that
+        have such a vertex.
+    """
     corner, normal = x[faces[rows]], normals[faces[rows]]
     det: Any = np.linalg.det
     chosen = np.flatnonzero(np.abs(det(normal)) > _INDEPENDENT)
     rows, corner, normal = rows[chosen], corner[chosen], normal[chosen]
     center = corner.mean(axis=1)
-    span = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
-    away = np.einsum("kij,kij->ki", normal, corner - center[:, None])
+    longest = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
+    offsets = np.einsum("kij,kij->ki", normal, corner - center[:, None])
     solve: Any = np.linalg.solve
-    direction: FloatArray = solve(normal, away[:, :, None])[:, :, 0]
-    points, normal, passed = _level_along(function, center, direction, _BESIDE * span)
+    direction: FloatArray = solve(normal, offsets[:, :, None])[:, :, 0]
+    points, normal, passed = _level_along(function, center, direction, _OFFSET * longest)
     return points[passed], normal[passed], rows[passed]
 
 
 def _undo_until_valid(x: FloatArray, flat: FloatArray, faces: IntArray) -> tuple[FloatArray, int]:
-    """Move vertices back to their original positions in the tetrahedra until no face is flipped and
-    no two faces intersect. Returns vertices and the number of faces affected. Pairs of faces
-    without a moved vertex are not tested.
+    """Move vertices back to their places on the triangles as tetrahedra cut them, until no face is
+    turned over and no two faces intersect. Pairs of faces without a moved vertex are not tested.
 
-    flat: (n, 3) the original positions.
+    x: (n, 3) the vertices. flat: (n, 3) their places on the triangles of tetrahedra.
+
+    Returns:
+        The vertices, and the number of faces whose vertices were moved back.
 
     Raises:
         LocalizedMeshingError: triangles still intersect.
     """
     x = x.copy()
     total = 0
-    upright = area_normals(flat[faces])
+    flat_normals = area_normals(flat[faces])
     for _ in range(_MOST_REPAIRS):
         moved = (x != flat).any(axis=1)
         turned = moved[faces].any(axis=1)
-        turned[turned] = row_dots(area_normals(x[faces[turned]]), upright[turned]) <= 0
+        turned[turned] = row_dots(area_normals(x[faces[turned]]), flat_normals[turned]) <= 0
         if not turned.any():
             break
         x[faces[turned]] = flat[faces[turned]]
         total += int(turned.sum())
-    among: BoolArray = np.asarray((x != flat).any(axis=1)[faces].any(axis=1))
+    is_tested: BoolArray = np.asarray((x != flat).any(axis=1)[faces].any(axis=1))
     failing = faces[:0, 0]
     for _ in range(_MOST_REPAIRS):
-        failing = np.union1d(intersecting_faces(x, faces, among), _folded_faces(x, faces, among))
+        failing = np.union1d(
+            intersecting_faces(x, faces, is_tested), _folded_faces(x, faces, is_tested)
+        )
         if not len(failing):
             return x, total
         total += len(failing)
-        near = np.zeros(len(x), np.bool_)
-        near[faces[failing]] = True
-        among = np.asarray(near[faces].any(axis=1))
-        if not (x[near] != flat[near]).any():  # together with neighbors, so that the loop ends
-            near[faces[among]] = True
-            among = np.asarray(near[faces].any(axis=1))
-        x[near] = flat[near]
+        is_undone = np.zeros(len(x), np.bool_)
+        is_undone[faces[failing]] = True
+        is_tested = np.asarray(is_undone[faces].any(axis=1))
+        if not (
+            x[is_undone] != flat[is_undone]
+        ).any():  # together with neighbors, so that the loop ends
+            is_undone[faces[is_tested]] = True
+            is_tested = np.asarray(is_undone[faces].any(axis=1))
+        x[is_undone] = flat[is_undone]
     raise LocalizedMeshingError(
         f"{len(failing):,} triangles pass through each other still", x[faces[failing]].mean(axis=1)
     )
 
 
 def _folded_faces(x: FloatArray, faces: IntArray, among: BoolArray) -> IntArray:
-    """The indices of faces that lie on a neighbor up to rounding, where either of both is
-    chosen."""
+    """The indices of the faces that lie on a neighbor, up to rounding. Pairs of neighbors count if
+    the mask `among` (m,) is set for either."""
     normal = area_normals(x[faces])
     normal /= np.maximum(row_norms(normal), 1e-300)[:, None]
     pairs = Edges.of(half_edges(faces)).paired_half_edges() % len(faces)
     first, second = pairs.T
-    on_other = (row_dots(normal[first], normal[second]) < _FOLDED) & (among[first] | among[second])
+    on_other = (row_dots(normal[first], normal[second]) < _FOLD_COSINE) & (
+        among[first] | among[second]
+    )
     return np.unique(pairs[on_other])
