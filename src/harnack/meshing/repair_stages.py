@@ -66,16 +66,18 @@ if TYPE_CHECKING:
 
 __all__ = ["repair"]
 
-# How many sizes of cells are tried for patches on which w is 1/2, if all triangles have to stay;
-# and if they need not, where there are no more open edges than that.
+# How many sizes of cells are tried for harmonic fillings, if all triangles have to stay; and if they
+# need not. In that case holes with more open edges than the third are not filled harmonically.
 _ATTEMPTS, _FEW_ATTEMPTS, _FEW_EDGES = 6, 1, 1000
-# Cells across the mesh if all is made anew; larger ones by this factor, up to so many times, where
-# the surface is rough and has more triangles than that.
-_ACROSS_ANEW = 48
-_MOST_ANEW, _LARGER, _MOST_LARGER = 80_000, 1.4, 3
+# If the mesh is remeshed: the number of cells across it. If that takes more triangles than the first
+# of the next numbers, as for a rough surface, cells are made larger by the second, at most as often as
+# the third says.
+_CELLS_ACROSS = 48
+_MAX_TRIANGLES, _GROWTH, _MAX_GROWTHS = 80_000, 1.4, 3
 
-# Points lie in a plane if the least of their singular values is this part of the largest.
-_FLAT = 1e-9
+# Points lie in a plane if the smallest of their singular values is at most this fraction of the
+# largest.
+_FLATNESS = 1e-9
 
 Keep = Literal["all", "valid", "none"]
 Patches = Literal["smooth", "harmonic"]
@@ -249,6 +251,11 @@ def _checked_settings(
     seed: int,
     report: Callable[[str], None],
 ) -> _RepairOptions:
+    """The arguments of `repair`, checked.
+
+    Raises:
+        ValueError: one of them is not among the allowed values.
+    """
     if keep is not None and not is_one_of(keep, ("all", "valid", "none")):
         raise ValueError(f'keep is None, "all", "valid" or "none", not {keep!r}')
     if not is_one_of(patches, ("smooth", "harmonic")):
@@ -259,7 +266,10 @@ def _checked_settings(
 
 @dataclass(frozen=True)
 class _Result:
-    """What a stage made, and how that differs from what was given."""
+    """The result of a stage.
+
+    surface: the closed mesh. facts: what `metadata["harnack"]` says of it.
+    difference: how it differs from the input; None if it does not."""
 
     surface: TriangleMesh
     facts: dict[str, Any]
@@ -267,11 +277,13 @@ class _Result:
 
     @property
     def badness(self) -> float:
-        """0 if it does not differ: see `Difference`."""
+        """`Difference.badness`; 0 if the result does not differ from the input."""
         return 0.0 if self.difference is None else self.difference.badness
 
     def finished(self, more: dict[str, Any], largest: bool) -> trimesh.Trimesh:
-        """The mesh, with what is known of it and of its parts; a warning if it differs."""
+        """The mesh that `repair` returns. It warns if the result differs from the input.
+
+        more: further facts. largest: whether to keep only the body of the largest volume."""
         from harnack.meshing.closed_mesh import ClosedMesh
 
         surface = self.surface
@@ -287,7 +299,7 @@ class _Result:
         if largest and len(parts) > 1:
             surface = largest_body(surface)
             dropped = len(parts) - len(component_facts(surface))
-            facts["kept"] = _count_of(surface, self.surface, facts["kept"])
+            facts["kept"] = _count_kept(surface, self.surface, facts["kept"])
         repaired = ClosedMesh(surface.vertices, surface.faces, process=False, validate=False)
         repaired.metadata["harnack"] = {
             **facts,
@@ -298,14 +310,16 @@ class _Result:
         return repaired
 
 
-def _count_of(surface: TriangleMesh, whole: TriangleMesh, first: int) -> int:
-    """How many of the first faces of a whole are in a surface that is a part of it."""
+def _count_kept(surface: TriangleMesh, whole: TriangleMesh, first: int) -> int:
+    """How many of the first `first` faces of the mesh `whole` are among the faces of `surface`, by
+    the coordinates of their corners."""
     corners = [one.vertices[one.faces].reshape(-1, 9) for one in (surface, whole)]
-    there = {row.tobytes() for row in corners[0]}
-    return sum(row.tobytes() in there for row in corners[1][:first])
+    present = {row.tobytes() for row in corners[0]}
+    return sum(row.tobytes() in present for row in corners[1][:first])
 
 
 def _check_is_mesh(mesh: Any) -> None:
+    """Raise a TypeError unless the object has vertices and faces."""
     if not hasattr(mesh, "vertices") or not hasattr(mesh, "faces"):
         raise TypeError(
             f"repair takes a mesh with vertices and faces, such as a trimesh.Trimesh, not "
@@ -314,18 +328,19 @@ def _check_is_mesh(mesh: Any) -> None:
 
 
 def _check_encloses(mesh: Any) -> None:
-    """Raise if all faces lie in a plane, or form a strip of one side only.
+    """Raise if a mesh cannot enclose anything: all its faces lie in a plane, or it has one side
+        only.
 
     Raises:
-        MeshError: so; or as `validate_mesh`.
+        MeshError: it cannot; or as `validate_mesh`.
     """
     vertices, faces = validate_mesh(
         np.asarray(mesh.vertices), np.asarray(mesh.faces), allow_zero_area=True
     )
     x = vertices[np.unique(faces)]
     x = x - x.mean(axis=0)
-    largest, *_, least = np.linalg.svd(x / np.abs(x).max(), compute_uv=False)
-    if least <= _FLAT * largest:
+    largest, *_, smallest = np.linalg.svd(x / np.abs(x).max(), compute_uv=False)
+    if smallest <= _FLATNESS * largest:
         raise MeshError(
             "all faces of the mesh lie in a plane, or nearly so: they enclose nothing that could "
             "be closed; give it a thickness first, or mesh its boundary with `thickness`"
@@ -343,11 +358,11 @@ def _check_encloses(mesh: Any) -> None:
 def _unite_bodies(
     intended: IntendedSolid, asked: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The boundary of the solid that a closed mesh bounds which passes through itself, or of parts
-    that touch.
+    """Stage "boolean_union": the boundary of the solid of a closed mesh that passes through itself,
+    or whose parts overlap or touch. Returns it with facts for the metadata.
 
     Raises:
-        MeshError, MeshingError: as `repair`.
+        MeshError, MeshingError: as `repair`; also if nothing of the mesh overlaps.
     """
     vertices, faces = intended.vertices, intended.oriented
     if len(singular_edges(faces)[0]):
@@ -372,7 +387,8 @@ def _unite_bodies(
 
 
 def _is_fine(vertices: FloatArray, faces: IntArray) -> bool:
-    """Whether no triangles meet beyond what they share, and no part is in another's material."""
+    """Whether triangles meet only in shared edges and vertices, and no part is inside out or in the
+    material of another."""
     try:
         _check_sides(TriangleMesh.without_unused_vertices(vertices, faces))
     except MeshError:
@@ -384,14 +400,15 @@ def _is_fine(vertices: FloatArray, faces: IntArray) -> bool:
 
 
 def _remesh(intended: IntendedSolid, asked: _RepairOptions) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The surface on which the winding number is 1/2, closed whatever the mesh is."""
+    """Stage "remeshed": the surface on which the winding number is 1/2, which is closed whatever
+    the mesh is. Returns it with facts for the metadata."""
     intended.check_encloses()
     corners = without_zero_area_faces(intended.vertices, intended.oriented)
     field = WindingNumber(*corners)
     if asked.spacing is not None:
         made = _by_signs(field, asked.spacing, asked)
     else:
-        spacing = float(np.ptp(corners[0], axis=0).max()) / _ACROSS_ANEW
+        spacing = float(np.ptp(corners[0], axis=0).max()) / _CELLS_ACROSS
         try:
             made = _of_bounded_size(field, spacing, asked)
         except MeshingError:
@@ -403,19 +420,23 @@ def _remesh(intended: IntendedSolid, asked: _RepairOptions) -> tuple[TriangleMes
 def _of_bounded_size(
     field: WindingNumber, spacing: float, asked: _RepairOptions
 ) -> trimesh.Trimesh:
-    """Of larger cells where there would be too many triangles, as of noisy meshes: the time of
-    checks grows with their number."""
-    for k in range(_MOST_LARGER):
+    """The surface on which the winding number is 1/2, with larger cells if it would have too many
+    triangles, as for a noisy mesh: the time of the checks grows with their number.
+
+    spacing: the size of cells that is tried first."""
+    for k in range(_MAX_GROWTHS):
         try:
-            return _by_signs(field, spacing * _LARGER**k, asked, _MOST_ANEW)
+            return _by_signs(field, spacing * _GROWTH**k, asked, _MAX_TRIANGLES)
         except TriangleLimitError as error:
             asked.report(f"{error}; so of larger cells")
-    return _by_signs(field, spacing * _LARGER**_MOST_LARGER, asked)
+    return _by_signs(field, spacing * _GROWTH**_MAX_GROWTHS, asked)
 
 
 def _by_signs(
     field: WindingNumber, spacing: float, asked: _RepairOptions, most: int = 2_000_000
 ) -> trimesh.Trimesh:
+    """The surface on which the winding number is 1/2. spacing: the size of cells. most: the largest
+    number of triangles."""
     return mesh_of(
         field, level=0.5, side="above", tolerance=asked.tolerance.length, cell_size=spacing,
         max_triangles=most, progress=asked.report,
@@ -428,7 +449,8 @@ def _by_signs(
 def _keep_valid(
     intended: IntendedSolid, asked: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The triangles that are sound, with patches.
+    """Stage "cleaned": the valid triangles, with fillings in place of all others and over holes.
+    Returns the mesh with facts for the metadata.
 
     Raises:
         MeshError, MeshingError: as `repair`.
@@ -448,14 +470,16 @@ def _keep_valid(
     }
 
 
-def _count_turned(intended: IntendedSolid, sound: CleanedMesh) -> int:
-    """How many of the triangles that were kept run the other way than those that were given."""
+def _count_turned(intended: IntendedSolid, cleaned: CleanedMesh) -> int:
+    """How many of the kept triangles have the reverse orientation of their input triangle. A
+    triangle may be reversed twice: with its part in `IntendedSolid`, and against its neighbors in
+    the cleaning."""
     turned_before = np.delete(
         intended.is_turned, zero_area_faces(intended.vertices, intended.faces)
     )
     is_turned = np.zeros(len(turned_before), np.bool_)
-    is_turned[sound.turned] = True
-    return int((is_turned ^ turned_before)[sound.kept].sum())
+    is_turned[cleaned.turned] = True
+    return int((is_turned ^ turned_before)[cleaned.kept].sum())
 
 
 # Loose triangles joined.
@@ -464,7 +488,8 @@ def _count_turned(intended: IntendedSolid, sound: CleanedMesh) -> int:
 def _weld_loose(
     intended: IntendedSolid, asked: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """Triangles with near corners joined, with patches; none is kept bit by bit.
+    """Stage "welded": triangles whose near corners are merged, with fillings. No triangle is kept
+    bit by bit. Returns the mesh with facts for the metadata.
 
     Raises:
         MeshError, MeshingError: as `repair`.
@@ -492,7 +517,8 @@ def _weld_loose(
 def _fill_only(
     intended: IntendedSolid, asked: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The mesh with patches; all its triangles stay.
+    """Stage "filled": all triangles of the mesh stay, and its holes are filled. Returns the mesh
+    with facts for the metadata.
 
     Raises:
         MeshError, MeshingError: as `repair`.
@@ -515,15 +541,19 @@ def _fill_only(
 
 
 def _checked(intended: IntendedSolid) -> tuple[FloatArray, IntArray]:
-    """Vertices and faces of a mesh all of which can be kept."""
+    """The vertices and faces of a mesh whose triangles can all be kept.
+
+    Raises:
+        MeshError: different vertices are at the same place; or as `validate_mesh`.
+    """
     vertices, faces = validate_mesh(intended.vertices, intended.faces)
     used = np.unique(faces)
     welded = weld_vertices(vertices[used])
-    twice = np.flatnonzero(welded != np.arange(len(used)))
-    if len(twice):
+    duplicates = np.flatnonzero(welded != np.arange(len(used)))
+    if len(duplicates):
         raise MeshError(
-            f"vertices {used[welded[twice[0]]]} and {used[twice[0]]} are at the same place, and "
-            f"{len(twice):,} in all: join such vertices first, for instance by "
+            f"vertices {used[welded[duplicates[0]]]} and {used[duplicates[0]]} are at the same place, and "
+            f"{len(duplicates):,} in all: join such vertices first, for instance by "
             "mesh.merge_vertices() of trimesh, or faces are not known to be neighbors"
         )
     return vertices, faces
@@ -532,28 +562,38 @@ def _checked(intended: IntendedSolid) -> tuple[FloatArray, IntArray]:
 def _kept_with(
     vertices: FloatArray, faces: IntArray, loops: list[IntArray], asked: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The mesh with patches over its holes: smooth ones if asked for, and harmonic ones.
+    """The mesh with fillings over its holes. Returns it with facts for the metadata.
+
+    loops: the vertices around each hole. Holes get smooth fillings if `asked` says so, and harmonic
+        ones if it does not or if smooth ones fail.
 
     Raises:
         MeshingError: as `repair`.
     """
-    x, together, left = vertices, faces, loops
+    x, together, unfilled = vertices, faces, loops
     if loops and asked.patches == "smooth":
         asked.report(f"filling {len(loops):,} holes")
         field = WindingNumber(vertices, faces)
         made = fill_holes(vertices, faces, loops, lambda p: field.value(p, precision="double"))
         x, together = np.concatenate([x, made.vertices]), np.concatenate([faces, made.faces])
-        left = made.unfilled_loops
-        asked.report(f"{len(left):,} holes are left" + f": {made.reason}" * bool(left))
-    rest = HarmonicFilling(vertices[:0], faces[:0], True, 0.0, 0)
-    if left:
+        unfilled = made.unfilled_loops
+        asked.report(f"{len(unfilled):,} holes are left" + f": {made.reason}" * bool(unfilled))
+    harmonic = HarmonicFilling(vertices[:0], faces[:0], True, 0.0, 0)
+    if unfilled:
         edges = checked_boundary_edges(together)
         if asked.keep is None and len(edges) > _FEW_EDGES:
-            raise MeshingError(f"{len(left):,} holes of {len(edges):,} edges have no smooth patch")
+            raise MeshingError(
+                f"{len(unfilled):,} holes of {len(edges):,} edges have no smooth patch"
+            )
         attempts = _ATTEMPTS if asked.keep == "all" else _FEW_ATTEMPTS
-        how = HoleFillingOptions(asked.tolerance, asked.spacing, asked.seed, attempts, asked.report)
-        rest = harmonic_patches(x, together, edges, how)
-        x, together = np.concatenate([x, rest.vertices]), np.concatenate([together, rest.faces])
+        settings = HoleFillingOptions(
+            asked.tolerance, asked.spacing, asked.seed, attempts, asked.report
+        )
+        harmonic = harmonic_patches(x, together, edges, settings)
+        x, together = (
+            np.concatenate([x, harmonic.vertices]),
+            np.concatenate([together, harmonic.faces]),
+        )
     surface = TriangleMesh.without_unused_vertices(x, together)
     if loops or asked.keep is None:
         _check_touching(together)
@@ -564,16 +604,17 @@ def _kept_with(
         "kept": len(faces),
         "holes": len(loops),
         "patches": len(together) - len(faces),
-        "harmonic": len(rest.faces),
-        "missing": rest.triangle_fill_count,
-        "refined": rest.is_refined,
-        "spacing": rest.spacing,
-        "evaluations": rest.evaluations,
+        "harmonic": len(harmonic.faces),
+        "missing": harmonic.triangle_fill_count,
+        "refined": harmonic.is_refined,
+        "spacing": harmonic.spacing,
+        "evaluations": harmonic.evaluations,
     }
 
 
 def _check_sides(surface: TriangleMesh) -> None:
-    """Raise if a part is inside out, or inside the material of another one, also in part."""
+    """Raise a MeshError if a part is inside out, lies in the material of another one, or passes
+    through itself or others."""
     shells = Shells.of(surface)
     depths = shells.nesting_depths()
     if ((shells.volumes < 0) & (depths == 0)).any():
@@ -585,7 +626,7 @@ def _check_sides(surface: TriangleMesh) -> None:
 
 
 def _check_touching(faces: IntArray) -> None:
-    """Raise unless the faces around each vertex are joined by edges."""
+    """Raise a MeshingError unless the faces around each vertex are connected by edges."""
     if len(places := nonmanifold_vertices(faces)):
         raise MeshingError(
             f"faces touch in {len(places):,} vertices alone, such as vertex {places[0]}: such a "
