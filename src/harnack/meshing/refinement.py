@@ -42,7 +42,7 @@ Walls = tuple[FloatArray, FloatArray] | None
 Where = Callable[[FloatArray], BoolArray] | None
 # Across a crease normals turn by at least this angle; and by this fraction of the angle between the
 # middle of an edge and one of its ends.
-_CREASE, _TURN_SHARE = math.radians(20), 0.75
+_CREASE, _SHARE = math.radians(20), 0.75
 # A vertex within this distance, relative to the tolerance, counts as on the surface.
 _ON_SURFACE = 1e-5
 # The largest distance of a crease from the middle of an edge, relative to the edge.
@@ -169,9 +169,7 @@ def _project_to_creases(
     cosine = row_dots(n_a, n_b)
     angle = np.arccos(np.clip(np.minimum(row_dots(n_a, n), row_dots(n_b, n)), -1, 1))
     total = np.arccos(np.clip(cosine, -1, 1))
-    rows = np.flatnonzero(
-        (total > _CREASE) & (angle > _TURN_SHARE * total) & (1 - cosine**2 > 0.01)
-    )
+    rows = np.flatnonzero((total > _CREASE) & (angle > _SHARE * total) & (1 - cosine**2 > 0.01))
     if not len(rows):
         return moved
     n_a, n_b, cosine = n_a[rows], n_b[rows], cosine[rows]

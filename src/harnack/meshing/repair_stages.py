@@ -66,12 +66,12 @@ if TYPE_CHECKING:
 
 __all__ = ["repair"]
 
-# How many sizes of cells are tried for harmonic fillings, if all triangles have to stay; and if they
-# need not. In that case holes with more open edges than the third are not filled harmonically.
+# How many sizes of cells are tried for harmonic fillings, if all triangles have to stay; and if
+# they need not. In that case holes with more open edges than the third are not filled like that.
 _ATTEMPTS, _FEW_ATTEMPTS, _FEW_EDGES = 6, 1, 1000
-# If the mesh is remeshed: the number of cells across it. If that takes more triangles than the first
-# of the next numbers, as for a rough surface, cells are made larger by the second, at most as often as
-# the third says.
+# If the mesh is remeshed: the number of cells across it. If that takes more triangles than the
+# first of the next numbers, as for a rough surface, cells are made larger by the second, at most as
+# often as the third says.
 _CELLS_ACROSS = 48
 _MAX_TRIANGLES, _GROWTH, _MAX_GROWTHS = 80_000, 1.4, 3
 
@@ -549,11 +549,11 @@ def _checked(intended: IntendedSolid) -> tuple[FloatArray, IntArray]:
     vertices, faces = validate_mesh(intended.vertices, intended.faces)
     used = np.unique(faces)
     welded = weld_vertices(vertices[used])
-    duplicates = np.flatnonzero(welded != np.arange(len(used)))
-    if len(duplicates):
+    twice = np.flatnonzero(welded != np.arange(len(used)))
+    if len(twice):
         raise MeshError(
-            f"vertices {used[welded[duplicates[0]]]} and {used[duplicates[0]]} are at the same place, and "
-            f"{len(duplicates):,} in all: join such vertices first, for instance by "
+            f"vertices {used[welded[twice[0]]]} and {used[twice[0]]} are at the same place, and "
+            f"{len(twice):,} in all: join such vertices first, for instance by "
             "mesh.merge_vertices() of trimesh, or faces are not known to be neighbors"
         )
     return vertices, faces
@@ -570,30 +570,23 @@ def _kept_with(
     Raises:
         MeshingError: as `repair`.
     """
-    x, together, unfilled = vertices, faces, loops
+    x, together, left = vertices, faces, loops
     if loops and asked.patches == "smooth":
         asked.report(f"filling {len(loops):,} holes")
         field = WindingNumber(vertices, faces)
         made = fill_holes(vertices, faces, loops, lambda p: field.value(p, precision="double"))
         x, together = np.concatenate([x, made.vertices]), np.concatenate([faces, made.faces])
-        unfilled = made.unfilled_loops
-        asked.report(f"{len(unfilled):,} holes are left" + f": {made.reason}" * bool(unfilled))
-    harmonic = HarmonicFilling(vertices[:0], faces[:0], True, 0.0, 0)
-    if unfilled:
+        left = made.unfilled_loops
+        asked.report(f"{len(left):,} holes are left" + f": {made.reason}" * bool(left))
+    rest = HarmonicFilling(vertices[:0], faces[:0], True, 0.0, 0)
+    if left:
         edges = checked_boundary_edges(together)
         if asked.keep is None and len(edges) > _FEW_EDGES:
-            raise MeshingError(
-                f"{len(unfilled):,} holes of {len(edges):,} edges have no smooth patch"
-            )
+            raise MeshingError(f"{len(left):,} holes of {len(edges):,} edges have no smooth patch")
         attempts = _ATTEMPTS if asked.keep == "all" else _FEW_ATTEMPTS
-        settings = HoleFillingOptions(
-            asked.tolerance, asked.spacing, asked.seed, attempts, asked.report
-        )
-        harmonic = harmonic_patches(x, together, edges, settings)
-        x, together = (
-            np.concatenate([x, harmonic.vertices]),
-            np.concatenate([together, harmonic.faces]),
-        )
+        how = HoleFillingOptions(asked.tolerance, asked.spacing, asked.seed, attempts, asked.report)
+        rest = harmonic_patches(x, together, edges, how)
+        x, together = np.concatenate([x, rest.vertices]), np.concatenate([together, rest.faces])
     surface = TriangleMesh.without_unused_vertices(x, together)
     if loops or asked.keep is None:
         _check_touching(together)
@@ -604,11 +597,11 @@ def _kept_with(
         "kept": len(faces),
         "holes": len(loops),
         "patches": len(together) - len(faces),
-        "harmonic": len(harmonic.faces),
-        "missing": harmonic.triangle_fill_count,
-        "refined": harmonic.is_refined,
-        "spacing": harmonic.spacing,
-        "evaluations": harmonic.evaluations,
+        "harmonic": len(rest.faces),
+        "missing": rest.triangle_fill_count,
+        "refined": rest.is_refined,
+        "spacing": rest.spacing,
+        "evaluations": rest.evaluations,
     }
 
 

@@ -70,7 +70,7 @@ _ROUNDS, _MOST_REPAIRS = 2, 12
 # faces, is omitted: the surface is rough at every scale.
 _MAX_CUT_FRACTION = 0.5
 # Neighbors lie on each other if the cosine between their normals is less than this.
-_FOLD_COSINE = -0.99999
+_FOLDED = -0.99999
 # Slivers and flat places are simplified by at most the first, relative to the tolerance, and by at
 # most the second, relative to a cell.
 _SIMPLIFY_TOLERANCE, _SIMPLIFY_CELL_FRACTION = 0.5, 0.05
@@ -632,24 +632,20 @@ def _undo_until_valid(x: FloatArray, flat: FloatArray, faces: IntArray) -> tuple
             break
         x[faces[turned]] = flat[faces[turned]]
         total += int(turned.sum())
-    is_tested: BoolArray = np.asarray((x != flat).any(axis=1)[faces].any(axis=1))
+    among: BoolArray = np.asarray((x != flat).any(axis=1)[faces].any(axis=1))
     failing = faces[:0, 0]
     for _ in range(_MOST_REPAIRS):
-        failing = np.union1d(
-            intersecting_faces(x, faces, is_tested), _folded_faces(x, faces, is_tested)
-        )
+        failing = np.union1d(intersecting_faces(x, faces, among), _folded_faces(x, faces, among))
         if not len(failing):
             return x, total
         total += len(failing)
-        is_undone = np.zeros(len(x), np.bool_)
-        is_undone[faces[failing]] = True
-        is_tested = np.asarray(is_undone[faces].any(axis=1))
-        if not (
-            x[is_undone] != flat[is_undone]
-        ).any():  # together with neighbors, so that the loop ends
-            is_undone[faces[is_tested]] = True
-            is_tested = np.asarray(is_undone[faces].any(axis=1))
-        x[is_undone] = flat[is_undone]
+        near = np.zeros(len(x), np.bool_)
+        near[faces[failing]] = True
+        among = np.asarray(near[faces].any(axis=1))
+        if not (x[near] != flat[near]).any():  # together with neighbors, so that the loop ends
+            near[faces[among]] = True
+            among = np.asarray(near[faces].any(axis=1))
+        x[near] = flat[near]
     raise LocalizedMeshingError(
         f"{len(failing):,} triangles pass through each other still", x[faces[failing]].mean(axis=1)
     )
@@ -662,7 +658,5 @@ def _folded_faces(x: FloatArray, faces: IntArray, among: BoolArray) -> IntArray:
     normal /= np.maximum(row_norms(normal), 1e-300)[:, None]
     pairs = Edges.of(half_edges(faces)).paired_half_edges() % len(faces)
     first, second = pairs.T
-    on_other = (row_dots(normal[first], normal[second]) < _FOLD_COSINE) & (
-        among[first] | among[second]
-    )
+    on_other = (row_dots(normal[first], normal[second]) < _FOLDED) & (among[first] | among[second])
     return np.unique(pairs[on_other])
