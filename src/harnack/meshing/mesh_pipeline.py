@@ -76,13 +76,15 @@ __all__ = ["mesh"]
 
 _HONORED = (*SURFACE_OPTIONS, "tolerance")
 
-# Cells across the level set, unless a spacing is given; curves have their own length besides.
-_ACROSS = 24
-_MOST_ATTEMPTS = 4
-_ACROSS_BY_SIGNS, _ATTEMPTS_BY_SIGNS = 48, 2
-# Room around what has an extent, and around a curve whose surface has none, as a part of the size.
+# The number of cells across the level set and the largest number of attempts, each with smaller
+# cells, unless a cell size is given; then the same for meshing by signs.
+_CELLS_ACROSS = 24
+_MAX_ATTEMPTS = 4
+_SIGN_CELLS, _SIGN_ATTEMPTS = 48, 2
+# The margin of the box around a level set that has an extent, and of the box around a curve whose
+# surface has none, as fractions of the box's size.
 _MARGIN = 0.01
-_ROOM = 0.05
+_CURVE_MARGIN = 0.05
 
 
 @shows_keywords(*_HONORED)
@@ -231,7 +233,10 @@ def mesh(
 
 @dataclass(frozen=True)
 class _MeshOptions:
-    """Arguments of `mesh`; volume: what the level set is cut by."""
+    """Arguments of `mesh`, checked.
+
+    volume: the volume by which the level set is cut; None if it is not.
+    spacing: the size of cells; None to choose it. The other attributes are named as in `mesh`."""
 
     volume: Volume | None
     tolerance: MeshTolerance
@@ -243,12 +248,14 @@ class _MeshOptions:
 
 @dataclass(frozen=True)
 class _RawMesh:
-    """A surface, its size, what is known of it, and the function that it is a level set of.
+    """A mesh of a level set before it is thickened or simplified.
 
-    check_level: raises a MeshingError unless a surface is within the tolerance of the level.
+    surface: the mesh. size: the longest side of its box.
+    facts: what `metadata["harnack"]` says of it.
+    function: the function of which it is a level set.
+    check_level: raises a MeshingError unless a mesh is within the tolerance of the level set.
     is_checked: whether that has been done, and the surface is known to be a manifold that does not
-        pass through itself.
-    """
+        pass through itself."""
 
     surface: TriangleMesh
     size: float
@@ -265,10 +272,14 @@ def _mesh_from_signs(
     is_thick: bool,
     asked: _MeshOptions,
 ) -> _RawMesh:
-    """A level set by the signs of f, or the closed surface of a solid.
+    """Mesh a level set, or the closed surface of a solid, by the signs of f - level.
+
+    level: None for the default. solid: as `_level_and_solid` returns it.
+    is_thick: whether the level set is to be thickened.
 
     Raises:
-        MeshingError: as `mesh_from_signs`; if it is empty, or not near the level at all.
+        MeshingError: as `mesh_from_signs`; also if the result is empty, or not near the level at
+            all.
     """
     ends = _ends_by_signs(field, level, solid, is_thick)
     levels = tuple(end for end in ends if math.isfinite(end))
@@ -284,11 +295,14 @@ def _mesh_from_signs(
     losses: list[LostParts] = []
 
     def function(one: float, side: float) -> SignFunction:
+        """The function side * (f - one) for a level `one`."""
         return SignFunction.of(field, one, filled, cells, side=side, most_faces=asked.most_faces)
 
     is_apart = False
 
     def signed(one: float, side: float, closed: bool) -> TriangleMesh:
+        """The mesh of the level `one`. side: 1, or -1 to swap its two sides. closed: whether it is
+        closed at the box. Its facts and lost parts are appended to the lists."""
         nonlocal is_apart
         try:
             made, lost, more = mesh_from_signs(
@@ -343,12 +357,11 @@ def _ends_by_signs(
     solid: tuple[float, float] | bool,
     is_thick: bool,
 ) -> tuple[float, float]:
-    """The values between which the inside is; of a level set that is not closed those from its
-    level on.
+    """The interval of values of f inside of the solid; for a level set, from its level to infinity.
 
     Raises:
-        TypeError: a surface that jumps is to be thickened.
-        ValueError: the field has no such level.
+        TypeError: a surface across which f jumps is to be thickened. ValueError: the field has no
+        such level.
     """
     if is_thick and field.has_jumps:
         raise TypeError(
@@ -363,10 +376,12 @@ def _ends_by_signs(
 
 
 def _cells_by_signs(field: Field, size: float, spacing: float | None) -> tuple[float, int]:
-    """How large cells are, and how often smaller ones may be tried."""
+    """The size of cells, and the largest number of attempts with ever smaller ones.
+
+    size: the longest side of the box. spacing: the size that was asked for; None to choose it."""
     if spacing is not None:
         return float(spacing), 1
-    cells, attempts = size / _ACROSS_BY_SIGNS, _ATTEMPTS_BY_SIGNS
+    cells, attempts = size / _SIGN_CELLS, _SIGN_ATTEMPTS
     detailed = cell_size_for_smoothing(
         field, cells, CELL_REFINEMENT_FACTOR, CELL_REFINEMENT_FACTOR**2
     )
@@ -380,10 +395,11 @@ def _faces_alone(
     solid: tuple[float, float] | bool,
     asked: _MeshOptions,
 ) -> _RawMesh:
-    """The triangles of a mesh that is its own surface, as they are, but for what the volume cuts.
+    """The triangles of a mesh that is its own spanning surface, cut by the volume and otherwise
+    unchanged.
 
     Raises:
-        MeshingError: it is to be closed; nothing is left; it has too many triangles.
+        MeshingError: a solid was asked for, nothing is left, or there are too many triangles.
     """
     if solid:
         raise MeshingError(
@@ -410,7 +426,10 @@ def _faces_alone(
 def _check_has_thickness(
     field: Field, whole: Manifold, ends: tuple[float, float], tolerance: float
 ) -> None:
-    """Raise if both levels are the same triangles, where the field jumps across them."""
+    """Raise a MeshingError if the surfaces at both levels are the same triangles, since the field
+    jumps across both levels there.
+
+    whole: the solid between them. ends: the two levels."""
     if 2 * abs(whole.volume()) < tolerance * whole.surface_area():
         low, high = (f"{one:g}" for one in ends)
         raise MeshingError(
@@ -420,18 +439,21 @@ def _check_has_thickness(
 
 
 def _merge_facts(facts: list[dict[str, Any]]) -> dict[str, Any]:
-    """What is known of the surfaces at both ends of a solid."""
+    """The facts of a solid from those of the surfaces at its two levels: counts are added, and of
+    lengths the larger is taken."""
     sums = ("evaluations", "undecided", "flat", "far", "looked_at", "lost", "sought")
     larger = {key: max(one[key] for one in facts) for key in ("spacing", "within")}
     return {**facts[0], **larger, **{key: sum(one[key] for one in facts) for key in sums}}
 
 
 def _check_sign_accuracy(field: Field, facts: dict[str, Any], tolerance: float) -> bool:
-    """Whether more than a few vertices and centers of triangles are beyond the tolerance, which is
-    warned of.
+    """Warn if more than one in a hundred vertices and centers of triangles are farther than the
+    tolerance from the level. Returns whether it warned.
+
+    facts: from `mesh_from_signs`.
 
     Raises:
-        MeshingError: some of them are nowhere near the level.
+        MeshingError: some of them are farther than several cells from the level.
     """
     far, count, within = facts["far"], facts["looked_at"], facts["within"]
     kind = type(field).__name__
@@ -455,8 +477,10 @@ def _check_sign_accuracy(field: Field, facts: dict[str, Any], tolerance: float) 
 
 
 def _warn_of_lost(field: Field, losses: list[LostParts], is_told: bool) -> None:
-    """Warns where parts of the level set are missing from the mesh; if it is told already that the
-    mesh is coarse, only of more than that."""
+    """Warn if parts of the level set are missing from the mesh.
+
+    is_told: whether a warning says already that the mesh is coarse. Then only thin parts and points
+        far from the mesh are worth another one."""
     for lost in losses:
         if lost.matter and (lost.show_thin_parts or not is_told):
             warnings.warn(
@@ -467,14 +491,17 @@ def _warn_of_lost(field: Field, losses: list[LostParts], is_told: bool) -> None:
 
 
 def _accept(surface: TriangleMesh) -> None:
-    """Accepts every surface: by signs distances were measured when it was made."""
+    """A check that accepts every surface: for meshes by signs, distances were measured before."""
 
 
 def _level_and_solid(
     surface: Surface, thickness: float | None
 ) -> tuple[float | None, tuple[float, float] | bool]:
-    """The level, and the values (low, high) on the closed solid in its place: True for the points
-    of a `Solid`, False for the level set.
+    """What to mesh: a level set or a solid.
+
+    Returns:
+        The level, or None for the default; and False for the level set, True for the points of a
+        `Solid`, or the interval (low, high) of the values of f in a solid, which then has no level.
 
     Raises:
         ValueError: several levels; a solid that is to be thickened.
@@ -500,13 +527,21 @@ def _level_and_solid(
 def _check_level(
     function: LevelFunction, made: TriangleMesh, tolerance: float, volume: Volume | None
 ) -> None:
-    """Raise unless a surface is within the tolerance of the level, and inside the volume."""
+    """Raise a MeshingError unless a mesh is within the tolerance of the level set, and inside the
+    volume."""
     if volume is not None:
         check_inside(made.vertices, volume, tolerance)
     check_near_level(function, made.vertices, made.faces, tolerance, volume)
 
 
 def _checked(field: Field) -> Field:
+    """The field, if it can be meshed; a `SolidAngle` without its circles' data.
+
+    Raises:
+        TypeError: it has patches, jumps that signs cannot handle, circles, or values that are
+            angles
+            without a known curve.
+    """
     check_is_field(field)
     if field.has_patches or (field.has_jumps and not uses_sign_meshing(field)):
         raise TypeError(
@@ -528,8 +563,10 @@ def _checked(field: Field) -> Field:
 
 
 def _volume(field: Field, clip: Volume | None, section: Volume | None) -> Volume | None:
-    """What the level sets are cut by: the clip, the domain where the field ends there or there is
-    no clip, and the section."""
+    """The intersection of the volumes that cut the level sets; None if there is none.
+
+    These are the clip, the section, and the domain of the field if the field ends there or there is
+    no clip."""
     ends = field.domain is not None and not (field.is_global and clip is not None)
     parts = dict.fromkeys((clip, field.domain if ends else None, section))
     kept = [one for one in parts if one is not None]
@@ -544,11 +581,16 @@ def _mesh_solid(
     solid: tuple[float, float] | Literal[True],
     asked: _MeshOptions,
 ) -> _RawMesh:
-    """The closed surface of a solid that is put together from smooth levels."""
+    """The closed surface of a solid, put together from meshes of smooth levels.
+
+    solid: True for the points of a `Solid`, or the interval of the values of f."""
     region = LevelFunction(*solid_and_level(field, solid, level), most_faces=asked.most_faces)
     evaluations = [0]
 
     def angle_mesher(error: float, cells: float) -> AngleMesher:
+        """A function that meshes level sets of angles. error: its tolerance. cells: its size of
+        cells."""
+
         def mesh_angle(angle: SolidAngle, value: float) -> TriangleMesh:
             angle = cast("SolidAngle", _checked(angle))
             box = _box(angle, (value,), None)
@@ -565,6 +607,7 @@ def _mesh_solid(
         _check_level(region, made, asked.tolerance.at(size), asked.volume)
 
     def check(made: TriangleMesh, size: float) -> None:
+        """Raise unless the mesh is a manifold near the level set."""
         check_manifold(made.faces, made.vertices)
         check_level(made, size)
 
@@ -599,10 +642,10 @@ def _mesh_level_set(field: Field, level: float | None, asked: _MeshOptions) -> _
     box = _box(field, (level,), volume)
     size = float((box.upper - box.lower).max())
     error = 0.5 * asked.tolerance.at(size)
-    cells = size / _ACROSS if asked.spacing is None else float(asked.spacing)
+    cells = size / _CELLS_ACROSS if asked.spacing is None else float(asked.spacing)
     if asked.spacing is None and field.min_wavelength is not None:
         cells = min(cells, field.min_wavelength / CELLS_PER_WAVE)
-    attempts = 1 if asked.spacing is not None else _MOST_ATTEMPTS
+    attempts = 1 if asked.spacing is not None else _MAX_ATTEMPTS
     if isinstance(field, SolidAngle):
         made, facts = _mesh_spanning_curve(
             function, box, error, cells, attempts, asked.seed, report
@@ -628,7 +671,14 @@ def _mesh_in_lattice(
     attempts: int,
     report: Callable[[str], None],
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The level set of a real-valued field in a box, in cells of a lattice."""
+    """The level set of a real-valued field in a box, and facts about it.
+
+    It is meshed in the cells of a lattice of size `spacing`. If that fails in a way that smaller
+    cells may mend, they are made smaller, with at most `attempts` attempts.
+
+    Raises:
+        MeshingError: the last attempt failed.
+    """
     before: MeshingError | None = None
     while True:
         report(f"cells of {spacing:.3g}")
@@ -642,11 +692,11 @@ def _mesh_in_lattice(
         except MeshingError as wrong:
             attempts -= 1
             if not attempts or not is_retry_promising(
-                wrong, before, CELL_REFINEMENT_FACTOR**attempts
+                error, before, CELL_REFINEMENT_FACTOR**attempts
             ):
                 raise
-            before, spacing = wrong, CELL_REFINEMENT_FACTOR * spacing
-            report(f"{wrong}; so smaller cells")
+            before, spacing = error, CELL_REFINEMENT_FACTOR * spacing
+            report(f"{error}; so smaller cells")
     facts = {
         "spacing": spacing,
         "evaluations": function.evaluations,
@@ -666,7 +716,7 @@ def _mesh_spanning_curve(
     seed: int,
     report: Callable[[str], None],
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The level set of an angle, which ends at its curve."""
+    """The level set of an angle, which ends at its curve, and facts about it."""
     ends = box.lower, box.upper
     made = mesh_spanning_curve(
         function, spacing, attempts, ends, box.has_walls, seed, tolerance, report
@@ -684,8 +734,10 @@ def _mesh_spanning_curve(
 
 @dataclass(frozen=True)
 class _MeshingBox:
-    """The box to be filled, from `lower` to `upper`, (3,) each, and whether the surface may end at
-    its faces."""
+    """The box in which a level set is meshed.
+
+    lower, upper: (3,) its corners.
+    has_walls: whether the surface may end at the faces of the box."""
 
     lower: FloatArray
     upper: FloatArray
@@ -693,10 +745,11 @@ class _MeshingBox:
 
 
 def _box(field: Field, levels: tuple[float, ...], volume: Volume | None) -> _MeshingBox:
-    """The box to be filled: around the level sets, if it has an extent, and the volume.
+    """The box in which level sets are meshed: around their extent, if they have one, and the
+        volume.
 
     Raises:
-        MeshingError: neither has bounds, or they have nothing in common.
+        MeshingError: neither has bounds, or they have no point in common.
     """
     extent, level = field.extent(levels), levels[0]
     if volume is None and extent is None and isinstance(field, SolidAngle):
@@ -732,8 +785,12 @@ def _box(field: Field, levels: tuple[float, ...], volume: Volume | None) -> _Mes
 
 
 def _around_curve(field: SolidAngle, extent: Volume | None, volume: Volume | None) -> _MeshingBox:
-    """Around the whole surface that a curve spans, which is cut later; or if that has no extent,
-    around the curve and the volume."""
+    """The box in which the surface of a curve is meshed. It contains the whole surface, which is
+    cut later; or, if the surface has no extent, the curve and the volume.
+
+    Raises:
+        MeshingError: the volume has no bounds.
+    """
     if extent is not None:
         return _MeshingBox(*_bounds_of(extent), False)
     assert volume is not None
@@ -742,11 +799,12 @@ def _around_curve(field: SolidAngle, extent: Volume | None, volume: Volume | Non
     lower, upper = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
     if not np.isfinite(upper - lower).all():
         raise MeshingError("the clip has no bounds: give a box or a ball")
-    pad = _ROOM * (upper - lower).max()
+    pad = _CURVE_MARGIN * (upper - lower).max()
     return _MeshingBox(lower - pad, upper + pad, True)
 
 
 def _bounds_of(volume: Volume | None) -> tuple[FloatArray, FloatArray]:
+    """The lower and the upper corner (3,) of the bounding box of a volume, which is not None."""
     assert volume is not None
     lower, upper = (np.array(end, np.float64) for end in volume.bounds())
     return lower, upper
