@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["WallThickness", "wall_thickness"]
 
 # Rays start this far below a face, relative to the mesh's size.
-_BELOW = 1e-6
+_START_DEPTH = 1e-6
 # The largest number of times that balls shrink; and the distance from the surface at which they
 # count as touching it.
 _MOST_ROUNDS, _TOUCHING = 30, 1e-6
@@ -118,46 +118,55 @@ def wall_thickness(part: Any, **options: Any) -> WallThickness:
 
 
 def _medial_diameters(solid: MeshSolid, start: FloatArray, normal: FloatArray) -> FloatArray:
-    """(k,) thickness at points of the surface with normals (k, 3)."""
+    """(k,) the thickness at points `start` (k, 3) of the surface of a solid, with outward unit
+    normals (k, 3): see `wall_thickness`.
+
+    A ball that touches the start begins as wide as the ray inwards is long. As long as the nearest
+    point of the surface to its center is inside of the ball and faces the start, the ball shrinks
+    to the one that touches this point as well."""
     size = solid.surface.size
-    below = _BELOW * size
+    below = _START_DEPTH * size
     # Not a fixed tolerance: rays into a small mesh would end where they start.
     hits: Any = trace(
         solid, start - below * normal, -normal,
         t_min=below, tolerance=0.1 * below, precision="double",
     )  # fmt: skip
     t = np.asarray(hits.t, np.float64) + below
-    width = np.where(np.isfinite(t), t, 2 * size)
+    diameter = np.where(np.isfinite(t), t, 2 * size)
     # Where that is already beyond the other side, the part is no thicker than the skipped length.
-    width[~_is_within(solid, start - 2 * below * normal)] = 2 * below
-    moving = np.arange(len(width))
+    diameter[~_is_within(solid, start - 2 * below * normal)] = 2 * below
+    shrinking = np.arange(len(diameter))
     for _ in range(_MOST_ROUNDS):
-        if not len(moving):
+        if not len(shrinking):
             break
-        p, n, r = start[moving], normal[moving], 0.5 * width[moving]
+        p, n, r = start[shrinking], normal[shrinking], 0.5 * diameter[shrinking]
         center = p - r[:, None] * n
-        distance, foot, towards = _nearest(solid, center)
+        distance, nearest, direction = _nearest(solid, center)
         # The ball is empty, or touches points that do not face the center.
         inside = distance < r * (1 - _TOUCHING)
-        shrinks = inside & (row_dots(towards, n) < _OPPOSITE)
-        away = p - foot
-        along = row_dots(away, n)
-        shrinks &= along > 0
-        smaller = row_dots(away, away)[shrinks] / (2 * along[shrinks])
-        width[moving[shrinks]] = np.minimum(width[moving[shrinks]], 2 * smaller)
-        moving = moving[shrinks]
-    return width
+        shrinks = inside & (row_dots(direction, n) < _OPPOSITE)
+        to_start = p - nearest
+        depth = row_dots(to_start, n)
+        shrinks &= depth > 0
+        radius = row_dots(to_start, to_start)[shrinks] / (2 * depth[shrinks])
+        diameter[shrinking[shrinks]] = np.minimum(diameter[shrinking[shrinks]], 2 * radius)
+        shrinking = shrinking[shrinks]
+    return diameter
 
 
 def _is_within(solid: MeshSolid, points: FloatArray) -> BoolArray:
+    """(k,) whether points (k, 3) are inside of the solid."""
     backend = choose_backend("double")
     value = solid.prepare(backend).evaluate(to_vector3(backend, points)).value
     return np.asarray(to_numpy(value) < 0)
 
 
 def _nearest(solid: MeshSolid, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Distances (k,) to the surface from points within, the nearest points (k, 3), and the
-    directions towards them (k, 3)."""
+    """The points of the surface that are nearest to points (k, 3) inside of it.
+
+    Returns:
+        Their distances (k,); the points (k, 3); and the unit vectors (k, 3) towards them.
+    """
     backend = choose_backend("double")
     sample = solid.prepare(backend).evaluate(to_vector3(backend, points))
     value, gradient = to_numpy(sample.value), to_numpy(sample.gradient)

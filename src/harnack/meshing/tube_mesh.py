@@ -23,12 +23,13 @@ if TYPE_CHECKING:
 __all__ = ["tube_manifold"]
 
 _MOST_VERTICES = 4_000_000
-# The largest error of polylines, relative to the tolerance.
-_LEFT_OUT = 0.25
+# By how much polylines may be simplified, relative to the tolerance.
+_SIMPLIFY_SHARE = 0.25
 # The smallest number of points around, also for wires far thinner than the tolerance.
 _LEAST_AROUND = 8
-# An edge leads back where the cosine of its turn is less than this above -1.
-_BACK = 1e-9
+# An edge leads back along the edge before if the cosine of the angle between them is at most -1 plus
+# this.
+_REVERSAL = 1e-9
 
 
 def tube_manifold(tube: Tube, level: float, tolerance: float) -> Manifold:
@@ -57,7 +58,8 @@ def tube_manifold(tube: Tube, level: float, tolerance: float) -> Manifold:
     step = math.sqrt(3 * tolerance / radius)
     segments = max(_LEAST_AROUND, math.ceil(2 * math.pi / step))
     waiting = [
-        _simpler(polyline, _LEFT_OUT * tolerance) for polyline in np.split(tube.points, tube.starts)
+        _simpler(polyline, _SIMPLIFY_SHARE * tolerance)
+        for polyline in np.split(tube.points, tube.starts)
     ]
     parts: list[Manifold] = []
     vertices = 0
@@ -81,24 +83,26 @@ def tube_manifold(tube: Tube, level: float, tolerance: float) -> Manifold:
 
 
 def _is_apart(surface: TriangleMesh) -> bool:
-    """Whether no faces pass through each other."""
+    """Whether no faces of a mesh pass through each other."""
     return not len(intersecting_faces(surface.vertices, surface.faces))
 
 
 def _simpler(points: FloatArray, length: float) -> FloatArray:
-    """A polyline (n, 3) without vertices that are within a length of the edges that replace them
-    (Douglas and Peucker 1973). Proof that all of these edges are as near to the polyline: the
-    points on an edge that are nearest to the replaced part of the polyline go from one of the
-    edge's ends to the other."""
+    """A polyline (n, 3) without the vertices that are within `length` of the edges that replace
+    them (Douglas and Peucker 1973).
+
+    Conversely, all points of these edges are within `length` of the old polyline. Proof. The point
+    of an edge that is nearest to a point of the replaced part moves from one end of the edge to the
+    other as the point runs along that part. So it passes every point of the edge."""
     is_kept = np.zeros(len(points), np.bool_)
     is_kept[[0, -1]] = True
     waiting = [(0, len(points) - 1)]
     while waiting:
         first, last = waiting.pop()
-        side, away = points[last] - points[first], points[first + 1 : last] - points[first]
-        square = float(side @ side)
-        fraction = (away @ side / square if square > 0 else np.zeros(len(away))).clip(0, 1)
-        distance = row_norms(away - fraction[:, None] * side)
+        edge, offsets = points[last] - points[first], points[first + 1 : last] - points[first]
+        square = float(edge @ edge)
+        fraction = (offsets @ edge / square if square > 0 else np.zeros(len(offsets))).clip(0, 1)
+        distance = row_norms(offsets - fraction[:, None] * edge)
         if not len(distance) or (square > 0 and distance.max() <= length):
             continue
         middle = first + 1 + int(distance.argmax())
@@ -109,23 +113,25 @@ def _simpler(points: FloatArray, length: float) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Sweep:
-    """A polyline (n, 3) with a radius, and the number of points around it."""
+    """A polyline that a ring of points is swept along.
+
+    radius: of the tube. around: the number of points of each ring. points: (n, 3) the polyline."""
 
     radius: float
     around: int
     points: FloatArray
 
     def surface(self) -> TriangleMesh | None:
-        """The surface of rings of points one after the other; None where a line along an edge would
-        end before it begins."""
+        """The surface through the rings of points. None if an edge leads back along the edge
+        before, or is too short for its corners: some line along it would end before it begins."""
         points, sides = self.points, np.diff(self.points, axis=0)
         edges = sides / np.abs(sides).max(axis=1)[:, None]  # squares of small ones underflow
         edges /= row_norms(edges)[:, None]
         is_closed = len(edges) > 2 and bool((points[0] == points[-1]).all())
-        swung = self._transported(edges, is_closed=is_closed)
-        if swung is None:
+        result = self._transported(edges, is_closed=is_closed)
+        if result is None:
             return None
-        frames, shift = swung
+        frames, shift = result
         turns = itertools.pairwise([*edges, edges[0]] if is_closed else edges)
         corners = [
             self._corner(point, turn, self._directions(end))
@@ -143,15 +149,22 @@ class _Sweep:
         return self._joined(np.concatenate(rings), shift if is_closed else None)
 
     def _directions(self, frame: FloatArray) -> FloatArray:
-        """(around, 3) unit vectors in the plane of a frame, at equal angles."""
+        """(around, 3) unit vectors at equal angles in the plane of a frame, two orthonormal vectors
+        (2, 3)."""
         angle = 2 * math.pi * np.arange(self.around) / self.around
         return np.cos(angle)[:, None] * frame[0] + np.sin(angle)[:, None] * frame[1]
 
     def _corner(
         self, point: FloatArray, turn: tuple[FloatArray, FloatArray], directions: FloatArray
     ) -> FloatArray:
-        """Rings (k, around, 3) where two edges meet: lines along them meet in the plane between
-        them on the inner side, and arcs of the ball lead from one to the other on the outer."""
+        """Rings (k, around, 3) of points where two edges meet.
+
+        turn: the unit vectors of the edge before and of the edge after. directions: those of the
+            ring before the corner.
+
+        On the inner side, lines along the edges meet in the plane between them, in a single point.
+        On the outer side, arcs of the ball around the point lead from one edge to the other; k is
+        the number of points of these arcs."""
         before, after = turn
         cosine, across = float(before @ after), after - (before @ after) * before
         sine = float(np.linalg.norm(across))
@@ -170,17 +183,24 @@ class _Sweep:
         return point + self.radius * np.where((component > 0)[:, None], inner, turned)
 
     def _end(self, point: FloatArray, axis: FloatArray, frame: FloatArray, sign: int) -> FloatArray:
-        """Rings from the pole of a half ball to its rim, or in the reverse order at the last
-        point."""
+        """Rings (k, around, 3) of the half ball that closes an end of the tube.
+
+        axis: the unit vector of the edge. frame: orthonormal vectors across it.
+        sign: -1 at the first point, where rings go from the pole to the rim; 1 at the last point,
+            where they go from the rim to the pole."""
         count = math.ceil(0.25 * self.around)
         angle = 0.5 * math.pi * np.arange(count + 1)[:, None, None] / count
         rings = np.cos(angle) * self._directions(frame) + sign * np.sin(angle) * axis
         return point + self.radius * (rings if sign > 0 else rings[::-1])
 
     def _joined(self, rings: FloatArray, shift: int | None) -> TriangleMesh:
-        """The mesh of faces between neighbors of rings (k, around, 3), without faces with equal
-        corners. shift: the amount by which the indices around grow from the last ring to the first;
-        None if the ends are poles."""
+        """The mesh with faces between neighboring rings. rings: (k, around, 3).
+
+        shift: for a closed polyline, by how much the index around grows from the last ring to the
+            first; None for a polyline with two ends, whose first and last rings are single points.
+
+        Corners that are equal in neighboring rings are one vertex, and faces without three
+        different vertices are left out."""
         count, n = len(rings), self.around
         row, column = np.mgrid[: count - 1 if shift is None else count, :n].reshape(2, -1)
         moved = np.where(row == count - 1, shift or 0, 0)
@@ -201,16 +221,23 @@ class _Sweep:
     def _transported(
         self, edges: FloatArray, *, is_closed: bool
     ) -> tuple[list[tuple[FloatArray, FloatArray]], int] | None:
-        """Two unit vectors (2, 3) across each edge, at its start and its end, turned as the edges
-        turn; for a closed polyline they also turn a little about the edges, so that the indices
-        around agree at the last and the first edge up to a shift. None where an edge leads back
-        along the edge before."""
+        """Two orthonormal vectors across each edge, turned from edge to edge as the edges turn.
+
+        edges: (n, 3) unit vectors.
+
+        Returns:
+            For each edge the vectors (2, 3) at its start and at its end; and a shift. For a closed
+            polyline, the vectors also turn a little about the edges, so that the rings of the last
+            and the first edge coincide if the index around grows by the shift. Otherwise they are
+            the same at both ends, and the shift is 0. None if an edge leads back along the edge
+            before.
+        """
         first = np.cross(edges[0], np.eye(3)[np.abs(edges[0]).argmin()])
         first /= np.linalg.norm(first)
         across = [first]
         for before, after in itertools.pairwise([*edges, edges[0]] if is_closed else edges):
             cosine = float(before @ after)
-            if cosine <= -1 + _BACK:
+            if cosine <= -1 + _REVERSAL:
                 return None
             # The rotation that takes one edge's direction to the next.
             axis, u = np.cross(before, after), across[-1]
@@ -230,6 +257,6 @@ class _Sweep:
 
 
 def _spun(frame: FloatArray, angle: float) -> FloatArray:
-    """The frame, turned by an angle in its plane."""
+    """A frame, two orthonormal vectors (2, 3), turned by an angle in its plane."""
     c, s = math.cos(angle), math.sin(angle)
     return np.stack([c * frame[0] + s * frame[1], c * frame[1] - s * frame[0]])
