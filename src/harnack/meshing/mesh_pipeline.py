@@ -535,12 +535,12 @@ def _check_level(
 
 
 def _checked(field: Field) -> Field:
-    """The field, if it can be meshed; a `SolidAngle` without its circles' data.
+    """The field, if it can be meshed. A `SolidAngle` is made anew from its loops.
 
     Raises:
-        TypeError: it has patches, jumps that signs cannot handle, circles, or values that are
-            angles
-            without a known curve.
+        TypeError: it has patches, circles, jumps that meshing by signs does not handle, or values
+            that
+            are angles although it is no `SolidAngle`.
     """
     check_is_field(field)
     if field.has_patches or (field.has_jumps and not uses_sign_meshing(field)):
@@ -692,11 +692,11 @@ def _mesh_in_lattice(
         except MeshingError as wrong:
             attempts -= 1
             if not attempts or not is_retry_promising(
-                error, before, CELL_REFINEMENT_FACTOR**attempts
+                wrong, before, CELL_REFINEMENT_FACTOR**attempts
             ):
                 raise
-            before, spacing = error, CELL_REFINEMENT_FACTOR * spacing
-            report(f"{error}; so smaller cells")
+            before, spacing = wrong, CELL_REFINEMENT_FACTOR * spacing
+            report(f"{wrong}; so smaller cells")
     facts = {
         "spacing": spacing,
         "evaluations": function.evaluations,

@@ -24,11 +24,11 @@ __all__ = ["tube_manifold"]
 
 _MOST_VERTICES = 4_000_000
 # By how much polylines may be simplified, relative to the tolerance.
-_SIMPLIFY_SHARE = 0.25
+_SIMPLIFY = 0.25
 # The smallest number of points around, also for wires far thinner than the tolerance.
 _LEAST_AROUND = 8
-# An edge leads back along the edge before if the cosine of the angle between them is at most -1 plus
-# this.
+# An edge leads back along the edge before if the cosine of the angle between them is at most -1
+# plus this.
 _REVERSAL = 1e-9
 
 
@@ -58,8 +58,7 @@ def tube_manifold(tube: Tube, level: float, tolerance: float) -> Manifold:
     step = math.sqrt(3 * tolerance / radius)
     segments = max(_LEAST_AROUND, math.ceil(2 * math.pi / step))
     waiting = [
-        _simpler(polyline, _SIMPLIFY_SHARE * tolerance)
-        for polyline in np.split(tube.points, tube.starts)
+        _simpler(polyline, _SIMPLIFY * tolerance) for polyline in np.split(tube.points, tube.starts)
     ]
     parts: list[Manifold] = []
     vertices = 0
