@@ -30,14 +30,14 @@ from harnack.tree.triangle_tree import TriangleTree, triangle_records
 __all__ = ["boundary_of_solid", "neighbors", "passes_itself"]
 
 _LEAF_SIZE = 4
-# Relative to the mesh's size: pieces thinner than the first are not tested for winding numbers
-# beside them; corners nearer than the second are joined.
+# Relative to the mesh's size: winding numbers beside pieces thinner than the first are not used;
+# corners nearer to each other than the second are joined.
 _THIN, _SAME = 1e-9, 1e-11
-# Faces around an edge have the same direction if the angle between them, in full turns, is less
-# than this.
-_SAME_TURN = 1e-9
-# How often edges are halved at corners on them.
-_MOST_HALVINGS = 200
+# Two faces around an edge count as having the same direction if the angle between them, as a
+# fraction of a full turn, is less than this.
+_TURN = 1e-9
+# The largest number of rounds in which edges are cut at corners on them.
+_MAX_ROUNDS = 200
 
 
 def passes_itself(surface: TriangleMesh, number: IntArray) -> bool:
@@ -90,13 +90,16 @@ def boundary_of_solid(vertices: FloatArray, faces: IntArray) -> TriangleMesh:
 
 @dataclass(frozen=True)
 class _Cut:
-    """Pieces (k, 3, 3) of some faces of a mesh, cut along each other, in coordinates of at most
-    about one: center + size times these are the original coordinates.
+    """Some faces of a mesh, cut along each other, and the winding numbers beside the pieces.
 
-    unit: (n, 3) vertices. faces: the faces that were cut; owner: (k,) the face of the mesh that
-        each piece is of. front, back: (k,) winding numbers on its sides. is_thick: (k,) whether
-        these are known.
-    """
+    Lengths are scaled so that coordinates are at most about one: center + size * x is the original
+    position of x.
+
+    rays: a tree of the faces that were cut. unit: (n, 3) the vertices of the mesh.
+    faces: (j, 3) the faces that were cut. pieces: (k, 3, 3).
+    owner: (k,) the face of the mesh that each piece is a part of.
+    front, back: (k,) the winding numbers on the two sides of each piece.
+    is_thick: (k,) whether a piece is thick enough for these numbers to be right."""
 
     rays: TriangleTree
     unit: FloatArray
@@ -113,8 +116,10 @@ class _Cut:
     def of(
         cls, vertices: FloatArray, faces: IntArray, rows: IntArray, closed: IntArray | None = None
     ) -> _Cut:
-        """The pieces of the faces `rows`. closed: all faces, with those without an area, if there
-        are such faces."""
+        """Cut the faces `rows` (indices) of a mesh along each other.
+
+        closed: all faces of the mesh, including those without an area, if `faces` lacks these;
+            winding numbers are counted with it."""
         corner = vertices[faces]
         low, high = corner.min(axis=(0, 1)), corner.max(axis=(0, 1))
         size = float(2.0 ** np.ceil(np.log2(0.5 * float((high - low).max()))))
@@ -132,9 +137,10 @@ class _Cut:
         )
 
     def is_there_before(self) -> BoolArray:
-        """(k,) which pieces lie on a face that precedes their own, in one plane, if all faces were
-        cut: of several pieces in one place a single one is enough."""
-        is_there = np.zeros(len(self.pieces), np.bool_)
+        """(k,) which pieces lie on a face with a lower index than their own, in the same plane. Of
+        several pieces at one place only that of the lowest face is needed. All faces have to be
+        cut."""
+        is_repeated = np.zeros(len(self.pieces), np.bool_)
         covered, covering = overlapping_faces(self.rays, self.unit, self.faces)
         covered, covering = covered[covering < covered], covering[covering < covered]
         order = np.argsort(self.owner, kind="stable")
@@ -142,19 +148,20 @@ class _Cut:
             np.searchsorted(self.owner[order], covered, side=side) for side in ("left", "right")
         )
         count = end - start
-        past = np.cumsum(count) - count
-        rows = order[np.arange(int(count.sum())) + np.repeat(start - past, count)]
+        offset = np.cumsum(count) - count
+        rows = order[np.arange(int(count.sum())) + np.repeat(start - offset, count)]
         triangle = self.unit[self.faces[np.repeat(covering, count)]]
         middle, normal = self.pieces[rows].mean(axis=1), area_normals(triangle)
         within = np.ones(len(rows), np.bool_)
         for i, j in ((0, 1), (1, 2), (2, 0)):
             inward = np.cross(normal, triangle[:, j] - triangle[:, i])
             within &= row_dots(inward, middle - triangle[:, i]) > 0
-        is_there[rows[within]] = True
-        return is_there
+        is_repeated[rows[within]] = True
+        return is_repeated
 
 
 def _rays(scaled: FloatArray, faces: IntArray) -> TriangleTree:
+    """A tree of the faces (m, 3) between the vertices `scaled` (n, 3), in double precision."""
     tree = build_balanced_tree(scaled[faces].mean(axis=1), leaf_size=_LEAF_SIZE)
     return TriangleTree.of(choose_backend("double"), tree, triangle_records(scaled, faces))
 
@@ -163,15 +170,18 @@ def _rays(scaled: FloatArray, faces: IntArray) -> TriangleTree:
 
 
 def _cut_at_corners(x: FloatArray, faces: IntArray) -> IntArray:
-    """Faces, cut until every edge is run as often in one direction as in the other. Edges for which
-    that fails are cut at a corner of such edges that lies on them, of several the corner nearest to
-    the middle.
+    """Cut faces until every edge is run as often in one direction as in the other.
+
+    x: (n, 3) the vertices. An edge for which that fails is cut at an end of another such edge that
+    lies on it; of several, at the one nearest to its middle.
+
+    Returns the faces.
 
     Raises:
-        MeshingError: they do not fit together.
+        MeshingError: the pieces do not fit together.
     """
     edges, _ = singular_edges(faces)
-    for _ in range(_MOST_HALVINGS):
+    for _ in range(_MAX_ROUNDS):
         if not len(edges):
             return faces
         edges = np.unique(np.sort(edges, axis=1), axis=0)
@@ -197,8 +207,12 @@ def _cut_at_corners(x: FloatArray, faces: IntArray) -> IntArray:
 
 
 def _corners_on(x: FloatArray, edges: IntArray) -> tuple[IntArray, BoolArray]:
-    """For each of edges (k, 2) the end of another edge that lies on it, nearest to its middle; and
-    whether there is such an end."""
+    """For each of the edges (k, 2), the end of another edge that lies on it, if there is one; of
+    several, the one nearest to its middle.
+
+    Returns:
+        The vertices (k,), 0 where there is none; and the mask (k,) of edges that have one.
+    """
     import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial
@@ -239,37 +253,41 @@ def neighbors(x: FloatArray, faces: IntArray) -> IntArray:
 
 
 def _wedges(ends: FloatArray, third: FloatArray, is_along: BoolArray) -> IntArray:
-    """(k, 2) which faces around an edge have material between them.
+    """Pairs (k, 2) of faces around an edge that have material between them.
 
-    ends: (2, 3) of the edge. third: (n, 3) the other corners of its faces; is_along: (n,) whether
-        they run it from the first end to the second.
+    ends: (2, 3) the ends of the edge. third: (n, 3) the third corners of its faces.
+    is_along: (n,) whether a face runs the edge from the first end to the second.
 
-    Seen against the edge's direction, counter-clockwise, material begins behind a face that runs
-    the edge backwards, since its positive side looks back, and ends at the next one that runs it
-    forwards. Of faces in the same direction, faces at which material ends come first.
-    """
+    Faces are visited counter-clockwise, as seen against the direction of the edge. Material begins
+    behind a face that runs the edge backwards, since the front of the face looks back, and ends at
+    the next face that runs it forwards. Of faces in the same direction, those at which material
+    ends come first."""
     direction = ends[1] - ends[0]
     away = third - ends[0]
     away -= np.outer(away @ direction / (direction @ direction), direction)
     across: Any = away[0] / max(float(np.linalg.norm(away[0])), 1e-300)
     upright: Any = np.cross(direction / float(np.linalg.norm(direction)), across)
     turns: FloatArray = np.arctan2(away @ upright, away @ across) / (2 * np.pi)
-    steps: IntArray = np.round(turns / _SAME_TURN).astype(np.int64) % round(1 / _SAME_TURN)
-    begun, wedges = list[int](), list[tuple[int, int]]()
+    steps: IntArray = np.round(turns / _TURN).astype(np.int64) % round(1 / _TURN)
+    opened, wedges = list[int](), list[tuple[int, int]]()
     is_taken = np.zeros(len(third), np.bool_)
     for k in 2 * np.lexsort((~is_along, steps)).tolist():  # twice around
         if is_taken[k]:
             continue
-        if not is_along[k] and k not in begun:
-            begun.append(k)
-        elif is_along[k] and begun:
-            wedges.append((begun.pop(), k))
+        if not is_along[k] and k not in opened:
+            opened.append(k)
+        elif is_along[k] and opened:
+            wedges.append((opened.pop(), k))
             is_taken[list(wedges[-1])] = True
     return np.array(wedges, np.int64).reshape(-1, 2)
 
 
 def _apart_at_contacts(x: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
-    """A closed surface in which each sheet has corners of its own where sheets touch."""
+    """Give each sheet vertices of its own where sheets of a closed surface touch. Returns the
+    vertices and the faces.
+
+    At each vertex, corners of faces that are connected by edges form a fan, and each fan gets a
+    vertex."""
     m = len(faces)
     edge, opposite = neighbors(x, faces).T
     # Corner k of face i is k m + i, and edge k runs from it to the next.
