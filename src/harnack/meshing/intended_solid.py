@@ -60,14 +60,14 @@ _OPEN_SHARE = 0.4
 
 @dataclass(frozen=True)
 class Difference:
-    """How a surface differs from the input of the repair.
+    """How the result of a repair differs from the input.
 
-    share: the fraction of the compared points that are on the wrong side.
-    places: (k, 3), a selection of these points.
-    missing: the number of points that should be inside, and are not; added: the reverse.
-    volumes: of the surface and of the closed mesh that bounds its solid once; None if they are
-        equal, or if the mesh does not bound its solid once.
-    """
+    share: the fraction of the compared points that are on the wrong side of the surface.
+    places: (k, 3) some of these points.
+    missing: the number of points that should be inside, and are not.
+    added: the number of points that should not be inside, and are.
+    volumes: of the surface, and of the input. None if they agree, or if the input is not a closed
+        mesh that winds around every point at most once."""
 
     share: float
     places: FloatArray
@@ -77,8 +77,8 @@ class Difference:
 
     @property
     def badness(self) -> float:
-        """A number to compare surfaces by: the surface with the smaller number is nearer to the
-        input."""
+        """A number by which results are compared: the smaller it is, the nearer is the surface to
+        the input."""
         volume_error = 0.0
         if self.volumes is not None:
             new, intended = self.volumes
@@ -122,14 +122,15 @@ class IntendedSolid:
 
     @classmethod
     def of(cls, mesh: Any, *, as_it_is: bool = False) -> IntendedSolid:
-        """The solid of any object with vertices and faces, which may have no area.
+        """The solid that a mesh is meant to bound.
 
-        Corners apart by rounding are joined. Then each closed part that is inside out is turned
-        over, with all that lies in it. So are the faces that are not closed and lie in no closed
-        part, with all that lies in them, if they wind around more points clockwise than
+        mesh: any object with vertices and faces; faces may have no area.
+        as_it_is: whether to reverse no faces.
+
+        Corners that differ by rounding are joined. Then each closed part that is inside out is
+        reversed, with all that lies in it. The faces that are not closed and lie in no closed part
+        are reversed, with all that lies in them, if they wind around more points clockwise than
         counter-clockwise.
-
-        as_it_is: turn nothing over.
 
         Raises:
             MeshError: as `validate_mesh`.
@@ -162,16 +163,16 @@ class IntendedSolid:
 
     @functools.cached_property
     def size(self) -> float:
-        """The longest side of the box."""
+        """The longest side of the mesh's bounding box."""
         return float(np.ptp(self.vertices[self.oriented], axis=(0, 1)).max())
 
     @functools.cached_property
     def field(self) -> WindingNumber | None:
-        """The winding number, or None where all faces cancel."""
+        """The winding number of the mesh; None if all faces cancel each other."""
         return _winding_number(self.vertices, self.oriented)
 
     def winding(self, points: FloatArray) -> FloatArray:
-        """(k,) the winding number at points (k, 3)."""
+        """(k,) the winding numbers of the mesh at points (k, 3)."""
         return _values(self.field, points)
 
     @functools.cached_property
@@ -201,10 +202,13 @@ class IntendedSolid:
         return points, self.winding(points)
 
     def check_encloses(self) -> None:
-        """Raise if so much of the area has nothing inside, on neither side, that it is no solid.
+        """Raise if the mesh is an open sheet.
+
+        At points spread over the faces it is tested whether the winding number on either side is at
+        least 1/2. The mesh is an open sheet if that fails on more than 40 % of its area.
 
         Raises:
-            MeshError: it is no solid.
+            MeshError: it is an open sheet.
         """
         rng = np.random.default_rng(0)
         corner = self.vertices[self.oriented]
@@ -382,7 +386,10 @@ def _lies_in(x: FloatArray, faces: IntArray, container: IntArray) -> bool:
 
 
 def _winds_clockwise(x: FloatArray, faces: IntArray) -> bool:
-    """Whether a mesh winds around more points clockwise than counter-clockwise."""
+    """Whether a mesh winds around more points clockwise than counter-clockwise, of points near it.
+
+    Nearly all faces of an ordinary mesh look away from its middle. Then the signed volumes of the
+    tetrahedra between faces and middle decide, without winding numbers."""
     rng = np.random.default_rng(0)
     triangles = x[faces]
     size = float(np.ptp(triangles, axis=(0, 1)).max())

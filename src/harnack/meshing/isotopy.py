@@ -69,17 +69,17 @@ _FAR_FROM_CURVE = 1.5
 
 @dataclass(frozen=True)
 class IsotopyCoverage:
-    """The fractions of tetrahedra, among those that may hold a point of the level set or hold a
-    point of the mesh, on which the topology is proved.
+    """On which part of the tetrahedra the topology of a mesh is proved to be that of the level set.
 
-    proved: the fraction of all where (a), (b) or (c) is proved. If it is 1, mesh and level set are
-        isotopic.
-    proved_off_curve: the fraction of those farther than 1.5 cells from the curve.
-    count: the number of tetrahedra; for fields that do not bound the changes of their gradient only
-        of those that hold a point of the mesh.
-    unproved_off_curve: (k, 4) the corners of those farther than 1.5 cells from the curve where
-        nothing is proved.
-    """
+    Only tetrahedra count that may hold a point of the level set, or that hold a point of the mesh.
+
+    proved: the fraction of these on which (a), (b) or (c) is proved. If it is 1, the mesh and the
+        level set are isotopic.
+    proved_off_curve: the same fraction among those farther than 1.5 cells from the curve.
+    count: the number of these tetrahedra. For fields that do not bound the change of their gradient
+        only those that hold a point of the mesh are counted.
+    unproved_off_curve: (k, 4) the corners of the tetrahedra farther than 1.5 cells from the curve
+        on which nothing is proved."""
 
     proved: float
     proved_off_curve: float
@@ -87,7 +87,7 @@ class IsotopyCoverage:
     unproved_off_curve: IntArray
 
     def shares(self) -> dict[str, float]:
-        """The fractions, for the metadata of a mesh."""
+        """The two fractions, by the names that they have in the metadata of a mesh."""
         return {"isotopy": self.proved, "isotopy_far": self.proved_off_curve}
 
 
@@ -156,7 +156,7 @@ def _share(proved: BoolArray) -> float:
 
 
 def _balls(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Centers (n, 3) and radii (n,) of balls around simplices (n, k, 3)."""
+    """Balls around simplices (n, k, 3): centers (n, 3) and radii (n,)."""
     center = corners.mean(axis=1)
     return center, np.linalg.norm(corners - center[:, None], axis=2).max(axis=1)
 

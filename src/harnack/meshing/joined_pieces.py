@@ -41,16 +41,16 @@ _MAX_ROUNDS = 200
 
 
 def passes_itself(surface: TriangleMesh, number: IntArray) -> bool:
-    """Whether a closed surface none of whose triangles pass through others does so along edges that
-    lie on faces, where nothing passes through a triangle.
+    """Whether a closed surface passes through itself along edges that lie on its faces.
 
+    surface: none of its triangles pass through each other's inside.
     number: (m,) the number of the connected component that each face belongs to.
 
-    Proof. Where one sheet passes through another, each is cut in two, with winding numbers on both
-    sides of one part that are larger by one than those of the other. So the winding numbers beside
-    pieces of faces that touch others are not the same all over a connected component. Where no
-    sheet passes through it they are: they change at no other place.
-    """
+    Proof. Where one sheet passes through another, each is cut in two, and the winding numbers on
+    both sides of one of the two parts are larger by one than those of the other part. So the
+    winding numbers beside pieces of faces that touch others are not the same all over a connected
+    component. Where no sheet passes through the surface they are the same: they change at no other
+    place."""
     pairs, _ = touching_pairs(surface.vertices, surface.faces)
     if not len(pairs):
         return False
@@ -61,13 +61,13 @@ def passes_itself(surface: TriangleMesh, number: IntArray) -> bool:
 
 
 def boundary_of_solid(vertices: FloatArray, faces: IntArray) -> TriangleMesh:
-    """The boundary of the points around which a closed mesh winds at least once; it may wind around
-    others clockwise. Where the boundary touches itself each sheet has corners of its own.
+    """The boundary of the set of points around which a closed mesh winds at least once.
 
-    Corners of the mesh are as they were, bit by bit.
+    The mesh may wind around other points clockwise. Vertices of the mesh that are left are
+    unchanged, bit by bit. Where the boundary touches itself, each sheet has vertices of its own.
 
     Raises:
-        MeshingError: there are no such points, or pieces do not fit together.
+        MeshingError: there are no such points, or the pieces do not fit together.
     """
     x, proper_faces = without_zero_area_faces(vertices, faces)
     cut = _Cut.of(x, proper_faces, np.arange(len(proper_faces)), closed=faces)
@@ -238,8 +238,10 @@ def _corners_on(x: FloatArray, edges: IntArray) -> tuple[IntArray, BoolArray]:
 
 
 def neighbors(x: FloatArray, faces: IntArray) -> IntArray:
-    """(k, 2) pairs of `half_edges` at which two faces belong together: the two at an edge of two
-    faces, and at an edge of more faces those that have the material between them."""
+    """(k, 2) pairs of `half_edges` at which two faces belong together.
+
+    At an edge of two faces these are the two. At an edge of more faces, they are those that have
+    material between them (`_wedges`). x: (n, 3) the vertices."""
     pairs, m = half_edges(faces), len(faces)
     edges = Edges.of(pairs)
     beside = [edges.paired_half_edges()]

@@ -125,21 +125,24 @@ def check_no_missed_parts(
     box: tuple[FloatArray, FloatArray],
     elsewhere: Clearance | None = None,
 ) -> None:
-    """Raise if the level set has parts, two cells long or longer, away from its triangles: thin
-    walls, knife edges, islands.
+    """Raise if the mesh of a level set misses parts that are at least two cells long: thin walls,
+    sharp edges, islands.
 
-    Signs at the points of a lattice do not show a wall between two of them. Newton's method,
-    started at these points, finds its sides: the end point, on the level, should be near triangles.
-    These points are a dense sample, and no proof. Islands smaller than a cell may be missed.
+    points, samples: points (n, 3) of a lattice, and the function there.
+    is_beside: (n,) which points are corners of tetrahedra that the mesh cuts.
+    surface: the vertices and faces of the mesh.
+    size: of a cell, a length.
+    box: the lower and the upper corner of the box in which the level set counts.
+    elsewhere: the radius of a ball around each point within which the level set does not count.
 
-    samples: at points (n, 3) of the lattice. is_beside: (n,) which points are corners of cut
-        tetrahedra.
-    surface: vertices and faces. size: of a cell. box: where the level set counts; elsewhere: the
-        radius around points within which it does not count.
+    The signs at the points of a lattice do not show a wall between two points. Newton's method,
+    started at points beside the wall, finds the sides of the wall: it ends on the level set, where
+    there should be triangles nearby. These end points are a dense sample, but no proof. Islands
+    smaller than a cell may be missed.
 
     Raises:
-        MissedPartsError: parts are missed; with points of the longest. UnrefinableError: the
-            function equals its level in a volume, or touches it along a surface.
+        MissedPartsError: parts are missed; it has points of the longest part. UnrefinableError: the
+        function equals its level in a volume, or touches it along a surface.
     """
     import scipy.spatial  # imported here: it takes half a second
 
@@ -284,16 +287,16 @@ def _longest_part(x: FloatArray, max_gap: float) -> FloatArray:
 def check_estimated_triangles(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float
 ) -> None:
-    """Raise if refinement of these triangles is estimated to make more triangles than the function
-    allows.
+    """Raise if refinement to the tolerance would make more triangles than the function allows, by
+    an estimate.
 
-    The distance of the middle of a triangle from the surface falls with its area: a triangle that
-    is k times the tolerance away is refined to about k triangles. A selection of triangles is
-    examined.
+    The distance of the midpoints of a triangle's edges from the surface falls with the triangle's
+    area. So a triangle with a distance of k tolerances is refined to about k triangles. A selection
+    of triangles is examined.
 
     Raises:
-        MeshingError: the function has no slope between the vertices.
-        TriangleLimitError: the estimate exceeds the limit; with a tolerance that would suffice.
+        MeshingError: the gradient is 0 at the midpoint of an edge. TriangleLimitError: the estimate
+        exceeds the limit. The message says which tolerance would do.
     """
     sampled = faces[:: max(1, len(faces) // 20_000)]
     if not len(sampled):
@@ -333,8 +336,7 @@ class TriangleMesh:
     """A triangle mesh.
 
     vertices: (n, 3).
-    faces: (m, 3), counter-clockwise as seen from where f is greater.
-    """
+    faces: (m, 3) the vertices of each face, counter-clockwise as seen from where f is larger."""
 
     vertices: FloatArray
     faces: IntArray
@@ -354,11 +356,11 @@ class TriangleMesh:
 
 @dataclass(frozen=True)
 class IrrelevantRegion:
-    """The region where a surface need not be meshed, because other operands remove it.
+    """A region in which a surface need not be meshed, because other operands remove it.
 
-    clearance: radii of balls about points (k, 3) that lie in the region.
-    cached_cells: for each lattice, the cells that are not proved to lie in the region.
-    """
+    clearance: from points (k, 3) to the radii of balls around them that lie in the region.
+    cached_cells: for each lattice, the indices of the cells that are not proved to lie in the
+        region."""
 
     clearance: Clearance
     cached_cells: dict[tuple[float, ...], IntArray] = dataclasses.field(
@@ -366,8 +368,8 @@ class IrrelevantRegion:
     )
 
     def relevant_cells(self, lattice: BccLattice, most: int) -> IntArray:
-        """Indices (n, 3) of the cells that are not proved to lie in the region, and of a border of
-        cells around them.
+        """The indices (n, 3) of the cells that are not proved to lie in the region, and of cells
+        around them, in a border two cells wide. most: as for `BccLattice.nonempty_cells`.
 
         Raises:
             MeshingError: there are more cells than `most` triangles take.
@@ -384,14 +386,17 @@ class IrrelevantRegion:
 def mesh_open_surface(
     function: LevelFunction, lattice: BccLattice, tolerance: float, report: Callable[[str], None]
 ) -> tuple[TriangleMesh, IsotopyCoverage]:
-    """The mesh of the level set in the box of a lattice, which ends on the box's faces; and its
-    proved isotopy, before it is refined.
+    """Mesh the level set in the box of a lattice; the mesh ends on the faces of the box.
 
-    tolerance: of the middles of edges and faces, a length.
+    tolerance: a length, the largest distance of the midpoints of edges and of the centers of faces
+        from the level set.
+
+    Returns:
+        The mesh; and on which part of the tetrahedra its topology is proved, before refinement.
 
     Raises:
-        MeshingError: no cell is cut, or there are too many; an UnrefinableError where the function
-            is not finite, or its level set is a volume.
+        MeshingError: no cell is cut, or there are too many cells. UnrefinableError: the function is
+        not finite somewhere, or its level set is a volume.
     """
     walls = lattice.lower, lattice.upper
     cells = lattice.nonempty_cells(function.clearance, function.most_faces)
@@ -426,21 +431,22 @@ def mesh_closed_surface(
     as_cut: bool = False,
     elsewhere: IrrelevantRegion | None = None,
 ) -> TriangleMesh:
-    """The boundary of the points of a lattice's box where the function is negative.
+    """Mesh the boundary of the points in a lattice's box at which the function is negative.
 
-    On the box it consists of the faces of the cells whose centers are negative, as if the points of
-    the lattice there were on the level. Triangles in the two outermost layers of cells are coarse
-    and may touch in vertices: they are to be cut away. There are no faces if the function is
-    nowhere negative.
+    On the faces of the box, the boundary consists of faces of the cells whose centers are negative,
+    as if the lattice points there were on the level. Triangles in the two outermost layers of cells
+    are coarse and may touch in vertices: the caller cuts them away. The mesh has no faces if the
+    function is negative nowhere.
 
+    tolerance: a length, as for `mesh_open_surface`.
     as_cut: whether to leave the triangles as the cells cut them, which never pass through each
-        other, and to leave out parts between points of the lattice: for functions with creases
-        everywhere, as distances from meshes, and cells of about the tolerance.
-    elsewhere: the region where the surface does not matter: except for a few cells at its border,
-        the function counts as positive there, and the surface is closed by coarse triangles.
+        other, and to miss parts between lattice points. That is for functions with creases
+        everywhere, as distances from meshes, and for cells of about the tolerance.
+    elsewhere: a region in which the surface does not matter. Except for a few cells at the region's
+        border, the function counts as positive there, and coarse triangles close the surface.
 
     Raises:
-        MeshingError: too many cells.
+        MeshingError: there are too many cells.
     """
     limit, does_matter = function.most_faces, None
     if elsewhere is None:
@@ -493,9 +499,11 @@ def mesh_closed_surface(
 def split_faces_off_level(
     function: LevelFunction, surface: TriangleMesh, farthest: float, times: int
 ) -> TriangleMesh:
-    """The mesh in which faces whose center is farther than `farthest` from the level, as across a
-    crease, are cut into three at a point on the level; so are the new faces, `times` times. All
-    edges stay."""
+    """Cut faces whose center is farther than `farthest` (a length) from the level set, as across a
+    crease.
+
+    Each is cut into three at its center, moved onto the level set; so are the new faces, up to
+    `times` times. All edges stay."""
     vertices, faces = surface.vertices, surface.faces
     pending = np.arange(len(faces))
     for _ in range(times):
@@ -576,6 +584,7 @@ def _refinable_points(
     deep = None if does_matter is None else lattice.interior_cells(does_matter)
 
     def counts(points: FloatArray) -> BoolArray:
+        """(n,) whether triangles may be refined at points (n, 3)."""
         is_inside = np.ones(len(points), np.bool_)
         for x, low, high in zip(points.T, lower, upper, strict=True):
             is_inside &= (x >= low) & (x <= high)
