@@ -74,7 +74,7 @@ class LevelSamples:
 
 
 class EvaluatorCache:
-    """Fields on the backend of double precision, each prepared once."""
+    """Fields prepared for double precision, so that functions of the same field share them."""
 
     def __init__(self) -> None:
         self._made: dict[int, tuple[Field, Field]] = {}
@@ -131,6 +131,7 @@ class LevelFunction:
         """(n,) f - level at points (n, 3), without gradients."""
 
         def value(p: Vec3) -> tuple[Real]:
+            """The value of f at p."""
             with share_samples(), without_alternatives():
                 return (self._prepared.evaluate(p).value,)
 
@@ -141,6 +142,7 @@ class LevelFunction:
         rounding error, and for a sum a truncation error as well."""
 
         def value_and_error(p: Vec3) -> tuple[Real, Real]:
+            """The value of f at p, and the bound of its error."""
             with without_alternatives():
                 sample = self._prepared.evaluate(p)
             return sample.value, self._backend.Float(sample.value_error)
@@ -159,6 +161,7 @@ class LevelFunction:
         The samples have no `quarter_period_radius`: it is 0."""
 
         def compute(p: Vec3, r: Vec3) -> tuple[Real, Vec3, Real]:
+            """Value, gradient and bound of the gradient's change within r.x of p."""
             sample = self._prepared.evaluate(p)
             change = self._prepared.gradient_change_bound(p, r.x) + sample.gradient_error
             return sample.value, sample.gradient, change
@@ -174,6 +177,7 @@ class LevelFunction:
         (`level_distance_lower_bound`)."""
 
         def bound(p: Vec3) -> tuple[Real]:
+            """The lower bound of the distance from p."""
             sample = self._prepared.evaluate(p)
             return (
                 level_distance_lower_bound(self._backend, self._prepared, self._levels, p, sample),

@@ -58,18 +58,21 @@ _THIN = 0.25
 
 @dataclass(frozen=True)
 class PointsOnLevel:
-    """Points (k, 3) on the level, and unit normals (k, 3) there towards where the function is
-    positive."""
+    """Some points on a level set.
+
+    points: (k, 3).
+    normals: (k, 3) unit normals there, towards where the function is positive."""
 
     points: FloatArray
     normals: FloatArray
 
     @classmethod
     def of(cls, function: SignFunction, tolerance: float) -> PointsOnLevel:
-        """The known points on the level of a field; none for fields without such points.
+        """Points on the level set that are known without a mesh of it: see the text above. There
+        are none for other fields.
 
-        tolerance: a length; the distance from the points of a cloud at which its sign is evaluated.
-        """
+        tolerance: a length. The sign of a cloud's field is evaluated at least this far from its
+            points."""
         mesh = function.field.jump_mesh()
         if mesh is not None:
             return cls._on_triangles(function, mesh[0][mesh[1]])
@@ -116,11 +119,11 @@ class PointsOnLevel:
         return cls(points[jumps], np.where(ahead > 0, 1.0, -1.0)[jumps, None] * normal[jumps])
 
     def some(self, rows: Any) -> PointsOnLevel:
-        """The points that `rows`, indices or a mask, select."""
+        """The selected points. rows: their indices, or a mask."""
         return PointsOnLevel(self.points[rows], self.normals[rows])
 
     def within(self, lower: FloatArray, upper: FloatArray, volume: Volume | None) -> PointsOnLevel:
-        """The points in a box and in a volume."""
+        """The points in the box from `lower` to `upper`, and in the volume if one is given."""
         is_in = ((self.points > lower) & (self.points < upper)).all(axis=1)
         if volume is not None:
             is_in &= volume.contains_points(self.points)
@@ -164,11 +167,10 @@ class LostParts:
         tolerance: float,
         spacing: float,
     ) -> LostParts:
-        """The lost parts of a mesh of the level set.
+        """Find the parts of a level set that a mesh has lost.
 
-        known: points on the level, near which the mesh should be.
-        spacing: of the cells of the mesh.
-        """
+        known: points on the level set, near which the mesh should be.
+        surface: the mesh. spacing: the size of its cells."""
         corner = surface.vertices[surface.faces]
         distant = known.some(_are_farther(known.points, corner, tolerance))
         beyond = _are_farther(distant.points, corner, max(tolerance, _ALLOWED_CELLS * spacing))
@@ -225,7 +227,7 @@ class LostParts:
 
 
 def _advice(field: Field) -> str:
-    """The remedy where cells miss parts, in words."""
+    """What to do if cells miss parts of the field's level set, in words."""
     advice = "choose a smaller `cell_size`"
     if isinstance(field, WindingNumber):
         advice += "; repairing the mesh keeps thin parts where their triangles are sound"

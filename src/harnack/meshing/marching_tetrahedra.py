@@ -52,11 +52,10 @@ class Tetrahedra:
     """Tetrahedra and their edges.
 
     points: (n, 3).
-    corners: (m, 4) indices of points.
-    ends: (k, 2) endpoints of all edges, the lower index first.
-    edges: (m, 6) indices of edges, for the pairs of corners (0, 1), (0, 2), (0, 3), (1, 2), (1, 3),
-        (2, 3).
-    """
+    corners: (m, 4) the points of each tetrahedron, by index.
+    ends: (k, 2) the points at the ends of each edge, the lower index first.
+    edges: (m, 6) the edges of each tetrahedron, by index, for the pairs of corners (0, 1), (0, 2),
+        (0, 3), (1, 2), (1, 3), (2, 3)."""
 
     points: FloatArray
     corners: IntArray
@@ -65,31 +64,35 @@ class Tetrahedra:
 
     @classmethod
     def of(cls, points: FloatArray, corners: IntArray) -> Tetrahedra:
-        """Tetrahedra with these corners; their edges are numbered."""
+        """Tetrahedra with these points and corners; their edges are found and numbered."""
         edges = Edges.of(np.concatenate([corners[:, pair] for pair in _PAIRS]))
         return cls(points, corners, edges.vertices, edges.edge_of_pair.reshape(len(_PAIRS), -1).T)
 
     def edge_between(self, i: int, j: int, rows: IntArray) -> tuple[IntArray, IntArray]:
-        """For tetrahedra `rows`, the edge between corners i and j, and its direction: 1 if it leads
-        from i to j, else -1."""
+        """The edge between corners i and j of each of the tetrahedra `rows` (k,).
+
+        Returns:
+            The indices (k,) of the edges; and their directions (k,): 1 if the edge leads from
+            corner i to corner j, else -1.
+        """
         edge = self.edges[rows, _PAIRS.index((min(i, j), max(i, j)))]
         return edge, np.where(self.ends[edge, 0] == self.corners[rows, i], 1, -1)
 
     def has_edges(self, pairs: IntArray) -> BoolArray:
-        """(k,) whether there are edges between pairs (k, 2) of points."""
+        """(k,) whether two points are joined by an edge, for pairs (k, 2) of points."""
         n = len(self.points)
         return np.isin(edge_keys(pairs, n), edge_keys(self.ends, n))
 
 
 def delaunay(points: FloatArray) -> Tetrahedra:
-    """The Delaunay tetrahedra of points (n, 3) in general position, except that many may lie on the
-    faces of a box.
+    """The Delaunay tetrahedra of points (n, 3). Points are in general position, except that many
+    may lie on the faces of a box.
 
-    Eight points far away are added and left out again with their tetrahedra: Qhull takes long over
-    a hull that is flat.
+    Eight points far away are added, and removed again with their tetrahedra, because Qhull takes
+    long if the convex hull of the points is flat.
 
     Raises:
-        MeshingError: points are too near to each other, relative to their extent.
+        MeshingError: some points are too near to each other, relative to their extent.
     """
     import scipy.spatial  # imported here: it takes half a second
 
@@ -114,13 +117,14 @@ def delaunay(points: FloatArray) -> Tetrahedra:
 
 @dataclass(frozen=True)
 class EdgeCrossings:
-    """Crossings of all edges of tetrahedra, between points off the level.
+    """How a function crosses its level along the edges of tetrahedra. Edges with an end on the
+    level have no crossings.
 
-    count: (k,) the number of upward minus that of downward crossings of the level along each edge.
-    change: (k,) the change of the function along each edge.
-    proved: the number of changes that are proved to be the difference of wrapped values.
-    integrated_count: the number of changes that were integrated along the edge.
-    """
+    count: (k,) for each edge the number of upward crossings minus that of downward crossings.
+    change: (k,) the continuous change of the function along each edge.
+    proved: the number of edges whose change is proved to be the difference of the values, wrapped
+        by the period.
+    integrated_count: the number of edges along which the change was integrated."""
 
     count: IntArray
     change: FloatArray
@@ -131,15 +135,16 @@ class EdgeCrossings:
 def count_crossings(
     function: LevelFunction, points: TetrahedronPoints, tets: Tetrahedra
 ) -> EdgeCrossings:
-    """Count the crossings of every edge.
+    """Count how a function crosses its level along every edge of tetrahedra.
 
-    Wrapping. Within `LevelSamples.quarter_period_radius` of a point the function changes by less
-    than a quarter of its period. If these radii at both ends cover the edge, it changes by less
-    than half a period along it, so that the change is the wrapped difference. Along other edges
-    the change is integrated (`Field.continuous_change`).
+    For an angle, the change along an edge is needed. Within `LevelSamples.quarter_period_radius` of
+    a point the function changes by less than a quarter of its period. So if the radii of both ends
+    together cover the edge, it changes by less than half a period along the edge, and the change is
+    the wrapped difference of the values. Along other edges the change is integrated
+    (`Field.continuous_change`).
 
     Raises:
-        MeshingError: edges that are not covered, of a field that cannot be integrated.
+        MeshingError: the field of an uncovered edge cannot be integrated.
     """
     a, b = tets.ends.T
     value = points.samples.value
@@ -190,7 +195,8 @@ def _integrate_change(
 
 
 EdgeRootFinder: TypeAlias = Callable[[FloatArray, FloatArray], FloatArray]
-"""From the ends (k, 3) of edges, below the level and above it, to where they meet it (k, 3)."""
+"""A function from the ends (k, 3) of edges, first those below the level and then those above it, to
+the points (k, 3) where the edges meet the level set."""
 
 
 def extract_triangles(
@@ -200,15 +206,20 @@ def extract_triangles(
     crossings: EdgeCrossings,
     roots_of: EdgeRootFinder | None = None,
 ) -> tuple[FloatArray, IntArray]:
-    """Vertices (n, 3) and faces (m, 3), counter-clockwise as seen from where the function is
-    greater. The first vertices are `points`, whether they are in use or not; they are followed by a
-    vertex for each edge that is crossed, in their order.
+    """The triangles of the level set in tetrahedra.
 
+    points, tets, crossings: the tetrahedra's points, with the function there; the tetrahedra; and
+        how the function crosses its level along their edges.
     roots_of: computes where edges meet the level of a real-valued function; None for a search along
         them.
 
+    Returns:
+        Vertices (n, 3) and faces (m, 3), counter-clockwise as seen from where the function is
+        larger. The first vertices are `points`, whether they are used or not; then follows one
+        vertex for each crossed edge, in the order of the edges.
+
     Raises:
-        MeshingError: crossings that do not agree around a face, or two levels between corners.
+        MeshingError: crossings do not agree around a face, or two levels pass between corners.
     """
     side = _sides(points, tets, crossings)
     on = points.is_on_level[tets.corners]
@@ -244,6 +255,7 @@ def extract_triangles(
         rise = _mean(points.points, corner[:, up]) - _mean(points.points, corner[:, down])
 
         def at(i: int, j: int, rows: IntArray = rows) -> IntArray:
+            """The vertices on the edges between corners i and j of tetrahedra `rows`."""
             return vertex_of_edge[tets.edge_between(i, j, rows)[0]]
 
         on_level = [corner[:, k] for k in level]
@@ -266,7 +278,8 @@ def extract_triangles(
 
 
 def is_cut(points: TetrahedronPoints, tets: Tetrahedra, crossings: EdgeCrossings) -> BoolArray:
-    """(m,) whether a level passes between corners of a tetrahedron, or through one."""
+    """(m,) whether the level set passes between the corners of each tetrahedron, or through one of
+    them."""
     return points.is_on_level[tets.corners].any(axis=1) | (crossings.count[tets.edges] != 0).any(
         axis=1
     )
