@@ -54,11 +54,11 @@ _WELD_DISTANCES = (0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3)
 class CleanedMesh:
     """A closed mesh in which the valid triangles of the input come first, bit by bit.
 
-    kept: for each of the first faces, the index of the input face that it is, in order.
-    turned: which of these faces are reversed.
-    left_out: the number of input triangles that were removed, by reason.
-    holes: the number of filled holes.
-    """
+    surface: the mesh.
+    kept: (k,) for each of the first k faces, the index of the input face that it is; ascending.
+    turned: the indices of the input faces among these that are reversed in the mesh.
+    left_out: for each reason, the number of input triangles that were removed for it.
+    holes: the number of filled holes."""
 
     surface: TriangleMesh
     kept: IntArray
@@ -70,10 +70,10 @@ class CleanedMesh:
 def clean_and_fill(
     vertices: FloatArray, faces: IntArray, report: Callable[[str], None]
 ) -> CleanedMesh:
-    """The valid triangles of a mesh, with patches in place of all others and over holes.
+    """Keep the valid triangles of a mesh, and put fillings in place of all others and over holes.
 
     Raises:
-        MeshingError: half of the triangles, or all, would be removed, or most of them are loose.
+        MeshingError: half of the triangles or more would be removed, or most of them are loose.
     """
     report("looking for triangles that are sound")
     state = _WorkingMesh.of(vertices, faces)
@@ -99,11 +99,16 @@ def clean_and_fill(
 
 
 def weld_near_corners(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray, float]:
-    """The vertices of loose triangles, with near corners moved to their mean: of several distances
-    the one that leaves the fewest edges open; the faces; and the largest move of a corner.
+    """Join near corners of loose triangles, by moving them to their mean.
+
+    Corners are near if they are closer than a certain distance. Several distances are tried, and
+    that which leaves the fewest edges open is used.
+
+    Returns:
+        The vertices (n, 3); the faces (m, 3); and the largest move of a corner, a length.
 
     Raises:
-        MeshingError: triangles are not loose, or most edges stay open.
+        MeshingError: the triangles are not loose, or most edges stay open.
     """
     points, index = np.unique(vertices[faces].reshape(-1, 3), axis=0, return_inverse=True)
     corners = np.asarray(index, np.int64).reshape(-1, 3)
@@ -297,9 +302,10 @@ def _pieces(edges: Edges, count: int) -> IntArray:
 
 
 def against_neighbors(x: FloatArray, faces: IntArray) -> BoolArray:
-    """(m,) which faces are to be turned over so that all faces that share an edge of two faces
-    agree: in each connected part those of the orientation with the smaller area. Parts with only
-    one side are left as they are."""
+    """(m,) which faces to reverse so that faces that share an edge agree in orientation.
+
+    In each connected part of the surface, one orientation is chosen: the one in which faces with
+    the larger area are already. Parts with only one side are left as they are."""
     m, part = len(faces), orientation_components(faces)
     corner = x[faces]
     area = row_norms(area_normals(corner))

@@ -53,12 +53,11 @@ def flip_edges(
     faces: IntArray,
     tolerance: float,
 ) -> IntArray:
-    """Faces after rounds of flips, each of which improves the two triangles at its edge; of several
-    flips of one triangle only the best is done.
+    """Faces (m, 3) after rounds of flips. Each flip makes the smaller of the smallest angles of two
+    triangles larger; of several flips of a triangle, only the best is done.
 
-    tolerance: how far the middles of new edges, and the centers of new triangles, may be from the
-        surface, estimated by the slope there.
-    """
+    tolerance: a length, the largest distance of the midpoints of new edges and of the centers of
+        new triangles from the level set, estimated by the gradient there."""
     refused = np.zeros(0, np.int64)
     boundary = edge_keys(boundary_edges(faces), len(vertices))
     for _ in range(_MOST_ROUNDS_OF_FLIPS):
@@ -148,7 +147,7 @@ def _are_among(numbers: IntArray, keys: IntArray) -> BoolArray:
 
 
 def least_angles(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """(m,) the least angle of each triangle, in radians; 0 for a triangle without an area."""
+    """(m,) the smallest angle of each triangle, in radians; 0 for a triangle without an area."""
     corner = vertices[faces]
     side = np.stack([corner[:, (k + 2) % 3] - corner[:, (k + 1) % 3] for k in range(3)], axis=1)
     square = np.einsum("ijk,ijk->ij", side, side)
@@ -166,13 +165,15 @@ def collapse_slivers(
     fixed: BoolArray,
     tolerance: float,
 ) -> IntArray:
-    """Faces without slivers whose shortest edge can be contracted to one of its ends.
+    """The faces without the slivers whose shortest edge can be contracted to one of its ends.
 
-    An edge (u, v) can be contracted to u without a change of topology if u and v have only the two
-    neighbors in common that are the third corners of its faces (the link condition), and v is not
-    `fixed` (n,), as boundary vertices are. It is contracted if no new triangle is a sliver, all
-    face the way that the surface does, and their centers are within `tolerance` of it.
-    """
+    fixed: (n,) which vertices may not be removed, as those of the boundary.
+    tolerance: a length, the largest distance of the centers of new triangles from the level set.
+
+    An edge (u, v) can be contracted to u without a change of topology if v is not fixed and if u
+    and v have only two neighbors in common, the third corners of the edge's two faces (the link
+    condition). It is contracted if no new triangle is a sliver, and if all of them face along the
+    gradient and are near the level set."""
     slivers = np.flatnonzero(least_angles(vertices, faces) < _SLIVER)
     is_removed = np.zeros(len(faces), np.bool_)
     faces = faces.copy()
@@ -236,11 +237,12 @@ def relax_vertices(
     tolerance: float,
     walls: Walls,
 ) -> FloatArray:
-    """Vertices (n, 3), moved where that makes the least angles of triangles larger; boundary
+    """Vertices (n, 3), moved where that makes the smallest angle around them larger. Boundary
     vertices stay.
 
-    tolerance: how far the centers of triangles around moved vertices may be from the surface.
-    """
+    tolerance: a length, the largest distance of the centers of triangles around moved vertices from
+        the level set.
+    walls: the lower and the upper corner of the box, on whose faces points stay; or None."""
     fixed = np.zeros(len(vertices), np.bool_)
     fixed[boundary_edges(faces)] = True
     vertices = vertices.copy()

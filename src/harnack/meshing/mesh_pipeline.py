@@ -216,6 +216,7 @@ def mesh(
         triangles = largest_body(triangles)
 
     def check(one: TriangleMesh) -> None:
+        """Raise unless a changed mesh is still a manifold and, for a solid, near the level."""
         if solid:
             made.check_level(one)
         check_manifold(one.faces)
@@ -592,6 +593,7 @@ def _mesh_solid(
         cells."""
 
         def mesh_angle(angle: SolidAngle, value: float) -> TriangleMesh:
+            """The mesh of the level set of an angle at `value`."""
             angle = cast("SolidAngle", _checked(angle))
             box = _box(angle, (value,), None)
             function = LevelFunction(angle, value, most_faces=asked.most_faces)
@@ -634,7 +636,8 @@ def _mesh_solid(
 
 
 def _mesh_level_set(field: Field, level: float | None, asked: _MeshOptions) -> _RawMesh:
-    """A level set of a function that is smooth nearly everywhere, or of an angle."""
+    """Mesh a level set of a function that is smooth nearly everywhere, or of an angle. level: None
+    for the default of the field."""
     level = field.default_level if level is None else float(level)
     function = LevelFunction(field, level, most_faces=asked.most_faces)
     field.validate_levels((level,))

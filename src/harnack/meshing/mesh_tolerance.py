@@ -13,8 +13,9 @@ __all__ = ["MeshTolerance"]
 
 @dataclass(frozen=True)
 class MeshTolerance:
-    """The largest distance of triangles from a surface: a length, or None for 1e-3 of the size
-    of the surface."""
+    """The largest distance of triangles from a surface.
+
+    length: a length; None for 1e-3 of the size of the surface."""
 
     length: float | None = None
 

@@ -39,15 +39,20 @@ def project_outliers(
     tolerance: float,
     check: Callable[[TriangleMesh], None],
 ) -> TriangleMesh | None:
-    """The surface with vertices that are far from the level moved onto it, and faces with a far
-    center cut at the far middles of their edges, or at the center, moved onto the level; None if
-    that cannot be done.
+    """Mend a closed surface of which a few points are too far from the level set.
 
-    surface: none of its triangles pass through each other, and nearly all are near the level.
-    places: (k, 3) the far vertices, and centers of faces. tolerance: a length; no point is moved
-        farther than twice that.
+    Far vertices are moved onto the level set. Faces with a far center are cut at the midpoints of
+    their edges that are off the level set, or at the center, and the new vertices are moved onto
+    it.
+
+    surface: none of its triangles pass through each other, and nearly all are near the level set.
+    places: (k, 3) the far vertices and the far centers of faces.
+    tolerance: a length; no point is moved farther than twice that.
     check: raises a MeshingError for a surface that is not near the level. It is called with the
         changed faces; whether these pass through other triangles is decided exactly.
+
+    Returns:
+        The mended surface, or None if that fails.
     """
     if len(places) > _MAX_OUTLIERS:
         return None

@@ -48,12 +48,11 @@ _WORDS = re.compile(r"\{([^{}|]*)\|([^{}|]*)\}")
 class PrintProblem:
     """A problem of a mesh that is to be printed.
 
-    kind: its name, such as "open edges".
-    count: the number of its occurrences.
-    locations: (k, 3) of all occurrences, or of a part of them.
+    kind: the name of the problem, such as "open edges".
+    count: how often it occurs.
+    locations: (k, 3) where it occurs, or some of these places.
     message: the problem in a sentence.
-    is_error: whether it is an error, and not a hint.
-    """
+    is_error: True for an error, False for a hint."""
 
     kind: str
     count: int
@@ -66,12 +65,11 @@ class PrintProblem:
 class PrintCheck:
     """The result of checking a mesh that is to be printed.
 
-    problems: the worst first.
-    size: (x, y, z).
+    problems: errors first, then hints.
+    size: (x, y, z), the edge lengths of the bounding box.
     volume: None if the mesh is not closed.
-    triangles: the number of triangles. parts: the number of components that do not touch each
-        other.
-    """
+    triangles: the number of triangles.
+    parts: the number of components, which are not connected by vertices."""
 
     problems: tuple[PrintProblem, ...]
     size: tuple[float, float, float]
@@ -81,11 +79,12 @@ class PrintCheck:
 
     @property
     def is_printable(self) -> bool:
-        """Whether there is no error; there may be hints."""
+        """Whether there are no errors; there may be hints."""
         return not _has_errors(self.problems)
 
     def as_dict(self, most_places: int = 10) -> dict[str, Any]:
-        """The result as a dictionary of plain numbers and texts, as JSON holds them."""
+        """The result as a dictionary of numbers and texts, which JSON can hold. most_places: the
+        largest number of locations of each problem."""
         return {
             "fine": self.is_printable,
             "size": list(self.size),

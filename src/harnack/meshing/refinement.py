@@ -72,12 +72,20 @@ def refine(
     report: Callable[[str], None],
     where: Where = None,
 ) -> tuple[FloatArray, IntArray]:
-    """Split edges at their midpoints, and move these onto the surface, until the midpoints of all
-    edges but those of the boundary, and the centers of all faces, are within `tolerance` of it; or
-    until refinement is found to diverge, which the caller has to check (`check_near_level`).
+    """Split edges at their midpoints, and move the new vertices onto the level set, until the mesh
+    is within `tolerance` of it.
 
-    where: which midpoints and centers count. Edges that are split beside these are moved onto the
-        surface as well: otherwise they would be split again and again, as they end off the surface.
+    That is, until the midpoints of all edges, except boundary edges, and the centers of all faces
+    are within the tolerance (a length); or until refinement is found to diverge, which the caller
+    has to check (`check_near_level`).
+
+    walls: the lower and the upper corner of the box on whose faces the boundary lies, so that its
+        edges are split too; None if the boundary stays as it is.
+    where: which midpoints and centers count. The midpoints of edges that are split at the border of
+        that region are moved onto the level set as well: otherwise these edges would be split again
+        and again, as they end off the level set.
+
+    Returns the vertices and the faces.
 
     Raises:
         TriangleLimitError: it takes more triangles than the function allows.
@@ -243,7 +251,7 @@ def _level_along(
 def unrefined_midpoints(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float
 ) -> FloatArray:
-    """Midpoints (k, 3) of the edges that `refine` would still split."""
+    """(k, 3) the midpoints of the edges that `refine` would still split."""
     marks = _RefinementMarks.of(function, vertices, faces, tolerance, None, None)
     return marks.middle[marks.marked]
 
@@ -337,10 +345,10 @@ def _edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
 
 
 def split_faces(vertices: FloatArray, faces: IntArray, middle: IntArray) -> IntArray:
-    """Faces, split at the midpoints of their edges.
+    """Split faces (m, 3) at the midpoints of their edges.
 
-    middle: (m, 3) vertices at the midpoints, -1 for edges that are not split.
-    """
+    middle: (m, 3) the vertices at the midpoints of the edges 01, 12 and 20 of each face; -1 for
+        edges that are not split."""
     cut = middle >= 0
     number = cut.sum(axis=1)
     parts = [faces[number == 0]]
@@ -372,9 +380,11 @@ def improve(
     walls: Walls,
     report: Callable[[str], None],
 ) -> tuple[FloatArray, IntArray]:
-    """Vertices and faces with better angles: edges are flipped and vertices smoothed in turn,
-    slivers are contracted; then edges are cut again where triangles are no longer within
-    `tolerance`."""
+    """Improve the angles of triangles. Returns the vertices and the faces.
+
+    Edges are flipped and vertices smoothed in turn, and slivers are contracted. Then edges are
+    split again where triangles are no longer within `tolerance`, and finally edges are flipped and
+    vertices moved for larger angles."""
     for _ in range(2):
         faces = flip_edges(function, vertices, faces, tolerance)
         vertices = smooth(function, vertices, faces, walls, rounds=2)
@@ -395,8 +405,10 @@ def smooth(
     walls: Walls,
     rounds: int = 3,
 ) -> FloatArray:
-    """Vertices moved towards the mean of their neighbors and back onto the surface, a few times;
-    boundary vertices stay. Moves that turn a face by much are reverted."""
+    """The vertices (n, 3), moved halfway to the mean of their neighbors and back onto the level
+    set, for some rounds. Boundary vertices stay, and moves that turn a face by much are undone.
+
+    walls: the lower and the upper corner of the box, on whose faces points stay; or None."""
     ends, _, _ = _edges(faces)
     boundary = np.unique(boundary_edges(faces))
     free = np.zeros(len(vertices), np.bool_)
@@ -433,10 +445,11 @@ def smooth_within_tolerance(
     tolerance: float,
     where: Where = None,
 ) -> FloatArray:
-    """As `smooth`, except that vertices stay if smoothing would move a center or a middle of an
-    edge of their faces farther from the surface than `tolerance`, as beside a crease.
+    """Smooth vertices as `smooth` does, but undo that for the vertices of faces that are then too
+    far from the level set, as beside a crease.
 
-    where: which middles and centers count."""
+    Too far are faces whose center, or the midpoint of one of whose edges, is farther than
+    `tolerance` (a length). where: which midpoints and centers count."""
     after = smooth(function, vertices, faces, walls)
     rows = np.arange(len(faces))
     for _ in range(8):

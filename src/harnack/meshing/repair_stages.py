@@ -233,7 +233,8 @@ def repair(
 
 @dataclass(frozen=True)
 class _RepairOptions:
-    """The arguments of `repair`."""
+    """The arguments of `repair`, checked. patches is its `filling`, spacing its `cell_size`, and
+    report its `progress`."""
 
     keep: Keep | None
     patches: Patches

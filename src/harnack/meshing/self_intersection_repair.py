@@ -45,11 +45,13 @@ _NO_AREA = 1e-4
 
 
 def resolve_self_intersections(surface: TriangleMesh, length: float) -> TriangleMesh:
-    """A closed surface, mended where its triangles pass through each other
-    (`resolve_local_intersections`), so that none do.
+    """A closed surface, mended so that none of its triangles pass through each other
+    (`resolve_local_intersections`). It is returned unchanged if none do.
+
+    length: how far one change may move the surface.
 
     Raises:
-        MeshingError: vertices are not finite; a SelfIntersectionError if triangles still cross.
+        MeshingError: vertices are not finite. SelfIntersectionError: some triangles still cross.
     """
     try:
         check_no_self_intersection(surface.vertices, surface.faces)
@@ -64,12 +66,13 @@ def resolve_self_intersections(surface: TriangleMesh, length: float) -> Triangle
 def resolve_local_intersections(
     surface: TriangleMesh, crossing: IntArray, length: float
 ) -> tuple[TriangleMesh, int]:
-    """A closed surface with edges contracted and flipped where triangles cross; and the number of
-    triangles that still cross.
+    """Contract and flip edges near crossing triangles, so that fewer cross.
 
-    crossing: all faces that cross others (`intersecting_faces`).
-    length: how far the surface may be moved by one change; vertices stay where they are, or are
-        removed.
+    crossing: the indices of all faces that cross others (`intersecting_faces`).
+    length: how far one change may move the surface. Vertices are removed or stay where they are.
+
+    Returns:
+        The changed closed surface, and the number of triangles that still cross.
     """
     if not 0 < len(crossing) <= _MAX_CROSSING or length <= 0:
         return surface, len(crossing)

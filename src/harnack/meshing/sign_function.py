@@ -368,6 +368,7 @@ def _clearances(
         levels = Levels((dr.opaque(backend.Float, level),), smooth.period)
 
         def kernel(p: Vec3) -> tuple[Real]:
+            """The bound at p."""
             return (level_distance_lower_bound(backend, prepared, levels, p, prepared.evaluate(p)),)
 
         return lambda points: _numbers(backend, kernel, points)
@@ -377,6 +378,7 @@ def _clearances(
     sheets = field.prepare(backend)
 
     def distance(p: Vec3) -> tuple[Real]:
+        """The distance from the triangles of the mesh."""
         return (sheets.distance_to_jumps(p),)
 
     return [bound(WindingModuloOne(field)), lambda points: _numbers(backend, distance, points)]

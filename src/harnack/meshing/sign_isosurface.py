@@ -132,15 +132,22 @@ def mesh_from_signs(
     closed: bool = False,
     volume: Volume | None = None,
 ) -> tuple[SignIsosurface, LostParts, dict[str, Any]]:
-    """Extract a mesh from signs in the cells of a box (`extract_from_signs`). Returns it with the
-    parts of the level set that it lost, and facts about it.
+    """Extract a mesh from signs in cells of a box (`extract_from_signs`), in smaller cells if these
+    do not suffice.
 
-    Where more than a few vertices and centers of triangles are beyond the tolerance, a length, or
-    where smaller cells may show lost parts, it is extracted again from smaller cells. The facts
-    contain the number of points that are finally beyond the tolerance, and a distance within which
-    all of them are.
+    box: its lower and its upper corner. spacing: the size of the first cells. tolerance: a length.
+    attempts: the largest number of extractions.
+    closed: whether the mesh is closed at the box's faces.
+    volume: only parts that are lost within it count.
 
-    volume: only parts lost within it count.
+    It is extracted again, from cells 0.6 times as large, if more than one in a hundred vertices and
+    centers of triangles are farther than the tolerance from the level set, or if smaller cells may
+    show lost parts.
+
+    Returns:
+        The mesh; the parts of the level set that it lost; and facts for the metadata, among them
+        the number of points that are finally farther than the tolerance, and a distance within
+        which all of them are.
 
     Raises:
         MeshingError: as `extract_from_signs`.

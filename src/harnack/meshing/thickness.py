@@ -33,10 +33,8 @@ _OPPOSITE = -0.5
 class WallThickness:
     """The thickness of a closed mesh at its faces, from `wall_thickness`.
 
-    vertices: (n, 3).
-    faces: (m, 3).
-    values: (m,) thickness at the centers of faces, a length; nan for faces without an area.
-    """
+    vertices, faces: (n, 3), (m, 3) the mesh.
+    values: (m,) the thickness at the centers of faces, a length; nan for faces without an area."""
 
     vertices: FloatArray
     faces: IntArray
@@ -47,23 +45,24 @@ class WallThickness:
 
     @property
     def thinnest(self) -> float:
-        """The least of the values."""
+        """The smallest thickness of all faces."""
         return float(np.nanmin(self.values))
 
     def thin_locations(self, less_than: float) -> FloatArray:
-        """Centers (k, 3) of the faces at which the wall is thinner than `less_than`, the thinnest
-        first."""
+        """(k, 3) the centers of the faces at which the wall is thinner than `less_than`, the
+        thinnest first."""
         rows = np.flatnonzero(self.is_thinner(less_than))
         rows = rows[np.argsort(self.values[rows])]
         return self.vertices[self.faces[rows]].mean(axis=1)
 
     def is_thinner(self, than: float) -> BoolArray:
-        """(m,) whether the wall is thinner than `than` at each face."""
+        """(m,) whether the wall is thinner than `than`, a length, at each face."""
         return np.asarray(np.nan_to_num(self.values, nan=np.inf) < than)
 
     def to_colored_mesh(self, low: float, high: float) -> trimesh.Trimesh:
-        """The mesh with colors of faces: red up to `low`, through yellow, to gray from `high` on.
-        PLY and GLB files hold them."""
+        """The mesh with a color for each face. It is red where the thickness is at most `low`,
+        changes over yellow to gray, and is gray from `high` on. PLY and GLB files hold such colors.
+        """
         import trimesh  # imported here: it takes half a second
 
         fraction = np.clip((self.values - low) / max(high - low, 1e-300), 0.0, 1.0)
