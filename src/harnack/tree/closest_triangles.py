@@ -45,7 +45,7 @@ _LEAF_SIZE = 4
 
 @dataclass(frozen=True)
 class BoxTree:
-    """A tree of boxes, which may overlap, with coordinates of at most about 1."""
+    """A tree of boxes, which may overlap. Their coordinates are at most about 1."""
 
     tree: PackedTree
 
@@ -62,16 +62,18 @@ class BoxTree:
     def next_box(
         self, o: Vec3, d: Vec3, after: tuple[Real, Any], start: Real, end: Real, active: Mask
     ) -> tuple[Real, Real, Any]:
-        """Return the next box along each ray o + t d, |d| = 1, after `after` = (t, number).
+        """The next box that each ray o + t d, |d| = 1, enters after `after` = (t, number).
 
-        A box is entered at t = max(entry, start); boxes are ordered by (t, number). Boxes that a
-        ray has left before `start` are not entered. Starting with after = (t, NO_BOX), t < start,
-        repeated calls visit every box that the ray meets for start <= t <= end exactly once. Boxes
-        are padded a little, so that rounding never skips a box that the ray meets.
+        A ray enters a box at t = max(t of the first point of the ray in the box, start), and boxes
+        are ordered by (t, number). Boxes that a ray has left before `start` are not entered.
+        Starting with after = (t, NO_BOX), t < start, repeated calls visit every box that the ray
+        meets for start <= t <= end exactly once. Boxes are enlarged a little, so that rounding
+        never skips a box that the ray meets.
 
         Returns:
-            The t where the ray enters, the t where it leaves, and the box's number (NO_BOX for
-                none).
+            The t where the ray enters the box, the t where it leaves it, and the number of the box
+            (NO_BOX
+                if there is none).
         """
         real, index = self.tree.backend.Float, self.tree.backend.UInt32
         t_after, n_after = real(after[0]), index(after[1])
@@ -152,13 +154,13 @@ class ClosestTriangle:
 
 
 def distance_lower_bound(rays: TriangleTree, x: Vec3) -> Real:
-    """A proved lower bound of the distance from x to the triangles, exact up to rounding; the
-    triangles have coordinates of at most about one.
+    """A proved lower bound of the distance from x to the triangles, which is exact up to rounding.
+    Coordinates of triangles are at most about one.
 
-    Proof. `ClosestPointOnTriangle` is off by a few epsilons of |x| + 1, by its docstring; boxes are
-    skipped only if they are farther than the best so far by that much. 16 epsilons of |x| + 1 are
-    subtracted, several times the largest error found with random needles and random triangles.
-    """
+    Proof. The distance from `ClosestPointOnTriangle` is off by a few machine epsilons of |x| + 1,
+    as is proved there. Boxes are skipped only if they are farther than the best distance so far by
+    that much. 16 epsilons of |x| + 1 are subtracted, several times the largest error that was found
+    with random needles and random triangles."""
     real, vector = rays.tree.backend.Float, rays.tree.backend.Array3f
     x = vector(x)
     pad = _pad(rays, x)
@@ -359,7 +361,8 @@ class ClosestPointOnTriangle:
         by_qr = ~by_pr & (squares[1] > squares[0])
 
         def chosen(of_pq: Any, of_qr: Any, of_pr: Any) -> Any:
-            """The argument that belongs to the longest of the edges pq, qr and pr."""
+            """The number or vector of the longest edge, of one for each of the edges pq, qr
+            and pr."""
             return dr.select(by_pr, of_pr, dr.select(by_qr, of_qr, of_pq))
 
         a, e, inverse = chosen(p, q, p), chosen(pq, qr, pr), chosen(first, second, third)
@@ -414,10 +417,12 @@ def jump_sum_within(rays: TriangleTree, x: Vec3, distance: Real, active: Mask = 
     reach, inside = distance * distance, _distance_test(rays, x, distance)
 
     def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
+        """Enter a node if its box comes within the distance."""
         close = inside(node, reach)
         return close, for_each_primitive(node, close & node.is_leaf, add, state)
 
     def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
+        """Add the jump across the triangle of a record, if it is within the distance."""
         within = (
             active
             & (row[NUMBER_COLUMN] >= 0)

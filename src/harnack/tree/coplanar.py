@@ -186,7 +186,7 @@ def _next_in_plane(
 
 
 def _unit(vector: Vec3) -> Vec3:
-    """A vector scaled to length 1; 0 stays 0."""
+    """A vector scaled to length 1; a vector of length 0 stays 0."""
     length = dr.norm(vector)
     return dr.select(length > 0, vector / dr.select(length > 0, length, 1), 0)
 

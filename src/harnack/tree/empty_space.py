@@ -85,7 +85,7 @@ class BoxCells:
         return _kdop_of_boxes(self.centers, 0.5 * self.size + slack)
 
     def octants(self) -> BoxCells:
-        """The eight octants of each box."""
+        """The eight octants of each box: (8 n) boxes of half the size."""
         half = 0.5 * self.size
         return BoxCells((self.corners[:, None] + _OCTANTS * half).reshape(-1, 3), half)
 
@@ -168,11 +168,11 @@ def refine_cells(
 def nonempty_cells(
     lower: FloatArray, upper: FloatArray, clearance: Clearance, most: int, finest: int
 ) -> BoxCells:
-    """The leaves of the octree of a box that are not proved empty; there are none if all of the box
-    is proved empty.
+    """The smallest cells of the octree of a box that are not proved empty.
 
-    most: the largest number of cells tested in a round. finest: the largest number of rounds.
-    """
+    lower, upper: the corners of the box. most: the largest number of cells tested in a round.
+    finest: the largest number of rounds; each halves the edges. There are no cells if all of the
+        box is proved empty."""
     root = BoxCells(np.array(lower)[None], np.array(upper) - np.array(lower))
     return refine_cells(root, clearance, most, finest).occupied
 
@@ -235,7 +235,7 @@ class EmptySpaceGrid:
         )
 
     def cell(self, p: Vec3) -> GridCell:
-        """The cell in which p lies, or the nearest one."""
+        """The cell in which p lies or, if p is outside of the grid, the nearest cell."""
         position = (p - self.origin) / self.cell_size
         corner = type(p)(*(clamp(dr.floor(position[k]), 0, self.shape[k] - 1) for k in range(3)))
         x, y, z = (self.backend.UInt32(corner[k]) for k in range(3))
@@ -308,7 +308,8 @@ class GridCell:
 
     @property
     def empty_distance(self) -> Any:
-        """The chessboard distance, in cells, to the nearest occupied cell (`GridData`)."""
+        """The chessboard distance, in cells, from this cell to the nearest occupied one
+        (`GridData`)."""
         return dr.gather(self.grid.backend.UInt32, self.grid.empty_distance, self.index)
 
     def exit_distance(self, d: Vec3, around: Real = 1.0) -> Real:
@@ -359,8 +360,8 @@ _MARGIN, _ROUNDS = 1 / 16, 3
 
 @dataclass(frozen=True)
 class OccupancyGrid(GridData):
-    """A grid whose empty cells, and the margins around them (`EmptySpaceGrid`), hold no point of a
-    set."""
+    """A grid of the cells that may contain a point of a set. Empty cells, and the margins around
+    them (`EmptySpaceGrid`), contain no point of the set."""
 
     @classmethod
     def from_clearance(
@@ -417,7 +418,7 @@ class OccupancyGrid(GridData):
         return replace(self, empty_distance=distance_to_occupied(~full))
 
     def upload(self, backend: Backend) -> EmptySpaceGrid:
-        """The grid on a backend."""
+        """The grid on a backend, for rays."""
         return EmptySpaceGrid(*EmptySpaceGrid.upload_layout(backend, self), _MARGIN)
 
 
@@ -426,28 +427,29 @@ _NEIGHBOR_STENCIL = np.ones((3, 3, 3), np.bool_)
 
 
 def largest_connected_component(cells: OccupancyGrid) -> OccupancyGrid:
-    """The grid in which only the cells of a single connected group are occupied: the group with the
-    largest sum of its projections along the three axes.
+    """The grid in which only the largest group of connected cells is occupied.
 
-    A projection counts the rows of cells, along an axis, that contain a cell of the group. The
-    number of cells would measure areas, or volumes, only if each piece of a surface was surrounded
-    by as many occupied cells: but there are more where its function vanishes to a higher order, and
-    around the two sides of a plate thinner than a cell no more than around a single side.
-    Projections do not depend on that, except for the cells at their outlines: there are several
-    more where a function vanishes to a higher order, so that with coarse cells a smaller component
-    may be chosen for it. Of equal groups the first along z, y and x is chosen.
+    The size of a group is the sum of its projections along the three axes. A projection counts the
+    rows of cells along an axis that contain a cell of the group. Of equal groups, the first along
+    z, y and x is chosen.
+
+    The number of cells would be a worse measure of areas or volumes. It would be right only if each
+    piece of a surface were surrounded by as many occupied cells. But there are more around it where
+    the function vanishes to a higher order; and around the two sides of a plate thinner than a cell
+    there are no more than around a single side. Projections do not depend on that, except for the
+    cells at their outlines. There are several more of these where a function vanishes to a higher
+    order, so that with coarse cells a smaller component may be chosen.
 
     Proof that no component of the set is cut in two. All of the set lies in occupied cells, as
     closed cubes. A connected part of it cannot be covered by two unions of such cubes that are
-    closed and have no point in common; cubes have a point in common if they share at least a
-    corner, that is, if they are neighbors. So it lies in the cells of a single group.
+    closed and have no point in common. Cubes have a point in common if they share at least a
+    corner, that is, if they are neighbors. So the part lies in the cells of a single group.
 
-    Proof that rays may jump across the other groups, with the margin that
+    Proof that rays may jump across the other groups, with the margin by which
     `EmptySpaceGrid.empty_run` goes beyond the cells that it jumps across. A neighbor of a cell of
-    another group belongs to that group or was empty before, and the margin is less than a cell, so
-    the margin contains nothing of the chosen group; the margin of a cell that was empty before
-    contains nothing of the set at all.
-    """
+    another group belongs to that group or was empty before, and the margin is less than a cell. So
+    the margin contains nothing of the chosen group. The margin of a cell that was empty before
+    contains nothing of the set at all."""
     x, y, z = cells.shape
     full = (cells.empty_distance == 0).reshape(z, y, x)
     if not full.any():

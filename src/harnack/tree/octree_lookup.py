@@ -52,12 +52,12 @@ class OctreeLookup:
     """The octree of a cube, on a backend.
 
     lower_corner: the lower corner of the cube.
-    cells_per_length: 2^MAX_DEPTH divided by its side.
-    top_grid: (8^_TOP_DEPTH,) the encoded octree node at depth _TOP_DEPTH that contains each cell of
-        a uniform grid, z fastest; a coarser leaf fills all of its cells.
+    cells_per_length: 2^MAX_DEPTH divided by the width of the cube.
+    top_grid: (8^_TOP_DEPTH,) the cells of a uniform grid, z fastest. Each holds the encoded node at
+        depth _TOP_DEPTH that the cell is, or the encoded leaf at a smaller depth that contains the
+        cell.
     encoded_nodes: all nodes except the root, encoded: the index of the first of eight consecutive
-        children (z fastest), or -1 - k for leaf k.
-    """
+        children (z fastest), or -1 - k for leaf k."""
 
     backend: Backend
     lower_corner: Vec3

@@ -122,7 +122,8 @@ def node_slabs(
 
 @dataclass(frozen=True)
 class RayFrame:
-    """Coordinates along and across rays o + t d: right-handed unit vectors u, v and d."""
+    """Coordinates along and across rays o + t d. The unit vectors u, v and d are orthogonal and
+    right-handed."""
 
     o: Vec3
     u: Vec3
@@ -131,19 +132,19 @@ class RayFrame:
 
     @classmethod
     def along(cls, backend: Backend, o: Vec3, d: Vec3) -> RayFrame:
-        """The frame of rays o + t d, |d| = 1."""
+        """The frame of rays o + t d, where |d| = 1."""
         vector = backend.Array3f
         o, d = vector(o), vector(d)
         u, v = orthonormal_basis(d)
         return cls(o, u, v, d)
 
     def transverse(self, p: Vec3) -> tuple[Real, Real]:
-        """The coordinates of p in the plane normal to the rays."""
+        """The coordinates (u, v) of p in the plane normal to the rays, relative to the ray."""
         a = p - self.o
         return _flush_tiny(dr.dot(a, self.u)), _flush_tiny(dr.dot(a, self.v))
 
     def depth(self, p: Vec3) -> Real:
-        """The coordinate of p along the rays."""
+        """The t of the point of the ray that is nearest to p."""
         return dr.dot(p - self.o, self.d)
 
     def component(self, a: Vec3) -> Real:
@@ -153,7 +154,7 @@ class RayFrame:
 
 @dataclass(frozen=True)
 class VerticalRayFrame:
-    """The frame of rays from points o along the z axis, which takes no computation."""
+    """The frame of rays from points o along the z axis. It takes no computation."""
 
     o: Vec3
 
@@ -178,16 +179,17 @@ def _flush_tiny(coordinate: Real) -> Real:
 
 
 def edge_function(a: tuple[Real, Real], b: tuple[Real, Real]) -> Real:
-    """Twice the area of (0, a, b): its sign says on which side of the edge ab a ray passes.
+    """Twice the signed area of the triangle (0, a, b). Its sign says on which side of the edge ab
+    the ray passes.
 
-    The same bits for every triangle at the edge, if a and b come in the same order.
-    """
+    a, b: coordinates across the ray. The result is the same, to the last bit, for every triangle at
+        the edge, if a and b come in the same order."""
     return dr.fma(a[0], b[1], -(a[1] * b[0]))
 
 
 @dataclass(frozen=True)
 class TriangleTree:
-    """Crossings of rays with triangles, by a tree of boxes."""
+    """A tree of bounding boxes over triangles, which finds their crossings with rays."""
 
     tree: PackedTree
 
@@ -195,10 +197,11 @@ class TriangleTree:
     def of(
         cls, backend: Backend, tree: BalancedTree, records: FloatArray, *, slabs: bool = False
     ) -> TriangleTree:
-        """Build the tree from the records of `triangle_records`.
+        """Build the tree.
 
-        slabs: whether nodes have slabs besides boxes, for closest points from far away.
-        """
+        records: of the triangles, from `triangle_records`.
+        slabs: whether nodes have slabs (`node_slabs`) besides boxes, for closest points from far
+            away."""
         corners = records[:, :9].reshape(-1, 3, 3)
         levels = node_boxes(tree, corners.min(axis=1), corners.max(axis=1))
         if slabs:
@@ -214,16 +217,19 @@ class TriangleTree:
         active: Mask,
         reach: float = 0.0,
     ) -> tuple[Real, Any, Real, Vec3]:
-        """The next crossing after `after` = (t, number) with t <= t_max, ordered by (t, number).
+        """The next crossing of a ray after `after`, with t <= t_max.
 
-        reach: if more than 0, triangles whose border is within this distance of the ray count as
-            crossed too, except triangles whose border is that close to an end of the ray, t = 0 or
-            t_max.
+        after: (t, number). Crossings are ordered by t, and those at the same t by the number of the
+            triangle.
+        reach: a length. If it is more than 0, a triangle counts as crossed too if its border is
+            within this distance of the ray; but not if its border is that close to an end of the
+            ray, t = 0 or t_max.
 
         Returns:
-            t (inf for none), the triangle's index (NO_TRIANGLE for none), the sign of the crossing
-                (1 where the triangle's normal by the right-hand rule points along the ray, -1 where
-                it points back, 0 for none), and that normal (unit).
+            t (inf if there is none); the number of the triangle (NO_TRIANGLE if there is none); the
+            sign of
+                the crossing; and the unit normal of the triangle by the right-hand rule. The sign is 1 if
+                the normal points along the ray, -1 if it points back, and 0 if there is no crossing.
         """
         real, index, vector = (
             self.tree.backend.Float,
@@ -264,10 +270,11 @@ class TriangleTree:
         return best, number, sign, normal * dr.rsqrt(fmax(dr.squared_norm(normal), real(1e-37)))
 
     def signed_crossings_ahead(self, frame: RayFrame, t_min: Real, active: Mask = True) -> Real:
-        """The sum of the signs of all crossings with t > t_min."""
+        """The sum of the signs of all crossings of a ray with t > t_min (`signed_crossing`)."""
         real, inside = self.tree.backend.Float, self._slab_test(frame)
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
+            """Enter a node if the ray comes near its box ahead of t_min."""
             open_ = inside(node, real(t_min), real(dr.inf))
             return open_, for_each_primitive(node, open_ & node.is_leaf, add, state)
 
@@ -281,17 +288,18 @@ class TriangleTree:
     def signed_crossings_between(
         self, frame: RayFrame, end: Real, unit: Real, active: Mask
     ) -> tuple[Real, Mask]:
-        """The sum of the signs of all crossings with 0 < t < end, and where that sum is certain.
+        """The sum of the signs of all crossings with 0 < t < end, and a mask of the rays for which
+        that sum is certain.
 
-        unit: the rounding of a coordinate.
+        unit: the rounding error of a coordinate.
 
-        A computed t belongs to a point of the triangle within a few units of the ray, so that its
-        error is that distance over the cosine between ray and normal. Where t may therefore lie on
-        either side of an end, the sum is not certain.
-        """
+        A computed t belongs to a point of the triangle within a few units of the ray. So the error
+        of t is that distance divided by the cosine of the angle between ray and normal. If t may
+        therefore lie on either side of an end of the interval, the sum is not certain."""
         real, inside = self.tree.backend.Float, self._slab_test(frame)
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
+            """Enter a node if the ray comes near its box between 0 and `end`."""
             open_ = inside(node, real(0), real(end))
             return open_, for_each_primitive(node, open_ & node.is_leaf, add, state)
 
@@ -314,18 +322,19 @@ class TriangleTree:
         return total, sure
 
     def signed_crossings_vertical(self, x: Vec3, way: Real, active: Mask = True) -> Real:
-        """The sum of the signs of all crossings of rays from x upwards (way 1) or downwards (-1)
-        along the z axis.
+        """The sum of the signs of all crossings of rays from x along the z axis.
 
-        For both, the signs are those with respect to the upward direction. Testing boxes costs less
-        than for other directions.
-        """
+        way: 1 for rays upwards, -1 for rays downwards. In both cases the signs are those for the
+            upward direction.
+
+        Testing boxes costs less than for other directions."""
         real = self.tree.backend.Float
         up, height = way > 0, way * x.z
         pad = 4 * self.tree.backend.machine_epsilon * (1 + dr.max(dr.abs(x)))
         low_x, high_x, low_y, high_y = x.x - pad, x.x + pad, x.y - pad, x.y + pad
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
+            """Enter a node if its box, slightly enlarged, meets the vertical ray."""
             x0, y0, z0, x1, y1, z1 = node.head
             open_ = (
                 (high_x >= x0) & (low_x <= x1) & (high_y >= y0) & (low_y <= y1)
