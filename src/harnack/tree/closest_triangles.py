@@ -72,8 +72,7 @@ class BoxTree:
 
         Returns:
             The t where the ray enters the box, the t where it leaves it, and the number of the box
-            (NO_BOX
-                if there is none).
+            (NO_BOX if there is none).
         """
         real, index = self.tree.backend.Float, self.tree.backend.UInt32
         t_after, n_after = real(after[0]), index(after[1])

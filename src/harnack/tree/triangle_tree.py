@@ -227,9 +227,9 @@ class TriangleTree:
 
         Returns:
             t (inf if there is none); the number of the triangle (NO_TRIANGLE if there is none); the
-            sign of
-                the crossing; and the unit normal of the triangle by the right-hand rule. The sign is 1 if
-                the normal points along the ray, -1 if it points back, and 0 if there is no crossing.
+            sign of the crossing; and the unit normal of the triangle by the right-hand rule. The
+            sign is 1 if the normal points along the ray, -1 if it points back, and 0 if there is no
+            crossing.
         """
         real, index, vector = (
             self.tree.backend.Float,
@@ -391,19 +391,20 @@ def normal_of(row: list[Real], vector: Any) -> Vec3:
 
 
 def signed_crossing(row: list[Real], frame: RayFrame | VerticalRayFrame) -> tuple[Real, Real]:
-    """t and the sign of the crossing of a ray with the triangle of a record; 0 where there is none.
+    """The t and the sign of the crossing of a ray with the triangle of a record. The sign is 0 if
+    there is none.
 
-    In the plane across the ray, the sign is the winding number of the triangle about the ray:
-    over its edges, +1 for each that crosses the half-line v = 0, u > 0 upwards and -1 downwards.
-    Upwards means from v <= 0 to v > 0, which v alone decides; that u > 0 there is the sign of
-    `edge_function`. Both are the same for all triangles around a vertex or an edge, so that a
-    rounding error that adds a crossing to one of them takes it from its neighbor: the sum over a
-    closed surface is right whatever the rounding did, and rays through edges and vertices need no
-    special case.
+    In the plane across the ray, with coordinates (u, v), the sign is the winding number of the
+    triangle about the ray. It is a sum over the edges of the triangle: +1 for each that crosses the
+    half-line v = 0, u > 0 upwards, and -1 for each that crosses it downwards. Upwards means from v
+    <= 0 to v > 0, which v alone decides; whether u > 0 at the crossing is the sign of
+    `edge_function`. Both are the same for all triangles around a vertex or an edge. So a rounding
+    error that adds a crossing to one of them takes it from its neighbor: the sum over a closed
+    surface is right whatever the rounding did, and rays through edges and vertices need no special
+    case.
 
     t is the depth of a point of the triangle within a few roundings of coordinates of the ray,
-    however thin the triangle is (`_crossing_depth`).
-    """
+    however thin the triangle is (`_crossing_depth`)."""
     vector = cast("Any", type(frame.o))
     p, q, r = corners_of(row, vector)
     a, b, c = frame.transverse(p), frame.transverse(q), frame.transverse(r)
