@@ -79,22 +79,23 @@ class WallThickness:
 def wall_thickness(part: Any, **options: Any) -> WallThickness:
     """The thickness of a part behind each of its faces.
 
-    At the center of a face a ray goes into the part, along the normal, and ends at the other side:
-    at a distance t. Then the ball that touches the center, t wide, shrinks until it holds no place
-    of the surface that faces the center (normals more than 120 degrees apart): to the ball that
-    touches the nearest such place as well, again and again (Ma, Bae and Choi 2012, 3D medial axis
-    point approximation using nearest neighbors and the normal field). Its diameter is the
-    thickness. Where walls are parallel it is their distance, and it is never more than the length
-    of the ray. Places beside the edges of a part, where the nearest wall is no opposite one, are
-    not thin by that: there the ball shrinks no further, so that the value is an upper bound.
+    part: a closed mesh (a trimesh.Trimesh, (vertices, faces), or the name of a file); or a solid,
+        which is meshed first.
+    options: of `mesh`, for a solid.
+
+    At the center of a face a ray goes into the part, against the normal, and ends at the other
+    side, at a distance t. A ball of diameter t touches the center from inside. It shrinks until it
+    holds no point of the surface that faces the center (whose normal differs by more than 120
+    degrees): again and again, it is replaced by the ball that touches the center and the nearest
+    such point (Ma, Bae and Choi 2012, 3D medial axis point approximation using nearest neighbors
+    and the normal field). Its diameter is the thickness. Where walls are parallel it is their
+    distance, and it is never more than the length of the ray. A place beside an edge of the part,
+    where the nearest wall is not opposite, does not count as thin for that: there the ball shrinks
+    no further, so that the value is an upper bound.
 
     Error: rays and nearest points are exact on the triangles, in double precision, to 1e-6 of the
-    mesh's size. Between centers nothing is measured; make large faces smaller for that
+    mesh's size. Between centers nothing is measured: make large faces smaller for that
     (`mesh.subdivide_to_size`).
-
-    part: a closed mesh (a trimesh.Trimesh, (vertices, faces), or a file's name), or a solid, of
-        which a mesh is made.
-    options: of `mesh`, for a solid.
 
     Raises:
         MeshError: a mesh that bounds no solid. MeshingError: a solid that cannot be meshed.

@@ -22,12 +22,14 @@ _MOST_VERTICES = 4_000_000
 
 
 def thread_manifold(thread: Thread, lower: float, upper: float, tolerance: float) -> Manifold:
-    """A thread for lower <= z <= upper; the mesh beyond that range has no meaning.
+    """The mesh of a thread for lower <= z <= upper. Below and above that range it has no meaning.
 
-    Vertices lie on the surface, so that the edges of the profile are edges of the mesh. With n
-    vertices around, faces are within 2 r (pi/n)^2 of the surface: their corners differ by 2 pi/n in
-    angle at most, so that a chord has a sagitta of r (pi/n)^2/2, and a diagonal of a face that is
-    turned by 2 pi/n departs from it by less than three times that.
+    tolerance: a length, the largest distance of faces from the surface.
+
+    Vertices lie on the surface, so the edges of the thread's profile are edges of the mesh. With n
+    vertices around and the largest radius r, faces are within 2 r (pi/n)^2 of the surface. Their
+    corners differ by at most 2 pi/n in angle. So a chord has a sagitta of r (pi/n)^2/2, and the
+    departure of the diagonal of a face, which is turned by 2 pi/n, is less than three times that.
 
     Raises:
         MeshingError: the mesh would have millions of faces.

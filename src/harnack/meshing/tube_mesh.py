@@ -33,19 +33,20 @@ _REVERSAL = 1e-9
 
 
 def tube_manifold(tube: Tube, level: float, tolerance: float) -> Manifold:
-    """The points within radius + level of a tube's polylines; vertices lie on the surface, and
-    faces within `tolerance` of it.
+    """The mesh of the points within radius + level of a tube's polylines. Vertices lie on the
+    surface, and faces are within `tolerance` (a length) of it.
 
-    Vertices of a polyline within a quarter of the tolerance of a shorter polyline are left out.
-    Each polyline is swept as a whole. Where its mesh would pass through itself, as at corners too
-    sharp for the radius or where the tube returns to itself, the polyline is cut in two at a
-    vertex, where both parts end with a ball: the tube is the union of both parts' tubes.
+    First, vertices of a polyline are removed as long as the polyline stays within a quarter of the
+    tolerance. Then each polyline is swept as a whole. If its mesh would pass through itself, as at
+    corners too sharp for the radius or where the tube returns to itself, the polyline is cut in two
+    at a vertex, where both parts end with a ball: the tube is the union of both parts' tubes.
 
-    Proof of the tolerance, with the angle a = 2 pi/n between points around. Distances from two
-    polylines differ by no more than these do. Faces between lines along an edge have chords of
-    angle a, r a^2/8 deep, and where two edges meet in a single ring, at an angle up to a, lines
-    along the edge lie as deep as that. On the balls outside of corners and at ends both chords are
-    of angle a at most. The sum is at most r a^2/4, three quarters of the tolerance.
+    Proof of the tolerance. Let r be the radius, n the number of points around and a = 2 pi/n. The
+    distances of a point from two polylines differ by no more than the polylines do. Faces between
+    lines along an edge have chords of angle a, which are r a^2/8 deep. Where two edges meet in a
+    single ring, at an angle up to a, lines along the edge lie as deep as that. On the balls outside
+    of corners and at ends both chords are of angle a at most. The sum is at most r a^2/4, three
+    quarters of the tolerance.
 
     Raises:
         MeshingError: the mesh would have millions of faces.
