@@ -102,86 +102,97 @@ def mesh(
 ) -> trimesh.Trimesh:
     """Triangles of a level set, or the closed surface of a solid.
 
-    Tetrahedra around the level set, found by an octree whose empty cells are proved empty, are cut
-    by it; the surface of an angle ends exactly at its curve. Then edges are cut and vertices moved
-    onto the surface until middles of edges and centers of triangles are within the tolerance.
-    Solids are put together from the meshes of smooth levels by manifold3d, and so cut by the clip.
+    How it is meshed depends on the field:
 
-    Fields that are sums over meshes, points and blobs (`WindingNumber`, `DipolePotential`,
-    `ScreenedWindingNumber`, `Morph`, `HRBF`, `Blobs`) are meshed by the signs of their values alone
-    (`meshing.sign_isosurface`), which gives a closed surface whatever the mesh or the cloud is.
-    Vertices lie where edges of the cells meet the level, so on the very triangles of a sound mesh;
-    parts that are thinner or nearer to each other than a cell may be missed or joined, which is
-    looked for at about three thousand points of the level (`meshing.lost_parts`) and warned of. Of
-    a mesh that is its own spanning surface (`WindingNumber`), such as a file of a `SolidAngle`'s,
-    the triangles are kept as they are, whatever tolerance, spacing and seed are.
+    - Smooth fields and angles. An octree finds the tetrahedra around the level set; cells are left out
+      only if they are proved empty. The level set cuts the tetrahedra into triangles; the surface of an
+      angle ends exactly at its curve. Then edges are split and vertices moved onto the surface, until
+      the midpoints of edges and the centers of triangles are within the tolerance.
+    - Solids. The meshes of smooth levels are put together by manifold3d, which also cuts them by the
+      clip.
+    - Sums over meshes, points and blobs (`WindingNumber`, `DipolePotential`, `ScreenedWindingNumber`,
+      `Morph`, `HRBF`, `Blobs`). They are meshed by the signs of their values alone
+      (`meshing.sign_isosurface`), which gives a closed surface whatever the mesh or the cloud is.
+      Vertices lie where edges of the cells meet the level set, so on the triangles of a valid mesh
+      themselves. Parts that are thinner than a cell, or nearer to each other, may be missed or joined.
+      That is looked for at about three thousand points of the level set (`meshing.lost_parts`), and a
+      warning says so.
+    - A `WindingNumber` of a mesh that is its own spanning surface, such as a mesh of a `SolidAngle`.
+      The triangles are kept as they are, whatever the tolerance, cell size and seed are.
 
-    surface: a field or a `Surface`; of a `SolidAngle` of polygons, or a real-valued field that is
-        continuous, or one of those named above; of one level, but for side="between". Surfaces end
-        where clip, section or the field's domain cut them, and solids (`side`) are closed there. A
-        clip is needed where the level set has no extent. The points of a `Solid` are those with
-        f <= level, unless side="surface" asks for the level set alone, which is open where it is
-        cut. `largest` keeps one connected component alone: of a surface the one with the largest
-        area, of a closed mesh the one with the largest volume, whose cavities stay.
-    cell_size: of cells before anything is refined, in the field's unit; None chooses a 24th of the
-        longest side (by signs a 48th), and of waves (`Field.min_wavelength`) a fifth of theirs at
-        the most. Sheets that are nearer to each other are told apart where that is noticed; else a
-        MeshingError says so.
-    thickness: makes a closed part so thick, in the field's unit, of a surface: half on each side.
-    simplify: leave out vertices that are not needed within the tolerance, of closed meshes: of the
-        mesh that is made without it, whose middles of edges are within half of the tolerance.
+    surface: a field or a `Surface`. The field is a `SolidAngle` of polygons, a continuous real-valued
+        field, or one of those named above. There is one level, except with side="between".
+        Surfaces end where the clip, the section or the field's domain cuts them; solids (`side`) are
+        closed there. A clip is needed if the level set has no extent. The points of a `Solid` are those
+        with f <= level, unless side="surface" asks for the level set alone, which is open where it is
+        cut. `largest` keeps a single connected component: the one with the largest area of a surface,
+        and the one with the largest volume, with its cavities, of a closed mesh.
+    cell_size: the size of cells before refinement, in the field's unit. None chooses a 24th of the
+        longest side of the box (a 48th for meshing by signs), and at most a fifth of the length of
+        waves (`Field.min_wavelength`). Sheets that are nearer to each other are told apart where that
+        is noticed; otherwise a MeshingError says so.
+    thickness: makes a closed part with this thickness of a surface, in the field's unit: half of it on
+        each side.
+    simplify: whether to remove vertices that are not needed within the tolerance; for closed meshes.
+        The mesh that is simplified has midpoints of edges within half of the tolerance.
     seed: of the small random moves that keep points in general position.
-    max_triangles: of one level set, before anything is simplified; what would take more is not
-        begun or given up, with a MeshingError. Cells are limited with them, to two millions.
-    progress: told what is being done.
-    options: a `TraceOptions`, of which meshes have the tolerance alone: the largest distance of
-        triangles from the surface, sampled and not proved; None for 1e-3 of the longest side of the
-        level set's box.
-    keywords: those of `Surface` beside a bare field, and `tolerance` in place of `options`.
+    max_triangles: the largest number of triangles of one level set, before it is simplified. A mesh that
+        would take more is not begun, or given up, with a MeshingError. It limits the number of cells
+        too, as does a fixed limit of two million.
+    progress: a function that is told what is being done.
+    options: a `TraceOptions`. Meshes use only its tolerance: the largest distance of triangles from the
+        surface, which is sampled and not proved; None for 1e-3 of the longest side of the level set's
+        box.
+    keywords: the keywords of `Surface`, if `surface` is a field; and `tolerance` in place of `options`.
 
-    All that is returned has been checked: every edge has two faces, or one at the boundary, no two
-    triangles pass through each other, vertices and centers of triangles are within the tolerance of
-    the level by samples of the field, and inside the clip (of a thick part, the surface that it is
-    made of). Else a MeshingError is raised. By signs all is checked but the last: if more than one
-    in a hundred vertices and centers are beyond the tolerance, smaller cells are tried; if that is
-    not enough, a warning says how many there are and how far they are; and a MeshingError if some
-    are farther than a few cells. The same is done and said where parts of the level set are lost.
+    The result has been checked, and a MeshingError is raised if a check fails: every edge has two
+    faces, or one at the boundary; no two triangles pass through each other; and vertices and centers
+    of triangles are within the tolerance of the level set, by samples of the field, and inside the
+    clip (for a thickened surface, those of the surface before). For meshing by signs, the last check
+    differs. If more than one in a hundred vertices and centers are farther than the tolerance, smaller
+    cells are tried. If that is not enough, a warning says how many there are and how far they are; if
+    some are farther than a few cells, a MeshingError is raised. Smaller cells are also tried, and a
+    warning given, where parts of the level set are lost.
 
     Returns:
-        A trimesh.Trimesh; if it is closed, `export` writes closed files, in single precision, or
-        raises a MeshingError. Vertices of a curve come first, in order, bit by bit, and its edges
-        are the boundary. Without a boundary, faces are turned outwards: the volume is positive;
-        else they are turned towards larger values. `metadata["harnack"]` has level, spacing,
-        evaluations, the Euler characteristic,
-        boundary: indices (k, 2) of edges of one face,
-        creases: how many edges have faces more than 30 degrees apart: a function with kinks, such
-            as |x| or max(f, g), has them where its level set does. That these are within the
-            tolerance is checked at middles of edges and triangles; nothing is proved there; and
-        proved, integrated: how many changes along edges of tetrahedra are proved to be differences
-            of wrapped values, and how many were integrated;
-        isotopy, isotopy_far: the shares of tetrahedra on which the first triangles are proved to
-            have the topology of the level set (`meshing.isotopy`), of all and of those farther than
-            1.5 times the spacing from the curve;
-        turned: triangles of an angle, smaller than the tolerance, that are turned over.
-        Of meshes by signs, made_by is "signs", and
-        far, looked_at, within: how many vertices and centers of triangles are beyond the tolerance,
-            of how many, and a distance within which all are, sampled up to a factor of 2;
-        lost, sought: how many points of the level are beyond the tolerance from the mesh, of how
-            many: on triangles of a mesh, at points of a cloud, on the way out of blobs;
-        undecided: at how many points of the lattice the error of f leaves its sign open;
-        flat: how many triangles were not fitted to creases, as they would pass through others;
-        Where the triangles of a mesh were kept, made_by is "faces", and there is none of
-        this.
-        cloud: of a `DipolePotential`, what it says of itself (`describe`), such as how many points
-            it has, what was estimated, and the smoothing and noise that were chosen and found.
+        A trimesh.Trimesh. If it is closed, its `export` writes closed files, in single precision, or
+        raises a MeshingError. Vertices of a curve come first, in order, bit by bit, and the edges of the
+        curve are the boundary. Without a boundary, faces are turned outwards, so that the volume is
+        positive; otherwise they are turned towards larger values. `metadata["harnack"]` has level,
+        spacing (the size of cells), evaluations, the Euler characteristic, and
 
-        Solids and thick surfaces have more: see `docs/printing.md`.
+        boundary: (k, 2) the vertices of the edges of one face;
+        creases: the number of edges whose faces are more than 30 degrees apart. A function with kinks,
+            such as |x| or max(f, g), has such edges where its level set does. Whether these are within
+            the tolerance is checked at midpoints of edges and centers of triangles, and not proved;
+        proved, integrated: the number of edges of tetrahedra along which the change of the function is
+            proved to be the difference of wrapped values, and of those along which it was integrated;
+        isotopy, isotopy_far: the fraction of the tetrahedra on which the first triangles are proved to
+            have the topology of the level set (`meshing.isotopy`); the same among the tetrahedra farther
+            than 1.5 times the spacing from the curve;
+        turned: the number of triangles of an angle, smaller than the tolerance, that are turned over.
+
+        For meshes by signs, made_by is "signs", and there are
+
+        far, looked_at, within: the number of vertices and centers of triangles that are farther than the
+            tolerance; the number of all that were tested; and a distance within which all are, too large
+            by up to a factor of 2;
+        lost, sought: the number of points of the level set that are farther than the tolerance from the
+            mesh, and of all that were tested: on triangles of a mesh, at points of a cloud, on the way
+            out of blobs;
+        undecided: the number of points of the lattice at which the error of f leaves its sign open;
+        flat: the number of triangles that were not fitted to creases, as they would pass through others;
+        cloud: for a `DipolePotential`, what its `describe` returns, such as the number of points, what
+            was estimated, and the smoothing and noise that were chosen and found.
+
+        If the triangles of a mesh were kept, made_by is "faces", and these entries are missing. Solids
+        and thickened surfaces have more entries: see `docs/printing.md`.
 
     Raises:
-        MeshingError: a ValueError, if it could not be done; the message says why.
-        TypeError: a field that has patches; a clip that is no volume; an option of traces that
-            meshes do not have; keywords beside an object that holds them.
-        ValueError: options out of range, or that contradict each other; several levels.
+        MeshingError: a ValueError, if the surface could not be meshed; the message says why.
+        TypeError: the field has patches; the clip is no volume; an option of traces that meshes do not
+            have; keywords beside an object that holds them.
+        ValueError: options are out of range or contradict each other; several levels.
     """
     target, choices = surface_and_options("mesh", surface, options, keywords, _HONORED)
     accuracy = MeshTolerance.of(choices)
