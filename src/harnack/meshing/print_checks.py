@@ -107,26 +107,32 @@ class PrintCheck:
 def check_print(
     part: Any, *, min_thickness: float | None = None, build_volume: Any = None
 ) -> PrintCheck:
-    """What a slicer would complain of in a mesh, and where.
+    """Find what a slicer would complain about in a mesh, and where it is.
 
-    Errors are: open edges, edges of more than two faces, neighbors that do not agree on their two
-    sides, parts that are inside out or in the material of others, vertices where sheets touch,
-    corners and edges that lie on other faces, triangles that pass through each other or lie on each
-    other (decided exactly), duplicate faces; walls thinner than `min_thickness`; a size that does
-    not fit on the bed. Hints are: corners apart from others by rounding, which count as one, faces
-    without an area, several parts, tiny ones, cavities without a way out (for powder and resin),
-    and a size that looks like inches or meters, and, of walls, faces so large that a thin place
-    beside their centers may be missed.
+    Errors are:
 
-    part: a trimesh.Trimesh, (vertices, faces), or the name of a file. Vertices at the same place
-        count as one.
-    min_thickness: the least allowed thickness, a length (see `thickness`); None to leave it out.
-    build_volume: (x, y, z), the size that fits, turned by right angles about z; None to leave it
-        out.
+    - open edges, edges of more than two faces, and neighbors that do not agree on their two sides;
+    - parts that are inside out, or in the material of other parts;
+    - vertices where sheets touch, and corners and edges that lie on other faces;
+    - triangles that pass through each other or lie on each other (decided exactly), and duplicate
+      faces;
+    - walls thinner than `min_thickness`, and a size that does not fit into `build_volume`.
+
+    Hints are: corners that only rounding separates from others (they count as one), faces without an
+    area, several parts, tiny parts, cavities without a way out (for powder and resin), a size that looks
+    like inches or meters, and, if thickness is measured, faces so large that a thin place beside their
+    centers may be missed.
+
+    part: a trimesh.Trimesh, (vertices, faces), or the name of a file. Vertices at the same place count
+        as one.
+    min_thickness: the smallest allowed thickness, a length (see `thickness`); None to skip that check.
+    build_volume: (x, y, z), the largest size, into which the part may be turned by a right angle about
+        z; None to skip that check.
 
     Raises:
-        MeshError: no mesh. FileFormatError: a file that cannot be read. ValueError: a thickness or
-            a bed that is no length.
+        MeshError: the object is no mesh.
+        FileFormatError: the file cannot be read.
+        ValueError: the thickness is no positive length, or the build volume not three of them.
     """
     if min_thickness is not None:
         min_thickness = as_positive(min_thickness, "min_thickness")

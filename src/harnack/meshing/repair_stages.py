@@ -114,28 +114,31 @@ def repair(
     - remeshed: the surface on which the winding number w of the mesh is 1/2 is extracted from the
       signs of w - 1/2 in cells (`meshing.sign_isosurface`); it is closed whatever the mesh is.
 
-    Each result is compared with w at some thousand points, farther from both surfaces than two
-    tolerances: where w is above 0.86 the inside has to be, and where it is below 0.14 the outside;
-    and the volume has to be that of a closed mesh that winds around no point twice. One that
-    differs gives way to the next stage; if all do, the one that differs least is returned, with a
-    warning. That is sampled: what differs in less than a thousandth of the box may not be seen.
+    Each result is compared with w at some thousand points that are farther than two tolerances from
+    both surfaces. Points where w is above 0.86 have to be inside of the result, points where it is
+    below 0.14 outside. If the input is a closed mesh that winds around no point twice, the volumes
+    have to agree as well. If a result differs, the next stage is tried; if all results differ, the
+    one that differs least is returned, with a warning. The comparison is a sample: what differs in
+    less than a thousandth of the box may not be seen.
 
     mesh: anything with `vertices` (n, 3) and `faces` (m, 3).
-    keep: "all" does only the stage "filled", "valid" only "cleaned", and "none" only "remeshed",
-        or raises an error; None tries all five, up to the first that succeeds.
-    filling: "smooth" hole fillings continue the surface around each hole, with its tangents, and
-        bend least. They are computed hole by hole, and used where w is within 0.36 of 1/2 modulo 1
-        on them; other holes get "harmonic" fillings, on which w is 1/2 modulo 1: these join the
-        boundary loops of a gap between two components, and have a dent where the surface was
-        round. Only for harmonic fillings is it proved which surface they approximate.
-    largest: keep only the body of the largest volume, with its cavities.
-    cell_size: of cells before anything is refined, in the mesh's unit; None chooses.
+    keep: which stages to try. "all" is only "filled", "valid" only "cleaned", "none" only
+        "remeshed"; an error is raised if the stage fails. None tries all five, up to the first that
+        succeeds.
+    filling: "smooth" or "harmonic". Smooth fillings continue the surface around a hole, with its
+        tangents, and have minimal bending. They are computed hole by hole, and used if w is within
+        0.36 of 1/2 modulo 1 on them. Other holes get harmonic fillings, on which w is 1/2 modulo 1.
+        These can join the boundary loops of a gap between two components, and have a dent where the
+        surface was round. Only for harmonic fillings is it proved which surface they approximate.
+    largest: whether to keep only the body of the largest volume, with its cavities.
+    cell_size: the size of cells before refinement, in the mesh's unit; None chooses it.
     seed: of the small random moves that keep points in general position.
-    progress: told what is being done.
-    options: a `TraceOptions`, of which repairs have the tolerance alone: the largest distance of
-        harmonic fillings and of remeshed triangles from the surface w = 1/2, a length, sampled and
-        not proved. None is 1e-3 of the longest side of the box of the mesh and, for fillings, of
-        the box around all holes. tolerance: the same, in place of `options`.
+    progress: a function that is told what is being done.
+    options: a `TraceOptions`. Repairs use only its tolerance: the largest distance of harmonic
+        fillings and of remeshed triangles from the surface w = 1/2, a length, which is sampled and
+        not proved. None is 1e-3 of the longest side of the box around the mesh or, for fillings, of
+        the box around all holes.
+    tolerance: the same, in place of `options`.
 
     Returns:
         A closed trimesh.Trimesh: every edge has two faces, which agree. `metadata["harnack"]` has
@@ -178,10 +181,10 @@ def repair(
         signs, such as far and within; kept is 0.
 
     Raises:
-        MeshError: a ValueError, for a mesh that has no triangles, or numbers that are none; one
-            that is an open sheet, most of which has nothing inside, if it would be made anew; with
-            keep="all" also for edges of more than two faces, faces that disagree on their sides,
-            faces without an area and vertices at one place.
+        MeshError: a ValueError. The mesh has no triangles, or numbers that are not finite; or it
+            would be remeshed and is an open sheet with nothing inside of most of it. With keep="all"
+            also: it has edges of more than two faces, faces that disagree in orientation, faces
+            without an area, or several vertices at one place.
         MeshingError: a ValueError, with keep="all" or "valid", if patches could not be made, or
             meet the mesh or each other; else if the surface w = 1/2 is empty or takes too many
             cells.
