@@ -104,94 +104,103 @@ def mesh(
 
     How it is meshed depends on the field:
 
-    - Smooth fields and angles. An octree finds the tetrahedra around the level set; cells are left out
-      only if they are proved empty. The level set cuts the tetrahedra into triangles; the surface of an
-      angle ends exactly at its curve. Then edges are split and vertices moved onto the surface, until
-      the midpoints of edges and the centers of triangles are within the tolerance.
-    - Solids. The meshes of smooth levels are put together by manifold3d, which also cuts them by the
-      clip.
-    - Sums over meshes, points and blobs (`WindingNumber`, `DipolePotential`, `ScreenedWindingNumber`,
-      `Morph`, `HRBF`, `Blobs`). They are meshed by the signs of their values alone
-      (`meshing.sign_isosurface`), which gives a closed surface whatever the mesh or the cloud is.
-      Vertices lie where edges of the cells meet the level set, so on the triangles of a valid mesh
-      themselves. Parts that are thinner than a cell, or nearer to each other, may be missed or joined.
-      That is looked for at about three thousand points of the level set (`meshing.lost_parts`), and a
-      warning says so.
-    - A `WindingNumber` of a mesh that is its own spanning surface, such as a mesh of a `SolidAngle`.
-      The triangles are kept as they are, whatever the tolerance, cell size and seed are.
+    - Smooth fields and angles. An octree finds the tetrahedra around the level set; cells are left
+      out only if they are proved empty. The level set cuts the tetrahedra into triangles; the
+      surface of an angle ends exactly at its curve. Then edges are split and vertices moved onto
+      the surface, until the midpoints of edges and the centers of triangles are within the
+      tolerance.
+    - Solids. The meshes of smooth levels are put together by manifold3d, which also cuts them by
+      the clip.
+    - Sums over meshes, points and blobs (`WindingNumber`, `DipolePotential`,
+      `ScreenedWindingNumber`, `Morph`, `HRBF`, `Blobs`). They are meshed by the signs of their
+      values alone (`meshing.sign_isosurface`), which gives a closed surface whatever the mesh or
+      the cloud is. Vertices lie where edges of the cells meet the level set, so on the triangles of
+      a valid mesh themselves. Parts that are thinner than a cell, or nearer to each other, may be
+      missed or joined. That is looked for at about three thousand points of the level set
+      (`meshing.lost_parts`), and a warning says so.
+    - A `WindingNumber` of a mesh that is its own spanning surface, such as a mesh of a
+      `SolidAngle`. The triangles are kept as they are, whatever the tolerance, cell size and seed
+      are.
 
-    surface: a field or a `Surface`. The field is a `SolidAngle` of polygons, a continuous real-valued
-        field, or one of those named above. There is one level, except with side="between".
-        Surfaces end where the clip, the section or the field's domain cuts them; solids (`side`) are
-        closed there. A clip is needed if the level set has no extent. The points of a `Solid` are those
-        with f <= level, unless side="surface" asks for the level set alone, which is open where it is
-        cut. `largest` keeps a single connected component: the one with the largest area of a surface,
-        and the one with the largest volume, with its cavities, of a closed mesh.
+    surface: a field or a `Surface`. The field is a `SolidAngle` of polygons, a continuous
+        real-valued field, or one of those named above. There is one level, except with
+        side="between". Surfaces end where the clip, the section or the field's domain cuts them;
+        solids (`side`) are closed there. A clip is needed if the level set has no extent. The
+        points of a `Solid` are those with f <= level, unless side="surface" asks for the level set
+        alone, which is open where it is cut. `largest` keeps a single connected component: the one
+        with the largest area of a surface, and the one with the largest volume, with its cavities,
+        of a closed mesh.
     cell_size: the size of cells before refinement, in the field's unit. None chooses a 24th of the
         longest side of the box (a 48th for meshing by signs), and at most a fifth of the length of
-        waves (`Field.min_wavelength`). Sheets that are nearer to each other are told apart where that
-        is noticed; otherwise a MeshingError says so.
-    thickness: makes a closed part with this thickness of a surface, in the field's unit: half of it on
-        each side.
-    simplify: whether to remove vertices that are not needed within the tolerance; for closed meshes.
-        The mesh that is simplified has midpoints of edges within half of the tolerance.
+        waves (`Field.min_wavelength`). Sheets that are nearer to each other are told apart where
+        that is noticed; otherwise a MeshingError says so.
+    thickness: makes a closed part with this thickness of a surface, in the field's unit: half of it
+        on each side.
+    simplify: whether to remove vertices that are not needed within the tolerance; for closed
+        meshes. The mesh that is simplified has midpoints of edges within half of the tolerance.
     seed: of the small random moves that keep points in general position.
-    max_triangles: the largest number of triangles of one level set, before it is simplified. A mesh that
-        would take more is not begun, or given up, with a MeshingError. It limits the number of cells
-        too, as does a fixed limit of two million.
+    max_triangles: the largest number of triangles of one level set, before it is simplified. A mesh
+        that would take more is not begun, or given up, with a MeshingError. It limits the number of
+        cells too, as does a fixed limit of two million.
     progress: a function that is told what is being done.
-    options: a `TraceOptions`. Meshes use only its tolerance: the largest distance of triangles from the
-        surface, which is sampled and not proved; None for 1e-3 of the longest side of the level set's
-        box.
-    keywords: the keywords of `Surface`, if `surface` is a field; and `tolerance` in place of `options`.
+    options: a `TraceOptions`. Meshes use only its tolerance: the largest distance of triangles from
+        the surface, which is sampled and not proved; None for 1e-3 of the longest side of the level
+        set's box.
+    keywords: the keywords of `Surface`, if `surface` is a field; and `tolerance` in place of
+        `options`.
 
     The result has been checked, and a MeshingError is raised if a check fails: every edge has two
-    faces, or one at the boundary; no two triangles pass through each other; and vertices and centers
-    of triangles are within the tolerance of the level set, by samples of the field, and inside the
-    clip (for a thickened surface, those of the surface before). For meshing by signs, the last check
-    differs. If more than one in a hundred vertices and centers are farther than the tolerance, smaller
-    cells are tried. If that is not enough, a warning says how many there are and how far they are; if
-    some are farther than a few cells, a MeshingError is raised. Smaller cells are also tried, and a
-    warning given, where parts of the level set are lost.
+    faces, or one at the boundary; no two triangles pass through each other; and vertices and
+    centers of triangles are within the tolerance of the level set, by samples of the field, and
+    inside the clip (for a thickened surface, those of the surface before). For meshing by signs,
+    the last check differs. If more than one in a hundred vertices and centers are farther than the
+    tolerance, smaller cells are tried. If that is not enough, a warning says how many there are and
+    how far they are; if some are farther than a few cells, a MeshingError is raised. Smaller cells
+    are also tried, and a warning given, where parts of the level set are lost.
 
     Returns:
-        A trimesh.Trimesh. If it is closed, its `export` writes closed files, in single precision, or
-        raises a MeshingError. Vertices of a curve come first, in order, bit by bit, and the edges of the
-        curve are the boundary. Without a boundary, faces are turned outwards, so that the volume is
-        positive; otherwise they are turned towards larger values. `metadata["harnack"]` has level,
-        spacing (the size of cells), evaluations, the Euler characteristic, and
+        A trimesh.Trimesh. If it is closed, its `export` writes closed files, in single precision,
+        or raises a MeshingError. Vertices of a curve come first, in order, bit by bit, and the
+        edges of the curve are the boundary. Without a boundary, faces are turned outwards, so that
+        the volume is positive; otherwise they are turned towards larger values.
+        `metadata["harnack"]` has level, spacing (the size of cells), evaluations, the Euler
+        characteristic, and
 
         boundary: (k, 2) the vertices of the edges of one face;
-        creases: the number of edges whose faces are more than 30 degrees apart. A function with kinks,
-            such as |x| or max(f, g), has such edges where its level set does. Whether these are within
-            the tolerance is checked at midpoints of edges and centers of triangles, and not proved;
-        proved, integrated: the number of edges of tetrahedra along which the change of the function is
-            proved to be the difference of wrapped values, and of those along which it was integrated;
-        isotopy, isotopy_far: the fraction of the tetrahedra on which the first triangles are proved to
-            have the topology of the level set (`meshing.isotopy`); the same among the tetrahedra farther
-            than 1.5 times the spacing from the curve;
-        turned: the number of triangles of an angle, smaller than the tolerance, that are turned over.
+        creases: the number of edges whose faces are more than 30 degrees apart. A function with
+            kinks, such as |x| or max(f, g), has such edges where its level set does. Whether these
+            are within the tolerance is checked at midpoints of edges and centers of triangles, and
+            not proved;
+        proved, integrated: the number of edges of tetrahedra along which the change of the function
+            is proved to be the difference of wrapped values, and of those along which it was
+            integrated;
+        isotopy, isotopy_far: the fraction of the tetrahedra on which the first triangles are proved
+            to have the topology of the level set (`meshing.isotopy`); the same among the tetrahedra
+            farther than 1.5 times the spacing from the curve;
+        turned: the number of triangles of an angle, smaller than the tolerance, that are turned
+            over.
 
         For meshes by signs, made_by is "signs", and there are
 
-        far, looked_at, within: the number of vertices and centers of triangles that are farther than the
-            tolerance; the number of all that were tested; and a distance within which all are, too large
-            by up to a factor of 2;
-        lost, sought: the number of points of the level set that are farther than the tolerance from the
-            mesh, and of all that were tested: on triangles of a mesh, at points of a cloud, on the way
-            out of blobs;
+        far, looked_at, within: the number of vertices and centers of triangles that are farther
+            than the tolerance; the number of all that were tested; and a distance within which all
+            are, too large by up to a factor of 2;
+        lost, sought: the number of points of the level set that are farther than the tolerance from
+            the mesh, and of all that were tested: on triangles of a mesh, at points of a cloud, on
+            the way out of blobs;
         undecided: the number of points of the lattice at which the error of f leaves its sign open;
-        flat: the number of triangles that were not fitted to creases, as they would pass through others;
-        cloud: for a `DipolePotential`, what its `describe` returns, such as the number of points, what
-            was estimated, and the smoothing and noise that were chosen and found.
+        flat: the number of triangles that were not fitted to creases, as they would pass through
+            others;
+        cloud: for a `DipolePotential`, what its `describe` returns, such as the number of points,
+            what was estimated, and the smoothing and noise that were chosen and found.
 
-        If the triangles of a mesh were kept, made_by is "faces", and these entries are missing. Solids
-        and thickened surfaces have more entries: see `docs/printing.md`.
+        If the triangles of a mesh were kept, made_by is "faces", and these entries are missing.
+        Solids and thickened surfaces have more entries: see `docs/printing.md`.
 
     Raises:
         MeshingError: a ValueError, if the surface could not be meshed; the message says why.
-        TypeError: the field has patches; the clip is no volume; an option of traces that meshes do not
-            have; keywords beside an object that holds them.
+        TypeError: the field has patches; the clip is no volume; an option of traces that meshes do
+            not have; keywords beside an object that holds them.
         ValueError: options are out of range or contradict each other; several levels.
     """
     target, choices = surface_and_options("mesh", surface, options, keywords, _HONORED)

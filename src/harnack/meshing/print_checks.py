@@ -118,16 +118,17 @@ def check_print(
       faces;
     - walls thinner than `min_thickness`, and a size that does not fit into `build_volume`.
 
-    Hints are: corners that only rounding separates from others (they count as one), faces without an
-    area, several parts, tiny parts, cavities without a way out (for powder and resin), a size that looks
-    like inches or meters, and, if thickness is measured, faces so large that a thin place beside their
-    centers may be missed.
+    Hints are: corners that only rounding separates from others (they count as one), faces without
+    an area, several parts, tiny parts, cavities without a way out (for powder and resin), a size
+    that looks like inches or meters, and, if thickness is measured, faces so large that a thin
+    place beside their centers may be missed.
 
-    part: a trimesh.Trimesh, (vertices, faces), or the name of a file. Vertices at the same place count
-        as one.
-    min_thickness: the smallest allowed thickness, a length (see `thickness`); None to skip that check.
-    build_volume: (x, y, z), the largest size, into which the part may be turned by a right angle about
-        z; None to skip that check.
+    part: a trimesh.Trimesh, (vertices, faces), or the name of a file. Vertices at the same place
+        count as one.
+    min_thickness: the smallest allowed thickness, a length (see `thickness`); None to skip that
+        check.
+    build_volume: (x, y, z), the largest size, into which the part may be turned by a right angle
+        about z; None to skip that check.
 
     Raises:
         MeshError: the object is no mesh.

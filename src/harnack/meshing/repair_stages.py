@@ -182,7 +182,7 @@ def repair(
 
     Raises:
         MeshError: a ValueError. The mesh has no triangles, or numbers that are not finite; or it
-            would be remeshed and is an open sheet with nothing inside of most of it. With keep="all"
+            would be remeshed and is an open sheet: most of it has nothing inside. With keep="all"
             also: it has edges of more than two faces, faces that disagree in orientation, faces
             without an area, or several vertices at one place.
         MeshingError: a ValueError, with keep="all" or "valid", if patches could not be made, or
