@@ -1,45 +1,49 @@
 """How much of a mesh in tetrahedra is proved to have the topology of the level set.
 
-Let f be the function minus its level, F its interpolation at the corners of the tetrahedra, linear
-on each, whose zero set are the triangles of `marching_tetrahedra`, and H_t = (1-t) F + t f, 0 <= t
-<= 1.
+Let f be the function minus its level. Let F be the function that is linear on each tetrahedron and
+equals f at the corners; its zero set are the triangles of `marching_tetrahedra`. Let H_t = (1-t) F
++ t f for 0 <= t <= 1. F|T is F on the tetrahedron T, so grad F|T is a constant vector.
 
 Theorem. If each tetrahedron T satisfies (a), (b) or (c), the zero sets of f and F are isotopic:
 (a) neither f nor F has a zero in T, and both have the same sign there;
 (b) grad f(x) . grad F|T > 0 for all x in T;
 (c) each corner v of T has a vector n with n . grad F|S > 0 and n . grad f(x) > 0 for all x in S,
-    for all S around v that do not satisfy (a).
+    for all tetrahedra S around v that do not satisfy (a).
 
-Proof. Let H_t(x) = 0 for some t. By (a), x is in tetrahedra of kinds (b) and (c) alone. Some n has
-n . grad f(x) > 0 and n . grad F|T > 0 for all T that hold x: if all are of kind (b), n = grad f(x);
-else x lies in a simplex of one of kind (c), all corners of which have such an n, and all T that
-hold x are around each of them. H_t is Lipschitz, and Clarke's generalized gradient of it at x is
-the convex hull of (1-t) grad F|T + t grad f(x) over these T: it does not hold 0. By Clarke's
-implicit function theorem the zero set of H in (x, t) is near there the graph of a Lipschitz
-function over n's orthogonal plane and t. The fields n/(n . n), patched by a partition of unity,
-still have positive products with all these gradients, and following them as t goes from 0 to 1
-moves the zero set of F onto that of f (Thom's argument, for Lipschitz functions). On a wall of the
-box, where the surface ends, x moves within the wall: there (b) is required of the gradients'
-projections onto it, for each face, edge or corner of a tetrahedron that lies in walls.
+Proof. Let H_t(x) = 0 for some t. Then x lies in no tetrahedron of kind (a). There is a vector n with
+n . grad f(x) > 0 and n . grad F|T > 0 for all T that contain x. If all of these are of kind (b), it
+is n = grad f(x). Otherwise x lies in a tetrahedron of kind (c), and so inside of a simplex (a face,
+an edge or a corner of it, or all of it). Each corner of this simplex has such an n, and all T that
+contain x are around each of these corners. H_t is Lipschitz, and its generalized gradient by Clarke
+at x is the convex hull of (1-t) grad F|T + t grad f(x) over these T. It does not contain 0, because
+all of its elements have positive products with n. By Clarke's implicit function theorem the zero set
+of H in (x, t) is near there the graph of a Lipschitz function over t and the plane orthogonal to n.
+The fields n/(n . n), patched by a partition of unity, still have positive products with all these
+gradients. Following them as t goes from 0 to 1 moves the zero set of F onto that of f (Thom's
+argument, for Lipschitz functions). On a wall, a face of the box where the surface ends, x moves
+within the wall. So for each face, edge or corner of a tetrahedron that lies in walls, (b) is also
+required of the projections of the gradients onto these walls.
 
-Four corners on the level. F is 0 on such a T, and `marching_tetrahedra` gives all of it to one
-side. If two of its faces are in the mesh, put F = +-epsilon at the middle of the edge that the
-other two share: T becomes two tetrahedra, on each of which grad F is a normal of one of those
-faces, F elsewhere changes by no more than epsilon, which (b) and (c) bear as they are strict, and
-the zero set is the mesh. So (b) and (c) are required of both normals. Other such T are not proved.
+Four corners on the level. F is 0 on such a T, and `marching_tetrahedra` gives all of T to one side
+of the level set. If two of the faces of T are in the mesh, set F to +epsilon or -epsilon at the
+middle of the edge that the other two faces share. Then T becomes two tetrahedra, and on each of
+them grad F is a normal of one of the two faces in the mesh. Elsewhere F changes by no more than
+epsilon, which (b) and (c) allow as they are strict inequalities, and the zero set is the mesh. So
+(b) and (c) are required of both normals. If T has another number of faces in the mesh, nothing is
+proved on it.
 
-An angle. Where f's lift stays within half a period of the level on T, which is a part of the check
-of (b), the wrapped values at the corners are that lift's, and all is as for a number.
+Angles. The lift of an angle-valued f is a continuous real-valued function that equals f modulo the
+period. The check of (b) includes that the lift stays within half a period of the level on T. Then
+the wrapped values at the corners are the values of this lift, and all is as for real values.
 
-The check. |grad f(y) - grad f(c)| <= D for all y in the ball around T with center c and radius R,
-by the field's own promise (`Field.gradient_change_bound`). So (b) holds if grad f(c) . grad F > D
-|grad F|, and f has no zero in T if |f(c)| > (|grad f(c)| + D) R. If neither holds T is halved,
-across its longest edge, a few times: grad F is the same in both halves, and (a) or (b) may hold in
-each.
+The check. By the field's own promise (`Field.gradient_change_bound`), |grad f(y) - grad f(c)| <= D
+for all y in the ball around T with center c and radius R. So (b) holds if grad f(c) . grad F > D
+|grad F|, and f has no zero in T if |f(c)| > (|grad f(c)| + D) R. If neither holds, T is halved at
+its longest edge, a few times: grad F is the same in both halves, and (a) or (b) may hold in each.
 
 Near the curve nothing is proved. The proof is about the first triangles, before they are refined.
-The refined triangles are checked not to meet (`checks.intersecting_faces`) and to face along the
-gradient; it is not checked that they were moved without meeting on the way.
+It is checked that the refined triangles do not meet (`checks.intersecting_faces`) and that they face
+along the gradient. It is not checked that they were moved without meeting on the way.
 """
 
 from __future__ import annotations

@@ -1,10 +1,12 @@
-"""The boundary of the solid of a closed mesh that intersects itself: its faces are cut along each
-other, and the pieces that bound the solid are joined.
+"""The boundary of the solid of a closed mesh that intersects itself.
 
-The winding numbers on both sides of each piece tell whether the piece bounds the points around
-which the mesh winds at least once. Where two faces meet, the pieces of each have vertices that
-differ by rounding from those of the other, and a piece may have vertices in the middle of an edge
-of another. So vertices are merged first, and then edges are split at the vertices on them.
+The faces of the mesh are cut along each other, and the pieces that bound the solid are joined. The
+winding numbers on both sides of a piece tell whether it bounds the solid, the set of points around
+which the mesh winds at least once.
+
+Where two faces meet, the vertices of pieces of one face differ by rounding from those of the other
+face, and a piece may have vertices in the middle of an edge of another piece. So vertices are merged
+first, and then edges are split at the vertices on them.
 """
 
 from __future__ import annotations

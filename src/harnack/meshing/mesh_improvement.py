@@ -1,16 +1,16 @@
 """Better triangles: edges flipped, slivers contracted, vertices moved along the surface.
 
-Flips. Two triangles (a, b, c) and (b, a, d) become (c, d, b) and (d, c, a) where that makes the
-smaller of their least angles larger, where the new edge is within the tolerance of the surface, and
-where the new triangles face the way the surface does.
+Flips. Two triangles (a, b, c) and (b, a, d) become (c, d, b) and (d, c, a) if that makes the
+smallest of their angles larger, if the new edge is within the tolerance of the level set, and if the
+new triangles face along the gradient.
 
 Contractions. The ends of a sliver's shortest edge are merged: see `collapse_slivers`.
 
-Moves. Means of neighbors, to which `smoothed` moves vertices, make thin triangles where lengths of
-edges change quickly, as beside long boundary edges that cannot be cut. Here several positions are
-tried for each vertex of a thin triangle, and it moves to the best of them if the least angle of all
-triangles around it grows. No two neighbors move at once, so that the measured angles are those of
-the new mesh: the least angle around a moved vertex never falls.
+Moves. `refinement.smooth` moves vertices to the means of their neighbors. That makes thin triangles
+where the lengths of edges change quickly, as beside long boundary edges that cannot be split. Here
+several positions are tried for each vertex of a thin triangle, and it moves to the best of them if
+the smallest angle of all triangles around it grows. No two neighbors move at once. So the measured
+angles are the angles of the new mesh, and the smallest angle around a moved vertex never falls.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""The local repair of closed meshes a few of whose vertices or faces are too far from the level.
+"""The local repair of closed meshes in which a few vertices or faces are too far from the level set.
 
 Offsets of meshes have creases everywhere. Where another part cuts a triangle that lies across a
-crease, the pieces have centers and corners of their own, of which one in a hundred thousand may be
-farther from the level than the triangle's center. There edges across the crease are cut on it, and
-the new faces are checked with those around them.
+crease, the pieces have centers and corners of their own. One in a hundred thousand of these may be
+farther from the level set than the triangle's center. There, edges across the crease are cut at the
+crease, and the new faces are checked together with the faces around them.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 """Functions that are meshed by their signs: values at points, and crossings of the level on
 segments.
 
-Every real-valued function has a sign at every point, whether or not it is continuous: winding
+Every real-valued function has a sign at every point, whether or not it is continuous. Winding
 numbers jump at triangles and are known up to an error, and potentials of dipoles are infinite at
-points. Newton's method fails for both. Here a segment whose ends have different signs is bisected,
-by values alone, and the last interval is intersected with the jump surfaces of the field, such as
-triangles.
+points: Newton's method fails for both. Here a segment whose ends have different signs is halved
+several times, by values alone, and what is left is intersected with the jump surfaces of the field,
+such as triangles.
 """
 
 from __future__ import annotations
