@@ -10,19 +10,19 @@ Theorem. If each tetrahedron T satisfies (a), (b) or (c), the zero sets of f and
 (c) each corner v of T has a vector n with n . grad F|S > 0 and n . grad f(x) > 0 for all x in S,
     for all tetrahedra S around v that do not satisfy (a).
 
-Proof. Let H_t(x) = 0 for some t. Then x lies in no tetrahedron of kind (a). There is a vector n with
-n . grad f(x) > 0 and n . grad F|T > 0 for all T that contain x. If all of these are of kind (b), it
-is n = grad f(x). Otherwise x lies in a tetrahedron of kind (c), and so inside of a simplex (a face,
-an edge or a corner of it, or all of it). Each corner of this simplex has such an n, and all T that
-contain x are around each of these corners. H_t is Lipschitz, and its generalized gradient by Clarke
-at x is the convex hull of (1-t) grad F|T + t grad f(x) over these T. It does not contain 0, because
-all of its elements have positive products with n. By Clarke's implicit function theorem the zero set
-of H in (x, t) is near there the graph of a Lipschitz function over t and the plane orthogonal to n.
-The fields n/(n . n), patched by a partition of unity, still have positive products with all these
-gradients. Following them as t goes from 0 to 1 moves the zero set of F onto that of f (Thom's
-argument, for Lipschitz functions). On a wall, a face of the box where the surface ends, x moves
-within the wall. So for each face, edge or corner of a tetrahedron that lies in walls, (b) is also
-required of the projections of the gradients onto these walls.
+Proof. Let H_t(x) = 0 for some t. Then x lies in no tetrahedron of kind (a). There is a vector n
+with n . grad f(x) > 0 and n . grad F|T > 0 for all T that contain x. If all of these are of kind
+(b), it is n = grad f(x). Otherwise x lies in a tetrahedron of kind (c), and so inside of a simplex
+(a face, an edge or a corner of it, or all of it). Each corner of this simplex has such an n, and
+all T that contain x are around each of these corners. H_t is Lipschitz, and its generalized
+gradient by Clarke at x is the convex hull of (1-t) grad F|T + t grad f(x) over these T. It does not
+contain 0, because all of its elements have positive products with n. By Clarke's implicit function
+theorem the zero set of H in (x, t) is near there the graph of a Lipschitz function over t and the
+plane orthogonal to n. The fields n/(n . n), patched by a partition of unity, still have positive
+products with all these gradients. Following them as t goes from 0 to 1 moves the zero set of F onto
+that of f (Thom's argument, for Lipschitz functions). On a wall, a face of the box where the surface
+ends, x moves within the wall. So for each face, edge or corner of a tetrahedron that lies in walls,
+(b) is also required of the projections of the gradients onto these walls.
 
 Four corners on the level. F is 0 on such a T, and `marching_tetrahedra` gives all of T to one side
 of the level set. If two of the faces of T are in the mesh, set F to +epsilon or -epsilon at the
@@ -42,8 +42,8 @@ for all y in the ball around T with center c and radius R. So (b) holds if grad 
 its longest edge, a few times: grad F is the same in both halves, and (a) or (b) may hold in each.
 
 Near the curve nothing is proved. The proof is about the first triangles, before they are refined.
-It is checked that the refined triangles do not meet (`checks.intersecting_faces`) and that they face
-along the gradient. It is not checked that they were moved without meeting on the way.
+It is checked that the refined triangles do not meet (`checks.intersecting_faces`) and that they
+face along the gradient. It is not checked that they were moved without meeting on the way.
 """
 
 from __future__ import annotations

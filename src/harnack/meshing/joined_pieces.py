@@ -5,8 +5,8 @@ winding numbers on both sides of a piece tell whether it bounds the solid, the s
 which the mesh winds at least once.
 
 Where two faces meet, the vertices of pieces of one face differ by rounding from those of the other
-face, and a piece may have vertices in the middle of an edge of another piece. So vertices are merged
-first, and then edges are split at the vertices on them.
+face, and a piece may have vertices in the middle of an edge of another piece. So vertices are
+merged first, and then edges are split at the vertices on them.
 """
 
 from __future__ import annotations

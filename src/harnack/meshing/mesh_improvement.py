@@ -1,8 +1,8 @@
 """Better triangles: edges flipped, slivers contracted, vertices moved along the surface.
 
 Flips. Two triangles (a, b, c) and (b, a, d) become (c, d, b) and (d, c, a) if that makes the
-smallest of their angles larger, if the new edge is within the tolerance of the level set, and if the
-new triangles face along the gradient.
+smallest of their angles larger, if the new edge is within the tolerance of the level set, and if
+the new triangles face along the gradient.
 
 Contractions. The ends of a sliver's shortest edge are merged: see `collapse_slivers`.
 

@@ -1,4 +1,4 @@
-"""The local repair of closed meshes in which a few vertices or faces are too far from the level set.
+"""The local repair of closed meshes in which a few vertices or faces are off the level set.
 
 Offsets of meshes have creases everywhere. Where another part cuts a triangle that lies across a
 crease, the pieces have centers and corners of their own. One in a hundred thousand of these may be
