@@ -190,15 +190,15 @@ def _cut_at_corners(x: FloatArray, faces: IntArray) -> IntArray:
         middle, is_cut = _corners_on(x, edges)
         if not is_cut.any():
             break
-        key = len(x)
-        names = edges[is_cut] @ [key, 1]
-        corner_pairs = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2) @ [key, 1]
-        at = np.searchsorted(names, corner_pairs).clip(max=len(names) - 1)
-        is_met = names[at] == corner_pairs
-        rows, side = np.flatnonzero(is_met.any(axis=1)), is_met.argmax(axis=1)
+        count = len(x)
+        keys = edges[is_cut] @ [count, 1]
+        face_keys = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2) @ [count, 1]
+        position = np.searchsorted(keys, face_keys).clip(max=len(keys) - 1)
+        has_cut = keys[position] == face_keys
+        rows, side = np.flatnonzero(has_cut.any(axis=1)), has_cut.argmax(axis=1)
         side = side[rows]
         a, b, c = (faces[rows, (side + k) % 3] for k in range(3))
-        p = middle[is_cut][at[rows, side]]
+        p = middle[is_cut][position[rows, side]]
         halves = [np.column_stack([a, p, c]), np.column_stack([p, b, c])]
         halves = [half[(half[:, 0] != half[:, 2]) & (half[:, 1] != half[:, 2])] for half in halves]
         faces = np.concatenate([np.delete(faces, rows, axis=0), *halves])
@@ -221,18 +221,18 @@ def _corners_on(x: FloatArray, edges: IntArray) -> tuple[IntArray, BoolArray]:
     corners = np.unique(edges)
     p, q = x[edges[:, 0]], x[edges[:, 1]]
     half = 0.5 * row_norms(q - p)
-    near = searching.cKDTree(x[corners]).query_ball_point(0.5 * (p + q), half)
-    count = np.array([len(group) for group in near])
+    nearby = searching.cKDTree(x[corners]).query_ball_point(0.5 * (p + q), half)
+    count = np.array([len(group) for group in nearby])
     row = np.repeat(np.arange(len(edges)), count)
-    corner = corners[np.fromiter(itertools.chain.from_iterable(near), np.int64, int(count.sum()))]
+    corner = corners[np.fromiter(itertools.chain.from_iterable(nearby), np.int64, int(count.sum()))]
     direction = (q - p)[row] / np.maximum(2 * half[row], 1e-300)[:, None]
-    to = x[corner] - p[row]
-    along = row_dots(to, direction)
-    is_on = row_norms(to - along[:, None] * direction) <= _SAME
+    relative = x[corner] - p[row]
+    position = row_dots(relative, direction)
+    is_on = row_norms(relative - position[:, None] * direction) <= _SAME
     is_on &= (corner != edges[row, 0]) & (corner != edges[row, 1])
-    is_on &= (along > 0) & (along < 2 * half[row])
-    row, corner, offset = row[is_on], corner[is_on], np.abs(along - half[row])[is_on]
-    order = np.lexsort((offset, row))
+    is_on &= (position > 0) & (position < 2 * half[row])
+    row, corner, distance = row[is_on], corner[is_on], np.abs(position - half[row])[is_on]
+    order = np.lexsort((distance, row))
     row, first = np.unique(row[order], return_index=True)
     middle, is_cut = np.zeros(len(edges), np.int64), np.zeros(len(edges), np.bool_)
     middle[row], is_cut[row] = corner[order][first], True
@@ -267,12 +267,12 @@ def _wedges(ends: FloatArray, third: FloatArray, is_along: BoolArray) -> IntArra
     the next face that runs it forwards. Of faces in the same direction, those at which material
     ends come first."""
     direction = ends[1] - ends[0]
-    away = third - ends[0]
-    away -= np.outer(away @ direction / (direction @ direction), direction)
-    across: Any = away[0] / max(float(np.linalg.norm(away[0])), 1e-300)
-    upright: Any = np.cross(direction / float(np.linalg.norm(direction)), across)
-    turns: FloatArray = np.arctan2(away @ upright, away @ across) / (2 * np.pi)
-    steps: IntArray = np.round(turns / _TURN).astype(np.int64) % round(1 / _TURN)
+    offsets = third - ends[0]
+    offsets -= np.outer(offsets @ direction / (direction @ direction), direction)
+    axis_u: Any = offsets[0] / max(float(np.linalg.norm(offsets[0])), 1e-300)
+    axis_v: Any = np.cross(direction / float(np.linalg.norm(direction)), axis_u)
+    angles: FloatArray = np.arctan2(offsets @ axis_v, offsets @ axis_u) / (2 * np.pi)
+    steps: IntArray = np.round(angles / _TURN).astype(np.int64) % round(1 / _TURN)
     opened, wedges = list[int](), list[tuple[int, int]]()
     is_taken = np.zeros(len(third), np.bool_)
     for k in 2 * np.lexsort((~is_along, steps)).tolist():  # twice around

@@ -133,11 +133,11 @@ def _flips_stay_near(
     middle = corner[:, 0, :2].mean(axis=1)
     points = np.concatenate([middle, *corner.mean(axis=2).transpose(1, 0, 2)])
     samples = function.sample(points)
-    near = (samples.distance <= tolerance).reshape(3, -1).all(axis=0)
+    is_near = (samples.distance <= tolerance).reshape(3, -1).all(axis=0)
     gradient = samples.gradient.reshape(3, -1, 3)[1:].transpose(1, 0, 2)
     size = np.linalg.norm(normal, axis=2) * np.linalg.norm(gradient, axis=2)
-    facing = ((normal * gradient).sum(axis=2) > _FACING * size).all(axis=1)
-    return near & facing
+    faces_along = ((normal * gradient).sum(axis=2) > _FACING * size).all(axis=1)
+    return is_near & faces_along
 
 
 def _are_among(numbers: IntArray, keys: IntArray) -> BoolArray:
@@ -217,9 +217,9 @@ def _is_good(
     normal = area_normals(corner)
     samples = function.sample(corner.mean(axis=1))
     size = row_norms(normal) * row_norms(samples.gradient)
-    facing = row_dots(normal, samples.gradient) > _MIN_COLLAPSE_COSINE * size
-    near = samples.distance <= tolerance
-    return bool((facing & near & (least_angles(vertices, new) > _SLIVER)).all())
+    faces_along = row_dots(normal, samples.gradient) > _MIN_COLLAPSE_COSINE * size
+    is_near = samples.distance <= tolerance
+    return bool((faces_along & is_near & (least_angles(vertices, new) > _SLIVER)).all())
 
 
 Walls = tuple[FloatArray, FloatArray] | None

@@ -489,13 +489,15 @@ class _CreaseRefinement:
         ends = every.vertices[rows]
         one, other = normals[ends[:, 0]], normals[ends[:, 1]]
         a, b = x[ends[:, 0]], x[ends[:, 1]]
-        t, along, turned = _toward_tangent_planes(a, b, one, other)
-        long = row_norms(b - a)
+        t, along, sine2 = _toward_tangent_planes(a, b, one, other)
+        length = row_norms(b - a)
         is_far = (
-            (turned > _MIN_SQUARE) & (row_norms(along) > tolerance) & (long > _SHORTEST * tolerance)
+            (sine2 > _MIN_SQUARE)
+            & (row_norms(along) > tolerance)
+            & (length > _SHORTEST * tolerance)
         )
         rows, along, t = rows[is_far], along[is_far], t[is_far]
-        foot, span = a[is_far] + t[:, None] * (b - a)[is_far], long[is_far]
+        foot, span = a[is_far] + t[:, None] * (b - a)[is_far], length[is_far]
         points, normal, passed = _level_along(function, foot, along, _OFFSET * span)
         rows, points, normal, t = rows[passed], points[passed], normal[passed], t[passed]
         ends = every.vertices[rows]
@@ -550,19 +552,19 @@ def _toward_tangent_planes(
     Edges of a plane triangulation pass over such a line in order, and so do these points.
     """
     edge, line = b - a, np.cross(n_a, n_b)
-    cosine, turned = row_dots(n_a, n_b), row_dots(line, line)
+    cosine, sine2 = row_dots(n_a, n_b), row_dots(line, line)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         # A point of the line, relative to a: p.n_a = 0 and p.n_b = edge.n_b.
-        height = row_dots(edge, n_b) / turned
-        point = height[:, None] * (n_b - cosine[:, None] * n_a)
-        along = line / np.sqrt(turned)[:, None]
-        across = edge - row_dots(edge, along)[:, None] * along
+        factor = row_dots(edge, n_b) / sine2
+        point = factor[:, None] * (n_b - cosine[:, None] * n_a)
+        axis = line / np.sqrt(sine2)[:, None]
+        across = edge - row_dots(edge, axis)[:, None] * axis
         fraction = row_dots(point, across) / row_dots(across, across)
         fraction = np.clip(fraction, _FROM_CORNERS, 1 - _FROM_CORNERS)
         foot = fraction[:, None] * edge
-        direction = point + row_dots(foot - point, along)[:, None] * along - foot
+        direction = point + row_dots(foot - point, axis)[:, None] * axis - foot
     is_finite = np.isfinite(fraction) & np.isfinite(direction).all(axis=1)
-    return np.where(is_finite, fraction, 0.5), np.where(is_finite[:, None], direction, 0.0), turned
+    return np.where(is_finite, fraction, 0.5), np.where(is_finite[:, None], direction, 0.0), sine2
 
 
 def _level_along(
@@ -579,12 +581,12 @@ def _level_along(
         meaning.
     """
     along = along * np.minimum(1, limit / np.maximum(row_norms(along), 1e-300))[:, None]
-    near, end = start - _BEFORE * along, start + _AFTER * along
-    is_positive = function.values(near) > 0
+    begin, end = start - _BEFORE * along, start + _AFTER * along
+    is_positive = function.values(begin) > 0
     changes_sign = is_positive != (function.values(end) > 0)
     rows = np.flatnonzero(changes_sign)
     upwards = ~is_positive[rows, None]
-    low, high = np.where(upwards, near[rows], end[rows]), np.where(upwards, end[rows], near[rows])
+    low, high = np.where(upwards, begin[rows], end[rows]), np.where(upwards, end[rows], begin[rows])
     points, normal = start.copy(), np.zeros_like(start)
     points[rows], normal[rows] = function.crossings(low, high)
     return points, normal, changes_sign
@@ -605,8 +607,8 @@ def _crease_corners(
     """
     corner, normal = x[faces[rows]], normals[faces[rows]]
     det: Any = np.linalg.det
-    chosen = np.flatnonzero(np.abs(det(normal)) > _INDEPENDENT)
-    rows, corner, normal = rows[chosen], corner[chosen], normal[chosen]
+    independent = np.flatnonzero(np.abs(det(normal)) > _INDEPENDENT)
+    rows, corner, normal = rows[independent], corner[independent], normal[independent]
     center = corner.mean(axis=1)
     longest = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
     offsets = np.einsum("kij,kij->ki", normal, corner - center[:, None])

@@ -203,10 +203,10 @@ class _Sweep:
         different vertices are left out."""
         count, n = len(rings), self.around
         row, column = np.mgrid[: count - 1 if shift is None else count, :n].reshape(2, -1)
-        moved = np.where(row == count - 1, shift or 0, 0)
+        turn = np.where(row == count - 1, shift or 0, 0)
         next_row = (row + 1) % count * n
         a, b = row * n + column, row * n + (column + 1) % n
-        c, d = next_row + (column + moved + 1) % n, next_row + (column + moved) % n
+        c, d = next_row + (column + turn + 1) % n, next_row + (column + turn) % n
         vertex: IntArray = np.arange(count * n, dtype=np.int64).reshape((count, n))
         for k in range(1, count):
             same = (rings[k] == rings[k - 1]).all(axis=1)
@@ -232,25 +232,25 @@ class _Sweep:
             the same at both ends, and the shift is 0. None if an edge leads back along the edge
             before.
         """
-        first = np.cross(edges[0], np.eye(3)[np.abs(edges[0]).argmin()])
-        first /= np.linalg.norm(first)
-        across = [first]
+        start = np.cross(edges[0], np.eye(3)[np.abs(edges[0]).argmin()])
+        start /= np.linalg.norm(start)
+        vectors = [start]
         for before, after in itertools.pairwise([*edges, edges[0]] if is_closed else edges):
             cosine = float(before @ after)
             if cosine <= -1 + _REVERSAL:
                 return None
             # The rotation that takes one edge's direction to the next.
-            axis, u = np.cross(before, after), across[-1]
+            axis, u = np.cross(before, after), vectors[-1]
             turned = cosine * u + np.cross(axis, u) + axis * (axis @ u) / (1 + cosine)
             turned -= (turned @ after) * after
-            across.append(turned / np.linalg.norm(turned))
+            vectors.append(turned / np.linalg.norm(turned))
         shift, twist = 0, 0.0
         if is_closed:
-            mismatch = math.atan2(across[-1] @ np.cross(edges[0], first), across[-1] @ first)
+            mismatch = math.atan2(vectors[-1] @ np.cross(edges[0], start), vectors[-1] @ start)
             step = 2 * math.pi / self.around
             shift = round(mismatch / step)
             twist = (mismatch - shift * step) / len(edges)
-        frames = [np.stack([u, np.cross(edge, u)]) for u, edge in zip(across, edges, strict=False)]
+        frames = [np.stack([u, np.cross(edge, u)]) for u, edge in zip(vectors, edges, strict=False)]
         return [
             (_spun(f, -twist * k), _spun(f, -twist * (k + 1))) for k, f in enumerate(frames)
         ], shift

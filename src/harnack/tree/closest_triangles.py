@@ -107,10 +107,10 @@ class BoxTree:
         """Make a function that computes at which t rays o + t d enter and leave a box.
 
         The function takes six numbers, the lower and the upper corner. It returns t slightly too
-        small and slightly too large, which covers rounding: each plane of the box is moved outwards
-        by 16 roundings of the size of coordinates, and t is widened by 8 roundings of itself. (x -
-        o)/d has three roundings, and that of x - o is at most half a unit of the last place of
-        coordinates. The ray misses the box if the first t is larger than the second."""
+        small and slightly too large, which covers rounding. Each plane of the box is moved outwards
+        by 16 roundings of the size of coordinates, and t is widened by 8 roundings of itself. The
+        quotient (x - o)/d has three roundings, and that of x - o is at most half a unit of the last
+        place of coordinates. The ray misses the box if the first t is larger than the second."""
         backend = self.tree.backend
         vector = backend.Array3f
         # Never zero: 1e-18 of the boxes' size is far below their padding.

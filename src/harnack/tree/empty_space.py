@@ -168,11 +168,12 @@ def refine_cells(
 def nonempty_cells(
     lower: FloatArray, upper: FloatArray, clearance: Clearance, most: int, finest: int
 ) -> BoxCells:
-    """The smallest cells of the octree of a box that are not proved empty.
+    """The smallest cells of the octree of a box that are not proved empty. There are no cells if
+    all of the box is proved empty.
 
-    lower, upper: the corners of the box. most: the largest number of cells tested in a round.
-    finest: the largest number of rounds; each halves the edges. There are no cells if all of the
-        box is proved empty."""
+    lower, upper: the corners of the box.
+    most: the largest number of cells tested in a round.
+    finest: the largest number of rounds; each halves the edges."""
     root = BoxCells(np.array(lower)[None], np.array(upper) - np.array(lower))
     return refine_cells(root, clearance, most, finest).occupied
 
@@ -322,16 +323,16 @@ class GridCell:
         A face of the cube where the grid ends does not count, since points outside of the grid are
         treated like its nearest cell. So the length may be infinite."""
         length: Real = self.grid.backend.Float(dr.inf)
-        beyond = self.grid.margin - _ROUNDING_SHARE
+        margin = self.grid.margin - _ROUNDING_SHARE
         for k in range(3):
             upper, lower = self.corner[k] + around, self.corner[k] + 1 - around
             rising = d[k] > 0
             gap = dr.select(
                 rising, upper - self.cell_coordinates[k], self.cell_coordinates[k] - lower
             )
-            ends = dr.select(rising, upper >= self.grid.shape[k], lower <= 0)
-            reach = (gap + beyond) / dr.abs(d[k])
-            length = fmin(dr.select(ends | (d[k] == 0), dr.inf, reach), length)
+            is_grid_end = dr.select(rising, upper >= self.grid.shape[k], lower <= 0)
+            distance = (gap + margin) / dr.abs(d[k])
+            length = fmin(dr.select(is_grid_end | (d[k] == 0), dr.inf, distance), length)
         return length * self.grid.cell_size
 
 
