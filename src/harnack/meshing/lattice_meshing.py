@@ -141,8 +141,8 @@ def check_no_missed_parts(
     smaller than a cell may be missed.
 
     Raises:
-        MissedPartsError: parts are missed; it has points of the longest part. UnrefinableError: the
-        function equals its level in a volume, or touches it along a surface.
+        MissedPartsError: parts are missed; it has points of the longest part.
+        UnrefinableError: the function equals its level in a volume, or touches it along a surface.
     """
     import scipy.spatial  # imported here: it takes half a second
 
@@ -295,8 +295,9 @@ def check_estimated_triangles(
     of triangles is examined.
 
     Raises:
-        MeshingError: the gradient is 0 at the midpoint of an edge. TriangleLimitError: the estimate
-        exceeds the limit. The message says which tolerance would do.
+        MeshingError: the gradient is 0 at the midpoint of an edge.
+        TriangleLimitError: the estimate exceeds the limit. The message says which tolerance would
+            do.
     """
     sampled = faces[:: max(1, len(faces) // 20_000)]
     if not len(sampled):
@@ -395,8 +396,8 @@ def mesh_open_surface(
         The mesh; and on which part of the tetrahedra its topology is proved, before refinement.
 
     Raises:
-        MeshingError: no cell is cut, or there are too many cells. UnrefinableError: the function is
-        not finite somewhere, or its level set is a volume.
+        MeshingError: no cell is cut, or there are too many cells.
+        UnrefinableError: the function is not finite somewhere, or its level set is a volume.
     """
     walls = lattice.lower, lattice.upper
     cells = lattice.nonempty_cells(function.clearance, function.most_faces)

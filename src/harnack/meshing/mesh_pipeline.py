@@ -381,8 +381,8 @@ def _ends_by_signs(
     """The interval of values of f inside of the solid; for a level set, from its level to infinity.
 
     Raises:
-        TypeError: a surface across which f jumps is to be thickened. ValueError: the field has no
-        such level.
+        TypeError: a surface across which f jumps is to be thickened.
+        ValueError: the field has no such level.
     """
     if is_thick and field.has_jumps:
         raise TypeError(

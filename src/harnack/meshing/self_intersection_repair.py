@@ -51,7 +51,8 @@ def resolve_self_intersections(surface: TriangleMesh, length: float) -> Triangle
     length: how far one change may move the surface.
 
     Raises:
-        MeshingError: vertices are not finite. SelfIntersectionError: some triangles still cross.
+        MeshingError: vertices are not finite.
+        SelfIntersectionError: some triangles still cross.
     """
     try:
         check_no_self_intersection(surface.vertices, surface.faces)

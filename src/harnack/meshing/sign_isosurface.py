@@ -308,9 +308,9 @@ def _march(
     there. Then the cells around the open edges are added, until the surface ends on the box only.
 
     Raises:
-        EmptySurfaceError: there is no surface. MeshingError: too many cells, values that are not
-            finite,
-            or a surface that still ends after 20 rounds.
+        EmptySurfaceError: there is no surface.
+        MeshingError: too many cells, values that are not finite, or a surface that still ends after
+            20 rounds.
     """
     cells = lattice.nonempty_cells(function.clearance, function.most_faces)
     if closed:
@@ -490,14 +490,12 @@ class _CreaseRefinement:
         one, other = normals[ends[:, 0]], normals[ends[:, 1]]
         a, b = x[ends[:, 0]], x[ends[:, 1]]
         t, along, sine2 = _toward_tangent_planes(a, b, one, other)
-        length = row_norms(b - a)
+        long = row_norms(b - a)
         is_far = (
-            (sine2 > _MIN_SQUARE)
-            & (row_norms(along) > tolerance)
-            & (length > _SHORTEST * tolerance)
+            (sine2 > _MIN_SQUARE) & (row_norms(along) > tolerance) & (long > _SHORTEST * tolerance)
         )
         rows, along, t = rows[is_far], along[is_far], t[is_far]
-        foot, span = a[is_far] + t[:, None] * (b - a)[is_far], length[is_far]
+        foot, span = a[is_far] + t[:, None] * (b - a)[is_far], long[is_far]
         points, normal, passed = _level_along(function, foot, along, _OFFSET * span)
         rows, points, normal, t = rows[passed], points[passed], normal[passed], t[passed]
         ends = every.vertices[rows]

@@ -98,7 +98,8 @@ def wall_thickness(part: Any, **options: Any) -> WallThickness:
     (`mesh.subdivide_to_size`).
 
     Raises:
-        MeshError: a mesh that bounds no solid. MeshingError: a solid that cannot be meshed.
+        MeshError: a mesh that bounds no solid.
+        MeshingError: a solid that cannot be meshed.
     """
     if isinstance(part, Solid) and not isinstance(part, MeshSolid):
         part = mesh(part, **options)
