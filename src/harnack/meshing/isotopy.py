@@ -356,8 +356,7 @@ def _regular_on_walls(
 ) -> BoolArray:
     """(n,) whether (b) is proved for the projections onto the walls of the box.
 
-    rows: (n,) the mask of the tetrahedra whose faces, edges and corners in walls are
-        tested.
+    rows: (n,) the mask of the tetrahedra whose faces, edges and corners in walls are tested.
     walls: the lower and the upper corner (3,) of the box.
 
     Tetrahedra that are not in `rows` count as proved if they have no corner on a wall, else as not

@@ -174,10 +174,10 @@ def _rays(scaled: FloatArray, faces: IntArray) -> TriangleTree:
 def _cut_at_corners(x: FloatArray, faces: IntArray) -> IntArray:
     """Cut faces until every edge is run as often in one direction as in the other.
 
-    x: (n, 3) the vertices. An edge for which that fails is cut at an end of another such edge that
-    lies on it; of several, at the one nearest to its middle.
+    x: (n, 3) the vertices.
 
-    Returns the faces.
+    An edge for which that fails is cut at an end of another such edge that lies on it; of several,
+    at the one nearest to its middle. Returns the faces.
 
     Raises:
         MeshingError: the pieces do not fit together.

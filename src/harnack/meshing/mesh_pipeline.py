@@ -560,8 +560,7 @@ def _checked(field: Field) -> Field:
 
     Raises:
         TypeError: it has patches, circles, jumps that meshing by signs does not handle, or values
-            that
-            are angles although it is no `SolidAngle`.
+            that are angles although it is no `SolidAngle`.
     """
     check_is_field(field)
     if field.has_patches or (field.has_jumps and not uses_sign_meshing(field)):

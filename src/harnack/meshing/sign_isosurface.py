@@ -540,8 +540,8 @@ def _toward_tangent_planes(
     """From where on an edge, and how far, a point has to move to reach the intersection of the
     tangent planes at its ends.
 
-    a, b: (k, 3) the ends of edges. n_a, n_b: (k, 3) unit normals of the planes through them, which
-    meet in a line.
+    a, b: (k, 3) the ends of edges.
+    n_a, n_b: (k, 3) unit normals of the planes through these ends. The two planes meet in a line.
 
     Returns:
         The fraction (k,) of the edge at which it is nearest to the line; the displacement (k, 3)
@@ -595,9 +595,10 @@ def _crease_corners(
 ) -> tuple[FloatArray, FloatArray, IntArray]:
     """New vertices within faces that cut off a corner of the level set.
 
-    rows: (k,) the indices of the faces. Where the normals at the vertices of a face are
-    independent, their tangent planes meet in a point. The new vertex is where the line from the
-    face's center to that point passes the level.
+    x, normals: (n, 3) the vertices, and the normals there. rows: (k,) the indices of the faces.
+
+    Where the normals at the vertices of a face are independent, the tangent planes there meet in a
+    point. The new vertex is where the line from the face's center to that point passes the level.
 
     Returns:
         The new vertices (j, 3); the normals (j, 3) there; and the indices (j,) of the faces that

@@ -208,8 +208,9 @@ class EmptySpaceGrid:
 
     A point outside of the grid is treated like its nearest cell.
 
-    margin: an empty cell enlarged on all sides by this number of cells is empty too. The other
-    attributes are those of `GridData`."""
+    backend, origin, cell_size, shape, empty_distance: as in `GridData`, uploaded.
+    margin: an empty cell enlarged on all sides by this number of cells is empty too.
+    """
 
     backend: Backend
     origin: Vec3

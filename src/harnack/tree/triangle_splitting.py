@@ -121,8 +121,11 @@ def _crossing_faces(
 ) -> tuple[IntArray, IntArray]:
     """Pairs of faces, (k,) and (k,), that pass through one another; each pair in both orders.
 
-    tree: of the same faces. They are found by the edges that cross faces: an edge that crosses a
-    face makes a pair of that face with each face at the edge."""
+    tree: of the same faces.
+
+    Pairs are found by the edges that cross faces: an edge that crosses a face makes a pair of that
+    face with each face at the edge.
+    """
     ends = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     edges, edge = np.unique(ends, axis=0, return_inverse=True)
     edge = edge.reshape(-1)
