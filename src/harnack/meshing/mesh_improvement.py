@@ -386,10 +386,11 @@ def _moves_stay_near(
     rows: IntArray,
     tolerance: float,
 ) -> BoolArray:
-    """(j,) whether the vertices `rows` (j,) of stars may move to their targets, of `targets` (k,
-    3).
+    """(j,) whether the vertices `rows` (j,) of stars may move to their targets.
 
-    The target has to be on the level set, the centers of the triangles around it within `tolerance`
+    targets: (k, 3) for all stars.
+
+    A target has to be on the level set, the centers of the triangles around it within `tolerance`
     of the level set, and the triangles have to face along the gradient."""
     moved = np.zeros(len(stars.centers), np.bool_)
     moved[rows] = True

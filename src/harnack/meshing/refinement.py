@@ -292,7 +292,8 @@ class _RefinementMarks:
         where: Where,
     ) -> _RefinementMarks:
         """Mark the edges to be split: those whose midpoint is farther than `tolerance` from the
-        level set, and, for a face whose center alone is so far, its longest edge.
+        level set; and, for each face whose center is so far, the longest edge that may be split.
+        For functions with creases, faces are excepted that cut off a corner (`misses_corner`).
 
         walls: the lower and the upper corner of the box, on whose faces the boundary lies, so that
             its edges may be split; None if the boundary stays as it is.
@@ -325,8 +326,9 @@ class _RefinementMarks:
 
 
 def _normals_turn(function: LevelFunction, corner: FloatArray) -> BoolArray:
-    """(k,) whether normals at two corners of a face differ by the angle of a crease. corner: (k, 3,
-    3)."""
+    """(k,) whether normals at two corners of a face differ by the angle of a crease.
+
+    corner: (k, 3, 3) the corners of the faces."""
     slope = function.sample(corner.reshape(-1, 3)).gradient
     normal = (slope / np.maximum(row_norms(slope), 1e-300)[:, None]).reshape(-1, 3, 3)
     cosines = [row_dots(normal[:, k], normal[:, k - 1]) for k in range(3)]

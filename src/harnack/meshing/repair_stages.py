@@ -332,11 +332,10 @@ def _check_is_mesh(mesh: Any) -> None:
 
 
 def _check_encloses(mesh: Any) -> None:
-    """Raise if a mesh cannot enclose anything: all its faces lie in a plane, or it has one side
-        only.
+    """Raise if a mesh cannot enclose anything.
 
     Raises:
-        MeshError: it cannot; or as `validate_mesh`.
+        MeshError: all faces lie in a plane, or the mesh has one side only; or as `validate_mesh`.
     """
     vertices, faces = validate_mesh(
         np.asarray(mesh.vertices), np.asarray(mesh.faces), allow_zero_area=True
