@@ -72,8 +72,8 @@ _ATTEMPTS, _FEW_ATTEMPTS, _FEW_EDGES = 6, 1, 1000
 # If the mesh is remeshed: the number of cells across it. If that takes more triangles than the
 # first of the next numbers, as for a rough surface, cells are made larger by the second, at most as
 # often as the third says.
-_CELLS_ACROSS = 48
-_MAX_TRIANGLES, _GROWTH, _MAX_GROWTHS = 80_000, 1.4, 3
+_ACROSS_ANEW = 48
+_MOST_ANEW, _GROWTH, _MAX_GROWTHS = 80_000, 1.4, 3
 
 # Points lie in a plane if the smallest of their singular values is at most this fraction of the
 # largest.
@@ -411,7 +411,7 @@ def _remesh(intended: IntendedSolid, asked: _RepairOptions) -> tuple[TriangleMes
     if asked.spacing is not None:
         made = _by_signs(field, asked.spacing, asked)
     else:
-        spacing = float(np.ptp(corners[0], axis=0).max()) / _CELLS_ACROSS
+        spacing = float(np.ptp(corners[0], axis=0).max()) / _ACROSS_ANEW
         try:
             made = _of_bounded_size(field, spacing, asked)
         except MeshingError:
@@ -429,7 +429,7 @@ def _of_bounded_size(
     spacing: the size of cells that is tried first."""
     for k in range(_MAX_GROWTHS):
         try:
-            return _by_signs(field, spacing * _GROWTH**k, asked, _MAX_TRIANGLES)
+            return _by_signs(field, spacing * _GROWTH**k, asked, _MOST_ANEW)
         except TriangleLimitError as error:
             asked.report(f"{error}; so of larger cells")
     return _by_signs(field, spacing * _GROWTH**_MAX_GROWTHS, asked)
