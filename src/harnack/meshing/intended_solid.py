@@ -34,38 +34,40 @@ __all__ = ["Difference", "IntendedSolid"]
 
 # The number of points at which winding numbers are compared: in the box around the mesh, and near
 # each surface.
-_BOX_POINTS, _SURFACE_POINTS = 2000, 1000
+_IN_BOX, _NEAR = 2000, 1000
 # The smallest and the largest distance of the points near a surface from it, and the margin of the
 # box, relative to the size.
 _NEAREST, _FARTHEST, _MARGIN = 2e-3, 0.1, 0.05
-# The winding number is clearly above or below 1/2 if it differs by more than smooth patches need.
-_CLEARLY = 0.36
+# The winding number is clearly above or below 1/2 if it differs from 1/2 by more than this: smooth
+# patches over holes stay within it.
+_CLEARANCE = 0.36
 # The largest relative difference of volumes of closed meshes that bound their solid once.
-_VOLUME = 0.01
-# A mesh winds counter-clockwise if the signed volumes of cones to its middle sum to this fraction
-# of the sum of their magnitudes.
-_PLAINLY = 0.5
+_VOLUME_TOLERANCE = 0.01
+# Each face and the middle of the mesh span a tetrahedron. The mesh winds counter-clockwise if the
+# sum of the signed volumes is more than this fraction of the sum of their magnitudes.
+_OUTWARD_SHARE = 0.5
 # The distance of points next to faces from these, relative to the size.
 _BESIDE = 1e-6
-# The number of differing points that are tested again, and the number that are listed.
-_LOOKED_AT, _LISTED = 40, 10
+# The largest number of differing points whose distances from the surfaces are computed, and the
+# largest number that a `Difference` lists.
+_MAX_RETESTED, _MAX_LISTED = 40, 10
 # The number of points of each closed part that are tested for where the part lies and what became
 # of it.
-_PLACES = 16
+_PART_SAMPLES = 16
 # A mesh is an open sheet if at least this fraction of its area has nothing inside.
-_OPEN = 0.4
+_OPEN_SHARE = 0.4
 
 
 @dataclass(frozen=True)
 class Difference:
-    """How a surface differs from the input of the repair.
+    """How the result of a repair differs from the input.
 
-    share: the fraction of the compared points that are on the wrong side.
-    places: (k, 3), a selection of these points.
-    missing: the number of points that should be inside, and are not; added: the reverse.
-    volumes: of the surface and of the closed mesh that bounds its solid once; None if they are
-        equal, or if the mesh does not bound its solid once.
-    """
+    share: the fraction of the compared points that are on the wrong side of the surface.
+    places: (k, 3) some of these points.
+    missing: the number of points that should be inside, and are not.
+    added: the number of points that should not be inside, and are.
+    volumes: of the surface, and of the input. None if they agree, or if the input is not a closed
+        mesh that winds around every point at most once."""
 
     share: float
     places: FloatArray
@@ -75,8 +77,8 @@ class Difference:
 
     @property
     def badness(self) -> float:
-        """A number to compare surfaces by: the surface with the smaller number is nearer to the
-        input."""
+        """A number by which results are compared: the smaller it is, the nearer is the surface to
+        the input."""
         volume_error = 0.0
         if self.volumes is not None:
             new, intended = self.volumes
@@ -103,11 +105,13 @@ class Difference:
 class IntendedSolid:
     """A mesh whose corners are joined and that is not inside out.
 
-    vertices: (n, 3). faces: (m, 3); is_turned: (m,) which of them were turned over.
-    oriented: (k, 3) faces that agree with their neighbors where that is possible. parts: the closed
-        parts of these faces, which may touch, cross or lie in each other (`closed_parts`).
-    rounded: the number of corners that were joined with others, apart by rounding.
-    """
+    vertices, faces: (n, 3), (m, 3) the mesh.
+    is_turned: (m,) the mask of the faces whose orientation was reversed.
+    oriented: (k, 3) faces that agree in orientation with their neighbors where that is possible.
+    parts: for each closed part of `oriented`, the indices of its faces. Parts may touch, cross or
+        lie in each other (`closed_parts`).
+    rounded: the number of corners that were joined with others because only rounding separated
+        them."""
 
     vertices: FloatArray
     faces: IntArray
@@ -118,14 +122,15 @@ class IntendedSolid:
 
     @classmethod
     def of(cls, mesh: Any, *, as_it_is: bool = False) -> IntendedSolid:
-        """The solid of any object with vertices and faces, which may have no area.
+        """The solid that a mesh is meant to bound.
 
-        Corners apart by rounding are joined. Then each closed part that is inside out is turned
-        over, with all that lies in it. So are the faces that are not closed and lie in no closed
-        part, with all that lies in them, if they wind around more points clockwise than
+        mesh: any object with vertices and faces; faces may have no area.
+        as_it_is: whether to reverse no faces.
+
+        Corners that differ by rounding are joined. Then each closed part that is inside out is
+        reversed, with all that lies in it. The faces that are not closed and lie in no closed part
+        are reversed, with all that lies in them, if they wind around more points clockwise than
         counter-clockwise.
-
-        as_it_is: turn nothing over.
 
         Raises:
             MeshError: as `validate_mesh`.
@@ -144,48 +149,48 @@ class IntendedSolid:
         if as_it_is or not len(rows):
             return cls(x, faces, is_turned, joined, [], welded.rounded)
         disagrees = against_neighbors(x, joined)
-        agreeing = _turn_faces(joined, disagrees)
-        raw = _turn_faces(raw[rows], disagrees)
+        agreeing = _turned(joined, disagrees)
+        raw = _turned(raw[rows], disagrees)
         step = 1 if volume_of(x, agreeing) >= 0 else -1  # most faces have their material inside
         parts = closed_parts(x, raw[:, ::step], agreeing[:, ::step])
         turned = _inside_out(x, agreeing, parts)
-        oriented = _turn_faces(agreeing, turned)
+        oriented = _turned(agreeing, turned)
         if turned.any() and not turned.all():
-            parts = closed_parts(x, _turn_faces(raw, turned), oriented)
+            parts = closed_parts(x, _turned(raw, turned), oriented)
         if not disagrees.any():  # otherwise no part is turned as a whole
             is_turned[rows] = turned
-        return cls(x, _turn_faces(faces, is_turned), is_turned, oriented, parts, welded.rounded)
+        return cls(x, _turned(faces, is_turned), is_turned, oriented, parts, welded.rounded)
 
     @functools.cached_property
     def size(self) -> float:
-        """The longest side of the box."""
+        """The longest side of the mesh's bounding box."""
         return float(np.ptp(self.vertices[self.oriented], axis=(0, 1)).max())
 
     @functools.cached_property
     def field(self) -> WindingNumber | None:
-        """The winding number, or None where all faces cancel."""
+        """The winding number of the mesh; None if all faces cancel each other."""
         return _winding_number(self.vertices, self.oriented)
 
     def winding(self, points: FloatArray) -> FloatArray:
-        """(k,) the winding number at points (k, 3)."""
+        """(k,) the winding numbers of the mesh at points (k, 3)."""
         return _values(self.field, points)
 
     @functools.cached_property
     def samples(self) -> tuple[FloatArray, FloatArray]:
-        """Points in the box and near the faces, and winding numbers there."""
+        """Points (k, 3) in the box and near the faces, and the winding numbers (k,) there."""
         rng = np.random.default_rng(0)
         corner = self.vertices[self.oriented]
         low, high = corner.min(axis=(0, 1)), corner.max(axis=(0, 1))
         margin = _MARGIN * self.size
-        box = rng.uniform(low - margin, high + margin, (_BOX_POINTS, 3))
+        box = rng.uniform(low - margin, high + margin, (_IN_BOX, 3))
         points = np.concatenate([box, _near(corner, self.size, rng)])
         return points, self.winding(points)
 
     @functools.cached_property
     def beside(self) -> tuple[FloatArray, FloatArray]:
-        """Points next to faces of closed parts, on both sides, and winding numbers there: the parts
-        may be so small or thin that no other points are in them."""
-        chosen = [self.oriented[part[:: max(1, len(part) // _PLACES)]] for part in self.parts]
+        """Points (k, 3) next to faces of closed parts, on both sides, and the winding numbers (k,)
+        there. A closed part may be so small or thin that no other test points are in it."""
+        chosen = [self.oriented[part[:: max(1, len(part) // _PART_SAMPLES)]] for part in self.parts]
         if not chosen:
             return np.zeros((0, 3)), np.zeros(0)
         corner = self.vertices[np.concatenate(chosen)]
@@ -197,30 +202,33 @@ class IntendedSolid:
         return points, self.winding(points)
 
     def check_encloses(self) -> None:
-        """Raise if so much of the area has nothing inside, on neither side, that it is no solid.
+        """Raise if the mesh is an open sheet.
+
+        At points spread over the faces it is tested whether the winding number on either side is at
+        least 1/2. The mesh is an open sheet if that fails on more than 40 % of its area.
 
         Raises:
-            MeshError: it is no solid.
+            MeshError: it is an open sheet.
         """
         rng = np.random.default_rng(0)
         corner = self.vertices[self.oriented]
-        points, normals = _on_faces(corner, _SURFACE_POINTS, rng)
+        points, normals = _on_faces(corner, _NEAR, rng)
         away = _NEAREST * self.size * normals
         beside = self.winding(np.concatenate([points + away, points - away]))
         nothing = (beside.reshape(2, -1) < 0.5).all(axis=0)
         fraction = float(nothing.mean())
-        if fraction > _OPEN:
+        if fraction > _OPEN_SHARE:
             raise MeshError(
                 f"the mesh is an open sheet: {fraction:.0%} of its area have nothing inside, on "
                 "neither side, so that most of it would be lost; give it a thickness first, in the "
                 "program that made it"
             )
 
-    def difference(self, surface: TriangleMesh, distance: float) -> Difference | None:
-        """The difference of a closed surface from the input, at points farther than `distance` from
-        both, and next to closed parts and farther than that from the surface; None if there is
-        none.
-        """
+    def difference(self, surface: TriangleMesh, away: float) -> Difference | None:
+        """The difference of a closed surface from the input, or None if there is none.
+
+        It is measured at points that are farther than `away` (a length) from both, and at points
+        next to closed parts that are farther than `away` from the surface."""
         points, w = self.samples
         corner = surface.vertices[surface.faces]
         near_surface = _near(corner, self.size, np.random.default_rng(1))
@@ -230,20 +238,23 @@ class IntendedSolid:
         )
         field = _winding_number(surface.vertices, surface.faces)
         both = np.concatenate([self.vertices[self.oriented], corner])
-        missing, added, distant = _on_other_side(points, w, field, both, distance)
+        missing, added, distant = _on_other_side(points, w, field, both, away)
         beside, windings = self.beside
-        lost, filled, beside_far = _on_other_side(beside, windings, field, corner, distance)
+        lost, filled, beside_far = _on_other_side(beside, windings, field, corner, away)
         distant = np.concatenate([distant, beside_far])
-        volumes = self._volumes(surface, distance)
+        volumes = self._volumes(surface, away)
         if not len(distant) and volumes is None:
             return None
         missing, added = missing + lost, added + filled
         fraction = (missing + added) / (len(points) + len(beside))
-        return Difference(fraction, distant[:_LISTED], missing, added, volumes)
+        return Difference(fraction, distant[:_MAX_LISTED], missing, added, volumes)
 
     def _volumes(self, surface: TriangleMesh, away: float) -> tuple[float, float] | None:
-        """The volumes of the surface and the mesh if they differ, for a closed mesh that winds
-        around no point twice or clockwise."""
+        """The volumes of the surface and of the mesh, or None if they agree.
+
+        They are compared only for a closed mesh that winds around no point twice or clockwise; for
+        other meshes the result is None. Volumes agree if they differ by at most 1 %, or by at most
+        `away` (a length) times the area of the surface."""
         _, w = self.samples
         if self.field is None or len(self.field.mesh.singular_edges):
             return None
@@ -254,7 +265,7 @@ class IntendedSolid:
             volume_of(self.vertices, self.oriented),
         )
         area = 0.5 * float(row_norms(area_normals(surface.vertices[surface.faces])).sum())
-        allowed = max(_VOLUME * abs(intended), away * area)
+        allowed = max(_VOLUME_TOLERANCE * abs(intended), away * area)
         return (new, intended) if abs(new - intended) > allowed else None
 
 
@@ -262,24 +273,33 @@ def _on_other_side(
     points: FloatArray,
     w: FloatArray,
     field: WindingNumber | None,
-    corner: FloatArray,
+    triangles: FloatArray,
     away: float,
 ) -> tuple[int, int, FloatArray]:
-    """The number of points with winding numbers w clearly above 1/2 that are outside of the result;
-    the number of points clearly below that are inside; and, of a selection of both, the points that
-    are farther than `away` from triangles (m, 3, 3). If there are no such points, both numbers are
-    0."""
+    """Count points on the wrong side of the result of a repair.
+
+    w: the winding numbers (n,) of the input at `points` (n, 3).
+    field: the winding number of the result.
+    triangles: (m, 3, 3). Points within `away` of them are no evidence, as stated below.
+
+    Returns:
+        The number of points outside of the result whose winding numbers are clearly above 1/2; the
+        number of points inside whose winding numbers are clearly below; and, among a selection of
+        all these points, those (k, 3) farther than `away` from the triangles. If there are none of
+        the last, both numbers are 0.
+    """
     inside = _values(field, points) > 0.5
-    missing, added = ~inside & (w > 0.5 + _CLEARLY), inside & (w < 0.5 - _CLEARLY)
+    missing, added = (~inside & (w > 0.5 + _CLEARANCE), inside & (w < 0.5 - _CLEARANCE))
     rows = np.flatnonzero(missing | added)
-    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _LOOKED_AT)).astype(int)]
-    distant = rows[[distance_from_triangles(points[k], corner) > away for k in rows]]
+    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _MAX_RETESTED)).astype(int)]
+    distant = rows[[distance_from_triangles(points[k], triangles) > away for k in rows]]
     if not len(distant):
         return 0, 0, np.zeros((0, 3))
     return int(missing.sum()), int(added.sum()), points[distant]
 
 
 def _winding_number(x: FloatArray, faces: IntArray) -> WindingNumber | None:
+    """The winding number of a mesh, or None if all faces cancel or have no area."""
     try:
         return WindingNumber(*without_zero_area_faces(x, faces))
     except MeshError:  # all faces cancel, or have no area
@@ -287,50 +307,54 @@ def _winding_number(x: FloatArray, faces: IntArray) -> WindingNumber | None:
 
 
 def _values(field: WindingNumber | None, points: FloatArray) -> FloatArray:
+    """The values (k,) of a winding number at points (k, 3); 0 if `field` is None."""
     if field is None:
         return np.zeros(len(points))
     return np.asarray(field.value(points, precision="double"))
 
 
-def _turn_faces(faces: IntArray, which: BoolArray) -> IntArray:
-    """Faces (m, 3), with the faces of the mask `which` (m,) reversed."""
-    return np.where(which[:, None], faces[:, ::-1], faces)
+def _turned(faces: IntArray, is_turned: BoolArray) -> IntArray:
+    """Faces (m, 3), with the orientation reversed where the mask (m,) is set."""
+    return np.where(is_turned[:, None], faces[:, ::-1], faces)
 
 
 # Points.
 
 
 def _on_faces(
-    corner: FloatArray, count: int, rng: np.random.Generator
+    triangles: FloatArray, count: int, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Points (k, 3) spread over faces (m, 3, 3) by area, and unit normals there."""
-    normal = area_normals(corner)
+    """Random points (count, 3) on triangles (m, 3, 3), uniform by area, and the unit normals
+    (count, 3) of their triangles."""
+    normal = area_normals(triangles)
     area = row_norms(normal)
-    rows = rng.choice(len(corner), count, p=area / area.sum())
+    chosen = rng.choice(len(triangles), count, p=area / area.sum())
     shares = rng.dirichlet((1.0, 1.0, 1.0), count)
-    points = np.einsum("ki,kij->kj", shares, corner[rows])
-    return points, normal[rows] / area[rows, None]
+    points = np.einsum("ki,kij->kj", shares, triangles[chosen])
+    return points, normal[chosen] / area[chosen, None]
 
 
-def _near(corner: FloatArray, size: float, rng: np.random.Generator) -> FloatArray:
-    """Points on both sides of faces (m, 3, 3), at distances of all magnitudes."""
-    points, normals = _on_faces(corner, _SURFACE_POINTS, rng)
-    heights = size * np.exp(rng.uniform(math.log(_NEAREST), math.log(_FARTHEST), len(points)))
-    heights *= rng.choice((-1.0, 1.0), len(points))
-    return points + heights[:, None] * normals
+def _near(triangles: FloatArray, size: float, rng: np.random.Generator) -> FloatArray:
+    """Random points (k, 3) on both sides of triangles (m, 3, 3). The logarithm of their distance
+    from the triangle is uniform between `_NEAREST` and `_FARTHEST` times `size`."""
+    points, normals = _on_faces(triangles, _NEAR, rng)
+    offsets = size * np.exp(rng.uniform(math.log(_NEAREST), math.log(_FARTHEST), len(points)))
+    offsets *= rng.choice((-1.0, 1.0), len(points))
+    return points + offsets[:, None] * normals
 
 
 # Parts that are inside out.
 
 
 def _inside_out(x: FloatArray, faces: IntArray, parts: list[IntArray]) -> BoolArray:
-    """(m,) which faces to turn over for the input not to be inside out. parts: the closed parts.
+    """(m,) the mask of the faces to reverse so that the input is not inside out.
 
-    A part is turned with the outermost part that it lies in. So are the faces that are not closed;
-    where these lie in no part they are turned by themselves, together with the parts that lie in
-    them.
-    """
-    turned, is_rest = np.zeros(len(faces), np.bool_), np.ones(len(faces), np.bool_)
+    parts: for each closed part, the indices of its faces.
+
+    A closed part is reversed together with the outermost part that contains it. The faces that
+    belong to no closed part are reversed with the largest closed part that contains them. If none
+    does, they are judged by themselves, and the closed parts inside them are reversed with them."""
+    is_inside_out, is_rest = np.zeros(len(faces), np.bool_), np.ones(len(faces), np.bool_)
     for rows in parts:
         is_rest[rows] = False
     open_faces = faces[is_rest]
@@ -343,31 +367,35 @@ def _inside_out(x: FloatArray, faces: IntArray, parts: list[IntArray]) -> BoolAr
         if not any(holds_rest) and _lies_in(x, closed[outermost], open_faces):
             is_with_rest[parts[k]] = True
         else:
-            turned[parts[k]] = volumes[outermost] < 0
+            is_inside_out[parts[k]] = volumes[outermost] < 0
     if any(holds_rest):
         sizes = np.where(holds_rest, np.abs(volumes), 0)
-        turned[is_rest] = volumes[int(sizes.argmax())] < 0
+        is_inside_out[is_rest] = volumes[int(sizes.argmax())] < 0
     elif len(open_faces) and _winds_clockwise(x, open_faces):
-        turned |= is_with_rest
-    return turned
+        is_inside_out |= is_with_rest
+    return is_inside_out
 
 
-def _lies_in(x: FloatArray, part: IntArray, container: IntArray) -> bool:
-    """Whether the faces `container` wind around points of the faces `part`: all of a selection."""
-    if not len(part) or not len(container):
+def _lies_in(x: FloatArray, faces: IntArray, container: IntArray) -> bool:
+    """Whether the mesh `container` (k, 3) winds around the center of each of a selection of `faces`
+    (m, 3). Both index the vertices x."""
+    if not len(faces) or not len(container):
         return False
-    centers = x[part[:: max(1, len(part) // _PLACES)]].mean(axis=1)
+    centers = x[faces[:: max(1, len(faces) // _PART_SAMPLES)]].mean(axis=1)
     return bool((np.abs(_values(_winding_number(x, container), centers)) > 0.5).all())
 
 
 def _winds_clockwise(x: FloatArray, faces: IntArray) -> bool:
-    """Whether a mesh winds around more points clockwise than counter-clockwise."""
+    """Whether a mesh winds around more points clockwise than counter-clockwise, of points near it.
+
+    Nearly all faces of an ordinary mesh look away from its middle. Then the signed volumes of the
+    tetrahedra between faces and middle decide, without winding numbers."""
     rng = np.random.default_rng(0)
-    corner = x[faces]
-    size = float(np.ptp(corner, axis=(0, 1)).max())
-    middle: FloatArray = corner.mean(axis=(0, 1))
-    cones = row_dots(corner[:, 0] - middle, area_normals(corner))
-    if float(cones.sum()) > _PLAINLY * float(np.abs(cones).sum()):
+    triangles = x[faces]
+    size = float(np.ptp(triangles, axis=(0, 1)).max())
+    middle: FloatArray = triangles.mean(axis=(0, 1))
+    volumes = row_dots(triangles[:, 0] - middle, area_normals(triangles))
+    if float(volumes.sum()) > _OUTWARD_SHARE * float(np.abs(volumes).sum()):
         return False  # nearly all faces look away from the middle
-    w = _values(_winding_number(x, faces), _near(corner, size, rng))
+    w = _values(_winding_number(x, faces), _near(triangles, size, rng))
     return bool((w < -0.5).sum() > (w > 0.5).sum())

@@ -1,45 +1,49 @@
 """How much of a mesh in tetrahedra is proved to have the topology of the level set.
 
-Let f be the function minus its level, F its interpolation at the corners of the tetrahedra, linear
-on each, whose zero set are the triangles of `marching_tetrahedra`, and H_t = (1-t) F + t f, 0 <= t
-<= 1.
+Let f be the function minus its level. Let F be the function that is linear on each tetrahedron and
+equals f at the corners; its zero set are the triangles of `marching_tetrahedra`. Let H_t = (1-t) F
++ t f for 0 <= t <= 1. F|T is F on the tetrahedron T, so grad F|T is a constant vector.
 
 Theorem. If each tetrahedron T satisfies (a), (b) or (c), the zero sets of f and F are isotopic:
 (a) neither f nor F has a zero in T, and both have the same sign there;
 (b) grad f(x) . grad F|T > 0 for all x in T;
 (c) each corner v of T has a vector n with n . grad F|S > 0 and n . grad f(x) > 0 for all x in S,
-    for all S around v that do not satisfy (a).
+    for all tetrahedra S around v that do not satisfy (a).
 
-Proof. Let H_t(x) = 0 for some t. By (a), x is in tetrahedra of kinds (b) and (c) alone. Some n has
-n . grad f(x) > 0 and n . grad F|T > 0 for all T that hold x: if all are of kind (b), n = grad f(x);
-else x lies in a simplex of one of kind (c), all corners of which have such an n, and all T that
-hold x are around each of them. H_t is Lipschitz, and Clarke's generalized gradient of it at x is
-the convex hull of (1-t) grad F|T + t grad f(x) over these T: it does not hold 0. By Clarke's
-implicit function theorem the zero set of H in (x, t) is near there the graph of a Lipschitz
-function over n's orthogonal plane and t. The fields n/(n . n), patched by a partition of unity,
-still have positive products with all these gradients, and following them as t goes from 0 to 1
-moves the zero set of F onto that of f (Thom's argument, for Lipschitz functions). On a wall of the
-box, where the surface ends, x moves within the wall: there (b) is required of the gradients'
-projections onto it, for each face, edge or corner of a tetrahedron that lies in walls.
+Proof. Let H_t(x) = 0 for some t. Then x lies in no tetrahedron of kind (a). There is a vector n
+with n . grad f(x) > 0 and n . grad F|T > 0 for all T that contain x. If all of these are of kind
+(b), it is n = grad f(x). Otherwise x lies in a tetrahedron of kind (c), and so inside of a simplex
+(a face, an edge or a corner of it, or all of it). Each corner of this simplex has such an n, and
+all T that contain x are around each of these corners. H_t is Lipschitz, and its generalized
+gradient by Clarke at x is the convex hull of (1-t) grad F|T + t grad f(x) over these T. It does not
+contain 0, because all of its elements have positive products with n. By Clarke's implicit function
+theorem the zero set of H in (x, t) is near there the graph of a Lipschitz function over t and the
+plane orthogonal to n. The fields n/(n . n), patched by a partition of unity, still have positive
+products with all these gradients. Following them as t goes from 0 to 1 moves the zero set of F onto
+that of f (Thom's argument, for Lipschitz functions). On a wall, a face of the box where the surface
+ends, x moves within the wall. So for each face, edge or corner of a tetrahedron that lies in walls,
+(b) is also required of the projections of the gradients onto these walls.
 
-Four corners on the level. F is 0 on such a T, and `marching_tetrahedra` gives all of it to one
-side. If two of its faces are in the mesh, put F = +-epsilon at the middle of the edge that the
-other two share: T becomes two tetrahedra, on each of which grad F is a normal of one of those
-faces, F elsewhere changes by no more than epsilon, which (b) and (c) bear as they are strict, and
-the zero set is the mesh. So (b) and (c) are required of both normals. Other such T are not proved.
+Four corners on the level. F is 0 on such a T, and `marching_tetrahedra` gives all of T to one side
+of the level set. If two of the faces of T are in the mesh, set F to +epsilon or -epsilon at the
+middle of the edge that the other two faces share. Then T becomes two tetrahedra, and on each of
+them grad F is a normal of one of the two faces in the mesh. Elsewhere F changes by no more than
+epsilon, which (b) and (c) allow as they are strict inequalities, and the zero set is the mesh. So
+(b) and (c) are required of both normals. If T has another number of faces in the mesh, nothing is
+proved on it.
 
-An angle. Where f's lift stays within half a period of the level on T, which is a part of the check
-of (b), the wrapped values at the corners are that lift's, and all is as for a number.
+Angles. The lift of an angle-valued f is a continuous real-valued function that equals f modulo the
+period. The check of (b) includes that the lift stays within half a period of the level on T. Then
+the wrapped values at the corners are the values of this lift, and all is as for real values.
 
-The check. |grad f(y) - grad f(c)| <= D for all y in the ball around T with center c and radius R,
-by the field's own promise (`Field.gradient_change_bound`). So (b) holds if grad f(c) . grad F > D
-|grad F|, and f has no zero in T if |f(c)| > (|grad f(c)| + D) R. If neither holds T is halved,
-across its longest edge, a few times: grad F is the same in both halves, and (a) or (b) may hold in
-each.
+The check. By the field's own promise (`Field.gradient_change_bound`), |grad f(y) - grad f(c)| <= D
+for all y in the ball around T with center c and radius R. So (b) holds if grad f(c) . grad F > D
+|grad F|, and f has no zero in T if |f(c)| > (|grad f(c)| + D) R. If neither holds, T is halved at
+its longest edge, a few times: grad F is the same in both halves, and (a) or (b) may hold in each.
 
 Near the curve nothing is proved. The proof is about the first triangles, before they are refined.
-The refined triangles are checked not to meet (`checks.intersecting_faces`) and to face along the
-gradient; it is not checked that they were moved without meeting on the way.
+It is checked that the refined triangles do not meet (`checks.intersecting_faces`) and that they
+face along the gradient. It is not checked that they were moved without meeting on the way.
 """
 
 from __future__ import annotations
@@ -59,27 +63,27 @@ __all__ = ["IsotopyCoverage", "isotopy_of"]
 
 Walls = tuple[FloatArray, FloatArray] | None
 _HALVINGS = 5
-_TRIALS = 20
-_UNKNOWN = 1e200
-# The number of tetrahedra that are examined before all are.
-_FIRST_EXAMINED = 100
+_MAX_PERCEPTRON_ROUNDS = 20
+_NO_BOUND = 1e200
+# The number of tetrahedra on which it is tried first whether the gradient's change is bounded.
+_MAX_TRIED = 100
 # The distance, in cells, beyond which tetrahedra are far from the curve.
 _FAR_FROM_CURVE = 1.5
 
 
 @dataclass(frozen=True)
 class IsotopyCoverage:
-    """The fractions of tetrahedra, among those that may hold a point of the level set or hold a
-    point of the mesh, on which the topology is proved.
+    """On which part of the tetrahedra the topology of a mesh is proved to be that of the level set.
 
-    proved: the fraction of all where (a), (b) or (c) is proved. If it is 1, mesh and level set are
-        isotopic.
-    proved_off_curve: the fraction of those farther than 1.5 cells from the curve.
-    count: the number of tetrahedra; for fields that do not bound the changes of their gradient only
-        of those that hold a point of the mesh.
-    unproved_off_curve: (k, 4) the corners of those farther than 1.5 cells from the curve where
-        nothing is proved.
-    """
+    Only tetrahedra count that may hold a point of the level set, or that hold a point of the mesh.
+
+    proved: the fraction of these on which (a), (b) or (c) is proved. If it is 1, the mesh and the
+        level set are isotopic.
+    proved_off_curve: the same fraction among those farther than 1.5 cells from the curve.
+    count: the number of these tetrahedra. For fields that do not bound the change of their gradient
+        only those that hold a point of the mesh are counted.
+    unproved_off_curve: (k, 4) the corners of the tetrahedra farther than 1.5 cells from the curve
+        on which nothing is proved."""
 
     proved: float
     proved_off_curve: float
@@ -87,7 +91,7 @@ class IsotopyCoverage:
     unproved_off_curve: IntArray
 
     def shares(self) -> dict[str, float]:
-        """The fractions, for the metadata of a mesh."""
+        """The two fractions, by the names that they have in the metadata of a mesh."""
         return {"isotopy": self.proved, "isotopy_far": self.proved_off_curve}
 
 
@@ -101,10 +105,15 @@ def isotopy_of(
     spacing: float,
     walls: Walls,
 ) -> IsotopyCoverage:
-    """The tetrahedra on which the topology of their mesh is proved; tetrahedra: (m, 4) corners.
+    """On which tetrahedra the topology of the mesh is proved to be that of the level set.
 
-    is_cut: (m,) whether a tetrahedron holds a point of the mesh. faces: (k, 3) of the mesh, whose
-        first vertices are the points.
+    points, tetrahedra: the points, and the indices (m, 4) of the corners of the tetrahedra.
+
+    is_cut: (m,) whether a tetrahedron holds a point of the mesh.
+    faces: (k, 3) the triangles of the mesh; its first vertices are the points of the tetrahedra.
+    boundary: the curve. spacing: the size of cells.
+    walls: the lower and the upper corner (3,) of the box, on whose faces the surface may end;
+        None if it does not end there.
     """
     corners = points.points[tetrahedra]
     if not _has_bounds(function, corners[is_cut]):
@@ -115,7 +124,7 @@ def isotopy_of(
     index, corners = tetrahedra[holds], corners[holds]
     values = points.samples.value[index]
     values[points.is_on_level[index]] = 0.0
-    slopes = _slopes_on(function, corners, index, values, faces)
+    slopes = _linear_gradients(function, corners, index, values, faces)
     beside = (index < len(boundary.points)).any(axis=1)
     proved = np.bincount(slopes.owner, minlength=len(index)) > 0
     proved &= ~beside
@@ -134,57 +143,64 @@ def isotopy_of(
     stars = ~proved & ~beside & far
     proved[stars] = _proved_by_stars(function, corners, index, slopes, np.flatnonzero(stars))
     proved &= on_walls
-    return IsotopyCoverage(
-        _proved_fraction(proved), _proved_fraction(proved[far]), len(index), index[far & ~proved]
-    )
+    return IsotopyCoverage(_share(proved), _share(proved[far]), len(index), index[far & ~proved])
 
 
 def _has_bounds(function: LevelFunction, corners: FloatArray) -> bool:
-    """Whether changes of the gradient are bounded on any of a selection of tetrahedra (n, 4, 3); if
-    not, all cut tetrahedra stay unproved, and no others need to be examined."""
-    sampled = corners[:: max(1, len(corners) // _FIRST_EXAMINED)]
-    center, radius = _balls(sampled)
-    return not len(sampled) or bool((function.gradient_bounds(center, radius)[1] < _UNKNOWN).any())
+    """Whether the field bounds the change of its gradient on any of a selection of tetrahedra
+    (n, 4, 3). If not, all cut tetrahedra stay unproved, and no others need to be examined."""
+    tried = corners[:: max(1, len(corners) // _MAX_TRIED)]
+    center, radius = _balls(tried)
+    return not len(tried) or bool((function.gradient_bounds(center, radius)[1] < _NO_BOUND).any())
 
 
-def _proved_fraction(proved: BoolArray) -> float:
+def _share(proved: BoolArray) -> float:
+    """The fraction of a mask that is set; 1 for an empty mask."""
     return float(proved.mean()) if len(proved) else 1.0
 
 
 def _balls(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Centers (n, 3) and radii (n,) of balls around simplices (n, k, 3)."""
+    """Balls around simplices (n, k, 3): centers (n, 3) and radii (n,)."""
     center = corners.mean(axis=1)
     return center, np.linalg.norm(corners - center[:, None], axis=2).max(axis=1)
 
 
 @dataclass(frozen=True)
 class _LinearGradients:
-    """Gradients of F, slope (k, 3), on the tetrahedra owner (k,): each has one gradient, or two, or
-    none."""
+    """Gradients of the linear interpolation F on tetrahedra.
+
+    owner: (k,) the index of the tetrahedron that each gradient belongs to. A tetrahedron has one
+        gradient, two or none.
+    slope: (k, 3) the gradients."""
 
     owner: IntArray
     slope: FloatArray
 
 
-def _slopes_on(
+def _linear_gradients(
     function: LevelFunction,
     corners: FloatArray,
     index: IntArray,
     values: FloatArray,
     faces: IntArray,
 ) -> _LinearGradients:
-    """The gradients on tetrahedra with corners (m, 4, 3), their indices (m, 4) and values (m, 4):
-    none for flat tetrahedra, two for those with four corners on the level and two faces in the
-    mesh."""
-    sides = corners[:, 1:] - corners[:, :1]
-    size = np.linalg.norm(sides, axis=2).max(axis=1)
-    sound = np.abs(np.linalg.det(sides)) > 1e-9 * size**3
-    flat = (values == 0).all(axis=1)
-    rows = np.flatnonzero(sound & ~flat)
+    """The gradients of F, which interpolates `values` (m, 4) linearly on tetrahedra.
+
+    corners, index: (m, 4, 3), (m, 4) the corners of the tetrahedra and the indices of these points.
+    faces: (j, 3) of the mesh.
+
+    A tetrahedron without a volume has no gradient. If all four corners are on the level, F is 0
+    there. Then, if exactly two of its faces are in the mesh, it has two gradients: the normals of
+    these faces (see "Four corners on the level" above). Otherwise it has none."""
+    edges = corners[:, 1:] - corners[:, :1]
+    size = np.linalg.norm(edges, axis=2).max(axis=1)
+    has_volume = np.abs(np.linalg.det(edges)) > 1e-9 * size**3
+    on_level = (values == 0).all(axis=1)
+    rows = np.flatnonzero(has_volume & ~on_level)
     rise = values[rows, 1:] - values[rows, :1]
-    slope: FloatArray = np.linalg.solve(sides[rows], rise[..., None])[..., 0].astype(np.float64)
+    slope: FloatArray = np.linalg.solve(edges[rows], rise[..., None])[..., 0].astype(np.float64)
     owners, slopes = [rows], [slope]
-    rows = np.flatnonzero(sound & flat)
+    rows = np.flatnonzero(has_volume & on_level)
     count = int(index.max(initial=0)) + 1
     keys = _triple_keys(faces[(faces < count).all(axis=1)], count)
     triples = np.array([np.delete(np.arange(4), k) for k in range(4)])
@@ -192,21 +208,23 @@ def _slopes_on(
         [np.isin(_triple_keys(index[rows][:, triple], count), keys) for triple in triples], axis=1
     )
     sign = np.sign(function.values(corners[rows].mean(axis=1)))
-    pair = in_mesh.sum(axis=1) == 2
+    has_two = in_mesh.sum(axis=1) == 2
     for k, triple in enumerate(triples):
-        chosen = np.flatnonzero(pair & in_mesh[:, k])
-        a, b, c = (corners[rows[chosen], corner] for corner in triple)
+        those = np.flatnonzero(has_two & in_mesh[:, k])
+        a, b, c = (corners[rows[those], corner] for corner in triple)
         normal = np.cross(b - a, c - a)
-        inward = ((corners[rows[chosen], k] - a) * normal).sum(axis=1)
-        owners.append(rows[chosen])
-        slopes.append(normal * (np.sign(inward) * sign[chosen])[:, None])
+        inward = ((corners[rows[those], k] - a) * normal).sum(axis=1)
+        owners.append(rows[those])
+        slopes.append(normal * (np.sign(inward) * sign[those])[:, None])
     return _LinearGradients(np.concatenate(owners), np.concatenate(slopes))
 
 
-def _triple_keys(triples: IntArray, count: int) -> IntArray:
-    """A number for each triple (k, 3) of fewer than two million points, the same for any order."""
+def _triple_keys(triples: IntArray, point_count: int) -> IntArray:
+    """One number for each triple (k, 3) of point indices, the same for any order of the three.
+
+    point_count: more than the largest index, and less than two million."""
     a, b, c = np.sort(triples, axis=1).T
-    keys: IntArray = (a * count + b) * count + c
+    keys: IntArray = (a * point_count + b) * point_count + c
     return keys
 
 
@@ -217,28 +235,30 @@ def _proved_by_stars(
     slopes: _LinearGradients,
     rows: IntArray,
 ) -> BoolArray:
-    """(k,) whether (c) is proved for tetrahedra `rows` (k,).
+    """(k,) whether (c) is proved for the tetrahedra with indices `rows` (k,).
 
-    n is computed as by a perceptron: starting with the sum of all unit gradients of F around a
-    corner, gradients whose product with n is not positive are added again, a few times.
-    """
+    corners, index: (m, 4, 3), (m, 4) of all tetrahedra. slopes: the gradients of F on them.
+
+    For each corner, the vector n of (c) is computed as by a perceptron: it starts as the sum of all
+    unit gradients of F around the corner; then the gradients whose product with n is not positive
+    are added again, for a few rounds."""
     vertices = np.unique(index[rows])
     number = np.full(int(index.max(initial=0)) + 1, -1, np.int64)
     number[vertices] = np.arange(len(vertices))
     # Pairs of a corner and a tetrahedron around it; then pairs of a corner and a gradient there.
     tet, corner = np.nonzero(number[index] >= 0)
     star = number[index[tet, corner]]
-    entry, column = np.nonzero(number[index[slopes.owner]] >= 0)
-    vertex = number[index[slopes.owner[entry], column]]
+    entry, corner_of_entry = np.nonzero(number[index[slopes.owner]] >= 0)
+    vertex = number[index[slopes.owner[entry], corner_of_entry]]
     units = slopes.slope[entry]
     units = units / np.maximum(np.linalg.norm(units, axis=1), 1e-300)[:, None]
     n = np.zeros((len(vertices), 3))
     np.add.at(n, vertex, units)
-    for _ in range(_TRIALS):
-        short = (n[vertex] * units).sum(axis=1) <= 0
-        if not short.any():
+    for _ in range(_MAX_PERCEPTRON_ROUNDS):
+        is_short = (n[vertex] * units).sum(axis=1) <= 0
+        if not is_short.any():
             break
-        np.add.at(n, vertex[short], units[short])
+        np.add.at(n, vertex[is_short], units[is_short])
     is_proved = np.ones(len(vertices), np.bool_)
     is_proved[vertex[(n[vertex] * units).sum(axis=1) <= 1e-9]] = False
     has_slope = np.bincount(slopes.owner, minlength=len(index)) > 0
@@ -251,15 +271,16 @@ def _proved_by_stars(
 
 
 def _proved_empty(function: LevelFunction, corners: FloatArray) -> BoolArray:
-    """(n,) whether f is proved to have no zero in tetrahedra (n, 4, 3), by halving them. As F has
-    none and f has no net crossing of a level on their edges, both are between the same two levels:
-    (a)."""
+    """(n,) whether (a) is proved on tetrahedra (n, 4, 3): f has no zero there.
+
+    They are halved a few times for that. F has no zero there either, and f has no net crossing of a
+    level on their edges, so both lie between the same two levels, which is (a)."""
     owner, pieces = np.arange(len(corners)), corners
     for _ in range(_HALVINGS + 1):
         center, radius = _balls(pieces)
         undecided = function.clearance(center) <= radius * (1 + 1e-9)
         owner = np.concatenate([owner[undecided], owner[undecided]])
-        pieces = _halve_simplices(pieces[undecided])
+        pieces = _halved(pieces[undecided])
         if not len(pieces):
             break
     free = np.ones(len(corners), np.bool_)
@@ -276,9 +297,9 @@ def _proved_regular(
 ) -> BoolArray:
     """(n,) whether (a) or (b) is proved on all of simplices (n, k, 3), by halving them.
 
-    start: (n,) F at their first corners. slope: grad F. free: (3,) 1 for the coordinates in which
-        walls let points move, else 0.
-    """
+    start: (n,) the values of F at the first corners.
+    slope: (n, 3) grad F, or in (c) the vector n.
+    free: (3,) 1 for coordinates in which points may move, 0 for those that a wall fixes."""
     owner, first = np.arange(len(corners)), corners[:, 0]
     pieces, proved = corners, np.ones(len(corners), np.bool_)
     half_period = np.inf if function.period is None else 0.499 * function.period
@@ -288,35 +309,36 @@ def _proved_regular(
         center, radius = _balls(pieces)
         radius = radius * (1 + 1e-9)
         samples, change = function.gradient_bounds(center, radius)
-        change = np.minimum(change, _UNKNOWN)
-        if (change == _UNKNOWN).all():
+        change = np.minimum(change, _NO_BOUND)
+        if (change == _NO_BOUND).all():
             proved[owner] = False
             break
-        along = slope[owner] * free
-        steep = np.linalg.norm(samples.gradient, axis=1)
-        moved = (steep + change) * radius
-        rise = (samples.gradient * along).sum(axis=1)
-        is_regular = rise > change * np.linalg.norm(along, axis=1) * (1 + 1e-9)
-        within = np.abs(samples.value) + moved < half_period
+        projected = slope[owner] * free
+        gradient_length = np.linalg.norm(samples.gradient, axis=1)
+        moved = (gradient_length + change) * radius
+        product = (samples.gradient * projected).sum(axis=1)
+        is_regular = product > change * np.linalg.norm(projected, axis=1) * (1 + 1e-9)
+        is_within_half_period = np.abs(samples.value) + moved < half_period
         linear = start[owner, None] + ((pieces - first[owner, None]) * slope[owner, None]).sum(2)
         sign = np.sign(samples.value)
         is_regular |= (np.abs(samples.value) > moved) & (linear * sign[:, None] > 0).all(axis=1)
         if halving == 0:
-            proved &= within
+            proved &= is_within_half_period
         undecided = ~is_regular & proved[owner]
         if halving == _HALVINGS or pieces.shape[1] == 1:
             proved[owner[undecided]] = False
             break
         owner = np.concatenate([owner[undecided], owner[undecided]])
-        pieces = _halve_simplices(pieces[undecided])
+        pieces = _halved(pieces[undecided])
     return proved
 
 
-def _halve_simplices(pieces: FloatArray) -> FloatArray:
-    """Simplices (2n, k, 3): both halves of each, cut at the middle of its longest edge."""
+def _halved(pieces: FloatArray) -> FloatArray:
+    """Cut simplices (n, k, 3) at the middle of their longest edges. Returns (2n, k, 3): first one
+    half of each, then the other."""
     pairs = list(itertools.combinations(range(pieces.shape[1]), 2))
-    span = [np.linalg.norm(pieces[:, i] - pieces[:, j], axis=1) for i, j in pairs]
-    i, j = np.array(pairs)[np.argmax(span, axis=0)].T if len(pieces) else (np.zeros(0, int),) * 2
+    lengths = [np.linalg.norm(pieces[:, i] - pieces[:, j], axis=1) for i, j in pairs]
+    i, j = np.array(pairs)[np.argmax(lengths, axis=0)].T if len(pieces) else (np.zeros(0, int),) * 2
     rows = np.arange(len(pieces))
     middle = 0.5 * (pieces[rows, i] + pieces[rows, j])
     first, second = pieces.copy(), pieces.copy()
@@ -332,42 +354,47 @@ def _regular_on_walls(
     rows: BoolArray,
     walls: tuple[FloatArray, FloatArray],
 ) -> BoolArray:
-    """(n,) whether (b) is proved for projections, on the faces, edges and corners of tetrahedra
-    `rows` (n,) that lie in walls; True for other tetrahedra without a corner there."""
-    margin = 1e-9 * (walls[1] - walls[0])
-    on = np.stack([np.abs(corners - wall) <= margin for wall in walls], axis=-1)  # (n, 4, 3, 2)
+    """(n,) whether (b) is proved for the projections onto the walls of the box.
+
+    rows: (n,) the mask of the tetrahedra whose faces, edges and corners in walls are tested.
+    walls: the lower and the upper corner (3,) of the box.
+
+    Tetrahedra that are not in `rows` count as proved if they have no corner on a wall, else as not
+    proved."""
+    tolerance = 1e-9 * (walls[1] - walls[0])
+    on = np.stack([np.abs(corners - wall) <= tolerance for wall in walls], axis=-1)  # (n, 4, 3, 2)
     proved = rows | ~on.any(axis=(1, 2, 3))
     planes = list(itertools.product(range(3), range(2)))
     for count in (1, 2):  # in corners of the box no point moves, and nothing is required
-        for chosen in itertools.combinations(planes, count):
-            axes = [axis for axis, _ in chosen]
+        for planes_chosen in itertools.combinations(planes, count):
+            axes = [axis for axis, _ in planes_chosen]
             if len(set(axes)) < count:
                 continue
-            inside = np.all([on[:, :, axis, side] for axis, side in chosen], axis=0)
+            in_planes = np.all([on[:, :, axis, side] for axis, side in planes_chosen], axis=0)
             free = np.ones(3)
             free[axes] = 0.0
-            number = inside.sum(axis=1)
+            corner_count = in_planes.sum(axis=1)
             for k in range(1, 4):
-                entry = np.flatnonzero(((number == k) & rows)[slopes.owner])
+                entry = np.flatnonzero(((corner_count == k) & rows)[slopes.owner])
                 if not len(entry):
                     continue
                 owner = slopes.owner[entry]
-                which = np.argsort(~inside[owner], axis=1, kind="stable")[:, :k]
-                part = np.take_along_axis(corners[owner], which[..., None], axis=1)
-                start = np.take_along_axis(values[owner], which[:, :1], axis=1)[:, 0]
+                columns = np.argsort(~in_planes[owner], axis=1, kind="stable")[:, :k]
+                part = np.take_along_axis(corners[owner], columns[..., None], axis=1)
+                start = np.take_along_axis(values[owner], columns[:, :1], axis=1)[:, 0]
                 is_regular = _proved_regular(function, part, start, slopes.slope[entry], free)
                 proved[owner[~is_regular]] = False
     return proved
 
 
 def _distances(points: FloatArray, boundary: BoundaryCurve) -> FloatArray:
-    """(n,) the distances of points from the curve, too large by at most half of its longest
-    edge."""
+    """(n,) distances of points (n, 3) from the curve, measured to nine points of each of its edges.
+    So they are too large by at most half of its longest edge."""
     import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial
     a, b = (boundary.points[boundary.edges[:, k]] for k in (0, 1))
     fraction = np.linspace(0, 1, 9)[:, None, None]
-    on: FloatArray = (a + fraction * (b - a)).reshape(-1, 3)
-    distances: FloatArray = searching.cKDTree(on).query(points)[0]
+    curve_points: FloatArray = (a + fraction * (b - a)).reshape(-1, 3)
+    distances: FloatArray = searching.cKDTree(curve_points).query(points)[0]
     return distances

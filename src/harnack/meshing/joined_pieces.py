@@ -1,10 +1,12 @@
-"""The boundary of the solid of a closed mesh that intersects itself: its faces are cut along each
-other, and the pieces that bound the solid are joined.
+"""The boundary of the solid of a closed mesh that intersects itself.
 
-The winding numbers on both sides of each piece tell whether the piece bounds the points around
-which the mesh winds at least once. Where two faces meet, the pieces of each have vertices that
-differ by rounding from those of the other, and a piece may have vertices in the middle of an edge
-of another. So vertices are merged first, and then edges are split at the vertices on them.
+The faces of the mesh are cut along each other, and the pieces that bound the solid are joined. The
+winding numbers on both sides of a piece tell whether it bounds the solid, the set of points around
+which the mesh winds at least once.
+
+Where two faces meet, the vertices of pieces of one face differ by rounding from those of the other
+face, and a piece may have vertices in the middle of an edge of another piece. So vertices are
+merged first, and then edges are split at the vertices on them.
 """
 
 from __future__ import annotations
@@ -30,27 +32,27 @@ from harnack.tree.triangle_tree import TriangleTree, triangle_records
 __all__ = ["boundary_of_solid", "neighbors", "passes_itself"]
 
 _LEAF_SIZE = 4
-# Relative to the mesh's size: pieces thinner than the first are not tested for winding numbers
-# beside them; corners nearer than the second are joined.
-_THIN, _JOIN_DISTANCE = 1e-9, 1e-11
-# Faces around an edge have the same direction if the angle between them, in full turns, is less
-# than this.
-_SAME_TURN = 1e-9
-# How often edges are halved at corners on them.
-_MAX_HALVINGS = 200
+# Relative to the mesh's size: winding numbers beside pieces thinner than the first are not used;
+# corners nearer to each other than the second are joined.
+_THIN, _SAME = 1e-9, 1e-11
+# Two faces around an edge count as having the same direction if the angle between them, as a
+# fraction of a full turn, is less than this.
+_TURN = 1e-9
+# The largest number of rounds in which edges are cut at corners on them.
+_MAX_ROUNDS = 200
 
 
 def passes_itself(surface: TriangleMesh, number: IntArray) -> bool:
-    """Whether a closed surface none of whose triangles pass through others does so along edges that
-    lie on faces, where nothing passes through a triangle.
+    """Whether a closed surface passes through itself along edges that lie on its faces.
 
+    surface: none of its triangles pass through each other's inside.
     number: (m,) the number of the connected component that each face belongs to.
 
-    Proof. Where one sheet passes through another, each is cut in two, with winding numbers on both
-    sides of one part that are larger by one than those of the other. So the winding numbers beside
-    pieces of faces that touch others are not the same all over a connected component. Where no
-    sheet passes through it they are: they change at no other place.
-    """
+    Proof. Where one sheet passes through another, each is cut in two, and the winding numbers on
+    both sides of one of the two parts are larger by one than those of the other part. So the
+    winding numbers beside pieces of faces that touch others are not the same all over a connected
+    component. Where no sheet passes through the surface they are the same: they change at no other
+    place."""
     pairs, _ = touching_pairs(surface.vertices, surface.faces)
     if not len(pairs):
         return False
@@ -61,13 +63,13 @@ def passes_itself(surface: TriangleMesh, number: IntArray) -> bool:
 
 
 def boundary_of_solid(vertices: FloatArray, faces: IntArray) -> TriangleMesh:
-    """The boundary of the points around which a closed mesh winds at least once; it may wind around
-    others clockwise. Where the boundary touches itself each sheet has corners of its own.
+    """The boundary of the set of points around which a closed mesh winds at least once.
 
-    Corners of the mesh are as they were, bit by bit.
+    The mesh may wind around other points clockwise. Vertices of the mesh that are left are
+    unchanged, bit by bit. Where the boundary touches itself, each sheet has vertices of its own.
 
     Raises:
-        MeshingError: there are no such points, or pieces do not fit together.
+        MeshingError: there are no such points, or the pieces do not fit together.
     """
     x, proper_faces = without_zero_area_faces(vertices, faces)
     cut = _Cut.of(x, proper_faces, np.arange(len(proper_faces)), closed=faces)
@@ -78,8 +80,8 @@ def boundary_of_solid(vertices: FloatArray, faces: IntArray) -> TriangleMesh:
     pieces = cut.pieces[bounds]
     looks_in = (cut.front > cut.back)[bounds]
     pieces = np.where(looks_in[:, None, None], pieces[:, ::-1], pieces)
-    points = np.concatenate([cut.vertices, pieces.reshape(-1, 3)])
-    group = connected_groups(pairs_within(points, _JOIN_DISTANCE), len(points))
+    points = np.concatenate([cut.unit, pieces.reshape(-1, 3)])
+    group = connected_groups(pairs_within(points, _SAME), len(points))
     first = np.unique(group, return_index=True)[1][group]  # corners of the mesh come first
     joined = first[len(x) :].reshape(-1, 3)
     joined = joined[(joined != np.roll(joined, 1, axis=1)).all(axis=1)]
@@ -90,16 +92,19 @@ def boundary_of_solid(vertices: FloatArray, faces: IntArray) -> TriangleMesh:
 
 @dataclass(frozen=True)
 class _Cut:
-    """Pieces (k, 3, 3) of some faces of a mesh, cut along each other, in coordinates of at most
-    about one: center + size times these are the original coordinates.
+    """Some faces of a mesh, cut along each other, and the winding numbers beside the pieces.
 
-    vertices: (n, 3). faces: the faces that were cut; owner: (k,) the face of the mesh that
-        each piece is of. front, back: (k,) winding numbers on its sides. is_thick: (k,) whether
-        these are known.
-    """
+    Lengths are scaled so that coordinates are at most about one: center + size * x is the original
+    position of x.
+
+    rays: a tree of the faces that were cut. unit: (n, 3) the vertices of the mesh.
+    faces: (j, 3) the faces that were cut. pieces: (k, 3, 3).
+    owner: (k,) the face of the mesh that each piece is a part of.
+    front, back: (k,) the winding numbers on the two sides of each piece.
+    is_thick: (k,) whether a piece is thick enough for these numbers to be right."""
 
     rays: TriangleTree
-    vertices: FloatArray
+    unit: FloatArray
     faces: IntArray
     center: FloatArray
     size: float
@@ -113,8 +118,10 @@ class _Cut:
     def of(
         cls, vertices: FloatArray, faces: IntArray, rows: IntArray, closed: IntArray | None = None
     ) -> _Cut:
-        """The pieces of the faces `rows`. closed: all faces, with those without an area, if there
-        are such faces."""
+        """Cut the faces `rows` (indices) of a mesh along each other.
+
+        closed: all faces of the mesh, including those without an area, if `faces` lacks these;
+            winding numbers are counted with it."""
         corner = vertices[faces]
         low, high = corner.min(axis=(0, 1)), corner.max(axis=(0, 1))
         size = float(2.0 ** np.ceil(np.log2(0.5 * float((high - low).max()))))
@@ -132,29 +139,31 @@ class _Cut:
         )
 
     def is_there_before(self) -> BoolArray:
-        """(k,) which pieces lie on a face that precedes their own, in one plane, if all faces were
-        cut: of several pieces in one place a single one is enough."""
-        is_there = np.zeros(len(self.pieces), np.bool_)
-        covered, covering = overlapping_faces(self.rays, self.vertices, self.faces)
+        """(k,) which pieces lie on a face with a lower index than their own, in the same plane. Of
+        several pieces at one place only that of the lowest face is needed. All faces have to be
+        cut."""
+        is_repeated = np.zeros(len(self.pieces), np.bool_)
+        covered, covering = overlapping_faces(self.rays, self.unit, self.faces)
         covered, covering = covered[covering < covered], covering[covering < covered]
         order = np.argsort(self.owner, kind="stable")
         start, end = (
             np.searchsorted(self.owner[order], covered, side=side) for side in ("left", "right")
         )
         count = end - start
-        past = np.cumsum(count) - count
-        rows = order[np.arange(int(count.sum())) + np.repeat(start - past, count)]
-        triangle = self.vertices[self.faces[np.repeat(covering, count)]]
+        offset = np.cumsum(count) - count
+        rows = order[np.arange(int(count.sum())) + np.repeat(start - offset, count)]
+        triangle = self.unit[self.faces[np.repeat(covering, count)]]
         middle, normal = self.pieces[rows].mean(axis=1), area_normals(triangle)
         within = np.ones(len(rows), np.bool_)
         for i, j in ((0, 1), (1, 2), (2, 0)):
             inward = np.cross(normal, triangle[:, j] - triangle[:, i])
             within &= row_dots(inward, middle - triangle[:, i]) > 0
-        is_there[rows[within]] = True
-        return is_there
+        is_repeated[rows[within]] = True
+        return is_repeated
 
 
 def _rays(scaled: FloatArray, faces: IntArray) -> TriangleTree:
+    """A tree of the faces (m, 3) between the vertices `scaled` (n, 3), in double precision."""
     tree = build_balanced_tree(scaled[faces].mean(axis=1), leaf_size=_LEAF_SIZE)
     return TriangleTree.of(choose_backend("double"), tree, triangle_records(scaled, faces))
 
@@ -163,30 +172,33 @@ def _rays(scaled: FloatArray, faces: IntArray) -> TriangleTree:
 
 
 def _cut_at_corners(x: FloatArray, faces: IntArray) -> IntArray:
-    """Faces, cut until every edge is run as often in one direction as in the other. Edges for which
-    that fails are cut at a corner of such edges that lies on them, of several the corner nearest to
-    the middle.
+    """Cut faces until every edge is run as often in one direction as in the other.
+
+    x: (n, 3) the vertices.
+
+    An edge for which that fails is cut at an end of another such edge that lies on it; of several,
+    at the one nearest to its middle. Returns the faces.
 
     Raises:
-        MeshingError: they do not fit together.
+        MeshingError: the pieces do not fit together.
     """
     edges, _ = singular_edges(faces)
-    for _ in range(_MAX_HALVINGS):
+    for _ in range(_MAX_ROUNDS):
         if not len(edges):
             return faces
         edges = np.unique(np.sort(edges, axis=1), axis=0)
         middle, is_cut = _corners_on(x, edges)
         if not is_cut.any():
             break
-        key = len(x)
-        names = edges[is_cut] @ [key, 1]
-        corner_pairs = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2) @ [key, 1]
-        at = np.searchsorted(names, corner_pairs).clip(max=len(names) - 1)
-        is_met = names[at] == corner_pairs
-        rows, side = np.flatnonzero(is_met.any(axis=1)), is_met.argmax(axis=1)
+        count = len(x)
+        keys = edges[is_cut] @ [count, 1]
+        face_keys = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2) @ [count, 1]
+        position = np.searchsorted(keys, face_keys).clip(max=len(keys) - 1)
+        has_cut = keys[position] == face_keys
+        rows, side = np.flatnonzero(has_cut.any(axis=1)), has_cut.argmax(axis=1)
         side = side[rows]
         a, b, c = (faces[rows, (side + k) % 3] for k in range(3))
-        p = middle[is_cut][at[rows, side]]
+        p = middle[is_cut][position[rows, side]]
         halves = [np.column_stack([a, p, c]), np.column_stack([p, b, c])]
         halves = [half[(half[:, 0] != half[:, 2]) & (half[:, 1] != half[:, 2])] for half in halves]
         faces = np.concatenate([np.delete(faces, rows, axis=0), *halves])
@@ -197,26 +209,30 @@ def _cut_at_corners(x: FloatArray, faces: IntArray) -> IntArray:
 
 
 def _corners_on(x: FloatArray, edges: IntArray) -> tuple[IntArray, BoolArray]:
-    """For each of edges (k, 2) the end of another edge that lies on it, nearest to its middle; and
-    whether there is such an end."""
+    """For each of the edges (k, 2), the end of another edge that lies on it, if there is one; of
+    several, the one nearest to its middle.
+
+    Returns:
+        The vertices (k,), 0 where there is none; and the mask (k,) of edges that have one.
+    """
     import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial
     corners = np.unique(edges)
     p, q = x[edges[:, 0]], x[edges[:, 1]]
     half = 0.5 * row_norms(q - p)
-    near = searching.cKDTree(x[corners]).query_ball_point(0.5 * (p + q), half)
-    count = np.array([len(group) for group in near])
+    nearby = searching.cKDTree(x[corners]).query_ball_point(0.5 * (p + q), half)
+    count = np.array([len(group) for group in nearby])
     row = np.repeat(np.arange(len(edges)), count)
-    corner = corners[np.fromiter(itertools.chain.from_iterable(near), np.int64, int(count.sum()))]
+    corner = corners[np.fromiter(itertools.chain.from_iterable(nearby), np.int64, int(count.sum()))]
     direction = (q - p)[row] / np.maximum(2 * half[row], 1e-300)[:, None]
-    to = x[corner] - p[row]
-    along = row_dots(to, direction)
-    is_on = row_norms(to - along[:, None] * direction) <= _JOIN_DISTANCE
+    relative = x[corner] - p[row]
+    position = row_dots(relative, direction)
+    is_on = row_norms(relative - position[:, None] * direction) <= _SAME
     is_on &= (corner != edges[row, 0]) & (corner != edges[row, 1])
-    is_on &= (along > 0) & (along < 2 * half[row])
-    row, corner, offset = row[is_on], corner[is_on], np.abs(along - half[row])[is_on]
-    order = np.lexsort((offset, row))
+    is_on &= (position > 0) & (position < 2 * half[row])
+    row, corner, distance = row[is_on], corner[is_on], np.abs(position - half[row])[is_on]
+    order = np.lexsort((distance, row))
     row, first = np.unique(row[order], return_index=True)
     middle, is_cut = np.zeros(len(edges), np.int64), np.zeros(len(edges), np.bool_)
     middle[row], is_cut[row] = corner[order][first], True
@@ -224,8 +240,10 @@ def _corners_on(x: FloatArray, edges: IntArray) -> tuple[IntArray, BoolArray]:
 
 
 def neighbors(x: FloatArray, faces: IntArray) -> IntArray:
-    """(k, 2) pairs of `half_edges` at which two faces belong together: the two at an edge of two
-    faces, and at an edge of more faces those that have the material between them."""
+    """(k, 2) pairs of `half_edges` at which two faces belong together.
+
+    At an edge of two faces these are the two. At an edge of more faces, they are those that have
+    material between them (`_wedges`). x: (n, 3) the vertices."""
     pairs, m = half_edges(faces), len(faces)
     edges = Edges.of(pairs)
     beside = [edges.paired_half_edges()]
@@ -239,37 +257,41 @@ def neighbors(x: FloatArray, faces: IntArray) -> IntArray:
 
 
 def _wedges(ends: FloatArray, third: FloatArray, is_along: BoolArray) -> IntArray:
-    """(k, 2) which faces around an edge have material between them.
+    """Pairs (k, 2) of faces around an edge that have material between them.
 
-    ends: (2, 3) of the edge. third: (n, 3) the other corners of its faces; is_along: (n,) whether
-        they run it from the first end to the second.
+    ends: (2, 3) the ends of the edge. third: (n, 3) the third corners of its faces.
+    is_along: (n,) whether a face runs the edge from the first end to the second.
 
-    Seen against the edge's direction, counter-clockwise, material begins behind a face that runs
-    the edge backwards, since its positive side looks back, and ends at the next one that runs it
-    forwards. Of faces in the same direction, faces at which material ends come first.
-    """
+    Faces are visited counter-clockwise, as seen against the direction of the edge. Material begins
+    behind a face that runs the edge backwards, since the front of the face looks back, and ends at
+    the next face that runs it forwards. Of faces in the same direction, those at which material
+    ends come first."""
     direction = ends[1] - ends[0]
-    away = third - ends[0]
-    away -= np.outer(away @ direction / (direction @ direction), direction)
-    across: Any = away[0] / max(float(np.linalg.norm(away[0])), 1e-300)
-    upright: Any = np.cross(direction / float(np.linalg.norm(direction)), across)
-    turns: FloatArray = np.arctan2(away @ upright, away @ across) / (2 * np.pi)
-    steps: IntArray = np.round(turns / _SAME_TURN).astype(np.int64) % round(1 / _SAME_TURN)
-    begun, wedges = list[int](), list[tuple[int, int]]()
+    offsets = third - ends[0]
+    offsets -= np.outer(offsets @ direction / (direction @ direction), direction)
+    axis_u: Any = offsets[0] / max(float(np.linalg.norm(offsets[0])), 1e-300)
+    axis_v: Any = np.cross(direction / float(np.linalg.norm(direction)), axis_u)
+    angles: FloatArray = np.arctan2(offsets @ axis_v, offsets @ axis_u) / (2 * np.pi)
+    steps: IntArray = np.round(angles / _TURN).astype(np.int64) % round(1 / _TURN)
+    opened, wedges = list[int](), list[tuple[int, int]]()
     is_taken = np.zeros(len(third), np.bool_)
     for k in 2 * np.lexsort((~is_along, steps)).tolist():  # twice around
         if is_taken[k]:
             continue
-        if not is_along[k] and k not in begun:
-            begun.append(k)
-        elif is_along[k] and begun:
-            wedges.append((begun.pop(), k))
+        if not is_along[k] and k not in opened:
+            opened.append(k)
+        elif is_along[k] and opened:
+            wedges.append((opened.pop(), k))
             is_taken[list(wedges[-1])] = True
     return np.array(wedges, np.int64).reshape(-1, 2)
 
 
 def _apart_at_contacts(x: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
-    """A closed surface in which each sheet has corners of its own where sheets touch."""
+    """Give each sheet vertices of its own where sheets of a closed surface touch. Returns the
+    vertices and the faces.
+
+    At each vertex, corners of faces that are connected by edges form a fan, and each fan gets a
+    vertex."""
     m = len(faces)
     edge, opposite = neighbors(x, faces).T
     # Corner k of face i is k m + i, and edge k runs from it to the next.

@@ -57,50 +57,45 @@ __all__ = [
     "split_faces_off_level",
 ]
 
-# Distances in cells, for points of missed parts: the largest estimated distance of the level from a
-# lattice point; the largest move of the point onto it; the smallest distance of the moved point
-# from all triangles, by their corners and centers, which are less than half a cell from all points
-# on them; and its smallest distance from the faces of the box, beyond which the surface may
-# continue.
+# Distances in cells, for the search of missed parts. A lattice point is moved onto the level set if
+# its estimated distance from it is less than the first. The result counts if the move is less than
+# the second, if the moved point is farther than the third from the corners and centers of all
+# triangles (no point of a triangle is half a cell or more from these), and if it is farther than
+# the fourth from the faces of the box, as the surface may continue outside of the box.
 _MAX_SEED_DISTANCE, _MAX_SEED_MOVE, _MIN_MESH_DISTANCE, _MIN_WALL_DISTANCE = 1.0, 1.5, 0.75, 0.5
-# In cells: points nearer than the first belong together; parts at least as long as the second count
-# as missed.
+# In cells: points closer to each other than the first belong to one part; a part at least as long
+# as the second counts as missed.
 _CLUSTER_DISTANCE, _MIN_MISSED_LENGTH = 1.0, 2.0
-# Parts thinner than this many cells are missed nearly everywhere; and the thinnest measured.
-_THIN, _MIN_THICKNESS = 0.25, 2.0**-7
-# How near to the level, in cells, a point has to come by Newton's method.
-_ON = 1e-3
-# Newton's method may converge to a multiple root where the distance fell by at least this factor.
-_SLOW = 0.7
-# The test for a function that touches its level: the number of points; how far beside them, in
-# cells, the function is evaluated; the number of golden sections and their ratio; and how near the
-# function comes to the level, relative to its values beside the point.
-_MAX_TOUCH_TESTS, _SIDE_OFFSET, _SECTIONS, _GOLDEN, _TOUCHES = (
-    60,
-    0.01,
-    40,
-    0.6180339887498949,
-    1e-8,
-)
-# The largest fraction of vertices that may be farther from the level than the second, in cells:
-# where signs change by a jump.
-_MAX_JUMP_FRACTION, _FAR_DISTANCE = 0.04, 0.1
-# A function that equals its level at a larger fraction of this number of points has no surface
-# there.
-_MAX_FLAT_FRACTION, _MAX_PROBES = 0.75, 2000
-# How far around a point, in cells, the function has to equal its level for the level set to be a
-# volume.
-_FLAT_AROUND = 0.25
+# In cells: parts thinner than the first are missed nearly everywhere; thicknesses below the second
+# are not told apart.
+_HOPELESS_THICKNESS, _MIN_THICKNESS = 0.25, 2.0**-7
+# The largest distance from the level set, in cells, of a point that Newton's method moved onto it.
+_ON_LEVEL_DISTANCE = 1e-3
+# Where Newton's method has not converged but the distance fell below this multiple of the distance
+# at the start, it may be converging slowly, to a multiple root.
+_SLOW_CONVERGENCE = 0.7
+# The test for a function that touches its level: the largest number of points; how far beside
+# them, in cells, the function is evaluated; the number of golden sections and their ratio; and how
+# close to the level the function has to come, relative to its values beside the point.
+_MAX_TRIED, _TOUCH_OFFSET, _SECTIONS, _GOLDEN, _TOUCHING = 60, 0.01, 40, 0.6180339887498949, 1e-8
+# A function jumps if more than the first, a fraction of the vertices, are farther than the second,
+# in cells, from the level set.
+_MAX_JUMP_SHARE, _JUMP_DISTANCE = 0.04, 0.1
+# A function that equals its level at more than this fraction of points has no surface there; and
+# about how many points are tested.
+_MAX_FLAT_SHARE, _MOST_PROBES = 0.75, 2000
+# The level set is a volume if the function equals its level at this distance, in cells, from points
+# of the level set in all directions.
+_FLAT_RADIUS = 0.25
 
 
 class MissedPartsError(MeshingError):
-    """A level set of which some parts lie between the points of a lattice.
+    """A level set has parts between the points of a lattice, which the mesh therefore misses.
 
-    places: (k, 3) points of the longest part, on the level; thickness: (k,) of the part there, a
-        multiple of `_MIN_THICKNESS` cells: 0 where it is thinner, inf where it is thicker than a
-        cell.
-    size: of cells.
-    """
+    places: (k, 3) points on the level set, in the longest missed part.
+    thickness: (k,) thicknesses of the part there, multiples of 2^-7 cells; 0 where it is thinner,
+        inf where it is thicker than a cell.
+    size: the size of a cell, a length."""
 
     def __init__(
         self, message: str, places: FloatArray, thickness: FloatArray, size: float
@@ -109,13 +104,15 @@ class MissedPartsError(MeshingError):
         self.places, self.thickness, self.size = places, thickness, size
 
     def may_be_fixed_by(self, smaller: float) -> bool:
-        """Whether cells `smaller` times as large may help: not if they would also miss a part that
-        is two of these cells long and far thinner than a cell, as beside a cusp or the tip of a
-        cone, which no size of cells resolves."""
-        thin = self.places[self.thickness < _THIN * smaller * self.size]
-        part = _longest_part(thin, _CLUSTER_DISTANCE * self.size)
-        reach = float(np.ptp(part, axis=0).max()) if len(part) else 0.0
-        return reach < _MIN_MISSED_LENGTH * smaller * self.size
+        """Whether smaller cells may find the part. smaller: their size, as a fraction of `size`.
+
+        They would not if they also missed a part that is at least two of them long and thinner than
+        a quarter of one. Such a part is beside a cusp or the tip of a cone, and no size of cells
+        resolves it."""
+        thin_places = self.places[self.thickness < _HOPELESS_THICKNESS * smaller * self.size]
+        part = _longest_part(thin_places, _CLUSTER_DISTANCE * self.size)
+        length = float(np.ptp(part, axis=0).max()) if len(part) else 0.0
+        return length < _MIN_MISSED_LENGTH * smaller * self.size
 
 
 def check_no_missed_parts(
@@ -126,23 +123,26 @@ def check_no_missed_parts(
     surface: tuple[FloatArray, IntArray],
     size: float,
     box: tuple[FloatArray, FloatArray],
-    irrelevant: Clearance | None = None,
+    elsewhere: Clearance | None = None,
 ) -> None:
-    """Raise if the level set has parts, two cells long or longer, away from its triangles: thin
-    walls, knife edges, islands.
+    """Raise if the mesh of a level set misses parts that are at least two cells long: thin walls,
+    sharp edges, islands.
 
-    Signs at the points of a lattice do not show a wall between two of them. Newton's method,
-    started at these points, finds its sides: the end point, on the level, should be near triangles.
-    These points are a dense sample, and no proof. Islands smaller than a cell may be missed.
+    points, samples: points (n, 3) of a lattice, and the function there.
+    is_beside: (n,) which points are corners of tetrahedra that the mesh cuts.
+    surface: the vertices and faces of the mesh.
+    size: of a cell, a length.
+    box: the lower and the upper corner of the box in which the level set counts.
+    elsewhere: the radius of a ball around each point within which the level set does not count.
 
-    samples: at points (n, 3) of the lattice. is_beside: (n,) which points are corners of cut
-        tetrahedra.
-    surface: vertices and faces. size: of a cell. box: where the level set counts; irrelevant: the
-        radius around points within which it does not count.
+    The signs at the points of a lattice do not show a wall between two points. Newton's method,
+    started at points beside the wall, finds the sides of the wall: it ends on the level set, where
+    there should be triangles nearby. These end points are a dense sample, but no proof. Islands
+    smaller than a cell may be missed.
 
     Raises:
-        MissedPartsError: parts are missed; with points of the longest. UnrefinableError: the
-            function equals its level in a volume, or touches it along a surface.
+        MissedPartsError: parts are missed; it has points of the longest part.
+        UnrefinableError: the function equals its level in a volume, or touches it along a surface.
     """
     import scipy.spatial  # imported here: it takes half a second
 
@@ -154,11 +154,11 @@ def check_no_missed_parts(
     step = np.full(len(rows), 0.5 * size)
     x = newton_to_level(function, start, samples.select(rows), step, None)
     end_samples = function.sample(x)
-    on_level = end_samples.distance < _ON * size
-    slow = ~on_level & (end_samples.distance < _SLOW * samples.distance[rows])
+    on_level = end_samples.distance < _ON_LEVEL_DISTANCE * size
+    slow = ~on_level & (end_samples.distance < _SLOW_CONVERGENCE * samples.distance[rows])
     if slow.any():
         x[slow] = to_multiple_roots(function, x[slow], end_samples.select(slow), step[slow])
-        on_level[slow] = function.sample(x[slow]).distance < _ON * size
+        on_level[slow] = function.sample(x[slow]).distance < _ON_LEVEL_DISTANCE * size
     on_level &= row_norms(x - start) < _MAX_SEED_MOVE * size
     deep = _MIN_WALL_DISTANCE * size
     on_level &= ((x >= box[0] + deep) & (x <= box[1] - deep)).all(axis=1)
@@ -167,11 +167,11 @@ def check_no_missed_parts(
     if len(faces) and len(x):
         mesh_points = np.concatenate([vertices[np.unique(faces)], vertices[faces].mean(axis=1)])
         x = x[searching.cKDTree(mesh_points).query(x)[0] > _MIN_MESH_DISTANCE * size]
-    if irrelevant is not None and len(x):
-        x = x[irrelevant(x) <= 0]
+    if elsewhere is not None and len(x):
+        x = x[elsewhere(x) <= 0]
     part = _longest_part(x, _CLUSTER_DISTANCE * size)
     if len(part) and np.ptp(part, axis=0).max() >= _MIN_MISSED_LENGTH * size:
-        _check_off_level_around(function, part, _FLAT_AROUND * size)
+        _check_off_level_around(function, part, _FLAT_RADIUS * size)
         _check_passes_level(function, part, size)
         a, b, c = part[0]
         raise MissedPartsError(
@@ -187,29 +187,35 @@ def check_no_missed_parts(
 
 
 def _thickness(function: LevelFunction, x: FloatArray, size: float) -> FloatArray:
-    """(k,) the distance from points (k, 3) on the level to the next change of sign along the slope,
-    up to `size`: 0 where the sign does not change at the point itself, inf where it does not change
-    again."""
-    slope = function.sample(x).gradient
-    direction = slope / np.maximum(row_norms(slope), 1e-300)[:, None]
+    """(k,) the thickness of the part at points x (k, 3) on the level set.
+
+    It is the distance to the next change of sign along the gradient or against it, the smaller of
+    both, among distances 2^-7, 2^-6, ..., 1 times `size`. It is 0 where the sign is the same on
+    both sides of the point at the smallest distance, and inf where the sign does not change again.
+    """
+    gradient = function.sample(x).gradient
+    direction = gradient / np.maximum(row_norms(gradient), 1e-300)[:, None]
     distances = size * 2.0 ** np.arange(round(math.log2(_MIN_THICKNESS)), 1)
-    sides: list[BoolArray] = []
+    nearest_is_above: list[BoolArray] = []
     thickness = np.full(len(x), np.inf)
     for sign in (1.0, -1.0):
         probes = x[:, None] + sign * distances[:, None] * direction[:, None]
         is_above = function.values(probes.reshape(-1, 3)).reshape(len(x), len(distances)) > 0
         changed = is_above != is_above[:, :1]
-        first = distances[changed.argmax(axis=1)]
-        thickness = np.minimum(thickness, np.where(changed.any(axis=1), first, np.inf))
-        sides.append(is_above[:, 0])
-    return np.where(sides[0] == sides[1], 0.0, thickness)
+        first_change = distances[changed.argmax(axis=1)]
+        thickness = np.minimum(thickness, np.where(changed.any(axis=1), first_change, np.inf))
+        nearest_is_above.append(is_above[:, 0])
+    return np.where(nearest_is_above[0] == nearest_is_above[1], 0.0, thickness)
 
 
-def _check_off_level_around(function: LevelFunction, part: FloatArray, reach: float) -> None:
-    """Raise if the function equals its level, up to rounding, at most of the points (n, 3) and on
-    all sides of them: such as max(x, 0), for which no cells are small enough."""
-    probes = part[:: -(-len(part) // _MAX_PROBES)]
-    offsets = reach * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+def _check_off_level_around(function: LevelFunction, points: FloatArray, radius: float) -> None:
+    """Raise if the function equals its level in a volume, as max(x, 0) does for level 0, so that no
+    cells are small enough.
+
+    That is so if, for most of `points` (n, 3), it equals the level up to rounding at the point and
+    at distance `radius` from it in all six axis directions."""
+    probes = points[:: -(-len(points) // _MOST_PROBES)]
+    offsets = radius * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     near_points = (probes[:, None] + offsets).reshape(-1, 3)
     is_flat = function.is_on_level(near_points).reshape(len(probes), -1).all(axis=1)
     if is_flat.mean() > 0.5:
@@ -221,34 +227,37 @@ def _check_off_level_around(function: LevelFunction, part: FloatArray, reach: fl
         )
 
 
-def _check_passes_level(function: LevelFunction, part: FloatArray, size: float) -> None:
-    """Raise if the function touches its level at most of the points (n, 3) near it, and does not
-    pass it, as a square, whose sign no cells show.
+def _check_passes_level(function: LevelFunction, points: FloatArray, size: float) -> None:
+    """Raise if the function touches its level at most of `points` (n, 3), which are near the level
+    set, and does not pass it. A square does so, and no cells show it by signs.
 
-    Across such a point, on a line along the slope beside it, the function is on one side of the
-    level, and where it comes nearest, by golden sections, it is as near as rounding allows.
-    """
-    x = part[:: -(-len(part) // _MAX_TOUCH_TESTS)]
-    half = _SIDE_OFFSET * size
-    beside = function.sample((x[:, None] + half * np.eye(3)).reshape(-1, 3)).gradient.reshape(
+    The function is examined along a line through each point, in the direction of its gradient
+    beside the point (at the point it may be 0), up to a hundredth of a cell of size `size` away.
+    The function touches its level if both ends of the line have values on the same side of the
+    level, and its value closest to the level, found by golden sections, is as close to it as
+    rounding allows."""
+    x = points[:: -(-len(points) // _MAX_TRIED)]
+    offset = _TOUCH_OFFSET * size
+    gradients = function.sample((x[:, None] + offset * np.eye(3)).reshape(-1, 3)).gradient.reshape(
         -1, 3, 3
     )
-    steepest = beside[np.arange(len(x)), (beside**2).sum(axis=2).argmax(axis=1)]
+    steepest = gradients[np.arange(len(x)), (gradients**2).sum(axis=2).argmax(axis=1)]
     direction = steepest / np.maximum(row_norms(steepest), 1e-300)[:, None]
 
     def along(s: FloatArray) -> FloatArray:
+        """The function on the lines at the signed distances s (k,) from the points x."""
         return function.values(x + s[:, None] * direction)
 
-    low, high = np.full(len(x), -half), np.full(len(x), half)
-    side = np.sign(along(low))
-    ends = np.minimum(side * along(low), side * along(high))
-    nearest = ends.copy()
+    low, high = np.full(len(x), -offset), np.full(len(x), offset)
+    sign_of_point = np.sign(along(low))
+    end_value = np.minimum(sign_of_point * along(low), sign_of_point * along(high))
+    smallest = end_value.copy()
     for _ in range(_SECTIONS):
         s, t = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-        near_low, near_high = side * along(s), side * along(t)
-        nearest = np.minimum(nearest, np.minimum(near_low, near_high))
-        low, high = np.where(near_low > near_high, s, low), np.where(near_low > near_high, high, t)
-    touches = (ends > 0) & (nearest >= 0) & (nearest <= _TOUCHES * ends)
+        f_left, f_right = sign_of_point * along(s), sign_of_point * along(t)
+        smallest = np.minimum(smallest, np.minimum(f_left, f_right))
+        low, high = np.where(f_left > f_right, s, low), np.where(f_left > f_right, high, t)
+    touches = (end_value > 0) & (smallest >= 0) & (smallest <= _TOUCHING * end_value)
     if touches.mean() > 0.5:
         a, b, c = x[touches][0]
         name, level = type(function.field).__name__, function.level
@@ -260,32 +269,35 @@ def _check_passes_level(function: LevelFunction, part: FloatArray, size: float) 
         )
 
 
-def _longest_part(x: FloatArray, apart: float) -> FloatArray:
-    """The points (n, 3) that form the longest chain whose neighbors are no farther apart than
-    `apart`."""
+def _longest_part(x: FloatArray, max_gap: float) -> FloatArray:
+    """The points of the part with the longest bounding box, of points x (n, 3).
+
+    Two points belong to one part if a chain of points with gaps of at most `max_gap` connects them.
+    """
     if not len(x):
         return x
-    part = connected_groups(pairs_within(x, apart), len(x))
+    part = connected_groups(pairs_within(x, max_gap), len(x))
     count = int(part.max()) + 1
-    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
-    np.minimum.at(low, part, x)
-    np.maximum.at(high, part, x)
-    return x[part == (high - low).max(axis=1).argmax()]
+    lower, upper = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    np.minimum.at(lower, part, x)
+    np.maximum.at(upper, part, x)
+    return x[part == (upper - lower).max(axis=1).argmax()]
 
 
 def check_estimated_triangles(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float
 ) -> None:
-    """Raise if refinement of these triangles is estimated to make more triangles than the function
-    allows.
+    """Raise if refinement to the tolerance would make more triangles than the function allows, by
+    an estimate.
 
-    The distance of the middle of a triangle from the surface falls with its area: a triangle that
-    is k times the tolerance away is refined to about k triangles. A selection of triangles is
-    examined.
+    The distance of the midpoints of a triangle's edges from the surface falls with the triangle's
+    area. So a triangle with a distance of k tolerances is refined to about k triangles. A selection
+    of triangles is examined.
 
     Raises:
-        MeshingError: the function has no slope between the vertices.
-        TriangleLimitError: the estimate exceeds the limit; with a tolerance that would suffice.
+        MeshingError: the gradient is 0 at the midpoint of an edge.
+        TriangleLimitError: the estimate exceeds the limit. The message says which tolerance would
+            do.
     """
     sampled = faces[:: max(1, len(faces) // 20_000)]
     if not len(sampled):
@@ -312,12 +324,12 @@ def check_estimated_triangles(
 
 
 # Points this near to the level, relative to the length of a cell, are moved onto it.
-_SNAPPED = 0.25
+_SNAP_DISTANCE = 0.25
 # The width, in cells, of the border around relevant cells that is meshed as well.
 _BORDER = 2.0
 # The number of cells along an edge of a block.
 _BLOCK = 8
-_MAX_ROUNDS = 20
+_MOST_ROUNDS = 20
 
 
 @dataclass(frozen=True)
@@ -325,8 +337,7 @@ class TriangleMesh:
     """A triangle mesh.
 
     vertices: (n, 3).
-    faces: (m, 3), counter-clockwise as seen from where f is greater.
-    """
+    faces: (m, 3) the vertices of each face, counter-clockwise as seen from where f is larger."""
 
     vertices: FloatArray
     faces: IntArray
@@ -346,29 +357,29 @@ class TriangleMesh:
 
 @dataclass(frozen=True)
 class IrrelevantRegion:
-    """The region where a surface need not be meshed, because other operands remove it.
+    """A region in which a surface need not be meshed, because other operands remove it.
 
-    clearance: radii of balls about points (k, 3) that lie in the region.
-    cached_cells: for each lattice, the cells that are not proved to lie in the region.
-    """
+    clearance: from points (k, 3) to the radii of balls around them that lie in the region.
+    cached_cells: for each lattice, the indices of the cells that are not proved to lie in the
+        region."""
 
     clearance: Clearance
     cached_cells: dict[tuple[float, ...], IntArray] = dataclasses.field(
         default_factory=dict[tuple[float, ...], IntArray]
     )
 
-    def relevant_cells(self, lattice: BccLattice, limit: int) -> IntArray:
-        """Indices (n, 3) of the cells that are not proved to lie in the region, and of a border of
-        cells around them.
+    def relevant_cells(self, lattice: BccLattice, most: int) -> IntArray:
+        """The indices (n, 3) of the cells that are not proved to lie in the region, and of cells
+        around them, in a border two cells wide. most: as for `BccLattice.nonempty_cells`.
 
         Raises:
-            MeshingError: there are more cells than `limit` triangles take.
+            MeshingError: there are more cells than `most` triangles take.
         """
-        key = (*lattice.lower.tolist(), *lattice.size.tolist(), *lattice.counts.tolist(), limit)
+        key = (*lattice.lower.tolist(), *lattice.size.tolist(), *lattice.counts.tolist(), most)
         if key not in self.cached_cells:
             border = _BORDER * float(lattice.size.max())
             self.cached_cells[key] = lattice.nonempty_cells(
-                lambda points: self.clearance(points) - border, limit
+                lambda points: self.clearance(points) - border, most
             )
         return self.cached_cells[key]
 
@@ -376,14 +387,17 @@ class IrrelevantRegion:
 def mesh_open_surface(
     function: LevelFunction, lattice: BccLattice, tolerance: float, report: Callable[[str], None]
 ) -> tuple[TriangleMesh, IsotopyCoverage]:
-    """The mesh of the level set in the box of a lattice, which ends on the box's faces; and its
-    proved isotopy, before it is refined.
+    """Mesh the level set in the box of a lattice; the mesh ends on the faces of the box.
 
-    tolerance: of the middles of edges and faces, a length.
+    tolerance: a length, the largest distance of the midpoints of edges and of the centers of faces
+        from the level set.
+
+    Returns:
+        The mesh; and on which part of the tetrahedra its topology is proved, before refinement.
 
     Raises:
-        MeshingError: no cell is cut, or there are too many; an UnrefinableError where the function
-            is not finite, or its level set is a volume.
+        MeshingError: no cell is cut, or there are too many cells.
+        UnrefinableError: the function is not finite somewhere, or its level set is a volume.
     """
     walls = lattice.lower, lattice.upper
     cells = lattice.nonempty_cells(function.clearance, function.most_faces)
@@ -416,30 +430,31 @@ def mesh_closed_surface(
     report: Callable[[str], None],
     *,
     as_cut: bool = False,
-    irrelevant: IrrelevantRegion | None = None,
+    elsewhere: IrrelevantRegion | None = None,
 ) -> TriangleMesh:
-    """The boundary of the points of a lattice's box where the function is negative.
+    """Mesh the boundary of the points in a lattice's box at which the function is negative.
 
-    On the box it consists of the faces of the cells whose centers are negative, as if the points of
-    the lattice there were on the level. Triangles in the two outermost layers of cells are coarse
-    and may touch in vertices: they are to be cut away. There are no faces if the function is
-    nowhere negative.
+    On the faces of the box, the boundary consists of faces of the cells whose centers are negative,
+    as if the lattice points there were on the level. Triangles in the two outermost layers of cells
+    are coarse and may touch in vertices: the caller cuts them away. The mesh has no faces if the
+    function is negative nowhere.
 
+    tolerance: a length, as for `mesh_open_surface`.
     as_cut: whether to leave the triangles as the cells cut them, which never pass through each
-        other, and to leave out parts between points of the lattice: for functions with creases
-        everywhere, as distances from meshes, and cells of about the tolerance.
-    irrelevant: the region where the surface does not matter: except for a few cells at its border,
-        the function counts as positive there, and the surface is closed by coarse triangles.
+        other, and to miss parts between lattice points. That is for functions with creases
+        everywhere, as distances from meshes, and for cells of about the tolerance.
+    elsewhere: a region in which the surface does not matter. Except for a few cells at the region's
+        border, the function counts as positive there, and coarse triangles close the surface.
 
     Raises:
-        MeshingError: too many cells.
+        MeshingError: there are too many cells.
     """
     limit, does_matter = function.most_faces, None
-    if irrelevant is None:
+    if elsewhere is None:
         cells = lattice.nonempty_cells(function.clearance, limit)
     else:
         cells, does_matter = lattice.relevant_cells(
-            function.clearance, irrelevant.relevant_cells(lattice, limit), function.values, limit
+            function.clearance, elsewhere.relevant_cells(lattice, limit), function.values, limit
         )
     outer = lattice.outer_cells()
     if does_matter is not None:
@@ -464,14 +479,14 @@ def mesh_closed_surface(
         return TriangleMesh.without_unused_vertices(vertices, np.concatenate([rest, *caps]))
     _check_nothing_missed(
         function, points, samples, corners, first, faces, lattice, inner,
-        None if irrelevant is None else irrelevant.clearance,
+        None if elsewhere is None else elsewhere.clearance,
     )  # fmt: skip
     # Triangles that end at the outermost cells are moved and cut, their ends are not.
     if len(rest):
         _check_is_continuous(function, vertices, rest, lattice)
         check_estimated_triangles(function, vertices, rest, tolerance)
         vertices = smooth(function, vertices, rest, None)
-        counts = _inside(lattice, does_matter)
+        counts = _refinable_points(lattice, does_matter)
         vertices, rest = refine(function, vertices, rest, tolerance, None, report, counts)
         vertices = smooth_within_tolerance(function, vertices, rest, None, tolerance, counts)
     faces = np.concatenate([rest, *caps])
@@ -485,9 +500,11 @@ def mesh_closed_surface(
 def split_faces_off_level(
     function: LevelFunction, surface: TriangleMesh, farthest: float, times: int
 ) -> TriangleMesh:
-    """The mesh in which faces whose center is farther than `farthest` from the level, as across a
-    crease, are cut into three at a point on the level; so are the new faces, `times` times. All
-    edges stay."""
+    """Cut faces whose center is farther than `farthest` (a length) from the level set, as across a
+    crease.
+
+    Each is cut into three at its center, moved onto the level set; so are the new faces, up to
+    `times` times. All edges stay."""
     vertices, faces = surface.vertices, surface.faces
     pending = np.arange(len(faces))
     for _ in range(times):
@@ -509,19 +526,21 @@ def split_faces_off_level(
 
 
 def _are_negative(function: LevelFunction, lattice: BccLattice, cells: IntArray) -> BoolArray:
-    """(k,) whether the function is negative at the centers of cells (k, 3): as at the center of the
-    block of cells, where the level is proved not to be in the block."""
+    """(k,) whether the function is at most 0 at the centers of cells with indices (k, 3).
+
+    Cells are grouped in blocks. If the level set is proved not to enter a block, the sign at the
+    block's center holds for all of its cells."""
     shape = lattice.counts // _BLOCK + 1
     x, y, z = (cells // _BLOCK).T
-    keys, index, _, _ = unique_with_inverse((x * shape[1] + y) * shape[2] + z)
+    keys, block_of_cell, _, _ = unique_with_inverse((x * shape[1] + y) * shape[2] + z)
     xy, z = np.divmod(keys, shape[2])
     blocks = np.stack([*np.divmod(xy, shape[1]), z], axis=1)
     centers = lattice.points(_BLOCK * (2 * blocks + 1))
     half_diagonal = 0.5 * _BLOCK * float(np.linalg.norm(lattice.size))
-    is_sure = function.clearance(centers) > half_diagonal * (1 + 1e-9)
-    negative = (function.values(centers) <= 0)[index]
-    open_rows = np.flatnonzero(~is_sure[index])
-    negative[open_rows] = function.values(lattice.points(2 * cells[open_rows] + 1)) <= 0
+    is_one_sided = function.clearance(centers) > half_diagonal * (1 + 1e-9)
+    negative = (function.values(centers) <= 0)[block_of_cell]
+    undecided = np.flatnonzero(~is_one_sided[block_of_cell])
+    negative[undecided] = function.values(lattice.points(2 * cells[undecided] + 1)) <= 0
     return negative
 
 
@@ -537,28 +556,36 @@ def _check_nothing_missed(
     elsewhere: Clearance | None = None,
 ) -> None:
     # Tetrahedra with corners on both sides; those with corners on the level may have no face.
-    side = np.where(first.points.is_on_level, 0.0, np.sign(first.points.samples.value))[corners]
+    """Raise if parts of the level set are missed (see `check_no_missed_parts`).
+
+    points, samples: of the lattice. corners: (m, 4) of all tetrahedra.
+    first: the mesh before refinement. faces: those of its faces that count.
+    box: the lower and the upper corner of the box where the level set counts.
+    elsewhere: radii of balls in which it does not count."""
+    signs = np.where(first.points.is_on_level, 0.0, np.sign(first.points.samples.value))[corners]
     is_beside = np.zeros(len(points), np.bool_)
-    is_beside[corners[(side.min(axis=1) < 0) & (side.max(axis=1) > 0)]] = True
+    is_beside[corners[(signs.min(axis=1) < 0) & (signs.max(axis=1) > 0)]] = True
     surface = first.vertices, faces
     size = float(lattice.size.max())
     check_no_missed_parts(function, points, samples, is_beside, surface, size, box, elsewhere)
 
 
-def _inside(
+def _refinable_points(
     lattice: BccLattice, does_matter: BoolArray | None
 ) -> Callable[[FloatArray], BoolArray]:
-    """A function that tells which points are farther than one and a half cells from the box's
-    faces, and neither in nor beside irrelevant cells. does_matter: (counts) the mask of relevant
-    cells.
+    """A function from points (n, 3) to the mask (n,) of those where triangles may be refined.
 
-    Triangles that end in the outermost cells would be cut again and again: the edge that they end
-    with stays as it is, and their centers are no deeper than that.
-    """
+    These points are farther than one and a half cells from the faces of the box, and neither in an
+    irrelevant cell nor in a cell beside one. does_matter: the mask of the relevant cells, one entry
+    for each cell of the lattice; None if all are relevant.
+
+    Triangles that end in the outermost cells are not refined: it would never end, as the edge that
+    they end with stays as it is. Their centers are in the outermost one and a half cells."""
     lower, upper = lattice.lower + 1.5 * lattice.size, lattice.upper - 1.5 * lattice.size
     deep = None if does_matter is None else lattice.interior_cells(does_matter)
 
     def counts(points: FloatArray) -> BoolArray:
+        """(n,) whether triangles may be refined at points (n, 3)."""
         is_inside = np.ones(len(points), np.bool_)
         for x, low, high in zip(points.T, lower, upper, strict=True):
             is_inside &= (x >= low) & (x <= high)
@@ -572,37 +599,47 @@ def _inside(
 def _wall_faces(
     points: FloatArray, samples: LevelSamples, corners: IntArray, is_wall: BoolArray
 ) -> IntArray:
-    """Faces (m, 3) on the box of tetrahedra whose fourth corner is negative, seen from outside."""
-    on = is_wall[corners]
-    rows = np.flatnonzero(on.sum(axis=1) == 3)
-    order = np.argsort(on[rows], axis=1, kind="stable")  # the fourth corner first
-    apex, *base = np.take_along_axis(corners[rows], order, axis=1).T
-    below = samples.value[apex] <= 0
-    face, apex = np.stack(base, axis=1)[below], apex[below]
+    """Faces (m, 3) of tetrahedra that lie on the faces of the box and cover the negative part of
+    it.
+
+    corners: (k, 4) of the tetrahedra. is_wall: (n,) the mask of the points on the faces of the box.
+
+    A tetrahedron has such a face if exactly three of its corners are on the box and the function is
+    at most 0 at the fourth. The faces are counter-clockwise as seen from outside of the box."""
+    on_wall = is_wall[corners]
+    with_wall_face = np.flatnonzero(on_wall.sum(axis=1) == 3)
+    order = np.argsort(on_wall[with_wall_face], axis=1, kind="stable")  # the fourth corner first
+    apex, *base = np.take_along_axis(corners[with_wall_face], order, axis=1).T
+    is_negative = samples.value[apex] <= 0
+    face, apex = np.stack(base, axis=1)[is_negative], apex[is_negative]
     a, b, c = (points[face[:, k]] for k in range(3))
-    inward = (np.cross(b - a, c - a) * (points[apex] - a)).sum(axis=1) > 0
-    face[inward] = face[inward][:, ::-1]
+    faces_inwards = (np.cross(b - a, c - a) * (points[apex] - a)).sum(axis=1) > 0
+    face[faces_inwards] = face[faces_inwards][:, ::-1]
     return face
 
 
 def _sample_lattice(
-    function: LevelFunction, points: FloatArray, lattice: BccLattice, is_beyond: BoolArray
+    function: LevelFunction, points: FloatArray, lattice: BccLattice, is_irrelevant: BoolArray
 ) -> LevelSamples:
-    """The function at points of a lattice, with a large positive value at irrelevant points
-    `is_beyond`; raises UnrefinableError where it is not finite, or equals its level nearly
-    everywhere."""
+    """The function at points (n, 3) of a lattice; a large positive value where `is_irrelevant` (n,)
+    is set.
+
+    Raises:
+        UnrefinableError: the function is not finite at a point, or equals its level nearly
+            everywhere.
+    """
     count = len(points)
     samples = LevelSamples(np.full(count, 10 * OUTSIDE_VALUE), np.ones((count, 3)), np.zeros(count))
-    points = points[~is_beyond]
-    samples = samples.replaced(~is_beyond, function.sample(points))
-    fails = ~np.isfinite(samples.value[~is_beyond])
+    points = points[~is_irrelevant]
+    samples = samples.replaced(~is_irrelevant, function.sample(points))
+    fails = ~np.isfinite(samples.value[~is_irrelevant])
     if fails.any():
         x, y, z = points[fails][0]
-        nearer = ", or a smaller `cell_size`: it is asked for three cells around other parts"
+        advice = ", or a smaller `cell_size`: it is asked for three cells around other parts"
         raise UnrefinableError(
             f"{type(function.field).__name__} has no finite value at {fails.sum():,} points, such "
             f"as ({x:.4g}, {y:.4g}, {z:.4g}): choose a `clip` where it has"
-            + (nearer if is_beyond.any() else "")
+            + (advice if is_irrelevant.any() else "")
         )
     _check_off_level_at_most_points(function, points, lattice)
     return samples
@@ -611,11 +648,11 @@ def _sample_lattice(
 def _check_is_continuous(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, lattice: BccLattice
 ) -> None:
-    """Raise if at many vertices the sign of the function changes and the level is not near: the
-    function jumps there, and refinement would never end."""
+    """Raise if many vertices are far from the level set. The signs change at all vertices, so the
+    function jumps at these, and refinement would never end."""
     x = vertices[np.unique(faces)]
-    is_far = function.sample(x).distance > _FAR_DISTANCE * float(lattice.size.max())
-    if is_far.sum() > _MAX_JUMP_FRACTION * len(x):
+    is_far = function.sample(x).distance > _JUMP_DISTANCE * float(lattice.size.max())
+    if is_far.sum() > _MAX_JUMP_SHARE * len(x):
         a, b, c = x[is_far][0]
         raise UnrefinableError(
             f"{type(function.field).__name__} changes its sign without coming to its level at "
@@ -628,13 +665,13 @@ def _check_is_continuous(
 def _check_off_level_at_most_points(
     function: LevelFunction, points: FloatArray, lattice: BccLattice
 ) -> None:
-    """Raise if the function equals its level nearly everywhere, up to rounding: such as x - x, for
-    which no cells are proved empty, however small they are."""
-    if len(points) <= _MAX_FLAT_FRACTION * 2 * math.prod(lattice.counts.tolist()):
+    """Raise if the function equals its level, up to rounding, nearly everywhere, as x - x does. No
+    cells of such a function are proved empty, however small they are."""
+    if len(points) <= _MAX_FLAT_SHARE * 2 * math.prod(lattice.counts.tolist()):
         return
-    probes = points[:: -(-len(points) // _MAX_PROBES)]
+    probes = points[:: -(-len(points) // _MOST_PROBES)]
     fraction = float(function.is_on_level(probes).mean())
-    if fraction > _MAX_FLAT_FRACTION:
+    if fraction > _MAX_FLAT_SHARE:
         raise UnrefinableError(
             f"{type(function.field).__name__} is {function.level:g}, up to rounding, at "
             f"{fraction:.0%} of the points looked at: its level there is a volume and no surface; "
@@ -644,10 +681,14 @@ def _check_off_level_at_most_points(
 
 @dataclass(frozen=True)
 class _InitialMesh:
-    """Vertices and faces before refinement, and the points of the tetrahedra, with points near the
-    level moved onto it; rows: (k,) the tetrahedra that the level may pass through between points,
-    and crossed: (k,) whether it does; ends: (j, 2) points at the ends of the edges on which the
-    other vertices lie."""
+    """A mesh before refinement, and the tetrahedra that it was made in.
+
+    vertices, faces: (n, 3), (m, 3). The first vertices are the points of the tetrahedra; the others
+        lie on edges that the level set crosses.
+    points: the points of the tetrahedra; those near the level set were moved onto it.
+    rows: (k,) the indices of the tetrahedra through whose inside the level set may pass.
+    crossed: (k,) whether it crosses an edge of each.
+    ends: (j, 2) the indices of the two end points of each edge that it crosses."""
 
     vertices: FloatArray
     faces: IntArray
@@ -657,14 +698,15 @@ class _InitialMesh:
     ends: IntArray
 
     def is_cut(self, corners: IntArray) -> BoolArray:
-        """(m,) which of all tetrahedra, given by their corners (m, 4), hold points of the faces."""
+        """(m,) which of all tetrahedra, given by their corners (m, 4), hold a point of a face."""
         cut = _have_any(self.points.is_on_level, corners)
         cut[self.rows] |= self.crossed
         return cut
 
-    def is_beside(self, mask: BoolArray) -> BoolArray:
-        """Whether each vertex is one of the chosen points, or on an edge that ends there."""
-        return np.concatenate([mask, mask[self.ends].any(axis=1)])
+    def is_beside(self, chosen: BoolArray) -> BoolArray:
+        """(n,) whether each vertex is a chosen point, or lies on an edge with a chosen end. chosen:
+        a mask of the points."""
+        return np.concatenate([chosen, chosen[self.ends].any(axis=1)])
 
 
 def _march(
@@ -677,16 +719,25 @@ def _march(
     lattice: BccLattice,
     walls: tuple[FloatArray, FloatArray] | None,
 ) -> _InitialMesh:
-    """Vertices and faces of a manifold, with points near the level moved onto it.
+    """The mesh before refinement, a manifold, with points near the level set moved onto it.
 
-    is_fixed: (n,) which points are not moved. is_wall: (n,) which points count as on the level.
+    Where parts of the surface touch in a moved point, the point is moved back to its original
+    position, until no parts touch.
+
+    points, samples: of the lattice. corners: (m, 4) of the tetrahedra.
+    is_fixed: (n,) the mask of the points that are not moved.
+    is_wall: (n,) the mask of the points that count as on the level.
+    walls: the lower and the upper corner of the box, on whose faces points stay; or None.
+
+    Raises:
+        MeshingError: parts still touch after 20 rounds.
     """
-    at_rest, original = points, samples
+    original_points, original_samples = points, samples
     points, samples, is_on = _snap_points(function, points, samples, is_fixed, lattice, walls)
     is_on |= is_wall
     touching, is_affected = np.zeros(0, np.int64), np.ones(len(points), np.bool_)
     rows = cut_rows = np.flatnonzero(_may_be_cut(samples.value, is_on, corners))
-    for _ in range(_MAX_ROUNDS):
+    for _ in range(_MOST_ROUNDS):
         sampled, tets = (
             TetrahedronPoints(points, is_on, samples),
             Tetrahedra.of(points, corners[rows]),
@@ -700,11 +751,11 @@ def _march(
         if not len(touching):
             break
         points, is_on = points.copy(), is_on.copy()
-        points[touching], is_on[touching] = at_rest[touching], False
-        samples = samples.replaced(touching, original.select(touching))
+        points[touching], is_on[touching] = original_points[touching], False
+        samples = samples.replaced(touching, original_samples.select(touching))
         # Parts may touch anew only at points beside these: they are examined with all of their
         # tetrahedra.
-        near, is_affected = np.zeros(len(points), np.bool_), np.zeros(len(points), np.bool_)
+        near, is_affected = (np.zeros(len(points), np.bool_), np.zeros(len(points), np.bool_))
         near[touching] = True
         is_affected[corners[_have_any(near, corners)]] = True
         affected = np.flatnonzero(_have_any(is_affected, corners))
@@ -726,6 +777,7 @@ def _march(
 
 
 def _middles(low: FloatArray, high: FloatArray) -> FloatArray:
+    """The midpoints of the edges from `low` to `high`, both (k, 3)."""
     return 0.5 * (low + high)
 
 
@@ -737,17 +789,23 @@ def _snap_points(
     lattice: BccLattice,
     walls: tuple[FloatArray, FloatArray] | None,
 ) -> tuple[FloatArray, LevelSamples, BoolArray]:
-    """The points, with points near the level moved onto it; their samples; and which are on the
-    level."""
+    """Move points near the level set onto it.
+
+    Points are moved if their estimated distance from it is less than a quarter of a cell, and if
+    `is_fixed` (n,) is not set there.
+
+    Returns:
+        The points (n, 3); their samples; and the mask (n,) of those on the level.
+    """
     size = float(lattice.size.min())
-    near = np.flatnonzero((samples.distance < _SNAPPED * size) & ~is_fixed)
-    longest = np.full(len(near), 0.5 * _SNAPPED * size)
-    moved = newton_to_level(function, points[near], samples.select(near), longest, walls, steps=4)
+    near = np.flatnonzero((samples.distance < _SNAP_DISTANCE * size) & ~is_fixed)
+    max_step = np.full(len(near), 0.5 * _SNAP_DISTANCE * size)
+    moved = newton_to_level(function, points[near], samples.select(near), max_step, walls, steps=4)
     new_samples = function.sample(moved)
-    apart = row_norms(moved - points[near])
-    steep = row_norms(new_samples.gradient)
-    converged = np.abs(new_samples.value) < 1e-9 * np.maximum(steep * size, 1e-300)
-    converged &= apart < 1.2 * _SNAPPED * size
+    move = row_norms(moved - points[near])
+    gradient_length = row_norms(new_samples.gradient)
+    converged = np.abs(new_samples.value) < 1e-9 * np.maximum(gradient_length * size, 1e-300)
+    converged &= move < 1.2 * _SNAP_DISTANCE * size
     rows = near[converged]
     # A point with a value of exactly 0 counts as on the level unmoved, so that all other points
     # have a sign.
@@ -757,7 +815,8 @@ def _snap_points(
 
 
 def _have_any(chosen: BoolArray, corners: IntArray) -> BoolArray:
-    """(m,) which tetrahedra (m, 4) have a chosen point."""
+    """(m,) which tetrahedra, given by their corners (m, 4), have a chosen point. chosen: a mask of
+    points."""
     has_chosen = np.zeros(len(corners), np.bool_)
     for column in corners.T:  # four times as fast as chosen[corners].any(axis=1)
         has_chosen |= chosen[column]
@@ -770,14 +829,17 @@ _ABOVE, _BELOW, _ON_LEVEL = 1, 5, 25
 
 
 def _may_be_cut(value: FloatArray, is_on: BoolArray, corners: IntArray) -> BoolArray:
-    """(m,) whether the level may pass through tetrahedra (m, 4)."""
-    kind = np.where(is_on, _ON_LEVEL, np.where(value > 0, _ABOVE, _BELOW)).astype(np.uint8)
-    sums = np.zeros(len(corners), np.uint8)
+    """(m,) whether the level may pass through tetrahedra, given by their corners (m, 4): they have
+    corners on both sides of it, or at least three corners on it.
+
+    value: (n,) the function at the points. is_on: (n,) which points are on the level."""
+    code = np.where(is_on, _ON_LEVEL, np.where(value > 0, _ABOVE, _BELOW)).astype(np.uint8)
+    code_sum = np.zeros(len(corners), np.uint8)
     for column in corners.T:
-        sums += kind[column]
+        code_sum += code[column]
     cut = np.zeros(4 * _ON_LEVEL + 1, np.bool_)
     for above, below in itertools.product(range(5), repeat=2):
         on = 4 - above - below
         if on >= 0:
             cut[above * _ABOVE + below * _BELOW + on * _ON_LEVEL] = (above and below) or on >= 3
-    return cut[sums]
+    return cut[code_sum]

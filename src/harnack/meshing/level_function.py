@@ -26,74 +26,75 @@ if TYPE_CHECKING:
 __all__ = ["CELLS_PER_WAVE", "MOST_FACES", "EvaluatorCache", "LevelFunction", "LevelSamples"]
 
 MOST_FACES = 2_000_000
-"""Triangles of a level set, unless a person chooses otherwise."""
+"""The largest number of triangles of a level set, unless another is chosen."""
 
 CELLS_PER_WAVE = 5.0
-"""Cells along a wave (`Field.min_wavelength`), at the least, unless a spacing is given."""
+"""The smallest number of cells along a wave (`Field.min_wavelength`), unless a spacing is given."""
 
 _PROOFS = choose_enclosures("curvature")
 
 
 @dataclass(frozen=True)
 class LevelSamples:
-    """The function at points.
+    """Values and gradients of a function at n points.
 
     value: (n,) f - level; for an angle the value nearest to 0, in [-period/2, period/2].
     gradient: (n, 3).
-    quarter_period_radius: (n,) a radius within which f is proved to change by less than a quarter
-        of its period; 0 without a period.
-    """
+    quarter_period_radius: (n,) a radius of a ball around each point. Within the ball, f is proved
+        to differ from its value at the point by less than a quarter of its period. 0 without a
+        period."""
 
     value: FloatArray
     gradient: FloatArray
     quarter_period_radius: FloatArray
 
     def select(self, rows: Any) -> LevelSamples:
-        """The samples at the points that `rows`, indices or a mask, select."""
+        """The samples of the selected points. rows: their indices, or a mask."""
         return LevelSamples(self.value[rows], self.gradient[rows], self.quarter_period_radius[rows])
 
-    def replaced(self, rows: Any, samples: LevelSamples) -> LevelSamples:
-        """The samples, with `samples` in place of the samples at points `rows`."""
+    def replaced(self, rows: Any, others: LevelSamples) -> LevelSamples:
+        """A copy in which the samples at points `rows` (indices or a mask) are `others`."""
         value, gradient, reach = (
             self.value.copy(),
             self.gradient.copy(),
             self.quarter_period_radius.copy(),
         )
         value[rows], gradient[rows], reach[rows] = (
-            samples.value,
-            samples.gradient,
-            samples.quarter_period_radius,
+            others.value,
+            others.gradient,
+            others.quarter_period_radius,
         )
         return LevelSamples(value, gradient, reach)
 
     @property
     def distance(self) -> FloatArray:
-        """(n,) the distance to the level, estimated by the slope: |f - level|/|gradient|."""
-        steep = row_norms(self.gradient)
-        return np.abs(self.value) / np.maximum(steep, 1e-300)
+        """(n,) the estimated distance from the level set: |f - level|/|gradient|."""
+        slope = row_norms(self.gradient)
+        return np.abs(self.value) / np.maximum(slope, 1e-300)
 
 
 class EvaluatorCache:
-    """Fields on the backend of double precision, each prepared once."""
+    """Fields prepared for double precision, so that functions of the same field share them."""
 
     def __init__(self) -> None:
-        self._evaluators: dict[int, tuple[Field, Field]] = {}
+        self._made: dict[int, tuple[Field, Field]] = {}
 
     def of(self, field: Field) -> Field:
-        if id(field) not in self._evaluators:  # it is stored, so that no other field has its id
-            self._evaluators[id(field)] = field, field.prepare(choose_backend("double"))
-        return self._evaluators[id(field)][1]
+        """The field, prepared for double precision; prepared at the first call only."""
+        if id(field) not in self._made:  # it is stored, so that no other field has its id
+            self._made[id(field)] = field, field.prepare(choose_backend("double"))
+        return self._made[id(field)][1]
 
 
 @dataclass
 class LevelFunction:
-    """f - level, in double precision.
+    """f - level of a field f, in double precision.
 
-    most_faces: the largest number of triangles of its mesh.
-    evaluations: of f so far, in points. uploads: the prepared fields, which functions share.
-    secant_steps: the number of secant steps for the roots on edges of cells, for functions that are
-        nearly linear along edges, such as distances; 0 for a search.
-    """
+    most_faces: the largest allowed number of triangles of its mesh.
+    uploads: the prepared fields; several functions may share them.
+    secant_steps: where edges of cells meet the level set is found by this number of secant steps,
+        for functions that are nearly linear along edges, such as distances; 0 for a search.
+    evaluations: the number of points at which f has been evaluated."""
 
     field: Field
     level: float
@@ -115,46 +116,52 @@ class LevelFunction:
         return self.field.period
 
     def relative_to_level(self, value: FloatArray) -> FloatArray:
-        """f - level, from values of f."""
+        """(n,) f - level for values (n,) of f; for an angle, that of the smallest magnitude."""
         difference = value - self.level
         if self.period is None:
             return difference
         return difference - self.period * np.round(difference / self.period)
 
     def sample(self, points: FloatArray) -> LevelSamples:
-        """The function at points (n, 3)."""
-        value, gradient, reach = self._in_batches(points, self._evaluated)
-        return LevelSamples(self.relative_to_level(value), gradient, reach)
+        """Values and gradients of the function at points (n, 3)."""
+        value, gradient, radius = self._in_batches(points, self._evaluated)
+        return LevelSamples(self.relative_to_level(value), gradient, radius)
 
     def values(self, points: FloatArray) -> FloatArray:
-        """(n,) f - level alone."""
+        """(n,) f - level at points (n, 3), without gradients."""
 
         def value(p: Vec3) -> tuple[Real]:
+            """The value of f at p."""
             with share_samples(), without_alternatives():
                 return (self._prepared.evaluate(p).value,)
 
         return self.relative_to_level(self._in_batches(points, value)[0])
 
     def is_on_level(self, points: FloatArray) -> BoolArray:
-        """(n,) where f equals the level up to its error: rounding error, and truncation error of a
-        sum."""
+        """(n,) whether f equals the level at points (n, 3), up to the bound of its error. That is a
+        rounding error, and for a sum a truncation error as well."""
 
-        def both(p: Vec3) -> tuple[Real, Real]:
+        def value_and_error(p: Vec3) -> tuple[Real, Real]:
+            """The value of f at p, and the bound of its error."""
             with without_alternatives():
                 sample = self._prepared.evaluate(p)
             return sample.value, self._backend.Float(sample.value_error)
 
-        value, error = self._in_batches(points, both)
+        value, error = self._in_batches(points, value_and_error)
         return np.abs(self.relative_to_level(value)) <= error
 
     def gradient_bounds(
         self, points: FloatArray, radius: FloatArray
     ) -> tuple[LevelSamples, FloatArray]:
-        """The samples of the function at points (n, 3), without `quarter_period_radius`, and a
-        bound of the change of its gradient within `radius` (n,) of each point, rounding included:
-        see `Field.gradient_change_bound`."""
+        """Samples at points (n, 3), and bounds (n,) of how far the gradient changes nearby.
+
+        radius: (n,) the radius around each point within which the bound holds. Rounding is included
+            (`Field.gradient_change_bound`).
+
+        The samples have no `quarter_period_radius`: it is 0."""
 
         def compute(p: Vec3, r: Vec3) -> tuple[Real, Vec3, Real]:
+            """Value, gradient and bound of the gradient's change within r.x of p."""
             sample = self._prepared.evaluate(p)
             change = self._prepared.gradient_change_bound(p, r.x) + sample.gradient_error
             return sample.value, sample.gradient, change
@@ -166,9 +173,11 @@ class LevelFunction:
         return LevelSamples(self.relative_to_level(value), gradient, np.zeros(len(points))), change
 
     def clearance(self, points: FloatArray) -> FloatArray:
-        """(n,) a lower bound of the distance to the level set: see `level_distance_lower_bound`."""
+        """(n,) a proved lower bound of the distance from points (n, 3) to the level set
+        (`level_distance_lower_bound`)."""
 
         def bound(p: Vec3) -> tuple[Real]:
+            """The lower bound of the distance from p."""
             sample = self._prepared.evaluate(p)
             return (
                 level_distance_lower_bound(self._backend, self._prepared, self._levels, p, sample),
@@ -177,14 +186,19 @@ class LevelFunction:
         return self._in_batches(points, bound)[0]
 
     def _evaluated(self, p: Vec3) -> tuple[Real, Vec3, Real]:
+        """The value, the gradient and the `LevelSamples.quarter_period_radius` of f at points.
+
+        For an angle, the radius is a length within which the bounds of the sample prove that f
+        changes by less than a quarter of the period, rounding errors included. It is 0 for other
+        fields."""
         if self.period is None:
             with share_samples(), without_alternatives():
                 sample = self._prepared.evaluate(p)
             return sample.value, sample.gradient, self._backend.Float(0)
         with share_samples():
             sample = self._prepared.evaluate(p)
-        steepest = safe_norm(sample.gradient) + sample.gradient_error
-        slopes = SlopeRange(-steepest, steepest)
+        max_slope = safe_norm(sample.gradient) + sample.gradient_error
+        slopes = SlopeRange(-max_slope, max_slope)
         enclosures = _PROOFS.from_promises(
             sample.promises, sample.alternative_promises, sample.value, sample.value_error, slopes
         )
@@ -199,5 +213,7 @@ class LevelFunction:
     def _in_batches(
         self, points: FloatArray, kernel: Callable[[Vec3], tuple[Any, ...]]
     ) -> tuple[FloatArray, ...]:
+        """The results of a kernel at points (n, 3), computed batch by batch; counted as
+        evaluations."""
         self.evaluations += len(points)
         return map_batches(self._backend, kernel, points, at_once=1 << 18)

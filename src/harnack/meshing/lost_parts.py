@@ -1,14 +1,15 @@
 """Parts of a level set that are missing from its mesh by signs: walls and gaps thinner than a cell.
 
-Signs at the points of a lattice do not show a wall between two of them, nor a gap. That the mesh is
-near the level everywhere is checked by `points_off_level`; here the converse is checked, from
-points that are known to lie on the level to the mesh. Around a point of the level that is farther
-than d from the mesh the sign of the function changes within d, and that of the mesh does not: so
-there is a part of the solid, or of the space around it, which the mesh does not have.
+The signs at the points of a lattice do not show a wall or a gap between two points.
+`points_off_level` checks that all points of the mesh are near the level set. Here the converse is
+checked: that points that are known to lie on the level set are near the mesh. Suppose that such a
+point is farther than d from the mesh. Then the sign of the function changes within d of the point,
+and the side of the mesh does not. So there is a part of the solid, or of the space around it, that
+the mesh does not have.
 
-Points of the level are known on the triangles of a mesh across which its winding number jumps over
-the level, beside the points of a cloud, and along rays out of blobs. They are a sample of about
-three thousand, spread evenly, and no proof.
+Points of the level set are known: on the triangles of a mesh, where the winding number jumps across
+the level; beside the points of a cloud; and along rays out of blobs. About three thousand of them
+are used, spread evenly. They are a sample, and no proof.
 """
 
 from __future__ import annotations
@@ -38,38 +39,41 @@ __all__ = ["LostParts", "PointsOnLevel"]
 
 # The number of points that are spread over triangles by area, and the number of triangles with a
 # point in their middle.
-_BY_AREA, _MIDDLES = 2000, 1000
-# The distance of points beside triangles from these, relative to the size, or if that is more,
-# relative to the coordinates; and the smallest difference of w on both sides from the level, below
-# which rounding would decide.
-_BESIDE, _ROUNDED, _CLEARLY = 1e-9, 64 * 2.0**-53, 0.02
+_MAX_POINTS, _MIDDLES = 2000, 1000
+# Test points lie beside triangles at the first distance relative to the size of the mesh, or at the
+# second relative to the largest coordinate, whichever is larger. The values there have to differ
+# from the level by more than the third: otherwise rounding would decide on which side they are.
+_BESIDE, _ROUNDED, _MIN_JUMP = 1e-9, 64 * 2.0**-53, 0.02
 # The largest distance of the level from the points of a cloud, in smoothing lengths.
-_SMOOTHED = 2.0
-# Parts are lost if more than this fraction of the points are beyond the tolerance from the mesh,
-# the fraction that is allowed for the mesh's points off the level; or if a point is farther than
-# this number of cells.
-_SHARE, _CELLS = 0.01, 0.5
+_MAX_SMOOTHING_LENGTHS = 2.0
+# Parts are lost if more than the first, a fraction of the points, are farther from the mesh than
+# the tolerance (the same fraction of the mesh's points may be off the level); or if any point is
+# farther than the second, in cells.
+_ALLOWED_SHARE, _ALLOWED_CELLS = 0.01, 0.5
 # The number of points at which the thickness of a part is measured; and the thicknesses that are
 # tried, in cells.
-_LOOKED_AT, _THICKNESSES = 40, 2.0 ** np.arange(-10, 0.5, 0.25)
+_MAX_MEASURED, _THICKNESSES = 40, 2.0 ** np.arange(-10, 0.5, 0.25)
 # Parts thinner than this, in cells, are lost nearly everywhere.
 _THIN = 0.25
 
 
 @dataclass(frozen=True)
 class PointsOnLevel:
-    """Points (k, 3) on the level, and unit normals (k, 3) there towards where the function is
-    positive."""
+    """Some points on a level set.
+
+    points: (k, 3).
+    normals: (k, 3) unit normals there, towards where the function is positive."""
 
     points: FloatArray
     normals: FloatArray
 
     @classmethod
     def of(cls, function: SignFunction, tolerance: float) -> PointsOnLevel:
-        """The known points on the level of a field; none for fields without such points.
+        """Points on the level set that are known without a mesh of it: see the text above. There
+        are none for other fields.
 
-        tolerance: a length; the distance from the points of a cloud at which its sign is evaluated.
-        """
+        tolerance: a length. The sign of a cloud's field is evaluated at least this far from its
+            points."""
         mesh = function.field.jump_mesh()
         if mesh is not None:
             return cls._on_triangles(function, mesh[0][mesh[1]])
@@ -77,13 +81,13 @@ class PointsOnLevel:
         low = np.zeros((0, 3))
         high = low
         if isinstance(field, OrientedPoints | HRBF):
-            rows = _evenly_spaced_rows(len(field.points), _BY_AREA)
+            rows = _spread(len(field.points), _MAX_POINTS)
             smoothed = field.smoothing if isinstance(field, DipolePotential) else 0.0
-            offset = max(tolerance, _SMOOTHED * smoothed) * field.normals[rows]
+            offset = max(tolerance, _MAX_SMOOTHING_LENGTHS * smoothed) * field.normals[rows]
             offset /= np.maximum(row_norms(field.normals[rows]), 1e-300)[:, None]
             low, high = field.points[rows] - offset, field.points[rows] + offset
         elif isinstance(field, Blobs):
-            rows = _evenly_spaced_rows(len(field.centers), _BY_AREA)
+            rows = _spread(len(field.centers), _MAX_POINTS)
             offset = np.random.default_rng(0).normal(size=(len(rows), 3))
             offset *= ((field.radii * field.kernel.support)[rows] / row_norms(offset))[:, None]
             low, high = field.centers[rows], field.centers[rows] + offset
@@ -92,50 +96,56 @@ class PointsOnLevel:
         return cls(*function.crossings(low[is_low != is_high], high[is_low != is_high]))
 
     @classmethod
-    def _on_triangles(cls, function: SignFunction, corner: FloatArray) -> PointsOnLevel:
-        """Points on triangles (m, 3, 3) across which the function changes its sign."""
-        normal = area_normals(corner)
+    def _on_triangles(cls, function: SignFunction, triangles: FloatArray) -> PointsOnLevel:
+        """Points on triangles (m, 3, 3) across which the function changes its sign, and the normals
+        of the triangles there, turned towards where the function is positive.
+
+        About two thousand points are spread over the triangles by area, and a thousand triangles,
+        or all if there are fewer, have a point in their middle."""
+        normal = area_normals(triangles)
         area = row_norms(normal)
-        rows = np.concatenate([_by_area(area), _evenly_spaced_rows(len(corner), _MIDDLES)])
-        shares = np.random.default_rng(0).dirichlet((1.0, 1.0, 1.0), len(rows))
-        shares[-min(len(corner), _MIDDLES) :] = 1 / 3
-        points, normal = np.einsum("ki,kij->kj", shares, corner[rows]), normal[rows]
+        rows = np.concatenate([_by_area(area), _spread(len(triangles), _MIDDLES)])
+        barycentric = np.random.default_rng(0).dirichlet((1.0, 1.0, 1.0), len(rows))
+        barycentric[-min(len(triangles), _MIDDLES) :] = 1 / 3
+        points, normal = np.einsum("ki,kij->kj", barycentric, triangles[rows]), normal[rows]
         normal /= np.maximum(area[rows], 1e-300)[:, None]
-        size, largest = float(np.ptp(corner, axis=(0, 1)).max()), float(np.abs(corner).max())
-        away = max(_BESIDE * size, _ROUNDED * largest) * normal
-        beside = np.concatenate([points + away, points - away])
+        size, largest = float(np.ptp(triangles, axis=(0, 1)).max()), float(np.abs(triangles).max())
+        offset = max(_BESIDE * size, _ROUNDED * largest) * normal
+        beside = np.concatenate([points + offset, points - offset])
         value = function.relative_to_level(function.field.value(beside, precision="double"))
         function.evaluations += len(beside)
         ahead, behind = value.reshape(2, -1)
         jumps = (ahead > 0) != (behind > 0)
-        jumps &= (np.minimum(np.abs(ahead), np.abs(behind)) > _CLEARLY) & (area[rows] > 0)
+        jumps &= (np.minimum(np.abs(ahead), np.abs(behind)) > _MIN_JUMP) & (area[rows] > 0)
         return cls(points[jumps], np.where(ahead > 0, 1.0, -1.0)[jumps, None] * normal[jumps])
 
-    def select(self, rows: Any) -> PointsOnLevel:
-        """The points that `rows`, indices or a mask, select."""
+    def some(self, rows: Any) -> PointsOnLevel:
+        """The selected points. rows: their indices, or a mask."""
         return PointsOnLevel(self.points[rows], self.normals[rows])
 
     def within(self, lower: FloatArray, upper: FloatArray, volume: Volume | None) -> PointsOnLevel:
-        """The points in a box and in a volume."""
+        """The points in the box from `lower` to `upper`, and in the volume if one is given."""
         is_in = ((self.points > lower) & (self.points < upper)).all(axis=1)
         if volume is not None:
             is_in &= volume.contains_points(self.points)
-        return self.select(is_in)
+        return self.some(is_in)
 
 
 @dataclass(frozen=True)
 class LostParts:
-    """Points of the level that are farther from a mesh than they should be.
+    """Points of the level set that are farther from a mesh than they should be.
 
-    far: the number of points farther than the tolerance, of `looked_at`; beyond: the number of
-        these that are farther than half a cell; within: a distance within which all points are, by
-        corners and centers of triangles; inf if there are none.
-    missing, filled: (k, 3), selections of the far points: on parts that are missing, and in gaps
-        that are filled; unexplained: points for which neither is known.
-    thickness: the median thickness of such parts and gaps; inf if they are wider than cells, or not
-        known.
-    spacing: of cells. advice: what to do.
-    """
+    far: the number of points farther than `tolerance`. looked_at: the number of all points.
+    beyond: the number of points that are also farther than half a cell.
+    within: no point is farther than this from a corner or a center of a triangle; inf if there are
+        no triangles.
+    missing, filled: (k, 3), (j, 3) some of the far points: on parts that the mesh misses, and in
+        gaps that it fills.
+    others: (i, 3) far points for which neither is known.
+    thickness: the median thickness of these parts and gaps; inf if they are wider than cells, or
+        not known.
+    spacing: the size of cells.
+    advice: what to do, in words."""
 
     far: int
     looked_at: int
@@ -144,7 +154,7 @@ class LostParts:
     within: float
     missing: FloatArray
     filled: FloatArray
-    unexplained: FloatArray
+    others: FloatArray
     thickness: float
     spacing: float
     advice: str
@@ -153,27 +163,26 @@ class LostParts:
     def of(
         cls,
         function: SignFunction,
-        level_points: PointsOnLevel,
+        known: PointsOnLevel,
         surface: TriangleMesh,
         tolerance: float,
         spacing: float,
     ) -> LostParts:
-        """The lost parts of a mesh of the level set.
+        """Find the parts of a level set that a mesh has lost.
 
-        level_points: points on the level, near which the mesh should be.
-        spacing: of the cells of the mesh.
-        """
+        known: points on the level set, near which the mesh should be.
+        surface: the mesh. spacing: the size of its cells."""
         corner = surface.vertices[surface.faces]
-        distant = level_points.select(_are_farther(level_points.points, corner, tolerance))
-        beyond = _are_farther(distant.points, corner, max(tolerance, _CELLS * spacing))
+        distant = known.some(_are_farther(known.points, corner, tolerance))
+        beyond = _are_farther(distant.points, corner, max(tolerance, _ALLOWED_CELLS * spacing))
         within = _bound_of_distances(distant.points, corner) if len(distant.points) else tolerance
-        shown = distant.select(_evenly_spaced_rows(len(distant.points), _LOOKED_AT))
+        shown = distant.some(_spread(len(distant.points), _MAX_MEASURED))
         thickness, is_inside = _thicknesses(function, shown, spacing)
         is_thin = np.isfinite(thickness)
         thickness = thickness[is_thin]
         return cls(
             len(distant.points),
-            len(level_points.points),
+            len(known.points),
             tolerance,
             int(beyond.sum()),
             within,
@@ -187,19 +196,18 @@ class LostParts:
 
     @property
     def matter(self) -> bool:
-        """Whether there are more points off the mesh than creases and corners cause for any
-        mesh."""
-        return self.beyond > 0 or self.far > _SHARE * self.looked_at
+        """Whether more points are off the mesh than creases and corners cause for any mesh."""
+        return self.beyond > 0 or self.far > _ALLOWED_SHARE * self.looked_at
 
     @property
     def show_thin_parts(self) -> bool:
-        """Whether points are on parts or in gaps that are thinner than cells, or beyond half a
-        cell, so that the coarseness of the mesh is not the only cause."""
+        """Whether some points are on parts or in gaps thinner than cells, or farther than half a
+        cell from the mesh. Then the coarseness of the mesh is not the only cause."""
         return self.beyond + len(self.missing) + len(self.filled) > 0
 
     def are_mended_by(self, smaller: float) -> bool:
-        """Whether cells smaller by a factor may show the lost parts: not if most are far
-        thinner."""
+        """Whether smaller cells may show the lost parts: not if most of these are thinner than a
+        quarter of such a cell. smaller: their size, as a fraction of `spacing`."""
         return self.thickness >= _THIN * smaller * self.spacing
 
     def __str__(self) -> str:
@@ -216,11 +224,11 @@ class LostParts:
         )
         if shown:
             return f"{text}; they are about {self.thickness:.2g} thick"
-        return f"{text}such as {point_text(self.unexplained[0])}"
+        return f"{text}such as {point_text(self.others[0])}"
 
 
 def _advice(field: Field) -> str:
-    """The remedy where cells miss parts, in words."""
+    """What to do if cells miss parts of the field's level set, in words."""
     advice = "choose a smaller `cell_size`"
     if isinstance(field, WindingNumber):
         advice += "; repairing the mesh keeps thin parts where their triangles are sound"
@@ -230,56 +238,67 @@ def _advice(field: Field) -> str:
 
 
 def _by_area(area: FloatArray) -> IntArray:
-    """Row indices, each repeated in proportion to its area."""
-    ends: FloatArray = np.cumsum(area)
-    targets: FloatArray = (np.arange(_BY_AREA) + 0.5) / _BY_AREA * ends[-1]
-    return np.searchsorted(ends, targets)
+    """The indices (2000,) of triangles, each repeated in proportion to its area. area: (m,)."""
+    cumulative: FloatArray = np.cumsum(area)
+    targets: FloatArray = (np.arange(_MAX_POINTS) + 0.5) / _MAX_POINTS * cumulative[-1]
+    return np.searchsorted(cumulative, targets)
 
 
-def _evenly_spaced_rows(count: int, max_count: int) -> IntArray:
-    """The indices of all rows, or of `max_count` rows, evenly spread."""
+def _spread(count: int, max_count: int) -> IntArray:
+    """Evenly spread indices below `count`: `max_count` of them, or all if there are fewer."""
     return np.linspace(0, count - 1, min(count, max_count)).astype(np.int64)
 
 
 def _thicknesses(
     function: SignFunction, points: PointsOnLevel, spacing: float
 ) -> tuple[FloatArray, BoolArray]:
-    """The distances from points of the level (k, 3), along the normal on either side, to the next
-    change of sign, up to about a cell, the smaller of both; and whether that side is inside. For
-    clouds they are not known."""
+    """The thickness of the part or the gap at each of k points of the level set.
+
+    From each point the sign of the function is followed along the normal and against it, at
+    distances up to the size of a cell. The thickness is the distance to the next change of sign, on
+    the side where it is smaller.
+
+    Returns:
+        The thicknesses (k,), inf where the sign does not change again; and a mask (k,): True where
+        that side is inside, so that it is a part, False where it is outside, so that it is a gap.
+        For clouds all thicknesses are inf: they are not known.
+    """
     if isinstance(function.field, OrientedPoints):  # each point is in its own bubble
         nowhere = np.full(len(points.points), np.inf)
         return nowhere, nowhere > 0
     distances = spacing * _THICKNESSES
-    sides: list[FloatArray] = []
+    per_side: list[FloatArray] = []
     for sign in (1.0, -1.0):
         probes = points.points[:, None] + sign * distances[:, None] * points.normals[:, None]
         is_positive = function.values(probes.reshape(-1, 3)).reshape(-1, len(distances)) > 0
         changed = is_positive != (sign > 0)
-        sides.append(np.where(changed.any(axis=1), distances[changed.argmax(axis=1)], np.inf))
-    above, below = sides
+        per_side.append(np.where(changed.any(axis=1), distances[changed.argmax(axis=1)], np.inf))
+    above, below = per_side
     # The function is positive inside, or where its side is -1 outside.
     return np.minimum(above, below), (above < below) == (function.side > 0)
 
 
-def _bound_of_distances(points: FloatArray, corner: FloatArray) -> float:
-    """A distance within which points (n, 3) are from triangles (m, 3, 3); inf without any."""
+def _bound_of_distances(points: FloatArray, triangles: FloatArray) -> float:
+    """A bound of the distances of points (n, 3) from triangles (m, 3, 3): the largest distance from
+    the nearest corner or center. inf if there are no triangles."""
     import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial
-    if not len(corner):
+    if not len(triangles):
         return math.inf
-    mesh_points = np.concatenate([corner.reshape(-1, 3), corner.mean(axis=1)])
+    mesh_points = np.concatenate([triangles.reshape(-1, 3), triangles.mean(axis=1)])
     tree = searching.cKDTree(mesh_points, compact_nodes=False, balanced_tree=False)
     return float(tree.query(points)[0].max())
 
 
 def _are_farther(points: FloatArray, corner: FloatArray, distance: float) -> BoolArray:
-    """(n,) whether points (n, 3) are farther than a distance from all triangles (m, 3, 3).
+    """(n,) whether points (n, 3) are farther than `distance` from all triangles.
+
+    corner: (m, 3, 3) the corners of the triangles.
 
     A triangle within the distance has its center within the sum of the distance and the triangle's
-    radius. Triangles whose radii differ by less than a factor of 2 are examined together.
-    """
+    radius around its center. Triangles whose radii differ by less than a factor of 2 are searched
+    together, with the larger radius."""
     import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial
@@ -287,15 +306,15 @@ def _are_farther(points: FloatArray, corner: FloatArray, distance: float) -> Boo
     if not len(points):
         return is_far
     center = corner.mean(axis=1)
-    reach = np.stack([row_norms(corner[:, k] - center) for k in range(3)]).max(axis=0)
-    octave = np.ceil(np.log2(np.maximum(reach, distance))).astype(np.int64)
-    for k in np.unique(octave).tolist():
-        remaining, rows = np.flatnonzero(is_far), np.flatnonzero(octave == k)
+    radius = np.stack([row_norms(corner[:, k] - center) for k in range(3)]).max(axis=0)
+    exponent = np.ceil(np.log2(np.maximum(radius, distance))).astype(np.int64)
+    for k in np.unique(exponent).tolist():
+        remaining, rows = np.flatnonzero(is_far), np.flatnonzero(exponent == k)
         tree = searching.cKDTree(center[rows], compact_nodes=False, balanced_tree=False)
         near = tree.query_ball_point(points[remaining], 2.0**k + distance)
         counts = np.array([len(indices) for indices in near], np.int64)
         if not counts.sum():
             continue
-        query, of = np.repeat(remaining, counts), rows[np.concatenate(near).astype(np.int64)]
-        is_far[query[distances_from_triangles(points[query], corner[of]) <= distance]] = False
+        query, face = (np.repeat(remaining, counts), rows[np.concatenate(near).astype(np.int64)])
+        is_far[query[distances_from_triangles(points[query], corner[face]) <= distance]] = False
     return is_far

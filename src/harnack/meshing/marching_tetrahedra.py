@@ -39,12 +39,12 @@ __all__ = [
 ]
 
 _PAIRS = tuple(itertools.combinations(range(4), 2))
-# Values this large mark points outside: where the other end has a value, the edge is crossed in its
-# middle.
+# Values this large mark points outside of the region that matters. An edge with one such end is
+# crossed in its middle.
 OUTSIDE_VALUE = 1e299
-# The error of roots on edges, relative to the edge; and the distance of roots by secants from its
-# ends, so that triangles have an area.
-_ROOT_ERROR, _FROM_ENDS = 1e-10, 1e-4
+# The error of roots on edges, as a fraction of the edge. Roots by secants keep the second fraction
+# of the edge from its ends, so that triangles have an area.
+_ROOT_ERROR, _MIN_END_DISTANCE = 1e-10, 1e-4
 
 
 @dataclass(frozen=True)
@@ -52,11 +52,10 @@ class Tetrahedra:
     """Tetrahedra and their edges.
 
     points: (n, 3).
-    corners: (m, 4) indices of points.
-    ends: (k, 2) endpoints of all edges, the lower index first.
-    edges: (m, 6) indices of edges, for the pairs of corners (0, 1), (0, 2), (0, 3), (1, 2), (1, 3),
-        (2, 3).
-    """
+    corners: (m, 4) the points of each tetrahedron, by index.
+    ends: (k, 2) the points at the ends of each edge, the lower index first.
+    edges: (m, 6) the edges of each tetrahedron, by index, for the pairs of corners (0, 1), (0, 2),
+        (0, 3), (1, 2), (1, 3), (2, 3)."""
 
     points: FloatArray
     corners: IntArray
@@ -65,31 +64,35 @@ class Tetrahedra:
 
     @classmethod
     def of(cls, points: FloatArray, corners: IntArray) -> Tetrahedra:
-        """Tetrahedra with these corners; their edges are numbered."""
+        """Tetrahedra with these points and corners; their edges are found and numbered."""
         edges = Edges.of(np.concatenate([corners[:, pair] for pair in _PAIRS]))
         return cls(points, corners, edges.vertices, edges.edge_of_pair.reshape(len(_PAIRS), -1).T)
 
     def edge_between(self, i: int, j: int, rows: IntArray) -> tuple[IntArray, IntArray]:
-        """For tetrahedra `rows`, the edge between corners i and j, and its direction: 1 if it leads
-        from i to j, else -1."""
+        """The edge between corners i and j of each of the tetrahedra `rows` (k,).
+
+        Returns:
+            The indices (k,) of the edges; and their directions (k,): 1 if the edge leads from
+            corner i to corner j, else -1.
+        """
         edge = self.edges[rows, _PAIRS.index((min(i, j), max(i, j)))]
         return edge, np.where(self.ends[edge, 0] == self.corners[rows, i], 1, -1)
 
     def has_edges(self, pairs: IntArray) -> BoolArray:
-        """(k,) whether there are edges between pairs (k, 2) of points."""
+        """(k,) whether two points are joined by an edge, for pairs (k, 2) of points."""
         n = len(self.points)
         return np.isin(edge_keys(pairs, n), edge_keys(self.ends, n))
 
 
 def delaunay(points: FloatArray) -> Tetrahedra:
-    """The Delaunay tetrahedra of points (n, 3) in general position, except that many may lie on the
-    faces of a box.
+    """The Delaunay tetrahedra of points (n, 3). Points are in general position, except that many
+    may lie on the faces of a box.
 
-    Eight points far away are added and left out again with their tetrahedra: Qhull takes long over
-    a hull that is flat.
+    Eight points far away are added, and removed again with their tetrahedra, because Qhull takes
+    long if the convex hull of the points is flat.
 
     Raises:
-        MeshingError: points are too near to each other, relative to their extent.
+        MeshingError: some points are too near to each other, relative to their extent.
     """
     import scipy.spatial  # imported here: it takes half a second
 
@@ -114,13 +117,14 @@ def delaunay(points: FloatArray) -> Tetrahedra:
 
 @dataclass(frozen=True)
 class EdgeCrossings:
-    """Crossings of all edges of tetrahedra, between points off the level.
+    """How a function crosses its level along the edges of tetrahedra. Edges with an end on the
+    level have no crossings.
 
-    count: (k,) the number of upward minus that of downward crossings of the level along each edge.
-    change: (k,) the change of the function along each edge.
-    proved: the number of changes that are proved to be the difference of wrapped values.
-    integrated_count: the number of changes that were integrated along the edge.
-    """
+    count: (k,) for each edge the number of upward crossings minus that of downward crossings.
+    change: (k,) the continuous change of the function along each edge.
+    proved: the number of edges whose change is proved to be the difference of the values, wrapped
+        by the period.
+    integrated_count: the number of edges along which the change was integrated."""
 
     count: IntArray
     change: FloatArray
@@ -131,15 +135,16 @@ class EdgeCrossings:
 def count_crossings(
     function: LevelFunction, points: TetrahedronPoints, tets: Tetrahedra
 ) -> EdgeCrossings:
-    """Count the crossings of every edge.
+    """Count how a function crosses its level along every edge of tetrahedra.
 
-    Wrapping. Within `LevelSamples.quarter_period_radius` of a point the function changes by less
-    than a quarter of its period. If these radii at both ends cover the edge, it changes by less
-    than half a period along it, so that the change is the wrapped difference. Along other edges
-    the change is integrated (`Field.continuous_change`).
+    For an angle, the change along an edge is needed. Within `LevelSamples.quarter_period_radius` of
+    a point the function changes by less than a quarter of its period. So if the radii of both ends
+    together cover the edge, it changes by less than half a period along the edge, and the change is
+    the wrapped difference of the values. Along other edges the change is integrated
+    (`Field.continuous_change`).
 
     Raises:
-        MeshingError: edges that are not covered, of a field that cannot be integrated.
+        MeshingError: the field of an uncovered edge cannot be integrated.
     """
     a, b = tets.ends.T
     value = points.samples.value
@@ -165,25 +170,33 @@ def count_crossings(
 def _integrate_change(
     field: Field, p: FloatArray, q: FloatArray, wrapped: FloatArray, period: float
 ) -> FloatArray:
-    """The change of f from p to q (n, 3), as the field integrates it, which differs from the
-    wrapped change by whole periods."""
+    """(n,) the continuous change of f along the segments from p to q (n, 3), as the field
+    integrates it.
+
+    wrapped: (n,) the differences of the values at the ends, from which it differs by whole periods.
+
+    Raises:
+        MeshingError: the field cannot integrate its change, or the result does not differ by whole
+            periods.
+    """
     exact = field.continuous_change(p, q)
     if exact is None:
         raise MeshingError(
             f"how {type(field).__name__} changes along {len(p)} edges of the mesh is not proved, "
             "and it has no `change_along`: choose a smaller `cell_size`"
         )
-    turns = np.round((exact - wrapped) / period)
-    if np.abs(exact - wrapped - period * turns).max(initial=0.0) > 1e-6:
+    periods = np.round((exact - wrapped) / period)
+    if np.abs(exact - wrapped - period * periods).max(initial=0.0) > 1e-6:
         raise MeshingError(
             f"{type(field).__name__}.change_along is not the difference of two values, modulo "
             "the period"
         )
-    return wrapped + period * turns
+    return wrapped + period * periods
 
 
 EdgeRootFinder: TypeAlias = Callable[[FloatArray, FloatArray], FloatArray]
-"""From the ends (k, 3) of edges, below the level and above it, to where they meet it (k, 3)."""
+"""A function from the ends (k, 3) of edges, first those below the level and then those above it, to
+the points (k, 3) where the edges meet the level set."""
 
 
 def extract_triangles(
@@ -193,15 +206,20 @@ def extract_triangles(
     crossings: EdgeCrossings,
     roots_of: EdgeRootFinder | None = None,
 ) -> tuple[FloatArray, IntArray]:
-    """Vertices (n, 3) and faces (m, 3), counter-clockwise as seen from where the function is
-    greater. The first vertices are `points`, whether they are in use or not; they are followed by a
-    vertex for each edge that is crossed, in their order.
+    """The triangles of the level set in tetrahedra.
 
+    points, tets, crossings: the tetrahedra's points, with the function there; the tetrahedra; and
+        how the function crosses its level along their edges.
     roots_of: computes where edges meet the level of a real-valued function; None for a search along
         them.
 
+    Returns:
+        Vertices (n, 3) and faces (m, 3), counter-clockwise as seen from where the function is
+        larger. The first vertices are `points`, whether they are used or not; then follows one
+        vertex for each crossed edge, in the order of the edges.
+
     Raises:
-        MeshingError: crossings that do not agree around a face, or two levels between corners.
+        MeshingError: crossings do not agree around a face, or two levels pass between corners.
     """
     side = _sides(points, tets, crossings)
     on = points.is_on_level[tets.corners]
@@ -237,6 +255,7 @@ def extract_triangles(
         rise = _mean(points.points, corner[:, up]) - _mean(points.points, corner[:, down])
 
         def at(i: int, j: int, rows: IntArray = rows) -> IntArray:
+            """The vertices on the edges between corners i and j of tetrahedra `rows`."""
             return vertex_of_edge[tets.edge_between(i, j, rows)[0]]
 
         on_level = [corner[:, k] for k in level]
@@ -259,18 +278,22 @@ def extract_triangles(
 
 
 def is_cut(points: TetrahedronPoints, tets: Tetrahedra, crossings: EdgeCrossings) -> BoolArray:
-    """(m,) whether a level passes between corners of a tetrahedron, or through one."""
+    """(m,) whether the level set passes between the corners of each tetrahedron, or through one of
+    them."""
     return points.is_on_level[tets.corners].any(axis=1) | (crossings.count[tets.edges] != 0).any(
         axis=1
     )
 
 
 def _mean(points: FloatArray, index: IntArray) -> FloatArray:
+    """(k, 3) the mean of the points with indices (k, j)."""
     return points[index].mean(axis=1)
 
 
 def _halves(vertices: FloatArray, ring: list[IntArray]) -> tuple[IntArray, IntArray]:
-    """The two triangles of a quadrilateral cut along its shorter diagonal."""
+    """The two triangles (k, 3) of quadrilaterals, which are cut along their shorter diagonal.
+
+    ring: the indices (k,) of the four corners, in their order around the quadrilateral."""
     a, b, c, d = ring
     ac, bd = (row_norms(vertices[x] - vertices[y]) for x, y in ((a, c), (b, d)))
     longer = (ac > bd)[:, None]
@@ -280,31 +303,36 @@ def _halves(vertices: FloatArray, ring: list[IntArray]) -> tuple[IntArray, IntAr
 
 
 def _sides(points: TetrahedronPoints, tets: Tetrahedra, crossings: EdgeCrossings) -> IntArray:
-    """(m, 4) the number of levels between the first corner that is off the level and each other
-    corner."""
-    on = points.is_on_level[tets.corners]
-    rows = np.arange(len(on))
-    first = np.argmin(on, axis=1)
-    side = np.zeros(on.shape, np.int64)
+    """(m, 4) the signed number of levels between the first corner of each tetrahedron that is off
+    the level and its other corners; 0 for corners on the level.
 
-    def between(i: int, j: int, rows: IntArray) -> IntArray:
+    Raises:
+        LocalizedMeshingError: the crossings of three edges of a face do not add up.
+    """
+    is_on = points.is_on_level[tets.corners]
+    rows = np.arange(len(is_on))
+    first = np.argmin(is_on, axis=1)
+    count = np.zeros(is_on.shape, np.int64)
+
+    def crossed(i: int, j: int, rows: IntArray) -> IntArray:
+        """The signed crossings (k,) of the edges from corner i to corner j of tetrahedra `rows`."""
         edge, sign = tets.edge_between(i, j, rows)
         return sign * crossings.count[edge]
 
     for i, j in itertools.permutations(range(4), 2):
-        chosen = rows[(first == i) & ~on[:, j]]
-        side[chosen, j] = between(i, j, chosen)
-    disagrees = np.zeros(len(rows), np.bool_)
+        chosen = rows[(first == i) & ~is_on[:, j]]
+        count[chosen, j] = crossed(i, j, chosen)
+    is_wrong = np.zeros(len(rows), np.bool_)
     for i, j in _PAIRS:
-        chosen = rows[~on[:, i] & ~on[:, j]]
-        disagrees[chosen] |= side[chosen, j] - side[chosen, i] != between(i, j, chosen)
-    if disagrees.any():
+        chosen = rows[~is_on[:, i] & ~is_on[:, j]]
+        is_wrong[chosen] |= count[chosen, j] - count[chosen, i] != crossed(i, j, chosen)
+    if is_wrong.any():
         raise LocalizedMeshingError(
             "crossings of the level set do not agree around a triangle: the curve passes "
             "through it; choose a smaller `cell_size`",
-            _mean(points.points, tets.corners[disagrees]),
+            _mean(points.points, tets.corners[is_wrong]),
         )
-    return side
+    return count
 
 
 def _roots(
@@ -314,7 +342,12 @@ def _roots(
     crossings: EdgeCrossings,
     edges: IntArray,
 ) -> FloatArray:
-    """(r, 3) the points where `edges` meet the level, by Chandrupatla's method along the edge."""
+    """(r, 3) the points where edges meet the level set.
+
+    edges: (r,) the indices of the edges, each of which crosses it.
+
+    They are found by secants if the function has `secant_steps`, else by Chandrupatla's method. An
+    edge with an end outside (`OUTSIDE_VALUE`) is cut in its middle."""
     a, b = tets.ends[edges].T
     p, direction = points.points[a], points.points[b] - points.points[a]
     value, change = points.samples.value[a], crossings.change[edges]
@@ -323,64 +356,80 @@ def _roots(
         value = np.remainder(value, function.period)
         value = value - np.where(crossings.count[edges] > 0, function.period, 0)
 
-    def lifted(t: FloatArray, *of: FloatArray) -> FloatArray:
-        origin, along, start, rise = (
-            np.stack(of[0:3], axis=-1), np.stack(of[3:6], axis=-1), of[6], of[7]
+    def lifted_values(t: FloatArray, *args: FloatArray) -> FloatArray:
+        """f - level at fractions t of edges. args: the start (3 arrays), the direction (3),
+        the value at the start and the change along the edge, for each edge. Values of an angle are
+        moved by the whole number of periods that brings them nearest to the middle of the change.
+        """
+        origin, edge, start, rise = (
+            np.stack(args[0:3], axis=-1), np.stack(args[3:6], axis=-1), args[6], args[7]
         )  # fmt: skip
-        flat = (origin + t[..., None] * along).reshape(-1, 3)
-        sampled = function.values(flat).reshape(t.shape)
+        locations = (origin + t[..., None] * edge).reshape(-1, 3)
+        wrapped = function.values(locations).reshape(t.shape)
         if function.period is None:
-            return sampled
-        return sampled + function.period * np.rint((start + 0.5 * rise - sampled) / function.period)
+            return wrapped
+        return wrapped + function.period * np.rint((start + 0.5 * rise - wrapped) / function.period)
 
     if function.secant_steps:
         return p + _illinois(function, p, direction, value, value + change)[:, None] * direction
     finite = np.flatnonzero(np.maximum(np.abs(value), np.abs(value + change)) < OUTSIDE_VALUE)
     fraction = np.full(len(a), 0.5)
     fraction[finite] = _chandrupatla(
-        function, p[finite], direction[finite], value[finite], change[finite], lifted
+        function, p[finite], direction[finite], value[finite], change[finite], lifted_values
     )
     return p + fraction[:, None] * direction
 
 
 def _illinois(
-    function: LevelFunction, p: FloatArray, direction: FloatArray, low: FloatArray, high: FloatArray
+    function: LevelFunction, p: FloatArray, edge: FloatArray, low: FloatArray, high: FloatArray
 ) -> FloatArray:
-    """(r,) the fractions along edges where they meet the level, by a few secants from the values at
-    both ends; the value at an end that stays is halved from the second time on (the Illinois
-    method)."""
-    first, last = np.zeros(len(p)), np.ones(len(p))
+    """(r,) the fractions of edges at which they meet the level set, by a few secant steps.
+
+    p, edge: (r, 3) one end of each edge, and the vector to the other.
+    low, high: (r,) the values at these ends.
+
+    If the root is on the same side of the secant's root twice or more in a row, the value at the
+    end that stays is halved (the Illinois method)."""
+    left, right = np.zeros(len(p)), np.ones(len(p))
     up = high > low
-    low, high = np.where(up, low, -low), np.where(up, high, -high)
-    stayed = np.zeros(len(p), np.int64)
+    low, high = (np.where(up, low, -low), np.where(up, high, -high))
+    repeats = np.zeros(len(p), np.int64)
     fraction = low / (low - high)
     for _ in range(function.secant_steps):
-        value = function.values(p + fraction[:, None] * direction)
+        value = function.values(p + fraction[:, None] * edge)
         value = np.where(up, value, -value)
         is_positive = value > 0
-        stayed = np.where(is_positive, np.maximum(stayed, 0) + 1, np.minimum(stayed, 0) - 1)
-        low = np.where(is_positive, np.where(stayed > 1, 0.5 * low, low), value)
-        high = np.where(is_positive, value, np.where(stayed < -1, 0.5 * high, high))
-        first, last = np.where(is_positive, first, fraction), np.where(is_positive, fraction, last)
-        fraction = first + (last - first) * low / np.minimum(low - high, -1e-300)
-    return np.clip(fraction, _FROM_ENDS, 1 - _FROM_ENDS)
+        repeats = np.where(is_positive, np.maximum(repeats, 0) + 1, np.minimum(repeats, 0) - 1)
+        low = np.where(is_positive, np.where(repeats > 1, 0.5 * low, low), value)
+        high = np.where(is_positive, value, np.where(repeats < -1, 0.5 * high, high))
+        left, right = np.where(is_positive, left, fraction), np.where(is_positive, fraction, right)
+        fraction = left + (right - left) * low / np.minimum(low - high, -1e-300)
+    return np.clip(fraction, _MIN_END_DISTANCE, 1 - _MIN_END_DISTANCE)
 
 
 def _chandrupatla(
     function: LevelFunction,
-    p: FloatArray,
+    start: FloatArray,
     direction: FloatArray,
     value: FloatArray,
     change: FloatArray,
-    lifted: Callable[..., FloatArray],
+    lifted_values: Callable[..., FloatArray],
 ) -> FloatArray:
-    """(r,) the fractions along edges where they meet the level, by Chandrupatla's method."""
+    """(r,) the fractions of edges at which they meet the level set, by Chandrupatla's method.
+
+    start, direction: (r, 3) one end of each edge, and the vector to the other.
+    value, change: (r,) f - level at that end, and its change along the edge.
+    lifted_values: the function of the fraction and of these eight numbers whose root is searched.
+
+    Raises:
+        MeshingError: roots are not found.
+    """
     import scipy.optimize.elementwise as elementwise  # imported here: it takes half a second
 
     search = cast("Any", elementwise).find_root
-    arguments = (*p.T, *direction.T, value, change)
+    arguments = (*start.T, *direction.T, value, change)
     result = search(
-        lifted, (np.zeros(len(p)), np.ones(len(p))), args=arguments,
+        lifted_values, (np.zeros(len(start)), np.ones(len(start))), args=arguments,
         tolerances={"xatol": _ROOT_ERROR, "fatol": 0.0, "xrtol": 0.0, "frtol": 0.0},
         maxiter=60,
     )  # fmt: skip
@@ -395,54 +444,64 @@ def _chandrupatla(
 def _faces_on_the_level(
     function: LevelFunction, points: TetrahedronPoints, tets: Tetrahedra
 ) -> tuple[IntArray, FloatArray]:
-    """Faces of tetrahedra that have all corners on the level and different sides of the level
-    before and behind them; and the upward direction through each.
+    """Faces between two tetrahedra, with all three corners on the level, that separate its two
+    sides.
+
+    Returns:
+        The faces (k, 3), and vectors (k, 3) through them in the direction in which the function
+        rises.
 
     The side of a tetrahedron is that of its fourth corner or, if this is on the level too, of its
     center.
     """
-    on = points.is_on_level[tets.corners]
+    is_on = points.is_on_level[tets.corners]
     triples: list[IntArray] = []
     for k in range(4):
-        rows = np.flatnonzero(np.delete(on, k, axis=1).all(axis=1))
+        rows = np.flatnonzero(np.delete(is_on, k, axis=1).all(axis=1))
         face = np.sort(np.delete(tets.corners[rows], k, axis=1), axis=1)
         triples.append(np.column_stack([face, rows, np.full(len(rows), k)]))
     table = np.concatenate(triples)
     table = table[np.lexsort(table[:, 2::-1].T)]
-    twice = np.flatnonzero((table[1:, :3] == table[:-1, :3]).all(axis=1))
-    first, second, face = table[twice], table[twice + 1], table[twice, :3]
+    shared = np.flatnonzero((table[1:, :3] == table[:-1, :3]).all(axis=1))
+    first, second, face = table[shared], table[shared + 1], table[shared, :3]
     if not len(face):
         return np.zeros((0, 3), np.int64), np.zeros((0, 3))
     middle = _mean(points.points, face)
-    (before, low), (behind, high) = (
+    (before, f_before), (behind, f_behind) = (
         _side_sample(function, points, tets, row) for row in (first, second)
     )
     if function.period is None:
-        count = (high > 0).astype(np.int64) - (low > 0)
+        count = (f_behind > 0).astype(np.int64) - (f_before > 0)
     else:
         period = function.period
         value = function.values(middle)
         change = sum(
             sign
             * _integrate_change(function.field, side, middle, _wrap(value - start, period), period)
-            for sign, side, start in ((1, before, low), (-1, behind, high))
+            for sign, side, start in ((1, before, f_before), (-1, behind, f_behind))
         )
-        difference = np.remainder(low, period) + change - np.remainder(high, period)
+        difference = np.remainder(f_before, period) + change - np.remainder(f_behind, period)
         count = np.round(difference / period).astype(np.int64)
     rise = (behind - before) * np.sign(count)[:, None]
     return face[count != 0], rise[count != 0]
 
 
 def _wrap(change: FloatArray, period: float) -> FloatArray:
+    """A change, moved by whole periods into [-period/2, period/2]."""
     return change - period * np.round(change / period)
 
 
 def _side_sample(
-    function: LevelFunction, points: TetrahedronPoints, tets: Tetrahedra, rows: IntArray
+    function: LevelFunction, points: TetrahedronPoints, tets: Tetrahedra, table: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Points (n, 3) on one side of faces, and the values of the function at them."""
-    corners = tets.corners[rows[:, 3]]
-    apex = corners[np.arange(len(rows)), rows[:, 4]]
+    """Points (n, 3) in tetrahedra at faces, and the function (n,) there.
+
+    table: (n, 5) the three corners of each face, the index of a tetrahedron with this face, and
+        which of its corners is not on the face.
+
+    The point is that corner or, if it is on the level too, the center of the tetrahedron."""
+    corners = tets.corners[table[:, 3]]
+    apex = corners[np.arange(len(table)), table[:, 4]]
     side_points, value = points.points[apex], points.samples.value[apex]
     is_on = np.flatnonzero(points.is_on_level[apex])
     side_points[is_on] = points.points[corners[is_on]].mean(axis=1)

@@ -40,28 +40,28 @@ from harnack.meshing.lattice_meshing import TriangleMesh
 
 __all__ = ["CleanedMesh", "against_neighbors", "clean_and_fill", "weld_near_corners"]
 
-# The largest number of rings around holes that are removed; and the largest fraction of all
-# triangles that may be.
-_MAX_RINGS, _MAX_REMOVED_FRACTION = 6, 0.5
+# The largest number of rings of triangles that are removed around a hole; and the largest fraction
+# of all triangles that may be removed.
+_MOST_RINGS, _MAX_REMOVED_SHARE = 6, 0.5
 # If the ratio of open edges to triangles is larger than this, the triangles are loose.
 _MAX_OPEN_RATIO = 0.5
-# Corners of loose triangles that are nearer than one of these distances, relative to the usual
-# edge, are joined.
-_JOIN_DISTANCES = (0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3)
+# The distances, relative to the median edge length, that are tried for loose triangles: corners
+# nearer than the distance are joined.
+_WELD_DISTANCES = (0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3)
 
 
 @dataclass(frozen=True)
 class CleanedMesh:
     """A closed mesh in which the valid triangles of the input come first, bit by bit.
 
-    kept_faces: for each of the first faces, the index of the input face that it is, in order.
-    turned: which of these faces are reversed.
-    left_out: the number of input triangles that were removed, by reason.
-    holes: the number of filled holes.
-    """
+    surface: the mesh.
+    kept: (k,) for each of the first k faces, the index of the input face that it is; ascending.
+    turned: the indices of the input faces among these that are reversed in the mesh.
+    left_out: for each reason, the number of input triangles that were removed for it.
+    holes: the number of filled holes."""
 
     surface: TriangleMesh
-    kept_faces: IntArray
+    kept: IntArray
     turned: IntArray
     left_out: dict[str, int]
     holes: int
@@ -70,15 +70,15 @@ class CleanedMesh:
 def clean_and_fill(
     vertices: FloatArray, faces: IntArray, report: Callable[[str], None]
 ) -> CleanedMesh:
-    """The valid triangles of a mesh, with hole fillings in place of all others and over holes.
+    """Keep the valid triangles of a mesh, and put fillings in place of all others and over holes.
 
     Raises:
-        MeshingError: half of the triangles, or all, would be removed, or most of them are loose.
+        MeshingError: half of the triangles or more would be removed, or most of them are loose.
     """
     report("looking for triangles that are sound")
     state = _WorkingMesh.of(vertices, faces)
-    holes, why, min_faces = 0, "", _MAX_REMOVED_FRACTION * len(state.faces)
-    for ring in range(_MAX_RINGS):
+    holes, why, min_faces = 0, "", _MAX_REMOVED_SHARE * len(state.faces)
+    for ring in range(_MOST_RINGS):
         state = state.without_nonmanifold_edges()
         if not len(state.faces):
             raise MeshingError("none of its triangles is sound")
@@ -95,15 +95,20 @@ def clean_and_fill(
         state = state.without_ring(failing)
         if (state.source_face >= 0).sum() < min_faces:
             raise MeshingError(f"half of the triangles would be left out: {why}")
-    raise MeshingError(f"holes cannot be filled, even {_MAX_RINGS} rings wider: {why}")
+    raise MeshingError(f"holes cannot be filled, even {_MOST_RINGS} rings wider: {why}")
 
 
 def weld_near_corners(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray, float]:
-    """The vertices of loose triangles, with near corners moved to their mean: of several distances
-    the one that leaves the fewest edges open; the faces; and the largest move of a corner.
+    """Join near corners of loose triangles, by moving them to their mean.
+
+    Corners are near if they are closer than a certain distance. Several distances are tried, and
+    that which leaves the fewest edges open is used.
+
+    Returns:
+        The vertices (n, 3); the faces (m, 3); and the largest move of a corner, a length.
 
     Raises:
-        MeshingError: triangles are not loose, or most edges stay open.
+        MeshingError: the triangles are not loose, or most edges stay open.
     """
     points, index = np.unique(vertices[faces].reshape(-1, 3), axis=0, return_inverse=True)
     corners = np.asarray(index, np.int64).reshape(-1, 3)
@@ -112,7 +117,7 @@ def weld_near_corners(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray
     at = points[corners]
     usual = float(np.median(row_norms((at - np.roll(at, 1, axis=1)).reshape(-1, 3))))
     candidates: list[tuple[int, FloatArray, IntArray, float]] = []
-    for part in _JOIN_DISTANCES:
+    for part in _WELD_DISTANCES:
         group = connected_groups(pairs_within(points, part * usual), len(points))
         count = np.bincount(group)[:, None]
         mean = np.stack([np.bincount(group, column) for column in points.T], axis=1) / count
@@ -132,9 +137,12 @@ def weld_near_corners(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray
 
 @dataclass(frozen=True)
 class _WorkingMesh:
-    """Vertices, those of the input first; faces; for each face the index of the input face that it
-    is, or -1, and whether it is reversed. counts: the number of input faces that were removed, by
-    reason."""
+    """A mesh while it is cleaned, and where its faces come from.
+
+    vertices: (n, 3), those of the input first. faces: (m, 3).
+    source_face: (m,) the index of the input face that each face is; -1 for a face of a filling.
+    is_turned: (m,) whether the face has the reverse orientation of its input face.
+    counts: for each reason, the number of input faces that were removed for it."""
 
     vertices: FloatArray
     faces: IntArray
@@ -144,12 +152,13 @@ class _WorkingMesh:
 
     @classmethod
     def of(cls, vertices: FloatArray, faces: IntArray) -> _WorkingMesh:
-        """The faces that intersect no others, oriented."""
+        """The faces of a mesh that have an area and intersect no others; of duplicates one is kept.
+        Vertices at the same position count as one."""
         joined = weld_vertices(vertices)[faces]
-        every = np.arange(len(faces))
+        all_faces = np.arange(len(faces))
         corner = vertices[joined]
         area = row_norms(area_normals(corner))
-        rows = every[area > 0]
+        rows = all_faces[area > 0]
         reasons = ("flat", "doubled", "crossing", "branching", "one-sided", "around", "inside")
         counts = dict.fromkeys(reasons, 0) | {"flat": len(faces) - len(rows)}
         _, first = np.unique(np.sort(joined[rows], axis=1), axis=0, return_index=True)
@@ -160,18 +169,21 @@ class _WorkingMesh:
         rows = np.delete(rows, crossing)
         return cls(vertices, joined[rows], rows, np.zeros(len(rows), np.bool_), counts)
 
-    def keep_faces(self, rows: BoolArray, reason: str) -> _WorkingMesh:
-        """The mesh with only the faces `rows`; input faces that are removed are counted under
-        `reason`."""
-        lost = int((~rows & (self.source_face >= 0)).sum())
-        counts = self.counts | {reason: self.counts[reason] + lost}
+    def keep_faces(self, kept: BoolArray, reason: str) -> _WorkingMesh:
+        """The mesh with only the faces where the mask `kept` (m,) is set. Input faces that are
+        removed are counted under `reason`."""
+        removed = int((~kept & (self.source_face >= 0)).sum())
+        counts = self.counts | {reason: self.counts[reason] + removed}
         return _WorkingMesh(
-            self.vertices, self.faces[rows], self.source_face[rows], self.is_turned[rows], counts
+            self.vertices, self.faces[kept], self.source_face[kept], self.is_turned[kept], counts
         )
 
     def without_nonmanifold_edges(self) -> _WorkingMesh:
-        """The mesh without faces at edges of more than two faces; and oriented, without the faces
-        at edges where that is not possible."""
+        """The mesh with at most two faces at each edge, which agree in orientation.
+
+        Faces at edges of more faces are removed, and sheets that hang on the surface there
+        (`without_fins`). The other faces are oriented alike; those at edges where that is not
+        possible are removed too."""
         state = self.without_fins()
         edges = Edges.of(half_edges(state.faces))
         excess = np.asarray((edges.multiplicity > 2)[edges.edge_of_pair].reshape(3, -1).any(axis=0))
@@ -181,11 +193,9 @@ class _WorkingMesh:
         pairs = half_edges(oriented)
         edges = Edges.of(pairs)
         sign = np.where(pairs[:, 0] < pairs[:, 1], 1, -1)
-        sum_of = np.bincount(edges.edge_of_pair, sign, minlength=len(edges.multiplicity))
+        net = np.bincount(edges.edge_of_pair, sign, minlength=len(edges.multiplicity))
         one_sided = (
-            ((edges.multiplicity == 2) & (sum_of != 0))[edges.edge_of_pair]
-            .reshape(3, -1)
-            .any(axis=0)
+            ((edges.multiplicity == 2) & (net != 0))[edges.edge_of_pair].reshape(3, -1).any(axis=0)
         )
         state = _WorkingMesh(
             state.vertices, oriented, state.source_face, state.is_turned ^ turned, state.counts
@@ -193,9 +203,10 @@ class _WorkingMesh:
         return state.keep_faces(~np.asarray(one_sided), "one-sided")
 
     def without_fins(self) -> _WorkingMesh:
-        """The mesh without sheets that hang on a surface: of the pieces between edges of more than
-        two faces, pieces with open ends are removed, the smallest first, as long as there are such
-        edges. The largest piece stays."""
+        """The mesh without fins, sheets that hang on a surface along edges of more than two faces.
+
+        Such edges divide the mesh into pieces. As long as there are such edges, the smallest piece
+        that touches one and also has open edges is removed, but never the largest piece of all."""
         state = self
         while True:
             edges = Edges.of(half_edges(state.faces))
@@ -205,8 +216,8 @@ class _WorkingMesh:
             uses = edges.multiplicity[edges.edge_of_pair].reshape(3, -1)
             count = int(piece.max()) + 1
             branches, ends = (
-                np.bincount(piece, has.any(axis=0), minlength=count) > 0
-                for has in (uses > 2, uses == 1)
+                np.bincount(piece, is_marked.any(axis=0), minlength=count) > 0
+                for is_marked in (uses > 2, uses == 1)
             )
             area = np.bincount(piece, row_norms(area_normals(state.vertices[state.faces])))
             fins = np.flatnonzero(branches & ends & (area < area.max()))
@@ -215,8 +226,13 @@ class _WorkingMesh:
             state = state.keep_faces(piece != fins[area[fins].argmin()], "branching")
 
     def filled(self, loops: list[IntArray]) -> tuple[_WorkingMesh, list[IntArray], str]:
-        """The mesh with patches that pass the checks; the loops that are not filled, and the
-        reason."""
+        """Fill holes.
+
+        loops: the vertices around each hole.
+
+        Returns:
+            The mesh with the fillings that pass the checks; the loops that are not filled; and why.
+        """
         if not loops:
             return self, [], ""
         field = WindingNumber(self.vertices, self.faces)
@@ -234,56 +250,62 @@ class _WorkingMesh:
         return state, filling.unfilled_loops, filling.reason
 
     def without_ring(self, places: IntArray) -> _WorkingMesh:
-        """The mesh without the faces at the vertices `places`."""
+        """The mesh without the faces at these vertices. places: indices of vertices."""
         is_bad = np.zeros(len(self.vertices), np.bool_)
         is_bad[places] = True
         return self.keep_faces(~np.asarray(is_bad[self.faces].any(axis=1)), "around")
 
     def result(self, holes: int) -> CleanedMesh:
-        """The cleaned surface, input faces first.
+        """The cleaned surface: faces are oriented outwards, faces inside of the solid are dropped,
+        and input faces come first.
+
+        holes: the number of filled holes, which is passed on.
 
         Raises:
-            MeshingError: parts pass through each other.
+            MeshingError: the surface passes through itself.
         """
         last = len(self.vertices) + len(self.source_face)  # after all input faces
         order = np.argsort(np.where(self.source_face < 0, last, self.source_face), kind="stable")
         faces, source = self.faces[order], self.source_face[order]
         check_manifold(faces)
-        inwards = faces_to_flip(TriangleMesh(self.vertices, faces))
-        faces = np.where(inwards[:, None], faces[:, ::-1], faces)
+        is_flipped = faces_to_flip(TriangleMesh(self.vertices, faces))
+        faces = np.where(is_flipped[:, None], faces[:, ::-1], faces)
         mesh = TriangleMesh(self.vertices, faces)
         shells = Shells.of(mesh)
         if passes_itself(mesh, shells.component_of_face):
             raise MeshingError("it passes through itself along edges that lie on faces")
-        bounds = shells.bound()
-        lost = int((source[~bounds] >= 0).sum())
+        is_outer = shells.bound()
+        dropped = int((source[~is_outer] >= 0).sum())
         faces, source, is_turned = (
-            faces[bounds],
-            source[bounds],
-            (self.is_turned[order] ^ inwards)[bounds],
+            faces[is_outer],
+            source[is_outer],
+            (self.is_turned[order] ^ is_flipped)[is_outer],
         )
         turned = source[is_turned & (source >= 0)]
         surface = TriangleMesh.without_unused_vertices(self.vertices, faces)
-        counts = self.counts | {"inside": lost}
+        counts = self.counts | {"inside": dropped}
         return CleanedMesh(surface, source[source >= 0], turned, counts, holes)
 
 
 def _pieces(edges: Edges, count: int) -> IntArray:
-    """(m,) the piece that each of `count` faces belongs to, where edges of two faces join faces to
-    pieces. edges: of `half_edges`."""
+    """(m,) the number of the piece that each face belongs to. Faces belong to one piece if a chain
+    of faces connects them, in which neighbors share an edge of exactly two faces.
+
+    edges: of all `half_edges`. count: the number of faces, m."""
     import scipy.sparse  # imported here: it takes half a second
     import scipy.sparse.csgraph as csgraph_module
 
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
     first, second = edges.paired_half_edges().T % count
-    joined = sparse.coo_matrix((np.ones(len(first)), (first, second)), shape=(count, count))
-    return np.asarray(csgraph.connected_components(joined, directed=False)[1], np.int64)
+    adjacency = sparse.coo_matrix((np.ones(len(first)), (first, second)), shape=(count, count))
+    return np.asarray(csgraph.connected_components(adjacency, directed=False)[1], np.int64)
 
 
 def against_neighbors(x: FloatArray, faces: IntArray) -> BoolArray:
-    """(m,) which faces are to be turned over so that all faces that share an edge of two faces
-    agree: in each connected part those of the orientation with the smaller area. Parts with only
-    one side are left as they are."""
+    """(m,) which faces to reverse so that faces that share an edge agree in orientation.
+
+    In each connected part of the surface, one orientation is chosen: the one in which faces with
+    the larger area are already. Parts with only one side are left as they are."""
     m, part = len(faces), orientation_components(faces)
     corner = x[faces]
     area = row_norms(area_normals(corner))

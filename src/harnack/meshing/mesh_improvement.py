@@ -1,16 +1,16 @@
 """Better triangles: edges flipped, slivers contracted, vertices moved along the surface.
 
-Flips. Two triangles (a, b, c) and (b, a, d) become (c, d, b) and (d, c, a) where that makes the
-smaller of their least angles larger, where the new edge is within the tolerance of the surface, and
-where the new triangles face the way the surface does.
+Flips. Two triangles (a, b, c) and (b, a, d) become (c, d, b) and (d, c, a) if that makes the
+smallest of their angles larger, if the new edge is within the tolerance of the level set, and if
+the new triangles face along the gradient.
 
 Contractions. The ends of a sliver's shortest edge are merged: see `collapse_slivers`.
 
-Moves. Means of neighbors, to which `smoothed` moves vertices, make thin triangles where lengths of
-edges change quickly, as beside long boundary edges that cannot be cut. Here several positions are
-tried for each vertex of a thin triangle, and it moves to the best of them if the least angle of all
-triangles around it grows. No two neighbors move at once, so that the measured angles are those of
-the new mesh: the least angle around a moved vertex never falls.
+Moves. `refinement.smooth` moves vertices to the means of their neighbors. That makes thin triangles
+where the lengths of edges change quickly, as beside long boundary edges that cannot be split. Here
+several positions are tried for each vertex of a thin triangle, and it moves to the best of them if
+the smallest angle of all triangles around it grows. No two neighbors move at once. So the measured
+angles are the angles of the new mesh, and the smallest angle around a moved vertex never falls.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ from harnack.meshing.level_function import LevelFunction
 
 __all__ = ["collapse_slivers", "flip_edges", "least_angles", "relax_vertices"]
 
-# The smallest growth of a least angle: of its cosine in flips, in radians in moves; and the
-# smallest cosine between normals of a triangle before and after, and between its normal and the
-# gradient.
+# A flip has to lower the cosine of the smallest angle by more than the first, a move has to raise
+# the smallest angle by more than it, in radians. The second is the smallest cosine between the
+# normals of a triangle before and after, and between its normal and the gradient.
 _GAIN = 0.01
 _FACING = 0.5
-_MAX_ROUNDS_OF_FLIPS = 12
+_MOST_ROUNDS_OF_FLIPS = 12
 # Triangles with a smaller angle, in radians, are slivers: 4 degrees.
 _SLIVER = 0.07
 # The smallest cosine between normals of the triangles around a contracted edge and the gradient.
@@ -53,15 +53,14 @@ def flip_edges(
     faces: IntArray,
     tolerance: float,
 ) -> IntArray:
-    """Faces after rounds of flips, each of which improves the two triangles at its edge; of several
-    flips of one triangle only the best is done.
+    """Faces (m, 3) after rounds of flips. Each flip makes the smaller of the smallest angles of two
+    triangles larger; of several flips of a triangle, only the best is done.
 
-    tolerance: how far the middles of new edges, and the centers of new triangles, may be from the
-        surface, estimated by the slope there.
-    """
+    tolerance: a length, the largest distance of the midpoints of new edges and of the centers of
+        new triangles from the level set, estimated by the gradient there."""
     refused = np.zeros(0, np.int64)
     boundary = edge_keys(boundary_edges(faces), len(vertices))
-    for _ in range(_MAX_ROUNDS_OF_FLIPS):
+    for _ in range(_MOST_ROUNDS_OF_FLIPS):
         pairs, quads = _quadrilaterals(faces)
         a, b, c, d = quads.T
         before = least_angles(vertices, faces)[pairs].min(axis=1)
@@ -73,7 +72,7 @@ def flip_edges(
         useful = gain > _GAIN
         useful[useful] = ~np.isin(key[useful], refused)
         used_keys = sorted_unique(edge_keys(quads[:, :2], count))
-        useful[useful] = ~_holds(used_keys, key[useful]) & ~np.isin(key[useful], boundary)
+        useful[useful] = ~_are_among(used_keys, key[useful]) & ~np.isin(key[useful], boundary)
         rows = _independent_flips(np.flatnonzero(useful), gain, pairs, key, len(faces))
         if not len(rows):
             break
@@ -86,8 +85,13 @@ def flip_edges(
 
 
 def _quadrilaterals(faces: IntArray) -> tuple[IntArray, IntArray]:
-    """Pairs (k, 2) of faces with a common edge, and their corners (k, 4): the edge (a, b) as the
-    first runs it, and the third corners of both."""
+    """The pairs of faces that share an edge.
+
+    Returns:
+        The indices (k, 2) of the two faces; and the corners (k, 4) of the quadrilateral that they
+        form: the ends of the shared edge, in the direction of the first face, and the third corners
+        of the first and of the second face.
+    """
     edges, count = half_edges(faces), int(faces.max()) + 1
     keys = edge_keys(edges, count)
     order = np.argsort(keys, kind="stable")
@@ -100,15 +104,19 @@ def _quadrilaterals(faces: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def _independent_flips(
-    rows: IntArray, gain: FloatArray, pairs: IntArray, key: IntArray, count: int
+    rows: IntArray, gain: FloatArray, pairs: IntArray, key: IntArray, face_count: int
 ) -> IntArray:
-    """The candidates that are the best of both their faces, and the only ones of their edge."""
+    """Choose flips that do not interfere: each is the best of all that change either of its two
+    faces, and no two make the same edge.
+
+    rows: (k,) the candidates, indices of pairs of faces. gain: (n,) of all pairs.
+    pairs: (n, 2) the two faces of each pair. key: (n,) a number of the new edge of each."""
     rows = rows[np.argsort(-gain[rows], kind="stable")]
     rank = np.arange(len(rows))
-    first = np.full(count, len(rows))
+    best_rank = np.full(face_count, len(rows))
     for k in (0, 1):
-        np.minimum.at(first, pairs[rows, k], rank)
-    best = (first[pairs[rows]] == rank[:, None]).all(axis=1)
+        np.minimum.at(best_rank, pairs[rows, k], rank)
+    best = (best_rank[pairs[rows]] == rank[:, None]).all(axis=1)
     rows = rows[best]
     return rows[np.unique(key[rows], return_index=True)[1]]
 
@@ -116,27 +124,30 @@ def _independent_flips(
 def _flips_stay_near(
     function: LevelFunction, vertices: FloatArray, new: IntArray, tolerance: float
 ) -> BoolArray:
-    """(k,) whether both new triangles (k, 2, 3) are near the surface and face the way it does."""
+    """(k,) whether flips keep the surface. new: (k, 2, 3) the two new triangles of each flip.
+
+    The middle of the new edge and the centers of both triangles have to be within `tolerance` of
+    the level set, by the gradient there, and both triangles have to face along the gradient."""
     corner = vertices[new]  # (k, 2, 3, 3)
     normal = np.cross(corner[:, :, 1] - corner[:, :, 0], corner[:, :, 2] - corner[:, :, 0])
     middle = corner[:, 0, :2].mean(axis=1)
     points = np.concatenate([middle, *corner.mean(axis=2).transpose(1, 0, 2)])
     samples = function.sample(points)
-    near = (samples.distance <= tolerance).reshape(3, -1).all(axis=0)
-    slope = samples.gradient.reshape(3, -1, 3)[1:].transpose(1, 0, 2)
-    size = np.linalg.norm(normal, axis=2) * np.linalg.norm(slope, axis=2)
-    facing = ((normal * slope).sum(axis=2) > _FACING * size).all(axis=1)
-    return near & facing
+    is_near = (samples.distance <= tolerance).reshape(3, -1).all(axis=0)
+    gradient = samples.gradient.reshape(3, -1, 3)[1:].transpose(1, 0, 2)
+    size = np.linalg.norm(normal, axis=2) * np.linalg.norm(gradient, axis=2)
+    faces_along = ((normal * gradient).sum(axis=2) > _FACING * size).all(axis=1)
+    return is_near & faces_along
 
 
-def _holds(numbers: IntArray, keys: IntArray) -> BoolArray:
-    """(k,) whether the keys (k,) are among ascending numbers (n,)."""
+def _are_among(numbers: IntArray, keys: IntArray) -> BoolArray:
+    """(k,) whether each key (k,) is among the numbers (n,), which are in ascending order."""
     at = np.searchsorted(numbers, keys)
     return numbers[np.minimum(at, len(numbers) - 1)] == keys if len(numbers) else at < 0
 
 
 def least_angles(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """(m,) the least angle of each triangle, in radians; 0 for a triangle without an area."""
+    """(m,) the smallest angle of each triangle, in radians; 0 for a triangle without an area."""
     corner = vertices[faces]
     side = np.stack([corner[:, (k + 2) % 3] - corner[:, (k + 1) % 3] for k in range(3)], axis=1)
     square = np.einsum("ijk,ijk->ij", side, side)
@@ -154,13 +165,15 @@ def collapse_slivers(
     fixed: BoolArray,
     tolerance: float,
 ) -> IntArray:
-    """Faces without slivers whose shortest edge can be contracted to one of its ends.
+    """The faces without the slivers whose shortest edge can be contracted to one of its ends.
 
-    An edge (u, v) can be contracted to u without a change of topology if u and v have only the two
-    neighbors in common that are the third corners of its faces (the link condition), and v is not
-    `fixed` (n,), as boundary vertices are. It is contracted if no new triangle is a sliver, all
-    face the way that the surface does, and their centers are within `tolerance` of it.
-    """
+    fixed: (n,) which vertices may not be removed, as those of the boundary.
+    tolerance: a length, the largest distance of the centers of new triangles from the level set.
+
+    An edge (u, v) can be contracted to u without a change of topology if v is not fixed and if u
+    and v have only two neighbors in common, the third corners of the edge's two faces (the link
+    condition). It is contracted if no new triangle is a sliver, and if all of them face along the
+    gradient and are near the level set."""
     slivers = np.flatnonzero(least_angles(vertices, faces) < _SLIVER)
     is_removed = np.zeros(len(faces), np.bool_)
     faces = faces.copy()
@@ -179,7 +192,7 @@ def collapse_slivers(
             if not _can_contract(faces[~is_removed], target, source):
                 continue
             new = np.where(faces[star[~beside]] == source, target, faces[star[~beside]])
-            if _are_valid_triangles(function, vertices, new, tolerance):
+            if _is_good(function, vertices, new, tolerance):
                 faces[star[~beside]] = new
                 is_removed[star[beside]] = True
                 break
@@ -187,31 +200,34 @@ def collapse_slivers(
 
 
 def _can_contract(faces: IntArray, target: int, source: int) -> bool:
-    """Whether an edge with two faces satisfies the link condition."""
+    """Whether the edge between two vertices has two faces and satisfies the link condition
+    (`collapse_slivers`)."""
     target_faces, source_faces = (faces[(faces == v).any(axis=1)] for v in (target, source))
     common = np.setdiff1d(np.intersect1d(target_faces, source_faces), [target, source])
     beside = source_faces[(source_faces == target).any(axis=1)]
     return len(beside) == 2 and np.array_equal(common, np.setdiff1d(beside, [target, source]))
 
 
-def _are_valid_triangles(
+def _is_good(
     function: LevelFunction, vertices: FloatArray, new: IntArray, tolerance: float
 ) -> bool:
+    """Whether all new triangles are good: each faces along the gradient, its center is within
+    `tolerance` of the level set, and it is no sliver. new: (k, 3)."""
     corner = vertices[new]
     normal = area_normals(corner)
     samples = function.sample(corner.mean(axis=1))
     size = row_norms(normal) * row_norms(samples.gradient)
-    facing = row_dots(normal, samples.gradient) > _MIN_COLLAPSE_COSINE * size
-    near = samples.distance <= tolerance
-    return bool((facing & near & (least_angles(vertices, new) > _SLIVER)).all())
+    faces_along = row_dots(normal, samples.gradient) > _MIN_COLLAPSE_COSINE * size
+    is_near = samples.distance <= tolerance
+    return bool((faces_along & is_near & (least_angles(vertices, new) > _SLIVER)).all())
 
 
 Walls = tuple[FloatArray, FloatArray] | None
 # Triangles with a smaller angle are thin, in radians: 30 degrees.
 _THIN = 0.52
-_MAX_ROUNDS_OF_MOVES = 6
-# The fractions of the displacement to each aim that are tried.
-_PARTS = (1.0, 0.5)
+_MOST_ROUNDS_OF_MOVES = 6
+# A vertex is tried at these fractions of the way to each target.
+_MOVE_FRACTIONS = (1.0, 0.5)
 
 
 def relax_vertices(
@@ -221,22 +237,23 @@ def relax_vertices(
     tolerance: float,
     walls: Walls,
 ) -> FloatArray:
-    """Vertices (n, 3), moved where that makes the least angles of triangles larger; boundary
+    """Vertices (n, 3), moved where that makes the smallest angle around them larger. Boundary
     vertices stay.
 
-    tolerance: how far the centers of triangles around moved vertices may be from the surface.
-    """
+    tolerance: a length, the largest distance of the centers of triangles around moved vertices from
+        the level set.
+    walls: the lower and the upper corner of the box, on whose faces points stay; or None."""
     fixed = np.zeros(len(vertices), np.bool_)
     fixed[boundary_edges(faces)] = True
     vertices = vertices.copy()
-    for _ in range(_MAX_ROUNDS_OF_MOVES):
+    for _ in range(_MOST_ROUNDS_OF_MOVES):
         angles = least_angles(vertices, faces)
         thin = np.unique(faces[angles < _THIN])
         stars = _VertexStars.of(faces, thin[~fixed[thin]], len(vertices))
         if not len(stars.centers):
             break
         before = stars.least(angles[stars.face])
-        moved, after = _best_positions(function, vertices, faces, stars, walls)
+        moved, after = _best_places(function, vertices, faces, stars, walls)
         gain = after - before
         rows = _independent_moves(np.flatnonzero(gain > _GAIN), gain, stars, faces, len(vertices))
         rows = rows[_moves_stay_near(function, vertices, faces, stars, moved, rows, tolerance)]
@@ -248,8 +265,13 @@ def relax_vertices(
 
 @dataclass(frozen=True)
 class _VertexStars:
-    """Faces around vertices: the vertices, centers (k,), and pairs of a vertex, owner (p,), and a
-    face, face (p,), with the corners of that face, corners (p, 3), the center first."""
+    """The faces around some vertices.
+
+    centers: (k,) the vertices.
+    owner: (p,) for each pair of such a vertex and a face around it, the vertex, as an index of
+        `centers`.
+    face: (p,) the face of each pair.
+    corners: (p, 3) the corners of that face, the vertex first."""
 
     centers: IntArray
     owner: IntArray
@@ -258,6 +280,7 @@ class _VertexStars:
 
     @classmethod
     def of(cls, faces: IntArray, centers: IntArray, count: int) -> _VertexStars:
+        """The stars of the vertices `centers` (k,) in a mesh. count: the number of all vertices."""
         index = np.full(count, -1, np.int64)
         index[centers] = np.arange(len(centers))
         face, column = np.nonzero(index[faces] >= 0)
@@ -265,13 +288,13 @@ class _VertexStars:
         return cls(centers, index[corners[:, 0]], face, corners)
 
     def least(self, of_pairs: FloatArray) -> FloatArray:
-        """(k,) the least of numbers (p,) around each vertex."""
+        """(k,) the smallest of the numbers (p,) of the pairs of each vertex."""
         smallest = np.full(len(self.centers), np.inf)
         np.minimum.at(smallest, self.owner, of_pairs)
         return smallest
 
     def mean(self, of_pairs: FloatArray) -> FloatArray:
-        """(k, 3) means of vectors (p, 3) around each vertex."""
+        """(k, 3) the mean of the vectors (p, 3) of the pairs of each vertex."""
         count = np.bincount(self.owner, minlength=len(self.centers))
         sums = [
             np.bincount(self.owner, of_pairs[:, axis], minlength=len(self.centers))
@@ -280,14 +303,24 @@ class _VertexStars:
         return np.stack(sums, axis=1) / count[:, None]
 
 
-def _best_positions(
+def _best_places(
     function: LevelFunction,
     vertices: FloatArray,
     faces: IntArray,
     stars: _VertexStars,
     walls: Walls,
 ) -> tuple[FloatArray, FloatArray]:
-    """The best positions (k, 3) of vertices, and the least angle around each vertex there (k,)."""
+    """Find good positions for the vertices of stars.
+
+    Targets for a vertex are: the mean of the positions at which one of its triangles would be
+    equilateral; the mean of the midpoints of the edges opposite to it; the mean of these two; and
+    the position at which its thinnest triangle would be equilateral. The vertex is tried at half of
+    the way and at all of the way to each.
+
+    Returns:
+        The position (k, 3) where the smallest angle around the vertex is largest, moved onto the
+        level set; and that smallest angle (k,) there.
+    """
     center, a, b = (vertices[stars.corners[:, k]] for k in range(3))
     normal = np.cross(a - center, b - center)
     normal /= np.maximum(row_norms(normal), 1e-300)[:, None]
@@ -295,18 +328,18 @@ def _best_positions(
     # The position at which the triangle over the opposite edge has equal sides.
     apex = middle + np.sqrt(0.75) * np.cross(normal, b - a)
     start = vertices[stars.centers]
-    aims = [stars.mean(apex), stars.mean(middle), 0.5 * (stars.mean(apex) + stars.mean(middle))]
+    targets = [stars.mean(apex), stars.mean(middle), 0.5 * (stars.mean(apex) + stars.mean(middle))]
     angles = least_angles(vertices, faces[stars.face])
-    thinnest = angles <= stars.least(angles)[stars.owner]
-    aims.append(start.copy())
-    aims[-1][stars.owner[thinnest]] = apex[thinnest]
+    is_thinnest = angles <= stars.least(angles)[stars.owner]
+    targets.append(start.copy())
+    targets[-1][stars.owner[is_thinnest]] = apex[is_thinnest]
     best, best_angle = start.copy(), np.full(len(start), -np.inf)
-    for aim in aims:
-        for part in _PARTS:
-            x = start + part * (aim - start)
+    for target in targets:
+        for fraction in _MOVE_FRACTIONS:
+            x = start + fraction * (target - start)
             angle = _least_at(x, stars, a, b, normal)
-            better = angle > best_angle
-            best[better], best_angle[better] = x[better], angle[better]
+            is_better = angle > best_angle
+            best[is_better], best_angle[is_better] = x[is_better], angle[is_better]
     # Only the best position is moved onto the surface, which changes it little: the aims are near
     # it.
     span = row_norms(best - start) + 1e-300
@@ -315,31 +348,33 @@ def _best_positions(
 
 
 def _least_at(
-    x: FloatArray, stars: _VertexStars, a: FloatArray, b: FloatArray, normal: FloatArray
+    positions: FloatArray, stars: _VertexStars, a: FloatArray, b: FloatArray, normal: FloatArray
 ) -> FloatArray:
-    """(k,) the least angle around vertices if they are at x (k, 3); -1 where a triangle turns.
+    """(k,) the smallest angle around the vertices of stars if they are at `positions` (k, 3); -1
+    where a triangle turns by more than 60 degrees.
 
-    a, b, normal: (p, 3) the other corners of each pair's face, and its unit normal.
-    """
-    apex = x[stars.owner]
-    cross = np.cross(a - apex, b - apex)
+    a, b: (p, 3) the other two corners of the face of each pair. normal: (p, 3) its unit normal."""
+    center = positions[stars.owner]
+    cross = np.cross(a - center, b - center)
     size = row_norms(cross)
-    corner = np.stack([apex, a, b], axis=1)
+    corner = np.stack([center, a, b], axis=1)
     angles = least_angles(corner.reshape(-1, 3), np.arange(3 * len(a)).reshape(-1, 3))
     facing = row_dots(cross, normal) > _FACING * size
     return stars.least(np.where(facing, angles, -1.0))
 
 
 def _independent_moves(
-    rows: IntArray, gain: FloatArray, stars: _VertexStars, faces: IntArray, count: int
+    rows: IntArray, gain: FloatArray, stars: _VertexStars, faces: IntArray, vertex_count: int
 ) -> IntArray:
-    """The vertices that gain more than all their neighbors."""
-    rank = np.full(count, len(rows))
+    """Choose the vertices that gain more than all candidates among their neighbors.
+
+    rows: (j,) the candidates, indices of `stars.centers`. gain: (k,) of all stars."""
+    rank = np.full(vertex_count, len(rows))
     ordered = rows[np.argsort(-gain[rows], kind="stable")]
     rank[stars.centers[ordered]] = np.arange(len(rows))
-    first = np.full(len(stars.centers), len(rows))
-    np.minimum.at(first, stars.owner, rank[stars.corners].min(axis=1))
-    return rows[first[rows] == rank[stars.centers[rows]]]
+    best_rank = np.full(len(stars.centers), len(rows))
+    np.minimum.at(best_rank, stars.owner, rank[stars.corners].min(axis=1))
+    return rows[best_rank[rows] == rank[stars.centers[rows]]]
 
 
 def _moves_stay_near(
@@ -351,8 +386,12 @@ def _moves_stay_near(
     rows: IntArray,
     tolerance: float,
 ) -> BoolArray:
-    """(k,) whether the vertices `rows`, at their targets, are on the surface, and the triangles
-    around them near it, facing the way it does."""
+    """(j,) whether the vertices `rows` (j,) of stars may move to their targets.
+
+    targets: (k, 3) for all stars.
+
+    A target has to be on the level set, the centers of the triangles around it within `tolerance`
+    of the level set, and the triangles have to face along the gradient."""
     moved = np.zeros(len(stars.centers), np.bool_)
     moved[rows] = True
     pairs = np.flatnonzero(moved[stars.owner])

@@ -15,7 +15,7 @@ from harnack.fields.field import check_is_field
 from harnack.fields.solid_angles.dipole import DipolePotential
 from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.fields.solid_angles.winding_number import WindingNumber
-from harnack.geometry import Box, Volume
+from harnack.geometry import Box, Volume, VolumeIntersection
 from harnack.meshing.bcc_lattice import BccLattice
 from harnack.meshing.checks import (
     EmptySurfaceError,
@@ -60,7 +60,6 @@ from harnack.meshing.sign_isosurface import (
 )
 from harnack.progress import teller
 from harnack.tracer import Surface
-from harnack.tracer.surface import intersection_of
 from harnack.tracer.trace_options import SURFACE_OPTIONS, shows_keywords, surface_and_options
 
 if TYPE_CHECKING:
@@ -77,13 +76,15 @@ __all__ = ["mesh"]
 
 _HONORED = (*SURFACE_OPTIONS, "tolerance")
 
-# Cells across the level set, unless a spacing is given; curves have their own length besides.
-_ACROSS = 24
+# The number of cells across the level set and the largest number of attempts, each with smaller
+# cells, unless a cell size is given; then the same for meshing by signs.
+_CELLS_ACROSS = 24
 _MAX_ATTEMPTS = 4
-_ACROSS_BY_SIGNS, _ATTEMPTS_BY_SIGNS = 48, 2
-# The margin around an extent, and around a curve whose surface has none, as a fraction of the size.
+_SIGN_CELLS, _SIGN_ATTEMPTS = 48, 2
+# The margin of the box around a level set that has an extent, and of the box around a curve whose
+# surface has none, as fractions of the box's size.
 _MARGIN = 0.01
-_ROOM = 0.05
+_CURVE_MARGIN = 0.05
 
 
 @shows_keywords(*_HONORED)
@@ -101,86 +102,106 @@ def mesh(
 ) -> trimesh.Trimesh:
     """Triangles of a level set, or the closed surface of a solid.
 
-    Tetrahedra around the level set, found by an octree whose empty cells are proved empty, are cut
-    by it; the surface of an angle ends exactly at its curve. Then edges are cut and vertices moved
-    onto the surface until middles of edges and centers of triangles are within the tolerance.
-    Solids are put together from the meshes of smooth levels by manifold3d, and so cut by the clip.
+    How it is meshed depends on the field:
 
-    Fields that are sums over meshes, points and blobs (`WindingNumber`, `DipolePotential`,
-    `ScreenedWindingNumber`, `Morph`, `HRBF`, `Blobs`) are meshed by the signs of their values alone
-    (`meshing.sign_isosurface`), which gives a closed surface whatever the mesh or the cloud is.
-    Vertices lie where edges of the cells meet the level, so on the very triangles of a sound mesh;
-    parts that are thinner or nearer to each other than a cell may be missed or joined, which is
-    looked for at about three thousand points of the level (`meshing.lost_parts`) and warned of. Of
-    a mesh that is its own spanning surface (`WindingNumber`), such as a file of a `SolidAngle`'s,
-    the triangles are kept as they are, whatever tolerance, spacing and seed are.
+    - Smooth fields and angles. An octree finds the tetrahedra around the level set; cells are left
+      out only if they are proved empty. The level set cuts the tetrahedra into triangles; the
+      surface of an angle ends exactly at its curve. Then edges are split and vertices moved onto
+      the surface, until the midpoints of edges and the centers of triangles are within the
+      tolerance.
+    - Solids. The meshes of smooth levels are put together by manifold3d, which also cuts them by
+      the clip.
+    - Sums over meshes, points and blobs (`WindingNumber`, `DipolePotential`,
+      `ScreenedWindingNumber`, `Morph`, `HRBF`, `Blobs`). They are meshed by the signs of their
+      values alone (`meshing.sign_isosurface`), which gives a closed surface whatever the mesh or
+      the cloud is. Vertices lie where edges of the cells meet the level set, so on the triangles of
+      a valid mesh themselves. Parts that are thinner than a cell, or nearer to each other, may be
+      missed or joined. That is looked for at about three thousand points of the level set
+      (`meshing.lost_parts`), and a warning says so.
+    - A `WindingNumber` of a mesh that is its own spanning surface, such as a mesh of a
+      `SolidAngle`. The triangles are kept as they are, whatever the tolerance, cell size and seed
+      are.
 
-    surface: a field or a `Surface`; of a `SolidAngle` of polygons, or a real-valued field that is
-        continuous, or one of those named above; of one level, but for side="between". Surfaces end
-        where clip, section or the field's domain cut them, and solids (`side`) are closed there. A
-        clip is needed where the level set has no extent. The points of a `Solid` are those with
-        f <= level, unless side="surface" asks for the level set alone, which is open where it is
-        cut. `largest` keeps one connected component alone: of a surface the one with the largest
-        area, of a closed mesh the one with the largest volume, whose cavities stay.
-    cell_size: of cells before anything is refined, in the field's unit; None chooses a 24th of the
-        longest side (by signs a 48th), and of waves (`Field.min_wavelength`) a fifth of theirs at
-        the most. Sheets that are nearer to each other are told apart where that is noticed; else a
-        MeshingError says so.
-    thickness: makes a closed part so thick, in the field's unit, of a surface: half on each side.
-    simplify: leave out vertices that are not needed within the tolerance, of closed meshes: of the
-        mesh that is made without it, whose middles of edges are within half of the tolerance.
+    surface: a field or a `Surface`. The field is a `SolidAngle` of polygons, a continuous
+        real-valued field, or one of those named above. There is one level, except with
+        side="between". Surfaces end where the clip, the section or the field's domain cuts them;
+        solids (`side`) are closed there. A clip is needed if the level set has no extent. The
+        points of a `Solid` are those with f <= level, unless side="surface" asks for the level set
+        alone, which is open where it is cut. `largest` keeps a single connected component: the one
+        with the largest area of a surface, and the one with the largest volume, with its cavities,
+        of a closed mesh.
+    cell_size: the size of cells before refinement, in the field's unit. None chooses a 24th of the
+        longest side of the box (a 48th for meshing by signs), and at most a fifth of the length of
+        waves (`Field.min_wavelength`). Sheets that are nearer to each other are told apart where
+        that is noticed; otherwise a MeshingError says so.
+    thickness: makes a closed part with this thickness of a surface, in the field's unit: half of it
+        on each side.
+    simplify: whether to remove vertices that are not needed within the tolerance; for closed
+        meshes. The mesh that is simplified has midpoints of edges within half of the tolerance.
     seed: of the small random moves that keep points in general position.
-    max_triangles: of one level set, before anything is simplified; what would take more is not
-        begun or given up, with a MeshingError. Cells are limited with them, to two millions.
-    progress: called with the name of each step of the work.
-    options: a `TraceOptions`, of which meshes have the tolerance alone: the largest distance of
-        triangles from the surface, sampled and not proved; None for 1e-3 of the longest side of the
-        level set's box.
-    keywords: those of `Surface` beside a bare field, and `tolerance` in place of `options`.
+    max_triangles: the largest number of triangles of one level set, before it is simplified. A mesh
+        that would take more is not begun, or given up, with a MeshingError. It limits the number of
+        cells too, as does a fixed limit of two million.
+    progress: a function that is told what is being done.
+    options: a `TraceOptions`. Meshes use only its tolerance: the largest distance of triangles from
+        the surface, which is sampled and not proved; None for 1e-3 of the longest side of the level
+        set's box.
+    keywords: the keywords of `Surface`, if `surface` is a field; and `tolerance` in place of
+        `options`.
 
-    All that is returned has been checked: every edge has two faces, or one at the boundary, no two
-    triangles pass through each other, vertices and centers of triangles are within the tolerance of
-    the level by samples of the field, and inside the clip (of a thick part, the surface that it is
-    made of). Else a MeshingError is raised. By signs all is checked but the last: if more than one
-    in a hundred vertices and centers are beyond the tolerance, smaller cells are tried; if that is
-    not enough, a warning says how many there are and how far they are; and a MeshingError if some
-    are farther than a few cells. The same is done and said where parts of the level set are lost.
+    The result has been checked, and a MeshingError is raised if a check fails: every edge has two
+    faces, or one at the boundary; no two triangles pass through each other; and vertices and
+    centers of triangles are within the tolerance of the level set, by samples of the field, and
+    inside the clip (for a thickened surface, those of the surface before). For meshing by signs,
+    the last check differs. If more than one in a hundred vertices and centers are farther than the
+    tolerance, smaller cells are tried. If that is not enough, a warning says how many there are and
+    how far they are; if some are farther than a few cells, a MeshingError is raised. Smaller cells
+    are also tried, and a warning given, where parts of the level set are lost.
 
     Returns:
-        A trimesh.Trimesh; if it is closed, `export` writes closed files, in single precision, or
-        raises a MeshingError. Vertices of a curve come first, in order, bit by bit, and its edges
-        are the boundary. Without a boundary, faces are turned outwards: the volume is positive;
-        else they are turned towards larger values. `metadata["harnack"]` has level, spacing,
-        evaluations, the Euler characteristic,
-        boundary: indices (k, 2) of edges of one face,
-        creases: how many edges have faces more than 30 degrees apart: a function with kinks, such
-            as |x| or max(f, g), has them where its level set does. That these are within the
-            tolerance is checked at middles of edges and triangles; nothing is proved there; and
-        proved, integrated: how many changes along edges of tetrahedra are proved to be differences
-            of wrapped values, and how many were integrated;
-        isotopy, isotopy_far: the shares of tetrahedra on which the first triangles are proved to
-            have the topology of the level set (`meshing.isotopy`), of all and of those farther than
-            1.5 times the spacing from the curve;
-        turned: triangles of an angle, smaller than the tolerance, that are turned over.
-        Of meshes by signs, made_by is "signs", and
-        far, looked_at, within: how many vertices and centers of triangles are beyond the tolerance,
-            of how many, and a distance within which all are, sampled up to a factor of 2;
-        lost, sought: how many points of the level are beyond the tolerance from the mesh, of how
-            many: on triangles of a mesh, at points of a cloud, on the way out of blobs;
-        undecided: at how many points of the lattice the error of f leaves its sign open;
-        flat: how many triangles were not fitted to creases, as they would pass through others;
-        Where the triangles of a mesh were kept, made_by is "faces", and there is none of
-        this.
-        cloud: of a `DipolePotential`, the result of `describe`, such as the number of points, the
-            estimated quantities, the chosen smoothing and the noise.
+        A trimesh.Trimesh. If it is closed, its `export` writes closed files, in single precision,
+        or raises a MeshingError. Vertices of a curve come first, in order, bit by bit, and the
+        edges of the curve are the boundary. Without a boundary, faces are turned outwards, so that
+        the volume is positive; otherwise they are turned towards larger values.
+        `metadata["harnack"]` has level, spacing (the size of cells), evaluations, the Euler
+        characteristic, and
 
-        Solids and thick surfaces have more: see `docs/printing.md`.
+        boundary: (k, 2) the vertices of the edges of one face;
+        creases: the number of edges whose faces are more than 30 degrees apart. A function with
+            kinks, such as |x| or max(f, g), has such edges where its level set does. Whether these
+            are within the tolerance is checked at midpoints of edges and centers of triangles, and
+            not proved;
+        proved, integrated: the number of edges of tetrahedra along which the change of the function
+            is proved to be the difference of wrapped values, and of those along which it was
+            integrated;
+        isotopy, isotopy_far: the fraction of the tetrahedra on which the first triangles are proved
+            to have the topology of the level set (`meshing.isotopy`); the same among the tetrahedra
+            farther than 1.5 times the spacing from the curve;
+        turned: the number of triangles of an angle, smaller than the tolerance, that are turned
+            over.
+
+        For meshes by signs, made_by is "signs", and there are
+
+        far, looked_at, within: the number of vertices and centers of triangles that are farther
+            than the tolerance; the number of all that were tested; and a distance within which all
+            are, too large by up to a factor of 2;
+        lost, sought: the number of points of the level set that are farther than the tolerance from
+            the mesh, and of all that were tested: on triangles of a mesh, at points of a cloud, on
+            the way out of blobs;
+        undecided: the number of points of the lattice at which the error of f leaves its sign open;
+        flat: the number of triangles that were not fitted to creases, as they would pass through
+            others;
+        cloud: for a `DipolePotential`, what its `describe` returns, such as the number of points,
+            what was estimated, and the smoothing and noise that were chosen and found.
+
+        If the triangles of a mesh were kept, made_by is "faces", and these entries are missing.
+        Solids and thickened surfaces have more entries: see `docs/printing.md`.
 
     Raises:
-        MeshingError: a ValueError, if it could not be done; the message says why.
-        TypeError: a field that has patches; a clip that is no volume; an option of traces that
-            meshes do not have; keywords beside an object that holds them.
-        ValueError: options out of range, or that contradict each other; several levels.
+        MeshingError: a ValueError, if the surface could not be meshed; the message says why.
+        TypeError: the field has patches; the clip is no volume; an option of traces that meshes do
+            not have; keywords beside an object that holds them.
+        ValueError: options are out of range or contradict each other; several levels.
     """
     target, choices = surface_and_options("mesh", surface, options, keywords, _HONORED)
     accuracy = MeshTolerance.of(choices)
@@ -191,48 +212,52 @@ def mesh(
     is_closed = bool(solid) or thickness is not None
     if simplify and not is_closed:
         raise ValueError('simplify is for closed meshes: give side="below" or thickness as well')
-    volume = intersection_of([field.domain, target.clip, target.section])
-    settings = _MeshOptions(volume, accuracy, cell_size, seed, max_triangles, report)
+    volume = _volume(field, target.clip, target.section)
+    asked = _MeshOptions(volume, accuracy, cell_size, seed, max_triangles, report)
     if uses_sign_meshing(field):
-        raw = _mesh_from_signs(field, level, solid, thickness is not None, settings)
+        made = _mesh_from_signs(field, level, solid, thickness is not None, asked)
     elif solid:
-        raw = _mesh_solid(field, level, solid, settings)
+        made = _mesh_solid(field, level, solid, asked)
     else:
-        raw = _mesh_level_set(field, level, settings)
-    triangles, facts = raw.surface, dict(raw.facts)
+        made = _mesh_level_set(field, level, asked)
+    triangles, facts = made.surface, dict(made.facts)
     if solid:
         facts["side"] = target.side or "below"
     else:
         triangles = largest_component(triangles) if largest else triangles
-        raw.check_level(triangles)
-    tolerance = accuracy.at(raw.size)
+        made.check_level(triangles)
+    tolerance = accuracy.at(made.size)
     if thickness is not None:
         report("thickening")
-        normals = vertex_normals(raw.function, triangles)
-        triangles, new_facts = thicken(triangles, normals, float(thickness), 0.5 * tolerance)
-        facts |= new_facts
+        normals = vertex_normals(made.function, triangles)
+        triangles, more = thicken(triangles, normals, float(thickness), 0.5 * tolerance)
+        facts |= more
     if largest and is_closed:
         triangles = largest_body(triangles)
 
-    def check(candidate: TriangleMesh) -> None:
+    def check(one: TriangleMesh) -> None:
+        """Raise unless a changed mesh is still a manifold and, for a solid, near the level."""
         if solid:
-            raw.check_level(candidate)
-        check_manifold(candidate.faces)
+            made.check_level(one)
+        check_manifold(one.faces)
 
-    if not raw.is_checked:
+    if not made.is_checked:
         report("checking")
         check(triangles)
         check_no_self_intersection(triangles.vertices, triangles.faces)
     if simplify:
         report("simplifying")
-        triangles, new_facts = simplify_mesh(triangles, tolerance, check)
-        facts |= new_facts
+        triangles, more = simplify_mesh(triangles, tolerance, check)
+        facts |= more
     return to_trimesh(triangles, facts, is_closed)
 
 
 @dataclass(frozen=True)
 class _MeshOptions:
-    """Arguments of `mesh`; volume: the volume by which the level set is cut."""
+    """Arguments of `mesh`, checked.
+
+    volume: the volume by which the level set is cut; None if it is not.
+    spacing: the size of cells; None to choose it. The other attributes are named as in `mesh`."""
 
     volume: Volume | None
     tolerance: MeshTolerance
@@ -244,12 +269,14 @@ class _MeshOptions:
 
 @dataclass(frozen=True)
 class _RawMesh:
-    """A surface, its size, its metadata, and the function of which it is a level set.
+    """A mesh of a level set before it is thickened or simplified.
 
-    check_level: raises a MeshingError unless a surface is within the tolerance of the level.
+    surface: the mesh. size: the longest side of its box.
+    facts: what `metadata["harnack"]` says of it.
+    function: the function of which it is a level set.
+    check_level: raises a MeshingError unless a mesh is within the tolerance of the level set.
     is_checked: whether that has been done, and the surface is known to be a manifold that does not
-        pass through itself.
-    """
+        pass through itself."""
 
     surface: TriangleMesh
     size: float
@@ -264,82 +291,85 @@ def _mesh_from_signs(
     level: float | None,
     solid: tuple[float, float] | bool,
     is_thick: bool,
-    options: _MeshOptions,
+    asked: _MeshOptions,
 ) -> _RawMesh:
-    """A level set by the signs of f, or the closed surface of a solid.
+    """Mesh a level set, or the closed surface of a solid, by the signs of f - level.
+
+    level: None for the default. solid: as `_level_and_solid` returns it.
+    is_thick: whether the level set is to be thickened.
 
     Raises:
-        MeshingError: as `mesh_from_signs`; if it is empty, or not near the level at all.
+        MeshingError: as `mesh_from_signs`; also if the result is empty, or not near the level at
+            all.
     """
     ends = _ends_by_signs(field, level, solid, is_thick)
     levels = tuple(end for end in ends if math.isfinite(end))
     if isinstance(field, WindingNumber) and field.is_of_sheets_alone(levels):
-        return _input_faces_as_surface(field, levels[0], solid, options)
-    volume, box = options.volume, _box(field, levels, options.volume)
+        return _faces_alone(field, levels[0], solid, asked)
+    volume, box = asked.volume, _box(field, levels, asked.volume)
     size = float((box.upper - box.lower).max())
-    if solid and _is_outside_inside(field, ends, box):
-        box = _unlimited_box(field, volume)
-    cells, attempts = _cells_by_signs(field, size, options.spacing)
-    # If no surface ends at the box, its cells should not lie along symmetries of the field.
+    cells, attempts = _cells_by_signs(field, size, asked.spacing)
+    # Where nothing ends at the box, its cells should not lie along what is symmetrical.
     room = np.zeros(3) if box.has_walls else size * np.array([0.0037, 0.0053, 0.0029])
     filled = box.lower - room, box.upper + 0.5 * room
     facts: list[dict[str, Any]] = []
     losses: list[LostParts] = []
 
-    def function(value: float, side: float) -> SignFunction:
-        return SignFunction.of(
-            field, value, filled, cells, side=side, most_faces=options.most_faces
-        )
+    def function(one: float, side: float) -> SignFunction:
+        """The function side * (f - one) for a level `one`."""
+        return SignFunction.of(field, one, filled, cells, side=side, most_faces=asked.most_faces)
 
     is_apart = False
 
-    def signed(value: float, side: float, closed: bool) -> TriangleMesh:
+    def signed(one: float, side: float, closed: bool) -> TriangleMesh:
+        """The mesh of the level `one`. side: 1, or -1 to swap its two sides. closed: whether it is
+        closed at the box. Its facts and lost parts are appended to the lists."""
         nonlocal is_apart
         try:
-            result, lost_parts, new_facts = mesh_from_signs(
-                function(value, side),
+            made, lost, more = mesh_from_signs(
+                function(one, side),
                 filled,
                 cells,
-                options.tolerance.at(size),
+                asked.tolerance.at(size),
                 attempts,
-                options.report,
+                asked.report,
                 closed=closed,
-                volume=options.volume,
+                volume=asked.volume,
             )
         except EmptySurfaceError as error:
             raise EmptySurfaceError(f"{error}{empty_surface_hint(field)}") from error
-        facts.append(new_facts)
-        losses.append(lost_parts)
-        is_apart = result.is_intersection_free
-        return result.surface
+        facts.append(more)
+        losses.append(lost)
+        is_apart = made.is_intersection_free
+        return made.surface
 
     if not solid:
-        surface = signed(levels[0], 1.0, False)
+        made = signed(levels[0], 1.0, False)
         if volume is not None and not (isinstance(volume, Box) and box.has_walls):
-            surface, is_apart = clip_to_volume(surface, volume), False
+            made, is_apart = clip_to_volume(made, volume), False
     elif volume is None and ends[1] == math.inf:
-        surface = signed(levels[0], -1.0, False)
+        made = signed(levels[0], -1.0, False)
     else:
-        manifold = box_manifold(box.lower, box.upper)
+        whole = box_manifold(box.lower, box.upper)
         if math.isfinite(ends[0]):
-            manifold = to_manifold(signed(ends[0], -1.0, True))
+            whole = to_manifold(signed(ends[0], -1.0, True))
         if math.isfinite(ends[1]):
-            manifold = manifold - to_manifold(signed(ends[1], -1.0, True))
+            whole = whole - to_manifold(signed(ends[1], -1.0, True))
         if field.has_jumps and len(levels) == 2:
-            _check_has_thickness(field, manifold, ends, options.tolerance.at(size))
+            _check_has_thickness(field, whole, ends, asked.tolerance.at(size))
         cut = volume or Box(tuple(box.lower.tolist()), tuple(box.upper.tolist()))
-        manifold ^= volume_manifold(cut, box.lower, box.upper, 0.5 * options.tolerance.at(size))
-        surface, is_apart = from_manifold(manifold), False
-    if not len(surface.faces):
+        whole ^= volume_manifold(cut, box.lower, box.upper, 0.5 * asked.tolerance.at(size))
+        made, is_apart = from_manifold(whole), False
+    if not len(made.faces):
         raise MeshingError("the level set is empty: it lies outside of the clip")
     if is_apart:
-        check_manifold(surface.faces)
-    mesh_facts = {"level": levels[0], **_merge_facts(facts)}
+        check_manifold(made.faces)
+    known = {"level": levels[0], **_merge_facts(facts)}
     if isinstance(field, DipolePotential):
-        mesh_facts["cloud"] = field.describe()
-    was_warned = _check_sign_accuracy(field, mesh_facts, options.tolerance.at(size))
-    _warn_of_lost(field, losses, was_warned)
-    return _RawMesh(surface, size, mesh_facts, function(levels[0], 1.0), _accept, is_apart)
+        known["cloud"] = field.describe()
+    is_told = _check_sign_accuracy(field, known, asked.tolerance.at(size))
+    _warn_of_lost(field, losses, is_told)
+    return _RawMesh(made, size, known, function(levels[0], 1.0), _accept, is_apart)
 
 
 def _ends_by_signs(
@@ -348,11 +378,10 @@ def _ends_by_signs(
     solid: tuple[float, float] | bool,
     is_thick: bool,
 ) -> tuple[float, float]:
-    """The values between which the inside is; of a level set that is not closed those from its
-    level on.
+    """The interval of values of f inside of the solid; for a level set, from its level to infinity.
 
     Raises:
-        TypeError: a surface that jumps is to be thickened.
+        TypeError: a surface across which f jumps is to be thickened.
         ValueError: the field has no such level.
     """
     if is_thick and field.has_jumps:
@@ -368,10 +397,12 @@ def _ends_by_signs(
 
 
 def _cells_by_signs(field: Field, size: float, spacing: float | None) -> tuple[float, int]:
-    """How large cells are, and how often smaller ones may be tried."""
+    """The size of cells, and the largest number of attempts with ever smaller ones.
+
+    size: the longest side of the box. spacing: the size that was asked for; None to choose it."""
     if spacing is not None:
         return float(spacing), 1
-    cells, attempts = size / _ACROSS_BY_SIGNS, _ATTEMPTS_BY_SIGNS
+    cells, attempts = size / _SIGN_CELLS, _SIGN_ATTEMPTS
     detailed = cell_size_for_smoothing(
         field, cells, CELL_REFINEMENT_FACTOR, CELL_REFINEMENT_FACTOR**2
     )
@@ -379,17 +410,17 @@ def _cells_by_signs(field: Field, size: float, spacing: float | None) -> tuple[f
     return (detailed, attempts - 1) if detailed < cells else (cells, attempts)
 
 
-def _input_faces_as_surface(
+def _faces_alone(
     field: WindingNumber,
     level: float,
     solid: tuple[float, float] | bool,
-    options: _MeshOptions,
+    asked: _MeshOptions,
 ) -> _RawMesh:
-    """The triangles of a mesh that is its own surface, unchanged except where the volume cuts them.
+    """The triangles of a mesh that is its own spanning surface, cut by the volume and otherwise
+    unchanged.
 
     Raises:
-        MeshingError: the surface has to be closed; nothing of it is left in the volume; it has too
-            many triangles.
+        MeshingError: a solid was asked for, nothing is left, or there are too many triangles.
     """
     if solid:
         raise MeshingError(
@@ -399,26 +430,29 @@ def _input_faces_as_surface(
     vertices, faces = field.mesh.vertices, field.mesh.faces
     size = float(np.ptp(vertices[faces].reshape(-1, 3), axis=0).max())
     surface = TriangleMesh.without_unused_vertices(vertices, faces)
-    if options.volume is not None:
-        surface = clip_to_volume(surface, options.volume)
+    if asked.volume is not None:
+        surface = clip_to_volume(surface, asked.volume)
     if not len(surface.faces):
         raise MeshingError("the level set is empty: it lies outside of the clip")
-    if len(surface.faces) > options.most_faces:
+    if len(surface.faces) > asked.most_faces:
         raise TriangleLimitError(
             f"{len(surface.faces):,} triangles of the mesh are its surface, and max_triangles is "
-            f"{options.most_faces:,}: choose a larger `max_triangles`, or a smaller `clip`"
+            f"{asked.most_faces:,}: choose a larger `max_triangles`, or a smaller `clip`"
         )
-    facts = {"level": level, "made_by": "faces", "spacing": math.nan, "evaluations": 0}
-    function = LevelFunction(field, level, most_faces=options.most_faces)
-    return _RawMesh(surface, size, facts, function, _accept, False)
+    known = {"level": level, "made_by": "faces", "spacing": math.nan, "evaluations": 0}
+    function = LevelFunction(field, level, most_faces=asked.most_faces)
+    return _RawMesh(surface, size, known, function, _accept, False)
 
 
 def _check_has_thickness(
-    field: Field, manifold: Manifold, ends: tuple[float, float], tolerance: float
+    field: Field, whole: Manifold, ends: tuple[float, float], tolerance: float
 ) -> None:
-    """Raise if both levels are the same triangles, where the field jumps across them."""
-    if 2 * abs(manifold.volume()) < tolerance * manifold.surface_area():
-        low, high = (f"{end:g}" for end in ends)
+    """Raise a MeshingError if the surfaces at both levels are the same triangles, since the field
+    jumps across both levels there.
+
+    whole: the solid between them. ends: the two levels."""
+    if 2 * abs(whole.volume()) < tolerance * whole.surface_area():
+        low, high = (f"{one:g}" for one in ends)
         raise MeshingError(
             f"the part between the levels {low} and {high} of this {type(field).__name__} has no "
             f'thickness: it jumps across both at its triangles; for the inside give side="above"'
@@ -426,18 +460,21 @@ def _check_has_thickness(
 
 
 def _merge_facts(facts: list[dict[str, Any]]) -> dict[str, Any]:
-    """The metadata of a solid from those of the surfaces at both ends."""
+    """The facts of a solid from those of the surfaces at its two levels: counts are added, and of
+    lengths the larger is taken."""
     sums = ("evaluations", "undecided", "flat", "far", "looked_at", "lost", "sought")
-    larger = {key: max(entry[key] for entry in facts) for key in ("spacing", "within")}
-    return {**facts[0], **larger, **{key: sum(entry[key] for entry in facts) for key in sums}}
+    larger = {key: max(one[key] for one in facts) for key in ("spacing", "within")}
+    return {**facts[0], **larger, **{key: sum(one[key] for one in facts) for key in sums}}
 
 
 def _check_sign_accuracy(field: Field, facts: dict[str, Any], tolerance: float) -> bool:
-    """Whether more than a few vertices and centers of triangles are beyond the tolerance; warns of
-    it.
+    """Warn if more than one in a hundred vertices and centers of triangles are farther than the
+    tolerance from the level. Returns whether it warned.
+
+    facts: from `mesh_from_signs`.
 
     Raises:
-        MeshingError: some of them are nowhere near the level.
+        MeshingError: some of them are farther than several cells from the level.
     """
     far, count, within = facts["far"], facts["looked_at"], facts["within"]
     kind = type(field).__name__
@@ -461,8 +498,10 @@ def _check_sign_accuracy(field: Field, facts: dict[str, Any], tolerance: float) 
 
 
 def _warn_of_lost(field: Field, losses: list[LostParts], is_told: bool) -> None:
-    """Warns where parts of the level set are missing from the mesh; if it is told already that the
-    mesh is coarse, only of more than that."""
+    """Warn if parts of the level set are missing from the mesh.
+
+    is_told: whether a warning says already that the mesh is coarse. Then only thin parts and points
+        far from the mesh are worth another one."""
     for lost in losses:
         if lost.matter and (lost.show_thin_parts or not is_told):
             warnings.warn(
@@ -473,14 +512,17 @@ def _warn_of_lost(field: Field, losses: list[LostParts], is_told: bool) -> None:
 
 
 def _accept(surface: TriangleMesh) -> None:
-    """Accepts every surface: by signs distances were measured when it was made."""
+    """A check that accepts every surface: for meshes by signs, distances were measured before."""
 
 
 def _level_and_solid(
     surface: Surface, thickness: float | None
 ) -> tuple[float | None, tuple[float, float] | bool]:
-    """The level, and the values (low, high) on the closed solid in its place: True for the points
-    of a `Solid`, False for the level set.
+    """What to mesh: a level set or a solid.
+
+    Returns:
+        The level, or None for the default; and False for the level set, True for the points of a
+        `Solid`, or the interval (low, high) of the values of f in a solid, which then has no level.
 
     Raises:
         ValueError: several levels; a solid that is to be thickened.
@@ -504,15 +546,22 @@ def _level_and_solid(
 
 
 def _check_level(
-    function: LevelFunction, surface: TriangleMesh, tolerance: float, volume: Volume | None
+    function: LevelFunction, made: TriangleMesh, tolerance: float, volume: Volume | None
 ) -> None:
-    """Raise unless a surface is within the tolerance of the level, and inside the volume."""
+    """Raise a MeshingError unless a mesh is within the tolerance of the level set, and inside the
+    volume."""
     if volume is not None:
-        check_inside(surface.vertices, volume, tolerance)
-    check_near_level(function, surface.vertices, surface.faces, tolerance, volume)
+        check_inside(made.vertices, volume, tolerance)
+    check_near_level(function, made.vertices, made.faces, tolerance, volume)
 
 
 def _checked(field: Field) -> Field:
+    """The field, if it can be meshed. A `SolidAngle` is made anew from its loops.
+
+    Raises:
+        TypeError: it has patches, circles, jumps that meshing by signs does not handle, or values
+            that are angles although it is no `SolidAngle`.
+    """
     check_is_field(field)
     if field.has_patches or (field.has_jumps and not uses_sign_meshing(field)):
         raise TypeError(
@@ -533,91 +582,107 @@ def _checked(field: Field) -> Field:
     return field
 
 
+def _volume(field: Field, clip: Volume | None, section: Volume | None) -> Volume | None:
+    """The intersection of the volumes that cut the level sets; None if there is none.
+
+    These are the clip, the section, and the domain of the field if the field ends there or there is
+    no clip."""
+    ends = field.domain is not None and not (field.is_global and clip is not None)
+    parts = dict.fromkeys((clip, field.domain if ends else None, section))
+    kept = [one for one in parts if one is not None]
+    if len(kept) < 2:
+        return kept[0] if kept else None
+    return VolumeIntersection(kept)
+
+
 def _mesh_solid(
     field: Field,
     level: float | None,
     solid: tuple[float, float] | Literal[True],
-    options: _MeshOptions,
+    asked: _MeshOptions,
 ) -> _RawMesh:
-    """The closed surface of a solid that is put together from smooth levels."""
-    region = LevelFunction(*solid_and_level(field, solid, level), most_faces=options.most_faces)
+    """The closed surface of a solid, put together from meshes of smooth levels.
+
+    solid: True for the points of a `Solid`, or the interval of the values of f."""
+    region = LevelFunction(*solid_and_level(field, solid, level), most_faces=asked.most_faces)
     evaluations = [0]
 
     def angle_mesher(error: float, cells: float) -> AngleMesher:
+        """A function that meshes level sets of angles. error: its tolerance. cells: its size of
+        cells."""
+
         def mesh_angle(angle: SolidAngle, value: float) -> TriangleMesh:
+            """The mesh of the level set of an angle at `value`."""
             angle = cast("SolidAngle", _checked(angle))
             box = _box(angle, (value,), None)
-            function = LevelFunction(angle, value, most_faces=options.most_faces)
-            surface, facts = _mesh_spanning_curve(
-                function, box, error, cells, 1, options.seed, options.report
+            function = LevelFunction(angle, value, most_faces=asked.most_faces)
+            made, facts = _mesh_spanning_curve(
+                function, box, error, cells, 1, asked.seed, asked.report
             )
             evaluations[0] += facts["evaluations"]
-            return surface
+            return made
 
         return mesh_angle
 
-    def check_level(surface: TriangleMesh, size: float) -> None:
-        _check_level(region, surface, options.tolerance.at(size), options.volume)
+    def check_level(made: TriangleMesh, size: float) -> None:
+        _check_level(region, made, asked.tolerance.at(size), asked.volume)
 
-    def check(surface: TriangleMesh, size: float) -> None:
-        check_manifold(surface.faces, surface.vertices)
-        check_level(surface, size)
+    def check(made: TriangleMesh, size: float) -> None:
+        """Raise unless the mesh is a manifold near the level set."""
+        check_manifold(made.faces, made.vertices)
+        check_level(made, size)
 
-    solid_mesh = mesh_solid(
+    made = mesh_solid(
         cast("Solid", region.field),
         region.level,
-        options.volume,
-        options.tolerance,
-        options.spacing,
+        asked.volume,
+        asked.tolerance,
+        asked.spacing,
         angle_mesher,
-        options.most_faces,
+        asked.most_faces,
         check,
-        options.report,
+        asked.report,
     )
     facts = {
         "level": region.level,
-        "spacing": solid_mesh.spacing,
-        "evaluations": solid_mesh.evaluations + evaluations[0],
-        "surfaces_with_options": solid_mesh.levels,
+        "spacing": made.spacing,
+        "evaluations": made.evaluations + evaluations[0],
+        "surfaces_with_options": made.levels,
     }
     return _RawMesh(
-        solid_mesh.surface,
-        solid_mesh.size,
-        facts,
-        region,
-        lambda surface: check_level(surface, solid_mesh.size),
-        True,
+        made.surface, made.size, facts, region, lambda one: check_level(one, made.size), True
     )
 
 
-def _mesh_level_set(field: Field, level: float | None, options: _MeshOptions) -> _RawMesh:
-    """A level set of a function that is smooth nearly everywhere, or of an angle."""
+def _mesh_level_set(field: Field, level: float | None, asked: _MeshOptions) -> _RawMesh:
+    """Mesh a level set of a function that is smooth nearly everywhere, or of an angle. level: None
+    for the default of the field."""
     level = field.default_level if level is None else float(level)
-    function = LevelFunction(field, level, most_faces=options.most_faces)
+    function = LevelFunction(field, level, most_faces=asked.most_faces)
     field.validate_levels((level,))
-    volume, report = options.volume, options.report
+    volume, report = asked.volume, asked.report
     box = _box(field, (level,), volume)
     size = float((box.upper - box.lower).max())
-    error = 0.5 * options.tolerance.at(size)
-    cells = size / _ACROSS if options.spacing is None else float(options.spacing)
-    if options.spacing is None and field.min_wavelength is not None:
+    error = 0.5 * asked.tolerance.at(size)
+    cells = size / _CELLS_ACROSS if asked.spacing is None else float(asked.spacing)
+    if asked.spacing is None and field.min_wavelength is not None:
         cells = min(cells, field.min_wavelength / CELLS_PER_WAVE)
-    attempts = 1 if options.spacing is not None else _MAX_ATTEMPTS
+    attempts = 1 if asked.spacing is not None else _MAX_ATTEMPTS
     if isinstance(field, SolidAngle):
-        surface, facts = _mesh_spanning_curve(
-            function, box, error, cells, attempts, options.seed, report
+        made, facts = _mesh_spanning_curve(
+            function, box, error, cells, attempts, asked.seed, report
         )
     else:
-        surface, facts = _mesh_in_lattice(function, box, error, cells, attempts, report)
+        made, facts = _mesh_in_lattice(function, box, error, cells, attempts, report)
     if volume is not None and not (isinstance(volume, Box) and box.has_walls):
-        surface = clip_to_volume(surface, volume)
-        if not len(surface.faces):
+        made = clip_to_volume(made, volume)
+        if not len(made.faces):
             raise MeshingError("the level set is empty: it lies outside of the clip")
 
-    def check_level(triangles: TriangleMesh) -> None:
-        _check_level(function, triangles, options.tolerance.at(size), volume)
+    def check_level(one: TriangleMesh) -> None:
+        _check_level(function, one, asked.tolerance.at(size), volume)
 
-    return _RawMesh(surface, size, {"level": level, **facts}, function, check_level, False)
+    return _RawMesh(made, size, {"level": level, **facts}, function, check_level, False)
 
 
 def _mesh_in_lattice(
@@ -628,24 +693,31 @@ def _mesh_in_lattice(
     attempts: int,
     report: Callable[[str], None],
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The level set of a real-valued field in a box, in cells of a lattice."""
-    previous: MeshingError | None = None
+    """The level set of a real-valued field in a box, and facts about it.
+
+    It is meshed in the cells of a lattice of size `spacing`. If that fails in a way that smaller
+    cells may mend, they are made smaller, with at most `attempts` attempts.
+
+    Raises:
+        MeshingError: the last attempt failed.
+    """
+    before: MeshingError | None = None
     while True:
         report(f"cells of {spacing:.3g}")
         try:
             lattice = BccLattice.covering_box(box.lower, box.upper, spacing)
-            surface, isotopy = mesh_open_surface(function, lattice, tolerance, report)
-            check_manifold(surface.faces, surface.vertices)
-            check_near_level(function, surface.vertices, surface.faces, 2 * tolerance, None)
-            check_no_self_intersection(surface.vertices, surface.faces)
+            made, isotopy = mesh_open_surface(function, lattice, tolerance, report)
+            check_manifold(made.faces, made.vertices)
+            check_near_level(function, made.vertices, made.faces, 2 * tolerance, None)
+            check_no_self_intersection(made.vertices, made.faces)
             break
         except MeshingError as wrong:
             attempts -= 1
             if not attempts or not is_retry_promising(
-                wrong, previous, CELL_REFINEMENT_FACTOR**attempts
+                wrong, before, CELL_REFINEMENT_FACTOR**attempts
             ):
                 raise
-            previous, spacing = wrong, CELL_REFINEMENT_FACTOR * spacing
+            before, spacing = wrong, CELL_REFINEMENT_FACTOR * spacing
             report(f"{wrong}; so smaller cells")
     facts = {
         "spacing": spacing,
@@ -654,7 +726,7 @@ def _mesh_in_lattice(
         "integrated": 0,
         **isotopy.shares(),
     }
-    return surface, facts
+    return made, facts
 
 
 def _mesh_spanning_curve(
@@ -666,26 +738,28 @@ def _mesh_spanning_curve(
     seed: int,
     report: Callable[[str], None],
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The level set of an angle, which ends at its curve."""
+    """The level set of an angle, which ends at its curve, and facts about it."""
     ends = box.lower, box.upper
-    result = mesh_spanning_curve(
+    made = mesh_spanning_curve(
         function, spacing, attempts, ends, box.has_walls, seed, tolerance, report
     )
     facts = {
-        "spacing": result.spacing,
+        "spacing": made.spacing,
         "evaluations": function.evaluations,
-        "proved": result.crossings.proved,
-        "integrated": result.crossings.integrated_count,
-        **result.isotopy.shares(),
-        "turned": result.turned,
+        "proved": made.crossings.proved,
+        "integrated": made.crossings.integrated_count,
+        **made.isotopy.shares(),
+        "turned": made.turned,
     }
-    return TriangleMesh.without_unused_vertices(result.vertices, result.faces), facts
+    return TriangleMesh.without_unused_vertices(made.vertices, made.faces), facts
 
 
 @dataclass(frozen=True)
 class _MeshingBox:
-    """The box to be filled, from `lower` to `upper`, (3,) each, and whether the surface may end at
-    its faces."""
+    """The box in which a level set is meshed.
+
+    lower, upper: (3,) its corners.
+    has_walls: whether the surface may end at the faces of the box."""
 
     lower: FloatArray
     upper: FloatArray
@@ -693,10 +767,11 @@ class _MeshingBox:
 
 
 def _box(field: Field, levels: tuple[float, ...], volume: Volume | None) -> _MeshingBox:
-    """The box to be filled: around the level sets, if it has an extent, and the volume.
+    """The box in which level sets are meshed: around their extent, if they have one, and the
+        volume.
 
     Raises:
-        MeshingError: neither has bounds, or they have nothing in common.
+        MeshingError: neither has bounds, or they have no point in common.
     """
     extent, level = field.extent(levels), levels[0]
     if volume is None and extent is None and isinstance(field, SolidAngle):
@@ -710,7 +785,7 @@ def _box(field: Field, levels: tuple[float, ...], volume: Volume | None) -> _Mes
             "clip, such as a box (harnack.Box)"
         )
     if isinstance(field, SolidAngle):
-        return _box_of_spanned_surface(field, extent, volume)
+        return _around_curve(field, extent, volume)
     lower, upper = _bounds_of(extent if volume is None else volume)
     if volume is not None and extent is not None and extent != volume:
         # A little room, so that what touches its extent does not end there.
@@ -731,41 +806,13 @@ def _box(field: Field, levels: tuple[float, ...], volume: Volume | None) -> _Mes
     return _MeshingBox(lower, upper, volume is not None)
 
 
-def _is_outside_inside(field: Field, ends: tuple[float, float], box: _MeshingBox) -> bool:
-    """Whether the values of the solid, between both ends, are those outside of the box around all
-    its levels: no level passes there, so that a point of it decides."""
-    center, half = 0.5 * (box.lower + box.upper), 0.5 * (box.upper - box.lower)
-    signs = np.array(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3)).reshape(3, -1).T
-    signs = signs[signs.any(axis=1)]
-    points = np.concatenate([center + factor * half * signs for factor in (1.5, 1.02)])
-    if field.domain is not None:
-        points = points[field.domain.contains_points(points)]
-    if not len(points):
-        return False
-    value = float(np.asarray(field.value(points[:1], precision="double"))[0])
-    return ends[0] <= value <= ends[1]
-
-
-def _unlimited_box(field: Field, volume: Volume | None) -> _MeshingBox:
-    """The box of the volume, for a solid that goes on outside of its levels' box.
+def _around_curve(field: SolidAngle, extent: Volume | None, volume: Volume | None) -> _MeshingBox:
+    """The box in which the surface of a curve is meshed. It contains the whole surface, which is
+    cut later; or, if the surface has no extent, the curve and the volume.
 
     Raises:
-        MeshingError: the volume has no bounds, so that the solid has none.
+        MeshingError: the volume has no bounds.
     """
-    bounds = None if volume is None else _bounds_of(volume)
-    if bounds is None or not np.isfinite(bounds).all():
-        raise MeshingError(
-            f"the solid on this side of the level of {type(field).__name__} reaches to infinity: "
-            "choose the other side, or give a clip with bounds, such as a box (harnack.Box)"
-        )
-    return _MeshingBox(*bounds, True)
-
-
-def _box_of_spanned_surface(
-    field: SolidAngle, extent: Volume | None, volume: Volume | None
-) -> _MeshingBox:
-    """Around the whole surface that a curve spans, which is cut later; or if that has no extent,
-    around the curve and the volume."""
     if extent is not None:
         return _MeshingBox(*_bounds_of(extent), False)
     assert volume is not None
@@ -774,11 +821,12 @@ def _box_of_spanned_surface(
     lower, upper = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
     if not np.isfinite(upper - lower).all():
         raise MeshingError("the clip has no bounds: give a box or a ball")
-    pad = _ROOM * (upper - lower).max()
+    pad = _CURVE_MARGIN * (upper - lower).max()
     return _MeshingBox(lower - pad, upper + pad, True)
 
 
 def _bounds_of(volume: Volume | None) -> tuple[FloatArray, FloatArray]:
+    """The lower and the upper corner (3,) of the bounding box of a volume, which is not None."""
     assert volume is not None
     lower, upper = (np.array(end, np.float64) for end in volume.bounds())
     return lower, upper

@@ -13,14 +13,15 @@ __all__ = ["MeshTolerance"]
 
 @dataclass(frozen=True)
 class MeshTolerance:
-    """The largest distance of triangles from a surface: a length, or None for 1e-3 of the size
-    of the surface."""
+    """The largest distance of triangles from a surface.
+
+    length: a length; None for 1e-3 of the size of the surface."""
 
     length: float | None = None
 
     @classmethod
     def of(cls, options: TraceOptions) -> MeshTolerance:
-        """The tolerance of a call.
+        """The tolerance of a call of `mesh` or `repair`, from its options.
 
         Raises:
             TypeError: a `HitTolerance` that is more than a length.
@@ -34,7 +35,7 @@ class MeshTolerance:
         """The tolerance for a surface of this size, a length.
 
         Raises:
-            ValueError: it is half of the size or more.
+            ValueError: the tolerance that was given is half of the size or more.
         """
         length = 1e-3 * size if self.length is None else self.length
         if not length < 0.5 * size and self.length is not None:
@@ -45,5 +46,6 @@ class MeshTolerance:
         return length
 
     def within(self, size: float) -> float:
-        """The tolerance for a part of a surface, which may be smaller than the tolerance."""
+        """The tolerance for a part of a surface, of this size. Unlike `at` it does not fail if the
+        part is smaller than the tolerance that was given: the result is at most 0.4 of the size."""
         return self.at(size) if self.length is None else min(self.length, 0.4 * size)

@@ -1,9 +1,9 @@
-"""The local repair of closed meshes a few of whose vertices or faces are too far from the level.
+"""The local repair of closed meshes in which a few vertices or faces are off the level set.
 
 Offsets of meshes have creases everywhere. Where another part cuts a triangle that lies across a
-crease, the pieces have centers and corners of their own, of which one in a hundred thousand may be
-farther from the level than the triangle's center. There edges across the crease are cut on it, and
-the new faces are checked with those around them.
+crease, the pieces have centers and corners of their own. One in a hundred thousand of these may be
+farther from the level set than the triangle's center. There, edges across the crease are cut at the
+crease, and the new faces are checked together with the faces around them.
 """
 
 from __future__ import annotations
@@ -23,14 +23,13 @@ from harnack.meshing.self_intersection_repair import resolve_local_intersections
 
 __all__ = ["project_outliers"]
 
-# The largest number of locations that are repaired, and the number of rounds in which faces may be
-# cut.
-_MAX_LOCATIONS, _MAX_ROUNDS = 100, 4
-# Edges of faces at outliers are cut if their middle is farther off the level than this, in
-# tolerances.
-_CUT_DISTANCE = 0.5
-# The largest distance by which the repair of intersections may move cut faces, in tolerances.
-_REPAIR_TOLERANCE = 0.25
+# The largest number of locations that is mended; and how often faces may be cut, one after the
+# other.
+_MAX_OUTLIERS, _MAX_ROUNDS = 100, 4
+# Edges of such faces are cut if their middle is farther off the level than this, in tolerances.
+_MAX_MIDPOINT_DISTANCE = 0.5
+# How far mending of intersections may move cut faces, in tolerances.
+_MENDED_WITHIN = 0.25
 
 
 def project_outliers(
@@ -40,17 +39,22 @@ def project_outliers(
     tolerance: float,
     check: Callable[[TriangleMesh], None],
 ) -> TriangleMesh | None:
-    """The surface with vertices that are far from the level moved onto it, and faces with a far
-    center cut at the far middles of their edges, or at the center, moved onto the level; None if
-    that cannot be done.
+    """Mend a closed surface of which a few points are too far from the level set.
 
-    surface: none of its triangles pass through each other, and nearly all are near the level.
-    places: (k, 3) the far vertices, and centers of faces. tolerance: a length; no point is moved
-        farther than twice that.
+    Far vertices are moved onto the level set. Faces with a far center are cut at the midpoints of
+    their edges that are off the level set, or at the center, and the new vertices are moved onto
+    it.
+
+    surface: none of its triangles pass through each other, and nearly all are near the level set.
+    places: (k, 3) the far vertices and the far centers of faces.
+    tolerance: a length; no point is moved farther than twice that.
     check: raises a MeshingError for a surface that is not near the level. It is called with the
         changed faces; whether these pass through other triangles is decided exactly.
+
+    Returns:
+        The mended surface, or None if that fails.
     """
-    if len(places) > _MAX_LOCATIONS:
+    if len(places) > _MAX_OUTLIERS:
         return None
     vertices, faces = surface.vertices, surface.faces
     is_new = np.zeros(len(faces), np.bool_)
@@ -79,17 +83,27 @@ def _project_and_split(
     points: FloatArray,
     tolerance: float,
 ) -> tuple[tuple[FloatArray, IntArray], BoolArray] | None:
-    """Vertices and faces with the vertices at `points` moved onto the level and the faces with a
-    center at `points` cut; and (m,) which faces are new, including those of `is_new`. None if a
-    point is neither a vertex nor a center, or too far from the level."""
+    """Move vertices at `points` onto the level set, and cut the faces with a center at `points`.
+
+    Such a face is cut at the midpoints of its edges that are off the level set by more than half of
+    the tolerance, or at its center if there are none. The new vertices are moved onto the level
+    set.
+
+    is_new: (m,) the mask of the faces that earlier calls made.
+
+    Returns:
+        The vertices and the faces; and the mask of the new faces, including those of `is_new` that
+        are left and the faces at moved vertices. None if a point is neither a vertex nor a center,
+        or would be moved by more than two tolerances.
+    """
     vertices, faces = surface.vertices, surface.faces
     corners = _rows_at(points, vertices)
     centers = _rows_at(points, vertices[faces].mean(axis=1))
     if len(corners) + len(centers) < len(points):
         return None
     pairs = half_edges(faces[centers])
-    middle = vertices[pairs].mean(axis=1)
-    pairs = pairs[function.sample(middle).distance > _CUT_DISTANCE * tolerance]
+    midpoints = vertices[pairs].mean(axis=1)
+    pairs = pairs[function.sample(midpoints).distance > _MAX_MIDPOINT_DISTANCE * tolerance]
     count = len(vertices)
     keys = sorted_unique(edge_keys(pairs, count))
     ends = np.stack(np.divmod(keys, count), axis=1)
@@ -133,16 +147,19 @@ def _check_new_faces(
     tolerance: float,
     check: Callable[[TriangleMesh], None],
 ) -> TriangleMesh | None:
-    """The surface if its new faces (m,) pass through no others; otherwise mended there, and then
-    checked as a whole; None if that does not help."""
+    """Check that the new faces pass through no others, and mend the surface if they do.
+
+    is_new: (m,) the mask of the new faces.
+
+    Returns:
+        The surface, if nothing crosses; the mended surface, if `check` accepts it; else None.
+    """
     vertices, faces = surface.vertices, surface.faces
     nearby = _in_boxes_of(vertices[faces], np.flatnonzero(is_new))
     crossing = nearby[intersecting_faces(vertices, faces[nearby])]
     if not len(crossing):
         return surface
-    mended, remaining = resolve_local_intersections(
-        surface, crossing, _REPAIR_TOLERANCE * tolerance
-    )
+    mended, remaining = resolve_local_intersections(surface, crossing, _MENDED_WITHIN * tolerance)
     if remaining:
         return None
     try:
@@ -152,17 +169,18 @@ def _check_new_faces(
     return mended
 
 
-def _in_boxes_of(corner: FloatArray, rows: IntArray) -> IntArray:
-    """The indices of triangles (m, 3, 3) whose box meets that of a triangle in `rows`."""
-    lower, upper = corner.min(axis=1), corner.max(axis=1)
-    meets = np.zeros(len(corner), np.bool_)
+def _in_boxes_of(triangles: FloatArray, rows: IntArray) -> IntArray:
+    """The indices of the triangles whose bounding box meets that of one of the triangles `rows`.
+    triangles: (m, 3, 3)."""
+    lower, upper = triangles.min(axis=1), triangles.max(axis=1)
+    meets = np.zeros(len(triangles), np.bool_)
     for row in rows.tolist():
         meets |= (lower <= upper[row]).all(axis=1) & (upper >= lower[row]).all(axis=1)
     return np.flatnonzero(meets)
 
 
 def _rows_at(targets: FloatArray, points: FloatArray) -> IntArray:
-    """The indices of points that are equal to a target."""
+    """The indices of the points (n, 3) that are equal to one of the targets (k, 3), bit by bit."""
     rows = np.flatnonzero(np.isin(points[:, 0], targets[:, 0]))
     same = (points[rows, None] == targets).all(axis=2).any(axis=1)
     return rows[same]

@@ -31,16 +31,16 @@ from harnack.meshing.thickness import wall_thickness
 __all__ = ["PrintCheck", "PrintProblem", "check_print"]
 
 # A part is tiny if it is no longer than this, relative to the whole.
-_TINY = 0.01
+_TINY_SHARE = 0.01
 # Sizes in millimeters beyond which another unit is likely.
 _SMALLEST, _LARGEST = 1.0, 2000.0
 _INCH = 25.4
-# The relative error of a part of exactly the least thickness, or the bed's size: files hold single
-# precision, and thickness is measured to that.
+# A part may be thinner than the smallest thickness, or larger than the build volume, by this
+# relative error: files hold single precision, and thickness is measured with that accuracy.
 _ROUNDING = 1e-6
-# Faces longer than this, in least thicknesses, may hide thin places beside their centers.
+# Faces longer than this, in smallest thicknesses, may hide thin places beside their centers.
 _COARSE = 5.0
-# The words for one and for several, in the texts of messages.
+# In the texts of messages, {one|several} has the words for a single problem and for several.
 _WORDS = re.compile(r"\{([^{}|]*)\|([^{}|]*)\}")
 
 
@@ -48,12 +48,11 @@ _WORDS = re.compile(r"\{([^{}|]*)\|([^{}|]*)\}")
 class PrintProblem:
     """A problem of a mesh that is to be printed.
 
-    kind: its name, such as "open edges".
-    count: the number of its occurrences.
-    locations: (k, 3) of all occurrences, or of a part of them.
+    kind: the name of the problem, such as "open edges".
+    count: how often it occurs.
+    locations: (k, 3) where it occurs, or some of these places.
     message: the problem in a sentence.
-    is_error: whether it is an error, and not a hint.
-    """
+    is_error: True for an error, False for a hint."""
 
     kind: str
     count: int
@@ -66,12 +65,11 @@ class PrintProblem:
 class PrintCheck:
     """The result of checking a mesh that is to be printed.
 
-    problems: the worst first.
-    size: (x, y, z).
+    problems: errors first, then hints.
+    size: (x, y, z), the edge lengths of the bounding box.
     volume: None if the mesh is not closed.
-    triangles: the number of triangles. parts: the number of components that do not touch each
-        other.
-    """
+    triangles: the number of triangles.
+    parts: the number of components, which are not connected by vertices."""
 
     problems: tuple[PrintProblem, ...]
     size: tuple[float, float, float]
@@ -81,11 +79,12 @@ class PrintCheck:
 
     @property
     def is_printable(self) -> bool:
-        """Whether there is no error; there may be hints."""
+        """Whether there are no errors; there may be hints."""
         return not _has_errors(self.problems)
 
     def as_dict(self, most_places: int = 10) -> dict[str, Any]:
-        """The result as a dictionary of plain numbers and texts, as JSON holds them."""
+        """The result as a dictionary of numbers and texts, which JSON can hold. most_places: the
+        largest number of locations of each problem."""
         return {
             "fine": self.is_printable,
             "size": list(self.size),
@@ -108,26 +107,33 @@ class PrintCheck:
 def check_print(
     part: Any, *, min_thickness: float | None = None, build_volume: Any = None
 ) -> PrintCheck:
-    """What a slicer would complain of in a mesh, and where.
+    """Find what a slicer would complain about in a mesh, and where it is.
 
-    Errors are: open edges, edges of more than two faces, neighbors that do not agree on their two
-    sides, parts that are inside out or in the material of others, vertices where sheets touch,
-    corners and edges that lie on other faces, triangles that pass through each other or lie on each
-    other (decided exactly), duplicate faces; walls thinner than `min_thickness`; a size that does
-    not fit on the bed. Hints are: corners apart from others by rounding, which count as one, faces
-    without an area, several parts, tiny ones, cavities without a way out (for powder and resin),
-    and a size that looks like inches or meters, and, of walls, faces so large that a thin place
-    beside their centers may be missed.
+    Errors are:
+
+    - open edges, edges of more than two faces, and neighbors that do not agree on their two sides;
+    - parts that are inside out, or in the material of other parts;
+    - vertices where sheets touch, and corners and edges that lie on other faces;
+    - triangles that pass through each other or lie on each other (decided exactly), and duplicate
+      faces;
+    - walls thinner than `min_thickness`, and a size that does not fit into `build_volume`.
+
+    Hints are: corners that only rounding separates from others (they count as one), faces without
+    an area, several parts, tiny parts, cavities without a way out (for powder and resin), a size
+    that looks like inches or meters, and, if thickness is measured, faces so large that a thin
+    place beside their centers may be missed.
 
     part: a trimesh.Trimesh, (vertices, faces), or the name of a file. Vertices at the same place
         count as one.
-    min_thickness: the least allowed thickness, a length (see `thickness`); None to leave it out.
-    build_volume: (x, y, z), the size that fits, turned by right angles about z; None to leave it
-        out.
+    min_thickness: the smallest allowed thickness, a length (see `thickness`); None to skip that
+        check.
+    build_volume: (x, y, z), the largest size, into which the part may be turned by a right angle
+        about z; None to skip that check.
 
     Raises:
-        MeshError: no mesh. FileFormatError: a file that cannot be read. ValueError: a thickness or
-            a bed that is no length.
+        MeshError: the object is no mesh.
+        FileFormatError: the file cannot be read.
+        ValueError: the thickness is no positive length, or the build volume not three of them.
     """
     if min_thickness is not None:
         min_thickness = as_positive(min_thickness, "min_thickness")
@@ -148,11 +154,11 @@ def check_print(
     if min_thickness is not None:
         problems += [
             _thin_walls(x, faces, min_thickness, not _has_errors(problems)),
-            _coarse_face_problem(x, faces, min_thickness),
+            _coarse_faces(x, faces, min_thickness),
         ]
     low, high = x[faces].min(axis=(0, 1)), x[faces].max(axis=(0, 1))
     size = cast("tuple[float, float, float]", tuple((high - low).tolist()))
-    problems += _of_size(size, sides)
+    problems += _size_problems(size, sides)
     problems.append(rounded)
     reported = sorted(
         (entry for entry in problems if entry.count), key=lambda entry: not entry.is_error
@@ -162,12 +168,17 @@ def check_print(
 
 
 def _has_errors(problems: Sequence[PrintProblem]) -> bool:
+    """Whether there is a problem that is an error, not only a hint."""
     return any(problem.is_error and problem.count for problem in problems)
 
 
 def _mesh_of(part: Any) -> tuple[FloatArray, IntArray, PrintProblem]:
-    """Vertices; faces, between the vertices at one place or apart by rounding, including faces of
-    zero area; and a hint with the number of corners that were apart."""
+    """Read a mesh, and join its vertices that are at one place or apart by rounding.
+
+    Returns:
+        The vertices; the faces between joined vertices, including faces without an area; and a hint
+        with the number of vertices that were apart by rounding.
+    """
     if isinstance(part, str | os.PathLike):
         read = read_geometry(cast("Any", part), "winding")
         if not isinstance(read, LoadedMesh):
@@ -195,17 +206,19 @@ def _mesh_of(part: Any) -> tuple[FloatArray, IntArray, PrintProblem]:
     return x, welded.index[faces], note
 
 
-def _problem(kind: str, where: FloatArray, text: str, *, is_fatal: bool = True) -> PrintProblem:
-    """A problem with its message. text: with {} for the number, and the words for one and for
-    several as {one|several}."""
-    count = len(where)
-    near = "" if not count else f", {'' if count == 1 else 'such as '}at {point_text(where[0])}"
+def _problem(kind: str, locations: FloatArray, text: str, *, is_fatal: bool = True) -> PrintProblem:
+    """A problem at some locations (k, 3), with its message.
+
+    text: has {} for the number, and words that depend on it as {one|several}."""
+    count = len(locations)
+    near = "" if not count else f", {'' if count == 1 else 'such as '}at {point_text(locations[0])}"
     text = _WORDS.sub(lambda pair: pair[1 if count == 1 else 2], text)
-    return PrintProblem(kind, count, where, text.format(f"{count:,}") + near, is_fatal)
+    return PrintProblem(kind, count, locations, text.format(f"{count:,}") + near, is_fatal)
 
 
 def _topology(x: FloatArray, faces: IntArray) -> list[PrintProblem]:
-    """The problems of edges, sides, duplicates and faces without an area."""
+    """The problems of edges, of orientation, of duplicate faces, of vertices where parts touch and
+    of faces without an area."""
     flat = zero_area_faces(x, faces)
     vanished = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
     used = faces[~vanished]
@@ -254,9 +267,12 @@ def _topology(x: FloatArray, faces: IntArray) -> list[PrintProblem]:
 
 
 def _component_problems(shells: Shells, is_closed: bool, is_clear: bool) -> list[PrintProblem]:
-    """The problems of components: inside out, inside others, cavities, loose and tiny parts.
-    is_clear: whether the mesh is closed and no faces pass through each other, so that a part is
-    inside another as a whole or not at all."""
+    """The problems of components: those that are inside out, inside others, loose or tiny, and
+        cavities.
+
+    is_closed: whether the mesh is closed.
+    is_clear: whether also no faces pass through each other, so that a component is inside another
+        one as a whole or not at all."""
     volumes, none = shells.volumes, np.zeros(len(shells.volumes), np.bool_)
     middle = 0.5 * (shells.lower + shells.upper)
     length = (shells.upper - shells.lower).max(axis=1)
@@ -264,7 +280,7 @@ def _component_problems(shells: Shells, is_closed: bool, is_clear: bool) -> list
     is_hollow = (volumes < 0) & (depth > 0)
     is_nested = (volumes > 0) & (depth > 0) & is_clear
     inside_out = (volumes < 0) & ~is_hollow if is_closed else none
-    is_tiny = (length < _TINY * length.max()) & ~is_hollow
+    is_tiny = (length < _TINY_SHARE * length.max()) & ~is_hollow
     loose = middle[~is_hollow]
     return [
         _problem(
@@ -295,12 +311,10 @@ def _component_problems(shells: Shells, is_closed: bool, is_clear: bool) -> list
 def _contacts(
     x: FloatArray, faces: IntArray, shells: Shells, is_closed: bool
 ) -> tuple[PrintProblem, PrintProblem]:
-    """The problems of faces that pass through or lie on others, and of faces that only touch
-    others.
+    """Two problems: faces that pass through or lie on others, and faces that only touch others.
 
-    Faces without an area close gaps between corners and edges that lie on each other: for a part
-    with such faces, contacts with itself are not reported.
-    """
+    Faces without an area close gaps between corners and edges that lie on each other. So for a
+    component with such faces, contacts with itself are not reported."""
     is_flat = np.zeros(len(faces), np.bool_)
     is_flat[zero_area_faces(x, faces)] = True
     is_plain = np.isin(shells.component_of_face, shells.component_of_face[is_flat], invert=True)
@@ -331,6 +345,8 @@ def _contacts(
 
 
 def _thin_walls(x: FloatArray, faces: IntArray, wall: float, is_solid: bool) -> PrintProblem:
+    """The problem of walls thinner than `wall`, a length; if the mesh bounds no solid, that they
+    could not be measured."""
     if not is_solid:
         # The name differs from that of walls that were measured to be thin.
         why = "how thick walls are is not known before the rest is mended"
@@ -342,8 +358,9 @@ def _thin_walls(x: FloatArray, faces: IntArray, wall: float, is_solid: bool) -> 
     return _problem("thin walls", locations, text)
 
 
-def _coarse_face_problem(x: FloatArray, faces: IntArray, wall: float) -> PrintProblem:
-    """The problem of faces so large that thin places beside their centers may be missed."""
+def _coarse_faces(x: FloatArray, faces: IntArray, wall: float) -> PrintProblem:
+    """The problem of faces so long, relative to the smallest thickness `wall`, that thin places
+    beside their centers may be missed."""
     corner = x[faces]
     longest = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
     centers = corner[longest > _COARSE * wall].mean(axis=1)
@@ -352,7 +369,10 @@ def _coarse_face_problem(x: FloatArray, faces: IntArray, wall: float) -> PrintPr
     return _problem("walls measured coarsely", centers, text, is_fatal=False)
 
 
-def _of_size(size: tuple[float, float, float], bed: list[float] | None) -> list[PrintProblem]:
+def _size_problems(size: tuple[float, float, float], bed: list[float] | None) -> list[PrintProblem]:
+    """The problems of the size: a likely other unit, and a part that does not fit.
+
+    size: (x, y, z) of the part. bed: (x, y, z) of the space that it has to fit in; None for any."""
     longest, nowhere = max(size), np.zeros((0, 3))
     text = " x ".join(f"{length:.4g}" for length in size)
     problems: list[PrintProblem] = []

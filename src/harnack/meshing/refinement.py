@@ -38,24 +38,25 @@ __all__ = [
 ]
 
 Walls = tuple[FloatArray, FloatArray] | None
-# A function that tells which points (k, 3) count; None for all.
+# A function from points (k, 3) to the mask (k,) of those that matter; None if all do.
 Where = Callable[[FloatArray], BoolArray] | None
-# Across a crease normals turn by at least this angle, and by this fraction of it between two
-# points.
-_BENT, _AT_ONCE = math.radians(20), 0.75
-# A vertex this near, relative to the tolerance, counts as on the surface.
-_ON = 1e-5
+# Across a crease normals turn by at least this angle; and by this fraction of the angle between the
+# middle of an edge and one of its ends.
+_CREASE, _SHARE = math.radians(20), 0.75
+# A vertex within this distance, relative to the tolerance, counts as on the surface.
+_ON_SURFACE = 1e-5
 # The largest distance of a crease from the middle of an edge, relative to the edge.
-_BESIDE = 1.5
-# A crease is not searched for nearer to the ends than this; and the number of samples of the
-# search, which is done twice.
+_OFFSET = 1.5
+# A point on a crease is not used if it is nearer to an end of the edge than this fraction of the
+# edge; and the number of samples of the search for it, which is done twice.
 _FROM_ENDS, _SAMPLES = 0.05, 33
-# The level is searched for up to this multiple of the displacement to where tangent planes meet;
-# and three planes meet in a point if the determinant of their normals is larger than the second.
-_SEARCH_EXTENSION, _INDEPENDENT = 1.25, 0.1
+# The level set is searched for up to this multiple of the displacement to the point where tangent
+# planes meet; and three planes meet in a point if the determinant of their unit normals is larger
+# than the second.
+_SEARCH_LENGTH, _INDEPENDENT = 1.25, 0.1
 # Edges shorter than this, relative to the tolerance, are never cut.
-_SHORTEST = 0.5
-_MAX_ROUNDS = 12
+_MIN_EDGE_LENGTH = 0.5
+_MOST_ROUNDS = 12
 # The number of edges and centers to be cut grows at first, and then falls. If it grows to this
 # multiple of its smallest value before, refinement will not end: the surface bends within any
 # triangle, as around each dipole of a cloud.
@@ -71,18 +72,26 @@ def refine(
     report: Callable[[str], None],
     where: Where = None,
 ) -> tuple[FloatArray, IntArray]:
-    """Split edges at their midpoints, and move these onto the surface, until the midpoints of all
-    edges but those of the boundary, and the centers of all faces, are within `tolerance` of it; or
-    until refinement is found to diverge, which the caller has to check (`check_near_level`).
+    """Split edges at their midpoints, and move the new vertices onto the level set, until the mesh
+    is within `tolerance` of it.
 
-    where: which midpoints and centers count. Edges that are split beside these are moved onto the
-        surface as well: otherwise they would be split again and again, as they end off the surface.
+    That is, until the midpoints of all edges, except boundary edges, and the centers of all faces
+    are within the tolerance (a length); or until refinement is found to diverge, which the caller
+    has to check (`check_near_level`).
+
+    walls: the lower and the upper corner of the box on whose faces the boundary lies, so that its
+        edges are split too; None if the boundary stays as it is.
+    where: which midpoints and centers count. The midpoints of edges that are split at the border of
+        that region are moved onto the level set as well: otherwise these edges would be split again
+        and again, as they end off the level set.
+
+    Returns the vertices and the faces.
 
     Raises:
         TriangleLimitError: it takes more triangles than the function allows.
     """
     smallest_count, before = math.inf, 0
-    for round_number in range(_MAX_ROUNDS):
+    for round_number in range(_MOST_ROUNDS):
         report(f"refining, round {round_number + 1}: {len(faces):,} triangles")
         marks = _RefinementMarks.of(function, vertices, faces, tolerance, walls, where)
         marked = marks.marked
@@ -119,18 +128,21 @@ def refine(
 def _converge_vertices(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float, walls: Walls
 ) -> FloatArray:
-    """The vertices after more of Newton's steps for those that are not yet on the surface, as
-    beside the dipoles of a cloud, where slopes change within a step."""
+    """Vertices after more of Newton's steps for those that are not yet on the level set. There are
+    such vertices beside the dipoles of a cloud, where the gradient changes within a step. A vertex
+    is moved only if that brings it closer to the level, and by less than the tolerance.
+
+    Boundary vertices stay, unless the boundary lies in `walls`."""
     samples = function.sample(vertices)
-    is_off = samples.distance > _ON * tolerance
+    is_off = samples.distance > _ON_SURFACE * tolerance
     if walls is None:
         is_off[boundary_edges(faces)] = False
     rows = np.flatnonzero(is_off)
     if not len(rows):
         return vertices
-    longest = np.full(len(rows), 0.5 * tolerance)
+    max_step = np.full(len(rows), 0.5 * tolerance)
     moved = newton_to_level(
-        function, vertices[rows], samples.select(rows), longest, walls, steps=20
+        function, vertices[rows], samples.select(rows), max_step, walls, steps=20
     )
     is_closer = np.abs(function.sample(moved).value) < np.abs(samples.value[rows])
     is_closer &= row_norms(moved - vertices[rows]) < tolerance
@@ -142,16 +154,20 @@ def _converge_vertices(
 def _project_to_creases(
     function: LevelFunction, vertices: FloatArray, ends: IntArray, moved: FloatArray, walls: Walls
 ) -> FloatArray:
-    """The middles (k, 3) of edges, given by their vertices (k, 2), after they were moved onto the
-    surface; where edges cut off a sharp crease, moved onto the crease instead.
+    """Move the new vertices of edges that cut off a sharp crease onto the crease.
+
+    ends: (k, 2) the vertices of the edges.
+    moved: (k, 3) their middles, moved onto the level set. Returned, except for those edges.
 
     Newton's method leads to one of the two sides of a crease, and an edge along the normal of that
-    side leads back to its end: cut there again and again, its length stays the same. The point
-    nearest to the middle in the tangent planes of both ends is on the crease, as far as its sides
-    are flat (Kobbelt et al. 2001); the point is where the segment to it passes the level. There is
-    a crease if normals turn by 20 degrees or more, and by nearly all of that angle between the
-    moved middle and one of the ends; on a smooth surface they turn by about half of it there.
-    """
+    side leads back to its end: cut there again and again, its length stays the same. Instead, take
+    the point of both tangent planes at the ends that is nearest to the middle. It is on the crease,
+    as far as the sides of the crease are flat (Kobbelt et al. 2001). The new vertex is where the
+    segment from the middle to this point passes the level.
+
+    There is a crease if normals turn by 20 degrees or more between the ends, and by nearly all of
+    that angle between the moved middle and one of the ends; on a smooth surface they turn by about
+    half of it there."""
     used, index = np.unique(ends, return_inverse=True)
     slope = function.sample(vertices[used]).gradient
     at_ends = (slope / np.maximum(row_norms(slope), 1e-300)[:, None])[index.reshape(-1, 2)]
@@ -161,27 +177,31 @@ def _project_to_creases(
     cosine = row_dots(n_a, n_b)
     angle = np.arccos(np.clip(np.minimum(row_dots(n_a, n), row_dots(n_b, n)), -1, 1))
     total = np.arccos(np.clip(cosine, -1, 1))
-    rows = np.flatnonzero((total > _BENT) & (angle > _AT_ONCE * total) & (1 - cosine**2 > 0.01))
+    rows = np.flatnonzero((total > _CREASE) & (angle > _SHARE * total) & (1 - cosine**2 > 0.01))
     if not len(rows):
         return moved
     n_a, n_b, cosine = n_a[rows], n_b[rows], cosine[rows]
     a, b = (vertices[ends[rows, k]] for k in (0, 1))
     middle, span = 0.5 * (a + b), row_norms(b - a)
-    high, low = row_dots(n_a, a - middle), row_dots(n_b, b - middle)
-    weights = np.stack([high - cosine * low, low - cosine * high]) / (1 - cosine**2)
+    h_a, h_b = row_dots(n_a, a - middle), row_dots(n_b, b - middle)
+    weights = np.stack([h_a - cosine * h_b, h_b - cosine * h_a]) / (1 - cosine**2)
     direction = weights[0][:, None] * n_a + weights[1][:, None] * n_b
-    projected, passed = _level_along(function, middle, direction, _BESIDE * span, walls)
-    passed &= np.minimum(row_norms(projected - a), row_norms(projected - b)) > _FROM_ENDS * span
+    projected, found = _level_along(function, middle, direction, _OFFSET * span, walls)
+    found &= np.minimum(row_norms(projected - a), row_norms(projected - b)) > _FROM_ENDS * span
     moved = moved.copy()
-    moved[rows[passed]] = projected[passed]
+    moved[rows[found]] = projected[found]
     return moved
 
 
 def _crease_corners(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, walls: Walls
 ) -> FloatArray:
-    """A point on the surface within each of the faces (k, 3), which cut off a corner: where the
-    tangent planes of its vertices meet, or near the center."""
+    """A point (k, 3) on the level set for each of the faces (k, 3), which cut off a corner of the
+    surface.
+
+    If the normals at the vertices of a face are independent, their tangent planes meet in a point.
+    The result is where the segment from the face's center to this point passes the level; if it
+    does not, or if normals are not independent, it is the center, moved onto the level set."""
     corner = vertices[faces]
     center = corner.mean(axis=1)
     span = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
@@ -189,42 +209,49 @@ def _crease_corners(
     slope = function.sample(corner.reshape(-1, 3)).gradient
     normal = (slope / np.maximum(row_norms(slope), 1e-300)[:, None]).reshape(-1, 3, 3)
     rows = np.flatnonzero(np.abs(np.linalg.det(normal)) > _INDEPENDENT)
-    away = (normal * (corner - center[:, None])).sum(axis=2)
+    offsets = (normal * (corner - center[:, None])).sum(axis=2)
     solve: Any = np.linalg.solve
-    direction: FloatArray = solve(normal[rows], away[rows][:, :, None])[:, :, 0]
-    crossing, passed = _level_along(function, center[rows], direction, _BESIDE * span[rows], walls)
-    moved[rows[passed]] = crossing[passed]
+    direction: FloatArray = solve(normal[rows], offsets[rows][:, :, None])[:, :, 0]
+    crossing, found = _level_along(function, center[rows], direction, _OFFSET * span[rows], walls)
+    moved[rows[found]] = crossing[found]
     return moved
 
 
 def _level_along(
     function: LevelFunction, start: FloatArray, along: FloatArray, limit: FloatArray, walls: Walls
 ) -> tuple[FloatArray, BoolArray]:
-    """Points on the level from `start` (k, 3) along the displacements `along`, at most a little
-    beyond their ends and no farther than `limit`; and whether the level is passed there."""
+    """Search for the level set along segments from `start` (k, 3).
+
+    along: (k, 3) the displacements from start to end, which are shortened to at most `limit` (k,),
+        a length. The search goes on for a quarter of that beyond the end.
+
+    Returns:
+        The first crossing (k, 3) on each segment, and the mask (k,) of segments that cross the
+        level. Where there is none, the point has no meaning.
+    """
     along = along * np.minimum(1, limit / np.maximum(row_norms(along), 1e-300))[:, None]
-    low, high = np.zeros(len(start)), np.full(len(start), _SEARCH_EXTENSION)
-    passed = np.ones(len(start), np.bool_)
-    parts = np.linspace(0, 1, _SAMPLES)
+    low, high = np.zeros(len(start)), np.full(len(start), _SEARCH_LENGTH)
+    found = np.ones(len(start), np.bool_)
+    fractions = np.linspace(0, 1, _SAMPLES)
     for _ in range(2):
-        t = low[:, None] + (high - low)[:, None] * parts
+        t = low[:, None] + (high - low)[:, None] * fractions
         x = start[:, None] + t[:, :, None] * along[:, None]
         x = x if walls is None else np.clip(x, *walls)
         is_above = (function.sample(x.reshape(-1, 3)).value > 0).reshape(t.shape)
         passes = is_above[:, 1:] != is_above[:, :-1]
-        passed &= passes.any(axis=1)
+        found &= passes.any(axis=1)
         first = passes.argmax(axis=1)[:, None]
         low, high = (np.take_along_axis(t, first + k, axis=1)[:, 0] for k in (0, 1))
     crossing = start + low[:, None] * along
     crossing = crossing if walls is None else np.clip(crossing, *walls)
-    longest = 4 * (high - low) * row_norms(along)
-    return newton_to_level(function, crossing, function.sample(crossing), longest, walls), passed
+    max_step = 4 * (high - low) * row_norms(along)
+    return newton_to_level(function, crossing, function.sample(crossing), max_step, walls), found
 
 
 def unrefined_midpoints(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float
 ) -> FloatArray:
-    """Midpoints (k, 3) of the edges that `refine` would still split."""
+    """(k, 3) the midpoints of the edges that `refine` would still split."""
     marks = _RefinementMarks.of(function, vertices, faces, tolerance, None, None)
     return marks.middle[marks.marked]
 
@@ -233,17 +260,16 @@ def unrefined_midpoints(
 class _RefinementMarks:
     """The edges of a mesh, and which of them are to be split.
 
-    edges: (m, 3) of the faces.
-    ends: (k, 2) the endpoints of edges.
-    middle: (k, 3) their midpoints.
-    span: (k,) their lengths.
-    samples: at the midpoints.
-    is_beyond: (k,) midpoints that count and are beyond the tolerance.
-    is_off: (m,) faces whose centers count and are beyond the tolerance.
+    edges: (m, 3) the indices of the edges of each face.
+    ends: (k, 2) the vertices at the ends of each edge.
+    middle: (k, 3) the midpoints of the edges. span: (k,) their lengths.
+    samples: the function at the midpoints.
+    is_beyond: (k,) edges whose midpoint counts and is farther than the tolerance from the level
+        set.
+    is_off: (m,) faces whose center counts and is farther than the tolerance from the level set.
     marked: (k,) edges to be split.
-    misses_corner: (m,) faces that are off although none of their edges is beyond the tolerance, as
-        they cut off a corner of a surface with creases.
-    """
+    misses_corner: (m,) faces that are off although the midpoints of their edges are not, as they
+        cut off a corner of a surface with creases. They get a new vertex within."""
 
     edges: IntArray
     ends: IntArray
@@ -265,8 +291,13 @@ class _RefinementMarks:
         walls: Walls,
         where: Where,
     ) -> _RefinementMarks:
-        """The marks of edges whose midpoint, or the center of an adjacent face, is beyond the
-        tolerance."""
+        """Mark the edges to be split: those whose midpoint is farther than `tolerance` from the
+        level set; and, for each face whose center is so far, the longest edge that may be split.
+        For functions with creases, faces are excepted that cut off a corner (`misses_corner`).
+
+        walls: the lower and the upper corner of the box, on whose faces the boundary lies, so that
+            its edges may be split; None if the boundary stays as it is.
+        where: which midpoints and centers count."""
         ends, edges, is_boundary = _edges(faces)
         if walls is not None:  # the boundary lies in the walls, and so do the middles of its edges
             is_boundary = np.zeros_like(is_boundary)
@@ -280,40 +311,46 @@ class _RefinementMarks:
             is_beyond &= where(middle)
             is_off &= where(center)
         marked = is_beyond.copy()
-        must_split = is_off & (span[edges].max(axis=1) > _SHORTEST * tolerance)
+        must_split = is_off & (span[edges].max(axis=1) > _MIN_EDGE_LENGTH * tolerance)
         cuts_off = np.zeros(len(faces), np.bool_)
         lone = np.flatnonzero(must_split & ~marked[edges].any(axis=1))
         if function.field.has_creases:
-            cuts_off[lone] = _turn_as_at_crease(function, vertices[faces[lone]])
+            cuts_off[lone] = _normals_turn(function, vertices[faces[lone]])
         must_split &= ~cuts_off
         # For a face that is off the surface, the longest edge that may be cut.
         free = np.where(is_boundary[edges], 0.0, span[edges])
         worst = edges[np.arange(len(faces)), free.argmax(axis=1)]
         marked[worst[must_split]] = True
-        marked &= ~is_boundary & (span > _SHORTEST * tolerance)
+        marked &= ~is_boundary & (span > _MIN_EDGE_LENGTH * tolerance)
         return cls(edges, ends, middle, span, samples, is_beyond, is_off, marked, cuts_off)
 
 
-def _turn_as_at_crease(function: LevelFunction, corner: FloatArray) -> BoolArray:
-    """(k,) whether normals at the corners (k, 3, 3) of faces turn as across a crease."""
+def _normals_turn(function: LevelFunction, corner: FloatArray) -> BoolArray:
+    """(k,) whether normals at two corners of a face differ by the angle of a crease.
+
+    corner: (k, 3, 3) the corners of the faces."""
     slope = function.sample(corner.reshape(-1, 3)).gradient
     normal = (slope / np.maximum(row_norms(slope), 1e-300)[:, None]).reshape(-1, 3, 3)
-    between = [row_dots(normal[:, k], normal[:, k - 1]) for k in range(3)]
-    return np.min(between, axis=0) < math.cos(_BENT)
+    cosines = [row_dots(normal[:, k], normal[:, k - 1]) for k in range(3)]
+    return np.min(cosines, axis=0) < math.cos(_CREASE)
 
 
 def _edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
-    """All edges (k, 2), the indices of the edges of each face (m, 3) (that of corners 0 and 1
-    first), and whether each edge belongs to one face only."""
+    """The edges of faces (m, 3).
+
+    Returns:
+        The vertices (k, 2) of all edges; the indices (m, 3) of the edges of each face, that between
+        its first two corners first; and the mask (k,) of the edges that belong to one face only.
+    """
     edges = Edges.of(half_edges(faces))
     return edges.vertices, edges.edge_of_pair.reshape(3, -1).T, edges.multiplicity == 1
 
 
 def split_faces(vertices: FloatArray, faces: IntArray, middle: IntArray) -> IntArray:
-    """Faces, split at the midpoints of their edges.
+    """Split faces (m, 3) at the midpoints of their edges.
 
-    middle: (m, 3) vertices at the midpoints, -1 for edges that are not split.
-    """
+    middle: (m, 3) the vertices at the midpoints of the edges 01, 12 and 20 of each face; -1 for
+        edges that are not split."""
     cut = middle >= 0
     number = cut.sum(axis=1)
     parts = [faces[number == 0]]
@@ -345,9 +382,11 @@ def improve(
     walls: Walls,
     report: Callable[[str], None],
 ) -> tuple[FloatArray, IntArray]:
-    """Vertices and faces with better angles: edges are flipped and vertices smoothed in turn,
-    slivers are contracted; then edges are cut again where triangles are no longer within
-    `tolerance`."""
+    """Improve the angles of triangles. Returns the vertices and the faces.
+
+    Edges are flipped and vertices smoothed in turn, and slivers are contracted. Then edges are
+    split again where triangles are no longer within `tolerance`, and finally edges are flipped and
+    vertices moved for larger angles."""
     for _ in range(2):
         faces = flip_edges(function, vertices, faces, tolerance)
         vertices = smooth(function, vertices, faces, walls, rounds=2)
@@ -368,8 +407,10 @@ def smooth(
     walls: Walls,
     rounds: int = 3,
 ) -> FloatArray:
-    """Vertices moved towards the mean of their neighbors and back onto the surface, a few times;
-    boundary vertices stay. Moves that turn a face by much are reverted."""
+    """The vertices (n, 3), moved halfway to the mean of their neighbors and back onto the level
+    set, for some rounds. Boundary vertices stay, and moves that turn a face by much are undone.
+
+    walls: the lower and the upper corner of the box, on whose faces points stay; or None."""
     ends, _, _ = _edges(faces)
     boundary = np.unique(boundary_edges(faces))
     free = np.zeros(len(vertices), np.bool_)
@@ -406,10 +447,11 @@ def smooth_within_tolerance(
     tolerance: float,
     where: Where = None,
 ) -> FloatArray:
-    """As `smooth`, except that vertices stay if smoothing would move a center or a middle of an
-    edge of their faces farther from the surface than `tolerance`, as beside a crease.
+    """Smooth vertices as `smooth` does, but undo that for the vertices of faces that are then too
+    far from the level set, as beside a crease.
 
-    where: which middles and centers count."""
+    Too far are faces whose center, or the midpoint of one of whose edges, is farther than
+    `tolerance` (a length). where: which midpoints and centers count."""
     after = smooth(function, vertices, faces, walls)
     rows = np.arange(len(faces))
     for _ in range(8):
@@ -429,14 +471,17 @@ def smooth_within_tolerance(
 
 
 def _undo_flipped(before: FloatArray, after: FloatArray, faces: IntArray) -> FloatArray:
-    """The vertices `after`, except those of faces that turned over, which are reverted to
-    `before`."""
+    """The vertices `after`, except that the vertices of faces that turned over go back to `before`.
+
+    A face counts as turned over if its normal turned by more than about 70 degrees. That is
+    repeated, as reverting vertices may turn other faces; if it does not end, all vertices go back.
+    """
     for _ in range(8):
         corner = after[faces]
         normal = area_normals(corner)
         old = before[faces]
-        was = area_normals(old)
-        turned = row_dots(normal, was) <= 0.3 * row_norms(normal) * row_norms(was)
+        old_normal = area_normals(old)
+        turned = row_dots(normal, old_normal) <= 0.3 * row_norms(normal) * row_norms(old_normal)
         if not turned.any():
             return after
         after = after.copy()

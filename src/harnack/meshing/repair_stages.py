@@ -66,18 +66,18 @@ if TYPE_CHECKING:
 
 __all__ = ["repair"]
 
-# The number of sizes of cells that are tried for harmonic fillings if all triangles have to stay;
-# and if they need not stay, where there are at most the third number of open edges.
-_ATTEMPTS, _OPTIONAL_ATTEMPTS, _MAX_OPTIONAL_EDGES = 6, 1, 1000
-# The number of cells across the mesh if it is remeshed. If the surface is rough and has more
-# triangles than the second number, cells are made larger by the third, at most as often as the
-# fourth says.
+# How many sizes of cells are tried for harmonic fillings, if all triangles have to stay; and if
+# they need not. In that case holes with more open edges than the third are not filled like that.
+_ATTEMPTS, _FEW_ATTEMPTS, _FEW_EDGES = 6, 1, 1000
+# If the mesh is remeshed: the number of cells across it. If that takes more triangles than the
+# first of the next numbers, as for a rough surface, cells are made larger by the second, at most as
+# often as the third says.
 _ACROSS_ANEW = 48
-_MOST_ANEW, _CELL_GROWTH, _MAX_GROWTHS = 80_000, 1.4, 3
+_MOST_ANEW, _GROWTH, _MAX_GROWTHS = 80_000, 1.4, 3
 
-# Points lie in a plane if the smallest of their singular values is below this fraction of the
+# Points lie in a plane if the smallest of their singular values is at most this fraction of the
 # largest.
-_FLAT = 1e-9
+_FLATNESS = 1e-9
 
 Keep = Literal["all", "valid", "none"]
 Patches = Literal["smooth", "harmonic"]
@@ -114,28 +114,31 @@ def repair(
     - remeshed: the surface on which the winding number w of the mesh is 1/2 is extracted from the
       signs of w - 1/2 in cells (`meshing.sign_isosurface`); it is closed whatever the mesh is.
 
-    Each result is compared with w at some thousand points, farther from both surfaces than two
-    tolerances: where w is above 0.86 the inside has to be, and where it is below 0.14 the outside;
-    and the volume has to be that of a closed mesh that winds around no point twice. One that
-    differs gives way to the next stage; if all do, the one that differs least is returned, with a
-    warning. That is sampled: what differs in less than a thousandth of the box may not be seen.
+    Each result is compared with w at some thousand points that are farther than two tolerances from
+    both surfaces. Points where w is above 0.86 have to be inside of the result, points where it is
+    below 0.14 outside. If the input is a closed mesh that winds around no point twice, the volumes
+    have to agree as well. If a result differs, the next stage is tried; if all results differ, the
+    one that differs least is returned, with a warning. The comparison is a sample: what differs in
+    less than a thousandth of the box may not be seen.
 
     mesh: anything with `vertices` (n, 3) and `faces` (m, 3).
-    keep: "all" does only the stage "filled", "valid" only "cleaned", and "none" only "remeshed",
-        or raises an error; None tries all five, up to the first that succeeds.
-    filling: "smooth" hole fillings continue the surface around each hole, with its tangents, and
-        bend least. They are computed hole by hole, and used where w is within 0.36 of 1/2 modulo 1
-        on them; other holes get "harmonic" fillings, on which w is 1/2 modulo 1: these join the
-        boundary loops of a gap between two components, and have a dent where the surface was
-        round. Only for harmonic fillings is it proved which surface they approximate.
-    largest: keep only the body of the largest volume, with its cavities.
-    cell_size: of cells before anything is refined, in the mesh's unit; None chooses.
+    keep: which stages to try. "all" is only "filled", "valid" only "cleaned", "none" only
+        "remeshed"; an error is raised if the stage fails. None tries all five, up to the first that
+        succeeds.
+    filling: "smooth" or "harmonic". Smooth fillings continue the surface around a hole, with its
+        tangents, and have minimal bending. They are computed hole by hole, and used if w is within
+        0.36 of 1/2 modulo 1 on them. Other holes get harmonic fillings, on which w is 1/2 modulo 1.
+        These can join the boundary loops of a gap between two components, and have a dent where the
+        surface was round. Only for harmonic fillings is it proved which surface they approximate.
+    largest: whether to keep only the body of the largest volume, with its cavities.
+    cell_size: the size of cells before refinement, in the mesh's unit; None chooses it.
     seed: of the small random moves that keep points in general position.
-    progress: called with the name of each step of the work.
-    options: a `TraceOptions`, of which repairs have the tolerance alone: the largest distance of
-        harmonic fillings and of remeshed triangles from the surface w = 1/2, a length, sampled and
-        not proved. None is 1e-3 of the longest side of the box of the mesh and, for fillings, of
-        the box around all holes. tolerance: the same, in place of `options`.
+    progress: a function that is told what is being done.
+    options: a `TraceOptions`. Repairs use only its tolerance: the largest distance of harmonic
+        fillings and of remeshed triangles from the surface w = 1/2, a length, which is sampled and
+        not proved. None is 1e-3 of the longest side of the box around the mesh or, for fillings, of
+        the box around all holes.
+    tolerance: the same, in place of `options`.
 
     Returns:
         A closed trimesh.Trimesh: every edge has two faces, which agree. `metadata["harnack"]` has
@@ -178,10 +181,10 @@ def repair(
         signs, such as far and within; kept is 0.
 
     Raises:
-        MeshError: a ValueError, for a mesh that has no triangles, or numbers that are none; one
-            that is an open sheet, most of which has nothing inside, if it would be made anew; with
-            keep="all" also for edges of more than two faces, faces that disagree on their sides,
-            faces without an area and vertices at one place.
+        MeshError: a ValueError. The mesh has no triangles, or numbers that are not finite; or it
+            would be remeshed and is an open sheet: most of it has nothing inside. With keep="all"
+            also: it has edges of more than two faces, faces that disagree in orientation, faces
+            without an area, or several vertices at one place.
         MeshingError: a ValueError, with keep="all" or "valid", if patches could not be made, or
             meet the mesh or each other; else if the surface w = 1/2 is empty or takes too many
             cells.
@@ -189,7 +192,7 @@ def repair(
     largest = flag(largest, "largest")
     keywords = {} if tolerance is None else {"tolerance": tolerance}
     accuracy = MeshTolerance.of(trace_options("repair", options, keywords, ("tolerance",)))
-    settings = _checked_settings(keep, filling, accuracy, cell_size, seed, teller(progress))
+    asked = _checked_settings(keep, filling, accuracy, cell_size, seed, teller(progress))
     _check_is_mesh(mesh)
     _check_encloses(mesh)
     intended = IntendedSolid.of(mesh, as_it_is=keep == "all")
@@ -204,20 +207,20 @@ def repair(
     reasons, results = list[str](), list[_Result]()
     for name in names:
         try:
-            surface, facts = stages[name](intended, settings)
+            surface, facts = stages[name](intended, asked)
         except (MeshError, MeshingError) as error:
             if name == names[-1] and not results:
                 raise
             reasons.append(str(error))
-            settings.report(f"{error}; so not all is kept")
+            asked.report(f"{error}; so not all is kept")
             continue
-        settings.report("comparing with what was given")
+        asked.report("comparing with what was given")
         away = 2 * accuracy.at(intended.size) + facts.get("moved", 0.0)
         results.append(_Result(surface, facts, intended.difference(surface, away)))
         if results[-1].difference is None:
             break
         reasons.append(f"the result of {facts['stage']} is another solid: {results[-1].difference}")
-        settings.report(f"{reasons[-1]}; so another way")
+        asked.report(f"{reasons[-1]}; so another way")
     best = min(results, key=lambda result: result.badness)
     moved = best.facts.get("moved", 0.0)
     if moved > 2 * accuracy.at(intended.size):
@@ -233,7 +236,8 @@ def repair(
 
 @dataclass(frozen=True)
 class _RepairOptions:
-    """The arguments of `repair`."""
+    """The arguments of `repair`, checked. patches is its `filling`, spacing its `cell_size`, and
+    report its `progress`."""
 
     keep: Keep | None
     patches: Patches
@@ -251,6 +255,11 @@ def _checked_settings(
     seed: int,
     report: Callable[[str], None],
 ) -> _RepairOptions:
+    """The arguments of `repair`, checked.
+
+    Raises:
+        ValueError: one of them is not among the allowed values.
+    """
     if keep is not None and not is_one_of(keep, ("all", "valid", "none")):
         raise ValueError(f'keep is None, "all", "valid" or "none", not {keep!r}')
     if not is_one_of(patches, ("smooth", "harmonic")):
@@ -261,7 +270,10 @@ def _checked_settings(
 
 @dataclass(frozen=True)
 class _Result:
-    """The result of a stage, and its difference from the intended solid; None for no difference."""
+    """The result of a stage.
+
+    surface: the closed mesh. facts: what `metadata["harnack"]` says of it.
+    difference: how it differs from the input; None if it does not."""
 
     surface: TriangleMesh
     facts: dict[str, Any]
@@ -269,17 +281,17 @@ class _Result:
 
     @property
     def badness(self) -> float:
-        """0 if it does not differ: see `Difference`."""
+        """`Difference.badness`; 0 if the result does not differ from the input."""
         return 0.0 if self.difference is None else self.difference.badness
 
-    def finished(self, more_facts: dict[str, Any], largest: bool) -> trimesh.Trimesh:
-        """The mesh, with its metadata; with a warning if it differs from the intended solid.
+    def finished(self, more: dict[str, Any], largest: bool) -> trimesh.Trimesh:
+        """The mesh that `repair` returns. It warns if the result differs from the input.
 
-        more_facts: further metadata."""
+        more: further facts. largest: whether to keep only the body of the largest volume."""
         from harnack.meshing.closed_mesh import ClosedMesh
 
         surface = self.surface
-        facts: dict[str, Any] = {**self.facts, **more_facts, "differs": None}
+        facts: dict[str, Any] = {**self.facts, **more, "differs": None}
         if self.difference is not None:
             facts["differs"] = dataclasses.asdict(self.difference)
             warnings.warn(
@@ -291,7 +303,7 @@ class _Result:
         if largest and len(parts) > 1:
             surface = largest_body(surface)
             dropped = len(parts) - len(component_facts(surface))
-            facts["kept"] = _count_of(surface, self.surface, facts["kept"])
+            facts["kept"] = _count_kept(surface, self.surface, facts["kept"])
         repaired = ClosedMesh(surface.vertices, surface.faces, process=False, validate=False)
         repaired.metadata["harnack"] = {
             **facts,
@@ -302,14 +314,16 @@ class _Result:
         return repaired
 
 
-def _count_of(surface: TriangleMesh, whole: TriangleMesh, first: int) -> int:
-    """The number of the first faces of a whole mesh that are in a surface that is a part of it."""
-    corners = [mesh.vertices[mesh.faces].reshape(-1, 9) for mesh in (surface, whole)]
-    rows = {row.tobytes() for row in corners[0]}
-    return sum(row.tobytes() in rows for row in corners[1][:first])
+def _count_kept(surface: TriangleMesh, whole: TriangleMesh, first: int) -> int:
+    """How many of the first `first` faces of the mesh `whole` are among the faces of `surface`, by
+    the coordinates of their corners."""
+    corners = [one.vertices[one.faces].reshape(-1, 9) for one in (surface, whole)]
+    present = {row.tobytes() for row in corners[0]}
+    return sum(row.tobytes() in present for row in corners[1][:first])
 
 
 def _check_is_mesh(mesh: Any) -> None:
+    """Raise a TypeError unless the object has vertices and faces."""
     if not hasattr(mesh, "vertices") or not hasattr(mesh, "faces"):
         raise TypeError(
             f"repair takes a mesh with vertices and faces, such as a trimesh.Trimesh, not "
@@ -318,18 +332,18 @@ def _check_is_mesh(mesh: Any) -> None:
 
 
 def _check_encloses(mesh: Any) -> None:
-    """Raise if all faces lie in a plane, or form a strip of one side only.
+    """Raise if a mesh cannot enclose anything.
 
     Raises:
-        MeshError: so; or as `validate_mesh`.
+        MeshError: all faces lie in a plane, or the mesh has one side only; or as `validate_mesh`.
     """
     vertices, faces = validate_mesh(
         np.asarray(mesh.vertices), np.asarray(mesh.faces), allow_zero_area=True
     )
     x = vertices[np.unique(faces)]
     x = x - x.mean(axis=0)
-    largest, *_, least = np.linalg.svd(x / np.abs(x).max(), compute_uv=False)
-    if least <= _FLAT * largest:
+    largest, *_, smallest = np.linalg.svd(x / np.abs(x).max(), compute_uv=False)
+    if smallest <= _FLATNESS * largest:
         raise MeshError(
             "all faces of the mesh lie in a plane, or nearly so: they enclose nothing that could "
             "be closed; give it a thickness first, or mesh its boundary with `thickness`"
@@ -345,39 +359,39 @@ def _check_encloses(mesh: Any) -> None:
 
 
 def _unite_bodies(
-    intended: IntendedSolid, options: _RepairOptions
+    intended: IntendedSolid, asked: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The boundary of the solid that a closed mesh bounds which passes through itself, or of parts
-    that touch.
+    """Stage "boolean_union": the boundary of the solid of a closed mesh that passes through itself,
+    or whose parts overlap or touch. Returns it with facts for the metadata.
 
     Raises:
-        MeshError, MeshingError: as `repair`.
+        MeshError, MeshingError: as `repair`; also if nothing of the mesh overlaps.
     """
     vertices, faces = intended.vertices, intended.oriented
     if len(singular_edges(faces)[0]):
         raise MeshError("the mesh is not closed")
-    if _is_free_of_overlaps(vertices, faces):
+    if _is_fine(vertices, faces):
         raise MeshError("nothing of it passes through or lies in itself")
     facts = {"stage": "boolean_union", "kept": 0}
-    slivers = 0.5 * options.tolerance.at(intended.size)
+    slivers = 0.5 * asked.tolerance.at(intended.size)
     if len(intended.parts) > 1 and sum(map(len, intended.parts)) == len(faces):
-        options.report(f"uniting {len(intended.parts):,} parts")
+        asked.report(f"uniting {len(intended.parts):,} parts")
         try:
             return united_parts(vertices, faces, intended.parts, slivers), facts
         except (MeshError, MeshingError) as error:
-            options.report(f"{error}; so all at once")
-    options.report("cutting faces along each other")
+            asked.report(f"{error}; so all at once")
+    asked.report("cutting faces along each other")
     try:
         return mended_by_cuts(vertices, faces, slivers), facts
     except MeshingError as error:
-        options.report(f"{error}; so by cells")
-    mesh = mesh_of(MeshSolid(vertices, faces), progress=options.report)
-    return TriangleMesh(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64)), facts
+        asked.report(f"{error}; so by cells")
+    made = mesh_of(MeshSolid(vertices, faces), progress=asked.report)
+    return TriangleMesh(np.asarray(made.vertices), np.asarray(made.faces, np.int64)), facts
 
 
-def _is_free_of_overlaps(vertices: FloatArray, faces: IntArray) -> bool:
-    """Whether no triangles meet except in common vertices and edges, and no part is in another's
-    material."""
+def _is_fine(vertices: FloatArray, faces: IntArray) -> bool:
+    """Whether triangles meet only in shared edges and vertices, and no part is inside out or in the
+    material of another."""
     try:
         _check_sides(TriangleMesh.without_unused_vertices(vertices, faces))
     except MeshError:
@@ -385,110 +399,117 @@ def _is_free_of_overlaps(vertices: FloatArray, faces: IntArray) -> bool:
     return not len(nonmanifold_vertices(faces)) and not len(intersecting_faces(vertices, faces))
 
 
-# Remeshing.
+# All made anew.
 
 
-def _remesh(
-    intended: IntendedSolid, options: _RepairOptions
-) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The surface on which the winding number is 1/2, closed whatever the mesh is."""
+def _remesh(intended: IntendedSolid, asked: _RepairOptions) -> tuple[TriangleMesh, dict[str, Any]]:
+    """Stage "remeshed": the surface on which the winding number is 1/2, which is closed whatever
+    the mesh is. Returns it with facts for the metadata."""
     intended.check_encloses()
     corners = without_zero_area_faces(intended.vertices, intended.oriented)
     field = WindingNumber(*corners)
-    if options.spacing is not None:
-        mesh = _by_signs(field, options.spacing, options)
+    if asked.spacing is not None:
+        made = _by_signs(field, asked.spacing, asked)
     else:
         spacing = float(np.ptp(corners[0], axis=0).max()) / _ACROSS_ANEW
         try:
-            mesh = _of_bounded_size(field, spacing, options)
+            made = _of_bounded_size(field, spacing, asked)
         except MeshingError:
-            mesh = _by_signs(field, 0.6 * spacing, options)
-    facts = mesh.metadata["harnack"] | {"stage": "remeshed", "kept": 0}
-    return TriangleMesh(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64)), facts
+            made = _by_signs(field, 0.6 * spacing, asked)
+    facts = made.metadata["harnack"] | {"stage": "remeshed", "kept": 0}
+    return TriangleMesh(np.asarray(made.vertices), np.asarray(made.faces, np.int64)), facts
 
 
 def _of_bounded_size(
-    field: WindingNumber, spacing: float, options: _RepairOptions
+    field: WindingNumber, spacing: float, asked: _RepairOptions
 ) -> trimesh.Trimesh:
-    """The mesh by signs, with larger cells if there would be too many triangles, as for noisy
-    meshes: the time of checks grows with their number."""
+    """The surface on which the winding number is 1/2, with larger cells if it would have too many
+    triangles, as for a noisy mesh: the time of the checks grows with their number.
+
+    spacing: the size of cells that is tried first."""
     for k in range(_MAX_GROWTHS):
         try:
-            return _by_signs(field, spacing * _CELL_GROWTH**k, options, _MOST_ANEW)
+            return _by_signs(field, spacing * _GROWTH**k, asked, _MOST_ANEW)
         except TriangleLimitError as error:
-            options.report(f"{error}; so of larger cells")
-    return _by_signs(field, spacing * _CELL_GROWTH**_MAX_GROWTHS, options)
+            asked.report(f"{error}; so of larger cells")
+    return _by_signs(field, spacing * _GROWTH**_MAX_GROWTHS, asked)
 
 
 def _by_signs(
-    field: WindingNumber, spacing: float, options: _RepairOptions, max_triangles: int = 2_000_000
+    field: WindingNumber, spacing: float, asked: _RepairOptions, most: int = 2_000_000
 ) -> trimesh.Trimesh:
+    """The surface on which the winding number is 1/2. spacing: the size of cells. most: the largest
+    number of triangles."""
     return mesh_of(
-        field, level=0.5, side="above", tolerance=options.tolerance.length, cell_size=spacing,
-        max_triangles=max_triangles, progress=options.report,
+        field, level=0.5, side="above", tolerance=asked.tolerance.length, cell_size=spacing,
+        max_triangles=most, progress=asked.report,
     )  # fmt: skip
 
 
-# Valid triangles kept.
+# What is sound kept.
 
 
 def _keep_valid(
-    intended: IntendedSolid, options: _RepairOptions
+    intended: IntendedSolid, asked: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The valid triangles, with hole fillings.
+    """Stage "cleaned": the valid triangles, with fillings in place of all others and over holes.
+    Returns the mesh with facts for the metadata.
 
     Raises:
         MeshError, MeshingError: as `repair`.
     """
     vertices, faces = without_zero_area_faces(intended.vertices, intended.faces)
-    cleaned = clean_and_fill(vertices, faces, options.report)
+    made = clean_and_fill(vertices, faces, asked.report)
     flat = len(intended.faces) - len(faces)
-    left_out = {"flat": cleaned.left_out["flat"] + flat}
-    return cleaned.surface, {
+    left_out = {"flat": made.left_out["flat"] + flat}
+    return made.surface, {
         "stage": "cleaned",
-        "kept": len(cleaned.kept_faces),
-        "turned": _count_turned(intended, cleaned),
-        "left_out": cleaned.left_out | left_out,
-        "holes": cleaned.holes,
-        "patches": len(cleaned.surface.faces) - len(cleaned.kept_faces),
+        "kept": len(made.kept),
+        "turned": _count_turned(intended, made),
+        "left_out": made.left_out | left_out,
+        "holes": made.holes,
+        "patches": len(made.surface.faces) - len(made.kept),
         "harmonic": 0,
     }
 
 
-def _count_turned(intended: IntendedSolid, sound: CleanedMesh) -> int:
-    """The number of kept triangles whose orientation differs from that of the input triangles."""
+def _count_turned(intended: IntendedSolid, cleaned: CleanedMesh) -> int:
+    """How many of the kept triangles have the reverse orientation of their input triangle. A
+    triangle may be reversed twice: with its part in `IntendedSolid`, and against its neighbors in
+    the cleaning."""
     turned_before = np.delete(
         intended.is_turned, zero_area_faces(intended.vertices, intended.faces)
     )
     is_turned = np.zeros(len(turned_before), np.bool_)
-    is_turned[sound.turned] = True
-    return int((is_turned ^ turned_before)[sound.kept_faces].sum())
+    is_turned[cleaned.turned] = True
+    return int((is_turned ^ turned_before)[cleaned.kept].sum())
 
 
 # Loose triangles joined.
 
 
 def _weld_loose(
-    intended: IntendedSolid, options: _RepairOptions
+    intended: IntendedSolid, asked: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """Triangles with near corners joined, with hole fillings; none is kept bit by bit.
+    """Stage "welded": triangles whose near corners are merged, with fillings. No triangle is kept
+    bit by bit. Returns the mesh with facts for the metadata.
 
     Raises:
         MeshError, MeshingError: as `repair`.
     """
     corners = without_zero_area_faces(intended.vertices, intended.faces)
     vertices, faces, moved = weld_near_corners(*corners)
-    cleaned = clean_and_fill(vertices, faces, options.report)
-    count = len(cleaned.kept_faces)
-    return cleaned.surface, {
+    made = clean_and_fill(vertices, faces, asked.report)
+    count = len(made.kept)
+    return made.surface, {
         "stage": "welded",
         "kept": 0,
         "joined": count,
         "moved": moved,
-        "turned": len(cleaned.turned),
-        "left_out": cleaned.left_out | {"flat": len(intended.faces) - len(faces)},
-        "holes": cleaned.holes,
-        "patches": len(cleaned.surface.faces) - count,
+        "turned": len(made.turned),
+        "left_out": made.left_out | {"flat": len(intended.faces) - len(faces)},
+        "holes": made.holes,
+        "patches": len(made.surface.faces) - count,
         "harmonic": 0,
     }
 
@@ -497,9 +518,10 @@ def _weld_loose(
 
 
 def _fill_only(
-    intended: IntendedSolid, options: _RepairOptions
+    intended: IntendedSolid, asked: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The mesh with hole fillings; all its triangles stay.
+    """Stage "filled": all triangles of the mesh stay, and its holes are filled. Returns the mesh
+    with facts for the metadata.
 
     Raises:
         MeshError, MeshingError: as `repair`.
@@ -508,21 +530,25 @@ def _fill_only(
     if intended.is_turned.any():
         raise MeshError("a part of the mesh is inside out")
     edges = checked_boundary_edges(faces)
-    if options.keep is None and len(crossing := intersecting_faces(vertices, faces)):
+    if asked.keep is None and len(crossing := intersecting_faces(vertices, faces)):
         raise MeshError(f"{len(crossing):,} triangles of the mesh pass through others")
     loops = hole_loops(vertices, faces, edges)
-    if options.patches == "smooth":
+    if asked.patches == "smooth":
         try:
-            return _fill_all_holes(vertices, faces, loops, options)
+            return _kept_with(vertices, faces, loops, asked)
         except MeshingError as error:
-            if options.keep is None:
+            if asked.keep is None:
                 raise
-            options.report(f"{error}; once more, with harmonic patches alone")
-    return _fill_all_holes(vertices, faces, loops, dataclasses.replace(options, patches="harmonic"))
+            asked.report(f"{error}; once more, with harmonic patches alone")
+    return _kept_with(vertices, faces, loops, dataclasses.replace(asked, patches="harmonic"))
 
 
 def _checked(intended: IntendedSolid) -> tuple[FloatArray, IntArray]:
-    """The vertices and faces of a mesh, if all of them can be kept; else MeshError."""
+    """The vertices and faces of a mesh whose triangles can all be kept.
+
+    Raises:
+        MeshError: different vertices are at the same place; or as `validate_mesh`.
+    """
     vertices, faces = validate_mesh(intended.vertices, intended.faces)
     used = np.unique(faces)
     welded = weld_vertices(vertices[used])
@@ -536,55 +562,55 @@ def _checked(intended: IntendedSolid) -> tuple[FloatArray, IntArray]:
     return vertices, faces
 
 
-def _fill_all_holes(
-    vertices: FloatArray, faces: IntArray, loops: list[IntArray], options: _RepairOptions
+def _kept_with(
+    vertices: FloatArray, faces: IntArray, loops: list[IntArray], asked: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The mesh with its holes filled: by smooth fillings if requested, and by harmonic fillings.
+    """The mesh with fillings over its holes. Returns it with facts for the metadata.
+
+    loops: the vertices around each hole. Holes get smooth fillings if `asked` says so, and harmonic
+        ones if it does not or if smooth ones fail.
 
     Raises:
         MeshingError: as `repair`.
     """
-    x, whole, unfilled = vertices, faces, loops
-    if loops and options.patches == "smooth":
-        options.report(f"filling {len(loops):,} holes")
+    x, together, left = vertices, faces, loops
+    if loops and asked.patches == "smooth":
+        asked.report(f"filling {len(loops):,} holes")
         field = WindingNumber(vertices, faces)
-        filling = fill_holes(vertices, faces, loops, lambda p: field.value(p, precision="double"))
-        x, whole = np.concatenate([x, filling.vertices]), np.concatenate([faces, filling.faces])
-        unfilled = filling.unfilled_loops
-        options.report(f"{len(unfilled):,} holes are left" + f": {filling.reason}" * bool(unfilled))
-    harmonic = HarmonicFilling(vertices[:0], faces[:0], True, 0.0, 0)
-    if unfilled:
-        edges = checked_boundary_edges(whole)
-        if options.keep is None and len(edges) > _MAX_OPTIONAL_EDGES:
-            raise MeshingError(
-                f"{len(unfilled):,} holes of {len(edges):,} edges have no smooth patch"
-            )
-        attempts = _ATTEMPTS if options.keep == "all" else _OPTIONAL_ATTEMPTS
-        setup = HoleFillingOptions(
-            options.tolerance, options.spacing, options.seed, attempts, options.report
-        )
-        harmonic = harmonic_patches(x, whole, edges, setup)
-        x, whole = np.concatenate([x, harmonic.vertices]), np.concatenate([whole, harmonic.faces])
-    surface = TriangleMesh.without_unused_vertices(x, whole)
-    if loops or options.keep is None:
-        _check_touching(whole)
-    if options.keep is None:
+        made = fill_holes(vertices, faces, loops, lambda p: field.value(p, precision="double"))
+        x, together = np.concatenate([x, made.vertices]), np.concatenate([faces, made.faces])
+        left = made.unfilled_loops
+        asked.report(f"{len(left):,} holes are left" + f": {made.reason}" * bool(left))
+    rest = HarmonicFilling(vertices[:0], faces[:0], True, 0.0, 0)
+    if left:
+        edges = checked_boundary_edges(together)
+        if asked.keep is None and len(edges) > _FEW_EDGES:
+            raise MeshingError(f"{len(left):,} holes of {len(edges):,} edges have no smooth patch")
+        attempts = _ATTEMPTS if asked.keep == "all" else _FEW_ATTEMPTS
+        how = HoleFillingOptions(asked.tolerance, asked.spacing, asked.seed, attempts, asked.report)
+        rest = harmonic_patches(x, together, edges, how)
+        x, together = np.concatenate([x, rest.vertices]), np.concatenate([together, rest.faces])
+    surface = TriangleMesh.without_unused_vertices(x, together)
+    if loops or asked.keep is None:
+        _check_touching(together)
+    if asked.keep is None:
         _check_sides(surface)
     return surface, {
         "stage": "filled",
         "kept": len(faces),
         "holes": len(loops),
-        "patches": len(whole) - len(faces),
-        "harmonic": len(harmonic.faces),
-        "missing": harmonic.triangle_fill_count,
-        "refined": harmonic.is_refined,
-        "spacing": harmonic.spacing,
-        "evaluations": harmonic.evaluations,
+        "patches": len(together) - len(faces),
+        "harmonic": len(rest.faces),
+        "missing": rest.triangle_fill_count,
+        "refined": rest.is_refined,
+        "spacing": rest.spacing,
+        "evaluations": rest.evaluations,
     }
 
 
 def _check_sides(surface: TriangleMesh) -> None:
-    """Raise if a part is inside out, or inside the material of another one, also in part."""
+    """Raise a MeshError if a part is inside out, lies in the material of another one, or passes
+    through itself or others."""
     shells = Shells.of(surface)
     depths = shells.nesting_depths()
     if ((shells.volumes < 0) & (depths == 0)).any():
@@ -596,7 +622,7 @@ def _check_sides(surface: TriangleMesh) -> None:
 
 
 def _check_touching(faces: IntArray) -> None:
-    """Raise unless the faces around each vertex are joined by edges."""
+    """Raise a MeshingError unless the faces around each vertex are connected by edges."""
     if len(places := nonmanifold_vertices(faces)):
         raise MeshingError(
             f"faces touch in {len(places):,} vertices alone, such as vertex {places[0]}: such a "

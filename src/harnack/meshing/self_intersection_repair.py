@@ -37,19 +37,22 @@ __all__ = ["resolve_local_intersections", "resolve_self_intersections"]
 
 # If there are more crossing triangles than this, or if their neighborhood is larger, they are no
 # slivers.
-_MAX_CROSSING_FACES, _MAX_NEIGHBORHOOD = 400, 5_000
+_MAX_CROSSING, _MAX_NEIGHBORHOOD = 400, 5_000
 # The largest number of changes in one place, and the number of attempts for each.
 _MAX_CHANGES, _MAX_ATTEMPTS = 40, 80
 # New triangles with less than this fraction of the area that they cover may face backwards.
-_NOTHING = 1e-4
+_NO_AREA = 1e-4
 
 
 def resolve_self_intersections(surface: TriangleMesh, length: float) -> TriangleMesh:
-    """A closed surface, mended where its triangles pass through each other
-    (`resolve_local_intersections`), so that none do.
+    """A closed surface, mended so that none of its triangles pass through each other
+    (`resolve_local_intersections`). It is returned unchanged if none do.
+
+    length: how far one change may move the surface.
 
     Raises:
-        MeshingError: vertices are not finite; a SelfIntersectionError if triangles still cross.
+        MeshingError: vertices are not finite.
+        SelfIntersectionError: some triangles still cross.
     """
     try:
         check_no_self_intersection(surface.vertices, surface.faces)
@@ -64,14 +67,15 @@ def resolve_self_intersections(surface: TriangleMesh, length: float) -> Triangle
 def resolve_local_intersections(
     surface: TriangleMesh, crossing: IntArray, length: float
 ) -> tuple[TriangleMesh, int]:
-    """A closed surface with edges contracted and flipped where triangles cross; and the number of
-    triangles that still cross.
+    """Contract and flip edges near crossing triangles, so that fewer cross.
 
-    crossing: all faces that cross others (`intersecting_faces`).
-    length: how far the surface may be moved by one change; vertices stay where they are, or are
-        removed.
+    crossing: the indices of all faces that cross others (`intersecting_faces`).
+    length: how far one change may move the surface. Vertices are removed or stay where they are.
+
+    Returns:
+        The changed closed surface, and the number of triangles that still cross.
     """
-    if not 0 < len(crossing) <= _MAX_CROSSING_FACES or length <= 0:
+    if not 0 < len(crossing) <= _MAX_CROSSING or length <= 0:
         return surface, len(crossing)
     vertices, faces = surface.vertices, surface.faces
     is_gone, pieces, crossing_count = np.zeros(len(faces), np.bool_), [faces[:0]], 0
@@ -92,38 +96,41 @@ def resolve_local_intersections(
 def _regions(
     vertices: FloatArray, faces: IntArray, crossing: IntArray
 ) -> Iterator[tuple[IntArray, IntArray]]:
-    """The faces, by index, of separate neighborhoods, and the vertices of each that may be removed.
+    """Separate neighborhoods of crossing faces.
 
-    A neighborhood is all faces whose boxes meet that of the faces around the faces around crossing
-    faces. Vertices of faces next to crossing faces may be removed: the new faces then lie within
-    that box, so that they cross no others.
-    """
+    A neighborhood grows in three steps: the faces that share a corner with crossing faces (the near
+    faces); the faces that share a corner with those; and all faces whose bounding boxes meet the
+    bounding box of the result. Neighborhoods with a face in common are merged.
+
+    Yields: The indices of the faces of a neighborhood, and the vertices that may be removed: those
+        of near faces. Faces that replace removed ones lie within the bounding box, so they cross no
+        face outside of the neighborhood."""
     import scipy.sparse  # imported here: it takes half a second
     import scipy.sparse.csgraph as csgraph_module
 
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
     corner = vertices[faces]
     lower, upper = corner.min(axis=1), corner.max(axis=1)
-    near = _faces_with_corners_of(faces, faces[crossing])
-    second_ring = _faces_with_corners_of(faces, faces[near])
+    near = _faces_at_corners(faces, faces[crossing])
+    second_ring = _faces_at_corners(faces, faces[near])
     pairs = half_edges(faces[second_ring])
-    joined = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(vertices),) * 2)
-    part = csgraph.connected_components(joined, directed=False)[1]
-    boxes: list[IntArray] = []
-    for label in np.unique(part[faces[second_ring, 0]]):
-        rows = second_ring[part[faces[second_ring, 0]] == label]
+    adjacency = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(vertices),) * 2)
+    part = csgraph.connected_components(adjacency, directed=False)[1]
+    neighborhoods: list[IntArray] = []
+    for group in np.unique(part[faces[second_ring, 0]]):
+        rows = second_ring[part[faces[second_ring, 0]] == group]
         low, high = lower[rows].min(axis=0), upper[rows].max(axis=0)
         members = np.flatnonzero((lower <= high).all(axis=1) & (upper >= low).all(axis=1))
-        for k in reversed(range(len(boxes))):
-            if len(np.intersect1d(members, boxes[k])):
-                members = np.union1d(members, boxes.pop(k))
-        boxes.append(members)
-    for rows in boxes:
+        for k in reversed(range(len(neighborhoods))):
+            if len(np.intersect1d(members, neighborhoods[k])):
+                members = np.union1d(members, neighborhoods.pop(k))
+        neighborhoods.append(members)
+    for rows in neighborhoods:
         yield rows, np.unique(faces[near[np.isin(near, rows)]])
 
 
-def _faces_with_corners_of(faces: IntArray, targets: IntArray) -> IntArray:
-    """The indices of faces that have a corner in common with `targets`."""
+def _faces_at_corners(faces: IntArray, targets: IntArray) -> IntArray:
+    """The indices of the faces that have a corner in common with the faces `targets` (k, 3)."""
     is_corner = np.zeros(int(faces.max()) + 1, np.bool_)
     is_corner[targets] = True
     return np.flatnonzero(is_corner[faces].any(axis=1))
@@ -131,8 +138,11 @@ def _faces_with_corners_of(faces: IntArray, targets: IntArray) -> IntArray:
 
 @dataclass(frozen=True)
 class _Neighborhood:
-    """Faces (m, 3) of a neighborhood, between vertices (n, 3) of the mesh; is_movable: (n,) the
-    vertices all of whose faces are in the neighborhood."""
+    """Some faces of a mesh, with vertices numbered anew.
+
+    vertices: (n, 3). faces: (m, 3).
+    is_movable: (n,) the vertices all of whose faces are in the neighborhood; these may be removed.
+    mesh_vertices: (n,) the index of each vertex in the mesh."""
 
     vertices: FloatArray
     faces: IntArray
@@ -141,31 +151,33 @@ class _Neighborhood:
 
     @classmethod
     def of(cls, vertices: FloatArray, faces: IntArray, movable: IntArray) -> _Neighborhood:
-        """The neighborhood of these faces, whose vertices `movable` may be removed."""
+        """The neighborhood of `faces`, given by vertices of the mesh. movable: the vertices that
+        may be removed."""
         names, index = np.unique(faces, return_inverse=True)
         return cls(vertices[names], index.reshape(-1, 3), np.isin(names, movable), names)
 
     def crossing(self) -> IntArray:
-        """Faces, by index, that pass through others."""
+        """The indices of faces that pass through others."""
         return intersecting_faces(self.vertices, self.faces)
 
     def around(self, vertex: int) -> IntArray:
-        """Faces, by index, at a vertex."""
+        """The indices of the faces at a vertex."""
         return np.flatnonzero((self.faces == vertex).any(axis=1))
 
     def neighbors(self, vertex: int) -> set[int]:
-        """The vertices that edges join to a vertex."""
+        """The vertices that share an edge with a vertex."""
         return set(self.faces[self.around(vertex)].ravel().tolist()) - {vertex}
 
-    def with_faces(self, removed: IntArray, new: IntArray) -> _Neighborhood:
-        """The neighborhood with the faces `removed`, by index, replaced by `new`."""
+    def with_faces(self, gone: IntArray, new: IntArray) -> _Neighborhood:
+        """The neighborhood with the faces `gone` (indices) replaced by `new` (k, 3)."""
         return dataclasses.replace(
-            self, faces=np.concatenate([np.delete(self.faces, removed, axis=0), new])
+            self, faces=np.concatenate([np.delete(self.faces, gone, axis=0), new])
         )
 
     def collapse_edge(self, a: int, b: int) -> tuple[IntArray, IntArray] | None:
-        """The faces that are removed, by index, and those that replace them if a is moved to b;
-        None if sheets would touch."""
+        """Move vertex a to its neighbor b. Returns the indices of the faces that are removed, and
+        the faces that replace them; None if sheets would touch, or if the vertices may not be
+        removed."""
         if not (self.is_movable[a] and self.is_movable[b]):
             return None
         if len(self.neighbors(a) & self.neighbors(b)) != 2:
@@ -175,9 +187,9 @@ class _Neighborhood:
         return removed, new[(new != np.roll(new, 1, axis=1)).all(axis=1)]
 
     def flip_edge(self, a: int, b: int) -> tuple[IntArray, IntArray] | None:
-        """The faces that are removed, by index, and those that replace them if the edge between a
-        and b is flipped to join the corners opposite to it; None if there already is such an
-        edge."""
+        """Replace the edge between a and b by one between the corners opposite to it. Returns the
+        indices of the two faces that are removed, and the two that replace them; None if there
+        already is such an edge, or if vertices may not be moved."""
         if not (self.is_movable[a] and self.is_movable[b]):
             return None
         removed = np.intersect1d(self.around(a), self.around(b))
@@ -195,8 +207,11 @@ class _Neighborhood:
 
 
 def _reduce_crossings(patch: _Neighborhood, length: float) -> tuple[IntArray, int]:
-    """The faces of a patch, by vertices of the mesh, after changes that let fewer cross; and the
-    number that still cross."""
+    """Change edges of a neighborhood, one after the other, as long as that lets fewer faces cross.
+
+    Returns:
+        The faces, given by vertices of the mesh, and the number of those that still cross.
+    """
     crossing = patch.crossing()
     for _ in range(_MAX_CHANGES):
         better = _best_change(patch, crossing, length) if len(crossing) else None
@@ -209,13 +224,14 @@ def _reduce_crossings(patch: _Neighborhood, length: float) -> tuple[IntArray, in
 def _best_change(
     patch: _Neighborhood, crossing: IntArray, length: float
 ) -> tuple[_Neighborhood, IntArray] | None:
-    """The patch after one change that lets fewer faces cross, and these faces; None if no change
-    does.
+    """The neighborhood after one change that lets fewer faces cross, and the indices of those that
+    still cross; None if no change does.
 
-    Changes that move the surface least are tried first: of edges of faces that cross, then of all
-    edges at their corners.
-    """
-    for rows in (crossing, _faces_with_corners_of(patch.faces, patch.faces[crossing])):
+    crossing: the indices of the faces that cross now.
+
+    Edges of crossing faces are tried first, then all edges at their corners; of each, the changes
+    that move the surface least come first."""
+    for rows in (crossing, _faces_at_corners(patch.faces, patch.faces[crossing])):
         for _, removed, new in sorted(_changes(patch, rows, length), key=lambda change: change[0])[
             :_MAX_ATTEMPTS
         ]:
@@ -229,8 +245,11 @@ def _best_change(
 def _changes(
     patch: _Neighborhood, rows: IntArray, length: float
 ) -> Iterator[tuple[float, IntArray, IntArray]]:
-    """Changes of the edges of the faces `rows`: how far they move the surface, the faces that are
-    removed, and those that replace them."""
+    """The possible changes of the edges of the faces `rows` that move the surface by at most
+    `length`.
+
+    Yields: How far a change moves the surface; the indices of the faces that it removes; and the
+        faces that replace them."""
     count = len(patch.vertices)
     keys = sorted_unique(edge_keys(half_edges(patch.faces[rows]), count))
     for a, b in np.stack(np.divmod(keys, count), axis=1).tolist():
@@ -249,25 +268,28 @@ def _changes(
 
 
 def _keeps_orientation(patch: _Neighborhood, rows: IntArray, new: IntArray, length: float) -> bool:
-    """Whether no new face, except slivers, faces backwards relative to the mean normal of the old
-    faces, and the volume between new and old faces is no more than if the old ones moved by a
-    length: a vertex on the new faces tells nothing about old faces that are folded, as at a thin
-    spike."""
-    corner, replaced = patch.vertices[patch.faces[rows]], patch.vertices[new]
-    old, after = area_normals(corner), area_normals(replaced)
+    """Whether faces `rows` may be replaced by the faces `new` (k, 3).
+
+    No new face, except slivers, may face against the mean normal of the old faces. And the volume
+    between new and old faces may be at most what the old ones would sweep if they moved by
+    `length`. That a moved vertex is near the new faces would not be enough: it tells nothing about
+    old faces that are folded, as at a thin spike."""
+    before, after = patch.vertices[patch.faces[rows]], patch.vertices[new]
+    old, new_area = area_normals(before), area_normals(after)
     mean = old.sum(axis=0)
     total = float(row_norms(old).sum())
-    origin = corner[0, 0]
-    between = (
-        row_dots(replaced[:, 0] - origin, after).sum() - row_dots(corner[:, 0] - origin, old).sum()
+    origin = before[0, 0]
+    volume = (
+        row_dots(after[:, 0] - origin, new_area).sum() - row_dots(before[:, 0] - origin, old).sum()
     )
-    if abs(float(between)) / 6 > length * total / 2:
+    if abs(float(volume)) / 6 > length * total / 2:
         return False
-    return bool(((after @ mean > 0) | (row_norms(after) <= _NOTHING * total)).all())
+    return bool(((new_area @ mean > 0) | (row_norms(new_area) <= _NO_AREA * total)).all())
 
 
 def _line_distance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> float:
-    """The distance between the line through a and b and the line through c and d."""
+    """The distance between the line through a and b and the line through c and d; inf for parallel
+    lines."""
     across = np.cross(b - a, d - c)
     size = float(np.linalg.norm(across))
     return abs(float(across @ (c - a))) / size if size > 0 else np.inf

@@ -1,11 +1,11 @@
 """Functions that are meshed by their signs: values at points, and crossings of the level on
 segments.
 
-Every real-valued function has a sign at every point, whether or not it is continuous: winding
+Every real-valued function has a sign at every point, whether or not it is continuous. Winding
 numbers jump at triangles and are known up to an error, and potentials of dipoles are infinite at
-points. Newton's method fails for both. Here a segment whose ends have different signs is bisected,
-by values alone, and the last interval is intersected with the jump surfaces of the field, such as
-triangles.
+points: Newton's method fails for both. Here a segment whose ends have different signs is halved
+several times, by values alone, and what is left is intersected with the jump surfaces of the field,
+such as triangles.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ if TYPE_CHECKING:
 __all__ = ["SignFunction", "cell_size_for_smoothing", "empty_surface_hint", "uses_sign_meshing"]
 
 # How often a segment is halved before it is intersected with facets; and how often a smooth
-# function is evaluated along it, alternately where the secant meets the level and in the middle.
-_HALVINGS, _STEPS = 4, 8
-# Values smaller than this, relative to those at the ends, need no further steps.
+# function is evaluated along a segment, in turn where the secant meets the level and in the middle.
+_HALVINGS, _MAX_EVALUATIONS = 4, 8
+# A search along a segment ends at a value smaller than this, relative to the values at both ends.
 _NEAR_ROOT = 1e-3
 # How far a segment is extended beyond both of its ends, relative to its remaining length.
-_SEGMENT_EXTENSION = 1e-6
+_EXTENSION = 1e-6
 # Single precision is used where it distinguishes this many points along a cell.
 _STEPS_IN_CELL = 1000
 # Surfaces with a smoothing length below this, relative to a cell, have details that the cell does
@@ -57,28 +57,32 @@ _STEPS_IN_CELL = 1000
 _UNRESOLVED_SMOOTHING, _RESOLVED_SMOOTHING_LENGTHS = 0.3, 4.8
 # The largest number of points of a cloud at which its value is tested, and the fraction of the
 # level that it must reach.
-_MAX_PROBES, _MIN_LEVEL_FRACTION = 2000, 0.1
+_MOST_PROBES, _MIN_VALUE_SHARE = 2000, 0.1
 
 
 def uses_sign_meshing(field: Field) -> bool:
-    """Whether a field is meshed by its signs: sums over meshes, points and blobs, whose values cost
-    little and whose promises reach no farther than to the next point."""
+    """Whether a field is meshed by its signs. These are sums over meshes, points and blobs: their
+    values cost little, and their promises hold no farther than to the next point."""
     return isinstance(field, BatchedField | Blobs | HRBF)
 
 
-def cell_size_for_smoothing(field: Field, spacing: float, upper: float, lower: float) -> float:
-    """The size of cells: `spacing`; or, where the surface of a cloud with noise is likely to have
-    details too small for these cells, smaller by factors between `lower` and `upper`."""
+def cell_size_for_smoothing(field: Field, spacing: float, most: float, least: float) -> float:
+    """The size of cells: `spacing`, or less for a cloud with noise.
+
+    Its surface is likely to have details too small for these cells if its smoothing length is less
+    than 0.3 of them. Then the size is multiplied by a factor from `least` to `most`, so that cells
+    are about 4.8 smoothing lengths wide."""
     if (
         not isinstance(field, DipolePotential)
         or not 0 < field.smoothing < _UNRESOLVED_SMOOTHING * spacing
     ):
         return spacing
-    return min(max(_RESOLVED_SMOOTHING_LENGTHS * field.smoothing, lower * spacing), upper * spacing)
+    return min(max(_RESOLVED_SMOOTHING_LENGTHS * field.smoothing, least * spacing), most * spacing)
 
 
 def empty_surface_hint(field: Field) -> str:
-    """A likely reason why there is no surface among the cells, to be added to an error message."""
+    """A likely reason why there is no surface among the cells, to be added to an error message; ""
+    if none is known."""
     if not isinstance(field, DipolePotential) or len(field.points) < 2:
         return ""
     alone = outlier_indices(field.points, build_point_tree(field.points))
@@ -93,11 +97,10 @@ def empty_surface_hint(field: Field) -> str:
 
 @dataclass
 class SignFunction(LevelFunction):
-    """side (f - level), of a real-valued field, by its values at points.
+    """The function side * (f - level) of a real-valued field f, by its values at points.
 
-    side: 1, or -1 for a function that is negative where f is above the level.
-    precision: of values. Crossings of facets are computed in double precision.
-    """
+    side: 1; or -1 for a function that is negative where f is above the level.
+    precision: of values. Crossings of facets are computed in double precision."""
 
     side: float = dataclasses.field(default=1.0, kw_only=True)
     precision: Precision = dataclasses.field(default="double", kw_only=True)
@@ -116,11 +119,14 @@ class SignFunction(LevelFunction):
         side: float = 1.0,
         most_faces: int,
     ) -> SignFunction:
-        """The function of a field, in single precision where that distinguishes points of a cell in
-        the box.
+        """Make the function side * (f - level) of a field, to be evaluated in a box.
+
+        Single precision is used if it resolves cells of size `spacing` everywhere in the box,
+        otherwise double precision.
 
         Raises:
-            MeshingError: a cloud has normals that do not face outwards, or encloses nothing.
+            MeshingError: the field is a cloud whose normals do not face outwards, or which encloses
+                nothing.
         """
         if isinstance(field, DipolePotential):
             _check_encloses(field, level)
@@ -137,8 +143,8 @@ class SignFunction(LevelFunction):
         return self.relative_to_level(self.field.value(points, precision=self.precision))
 
     def sample(self, points: FloatArray) -> LevelSamples:
-        """The samples of the function at points (n, 3). For a field that jumps the gradient is set
-        to 0, since it does not tell the distance to the level."""
+        """The samples of the function at points (n, 3). The gradient of a field that jumps is set
+        to 0, since it does not tell the distance to the level set."""
         none = np.zeros(len(points))
         if self.field.has_jumps:
             return LevelSamples(self.values(points), np.zeros((len(points), 3)), none)
@@ -150,6 +156,7 @@ class SignFunction(LevelFunction):
             prepared = self.field.prepare(backend)
 
             def both(p: Vec3) -> tuple[Real, Vec3]:
+                """The value and the gradient of the field at p."""
                 sample = prepared.evaluate(p)
                 return sample.value, sample.gradient
 
@@ -159,8 +166,9 @@ class SignFunction(LevelFunction):
         )
 
     def count_undecided(self, points: FloatArray, value: FloatArray) -> int:
-        """The number of points, given with the function's values, at which its error leaves the
-        sign undecided."""
+        """The number of points whose sign is not certain: the error bound is at least the value's
+            magnitude.
+        value: (n,) the values of the function at points (n, 3)."""
         if not isinstance(self.field, BatchedField):
             return 0
         scale = float(np.median(np.abs(value))) if len(value) else 0.0
@@ -171,9 +179,11 @@ class SignFunction(LevelFunction):
         return int((np.abs(value[near]) <= error).sum())
 
     def clearance(self, points: FloatArray) -> FloatArray:
-        """(n,) a lower bound of the distance to the level set: see `level_distance_lower_bound`.
-        For a winding number it is that of the winding number modulo 1, which has no jumps and needs
-        coarse samples alone, and the distance from its triangles."""
+        """(n,) a proved lower bound of the distance to the level set
+        (`level_distance_lower_bound`).
+
+        For a winding number it is the smaller of two: the bound for the winding number modulo 1,
+        which has no jumps and needs coarse samples only, and the distance from the triangles."""
         self.evaluations += len(points)
         if not self._clearances:
             self._clearances = _clearances(self.field, self.level, self.precision)
@@ -181,11 +191,13 @@ class SignFunction(LevelFunction):
         return np.min(distances, axis=0)
 
     def crossings(self, low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The points (n, 3) where segments between points (n, 3), at which the function is not
-        positive and positive, meet the level, and unit normals there towards where the function
-        grows.
+        """Where segments meet the level set.
 
-        They lie on facets where the function changes its sign by a jump, to rounding.
+        low, high: (n, 3) their ends. The function is not positive at `low` and positive at `high`.
+
+        Returns:
+            The points (n, 3), and unit normals (n, 3) there towards where the function grows. Where
+            the function changes its sign by a jump, the point lies on the facet, to rounding.
         """
         if not len(low):
             return low.copy(), low.copy()
@@ -194,11 +206,11 @@ class SignFunction(LevelFunction):
         normal, is_on_sheet = np.zeros_like(low), np.zeros(len(low), np.bool_)
         if self.field.has_jumps:
             first, last = self._bisect(low, direction)
-            t, normal, is_on_sheet = self._first_facet_crossing(low, direction, first, last)
+            t, normal, is_on_sheet = self._on_sheets(low, direction, first, last)
             rows = np.flatnonzero(~is_on_sheet)
             t[rows] = self._roots(low[rows], direction[rows], first[rows], last[rows], 2)
         else:
-            t = self._roots(low, direction, t, t + 1, _STEPS)
+            t = self._roots(low, direction, t, t + 1, _MAX_EVALUATIONS)
         x = low + t[:, None] * direction
         smooth = np.flatnonzero(~is_on_sheet)
         normal[smooth] = self._slopes(x[smooth], direction[smooth])
@@ -207,8 +219,10 @@ class SignFunction(LevelFunction):
         return x, normal / np.maximum(row_norms(normal), 1e-300)[:, None]
 
     def _slopes(self, x: FloatArray, direction: FloatArray) -> FloatArray:
-        """(n, 3) gradients at points; where there is none, the direction of the segment, which
-        leads upwards."""
+        """(n, 3) gradients of the function at points x (n, 3).
+
+        direction: (n, 3) replaces the gradient where it is 0 or not finite. It is that of the
+            segment through the point, along which the function grows."""
         if not len(x):
             return x
         self.evaluations += len(x)
@@ -222,8 +236,12 @@ class SignFunction(LevelFunction):
         return slope
 
     def _bisect(self, start: FloatArray, direction: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The ends (n,) of shorter parts of the segments, on which the function changes its sign as
-        well."""
+        """Shorten segments by halving, so that the function still has different signs at both ends.
+
+        start, direction: (n, 3) one end of each segment, and the vector to the other. The function
+            is not positive at the first end and positive at the other.
+
+        Returns the ends (n,) and (n,) of what is left, as fractions of the segments."""
         first, last = np.zeros(len(start)), np.ones(len(start))
         for _ in range(_HALVINGS):
             t = 0.5 * (first + last)
@@ -232,71 +250,90 @@ class SignFunction(LevelFunction):
         return first, last
 
     def _roots(
-        self, start: FloatArray, along: FloatArray, first: FloatArray, last: FloatArray, steps: int
+        self, start: FloatArray, edge: FloatArray, first: FloatArray, last: FloatArray, steps: int
     ) -> FloatArray:
-        """(n,) the fractions of segments, between `first` and `last`, where the function is 0: the
-        secant and the middle are tried in turn, so that every second step at least halves the
-        interval; until values are small relative to those at the ends, so that one more secant is
-        as good as exact."""
+        """(n,) the fractions of segments at which the function is 0, between the fractions `first`
+        and `last`.
+
+        start, edge: (n, 3) one end of each segment, and the vector to the other.
+        steps: the largest number of evaluations.
+
+        The root of the secant and the middle of the interval are tried in turn, so that every
+        second step at least halves the interval. A search ends early where the value is small
+        relative to those at the ends; then one more secant is as good as exact."""
         if not len(start):
             return first
         first, last = first.copy(), last.copy()
-        low, high = (self.values(start + t[:, None] * along) for t in (first, last))
-        enough = _NEAR_ROOT * np.minimum(np.abs(low), np.abs(high))
+        low, high = (self.values(start + t[:, None] * edge) for t in (first, last))
+        small_value = _NEAR_ROOT * np.minimum(np.abs(low), np.abs(high))
         rows = np.arange(len(start))
         for k in range(steps):
             ends = first[rows], last[rows]
             t = 0.5 * (ends[0] + ends[1]) if k % 2 else _secant(*ends, low[rows], high[rows])
-            value = self.values(start[rows] + t[:, None] * along[rows])
+            value = self.values(start[rows] + t[:, None] * edge[rows])
             is_up = value > 0
             first[rows], last[rows] = np.where(is_up, ends[0], t), np.where(is_up, t, ends[1])
             low[rows] = np.where(is_up, low[rows], value)
             high[rows] = np.where(is_up, value, high[rows])
-            rows = rows[~(np.abs(value) <= enough[rows])]
+            rows = rows[~(np.abs(value) <= small_value[rows])]
             if not len(rows):
                 break
         return _secant(first, last, low, high)
 
-    def _first_facet_crossing(
+    def _on_sheets(
         self, start: FloatArray, direction: FloatArray, first: FloatArray, last: FloatArray
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """The fractions (n,) at which segments, between `first` and `last`, first cross a jump
-        surface, its normals (n, 3), and whether there is such a crossing."""
+        """Where segments first cross a jump surface, between the fractions `first` and `last`.
+
+        start, direction: (n, 3) one end of each segment, and the vector to the other.
+
+        Returns:
+            The fractions (n,) of the crossings; the normals (n, 3) of the surface there, 0 where
+            there is no crossing; and the mask (n,) of segments that cross one.
+        """
         backend = choose_backend("double")
         field = self.field.prepare(backend)
         length = row_norms(direction)
         ray = direction / np.maximum(length, 1e-300)[:, None]
-        room = _SEGMENT_EXTENSION * (last - first)
-        origin = start + (first - room)[:, None] * direction
-        reach = (last - first + 2 * room) * length
+        extension = _EXTENSION * (last - first)
+        origin = start + (first - extension)[:, None] * direction
+        max_t = (last - first + 2 * extension) * length
 
-        def crossed(o: Vec3, d: Vec3, limit: Vec3) -> tuple[Real, Vec3]:
+        def next_jump(o: Vec3, d: Vec3, limit: Vec3) -> tuple[Real, Vec3]:
+            """The t and the normal of the first crossing along rays o + t d; limit.x is the largest
+            t."""
             none = backend.Array3f(0)
             after = JumpCrossing(backend.Float(0), backend.UInt32(NO_FACET), backend.Float(0), none)
             crossing = field.next_jump(o, d, after, limit.x, backend.Bool(True))
             return crossing.t, crossing.normal
 
-        t, normal = map_batches(backend, crossed, origin, ray, np.column_stack([reach] * 3))
-        is_crossed = np.isfinite(t) & (t <= reach)
-        along = first - room + np.where(is_crossed, t, 0.0) / np.maximum(length, 1e-300)
+        t, normal = map_batches(backend, next_jump, origin, ray, np.column_stack([max_t] * 3))
+        is_crossed = np.isfinite(t) & (t <= max_t)
+        fraction = first - extension + np.where(is_crossed, t, 0.0) / np.maximum(length, 1e-300)
         normal = np.where(is_crossed[:, None], normal, 0.0)
-        return along, normal, is_crossed
+        return fraction, normal, is_crossed
 
 
 def _check_encloses(field: DipolePotential, level: float) -> None:
-    """Raise unless the points lie about where f is half the level of a closed surface: without its
-    own term f is 2 pi at a point of such a surface, and -2 pi where its normals face inwards.
+    """Raise unless the points of a cloud bound something, as far as the field's values at the
+    points show.
 
-    If areas are given, points need not represent a surface.
+    At a point of a closed surface, f without the point's own term is 2 pi, half the level that is
+    inside; it is -2 pi if normals face inwards. So the median over the points has to be more than a
+    tenth of the level. If areas are given, points need not represent a surface, and nothing is
+    checked.
+
+    Raises:
+        MeshingError: normals face inwards, cancel each other, or the points lie in a plane.
     """
     if field.smoothing or not field.is_estimated[1] or not level > 0:
         return
-    step = -(-len(field.points) // _MAX_PROBES)
+    step = -(-len(field.points) // _MOST_PROBES)
     value = float(np.median(field.value(field.points[::step], precision="double")))
-    if not value > _MIN_LEVEL_FRACTION * level:
+    if not value > _MIN_VALUE_SHARE * level:
         fault = (
-            "normals face inwards: turn them around, or mesh level=-2 pi"
-            if value < -_MIN_LEVEL_FRACTION * level
+            "normals face inwards: turn them around, or mesh the level -2 pi"
+            if value < -_MIN_VALUE_SHARE * level
             else "normals cancel each other, or the points lie in a plane"
         )
         raise MeshingError(
@@ -306,8 +343,10 @@ def _check_encloses(field: DipolePotential, level: float) -> None:
 
 
 def _secant(first: FloatArray, last: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """The points where lines through two values of different signs meet 0; the middle where values
-    are no numbers."""
+    """Where the line through two values of different signs is 0; the middle where that is not
+    finite.
+
+    first, last: (n,) the ends of intervals. low, high: (n,) the values there."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         fraction = low / (low - high)
     fraction = np.where(np.isfinite(fraction), np.clip(fraction, 0.0, 1.0), 0.5)
@@ -317,15 +356,19 @@ def _secant(first: FloatArray, last: FloatArray, low: FloatArray, high: FloatArr
 def _clearances(
     field: Field, level: float, precision: Precision
 ) -> list[Callable[[FloatArray], FloatArray]]:
-    """Functions from points (n, 3) to lengths (n,), the smallest of which is a proved lower bound
-    of the distance to the level set."""
+    """Functions from points (n, 3) to lengths (n,). The smallest of these lengths is a proved lower
+    bound of the distance to the level set. (A winding number has two functions, other fields have
+    one.)"""
     backend = choose_backend(precision)
 
     def bound(smooth: Field) -> Callable[[FloatArray], FloatArray]:
+        """The function with the lower bound of the distance to the level set of a field without
+        jumps."""
         prepared = smooth.prepare(backend)
         levels = Levels((dr.opaque(backend.Float, level),), smooth.period)
 
         def kernel(p: Vec3) -> tuple[Real]:
+            """The bound at p."""
             return (level_distance_lower_bound(backend, prepared, levels, p, prepared.evaluate(p)),)
 
         return lambda points: _numbers(backend, kernel, points)
@@ -335,6 +378,7 @@ def _clearances(
     sheets = field.prepare(backend)
 
     def distance(p: Vec3) -> tuple[Real]:
+        """The distance from the triangles of the mesh."""
         return (sheets.distance_to_jumps(p),)
 
     return [bound(WindingModuloOne(field)), lambda points: _numbers(backend, distance, points)]
@@ -343,4 +387,5 @@ def _clearances(
 def _numbers(
     backend: Backend, kernel: Callable[[Vec3], tuple[Any, ...]], points: FloatArray
 ) -> FloatArray:
+    """The first result (n,) of a kernel at points (n, 3), in double precision, batch by batch."""
     return np.asarray(map_batches(backend, kernel, points, at_once=1 << 18)[0], np.float64)

@@ -63,40 +63,41 @@ __all__ = [
 # The smallest distance of vertices from the ends of edges, relative to the edge, so that all
 # triangles have an area.
 _EDGE_END_MARGIN = 1e-4
-# The number of rounds in which edges are cut; and how often vertices of triangles that pass through
-# others are moved back.
-_ROUNDS, _MAX_REPAIRS = 2, 12
+# The largest number of rounds in which edges are cut; and of rounds in which vertices of triangles
+# that pass through others are moved back.
+_ROUNDS, _MOST_REPAIRS = 2, 12
 # A round that would cut more than this fraction of the edges that the last round cut, or of the
 # faces, is omitted: the surface is rough at every scale.
 _MAX_CUT_FRACTION = 0.5
 # Neighbors lie on each other if the cosine between their normals is less than this.
 _FOLDED = -0.99999
-# Slivers and flat places are simplified within the first, relative to the tolerance, and the
-# second, relative to a cell.
+# Slivers and flat places are simplified by at most the first, relative to the tolerance, and by at
+# most the second, relative to a cell.
 _SIMPLIFY_TOLERANCE, _SIMPLIFY_CELL_FRACTION = 0.5, 0.05
 # Edges shorter than this, in tolerances, are not cut.
 _SHORTEST = 4.0
 # An edge is cut no nearer to its ends than this, relative to its length.
 _FROM_CORNERS = 0.1
-# Across a crease normals turn by at least this angle, and by this fraction of it between two
-# points.
+# Across a crease normals turn by at least this angle; and by this fraction of the angle between the
+# point on the crease and one of the ends of the edge.
 _MIN_CREASE_ANGLE, _CREASE_ANGLE_SHARE = math.radians(2), 0.75
-# The level is searched for from before the middle of an edge to behind the place where tangent
-# planes meet, relative to the displacement between these; which is clamped to the third, in lengths
-# of the edge.
-_BEFORE, _BEHIND, _BESIDE = 0.3, 1.3, 1.0
-# Tangent planes with nearly equal normals meet anywhere; three of them meet in a point if the
-# determinant of their normals is larger than the second.
-_PARALLEL, _INDEPENDENT = 1e-4, 0.1
+# The level set is searched for on the line from an edge to the point where tangent planes meet. The
+# search begins before the edge and ends after that point, by the first and up to the second of the
+# displacement between them. The displacement is clamped to the third, in lengths of the edge.
+_BEFORE, _AFTER, _OFFSET = 0.3, 1.3, 1.0
+# Two tangent planes meet in a line if the squared sine of the angle between them is larger than the
+# first; three of them meet in a point if the determinant of their unit normals is larger than the
+# second.
+_MIN_SQUARE, _INDEPENDENT = 1e-4, 0.1
 # The largest fraction of vertices and centers that may be beyond the tolerance before cells are
 # made smaller; and the ratio of smaller cells to the cells before.
 MAX_OFF_LEVEL_FRACTION, CELL_REFINEMENT_FACTOR = 0.01, 0.6
 # The largest distance from the level, in cells, that is measured.
 _MAX_DISTANCE_CELLS = 4.0
 # The largest number of triangles at whose corners and centers distances are measured.
-_MAX_MEASURED = 20_000
+_MOST_MEASURED = 20_000
 # Meshes with more triangles are not computed again.
-_MAX_REMADE = 100_000
+_MOST_REMADE = 100_000
 # How far points at which the function is no number are moved, relative to a cell.
 _SINGULAR_POINT_SHIFT = 1e-3
 _MAX_GROWTH_ROUNDS = 20
@@ -106,12 +107,12 @@ _MAX_GROWTH_ROUNDS = 20
 class SignIsosurface:
     """A mesh extracted from signs.
 
-    points: number of lattice points.
-    undecided: the number of lattice points where the error bound exceeds |f - level|, so that the
-        sign is undecided.
-    unfitted: number of triangles moved back from creases.
-    is_intersection_free: whether the absence of self-intersections was checked exactly.
-    """
+    surface: the mesh.
+    points: the number of lattice points.
+    undecided: the number of lattice points whose sign is not certain, because the error bound of f
+        is not smaller than |f - level|.
+    unfitted: the number of triangles that were moved back from creases.
+    is_intersection_free: whether it was checked exactly that no triangles intersect."""
 
     surface: TriangleMesh
     points: int
@@ -131,15 +132,22 @@ def mesh_from_signs(
     closed: bool = False,
     volume: Volume | None = None,
 ) -> tuple[SignIsosurface, LostParts, dict[str, Any]]:
-    """Extract a mesh from signs in the cells of a box (`extract_from_signs`). Returns it with the
-    parts of the level set that it lost, and facts about it.
+    """Extract a mesh from signs in cells of a box (`extract_from_signs`), in smaller cells if these
+    do not suffice.
 
-    Where more than a few vertices and centers of triangles are beyond the tolerance, a length, or
-    where smaller cells may show lost parts, it is extracted again from smaller cells. The facts
-    contain the number of points that are finally beyond the tolerance, and a distance within which
-    all of them are.
+    box: its lower and its upper corner. spacing: the size of the first cells. tolerance: a length.
+    attempts: the largest number of extractions.
+    closed: whether the mesh is closed at the box's faces.
+    volume: only parts that are lost within it count.
 
-    volume: only parts lost within it count.
+    It is extracted again, from cells 0.6 times as large, if more than one in a hundred vertices and
+    centers of triangles are farther than the tolerance from the level set, or if smaller cells may
+    show lost parts.
+
+    Returns:
+        The mesh; the parts of the level set that it lost; and facts for the metadata, among them
+        the number of points that are finally farther than the tolerance, and a distance within
+        which all of them are.
 
     Raises:
         MeshingError: as `extract_from_signs`.
@@ -165,7 +173,7 @@ def mesh_from_signs(
         may_help = far_count > MAX_OFF_LEVEL_FRACTION * count or (
             lost.matter and lost.are_mended_by(CELL_REFINEMENT_FACTOR)
         )
-        if attempts <= 0 or not may_help or len(mesh.surface.faces) > _MAX_REMADE:
+        if attempts <= 0 or not may_help or len(mesh.surface.faces) > _MOST_REMADE:
             break
         report(f"{far_count:,} of {count:,} vertices and centers are beyond the tolerance")
         if lost.matter:
@@ -195,24 +203,30 @@ def _distances(
     lattice: BccLattice,
     closed: bool,
 ) -> tuple[int, int, float]:
-    """The number of vertices and centers of faces that are farther from the level than the
-    tolerance, the number of all, and a distance within which all of them are, up to a factor of 2.
-    Of large meshes every second face is tested, or every third and so on. Faces that close the mesh
-    at the box are to be cut away, and left out."""
+    """How many vertices and centers of faces are off the level set.
+
+    Of large meshes every second face is tested, or every third and so on. If the mesh is `closed`,
+    faces in the two outermost layers of cells are left out: they are to be cut away.
+
+    Returns:
+        The number of these points that are farther than `tolerance` from the level set; the number
+        of points that were tested; and a distance within which all of them are, too large by up to
+        a factor of 2, or inf if some are farther than 4 cells.
+    """
     x, faces = surface.vertices, surface.faces
     if closed:
         lower, upper = lattice.lower + 2 * lattice.size, lattice.upper - 2 * lattice.size
         faces = faces[((x[faces] > lower) & (x[faces] < upper)).all(axis=(1, 2))]
     surface = TriangleMesh.without_unused_vertices(
-        x, faces[:: -(-len(faces) // _MAX_MEASURED) or 1]
+        x, faces[:: -(-len(faces) // _MOST_MEASURED) or 1]
     )
     x, faces = surface.vertices, surface.faces
     off_level, count = points_off_level(function, x, faces, tolerance, None)
     within, farther = tolerance, off_level
     while len(farther) and within < _MAX_DISTANCE_CELLS * float(lattice.size.max()):
         within *= 2
-        alone = np.zeros((0, 3), np.int64)
-        farther, _ = points_off_level(function, farther, alone, within, None)
+        no_faces = np.zeros((0, 3), np.int64)
+        farther, _ = points_off_level(function, farther, no_faces, within, None)
     return len(off_level), count, within if not len(farther) else math.inf
 
 
@@ -226,13 +240,13 @@ def extract_from_signs(
 ) -> SignIsosurface:
     """The boundary of the points of a lattice's box at which a function is not positive.
 
-    tolerance: how far edges may be from the surface, by the normals at their ends, before they are
-        cut.
-    closed: whether the function counts as positive beyond the box; otherwise the surface ends on
-        the box.
+    tolerance: a length. Edges are split that are farther from the surface, judged by the normals at
+        their ends.
+    closed: whether the function counts as positive outside of the box, so that the surface is
+        closed; otherwise it ends on the box.
 
     Raises:
-        MeshingError: there is no surface, there are too many cells, or values are no numbers.
+        MeshingError: there is no surface, there are too many cells, or values are not finite.
     """
     first = _march(function, lattice, closed, report)
     x, faces, normals, is_apart = _collapse_slivers(
@@ -252,7 +266,7 @@ def extract_from_signs(
         before = len(cut.points)
         check_triangle_limit(len(faces) + 2 * len(cut.points), function.most_faces)
         start, end = (flat[cut.ends[:, k]] for k in (0, 1))
-        feet = start + cut.fraction[:, None] * (end - start)
+        feet = start + cut.share[:, None] * (end - start)
         corner_feet = feet[cut.vertex_of_edge[cut.edges[cut.rows]] - len(x)]
         flat = np.concatenate([flat, feet, corner_feet.mean(axis=1)])
         x, faces = cut.applied(x, faces)
@@ -269,8 +283,11 @@ def extract_from_signs(
 
 @dataclass(frozen=True)
 class _RawIsosurface:
-    """Vertices (n, 3) on the level, normals there, and faces (m, 3); the number of points of the
-    lattice, and the number of these that are undecided."""
+    """A mesh as tetrahedra cut it.
+
+    vertices: (n, 3), on the level set. normals: (n, 3) of the level set there. faces: (m, 3).
+    points: the number of points of the lattice.
+    undecided: the number of these points whose sign is not certain."""
 
     vertices: FloatArray
     normals: FloatArray
@@ -282,11 +299,18 @@ class _RawIsosurface:
 def _march(
     function: SignFunction, lattice: BccLattice, closed: bool, report: Callable[[str], None]
 ) -> _RawIsosurface:
-    """The triangles of all tetrahedra whose corners differ.
+    """The mesh of all tetrahedra with corners of both signs.
 
-    Cells that are proved empty are left out. Where values are known up to an error, or proofs
-    depend on rounding, signs may differ at the corner of such a cell, and the surface would end
-    there: then its neighbors are added, until the surface does not end.
+    closed: whether the function counts as positive on the box's faces, so that the mesh is closed.
+
+    Cells that are proved empty are left out. Where values have errors, or proofs depend on
+    rounding, signs may nevertheless differ at the corners of such a cell, and the surface would end
+    there. Then the cells around the open edges are added, until the surface ends on the box only.
+
+    Raises:
+        EmptySurfaceError: there is no surface.
+        MeshingError: too many cells, values that are not finite, or a surface that still ends after
+            20 rounds.
     """
     cells = lattice.nonempty_cells(function.clearance, function.most_faces)
     if closed:
@@ -307,6 +331,8 @@ def _march(
         normals: list[FloatArray] = []
 
         def roots(low: FloatArray, high: FloatArray, normals: Any = normals) -> FloatArray:
+            """Where edges from `low` to `high` (k, 3) meet the level set, not too near to their
+            ends. The normals there are appended to `normals`."""
             x, normal = function.crossings(low, high)
             normals.append(normal)
             edge = high - low
@@ -320,15 +346,15 @@ def _march(
         ends = boundary_edges(faces)
         middle = x[ends].mean(axis=1)
         margin = 1e-9 * lattice.size
-        inner = (middle > lattice.lower + margin) & (middle < lattice.upper - margin)
-        open_middles = middle[inner.all(axis=1)]
+        is_inside = (middle > lattice.lower + margin) & (middle < lattice.upper - margin)
+        open_middles = middle[is_inside.all(axis=1)]
         if not len(open_middles):
             return _RawIsosurface(
                 x, normals[0], faces, len(points), function.count_undecided(points, value)
             )
-        index = np.floor((open_middles - lattice.lower) / lattice.size).astype(np.int64)
+        cell_index = np.floor((open_middles - lattice.lower) / lattice.size).astype(np.int64)
         offsets = np.array(list(itertools.product((-1, 0, 1), repeat=3)))
-        neighbors = np.clip((index[:, None] + offsets).reshape(-1, 3), 0, lattice.counts - 1)
+        neighbors = np.clip((cell_index[:, None] + offsets).reshape(-1, 3), 0, lattice.counts - 1)
         cells = distinct_rows(np.concatenate([cells, neighbors]))
     raise LocalizedMeshingError(
         "signs differ at the corners of ever more cells that are proved empty: values of "
@@ -338,30 +364,39 @@ def _march(
 
 
 def _collapse_slivers(
-    marched: _RawIsosurface, tolerance: float
+    raw: _RawIsosurface, tolerance: float
 ) -> tuple[FloatArray, IntArray, FloatArray, bool]:
-    """Vertices, faces and normals, with short edges contracted, and without vertices whose faces
-    lie in a plane, within a tolerance (manifold3d); unchanged if the surface is open, or if
-    triangles would pass through each other. And whether the absence of intersections was checked:
-    triangles as the tetrahedra cut them do not intersect, up to rounding."""
+    """Simplify a mesh, by at most `tolerance` (a length): short edges are contracted, and vertices
+    whose faces lie in a plane are removed.
+
+    It is unchanged if the surface is open, or if triangles would pass through each other.
+
+    Returns:
+        Vertices, faces and normals of vertices; and whether it was checked that no triangles
+        intersect. Triangles as the tetrahedra cut them do not intersect, up to rounding.
+    """
     import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial
-    x, faces = marched.vertices, marched.faces
+    x, faces = raw.vertices, raw.faces
     if len(boundary_edges(faces)):
-        return x, faces, marched.normals, False
+        return x, faces, raw.normals, False
     simpler = from_manifold(without_short_edges(to_manifold(TriangleMesh(x, faces)), tolerance))
     away, nearest = searching.cKDTree(x).query(simpler.vertices)
     if not len(simpler.faces) or away.any():
-        return x, faces, marched.normals, False
+        return x, faces, raw.normals, False
     if len(intersecting_faces(simpler.vertices, simpler.faces)):
-        return x, faces, marched.normals, False
-    return simpler.vertices, simpler.faces, marched.normals[nearest], True
+        return x, faces, raw.normals, False
+    return simpler.vertices, simpler.faces, raw.normals[nearest], True
 
 
 def _finite_values(function: SignFunction, points: FloatArray, size: FloatArray) -> FloatArray:
-    """The values of the function at points, or a little beside them where they are no numbers, as
-    at a dipole."""
+    """The values (n,) of the function at points (n, 3). Where a value is not finite, as at a
+    dipole, the function is evaluated a little beside the point. size: (3,) of a cell.
+
+    Raises:
+        MeshingError: some values are still not finite.
+    """
     value = function.values(points)
     for k in (1, 2):
         fails = np.flatnonzero(~np.isfinite(value))
@@ -385,7 +420,15 @@ def _triangles(
     corners: IntArray,
     roots: Callable[[FloatArray, FloatArray], FloatArray],
 ) -> tuple[FloatArray, IntArray]:
-    """Vertices within edges of tetrahedra (m, 4), and faces between them."""
+    """The triangles of tetrahedra with corners of both signs.
+
+    points, value: (n, 3), (n,) points and the function there; 0 counts as negative.
+    corners: (m, 4) of the tetrahedra. roots: from the two ends of edges to where they meet the
+        level.
+
+    Returns:
+        The vertices (k, 3), which lie within edges of tetrahedra, and the faces (j, 3).
+    """
     above = value > 0
     up = above[corners].sum(axis=1)
     tets = Tetrahedra.of(points, corners[(up > 0) & (up < 4)])
@@ -404,20 +447,18 @@ def _triangles(
 class _CreaseRefinement:
     """The places at which edges and faces are split to follow creases.
 
-    edges: (m, 3) of all faces.
-    vertex_of_edge: (k,) of edges, the index of the new vertex, or -1.
+    edges: (m, 3) the edges of all faces, by index.
+    vertex_of_edge: (k,) the index of the new vertex of each edge; -1 for edges that are not split.
     ends: (c, 2) the ends of the edges that are split.
-    fraction: (c,) the fraction along each of these edges where it is split.
-    corner_faces: (d, 3) faces with a new vertex within.
-    rows: (d,) the indices of these faces.
-    points, normals: of the new vertices, those of edges first.
-    is_on_crease: which new vertices are on a crease.
-    """
+    share: (c,) the fraction of each of these edges at which it is split.
+    corner_faces: (d, 3) the faces that also get a new vertex within. rows: (d,) their indices.
+    points, normals: (c + d, 3) of the new vertices, those of edges first.
+    is_on_crease: (c + d,) which new vertices are on a crease."""
 
     edges: IntArray
     vertex_of_edge: IntArray
     ends: IntArray
-    fraction: FloatArray
+    share: FloatArray
     corner_faces: IntArray
     rows: IntArray
     points: FloatArray
@@ -430,40 +471,45 @@ class _CreaseRefinement:
         function: SignFunction,
         x: FloatArray,
         normals: FloatArray,
-        is_creased: BoolArray,
+        bent: BoolArray,
         faces: IntArray,
         tolerance: float,
     ) -> _CreaseRefinement:
-        """The splits of edges that are farther from the surface than the tolerance, judged by where
-        the tangent planes of their ends meet; edges on a crease, whose ends have two tangent
-        planes, stay."""
+        """Choose the edges and faces to split.
+
+        bent: (n,) which vertices are on a crease. They have two tangent planes, and their edges
+            stay.
+
+        An edge is split if the line in which the tangent planes of its ends meet is farther from it
+        than `tolerance`, and if the level set is found in that direction. A face gets a vertex
+        within if all of its edges are split at a crease."""
         every = Edges.of(half_edges(faces))
         edges = every.edge_of_pair.reshape(3, -1).T
-        rows = np.flatnonzero((every.multiplicity == 2) & ~is_creased[every.vertices].any(axis=1))
+        rows = np.flatnonzero((every.multiplicity == 2) & ~bent[every.vertices].any(axis=1))
         ends = every.vertices[rows]
-        first_normal, second_normal = normals[ends[:, 0]], normals[ends[:, 1]]
+        one, other = normals[ends[:, 0]], normals[ends[:, 1]]
         a, b = x[ends[:, 0]], x[ends[:, 1]]
-        t, along, turned = _toward_tangent_planes(a, b, first_normal, second_normal)
+        t, along, sine2 = _toward_tangent_planes(a, b, one, other)
         long = row_norms(b - a)
         is_far = (
-            (turned > _PARALLEL) & (row_norms(along) > tolerance) & (long > _SHORTEST * tolerance)
+            (sine2 > _MIN_SQUARE) & (row_norms(along) > tolerance) & (long > _SHORTEST * tolerance)
         )
         rows, along, t = rows[is_far], along[is_far], t[is_far]
         foot, span = a[is_far] + t[:, None] * (b - a)[is_far], long[is_far]
-        points, normal, passed = _level_along(function, foot, along, _BESIDE * span)
+        points, normal, passed = _level_along(function, foot, along, _OFFSET * span)
         rows, points, normal, t = rows[passed], points[passed], normal[passed], t[passed]
         ends = every.vertices[rows]
         vertex = np.full(len(every.vertices), -1, np.int64)
         vertex[rows] = len(x) + np.arange(len(rows))
         total, angle = (
-            np.arccos(np.clip(cosine, -1, 1))
-            for cosine in (
+            np.arccos(np.clip(one, -1, 1))
+            for one in (
                 row_dots(normals[ends[:, 0]], normals[ends[:, 1]]),
                 np.minimum(*(row_dots(normals[ends[:, k]], normal) for k in (0, 1))),
             )
         )
         on_crease = (total > _MIN_CREASE_ANGLE) & (angle > _CREASE_ANGLE_SHARE * total)
-        is_bent = np.concatenate([is_creased, on_crease])
+        is_bent = np.concatenate([bent, on_crease])
         new = vertex[edges]
         corner = np.flatnonzero((new >= 0).all(axis=1) & is_bent[np.maximum(new, 0)].all(axis=1))
         inner, inner_normal, corner = _crease_corners(function, x, normals, faces, corner)
@@ -474,7 +520,7 @@ class _CreaseRefinement:
         )  # fmt: skip
 
     def applied(self, x: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
-        """The finer mesh."""
+        """The vertices and faces of the finer mesh."""
         vertices = np.concatenate([x, self.points])
         middle = self.vertex_of_edge[self.edges]
         is_other = np.ones(len(faces), np.bool_)
@@ -491,41 +537,54 @@ class _CreaseRefinement:
 def _toward_tangent_planes(
     a: FloatArray, b: FloatArray, n_a: FloatArray, n_b: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The points where edges from a to b (k, 3) come nearest to the line in which the planes
-    through their ends with normals `n_a` and `n_b` meet: the fraction (k,) of the edge, and the
-    displacement (k, 3) from there to the line; also the square of the sine between the normals.
+    """From where on an edge, and how far, a point has to move to reach the intersection of the
+    tangent planes at its ends.
+
+    a, b: (k, 3) the ends of edges.
+    n_a, n_b: (k, 3) unit normals of the planes through these ends. The two planes meet in a line.
+
+    Returns:
+        The fraction (k,) of the edge at which it is nearest to the line; the displacement (k, 3)
+        from there to the line; and the squared sine (k,) of the angle between the normals.
 
     Edges of a plane triangulation pass over such a line in order, and so do these points.
     """
     edge, line = b - a, np.cross(n_a, n_b)
-    cosine, turned = row_dots(n_a, n_b), row_dots(line, line)
+    cosine, sine2 = row_dots(n_a, n_b), row_dots(line, line)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         # A point of the line, relative to a: p.n_a = 0 and p.n_b = edge.n_b.
-        height = row_dots(edge, n_b) / turned
-        point = height[:, None] * (n_b - cosine[:, None] * n_a)
-        along = line / np.sqrt(turned)[:, None]
-        across = edge - row_dots(edge, along)[:, None] * along
+        factor = row_dots(edge, n_b) / sine2
+        point = factor[:, None] * (n_b - cosine[:, None] * n_a)
+        axis = line / np.sqrt(sine2)[:, None]
+        across = edge - row_dots(edge, axis)[:, None] * axis
         fraction = row_dots(point, across) / row_dots(across, across)
         fraction = np.clip(fraction, _FROM_CORNERS, 1 - _FROM_CORNERS)
         foot = fraction[:, None] * edge
-        direction = point + row_dots(foot - point, along)[:, None] * along - foot
+        direction = point + row_dots(foot - point, axis)[:, None] * axis - foot
     is_finite = np.isfinite(fraction) & np.isfinite(direction).all(axis=1)
-    return np.where(is_finite, fraction, 0.5), np.where(is_finite[:, None], direction, 0.0), turned
+    return np.where(is_finite, fraction, 0.5), np.where(is_finite[:, None], direction, 0.0), sine2
 
 
 def _level_along(
     function: SignFunction, start: FloatArray, along: FloatArray, limit: FloatArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Points of the level between a little before `start` (k, 3) and a little behind start + along,
-    no farther than `limit`; normals there; and whether the function has different signs at both
-    ends."""
+    """Search for the level set along segments from `start` (k, 3).
+
+    along: (k, 3) the displacements from start to end, which are shortened to at most `limit` (k,),
+        a length. The search begins a little before the start and ends a little beyond the end.
+
+    Returns:
+        The points (k, 3) where segments meet the level set, and normals (k, 3) there; and the mask
+        (k,) of segments at whose ends the function has different signs. Other points have no
+        meaning.
+    """
     along = along * np.minimum(1, limit / np.maximum(row_norms(along), 1e-300))[:, None]
-    near, end = start - _BEFORE * along, start + _BEHIND * along
-    is_positive = function.values(near) > 0
+    begin, end = start - _BEFORE * along, start + _AFTER * along
+    is_positive = function.values(begin) > 0
     changes_sign = is_positive != (function.values(end) > 0)
     rows = np.flatnonzero(changes_sign)
     upwards = ~is_positive[rows, None]
-    low, high = np.where(upwards, near[rows], end[rows]), np.where(upwards, end[rows], near[rows])
+    low, high = np.where(upwards, begin[rows], end[rows]), np.where(upwards, end[rows], begin[rows])
     points, normal = start.copy(), np.zeros_like(start)
     points[rows], normal[rows] = function.crossings(low, high)
     return points, normal, changes_sign
@@ -534,45 +593,56 @@ def _level_along(
 def _crease_corners(
     function: SignFunction, x: FloatArray, normals: FloatArray, faces: IntArray, rows: IntArray
 ) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Points on the level where the tangent planes at the corners of the faces `rows` meet;
-    normals; and the faces, by index, that have such a point."""
+    """New vertices within faces that cut off a corner of the level set.
+
+    x, normals: (n, 3) the vertices, and the normals there. rows: (k,) the indices of the faces.
+
+    Where the normals at the vertices of a face are independent, the tangent planes there meet in a
+    point. The new vertex is where the line from the face's center to that point passes the level.
+
+    Returns:
+        The new vertices (j, 3); the normals (j, 3) there; and the indices (j,) of the faces that
+        have such a vertex.
+    """
     corner, normal = x[faces[rows]], normals[faces[rows]]
     det: Any = np.linalg.det
-    chosen = np.flatnonzero(np.abs(det(normal)) > _INDEPENDENT)
-    rows, corner, normal = rows[chosen], corner[chosen], normal[chosen]
+    independent = np.flatnonzero(np.abs(det(normal)) > _INDEPENDENT)
+    rows, corner, normal = rows[independent], corner[independent], normal[independent]
     center = corner.mean(axis=1)
-    span = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
-    away = np.einsum("kij,kij->ki", normal, corner - center[:, None])
+    longest = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
+    offsets = np.einsum("kij,kij->ki", normal, corner - center[:, None])
     solve: Any = np.linalg.solve
-    direction: FloatArray = solve(normal, away[:, :, None])[:, :, 0]
-    points, normal, passed = _level_along(function, center, direction, _BESIDE * span)
+    direction: FloatArray = solve(normal, offsets[:, :, None])[:, :, 0]
+    points, normal, passed = _level_along(function, center, direction, _OFFSET * longest)
     return points[passed], normal[passed], rows[passed]
 
 
 def _undo_until_valid(x: FloatArray, flat: FloatArray, faces: IntArray) -> tuple[FloatArray, int]:
-    """Move vertices back to their original positions in the tetrahedra until no face is flipped and
-    no two faces intersect. Returns vertices and the number of faces affected. Pairs of faces
-    without a moved vertex are not tested.
+    """Move vertices back to their places on the triangles as tetrahedra cut them, until no face is
+    turned over and no two faces intersect. Pairs of faces without a moved vertex are not tested.
 
-    flat: (n, 3) the original positions.
+    x: (n, 3) the vertices. flat: (n, 3) their places on the triangles of tetrahedra.
+
+    Returns:
+        The vertices, and the number of faces whose vertices were moved back.
 
     Raises:
         LocalizedMeshingError: triangles still intersect.
     """
     x = x.copy()
     total = 0
-    upright = area_normals(flat[faces])
-    for _ in range(_MAX_REPAIRS):
+    flat_normals = area_normals(flat[faces])
+    for _ in range(_MOST_REPAIRS):
         moved = (x != flat).any(axis=1)
         turned = moved[faces].any(axis=1)
-        turned[turned] = row_dots(area_normals(x[faces[turned]]), upright[turned]) <= 0
+        turned[turned] = row_dots(area_normals(x[faces[turned]]), flat_normals[turned]) <= 0
         if not turned.any():
             break
         x[faces[turned]] = flat[faces[turned]]
         total += int(turned.sum())
     among: BoolArray = np.asarray((x != flat).any(axis=1)[faces].any(axis=1))
     failing = faces[:0, 0]
-    for _ in range(_MAX_REPAIRS):
+    for _ in range(_MOST_REPAIRS):
         failing = np.union1d(intersecting_faces(x, faces, among), _folded_faces(x, faces, among))
         if not len(failing):
             return x, total
@@ -590,8 +660,8 @@ def _undo_until_valid(x: FloatArray, flat: FloatArray, faces: IntArray) -> tuple
 
 
 def _folded_faces(x: FloatArray, faces: IntArray, among: BoolArray) -> IntArray:
-    """The indices of faces that lie on a neighbor up to rounding, where either of both is
-    chosen."""
+    """The indices of the faces that lie on a neighbor, up to rounding. Pairs of neighbors count if
+    the mask `among` (m,) is set for either."""
     normal = area_normals(x[faces])
     normal /= np.maximum(row_norms(normal), 1e-300)[:, None]
     pairs = Edges.of(half_edges(faces)).paired_half_edges() % len(faces)

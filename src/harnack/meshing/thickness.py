@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 __all__ = ["WallThickness", "wall_thickness"]
 
 # Rays start this far below a face, relative to the mesh's size.
-_BELOW = 1e-6
+_START_DEPTH = 1e-6
 # The largest number of times that balls shrink; and the distance from the surface at which they
 # count as touching it.
-_MAX_ROUNDS, _TOUCHING = 30, 1e-6
+_MOST_ROUNDS, _TOUCHING = 30, 1e-6
 # Two points are opposite if the cosine between their normals is below this: walls beside an edge of
 # a part, at up to 120 degrees, are no thin places.
 _OPPOSITE = -0.5
@@ -33,10 +33,8 @@ _OPPOSITE = -0.5
 class WallThickness:
     """The thickness of a closed mesh at its faces, from `wall_thickness`.
 
-    vertices: (n, 3).
-    faces: (m, 3).
-    values: (m,) thickness at the centers of faces, a length; nan for faces without an area.
-    """
+    vertices, faces: (n, 3), (m, 3) the mesh.
+    values: (m,) the thickness at the centers of faces, a length; nan for faces without an area."""
 
     vertices: FloatArray
     faces: IntArray
@@ -47,23 +45,24 @@ class WallThickness:
 
     @property
     def thinnest(self) -> float:
-        """The least of the values."""
+        """The smallest thickness of all faces."""
         return float(np.nanmin(self.values))
 
     def thin_locations(self, less_than: float) -> FloatArray:
-        """Centers (k, 3) of the faces at which the wall is thinner than `less_than`, the thinnest
-        first."""
+        """(k, 3) the centers of the faces at which the wall is thinner than `less_than`, the
+        thinnest first."""
         rows = np.flatnonzero(self.is_thinner(less_than))
         rows = rows[np.argsort(self.values[rows])]
         return self.vertices[self.faces[rows]].mean(axis=1)
 
-    def is_thinner(self, limit: float) -> BoolArray:
-        """(m,) whether the wall is thinner than `limit` at each face."""
-        return np.asarray(np.nan_to_num(self.values, nan=np.inf) < limit)
+    def is_thinner(self, than: float) -> BoolArray:
+        """(m,) whether the wall is thinner than `than`, a length, at each face."""
+        return np.asarray(np.nan_to_num(self.values, nan=np.inf) < than)
 
     def to_colored_mesh(self, low: float, high: float) -> trimesh.Trimesh:
-        """The mesh with colors of faces: red up to `low`, through yellow, to gray from `high` on.
-        PLY and GLB files hold them."""
+        """The mesh with a color for each face. It is red where the thickness is at most `low`,
+        changes over yellow to gray, and is gray from `high` on. PLY and GLB files hold such colors.
+        """
         import trimesh  # imported here: it takes half a second
 
         fraction = np.clip((self.values - low) / max(high - low, 1e-300), 0.0, 1.0)
@@ -80,25 +79,27 @@ class WallThickness:
 def wall_thickness(part: Any, **options: Any) -> WallThickness:
     """The thickness of a part behind each of its faces.
 
-    At the center of a face a ray goes into the part, along the normal, and ends at the other side:
-    at a distance t. Then the ball that touches the center, t wide, shrinks until it holds no place
-    of the surface that faces the center (normals more than 120 degrees apart): to the ball that
-    touches the nearest such place as well, again and again (Ma, Bae and Choi 2012, 3D medial axis
-    point approximation using nearest neighbors and the normal field). Its diameter is the
-    thickness. Where walls are parallel it is their distance, and it is never more than the length
-    of the ray. Places beside the edges of a part, where the nearest wall is no opposite one, are
-    not thin by that: there the ball shrinks no further, so that the value is an upper bound.
-
-    Error: rays and nearest points are exact on the triangles, in double precision, to 1e-6 of the
-    mesh's size. Between centers nothing is measured; make large faces smaller for that
-    (`mesh.subdivide_to_size`).
-
-    part: a closed mesh (a trimesh.Trimesh, (vertices, faces), or a file's name), or a solid, of
-        which a mesh is made.
+    part: a closed mesh (a trimesh.Trimesh, (vertices, faces), or the name of a file); or a solid,
+        which is meshed first.
     options: of `mesh`, for a solid.
 
+    At the center of a face a ray goes into the part, against the normal, and ends at the other
+    side, at a distance t. A ball of diameter t touches the center from inside. It shrinks until it
+    holds no point of the surface that faces the center (whose normal differs by more than 120
+    degrees): again and again, it is replaced by the ball that touches the center and the nearest
+    such point (Ma, Bae and Choi 2012, 3D medial axis point approximation using nearest neighbors
+    and the normal field). Its diameter is the thickness. Where walls are parallel it is their
+    distance, and it is never more than the length of the ray. A place beside an edge of the part,
+    where the nearest wall is not opposite, does not count as thin for that: there the ball shrinks
+    no further, so that the value is an upper bound.
+
+    Error: rays and nearest points are exact on the triangles, in double precision, to 1e-6 of the
+    mesh's size. Between centers nothing is measured: make large faces smaller for that
+    (`mesh.subdivide_to_size`).
+
     Raises:
-        MeshError: a mesh that bounds no solid. MeshingError: a solid that cannot be meshed.
+        MeshError: a mesh that bounds no solid.
+        MeshingError: a solid that cannot be meshed.
     """
     if isinstance(part, Solid) and not isinstance(part, MeshSolid):
         part = mesh(part, **options)
@@ -118,46 +119,55 @@ def wall_thickness(part: Any, **options: Any) -> WallThickness:
 
 
 def _medial_diameters(solid: MeshSolid, start: FloatArray, normal: FloatArray) -> FloatArray:
-    """(k,) thickness at points of the surface with normals (k, 3)."""
+    """(k,) the thickness at points `start` (k, 3) of the surface of a solid, with outward unit
+    normals (k, 3): see `wall_thickness`.
+
+    A ball that touches the start begins as wide as the ray inwards is long. As long as the nearest
+    point of the surface to its center is inside of the ball and faces the start, the ball shrinks
+    to the one that touches this point as well."""
     size = solid.surface.size
-    below = _BELOW * size
+    below = _START_DEPTH * size
     # Not a fixed tolerance: rays into a small mesh would end where they start.
     hits: Any = trace(
         solid, start - below * normal, -normal,
         t_min=below, tolerance=0.1 * below, precision="double",
     )  # fmt: skip
     t = np.asarray(hits.t, np.float64) + below
-    width = np.where(np.isfinite(t), t, 2 * size)
+    diameter = np.where(np.isfinite(t), t, 2 * size)
     # Where that is already beyond the other side, the part is no thicker than the skipped length.
-    width[~_is_within(solid, start - 2 * below * normal)] = 2 * below
-    moving = np.arange(len(width))
-    for _ in range(_MAX_ROUNDS):
-        if not len(moving):
+    diameter[~_is_within(solid, start - 2 * below * normal)] = 2 * below
+    shrinking = np.arange(len(diameter))
+    for _ in range(_MOST_ROUNDS):
+        if not len(shrinking):
             break
-        p, n, r = start[moving], normal[moving], 0.5 * width[moving]
+        p, n, r = start[shrinking], normal[shrinking], 0.5 * diameter[shrinking]
         center = p - r[:, None] * n
-        distance, foot, towards = _nearest(solid, center)
+        distance, nearest, direction = _nearest(solid, center)
         # The ball is empty, or touches points that do not face the center.
         inside = distance < r * (1 - _TOUCHING)
-        shrinks = inside & (row_dots(towards, n) < _OPPOSITE)
-        away = p - foot
-        along = row_dots(away, n)
-        shrinks &= along > 0
-        smaller = row_dots(away, away)[shrinks] / (2 * along[shrinks])
-        width[moving[shrinks]] = np.minimum(width[moving[shrinks]], 2 * smaller)
-        moving = moving[shrinks]
-    return width
+        shrinks = inside & (row_dots(direction, n) < _OPPOSITE)
+        to_start = p - nearest
+        depth = row_dots(to_start, n)
+        shrinks &= depth > 0
+        radius = row_dots(to_start, to_start)[shrinks] / (2 * depth[shrinks])
+        diameter[shrinking[shrinks]] = np.minimum(diameter[shrinking[shrinks]], 2 * radius)
+        shrinking = shrinking[shrinks]
+    return diameter
 
 
 def _is_within(solid: MeshSolid, points: FloatArray) -> BoolArray:
+    """(k,) whether points (k, 3) are inside of the solid."""
     backend = choose_backend("double")
     value = solid.prepare(backend).evaluate(to_vector3(backend, points)).value
     return np.asarray(to_numpy(value) < 0)
 
 
 def _nearest(solid: MeshSolid, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Distances (k,) to the surface from points within, the nearest points (k, 3), and the
-    directions towards them (k, 3)."""
+    """The points of the surface that are nearest to points (k, 3) inside of it.
+
+    Returns:
+        Their distances (k,); the points (k, 3); and the unit vectors (k, 3) towards them.
+    """
     backend = choose_backend("double")
     sample = solid.prepare(backend).evaluate(to_vector3(backend, points))
     value, gradient = to_numpy(sample.value), to_numpy(sample.gradient)

@@ -22,12 +22,14 @@ _MAX_VERTICES = 4_000_000
 
 
 def thread_manifold(thread: Thread, lower: float, upper: float, tolerance: float) -> Manifold:
-    """A thread for lower <= z <= upper; the mesh beyond that range has no meaning.
+    """The mesh of a thread for lower <= z <= upper. Below and above that range it has no meaning.
 
-    Vertices lie on the surface, so that the edges of the profile are edges of the mesh. With n
-    vertices around, faces are within 2 r (pi/n)^2 of the surface: their corners differ by 2 pi/n in
-    angle at most, so that a chord has a sagitta of r (pi/n)^2/2, and a diagonal of a face that is
-    turned by 2 pi/n departs from it by less than three times that.
+    tolerance: a length, the largest distance of faces from the surface.
+
+    Vertices lie on the surface, so the edges of the thread's profile are edges of the mesh. With n
+    vertices around and the largest radius r, faces are within 2 r (pi/n)^2 of the surface. Their
+    corners differ by at most 2 pi/n in angle. So a chord has a sagitta of r (pi/n)^2/2, and the
+    departure of the diagonal of a face, which is turned by 2 pi/n, is less than three times that.
 
     Raises:
         MeshingError: the mesh would have millions of faces.
@@ -66,9 +68,14 @@ def thread_manifold(thread: Thread, lower: float, upper: float, tolerance: float
 def _vertices(
     height: FloatArray, radii: FloatArray, segments: int, lead: float, shift: int
 ) -> FloatArray:
-    """Points of each helical line at each angle; and the points at angle 0 of the lines that the
-    last lines lead to after a turn. shift: the number of lines by which a line advances in a
-    turn."""
+    """The vertices of all helical lines.
+
+    height, radii: (lines,) each line at angle 0. segments: the number of angles.
+    lead: the height that a line gains in a turn.
+    shift: after a turn, a line is where the line `shift` places further was at angle 0.
+
+    Returns (lines * segments + shift, 3): the points of each line at each angle, line after line;
+    then the points at angle 0 of the lines that follow the last ones after a turn."""
     angle = 2 * math.pi * np.arange(segments) / segments
     continued = height[-shift:] + lead, radii[-shift:]
     z = height[:, None] + lead * angle / (2 * math.pi)
@@ -78,17 +85,20 @@ def _vertices(
 
 
 def _index(line: IntArray, step: IntArray, lines: int, segments: int, shift: int) -> IntArray:
-    """The index of the vertex of a line at an angle; after a turn it is that of another line at
+    """The index in `_vertices` of the vertex of a line at an angle. step: the index of the angle,
+    from 0 to `segments`; after a full turn it is the vertex of the line `shift` places further at
     angle 0."""
     line, step = np.where(step == segments, line + shift, line), np.where(step == segments, 0, step)
     return np.where(line < lines, line * segments + step, lines * segments + line - lines)
 
 
 def _faces(lines: int, segments: int, shift: int) -> IntArray:
-    """Two triangles between neighbors of a line, and fans from the axis that close both ends."""
+    """Two triangles between neighboring vertices of neighboring lines, and fans of triangles around
+    two points of the axis (`_middles`), which close both ends."""
     line, step = (grid.ravel() for grid in np.mgrid[: lines - 1, :segments])
 
     def at(i: IntArray, j: IntArray) -> IntArray:
+        """The indices of the vertices of lines i at angles j."""
         return _index(i, j, lines, segments, shift)
 
     a, b, c, d = at(line, step), at(line, step + 1), at(line + 1, step + 1), at(line + 1, step)
@@ -106,7 +116,7 @@ def _faces(lines: int, segments: int, shift: int) -> IntArray:
 
 
 def _middles(vertices: FloatArray, lines: int, segments: int) -> FloatArray:
-    """Points of the axis at the middle heights of the ends."""
+    """(2, 3) the points of the axis at the mean heights of the first and of the last line."""
     low = vertices[:segments, 2].mean()
     high = vertices[(lines - 1) * segments : lines * segments, 2].mean()
     return np.array([[0.0, 0.0, low], [0.0, 0.0, high]])

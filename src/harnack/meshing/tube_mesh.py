@@ -22,29 +22,31 @@ if TYPE_CHECKING:
 
 __all__ = ["tube_manifold"]
 
-_MAX_VERTICES = 4_000_000
-# The largest error of polylines, relative to the tolerance.
-_LEFT_OUT = 0.25
+_MOST_VERTICES = 4_000_000
+# By how much polylines may be simplified, relative to the tolerance.
+_SIMPLIFY = 0.25
 # The smallest number of points around, also for wires far thinner than the tolerance.
-_MIN_AROUND = 8
-# An edge leads back where the cosine of its turn is less than this above -1.
-_BACK = 1e-9
+_LEAST_AROUND = 8
+# An edge leads back along the edge before if the cosine of the angle between them is at most -1
+# plus this.
+_REVERSAL = 1e-9
 
 
 def tube_manifold(tube: Tube, level: float, tolerance: float) -> Manifold:
-    """The points within radius + level of a tube's polylines; vertices lie on the surface, and
-    faces within `tolerance` of it.
+    """The mesh of the points within radius + level of a tube's polylines. Vertices lie on the
+    surface, and faces are within `tolerance` (a length) of it.
 
-    Vertices of a polyline within a quarter of the tolerance of a shorter polyline are left out.
-    Each polyline is swept as a whole. Where its mesh would pass through itself, as at corners too
-    sharp for the radius or where the tube returns to itself, the polyline is cut in two at a
-    vertex, where both parts end with a ball: the tube is the union of both parts' tubes.
+    First, vertices of a polyline are removed as long as the polyline stays within a quarter of the
+    tolerance. Then each polyline is swept as a whole. If its mesh would pass through itself, as at
+    corners too sharp for the radius or where the tube returns to itself, the polyline is cut in two
+    at a vertex, where both parts end with a ball: the tube is the union of both parts' tubes.
 
-    Proof of the tolerance, with the angle a = 2 pi/n between points around. Distances from two
-    polylines differ by no more than these do. Faces between lines along an edge have chords of
-    angle a, r a^2/8 deep, and where two edges meet in a single ring, at an angle up to a, lines
-    along the edge lie as deep as that. On the balls outside of corners and at ends both chords are
-    of angle a at most. The sum is at most r a^2/4, three quarters of the tolerance.
+    Proof of the tolerance. Let r be the radius, n the number of points around and a = 2 pi/n. The
+    distances of a point from two polylines differ by no more than the polylines do. Faces between
+    lines along an edge have chords of angle a, which are r a^2/8 deep. Where two edges meet in a
+    single ring, at an angle up to a, lines along the edge lie as deep as that. On the balls outside
+    of corners and at ends both chords are of angle a at most. The sum is at most r a^2/4, three
+    quarters of the tolerance.
 
     Raises:
         MeshingError: the mesh would have millions of faces.
@@ -55,17 +57,16 @@ def tube_manifold(tube: Tube, level: float, tolerance: float) -> Manifold:
     if radius <= 0:
         return Manifold()
     step = math.sqrt(3 * tolerance / radius)
-    segments = max(_MIN_AROUND, math.ceil(2 * math.pi / step))
+    segments = max(_LEAST_AROUND, math.ceil(2 * math.pi / step))
     waiting = [
-        _simplify_polyline(polyline, _LEFT_OUT * tolerance)
-        for polyline in np.split(tube.points, tube.starts)
+        _simpler(polyline, _SIMPLIFY * tolerance) for polyline in np.split(tube.points, tube.starts)
     ]
     parts: list[Manifold] = []
     vertices = 0
     while waiting:
         # Rings of a half ball at both ends, and at least one ring at each vertex between.
         minimum = segments * sum(len(polyline) + segments // 2 for polyline in waiting)
-        if vertices + minimum > _MAX_VERTICES:
+        if vertices + minimum > _MOST_VERTICES:
             raise MeshingError(
                 f"a tube within {tolerance:.3g} has more than {2 * (vertices + minimum):,} faces: "
                 "choose a larger `tolerance`"
@@ -82,24 +83,26 @@ def tube_manifold(tube: Tube, level: float, tolerance: float) -> Manifold:
 
 
 def _is_apart(surface: TriangleMesh) -> bool:
-    """Whether no faces pass through each other."""
+    """Whether no faces of a mesh pass through each other."""
     return not len(intersecting_faces(surface.vertices, surface.faces))
 
 
-def _simplify_polyline(points: FloatArray, length: float) -> FloatArray:
-    """A polyline (n, 3) without vertices that are within a length of the edges that replace them
-    (Douglas and Peucker 1973). Proof that all of these edges are as near to the polyline: the
-    points on an edge that are nearest to the replaced part of the polyline go from one of the
-    edge's ends to the other."""
+def _simpler(points: FloatArray, length: float) -> FloatArray:
+    """A polyline (n, 3) without the vertices that are within `length` of the edges that replace
+    them (Douglas and Peucker 1973).
+
+    Conversely, all points of these edges are within `length` of the old polyline. Proof. The point
+    of an edge that is nearest to a point of the replaced part moves from one end of the edge to the
+    other as the point runs along that part. So it passes every point of the edge."""
     is_kept = np.zeros(len(points), np.bool_)
     is_kept[[0, -1]] = True
     waiting = [(0, len(points) - 1)]
     while waiting:
         first, last = waiting.pop()
-        side, away = points[last] - points[first], points[first + 1 : last] - points[first]
-        square = float(side @ side)
-        fraction = (away @ side / square if square > 0 else np.zeros(len(away))).clip(0, 1)
-        distance = row_norms(away - fraction[:, None] * side)
+        edge, offsets = points[last] - points[first], points[first + 1 : last] - points[first]
+        square = float(edge @ edge)
+        fraction = (offsets @ edge / square if square > 0 else np.zeros(len(offsets))).clip(0, 1)
+        distance = row_norms(offsets - fraction[:, None] * edge)
         if not len(distance) or (square > 0 and distance.max() <= length):
             continue
         middle = first + 1 + int(distance.argmax())
@@ -110,23 +113,25 @@ def _simplify_polyline(points: FloatArray, length: float) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Sweep:
-    """A polyline (n, 3) with a radius, and the number of points around it."""
+    """A polyline that a ring of points is swept along.
+
+    radius: of the tube. around: the number of points of each ring. points: (n, 3) the polyline."""
 
     radius: float
-    segments: int
+    around: int
     points: FloatArray
 
     def surface(self) -> TriangleMesh | None:
-        """The surface of rings of points one after the other; None where a line along an edge would
-        end before it begins."""
+        """The surface through the rings of points. None if an edge leads back along the edge
+        before, or is too short for its corners: some line along it would end before it begins."""
         points, sides = self.points, np.diff(self.points, axis=0)
         edges = sides / np.abs(sides).max(axis=1)[:, None]  # squares of small ones underflow
         edges /= row_norms(edges)[:, None]
         is_closed = len(edges) > 2 and bool((points[0] == points[-1]).all())
-        swung = self._transported(edges, is_closed=is_closed)
-        if swung is None:
+        result = self._transported(edges, is_closed=is_closed)
+        if result is None:
             return None
-        frames, shift = swung
+        frames, shift = result
         turns = itertools.pairwise([*edges, edges[0]] if is_closed else edges)
         corners = [
             self._corner(point, turn, self._directions(end))
@@ -144,15 +149,22 @@ class _Sweep:
         return self._joined(np.concatenate(rings), shift if is_closed else None)
 
     def _directions(self, frame: FloatArray) -> FloatArray:
-        """(around, 3) unit vectors in the plane of a frame, at equal angles."""
-        angle = 2 * math.pi * np.arange(self.segments) / self.segments
+        """(around, 3) unit vectors at equal angles in the plane of a frame, two orthonormal vectors
+        (2, 3)."""
+        angle = 2 * math.pi * np.arange(self.around) / self.around
         return np.cos(angle)[:, None] * frame[0] + np.sin(angle)[:, None] * frame[1]
 
     def _corner(
         self, point: FloatArray, turn: tuple[FloatArray, FloatArray], directions: FloatArray
     ) -> FloatArray:
-        """Rings (k, around, 3) where two edges meet: lines along them meet in the plane between
-        them on the inner side, and arcs of the ball lead from one to the other on the outer."""
+        """Rings (k, around, 3) of points where two edges meet.
+
+        turn: the unit vectors of the edge before and of the edge after. directions: those of the
+            ring before the corner.
+
+        On the inner side, lines along the edges meet in the plane between them, in a single point.
+        On the outer side, arcs of the ball around the point lead from one edge to the other; k is
+        the number of points of these arcs."""
         before, after = turn
         cosine, across = float(before @ after), after - (before @ after) * before
         sine = float(np.linalg.norm(across))
@@ -161,7 +173,7 @@ class _Sweep:
         across = across / sine
         angle = math.atan2(sine, cosine)
         component = directions @ across
-        step = 2 * math.pi / self.segments
+        step = 2 * math.pi / self.around
         count = math.ceil(angle / step)
         angles = np.array([0.5 * angle]) if count <= 1 else np.linspace(0.0, angle, count + 1)
         turned = directions + component[:, None] * (
@@ -171,23 +183,30 @@ class _Sweep:
         return point + self.radius * np.where((component > 0)[:, None], inner, turned)
 
     def _end(self, point: FloatArray, axis: FloatArray, frame: FloatArray, sign: int) -> FloatArray:
-        """Rings from the pole of a half ball to its rim, or in the reverse order at the last
-        point."""
-        count = math.ceil(0.25 * self.segments)
+        """Rings (k, around, 3) of the half ball that closes an end of the tube.
+
+        axis: the unit vector of the edge. frame: orthonormal vectors across it.
+        sign: -1 at the first point, where rings go from the pole to the rim; 1 at the last point,
+            where they go from the rim to the pole."""
+        count = math.ceil(0.25 * self.around)
         angle = 0.5 * math.pi * np.arange(count + 1)[:, None, None] / count
         rings = np.cos(angle) * self._directions(frame) + sign * np.sin(angle) * axis
         return point + self.radius * (rings if sign > 0 else rings[::-1])
 
     def _joined(self, rings: FloatArray, shift: int | None) -> TriangleMesh:
-        """The mesh of faces between neighbors of rings (k, around, 3), without faces with equal
-        corners. shift: the amount by which the indices around grow from the last ring to the first;
-        None if the ends are poles."""
-        count, n = len(rings), self.segments
+        """The mesh with faces between neighboring rings. rings: (k, around, 3).
+
+        shift: for a closed polyline, by how much the index around grows from the last ring to the
+            first; None for a polyline with two ends, whose first and last rings are single points.
+
+        Corners that are equal in neighboring rings are one vertex, and faces without three
+        different vertices are left out."""
+        count, n = len(rings), self.around
         row, column = np.mgrid[: count - 1 if shift is None else count, :n].reshape(2, -1)
-        moved = np.where(row == count - 1, shift or 0, 0)
+        turn = np.where(row == count - 1, shift or 0, 0)
         next_row = (row + 1) % count * n
         a, b = row * n + column, row * n + (column + 1) % n
-        c, d = next_row + (column + moved + 1) % n, next_row + (column + moved) % n
+        c, d = next_row + (column + turn + 1) % n, next_row + (column + turn) % n
         vertex: IntArray = np.arange(count * n, dtype=np.int64).reshape((count, n))
         for k in range(1, count):
             same = (rings[k] == rings[k - 1]).all(axis=1)
@@ -202,36 +221,42 @@ class _Sweep:
     def _transported(
         self, edges: FloatArray, *, is_closed: bool
     ) -> tuple[list[tuple[FloatArray, FloatArray]], int] | None:
-        """Two unit vectors (2, 3) across each edge, at its start and its end, turned as the edges
-        turn; for a closed polyline they also turn a little about the edges, so that the indices
-        around agree at the last and the first edge up to a shift. None where an edge leads back
-        along the edge before."""
-        first = np.cross(edges[0], np.eye(3)[np.abs(edges[0]).argmin()])
-        first /= np.linalg.norm(first)
-        across = [first]
+        """Two orthonormal vectors across each edge, turned from edge to edge as the edges turn.
+
+        edges: (n, 3) unit vectors.
+
+        Returns:
+            For each edge the vectors (2, 3) at its start and at its end; and a shift. For a closed
+            polyline, the vectors also turn a little about the edges, so that the rings of the last
+            and the first edge coincide if the index around grows by the shift. Otherwise they are
+            the same at both ends, and the shift is 0. None if an edge leads back along the edge
+            before.
+        """
+        start = np.cross(edges[0], np.eye(3)[np.abs(edges[0]).argmin()])
+        start /= np.linalg.norm(start)
+        vectors = [start]
         for before, after in itertools.pairwise([*edges, edges[0]] if is_closed else edges):
             cosine = float(before @ after)
-            if cosine <= -1 + _BACK:
+            if cosine <= -1 + _REVERSAL:
                 return None
             # The rotation that takes one edge's direction to the next.
-            axis, u = np.cross(before, after), across[-1]
+            axis, u = np.cross(before, after), vectors[-1]
             turned = cosine * u + np.cross(axis, u) + axis * (axis @ u) / (1 + cosine)
             turned -= (turned @ after) * after
-            across.append(turned / np.linalg.norm(turned))
+            vectors.append(turned / np.linalg.norm(turned))
         shift, twist = 0, 0.0
         if is_closed:
-            mismatch = math.atan2(across[-1] @ np.cross(edges[0], first), across[-1] @ first)
-            step = 2 * math.pi / self.segments
+            mismatch = math.atan2(vectors[-1] @ np.cross(edges[0], start), vectors[-1] @ start)
+            step = 2 * math.pi / self.around
             shift = round(mismatch / step)
             twist = (mismatch - shift * step) / len(edges)
-        frames = [np.stack([u, np.cross(edge, u)]) for u, edge in zip(across, edges, strict=False)]
+        frames = [np.stack([u, np.cross(edge, u)]) for u, edge in zip(vectors, edges, strict=False)]
         return [
-            (_rotate_frame(f, -twist * k), _rotate_frame(f, -twist * (k + 1)))
-            for k, f in enumerate(frames)
+            (_spun(f, -twist * k), _spun(f, -twist * (k + 1))) for k, f in enumerate(frames)
         ], shift
 
 
-def _rotate_frame(frame: FloatArray, angle: float) -> FloatArray:
-    """The frame, turned by an angle in its plane."""
+def _spun(frame: FloatArray, angle: float) -> FloatArray:
+    """A frame, two orthonormal vectors (2, 3), turned by an angle in its plane."""
     c, s = math.cos(angle), math.sin(angle)
     return np.stack([c * frame[0] + s * frame[1], c * frame[1] - s * frame[0]])

@@ -35,21 +35,21 @@ NO_PRIMITIVE = -1
 # The number of points that fit into the cache, with their indices.
 _POINTS_IN_CACHE = 1 << 17
 # Rows up to this length are reduced faster by a loop over columns than by NumPy's reductions.
-_LONG_ROW = 48
+_MAX_LOOPED_ROW = 48
 
 
 @dataclass(frozen=True)
 class BalancedTree:
-    """A balanced tree: primitives in leaves, and levels of nodes above them.
+    """A balanced tree: primitives in leaves, and complete levels of nodes above them.
 
-    Every leaf holds w or w - 1 primitives and every level is complete, so that a level is a reshape
-    and every sum over nodes a sum along an axis.
+    Every leaf holds w or w - 1 primitives, where w is the number of its slots, and every level of
+    nodes is complete. So a level is a reshape of arrays, and a sum over the children of each node
+    is a sum along an axis.
 
-    leaf_slots: (leaves, leaf_size) index of the primitive in each slot, NO_PRIMITIVE for an empty
-        one (the last of a leaf, if any).
-    arities: the number of children of every inner node, level by level from the leaves' parents to
-        the root.
-    """
+    leaf_slots: (leaves, w) the index of the primitive in each slot; NO_PRIMITIVE in an empty slot,
+        which can only be the last of a leaf.
+    arities: the number of children of the nodes of each level, from the parents of leaves to the
+        root."""
 
     leaf_slots: IntArray
     arities: tuple[int, ...]
@@ -61,7 +61,7 @@ class BalancedTree:
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """The number of nodes of each level, from the leaves to the root."""
+        """The number of nodes of each level of the tree, from the leaves to the root."""
         counts = [len(self.leaf_slots)]
         for arity in self.arities:
             counts.append(counts[-1] // arity)
@@ -69,17 +69,21 @@ class BalancedTree:
 
     @property
     def node_count(self) -> int:
-        """The number of nodes of all levels."""
+        """The number of nodes of the tree, leaves included."""
         return sum(self.counts)
 
     def node_links(self) -> tuple[tuple[IntArray, ...], tuple[IntArray, ...], tuple[IntArray, ...]]:
-        """The index of each node, of its first child, and of the node that follows its subtree when
-        all nodes are visited depth first (`node_count` for the last); each level by level, leaves
-        first.
+        """The links with which a walk visits all nodes depth first, without a stack.
 
-        The children of a node are numbered consecutively, then the children of the first of them,
-        and so on, so that siblings, which are mostly visited together, lie side by side in memory.
-        The first child of a leaf is 0, the index of the root, which stands for none.
+        Returns:
+            Three tuples of arrays, one array for each level of the tree, leaves first: the index of
+            each node; the index of its first child; and the index of the node that follows when its
+            subtree has been visited, `node_count` for the last one.
+
+        The children of a node have consecutive indices; after them come the descendants of the
+        first child, then those of the second, and so on. So siblings, which are mostly visited
+        together, lie side by side in memory. For a leaf the first child is 0, the index of the
+        root, which stands for none.
         """
         below = [0]  # the number of nodes below a node, for each level
         for arity in self.arities:
@@ -98,8 +102,8 @@ class BalancedTree:
         return tuple(number), tuple(first), tuple(after)
 
     def values_in_slots(self, values: FloatArray, empty: float = 0.0) -> FloatArray:
-        """Values of primitives (n, ...) in slots (leaves, leaf_size, ...); `empty` in empty
-        ones."""
+        """Arrange values (n, ...) of primitives by slots: (leaves, leaf_size, ...). Empty slots
+        hold the value `empty`."""
         out = values.take(self.leaf_slots, axis=0, mode="clip")
         leaf, slot = np.nonzero(self.leaf_slots == NO_PRIMITIVE)
         out[leaf, slot] = empty
@@ -107,12 +111,19 @@ class BalancedTree:
 
 
 def build_balanced_tree(points: FloatArray, *, leaf_size: int = 8, arity: int = 4) -> BalancedTree:
-    """A tree over finite points (n, 3), n >= 1: each split halves a node along its longest side.
+    """Build a tree over finite points (n, 3), n >= 1, by splits at the median along the longest
+    side of each node's box.
 
-    arity: 2 or 4 (two splits at once; the root may have 2 children).
+    leaf_size: the largest number of points of a leaf.
+    arity: the number of children of a node, 2 or 4 (two splits at once); with 4 the root may have
+        2.
 
-    O(n log n): each of log2(n / leaf_size) levels is one partial sort. Nodes that fit into the
-    cache are split down to their leaves, one after the other: threads would not make it faster.
+    The time is O(n log n): each of log2(n / leaf_size) levels of splits is one partial sort. Nodes
+    that fit into the cache are split down to their leaves, one after the other. Threads would not
+    make it faster.
+
+    Raises:
+        ValueError: another arity.
     """
     if arity not in (2, 4):
         raise ValueError(f"arity must be 2 or 4, not {arity}")
@@ -136,16 +147,23 @@ def build_balanced_tree(points: FloatArray, *, leaf_size: int = 8, arity: int = 
     return BalancedTree(slots, (4,) * (depth // 2) + (2,) * (depth % 2))
 
 
-def _split(rows: IntArray, x: FloatArray) -> tuple[IntArray, FloatArray]:
-    """The points of nodes, a row each, halved: indices (k, w) and positions x (3, k, w) become
-    (2k, ceil(w/2)) and (3, 2k, ceil(w/2)).
+def _split(rows: IntArray, positions: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Halve nodes along the longest axis of their points' boxes.
 
-    The last slot of a row may be empty: NO_PRIMITIVE, at NaN, which sorts behind all numbers. If
-    each row holds w or w - 1 points, each new row holds ceil(w/2) points or one less.
+    rows: (k, w) the indices of the points of each node, one node per row.
+    positions: (3, k, w) the coordinates of these points.
+
+    The last slot of a row may be empty: its index is NO_PRIMITIVE and its position NaN, which sorts
+    behind all numbers. If each row holds w or w - 1 points, each new row holds ceil(w/2) points or
+    one less.
+
+    Returns:
+        The indices (2k, ceil(w/2)) and the positions (3, 2k, ceil(w/2)) of the points of the
+        halves; the two halves of a node follow each other.
     """
     count, width = rows.shape
     half, middle = (width + 1) // 2, width // 2
-    key = x[_sides(x).argmax(axis=0), np.arange(count)]
+    key = positions[_box_sizes(positions).argmax(axis=0), np.arange(count)]
     order = cast("IntArray", np.argpartition(key, middle, axis=1))
     short = np.flatnonzero(np.isnan(key[:, -1]))
     at = (order[short] == width - 1).argmax(axis=1)  # the empty slot: somewhere on the right
@@ -154,49 +172,58 @@ def _split(rows: IntArray, x: FloatArray) -> tuple[IntArray, FloatArray]:
         order[short, -1], order[short, middle] = order[short, middle], width - 1
     order += np.arange(0, rows.size, width, dtype=np.int64)[:, None]
     return _halves(rows, order, half, NO_PRIMITIVE), np.stack(
-        [_halves(coordinate, order, half, np.nan) for coordinate in x]
+        [_halves(coordinate, order, half, np.nan) for coordinate in positions]
     )
 
 
-def _sides(x: FloatArray) -> FloatArray:
-    """Lengths (3, k) of the boxes of rows of points (3, k, w)."""
-    if x.shape[2] > _LONG_ROW:
-        return np.fmax.reduce(x, axis=2) - np.fmin.reduce(x, axis=2)
-    low = high = x[..., 0]
-    for k in range(1, x.shape[2]):
-        low, high = np.fmin(low, x[..., k]), np.fmax(high, x[..., k])
+def _box_sizes(positions: FloatArray) -> FloatArray:
+    """(3, k) the edge lengths of the bounding boxes of k rows of w points, positions (3, k, w). NaN
+    marks an empty slot."""
+    if positions.shape[2] > _MAX_LOOPED_ROW:
+        return np.fmax.reduce(positions, axis=2) - np.fmin.reduce(positions, axis=2)
+    low = high = positions[..., 0]
+    for k in range(1, positions.shape[2]):
+        low, high = np.fmin(low, positions[..., k]), np.fmax(high, positions[..., k])
     return high - low
 
 
 def _halves(values: npt.NDArray[Any], order: IntArray, half: int, empty: float) -> Any:
-    """Rows (k, w), reordered by flat indices and cut in two (2k, half), with `empty` at the end."""
+    """Reorder each row of values (k, w) and cut it in two.
+
+    order: (k, w) for each new place, the index into the flattened values.
+    half: the length of each half, ceil(w/2).
+    empty: the value that fills the last slot of second halves, if w is odd.
+
+    Returns (2k, half): the two halves of a row follow each other."""
     count, width = order.shape
-    out = np.empty((count, 2, half), values.dtype)
+    halves = np.empty((count, 2, half), values.dtype)
     flat = values.reshape(-1)
-    out[:, 0] = flat[order[:, :half]]
-    out[:, 1, : width - half] = flat[order[:, half:]]
+    halves[:, 0] = flat[order[:, :half]]
+    halves[:, 1, : width - half] = flat[order[:, half:]]
     if width % 2:
-        out[:, 1, half - 1] = empty
-    return out.reshape(-1, half)
+        halves[:, 1, half - 1] = empty
+    return halves.reshape(-1, half)
 
 
-_HEAD = 6  # numbers in the first packet of a node that are the caller's; two links follow
+# The first packet of a node holds this many numbers of the caller, and then two links.
+_CALLER_NUMBERS = 6
 # Links are stored as floats, and single precision holds no larger integers without gaps.
 _MAX_NODES = 2**24
 
 
 @dataclass(frozen=True)
 class PackedTree:
-    """A tree on a backend: nodes with links, siblings side by side (`BalancedTree.node_links`), and
-    primitives leaf by leaf.
+    """A tree on a backend: records of its nodes and of its primitives.
 
-    node_heads: for each node six numbers of the caller, the index of the node that follows its
-        subtree, and the index of its leaf or, for an inner node, minus the index of its first
-        child.
-    node_payloads: further numbers of the caller for each node, stored separately because a walk
-        reads many heads in a row and few payloads; None if there are none.
-    primitives: `leaf_size` rows for each leaf.
-    """
+    Siblings lie side by side (`BalancedTree.node_links`), and primitives leaf by leaf.
+
+    node_heads: eight numbers for each node: six of the caller; the index of the node at which the
+        walk goes on if it skips the node's subtree; and the index of the leaf or, for an inner
+        node, minus the index of its first child.
+    node_payloads: further numbers of the caller for each node, or None. They are stored separately
+        because a walk reads many heads in a row and few payloads.
+    node_count: the number of nodes.
+    primitives: `leaf_size` records for each leaf."""
 
     backend: Backend
     node_heads: RecordTable
@@ -206,40 +233,43 @@ class PackedTree:
     leaf_size: Any
 
     def head(self, i: Any) -> list[Real]:
-        """The eight numbers of node i that a walk needs."""
+        """The eight numbers of node i in `node_heads`."""
         return self.node_heads.read_record(i)
 
     def payload(self, i: Any, active: Mask) -> list[Real]:
-        """The further numbers of node i."""
+        """The numbers of node i in `node_payloads`, read where active; [] if there are none."""
         return [] if self.node_payloads is None else self.node_payloads.read_record(i, active)
 
     def primitive(self, leaf: Any, slot: Any, active: Mask) -> list[Real]:
-        """All numbers of a primitive."""
+        """The record of the primitive in a slot of a leaf, read where active."""
         return self.primitives.read_record(leaf * self.leaf_size + slot, active)
 
 
 def pack_tree(
     backend: Backend, tree: BalancedTree, levels: Sequence[FloatArray], primitives: FloatArray
 ) -> PackedTree:
-    """Pack a tree with the numbers of its nodes (k, 6 or more), level by level from the leaves, and
-    the numbers of its primitives in their slots (leaves, leaf_size, c).
+    """Upload a tree as records.
+
+    levels: for each level of the tree, leaves first, the numbers (k, c) of its nodes, c >= 6. The
+        first six of each are read at every visit of the node, the others only on demand.
+    primitives: (leaves, leaf_size, j) the numbers of the primitives, by slots.
 
     Raises:
-        ValueError: more nodes than links in single precision can count.
+        ValueError: there are more nodes than single precision can count.
     """
     if tree.node_count >= _MAX_NODES:
         raise ValueError(f"a tree of {tree.node_count} nodes is too large: cut the input in parts")
-    extra = levels[0].shape[1] - _HEAD
+    extra = levels[0].shape[1] - _CALLER_NUMBERS
     heads = np.zeros((tree.node_count, PACKET), backend.dtype)
     payloads = np.zeros((tree.node_count, extra), backend.dtype)
     links = tree.node_links()
     for number, first, after, values in zip(*links, levels, strict=True):
-        heads[number, :_HEAD] = values[:, :_HEAD]
-        heads[number, _HEAD] = after
-        heads[number, _HEAD + 1] = -first
-        payloads[number] = values[:, _HEAD:]
+        heads[number, :_CALLER_NUMBERS] = values[:, :_CALLER_NUMBERS]
+        heads[number, _CALLER_NUMBERS] = after
+        heads[number, _CALLER_NUMBERS + 1] = -first
+        payloads[number] = values[:, _CALLER_NUMBERS:]
     leaves = links[0][0]
-    heads[leaves, _HEAD + 1] = np.arange(len(leaves))
+    heads[leaves, _CALLER_NUMBERS + 1] = np.arange(len(leaves))
     return PackedTree(
         backend,
         RecordTable.upload(backend, heads),
@@ -255,12 +285,12 @@ LoopValues: TypeAlias = "tuple[Any, ...]"
 
 @dataclass(frozen=True)
 class VisitedNode:
-    """The node that a walk visits; each lane may be at a different node.
+    """The node that a walk visits; each lane may visit a different node.
 
-    index: of the node.
-    head: the six numbers of the caller that every visit reads.
-    leaf: the index of its leaf, if it is a leaf.
-    """
+    index: the index of the node.
+    head: the first six numbers of the node, which the caller of `pack_tree` gave.
+    leaf: the index of its leaf; it has no meaning for an inner node.
+    is_leaf: whether the node is a leaf."""
 
     tree: PackedTree
     index: Any
@@ -269,7 +299,7 @@ class VisitedNode:
     is_leaf: Mask
 
     def payload(self, active: Mask) -> list[Real]:
-        """The other numbers, fetched where active."""
+        """The further numbers of the node, fetched where active; [] if there are none."""
         return self.tree.payload(self.index, active)
 
 
@@ -278,16 +308,18 @@ PrimitiveBody: TypeAlias = "Callable[[list[Real], Mask, LoopValues], LoopValues]
 
 
 def traverse(tree: PackedTree, visit: Visit, state: LoopValues, active: Mask = True) -> LoopValues:
-    """The state after visiting nodes depth first, from the root on.
+    """Visit nodes depth first, from the root on, and return the final state.
 
-    visit: takes a node and the state. Returns whether to visit the node's children (else the walk
-        skips its subtree), and the new state.
+    visit: takes a node and the state. It returns whether to visit the node's children (otherwise
+        its subtree is skipped) and the new state.
+    state: a tuple of arrays, which `visit` updates.
+    active: the lanes that walk at all.
 
-    May be called while a loop is being recorded.
-    """
+    May be called while a loop is being recorded."""
     index, mask = tree.backend.UInt32, tree.backend.Bool
 
     def body(i: Any, *state: Any) -> LoopValues:
+        """Visit node i, and go on to its first child or past its subtree."""
         head = tree.head(i)
         is_leaf, number = head[7] >= 0, index(dr.abs(head[7]))
         node = VisitedNode(tree, i, tuple(head[:6]), number, is_leaf)
@@ -305,12 +337,13 @@ def traverse(tree: PackedTree, visit: Visit, state: LoopValues, active: Mask = T
 def for_each_primitive(
     node: VisitedNode, active: Mask, body: PrimitiveBody, state: LoopValues
 ) -> LoopValues:
-    """The state after visiting the primitives of a leaf, on active lanes. It costs nothing where
-    all lanes of a packet are inactive.
+    """Update the state by `body` for each primitive of a leaf, on active lanes, and return it.
 
-    Empty slots are visited as well: the caller of `pack_tree` has filled them with numbers without
-    effect.
-    """
+    body: takes the record of a primitive, the mask of active lanes and the state; returns the
+        state.
+
+    It costs nothing where all lanes of a packet are inactive. Empty slots are visited as well: the
+    caller of `pack_tree` has filled them with numbers that have no effect."""
     tree = node.tree
     index = tree.backend.UInt32
 

@@ -38,20 +38,21 @@ __all__ = ["MAX_BOXES", "NO_BOX", "BoxTree"]
 # Boxes are numbered in floats; single precision holds no larger integers without gaps.
 MAX_BOXES = 2**24
 NO_BOX = 0xFFFFFFFF
-# The column of a record behind its box.
-_NUMBER = 6
+# The column of a record that holds the number of its box, behind the box's two corners.
+_BOX_NUMBER_COLUMN = 6
 _LEAF_SIZE = 4
 
 
 @dataclass(frozen=True)
 class BoxTree:
-    """A tree of boxes, which may overlap, with coordinates of at most about 1."""
+    """A tree of boxes, which may overlap. Their coordinates are at most about 1."""
 
     tree: PackedTree
 
     @classmethod
     def from_corners(cls, backend: Backend, lower: FloatArray, upper: FloatArray) -> BoxTree:
-        """Boxes from their corners (n, 3)."""
+        """The tree of n boxes, from their lower and upper corners, (n, 3) each. Boxes are numbered
+        in this order."""
         hierarchy = build_balanced_tree(0.5 * (lower + upper), leaf_size=_LEAF_SIZE)
         number = np.arange(len(lower), dtype=np.float64)[:, None]
         records = hierarchy.values_in_slots(np.concatenate([lower, upper, number], axis=1))
@@ -61,33 +62,36 @@ class BoxTree:
     def next_box(
         self, o: Vec3, d: Vec3, after: tuple[Real, Any], start: Real, end: Real, active: Mask
     ) -> tuple[Real, Real, Any]:
-        """Return the next box along each ray o + t d, |d| = 1, after `after` = (t, number).
+        """The next box that each ray o + t d, |d| = 1, enters after `after` = (t, number).
 
-        A box is entered at t = max(entry, start); boxes are ordered by (t, number). Boxes that a
-        ray has left before `start` are not entered. Starting with after = (t, NO_BOX), t < start,
-        repeated calls visit every box that the ray meets for start <= t <= end exactly once. Boxes
-        are padded a little, so that rounding never skips a box that the ray meets.
+        A ray enters a box at t = max(t of the first point of the ray in the box, start), and boxes
+        are ordered by (t, number). Boxes that a ray has left before `start` are not entered.
+        Starting with after = (t, NO_BOX), t < start, repeated calls visit every box that the ray
+        meets for start <= t <= end exactly once. Boxes are enlarged a little, so that rounding
+        never skips a box that the ray meets.
 
         Returns:
-            The t where the ray enters, the t where it leaves, and the box's number (NO_BOX for
-                none).
+            The t where the ray enters the box, the t where it leaves it, and the number of the box
+            (NO_BOX if there is none).
         """
         real, index = self.tree.backend.Float, self.tree.backend.UInt32
         t_after, n_after = real(after[0]), index(after[1])
         span = self._slab_test(o, d)
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
+            """Enter a node if the ray meets its box before the best box so far."""
             near, far = span(node.head)
             open_ = (near <= far) & (far >= start) & (near <= fmin(state[0], end))
             return open_, for_each_primitive(node, open_ & node.is_leaf, nearer, state)
 
         def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
+            """Take the box of a record if it comes after `after` and before the best so far."""
             best, leave, number = state
             near, far = span(row)
-            t, n = fmax(near, start), index(fmax(row[_NUMBER], real(0)))
+            t, n = fmax(near, start), index(fmax(row[_BOX_NUMBER_COLUMN], real(0)))
             later = (t > t_after) | ((t == t_after) & (n > n_after))
             first = (t < best) | ((t == best) & (n < number))
-            entered = (near <= far) & (far >= start) & (t <= end) & (row[_NUMBER] >= 0)
+            entered = (near <= far) & (far >= start) & (t <= end) & (row[_BOX_NUMBER_COLUMN] >= 0)
             chosen = active & entered & later & first
             return (
                 dr.select(chosen, t, best),
@@ -100,21 +104,22 @@ class BoxTree:
         return near, far, number
 
     def _slab_test(self, o: Vec3, d: Vec3) -> Any:
-        """A function that computes where rays enter and leave a box, a little too early and too
-        late, which covers rounding.
+        """Make a function that computes at which t rays o + t d enter and leave a box.
 
-        Each plane of the box is moved outwards by 16 roundings of the size of coordinates, and t is
-        widened by 8 roundings of itself: (x - o)/d has three roundings, of which that of x - o is
-        at most half a unit of coordinates.
-        """
+        The function takes six numbers, the lower and the upper corner. It returns t slightly too
+        small and slightly too large, which covers rounding. Each plane of the box is moved outwards
+        by 16 roundings of the size of coordinates, and t is widened by 8 roundings of itself. The
+        quotient (x - o)/d has three roundings, and that of x - o is at most half a unit of the last
+        place of coordinates. The ray misses the box if the first t is larger than the second."""
         backend = self.tree.backend
         vector = backend.Array3f
         # Never zero: 1e-18 of the boxes' size is far below their padding.
-        steep = dr.select(dr.abs(d) < 1e-18, dr.select(d < 0, vector(-1e-18), vector(1e-18)), d)
-        inverse = dr.rcp(steep)
+        direction = dr.select(dr.abs(d) < 1e-18, dr.select(d < 0, vector(-1e-18), vector(1e-18)), d)
+        inverse = dr.rcp(direction)
         pad = 16 * backend.machine_epsilon * (1 + max_norm(o))
 
-        def span(box: Any) -> tuple[Real, Real]:
+        def interval(box: Any) -> tuple[Real, Real]:
+            """The t at which the rays enter the box and leave it."""
             low, high = vector(*box[:3]) - pad, vector(*box[3:6]) + pad
             a, b = (low - o) * inverse, (high - o) * inverse
             near = fmax(fmax(fmin(a.x, b.x), fmin(a.y, b.y)), fmin(a.z, b.z))
@@ -122,24 +127,23 @@ class BoxTree:
             rounding = 8 * backend.machine_epsilon
             return near - rounding * dr.abs(near), far + rounding * dr.abs(far)
 
-        return span
+        return interval
 
 
-# How far rounding may move a distance, in epsilons of the coordinates and of the mesh's size.
-_ROUNDING = 16.0
+# How far rounding may move a distance, in machine epsilons times 1 plus the largest coordinate.
+_ROUNDING_EPSILONS = 16.0
 
 
 @dataclass(frozen=True)
 class ClosestTriangle:
     """The triangle nearest to points x, among the triangles that a query considers.
 
-    squared_distance: inf where there is no triangle.
-    triangle: the index of the triangle; NO_TRIANGLE where there is none.
-    offset: (3,) from x to the nearest point of the triangle.
-    normal: (3,) of the triangle by the right-hand rule, of any length; zero for a triangle of zero
-        area.
-    is_inner: whether the nearest point lies inside the triangle, not on its edges.
-    """
+    squared_distance: of the triangle from x; inf where there is no triangle.
+    triangle: its index; NO_TRIANGLE where there is none.
+    offset: (3,) the vector from x to the nearest point of the triangle.
+    normal: (3,) a normal of the triangle by the right-hand rule, of any length; zero for a triangle
+        of zero area.
+    is_inner: whether the nearest point lies inside the triangle, not on its edges."""
 
     squared_distance: Real
     triangle: Any
@@ -149,23 +153,25 @@ class ClosestTriangle:
 
 
 def distance_lower_bound(rays: TriangleTree, x: Vec3) -> Real:
-    """A proved lower bound of the distance from x to the triangles, exact up to rounding; the
-    triangles have coordinates of at most about one.
+    """A proved lower bound of the distance from x to the triangles, which is exact up to rounding.
+    Coordinates of triangles are at most about one.
 
-    Proof. `ClosestPointOnTriangle` is off by a few epsilons of |x| + 1, by its docstring; boxes are
-    skipped only if they are farther than the best so far by that much. 16 epsilons of |x| + 1 are
-    subtracted, several times the largest error found with random needles and random triangles.
-    """
+    Proof. The distance from `ClosestPointOnTriangle` is off by a few machine epsilons of |x| + 1,
+    as is proved there. Boxes are skipped only if they are farther than the best distance so far by
+    that much. 16 epsilons of |x| + 1 are subtracted, several times the largest error that was found
+    with random needles and random triangles."""
     real, vector = rays.tree.backend.Float, rays.tree.backend.Array3f
     x = vector(x)
     pad = _pad(rays, x)
     inside = _distance_test(rays, x, pad)
 
     def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
+        """Enter a node if its box is nearer than the best distance so far."""
         closer = inside(node, state[0])
         return closer, for_each_primitive(node, closer & node.is_leaf, nearer, state)
 
     def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
+        """The smaller of the best squared distance so far and that to the triangle of a record."""
         square = ClosestPointOnTriangle.of(row, x).squared_distance
         return (dr.select(active, fmin(square, state[0]), state[0]),)
 
@@ -174,23 +180,31 @@ def distance_lower_bound(rays: TriangleTree, x: Vec3) -> Real:
 
 
 def initial_squared_distance(rays: TriangleTree, x: Vec3) -> Real:
-    """The squared distance from x to a vertex of a triangle nearby, rounded up: an upper bound that
-    lets a walk skip most boxes from its start."""
+    """An upper bound of the squared distance from x to the triangles, with which a walk can skip
+    most boxes from its start. It is the squared distance to a vertex in a nearby leaf, rounded up.
+    """
     square, pad = squared_distance_in_nearby_leaf(rays.tree, x, 0), _pad(rays, x)
     return square + 2 * pad * (dr.sqrt(square) + pad)
 
 
 def squared_distance_in_nearby_leaf(tree: PackedTree, x: Vec3, column: int) -> Real:
-    """The smallest squared distance from x to the points of a leaf nearby: the leaf that is reached
-    from the root by always entering the child whose box has the nearest center.
+    """The smallest squared distance from x to the points of a nearby leaf. It is an upper bound of
+    the smallest squared distance to any point of the tree.
 
-    column: the column of a record at which the coordinates of its point begin.
-    """
+    The leaf is found from the root by always going to the child whose box has the nearest center.
+
+    column: the column of a record at which the three coordinates of its point begin."""
     backend = tree.backend
     real, index, vector = backend.Float, backend.UInt32, backend.Array3f
     x = vector(x)
 
     def body(i: Any, end: Any, best: Real, first: Any, after: Any, nearest_leaf: Any) -> LoopValues:
+        """Look at node i among its siblings, the last of which is followed by node `end`. After the
+        last, go down to the first child of the sibling with the nearest center.
+
+        best: the smallest squared distance of a sibling's center. nearest_leaf: the leaf of that
+            sibling, NO_TRIANGLE for an inner node. first, after: its first child, and the node
+            after its subtree."""
         head = tree.head(i)
         middle = 0.5 * (vector(*head[:3]) + vector(*head[3:6]))
         square = dr.squared_norm(middle - x)
@@ -217,6 +231,7 @@ def squared_distance_in_nearby_leaf(tree: PackedTree, x: Vec3, column: int) -> R
     leaf = dr.while_loop(start, is_running, body, label="to a leaf")[5]
 
     def add(slot: Any, square: Real) -> LoopValues:
+        """Take the point in a slot of the leaf into account."""
         row = tree.primitive(leaf, slot, backend.Bool(True))
         point = vector(*row[column : column + 3])
         return slot + 1, fmin(square, dr.squared_norm(point - x))
@@ -231,11 +246,10 @@ def squared_distance_in_nearby_leaf(tree: PackedTree, x: Vec3, column: int) -> R
 def next_closest_triangle(
     rays: TriangleTree, x: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
 ) -> ClosestTriangle:
-    """The next triangle after `after` = (squared distance, number) that is nearer than `limit`.
+    """The next triangle after `after` that is nearer to x than `limit`, a squared distance.
 
-    Triangles are ordered by (squared distance, number). Starting with (-1, NO_TRIANGLE), repeated
-    calls visit each triangle once. limit: a squared distance.
-    """
+    Triangles are ordered by (squared distance, number), and `after` is such a pair. Starting with
+    (-1, NO_TRIANGLE), repeated calls visit each triangle once."""
     backend = rays.tree.backend
     real, index, vector = backend.Float, backend.UInt32, backend.Array3f
     x, limit = vector(x), real(limit)
@@ -243,10 +257,12 @@ def next_closest_triangle(
     inside = _distance_test(rays, x, _pad(rays, x))
 
     def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
+        """Enter a node if its box is nearer than the best triangle so far."""
         closer = inside(node, state[0])
         return closer, for_each_primitive(node, closer & node.is_leaf, nearer, state)
 
     def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
+        """Take the triangle of a record if it comes after `after` and before the best so far."""
         best, number, offset, normal, is_inner = state
         point = ClosestPointOnTriangle.of(row, x)
         square, n = point.squared_distance, index(fmax(row[NUMBER_COLUMN], real(0)))
@@ -267,31 +283,36 @@ def next_closest_triangle(
     return ClosestTriangle(dr.select(exists, square, dr.inf), number, offset, normal, is_inner)
 
 
-def _pad(rays: TriangleTree, x: Vec3) -> Real:
-    return _ROUNDING * rays.tree.backend.machine_epsilon * (1 + dr.max(dr.abs(x)))
+def _pad(triangles: TriangleTree, x: Vec3) -> Real:
+    """A bound of the rounding error of distances from x, a length: see `distance_lower_bound`."""
+    return _ROUNDING_EPSILONS * triangles.tree.backend.machine_epsilon * (1 + dr.max(dr.abs(x)))
 
 
-def _distance_test(rays: TriangleTree, x: Vec3, pad: Real) -> Any:
-    """A test whether a node comes within a squared distance of x: its box widened by `pad` and,
-    if the tree has them, its slab (`node_slabs`) as well."""
-    vector = rays.tree.backend.Array3f
+def _distance_test(triangles: TriangleTree, x: Vec3, pad: Real) -> Any:
+    """Make a function that tells whether a node's triangles may be within a distance of x.
 
-    def within(node: VisitedNode, square: Real) -> Mask:
+    The function takes a node and a squared distance, and returns a mask. It tests the distance from
+    the node's box and, if the tree has them, from its slab (`node_slabs`), both widened by the
+    length `pad`."""
+    vector = triangles.tree.backend.Array3f
+
+    def may_be_within(node: VisitedNode, square: Real) -> Mask:
+        """Whether the node's box and slab come within the distance whose square is given."""
         low, high = vector(*node.head[:3]) - pad, vector(*node.head[3:]) + pad
-        away = dr.select(x < low, low - x, dr.select(x > high, x - high, 0))
-        close = dr.squared_norm(away) <= square
-        slab = node.payload(close)
+        gap = dr.select(x < low, low - x, dr.select(x > high, x - high, 0))
+        is_box_near = dr.squared_norm(gap) <= square
+        slab = node.payload(is_box_near)
         if not slab:
-            return close
+            return is_box_near
         n, offset, thickness, radius = vector(*slab[:3]), slab[3], slab[4], slab[5]
-        from_center = x - 0.5 * (low + high)
-        height = dr.dot(from_center, n)
-        across = dr.norm(dr.fma(vector(-height), n, from_center))
-        excess = fmax(dr.abs(height - offset) - (thickness + pad), 0)
-        beside = fmax(across - (radius + pad), 0)
-        return close & (dr.fma(excess, excess, beside * beside) <= square)
+        relative = x - 0.5 * (low + high)
+        height = dr.dot(relative, n)
+        radial = dr.norm(dr.fma(vector(-height), n, relative))
+        normal_gap = fmax(dr.abs(height - offset) - (thickness + pad), 0)
+        radial_gap = fmax(radial - (radius + pad), 0)
+        return is_box_near & (dr.fma(normal_gap, normal_gap, radial_gap * radial_gap) <= square)
 
-    return within
+    return may_be_within
 
 
 @dataclass(frozen=True)
@@ -324,6 +345,7 @@ class ClosestPointOnTriangle:
 
     @classmethod
     def of(cls, row: list[Real], x: Vec3) -> ClosestPointOnTriangle:
+        """The closest point to x of the triangle of a record (`triangle_records`)."""
         vector = cast("Any", type(x))
         p, q, r = (corner - x for corner in corners_of(row, vector))
         first, second, third = row[INVERSE_SQUARES_COLUMN : INVERSE_SQUARES_COLUMN + 3]
@@ -338,7 +360,8 @@ class ClosestPointOnTriangle:
         by_qr = ~by_pr & (squares[1] > squares[0])
 
         def chosen(of_pq: Any, of_qr: Any, of_pr: Any) -> Any:
-            """The argument that belongs to the longest of the edges pq, qr and pr."""
+            """The number or vector of the longest edge, of one for each of the edges pq, qr
+            and pr."""
             return dr.select(by_pr, of_pr, dr.select(by_qr, of_qr, of_pq))
 
         a, e, inverse = chosen(p, q, p), chosen(pq, qr, pr), chosen(first, second, third)
@@ -353,8 +376,8 @@ class ClosestPointOnTriangle:
 
 
 def _project_on_edge(v: Vec3, e: Vec3, inverse: Real) -> tuple[Real, Vec3]:
-    """The coefficient t and the rest r of v = t e + r, with r orthogonal to e, even if e is short;
-    inverse = 1/|e|^2."""
+    """The coefficient t and the rest r of v = t e + r, where r is orthogonal to e. The rest is made
+    orthogonal twice, so that rounding does not matter even if e is short. inverse: 1/|e|^2."""
     vector = cast("Any", type(v))
     t = dr.dot(v, e) * inverse
     rest = dr.fma(vector(-t), e, v)
@@ -363,13 +386,13 @@ def _project_on_edge(v: Vec3, e: Vec3, inverse: Real) -> tuple[Real, Vec3]:
 
 
 def _closest_on_segment(a: Vec3, e: Vec3, inverse: Real) -> Vec3:
-    """The point of the segment from a to a + e that is nearest to the origin."""
+    """The point of the segment from a to a + e that is nearest to the origin. inverse: 1/|e|^2."""
     real, vector = cast("Any", type(inverse)), cast("Any", type(a))
     return dr.fma(vector(clamp(-dr.dot(a, e) * inverse, real(0), real(1))), e, a)
 
 
 def _shortest_vector(*vectors: Vec3) -> tuple[Real, Vec3]:
-    """The shortest of vectors, its squared length first."""
+    """The squared length of the shortest of some vectors, and this vector."""
     best, *rest = vectors
     square = dr.squared_norm(best)
     for vector in rest:
@@ -379,23 +402,26 @@ def _shortest_vector(*vectors: Vec3) -> tuple[Real, Vec3]:
 
 
 def squared_distance_to_segment(a: Vec3, e: Vec3, inverse: Real) -> Real:
-    """The squared distance from the origin to the segment from a to a + e; inverse: 1/|e|^2, any
-    finite number if e = 0."""
+    """The squared distance from the origin to the segment from a to a + e.
+
+    inverse: 1/|e|^2; any finite number if e = 0."""
     return dr.squared_norm(_closest_on_segment(a, e, inverse))
 
 
 def jump_sum_within(rays: TriangleTree, x: Vec3, distance: Real, active: Mask = True) -> Real:
-    """The sum of the absolute values of the jumps of the winding number across triangles within a
-    distance of x."""
+    """The sum of the absolute values of the jumps of the winding number across the triangles that
+    are within `distance` of x."""
     real, vector = rays.tree.backend.Float, rays.tree.backend.Array3f
     x, distance = vector(x), real(distance)
     reach, inside = distance * distance, _distance_test(rays, x, distance)
 
     def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
+        """Enter a node if its box comes within the distance."""
         close = inside(node, reach)
         return close, for_each_primitive(node, close & node.is_leaf, add, state)
 
     def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
+        """Add the jump across the triangle of a record, if it is within the distance."""
         within = (
             active
             & (row[NUMBER_COLUMN] >= 0)

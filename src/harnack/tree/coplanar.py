@@ -23,15 +23,15 @@ if TYPE_CHECKING:
 
 __all__ = ["borders_of_overlaps", "overlapping_faces"]
 
-# In units of the mesh's size: triangles this near to a plane lie in it, and overlap by more than
-# this.
-_SAME = 1e-12
-# The size of the cells, of normals and distances from the origin, in which planes are told apart.
-_CELL = 1e-6
+# A length in units of the mesh's size: a triangle lies in a plane if it is within this distance of
+# it, and two triangles overlap if they do so by more than this.
+_IN_PLANE = 1e-12
+# The size of the cells of R^4 by which planes are told apart: see `_candidates`.
+_PLANE_CELL = 1e-6
 # The rounding of a normal, as a length at the corner of a triangle of size one.
-_ROUNDED = 1e-15
-# Odd numbers, with which coordinates of cells are hashed to one number.
-_MIXED = np.array(
+_NORMAL_ROUNDING = 1e-15
+# Odd numbers by which the four coordinates of a cell are multiplied to hash it to one number.
+_HASH_FACTORS = np.array(
     [0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9, 0xD6E8FEB86659FD93], np.uint64
 )
 
@@ -39,13 +39,16 @@ _MIXED = np.array(
 def borders_of_overlaps(
     rays: TriangleTree, vertices: FloatArray, faces: IntArray, *, at_every_edge: bool = False
 ) -> tuple[IntArray, FloatArray]:
-    """The faces (k,) with parts that other faces in their plane cover, and knives (k, 3, 3):
-    triangles that meet that plane in an edge of the covered part's border.
+    """Faces that are partly covered by other faces in their plane, and where to cut them.
 
     rays: a tree of the same faces, with coordinates of at most about 1.
-    at_every_edge: whether edges between the covering faces count as borders. If not, edges inside
-        of a covered part are left out where the covering faces meet in edges that no further face
-        has: the face is equally covered on both sides.
+    at_every_edge: whether edges between the covering faces count as borders too. If not, edges
+        inside of a covered part are left out where the covering faces meet in edges that no further
+        face has: the face is equally covered on both sides of these.
+
+    Returns:
+        The indices of the covered faces (k,), repeated for each border edge; and knives (k, 3, 3):
+        triangles that meet the plane of the face in an edge of the border of the covered part.
     """
     covered, covering = overlapping_faces(rays, vertices, faces)
     if not len(covered):
@@ -71,15 +74,19 @@ def borders_of_overlaps(
 
 
 def _edges(faces: IntArray) -> tuple[IntArray, IntArray]:
-    """Edges (3 m, 2) of faces, the lower index first, and -1 for those that this order reverses,
-    else 1."""
+    """The edges of faces (m, 3), with their directions.
+
+    Returns:
+        (3 m, 2) the vertices of each edge, the lower index first; and (3 m,) 1 if the face runs the
+        edge in that order, else -1.
+    """
     ends = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     return np.sort(ends, axis=1), np.where(ends[:, 0] < ends[:, 1], 1, -1)
 
 
 def _normals(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Unit normals (m, 3) of triangles, 0 for triangles without a normal, and heights (m,) over
-    their longest edges."""
+    """Unit normals (m, 3) of triangles (m, 3, 3), 0 for triangles without a normal; and their
+    heights (m,) over their longest edges."""
     u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(u, v)
     area = np.sqrt(np.einsum("ni,ni->n", normal, normal))
@@ -89,26 +96,29 @@ def _normals(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
     return normal / np.where(area > 0, area, 1)[:, None], height
 
 
-def _candidates(corners: FloatArray, normal: FloatArray, height: FloatArray) -> IntArray:
-    """Triangles (k,) in whose plane others may lie.
+def _candidates(corners: FloatArray, normals: FloatArray, heights: FloatArray) -> IntArray:
+    """The indices (k,) of triangles in whose plane other triangles may lie. Of two triangles in one
+    plane, the one with the smaller height is always among them.
 
-    A plane is a point of R^4: its normal, whose first coordinate that is clear of 0 is positive,
-    and its distance from the origin. For two triangles in one plane these points differ by rounding
-    and by a move of corners by `_SAME`, over the smaller of their heights. So of triangles that are
-    alone in their cell of R^4 only those as near to its walls may have others in their plane; the
-    lower triangle of a pair is always among the returned triangles.
-    """
-    clear = np.abs(normal) - 0.3
-    first = np.take_along_axis(normal, (clear > 0).argmax(axis=1)[:, None], axis=1)
-    normal = np.where(first < 0, -normal, normal)
-    position = np.column_stack([normal, np.einsum("ni,ni->n", normal, corners[:, 0])]) / _CELL
-    cell = np.floor(position)
-    within = position - cell
-    to_wall = np.minimum(within, 1 - within).min(axis=1) * _CELL
-    tolerance = 4 * (_SAME + _ROUNDED) / np.where(height > 0, height, 1e-300)
-    is_sure = (to_wall > tolerance) & (np.abs(clear).min(axis=1) > tolerance)
+    corners: (m, 3, 3). normals: (m, 3) unit normals. heights: (m,) over the longest edges.
+
+    A plane is a point of R^4: its unit normal and its distance from the origin. The normal is
+    turned so that its first coordinate that is larger than 0.3 in magnitude is positive. For two
+    triangles in one plane these points differ only by rounding and by the effect of moving corners
+    by `_IN_PLANE`, divided by the smaller of the triangles' heights. R^4 is divided into cells. So
+    a triangle alone in its cell can share its plane with another one only if its point is that near
+    to a wall of the cell, or a coordinate of its normal that near to 0.3 in magnitude."""
+    excess = np.abs(normals) - 0.3
+    first = np.take_along_axis(normals, (excess > 0).argmax(axis=1)[:, None], axis=1)
+    normals = np.where(first < 0, -normals, normals)
+    plane = np.column_stack([normals, np.einsum("ni,ni->n", normals, corners[:, 0])]) / _PLANE_CELL
+    cell = np.floor(plane)
+    in_cell = plane - cell
+    wall_distance = np.minimum(in_cell, 1 - in_cell).min(axis=1) * _PLANE_CELL
+    tolerance = 4 * (_IN_PLANE + _NORMAL_ROUNDING) / np.where(heights > 0, heights, 1e-300)
+    is_sure = (wall_distance > tolerance) & (np.abs(excess).min(axis=1) > tolerance)
     # Cells with the same number count as one cell.
-    number = (cell.astype(np.int64).astype(np.uint64) * _MIXED).sum(axis=1)
+    number = (cell.astype(np.int64).astype(np.uint64) * _HASH_FACTORS).sum(axis=1)
     _, group, count = np.unique(number, return_inverse=True, return_counts=True)
     return np.flatnonzero((count[group] > 1) | ~is_sure)
 
@@ -116,11 +126,10 @@ def _candidates(corners: FloatArray, normal: FloatArray, height: FloatArray) -> 
 def overlapping_faces(
     rays: TriangleTree, vertices: FloatArray, faces: IntArray
 ) -> tuple[IntArray, IntArray]:
-    """Pairs of faces (k,), (k,) that overlap in a plane, each in both orders.
+    """Pairs of faces, (k,) and (k,), that overlap in a plane; each pair in both orders.
 
-    For each face, the overlapping faces that are not lower than itself are searched for; there are
-    few.
-    """
+    Each pair is found from its smaller face: for each face, the overlapping faces that are at least
+    as large are searched for, and there are few."""
     backend = rays.tree.backend
     corners = vertices[faces]
     normals, heights = _normals(corners)
@@ -143,65 +152,73 @@ def overlapping_faces(
 
 
 def _next_in_plane(
-    rays: TriangleTree, corners: tuple[Vec3, ...], face: Any, sizes: Real, after: Real
+    tree: TriangleTree, corners: tuple[Vec3, ...], face: Any, sizes: Real, after: Real
 ) -> Any:
-    """The first face with a number above `after` that overlaps `face`, a face in each lane, in its
-    plane, and is no smaller. sizes: of all faces; of two equal faces the later counts as larger."""
-    backend = rays.tree.backend
+    """For each lane, the lowest-numbered face after the number `after` that is coplanar with the
+    lane's face, overlaps it and is at least as large. NO_TRIANGLE if there is none.
+
+    corners, face: the corners and the number of the lane's face.
+    sizes: the heights of all faces over their longest edges; of two faces with equal heights the
+        later one counts as larger."""
+    backend = tree.tree.backend
     real, index, vector = backend.Float, backend.UInt32, backend.Array3f
     a, b, c = corners
     size = dr.gather(real, sizes, face)
-    low, high = fmin(fmin(a, b), c) - _SAME, fmax(fmax(a, b), c) + _SAME
+    low, high = fmin(fmin(a, b), c) - _IN_PLANE, fmax(fmax(a, b), c) + _IN_PLANE
 
     def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
-        below, above = vector(*node.head[:3]), vector(*node.head[3:6])
-        open_ = dr.all((below <= high) & (above >= low))
-        return open_, for_each_primitive(node, open_ & node.is_leaf, nearer, state)
+        """Enter a node if its box meets the box of the lane's face."""
+        node_low, node_high = vector(*node.head[:3]), vector(*node.head[3:6])
+        is_near = dr.all((node_low <= high) & (node_high >= low))
+        return is_near, for_each_primitive(node, is_near & node.is_leaf, nearer, state)
 
     def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
+        """Take the face of a record if it fits and has a lower number than the best so far."""
         number = index(fmax(row[NUMBER_COLUMN], real(0)))
-        theirs = corners_of(row, vector)
-        their_size = dr.gather(real, sizes, number, active)
-        larger = (their_size > size) | ((their_size == size) & (number > face))
+        other_corners = corners_of(row, vector)
+        other_size = dr.gather(real, sizes, number, active)
+        larger = (other_size > size) | ((other_size == size) & (number > face))
         chosen = active & (row[NUMBER_COLUMN] > after) & (number < state[0]) & larger
-        chosen &= _in_plane(corners, theirs) & _overlap(corners, theirs)
+        chosen &= _in_plane(corners, other_corners) & _overlap(corners, other_corners)
         return (dr.select(chosen, number, state[0]),)
 
-    return traverse(rays.tree, visit, (index(NO_TRIANGLE),))[0]
+    return traverse(tree.tree, visit, (index(NO_TRIANGLE),))[0]
 
 
 def _unit(vector: Vec3) -> Vec3:
-    """A vector scaled to length 1; 0 stays 0."""
+    """A vector scaled to length 1; a vector of length 0 stays 0."""
     length = dr.norm(vector)
     return dr.select(length > 0, vector / dr.select(length > 0, length, 1), 0)
 
 
 def _normal(corners: tuple[Vec3, ...]) -> Vec3:
+    """The unit normal of a triangle; 0 if it has no area."""
     a, b, c = corners
     return _unit(dr.cross(b - a, c - a))
 
 
 def _in_plane(ours: tuple[Vec3, ...], theirs: tuple[Vec3, ...]) -> Mask:
-    """Whether one of two triangles has all corners in the plane of the other. (The normal of a thin
-    triangle may be only rounding.)"""
+    """Whether one of two triangles has all corners in the plane of the other. One of the two tests
+    is enough: the normal of a thin triangle may be only rounding."""
 
     def lies_in(corners: tuple[Vec3, ...], plane: tuple[Vec3, ...]) -> Mask:
+        """Whether three corners lie in the plane of a triangle; False if that has no normal."""
         normal = _normal(plane)
-        near = [dr.abs(dr.dot(normal, p - plane[0])) <= _SAME for p in corners]
+        near = [dr.abs(dr.dot(normal, p - plane[0])) <= _IN_PLANE for p in corners]
         return near[0] & near[1] & near[2] & (dr.squared_norm(normal) > 0.5)
 
     return lies_in(ours, theirs) | lies_in(theirs, ours)
 
 
 def _overlap(ours: tuple[Vec3, ...], theirs: tuple[Vec3, ...]) -> Mask:
-    """Whether two triangles in a plane overlap by more than `_SAME`: no edge of either has the
-    other triangle on its far side."""
+    """Whether two triangles in one plane overlap by more than `_IN_PLANE`: for no edge of either
+    does the whole other triangle lie on the outer side of the edge."""
     overlaps: Mask = True
-    for triangle, opposite in ((ours, theirs), (theirs, ours)):
-        normal = _normal(triangle)
+    for one, other in ((ours, theirs), (theirs, ours)):
+        normal = _normal(one)
         for k in range(3):
-            p, q = triangle[k], triangle[(k + 1) % 3]
+            p, q = one[k], one[(k + 1) % 3]
             inward = dr.cross(normal, _unit(q - p))
-            reach = [dr.dot(inward, x - p) for x in opposite]
-            overlaps &= fmax(fmax(reach[0], reach[1]), reach[2]) > _SAME
+            offsets = [dr.dot(inward, x - p) for x in other]
+            overlaps &= fmax(fmax(offsets[0], offsets[1]), offsets[2]) > _IN_PLANE
     return overlaps

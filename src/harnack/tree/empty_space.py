@@ -50,14 +50,17 @@ __all__ = [
 ]
 
 Clearance: TypeAlias = Callable[[FloatArray], FloatArray]
-"""From points (n, 3) to lengths (n,): no point of some set is nearer than that."""
+"""A function from points (n, 3) to lengths (n,): no point of a set is nearer than that to them."""
 
 _OCTANTS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
 
 
 @dataclass(frozen=True)
 class BoxCells:
-    """Boxes of equal size: their lower corners (n, 3), and the size (3,) of each."""
+    """Boxes of equal size.
+
+    corners: (n, 3) the lower corner of each box.
+    size: (3,) the edge lengths of every box."""
 
     corners: FloatArray
     size: FloatArray
@@ -69,7 +72,7 @@ class BoxCells:
 
     @property
     def half_diagonal(self) -> float:
-        """The radius of the balls around the boxes."""
+        """Half the diagonal of a box: the radius of the ball around it."""
         return 0.5 * float(np.linalg.norm(self.size))
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
@@ -77,46 +80,50 @@ class BoxCells:
         return self.corners.min(axis=0), self.corners.max(axis=0) + self.size
 
     def bounding_kdop(self, slack: float) -> ConvexHull:
-        """The polytope around all boxes, enlarged by `slack`, whose normals are the 26 directions
-        of a cube's faces, edges and corners (a k-DOP)."""
+        """A polytope around all boxes, enlarged by `slack` (a length). Its 26 normals are the
+        directions from a cube's center to its faces, edges and corners (a k-DOP)."""
         return _kdop_of_boxes(self.centers, 0.5 * self.size + slack)
 
     def octants(self) -> BoxCells:
-        """The eight octants of each box."""
+        """The eight octants of each box: (8 n) boxes of half the size."""
         half = 0.5 * self.size
         return BoxCells((self.corners[:, None] + _OCTANTS * half).reshape(-1, 3), half)
 
-    def subset(self, mask: BoolArray) -> BoxCells:
-        """The boxes where a mask (n,) is set."""
-        return BoxCells(self.corners[mask], self.size)
+    def subset(self, which: BoolArray) -> BoxCells:
+        """The boxes for which the mask (n,) is set."""
+        return BoxCells(self.corners[which], self.size)
 
     def is_proved_empty(self, clearance: Clearance, margin: float = 0.0) -> BoolArray:
-        """(n,) whether the ball around each cell, enlarged on all sides by `margin` times its size,
-        is within the clearance of its center."""
+        """(n,) whether each box, enlarged on all sides by `margin` times its size, is proved to
+        hold no point of a set.
+
+        clearance: a function that bounds distances from the set. The ball around the enlarged box
+            has to be smaller than the clearance of its center."""
         if not len(self.corners):
             return np.zeros(0, np.bool_)
         return clearance(self.centers) > self.half_diagonal * (1 + 2 * margin + 1e-9)
 
 
 def kdop_of_points(points: FloatArray, slack: float) -> ConvexHull:
-    """The polytope around points (n, 3), enlarged by `slack`, with the normals of
-    `BoxCells.bounding_kdop`."""
+    """The 26-sided polytope (`BoxCells.bounding_kdop`) around points (n, 3), enlarged by
+    `slack`."""
     return _kdop_of_boxes(points, np.full(3, slack))
 
 
-def merge_kdops(first: ConvexHull, second: ConvexHull) -> ConvexHull:
-    """The smallest polytope with the normals of `BoxCells.bounding_kdop` that contains two such
+def merge_kdops(one: ConvexHull, other: ConvexHull) -> ConvexHull:
+    """The smallest 26-sided polytope (`BoxCells.bounding_kdop`) that contains two such
     polytopes."""
     return ConvexHull(
-        first.normals,
-        np.maximum(first.offsets, second.offsets),
-        np.minimum(first.lower, second.lower),
-        np.maximum(first.upper, second.upper),
+        one.normals,
+        np.maximum(one.offsets, other.offsets),
+        np.minimum(one.lower, other.lower),
+        np.maximum(one.upper, other.upper),
     )
 
 
 def _kdop_of_boxes(centers: FloatArray, half: FloatArray) -> ConvexHull:
-    """The polytope around boxes of half sizes (3,)."""
+    """The 26-sided polytope (`BoxCells.bounding_kdop`) around boxes with centers (n, 3) and half
+    edge lengths (3,)."""
     normals = np.array([v for v in itertools.product((-1, 0, 1), repeat=3) if any(v)], float)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     offsets = (centers @ normals.T).max(axis=0) + np.abs(normals) @ half
@@ -129,8 +136,7 @@ class RefinedCells:
 
     occupied: the cells of the finest size that are not proved empty: they may contain points of the
         set.
-    empty: the cells that are proved empty, coarsest first.
-    """
+    empty: the cells that are proved empty, the largest first."""
 
     occupied: BoxCells
     empty: tuple[BoxCells, ...]
@@ -143,13 +149,11 @@ def refine_cells(
     max_rounds: int,
     margin: float = 0.0,
 ) -> RefinedCells:
-    """Split `cells` repeatedly into octants where they are not proved empty.
+    """Split `cells` into octants, and those that are not proved empty again and again.
 
-    max_cells_per_round: the largest number of cells tested in a round; refinement stops before a
-        round that would test more.
+    max_cells_per_round: refinement stops before a round that would test more cells than this.
     max_rounds: the largest number of rounds; each halves the edges.
-    margin: as for `BoxCells.is_proved_empty`.
-    """
+    margin: as for `BoxCells.is_proved_empty`."""
     empty: list[BoxCells] = []
     for _ in range(max_rounds):
         if 8 * len(cells.corners) > max_cells_per_round:
@@ -162,20 +166,20 @@ def refine_cells(
 
 
 def nonempty_cells(
-    lower: FloatArray, upper: FloatArray, clearance: Clearance, max_cells: int, max_rounds: int
+    lower: FloatArray, upper: FloatArray, clearance: Clearance, most: int, finest: int
 ) -> BoxCells:
-    """The leaves of the octree of a box that are not proved empty; there are none if all of the box
-    is proved empty.
+    """The smallest cells of the octree of a box that are not proved empty. There are no cells if
+    all of the box is proved empty.
 
-    max_cells: the largest number of cells tested in a round.
-    max_rounds: the largest number of rounds.
-    """
+    lower, upper: the corners of the box.
+    most: the largest number of cells tested in a round.
+    finest: the largest number of rounds; each halves the edges."""
     root = BoxCells(np.array(lower)[None], np.array(upper) - np.array(lower))
-    return refine_cells(root, clearance, max_cells, max_rounds).occupied
+    return refine_cells(root, clearance, most, finest).occupied
 
 
-# The part of the margin around an empty cell, in cells, that covers the rounding of positions.
-_ROUNDING = 1 / 64
+# The part of the margin around an empty cell that is reserved for rounding, in cells.
+_ROUNDING_SHARE = 1 / 64
 
 
 Layout = TypeVar("Layout", bound="GridData")
@@ -186,11 +190,10 @@ class GridData:
     """A grid of cells, some of them proved empty; in NumPy.
 
     origin: (3,) its lower corner, in numbers of single precision.
-    cell_size: the side of a cell (`round_to_short_float`).
+    cell_size: the width of a cell (`round_to_short_float`).
     shape: the number of cells along x, y and z.
-    empty_distance: (cells,), x fastest: the chessboard distance, in cells, to the nearest occupied
-        cell; 0 for an occupied cell.
-    """
+    empty_distance: (cells,), x fastest: for each cell the chessboard distance, in cells, to the
+        nearest occupied cell; 0 for an occupied cell."""
 
     origin: FloatArray
     cell_size: float
@@ -205,7 +208,8 @@ class EmptySpaceGrid:
 
     A point outside of the grid is treated like its nearest cell.
 
-    margin: in cells; an empty cell enlarged by the margin on all sides is empty too.
+    backend, origin, cell_size, shape, empty_distance: as in `GridData`, uploaded.
+    margin: an empty cell enlarged on all sides by this number of cells is empty too.
     """
 
     backend: Backend
@@ -217,10 +221,11 @@ class EmptySpaceGrid:
 
     @staticmethod
     def upload_layout(backend: Backend, layout: GridData) -> tuple[Backend, Vec3, Real, Vec3, Any]:
-        """The attributes backend, origin, cell_size, shape and empty_distance of a grid,
-        uploaded."""
+        """Upload a grid. Returns the attributes backend, origin, cell_size, shape and
+        empty_distance."""
 
         def vector(numbers: Any) -> Vec3:
+            """Three numbers, uploaded."""
             return backend.Array3f(*(dr.opaque(backend.Float, float(number)) for number in numbers))
 
         return (
@@ -232,7 +237,7 @@ class EmptySpaceGrid:
         )
 
     def cell(self, p: Vec3) -> GridCell:
-        """The cell in which p lies, or the nearest one."""
+        """The cell in which p lies or, if p is outside of the grid, the nearest cell."""
         position = (p - self.origin) / self.cell_size
         corner = type(p)(*(clamp(dr.floor(position[k]), 0, self.shape[k] - 1) for k in range(3)))
         x, y, z = (self.backend.UInt32(corner[k]) for k in range(3))
@@ -242,14 +247,17 @@ class EmptySpaceGrid:
     def empty_run(self, p: Vec3, d: Vec3, length: Real) -> Real:
         """A length s for which p + s d is proved to stay in empty cells; it may exceed `length`.
 
-        Proof. All cells less than empty_distance cells from a point's cell are empty, and so are
-        the margins around them. Together they form a cube, larger than these cells by the margin. A
-        step leaves the cells by at most `margin` minus `_ROUNDING`, so that it stays inside of the
-        cube; the rest of the margin is for the rounding of positions. Steps end where a cell is
-        occupied.
-        """
+        p, d: the start, and the direction. length: the length at which the search may stop.
 
-        def state_of(s: Real) -> tuple[Real, Mask]:
+        Proof. All cells less than empty_distance cells away from a point's cell are empty, and so
+        are the margins around them. Together they form a cube, larger than these cells by the
+        margin. A step goes beyond the cells by at most the margin minus `_ROUNDING_SHARE`, so it
+        stays inside of the cube; the rest of the margin is for the rounding of positions. Steps end
+        where a cell is occupied."""
+
+        def extend(s: Real) -> tuple[Real, Mask]:
+            """From length s on, a longer length up to which the path stays in empty cells, and
+            whether the cell at s is empty; s itself if it is not."""
             cell = self.cell(dr.fma(type(p)(s), d, p))
             free = cell.empty_distance
             return dr.select(
@@ -257,7 +265,8 @@ class EmptySpaceGrid:
             ), free > 0
 
         def body(s: Real, active: Mask) -> tuple[Real, Mask]:
-            further, empty = state_of(s)
+            """Extend s on active lanes; they stay active while cells are empty and s < length."""
+            further, empty = extend(s)
             return dr.select(active, further, s), active & empty & (further < length)
 
         start = self.backend.Float(0) + 0 * p.x
@@ -270,17 +279,17 @@ class EmptySpaceGrid:
         return dr.while_loop((start, active), running, body, label="empty cells")[0]
 
     def is_resolved(self, o: Vec3, end: Real) -> Mask:
-        """Whether rounding moves points of rays from o up to `end` by less than `_ROUNDING` of a
-        cell. False if o is not finite."""
+        """Whether rounding moves points of rays from o, up to the length `end`, by less than the
+        part of the margin that is reserved for rounding. False if o is not finite."""
         rounding = 4 * self.backend.machine_epsilon * (max_norm(o) + end)
-        return (rounding < _ROUNDING * self.cell_size) & dr.all(dr.isfinite(o))
+        return (rounding < _ROUNDING_SHARE * self.cell_size) & dr.all(dr.isfinite(o))
 
     def end_of_empty_run(self, o: Vec3, d: Vec3, t: Real, end: Real) -> Real:
-        """A t, at most `end`, up to which rays o + t d, |d| = 1, stay in empty cells from `t` on.
+        """A length, at most `end`, up to which rays o + t d, |d| = 1, stay in empty cells from `t`
+        on.
 
         It is `t` itself where coordinates are so large that rounding might move a point into
-        another cell: a point is off by at most four roundings of its largest coordinate.
-        """
+        another cell: a point is off by at most four roundings of its largest coordinate."""
         length = dr.select(self.is_resolved(o, end), end - t, 0)
         run = self.empty_run(dr.fma(type(o)(t), d, o), d, length)
         return dr.select(length > 0, fmin(t + run, end), t)
@@ -288,12 +297,11 @@ class EmptySpaceGrid:
 
 @dataclass(frozen=True)
 class GridCell:
-    """The cell of a grid in which a point lies, in each lane.
+    """The cell of a grid in which a point lies, for each lane.
 
     cell_coordinates: the point, in units of cells from the origin of the grid.
     corner: the lower corner of its cell, in the same units.
-    index: of the cell in `EmptySpaceGrid.empty_distance`.
-    """
+    index: the index of the cell in `EmptySpaceGrid.empty_distance`."""
 
     grid: EmptySpaceGrid
     cell_coordinates: Vec3
@@ -302,29 +310,36 @@ class GridCell:
 
     @property
     def empty_distance(self) -> Any:
-        """The chessboard distance, in cells, to the nearest occupied cell (`GridData`)."""
+        """The chessboard distance, in cells, from this cell to the nearest occupied one
+        (`GridData`)."""
         return dr.gather(self.grid.backend.UInt32, self.grid.empty_distance, self.index)
 
-    def exit_distance(self, d: Vec3, radius: Real = 1.0) -> Real:
-        """The length for which the path with direction d stays among the cells less than `radius`
-        cells away, or in the margin around them; infinite in a direction in which the grid ends
-        there."""
+    def exit_distance(self, d: Vec3, around: Real = 1.0) -> Real:
+        """The length up to which the path from the point in direction d stays within a cube of
+        cells.
+
+        around: the cube consists of the cells less than `around` cells away from the point's cell,
+            and of the margin around them.
+
+        A face of the cube where the grid ends does not count, since points outside of the grid are
+        treated like its nearest cell. So the length may be infinite."""
         length: Real = self.grid.backend.Float(dr.inf)
-        beyond = self.grid.margin - _ROUNDING
+        margin = self.grid.margin - _ROUNDING_SHARE
         for k in range(3):
-            upper, lower = self.corner[k] + radius, self.corner[k] + 1 - radius
+            upper, lower = self.corner[k] + around, self.corner[k] + 1 - around
             rising = d[k] > 0
             gap = dr.select(
                 rising, upper - self.cell_coordinates[k], self.cell_coordinates[k] - lower
             )
-            ends = dr.select(rising, upper >= self.grid.shape[k], lower <= 0)
-            reach = (gap + beyond) / dr.abs(d[k])
-            length = fmin(dr.select(ends | (d[k] == 0), dr.inf, reach), length)
+            is_grid_end = dr.select(rising, upper >= self.grid.shape[k], lower <= 0)
+            distance = (gap + margin) / dr.abs(d[k])
+            length = fmin(dr.select(is_grid_end | (d[k] == 0), dr.inf, distance), length)
         return length * self.grid.cell_size
 
 
 def distance_to_occupied(empty: BoolArray) -> IntArray:
-    """`GridData.empty_distance` from the mask of empty cells (nz, ny, nx)."""
+    """`GridData.empty_distance`, from a mask (nz, ny, nx) of the empty cells. If all are empty,
+    each is as far as the largest number of cells along an axis."""
     if empty.all():
         return np.full(empty.size, max(empty.shape), np.int64)
     from scipy import ndimage  # imported here: it takes a third of a second
@@ -334,32 +349,34 @@ def distance_to_occupied(empty: BoolArray) -> IntArray:
 
 
 def round_to_short_float(size: float) -> float:
-    """A length near `size`, off by at most one part in 4,096, that is a power of two times an
-    integer below 2^13, so that single precision represents its multiples exactly."""
+    """A length near `size`, off by at most one part in 4,096, whose small multiples single
+    precision represents exactly. It is a power of two times an integer below 2^13."""
     mantissa, exponent = math.frexp(size)
     return math.ldexp(round(mantissa * 4096), exponent - 12)
 
 
-# The margin of `EmptySpaceGrid`; and the rounds of the octree, whose roots are 2^_ROUNDS cells
-# wide.
+# `EmptySpaceGrid.margin` of the grids; and how often cubes are halved down to cells, so that the
+# first cubes are 2^_ROUNDS cells wide.
 _MARGIN, _ROUNDS = 1 / 16, 3
 
 
 @dataclass(frozen=True)
 class OccupancyGrid(GridData):
-    """A grid whose empty cells, and the margins around them (`EmptySpaceGrid`), hold no point of a
-    set."""
+    """A grid of the cells that may contain a point of a set. Empty cells, and the margins around
+    them (`EmptySpaceGrid`), contain no point of the set."""
 
     @classmethod
     def from_clearance(
         cls, lower: FloatArray, upper: FloatArray, clearance: Clearance, across: int
     ) -> OccupancyGrid:
-        """A grid over a box that holds the set, with about `across` cells along its longest side.
+        """A grid over a box that holds the set, with about `across` cells along the box's longest
+        side.
 
-        Outside of the box the set has no points, so an empty cell at the box's faces is empty
-        outwards as well. There are fewer cells where they would be smaller than the spacing of
-        numbers in single precision.
-        """
+        lower, upper: the corners (3,) of the box. clearance: bounds of the distance from the set.
+
+        There are no points of the set outside of the box, so an empty cell at the box's faces is
+        empty outwards as well. There are fewer cells if they would otherwise be smaller than the
+        spacing of numbers in single precision."""
         reach = np.abs([lower, upper]).max().astype(np.float32)
         cell = max(float((upper - lower).max()) / across, float(np.spacing(reach)))
         cell = round_to_short_float(cell)
@@ -391,8 +408,8 @@ class OccupancyGrid(GridData):
         return self.origin + self.cell_size * (indices + 0.5)
 
     def refined(self, clearance: Clearance) -> OccupancyGrid:
-        """The same grid, in which a cell also counts as empty if its eight octants are proved
-        empty, with the same margin around the cell."""
+        """The same grid with more empty cells: a cell also counts as empty if its eight octants are
+        proved empty, with the same margin around the cell."""
         x, y, z = self.shape
         full = (self.empty_distance == 0).reshape(z, y, x)
         indices = np.argwhere(full)[:, ::-1]
@@ -403,7 +420,7 @@ class OccupancyGrid(GridData):
         return replace(self, empty_distance=distance_to_occupied(~full))
 
     def upload(self, backend: Backend) -> EmptySpaceGrid:
-        """The grid on a backend."""
+        """The grid on a backend, for rays."""
         return EmptySpaceGrid(*EmptySpaceGrid.upload_layout(backend, self), _MARGIN)
 
 
@@ -412,28 +429,29 @@ _NEIGHBOR_STENCIL = np.ones((3, 3, 3), np.bool_)
 
 
 def largest_connected_component(cells: OccupancyGrid) -> OccupancyGrid:
-    """The grid in which only the cells of a single connected group are occupied: the group with the
-    largest sum of its projections along the three axes.
+    """The grid in which only the largest group of connected cells is occupied.
 
-    A projection counts the rows of cells, along an axis, that contain a cell of the group. The
-    number of cells would measure areas, or volumes, only if each piece of a surface was surrounded
-    by as many occupied cells: but there are more where its function vanishes to a higher order, and
-    around the two sides of a plate thinner than a cell no more than around a single side.
-    Projections do not depend on that, except for the cells at their outlines: there are several
-    more where a function vanishes to a higher order, so that with coarse cells a smaller component
-    may be chosen for it. Of equal groups the first along z, y and x is chosen.
+    The size of a group is the sum of its projections along the three axes. A projection counts the
+    rows of cells along an axis that contain a cell of the group. Of equal groups, the first along
+    z, y and x is chosen.
+
+    The number of cells would be a worse measure of areas or volumes. It would be right only if each
+    piece of a surface were surrounded by as many occupied cells. But there are more around it where
+    the function vanishes to a higher order; and around the two sides of a plate thinner than a cell
+    there are no more than around a single side. Projections do not depend on that, except for the
+    cells at their outlines. There are several more of these where a function vanishes to a higher
+    order, so that with coarse cells a smaller component may be chosen.
 
     Proof that no component of the set is cut in two. All of the set lies in occupied cells, as
     closed cubes. A connected part of it cannot be covered by two unions of such cubes that are
-    closed and have no point in common; cubes have a point in common if they share at least a
-    corner, that is, if they are neighbors. So it lies in the cells of a single group.
+    closed and have no point in common. Cubes have a point in common if they share at least a
+    corner, that is, if they are neighbors. So the part lies in the cells of a single group.
 
-    Proof that rays may jump across the other groups, with the margin that
+    Proof that rays may jump across the other groups, with the margin by which
     `EmptySpaceGrid.empty_run` goes beyond the cells that it jumps across. A neighbor of a cell of
-    another group belongs to that group or was empty before, and the margin is less than a cell, so
-    the margin contains nothing of the chosen group; the margin of a cell that was empty before
-    contains nothing of the set at all.
-    """
+    another group belongs to that group or was empty before, and the margin is less than a cell. So
+    the margin contains nothing of the chosen group. The margin of a cell that was empty before
+    contains nothing of the set at all."""
     x, y, z = cells.shape
     full = (cells.empty_distance == 0).reshape(z, y, x)
     if not full.any():
@@ -447,8 +465,11 @@ def largest_connected_component(cells: OccupancyGrid) -> OccupancyGrid:
     return replace(cells, empty_distance=distance_to_occupied(~chosen))
 
 
-def _projection_sizes(group: IntArray, positions: IntArray, count: int) -> IntArray:
-    """(count,) the number of different places (n, 2) of each group from 1 to count."""
-    width = 1 + positions.max(axis=0)
-    index = (group * width[0] + positions[:, 0]) * width[1] + positions[:, 1]
+def _projection_sizes(group: IntArray, places: IntArray, count: int) -> IntArray:
+    """(count,) the number of different places of each group.
+
+    group: (n,) the group that each place belongs to, from 1 to count.
+    places: (n, 2) cells of a plane, onto which the cells of groups were projected."""
+    width = 1 + places.max(axis=0)
+    index = (group * width[0] + places[:, 0]) * width[1] + places[:, 1]
     return np.bincount(np.unique(index) // (width[0] * width[1]), minlength=count + 1)[1:]

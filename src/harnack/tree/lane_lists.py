@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Mask
 
 WriteEntry: TypeAlias = "Callable[[Any, Any, Mask], None]"
-"""Writes an entry, where active, at a place in the list of its lane."""
+"""Called with a position, an entry and a mask: writes the entry into the list of each lane."""
 
 
 _TOO_LONG = "more than 2^31 entries of lists: cut the input in parts"
@@ -31,8 +31,12 @@ _TOO_LONG = "more than 2^31 entries of lists: cut the input in parts"
 
 @dataclass(frozen=True)
 class LaneLists:
-    """A list for each lane. first: the index in `entries` at which it begins. count: its length.
-    entries: the entries of all lists."""
+    """One list of integers for each lane.
+
+    first: the index in `entries` at which each list begins.
+    count: the length of each list.
+    entries: the entries of all lists, one list after the other.
+    """
 
     first: Any
     count: Any
@@ -52,8 +56,14 @@ class LaneLists:
 
     @classmethod
     def concatenate(cls, backend: Backend, parts: list[LaneLists]) -> LaneLists:
-        """The lists of the lanes of all parts, part after part. In each part, the first list must
-        begin at entry 0 and the lists follow each other."""
+        """The lists of all parts together: the lanes of the first part, then those of the second,
+            ...
+
+        In each part, the first list must begin at entry 0 and each list where the one before ends.
+
+        Raises:
+            ValueError: there are 2^31 entries or more.
+        """
         counts = np.concatenate([to_numpy(part.count) for part in parts])
         entries = [to_numpy(part.entries)[: int(to_numpy(part.count).sum())] for part in parts]
         first = np.cumsum(counts, dtype=np.int64) - counts
@@ -63,7 +73,7 @@ class LaneLists:
         return cls(*(upload_integers(backend, part) for part in arrays))
 
     def subset(self, backend: Backend, lanes: IntArray) -> LaneLists:
-        """The lists of these lanes; a lane may occur several times."""
+        """The lists of these lanes, by index; a lane may occur several times."""
         index = backend.UInt32
         uploaded = upload_integers(backend, lanes)
         first, count = (dr.gather(index, numbers, uploaded) for numbers in (self.first, self.count))
@@ -71,8 +81,14 @@ class LaneLists:
 
 
 def build_lists(backend: Backend, walk: Callable[[WriteEntry | None], Any]) -> LaneLists:
-    """Build lists from a walk. walk: returns the number of entries of each lane, and writes each
-    entry if it is called with a `WriteEntry` instead of None."""
+    """Build one list for each lane by running `walk` twice: to count the entries and to write them.
+
+    walk: called with None, it returns the number of entries of each lane. Called with a
+        `WriteEntry`, it also writes each entry with it.
+
+    Raises:
+        ValueError: there are 2^31 entries or more.
+    """
     index = backend.UInt32
     count = walk(None)
     dr.eval(count)
@@ -82,6 +98,7 @@ def build_lists(backend: Backend, walk: Callable[[WriteEntry | None], Any]) -> L
     first, entries = upload_integers(backend, start[:-1]), dr.zeros(index, max(1, int(start[-1])))
 
     def put(position: Any, entry: Any, active: Mask) -> None:
+        """Write an entry at a position of the list of each active lane."""
         dr.scatter(entries, index(entry), first + position, active)
 
     dr.eval(walk(put), entries)
@@ -91,10 +108,14 @@ def build_lists(backend: Backend, walk: Callable[[WriteEntry | None], Any]) -> L
 def traverse_subtrees(
     tree: PackedTree, lists: LaneLists, visit: Visit, state: LoopValues
 ) -> LoopValues:
-    """The state after a walk (`balanced_tree.traverse`) over the subtrees of the listed nodes."""
+    """Walk over the subtrees of the nodes in each lane's list; return the final state.
+
+    visit, state: as for `balanced_tree.traverse`."""
     index = tree.backend.UInt32
 
     def body(k: Any, i: Any, end: Any, *state: Any) -> LoopValues:
+        """Visit node i of the subtree of list entry k; the subtree ends at node `end`. Where i
+        equals `end`, the subtree of entry k begins."""
         begins = i == end
         entry = dr.gather(index, lists.entries, lists.first + k, begins & (k < lists.count))
         i = dr.select(begins, entry, i)
@@ -118,7 +139,9 @@ def for_each_entry(
     body: Callable[[Any, Mask, LoopValues], LoopValues],
     state: LoopValues,
 ) -> LoopValues:
-    """The state after `body` of each entry of the lists, where active."""
+    """Update the state by `body` for each entry of each lane's list, and return it.
+
+    body: takes an entry, the mask of the lanes that have one, and the state; returns the state."""
     index = backend.UInt32
 
     def step(k: Any, *state: Any) -> LoopValues:

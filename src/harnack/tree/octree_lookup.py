@@ -20,25 +20,27 @@ if TYPE_CHECKING:
 
 __all__ = ["BALL_MARGIN", "MAX_DEPTH", "OCTANT_DIRECTIONS", "OctreeLookup", "encode_nodes"]
 
-# Cells of the finest level are 2^-MAX_DEPTH as wide as the cube, cells of the grid with which a
-# lookup begins 2^-_TOP_DEPTH.
+# The smallest cells have 2^-MAX_DEPTH of the width of the cube. A lookup begins in a uniform grid
+# whose cells have 2^-_TOP_DEPTH of it.
 MAX_DEPTH, _TOP_DEPTH = 10, 5
-# Statements about the ball of a cell should hold in a ball larger by this factor, for rounding: it
-# moves a point by less than 2^-20 of the cube's side in single precision, and such balls of the
-# finest cells reach 2^-19 of it beyond these.
+# What is proved for all points of a cell should be proved in the ball around it, enlarged by this
+# factor, because rounding may move a point out of the cell. Rounding in single precision moves it
+# by less than 2^-20 of the cube's width; the enlarged balls of the smallest cells are larger by
+# 2^-19 of that width.
 BALL_MARGIN = 1.004
-# From the center of a cube to those of its octants, in quarters of its side; z fastest.
+# Vectors from the center of a cube to the centers of its octants, in quarters of the cube's width;
+# the z component changes fastest.
 OCTANT_DIRECTIONS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
 def encode_nodes(is_leaf: BoolArray, leaves: int, split: int) -> IntArray:
-    """Encode the nodes of a level for `OctreeLookup.from_levels`: an inner node by the index of its
-    first child, leaf k by -1 - k.
+    """Encode the nodes of one depth of an octree for `OctreeLookup.from_levels`.
 
-    is_leaf: (nodes of the level,).
-    leaves: the number of leaves of the levels above.
-    split: the number of inner nodes of the levels above, including the root.
-    """
+    An inner node is encoded as the index of its first child, leaf k as -1 - k.
+
+    is_leaf: (n,) whether each node of this depth is a leaf.
+    leaves: the number of leaves at smaller depths.
+    split: the number of inner nodes at smaller depths, the root included."""
     number = np.empty(len(is_leaf), np.int64)
     number[is_leaf] = -1 - (leaves + np.arange(int(is_leaf.sum())))
     number[~is_leaf] = 8 * (split + np.arange(int((~is_leaf).sum())))
@@ -50,12 +52,12 @@ class OctreeLookup:
     """The octree of a cube, on a backend.
 
     lower_corner: the lower corner of the cube.
-    cells_per_length: 2^MAX_DEPTH divided by its side.
-    top_grid: (8^_TOP_DEPTH,) the encoded octree node at depth _TOP_DEPTH that contains each cell of
-        a uniform grid, z fastest; a coarser leaf fills all of its cells.
+    cells_per_length: 2^MAX_DEPTH divided by the width of the cube.
+    top_grid: (8^_TOP_DEPTH,) the cells of a uniform grid, z fastest. Each holds the encoded node at
+        depth _TOP_DEPTH that the cell is, or the encoded leaf at a smaller depth that contains the
+        cell.
     encoded_nodes: all nodes except the root, encoded: the index of the first of eight consecutive
-        children (z fastest), or -1 - k for leaf k.
-    """
+        children (z fastest), or -1 - k for leaf k."""
 
     backend: Backend
     lower_corner: Vec3
@@ -67,9 +69,12 @@ class OctreeLookup:
     def from_levels(
         cls, backend: Backend, low: FloatArray, side: float, levels: list[IntArray]
     ) -> OctreeLookup:
-        """Upload an octree. low, side: the lower corner (3,) and the side of its cube. levels: the
-        encoded nodes of each level (`encode_nodes`), from the root on; the eight children of each
-        inner node follow each other, in the order of the inner nodes of the level above."""
+        """Upload an octree.
+
+        low, side: the lower corner (3,) and the width of its cube.
+        levels: for each depth, the root first, the encoded nodes (`encode_nodes`). The eight
+            children of each inner node follow each other, in the order of the inner nodes of the
+            depth above."""
         root, *below = levels
         nodes = np.concatenate([*below, np.zeros(8, np.int64)])  # room for any octant
         corner = backend.Array3f(*(dr.opaque(backend.Float, float(number)) for number in low))
@@ -81,11 +86,12 @@ class OctreeLookup:
 
     @staticmethod
     def memory_bytes(nodes: int) -> int:
-        """The bytes that a lookup with this number of nodes takes, its grid included."""
+        """The memory in bytes of a lookup with `nodes` nodes, its grid included."""
         return 4 * (nodes + 8**_TOP_DEPTH)
 
     def find_leaf(self, x: Vec3) -> tuple[Any, Mask]:
-        """The index of the leaf that contains x, and whether x lies in the cube."""
+        """The index of the leaf that contains x, and a mask of whether x lies in the cube. Where it
+        does not, the leaf at the lower corner is returned."""
         index, integer = self.backend.UInt32, self.backend.Int32
         position = (x - self.lower_corner) * self.cells_per_length
         inside = dr.all((position >= 0) & (position < float(2**MAX_DEPTH)))
@@ -94,9 +100,12 @@ class OctreeLookup:
         first = (((ix >> down) << _TOP_DEPTH | (iy >> down)) << _TOP_DEPTH) | (iz >> down)
 
         def is_inner(node: Any, *_: Any) -> Mask:
+            """Whether a lane has not reached a leaf."""
             return node >= 0
 
         def step(node: Any, bit: Any) -> tuple[Any, Any]:
+            """Go to the child that contains the point: bit number `bit` of its coordinates chooses
+            it."""
             octant = ((ix >> bit) & 1) * 4 + ((iy >> bit) & 1) * 2 + ((iz >> bit) & 1)
             return dr.gather(integer, self.encoded_nodes, index(node) + octant), bit - 1
 
@@ -105,9 +114,10 @@ class OctreeLookup:
         return index(-1 - node), inside
 
 
-def _build_top_grid(root: int, nodes: IntArray) -> IntArray:
-    """`OctreeLookup.top_grid`."""
-    grid = np.full((1, 1, 1), root, np.int64)
+def _build_top_grid(encoded_root: int, nodes: IntArray) -> IntArray:
+    """`OctreeLookup.top_grid`, flattened. encoded_root: the root, encoded as by `encode_nodes`.
+    nodes: all other nodes, encoded."""
+    grid = np.full((1, 1, 1), encoded_root, np.int64)
     for _ in range(_TOP_DEPTH):
         x, y, z = np.indices([2 * side for side in grid.shape])
         node = grid[x >> 1, y >> 1, z >> 1]

@@ -35,15 +35,18 @@ _CENTROID = (1 / 3, 1 / 3, 1 / 3)
 def split_intersecting_faces(
     rays: TriangleTree, vertices: FloatArray, faces: IntArray, *, covered_whole: bool = False
 ) -> tuple[FloatArray, IntArray]:
-    """Triangles (k, 3, 3) that fill the faces (m, 3), none of which passes through another or is
-    partly covered by another; and (k,) the face that each is a piece of, with the orientation of
-    the face.
+    """Cut faces (m, 3) into triangles, none of which passes through another or is partly covered by
+    another.
 
     rays: a tree of the same faces, with coordinates of at most about 1.
     covered_whole: whether faces are also cut where others in their plane meet, so that each of
-        these covers all of a piece or nothing.
+        these covers all of a piece or nothing of it.
 
-    Where two triangles intersect in a segment, each end of the segment lies on an edge of either of
+    Returns:
+        The pieces (k, 3, 3), which have the orientation of their faces and fill them; and the index
+        (k,) of the face that each is a piece of.
+
+    Where two triangles intersect in a segment, each end of the segment lies on an edge of one of
     them. So every edge is traced as a ray. If it crosses a triangle T, the faces at the edge are
     cut by the plane of T, and T by their planes, but only where the cut meets the other triangle.
     An edge that meets another edge, up to rounding, counts as meeting all faces at that edge. Faces
@@ -70,8 +73,8 @@ def split_intersecting_faces(
 def separates_levels(
     rays: TriangleTree, pieces: FloatArray, levels: tuple[float, ...]
 ) -> BoolArray:
-    """(k,) whether a level lies strictly between the winding numbers on the two sides of a
-    triangle."""
+    """(k,) whether one of the levels lies strictly between the winding numbers on the two sides of
+    a triangle of `pieces` (k, 3, 3)."""
     low, high = winding_numbers_of_sides(rays, pieces)
     return np.any([(low < level) & (level < high) for level in levels], axis=0)
 
@@ -79,10 +82,11 @@ def separates_levels(
 def winding_numbers_of_sides(
     rays: TriangleTree, pieces: FloatArray, barycentric: tuple[float, float, float] = _CENTROID
 ) -> tuple[FloatArray, FloatArray]:
-    """(k,), (k,): the smaller and the larger of the winding numbers on the two sides of triangles.
+    """The winding numbers on the two sides of triangles: the smaller ones (k,) and the larger ones
+        (k,).
 
-    barycentric: the barycentric coordinates of the point of the triangle; by default its center.
-    """
+    barycentric: the barycentric coordinates of the point of the triangle at which they are
+        computed; by default its center."""
     front, back = windings_of_sides(rays, pieces, barycentric)
     return np.minimum(front, back), np.maximum(front, back)
 
@@ -90,13 +94,14 @@ def winding_numbers_of_sides(
 def windings_of_sides(
     rays: TriangleTree, pieces: FloatArray, shares: tuple[float, float, float] = _CENTROID
 ) -> tuple[FloatArray, FloatArray]:
-    """(k,), (k,): the winding numbers in front of triangles, the side from which they run
-    counter-clockwise, and behind them.
+    """The winding numbers (k,) in front of triangles `pieces` (k, 3, 3) and those (k,) behind them.
 
-    A ray along the normal of each triangle counts the crossings ahead of a point of the triangle,
-    and the crossings ahead of a point just behind it: so coincident triangles are passed all at
-    once.
-    """
+    The front is the side from which the corners run counter-clockwise. shares: the barycentric
+    coordinates of the point of the triangle; by default its center.
+
+    For each triangle, a ray along its normal counts the crossings ahead of a point a little in
+    front of the triangle, and those ahead of a point a little behind it. So coincident triangles
+    are passed all at once."""
     backend = rays.tree.backend
     a, b, c = np.moveaxis(pieces, 1, 0)
     normal = np.cross(b - a, c - a)
@@ -112,50 +117,60 @@ def windings_of_sides(
 
 
 def _crossing_faces(
-    rays: TriangleTree, vertices: FloatArray, faces: IntArray
+    tree: TriangleTree, vertices: FloatArray, faces: IntArray
 ) -> tuple[IntArray, IntArray]:
-    """Pairs of faces (k,), (k,) that pass through one another, each in both orders."""
+    """Pairs of faces, (k,) and (k,), that pass through one another; each pair in both orders.
+
+    tree: of the same faces.
+
+    Pairs are found by the edges that cross faces: an edge that crosses a face makes a pair of that
+    face with each face at the edge.
+    """
     ends = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     edges, edge = np.unique(ends, axis=0, return_inverse=True)
     edge = edge.reshape(-1)
-    beside = np.argsort(edge, kind="stable") // 3  # faces, edge after edge
-    first = np.searchsorted(np.sort(edge), np.arange(len(edges) + 1))
-    crossed, crossing = _crossings_of_edges(rays, vertices, faces, edges)
-    count = first[crossed + 1] - first[crossed]
-    rows = np.repeat(first[crossed], count) + _ranks_in_groups(count)
-    passing, passed = beside[rows], np.repeat(crossing, count)
+    faces_by_edge = np.argsort(edge, kind="stable") // 3  # faces, edge after edge
+    edge_start = np.searchsorted(np.sort(edge), np.arange(len(edges) + 1))
+    crossed, crossing = _crossings_of_edges(tree, vertices, faces, edges)
+    count = edge_start[crossed + 1] - edge_start[crossed]
+    rows = np.repeat(edge_start[crossed], count) + _ranks_in_groups(count)
+    passing, passed = faces_by_edge[rows], np.repeat(crossing, count)
     pairs = np.concatenate([np.column_stack([passing, passed]), np.column_stack([passed, passing])])
     pairs = np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)
     return pairs[:, 0], pairs[:, 1]
 
 
 def _ranks_in_groups(count: IntArray) -> IntArray:
-    """The concatenation of 0, 1, .., n - 1 for the counts n in turn."""
+    """The numbers 0, 1, ..., n - 1 for each of the counts n, concatenated."""
     first = np.cumsum(count) - count
     return cast("IntArray", np.arange(int(count.sum())) - np.repeat(first, count))
 
 
 def _crossings_of_edges(
-    rays: TriangleTree, vertices: FloatArray, faces: IntArray, edges: IntArray
+    tree: TriangleTree, vertices: FloatArray, faces: IntArray, edges: IntArray
 ) -> tuple[IntArray, IntArray]:
-    """The indices of edges (m, 2) and of faces without their ends that they cross, or whose borders
-    they meet."""
-    backend = rays.tree.backend
+    """All crossings of edges (m, 2) with faces that have neither end of the edge as a corner. Faces
+    whose border the edge meets count as crossed.
+
+    Returns:
+        (k,) the index of the edge and (k,) the index of the face of each crossing.
+    """
+    backend = tree.tree.backend
     corner = [upload_integers(backend, ids) for ids in faces.T]
-    span = vertices[edges[:, 1]] - vertices[edges[:, 0]]
-    length = np.linalg.norm(span, axis=1)
+    edge_vectors = vertices[edges[:, 1]] - vertices[edges[:, 0]]
+    length = np.linalg.norm(edge_vectors, axis=1)
     rows = np.flatnonzero(length > 0)
     after_t, after_n = np.full(len(edges), -_COINCIDENT), np.full(len(edges), NO_TRIANGLE, np.int64)
     batches: list[tuple[IntArray, IntArray]] = []
     while len(rows):
         o = to_vector3(backend, vertices[edges[rows, 0]])
-        d = to_vector3(backend, span[rows] / length[rows, None])
+        d = to_vector3(backend, edge_vectors[rows] / length[rows, None])
         frame = RayFrame.along(backend, o, d)
         end = backend.Float(length[rows] + _COINCIDENT)
         p, q = (upload_integers(backend, ids) for ids in edges[rows].T)
 
         after = backend.Float(after_t[rows]), upload_integers(backend, after_n[rows])
-        t, n = _next_foreign_crossing(rays, corner, frame, (p, q), end, after)
+        t, n = _next_foreign_crossing(tree, corner, frame, (p, q), end, after)
         number = to_numpy(n).astype(np.int64)
         hit = number != NO_TRIANGLE
         after_t[rows], after_n[rows] = to_numpy(t), number
@@ -165,15 +180,21 @@ def _crossings_of_edges(
 
 
 def _next_foreign_crossing(
-    rays: TriangleTree, corner: list[Any], frame: RayFrame, ends: tuple[Any, Any], end: Any,
+    tree: TriangleTree, corner: list[Any], frame: RayFrame, ends: tuple[Any, Any], end: Any,
     after: tuple[Any, Any],
 ) -> tuple[Any, Any]:  # fmt: skip
-    """The first crossing of rays after the crossing `after` with a face that has neither of two
-    vertices; corner: the corners of the faces."""
-    index = rays.tree.backend.UInt32
+    """The next crossing of each ray with a face that has neither of two vertices as a corner.
+
+    corner: three arrays, the vertices of all faces. ends: the two vertices, for each ray.
+    end: the largest t. after: (t, number), the crossing behind which the search begins.
+
+    Returns t and the number of the face; NO_TRIANGLE if there is none."""
+    index = tree.tree.backend.UInt32
 
     def body(t: Any, n: Any, active: Any) -> tuple[Any, ...]:
-        t, n, _, _ = rays.next_crossing(frame, (t, n), end, active, _COINCIDENT)
+        """Go to the next crossing; the lane stays active while its face has one of the two
+        vertices."""
+        t, n, _, _ = tree.next_crossing(frame, (t, n), end, active, _COINCIDENT)
         hit = active & (n != NO_TRIANGLE)
         corners = [dr.gather(index, vertex, n, hit) for vertex in corner]
         return t, n, hit & dr.any([(vertex == ends[0]) | (vertex == ends[1]) for vertex in corners])
@@ -182,26 +203,33 @@ def _next_foreign_crossing(
         del t, n
         return active
 
-    start = (*after, rays.tree.backend.Bool(True))
+    start = (*after, tree.tree.backend.Bool(True))
     return dr.while_loop(start, is_running, body, label="crossings of edges")[:2]
 
 
 def _cut_up(pieces: FloatArray, rows: IntArray, knives: FloatArray) -> tuple[FloatArray, IntArray]:
-    """The pieces of triangles (n, 3, 3) whose entries `rows` (k,) are cut by the planes of knives
-    (k, 3, 3); and the triangle that each is a piece of.
+    """Cut triangles by the planes of other triangles, the knives.
 
-    In each round every piece is cut by a knife that meets it, the middle of its list, and its parts
-    share the remaining knives: so the number of knives falls by about half.
+    pieces: (n, 3, 3) the triangles. knives: (k, 3, 3).
+    rows: (k,) the index of the triangle that each knife cuts. A knife cuts only where its triangle,
+        not only its plane, meets the piece.
+
+    In each round every piece is cut by one of the knives that meet it, the one in the middle of its
+    list, and the new pieces share the other knives of the list: so the number of knives of a piece
+    falls by about half.
+
+    Returns:
+        The pieces (j, 3, 3), and the index (j,) of the triangle that each is a piece of.
     """
     done: list[FloatArray] = []
     owners: list[IntArray] = []
-    by, source = np.arange(len(knives)), np.arange(len(pieces))
+    knife, source = np.arange(len(knives)), np.arange(len(pieces))
     while True:
-        height = _heights(pieces[rows], knives[by])
+        height = _heights(pieces[rows], knives[knife])
         height[np.abs(height) < _COINCIDENT] = 0
         meets = (height.max(axis=1) > 0) & (height.min(axis=1) < 0)
-        meets[meets] = _cut_meets_triangle(pieces[rows[meets]], height[meets], knives[by[meets]])
-        rows, by, height = rows[meets], by[meets], height[meets]
+        meets[meets] = _cut_meets_triangle(pieces[rows[meets]], height[meets], knives[knife[meets]])
+        rows, knife, height = rows[meets], knife[meets], height[meets]
         is_cut = np.zeros(len(pieces), np.bool_)
         is_cut[rows] = True
         done.append(pieces[~is_cut])
@@ -209,49 +237,60 @@ def _cut_up(pieces: FloatArray, rows: IntArray, knives: FloatArray) -> tuple[Flo
         if not len(rows):
             return np.concatenate(done), np.concatenate(owners)
         order = np.argsort(rows, kind="stable")
-        rows, by, height = rows[order], by[order], height[order]
+        rows, knife, height = rows[order], knife[order], height[order]
         owner, first, count = np.unique(rows, return_index=True, return_counts=True)
         middle = first + count // 2
         remaining = np.ones(len(rows), np.bool_)
         remaining[middle] = False
-        pieces, source = _parts(pieces[owner], height[middle]), np.tile(source[owner], 3)
+        pieces, source = _pieces_at_plane(pieces[owner], height[middle]), np.tile(source[owner], 3)
         targets = np.searchsorted(owner, rows[remaining])
         rows = (targets[:, None] + len(owner) * np.arange(3)).ravel()
-        by = np.repeat(by[remaining], 3)
+        knife = np.repeat(knife[remaining], 3)
 
 
-def _parts(pieces: FloatArray, height: FloatArray) -> FloatArray:
-    """The triangles (3 k, 3, 3) into which a plane cuts triangles whose corners have heights (k, 3)
-    above it: one on one side and two on the other."""
+def _pieces_at_plane(pieces: FloatArray, heights: FloatArray) -> FloatArray:
+    """Cut triangles (k, 3, 3) by planes, each into one triangle on one side and two on the other.
+
+    heights: (k, 3) the signed distances of the corners from the plane.
+
+    Returns (3 k, 3, 3): first the single triangle of each, then the first of the two, then the
+    second."""
     # The corner that is alone on its side comes first; a corner in the plane belongs to the side of
     # another corner.
-    side = np.where(height > 0, 1, -1)
-    side = np.where((height == 0), np.where(side.sum(axis=1) > 0, 1, -1)[:, None], side)
-    minority = np.where(side.sum(axis=1) > 0, -1, 1)
-    alone = (side == minority[:, None]).argmax(axis=1)
-    order = (alone[:, None] + np.arange(3)) % 3
+    signs = np.where(heights > 0, 1, -1)
+    signs = np.where((heights == 0), np.where(signs.sum(axis=1) > 0, 1, -1)[:, None], signs)
+    minority = np.where(signs.sum(axis=1) > 0, -1, 1)
+    odd_corner = (signs == minority[:, None]).argmax(axis=1)
+    order = (odd_corner[:, None] + np.arange(3)) % 3
     a, b, c = np.moveaxis(np.take_along_axis(pieces, order[:, :, None], axis=1), 1, 0)
-    h = np.take_along_axis(height, order, axis=1)
+    h = np.take_along_axis(heights, order, axis=1)
     p = a + (h[:, 0] / (h[:, 0] - h[:, 1]))[:, None] * (b - a)
     q = a + (h[:, 0] / (h[:, 0] - h[:, 2]))[:, None] * (c - a)
     return np.concatenate([np.stack(part, axis=1) for part in ((a, p, q), (p, b, c), (p, c, q))])
 
 
 def _heights(pieces: FloatArray, knives: FloatArray) -> FloatArray:
-    """(k, 3) the heights of corners of triangles above the planes of knives."""
+    """(k, 3) the signed distances of the corners of triangles from the planes of knives, both (k,
+    3, 3)."""
     a, b, c = np.moveaxis(knives, 1, 0)
     normal = np.cross(b - a, c - a)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
     return np.einsum("nij,nj->ni", pieces - a[:, None], normal)
 
 
-def _cut_meets_triangle(pieces: FloatArray, height: FloatArray, knives: FloatArray) -> BoolArray:
-    """(k,) whether the segment in which a plane cuts a triangle meets the plane's triangle."""
+def _cut_meets_triangle(pieces: FloatArray, heights: FloatArray, knives: FloatArray) -> BoolArray:
+    """(k,) whether the segment in which the plane of a knife cuts a triangle meets the knife's
+    triangle.
+
+    pieces, knives: (k, 3, 3). heights: (k, 3) of the corners of pieces above the planes.
+
+    The segment is clipped by the three edges of the knife: low and high are the ends of what is
+    left, as fractions of the segment."""
     a, b, c = np.moveaxis(knives, 1, 0)
     normal = np.cross(b - a, c - a)
     ends: list[FloatArray] = []
     for i, j in ((0, 1), (1, 2), (2, 0)):
-        hi, hj = height[:, i], height[:, j]
+        hi, hj = heights[:, i], heights[:, j]
         crosses = (hi * hj < 0) | ((hi == 0) ^ (hj == 0))
         fraction = np.where(crosses, hi / np.where(crosses, hi - hj, 1), np.nan)
         ends.append(pieces[:, i] + fraction[:, None] * (pieces[:, j] - pieces[:, i]))
@@ -259,8 +298,8 @@ def _cut_meets_triangle(pieces: FloatArray, height: FloatArray, knives: FloatArr
     points = np.stack(ends, axis=1)
     # The two ends: at most two of the three points differ.
     start = np.where(np.isnan(points[:, 0]), points[:, 1], points[:, 0])
-    apart = np.nan_to_num(np.linalg.norm(points - start[:, None], axis=2), nan=-1.0)
-    end = points[np.arange(len(points)), apart.argmax(axis=1)]
+    distances = np.nan_to_num(np.linalg.norm(points - start[:, None], axis=2), nan=-1.0)
+    end = points[np.arange(len(points)), distances.argmax(axis=1)]
     for p, q in ((a, b), (b, c), (c, a)):
         inward = np.cross(normal, q - p)
         inward /= np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-300)

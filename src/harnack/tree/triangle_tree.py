@@ -34,9 +34,11 @@ if TYPE_CHECKING:
 
 # Columns of a record; 0 to 8 are the corners.
 PARITY_COLUMN, NUMBER_COLUMN, INVERSE_SQUARES_COLUMN = 9, 10, 11
-# A ray within this number of roundings of a coordinate from an edge passes through the edge.
+# A ray passes through an edge if its distance from the edge is at most this many machine epsilons
+# times 1 plus the largest coordinate.
 _EDGE_ROUNDINGS = 4.0
-# A crossing within this number of roundings of a line's end may be on either side of the end.
+# Whether a crossing is before or behind the end of a line is not certain if the crossing is within
+# this number of roundings of the end.
 _UNCERTAIN_ROUNDINGS = 64.0
 # Triangles are numbered in floats; single precision holds no larger integers without gaps.
 MAX_TRIANGLES = 2**24
@@ -44,8 +46,10 @@ NO_TRIANGLE = 0xFFFFFFFF
 
 
 def triangle_records(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """(m, 14): the corners ordered by index; +1, or -1 if that order reverses the face; the index
-    of the face; 1/length^2 of the edges 01, 12 and 02."""
+    """Records (m, 14) of the triangles `faces` (m, 3).
+
+    Each has the corners (9 numbers), ordered by the indices of their vertices; +1, or -1 if that
+    order reverses the face; the index of the face; and 1/length^2 of the edges 01, 12 and 02."""
     order = np.argsort(faces, axis=1, kind="stable")
     corners = vertices[np.take_along_axis(faces, order, axis=1)]
     even = np.isin(order @ np.array([9, 3, 1]), (5, 15, 19))  # 012, 120, 201 in base three
@@ -58,7 +62,8 @@ def triangle_records(vertices: FloatArray, faces: IntArray) -> FloatArray:
 
 
 def records_in_slots(tree: BalancedTree, records: FloatArray) -> FloatArray:
-    """Records (leaves, leaf_size, c); empty slots are points at the leaf's first corner."""
+    """Arrange records (m, c) by the slots of a tree: (leaves, leaf_size, c). An empty slot gets a
+    triangle without an area, at the first corner of the leaf, with the number -1."""
     placed = tree.values_in_slots(records)
     empty = tree.leaf_slots < 0
     first = np.tile(placed[:, 0, :3], 3)
@@ -69,7 +74,8 @@ def records_in_slots(tree: BalancedTree, records: FloatArray) -> FloatArray:
 
 
 def node_boxes(tree: BalancedTree, low: FloatArray, high: FloatArray) -> list[FloatArray]:
-    """Boxes (k, 6) of the nodes of all levels, from those of primitives (n, 3)."""
+    """Bounding boxes of the nodes of a tree, from the corners low and high (n, 3) of the boxes of
+    its primitives. Returns an array (k, 6) for each level of the tree, leaves first."""
     low, high = (
         tree.values_in_slots(low, np.inf).min(axis=1),
         tree.values_in_slots(high, -np.inf).max(axis=1),
@@ -85,14 +91,18 @@ def node_boxes(tree: BalancedTree, low: FloatArray, high: FloatArray) -> list[Fl
 def node_slabs(
     tree: BalancedTree, corners: FloatArray, boxes: list[FloatArray]
 ) -> list[FloatArray]:
-    """Slabs (k, 6) of the nodes of all levels: a unit normal n, an offset, half a thickness and a
-    radius. With c the center of a node's box, the points of its triangles are c + h n + r, r
-    orthogonal to n, with |h - offset| <= thickness and |r| <= radius.
+    """Slabs around the triangles of the nodes of a tree. Returns an array (k, 6) for each level of
+    the tree, leaves first.
+
+    corners: (n, 3, 3) of the triangles. boxes: from `node_boxes`.
+
+    A slab has six numbers: a unit normal n, an offset, half a thickness and a radius. With c the
+    center of the node's box, each point of its triangles is c + h n + r, where r is orthogonal to
+    n, |h - offset| <= half the thickness and |r| <= radius.
 
     A piece of a smooth surface is much thinner than its box, which matters for points far away:
     with boxes alone, a walk visits the whole cap of the surface that bulges by less than the width
-    of a box.
-    """
+    of a box."""
     points = tree.values_in_slots(corners, np.nan).reshape(len(tree.leaf_slots), -1, 3)
     edges = corners - corners[:, :1]
     normals = tree.values_in_slots(np.cross(edges[:, 1], edges[:, 2])).sum(axis=1)
@@ -112,7 +122,8 @@ def node_slabs(
 
 @dataclass(frozen=True)
 class RayFrame:
-    """Coordinates along and across rays o + t d: right-handed unit vectors u, v and d."""
+    """Coordinates along and across rays o + t d. The unit vectors u, v and d are orthogonal and
+    right-handed."""
 
     o: Vec3
     u: Vec3
@@ -121,19 +132,19 @@ class RayFrame:
 
     @classmethod
     def along(cls, backend: Backend, o: Vec3, d: Vec3) -> RayFrame:
-        """The frame of rays o + t d, |d| = 1."""
+        """The frame of rays o + t d, where |d| = 1."""
         vector = backend.Array3f
         o, d = vector(o), vector(d)
         u, v = orthonormal_basis(d)
         return cls(o, u, v, d)
 
     def transverse(self, p: Vec3) -> tuple[Real, Real]:
-        """The coordinates of p in the plane normal to the rays."""
+        """The coordinates (u, v) of p in the plane normal to the rays, relative to the ray."""
         a = p - self.o
         return _flush_tiny(dr.dot(a, self.u)), _flush_tiny(dr.dot(a, self.v))
 
     def depth(self, p: Vec3) -> Real:
-        """The coordinate of p along the rays."""
+        """The t of the point of the ray that is nearest to p."""
         return dr.dot(p - self.o, self.d)
 
     def component(self, a: Vec3) -> Real:
@@ -143,7 +154,7 @@ class RayFrame:
 
 @dataclass(frozen=True)
 class VerticalRayFrame:
-    """The frame of rays from points o along the z axis, which takes no computation."""
+    """The frame of rays from points o along the z axis. It takes no computation."""
 
     o: Vec3
 
@@ -160,26 +171,25 @@ class VerticalRayFrame:
         return a.z
 
 
-def _flush_tiny(u: Real) -> Real:
-    """A coordinate across a ray; 0 if it is so small that a product of two could underflow.
-
-    Such a coordinate is far smaller than the rounding error of a vertex.
-    """
-    is_double = dr.type_v(type(u)) == dr.VarType.Float64
-    return dr.select(dr.abs(u) < (1e-140 if is_double else 1e-16), 0, u)
+def _flush_tiny(coordinate: Real) -> Real:
+    """A coordinate across a ray, or 0 if it is so small that a product of two could underflow. Such
+    a coordinate is far smaller than the rounding error of a vertex."""
+    is_double = dr.type_v(type(coordinate)) == dr.VarType.Float64
+    return dr.select(dr.abs(coordinate) < (1e-140 if is_double else 1e-16), 0, coordinate)
 
 
 def edge_function(a: tuple[Real, Real], b: tuple[Real, Real]) -> Real:
-    """Twice the area of (0, a, b): its sign says on which side of the edge ab a ray passes.
+    """Twice the signed area of the triangle (0, a, b). Its sign says on which side of the edge ab
+    the ray passes.
 
-    The same bits for every triangle at the edge, if a and b come in the same order.
-    """
+    a, b: coordinates across the ray. The result is the same, to the last bit, for every triangle at
+        the edge, if a and b come in the same order."""
     return dr.fma(a[0], b[1], -(a[1] * b[0]))
 
 
 @dataclass(frozen=True)
 class TriangleTree:
-    """Crossings of rays with triangles, by a tree of boxes."""
+    """A tree of bounding boxes over triangles, which finds their crossings with rays."""
 
     tree: PackedTree
 
@@ -187,10 +197,11 @@ class TriangleTree:
     def of(
         cls, backend: Backend, tree: BalancedTree, records: FloatArray, *, slabs: bool = False
     ) -> TriangleTree:
-        """Build the tree from the records of `triangle_records`.
+        """Build the tree.
 
-        slabs: whether nodes have slabs besides boxes, for closest points from far away.
-        """
+        records: of the triangles, from `triangle_records`.
+        slabs: whether nodes have slabs (`node_slabs`) besides boxes, for closest points from far
+            away."""
         corners = records[:, :9].reshape(-1, 3, 3)
         levels = node_boxes(tree, corners.min(axis=1), corners.max(axis=1))
         if slabs:
@@ -206,16 +217,19 @@ class TriangleTree:
         active: Mask,
         reach: float = 0.0,
     ) -> tuple[Real, Any, Real, Vec3]:
-        """The next crossing after `after` = (t, number) with t <= t_max, ordered by (t, number).
+        """The next crossing of a ray after `after`, with t <= t_max.
 
-        reach: if more than 0, triangles whose border is within this distance of the ray count as
-            crossed too, except triangles whose border is that close to an end of the ray, t = 0 or
-            t_max.
+        after: (t, number). Crossings are ordered by t, and those at the same t by the number of the
+            triangle.
+        reach: a length. If it is more than 0, a triangle counts as crossed too if its border is
+            within this distance of the ray; but not if its border is that close to an end of the
+            ray, t = 0 or t_max.
 
         Returns:
-            t (inf for none), the triangle's index (NO_TRIANGLE for none), the sign of the crossing
-                (1 where the triangle's normal by the right-hand rule points along the ray, -1 where
-                it points back, 0 for none), and that normal (unit).
+            t (inf if there is none); the number of the triangle (NO_TRIANGLE if there is none); the
+            sign of the crossing; and the unit normal of the triangle by the right-hand rule. The
+            sign is 1 if the normal points along the ray, -1 if it points back, and 0 if there is no
+            crossing.
         """
         real, index, vector = (
             self.tree.backend.Float,
@@ -226,11 +240,14 @@ class TriangleTree:
         inside = self._slab_test(frame, reach)
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
+            """Enter a node if the ray comes near its box before the best crossing so far."""
             limit = fmin(state[0], t_max)
             open_ = inside(node, t_after, limit)
             return open_, for_each_primitive(node, open_ & node.is_leaf, nearer, state)
 
         def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
+            """Take the crossing with a record's triangle if it is after `after` and before the best
+            so far."""
             best, number, sign, normal = state
             t, new_sign = signed_crossing(row, frame)
             n = index(fmax(row[NUMBER_COLUMN], real(0)))
@@ -253,14 +270,16 @@ class TriangleTree:
         return best, number, sign, normal * dr.rsqrt(fmax(dr.squared_norm(normal), real(1e-37)))
 
     def signed_crossings_ahead(self, frame: RayFrame, t_min: Real, active: Mask = True) -> Real:
-        """The sum of the signs of all crossings with t > t_min."""
+        """The sum of the signs of all crossings of a ray with t > t_min (`signed_crossing`)."""
         real, inside = self.tree.backend.Float, self._slab_test(frame)
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
+            """Enter a node if the ray comes near its box ahead of t_min."""
             open_ = inside(node, real(t_min), real(dr.inf))
             return open_, for_each_primitive(node, open_ & node.is_leaf, add, state)
 
         def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
+            """Add the sign of the crossing with a record's triangle, if it is ahead of t_min."""
             t, sign = signed_crossing(row, frame)
             return (state[0] + dr.select(active & (t > t_min), sign, 0),)
 
@@ -269,21 +288,24 @@ class TriangleTree:
     def signed_crossings_between(
         self, frame: RayFrame, end: Real, unit: Real, active: Mask
     ) -> tuple[Real, Mask]:
-        """The sum of the signs of all crossings with 0 < t < end, and where that sum is certain.
+        """The sum of the signs of all crossings with 0 < t < end, and a mask of the rays for which
+        that sum is certain.
 
-        unit: the rounding of a coordinate.
+        unit: the rounding error of a coordinate.
 
-        A computed t belongs to a point of the triangle within a few units of the ray, so that its
-        error is that distance over the cosine between ray and normal. Where t may therefore lie on
-        either side of an end, the sum is not certain.
-        """
+        A computed t belongs to a point of the triangle within a few units of the ray. So the error
+        of t is that distance divided by the cosine of the angle between ray and normal. If t may
+        therefore lie on either side of an end of the interval, the sum is not certain."""
         real, inside = self.tree.backend.Float, self._slab_test(frame)
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
+            """Enter a node if the ray comes near its box between 0 and `end`."""
             open_ = inside(node, real(0), real(end))
             return open_, for_each_primitive(node, open_ & node.is_leaf, add, state)
 
         def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
+            """Add the sign of the crossing with a record's triangle, if it is between 0 and `end`;
+            and clear the mask of certain sums if rounding may have decided that."""
             total, sure = state
             t, sign = signed_crossing(row, frame)
             normal = normal_of(row, self.tree.backend.Array3f)
@@ -299,19 +321,20 @@ class TriangleTree:
         total, sure = traverse(self.tree, visit, start, active)
         return total, sure
 
-    def signed_crossings_vertical(self, x: Vec3, direction: Real, active: Mask = True) -> Real:
-        """The sum of the signs of all crossings of rays from x upwards (way 1) or downwards (-1)
-        along the z axis.
+    def signed_crossings_vertical(self, x: Vec3, way: Real, active: Mask = True) -> Real:
+        """The sum of the signs of all crossings of rays from x along the z axis.
 
-        For both, the signs are those with respect to the upward direction. Testing boxes costs less
-        than for other directions.
-        """
+        way: 1 for rays upwards, -1 for rays downwards. In both cases the signs are those for the
+            upward direction.
+
+        Testing boxes costs less than for other directions."""
         real = self.tree.backend.Float
-        up, height = direction > 0, direction * x.z
+        up, height = way > 0, way * x.z
         pad = 4 * self.tree.backend.machine_epsilon * (1 + dr.max(dr.abs(x)))
         low_x, high_x, low_y, high_y = x.x - pad, x.x + pad, x.y - pad, x.y + pad
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
+            """Enter a node if its box, slightly enlarged, meets the vertical ray."""
             x0, y0, z0, x1, y1, z1 = node.head
             open_ = (
                 (high_x >= x0) & (low_x <= x1) & (high_y >= y0) & (low_y <= y1)
@@ -320,25 +343,30 @@ class TriangleTree:
             return open_, for_each_primitive(node, open_ & node.is_leaf, add, state)
 
         def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
+            """Add the sign of the crossing with a record's triangle, if it is ahead."""
             t, sign = signed_crossing(row, VerticalRayFrame(x))
-            return (state[0] + dr.select(active & (direction * t > 0), sign, 0),)
+            return (state[0] + dr.select(active & (way * t > 0), sign, 0),)
 
         return traverse(self.tree, visit, (real(0),), active)[0]
 
     def _slab_test(self, frame: RayFrame, reach: float = 0.0) -> Any:
-        """A test whether rays come as near as `reach` to a node's box between two t. Rounding may
-        turn a no into a yes, never a yes into a no."""
+        """Make a function that tells whether rays come near a node's box.
+
+        The function takes a node and two t. It returns a mask: whether the ray comes within `reach`
+        (a length) of the box between these t. Rounding may turn a no into a yes, never a yes into a
+        no."""
         backend = self.tree.backend
         vector = backend.Array3f
         d = frame.d
         # Never zero: 1e-18 of the box's size is far below its padding.
-        steep = dr.select(dr.abs(d) < 1e-18, dr.select(d < 0, vector(-1e-18), vector(1e-18)), d)
-        inverse = dr.rcp(steep)
+        direction = dr.select(dr.abs(d) < 1e-18, dr.select(d < 0, vector(-1e-18), vector(1e-18)), d)
+        inverse = dr.rcp(direction)
         o = frame.o
         size = max_norm(o)
         pad = 16 * backend.machine_epsilon * (1 + size) + reach
 
-        def inside(node: VisitedNode, t_min: Real, t_max: Real) -> Mask:
+        def may_meet(node: VisitedNode, t_min: Real, t_max: Real) -> Mask:
+            """Whether a ray comes near the node's box for t between t_min and t_max."""
             low, high = vector(*node.head[:3]) - pad, vector(*node.head[3:]) + pad
             a, b = (low - o) * inverse, (high - o) * inverse
             near = fmax(fmax(fmin(a.x, b.x), fmin(a.y, b.y)), fmin(a.z, b.z))
@@ -346,34 +374,37 @@ class TriangleTree:
             margin = 8 * backend.machine_epsilon * dr.abs(far) + pad
             return (near <= far + margin) & (far + margin >= t_min) & (near - margin <= t_max)
 
-        return inside
+        return may_meet
 
 
 def corners_of(row: list[Real], vector: Any) -> tuple[Vec3, Vec3, Vec3]:
-    """The corners of a record."""
+    """The three corners of the triangle of a record. vector: the type of the points."""
     return vector(*row[0:3]), vector(*row[3:6]), vector(*row[6:9])
 
 
 def normal_of(row: list[Real], vector: Any) -> Vec3:
-    """The normal of a record's triangle by the right-hand rule, of any length."""
+    """A normal of the triangle of a record by the right-hand rule, of any length.
+
+    vector: the type of the normal."""
     p, q, r = corners_of(row, vector)
     return row[PARITY_COLUMN] * dr.cross(q - p, r - p)
 
 
 def signed_crossing(row: list[Real], frame: RayFrame | VerticalRayFrame) -> tuple[Real, Real]:
-    """t and the sign of the crossing of a ray with the triangle of a record; 0 where there is none.
+    """The t and the sign of the crossing of a ray with the triangle of a record. The sign is 0 if
+    there is none.
 
-    In the plane across the ray, the sign is the winding number of the triangle about the ray:
-    over its edges, +1 for each that crosses the half-line v = 0, u > 0 upwards and -1 downwards.
-    Upwards means from v <= 0 to v > 0, which v alone decides; that u > 0 there is the sign of
-    `edge_function`. Both are the same for all triangles around a vertex or an edge, so that a
-    rounding error that adds a crossing to one of them takes it from its neighbor: the sum over a
-    closed surface is right whatever the rounding did, and rays through edges and vertices need no
-    special case.
+    In the plane across the ray, with coordinates (u, v), the sign is the winding number of the
+    triangle about the ray. It is a sum over the edges of the triangle: +1 for each that crosses the
+    half-line v = 0, u > 0 upwards, and -1 for each that crosses it downwards. Upwards means from v
+    <= 0 to v > 0, which v alone decides; whether u > 0 at the crossing is the sign of
+    `edge_function`. Both are the same for all triangles around a vertex or an edge. So a rounding
+    error that adds a crossing to one of them takes it from its neighbor: the sum over a closed
+    surface is right whatever the rounding did, and rays through edges and vertices need no special
+    case.
 
     t is the depth of a point of the triangle within a few roundings of coordinates of the ray,
-    however thin the triangle is (`_crossing_depth`).
-    """
+    however thin the triangle is (`_crossing_depth`)."""
     vector = cast("Any", type(frame.o))
     p, q, r = corners_of(row, vector)
     a, b, c = frame.transverse(p), frame.transverse(q), frame.transverse(r)
@@ -381,6 +412,11 @@ def signed_crossing(row: list[Real], frame: RayFrame | VerticalRayFrame) -> tupl
     up_a, up_b, up_c = a[1] > 0, b[1] > 0, c[1] > 0
 
     def upwards(from_up: Mask, to_up: Mask, left: Real) -> Real:
+        """How an edge crosses the half-line v = 0, u > 0: 1 upwards, -1 downwards, 0 if it does
+        not.
+
+        from_up, to_up: whether v > 0 at the ends of the edge. left: the `edge_function` of its
+            ends."""
         one = type(left)(1)
         return dr.select(~from_up & to_up & (left > 0), one, 0) - dr.select(
             from_up & ~to_up & (left < 0), one, 0
@@ -395,47 +431,50 @@ def signed_crossing(row: list[Real], frame: RayFrame | VerticalRayFrame) -> tupl
 
 
 def _is_beside(row: list[Real], frame: RayFrame, reach: float) -> Mask:
-    """Whether the line of a ray is as near as `reach` to the border of a record's triangle. (Terms
+    """Whether the line of a ray comes within `reach` of the border of a record's triangle. (Terms
     that `signed_crossing` computes as well are computed once.)"""
     p, q, r = corners_of(row, type(frame.o))
     a, b, c = frame.transverse(p), frame.transverse(q), frame.transverse(r)
-    near: Mask = False
+    is_near: Mask = False
     zero = type(a[0])(0)
     for start, end in ((a, b), (b, c), (a, c)):
-        area, square = edge_function(start, end), _square((*start, zero), (*end, zero))
+        twice_area, square = edge_function(start, end), _square((*start, zero), (*end, zero))
         t = -dr.fma(start[0], end[0] - start[0], start[1] * (end[1] - start[1])) / square
-        near |= (area * area <= reach * reach * square) & (t > 0) & (t < 1)
+        is_near |= (twice_area * twice_area <= reach * reach * square) & (t > 0) & (t < 1)
     for u, v in (a, b, c):
-        near |= dr.fma(u, u, v * v) <= reach * reach
-    return near
+        is_near |= dr.fma(u, u, v * v) <= reach * reach
+    return is_near
 
 
 def _crossing_depth(
     corners: tuple[RayCoordinates, RayCoordinates, RayCoordinates],
-    sides: tuple[Real, Real, Real],
+    areas: tuple[Real, Real, Real],
     close: Real,
 ) -> Real:
     """The t at which a ray passes through a triangle.
 
-    corners: (u, v, depth) of each, in the frame of the ray. sides: `edge_function` of the edges.
+    corners: (u, v, depth) of each corner, in the frame of the ray.
+    areas: the `edge_function` of the edges ab, bc and ac of the corners a, b and c.
+    close: the distance from an edge within which the ray passes through the edge.
 
-    The barycentric weight of a corner is an area divided by that of the triangle, which is only
-    rounding error where the triangle is thin. So the weight w of the corner off the longest edge is
-    clamped to the range that the ray's coordinate along that edge allows, and the coordinate s of
-    the point on the edge is then chosen for w: the ray is at s + w s', with s' the coordinate of
-    that corner, 0 <= s <= 1 - w, and coordinates along the longest edge are accurate. A wrong w
-    moves the point across that edge only, by no more than the rounding of an area over the edge's
-    length.
+    The barycentric weight of a corner is an area divided by that of the triangle. Where the
+    triangle is thin, it is only rounding error. So t is found along the longest edge, on which
+    coordinates are accurate. Let w be the weight of the corner off the longest edge, s' the
+    coordinate along that edge, from 0 to 1, of this corner, and s + w s' that of the ray, with 0 <=
+    s <= 1 - w. First, w is clamped to the range for which there is such an s; then s is computed
+    from w. A wrong w moves the point only across the longest edge, by no more than the rounding of
+    an area over the edge's length.
 
-    A ray that is as close as `close` to an edge or a vertex passes all triangles there at the depth
-    of that edge or vertex, the same bits for all: their jumps of w are at exactly the same t.
-    """
-    (a, b, c), (ab, bc, ac) = corners, sides
+    If the ray is within `close` of an edge or a vertex, it passes through all triangles there at
+    the depth of that edge or vertex, the same bits for all: the jumps of the winding number
+    across them are at exactly the same t."""
+    (a, b, c), (ab, bc, ac) = corners, areas
     squares = _square(a, b), _square(b, c), _square(a, c)
     is_first = (squares[0] >= squares[1]) & (squares[0] >= squares[2])
     is_last = squares[2] > squares[1]
 
     def of_longest(first: Real, second: Real, last: Real) -> Real:
+        """The number of the longest edge, of one number for each of the edges ab, bc and ac."""
         return dr.select(is_first, first, dr.select(is_last, last, second))
 
     start, end, apex = (
@@ -453,18 +492,19 @@ def _crossing_depth(
     s = clamp(dr.fma(-w, aside, along), zero, 1 - w)
     t = dr.fma(s, end[2] - start[2], dr.fma(w, apex[2] - start[2], start[2]))
     near = close * close
-    for (tail, head), side_, square in zip(
+    for (tail, head), area, square in zip(
         ((a, b), (b, c), (a, c)), (ab, bc, ac), squares, strict=True
     ):
         share = -dr.fma(tail[0], head[0] - tail[0], tail[1] * (head[1] - tail[1])) / square
-        at = dr.fma(clamp(share, zero, 1), head[2] - tail[2], tail[2])
-        beside = (side_ * side_ <= near * square) & (share > 0) & (share < 1)
-        t = dr.select(beside, at, t)
+        edge_depth = dr.fma(clamp(share, zero, 1), head[2] - tail[2], tail[2])
+        is_on_edge = (area * area <= near * square) & (share > 0) & (share < 1)
+        t = dr.select(is_on_edge, edge_depth, t)
     for u, v, depth in corners:
         t = dr.select(dr.fma(u, u, v * v) <= 4 * near, depth, t)
     return t
 
 
 def _square(a: RayCoordinates, b: RayCoordinates) -> Real:
+    """The squared distance between two points across a ray; their depths do not matter."""
     u, v = b[0] - a[0], b[1] - a[1]
     return dr.fma(u, u, v * v)
