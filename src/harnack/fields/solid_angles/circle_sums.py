@@ -102,17 +102,18 @@ class UnitCircle:
         Both are Dr.Jit numbers."""
         real: Any = cast("Any", type(r))
         agm_rounds = _AGM_ROUNDS["double" if float(dr.epsilon(r)) < 1e-10 else "single"]
-        one_minus_r = 1 - r
-        nearest_square = dr.fma(one_minus_r, one_minus_r, z * z)
-        nearest, farthest = dr.sqrt(nearest_square), dr.sqrt(dr.fma(1 + r, 1 + r, z * z))
-        inverse_farthest = 1 / farthest
-        kc = nearest * inverse_farthest
-        q = 4 * inverse_farthest / (farthest + nearest)
-        gamma = one_minus_r / (1 + r)
-        # c, d, p are Bulirsch's numbers for cel; m and e are the numbers of the means.
+        gap = 1 - r
+        square = dr.fma(gap, gap, z * z)
+        nearest, farthest = dr.sqrt(square), dr.sqrt(dr.fma(1 + r, 1 + r, z * z))
+        inverse = 1 / farthest
+        kc = nearest * inverse
+        q = 4 * inverse / (farthest + nearest)
+        gamma = gap / (1 + r)
+        # c, d, p are Bulirsch's numbers for cel; m and e are the numbers of the means. In the loop
+        # `difference` becomes c_(n+1)/(1-kc), and `total` the sum S; kc_gap is 1 - kc.
         c, d, p = real(1), dr.copysign(real(1), gamma), fmax(dr.abs(gamma), 1e-30)
         k, e, m = kc, kc, real(1)
-        difference_sum, difference, one_minus_kc = real(0), real(0.5), q * r
+        total, difference, kc_gap = real(0), real(0.5), q * r
         for n in range(agm_rounds):
             old_c, g = c, e / p
             c, d = c + d / p, 2 * dr.fma(old_c, g, d)
@@ -120,36 +121,24 @@ class UnitCircle:
             k = 2 * dr.sqrt(e)
             e = k * m
             if n >= 1:
-                difference = difference * difference * one_minus_kc / (4 * 0.5 ** (n + 1) * m)
-                difference_sum = dr.fma(2.0**n * difference, difference, difference_sum)
+                difference = difference * difference * kc_gap / (4 * 0.5 ** (n + 1) * m)
+                total = dr.fma(2.0**n * difference, difference, total)
         cel = (math.pi / 2) * dr.fma(c, m, d) / (m * (m + p))
-        first_kind = (math.pi / 2 * 2.0**agm_rounds) / m  # K
-        second_kind = first_kind * (
-            1
-            - 0.5 * one_minus_kc * (1 + kc)
-            - one_minus_kc * one_minus_kc * (0.25 + difference_sum)
-        )  # E
+        first = (math.pi / 2 * 2.0**agm_rounds) / m  # K
+        second = first * (1 - 0.5 * kc_gap * (1 + kc) - kc_gap * kc_gap * (0.25 + total))  # E
         height = dr.abs(z)
-        unsigned_angle = (
-            dr.select(r < 1, real(2 * math.pi), 0) - 4 * height * inverse_farthest / (1 + r) * cel
-        )
-        unsigned_angle = dr.select(
-            r == 1, math.pi - 2 * height * inverse_farthest * first_kind, unsigned_angle
-        )
-        bracket = 0.25 * dr.fma(kc, 4 + kc, 1) - dr.fma(kc, kc, 1) * difference_sum
-        radial = first_kind * inverse_farthest * bracket / (kc * kc)
-        third = 4 * second_kind * inverse_farthest / nearest_square
-        near_form = (
-            2
-            * inverse_farthest
-            * (first_kind + (one_minus_r * (1 + r) - z * z) / nearest_square * second_kind)
-        )
+        w = dr.select(r < 1, real(2 * math.pi), 0) - 4 * height * inverse / (1 + r) * cel
+        w = dr.select(r == 1, math.pi - 2 * height * inverse * first, w)
+        bracket = 0.25 * dr.fma(kc, 4 + kc, 1) - dr.fma(kc, kc, 1) * total
+        radial = first * inverse * bracket / (kc * kc)
+        third = 4 * second * inverse / square
+        near_form = 2 * inverse * (first + (gap * (1 + r) - z * z) / square * second)
         axial = dr.select(
-            first_kind * nearest_square < 2 * second_kind,
+            first * square < 2 * second,
             near_form,
-            third - one_minus_kc * one_minus_kc * radial,
+            third - kc_gap * kc_gap * radial,
         )
-        return cls(r, z, -dr.mulsign(unsigned_angle, z), nearest, farthest, q, radial, axial, third)
+        return cls(r, z, -dr.mulsign(w, z), nearest, farthest, q, radial, axial, third)
 
     @property
     def across(self) -> Real:
@@ -341,48 +330,41 @@ class CircleSet:
         def add(row: list[Real], rates: tuple[Any, ...]) -> tuple[Any, ...]:
             """The bounds `rates`, with those of the circle in a record added."""
             relative = self._relative(row, line.x)
-            slack, normal_component = line.slack, fmin(dr.abs(dr.dot(relative.normal, line.v)), 1)
-            plane_component = dr.sqrt(fmax(1 - normal_component * normal_component, 0))
-            # `normal_component` is a sum of numbers of order one: its rounding may be large relative
-            # to it.
-            normal_component += 4 * float(dr.epsilon(line.x))
+            slack, normal_part = line.slack, fmin(dr.abs(dr.dot(relative.normal, line.v)), 1)
+            plane_part = dr.sqrt(fmax(1 - normal_part * normal_part, 0))
+            # `normal_part` is a sum of numbers of order one: its rounding may be large relative to
+            # it.
+            normal_part += 4 * float(dr.epsilon(line.x))
             height = dr.abs(relative.circle.z) * relative.a + slack
             # The line is projected onto the circle's plane. At the position s on the line, its
             # distance from the axis is |outward + s plane_direction|.
             plane_direction = dr.fma(
                 vector(-dr.dot(relative.normal, line.v)), relative.normal, line.v
             )
-            plane_direction_square = dr.squared_norm(plane_direction)
-            closest_position = dr.select(
-                plane_direction_square > 0,
-                -dr.dot(relative.outward, plane_direction) / plane_direction_square,
+            square = dr.squared_norm(plane_direction)
+            closest = dr.select(
+                square > 0,
+                -dr.dot(relative.outward, plane_direction) / square,
                 0,
             )
             new_rates: list[Real] = []
             for length, rate in zip(lengths, rates, strict=True):
-                positions = (clamp(closest_position, -length, length), -length, length)
-                least_axis_distance, start_axis_distance, end_axis_distance = (
+                positions = (clamp(closest, -length, length), -length, length)
+                least_r, start_r, end_r = (
                     dr.norm(dr.fma(vector(s), plane_direction, relative.outward)) for s in positions
                 )
-                passing_distance = fmax(
-                    least_axis_distance - relative.a,
-                    relative.a - fmax(start_axis_distance, end_axis_distance),
+                passing = fmax(
+                    least_r - relative.a,
+                    relative.a - fmax(start_r, end_r),
                 )
-                least_nearest = fmax(relative.distance - length, passing_distance) - slack
-                least_farthest = fmax(relative.farthest - length, least_nearest + slack) - slack
-                gradient_bound = 2 * math.pi * relative.a / (least_nearest * least_farthest)
-                root_mean_inverse_square = dr.sqrt(
-                    0.5
-                    * (
-                        dr.rcp(least_nearest * least_nearest)
-                        + dr.rcp(least_farthest * least_farthest)
-                    )
-                )
-                max_height = dr.fma(length, normal_component, height)
-                circle_rate = gradient_bound * dr.fma(
-                    plane_component * max_height, root_mean_inverse_square, normal_component
-                )
-                new_rates.append(rate + dr.select(least_nearest > 0, circle_rate, dr.inf))
+                # near and far: the distances d and P at all points of the line within `length`.
+                near = fmax(relative.distance - length, passing) - slack
+                far = fmax(relative.farthest - length, near + slack) - slack
+                bound = 2 * math.pi * relative.a / (near * far)
+                root_mean = dr.sqrt(0.5 * (dr.rcp(near * near) + dr.rcp(far * far)))
+                max_height = dr.fma(length, normal_part, height)
+                circle_rate = bound * dr.fma(plane_part * max_height, root_mean, normal_part)
+                new_rates.append(rate + dr.select(near > 0, circle_rate, dr.inf))
             return tuple(new_rates)
 
         start = tuple(real(0) for _ in lengths)
