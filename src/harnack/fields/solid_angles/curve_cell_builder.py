@@ -328,17 +328,13 @@ def near_records(
     run_ids = np.flatnonzero(is_leaf[runs.cell])
     first, count, is_open = runs.first[run_ids], runs.count[run_ids], ~runs.is_whole[run_ids]
     leaf_index = (np.cumsum(is_leaf) - 1)[runs.cell[run_ids]]
-    vertex_count = count + np.where(is_open, 3, 1)
-    leaf_vertex_count = np.bincount(leaf_index, vertex_count, int(is_leaf.sum())).astype(np.int64)
-    record_count = -(-leaf_vertex_count // VERTICES_PER_RECORD)
+    length = count + np.where(is_open, 3, 1)
+    per_leaf = np.bincount(leaf_index, length, int(is_leaf.sum())).astype(np.int64)
+    record_count = -(-per_leaf // VERTICES_PER_RECORD)
     first_record = np.cumsum(record_count) - record_count
     # first_slot: the position of each run's first vertex among the vertices of its own cell; then
     # its position in the table.
-    first_slot = (
-        np.cumsum(vertex_count)
-        - vertex_count
-        - (np.cumsum(leaf_vertex_count) - leaf_vertex_count)[leaf_index]
-    )
+    first_slot = np.cumsum(length) - length - (np.cumsum(per_leaf) - per_leaf)[leaf_index]
     first_slot += first_record[leaf_index] * VERTICES_PER_RECORD
     table = np.zeros((int(record_count.sum()) * VERTICES_PER_RECORD, 4))
     run = np.repeat(np.arange(len(run_ids)), count + 1)
