@@ -44,9 +44,9 @@ _PERIOD = 4 * math.pi
 _NEAR_RADII, _SHARED_RADII = 3.0, 4.5
 # Cells are split if they have more near edges than `_NEAR_PER_CUBE_ROOT` times the cube root of the
 # number of all edges (but at least `_MIN_NEAR`), or if the truncation error exceeds about
-# `_MAX_TRUNCATION_RATIO` times the integral of |dp|/D^2, a bound of the gradient. Chosen by
+# `_MAX_TAIL_RATIO` times the integral of |dp|/D^2, a bound of the gradient. Chosen by
 # experiment.
-_NEAR_PER_CUBE_ROOT, _MIN_NEAR, _MAX_TRUNCATION_RATIO = 2.0, 6.0, 1e-5
+_NEAR_PER_CUBE_ROOT, _MIN_NEAR, _MAX_TAIL_RATIO = 2.0, 6.0, 1e-5
 # If memory is short, cells get twice as many near edges and four times the truncation, in at most
 # this many attempts.
 _ATTEMPTS = 4
@@ -86,7 +86,7 @@ def build_curve_cells(
     edges = LoopEdges.upload(backend, loops)
     max_near, max_tail = (
         max(_MIN_NEAR, _NEAR_PER_CUBE_ROOT * sum(map(len, loops)) ** (1 / 3)),
-        _MAX_TRUNCATION_RATIO,
+        _MAX_TAIL_RATIO,
     )
     max_near, max_tail = near * max_near, near * max_tail
     for _ in range(_ATTEMPTS):

@@ -57,11 +57,11 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
     from harnack.tree import BalancedTree
 
-# Cells pay if there are at least `_CELLS_PAY_PER_POINT` rays per point and at least `_MIN_RAYS`
+# Cells pay if there are at least `_PAYS` rays per point and at least `_LEAST_RAYS`
 # rays, and at most `_MAX_POINTS` points: to build them takes as long as to trace about 6 rays per
 # point without them. Smaller cells, in which a ray takes two thirds of the time, pay if there are
 # at least `_FINER_PAYS_PER_POINT` rays per point.
-_CELLS_PAY_PER_POINT, _MIN_RAYS, _MAX_POINTS = 7, 100_000, 200_000
+_PAYS, _LEAST_RAYS, _MAX_POINTS = 7, 100_000, 200_000
 _FINER_PAYS_PER_POINT = 60
 # The dipole of a point dominates the field where the squared distance from it is less than this
 # fraction of the point's area.
@@ -176,23 +176,23 @@ def _dipole_adder(x: Vec3, unit: Real, derivatives: int) -> AddPrimitive:
         dipole so far, which is updated."""
         inverse, terms = _dipole_term(row, x, derivatives)
         distance, has_area = dr.rcp(inverse), active & (row[6] > 0)
-        # inverse_upper is an upper bound of 1/(distance - 2 unit), as 2 unit bounds the rounding of
+        # `upper` is an upper bound of 1/(distance - 2 unit), as 2 unit bounds the rounding of
         # the distance. With z = 2 unit/distance, 1/(1-z) <= 1 + 2z for z <= 1/2. Nearer to a dipole
         # all bounds are infinite. Padding has no area and adds nothing.
         relative_rounding = 2 * unit * inverse
-        inverse_upper = dr.select(
+        upper = dr.select(
             relative_rounding <= 0.5, dr.fma(2 * relative_rounding, inverse, inverse), dr.inf
         )
-        inverse_upper = dr.select(has_area, inverse_upper, 0)
-        fourth = row[6] * dr.square(inverse_upper * inverse_upper)
+        upper = dr.select(has_area, upper, 0)
+        fourth = row[6] * dr.square(upper * upper)
         is_nearest = has_area & (distance <= sums.singularity_distance)
         added = sums.add_term(terms, active & (inverse < dr.inf))
         new_sums = dataclasses.replace(
             added,
-            rounding=added.rounding + dipole_rounding(row[6], inverse_upper, unit),
+            rounding=added.rounding + dipole_rounding(row[6], upper, unit),
             singularity_distance=dr.select(is_nearest, distance, sums.singularity_distance),
             s4=sums.s4 + fourth,
-            s5=dr.fma(fourth, inverse_upper, sums.s5),
+            s5=dr.fma(fourth, upper, sums.s5),
         )
         return new_sums, (dr.select(is_nearest, vector(*row[3:6]), state[0]),)
 
@@ -371,7 +371,7 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
             raise ValueError(
                 f"smoothing={self.smoothing:g} is a length in the unit of the points, whose cloud "
                 f"is about {2 * self._size:.2g} across: give one between "
-                f"{_LEAST_SMOOTHING * self._size:.2g} and {self._size:.2g}, such as the length of "
+                f"{_MIN_SMOOTHING * self._size:.2g} and {self._size:.2g}, such as the length of "
                 "the noise"
             )
         samples = self.points[:: -(-len(self.points) // _MAX_LEVEL_SAMPLES)]
@@ -498,7 +498,7 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
 
     def cells_pay_from(self) -> float:
         is_small = len(self.points) <= _MAX_POINTS and not self.smoothing
-        return max(_MIN_RAYS, _CELLS_PAY_PER_POINT * len(self.points)) if is_small else math.inf
+        return max(_LEAST_RAYS, _PAYS * len(self.points)) if is_small else math.inf
 
     def finer_cells_pay_from(self) -> float:
         return _FINER_PAYS_PER_POINT * len(self.points)

@@ -71,15 +71,15 @@ if TYPE_CHECKING:
 # its center are far. The first factor is for cells that are not split, the second for cells that
 # are split, whose expansion all cells inside them inherit. It is larger, as the truncation errors
 # of cells of all sizes add up.
-_NEAR_RADII, _SHARED_RADII = 2.5, 4.0
+_NEAR, _SHARED_RADII = 2.5, 4.0
 # Nodes of the tree with a radius up to this fraction of the radius of a cell's ball are left to the
 # cells inside it.
 _SMALL_NODE_RATIO = 0.35
-# Cells are split if they have more than `_START_NEAR` near primitives, by experiment. If memory is
+# Cells are split if they have more than `_MOST_NEAR` near primitives, by experiment. If memory is
 # short, this limit is doubled again and again, up to `_MAX_NEAR`, and for triangles up to
 # `_MAX_NEAR_FRACTION` of their number; with more near primitives the tree, or cells of edges, are
-# faster. Cells of points for very many rays begin with `_FINER_FRACTION` times `_START_NEAR`.
-_START_NEAR, _MAX_NEAR, _MAX_NEAR_FRACTION = 64, 512, 1 / 8
+# faster. Cells of points for very many rays begin with `_FINER_FRACTION` times `_MOST_NEAR`.
+_MOST_NEAR, _MAX_NEAR, _MAX_NEAR_FRACTION = 64, 512, 1 / 8
 _FINER_FRACTION = 3 / 8
 # The number of cells that are built at once.
 _CHUNK_SIZE = 1 << 14
@@ -149,8 +149,8 @@ class DipoleCells:
         error, slope_error = _truncation_at(
             distance * inverse, error, slope_error, tail, tail_slope
         )
-        far_least = least - distance
-        s4 = fourth * dr.square(dr.square(least / far_least))
+        free = least - distance
+        s4 = fourth * dr.square(dr.square(least / free))
         zero, gradient, shift = (
             self.backend.Float(0),
             inverse * vector(*slopes),
@@ -165,9 +165,9 @@ class DipoleCells:
             slope_error,
             None,
             rounding,
-            far_least,
+            free,
             s4,
-            s4 / far_least,
+            s4 / free,
             zero,
         )
         first, count = index(low) + index(high) * _INDEX_BASE, dr.select(active, index(count), 0)
@@ -188,7 +188,7 @@ class DipoleCells:
         start = (index(0), far.to_state(), own)
         _, state, own = dr.while_loop(start, runs, step, label="near primitives")
         sums, n = SourceSums.from_state(state), self.backend.Float(count)
-        added = (_NEAR_RADII + 1) * self.backend.machine_epsilon * n * sums.s4 / inverse
+        added = (_NEAR + 1) * self.backend.machine_epsilon * n * sums.s4 / inverse
         sums = dataclasses.replace(sums, gradient_truncation=sums.gradient_truncation + added)
         return sums, own, active
 
@@ -270,12 +270,12 @@ def build_cells(
     packed = source_tree(tree, levels, rows)
     step = 2.0 ** (math.ceil(math.log2(half)) - 8)
     half = math.ceil(half / step) * step
-    start_near, max_near = _START_NEAR, _MAX_NEAR
+    start_near, max_near = _MOST_NEAR, _MAX_NEAR
     if finer:
         start_near = int(_FINER_FRACTION * start_near)
     if packed.primitives.packets_per_record > 1:
         limit = int(_MAX_NEAR_FRACTION * (tree.leaf_slots != NO_PRIMITIVE).sum())
-        max_near = max(_START_NEAR, min(_MAX_NEAR, limit))
+        max_near = max(_MOST_NEAR, min(_MAX_NEAR, limit))
     octree = _octree_within_memory(packed, half, backend, (start_near, max_near), most_bytes)
     if octree is None:
         return None
@@ -296,7 +296,7 @@ def build_cells(
         radius, none_stay = (dr.opaque(double.Float, number) for number in (level.radius, -1.0))
         for cells in _chunks(leaves):
             batch, c = sources.subset(double, cells), to_vector3(double, level.centers[cells])
-            sums, nearby = batch.split_far(packed, c, radius, _NEAR_RADII, none_stay)
+            sums, nearby = batch.split_far(packed, c, radius, _NEAR, none_stay)
             lengths = to_numpy(nearby.primitives.count).astype(np.int64)
             first = total + np.cumsum(lengths) - lengths
             geometry = level.centers[cells], level.radius
@@ -422,7 +422,7 @@ def _octree(
         is_last = len(levels) == MAX_DEPTH
         limit = dr.opaque(backend.UInt32, _UNLIMITED if is_last else most_near)
         near, none_stay = (
-            dr.opaque(backend.Float, _NEAR_RADII * radius),
+            dr.opaque(backend.Float, _NEAR * radius),
             dr.opaque(backend.Float, -1.0),
         )
         roots, c = (

@@ -311,7 +311,7 @@ class _ClusterExpansion:
         inverse = dr.rsqrt(dr.squared_norm(r))
         harmonics = irregular_harmonics(r.x, r.y, r.z, inverse, DEGREE + len(norms))
         powers, q = [1.0], radius * inverse
-        tail_sum, magnitude, inverse_power, q_power = 0.0, 0.0, inverse, q
+        total, magnitude, inverse_power, q_power = 0.0, 0.0, inverse, q
         for _ in range(DEGREE):
             powers.append(powers[-1] * radius)
             q_power = q_power * q
@@ -323,13 +323,13 @@ class _ClusterExpansion:
         for l, norm in enumerate(norms, start=1):
             inverse_power = inverse_power * inverse
             factor, ratio = tail_factors(DEGREE, l)
-            tail_sum, magnitude = (
-                tail_sum + factor * norm * inverse_power,
+            total, magnitude = (
+                total + factor * norm * inverse_power,
                 magnitude + norm * inverse_power,
             )
         slope_ratio = ratio * (DEGREE + 2) / (DEGREE + 1)
-        tail = tail_sum * q_power / (1 - ratio * q)
-        slope = (DEGREE + 1) * tail_sum * q_power / (1 - slope_ratio * q)
+        tail = total * q_power / (1 - ratio * q)
+        slope = (DEGREE + 1) * total * q_power / (1 - slope_ratio * q)
         return cls(coefficients, tail, slope / radius, _ROUNDING * magnitude, inverse)
 
     def of_cluster(
@@ -403,7 +403,7 @@ class PendingSources:
         far, pending = (
             build_lists(
                 backend,
-                lambda put, far=far: _far_or_pending_nodes(
+                lambda put, far=far: _count_nodes(
                     tree, self.nodes, c, inner, smallest, put, far=far
                 ),
             )
@@ -491,7 +491,7 @@ class PendingSources:
         return for_each_entry(tree.backend, self.primitives, listed, counts)[0]
 
 
-def _far_or_pending_nodes(
+def _count_nodes(
     tree: PackedTree,
     lists: LaneLists,
     c: Vec3,

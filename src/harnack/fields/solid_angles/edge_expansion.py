@@ -308,21 +308,21 @@ def _rotated_coefficients(phi: dict[Any, list[Any]], e: Vec3, radius: Real) -> l
         if j == 0:
             continue
         re, im = phi[j, k]
-        new_re, new_im = k * e.z * im, -k * e.z * re
+        real, imag = k * e.z * im, -k * e.z * re
         down, up = 0.5 * (j + k), 0.5 * (j - k)
         if k >= 1:
-            re_next, im_next = phi[j, k - 1]
+            a, b = phi[j, k - 1]
         else:  # L_j,-1 = -conj L_j1
-            re_next, im_next = -phi[j, 1][0], phi[j, 1][1]
-        new_re, new_im = (
-            new_re + down * (-e.x * im_next - e.y * re_next),
-            new_im + down * (e.x * re_next - e.y * im_next),
+            a, b = -phi[j, 1][0], phi[j, 1][1]
+        real, imag = (
+            real + down * (-e.x * b - e.y * a),
+            imag + down * (e.x * a - e.y * b),
         )
         if k < j:
-            re_next, im_next = phi[j, k + 1]
-            new_re, new_im = (
-                new_re + up * (-e.x * im_next + e.y * re_next),
-                new_im + up * (e.x * re_next + e.y * im_next),
+            a, b = phi[j, k + 1]
+            real, imag = (
+                real + up * (-e.x * b + e.y * a),
+                imag + up * (e.x * a + e.y * b),
             )
-        coefficients.append(radius_powers[j] / j * (new_im if part else new_re))
+        coefficients.append(radius_powers[j] / j * (imag if part else real))
     return coefficients
