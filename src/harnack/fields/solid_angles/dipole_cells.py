@@ -158,17 +158,7 @@ class DipoleCells:
         )
         rounding = dr.fma(shift, dr.norm(gradient) + slope_error + 4 * shift * s4, rounding)
         far = SourceSums(
-            value,
-            gradient,
-            None,
-            error,
-            slope_error,
-            None,
-            rounding,
-            free,
-            s4,
-            s4 / free,
-            zero,
+            value, gradient, None, error, slope_error, None, rounding, free, s4, s4 / free, zero
         )
         first, count = index(low) + index(high) * _INDEX_BASE, dr.select(active, index(count), 0)
 

@@ -27,8 +27,8 @@ class Morph(BatchedField):
     """The slice at height w of a shape between solid a, at height 0, and solid b, at height `gap`.
 
     U_a(x, w) = w int_a dV/(|y-x|^2 + w^2)^2 is the solid angle that a, as a flat solid in four
-    dimensions, subtends at (x, w): harmonic in (x, w); for w -> 0 half of all directions, pi^2,
-    inside a, and 0 outside. The morph is the solid f > 1/2,
+    dimensions, subtends at (x, w). It is harmonic in (x, w). For w -> 0 it is pi^2, half of all
+    directions, inside a, and 0 outside. The morph is the solid f > 1/2,
 
         f(x) = (U_a(x, w) + U_b(x, gap - w))/(2 pi^2).
 
@@ -100,11 +100,13 @@ class Morph(BatchedField):
     def quadrature_displacement(
         self, points: Any, *, precision: Precision | None = None
     ) -> FloatArray:
-        """A bound (n,), to first order, of the distance of the surface through points (n, 3) from
-        the surface of the integral over the triangles, in the unit of the meshes; 0 at the ends.
+        """A bound (n,), to first order, of how far quadrature displaces the surface.
 
-        It is a bound of the error of the quadrature, far above the true error for meshes of regular
-        triangles, divided by the length of the gradient.
+        The surface is compared with the one that exact integration over the triangles would give,
+        at points (n, 3) of the surface. The bound is the bound of the error of the quadrature,
+        divided by the length of the gradient. For meshes of regular triangles the true displacement
+        is far smaller. It is a length in the unit of the meshes, and 0 if w is 0 or `gap`, where
+        there is no quadrature.
         """
         if isinstance(self._slice, MorphSlice):
             return self._slice.quadrature_displacement(points, precision)
@@ -166,7 +168,7 @@ class Morph(BatchedField):
 
 
 def _checked(mesh: Any, name: str) -> tuple[FloatArray, IntArray]:
-    """A validated mesh (vertices, faces); raises MeshError with the name of the argument."""
+    """The validated mesh (vertices, faces). Raises MeshError with the name of the argument."""
     try:
         vertices, faces = mesh
     except (TypeError, ValueError):
