@@ -40,9 +40,9 @@ if TYPE_CHECKING:
 _EDGES_PER_TRIP = 4
 # An imaginary part of a factor that would be zero is replaced by plus or minus this number.
 _TINY = 1e-36
-# A bound of the rounding of a product's angle Omega = 2 arg, in units of u, the unit roundoff. Each
-# factor adds `FACTOR_ROUNDINGS` units, and also `STEEP_ROUNDINGS` units times L e', with L and e' of
-# `LiftedEdge.bounds`.
+# Bounds of the rounding of a product's angle Omega = 2 arg, in units of u, the unit roundoff. Each
+# factor adds `FACTOR_ROUNDINGS` units, and also `STEEP_ROUNDINGS` units times L e' (see
+# `LiftedEdge.bounds`).
 #
 # Proof. Errors of arguments add up, as each step is compared with the exact product of its rounded
 # inputs. (1) `times` multiplies by F: each part of the result is off by at most u times the size of
@@ -326,7 +326,7 @@ def _factor(a: tuple[Real, Real], b: tuple[Real, Real], sa: Real, sb: Real) -> t
     a, b: the coordinates of both ends across the direction.
     sa, sb: the numbers s of both ends.
 
-    A ray that passes exactly through an edge or a vertex is treated as by
+    If the ray passes exactly through an edge or a vertex, it is treated as by
     `tree.triangle_tree.signed_crossing`: as if its v were smaller than zero by an infinitesimal
     amount, and its u by an amount infinitely smaller than that.
     """

@@ -151,7 +151,8 @@ def vertex_rounding(epsilon: float, x: Vec3, squares: Real) -> Real:
 
 
 def _edges_per_record(loops: tuple[FloatArray, ...]) -> int:
-    """Eight edges per record, or four if with eight more than a sixth of all edges were padding."""
+    """Eight edges per record, or four if padding to multiples of eight would add more than a fifth
+    to the number of edges."""
     edges = sum(len(loop) for loop in loops)
     padded = sum(-(-len(loop) // 8) * 8 for loop in loops)
     return 8 if padded <= 1.2 * edges else 4

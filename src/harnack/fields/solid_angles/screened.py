@@ -53,21 +53,21 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
 
 MAX_LENGTHS = 80.0
-"""Beyond this many screening lengths exponentials keep the value exp(-80) = 2e-35, near the end of
-the range of single precision: bounds are then too large, and values off by less than
-1e-33 area/(4 pi rho^2)."""
+"""At distances rho beyond this many screening lengths, exponentials have the value exp(-80) = 2e-35,
+because single precision holds hardly any smaller numbers. Bounds are then too large, and values off
+by less than 1e-33 area/(4 pi rho^2)."""
 
 # The factor that makes the harmonic ball smaller where the kernel falls fast.
 _BALL_SHRINKAGE = 0.1
 # The moments of a cluster are never used nearer than this many radii.
 _MIN_ACCEPTANCE = 1.5
-# For the default level: the number of pairs of a point and a dipole, and the largest and the
-# smallest number of points.
-_PAIRS, _MOST_PROBES, _LEAST_PROBES = 8_000_000, 512, 24
+# For the default level w is computed at several points. These bound the number of pairs of a point
+# and a dipole, and the number of points, which has a largest and a smallest value.
+_MAX_LEVEL_PAIRS, _MAX_LEVEL_POINTS, _MIN_LEVEL_POINTS = 8_000_000, 512, 24
 
 
 class YukawaKernel(RadialKernel):
-    """exp(-kappa r)/r on a backend; kappa: one over the screening length.
+    """The kernel exp(-kappa r)/r on a backend, with kappa one over the screening length.
 
     Kernel. K(rho) = exp(-kappa rho)/rho is the Yukawa potential: Delta K = kappa^2 K away from 0.
     With psi_0 = K and psi_(k+1) = -psi_k'/rho one has psi_k = theta_k(kappa rho) exp(-kappa rho)/
@@ -119,7 +119,7 @@ class YukawaKernel(RadialKernel):
 
 
 def thetas(t: Real, last: int) -> list[Real]:
-    """theta_0(t), ..., theta_last(t)."""
+    """The numbers theta_0(t), ..., theta_last(t) of `YukawaKernel`."""
     square = t * t
     values: list[Real] = [1.0, 1 + t]
     for k in range(2, last + 1):
@@ -130,13 +130,16 @@ def thetas(t: Real, last: int) -> list[Real]:
 def screened_promises(
     radial: RadialSums, f: Real, gradient: Vec3, kernel: YukawaKernel, size: Real, epsilon: float
 ) -> tuple[tuple[TaylorRemainder, ...], HarmonicBall]:
-    """The promises of `ScreenedWindingNumber`: of second derivatives, and a ball, which proves
-    shorter steps.
+    """The promises of `ScreenedWindingNumber`: several of second derivatives; and a ball, which
+    proves shorter steps.
 
+    radial: the sums at the point.
     f, gradient: value and gradient at the point, in units of `size`.
+    size: the length in user coordinates that is 1 here.
+    epsilon: the machine epsilon of the backend.
 
-    Radii stay below 36 screening lengths, so that exp(kappa r) times sums in which exponentials are
-    at least exp(-80) neither overflows nor grows.
+    Radii stay below 36 screening lengths. So exp(kappa r) times sums in which exponentials are at
+    least exp(-80) neither overflows nor grows.
     """
     sums, kappa = radial.sums, kernel.kappa
     nearest = fmax(sums.singularity_distance * (1 - SUM_MARGIN) - 8 * epsilon, 0)
@@ -157,12 +160,12 @@ def screened_promises(
 
 
 def accepting_distance(radius: FloatArray, kappa: float, accuracy: float) -> FloatArray:
-    """The distance r from which on the moments of a cluster are used: accuracy R Q_4(kappa
-    (r-R))^(1/5) <= r.
+    """For clusters of these radii R (k,), the distance r beyond which their moments are used: the
+    smallest r with accuracy R Q_4(kappa (r-R))^(1/5) <= r.
 
     For each unit of area, clusters of radius R on a surface cost 1/R^2 and have an error of R^3/r^5
-    Q_4; the sum of errors is smallest at a fixed cost if R is proportional to r Q_4^(-1/5).
-    Computed by bisection, from the safe side.
+    Q_4. The sum of errors is smallest at a fixed cost if R is proportional to r Q_4^(-1/5). r is
+    computed by bisection, and is never too small.
     """
     low, high = _MIN_ACCEPTANCE * radius, accuracy * radius
     for _ in range(40):
@@ -175,10 +178,10 @@ def accepting_distance(radius: FloatArray, kappa: float, accuracy: float) -> Flo
 
 
 def mean_at_dipoles(rows: FloatArray, kappa: float) -> float:
-    """The mean of w over the dipoles, or a sample of them, weighted, each without the dipoles at
-    its own position."""
+    """The mean, weighted by area, of w at the positions of the dipoles, or of some of them. Each
+    value is computed without the dipoles at its own position. rows: the records of the dipoles."""
     n = len(rows)
-    count = min(n, max(_LEAST_PROBES, min(_MOST_PROBES, _PAIRS // n)))
+    count = min(n, max(_MIN_LEVEL_POINTS, min(_MAX_LEVEL_POINTS, _MAX_LEVEL_PAIRS // n)))
     probes = np.unique(np.linspace(0, n - 1, count).astype(np.int64))
     x, y, z, *moment = np.ascontiguousarray(rows[:, :6].T)
     values: list[float] = []
@@ -196,12 +199,12 @@ def mean_at_dipoles(rows: FloatArray, kappa: float) -> float:
 MethodName = Literal["auto", "sum", "tree"]
 
 # The largest number of dipoles for which the direct sum is faster than a tree.
-_MOST_SUMMED = 2000
+_MAX_SUMMED = 2000
 # The largest number of cells that are tested in one round for an extent.
-_MOST_CELLS = 4096
+_MAX_CELLS = 4096
 _SMALLEST_LEVEL = 1e-20
 # Nearer to a dipole than `_ON_DIPOLE` roundings w may be any number up to `_ANY_LEVEL`.
-_ON_DIPOLE, _ANY_LEVEL = 32, 1e5
+_DIPOLE_ROUNDINGS, _MAX_LEVEL_AT_DIPOLE = 32, 1e5
 
 
 class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuffers"]):
@@ -277,7 +280,7 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
             areas = estimate_areas(points, normals)
         self._set_points(*validate_cloud(points, normals, areas))
         self.length, self.accuracy = float(length), float(accuracy)
-        is_small = len(self.points) <= _MOST_SUMMED
+        is_small = len(self.points) <= _MAX_SUMMED
         self.method: Literal["sum", "tree"] = (
             ("sum" if is_small else "tree") if method == "auto" else method
         )
@@ -350,7 +353,10 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
     def _cutoff_errors(
         self, data: _ScreenedBuffers, sums: SourceSums, unit: Real
     ) -> tuple[Real, Real, Real]:
-        """The additional errors of value, gradient and second derivatives by screening.
+        """The additional errors of value, gradient and second derivatives that screening causes.
+
+        sums: the sums at the points.
+        unit: the rounding of a coordinate.
 
         Exponentials are at least exp(-80) = 2e-35 (`MAX_LENGTHS`), times at most Q_3(80) exp(80) =
         9e4. Fourth derivatives of the kernel have Q_4(t) <= (1 + t/4) Q_3(t), and a coordinate is
@@ -384,8 +390,12 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         slope_error = sums.gradient_truncation + dr.fma(SLOPE_ROUNDINGS * unit, sums.s4, slope)
         # At a dipole, up to rounding, f has all values: the sample has a gradient so steep that
         # every level is close, and an error as large as the distance to such a level.
-        is_off_dipole = (sums.singularity_distance > _ON_DIPOLE * epsilon) & dr.isfinite(sums.value)
-        steep_gradient = on.backend.Array3f(0, 0, _ANY_LEVEL / (_ON_DIPOLE * epsilon))
+        is_off_dipole = (sums.singularity_distance > _DIPOLE_ROUNDINGS * epsilon) & dr.isfinite(
+            sums.value
+        )
+        steep_gradient = on.backend.Array3f(
+            0, 0, _MAX_LEVEL_AT_DIPOLE / (_DIPOLE_ROUNDINGS * epsilon)
+        )
         value = dr.select(is_off_dipole, sums.value, 0)
         gradient = dr.select(is_off_dipole, sums.gradient, steep_gradient)
         promises, ball = screened_promises(screened, value, gradient, on.kernel, on.size, epsilon)
@@ -393,7 +403,7 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
             value,
             gradient / on.size,
             promises,
-            dr.select(is_off_dipole, error, _ANY_LEVEL),
+            dr.select(is_off_dipole, error, _MAX_LEVEL_AT_DIPOLE),
             dr.select(is_off_dipole, slope_error / on.size, 0),
             truncation_error=dr.select(is_off_dipole, sums.truncation, 0),
             alternative_promises=(ball,),
@@ -407,30 +417,31 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
                 raise ValueError(f"level {level:g} is too small to be told from 0")
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """A box proved to contain the level sets; None for level 0, which may be unbounded.
+        """A box proved to contain the level sets; None for level 0, whose surface may be unbounded.
 
-        At distance D from the points |w| <= sum_i w_i Q_1(D/l)/D^2, which falls with D: beyond the
-        D where that is the smallest |level| there is no level. Cells of that box that are proved
-        empty are removed (`tight_extent`).
+        At distance D from the points |w| <= sum_i w_i Q_1(D/l)/D^2, with w_i = a_i/(4 pi). This
+        falls with D, so there is no level beyond the D at which it is the smallest |level|. Cells
+        of that box that are proved empty are removed (`tight_extent`).
         """
         if levels not in self._extents:
             self._extents[levels] = self._extent(levels)
         return self._extents[levels]
 
     def _extent(self, levels: tuple[float, ...]) -> Volume | None:
+        """`extent`, computed anew."""
         min_level = min(abs(level) for level in levels)
         if min_level < _SMALLEST_LEVEL:
             return None
         total = float(self._rows[:, 6].sum())
         low, high = 0.0, math.sqrt(total / min_level) * 1.001 + 1e-6
         for _ in range(60):
-            reach = 0.5 * (low + high)
-            t = self._kappa * reach
-            inside = total * (1 + t) * math.exp(-t) > min_level * reach * reach
-            low, high = (reach, high) if inside else (low, reach)
-        reach = 1.001 * high * self._size
-        lower, upper = self.points.min(axis=0) - reach, self.points.max(axis=0) + reach
-        return tight_extent(self, levels, lower, upper, _MOST_CELLS)
+            distance = 0.5 * (low + high)
+            t = self._kappa * distance
+            may_have_level = total * (1 + t) * math.exp(-t) > min_level * distance * distance
+            low, high = (distance, high) if may_have_level else (low, distance)
+        distance = 1.001 * high * self._size
+        lower, upper = self.points.min(axis=0) - distance, self.points.max(axis=0) + distance
+        return tight_extent(self, levels, lower, upper, _MAX_CELLS)
 
     def describe(self) -> dict[str, Any]:
         return {
