@@ -328,7 +328,7 @@ def _factor(a: tuple[Real, Real], b: tuple[Real, Real], sa: Real, sb: Real) -> t
 
     If the ray passes exactly through an edge or a vertex, it is treated as by
     `tree.triangle_tree.signed_crossing`: as if its v were smaller than zero by an infinitesimal
-    amount, and its u by an amount infinitely smaller than that.
+    amount, and its u by a much smaller infinitesimal amount.
     """
     real, (au, av), (bu, bv) = cast("Any", type(sa)), a, b
     on_ray = (au == 0) & (av == 0), (bu == 0) & (bv == 0)

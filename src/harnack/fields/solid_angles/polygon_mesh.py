@@ -189,8 +189,8 @@ class FaceSolidAngle(Field):
         return space_scaled(sample, face.size)
 
 
-# All cells are split `_MIN_DEPTH` times, cells at the sides of a box up to `_MAX_DEPTH` times; in
-# at most `_ROUNDS` rounds, and for at most `_MOST_PAIRS` pairs of an edge and a cell.
+# All cells are split `_MIN_DEPTH` times. Cells at the faces of a box are split up to `_MAX_DEPTH`
+# times, in at most `_ROUNDS` rounds, and for at most `_MAX_PAIRS` pairs of an edge and a cell.
 _MIN_DEPTH, _MAX_DEPTH, _ROUNDS, _MAX_PAIRS = 2, 7, 24, 30_000_000
 # Boxes are enlarged by this fraction of the size of a face.
 _BOX_MARGIN = 1e-4

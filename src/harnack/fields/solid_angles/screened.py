@@ -53,9 +53,9 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
 
 MAX_LENGTHS = 80.0
-"""At distances rho beyond this many screening lengths, exponentials have the value exp(-80) = 2e-35,
-because single precision holds hardly any smaller numbers. Bounds are then too large, and values off
-by less than 1e-33 area/(4 pi rho^2)."""
+"""At distances rho beyond this many screening lengths, exponentials are set to exp(-80) = 2e-35, as
+single precision holds hardly any smaller numbers. Bounds are then too large, and values off by less
+than 1e-33 area/(4 pi rho^2)."""
 
 # The factor that makes the harmonic ball smaller where the kernel falls fast.
 _BALL_SHRINKAGE = 0.1
@@ -203,8 +203,9 @@ _MAX_SUMMED = 2000
 # The largest number of cells that are tested in one round for an extent.
 _MAX_CELLS = 4096
 _SMALLEST_LEVEL = 1e-20
-# Nearer to a dipole than `_ON_DIPOLE` roundings w may be any number up to `_ANY_LEVEL`.
-_DIPOLE_ROUNDINGS, _MAX_LEVEL_AT_DIPOLE = 32, 1e5
+# A point nearer to a dipole than `_ON_DIPOLE` roundings counts as on it. There w may be any number
+# up to `_ANY_LEVEL`.
+_ON_DIPOLE, _ANY_LEVEL = 32, 1e5
 
 
 class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuffers"]):
@@ -390,12 +391,8 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         slope_error = sums.gradient_truncation + dr.fma(SLOPE_ROUNDINGS * unit, sums.s4, slope)
         # At a dipole, up to rounding, f has all values: the sample has a gradient so steep that
         # every level is close, and an error as large as the distance to such a level.
-        is_off_dipole = (sums.singularity_distance > _DIPOLE_ROUNDINGS * epsilon) & dr.isfinite(
-            sums.value
-        )
-        steep_gradient = on.backend.Array3f(
-            0, 0, _MAX_LEVEL_AT_DIPOLE / (_DIPOLE_ROUNDINGS * epsilon)
-        )
+        is_off_dipole = (sums.singularity_distance > _ON_DIPOLE * epsilon) & dr.isfinite(sums.value)
+        steep_gradient = on.backend.Array3f(0, 0, _ANY_LEVEL / (_ON_DIPOLE * epsilon))
         value = dr.select(is_off_dipole, sums.value, 0)
         gradient = dr.select(is_off_dipole, sums.gradient, steep_gradient)
         promises, ball = screened_promises(screened, value, gradient, on.kernel, on.size, epsilon)
@@ -403,7 +400,7 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
             value,
             gradient / on.size,
             promises,
-            dr.select(is_off_dipole, error, _MAX_LEVEL_AT_DIPOLE),
+            dr.select(is_off_dipole, error, _ANY_LEVEL),
             dr.select(is_off_dipole, slope_error / on.size, 0),
             truncation_error=dr.select(is_off_dipole, sums.truncation, 0),
             alternative_promises=(ball,),
