@@ -35,8 +35,8 @@ _ROUNDING = 1e-7
 # Centers of triangles must be within this fraction of the longest edge from the surface. For
 # triangles that `mesh` makes they are within a twentieth.
 _MAX_CENTER_DISTANCE = 0.1
-# At most `_MAX_TESTED` vertices or centers are tested, and the fraction `_REQUIRED_FRACTION` of them
-# must be near the surface. The first `_TESTED_FIRST` points already rule out most meshes.
+# At most `_MAX_TESTED` vertices or centers are tested, and the fraction `_REQUIRED_FRACTION` of
+# these must be near the surface. The first `_TESTED_FIRST` points already rule out most meshes.
 _MAX_TESTED, _REQUIRED_FRACTION, _TESTED_FIRST = 400, 0.99, 1
 # At `_SUMMED_POINTS` points the winding number of all triangles is computed; it must have the
 # expected value up to `_MAX_DIFFERENCE`.
