@@ -149,9 +149,9 @@ def add_edge_rates(
     line's x.
 
     m = a x v and n = e x v are a and e projected along the line and rotated by a right angle.
-    Distances in the plane perpendicular to the line are computed from them, and so is c = v . m x n.
-    So c is small if m and n are, whatever the lengths of a and e: its error is at most
-    8 epsilon |m| |e| plus slack |n|.
+    Distances in the plane perpendicular to the line are computed from them, and so is
+    c = v . m x n. So c is small if m and n are, whatever the lengths of a and e: its error is at
+    most 8 epsilon |m| |e| plus slack |n|.
     """
     a, e, inverse, slack = edge.a, edge.e, edge.inverse_square_length, line.slack
     epsilon = float(dr.epsilon(type(inverse)))

@@ -235,7 +235,8 @@ _FAR_GRADIENT_ROUNDINGS = 64.0
 _NO_SOURCE_DISTANCE = 1e4
 
 # A function that adds a primitive. Its arguments are the primitive's record, the mask of the lanes
-# on which to add it, the sums, and a further state of the caller. It returns the new sums and state.
+# on which to add it, the sums, and a further state of the caller. It returns the new sums and the
+# new state.
 AddPrimitive: TypeAlias = (
     "Callable[[list[Real], Mask, SourceSums, ExtraState], tuple[SourceSums, ExtraState]]"
 )

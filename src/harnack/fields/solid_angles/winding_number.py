@@ -608,7 +608,7 @@ class _WindingOnInterval(Field):
     on: the data of the winding number.
     frame: the frame of the rays.
     behind: the crossing at the start of the interval, in unit lengths.
-    offset: the sum of the signs of all crossings ahead of the start.
+    offset: the sum of the signs of all crossings ahead of the start; only the exact method uses it.
     detail: the accuracy scale.
     """
 
