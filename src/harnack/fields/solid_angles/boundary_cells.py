@@ -46,7 +46,8 @@ if TYPE_CHECKING:
 
 __all__ = ["BoundaryCells"]
 
-_TURNS_PER_STERADIAN = 1 / (4 * math.pi)
+# One over the solid angle of all directions.
+_PER_SPHERE = 1 / (4 * math.pi)
 # The boundary of a broken mesh consists of many small loops, and its cells must be built fast. So a
 # cell may have `_NEAR_FACTOR` times as many near edges as a cell of a single curve. If a cell is
 # split, edges farther than `_SHARED_RADII` radii from its center are in the expansions of all cells
@@ -154,17 +155,15 @@ class BoundaryCells:
         turns, is_clear = self.rays.signed_crossings_between(frame, distance, unit, inside)
         on_triangle = jump_sum_within(self.rays, x, _TRIANGLE_ROUNDINGS * unit, inside)
         estimate = (
-            dr.gather(real, self.center_values, local.cell, inside)
-            - turns
-            + _TURNS_PER_STERADIAN * change
+            dr.gather(real, self.center_values, local.cell, inside) - turns + _PER_SPHERE * change
         )
-        value = _TURNS_PER_STERADIAN * local.sums.angle
+        value = _PER_SPHERE * local.sums.angle
         offset = estimate - value
         branch = dr.round(offset)
         error = local.error + local.rounding
         is_valid = inside & is_certain & is_clear & (on_triangle == 0)
         is_valid &= (dr.abs(offset - branch) < _MAX_BRANCH_ERROR) & (
-            _TURNS_PER_STERADIAN * error < _MAX_BRANCH_ERROR
+            _PER_SPHERE * error < _MAX_BRANCH_ERROR
         )
         return dr.select(is_valid, value + branch, dr.nan)
 
@@ -199,14 +198,13 @@ class BoundaryCells:
 
             ray_promises = lipschitz_along(line, sums.gradient, sums.distance, rates)
         sample = Sample(
-            _TURNS_PER_STERADIAN * sums.angle,
-            _TURNS_PER_STERADIAN * sums.gradient,
-            tuple(promise.scaled(_TURNS_PER_STERADIAN) for promise in promises),
-            _TURNS_PER_STERADIAN * (cell_sums.error + rounded),
-            _TURNS_PER_STERADIAN
-            * dr.fma(SLOPE_ROUNDINGS / 3 * unit, sums.cubes, cell_sums.slope_error),
-            truncation_error=_TURNS_PER_STERADIAN * cell_sums.error,
-            alternative_promises=(ball.scaled(_TURNS_PER_STERADIAN),),
-            ray_promises=tuple(promise.scaled(_TURNS_PER_STERADIAN) for promise in ray_promises),
+            _PER_SPHERE * sums.angle,
+            _PER_SPHERE * sums.gradient,
+            tuple(promise.scaled(_PER_SPHERE) for promise in promises),
+            _PER_SPHERE * (cell_sums.error + rounded),
+            _PER_SPHERE * dr.fma(SLOPE_ROUNDINGS / 3 * unit, sums.cubes, cell_sums.slope_error),
+            truncation_error=_PER_SPHERE * cell_sums.error,
+            alternative_promises=(ball.scaled(_PER_SPHERE),),
+            ray_promises=tuple(promise.scaled(_PER_SPHERE) for promise in ray_promises),
         )
         return sample, inside & (sums.distance > _EDGE_ROUNDINGS * unit)

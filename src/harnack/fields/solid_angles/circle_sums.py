@@ -330,41 +330,39 @@ class CircleSet:
         def add(row: list[Real], rates: tuple[Any, ...]) -> tuple[Any, ...]:
             """The bounds `rates`, with those of the circle in a record added."""
             relative = self._relative(row, line.x)
-            slack, normal_part = line.slack, fmin(dr.abs(dr.dot(relative.normal, line.v)), 1)
-            plane_part = dr.sqrt(fmax(1 - normal_part * normal_part, 0))
+            slack, axial = line.slack, fmin(dr.abs(dr.dot(relative.normal, line.v)), 1)
+            across = dr.sqrt(fmax(1 - axial * axial, 0))
             # `normal_part` is a sum of numbers of order one: its rounding may be large relative to
             # it.
-            normal_part += 4 * float(dr.epsilon(line.x))
+            axial += 4 * float(dr.epsilon(line.x))
             height = dr.abs(relative.circle.z) * relative.a + slack
             # The line is projected onto the circle's plane. At the position s on the line, its
             # distance from the axis is |outward + s plane_direction|.
-            plane_direction = dr.fma(
-                vector(-dr.dot(relative.normal, line.v)), relative.normal, line.v
-            )
-            square = dr.squared_norm(plane_direction)
+            flat_v = dr.fma(vector(-dr.dot(relative.normal, line.v)), relative.normal, line.v)
+            square = dr.squared_norm(flat_v)
             closest = dr.select(
                 square > 0,
-                -dr.dot(relative.outward, plane_direction) / square,
+                -dr.dot(relative.outward, flat_v) / square,
                 0,
             )
             new_rates: list[Real] = []
             for length, rate in zip(lengths, rates, strict=True):
                 positions = (clamp(closest, -length, length), -length, length)
-                least_r, start_r, end_r = (
-                    dr.norm(dr.fma(vector(s), plane_direction, relative.outward)) for s in positions
+                lowest, first, last = (
+                    dr.norm(dr.fma(vector(s), flat_v, relative.outward)) for s in positions
                 )
                 passing = fmax(
-                    least_r - relative.a,
-                    relative.a - fmax(start_r, end_r),
+                    lowest - relative.a,
+                    relative.a - fmax(first, last),
                 )
                 # near and far: the distances d and P at all points of the line within `length`.
                 near = fmax(relative.distance - length, passing) - slack
                 far = fmax(relative.farthest - length, near + slack) - slack
                 bound = 2 * math.pi * relative.a / (near * far)
-                root_mean = dr.sqrt(0.5 * (dr.rcp(near * near) + dr.rcp(far * far)))
-                max_height = dr.fma(length, normal_part, height)
-                circle_rate = bound * dr.fma(plane_part * max_height, root_mean, normal_part)
-                new_rates.append(rate + dr.select(near > 0, circle_rate, dr.inf))
+                mean = dr.sqrt(0.5 * (dr.rcp(near * near) + dr.rcp(far * far)))
+                max_height = dr.fma(length, axial, height)
+                term = bound * dr.fma(across * max_height, mean, axial)
+                new_rates.append(rate + dr.select(near > 0, term, dr.inf))
             return tuple(new_rates)
 
         start = tuple(real(0) for _ in lengths)

@@ -436,6 +436,7 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         return field
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
+        """Values and derivatives at points x: see `BatchedField.values_at`."""
         data = self._batch_data(backend_of(x))
         x = data.to_unit(x)
         weight = float(self.areas.sum()) / self._size**2
@@ -446,6 +447,8 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         )
 
     def sharp_values_at(self, x: Vec3) -> PointValues:
+        """Values and gradients at points x. The accuracy is increased until the error of the
+        gradient is about 1 % of its length, unless the user chose the accuracy."""
         if self.accuracy is not None:
             return self.values_at(x, 1)
         return sharpened(lambda points, factor: self.values_at(points, 1, factor), x)
@@ -457,6 +460,7 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         return self._given_hierarchy or dipole_hierarchy((self.points - self._center) / self._size)
 
     def _upload(self, backend: Backend, *, traced: bool) -> _DipoleData:
+        """The data on a backend, for tracing or for values at points."""
         accuracy = self.accuracy or (_TRACING_ACCURACY if traced else _VALUES_ACCURACY)
         unit = (self.points - self._center) / self._size
         # Areas scale with the square of lengths; the potential is invariant under scaling.
@@ -497,10 +501,13 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         return 1.001 * (float(np.abs(unit).max()) + margin)
 
     def cells_pay_from(self) -> float:
+        """The smallest number of rays for which cells pay; infinite for large clouds and for
+        smoothed sums."""
         is_small = len(self.points) <= _MAX_POINTS and not self.smoothing
         return max(_LEAST_RAYS, _PAYS * len(self.points)) if is_small else math.inf
 
     def finer_cells_pay_from(self) -> float:
+        """The smallest number of rays for which smaller cells pay."""
         return _FINER_PAYS_PER_POINT * len(self.points)
 
     def prepare(self, backend: Backend) -> Self:
@@ -510,6 +517,7 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         return prepared
 
     def _sample(self, on: _DipoleData, p: Vec3, detail: Real) -> Sample:
+        """The sample at p, from the data `on` of a backend, at the accuracy scale `detail`."""
         return on.sample(p, detail)
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
@@ -529,6 +537,8 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
 
     @property
     def singular_points(self) -> FloatArray:
+        """The points (n, 3) at which f is singular: those with an area, if the sum is not
+        smoothed."""
         return np.zeros((0, 3)) if self.smoothing else self.points[self.areas > 0]
 
     @property

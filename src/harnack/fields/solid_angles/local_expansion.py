@@ -168,16 +168,19 @@ class _AbsoluteValues:
         self.number = number
 
     def __add__(self, other: Any) -> _AbsoluteValues:
+        """The sum of absolute values; also for differences."""
         return _AbsoluteValues(
             self.number + np.abs(other.number if isinstance(other, _AbsoluteValues) else other)
         )
 
     def __mul__(self, other: Any) -> _AbsoluteValues:
+        """The product of absolute values."""
         return _AbsoluteValues(
             self.number * np.abs(other.number if isinstance(other, _AbsoluteValues) else other)
         )
 
     def __neg__(self) -> _AbsoluteValues:
+        """The number itself, as its sign does not count."""
         return self
 
     __radd__ = __sub__ = __rsub__ = __add__

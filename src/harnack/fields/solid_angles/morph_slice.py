@@ -101,11 +101,14 @@ class SlicedKernel(RadialKernel):
     """
 
     def __init__(self, backend: Backend, height: float) -> None:
+        """height: w, in the unit of the distances."""
         self.height = dr.opaque(backend.Float, height)
         self.height_square = dr.opaque(backend.Float, height * height)
         self._degree = _DEGREES[np.dtype(backend.dtype).itemsize]
 
     def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
+        """psi_0 to psi_last, from the last i_n, which is a polynomial, and the recurrence for the
+        others."""
         del distance
         c = self.height * inverse
         s2 = dr.fma(-c, c, 1)
@@ -351,6 +354,7 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         return tuple(len(dipoles.rows) for dipoles in self._dipoles)
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
+        """Values and derivatives at points x: see `BatchedField.values_at`."""
         buffers = self._batch_data(backend_of(x))
         x = buffers.to_unit(x)
         sums = buffers.sums(x, closer, derivatives).sums
@@ -393,6 +397,8 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         return evaluate_points(points, kernel, precision)[0]
 
     def _upload(self, backend: Backend, *, traced: bool) -> _SliceBuffers:
+        """The quadrature points on a backend. They are the same for tracing and for values at
+        points."""
         del traced
         clouds = tuple(
             RadialTreecode(
@@ -403,6 +409,7 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         return _SliceBuffers(*frame_parameters(backend, self._center, self._size), clouds)
 
     def _sample(self, on: _SliceBuffers, p: Vec3, detail: Real) -> Sample:
+        """The sample at p, from the data `on` of a backend, at the accuracy scale `detail`."""
         return on.sample(p, detail)
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
@@ -424,6 +431,8 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         return self._extents[levels]
 
     def occupied_cells(self, levels: tuple[float, ...]) -> OccupancyGrid:
+        """Cells over the extent, without those that are proved to contain no level; computed
+        once."""
         if levels not in self._occupied:
             self._occupied[levels] = occupied_cells(
                 self, levels, self.extent(levels), _CELLS_ACROSS

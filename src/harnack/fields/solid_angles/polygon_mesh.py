@@ -445,13 +445,16 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
         )
 
     def _upload(self, backend: Backend) -> _MeshBuffers:
+        """The faces' boxes and boundary curves on a backend."""
         boxes = PatchBoxes.upload(backend, *self.boxes())
         return _MeshBuffers(boxes, FaceLoops.upload(backend, self.faces))
 
     def patch(self, index: Any) -> Field:
+        """The solid angle of the face with this index, which may differ from lane to lane."""
         return self._require_data().curves.face(index)
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
+        """Raise ValueError for a level that is a multiple of 4 pi."""
         for level in levels:
             if abs(math.remainder(float(level), PERIOD)) < _LEVEL_MARGIN:
                 raise ValueError(

@@ -78,6 +78,7 @@ class RadialSum(abc.ABC):
     """
 
     def __init__(self, backend: Backend, rows: FloatArray, kernel: RadialKernel) -> None:
+        """rows: (n, 8) the records of the dipoles, from `dipole_records`."""
         self.backend, self.kernel = backend, kernel
         self.rounding = dr.opaque(backend.Float, 12 * backend.machine_epsilon)
 
@@ -110,6 +111,7 @@ class DirectSum(RadialSum):
         self._records = RecordTable.upload(backend, rows, empty_record(rows[0]), _DIPOLES_PER_TRIP)
 
     def accumulate(self, sums: RadialSums, x: Vec3, closer: Real) -> RadialSums:
+        """The sums with the terms of all dipoles added; `closer` has no effect."""
         del closer
         derivatives = sums.sums.derivatives
 
@@ -127,10 +129,12 @@ class RadialTreecode(RadialSum):
     def __init__(
         self, backend: Backend, dipoles: ClusteredDipoles, kernel: RadialKernel, accuracy: float
     ) -> None:
+        """accuracy: as for `RadialKernel.accepting_distance`."""
         super().__init__(backend, dipoles.rows, kernel)
         self._tree = dipoles.packed(backend, kernel, accuracy)
 
     def accumulate(self, sums: RadialSums, x: Vec3, closer: Real) -> RadialSums:
+        """The sums with the terms of near dipoles and far clusters added."""
         closer = fmax(self.backend.Float(closer), self.backend.Float(1))
         derivatives = sums.sums.derivatives
 

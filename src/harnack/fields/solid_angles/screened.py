@@ -92,14 +92,17 @@ class YukawaKernel(RadialKernel):
     """
 
     def __init__(self, backend: Backend, kappa: float) -> None:
+        """kappa: one over the screening length, in the unit of the distances."""
         self._number = kappa
         self.kappa = dr.opaque(backend.Float, kappa)
 
     def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
+        """psi_0 to psi_last at a distance, by the polynomials theta_k."""
         t = fmin(self.kappa * distance, MAX_LENGTHS)
         return KernelValues(dr.exp(-t) * inverse, thetas(t, last))
 
     def bounds(self, distance: Real, last: int) -> list[Real]:
+        """Q_2 to Q_last for t = kappa times the distance, by their sums of powers of t."""
         t = fmin(self.kappa * distance, MAX_LENGTHS)
         decay = dr.exp(-t)
         sum2 = dr.fma(t, dr.fma(t, 0.5, 1), 1)
@@ -337,6 +340,7 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         )
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
+        """Values and derivatives at points x: see `BatchedField.values_at`."""
         data = self._batch_data(backend_of(x))
         x = data.to_unit(x)
         sums, epsilon = data.dipoles.sums(x, closer, derivatives).sums, data.backend.machine_epsilon
@@ -370,6 +374,8 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         return value_error, 2 * value_error * inverse, hessian_error
 
     def _upload(self, backend: Backend, *, traced: bool) -> _ScreenedBuffers:
+        """The kernel and the dipoles on a backend. They are the same for tracing and for values at
+        points."""
         del traced
         kernel = YukawaKernel(backend, self._kappa)
         if self.method == "sum":
@@ -383,6 +389,7 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         )
 
     def _sample(self, on: _ScreenedBuffers, p: Vec3, detail: Real) -> Sample:
+        """The sample at p, from the data `on` of a backend, at the accuracy scale `detail`."""
         x = on.to_unit(p)
         screened, epsilon = on.dipoles.sums(x, detail, 1), on.backend.machine_epsilon
         sums, unit = screened.sums, coordinate_rounding(x)

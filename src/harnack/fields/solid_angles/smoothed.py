@@ -62,6 +62,7 @@ class SmoothedKernel(RadialKernel):
         self.height_square = dr.opaque(backend.Float, height * height)
 
     def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
+        """psi_0 to psi_last, by the closed form above: `factor` is (2k-1)!!, `half` is q/2."""
         del distance
         half = 0.5 * self.height_square * inverse * inverse
         thetas: list[Real] = []
@@ -72,6 +73,7 @@ class SmoothedKernel(RadialKernel):
         return KernelValues(inverse, thetas)
 
     def bounds(self, distance: Real, last: int) -> list[Real]:
+        """Q_2 to Q_last, for all distances of at least `_BOUND_FRACTION` times `distance`."""
         ratio = dr.sqrt(self.height_square) / (_BOUND_FRACTION * fmax(distance, 1e-30))
         q = fmin(ratio * ratio, 1)
         return [dr.fma(0.25 * (m + 1) * (m + 2), q, 1) for m in range(2, last + 1)]

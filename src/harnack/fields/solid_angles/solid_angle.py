@@ -183,6 +183,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
 
     @property
     def boundary_curves(self) -> tuple[FloatArray, ...]:
+        """The curves as polygons, without edges that cancel each other."""
         return (*self._net_loops, *(circle.polygon(_CIRCLE_SIDES) for circle in self._net_circles))
 
     def _points_around(self) -> FloatArray:
@@ -226,6 +227,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return "edges" if option == "edges" else "range"
 
     def _upload(self, backend: Backend, *, traced: bool) -> _CurveData:
+        """The data on a backend. traced: whether they are for tracing, which may use cells, or for
+        values at points."""
         # Centered and scaled to unit size: products of eight lengths stay far from overflow. The
         # backend's precision holds the center exactly, so that subtracting it near the curve is
         # exact.
@@ -292,6 +295,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
     def _evaluate_points(
         self, points: Any, precision: Precision | None, choose: Callable[[Sample], Any]
     ) -> npt.NDArray[Any]:
+        """As `Field._evaluate_points`, by a field without cells, because values at points are those
+        of all edges."""
         if self.has_variable_accuracy:
             return self._without_cells._evaluate_points(points, precision, choose)
         return super()._evaluate_points(points, precision, choose)
@@ -468,6 +473,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return tuple(loop for loop in self._differentiable_loops if _is_drjit(loop))
 
     def differentiable_value(self, p: Vec3) -> Real:
+        """f at p as an expression that Dr.Jit can differentiate by p and by the vertices of
+        loops."""
         backend = backend_of(p)
         # If vertices can move one by one, all edges are summed: after a move they may not cancel.
         loops = self._differentiable_loops or self._net_loops
@@ -497,6 +504,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return map_batches(backend, changes, p, q)[0]
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
+        """Raise ValueError for a level that is a multiple of 4 pi, if all edges cancel each
+        other."""
         for level in levels:
             if self._all_cancel and abs(math.remainder(float(level), _PERIOD)) < _LEVEL_MARGIN:
                 raise ValueError(
@@ -557,6 +566,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return field
 
     def cells_pay_from(self) -> float:
+        """The smallest number of rays for which cells pay; infinite if they never pay, or if there
+        can be no cells."""
         edges = sum(map(len, self._net_loops))
         is_fixed = not self._differentiable_loops and self.lift_bound_option != "paper"
         never_pays = not is_fixed or edges < _MIN_EDGES
@@ -711,14 +722,12 @@ def _convex_ball(angle: Real, distance: Real, error: Real) -> HarmonicBall:
     """
     principal = angle - _PERIOD * dr.round(angle / _PERIOD)
     branch = angle - principal
-    widening = dr.select(dr.abs(principal) > 0.5 * _PERIOD - error, _PERIOD, 0)
-    lower_widening, upper_widening = (
-        dr.select(principal < 0, widening, 0),
-        dr.select(principal > 0, widening, 0),
+    extra = dr.select(dr.abs(principal) > 0.5 * _PERIOD - error, _PERIOD, 0)
+    below, above = (
+        dr.select(principal < 0, extra, 0),
+        dr.select(principal > 0, extra, 0),
     )
-    return HarmonicBall(
-        distance, branch - 1.5 * _PERIOD - lower_widening, branch + 1.5 * _PERIOD + upper_widening
-    )
+    return HarmonicBall(distance, branch - 1.5 * _PERIOD - below, branch + 1.5 * _PERIOD + above)
 
 
 def _ray_promises(

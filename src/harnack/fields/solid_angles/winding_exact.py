@@ -43,7 +43,8 @@ if TYPE_CHECKING:
     from harnack.fields.capabilities import JumpCrossing
     from harnack.fields.solid_angles.winding_mesh import WindingMesh
 
-_TURNS_PER_STERADIAN = 1 / (4 * math.pi)
+# One over the solid angle of all directions.
+_PER_SPHERE = 1 / (4 * math.pi)
 
 
 @dataclass(frozen=True)
@@ -131,7 +132,7 @@ class ExactWinding:
             return PointValues(turns, real(self.rounding), *zeros, real(0), real(0))
         sums, unit = lifted_sums(self.edges, x, derivatives).total(), coordinate_rounding(x)
         sums = sums.add_term(SourceTerm(4 * math.pi * turns), True)
-        return sums.values(_TURNS_PER_STERADIAN, unit, self.rounding)
+        return sums.values(_PER_SPHERE, unit, self.rounding)
 
     def crossings_ahead(self, frame: RayFrame, t: Real, active: Mask) -> Real:
         """The sum of the signs of all crossings beyond the parameter t of rays. It is the part of w
@@ -166,4 +167,4 @@ class ExactWinding:
             return line_rates(loops, line, lengths, lanes & active)
 
         promises = lipschitz_along(line, sums.gradient, sums.singularity_distance, rates)
-        return sums.sample(_TURNS_PER_STERADIAN, unit, self.rounding, along=promises)
+        return sums.sample(_PER_SPHERE, unit, self.rounding, along=promises)

@@ -113,6 +113,7 @@ class WindingModuloOne(Field):
         return self._winding.evaluate_modulo_one(p)
 
     def at_accuracy(self, detail: Real) -> Field:
+        """The same field with samples of this accuracy scale."""
         return EvaluateOnly(lambda p: self._winding.evaluate_modulo_one(p, detail))
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
@@ -316,11 +317,14 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return self.mesh.input_face
 
     def prepare(self, backend: Backend) -> Self:
+        """A copy with its data on a backend, for tracing."""
         prepared = super().prepare(backend)
         prepared.coarsest_accuracy = prepared._require_data().winding.coarsest_detail
         return prepared
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
+        """Values and derivatives at points x: see `BatchedField.values_at`. With a tree, second
+        derivatives come from the boundary, unless the user chose the accuracy."""
         data = self._batch_data(backend_of(x))
         winding, x = data.winding, data.to_unit(x)
         if isinstance(winding, TreeWinding):
@@ -336,6 +340,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return self._stated(data, x, values)
 
     def sharp_values_at(self, x: Vec3) -> PointValues:
+        """Values and gradients at points x. With a tree, gradients come from the boundary, unless
+        the user chose the accuracy."""
         data = self._batch_data(backend_of(x))
         winding = data.winding
         if not isinstance(winding, TreeWinding) or self.accuracy is not None:
@@ -368,6 +374,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         )
 
     def _upload(self, backend: Backend, *, traced: bool) -> _WindingData:
+        """The data on a backend, for tracing or for values at points."""
         accuracy = self.accuracy or (_TRACING_ACCURACY if traced else _VALUES_ACCURACY)
         mesh = self.mesh
         rays = TriangleTree.of(backend, mesh.ray_tree, mesh.ray_records)
@@ -417,9 +424,12 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
 
     @property
     def has_unknown_branch(self) -> bool:
+        """Whether samples along rays may know w only up to an integer, as those of cells of edges
+        do."""
         return self._device is not None and self._device.cells is not None
 
     def cells_pay_from(self) -> float:
+        """The smallest number of rays for which cells pay; infinite if they never pay."""
         edges, triangles = len(self.mesh.singular_edges), len(self.mesh.triangles)
         if self._is_soup:
             is_small = triangles <= _MOST_OF_SOUP
@@ -467,6 +477,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return outside.select(inside, space_scaled(in_cells, data.size))
 
     def value_if_cheap(self, p: Vec3, rounding: Real, active: Mask) -> Real:
+        """w at p where it follows from the cell that contains p, else NaN. rounding: the rounding
+        of a coordinate of p."""
         data = self._data_for(p)
         if data.cells is None:
             return data.backend.Float(dr.nan)
@@ -483,6 +495,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
     def next_jump(
         self, o: Vec3, d: Vec3, after: JumpCrossing, t_max: Real, active: Mask
     ) -> JumpCrossing:
+        """The next crossing of a triangle on each ray, after the crossing `after` and up to
+        t_max."""
         data = self._data_for(o)
         frame = RayFrame.along(data.backend, data.to_unit(o), d)
         behind = (after.t / data.size, after.facet)
@@ -491,6 +505,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return JumpCrossing(t * data.size, facet, -sign, -normal)
 
     def initial_offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
+        """The sum of the signs of all crossings beyond t_min, for the exact method; otherwise 0."""
         data = self._data_for(o)
         if self.only_sheets:
             return data.backend.Float(0)
@@ -498,6 +513,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return data.winding.crossings_ahead(frame, t_min / data.size, active)
 
     def is_of_sheets_alone(self, levels: tuple[float, ...]) -> bool:
+        """Whether the surface of these levels is the mesh itself (`own_sheet`); computed once."""
         if len(levels) != 1:
             return False
         if levels not in self._own_levels:
@@ -505,6 +521,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return self._own_levels[levels]
 
     def with_levels(self, levels: tuple[float, ...]) -> WindingNumber:
+        """The field by which these levels are traced. If the surface is the mesh itself, this is a
+        copy that has the level only at its triangles."""
         if not self.is_of_sheets_alone(levels):
             return self
         field = self.with_cells(False)
@@ -514,6 +532,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
     def continuation(
         self, o: Vec3, d: Vec3, behind: JumpCrossing, ahead: JumpCrossing, offset: Real
     ) -> Field:
+        """w on a ray between the crossings `behind` and `ahead`, as a field without jumps."""
         if self.only_sheets:
             return _BesideSheets(self._data_for(o).backend, self._level_of_sheets, behind, ahead)
         data = self._data_for(o)
@@ -522,12 +541,14 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return _WindingOnInterval(data, frame, start, offset)
 
     def distance_to_jumps(self, p: Vec3) -> Real:
+        """A lower bound of the distance from p to the triangles."""
         data = self._data_for(p)
         return distance_lower_bound(data.rays, data.to_unit(p)) * data.size
 
     def nearest_facet(
         self, p: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
     ) -> NearestFacet:
+        """The nearest triangle after the one given by `after`, within the distance `limit`."""
         data = self._data_for(p)
         facet = next_closest_triangle(
             data.rays, data.to_unit(p), after, dr.square(limit / data.size), active
@@ -541,9 +562,11 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         )
 
     def jump_mesh(self) -> tuple[FloatArray, IntArray, bool] | None:
+        """Vertices, triangles, and whether the mesh is closed."""
         return self.mesh.vertices, self.mesh.triangles, not len(self.mesh.singular_edges)
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
+        """Raise ValueError for level 0, which is no surface."""
         for level in levels:
             if abs(level) < 1e-6:
                 raise ValueError("level 0 of a winding number is no surface; try 0.5")
@@ -627,12 +650,16 @@ class _WindingOnInterval(Field):
 
     @property
     def has_unknown_branch(self) -> bool:
+        """Whether samples may know w only up to an integer."""
         return self._on.cells is not None
 
     def at_accuracy(self, detail: Real) -> Field:
+        """The same function with samples of this accuracy scale."""
         return _WindingOnInterval(self._on, self._frame, self._behind, self._offset, detail)
 
     def evaluate(self, p: Vec3) -> Sample:
+        """A sample of w, from the cells where they are used. There it is w up to an integer, and
+        marked as such."""
         data, frame = self._on, self._frame
         x, detail = data.to_unit(p), self._detail
         if data.cells is None:
@@ -664,4 +691,5 @@ class _BesideSheets(Field):
         self._value = dr.select(jump > 0, real(level + 0.5), level - 0.5)
 
     def evaluate(self, p: Vec3) -> Sample:
+        """The sample of the constant."""
         return Sample(self._value, 0 * p, (Lipschitz(0.0),), 0.0)

@@ -104,9 +104,12 @@ def edges_of(row: list[Real], x: Vec3, frame: RayFrame | VerticalRayFrame) -> It
         yield NearEdge(edge, row[SINGULAR + k] > 0)
 
 
+# A function of a triangle's record and the parameter t of a crossing with it: whether the crossing
+# is ahead.
 IsAhead: TypeAlias = "Callable[[list[Real], Real], Mask]"
 
-_TURNS_PER_STERADIAN = 1 / (4 * math.pi)
+# One over the solid angle of all directions.
+_PER_SPHERE = 1 / (4 * math.pi)
 
 
 @dataclass(frozen=True)
@@ -182,7 +185,7 @@ class TreeWinding:
             return t > 0
 
         sums = self._sums(VerticalRayFrame(x), x, detail, unit, is_ahead, derivatives)
-        return self.clusters.values(sums, _TURNS_PER_STERADIAN, unit, self.rounding)
+        return self.clusters.values(sums, _PER_SPHERE, unit, self.rounding)
 
     def _sums(
         self,
@@ -289,7 +292,7 @@ class TreeWinding:
         promises = lipschitz_along(
             line, sums.gradient, sums.singularity_distance, self._rates(line, active)
         )
-        return sums.sample(_TURNS_PER_STERADIAN, unit, self.rounding, along=promises)
+        return sums.sample(_PER_SPHERE, unit, self.rounding, along=promises)
 
     def _rates(self, line: RayLine, where: Mask) -> Rates:
         """Returns a function that computes bounds of the derivative of 4 pi w along a line, as
