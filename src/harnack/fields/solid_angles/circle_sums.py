@@ -133,11 +133,7 @@ class UnitCircle:
         radial = first * inverse * bracket / (kc * kc)
         third = 4 * second * inverse / square
         near_form = 2 * inverse * (first + (gap * (1 + r) - z * z) / square * second)
-        axial = dr.select(
-            first * square < 2 * second,
-            near_form,
-            third - kc_gap * kc_gap * radial,
-        )
+        axial = dr.select(first * square < 2 * second, near_form, third - kc_gap * kc_gap * radial)
         return cls(r, z, -dr.mulsign(w, z), nearest, farthest, q, radial, axial, third)
 
     @property
@@ -332,29 +328,21 @@ class CircleSet:
             relative = self._relative(row, line.x)
             slack, axial = line.slack, fmin(dr.abs(dr.dot(relative.normal, line.v)), 1)
             across = dr.sqrt(fmax(1 - axial * axial, 0))
-            # `normal_part` is a sum of numbers of order one: its rounding may be large relative to
-            # it.
+            # `axial` is a sum of numbers of order one: its rounding may be large relative to it.
             axial += 4 * float(dr.epsilon(line.x))
             height = dr.abs(relative.circle.z) * relative.a + slack
             # The line is projected onto the circle's plane. At the position s on the line, its
-            # distance from the axis is |outward + s plane_direction|.
+            # distance from the axis is |outward + s flat_v|.
             flat_v = dr.fma(vector(-dr.dot(relative.normal, line.v)), relative.normal, line.v)
             square = dr.squared_norm(flat_v)
-            closest = dr.select(
-                square > 0,
-                -dr.dot(relative.outward, flat_v) / square,
-                0,
-            )
+            closest = dr.select(square > 0, -dr.dot(relative.outward, flat_v) / square, 0)
             new_rates: list[Real] = []
             for length, rate in zip(lengths, rates, strict=True):
                 positions = (clamp(closest, -length, length), -length, length)
                 lowest, first, last = (
                     dr.norm(dr.fma(vector(s), flat_v, relative.outward)) for s in positions
                 )
-                passing = fmax(
-                    lowest - relative.a,
-                    relative.a - fmax(first, last),
-                )
+                passing = fmax(lowest - relative.a, relative.a - fmax(first, last))
                 # near and far: the distances d and P at all points of the line within `length`.
                 near = fmax(relative.distance - length, passing) - slack
                 far = fmax(relative.farthest - length, near + slack) - slack

@@ -411,10 +411,7 @@ def _octree(
         radius = math.sqrt(3) * side * BALL_MARGIN
         is_last = len(levels) == MAX_DEPTH
         limit = dr.opaque(backend.UInt32, _UNLIMITED if is_last else most_near)
-        near, none_stay = (
-            dr.opaque(backend.Float, _NEAR * radius),
-            dr.opaque(backend.Float, -1.0),
-        )
+        near, none_stay = (dr.opaque(backend.Float, _NEAR * radius), dr.opaque(backend.Float, -1.0))
         roots, c = (
             root.subset(backend, np.zeros(len(centers), np.int64)),
             to_vector3(backend, centers),

@@ -314,15 +314,9 @@ def _rotated_coefficients(phi: dict[Any, list[Any]], e: Vec3, radius: Real) -> l
             a, b = phi[j, k - 1]
         else:  # L_j,-1 = -conj L_j1
             a, b = -phi[j, 1][0], phi[j, 1][1]
-        real, imag = (
-            real + down * (-e.x * b - e.y * a),
-            imag + down * (e.x * a - e.y * b),
-        )
+        real, imag = (real + down * (-e.x * b - e.y * a), imag + down * (e.x * a - e.y * b))
         if k < j:
             a, b = phi[j, k + 1]
-            real, imag = (
-                real + up * (-e.x * b + e.y * a),
-                imag + up * (e.x * a + e.y * b),
-            )
+            real, imag = (real + up * (-e.x * b + e.y * a), imag + up * (e.x * a + e.y * b))
         coefficients.append(radius_powers[j] / j * (imag if part else real))
     return coefficients

@@ -723,10 +723,7 @@ def _convex_ball(angle: Real, distance: Real, error: Real) -> HarmonicBall:
     principal = angle - _PERIOD * dr.round(angle / _PERIOD)
     branch = angle - principal
     extra = dr.select(dr.abs(principal) > 0.5 * _PERIOD - error, _PERIOD, 0)
-    below, above = (
-        dr.select(principal < 0, extra, 0),
-        dr.select(principal > 0, extra, 0),
-    )
+    below, above = (dr.select(principal < 0, extra, 0), dr.select(principal > 0, extra, 0))
     return HarmonicBall(distance, branch - 1.5 * _PERIOD - below, branch + 1.5 * _PERIOD + above)
 
 
