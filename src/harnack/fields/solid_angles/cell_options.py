@@ -1,16 +1,16 @@
 """The argument `cells` of fields that may have FMM cells, and the decision whether cells pay.
 
-Fields with cells (`dipole_cells`, `curve_cells`) take an argument `cells`: None for cells where
-they pay, True for cells in any case, False for no cells, or the number of megabytes that they may
-take.
+Fields with cells (`dipole_cells`, `curve_cells`) take an argument `cells`. None builds cells if
+they pay, True builds cells in any case, and False builds none. A number builds cells in any case
+and limits their memory to this number of megabytes.
 
 `trace`, `render`, and views that Python draws tell a field the number of rays
-(`Field.for_ray_count`), and the field builds cells if that pays: building the cells of a cloud
-costs as much as about six rays per point without cells. Solids pass the number on to their
-operands.
+(`Field.for_ray_count`). The field builds cells if that pays: to build the cells of a cloud takes as
+long as to trace about six rays per point without cells. Solids tell their operands the number, too.
 
 Values at points use cells if the user requested cells, whatever the number of points. If that
-number decided, values of a block of points could lie outside of the bounds for all points.
+number decided, the values of a part of the points could differ from those of all points by more
+than their error bounds.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""Builds FMM cells of curves (`curve_cells`), one octree level at a time.
+"""Builds FMM cells of curves (`curve_cells`), one octree depth at a time.
 
 A cell inherits the local expansion and the near list of its parent. Edges of that list that are far
-from the cell move into the expansion, so that a cell costs as much as the near list of its parent,
-and not as the whole curve. All edges are visited only for bounds of the far field.
+from the cell are added to the expansion. So the work for a cell is proportional to the near list of
+its parent, and not to the whole curve. All edges are visited only for bounds of the far edges.
 
-- `build_curve_cells`: the cells of a cube, with a limit of their bytes.
+- `build_curve_cells`: builds the cells of a cube, with a limit of their bytes.
 """
 
 from __future__ import annotations
@@ -225,7 +225,7 @@ class _CurveCellBuilder:
         )
 
     def cells(self) -> CurveCells:
-        """The cells on the backend."""
+        """The cells that were built, uploaded to the backend."""
         backend = self.backend
         lookup = OctreeLookup.from_levels(
             backend, self.middle - self.half, 2 * self.half, self.nodes

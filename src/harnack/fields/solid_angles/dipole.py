@@ -241,27 +241,29 @@ _FAR_OF_SIZE = 0.04
 class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_DipoleData"]):
     """f(x) = sum a_i n_i.(p_i - x)/|p_i - x|^3 of oriented points (paper, Eq. 12).
 
-    With a_i the areas that the points stand for, f is about 4 pi inside and 0 outside: the
-    surface is f = 2 pi. It passes through every point, with the point's normal.
+    The points p_i have unit normals n_i, and stand for areas a_i of the surface. f is about 4 pi
+    inside and 0 outside, and the surface is f = 2 pi. It passes through every point, with the
+    point's normal.
 
     smoothing: a length h, for points with noise. Then
 
         f(x) = sum a_i n_i.(p_i - x) (rho_i^2 + 5 h^2/2)/(rho_i^2 + h^2)^(5/2),  rho_i = |p_i - x|,
 
-    is the sum above blurred: averaged about x with the weight 15 h^4/(8 pi (rho^2 + h^2)^(7/2)),
-    whose standard deviation along each axis is h/sqrt(2). It is finite everywhere. Its surface
-    passes through no point, but has points on both sides: `default_level` is the median of f at the
-    points. Details smaller than h are lost, edges become round, parts thinner than h may vanish.
-    h = 1.4 sqrt(noise * spacing) was good on two meshes, with the standard deviation of the noise
-    along an axis and the distance between neighboring points.
+    is the sum above, averaged around x with the weight 15 h^4/(8 pi (rho^2 + h^2)^(7/2)), where rho
+    is the distance from x. The standard deviation of this weight along each axis is h/sqrt(2). f is
+    finite everywhere. Its surface does not pass through the points, but has points on both sides:
+    `default_level` is the median of f at the points. Details smaller than h are lost, edges become
+    round, and parts thinner than h may vanish. On two meshes h = 1.4 sqrt(noise * spacing) was
+    good, where noise is the standard deviation of the noise along an axis, and spacing the distance
+    between neighboring points.
 
     smoothing="auto": for points with noise of unknown size. The sum is then not that of the input
-    points: points far from all others are left out, with a warning; the remaining points are moved
-    along their normals onto the surface that fits their neighbors (`geometry.denoising`), only a
-    part of the points if noise is larger than the spacing; and their sum is smoothed over their
-    spacing, or less. Estimated normals are corrected by the sum and by the moved points. `points`,
-    `normals`, `areas` and `smoothing` are the data of that sum, and `describe` has the estimated
-    noise, and the numbers of points of the input and of points that were left out.
+    points. Points far from all others are left out, with a warning. The remaining points are moved
+    along their normals onto the surface that fits their neighbors (`geometry.denoising`); if the
+    noise is larger than the spacing, only some of these points are used. Their sum is smoothed
+    over their spacing, or less. Estimated normals are corrected by the sum and by the moved points.
+    `points`, `normals`, `areas` and `smoothing` are the data of that sum. `describe` has the
+    estimated noise, and the numbers of points of the input and of points that were left out.
 
     points: (n, 3).
     normals: (n, 3), outward, of any length; or "estimate", from neighbors, oriented along a
@@ -269,19 +271,20 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
     areas: (n,), or None to estimate them from neighbors (Barill et al. 2018, Sec. 3.1).
     smoothing: see above, in the points' unit; 0 for the sum of dipoles itself.
     accuracy: the sum uses the multipole moments of a cluster of points beyond `accuracy` times its
-        radius; by default 2 for values at points and 4 for tracing, which uses a larger accuracy
-        where the tolerance needs it. At least 1.5. By default the accuracy of gradients at points
-        is increased until their error is about 1 % of their length or less in most places
+        radius; at least 1.5. By default it is 2 for values at points and 4 for tracing. Tracing
+        uses a larger accuracy where the tolerance needs it. By default the accuracy of gradients at
+        points is increased until their error is about 1 % of their length or less in most places
         (`gradient_error_bound` bounds it).
-    cells: for many rays through many points: FMM cells, in which near points are summed directly
-        and all others are one polynomial, so that an evaluation for tracing costs a tenth. None
-        builds them where they pay (`for_ray_count`), for pictures of small clouds and for path
-        tracing; True always, also for values and gradients at points, which pays from some 600
-        values per point on; False never. They take some 1 kB per point, or the number of megabytes
-        of this argument (True: 256) with larger and slower cells; if these would be too large,
-        there are no cells, and `describe` of a prepared field reports this. Building takes as long
-        as tracing 100,000 to a million rays without cells, for each precision, at the first trace,
-        and several times the memory. All bounds are proved, whatever the arguments.
+    cells: whether to build FMM cells, for many rays through many points. In a cell, near points are
+        summed directly and all others are one polynomial, so that an evaluation for tracing costs a
+        tenth. None builds cells if they pay (`for_ray_count`), which is so for pictures of small
+        clouds and for path tracing. True always builds them, also for values and gradients at
+        points, which pays for more than some 600 values per point. False never builds them. They
+        take some 1 kB per point; if this is more than the number of megabytes of this argument
+        (True: 256), cells are larger and slower. If these would still be too large, there are no
+        cells, and `describe` of a prepared field reports this. They are built at the first trace,
+        for each precision, which takes as long as tracing 100,000 to a million rays without cells,
+        and several times their memory. All bounds are proved, whatever the arguments.
 
     `with_points` gives the field of points that have moved.
 

@@ -132,7 +132,8 @@ class LoopEdges:
     def for_each(
         self, body: EachEdge, state: tuple[Any, ...], label: str, active: Mask = True
     ) -> tuple[Any, ...]:
-        """The state after `body` has been applied to all edges: see `RecordTable.for_each`."""
+        """The state after `body` has been applied to all edges, one after the other. label, active:
+        as for `RecordTable.for_each`."""
 
         def of_record(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
             """Apply `body` to the edges of a record."""
@@ -247,10 +248,10 @@ class Edge:
         return dr.select(square > 0, numerator / denominator, 0), c
 
     def hessian_factors(self) -> tuple[Vec3, Vec3]:
-        """c and grad w: the edge's term of the Hessian is (c grad w^T + grad w c^T)/2.
+        """c and grad w. The edge's term of the Hessian is (c grad w^T + grad w c^T)/2.
 
-        Lengths should be of order one, to stay far from overflow: the terms fall like distance^-5
-        and grow like distance^-3.
+        Lengths should be of order one, to stay far from overflow: at the distance d, the terms fall
+            like d^-5 far away and grow like d^-3 near the edge.
         """
         a, e, vector = self.a, self.e, cast("Any", type(self.a))
         h = dr.fma(vector(-dr.dot(a, e) * self.inverse_square_length), e, a)

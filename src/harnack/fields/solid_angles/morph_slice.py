@@ -61,11 +61,11 @@ _DEGREES = {4: 12, 8: 22}
 
 
 class SlicedKernel(RadialKernel):
-    """(4/pi) K(r, w) on a backend, at a height w > 0: a Newton kernel of four dimensions,
-    restricted to a slice.
+    """The kernel (4/pi) K(r, w) on a backend, at a height w > 0. It comes from the Newton kernel of
+    four dimensions, restricted to a slice of three dimensions.
 
     Kernel. 1/|X|^2 is harmonic in R^4. The solid angle of a flat solid A x {0} at (x, w) is
-    U = w int_A dV/(r^2 + w^2)^2 with r = |y-x|; by the divergence theorem it is the integral over
+    U = w int_A dV/(r^2 + w^2)^2 with r = |y-x|. By the divergence theorem U is the integral over
     the boundary of A of -n.grad_y K, with
 
         K(r, w) = (1/2) int_w^oo dv/(r^2 + v^2) = atan(r/w)/(2r),   pi/(4r) for w = 0.
@@ -81,10 +81,12 @@ class SlicedKernel(RadialKernel):
     The last i_n = int_0^1 (sin(phi t)/sin phi)^(2n-2) dt phi/sin phi, cos phi = c, is a function of
     c that is analytic except for c <= -1: on [0, 1] it is computed as a polynomial.
 
-    Bound. |d^m K[u_1, ..., u_m]| <= m!/D^(m+1) for unit vectors, as for 1/r at the distance D;
-    attained for w = 0. Proof. Equal vectors u are the worst (Banach 1938). The m-th derivative of
-    1/|X|^2 along a line is (-1)^m m! U_m(cos)/|X|^(m+2) (Gegenbauer), so that, with
-    x = D/sqrt(r^2 + v^2) and a = u.z/D, |a| <= s, that of K is +-m!/D^(m+1) times (2/pi) I,
+    Bound. |d^m K[u_1, ..., u_m]| <= m!/D^(m+1) for unit vectors, as for 1/r at the distance D. The
+    bound is attained for w = 0. Proof. Equal vectors u are the worst (Banach 1938). The m-th
+    derivative of 1/|X|^2 along a line is (-1)^m m! U_m(cos)/|X|^(m+2), with Chebyshev's polynomial
+    U_m of the cosine of the angle between X and the line (Gegenbauer). Let z = y - x,
+    x = D/sqrt(r^2 + v^2) and a = u.z/D, |a| <= s. Then the derivative of K is +-m!/D^(m+1) times
+    (2/pi) I, with
 
         I = int_0^1 U_m(a x) x^m (1 - s^2 x^2)^(-1/2) dx.
 
@@ -304,15 +306,15 @@ _CELLS_ACROSS = 128
 
 
 class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
-    """f(x) = (U_a(x, w) + U_b(x, gap - w))/(2 pi^2), 0 < w < gap: see `Morph`.
+    """The field f(x) = (U_a(x, w) + U_b(x, gap - w))/(2 pi^2) with 0 < w < gap: see `Morph`.
 
     corners: two arrays (m, 3, 3) of triangles.
     w, gap, spacing, accuracy: as for `Morph`.
 
-    Promises, with the 4D distances D of all points and d the smallest of them (`SlicedKernel` has
-    the proof that second derivatives are no larger than those of dipoles at a distance D):
-    `TaylorRemainder` within 0.45 d, and a `HarmonicBall` of dimension 4 and radius 0.35 d, which
-    proves shorter steps.
+    Promises. Let d be the smallest distance, in four dimensions, of a quadrature point from x. The
+    promises are `TaylorRemainder` within 0.45 d, and a `HarmonicBall` of dimension 4 and radius
+    0.35 d, which proves shorter steps. `SlicedKernel` has the proof that second derivatives are no
+    larger than those of dipoles at the distances in four dimensions.
     """
 
     default_level = 0.5

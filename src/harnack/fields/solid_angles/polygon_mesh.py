@@ -68,10 +68,10 @@ class FaceLoops:
 
     @classmethod
     def upload(cls, backend: Backend, faces: PolygonFaces) -> FaceLoops:
-        """All faces, each centered and scaled to unit size.
+        """Upload all faces, each relative to its center and scaled to unit size.
 
-        Centers are numbers that the backend's precision holds exactly, so that subtracting them
-        near a face is exact.
+        The backend's precision holds the centers exactly, so that subtracting them near a face is
+        exact. Raises ValueError if there are too many corners.
         """
         low, high = faces.face_boxes()
         center = (0.5 * (low + high)).astype(backend.dtype).astype(np.float64)
@@ -377,16 +377,16 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
     of the solid angle of its boundary curve (paper, Sections 4.2.1 and 4.2.4).
 
     vertices: (n, 3).
-    faces: a list of faces, each a list of at least three indices of vertices, counter-clockwise
-        seen from outside; or a list of such loops, of which holes run clockwise. Faces may have
-        different numbers of corners, and need not be joined.
+    faces: a list of faces. A face is a list of at least three indices of vertices, counter-clockwise
+        seen from outside; or it is a list of such loops, in which holes run clockwise. Faces may
+        have different numbers of corners, and need not be joined.
 
-    The surface of a face is the set on which its solid angle is 2 pi, modulo 4 pi; another `level`
-    bulges it to one side. The faces are separate surfaces that meet in their common edges:
-    `Hits.primitive_index` is the index of the face that was hit, the normal is that of its surface,
-    to the positive side. Each face is traced by itself, with the proofs of `SolidAngle`, so that a
-    ray pays only for faces whose boxes it enters (`harnack.fields.capabilities`). `face(k)` is the
-    solid angle of face k.
+    The surface of a face is the set on which its solid angle is 2 pi, modulo 4 pi. With another
+    `level` the surface bulges to one side. The faces are separate surfaces that meet in their
+    common edges. `Hits.primitive_index` is the index of the face that was hit; the normal is that
+    of its surface, and points to larger solid angles. Each face is traced by itself, with the
+    proofs of `SolidAngle`, so that a ray pays only for faces whose boxes it enters
+    (`harnack.fields.capabilities`). `face(k)` is the solid angle of face k.
 
     Raises:
         MeshError: a ValueError, for vertices and faces that `geometry.validate_polygons` refuses.
@@ -416,11 +416,12 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
 
     @property
     def edges(self) -> IntArray:
-        """(e, 2) pairs of vertices joined by an edge of some face, each once."""
+        """Pairs (e, 2) of vertices that an edge of some face joins. Each pair occurs once."""
         return self.faces.edges
 
     def face(self, index: int) -> SolidAngle:
-        """The solid angle of the boundary of the face with this index."""
+        """The solid angle of the boundary of the face with this index. Raises IndexError if there
+        is no such face."""
         if not 0 <= index < self.faces.face_count:
             last = self.faces.face_count - 1
             raise IndexError(f"there is no face {index}: they are counted from 0 to {last}")
@@ -437,7 +438,8 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
         return self._boxes[levels]
 
     def evaluate(self, p: Vec3) -> NoReturn:
-        """Raises TypeError: there is a function for each face, but none for the mesh."""
+        """Not defined: there is a function for each face, but none for the mesh. Always raises
+        TypeError."""
         del p
         raise TypeError(
             "a polygon mesh is no level set of one function, but of one for each face: ask a "

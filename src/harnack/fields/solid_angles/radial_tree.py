@@ -282,7 +282,7 @@ def _moved_to_parents(
 def _symmetric(
     t1: FloatArray, t2: FloatArray, t3: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The symmetric parts of the three tensors."""
+    """The symmetric parts of the tensors (k, 3), (k, 3, 3) and (k, 3, 3, 3)."""
     orders = itertools.permutations((1, 2, 3))
     total = sum((t3.transpose(0, *order) for order in orders), start=np.zeros_like(t3))
     return t1, 0.5 * (t2 + t2.transpose(0, 2, 1)), total / 6

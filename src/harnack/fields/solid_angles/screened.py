@@ -214,21 +214,24 @@ _ON_DIPOLE, _ANY_LEVEL = 32, 1e5
 class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuffers"]):
     """w(x) = (1/4 pi) sum_i a_i n_i.(y_i - x) (1 + rho_i/l) exp(-rho_i/l)/rho_i^3, rho_i = |y_i-x|.
 
-    Minus the derivative of the Yukawa kernel exp(-rho/l)/rho along n_i at y_i; as l grows, the
-    winding number of the points (Barill et al. 2018). (Without the factor 1 + rho/l, as the kernel
-    is sometimes written, it would solve no screened equation.) Away from the points
+    Points y_i with unit normals n_i stand for areas a_i of a surface, and l is the screening
+    length. A term is minus the derivative of the Yukawa kernel exp(-rho/l)/rho along n_i at y_i. As
+    l grows, w becomes the winding number of the points (Barill et al. 2018). The kernel is
+    sometimes written without the factor 1 + rho/l; then w would solve no screened equation. Away
+    from the points
 
         Laplacian w = w/l^2:   w is not harmonic.
 
     Meaning. For dense samples of a closed surface with outward normals, w is 1 - u inside and
-    -u outside, where u, between 0 and 1, is the blurred indicator of the inside: u - l^2 Laplacian
-    u = 1 inside, 0 outside (Green's second identity). So w falls from 1 - u to -u at the surface
-    and decays like exp(-distance/l) on both sides: far points have no effect, holes wider than a
+    -u outside. Here u, between 0 and 1, is the blurred indicator of the inside: u - l^2 Laplacian u
+    is 1 inside and 0 outside (Green's second identity). So w falls from 1 - u to -u at the surface
+    and decays like exp(-distance/l) on both sides. Far points have no effect, holes wider than a
     few l stay open, and deep inside w is near 0 again. The level that lies on the surface is the
-    mean of the two limits: 1/2 for l much larger than the surface, 0 for l much smaller.
-    `default_level` is the mean of w over all points or a part of them, each without its own term,
-    weighted by area, as Kazhdan et al. 2006 choose theirs. l should be longer than the distance
-    between neighboring points: else the level sets are those of single dipoles.
+    mean of 1 - u and -u there: 1/2 for l much larger than the surface, 0 for l much smaller.
+    `default_level` is the mean of w, weighted by area, over all points or some of them, where the
+    value at a point leaves out its own term; Kazhdan et al. 2006 choose their level in this way. l
+    should be longer than the distance between neighboring points: else the level sets are those of
+    single dipoles.
 
     points, normals: (n, 3), normals of any length, to the outside.
     areas: (n,) the areas that the points stand for; None estimates them.
@@ -238,8 +241,8 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         is as small as that of an unscreened cluster at distance accuracy * R. The error is bounded
         and part of every promise. Tracing uses a higher accuracy where the tolerance needs it.
 
-    Promises (`screened_promises` has the formulas), for d_i the distances from x, d the smallest
-    of them:
+    Promises (`screened_promises` has the formulas). Let d_i be the distances of the points from x,
+    and d the smallest of them.
 
     - Curvature. On B(x, r), r < d, each term's second derivatives are at most |K'''|(d_i - s) =
       6 Q_3(kappa (d_i-s))/(d_i-s)^4 at distance s from x (`YukawaKernel`, kappa = 1/l). By
@@ -311,15 +314,19 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         method: MethodName = "auto",
         accuracy: float = 6.0,
     ) -> ScreenedWindingNumber:
-        """Dipoles at the centroids of triangles, each cut into 4 triangles `subdivide` times first.
+        """The field of dipoles at the centroids of the triangles of a mesh.
 
-        This is quadrature by the midpoint rule, not the integral over the triangles. At a distance
-        r > R, R the distance from the centroid to the farthest corner, a triangle of area a and
-        edges e contributes an error of at most a (e1^2+e2^2+e3^2)/36 (3-2q)/((1-q)^2 r^4)/(4 pi), q
-        = R/r (the first moment about the centroid vanishes; `radial_tree`, with one order less).
-        Nearer than about an edge's length the result is not that of the mesh at all: w is smooth
-        where a triangle would make it jump, and infinite at the centroids. Each subdivision divides
-        that range by 2 and the error beyond it by 4.
+        subdivide: how many times each triangle is cut into 4 triangles first.
+        length, method, accuracy: as for `ScreenedWindingNumber`.
+
+        This is quadrature by the midpoint rule, not the integral over the triangles. Let R be the
+        distance from the centroid to the farthest corner of a triangle of area a and edges of
+        lengths e1, e2, e3. At a distance r > R the triangle contributes an error of at most
+        a (e1^2+e2^2+e3^2)/36 (3-2q)/((1-q)^2 r^4)/(4 pi) with q = R/r. (The first moment about the
+        centroid vanishes; the proof is that of `radial_tree`, with one order less.) Nearer than
+        about an edge's length the result is not that of the mesh at all: w is smooth where a
+        triangle would make it jump, and infinite at the centroids. Each subdivision divides that
+        distance by 2, and the error beyond it by 4.
 
         Raises MeshError (a ValueError) as `validate_mesh`.
         """
@@ -414,8 +421,8 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         )
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
-        """Raises ValueError for a level too small for rounding. All other levels occur next to
-        every dipole."""
+        """Raises ValueError for a level that is too small to be told from 0 by its rounding. All
+        other levels are valid, as they occur next to every dipole."""
         for level in levels:
             if 0 < abs(level) < _SMALLEST_LEVEL:
                 raise ValueError(f"level {level:g} is too small to be told from 0")

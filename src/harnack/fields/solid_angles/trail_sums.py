@@ -266,7 +266,7 @@ class _AngleProduct:
         return _AngleProduct(x, y, self.half + (changes & (bits.sign(factor[1]) | 1)))
 
     def times_product(self, bits: _FloatFormat, other: _AngleProduct) -> _AngleProduct:
-        """The product with another product, whose half turns are added."""
+        """The product with another product. The half turns of both are added."""
         z = self.times(bits, (other.x, other.y))
         return _AngleProduct(z.x, z.y, z.half + ((other.half + 1) & -2))
 
@@ -278,7 +278,7 @@ class _AngleProduct:
         return _AngleProduct(self.x * scale, self.y * scale, self.half), length
 
     def turns(self) -> Real:
-        """theta/(2 pi)."""
+        """theta/(2 pi), as a number of turns."""
         real = cast("Any", type(self.x))
         # atan2 ignores the sign of a zero.
         y = dr.copysign(fmax(dr.abs(self.y), real(1e-30)), self.y)
@@ -349,8 +349,8 @@ class TrailValues:
         return all_turns, (all_margins <= 0) | is_far
 
     def _over_records(self, points: list[Point]) -> tuple[list[_AngleProduct], list[Real]]:
-        """For each point the product of all factors, and a number that is at most 0 if the product
-        is uncertain."""
+        """For each point the product of all factors, and a number that is at most 0 if rounding
+        could have changed a sign or if the product nearly underflowed."""
         backend = self.records.backend
         real, bits = backend.Float, _FloatFormat.of(backend)
         slack = real(-_SIGN_ROUNDINGS * 0.5 * backend.machine_epsilon)

@@ -1,4 +1,5 @@
-"""Meshes prepared for winding numbers: welded, duplicates canceled, scaled, in a tree."""
+"""Meshes prepared for winding numbers: vertices are welded, faces and their reversed copies are
+canceled, lengths are scaled, and triangles are sorted into a tree."""
 
 from __future__ import annotations
 

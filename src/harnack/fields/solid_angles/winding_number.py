@@ -1,13 +1,14 @@
-"""The generalized winding number of triangle meshes, whose level set closes holes and repairs
+"""The generalized winding number of triangle meshes. Its level set closes holes, and repairs
 triangle soups and overlaps.
 
 - `WindingNumber`: the field.
 - `winding_extent`, `winding_cells`: the volume and the cells that are proved to contain its level
-  sets, on its triangles and on the surfaces that span its holes.
+sets, on its triangles and on the surfaces that span its holes.
 
 Modulo 1 a winding number does not jump, and it takes a level only on the surfaces that span holes.
-Cells in which it is proved to take no level modulo 1 count as empty, whether or not they contain
-triangles: there rays sample the winding number only where they cross triangles.
+A cell counts as empty if the winding number is proved to take no level modulo 1 in it, whether or
+not it contains triangles. In empty cells rays sample the winding number only where they cross
+triangles.
 """
 
 from __future__ import annotations
@@ -206,39 +207,39 @@ _TRIANGLE_ROUNDINGS = 8.0
 class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
     """The winding number w of a triangle mesh around a point (Jacobson et al. 2013).
 
-    For a closed mesh w is 1 inside and 0 outside; for a mesh with holes, cracks, duplicated or
-    flipped faces, self-intersections, or a triangle soup, it is a function that is harmonic off the
-    triangles and jumps by integers across them. Its 1/2-surface is the mesh where the mesh is
-    sound, and spans its holes. Faces are counter-clockwise seen from outside.
+    For a closed mesh w is 1 inside and 0 outside. For a mesh with holes, cracks, duplicated or
+    flipped faces or self-intersections, or for a triangle soup, w is harmonic off the triangles and
+    jumps by integers across them. The surface w = 1/2 is the mesh itself where the mesh is sound,
+    and spans its holes. Faces are counter-clockwise seen from outside.
 
     vertices: (n, 3).
     faces: (m, 3) indices into them.
     method: "exact" (`edge_lift`: no truncation, cost by boundary edges), "tree" (`winding_tree`),
         or "auto": exact up to 2048 boundary edges.
     accuracy: for the tree, the moments of a cluster of triangles are used beyond `accuracy` times
-        its radius; a larger accuracy is slower and has smaller errors. At least 1.5; by default 2
-        for values at points and 4 for tracing, which uses a higher accuracy where the tolerance
-        needs it. By default gradients and Hessians at points do not come from this tree but from
-        sums over the boundary edges, exact up to rounding, for up to 32,768 edges; for more edges,
-        the accuracy of gradients is increased until their error is about 1 % of their length in
-        most places (`gradient_error_bound` bounds it).
+        its radius; at least 1.5. A larger accuracy is slower and has smaller errors. By default it
+        is 2 for values at points and 4 for tracing. Tracing uses a higher accuracy where the
+        tolerance needs it. By default gradients and Hessians at points do not come from this tree.
+        For up to 32,768 boundary edges they come from sums over these edges, exact up to rounding.
+        For more edges, the accuracy of gradients is increased until their error is about 1 % of
+        their length in most places (`gradient_error_bound` bounds it).
     order: the order of the multipoles of the tree: 0 (dipoles), 1 or 2 (octupoles).
-    cells: for many rays: FMM cells in which w, up to an integer, is the solid angle of a few near
-        edges plus one polynomial for all others, with a proved remainder (`boundary_cells`), so
-        that a sample costs the same whatever the number of edges. In a soup, where triangles have
-        hardly an edge in common, near triangles take the place of edges, with the tree as method
-        (`dipole_cells`). None builds them where they pay (`for_ray_count`), True always, False
-        never; they take at most the number of megabytes of this argument (True: 256), and several
-        times as much while they are built. The cells of soups, if the user requested them, give
-        values and gradients at points, too, which pays from some 2,000 points per triangle on; all
-        other values and derivatives at points are those of `method`.
+    cells: whether to build FMM cells, for many rays. In a cell w is, up to an integer, the solid
+        angle of a few near edges plus one polynomial for all others, with a proved remainder
+        (`boundary_cells`). So a sample costs the same whatever the number of edges. In a soup,
+        where triangles have hardly an edge in common, near triangles take the place of edges if the
+        method is "tree" (`dipole_cells`). None builds cells if they pay (`for_ray_count`), True
+        always, False never. They take at most the number of megabytes of this argument (True: 256),
+        and several times as much while they are built. If the user requested the cells of a soup,
+        they also give values and gradients at points, which pays for more than some 2,000 points
+        per triangle. All other values and derivatives at points are computed by `method`.
 
-    A mesh that lies on its own spanning surface, such as a file that `mesh` wrote of a
-    `SolidAngle`, or any flat mesh, has the level right beside all of its triangles, where rounding
-    decides on which side. Then the surface is the mesh itself, every triangle and nothing else: so
-    it is traced, meshed and measured, while values do not change (`own_sheet`). Other open meshes
-    have the level where they lie before the surface that spans their boundary, and not where they
-    lie behind it.
+    Some meshes lie on their own spanning surface, such as any flat mesh, or a file that `mesh`
+    wrote of a `SolidAngle`. Such a mesh has the level right beside all of its triangles, and
+    rounding decides on which side. Then the surface is the mesh itself, every triangle and nothing
+    else. It is traced, meshed and measured as such, while values do not change (`own_sheet`). Other
+    open meshes have the level where they lie before the surface that spans their boundary, and not
+    where they lie behind it.
 
     Hits on triangles have `Hits.primitive_index`; `facet_faces` gives the face of each.
     `with_vertices` gives the field for the same faces when vertices have moved.
