@@ -377,9 +377,9 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
     of the solid angle of its boundary curve (paper, Sections 4.2.1 and 4.2.4).
 
     vertices: (n, 3).
-    faces: a list of faces. A face is a list of at least three indices of vertices, counter-clockwise
-        seen from outside; or it is a list of such loops, in which holes run clockwise. Faces may
-        have different numbers of corners, and need not be joined.
+    faces: a list of faces. A face is a list of at least three indices of vertices, in
+        counter-clockwise order seen from outside; or it is a list of such loops, in which holes run
+        clockwise. Faces may have different numbers of corners, and need not be joined.
 
     The surface of a face is the set on which its solid angle is 2 pi, modulo 4 pi. With another
     `level` the surface bulges to one side. The faces are separate surfaces that meet in their
