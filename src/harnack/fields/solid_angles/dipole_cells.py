@@ -280,31 +280,41 @@ def build_cells(
     nodes: list[IntArray] = []
     tables: list[npt.NDArray[Any]] = []
     near: list[npt.NDArray[Any]] = []
-    splits, count, total = 0, 0, 0
+    split_count, leaf_count, near_count = 0, 0, 0
+    # Each pass adds the cells of one depth: first those that are not split, then those that are. A
+    # negative radius `none_stay` makes `split_far` replace every near node by its primitives.
     for level in octree:
         leaves, split = np.flatnonzero(level.is_leaf), np.flatnonzero(~level.is_leaf)
         radius, none_stay = (dr.opaque(double.Float, number) for number in (level.radius, -1.0))
         for cells in _chunks(leaves):
-            batch, c = sources.subset(double, cells), to_vector3(double, level.centers[cells])
-            sums, nearby = batch.split_far(packed, c, radius, _NEAR, none_stay)
-            lengths = to_numpy(nearby.primitives.count).astype(np.int64)
-            first = total + np.cumsum(lengths) - lengths
+            leaf_sources, c = (
+                sources.subset(double, cells),
+                to_vector3(double, level.centers[cells]),
+            )
+            sums, nearby = leaf_sources.split_far(packed, c, radius, _NEAR, none_stay)
+            near_lengths = to_numpy(nearby.primitives.count).astype(np.int64)
+            first = near_count + np.cumsum(near_lengths) - near_lengths
             geometry = level.centers[cells], level.radius
-            table = _cell_records(backend, *geometry, sums.plus(parents.of(cells)), first, lengths)
-            tables.append(table.astype(backend.dtype))
-            near.append(to_numpy(nearby.primitives.entries)[: int(lengths.sum())])
-            total += int(lengths.sum())
-        nodes.append(encode_nodes(level.is_leaf, count, splits))
-        count, splits = count + len(leaves), splits + len(split)
+            records = _cell_records(
+                backend, *geometry, sums.plus(parents.of(cells)), first, near_lengths
+            )
+            tables.append(records.astype(backend.dtype))
+            near.append(to_numpy(nearby.primitives.entries)[: int(near_lengths.sum())])
+            near_count += int(near_lengths.sum())
+        nodes.append(encode_nodes(level.is_leaf, leaf_count, split_count))
+        leaf_count, split_count = leaf_count + len(leaves), split_count + len(split)
         split_sums: list[DipoleExpansions] = []
         pending: list[PendingSources] = []
         for cells in _chunks(split):
-            inner, c = sources.subset(double, cells), to_vector3(double, level.centers[cells])
-            sums, rest = inner.split_far(
+            split_sources, c = (
+                sources.subset(double, cells),
+                to_vector3(double, level.centers[cells]),
+            )
+            sums, remaining = split_sources.split_far(
                 packed, c, radius, _SHARED_RADII, _SMALL_NODE_RATIO * radius
             )
             split_sums.append(sums.plus(parents.of(cells)))
-            pending.append(rest)
+            pending.append(remaining)
         if len(split):
             parents = _ParentExpansions(
                 DipoleExpansions.concatenate(split_sums), shifts, level.radius
@@ -312,12 +322,12 @@ def build_cells(
             sources = PendingSources.concatenate(double, pending).subset(
                 double, np.repeat(np.arange(len(split)), 8)
             )
-    table, entries = np.concatenate(tables), np.concatenate(near)
+    records, entries = np.concatenate(tables), np.concatenate(near)
     return DipoleCells(
         backend, OctreeLookup.from_levels(backend, np.full(3, -half), 2 * half, nodes),
-        RecordTable.upload(backend, table),
+        RecordTable.upload(backend, records),
         upload_integers(backend, entries if len(entries) else np.zeros(1, np.uint32)), primitives,
-        count, _bytes(backend, octree),
+        leaf_count, _bytes(backend, octree),
     )  # fmt: skip
 
 

@@ -97,14 +97,17 @@ def multipole_to_local(moments: Pairs, seen: Pairs, degree: int) -> list[Any]:
 
 
 def local_to_local_matrices(degree: int, offset: float) -> FloatArray:
-    """Matrices (8, n, n), one for each octant of a cube. Octants have the order of the cube's
-    corners, z fastest. If L are the n coefficients about the cube's center, T @ L are those about
-    the octant's center, in units of the octant's radius, which is half that of the cube.
+    """Matrices T (8, n, n) that shift a local expansion from the center of a cube to the centers of
+    its eight octants. Octants have the order of the cube's corners, z fastest.
+
+    If L are the n coefficients about the cube's center, T @ L are those about an octant's center.
+    They are in units of the octant's radius, which is half that of the cube.
 
     offset: the offset of an octant's center along each axis, in units of the cube's radius.
 
-    R_jk(s + v) = sum R_ab(v) R_(j-a),(k-b)(s), so that L'_ab = sum_jk L_jk conj(R_(j-a),(k-b)(s)).
-    This is exact, as all are polynomials.
+    For the offset s of the octant's center and the offset v of a point from there, R_jk(s + v) =
+    sum R_ab(v) R_(j-a),(k-b)(s). So L'_ab = sum_jk L_jk conj(R_(j-a),(k-b)(s)). This is exact, as
+    all are polynomials.
     """
     order = coefficient_keys(degree)
     index = {key: i for i, key in enumerate(order)}
@@ -114,14 +117,14 @@ def local_to_local_matrices(degree: int, offset: float) -> FloatArray:
         shifted = regular_harmonics(x, y, z, degree)
         for (j, k, part), column in index.items():
             for sign in (1, -1) if k else (1,):  # L_j,-k = (-1)^k conj L_jk counts too
-                unit = 1j if part else 1.0
+                phase = 1j if part else 1.0
                 if sign < 0:
-                    unit = (-1) ** k * np.conj(unit)
+                    phase = (-1) ** k * np.conj(phase)
                 for a, b in {(a, b) for a, b, _ in order if a <= j}:
                     if abs(sign * k - b) > j - a:
                         continue
-                    u, v = _signed(shifted, j - a, sign * k - b)
-                    term = unit * (u - 1j * v) * 0.5**a
+                    re, im = _signed(shifted, j - a, sign * k - b)
+                    term = phase * (re - 1j * im) * 0.5**a
                     matrices[octant, index[a, b, 0], column] += term.real
                     if b:
                         matrices[octant, index[a, b, 1], column] += term.imag

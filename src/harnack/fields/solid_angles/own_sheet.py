@@ -64,28 +64,28 @@ def lies_on_own_level(mesh: WindingMesh, level: float) -> bool:
     """
     if not len(mesh.singular_edges) or (mesh.multiplicity != 1).any():
         return False
-    inner = np.zeros(len(mesh.vertices), np.bool_)
-    inner[mesh.faces] = True
-    inner[mesh.singular_edges] = False
+    is_inner = np.zeros(len(mesh.vertices), np.bool_)
+    is_inner[mesh.faces] = True
+    is_inner[mesh.singular_edges] = False
     x = mesh.unit_vertices
     edges = x[mesh.singular_edges]
     corners = mesh.corners
-    is_filled = inner.any()
-    points = _spaced_rows(x[inner] if is_filled else corners.mean(axis=1), _MAX_TESTED)
+    has_inner = is_inner.any()
+    points = _spaced_rows(x[is_inner] if has_inner else corners.mean(axis=1), _MAX_TESTED)
     # In units in which the mesh has a size of one to two.
-    limit = 2 * _ON_SURFACE if is_filled else _ROUNDING
+    limit = 2 * _ON_SURFACE if has_inner else _ROUNDING
 
     def is_on(queries: FloatArray) -> BoolArray:
         """Whether points (k, 3) are on the surface: a mask (k,)."""
         gap, distance = _level_gaps(edges, queries, level)
-        return (distance if is_filled else gap) < limit
+        return (distance if has_inner else gap) < limit
 
     if not is_on(points[:_TESTED_FIRST]).all() or np.mean(is_on(points)) < _REQUIRED_FRACTION:
         return False
     corners = _spaced_rows(corners, _MAX_TESTED)
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    _, far = _level_gaps(edges, corners.mean(axis=1), level)
-    if np.mean(far < _MAX_CENTER_DISTANCE * longest) < _REQUIRED_FRACTION:
+    _, center_distance = _level_gaps(edges, corners.mean(axis=1), level)
+    if np.mean(center_distance < _MAX_CENTER_DISTANCE * longest) < _REQUIRED_FRACTION:
         return False
     # The mean of w on both sides, where w is the level, and the level plus or minus 1.
     mean = np.array(

@@ -152,15 +152,15 @@ def planar_region(loops: Loops, circles: Sequence[Circle]) -> PlanarRegion | Non
     if not all(_are_separated(loop, other) for loop, other in itertools.combinations(outlines, 2)):
         return None
     # The winding number just inside each loop: the sum of the signs of all loops around it.
-    inside = [
+    winding_inside = [
         sum(other.sign for other in outlines if other is loop or other.contains(loop.some_point))
         for loop in outlines
     ]
-    lowest, highest = min(0, *inside), max(0, *inside)
-    if highest - lowest != 1:
+    min_winding, max_winding = min(0, *winding_inside), max(0, *winding_inside)
+    if max_winding - min_winding != 1:
         return None
-    side = 1.0 if highest == 1 else -1.0
-    return PlanarRegion(side * normal, side * float(normal @ origin))
+    orientation = 1.0 if max_winding == 1 else -1.0
+    return PlanarRegion(orientation * normal, orientation * float(normal @ origin))
 
 
 def _plane_of(

@@ -384,7 +384,7 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
     The surface of a face is the set on which its solid angle is 2 pi, modulo 4 pi. With another
     `level` the surface bulges to one side. The faces are separate surfaces that meet in their
     common edges. `Hits.primitive_index` is the index of the face that was hit; the normal is that
-    of its surface, and points to larger solid angles. Each face is traced by itself, with the
+    of its surface, towards the positive side of the face. Each face is traced by itself, with the
     proofs of `SolidAngle`, so that a ray pays only for faces whose boxes it enters
     (`harnack.fields.capabilities`). `face(k)` is the solid angle of face k.
 

@@ -138,7 +138,7 @@ def screened_promises(
 
     radial: the sums at the point.
     f, gradient: value and gradient at the point, in units of `size`.
-    size: the length in user coordinates that is 1 here.
+    size: the length, in the user's unit, that is 1 in the coordinates of the sums.
     epsilon: the machine epsilon of the backend.
 
     Radii stay below 36 screening lengths. So exp(kappa r) times sums in which exponentials are at

@@ -299,24 +299,30 @@ class Treecode:
         `coarse_error_ratio`. This ratio is the median, over the leaves, of the ratio of the two
         bounds.
         """
-        rough = min(accuracy, _COARSE_RATIO)
+        coarse_ratio = min(accuracy, _COARSE_RATIO)
         fine_bounds = [truncation_bounds(level, accuracy * level.radius, order) for level in levels]
-        coarse_bounds = [truncation_bounds(level, rough * level.radius, order) for level in levels]
-        factor = _median_ratio(coarse_bounds[0][0], fine_bounds[0][0])
+        coarse_bounds = [
+            truncation_bounds(level, coarse_ratio * level.radius, order) for level in levels
+        ]
+        error_ratio = _median_ratio(coarse_bounds[0][0], fine_bounds[0][0])
         nodes: list[FloatArray] = []
-        slope_max = second_max = 0.0
+        gradient_ratio = hessian_ratio = 0.0
         for level, *bounds in zip(levels, fine_bounds, coarse_bounds, strict=True):
             error, slope, second = (
-                np.maximum(fine, coarse / factor) for fine, coarse in zip(*bounds, strict=True)
+                np.maximum(fine, coarse / error_ratio) for fine, coarse in zip(*bounds, strict=True)
             )
             nonzero = error > 0
-            slope_max = max(slope_max, float((slope[nonzero] / error[nonzero]).max(initial=0.0)))
-            second_max = max(second_max, float((second[nonzero] / error[nonzero]).max(initial=0.0)))
-            nodes.append(node_records(level, order, rough, error))
+            gradient_ratio = max(
+                gradient_ratio, float((slope[nonzero] / error[nonzero]).max(initial=0.0))
+            )
+            hessian_ratio = max(
+                hessian_ratio, float((second[nonzero] / error[nonzero]).max(initial=0.0))
+            )
+            nodes.append(node_records(level, order, coarse_ratio, error))
         packed = pack_tree(backend, tree, nodes, primitives)
-        ratios = factor, slope_max * (1 + 1e-6), second_max * (1 + 1e-6)
+        ratios = error_ratio, gradient_ratio * (1 + 1e-6), hessian_ratio * (1 + 1e-6)
         uploaded = (dr.opaque(backend.Float, ratio) for ratio in ratios)
-        return cls(backend, packed, accuracy, rough, order, *uploaded)
+        return cls(backend, packed, accuracy, coarse_ratio, order, *uploaded)
 
     @property
     def coarsest_accuracy(self) -> float:
@@ -339,7 +345,7 @@ class Treecode:
         own: the caller's own state, which `add` updates.
         derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
         """
-        free, closer = (
+        free_fraction, closer = (
             free_radius_fraction(self.coarse_ratio),
             self.acceptance_ratio(detail) / self.coarse_ratio,
         )
@@ -356,7 +362,7 @@ class Treecode:
                 inverse,
                 dr.fma(node.head[5], inverse * inverse, node.head[4]),
                 (error, slope, slope * inverse),
-                free * (node.square * inverse),
+                free_fraction * (node.square * inverse),
                 unit,
             )
             return sums.to_state(), state[1]
@@ -366,21 +372,21 @@ class Treecode:
             sums, own = add(row, active, SourceSums.from_state(state[0]), state[1])
             return sums.to_state(), own
 
-        far_off = _NO_SOURCE_DISTANCE * (1 + dr.max(dr.abs(x)))
-        start = (SourceSums.zero(self.backend, far_off, derivatives).to_state(), own)
+        no_source = _NO_SOURCE_DISTANCE * (1 + dr.max(dr.abs(x)))
+        start = (SourceSums.zero(self.backend, no_source, derivatives).to_state(), own)
         state = traverse_clusters(self.tree, x, closer, add_cluster, add_primitive, start, active)
-        sums, factor = (
+        sums, error_ratio = (
             SourceSums.from_state(state[0]),
             dr.select(detail < 1, self.coarse_error_ratio, 1),
         )
         second = sums.hessian_truncation
         sums = dataclasses.replace(
             sums,
-            truncation=factor * sums.truncation,
-            gradient_truncation=factor * self.gradient_error_ratio * sums.gradient_truncation,
+            truncation=error_ratio * sums.truncation,
+            gradient_truncation=error_ratio * self.gradient_error_ratio * sums.gradient_truncation,
             hessian_truncation=None
             if second is None
-            else factor * self.hessian_error_ratio * second,
+            else error_ratio * self.hessian_error_ratio * second,
         )
         return sums, state[1]
 

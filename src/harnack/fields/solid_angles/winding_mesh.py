@@ -177,16 +177,23 @@ class WindingMesh:
     def singular_flags(self) -> FloatArray:
         """Numbers (k, 3), for the edges 01, 12 and 02 of each triangle's record: 1 if the edge is
         singular, else 0."""
+        # An edge has the key low * count + high, with the indices of its ends. Only edges between
+        # two ends of singular edges need to be looked up.
         count = len(self.vertices)
-        keys = np.sort(self.singular_edges.min(axis=1) * count + self.singular_edges.max(axis=1))
-        at_ends = np.zeros(count, np.bool_)
-        at_ends[self.singular_edges] = True
+        singular_keys = np.sort(
+            self.singular_edges.min(axis=1) * count + self.singular_edges.max(axis=1)
+        )
+        is_end = np.zeros(count, np.bool_)
+        is_end[self.singular_edges] = True
         flags = np.zeros((len(self.triangles), 3))
-        ends = np.sort(self.triangles, axis=1)
+        sorted_corners = np.sort(self.triangles, axis=1)
         for k, (i, j) in enumerate(((0, 1), (1, 2), (0, 2))):
-            candidates = np.flatnonzero(at_ends[ends[:, i]] & at_ends[ends[:, j]])
-            edges: IntArray = ends[candidates, i] * count + ends[candidates, j]
-            flags[candidates, k] = keys.take(np.searchsorted(keys, edges), mode="clip") == edges
+            rows = np.flatnonzero(is_end[sorted_corners[:, i]] & is_end[sorted_corners[:, j]])
+            edge_keys: IntArray = sorted_corners[rows, i] * count + sorted_corners[rows, j]
+            flags[rows, k] = (
+                singular_keys.take(np.searchsorted(singular_keys, edge_keys), mode="clip")
+                == edge_keys
+            )
         return flags
 
     @functools.cached_property

@@ -90,8 +90,8 @@ class NearEdge:
         `dipole_expansion`. Far nodes are even farther.
         """
         square, inverse = self.edge.edge.squared_distance, self.edge.edge.inverse_square_length
-        closed = ~self.is_singular & (square * inverse < dr.square(0.5 * (reach - 1)))
-        return (inverse > 0) & ~closed
+        is_closed = ~self.is_singular & (square * inverse < dr.square(0.5 * (reach - 1)))
+        return (inverse > 0) & ~is_closed
 
 
 def edges_of(row: list[Real], x: Vec3, frame: RayFrame | VerticalRayFrame) -> Iterator[NearEdge]:
