@@ -287,30 +287,28 @@ def build_cells(
         leaves, split = np.flatnonzero(level.is_leaf), np.flatnonzero(~level.is_leaf)
         radius, none_stay = (dr.opaque(double.Float, number) for number in (level.radius, -1.0))
         for cells in _chunks(leaves):
-            leaf_sources, c = (
+            batch, c = (
                 sources.subset(double, cells),
                 to_vector3(double, level.centers[cells]),
             )
-            sums, nearby = leaf_sources.split_far(packed, c, radius, _NEAR, none_stay)
-            near_lengths = to_numpy(nearby.primitives.count).astype(np.int64)
-            first = near_count + np.cumsum(near_lengths) - near_lengths
+            sums, nearby = batch.split_far(packed, c, radius, _NEAR, none_stay)
+            lengths = to_numpy(nearby.primitives.count).astype(np.int64)
+            first = near_count + np.cumsum(lengths) - lengths
             geometry = level.centers[cells], level.radius
-            records = _cell_records(
-                backend, *geometry, sums.plus(parents.of(cells)), first, near_lengths
-            )
-            tables.append(records.astype(backend.dtype))
-            near.append(to_numpy(nearby.primitives.entries)[: int(near_lengths.sum())])
-            near_count += int(near_lengths.sum())
+            table = _cell_records(backend, *geometry, sums.plus(parents.of(cells)), first, lengths)
+            tables.append(table.astype(backend.dtype))
+            near.append(to_numpy(nearby.primitives.entries)[: int(lengths.sum())])
+            near_count += int(lengths.sum())
         nodes.append(encode_nodes(level.is_leaf, leaf_count, split_count))
         leaf_count, split_count = leaf_count + len(leaves), split_count + len(split)
         split_sums: list[DipoleExpansions] = []
         pending: list[PendingSources] = []
         for cells in _chunks(split):
-            split_sources, c = (
+            to_split, c = (
                 sources.subset(double, cells),
                 to_vector3(double, level.centers[cells]),
             )
-            sums, remaining = split_sources.split_far(
+            sums, remaining = to_split.split_far(
                 packed, c, radius, _SHARED_RADII, _SMALL_NODE_RATIO * radius
             )
             split_sums.append(sums.plus(parents.of(cells)))
@@ -322,10 +320,10 @@ def build_cells(
             sources = PendingSources.concatenate(double, pending).subset(
                 double, np.repeat(np.arange(len(split)), 8)
             )
-    records, entries = np.concatenate(tables), np.concatenate(near)
+    table, entries = np.concatenate(tables), np.concatenate(near)
     return DipoleCells(
         backend, OctreeLookup.from_levels(backend, np.full(3, -half), 2 * half, nodes),
-        RecordTable.upload(backend, records),
+        RecordTable.upload(backend, table),
         upload_integers(backend, entries if len(entries) else np.zeros(1, np.uint32)), primitives,
         leaf_count, _bytes(backend, octree),
     )  # fmt: skip

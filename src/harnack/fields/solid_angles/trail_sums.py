@@ -510,14 +510,14 @@ class LiftedTrails:
             product, g, min_square, rounding, s4, s5 = state
             product = LiftedProduct(*product)
             a = view_vertex(self._vertex(row, 0), frame, x)
-            integrals, weighted_integrals, nearest_square, max_length = (
+            total, weighted, nearest, longest = (
                 real(0),
                 real(0),
                 real(dr.inf),
                 real(0),
             )
-            # Over the edges of the record: integrals is the sum of L w, weighted_integrals the sum
-            # of d^2 L w.
+            # Over the edges of the record, total is the sum of L w, weighted the sum of d^2 L w,
+            # nearest the least d^2, and longest the largest L.
             for k in range(self.edges_per_record):
                 p, q = self._vertex(row, k), self._vertex(row, k + 1)
                 inverse, length = self._edge(row, k)
@@ -530,22 +530,20 @@ class LiftedTrails:
                 g = dr.fma(type(g)(w), c, g)
                 integral = dr.abs(length) * w
                 square = dr.select(is_edge, edge.squared_distance, dr.inf)
-                integrals, nearest_square = integrals + integral, fmin(nearest_square, square)
-                max_length = fmax(max_length, dr.abs(length))
-                weighted_integrals = weighted_integrals + dr.select(is_edge, integral * square, 0)
+                total, nearest = total + integral, fmin(nearest, square)
+                longest = fmax(longest, dr.abs(length))
+                weighted = weighted + dr.select(is_edge, integral * square, 0)
                 a = b
-            distance = fmax(dr.sqrt(nearest_square) - 2 * unit, 0)
-            field_rounding = dr.fma(steep_rounding, max_length, unit) * dr.sqrt(
-                integrals * weighted_integrals
-            )
-            rounding = rounding + (field_rounding + factor_rounding)
-            s5 = dr.fma(0.1875 * integrals, dr.rcp(distance), s5)
+            distance = fmax(dr.sqrt(nearest) - 2 * unit, 0)
+            field = dr.fma(steep_rounding, longest, unit) * dr.sqrt(total * weighted)
+            rounding = rounding + (field + factor_rounding)
+            s5 = dr.fma(0.1875 * total, dr.rcp(distance), s5)
             return (
                 product.parts(),
                 g,
-                fmin(nearest_square, min_square),
+                fmin(nearest, min_square),
                 rounding,
-                s4 + 0.25 * integrals,
+                s4 + 0.25 * total,
                 s5,
             )
 

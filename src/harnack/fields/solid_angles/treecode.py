@@ -299,30 +299,28 @@ class Treecode:
         `coarse_error_ratio`. This ratio is the median, over the leaves, of the ratio of the two
         bounds.
         """
-        coarse_ratio = min(accuracy, _COARSE_RATIO)
+        rough = min(accuracy, _COARSE_RATIO)
         fine_bounds = [truncation_bounds(level, accuracy * level.radius, order) for level in levels]
-        coarse_bounds = [
-            truncation_bounds(level, coarse_ratio * level.radius, order) for level in levels
-        ]
+        coarse_bounds = [truncation_bounds(level, rough * level.radius, order) for level in levels]
         error_ratio = _median_ratio(coarse_bounds[0][0], fine_bounds[0][0])
         nodes: list[FloatArray] = []
-        gradient_ratio = hessian_ratio = 0.0
+        slope_ratio = second_ratio = 0.0
         for level, *bounds in zip(levels, fine_bounds, coarse_bounds, strict=True):
             error, slope, second = (
                 np.maximum(fine, coarse / error_ratio) for fine, coarse in zip(*bounds, strict=True)
             )
             nonzero = error > 0
-            gradient_ratio = max(
-                gradient_ratio, float((slope[nonzero] / error[nonzero]).max(initial=0.0))
+            slope_ratio = max(
+                slope_ratio, float((slope[nonzero] / error[nonzero]).max(initial=0.0))
             )
-            hessian_ratio = max(
-                hessian_ratio, float((second[nonzero] / error[nonzero]).max(initial=0.0))
+            second_ratio = max(
+                second_ratio, float((second[nonzero] / error[nonzero]).max(initial=0.0))
             )
-            nodes.append(node_records(level, order, coarse_ratio, error))
+            nodes.append(node_records(level, order, rough, error))
         packed = pack_tree(backend, tree, nodes, primitives)
-        ratios = error_ratio, gradient_ratio * (1 + 1e-6), hessian_ratio * (1 + 1e-6)
+        ratios = error_ratio, slope_ratio * (1 + 1e-6), second_ratio * (1 + 1e-6)
         uploaded = (dr.opaque(backend.Float, ratio) for ratio in ratios)
-        return cls(backend, packed, accuracy, coarse_ratio, order, *uploaded)
+        return cls(backend, packed, accuracy, rough, order, *uploaded)
 
     @property
     def coarsest_accuracy(self) -> float:

@@ -180,20 +180,15 @@ class WindingMesh:
         # An edge has the key low * count + high, with the indices of its ends. Only edges between
         # two ends of singular edges need to be looked up.
         count = len(self.vertices)
-        singular_keys = np.sort(
-            self.singular_edges.min(axis=1) * count + self.singular_edges.max(axis=1)
-        )
+        keys = np.sort(self.singular_edges.min(axis=1) * count + self.singular_edges.max(axis=1))
         is_end = np.zeros(count, np.bool_)
         is_end[self.singular_edges] = True
         flags = np.zeros((len(self.triangles), 3))
-        sorted_corners = np.sort(self.triangles, axis=1)
+        ends = np.sort(self.triangles, axis=1)
         for k, (i, j) in enumerate(((0, 1), (1, 2), (0, 2))):
-            rows = np.flatnonzero(is_end[sorted_corners[:, i]] & is_end[sorted_corners[:, j]])
-            edge_keys: IntArray = sorted_corners[rows, i] * count + sorted_corners[rows, j]
-            flags[rows, k] = (
-                singular_keys.take(np.searchsorted(singular_keys, edge_keys), mode="clip")
-                == edge_keys
-            )
+            rows = np.flatnonzero(is_end[ends[:, i]] & is_end[ends[:, j]])
+            edges: IntArray = ends[rows, i] * count + ends[rows, j]
+            flags[rows, k] = keys.take(np.searchsorted(keys, edges), mode="clip") == edges
         return flags
 
     @functools.cached_property
