@@ -287,10 +287,7 @@ def build_cells(
         leaves, split = np.flatnonzero(level.is_leaf), np.flatnonzero(~level.is_leaf)
         radius, none_stay = (dr.opaque(double.Float, number) for number in (level.radius, -1.0))
         for cells in _chunks(leaves):
-            batch, c = (
-                sources.subset(double, cells),
-                to_vector3(double, level.centers[cells]),
-            )
+            batch, c = (sources.subset(double, cells), to_vector3(double, level.centers[cells]))
             sums, nearby = batch.split_far(packed, c, radius, _NEAR, none_stay)
             lengths = to_numpy(nearby.primitives.count).astype(np.int64)
             first = near_count + np.cumsum(lengths) - lengths
@@ -304,10 +301,7 @@ def build_cells(
         split_sums: list[DipoleExpansions] = []
         pending: list[PendingSources] = []
         for cells in _chunks(split):
-            to_split, c = (
-                sources.subset(double, cells),
-                to_vector3(double, level.centers[cells]),
-            )
+            to_split, c = (sources.subset(double, cells), to_vector3(double, level.centers[cells]))
             sums, remaining = to_split.split_far(
                 packed, c, radius, _SHARED_RADII, _SMALL_NODE_RATIO * radius
             )

@@ -510,12 +510,7 @@ class LiftedTrails:
             product, g, min_square, rounding, s4, s5 = state
             product = LiftedProduct(*product)
             a = view_vertex(self._vertex(row, 0), frame, x)
-            total, weighted, nearest, longest = (
-                real(0),
-                real(0),
-                real(dr.inf),
-                real(0),
-            )
+            total, weighted, nearest, longest = (real(0), real(0), real(dr.inf), real(0))
             # Over the edges of the record, total is the sum of L w, weighted the sum of d^2 L w,
             # nearest the least d^2, and longest the largest L.
             for k in range(self.edges_per_record):
@@ -538,14 +533,7 @@ class LiftedTrails:
             field = dr.fma(steep_rounding, longest, unit) * dr.sqrt(total * weighted)
             rounding = rounding + (field + factor_rounding)
             s5 = dr.fma(0.1875 * total, dr.rcp(distance), s5)
-            return (
-                product.parts(),
-                g,
-                fmin(nearest, min_square),
-                rounding,
-                s4 + 0.25 * total,
-                s5,
-            )
+            return (product.parts(), g, fmin(nearest, min_square), rounding, s4 + 0.25 * total, s5)
 
         identity = LiftedProduct.identity(real).parts()
         start = (identity, backend.Array3f(0), real(dr.inf), real(0), real(0), real(0))
