@@ -136,21 +136,19 @@ class RadialSums:
         q2_d3, q2_d4, q3_d4, q3_d5, error, slope, second = (
             dr.select(active, bound, 0) for bound in (*bounds, *errors)
         )
-        nearest, old_hessian_error = (
+        nearest, old_second = (
             fmin(tail.distance, sums.singularity_distance),
             sums.hessian_truncation,
         )
         # Dr.Jit's epsilon is half the distance from 1 to the next number; the epsilon of the bounds
         # is the whole distance.
-        position_rounding = 6 * 2 * float(dr.epsilon(q2_d3))
+        shift = 6 * 2 * float(dr.epsilon(q2_d3))
         sums = dataclasses.replace(
             sums,
             truncation=sums.truncation + error,
             gradient_truncation=sums.gradient_truncation + slope,
-            hessian_truncation=None if old_hessian_error is None else old_hessian_error + second,
-            rounding=dr.fma(
-                q2_d3, dr.fma(rounding, tail.distance, position_rounding), sums.rounding
-            ),
+            hessian_truncation=None if old_second is None else old_second + second,
+            rounding=dr.fma(q2_d3, dr.fma(rounding, tail.distance, shift), sums.rounding),
             singularity_distance=dr.select(active, nearest, sums.singularity_distance),
             s4=sums.s4 + q3_d4,
             s5=sums.s5 + q3_d5,
