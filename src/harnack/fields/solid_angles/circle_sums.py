@@ -5,7 +5,7 @@ them.
 - `CircleSet`: circles on a backend, and the sums over them.
 
 Value, gradient and Hessian of a circle are one expression: Bulirsch's loop for complete elliptic
-    integrals, unrolled. The forms of the formulas are chosen so that no terms cancel.
+integrals, unrolled. The forms of the formulas are chosen so that no terms cancel.
 """
 
 from __future__ import annotations

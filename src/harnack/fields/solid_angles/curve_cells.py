@@ -1,5 +1,5 @@
 """FMM cells of curves: in each cell, the solid angle of a curve is the direct sum over a short list
-    of near edges plus a local expansion, a harmonic polynomial, of all other edges.
+of near edges plus a local expansion, a harmonic polynomial, of all other edges.
 
 The cells are the leaves of an octree over a cube around the curve. The near edges of a cell are the
 edges within three radii of its ball from its center. So the cost of a sample depends only on the

@@ -1,5 +1,5 @@
 """Prepare noisy points for a smoothed sum of dipoles: points moved onto the surface, estimated
-    normals if the cloud has none, and the smoothing length.
+normals if the cloud has none, and the smoothing length.
 
 The sum itself corrects the signs of estimated normals (Lin et al. 2024). If most of the normals are
 right, the sum of all dipoles, smoothed over several points, falls across the surface in the right

@@ -99,8 +99,8 @@ def triangle_sources(corners: FloatArray) -> FloatArray:
     """Records (n, 30) of triangles (n, 3, 3).
 
     A record holds: centroid, area times normal, area, `TRIANGLE_RATIO` times the radius; then
-        radius, (E, G) of `multipole.truncation_bounds`, the sup norms of the moments 1, 3 and 4,
-        and the moments 3 and 4.
+    radius, (E, G) of `multipole.truncation_bounds`, the sup norms of the moments 1, 3 and 4, and
+    the moments 3 and 4.
 
     The second moment about the centroid is a mean of offsets from the centroid, and so is 0. A
     triangle whose area is rounded to 0 gets an area of 1e-30, because a record without an area
@@ -444,8 +444,8 @@ class PendingSources:
         Returns the number of primitives on each lane.
 
         A leaf that is far has no near primitives: a triangle's box lies in the ball of its node, of
-            radius R. So the triangle's radius is at most 2 R, and `TRIANGLE_RATIO` times it at most
-            1.5 * 2 R, while its centroid is farther from c than inner + 4 R - R.
+        radius R. So the triangle's radius is at most 2 R, and `TRIANGLE_RATIO` times it at most 3 R,
+        while its centroid is farther from c than inner + 4 R - R.
         """
         index, vector = tree.backend.UInt32, tree.backend.Array3f
         are_points = tree.primitives.packets_per_record == 1

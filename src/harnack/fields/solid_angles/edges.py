@@ -251,7 +251,7 @@ class Edge:
         """c and grad w. The edge's term of the Hessian is (c grad w^T + grad w c^T)/2.
 
         Lengths should be of order one, to stay far from overflow: at the distance d, the terms fall
-            like d^-5 far away and grow like d^-3 near the edge.
+        like d^-5 far away and grow like d^-3 near the edge.
         """
         a, e, vector = self.a, self.e, cast("Any", type(self.a))
         h = dr.fma(vector(-dr.dot(a, e) * self.inverse_square_length), e, a)
@@ -344,7 +344,7 @@ def sum_over_edges(edges: LoopEdges, x: Vec3, active: Mask = True) -> EdgeSums:
 
     def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
         """Add the edges of a record to the state: the product of spinors (zr, zi), half the
-            gradient g, the least squared distance d2, and a quarter or half of the three
+        gradient g, the least squared distance d2, and a quarter or half of the three
         integrals."""
         zr, zi, g, d2, squares, cubes, fourths = state
         p = edges.vertex(row, 0)

@@ -126,8 +126,8 @@ def planar_region(loops: Loops, circles: Sequence[Circle]) -> PlanarRegion | Non
     cannot be tested.
 
     The result is None in these cases: the loops do not lie in one plane up to 1e-12 of their size;
-        they cross, or come nearer to each other than 1e-6 of their size; they have winding numbers
-        other than 0 and 1 (or 0 and -1); or they have more than 2048 vertices.
+    they cross, or come nearer to each other than 1e-6 of their size; they have winding numbers
+    other than 0 and 1 (or 0 and -1); or they have more than 2048 vertices.
     """
     if sum(map(len, loops)) > _MAX_VERTICES or len(loops) + len(circles) > _MAX_VERTICES // 8:
         return None

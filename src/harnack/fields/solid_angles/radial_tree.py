@@ -1,5 +1,5 @@
 """Sums of dipoles of a radial potential: direct sums, or sums by a tree with clusters of far
-    dipoles.
+dipoles.
 
 Expansion. A cluster consists of dipoles m_i at c + d_i with |d_i| <= R. At the point x = c - z, at
 the distance r = D of z, Taylor's formula in d_i gives
@@ -247,18 +247,20 @@ def taylor_tree_moments(tree: BalancedTree, rows: FloatArray) -> list[TaylorMome
     slots = records_in_slots(tree, rows)
     levels: list[TaylorMoments] = []
     for count, arity in zip(tree.counts, (0, *tree.arities), strict=True):
-        p, m, w = np.split(slots.reshape(count, -1, slots.shape[2])[..., :7], [3, 6], axis=2)
-        weight = w.sum(axis=(1, 2))
-        center = (w * p).sum(axis=1) / np.where(weight > 0, weight, 1)[:, None]
-        d = p - center[:, None]
-        length = np.where(w[..., 0] > 0, np.linalg.norm(d, axis=2), 0)
-        third = (w[..., 0] * length**3).sum(axis=1)
+        position, moment, weights = np.split(
+            slots.reshape(count, -1, slots.shape[2])[..., :7], [3, 6], axis=2
+        )
+        weight = weights.sum(axis=(1, 2))
+        center = (weights * position).sum(axis=1) / np.where(weight > 0, weight, 1)[:, None]
+        offset = position - center[:, None]
+        length = np.where(weights[..., 0] > 0, np.linalg.norm(offset, axis=2), 0)
+        third = (weights[..., 0] * length**3).sum(axis=1)
         if not levels:
-            d = np.where(w > 0, d, 0)
+            offset = np.where(weights > 0, offset, 0)
             moments = _symmetric(
-                m.sum(axis=1),
-                np.einsum("ksi,ksj->kij", m, d),
-                np.einsum("ksi,ksj,ksl->kijl", m, d, d),
+                moment.sum(axis=1),
+                np.einsum("ksi,ksj->kij", moment, offset),
+                np.einsum("ksi,ksj,ksl->kijl", moment, offset, offset),
             )
         else:
             moments = _moved_to_parents(levels[-1], center, arity)

@@ -384,20 +384,24 @@ def _multiplied_by_record(
     zero, where rounding has the least effect.
     """
     z, margin = _AngleProduct(*state[:3]), state[3]
-    smallest = 2.0**-100 if bits.mantissa < 50 else 2.0**-800
+    min_length = 2.0**-100 if bits.mantissa < 50 else 2.0**-800
     a = _relative_vertex(bits, row[0:3], x)
-    part: _AngleProduct | None = None
+    record_product: _AngleProduct | None = None
     for k in range(_EDGES_PER_RECORD):
         b = _relative_vertex(bits, row[3 * k + 3 : 3 * k + 6], x)
         factor, sign_margin = _factor(a, b, slacks[k])
         margin = fmin(sign_margin, margin)
-        part = _AngleProduct.of(bits, factor) if part is None else part.times(bits, factor)
+        record_product = (
+            _AngleProduct.of(bits, factor)
+            if record_product is None
+            else record_product.times(bits, factor)
+        )
         if k == 1:
-            part, length = part.scaled(bits)
-            margin = fmin(length - smallest, margin)
+            record_product, length = record_product.scaled(bits)
+            margin = fmin(length - min_length, margin)
         a = b
-    z, length = z.times_product(bits, cast("_AngleProduct", part)).scaled(bits)
-    return z.x, z.y, z.half, fmin(length - smallest, margin)
+    z, length = z.times_product(bits, cast("_AngleProduct", record_product)).scaled(bits)
+    return z.x, z.y, z.half, fmin(length - min_length, margin)
 
 
 def _relative_vertex(bits: _FloatFormat, vertex: list[Real], point: Point) -> Seen:

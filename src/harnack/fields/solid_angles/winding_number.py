@@ -644,6 +644,7 @@ class _WindingOnInterval(Field):
         offset: Real,
         detail: Real = 1.0,
     ) -> None:
+        """The arguments are those of the class."""
         self.has_variable_accuracy = on.winding.has_detail or on.cells is not None
         self.coarsest_accuracy = on.winding.coarsest_detail
         self._on, self._frame, self._detail = on, frame, on.backend.Float(detail)

@@ -198,7 +198,7 @@ class TreeWinding:
         where: Mask = True,
     ) -> SourceSums:
         """Sums whose value is 4 pi w: far clusters, the crossings of near triangles that are ahead
-            of x on rays of the frame, and the open edges of near triangles (`NearEdge.is_open`).
+        of x on rays of the frame, and the open edges of near triangles (`NearEdge.is_open`).
 
         x: points of the rays.
         detail: the accuracy scale.
