@@ -444,8 +444,8 @@ class PendingSources:
         Returns the number of primitives on each lane.
 
         A leaf that is far has no near primitives: a triangle's box lies in the ball of its node, of
-        radius R. So the triangle's radius is at most 2 R, and `TRIANGLE_RATIO` times it at most 3 R,
-        while its centroid is farther from c than inner + 4 R - R.
+        radius R. So `TRIANGLE_RATIO` times the triangle's radius is at most 1.5 * 2 R = 3 R, while
+        its centroid is farther from c than inner + 4 R - R.
         """
         index, vector = tree.backend.UInt32, tree.backend.Array3f
         are_points = tree.primitives.packets_per_record == 1

@@ -176,10 +176,10 @@ class EdgeRuns:
         Therefore the closing edges are no nearer to the center than 2.5/sqrt(1 + 2.5^2) = 0.928 r.
         """
         center = centers[self.cell]
-        first = _unit(table.points[self.first] - center)
-        last = _unit(table.points[self.first + self.count] - center)
-        mean = first + last
-        difference = _unit(first - last)
+        to_first = _unit(table.points[self.first] - center)
+        to_last = _unit(table.points[self.first + self.count] - center)
+        mean = to_first + to_last
+        difference = _unit(to_first - to_last)
         axis = np.eye(3)[np.abs(difference).argmin(axis=1)]
         perpendicular = _unit(axis - (axis * difference).sum(axis=1, keepdims=True) * difference)
         perpendicular *= np.where((perpendicular * mean).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)

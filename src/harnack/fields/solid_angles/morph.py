@@ -35,26 +35,27 @@ class Morph(BatchedField):
     For w -> 0 that is a, as 0 < U_b < pi^2, and for w -> gap it is b. (This is the 'solid angle in
     four dimensions' of the talk on Gillespie et al. 2024, with level pi^2 of the sum.)
 
-    At w = 0 and w = gap the field is the winding number of the mesh itself, with jumps across its
-    triangles. Between the ends the surface is that of a *quadrature*: each mesh is replaced by
-    oriented points at the centroids of its triangles, cut so that their edges are at most `spacing`
-    times the height; where triangles are much smaller than that, a single point stands for several
-    triangles. The sum over these points is harmonic, like the integral, and the surface of that sum
-    is traced with proof; `quadrature_displacement` bounds its distance from the surface of the
-    integral.
+    For w = 0 and w = gap the field is the winding number of the mesh itself, with jumps across its
+    triangles. For w between these, the surface is that of a *quadrature*. Each mesh is replaced by
+    oriented points at the centroids of its triangles. Triangles are first cut so that their edges
+    are at most `spacing` times the height. If triangles are much smaller than that, a single point
+    stands for several triangles. The sum over these points is harmonic, like the integral, and the
+    surface of that sum is traced with proof. `quadrature_displacement` bounds its distance from the
+    surface that exact integration would give.
 
     mesh_a, mesh_b: pairs (vertices (n, 3), faces (m, 3)), counter-clockwise seen from outside.
-        Holes are allowed: between the ends a dent reaches into the solid there, as the surface is
-        where both winding numbers, blurred, add up to 1; at the ends the level 1/2 spans them.
+        Holes are allowed. For w between 0 and gap the surface has a dent at a hole, as it is the
+        set on which both winding numbers, blurred, add up to 1. For w = 0 and w = gap the surface
+        of level 1/2 spans the hole.
     gap: the distance between the solids, in the unit of the meshes. With a large gap the slices in
         the middle are small, or empty: for solids of half-diagonal 1, 0.1 to 0.2 is good.
     w: in [0, gap]. Like `gap` it is a kernel parameter: other numbers compile nothing.
     spacing: see above, at most 2. A smaller spacing gives sharper surfaces, and needs 1/spacing^2
         times as many points. For real meshes surfaces were off by at most 0.02, 0.04 and 0.09 of w
         for 1, 1.4 and 2.
-    accuracy: between the ends, the sum uses the moments of a cluster of points beyond `accuracy`
-        times its radius. Bounds of the truncation are part of every promise, and tracing uses a
-        higher accuracy where the tolerance needs it. At least 2.
+    accuracy: for w between 0 and gap, the sum uses the moments of a cluster of points beyond
+        `accuracy` times its radius; at least 2. Bounds of the truncation error are part of every
+        promise, and tracing uses a higher accuracy where the tolerance needs it.
 
     Raises:
         MeshError: a ValueError, as `validate_mesh`; or an argument is no pair.

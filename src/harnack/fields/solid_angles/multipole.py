@@ -264,11 +264,11 @@ def _leaf_moments(
             """Apply `body` to the primitive in a slot."""
             return slot + 1, *body(primitive(dr.gather(index, slots, slot)), *state)
 
-        def has_more(slot: Any, *_: Any) -> Any:
+        def more(slot: Any, *_: Any) -> Any:
             """Whether the leaf has further slots."""
             return slot < end
 
-        return dr.while_loop((first, *state), has_more, step, label="slots")[1:]
+        return dr.while_loop((first, *state), more, step, label="slots")[1:]
 
     def measure(source: _DipolePrimitive, low: Vec3, high: Vec3, area: Real, weighted: Vec3) -> Any:
         """Add a primitive to the box from low to high, to the area, and to the sum of positions
@@ -283,10 +283,10 @@ def _leaf_moments(
         `_power_terms`, then the moments."""
         for dipole in source.dipoles:
             offsets = [(weight, point - center) for weight, point in dipole.points]
-            has_more = _power_terms(dr.norm(dipole.normal), offsets) + _flatten(
+            more = _power_terms(dr.norm(dipole.normal), offsets) + _flatten(
                 _spread_dipole_moments(dipole.normal, offsets)
             )
-            parts = tuple(a + b for a, b in zip(parts, has_more, strict=True))
+            parts = tuple(a + b for a, b in zip(parts, more, strict=True))
         return parts
 
     start = (vector(dr.inf), vector(-dr.inf), real(0), vector(0))

@@ -107,14 +107,15 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
 
     - "edges" holds for **every** curve: |grad f| and the bound of second derivatives bound the
       change of f (`lift_ball`).
-    - "planar": on B(x, d), d the distance to the curve, the lift stays in a range 4 pi wide if all
-      loops together bound a region of a plane (`planar`); else, for circles only, in the sum of
-      one such range for each circle.
+    - "planar": let d be the distance from x to the curve. On the ball B(x, d) the lift stays in a
+      range 4 pi wide if all loops together bound a region of a plane (`planar`). If the curves are
+      circles only, it stays in the sum of one such range for each circle.
     - "convex": on B(x, d) the lift stays in (-6 pi, 6 pi) if the curve is one loop without
-      self-intersections on the boundary of a convex set: a segment crosses the 2 pi level, where
-      the principal value in (-2 pi, 2 pi) jumps by 4 pi, at most once net (paper, Theorem C.1).
-    - "paper" assumes that range for any curve and promises nothing else, as the paper does. It is
-      false for coils and links and exists for comparisons: hits can be missed.
+      self-intersections on the boundary of a convex set. For the principal value in (-2 pi, 2 pi)
+      jumps by 4 pi at the 2 pi level, and a segment crosses this level at most once net (paper,
+      Theorem C.1).
+    - "paper" assumes that range for any curve and promises nothing else, as the paper does. This is
+      false for coils and links, so that hits can be missed. It exists for comparisons.
 
     cells: whether to build FMM cells, for many rays and curves of many vertices. In a cell, near
     edges are summed directly, and all others are one polynomial with a proved remainder. So an
