@@ -207,9 +207,9 @@ def _are_separated(first: _PlanarLoop, second: _PlanarLoop) -> bool:
         return max(outer_gap, abs(first.radius - second.radius) - distance) >= _MIN_LOOP_DISTANCE
     if second.radius > 0:
         first, second = second, first
-    start, end = second.points, np.roll(second.points, -1, axis=0)
+    start, stop = second.points, np.roll(second.points, -1, axis=0)
     if first.radius > 0:
-        edge, offset = end - start, first.points[0] - start
+        edge, offset = stop - start, first.points[0] - start
         fraction = np.clip((offset * edge).sum(axis=1) / (edge * edge).sum(axis=1), 0, 1)
         nearest = float(np.linalg.norm(offset - fraction[:, None] * edge, axis=1).min())
         farthest = float(np.linalg.norm(offset, axis=1).max())
