@@ -151,8 +151,8 @@ def remainder_promises(cubes: Real, fourths: Real, distance: Real) -> tuple[Tayl
     is at most 3/2 times the integral of |dp|/|D|^3. At x + s v, |D| is less by s at most. So by
     Taylor the remainder after the linear term is, for t < d, at most
 
-        3/2 integral of |dp| integral over [0, t] of (t-s)/(|D|-s)^3 ds = 3/4 t^2 integral of
-        |dp|/(|D|^3 (1 - t/|D|)).
+        3/2 integral of |dp| integral over [0, t] of (t-s)/(|D|-s)^3 ds
+            = 3/4 t^2 integral of |dp|/(|D|^3 (1 - t/|D|)).
 
     For u = t/|D| <= q, 1/(1 - u) <= 1 + u/(1 - q). On the ball of radius q d that is
     `TaylorRemainder` with the constant 3/2 (I3 + q d I4/(1 - q)). The bound holds for any piece of
@@ -175,12 +175,12 @@ def gradient_change_bound(cubes: Real, fourths: Real, distance: Real, radius: Re
     (`remainder_promises`). So is the norm of the Hessian, and from x to x + t v the gradient
     changes by at most
 
-        3/2 integral of |dp| integral over [0, t] of ds/(|D|-s)^3 = 3/4 t integral of |dp|/|D|^3 (2
-        - u)/(1 - u)^2,    u = t/|D|.
+        3/2 integral of |dp| integral over [0, t] of ds/(|D|-s)^3
+            = 3/4 t integral of |dp|/|D|^3 (2 - u)/(1 - u)^2,    u = t/|D|.
 
-    For 0 <= u <= q < 1 the fraction (2 - u)/(1 - u)^2 is convex in u, and so at most its chord 2 +
-    u (3 - 2q)/(1 - q)^2. With q = t/d the change is at most 3/2 t I3 + 3/4 t^2 I4 (3 - 2q)/(1 -
-    q)^2.
+    For 0 <= u <= q < 1 the fraction (2 - u)/(1 - u)^2 is convex in u, and so at most its chord
+    2 + u (3 - 2q)/(1 - q)^2. With q = t/d the change is at most 3/2 t I3 + 3/4 t^2 I4
+    (3 - 2q)/(1 - q)^2.
     """
     q = radius / distance
     growth = (3 - 2 * q) / dr.square(1 - q)

@@ -531,9 +531,9 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
                 )
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """A box around the points that contains the level sets. At distance rho from all points |f|
-        <= (sum of areas)/rho^2, smoothed or not, as 1 + 5 q/2 <= (1 + q)^(5/2) with q =
-        h^2/rho^2."""
+        """A box around the points that contains the level sets. At distance rho from all points
+        |f| <= (sum of areas)/rho^2, smoothed or not, as 1 + 5 q/2 <= (1 + q)^(5/2) with
+        q = h^2/rho^2."""
         margin = 1.0001 * math.sqrt(float(self.areas.sum()) / min(abs(level) for level in levels))
         low, high = self._box
         return Box(low - margin, high + margin)

@@ -124,8 +124,8 @@ class DipoleExpansions:
     coefficients: (n, COEFFICIENTS) of the local expansion (`local_expansion.coefficient_keys`).
     error, slope: (n,) bounds of the truncation errors of value and gradient, anywhere in the ball.
     tail, tail_slope: (n,) further truncation errors of value and gradient are at most q^(p+1)
-        `tail` and q^p `tail_slope` at a distance of q times the radius from the center, with p =
-        `DEGREE`.
+        `tail` and q^p `tail_slope` at a distance of q times the radius from the center, with
+        p = `DEGREE`.
     s4: (n,) bounds of the sum of area/D^4, with D the smallest distance of a primitive from the
         center.
     min_distance: (n,) a lower bound of the distance of these primitives from the center.

@@ -156,10 +156,10 @@ class LiftedEdge:
 
         Variation. Let rho be the distance of a point of the edge. Taylor's remainder after the
         linear term is at most 3/4 t^2 times the integral of |dp|/(rho^3 (1-t/rho))
-        (`curve_queries.remainder_promises`). With a = L/2 and distance d an edge has int rho^-3 <=
-        2a/(d^2 sqrt(d^2+a^2)) =: 2e and int rho^-4 <= 2e/d. On [0, b], 1/(1-q) <= 1 + q/(1-b) <= 1
-        + q rise/4 (`SourceSums.sample`). So the terms s4 += e/2 and s5 += 3e/(8d) bound the edge's
-        part of the remainder. d is reduced by its rounding.
+        (`curve_queries.remainder_promises`). With a = L/2 and distance d an edge has int
+        rho^-3 <= 2a/(d^2 sqrt(d^2+a^2)) =: 2e and int rho^-4 <= 2e/d. On [0, b],
+        1/(1-q) <= 1 + q/(1-b) <= 1 + q rise/4 (`SourceSums.sample`). So the terms s4 += e/2 and
+        s5 += 3e/(8d) bound the edge's part of the remainder. d is reduced by its rounding.
         """
         distance = fmax(dr.sqrt(self.edge.squared_distance) - 2 * unit, 0)
         first, e = edge_variation(distance * distance, self.edge.inverse_square_length)

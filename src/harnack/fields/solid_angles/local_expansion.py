@@ -75,9 +75,9 @@ def multipole_to_local(moments: Pairs, seen: Pairs, degree: int) -> list[Any]:
         of the moments.
 
     Proof. f(x) = -sum conj(M_lm) I_lm(x - y). The addition theorem of R, applied to both arguments
-    of 1/|r + u - y| = sum conj(R_lm(y)) I_lm(r + u) = sum conj(R_lm(y - u)) I_lm(r), gives I_lm(r +
-    u) = sum_jk conj(R_jk(-u)) I_(l+j),(m+k)(r), as the R_lm are linearly independent, and R_jk(-u)
-    = (-1)^j R_jk(u). So L_jk = -(-1)^j sum_lm conj(M_lm) I_(l+j),(m+k)(c - y).
+    of 1/|r + u - y| = sum conj(R_lm(y)) I_lm(r + u) = sum conj(R_lm(y - u)) I_lm(r), gives
+    I_lm(r + u) = sum_jk conj(R_jk(-u)) I_(l+j),(m+k)(r), as the R_lm are linearly independent, and
+    R_jk(-u) = (-1)^j R_jk(u). So L_jk = -(-1)^j sum_lm conj(M_lm) I_(l+j),(m+k)(c - y).
     """
     coefficients: list[Any] = []
     degrees = sorted({l for l, _ in moments})
@@ -105,9 +105,9 @@ def local_to_local_matrices(degree: int, offset: float) -> FloatArray:
 
     offset: the offset of an octant's center along each axis, in units of the cube's radius.
 
-    For the offset s of the octant's center and the offset v of a point from there, R_jk(s + v) =
-    sum R_ab(v) R_(j-a),(k-b)(s). So L'_ab = sum_jk L_jk conj(R_(j-a),(k-b)(s)). This is exact, as
-    all are polynomials.
+    For the offset s of the octant's center and the offset v of a point from there,
+    R_jk(s + v) = sum R_ab(v) R_(j-a),(k-b)(s). So L'_ab = sum_jk L_jk conj(R_(j-a),(k-b)(s)). This
+    is exact, as all are polynomials.
     """
     order = coefficient_keys(degree)
     index = {key: i for i, key in enumerate(order)}
@@ -198,8 +198,9 @@ def rounding_tables(degree: int, largest: float) -> FloatArray:
     Proof. Value and derivatives are sums of products of coefficients, coordinates and constants.
     Each product passes through at most n = 9 degree + 2 (degree + 1)^2 roundings: 6 per degree in
     the recurrence of R_jk, 3 per degree of the coordinates, and the roundings of the sums. So they
-    are off by at most 1.01 n u times the sum of the absolute values of the products, with u =
-    epsilon/2. This sum is the same expression with all signs positive, at the largest coordinates.
+    are off by at most 1.01 n u times the sum of the absolute values of the products, with
+    u = epsilon/2. This sum is the same expression with all signs positive, at the largest
+    coordinates.
     """
     count = (degree + 1) ** 2
     coordinate = _AbsoluteValues(np.full(count, largest))

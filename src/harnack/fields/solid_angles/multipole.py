@@ -518,16 +518,16 @@ def remainder_constants(level: NodeMoments, rough: float) -> tuple[FloatArray, F
     """Numbers A and K, each (k,), that bound the remainder of a node's field after its linear part.
 
     They hold at points whose distance r from the node's center is at least r0, which is `rough`
-    times the node's radius R. Over a step of length t = q r with q <= Q =
-    `max_step_fraction(rough)`, the field differs from its linear part by at most
+    times the node's radius R. Over a step of length t = q r with
+    q <= Q = `max_step_fraction(rough)`, the field differs from its linear part by at most
 
         (A + K/r^2) t^2/r^4 Phi_1(q),   Phi_l(q) = ((1-q)^-(l+1) - 1 - (l+1)q)/q^2.
 
     The term l, a harmonic function of degree -(l+1), is at most B_l/r^(l+1), and its k-th
     derivative along a line (l+k)!/l! B_l/r^(l+1+k) (the argument of `truncation_bounds`, k times).
     So Taylor's remainder is at most B_l Phi_l(q) t^2/r^(l+3). In Phi_l/Phi_1 the ratio of
-    coefficients, (l+k)!/(l! (k+1)!), grows with k, so that the quotient grows with q, and W_l =
-    Phi_l(Q)/Phi_1(Q) is a bound. With r >= r0: A = B_1 + W_2 B_2/r0 and K = sum_{l>=3} W_l
+    coefficients, (l+k)!/(l! (k+1)!), grows with k, so that the quotient grows with q, and
+    W_l = Phi_l(Q)/Phi_1(Q) is a bound. With r >= r0: A = B_1 + W_2 B_2/r0 and K = sum_{l>=3} W_l
     B_l/r0^(l-3), for l >= 6 of B_l <= l R^(l-5) sum a |d|^4, with Phi_l(Q) < (1-Q)^-(l+1)/Q^2.
     """
     r0, q = np.maximum(rough * level.radius, 1e-50), max_step_fraction(rough)

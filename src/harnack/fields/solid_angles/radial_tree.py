@@ -12,15 +12,15 @@ T2[D^2] K = T2[z,z] psi_2 - tr T2 psi_1, T3[D^3] K = 3 z.tr T3 psi_2 - T3[z,z,z]
 harmonic in three dimensions, so that traces count: there are 19 numbers instead of 15.
 
 Truncation. The rest of Taylor's formula is an integral of the fourth derivative of K along the
-segment from c to c + d_i. At the fraction s of the segment this derivative is at most 4! Q_4/(r - s
-|d_i|)^5. There Q_4 is at most its value at r - R. The integral of the other factor is the rest of
-the Taylor series of 1/(r - .)^2: with q = |d_i|/r
+segment from c to c + d_i. At the fraction s of the segment this derivative is at most 4!
+Q_4/(r - s |d_i|)^5. There Q_4 is at most its value at r - R. The integral of the other factor is
+the rest of the Taylor series of 1/(r - .)^2: with q = |d_i|/r
 
     |rest| <= Q_4 |m_i| (1/(1-q)^2 - 1 - 2q - 3q^2)/r^2 = Q_4 |m_i| |d_i|^3 (4-3q)/((1-q)^2 r^5).
 
 For Q_4 = 1 the bound is attained by a dipole on the line to x that points along it. (4-3q)/(1-q)^2
-grows with q, so that q = R/r gives a bound for all dipoles. For the gradient, likewise from 2/(r -
-.)^3,
+grows with q, so that q = R/r gives a bound for all dipoles. For the gradient, likewise from
+2/(r - .)^3,
 
     Q_5 |m_i| |d_i|^3 (20 - 30q + 12q^2)/((1-q)^3 r^6),
 

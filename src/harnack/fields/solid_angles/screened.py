@@ -79,10 +79,11 @@ class YukawaKernel(RadialKernel):
 
     Bound. |d^m K[u_1, ..., u_m]| <= |K^(m)(rho)| for unit vectors: a derivative of K along a line
     is no larger than along the line to its pole. Proof: d^m K is a symmetric form, so equal vectors
-    u are the worst (Banach 1938). Write s^m as sum_j b_mj P_j(s) in Legendre polynomials, b_mj >=
-    0; then (u.grad)^m = sum_j b_mj |grad|^(m-j) Y_j(grad) with j = m, m-2, ... and solid harmonics
-    Y_j about u. On K, |grad|^2 is kappa^2, and Y_j(grad) K = (-1)^j psi_j Y_j(z) =
-    (-1)^j rho^j psi_j P_j(cos) (Hobson 1892). Every coefficient has the sign (-1)^m, and
+    u are the worst (Banach 1938). Write s^m as sum_j b_mj P_j(s) in Legendre polynomials,
+    b_mj >= 0; then (u.grad)^m = sum_j b_mj |grad|^(m-j) Y_j(grad) with j = m, m-2, ... and solid
+    harmonics Y_j about u. Applied to K, |grad|^2 is kappa^2, and
+    Y_j(grad) K = (-1)^j psi_j Y_j(z) = (-1)^j rho^j psi_j P_j(cos) (Hobson 1892), with cos the
+    cosine of the angle between u and z. Every coefficient has the sign (-1)^m, and
     |P_j| <= 1 = P_j(1).
 
         |K^(m)(rho)| = m! Q_m(kappa rho)/rho^(m+1),   Q_m(t) = exp(-t) sum_(j<=m) t^j/j!,
@@ -244,17 +245,18 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
     Promises (`screened_promises` has the formulas). Let d_i be the distances of the points from x,
     and d the smallest of them.
 
-    - Curvature. On B(x, r), r < d, each term's second derivatives are at most |K'''|(d_i - s) =
-      6 Q_3(kappa (d_i-s))/(d_i-s)^4 at distance s from x (`YukawaKernel`, kappa = 1/l). By
+    - `TaylorRemainder` bounds second derivatives. On the ball B(x, r) with r < d, each term's
+      second derivatives at distance s from x are at most
+      |K'''|(d_i - s) = 6 Q_3(kappa (d_i-s))/(d_i-s)^4, with `YukawaKernel` K and kappa = 1/l. By
       Taylor the integral of (t-s) times that bounds w(y) - w(x) - grad w.(y-x), t = |y-x|. With
-      Q_3(kappa (d_i-s)) <= exp(kappa r) Q_3(kappa d_i) and t/d_i = q it is at most
-      exp(kappa r) Q_3(kappa d_i) (3-2q)/(1-q)^2 t^2/d_i^4; (3-2q)/(1-q)^2 is convex, hence below
-      its chord on [0, r/d].
-    - HarmonicBall of dimension 4. w(y) cos(s/l) is harmonic in (y, s). For |y-x|^2 + s^2 < R^2 <
-      d^2 it is the product of a number in [w-S, w+S] and a number in [cos(min(R/l, pi)), 1], so it
-      lies between the smallest and the largest product of ends. S bounds the change of w on
-      B(x, R), by the integral of |K''|(d_i-s) = 2 Q_2/(d_i-s)^3, where 1/(1-q)^2 - 1 = 2q + ... is
-      bounded by its chord, too.
+      Q_3(kappa (d_i-s)) <= exp(kappa r) Q_3(kappa d_i) and q = t/d_i it is at most
+      exp(kappa r) Q_3(kappa d_i) (3-2q)/(1-q)^2 t^2/d_i^4. The function (3-2q)/(1-q)^2 is convex,
+      and so at most its chord on [0, r/d].
+    - `HarmonicBall` of dimension 4. w(y) cos(s/l) is harmonic in (y, s). For
+      |y-x|^2 + s^2 < R^2 < d^2 it is the product of a number in [w(x)-S, w(x)+S] and a number in
+      [cos(min(R/l, pi)), 1]. So it lies between the smallest and the largest product of the ends
+      of these intervals. S bounds the change of w on B(x, R), by the integral of
+      |K''|(d_i-s) = 2 Q_2/(d_i-s)^3, where 1/(1-q)^2 - 1 = 2q + ... is bounded by its chord, too.
 
     By default only the first promise is used: it took 14 to 30 evaluations per ray, and the second
     took 20 to 65 (spheres and tori of 270 to 2000 points, l from 0.03 to 100).
@@ -370,9 +372,9 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         sums: the sums at the points.
         unit: the rounding of a coordinate.
 
-        Exponentials are at least exp(-80) = 2e-35 (`MAX_LENGTHS`), times at most Q_3(80) exp(80) =
-        9e4. Fourth derivatives of the kernel have Q_4(t) <= (1 + t/4) Q_3(t), and a coordinate is
-        off by `unit`.
+        Exponentials are at least exp(-80) = 2e-35 (`MAX_LENGTHS`), times at most Q_3(80)
+        exp(80) = 9e4. Fourth derivatives of the kernel have Q_4(t) <= (1 + t/4) Q_3(t), and a
+        coordinate is off by `unit`.
         """
         inverse = dr.rcp(sums.singularity_distance)
         value_error = 2e-30 * float(self._rows[:, 6].sum()) * inverse * inverse

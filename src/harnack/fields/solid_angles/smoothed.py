@@ -42,11 +42,11 @@ class SmoothedKernel(RadialKernel):
         psi_k = (2k-1)!! (1 + (2k+1) q/2)/D^(2k+1),   q = h^2/D^2,
 
     sums of positive terms; a dipole m at y = x + z gives -m.grad_y K = m.z (rho^2 + 5 h^2/2)/D^5.
-    Since Laplacian D^p = p D^(p-2) (p + 1 - (p-2) q) in three dimensions, -Laplacian K/(4 pi) =
-    15 h^4/(8 pi D^7): positive, with integral 1 and second moment 3 h^2/2. So a sum over dipoles
-    is the sum over plain dipoles averaged with this weight. (1/D by itself has the weight
-    3 h^2/(4 pi D^5), whose second moment is infinite: at equal noise its surfaces were farther
-    off.)
+    Since Laplacian D^p = p D^(p-2) (p + 1 - (p-2) q) in three dimensions,
+    -Laplacian K/(4 pi) = 15 h^4/(8 pi D^7). This is positive, with integral 1 and second moment
+    3 h^2/2. So a sum over these dipoles is the sum over plain dipoles, averaged with this weight.
+    (The kernel 1/D has the weight 3 h^2/(4 pi D^5), which has an infinite second moment: at equal
+    noise its surfaces were farther off.)
 
     Bound. |d^m K[u_1, ..., u_m]| <= m! Q_m/D^(m+1), Q_m = 1 + q (m+1)(m+2)/4, for unit vectors.
     Proof. Equal vectors u are the worst (Banach 1938). D is the length of Z = (z, h), and along a

@@ -320,8 +320,8 @@ class TrailValues:
         """1/(4 pi) times the sum of Omega_e at points x, and a mask of the points that must be
         computed again.
 
-        ray_sign: 1 for the direction d = z; -1 if x and the edges are to be mirrored in a plane z =
-            const.
+        ray_sign: 1 for the direction d = z; -1 if x and the edges are to be mirrored in a plane
+            z = const.
 
         Each lane of the kernel computes several points. The mask is true in three cases: rounding
         could have changed the sign of an imaginary part; a product of factors nearly underflows
@@ -405,8 +405,8 @@ def _multiplied_by_record(
 
 
 def _relative_vertex(bits: _FloatFormat, vertex: list[Real], point: Point) -> Seen:
-    """A vertex a = (u, v, z) relative to a point: (u t, v t, s t) with t = |a| + |z| and s = |a| -
-    ray_sign z.
+    """A vertex a = (u, v, z) relative to a point: (u t, v t, s t) with t = |a| + |z| and
+    s = |a| - ray_sign z.
 
     s t is (|a| + |z|)^2 or u^2 + v^2, so that no difference cancels.
     """
