@@ -1,18 +1,19 @@
 """Winding numbers modulo 1 from FMM cells.
 
-Modulo 1, the winding number w of a mesh is 1/(4 pi) times the solid angle of its singular edges,
-the edges at which triangles do not cancel, which form closed curves. Cells (`curve_cells`) evaluate
-it at nearly the same cost for any number of edges, and without following a ray.
+Modulo 1, the winding number w of a mesh is 1/(4 pi) times the solid angle of its singular edges.
+These are the edges at which triangles do not cancel; they form closed curves. Cells (`curve_cells`)
+evaluate this solid angle at nearly the same cost for any number of edges, and without following a
+ray.
 
 `tracer.branch_tracker.BranchTracker` determines the integer along rays: proved steps stay between
-two periodic levels, and a jump adds an integer to w. A ray that comes from outside the extent of
-the field begins where w is about 0. A ray that begins inside gets w from the center of its cell,
-where w was computed once: along the line from the center, the solid angle of the near loops is
-followed continuously, the polynomial is continuous, and crossings of triangles are counted
-(`BoundaryCells.value_where_known`). Rays take samples that know their branch only if rounding
-leaves the result of these steps uncertain, and to pass a periodic level that is no true level.
-These cells replaced a tree of chains of edges along rays, which had to open all chains that a ray
-passes through.
+two periodic levels, and a jump adds an integer to w. If a ray comes from outside the extent of the
+field, w is about 0 where it begins. If a ray begins inside, it gets w from the center of its cell,
+where w was computed once (`BoundaryCells.value_where_known`). Along the line from that center to
+the ray's start, the solid angle of the near loops is followed continuously, the polynomial is
+continuous, and crossings of triangles are counted. Rays take samples that know their branch only if
+rounding leaves the result of these steps uncertain, and to pass a periodic level that is no true
+level. These cells replaced a tree of chains of edges along rays, which had to open all chains that
+a ray passes through.
 """
 
 from __future__ import annotations
@@ -45,15 +46,17 @@ if TYPE_CHECKING:
 
 __all__ = ["BoundaryCells"]
 
-_SHARE = 1 / (4 * math.pi)
-# The boundary of a broken mesh consists of many small loops, and its cells must be built fast: a
-# cell may have `_NEAR_FACTOR` times as many near edges as a cell of a single curve, and the edges
-# beyond `_SHARED` radii of a split cell count for all cells inside it.
-_NEAR_FACTOR, _SHARED = 4.0, 3.5
+# One over the solid angle of all directions.
+_PER_SPHERE = 1 / (4 * math.pi)
+# The boundary of a broken mesh consists of many small loops, and its cells must be built fast. So a
+# cell may have `_NEAR_FACTOR` times as many near edges as a cell of a single curve. If a cell is
+# split, edges farther than `_SHARED_RADII` radii from its center are in the expansions of all cells
+# inside it.
+_NEAR_FACTOR, _SHARED_RADII = 4.0, 3.5
 # The fraction of the bytes for all numbers except w at the centers: a cell has at least 64 others.
 _CELL_BYTES_FRACTION = 64 / 65
-# Bound of the error of a point, and the distance from an edge within which samples promise nothing,
-# both in roundings of a coordinate.
+# A bound of the error of a point's position, and the distance from an edge within which samples are
+# not valid, both in roundings of a coordinate.
 _POINT_ROUNDINGS, _EDGE_ROUNDINGS = 8.0, 16.0
 # A point at which w follows from the center of its cell, and this center, are at least
 # `_TRIANGLE_ROUNDINGS` roundings away from triangles. `_MAX_BRANCH_ERROR` bounds the error of w.
@@ -65,9 +68,9 @@ class BoundaryCells:
     """FMM cells of the singular edges of a mesh, on a backend, in the unit coordinates of the mesh.
 
     cells: the cells of the closed curves that the singular edges form.
-    rays: the tree of the triangles.
-    center_values: w at the center of each cell; NaN if a triangle is near, or if the error of w is
-        not below an eighth.
+    rays: the tree of the mesh's triangles.
+    center_values: (count,) the winding number w at the center of each cell. It is NaN if a triangle
+        is near to the center, or if the bound of the error of w is not below an eighth.
     """
 
     cells: CurveCells
@@ -79,10 +82,12 @@ class BoundaryCells:
         cls, rays: TriangleTree, mesh: WindingMesh, low: FloatArray, high: FloatArray,
         most_bytes: int, value: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
     ) -> BoundaryCells | None:  # fmt: skip
-        """The cells of a cube around the mesh and around the box from low (3,) to high (3,); None
-        if the cells would take more than `most_bytes` bytes.
+        """Build the cells of a cube that contains the mesh and the box from low (3,) to high (3,).
+        Returns None if the cells would take more than `most_bytes` bytes.
 
-        value: gives w (n,) at points (n, 3), and bounds (n,) of its error.
+        rays: the tree of the mesh's triangles.
+        low, high: corners of the box, in the unit of the mesh's own coordinates.
+        value: a function that gives w (n,) at points (n, 3), and bounds (n,) of its error.
         """
         backend = rays.tree.backend
         trails = closed_trails(mesh.singular_edges)
@@ -98,7 +103,7 @@ class BoundaryCells:
             points.max(axis=0),
             int(_CELL_BYTES_FRACTION * most_bytes),
             near=_NEAR_FACTOR,
-            shared=_SHARED,
+            shared=_SHARED_RADII,
         )
         if cells is None:
             return None
@@ -122,20 +127,22 @@ class BoundaryCells:
         return self.cells.size + self.count * np.dtype(self.cells.backend.dtype).itemsize
 
     def value_where_known(self, x: Vec3, unit: Real, active: Mask) -> Real:
-        """w at x on active lanes; NaN on other lanes, and where w does not follow from the cell.
+        """The winding number w at x, on active lanes. It is NaN on other lanes, and wherever w does
+        not follow from the cell.
 
         unit: the rounding of a coordinate of x, and of the ray on which x lies.
 
-        Proof. On the line from the cell's center c to x, w changes by the change of the solid angle
-        of the boundary over 4 pi, and by -1 where the line crosses a triangle along its normal
-        (`edge_lift`). This gives an estimate of w(x) with the errors of w(c) and of the cell. Then
-        w(x) is the number nearest to the estimate among the numbers that are congruent modulo 1 to
-        the value of the cell, as all errors together are below three eighths. The result is NaN on
-        a triangle, and where `signed_crossings_between` or `change_from_center` is not certain. Off
-        all triangles the result is also the value on the side on which x lies on the ray: the t of
-        a crossing is the depth of a point of the triangle that is a few roundings off the ray, and
-        so is the true t. If x were between these two, a point of the triangle would be as near to
-        x.
+        Proof. On the line from the cell's center c to x, w changes for two reasons: by 1/(4 pi)
+        times the change of the solid angle of the boundary, and by -1 where the line crosses a
+        triangle along its normal (`edge_lift`). This gives an estimate of w(x) with the errors of
+        w(c) and of the cell. The value of the cell is w(x) modulo 1. Among the numbers that differ
+        from it by integers, w(x) is the one nearest to the estimate, because all errors together
+        are below three eighths. The result is NaN on a triangle, and where
+        `signed_crossings_between` or `change_from_center` is not certain. Off all triangles the
+        result is also the value on the side on which x lies on the ray, for this reason: the
+        computed position t of a crossing on the ray is that of a point of the triangle a few
+        roundings off the ray, and so is the true t. If x were between these two, a point of the
+        triangle would be as near to x.
         """
         backend, real = self.cells.backend, self.cells.backend.Float
         local, inside = self.cells.sums(x, active)
@@ -147,24 +154,27 @@ class BoundaryCells:
         change, is_certain = self.cells.change_from_center(local, frame, x, unit, inside)
         turns, is_clear = self.rays.signed_crossings_between(frame, distance, unit, inside)
         on_triangle = jump_sum_within(self.rays, x, _TRIANGLE_ROUNDINGS * unit, inside)
-        estimate = dr.gather(real, self.center_values, local.cell, inside) - turns + _SHARE * change
-        value = _SHARE * local.sums.angle
+        estimate = (
+            dr.gather(real, self.center_values, local.cell, inside) - turns + _PER_SPHERE * change
+        )
+        value = _PER_SPHERE * local.sums.angle
         offset = estimate - value
         branch = dr.round(offset)
         error = local.error + local.rounding
         is_valid = inside & is_certain & is_clear & (on_triangle == 0)
         is_valid &= (dr.abs(offset - branch) < _MAX_BRANCH_ERROR) & (
-            _SHARE * error < _MAX_BRANCH_ERROR
+            _PER_SPHERE * error < _MAX_BRANCH_ERROR
         )
         return dr.select(is_valid, value + branch, dr.nan)
 
     def sample(
         self, x: Vec3, direction: Vec3 | None, unit: Real, active: Mask
     ) -> tuple[Sample, Mask]:
-        """A sample of w modulo 1 at x, and the mask of the lanes on which it is valid: the active
-        lanes whose x lies in a cell and not at an edge.
+        """A sample of w modulo 1 at x, and the mask of the lanes on which the sample is valid.
+        These are the active lanes whose x lies in a cell and is not at an edge.
 
-        The promises are about w continued smoothly, and are the promises of `SolidAngle`.
+        The promises are those of `SolidAngle`. They hold for the smooth continuation of w, without
+        its jumps.
 
         direction: (3,) a unit vector, along which `ray_promises` hold; None for no such promises.
         unit: the rounding of a coordinate.
@@ -182,17 +192,19 @@ class BoundaryCells:
             line = RayLine(x, direction, rounding)
 
             def rates(lengths: tuple[Real, ...], lanes: Mask) -> tuple[Real, ...]:
+                """Bounds of the derivative along the line up to each of the lengths
+                (`CurveCells.rates_along`), on the given lanes."""
                 return self.cells.rates_along(cell_sums, line, lengths, lanes & inside)
 
             ray_promises = lipschitz_along(line, sums.gradient, sums.distance, rates)
         sample = Sample(
-            _SHARE * sums.angle,
-            _SHARE * sums.gradient,
-            tuple(promise.scaled(_SHARE) for promise in promises),
-            _SHARE * (cell_sums.error + rounded),
-            _SHARE * dr.fma(SLOPE_ROUNDINGS / 3 * unit, sums.cubes, cell_sums.slope_error),
-            truncation_error=_SHARE * cell_sums.error,
-            alternative_promises=(ball.scaled(_SHARE),),
-            ray_promises=tuple(promise.scaled(_SHARE) for promise in ray_promises),
+            _PER_SPHERE * sums.angle,
+            _PER_SPHERE * sums.gradient,
+            tuple(promise.scaled(_PER_SPHERE) for promise in promises),
+            _PER_SPHERE * (cell_sums.error + rounded),
+            _PER_SPHERE * dr.fma(SLOPE_ROUNDINGS / 3 * unit, sums.cubes, cell_sums.slope_error),
+            truncation_error=_PER_SPHERE * cell_sums.error,
+            alternative_promises=(ball.scaled(_PER_SPHERE),),
+            ray_promises=tuple(promise.scaled(_PER_SPHERE) for promise in ray_promises),
         )
         return sample, inside & (sums.distance > _EDGE_ROUNDINGS * unit)

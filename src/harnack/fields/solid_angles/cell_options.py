@@ -1,16 +1,16 @@
 """The argument `cells` of fields that may have FMM cells, and the decision whether cells pay.
 
-Fields with cells (`dipole_cells`, `curve_cells`) take an argument `cells`: None for cells where
-they pay, True for cells in any case, False for no cells, or the number of megabytes that they may
-take.
+Fields with cells (`dipole_cells`, `curve_cells`) take an argument `cells`. None builds cells if
+they pay, True builds cells in any case, and False builds none. A number builds cells in any case
+and limits their memory to this number of megabytes.
 
 `trace`, `render`, and views that Python draws tell a field the number of rays
-(`Field.for_ray_count`), and the field builds cells if that pays: building the cells of a cloud
-costs as much as about six rays per point without cells. Solids pass the number on to their
-operands.
+(`Field.for_ray_count`). The field builds cells if that pays: to build the cells of a cloud takes as
+long as to trace about six rays per point without cells. Solids tell their operands the number, too.
 
 Values at points use cells if the user requested cells, whatever the number of points. If that
-number decided, values of a block of points could lie outside of the bounds for all points.
+number decided, the values of a part of the points could differ from those of all points by more
+than their error bounds.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ if TYPE_CHECKING:
 
 __all__ = ["BuiltCells", "FieldWithCells"]
 
-# Megabytes that cells may take by default.
+# Megabytes that cells may take if the argument `cells` does not say how many.
 _MEGABYTES = 256.0
 
 Built = TypeVar("Built")
 
 
 class BuiltCells(Protocol):
-    """Cells that were built: their number, and their bytes."""
+    """Cells that were built. count: their number. size: the number of their bytes."""
 
     @property
     def count(self) -> int: ...
@@ -50,9 +50,10 @@ class BuiltCells(Protocol):
 
 
 class FieldWithCells(Field):
-    """A field that may have cells. Subclasses set `cells` by `configure_cells`, and define
-    `cells_pay_from`.
+    """A field that may have FMM cells. The constructor of a subclass calls `configure_cells`, which
+    sets the attributes, and the subclass defines `cells_pay_from`.
 
+    cells: the argument `cells`, as described in this module.
     cells_for_values: whether values at points use the cells, too. It is true if the user requested
         cells, whatever the number of points, so that values and their error bounds always come from
         the same method.
@@ -67,8 +68,8 @@ class FieldWithCells(Field):
     _batches: Any
 
     def configure_cells(self, cells: Any) -> None:
-        """Store the argument `cells`. Raises ValueError if it is neither a bool, None nor a number
-        of megabytes."""
+        """Store the argument `cells`, and clear the caches of cells. Raises ValueError if `cells`
+        is neither a bool, None nor a number of megabytes."""
         kind = cast("Any", type(cells))
         if issubclass(kind, np.bool_):  # True is no megabyte
             cells = bool(cells)
@@ -83,14 +84,15 @@ class FieldWithCells(Field):
         self._built: TransientCache[tuple[Backend, int, bool], Any] = TransientCache()
 
     def with_cells(self, cells: bool = True) -> Self:
-        """A copy with cells for rays, or without cells."""
+        """A copy of this field that uses cells for rays only, or with cells=False no cells."""
         field = copy.copy(self)
         field.configure_cells(cells)
         field.cells_for_values, field._device, field._batches = False, None, TransientCache()
         return field
 
     def build_cached(self, backend: Backend, build: Callable[[], Built]) -> Built:
-        """The result of `build` for a backend, computed once for values and for tracing."""
+        """The result of `build()` for a backend. It is computed once, and used for values and for
+        tracing, as long as the limit of bytes and `finer_cells` are the same."""
         key = backend, self.max_bytes(), self.finer_cells
         if key not in self._built:
             self._built[key] = build()
@@ -98,16 +100,17 @@ class FieldWithCells(Field):
 
     @abc.abstractmethod
     def cells_pay_from(self) -> float:
-        """The number of rays from which on cells pay; infinite if they never pay."""
+        """The smallest number of rays for which cells pay; infinite if they never pay."""
 
     def finer_cells_pay_from(self) -> float:
-        """The number of rays from which on smaller cells pay. By default all cells have the same
-        size."""
+        """The smallest number of rays for which smaller cells pay. By default it is 0, for fields
+        whose cells have only one size."""
         return 0.0
 
     def for_ray_count(self, count: int) -> Self:
-        """This field with cells if `count` is at least `cells_pay_from` and the user neither
-        requested nor refused cells."""
+        """The field for tracing `count` rays. It has cells if the user left the choice open
+        (`cells` is None) and `count` is at least `cells_pay_from()`; otherwise it is this field
+        itself."""
         if self.cells is not None or not self.cells_pay_from() <= count:
             return self
         finer = self.finer_cells_pay_from() <= count
@@ -117,13 +120,16 @@ class FieldWithCells(Field):
         return self._with_cells[finer]
 
     def max_bytes(self) -> int:
-        """The number of bytes that cells may take."""
+        """The number of bytes that the cells may take."""
         return int(1e6 * (_MEGABYTES if self.cells is True else float(self.cells or 0)))
 
     def describe_cells(self, built: BuiltCells | None) -> dict[str, str]:
-        """The entry of `describe` about cells: their number and memory in a prepared field, the
-        memory that they may take in a field that is not prepared, or the number of rays from which
-        on there are cells."""
+        """The entry "cells" of `describe`, or an empty dictionary if the field has no cells.
+
+        In a prepared field the entry states the number and the memory of the cells `built`, which
+        is None if they would take too much memory. In a field that is not prepared it states how
+        much memory they may take, or the smallest number of rays for which there are cells.
+        """
         if self.cells is None and self.cells_pay_from() < math.inf:
             return {"cells": f"from {math.ceil(self.cells_pay_from()):,} rays on"}
         if not self.cells:

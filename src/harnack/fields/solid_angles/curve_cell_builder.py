@@ -1,10 +1,10 @@
-"""Builds FMM cells of curves (`curve_cells`), one octree level at a time.
+"""Builds FMM cells of curves (`curve_cells`), one octree depth at a time.
 
 A cell inherits the local expansion and the near list of its parent. Edges of that list that are far
-from the cell move into the expansion, so that a cell costs as much as the near list of its parent,
-and not as the whole curve. All edges are visited only for bounds of the far field.
+from the cell are added to the expansion. So the work for a cell is proportional to the near list of
+its parent, and not to the whole curve. All edges are visited only for bounds of the far edges.
 
-- `build_curve_cells`: the cells of a cube, with a limit of their bytes.
+- `build_curve_cells`: builds the cells of a cube, with a limit of their bytes.
 """
 
 from __future__ import annotations
@@ -38,41 +38,46 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
 
 _PERIOD = 4 * math.pi
-# Edges within this many radii of the cell's ball from its center are near: `_NEAR` for leaves;
-# `_SHARED` for cells that are split, as their far edges count in all cells inside them.
-_NEAR, _SHARED = 3.0, 4.5
-# Cells are split if they have more near edges than `_MAX_NEAR_FACTOR` times the cube root of the
-# number of all edges (but at least `_MIN_NEAR`), or if truncation exceeds about `_MAX_TAIL_RATIO`
-# times the integral of |dp|/D^2, a bound of the gradient. Chosen by experiment.
-_MAX_NEAR_FACTOR, _MIN_NEAR, _MAX_TAIL_RATIO = 2.0, 6.0, 1e-5
+# Edges are near to a cell if they are within this many radii of its ball from its center:
+# `_NEAR_RADII` for cells that are not split; `_SHARED_RADII` for cells that are split, as the
+# expansion of their far edges is passed on to all cells inside them.
+_NEAR_RADII, _SHARED_RADII = 3.0, 4.5
+# Cells are split if they have more near edges than `_NEAR_PER_CUBE_ROOT` times the cube root of the
+# number of all edges (but at least `_MIN_NEAR`), or if the truncation error exceeds about
+# `_MAX_TAIL_RATIO` times the integral of |dp|/D^2, a bound of the gradient. Chosen by
+# experiment.
+_NEAR_PER_CUBE_ROOT, _MIN_NEAR, _MAX_TAIL_RATIO = 2.0, 6.0, 1e-5
 # If memory is short, cells get twice as many near edges and four times the truncation, in at most
 # this many attempts.
 _ATTEMPTS = 4
 # Corners and centers of all cells are multiples of this over 2^DEEPEST, in unit coordinates: single
 # precision holds them exactly.
 _GRID_STEP = 2.0**-8
-# The relative margin of sums in single precision that serve as bounds; edges that are near by less
-# than this fraction count as far as well.
-_SLACK = 1e-3
+# The relative margin of sums in single precision that serve as bounds. Edges that are near by less
+# than this fraction of the distance count in the bounds of far edges as well.
+_SUM_MARGIN = 1e-3
 # The largest number of records of near edges, so that single precision holds their indices.
 _MAX_RECORDS = 2**24
 
 
 def build_curve_cells(
     backend: Backend, loops: tuple[FloatArray, ...], low: FloatArray, high: FloatArray,
-    most_bytes: int, near: float = 1.0, shared: float = _SHARED,
+    most_bytes: int, near: float = 1.0, shared: float = _SHARED_RADII,
 ) -> CurveCells | None:  # fmt: skip
-    """Cells of a cube around the box from low (3,) to high (3,), with at most `most_bytes` bytes;
-    None if they would take more even with larger cells and more near edges.
+    """Build cells of a cube around the box from low (3,) to high (3,), of at most `most_bytes`
+    bytes. Returns None if the cells would take more bytes even with larger cells and more near
+    edges.
 
     loops: closed curves (n, 3), of a size of about 1.
     near: the factor by which cells may have more near edges, and more truncation, than usual.
-    shared: edges beyond this many radii of the ball of a split cell count for all cells inside it.
+    shared: if a cell is split, the edges farther than this many radii of its ball from its center
+        are summed once, in an expansion that all cells inside it inherit.
 
     Proof. The cell of the cube begins with all loops as its near runs and an expansion of 0. Each
-    cell keeps the near edges among the runs of its parent, closed again. The cycle of the remaining
-    edges (`edge_runs.subtract_runs`) is far from the cell's ball and goes into the expansion. So in
-    each cell, near loops and expansion together have the solid angle of the curve, modulo 4 pi.
+    cell keeps those edges of its parent's runs that are near to it, as runs that are closed again.
+    The remaining edges (`edge_runs.subtract_runs`) form a cycle that is far from the cell's ball,
+    and go into the expansion. So in each cell, near loops and expansion together have the solid
+    angle of the curve, modulo 4 pi.
     """
     loops = tuple(loop.astype(backend.dtype).astype(np.float64) for loop in loops)
     middle = np.round(0.5 * (low + high) / _GRID_STEP) * _GRID_STEP
@@ -80,7 +85,7 @@ def build_curve_cells(
     half = (math.ceil(half / _GRID_STEP) + 1) * _GRID_STEP
     edges = LoopEdges.upload(backend, loops)
     max_near, max_tail = (
-        max(_MIN_NEAR, _MAX_NEAR_FACTOR * sum(map(len, loops)) ** (1 / 3)),
+        max(_MIN_NEAR, _NEAR_PER_CUBE_ROOT * sum(map(len, loops)) ** (1 / 3)),
         _MAX_TAIL_RATIO,
     )
     max_near, max_tail = near * max_near, near * max_tail
@@ -98,12 +103,14 @@ def build_curve_cells(
 class _CurveCellBuilder:
     """Cells under construction.
 
+    vertices, edges: the curve, for runs of edges and for sums over all edges.
     middle, half: center (3,) of the cube, and half of its side.
-    most_near, max_tail_ratio: limits of `_MAX_NEAR_FACTOR` and `_MAX_TAIL_RATIO` above which a cell
-        is split.
-    parent_ratio: as `_SHARED`, for cells that are split.
-    nodes: the nodes of each level, for `OctreeLookup.from_levels`.
-    tables, near: records of `CurveCells`.
+    most_near, max_tail_ratio: a cell is split if it has more near edges than `most_near`, or if its
+        truncation error is more than `max_tail_ratio` times the integral of |dp|/D^2.
+    parent_ratio: edges are near to a cell that is split if they are within this many radii of its
+        ball from its center.
+    nodes: the octree's nodes at each depth, for `OctreeLookup.from_levels`.
+    tables, near: records of the cells and of their near edges, as in `CurveCells`.
     leaves: the number of cells that are not split.
     near_record_count: the number of records of near edges.
     """
@@ -123,27 +130,28 @@ class _CurveCellBuilder:
     near_record_count: int = 0
 
     def grow(self, most_bytes: int) -> bool:
-        """Build all cells, level by level; returns False as soon as they exceed `most_bytes`."""
+        """Build all cells, one depth of the octree after the other. Returns False as soon as the
+        cells exceed `most_bytes`, and True when all are built."""
         shifts = local_to_local_matrices(DEGREE, 0.5 / (math.sqrt(3) * BALL_MARGIN))
         centers, runs, far = (
             self.middle[None],
             EdgeRuns.of_loops(self.vertices),
             EdgeExpansions.zero(1),
         )
-        splits = 0
-        for level in range(MAX_DEPTH + 1):
-            side = self.half / 2**level
-            radius = math.sqrt(3) * side * BALL_MARGIN
-            is_leaf, runs, far = self._level(centers, radius, runs, far, is_last=level == MAX_DEPTH)
+        split_count = 0
+        for depth in range(MAX_DEPTH + 1):
+            half_side = self.half / 2**depth
+            radius = math.sqrt(3) * half_side * BALL_MARGIN
+            is_leaf, runs, far = self._level(centers, radius, runs, far, is_last=depth == MAX_DEPTH)
             split = np.flatnonzero(~is_leaf)
-            self.nodes.append(encode_nodes(is_leaf, self.leaves - int(is_leaf.sum()), splits))
-            splits += len(split)
+            self.nodes.append(encode_nodes(is_leaf, self.leaves - int(is_leaf.sum()), split_count))
+            split_count += len(split)
             if self.size > most_bytes or self.near_record_count >= _MAX_RECORDS:
                 return False
             if not len(split):
                 break
             runs, far = runs.to_octants(~is_leaf), far.to_octants(~is_leaf, shifts, radius)
-            centers = (centers[split][:, None] + 0.5 * side * OCTANT_DIRECTIONS).reshape(-1, 3)
+            centers = (centers[split][:, None] + 0.5 * half_side * OCTANT_DIRECTIONS).reshape(-1, 3)
         return True
 
     def _level(
@@ -155,22 +163,27 @@ class _CurveCellBuilder:
         *,
         is_last: bool,
     ) -> tuple[BoolArray, EdgeRuns, EdgeExpansions]:
-        """Build one level: the mask (n,) of the cells that are not split, and the near runs and the
-        expansions of all n cells. Records of the cells that are not split are appended to `tables`
-        and `near`.
+        """Build the n cells of one depth of the octree. Records of the cells that are not split are
+        appended to `tables` and `near`.
 
+        centers: (n, 3) of the cells.
+        radius: the radius of their balls.
         runs, far: the near runs and the expansions that the cells inherit from their parents.
+        is_last: whether no cell may be split any more.
+
+        Returns the mask (n,) of the cells that are not split, and the near runs and the expansions
+        of all n cells.
         """
         double, n = choose_backend("double"), len(centers)
         run, vertex_ids = runs.edges()
         cell = runs.cell[run]
         distance = _distances(self.vertices, centers, cell, vertex_ids, double)
-        count = np.bincount(cell, distance <= _NEAR * radius, n)
+        count = np.bincount(cell, distance <= _NEAR_RADII * radius, n)
         far_bounds = _FarBounds.of(self.edges, centers, radius)
         is_leaf = (count <= self.most_near) & (
             far_bounds.tail <= self.max_tail_ratio * far_bounds.total
         ) | is_last
-        near_radius = np.where(is_leaf, _NEAR, self.parent_ratio) * radius
+        near_radius = np.where(is_leaf, _NEAR_RADII, self.parent_ratio) * radius
         near_runs, is_kept = runs.restrict_to_near(run, distance <= near_radius[cell])
         near_runs = near_runs.with_apexes(
             self.vertices, centers, near_radius, np.dtype(self.backend.dtype)
@@ -186,11 +199,11 @@ class _CurveCellBuilder:
             )
         )
         if is_leaf.any():
-            table, first, packets = near_records(self.vertices, near_runs, is_leaf)
+            table, first_record, record_counts = near_records(self.vertices, near_runs, is_leaf)
             self.near.append(table)
             factor = _rounding_factor(self.vertices, near_runs, centers, radius)[is_leaf]
             bounds = far.subset(is_leaf), far_bounds.subset(is_leaf), factor
-            near_range = self.near_record_count + first, packets
+            near_range = self.near_record_count + first_record, record_counts
             records = _cell_records(self.backend, centers[is_leaf], radius, *bounds, *near_range)
             self.tables.append(records)
             self.leaves, self.near_record_count = (
@@ -201,7 +214,8 @@ class _CurveCellBuilder:
 
     @property
     def size(self) -> int:
-        """The number of bytes of records, near edges, nodes, and the grid of the lookup."""
+        """The number of bytes of all cells so far: their records, near edges and nodes, and the
+        grid of the lookup."""
         number_size = np.dtype(self.backend.dtype).itemsize
         record = 8 * -(-(HEADER_SIZE + COEFFICIENTS) // 8)
         lookup = OctreeLookup.memory_bytes(sum(len(level) for level in self.nodes))
@@ -211,7 +225,7 @@ class _CurveCellBuilder:
         )
 
     def cells(self) -> CurveCells:
-        """The cells on the backend."""
+        """The cells that were built, uploaded to the backend."""
         backend = self.backend
         lookup = OctreeLookup.from_levels(
             backend, self.middle - self.half, 2 * self.half, self.nodes
@@ -224,11 +238,14 @@ class _CurveCellBuilder:
 
 @dataclass(frozen=True)
 class _FarBounds:
-    """Sums over edges at n centers, with distances D from these.
+    """Sums over the far edges of n cells. D is the distance of an edge's point from the cell's
+    center.
 
-    least, cubes, slope: see `CurveCells.records`.
-    tail: an estimate of the truncation error of the value.
-    total: an upper bound of the integral of |dp|/D^2 over all edges.
+    least: (n,) a lower bound of the distance of the far edges from the center.
+    cubes: (n,) an upper bound of the integral of |dp|/D^3.
+    slope: (n, 3) the gradient of this integral as a function of the center.
+    tail: (n,) an estimate of the truncation error of the expansion's value.
+    total: (n,) an upper bound of the integral of |dp|/D^2, over all edges.
     """
 
     least: FloatArray
@@ -239,26 +256,29 @@ class _FarBounds:
 
     @classmethod
     def of(cls, edges: LoopEdges, centers: FloatArray, radius: float) -> _FarBounds:
-        """The sums over edges that are not near; some near edges may count as well."""
+        """The sums for cells with these centers (n, 3) and balls of this radius. Some near edges
+        may count as well."""
         backend, c = edges.backend, to_vector3(edges.backend, centers)
-        rho = dr.opaque(backend.Float, radius)
-        inner = dr.opaque(backend.Float, _NEAR * radius * (1 - _SLACK))
+        ball_radius = dr.opaque(backend.Float, radius)
+        far_from = dr.opaque(backend.Float, _NEAR_RADII * radius * (1 - _SUM_MARGIN))
 
         def add(p: Vec3, q: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            least, cubes, slope, tail, total = state
+            """Add the edge from p to q to the sums `state`, at the centers c: the least squared
+            distance, and the others in the order of the attributes. inverse: 1/|q - p|^2."""
+            least_square, cubes, slope, tail, total = state
             edge = Edge.between(p, q, inverse, c)
             square, length = edge.squared_distance, dr.rsqrt(inverse)
             weight, inverse_distance = edge.biot_savart()[0] * length, dr.rsqrt(square)
-            is_far, ratio = square > inner * inner, rho * inverse_distance
-            remainder = weight * square
+            is_far, radius_ratio = square > far_from * far_from, ball_radius * inverse_distance
+            truncation = weight * square
             for _ in range(DEGREE + 1):
-                remainder = remainder * ratio
+                truncation = truncation * radius_ratio
             new_slope = dr.fma(type(slope)(length), edge.hessian_factors()[1], slope)
             return (
-                dr.select(is_far, fmin(least, square), least),
+                dr.select(is_far, fmin(least_square, square), least_square),
                 cubes + dr.select(is_far, weight, 0),
                 dr.select(is_far, new_slope, slope),
-                tail + dr.select(is_far, remainder, 0),
+                tail + dr.select(is_far, truncation, 0),
                 dr.fma(2 * weight, square * inverse_distance, total),
             )
 
@@ -267,19 +287,22 @@ class _FarBounds:
         sums = edges.for_each(add, start, "around cells")
         dr.eval(*sums)
         columns = (to_numpy(column).astype(np.float64) for column in sums)
-        least, cubes, slope, tail, total = columns
-        return cls(np.sqrt(least) * (1 - _SLACK), cubes * (1 + _SLACK), slope, tail, total)
+        least_square, cubes, slope, tail, total = columns
+        return cls(
+            np.sqrt(least_square) * (1 - _SUM_MARGIN), cubes * (1 + _SUM_MARGIN), slope, tail, total
+        )
 
-    def subset(self, mask: BoolArray) -> _FarBounds:
-        """The sums at the centers that a mask selects."""
-        return _FarBounds(*(values[mask] for values in vars(self).values()))
+    def subset(self, which: BoolArray) -> _FarBounds:
+        """The sums of the cells that a mask selects."""
+        return _FarBounds(*(values[which] for values in vars(self).values()))
 
 
 def _distances(
     vertices: VertexTable, centers: FloatArray, cell: IntArray, first: IntArray, backend: Backend
 ) -> FloatArray:
-    """(k,) distances of edges from the centers of cells: edge i begins at row `first[i]` of the
-    table of vertices and belongs to the cell of index `cell[i]`."""
+    """Distances (k,) of edges from the centers (n, 3) of the cells to which they belong. Edge i
+    runs from row `first[i]` of the table of vertices to the next row, and belongs to the cell of
+    index `cell[i]`."""
     if not len(cell):
         return np.zeros(0)
     vector = backend.Array3f
@@ -294,42 +317,54 @@ def _distances(
 def near_records(
     vertices: VertexTable, runs: EdgeRuns, is_leaf: BoolArray
 ) -> tuple[FloatArray, IntArray, IntArray]:
-    """The records of near edges (`CurveCells.near`) of the cells that are not split; and for each
-    of these cells the index of its first record and the number of its records."""
+    """Records of near edges (`CurveCells.near`) of the cells that are not split.
+
+    runs: the near runs of all cells, closed by apexes.
+    is_leaf: the mask of the cells that are not split.
+
+    Returns the table of records, and for each cell that is not split the index of its first record
+    and the number of its records.
+    """
     run_ids = np.flatnonzero(is_leaf[runs.cell])
     first, count, is_open = runs.first[run_ids], runs.count[run_ids], ~runs.is_whole[run_ids]
-    owner = (np.cumsum(is_leaf) - 1)[runs.cell[run_ids]]
+    leaf_index = (np.cumsum(is_leaf) - 1)[runs.cell[run_ids]]
     length = count + np.where(is_open, 3, 1)
-    total = np.bincount(owner, length, int(is_leaf.sum())).astype(np.int64)
-    packets = -(-total // VERTICES_PER_RECORD)
-    start = np.cumsum(packets) - packets
-    # The position of each run's first vertex among the vertices of its own cell; then in the table.
-    position = np.cumsum(length) - length - (np.cumsum(total) - total)[owner]
-    position += start[owner] * VERTICES_PER_RECORD
-    table = np.zeros((int(packets.sum()) * VERTICES_PER_RECORD, 4))
+    per_leaf = np.bincount(leaf_index, length, int(is_leaf.sum())).astype(np.int64)
+    record_count = -(-per_leaf // VERTICES_PER_RECORD)
+    first_record = np.cumsum(record_count) - record_count
+    # first_slot: the position of each run's first vertex among the vertices of its own cell; then
+    # its position in the table.
+    first_slot = np.cumsum(length) - length - (np.cumsum(per_leaf) - per_leaf)[leaf_index]
+    first_slot += first_record[leaf_index] * VERTICES_PER_RECORD
+    table = np.zeros((int(record_count.sum()) * VERTICES_PER_RECORD, 4))
     run = np.repeat(np.arange(len(run_ids)), count + 1)
-    k = np.arange(len(run)) - (np.cumsum(count + 1) - count - 1)[run]
-    slot, source = position[run] + k, first[run] + k
-    table[slot, :3] = vertices.points[source]
-    is_later = k > 0
-    edge = vertices.points[source[is_later]] - vertices.points[source[is_later] - 1]
+    rank = np.arange(len(run)) - (np.cumsum(count + 1) - count - 1)[run]
+    slot, vertex = first_slot[run] + rank, first[run] + rank
+    table[slot, :3] = vertices.points[vertex]
+    is_later = rank > 0
+    edge = vertices.points[vertex[is_later]] - vertices.points[vertex[is_later] - 1]
     table[slot[is_later], 3] = inverse_squares(edge)
-    last = (position + count)[is_open]
+    last_slot = (first_slot + count)[is_open]
     apex, start_point = runs.apex[run_ids[is_open]], vertices.points[first[is_open]]
-    table[last + 1, :3], table[last + 2, :3] = apex, start_point
-    table[last + 1, 3] = -inverse_squares(apex - table[last, :3])
-    table[last + 2, 3] = -inverse_squares(apex - start_point)
-    return table.reshape(-1, 4 * VERTICES_PER_RECORD), start, packets
+    table[last_slot + 1, :3], table[last_slot + 2, :3] = apex, start_point
+    table[last_slot + 1, 3] = -inverse_squares(apex - table[last_slot, :3])
+    table[last_slot + 2, 3] = -inverse_squares(apex - start_point)
+    return table.reshape(-1, 4 * VERTICES_PER_RECORD), first_record, record_count
 
 
 def _rounding_factor(
     vertices: VertexTable, runs: EdgeRuns, centers: FloatArray, radius: float
 ) -> FloatArray:
-    """(n,) factors with which `edges.vertex_rounding` holds for the near loops of n cells.
+    """Factors (n,) by which `edges.vertex_rounding` is to be multiplied so that it bounds the
+    rounding for the near loops of n cells.
+
+    runs: the near runs of the cells.
+    centers, radius: centers (n, 3) of the cells, and the radius of their balls.
 
     `edges.vertex_rounding` assumes edges of half length h <= 1 and vertices at most 1 + |x| from x.
-    It is linear in h and in that distance. So a factor that is at least 1, h, and the distance of
-    the apexes, the only vertices that may be outside of the unit ball, covers all other loops.
+    It is linear in h and in that distance. The apexes are the only vertices that may be outside of
+    the unit ball. So a factor that is at least 1, at least h, and at least the distance from x to
+    any apex, covers the loops that contain an apex.
     """
     factors = np.ones(len(centers))
     run_ids = np.flatnonzero(~runs.is_whole)
@@ -345,15 +380,22 @@ def _cell_records(
     backend: Backend, centers: FloatArray, radius: float, far: EdgeExpansions, bounds: _FarBounds,
     factor: FloatArray, first: IntArray, count: IntArray,
 ) -> FloatArray:  # fmt: skip
-    """Records of cells (`CurveCells.records`).
+    """Records (n, k) of cells, as described for `CurveCells.records`.
 
-    The rounding of the value has three parts: the polynomial without its constant
-    (`rounding_tables`); the angle of the near loops (`LoopEdges.rounding`); and the constant, at
-    most 2 pi, with two sums, at most 6 pi and the polynomial each: 32 epsilon and the share of the
-    tables for it. The rounding of the gradient, over the radius, counts as truncation.
+    centers, radius: centers (n, 3) of the cells, and the radius of their balls.
+    far, bounds: expansions and bounds of their far edges.
+    factor: (n,) the result of `_rounding_factor`.
+    first, count: (n,) index of the first record of near edges, and the number of these records.
+
+    The rounding of the value has three parts. The first is that of the polynomial without its
+    constant (`rounding_tables`). The second is that of the angle of the near loops
+    (`LoopEdges.rounding`). The third comes from the constant, which is at most 2 pi, and from two
+    sums, each of which is at most 6 pi plus the polynomial: it is at most 32 epsilon, plus a part
+    that the tables cover. The rounding of the gradient, which is proportional to 1/radius, counts
+    as truncation.
     """
     tables = rounding_tables(DEGREE, BALL_MARGIN / math.sqrt(3))
-    coefficients, margin = far.coefficients.copy(), 1 + _SLACK
+    coefficients, margin = far.coefficients.copy(), 1 + _SUM_MARGIN
     coefficients[:, 0] -= _PERIOD * np.round(coefficients[:, 0] / _PERIOD)
     rounding = backend.machine_epsilon * np.abs(coefficients[:, 1:]) @ tables[1:]
     value = rounding[:, 0] + backend.machine_epsilon * (48 + 7.25 * VERTICES_PER_RECORD * count)

@@ -2,21 +2,21 @@
 of near edges plus a local expansion, a harmonic polynomial, of all other edges.
 
 The cells are the leaves of an octree over a cube around the curve. The near edges of a cell are the
-edges within three radii of its ball from its center. So the cost of a sample depends on the near
-edges only, and not on the number of all edges. `curve_cell_builder` builds the cells.
+edges within three radii of its ball from its center. So the cost of a sample depends only on the
+near edges, and not on the number of all edges. `curve_cell_builder` builds the cells.
 
-An open run of near edges has no solid angle, so each run is closed to a loop by a further vertex
-beyond its ends (`edge_runs`). The remaining edges then form a cycle far away, whose solid angle is
-single-valued in the cell. Each far edge by itself gives a harmonic function, the part of Biot and
-Savart's field along the line to the center (`edge_expansion`), so that remainders are proved edge
-by edge and no fit aliases. A cell adds, to the expansion of its parent, the edges that were near to
-the parent and are far from its own ball. Closing edges count in values and not in promises, which
-are about the curve.
+An open run of near edges has no solid angle, so each run is closed to a loop by a further vertex,
+its apex (`edge_runs`). The remaining edges then form a cycle far away, whose solid angle is
+single-valued in the cell. Each far edge by itself gives a harmonic function: the integral of the
+edge's Biot and Savart field along the line from the center (`edge_expansion`). So remainders are
+proved edge by edge, and no coefficient is fitted to samples. A cell adds, to the expansion of its
+parent, the edges that were near to the parent and are far from its own ball. Closing edges count in
+values, but not in promises, which are about the curve.
 
 The cells have accuracy scale 1; for a higher accuracy all edges are summed. Cells are so small that
 fewer than 1 % of all samples need that sum, because a lane that sums over all edges delays its
 packet. Extents of curves with cells have few planes: with 1,024 vertices, clipping at the hull took
-three times as long as the march.
+three times as long as tracing the rays.
 """
 
 from __future__ import annotations
@@ -57,12 +57,15 @@ _LINE_FRACTION = 0.5
 class CurveCellSums:
     """Sums over all edges at a point x in a cell.
 
-    sums: as `edges.sum_over_edges` gives them; the integrals and the distance are bounds.
+    sums: the sums that `edges.sum_over_edges` gives; here the integrals and the distance are
+        bounds.
     error, slope_error: bounds of the truncation errors of value and gradient by the expansion.
-    rounding: a bound of the rounding of the value, to which `edges.vertex_rounding` is to be added.
+    rounding: a bound of the rounding of the value, without `edges.vertex_rounding`, which is to be
+        added.
     expansion_gradient: the gradient of the expansion.
-    far_i3: an upper bound of the integral of |dp|/D^3 over the far edges.
-    far_distance: a lower bound of the distance to the far edges.
+    far_i3: an upper bound of the integral of |dp|/D^3 over the far edges, with D the distance from
+        x.
+    far_distance: a lower bound of the distance from x to the far edges.
     near_first, count: index of the first record of near edges, and the number of these records.
     cell, center: the index of the cell, and its center (3,).
     expansion_change: the value of the expansion at x minus its value at the center.
@@ -87,15 +90,16 @@ class CurveCells:
     """Cells on a backend.
 
     lookup: the octree whose leaves are the cells.
-    records: one record per cell: center (3,) and one over the radius; bounds of the truncation
-        errors of value and gradient, and of the rounding of the value; a lower bound of the
-        distance of the far edges from the center; the factor of `EdgeSums.squares`; an upper bound
-        of the integral of |dp|/D^3 over the far edges, D the distance from the center, and its
-        gradient (3,); index of the first record of near edges, and the number of these records |
-        coefficients.
-    near: records of two vertices each: for each vertex its position (3,) and, for the edge that
-        leads to it, one over its squared length, negative for edges that close a run, 0 where there
-        is no edge.
+    records: one record per cell. In this order it holds: center (3,) and one over the radius;
+        bounds of the truncation errors of value and gradient, and of the rounding of the value; a
+        lower bound of the distance of the far edges from the center; the factor that multiplies
+        `EdgeSums.squares` of the near edges; an upper bound of the integral of |dp|/D^3 over the
+        far edges, D the distance from the center, and the gradient (3,) of this integral; index of
+        the first record of near edges, and the number of these records; and after these
+        `HEADER_SIZE` numbers the coefficients of the expansion.
+    near: records of two vertices each. For each vertex a record holds its position (3,) and a
+        number for the edge that leads to it: one over the squared length of this edge, negative
+        for edges that close a run, and 0 if there is no edge.
     count, size: the number of cells, and the number of their bytes.
     """
 
@@ -107,29 +111,30 @@ class CurveCells:
     size: int
 
     def centers(self) -> FloatArray:
-        """The centers (count, 3) of the cells, which numbers of the backend hold exactly."""
+        """The centers (count, 3) of the cells. Numbers of the backend hold them exactly."""
         row = self.records.read_record(dr.arange(self.backend.UInt32, self.count))
         return to_numpy(self.backend.Array3f(*row[:3])).astype(np.float64)
 
     def sums(self, x: Vec3, active: Mask) -> tuple[CurveCellSums, Mask]:
-        """The sums over all edges at x, and the mask of the lanes on which they hold: the active
-        lanes whose point lies in the cube.
+        """The sums over all edges at x, and the mask of the lanes on which they hold. These are the
+        active lanes whose point lies in the cube.
 
-        Proof of the bound of I3, the integral of |dp|/D^3, of far edges at a point u from the
-        center, by I3 and its gradient there. With s the cosine of the angle between u and p - c and
-        q = |u|/D, the term of p is D^-3 (1 - 2 q s + q^2)^(-3/2) = D^-3 sum of C_j(s) q^j with
-        Gegenbauer's polynomials, which are largest at s = 1. The first two terms are the value and
-        the gradient at the center; the others are at most (1-q)^-3 - 1 - 3q = q^2 psi(q), with
-        psi = (6 - 8q + 3q^2)/(1-q)^3, which grows with q.
+        Proof of the bound of I3, the integral of |dp|/D^3 over far edges, at the point c + u. It
+        follows from I3 and its gradient at the center c. For a point p of an edge, let D = |p - c|,
+        s the cosine of the angle between u and p - c, and q = |u|/D. The integrand at p is D^-3 (1
+        - 2 q s + q^2)^(-3/2) = D^-3 sum of C_j(s) q^j with Gegenbauer's polynomials C_j, which are
+        largest at s = 1. The first two terms give the value and the gradient at the center. The
+        others are at most (1-q)^-3 - 1 - 3q = q^2 psi(q), with psi = (6 - 8q + 3q^2)/(1-q)^3, which
+        grows with q.
 
-        Rounding moves x by less than 2.25 epsilon (1 + |x|), which changes the polynomial by at
-        most its gradient times that; for near edges `edges.vertex_rounding` counts it.
+        Rounding moves x by less than 2.25 epsilon (1 + |x|). This changes the polynomial by at most
+        its gradient times that; for near edges `edges.vertex_rounding` counts it.
         """
         vector, index = self.backend.Array3f, self.backend.UInt32
         cell, inside = self.lookup.find_leaf(x)
         active = active & inside
         row = self.records.read_record(cell, active)
-        inverse, error, slope_error, rounding, least, factor, cubes = row[3:10]
+        inverse, error, slope_error, rounding, far_least, factor, cubes = row[3:10]
         center = vector(*row[:3])
         u = x - center
         constant, *rest = row[HEADER_SIZE : HEADER_SIZE + COEFFICIENTS]
@@ -141,17 +146,17 @@ class CurveCells:
         first, count = index(row[13]), dr.select(active, index(row[14]), 0)
         near = self._sum_near(x, first, count)
         distance = dr.norm(u) * (1 + SUM_MARGIN)
-        q, free = distance / least, least - distance
-        ratio = least / free
-        psi = dr.fma(q, dr.fma(3, q, -8), 6) * ratio * ratio * ratio
+        q, far_free = distance / far_least, far_least - distance
+        least_over_free = far_least / far_free
+        psi = dr.fma(q, dr.fma(3, q, -8), 6) * least_over_free * least_over_free * least_over_free
         far_i3 = dr.fma(cubes, dr.fma(dr.square(q), psi, 1), dr.dot(u, vector(*row[10:13])))
         sums = EdgeSums(
             near.angle + (constant + value),
             near.gradient + slope,
-            fmin(near.distance, free),
+            fmin(near.distance, far_free),
             near.squares * factor,
             near.cubes + far_i3,
-            near.fourths + far_i3 / free,
+            near.fourths + far_i3 / far_free,
         )
         details = (
             error,
@@ -159,7 +164,7 @@ class CurveCells:
             rounding,
             slope,
             far_i3,
-            free,
+            far_free,
             first,
             count,
             cell,
@@ -169,31 +174,34 @@ class CurveCells:
         return CurveCellSums(sums, *details), active
 
     def change_from_center(
-        self, cell_sums: CurveCellSums, frame: RayFrame, x: Vec3, unit: Real, active: Mask
+        self, found: CurveCellSums, frame: RayFrame, x: Vec3, unit: Real, active: Mask
     ) -> tuple[Real, Mask]:
         """The change of the solid angle from the cell's center to x, followed continuously along
-        the line, and the mask of the lanes on which the change is certain.
+        the line between them; and the mask of the lanes on which this change is certain.
 
-        cell_sums: the sums at x.
-        frame: of the rays from the center to x.
+        found: the sums at x.
+        frame: the frame of the rays from the center to x.
         unit: the rounding of a coordinate.
 
-        Proof. The far edges add the polynomial in all of the ball. The near loops are closed, so
-        that the lifted sum of their edges (`edge_lift`) is their solid angle; it has no jumps on
-        the line, as long as the line meets no edge. Where rounding leaves it open on which side an
-        edge passes, the change is not certain: a coordinate across the line is off by a few units
-        of the distances of the edge's ends, at most eight, and both parts of a factor by that times
-        the coordinates of the ends; only for factors near the negative axis is it open which way
-        they turn.
+        Proof. The far edges contribute the polynomial, everywhere in the ball. The near loops are
+        closed, so that the lifted sum of their edges (`edge_lift`) is their solid angle; it has no
+        jumps on the line, as long as the line meets no edge. The change is not certain if rounding
+        leaves it open on which side of the line an edge passes. A coordinate across the line is off
+        by at most eight units of the distances of the edge's ends. Real and imaginary part of an
+        edge's factor are off by that times the coordinates of the ends. Only for factors near the
+        negative axis it is then open in which direction they turn.
         """
         real, vector, index = self.backend.Float, self.backend.Array3f, self.backend.UInt32
-        count, center = dr.select(active, cell_sums.count, 0), cell_sums.center
+        count, center = dr.select(active, found.count, 0), found.center
 
         def runs(i: Any, *_: Any) -> Mask:
+            """Whether the lane has further records of near edges."""
             return i < count
 
         def body(i: Any, p: Vec3, is_certain: Mask, *products: Real) -> tuple[Any, ...]:
-            row = self.near.read_record(cell_sums.near_first + i, i < count)
+            """Multiply both products, at x and at the center, by the factors of the edges of record
+            i. p: the vertex before the record. Returns the state of the loop."""
+            row = self.near.read_record(found.near_first + i, i < count)
             at_x, at_center = LiftedProduct(*products[:3]), LiftedProduct(*products[3:])
             a, a_center = view_vertex(p, frame, x), view_vertex(p, frame, center)
             for k in range(VERTICES_PER_RECORD):
@@ -214,28 +222,39 @@ class CurveCells:
         start = index(0), vector(0), self.backend.Bool(active), *identity, *identity
         _, _, is_certain, *products = dr.while_loop(start, runs, body, label="from the center")
         at_x, at_center = LiftedProduct(*products[:3]), LiftedProduct(*products[3:])
-        return at_x.angle() - at_center.angle() + cell_sums.expansion_change, is_certain
+        return at_x.angle() - at_center.angle() + found.expansion_change, is_certain
 
     def rates_along(
-        self, cell_sums: CurveCellSums, line: RayLine, lengths: tuple[Real, ...], active: Mask
+        self, found: CurveCellSums, line: RayLine, lengths: tuple[Real, ...], active: Mask
     ) -> tuple[Real, ...]:
-        """As `trail_sums.line_rates`, at the points of the sums in `cell_sums`.
+        """For each length T, a bound of the size of the derivative of the solid angle along a line,
+        at all points of the line within T of x in both directions.
 
-        Proof. f changes along a line by the sum of the changes that the fields of all edges cause
-        along it. For near edges `add_edge_rates` bounds these. The field H of all other edges at x
-        is the gradient of the polynomial, up to `slope_error`, with the fields of closing edges,
-        which are in the near loops. Along v it adds to f at x + sv at most |s||H . v| + s^2/2 K for
-        |s| <= r, with r half the distance d of far edges, and K the constant of
+        found: the sums at x.
+        line: the line through x = line.x, with the unit direction v = line.v.
+        lengths: the lengths T.
+
+        Returns a tuple with one bound for each length (as `trail_sums.line_rates`); it is infinite
+        where nothing is proved, and on lanes that are not active.
+
+        Proof. The rate is at most the sum of the rates of all edges. For near edges
+        `add_edge_rates` bounds these. Let H be the field of all other edges at x. It is the
+        gradient of the polynomial, up to `slope_error`, plus the fields of closing edges, which are
+        in the near loops. At x + sv these edges change the angle by at most |s||H . v| + s^2/2 K
+        for |s| <= r. Here r is half the distance d of far edges, and K is the constant of
         `curve_queries.remainder_promises` for q = 1/2, which is 3/2 (I3 + d I4), at most 3 I3.
         """
         vector, x = self.backend.Array3f, line.x
-        count = dr.select(active, cell_sums.count, 0)
+        count = dr.select(active, found.count, 0)
 
         def runs(i: Any, *_: Any) -> Mask:
+            """Whether the lane has further records of near edges."""
             return i < count
 
         def body(i: Any, p: Vec3, field: Vec3, *rates: Real) -> tuple[Any, ...]:
-            row = self.near.read_record(cell_sums.near_first + i, i < count)
+            """Add the edges of record i: those of the curve to `rates`, and closing edges to
+            `field`. p: the vertex before the record. Returns the state of the loop."""
+            row = self.near.read_record(found.near_first + i, i < count)
             for k in range(VERTICES_PER_RECORD):
                 q, inverse = vector(*row[4 * k : 4 * k + 3]), row[4 * k + 3]
                 edge = Edge.between(p, q, dr.select(inverse > 0, inverse, 1), x)
@@ -247,27 +266,37 @@ class CurveCells:
                 p = q
             return i + 1, p, field, *rates
 
-        start = (self.backend.UInt32(0), vector(0), cell_sums.expansion_gradient)
+        start = (self.backend.UInt32(0), vector(0), found.expansion_gradient)
         start = (*start, *(self.backend.Float(0) for _ in lengths))
         _, _, field, *rates = dr.while_loop(start, runs, body, label="near edges along")
-        slope = dr.abs(dr.dot(field, line.v)) + cell_sums.slope_error
-        slope = slope + SUM_MARGIN * cell_sums.sums.squares
-        half_k = (1 + SUM_MARGIN) * 1.5 * cell_sums.far_i3  # K/2
-        reach = _LINE_FRACTION * cell_sums.far_distance
+        slope = dr.abs(dr.dot(field, line.v)) + found.slope_error
+        slope = slope + SUM_MARGIN * found.sums.squares
+        half_k = (1 + SUM_MARGIN) * 1.5 * found.far_i3  # K/2
+        valid_length = _LINE_FRACTION * found.far_distance
         return tuple(
-            dr.select(active & (length <= reach), rate + dr.fma(length, half_k, slope), dr.inf)
+            dr.select(
+                active & (length <= valid_length), rate + dr.fma(length, half_k, slope), dr.inf
+            )
             for rate, length in zip(rates, lengths, strict=True)
         )
 
     def _sum_near(self, x: Vec3, first: Any, count: Any) -> EdgeSums:
-        """As `sum_over_edges`, over the near loops. Edges that close runs do not count in the
-        distance, in cubes and in fourths, which are about the curve."""
+        """Sums over the edges of near loops at x, as of `sum_over_edges`. Edges that close runs do
+        not count in the distance, in `cubes` and in `fourths`, which are about the curve.
+
+        first, count: index of the first record of near edges, and the number of these records.
+        """
         real, index, vector = self.backend.Float, self.backend.UInt32, self.backend.Array3f
 
         def runs(i: Any, *_: Any) -> Mask:
+            """Whether the lane has further records of near edges."""
             return i < count
 
         def body(i: Any, *state: Any) -> tuple[Any, ...]:
+            """Add the edges of record i to the state. The state holds the product of spinors (zr,
+            zi), half the gradient g, the least squared distance d2 and the three integrals, and of
+            the last vertex: its position p, and a = p - x with |a|, s and spinor.
+            """
             zr, zi, g, d2, squares, cubes, fourths, p, a, la, sa, *ca = state
             row = self.near.read_record(first + i, i < count)
             for k in range(VERTICES_PER_RECORD):
@@ -305,8 +334,9 @@ class CurveCells:
 def _with_edge(
     product: LiftedProduct, a: VertexView, b: VertexView, is_edge: Mask, slack: Real
 ) -> tuple[LiftedProduct, Mask]:
-    """The product, times the factor of the edge from a to b where `is_edge` is true; and the mask
-    of the lanes on which that factor is not within the slack of the negative axis."""
+    """The product times the factor of the edge from a to b, on lanes on which `is_edge` is true;
+    and the mask of the lanes on which that factor is farther than `slack` from the negative axis,
+    or is left out."""
     re, im = ends_factor(a, b, type(slack)(1))
     is_sure = ~is_edge | (dr.abs(im) > slack) | (re > slack)
     return product.times(dr.select(is_edge, re, 1), dr.select(is_edge, im, 0)), is_sure

@@ -6,9 +6,9 @@
 - `remainder_promises`, `gradient_change_bound`, `lift_ball`: promises of the solid angle near a
   point.
 
-Curves promise a bound of second derivatives: the integral of |dp|/|p - x|^3 is the weight in Biot
-and Savart's law, and bounds second derivatives. Ranges on balls, which caps and the published rule
-need, take 1.4 to 2 times as many evaluations on polygons and knots.
+Curves promise a bound of second derivatives. It comes from the integral of |dp|/|p - x|^3, which is
+also the weight in Biot and Savart's law. Caps and the published step rule need ranges on balls
+instead; with these, polygons and knots take 1.4 to 2 times as many evaluations.
 """
 
 from __future__ import annotations
@@ -41,14 +41,16 @@ __all__ = [
 
 
 def differentiable_angle(backend: Backend, loops: tuple[Any, ...], x: Vec3) -> Real:
-    """Omega(x) in steradians, modulo 4 pi, of closed loops: (n, 3) arrays or Dr.Jit vectors. The
-    result is one wide expression that Dr.Jit can differentiate in both directions.
+    """Omega(x) in steradians, modulo 4 pi, of closed loops. The result is one wide expression that
+    Dr.Jit can differentiate in both directions.
 
-    The loop of `sum_over_edges` is the fastest way to a number, but reverse mode cannot pass a
-    recorded loop. Here every pair of a point and an edge is a lane, and a block sum adds them up,
-    so that memory grows with points times vertices. The formula is that of `sum_over_edges`, with
-    one angle for each edge instead of a product: an angle may jump by 4 pi, its derivative does
-    not.
+    loops: the vertices of each loop, as an (n, 3) array or as a Dr.Jit vector.
+
+    The loop of `sum_over_edges` computes the value fastest, but reverse mode cannot differentiate a
+    recorded loop. Here every pair of a point and an edge is a lane, and a block sum adds up the
+    edges of each point. So the memory is proportional to the number of points times the number of
+    vertices. The formula is that of `sum_over_edges`, with one angle for each edge instead of a
+    product. An angle may jump by 4 pi; its derivative does not.
     """
     total = dr.zeros(backend.Float, dr.width(x))
     for loop in loops:
@@ -58,7 +60,7 @@ def differentiable_angle(backend: Backend, loops: tuple[Any, ...], x: Vec3) -> R
 
 
 def _loop_angle(backend: Backend, vertices: Vec3, x: Vec3) -> Real:
-    """`differentiable_angle` of one loop."""
+    """`differentiable_angle` of one loop with these vertices."""
     point_count, edge_count = dr.width(x), dr.width(vertices)
     lane = dr.arange(backend.UInt32, point_count * edge_count)
     point, edge = lane // edge_count, lane % edge_count
@@ -72,8 +74,8 @@ def _loop_angle(backend: Backend, vertices: Vec3, x: Vec3) -> Real:
 
 
 def segment_records(backend: Backend, start: FloatArray, end: FloatArray) -> RecordTable:
-    """Records of the k >= 1 segments from start (k, 3) to end (k, 3), of a size of about one. A
-    segment whose ends are equal in the backend's precision is a point."""
+    """Records of the k >= 1 segments from start (k, 3) to end (k, 3). The coordinates should be of
+    order one. A segment whose ends are equal in the backend's precision becomes a point."""
     start, end = (q.astype(backend.dtype).astype(np.float64) for q in (start, end))
     return RecordTable.upload(backend, single_edges(start, end))
 
@@ -84,6 +86,8 @@ def closest_on_segments(segments: RecordTable, x: Vec3) -> Vec3:
     x = vector(x)
 
     def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+        """The least squared distance and the closest point `state`, updated by the segment in a
+        record."""
         nearest, closest = state
         p, q = vector(*row[:3]), vector(*row[4:7])
         fraction = clamp(dr.dot(x - p, q - p) * row[7], 0, 1)
@@ -97,17 +101,20 @@ def closest_on_segments(segments: RecordTable, x: Vec3) -> Vec3:
 
 
 def continuous_change(edges: LoopEdges, p: Vec3, q: Vec3) -> Real:
-    """The change of the solid angle, followed continuously from p to q, which differ.
+    """The change of the solid angle, followed continuously along the segment from p to q. p and q
+    must differ.
 
-    Biot and Savart's field, integrated along the segment from p to q, gives for each edge from a to
-    b of the curve minus the solid angle of the parallelogram (a - p) + s (b - a) - t (q - p) at the
-    origin: less than 2 pi in size, as it lies in a plane that misses the origin unless the segment
-    meets the edge. As two triangles it is twice two arctangents (van Oosterom and Strackee 1983),
-    so there is no branch to choose.
+    The change is the integral of Biot and Savart's field along the segment. For an edge from a to b
+    of the curve, it is minus the solid angle at the origin of the parallelogram (a - p) + s (b - a)
+    - t (q - p) with s and t from 0 to 1. This is less than 2 pi in size, because the plane of the
+    parallelogram misses the origin unless the segment meets the edge. The parallelogram is split
+    into two triangles, whose solid angles are twice an arctangent each (van Oosterom and Strackee
+    1983), so there is no branch to choose.
     """
     real = edges.backend.Float
 
     def add(a: Vec3, b: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
+        """The change `state`, with that of the edge from a to b added."""
         del inverse
         ap, bp, bq, aq = a - p, b - p, b - q, a - q
         return (state[0] - _angle(ap, bp, bq) - _angle(ap, bq, aq),)
@@ -116,7 +123,7 @@ def continuous_change(edges: LoopEdges, p: Vec3, q: Vec3) -> Real:
 
 
 def _angle(a: Vec3, b: Vec3, c: Vec3) -> Real:
-    """The signed solid angle of a triangle at the origin."""
+    """The signed solid angle at the origin of the triangle with the corners a, b, c."""
     la, lb, lc = dr.norm(a), dr.norm(b), dr.norm(c)
     volume = dr.dot(a, dr.cross(b, c))
     dot_terms = dr.fma(dr.dot(a, b), lc, dr.fma(dr.dot(b, c), la, dr.dot(c, a) * lb))
@@ -125,39 +132,44 @@ def _angle(a: Vec3, b: Vec3, c: Vec3) -> Real:
 
 
 # Radii of the promises as fractions of the distance to the curve, by experiment.
-_REACHES = (0.3, 0.6, 0.85)
+_RADIUS_FRACTIONS = (0.3, 0.6, 0.85)
 
 
 def remainder_promises(cubes: Real, fourths: Real, distance: Real) -> tuple[TaylorRemainder, ...]:
-    """Promises of the second derivatives of the solid angle, by integrals over the curve.
+    """Bounds of the remainder of the solid angle after its linear term, on balls around x.
 
-    cubes, fourths: I3 and I4, the integrals of |dp|/|D|^3 and |dp|/|D|^4. distance: d, or less.
+    cubes, fourths: I3 and I4, the integrals of |dp|/|D|^3 and |dp|/|D|^4 over the curve, with D = p
+        - x.
+    distance: the distance d from x to the curve, or a lower bound of it.
 
-    Proof. Along a unit direction v the derivative of the solid angle is the integral of
-    v.(D x dp)/|D|^3 over the curve, D = p - x (Biot and Savart), and its second derivative is the
-    integral of 3 (v.D)(v.(D x dp))/|D|^5, as D changes by -v. D and D x dp are at right angles, so
-    the product of their components along v is at most half of the product of their lengths: the
-    second derivative is at most 3/2 times the integral of |dp|/|D|^3. At x + s v, |D| is less by s
-    at most. So by Taylor the remainder after the linear term is, for t < d, the distance to the
-    curve, at most
+    Returns one promise for each radius q d, for a few fixed fractions q.
+
+    Proof. Along a unit direction v the derivative of the solid angle is the integral of v.(D x
+    dp)/|D|^3 over the curve (Biot and Savart). Its second derivative is the integral of 3
+    (v.D)(v.(D x dp))/|D|^5, as D changes by -v. D and D x dp are perpendicular, so the product of
+    their components along v is at most half of the product of their lengths: the second derivative
+    is at most 3/2 times the integral of |dp|/|D|^3. At x + s v, |D| is less by s at most. So by
+    Taylor the remainder after the linear term is, for t < d, at most
 
         3/2 integral of |dp| integral over [0, t] of (t-s)/(|D|-s)^3 ds
-            = 3/4 t^2 integral of |dp|/(|D|^3 (1 - t/|D|)),
+            = 3/4 t^2 integral of |dp|/(|D|^3 (1 - t/|D|)).
 
-    and 1/(1 - u) <= 1 + u/(1 - q) for 0 <= u <= q. On the ball of radius q d that is
-    `TaylorRemainder` with the constant 3/2 (I3 + q d I4/(1 - q)). It holds for any piece of a
-    curve, and adds up.
+    For u = t/|D| <= q, 1/(1 - u) <= 1 + u/(1 - q). On the ball of radius q d that is
+    `TaylorRemainder` with the constant 3/2 (I3 + q d I4/(1 - q)). The bound holds for any piece of
+    a curve, and the bounds of pieces add up.
     """
     scale = 1.5 * (1 + SUM_MARGIN)
     return tuple(
         TaylorRemainder(scale * dr.fma(q / (1 - q) * distance, fourths, cubes), q * distance)
-        for q in _REACHES
+        for q in _RADIUS_FRACTIONS
     )
 
 
 def gradient_change_bound(cubes: Real, fourths: Real, distance: Real, radius: Real) -> Real:
-    """A bound of the change of the gradient within `radius`; infinite unless that is less than the
-    distance.
+    """A bound of the change of the gradient within the distance `radius` of x. It is infinite
+    unless `radius` is less than `distance`.
+
+    cubes, fourths, distance: I3, I4 and d, as for `remainder_promises`.
 
     Proof. The second derivative in every direction is at most 3/2 times the integral of |dp|/|D|^3
     (`remainder_promises`). So is the norm of the Hessian, and from x to x + t v the gradient
@@ -166,8 +178,9 @@ def gradient_change_bound(cubes: Real, fourths: Real, distance: Real, radius: Re
         3/2 integral of |dp| integral over [0, t] of ds/(|D|-s)^3
             = 3/4 t integral of |dp|/|D|^3 (2 - u)/(1 - u)^2,    u = t/|D|.
 
-    For 0 <= u <= q < 1 that fraction, which is convex in u, is at most 2 + u (3 - 2q)/(1 - q)^2,
-    its chord. With q = t/d: at most 3/2 t I3 + 3/4 t^2 I4 (3 - 2q)/(1 - q)^2.
+    For 0 <= u <= q < 1 the fraction (2 - u)/(1 - u)^2 is convex in u, and so at most its chord
+    2 + u (3 - 2q)/(1 - q)^2. With q = t/d the change is at most 3/2 t I3 + 3/4 t^2 I4
+    (3 - 2q)/(1 - q)^2.
     """
     q = radius / distance
     growth = (3 - 2 * q) / dr.square(1 - q)
@@ -182,9 +195,10 @@ def lift_ball(
     bends: tuple[TaylorRemainder, ...],
     slope_error: Real = 0.0,
 ) -> HarmonicBall:
-    """The range of the lift on the ball of one of the promises. The promises themselves prove
-    longer steps.
+    """A ball around x on which the lifted solid angle is proved to lie in a range. It is the ball
+    of one of the promises `bends`, which themselves prove longer steps.
 
+    value, gradient: the solid angle and its gradient at x.
     squares: the integral of |dp|/|D|^2, to which the rounding of the gradient is proportional.
     bends: the promises of `remainder_promises`.
     slope_error: a bound of the other errors of the gradient.

@@ -1,10 +1,10 @@
-"""Noisy points prepared for a smoothed sum of dipoles: the points moved onto the surface, estimated
-normals where the cloud has none, and the smoothing length.
+"""Prepare noisy points for a smoothed sum of dipoles: points moved onto the surface, estimated
+normals if the cloud has none, and the smoothing length.
 
-The sum itself corrects the signs of estimated normals (Lin et al. 2024): where most of the normals
-are right, the sum of all dipoles, smoothed over several points, falls across the surface in the
-right direction at the other points, too, such as the points of a thin ear whose two sides were
-confused.
+The sum itself corrects the signs of estimated normals (Lin et al. 2024). If most of the normals are
+right, the sum of all dipoles, smoothed over several points, falls across the surface in the right
+direction also at points whose own normals are wrong. Such points are, for example, those of a thin
+ear where the estimate confused the two sides.
 """
 
 from __future__ import annotations
@@ -29,16 +29,18 @@ if TYPE_CHECKING:
 
     from harnack.backend import FloatArray
 
-    # Gradients (n, 3) of the sum at its points, given points, normals, areas and the smoothing.
+    # A function that returns the gradients (n, 3) of the smoothed sum at the points of its dipoles,
+    # from points (n, 3), normals (n, 3), areas (n,) and the smoothing length.
     Gradients = Callable[[FloatArray, FloatArray, FloatArray, float], FloatArray]
 
 # The number of rounds in which signs of normals are corrected, and the smoothing length of the sums
 # that correct them, in spacings.
 _FLIP_ROUNDS, _FLIP_SMOOTHING = 2, 3.0
-# The smoothing length in spacings is `_SMOOTHING`, or with little noise `_SMOOTHING_OF_ROOT` times
-# the root of noise over spacing; if that is below `_NO_NOISE`, points stay and nothing is smoothed.
+# The smoothing length, as a multiple of the spacing, is the smaller of `_SMOOTHING` and
+# `_SMOOTHING_OF_ROOT` times the square root of noise over spacing. If it is below `_NO_NOISE`,
+# points are not moved and the sum is not smoothed.
 _SMOOTHING, _SMOOTHING_OF_ROOT, _NO_NOISE = 0.9, 1.4, 0.1
-# The smallest number of points that shows a surface, and outliers far from it.
+# The smallest number of points from which noise, and outliers, can be estimated.
 _MIN_POINTS = 32
 
 
@@ -48,7 +50,8 @@ class DenoisedCloud:
 
     points, normals: (m, 3) of the points that were kept, moved onto the surface.
     smoothing: the length over which their sum is to be smoothed; 0 if there is hardly any noise.
-    report: the estimated noise and related numbers, as for `Field.describe`.
+    report: the estimated noise, the spacing, and the numbers of points, as entries for
+        `Field.describe`.
     """
 
     points: FloatArray
@@ -58,9 +61,12 @@ class DenoisedCloud:
 
     @classmethod
     def of(cls, points: Any, normals: Any | None, gradients: Gradients) -> DenoisedCloud:
-        """Denoise points (n, 3) with normals (n, 3), or None to estimate the normals.
+        """Denoise points (n, 3) with normals (n, 3). If `normals` is None, they are estimated.
 
-        Warns of points that are left out, as they are far from all others.
+        gradients: computes gradients of the smoothed sum, by which signs of estimated normals are
+            corrected.
+
+        Warns if points are left out because they are far from all others.
 
         Raises:
             CloudError: as `validate_cloud` and `estimate_normals`; or there are too few points.
@@ -86,7 +92,9 @@ class DenoisedCloud:
             )
         cloud = CloudDenoiser(x, estimate_noise(x, known_normals, tree), tree)
         if known_normals is None:
-            new_points, new_normals = cloud.denoise_points_and_normals(_normals(cloud, gradients))
+            new_points, new_normals = cloud.denoise_points_and_normals(
+                _estimated_normals(cloud, gradients)
+            )
         else:
             new_points, new_normals = (
                 cloud.denoise_points(known_normals),
@@ -106,8 +114,11 @@ class DenoisedCloud:
         return cls(new_points, new_normals, smoothing * spacing, report)
 
 
-def _normals(cloud: CloudDenoiser, gradients: Gradients) -> FloatArray:
-    """Estimated normals (m, 3) of the selected points at their original positions."""
+def _estimated_normals(cloud: CloudDenoiser, gradients: Gradients) -> FloatArray:
+    """Estimate normals (m, 3) of the selected points of a cloud, at their original positions. Where
+    the smoothed sum rises along a normal, the normal is replaced by the direction in which the sum
+    falls. gradients: as for `DenoisedCloud.of`.
+    """
     x = cloud.points[cloud.selected]
     normals = estimate_normals(x)
     areas = np.full(len(x), cloud.spacing**2)

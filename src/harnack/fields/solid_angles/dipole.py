@@ -3,8 +3,8 @@
 - `DipolePotential`: the field.
 - `DipoleTree`: its sum by a tree, with multipole moments of far dipoles.
 
-The points of a field do not change (attributes such as `points` cannot be set): trees, cells and
-extents are computed from them once. `with_points` makes another field.
+The points of a field do not change (attributes such as `points` cannot be set), because trees,
+cells and extents are computed from them once. `with_points` makes another field.
 """
 
 from __future__ import annotations
@@ -57,26 +57,31 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
     from harnack.tree import BalancedTree
 
-# Cells pay from `_PAYS` rays per point and `_LEAST_RAYS` rays on, and up to `_MAX_POINTS` points:
-# to build them takes as long as to trace about 6 rays per point without them. Smaller cells, in
-# which a ray takes two thirds of the time, pay from `_FINER_PAYS` rays per point on.
+# Cells pay if there are at least `_PAYS` rays per point and at least `_LEAST_RAYS`
+# rays, and at most `_MAX_POINTS` points: to build them takes as long as to trace about 6 rays per
+# point without them. Smaller cells, in which a ray takes two thirds of the time, pay if there are
+# at least `_FINER_PAYS_PER_POINT` rays per point.
 _PAYS, _LEAST_RAYS, _MAX_POINTS = 7, 100_000, 200_000
-_FINER_PAYS = 60
-# A point counts as near if the squared distance is less than this fraction of its area.
-_SINGLE_POINT = 0.04
+_FINER_PAYS_PER_POINT = 60
+# The dipole of a point dominates the field where the squared distance from it is less than this
+# fraction of the point's area.
+_NEAR_SQUARE_PER_AREA = 0.04
 
 
 BuildCells: TypeAlias = "Callable[[list[NodeMoments], FloatArray, RecordTable], DipoleCells | None]"
-"""Builds cells from the moments of a tree, its dipoles as rows, and the same on the backend."""
+"""A function that builds cells, or returns None. Arguments: the moments of all levels of a tree,
+its dipoles as records, and the same records on the backend."""
 
 
 @dataclass(frozen=True)
 class DipoleTree:
-    """The sum of m_i.(y_i - x)/|y_i - x|^3 over dipoles i on a backend; a record holds y_i, m_i and
-    |m_i|.
+    """The sum of m_i.(y_i - x)/|y_i - x|^3 over dipoles i on a backend. A record of a dipole holds
+    its position y_i, its moment m_i and |m_i|.
 
-    cells: FMM cells, with which the cost of a sample depends on near dipoles only; None for no
-        cells.
+    clusters: the tree with its multipole moments.
+    rounding: a bound of the rounding of the final operations on the value.
+    cells: FMM cells, with which the cost of a sample depends only on the number of near dipoles;
+        None for no cells.
     """
 
     clusters: Treecode
@@ -92,10 +97,13 @@ class DipoleTree:
         cls, backend: Backend, tree: BalancedTree, points: FloatArray, moments: FloatArray,
         accuracy: float, build: BuildCells | None = None,
     ) -> DipoleTree:  # fmt: skip
-        """The tree of points (n, 3) of size about one and moments (n, 3), area times normal.
+        """Build the tree over points (n, 3), of size about one, with moments (n, 3), which are area
+        times normal.
 
-        tree: `dipole_hierarchy` of these points, or of the same points at earlier positions.
-        build: builds cells.
+        tree: the result of `dipole_hierarchy` for these points, or for the same points at earlier
+            positions.
+        accuracy: the moments of a node are used beyond this many times its radius.
+        build: builds cells; None for no cells.
         """
         levels = dipole_tree_moments(tree, points[:, None], moments[:, None], points, points)
         rows = dipole_records(points, moments)
@@ -111,7 +119,7 @@ class DipoleTree:
         return self.clusters.coarsest_accuracy if self.cells is None else 1.0
 
     def values(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:
-        """Value and derivatives up to order `derivatives` at x; closer: the accuracy scale, at
+        """Value and derivatives up to order `derivatives` at x. closer: the accuracy scale, at
         least 1."""
         unit, detail = (
             coordinate_rounding(x),
@@ -121,7 +129,8 @@ class DipoleTree:
         return self.clusters.values(sums, 1.0, unit, self.rounding)
 
     def _sums(self, x: Vec3, detail: Real, unit: Real, derivatives: int) -> tuple[SourceSums, Vec3]:
-        """All sums, and the moment of the nearest dipole of a near leaf."""
+        """The sums over all dipoles, by the tree; and the moment (3,) of the nearest dipole among
+        those that are summed one by one. unit: the rounding of a coordinate of x."""
         add, vector = _dipole_adder(x, unit, derivatives), self.backend.Array3f
         sums, state = self.clusters.sums(x, detail, add, (vector(0),), derivatives=derivatives)
         return sums, state[0]
@@ -129,7 +138,8 @@ class DipoleTree:
     def _near_sums(
         self, x: Vec3, detail: Real, unit: Real, derivatives: int = 1
     ) -> tuple[SourceSums, Vec3]:
-        """As `_sums`, by the cells if there are cells and no second derivatives are requested."""
+        """As `_sums`, but by the cells if there are cells and no second derivatives are
+        requested."""
         if self.cells is None or derivatives == 2:
             return self._sums(x, detail, unit, derivatives)
         add, start = _dipole_adder(x, unit, 1), (self.backend.Array3f(0),)
@@ -137,59 +147,64 @@ class DipoleTree:
         return sums, state[0]
 
     def sample(self, x: Vec3, detail: Real) -> Sample:
-        """Value, gradient and promises at x: see `SourceSums.sample`.
+        """Value, gradient and promises at x, as `SourceSums.sample`. detail: the accuracy scale.
 
-        With cells, accuracy scales up to 1 have the accuracy of the cells' expansions, and larger
-        scales come from the tree.
+        If there are cells, accuracy scales up to 1 get the accuracy of the cells' expansions, and
+        larger scales are computed by the tree.
         """
         unit = coordinate_rounding(x)
         sums, nearest = self._near_sums(x, detail, unit)
-        # Where the field of a single point dominates, shading uses that point's normal, reversed,
-        # as f is larger inside.
+        # Where the field of a single point dominates, shading uses that point's normal. It is
+        # reversed, because gradients point inwards: f is larger inside.
         area = dr.norm(nearest)
         is_dominated = (
-            sums.singularity_distance * sums.singularity_distance < _SINGLE_POINT * area
+            sums.singularity_distance * sums.singularity_distance < _NEAR_SQUARE_PER_AREA * area
         ) & (area > 0)
         normal = dr.select(is_dominated, -nearest / area, dr.normalize(sums.gradient))
         return sums.sample(1.0, unit, self.rounding, normal)
 
 
 def _dipole_adder(x: Vec3, unit: Real, derivatives: int) -> AddPrimitive:
-    """A function that adds a dipole to sums at x, and stores the moment of the nearest dipole."""
+    """Returns a function `add` that adds a dipole to the sums at x. unit: the rounding of a
+    coordinate of x."""
     vector = cast("Any", type(x))
 
     def add(
         row: list[Real], active: Mask, sums: SourceSums, state: tuple[Any, ...]
     ) -> tuple[SourceSums, tuple[Any, ...]]:
-        inverse, terms = _dipole(row, x, derivatives)
+        """Add the dipole of a record to the sums, where active. state: the moment of the nearest
+        dipole so far, which is updated."""
+        inverse, terms = _dipole_term(row, x, derivatives)
         distance, has_area = dr.rcp(inverse), active & (row[6] > 0)
-        # An upper bound of 1/(distance - 2 unit), 2 unit being the rounding of the distance:
-        # 1/(1-z) <= 1 + 2z for z <= 1/2. Nearer to a dipole all bounds are infinite. Padding has
-        # no area and adds nothing.
-        z = 2 * unit * inverse
-        inverse_bound = dr.select(z <= 0.5, dr.fma(2 * z, inverse, inverse), dr.inf)
-        inverse_bound = dr.select(has_area, inverse_bound, 0)
-        fourth = row[6] * dr.square(inverse_bound * inverse_bound)
+        # `upper` is an upper bound of 1/(distance - 2 unit), as 2 unit bounds the rounding of
+        # the distance. With z = 2 unit/distance, 1/(1-z) <= 1 + 2z for z <= 1/2. Nearer to a dipole
+        # all bounds are infinite. Padding has no area and adds nothing.
+        relative_rounding = 2 * unit * inverse
+        upper = dr.select(
+            relative_rounding <= 0.5, dr.fma(2 * relative_rounding, inverse, inverse), dr.inf
+        )
+        upper = dr.select(has_area, upper, 0)
+        fourth = row[6] * dr.square(upper * upper)
         is_nearest = has_area & (distance <= sums.singularity_distance)
         added = sums.add_term(terms, active & (inverse < dr.inf))
         new_sums = dataclasses.replace(
             added,
-            rounding=added.rounding + dipole_rounding(row[6], inverse_bound, unit),
+            rounding=added.rounding + dipole_rounding(row[6], upper, unit),
             singularity_distance=dr.select(is_nearest, distance, sums.singularity_distance),
             s4=sums.s4 + fourth,
-            s5=dr.fma(fourth, inverse_bound, sums.s5),
+            s5=dr.fma(fourth, upper, sums.s5),
         )
         return new_sums, (dr.select(is_nearest, vector(*row[3:6]), state[0]),)
 
     return add
 
 
-def _dipole(row: list[Real], x: Vec3, derivatives: int) -> tuple[Real, SourceTerm]:
-    """One over the distance to a dipole, and its value and, for derivatives >= 1, gradient (paper,
-    Eq. 12 and 15) and, for derivatives = 2, Hessian.
+def _dipole_term(row: list[Real], x: Vec3, derivatives: int) -> tuple[Real, SourceTerm]:
+    """One over the distance from x to the dipole of a record; and its value with gradient (paper,
+    Eq. 12 and 15) and Hessian, up to order `derivatives`.
 
-    With z = y - x and u = 1/|z|: f = m.z u^3, grad f = 3 (m.z) u^5 z - m u^3, and Hess f = 15 (m.z)
-    u^7 z z^T - 3 u^5 (m z^T + z m^T + (m.z) I).
+    With the dipole's moment m, z = y - x and u = 1/|z|: f = m.z u^3, grad f = 3 (m.z) u^5 z - m
+    u^3, and Hess f = 15 (m.z) u^7 z z^T - 3 u^5 (m z^T + z m^T + (m.z) I).
     """
     vector = cast("Any", type(x))
     z, m = vector(*row[:3]) - x, vector(*row[3:6])
@@ -213,12 +228,12 @@ def _dipole(row: list[Real], x: Vec3, derivatives: int) -> tuple[Real, SourceTer
     return u, SourceTerm(value, gradient, SymmetricMatrix(*hessian))
 
 
-_VALUES, _TRACED = 2.0, 4.0
-# The smallest smoothing length, as a fraction of half the size of the cloud; the largest number of
-# points from which the level is computed; the smallest valid level, as a fraction of 2 pi if areas
-# are estimated, and as a number otherwise.
+_VALUES_ACCURACY, _TRACING_ACCURACY = 2.0, 4.0
+# The smallest smoothing length, as a fraction of half the size of the cloud; and the largest number
+# of points from which the level is computed. The smallest valid level is `_MIN_LEVEL_FRACTION`
+# times 2 pi if areas are estimated, and `_MIN_LEVEL` otherwise.
 _MIN_SMOOTHING, _MAX_LEVEL_SAMPLES = 1e-5, 10_000
-_MIN_PART, _MIN_LEVEL = 0.1, 1e-3
+_MIN_LEVEL_FRACTION, _MIN_LEVEL = 0.1, 1e-3
 # A tenth of the points may be off a smoothed surface by this fraction of the cloud's longest side.
 _FAR_OF_SIZE = 0.04
 
@@ -226,27 +241,29 @@ _FAR_OF_SIZE = 0.04
 class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_DipoleData"]):
     """f(x) = sum a_i n_i.(p_i - x)/|p_i - x|^3 of oriented points (paper, Eq. 12).
 
-    With a_i the areas that the points stand for, f is about 4 pi inside and 0 outside: the
-    surface is f = 2 pi. It passes through every point, with the point's normal.
+    The points p_i have unit normals n_i, and stand for areas a_i of the surface. f is about 4 pi
+    inside and 0 outside, and the surface is f = 2 pi. It passes through every point, with the
+    point's normal.
 
     smoothing: a length h, for points with noise. Then
 
         f(x) = sum a_i n_i.(p_i - x) (rho_i^2 + 5 h^2/2)/(rho_i^2 + h^2)^(5/2),  rho_i = |p_i - x|,
 
-    is the sum above blurred: averaged about x with the weight 15 h^4/(8 pi (rho^2 + h^2)^(7/2)),
-    whose standard deviation along each axis is h/sqrt(2). It is finite everywhere. Its surface
-    passes through no point, but has points on both sides: `default_level` is the median of f at the
-    points. Details smaller than h are lost, edges become round, parts thinner than h may vanish.
-    h = 1.4 sqrt(noise * spacing) was good on two meshes, with the standard deviation of the noise
-    along an axis and the distance between neighboring points.
+    is the sum above, averaged around x with the weight 15 h^4/(8 pi (rho^2 + h^2)^(7/2)), where rho
+    is the distance from x. The standard deviation of this weight along each axis is h/sqrt(2). f is
+    finite everywhere. Its surface does not pass through the points, but has points on both sides:
+    `default_level` is the median of f at the points. Details smaller than h are lost, edges become
+    round, and parts thinner than h may vanish. On two meshes h = 1.4 sqrt(noise * spacing) was
+    good, where noise is the standard deviation of the noise along an axis, and spacing the distance
+    between neighboring points.
 
     smoothing="auto": for points with noise of unknown size. The sum is then not that of the input
-    points: points far from all others are left out, with a warning; the remaining points are moved
-    along their normals onto the surface that fits their neighbors (`geometry.denoising`), only a
-    part of the points if noise is larger than the spacing; and their sum is smoothed over their
-    spacing, or less. Estimated normals are corrected by the sum and by the moved points. `points`,
-    `normals`, `areas` and `smoothing` are the data of that sum, and `describe` has the estimated
-    noise, and the numbers of points of the input and of points that were left out.
+    points. Points far from all others are left out, with a warning. The remaining points are moved
+    along their normals onto the surface that fits their neighbors (`geometry.denoising`); if the
+    noise is larger than the spacing, only some of these points are used. Their sum is smoothed
+    over their spacing, or less. Estimated normals are corrected by the sum and by the moved points.
+    `points`, `normals`, `areas` and `smoothing` are the data of that sum. `describe` has the
+    estimated noise, and the numbers of points of the input and of points that were left out.
 
     points: (n, 3).
     normals: (n, 3), outward, of any length; or "estimate", from neighbors, oriented along a
@@ -254,19 +271,20 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
     areas: (n,), or None to estimate them from neighbors (Barill et al. 2018, Sec. 3.1).
     smoothing: see above, in the points' unit; 0 for the sum of dipoles itself.
     accuracy: the sum uses the multipole moments of a cluster of points beyond `accuracy` times its
-        radius; by default 2 for values at points and 4 for tracing, which uses a larger accuracy
-        where the tolerance needs it. At least 1.5. By default the accuracy of gradients at points
-        is increased until their error is about 1 % of their length or less in most places
+        radius; at least 1.5. By default it is 2 for values at points and 4 for tracing. Tracing
+        uses a larger accuracy where the tolerance needs it. By default the accuracy of gradients at
+        points is increased until their error is about 1 % of their length or less in most places
         (`gradient_error_bound` bounds it).
-    cells: for many rays through many points: FMM cells, in which near points are summed directly
-        and all others are one polynomial, so that an evaluation for tracing costs a tenth. None
-        builds them where they pay (`for_ray_count`), for pictures of small clouds and for path
-        tracing; True always, also for values and gradients at points, which pays from some 600
-        values per point on; False never. They take some 1 kB per point, or the number of megabytes
-        of this argument (True: 256) with larger and slower cells; if these would be too large,
-        there are no cells, and `describe` of a prepared field reports this. Building takes as long
-        as tracing 100,000 to a million rays without cells, for each precision, at the first trace,
-        and several times the memory. All bounds are proved, whatever the arguments.
+    cells: whether to build FMM cells, for many rays through many points. In a cell, near points are
+        summed directly and all others are one polynomial, so that an evaluation for tracing costs a
+        tenth. None builds cells if they pay (`for_ray_count`), which is so for pictures of small
+        clouds and for path tracing. True always builds them, also for values and gradients at
+        points, which pays for more than some 600 values per point. False never builds them. They
+        take some 1 kB per point; if this is more than the number of megabytes of this argument
+        (True: 256), cells are larger and slower. If these would still be too large, there are no
+        cells, and `describe` of a prepared field reports this. They are built at the first trace,
+        for each precision, which takes as long as tracing 100,000 to a million rays without cells,
+        and several times their memory. All bounds are proved, whatever the arguments.
 
     `with_points` gives the field of points that have moved.
 
@@ -327,8 +345,8 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
     def _fitted(
         self, points: Any, normals: Any, areas: Any, smoothing: str
     ) -> tuple[FloatArray, FloatArray, float]:
-        """Points, normals and smoothing length of `smoothing="auto"`; `fit_report` becomes the
-        report about the noise."""
+        """Denoise the cloud for `smoothing="auto"`. Returns points, normals and smoothing length,
+        and sets `fit_report` to the report about the noise."""
         if smoothing != "auto":
             raise ValueError(f'smoothing must be a length or "auto", not {smoothing!r}')
         if areas is not None:
@@ -338,6 +356,8 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
             )
 
         def gradients(x: FloatArray, n: FloatArray, areas: FloatArray, length: float) -> FloatArray:
+            """Gradients (n, 3) of the sum smoothed over `length`, at its own points x (n, 3) with
+            normals n (n, 3)."""
             field = DipolePotential(x, n, areas, smoothing=length)
             return np.asarray(field.rough_value_and_gradient(x)[1], np.float64)
 
@@ -347,8 +367,9 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         return cloud.points, cloud.normals, cloud.smoothing
 
     def _median_level(self) -> float:
-        """The median of the smoothed sum at the points, or at a sample of the points if there are
-        many."""
+        """The median of the smoothed sum at the points, or at some of the points if there are many.
+        Raises ValueError if the smoothing length is too small or too large for the cloud, and
+        CloudError if the median is not far enough from 0."""
         if not _MIN_SMOOTHING <= self.smoothing / self._size <= 1:
             raise ValueError(
                 f"smoothing={self.smoothing:g} is a length in the unit of the points, whose cloud "
@@ -360,7 +381,7 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         values = np.asarray(self.value(samples, precision="double"))
         level = float(np.median(values))
         # Areas from the user may stand for other things than a surface.
-        min_level = _MIN_PART * 2 * math.pi if self.is_estimated[1] else _MIN_LEVEL
+        min_level = _MIN_LEVEL_FRACTION * 2 * math.pi if self.is_estimated[1] else _MIN_LEVEL
         if not abs(level) >= min_level:
             raise CloudError(
                 f"the smoothed sum is {level:.2g} at the points, where it should be about 2 pi: "
@@ -372,8 +393,11 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         return level
 
     def _warn_if_far(self, points: FloatArray, values: FloatArray) -> None:
-        """Warn if a tenth of the points is far from the smoothed surface, to first order: `values`
-        are the values at the points minus the level."""
+        """Warn if a tenth of the points is far from the smoothed surface, to first order.
+
+        points: (n, 3).
+        values: (n,) the smoothed sum at the points minus the level.
+        """
         gradients = self.rough_value_and_gradient(points, precision="double")[1]
         norms = np.linalg.norm(gradients, axis=1)
         far = float(np.quantile(np.abs(values) / np.maximum(norms, 1e-300), 0.9))
@@ -390,12 +414,13 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
     def with_points(
         self, points: Any, normals: Any | Literal["estimate"] = None, areas: Any = None
     ) -> DipolePotential:
-        """The potential of the same points at other positions (n, 3); normals and areas as for a
-        new field.
+        """The potential of the same points at other positions (n, 3). Normals and areas are given
+        as for a new field.
 
-        If this field has a tree, the tree keeps its shape and gets new centers, radii, moments and
-        bounds. All promises are computed from the new positions, so a tree whose points moved far
-        is slower than a new tree, never wrong. Raises CloudError as for a new field.
+        If this field has a tree, the new field's tree has the same hierarchy of points, with new
+        centers, radii, moments and bounds. All promises are computed from the new positions. So a
+        tree whose points moved far is slower than a new tree, but never wrong. Raises CloudError as
+        for a new field.
         """
         field = DipolePotential(
             points,
@@ -414,6 +439,7 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         return field
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
+        """Values and derivatives at points x: see `BatchedField.values_at`."""
         data = self._batch_data(backend_of(x))
         x = data.to_unit(x)
         weight = float(self.areas.sum()) / self._size**2
@@ -424,18 +450,21 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         )
 
     def sharp_values_at(self, x: Vec3) -> PointValues:
+        """Values and gradients at points x. The accuracy is increased until the error of the
+        gradient is about 1 % of its length, unless the user chose the accuracy."""
         if self.accuracy is not None:
             return self.values_at(x, 1)
         return sharpened(lambda points, factor: self.values_at(points, 1, factor), x)
 
     @functools.cached_property
     def _hierarchy(self) -> BalancedTree:
-        """The tree's shape, from these points or, if they were moved, from their earlier
-        positions."""
+        """The hierarchy of the tree, without positions. It was computed from these points or, if
+        they were moved, from their earlier positions."""
         return self._given_hierarchy or dipole_hierarchy((self.points - self._center) / self._size)
 
     def _upload(self, backend: Backend, *, traced: bool) -> _DipoleData:
-        accuracy = self.accuracy or (_TRACED if traced else _VALUES)
+        """The data on a backend, for tracing or for values at points."""
+        accuracy = self.accuracy or (_TRACING_ACCURACY if traced else _VALUES_ACCURACY)
         unit = (self.points - self._center) / self._size
         # Areas scale with the square of lengths; the potential is invariant under scaling.
         moments = (self.areas / self._size**2)[:, None] * self.normals
@@ -450,11 +479,13 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         return _DipoleData(*frame_parameters(backend, self._center, self._size), tree)
 
     def _cell_builder(self, backend: Backend, half: float) -> BuildCells:
-        """A function that builds the cells of the cube [-half, half]^3, once for a backend."""
+        """Returns a function that builds the cells of the cube [-half, half]^3, once for a
+        backend."""
 
         def build(
             levels: list[NodeMoments], rows: FloatArray, dipoles: RecordTable
         ) -> DipoleCells | None:
+            """Build the cells, or take those that were built before (`BuildCells`)."""
             return self.build_cached(
                 backend,
                 lambda: build_cells(
@@ -466,17 +497,21 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         return build
 
     def _half_side(self, unit: FloatArray) -> float:
-        """Half the side of the cube of cells, which contains the `extent` of the default level, as
-        rays begin at the faces of the extent."""
-        reach = math.sqrt(float(self.areas.sum()) / self.default_level) / self._size
-        return 1.001 * (float(np.abs(unit).max()) + reach)
+        """Half the side of the cube that the cells fill. This cube contains the `extent` of the
+        default level, because rays begin at the faces of the extent. unit: (n, 3) the points in
+        unit coordinates."""
+        margin = math.sqrt(float(self.areas.sum()) / self.default_level) / self._size
+        return 1.001 * (float(np.abs(unit).max()) + margin)
 
     def cells_pay_from(self) -> float:
+        """The smallest number of rays for which cells pay; infinite for large clouds and for
+        smoothed sums."""
         is_small = len(self.points) <= _MAX_POINTS and not self.smoothing
         return max(_LEAST_RAYS, _PAYS * len(self.points)) if is_small else math.inf
 
     def finer_cells_pay_from(self) -> float:
-        return _FINER_PAYS * len(self.points)
+        """The smallest number of rays for which smaller cells pay."""
+        return _FINER_PAYS_PER_POINT * len(self.points)
 
     def prepare(self, backend: Backend) -> Self:
         prepared = super().prepare(backend)
@@ -485,6 +520,7 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         return prepared
 
     def _sample(self, on: _DipoleData, p: Vec3, detail: Real) -> Sample:
+        """The sample at p, from the data `on` of a backend, at the accuracy scale `detail`."""
         return on.sample(p, detail)
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
@@ -495,14 +531,17 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
                 )
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """A box around the points: at distance rho from all of them |f| <= (sum of areas)/rho^2,
-        smoothed or not, as 1 + 5 q/2 <= (1 + q)^(5/2)."""
-        reach = 1.0001 * math.sqrt(float(self.areas.sum()) / min(abs(level) for level in levels))
+        """A box around the points that contains the level sets. At distance rho from all points
+        |f| <= (sum of areas)/rho^2, smoothed or not, as 1 + 5 q/2 <= (1 + q)^(5/2) with
+        q = h^2/rho^2."""
+        margin = 1.0001 * math.sqrt(float(self.areas.sum()) / min(abs(level) for level in levels))
         low, high = self._box
-        return Box(low - reach, high + reach)
+        return Box(low - margin, high + margin)
 
     @property
     def singular_points(self) -> FloatArray:
+        """The points (n, 3) at which f is singular: those with an area, if the sum is not
+        smoothed."""
         return np.zeros((0, 3)) if self.smoothing else self.points[self.areas > 0]
 
     @property
@@ -524,9 +563,10 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
 
 @dataclass(frozen=True)
 class _DipoleData(UnitFrame):
-    """The data of a potential on a backend."""
+    """The data of a potential on a backend. tree: the sum over the dipoles, plain or smoothed."""
 
     tree: DipoleTree | SmoothedSum
 
     def sample(self, p: Vec3, detail: Real) -> Sample:
+        """The sample at points p, in the user's unit. detail: the accuracy scale."""
         return space_scaled(self.tree.sample(self.to_unit(p), detail), self.size)

@@ -6,10 +6,11 @@
 - `PendingSources`: the primitives of balls, split into such sums and the sources that are left to
   smaller balls.
 
-A node of radius R is far from a ball of radius rho if their centers are farther apart than k rho +
-`_NODE_RATIO` R, a triangle if they are farther apart than k rho + `TRIANGLE_RATIO` R, a dipole if
-it is farther from the ball's center than k rho, for a factor k > 1: then all points of it are
-farther from the center than k rho. A triangle is a sheet of dipoles, along its normal.
+Sources are far from a ball of radius rho by these rules, with a factor k > 1. A node of radius R is
+far if its center is farther than k rho + `_NODE_RATIO` R from the ball's center. For a triangle of
+radius R this distance is k rho + `TRIANGLE_RATIO` R, for a dipole k rho. So all points of a far
+source are farther from the ball's center than k rho. A triangle counts as a sheet of dipoles along
+its normal.
 """
 
 from __future__ import annotations
@@ -68,11 +69,14 @@ _ROUNDED_UP = 1 + 1e-9
 
 
 def source_tree(tree: BalancedTree, levels: list[NodeMoments], rows: FloatArray) -> PackedTree:
-    """The tree of primitives. Its nodes hold: center, `_NODE_RATIO` times the radius, radius, area
-    | moments up to `_MULTIPOLE_DEGREE`, (E, G) of `multipole.truncation_bounds`, and the sup norms
-    of the moments.
+    """Pack the tree of primitives, in double precision, with the data that expansions need.
 
-    rows: primitives in slots, dipoles (`treecode.dipole_records`) or `triangle_sources`.
+    A node's record holds: center, `_NODE_RATIO` times the radius, radius, area; then its moments up
+    to degree 4, (E, G) of `multipole.truncation_bounds`, and the sup norms of the moments.
+
+    levels: the moments of the tree's nodes.
+    rows: the records of the primitives in slots, dipoles (`treecode.dipole_records`) or
+        `triangle_sources`.
     """
     numbers: list[FloatArray] = []
     for level in levels:
@@ -86,18 +90,21 @@ def source_tree(tree: BalancedTree, levels: list[NodeMoments], rows: FloatArray)
 
 
 def _columns(level: NodeMoments, keys: Iterable[tuple[int, int, int]]) -> list[FloatArray]:
-    """The real or imaginary parts (k,) of the moments of nodes with these keys."""
+    """The real or imaginary parts of the moments with these keys (degree, order, 0 for real or 1
+    for imaginary). For each key there is one array, with an entry for each node."""
     return [level.moments[l, m].imag if part else level.moments[l, m].real for l, m, part in keys]
 
 
 def triangle_sources(corners: FloatArray) -> FloatArray:
-    """(n, 30) records of triangles (n, 3, 3): centroid, area times normal, area, `TRIANGLE_RATIO`
-    times the radius | radius, (E, G) of `multipole.truncation_bounds`, the sup norms of the moments
-    1, 3 and 4, and the moments 3 and 4.
+    """Records (n, 30) of triangles (n, 3, 3).
 
-    The second moment about the centroid is a mean of vectors from there, and so is 0. A triangle
-    whose area is rounded to 0 gets an area of 1e-30: records without an area are empty slots, and
-    its edges count.
+    A record holds: centroid, area times normal, area, `TRIANGLE_RATIO` times the radius; then
+    radius, (E, G) of `multipole.truncation_bounds`, the sup norms of the moments 1, 3 and 4, and
+    the moments 3 and 4.
+
+    The second moment about the centroid is a mean of offsets from the centroid, and so is 0. A
+    triangle whose area is rounded to 0 gets an area of 1e-30, because a record without an area
+    means an empty slot, but the edges of this triangle count.
     """
     leaves = BalancedTree(np.arange(len(corners), dtype=np.int64)[:, None], ())
     level = triangle_tree_moments(leaves, corners)[0]
@@ -112,14 +119,16 @@ def triangle_sources(corners: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class DipoleExpansions:
-    """Sums over far primitives of n balls.
+    """Sums over far primitives, for n balls.
 
     coefficients: (n, COEFFICIENTS) of the local expansion (`local_expansion.coefficient_keys`).
     error, slope: (n,) bounds of the truncation errors of value and gradient, anywhere in the ball.
-    tail, tail_slope: (n,) bounds of further truncation errors: at a distance a from the center at
-        most q^(p+1) and q^p times these, with q = a/radius and p = `DEGREE`.
-    s4: (n,) bounds of the sums of area/D^4, D the smallest distance of a primitive from the center.
-    min_distance: (n,) a distance from the center within which there are none of these primitives.
+    tail, tail_slope: (n,) further truncation errors of value and gradient are at most q^(p+1)
+        `tail` and q^p `tail_slope` at a distance of q times the radius from the center, with
+        p = `DEGREE`.
+    s4: (n,) bounds of the sum of area/D^4, with D the smallest distance of a primitive from the
+        center.
+    min_distance: (n,) a lower bound of the distance of these primitives from the center.
     """
 
     coefficients: FloatArray
@@ -145,9 +154,9 @@ class DipoleExpansions:
             self.coefficients + other.coefficients, *sums, min_distance=min_distance
         )
 
-    def subset(self, indices: IntArray) -> DipoleExpansions:
-        """The sums of the balls with these indices; a ball may occur several times."""
-        return DipoleExpansions(*(values[indices] for values in vars(self).values()))
+    def subset(self, which: IntArray) -> DipoleExpansions:
+        """The sums of the balls with these indices. An index may occur several times."""
+        return DipoleExpansions(*(values[which] for values in vars(self).values()))
 
     @classmethod
     def concatenate(cls, parts: list[DipoleExpansions]) -> DipoleExpansions:
@@ -156,13 +165,17 @@ class DipoleExpansions:
         return cls(*(np.concatenate(column) for column in columns))
 
     def to_octants(self, shifts: FloatArray, radius: float) -> DipoleExpansions:
-        """The same sums about the centers of the eight octants of cells with balls of this radius,
-        all octants of a cell in a row.
+        """The same sums about the centers of the eight octants of each cell. The octants of a cell
+        follow each other.
 
-        Proof. The ball of an octant lies in that of the cell, so that bounds of errors are bounds
-        there as well, but the truncation error of the polynomial is not small about an octant's
-        center. This center is half a radius away, or less by the margin, so that distances shrink
-        by at most that, and 1/D^4 grows by at most (1 - radius/(2 least))^-4, D >= least.
+        shifts: `local_expansion.local_to_local_matrices`.
+        radius: the radius of the cells' balls.
+
+        Proof. The ball of an octant lies in that of the cell, so that bounds of errors hold there
+        as well. But the truncation error of the polynomial is not small about an octant's center,
+        so `tail` is added to `error`. An octant's center is at most half a radius from the cell's
+        center, so that distances shrink by at most that, and 1/D^4 grows by at most (1 - radius/(2
+        least))^-4 for D >= least.
         """
         shifted = np.einsum("oab,kb->koa", shifts, self.coefficients)
         ratio = 0.5 * radius / self.min_distance  # 0 where there is nothing
@@ -176,9 +189,11 @@ class DipoleExpansions:
     def over_nodes(
         cls, tree: PackedTree, lists: LaneLists, c: Vec3, radius: Real
     ) -> DipoleExpansions:
-        """Sums over listed far nodes, for balls around c."""
+        """Sums over far nodes, for balls of this radius around c. lists: for each ball, a list of
+        nodes of the tree."""
 
         def term(i: Any, active: Mask) -> list[Any]:
+            """The numbers of `DipoleExpansions` for node i."""
             head, payload = tree.node_heads.read_record(i, active), tree.payload(i, active)
             numbers = dict(zip(_MOMENTS, payload, strict=False))
             error, slope_error, *norms = payload[len(_MOMENTS) :]
@@ -192,9 +207,11 @@ class DipoleExpansions:
     def over_primitives(
         cls, tree: PackedTree, lists: LaneLists, c: Vec3, radius: Real
     ) -> DipoleExpansions:
-        """Sums over listed far primitives, for balls around c."""
+        """Sums over far primitives, for balls of this radius around c. lists: for each ball, a list
+        of primitives of the tree."""
 
         def term(i: Any, active: Mask) -> list[Any]:
+            """The numbers of `DipoleExpansions` for primitive i, a dipole or a triangle."""
             row = tree.primitives.read_record(i, active)
             first = {(1, 0): (row[5], 0.0), (1, 1): (0.5 * row[3], 0.5 * row[4])}
             r = c - tree.backend.Array3f(*row[:3])
@@ -215,13 +232,15 @@ class DipoleExpansions:
     def _accumulated(
         cls, backend: Backend, lists: LaneLists, term: Callable[[Any, Mask], list[Any]]
     ) -> DipoleExpansions:
-        """The sums of `term` over the entries of lists.
+        """The sums of `term` over the entries of each list.
 
-        term: from an entry of a list, all numbers, the last of which is a minimum.
+        term: from an entry of a list and a mask, returns the numbers of `DipoleExpansions`. The
+            last of these is a minimum, all others are sums.
         """
         zero = backend.Float(0)
 
         def add(i: Any, active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
+            """Add the numbers of entry i to the state, where active."""
             *sums, minimum = state
             *added, nearest = term(i, active)
             pairs = zip(sums, added, strict=True)
@@ -239,11 +258,14 @@ class DipoleExpansions:
 
 
 def _fourth(number: Any) -> Any:
+    """The fourth power."""
     square = number * number
     return square * square
 
 
 def _pairs(numbers: dict[Any, Any]) -> dict[tuple[int, int], tuple[Any, Any]]:
+    """Moments as pairs of real and imaginary part, from their parts by (degree, order, 0 for real
+    or 1 for imaginary)."""
     return {
         (l, m): (numbers[l, m, 0], numbers.get((l, m, 1), 0.0))
         for l, m, part in numbers
@@ -253,12 +275,12 @@ def _pairs(numbers: dict[Any, Any]) -> dict[tuple[int, int], tuple[Any, Any]]:
 
 @dataclass(frozen=True)
 class _ClusterExpansion:
-    """The local expansion of multipole terms.
+    """The local expansion of multipole terms in a ball.
 
-    coefficients: coefficients times powers of the ball's radius.
+    coefficients: the coefficients of the polynomial, times powers of the ball's radius.
     tail, tail_slope: bounds of the truncation errors of value and gradient on the ball's sphere.
     rounding: a bound of the rounding of the value.
-    inverse: one over the distance.
+    inverse: one over the distance of the multipole's center from the ball's center.
     """
 
     coefficients: list[Any]
@@ -271,49 +293,56 @@ class _ClusterExpansion:
     def of(cls, r: Vec3, moments: Any, norms: list[Any], radius: Real) -> _ClusterExpansion:
         """The expansion of multipole terms in the ball of this radius.
 
-        r: from the multipoles to the ball's center.
-        norms: of the terms l = 1, 2, ...: term l is at most norms[l-1]/r^(l+1).
+        r: the vector from the multipole's center to the ball's center.
+        moments: moments as pairs, by degree and order.
+        norms: norms[l-1] bounds the term of degree l = 1, 2, ...: at distance r this term is at
+            most norms[l-1]/r^(l+1).
 
-        The bounds are those of `tail_factors`, whose c grows with l: they bound all terms of degree
-        j > p, so that at q times the radius, q <= 1, the truncation error is q^(p+1) times as much,
-        and q^p times as much for the gradient.
+        The bounds are those of `tail_factors`, whose c grows with l. They bound all terms of degree
+        j > p. So at q times the radius, q <= 1, the truncation error is q^(p+1) times as much as on
+        the sphere, and that of the gradient q^p times as much.
 
-        Rounding, in double precision: each product of a coefficient passes through fewer than 2^10
-        roundings, its shifts to smaller cells included, and the sum of the absolute values of all
+        Rounding, in double precision. Each product of a coefficient passes through fewer than 2^10
+        roundings, including its shifts to smaller cells. The sum of the absolute values of all
         products, with those of the harmonics of the ball, is below 2^23 norms[l-1]/r^(l+1) (tests
-        compute it). So value, and gradient times the radius, are off by at most 2^-20 of that.
+        compute it). So the value, and the gradient times the radius, are off by at most 2^-20 of
+        norms[l-1]/r^(l+1).
         """
         inverse = dr.rsqrt(dr.squared_norm(r))
         harmonics = irregular_harmonics(r.x, r.y, r.z, inverse, DEGREE + len(norms))
         powers, q = [1.0], radius * inverse
-        total, magnitude, u, power = 0.0, 0.0, inverse, q
+        total, magnitude, inverse_power, q_power = 0.0, 0.0, inverse, q
         for _ in range(DEGREE):
             powers.append(powers[-1] * radius)
-            power = power * q
+            q_power = q_power * q
         terms = zip(
             coefficient_keys(DEGREE), multipole_to_local(moments, harmonics, DEGREE), strict=True
         )
         coefficients = [term * powers[j] for (j, _, _), term in terms]
         ratio = 1.0
         for l, norm in enumerate(norms, start=1):
-            u = u * inverse
+            inverse_power = inverse_power * inverse
             factor, ratio = tail_factors(DEGREE, l)
-            total, magnitude = total + factor * norm * u, magnitude + norm * u
+            total, magnitude = (
+                total + factor * norm * inverse_power,
+                magnitude + norm * inverse_power,
+            )
         slope_ratio = ratio * (DEGREE + 2) / (DEGREE + 1)
-        tail = total * power / (1 - ratio * q)
-        slope = (DEGREE + 1) * total * power / (1 - slope_ratio * q)
+        tail = total * q_power / (1 - ratio * q)
+        slope = (DEGREE + 1) * total * q_power / (1 - slope_ratio * q)
         return cls(coefficients, tail, slope / radius, _ROUNDING * magnitude, inverse)
 
     def of_cluster(
         self, left_out: Real, slope_left_out: Real, size: Real, area: Real, radius: Real
     ) -> list[Any]:
-        """The numbers of `DipoleExpansions` for a cluster of dipoles with moments up to
-        `_MULTIPOLE_DEGREE`.
+        """The numbers of `DipoleExpansions` for a cluster of dipoles whose moments up to degree 4
+        were used.
 
         left_out, slope_left_out: (E, G) of `multipole.truncation_bounds`, for points that are no
-            nearer than the ball.
+            nearer to the cluster than the ball is.
         size: the cluster's radius.
         area: the area of its dipoles.
+        radius: the radius of the ball.
         """
         distance = dr.rcp(self.inverse)
         inverse_gap = dr.rcp(distance - radius)
@@ -329,19 +358,22 @@ class _ClusterExpansion:
 
 @dataclass(frozen=True)
 class PendingSources:
-    """Sources that balls have still to take into account: for each ball a list of nodes, whose
-    primitives all count, and a list of primitives, as rows of the tree's primitives."""
+    """Sources that balls have not yet taken into account.
+
+    nodes: for each ball a list of nodes, each of which stands for all its primitives.
+    primitives: for each ball a list of primitives, as rows of the tree's primitives.
+    """
 
     nodes: LaneLists
     primitives: LaneLists
 
     @classmethod
     def of_root(cls, backend: Backend) -> PendingSources:
-        """All primitives of a tree, for one ball."""
+        """The root of a tree, and so all its primitives, for one ball."""
         return cls(LaneLists.of_root(backend), LaneLists.empty(backend))
 
     def subset(self, backend: Backend, lanes: IntArray) -> PendingSources:
-        """The sources of the balls with these indices; a ball may occur several times."""
+        """The sources of the balls with these indices. An index may occur several times."""
         return PendingSources(
             self.nodes.subset(backend, lanes), self.primitives.subset(backend, lanes)
         )
@@ -355,20 +387,25 @@ class PendingSources:
     def split_far(
         self, tree: PackedTree, c: Vec3, radius: Real, factor: float, smallest: Real
     ) -> tuple[DipoleExpansions, PendingSources]:
-        """The sums over the sources farther than `factor` radii from the centers c of balls, and
-        the remaining sources.
+        """Split the sources into those that are far from the balls, and the rest.
 
-        smallest: inner nodes up to this radius stay nodes if they are not far. Larger nodes are
-            replaced by their children, and leaves by their primitives, which are far or near.
+        c: the centers of the balls.
+        factor: k of this module: dipoles are far if they are farther than `factor` radii from the
+            center.
+        smallest: inner nodes that are not far stay nodes if their radius is at most this. Larger
+            nodes are replaced by their children, and leaves by their primitives, which are far or
+            near.
 
-        Each primitive is in exactly one far node, or is itself far, or is among the remaining
-        sources.
+        Returns the sums over the far sources, and the remaining sources. Each primitive is in
+        exactly one far node, or is itself far, or is among the remaining sources.
         """
         backend, inner = tree.backend, factor * radius
         far, pending = (
             build_lists(
                 backend,
-                lambda put, far=far: _nodes(tree, self.nodes, c, inner, smallest, put, far=far),
+                lambda put, far=far: _count_nodes(
+                    tree, self.nodes, c, inner, smallest, put, far=far
+                ),
             )
             for far in (True, False)
         )
@@ -392,38 +429,50 @@ class PendingSources:
         put: WriteEntry | None,
         *,
         far: bool,
-        max_count: Any = None,
+        most: Any = None,
     ) -> Any:
-        """The number of far primitives, of the list of primitives and of leaves that are not far,
-        or with far = False the number of the other primitives; for `build_lists`. A primitive is
-        far if it is farther from c than `inner` and its reach. If there are more than `max_count`,
-        not all may be counted.
+        """Count the far primitives, or with far=False the near primitives, and write them to lists.
+        This is a walk for `build_lists`. The primitives are those of the list of primitives, and
+        those of leaves that are not far.
 
-        A leaf that is far has no near primitives. A triangle's box lies in the ball of its node, so
-        that the triangle's radius is at most the diameter of that ball: its centroid is farther
-        from c than inner + 4 R - R, and the reach is at most 1.5 * 2 R.
+        inner: k rho: a dipole is far if its distance from c is more than this. For a triangle
+            `TRIANGLE_RATIO` times its radius is added.
+        smallest: nodes up to this radius stay nodes, so that their primitives are not visited.
+        put: writes an entry; None to count only.
+        most: once a count exceeds this, the remaining primitives need not be counted.
+
+        Returns the number of primitives on each lane.
+
+        A leaf that is far has no near primitives: a triangle's box lies in the ball of its node, of
+        radius R. So `TRIANGLE_RATIO` times the triangle's radius is at most 1.5 * 2 R = 3 R, while
+        its centroid is farther from c than inner + 4 R - R.
         """
         index, vector = tree.backend.UInt32, tree.backend.Array3f
         are_points = tree.primitives.packets_per_record == 1
 
         def is_chosen(row: list[Real], active: Mask) -> Mask:
-            reach = inner if are_points else inner + row[7]
-            is_far = dr.squared_norm(c - vector(*row[:3])) > dr.square(reach)
+            """Whether the primitive of a record is to be counted."""
+            far_distance = inner if are_points else inner + row[7]
+            is_far = dr.squared_norm(c - vector(*row[:3])) > dr.square(far_distance)
             return (is_far if far else ~is_far) & (row[6] > 0) & active
 
         def visit(node: VisitedNode, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
+            """Count the primitives of a leaf. state: the number so far. Returns whether the walk
+            enters the node, and the new number."""
             square = dr.squared_norm(c - vector(*node.head[:3]))
             enters = square <= dr.square(inner + node.head[3])
             if are_points and not far:  # only nodes whose ball comes near have near points
                 enters &= square <= dr.square(inner + node.head[4] * (1 + 1e-9) + 1e-12)
             enters &= node.is_leaf | (node.head[4] > smallest)
-            if max_count is not None:
-                enters &= state[0] <= max_count
+            if most is not None:
+                enters &= state[0] <= most
 
             def runs(slot: Any, *_: Any) -> Mask:
+                """Whether the leaf has further slots."""
                 return enters & node.is_leaf & (slot < tree.leaf_size)
 
             def step(slot: Any, count: Any) -> tuple[Any, ...]:
+                """Count the primitive in a slot of the leaf."""
                 chosen = is_chosen(tree.primitive(node.leaf, slot, enters), enters)
                 if put is not None:
                     put(count, node.leaf * tree.leaf_size + slot, chosen)
@@ -432,6 +481,7 @@ class PendingSources:
             return enters, (dr.while_loop((index(0), state[0]), runs, step, label="primitives")[1],)
 
         def listed(i: Any, active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
+            """Count primitive i of the list of primitives."""
             chosen = is_chosen(tree.primitives.read_record(i, active), active)
             if put is not None:
                 put(state[0], i, chosen)
@@ -441,7 +491,7 @@ class PendingSources:
         return for_each_entry(tree.backend, self.primitives, listed, counts)[0]
 
 
-def _nodes(
+def _count_nodes(
     tree: PackedTree,
     lists: LaneLists,
     c: Vec3,
@@ -451,13 +501,23 @@ def _nodes(
     *,
     far: bool,
 ) -> Any:
-    """The number of nodes in listed subtrees that are far from c, or with far = False the number of
-    pending inner nodes, which are not far and have a radius of at most `smallest`; for
-    `build_lists`. Other nodes are replaced by their children; leaves that are not far are in
-    neither list."""
+    """Count the far nodes, or with far=False the pending nodes, in the subtrees of the listed
+    nodes, and write them to lists. This is a walk for `build_lists`.
+
+    Pending nodes are inner nodes that are not far and have a radius of at most `smallest`. Other
+    nodes that are not far are replaced by their children. Leaves that are not far are in neither
+    list.
+
+    c, inner: centers of the balls, and k rho of this module.
+    put: writes an entry; None to count only.
+
+    Returns the number of nodes on each lane.
+    """
     index, vector = tree.backend.UInt32, tree.backend.Array3f
 
     def visit(node: VisitedNode, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
+        """Count a node. state: the number so far. Returns whether the walk enters the node, and the
+        new number."""
         is_far = dr.squared_norm(c - vector(*node.head[:3])) > dr.square(inner + node.head[3])
         is_pending = ~is_far & ~node.is_leaf & (node.head[4] <= smallest)
         chosen = is_far if far else is_pending

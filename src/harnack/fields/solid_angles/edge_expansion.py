@@ -1,18 +1,19 @@
 """Harmonic polynomials of far edges in balls, and bounds of their truncation errors.
 
-The solid angles are those of cycles of directed edges far from a ball with the center c and the
-radius rho. With p = c + d on an edge from c + a to c + a + e, Biot and Savart's field of the edge
-at c + u is
+The polynomials expand the solid angle Omega of cycles of directed edges far from a ball with the
+center c and the radius rho. For an edge from c + a to c + a + e, Biot and Savart's field at c + u
+is
 
     h(u) = (a - u) x e W(u),    W(u) = integral over [0, 1] of dt/|a + te - u|^3,
 
-and grad Omega is the sum of these over the cycle. So Omega(c + u) - Omega(c) is the sum of
+and grad Omega is the sum of these over the cycle. So Omega(c + u) - Omega(c) is the sum over the
+edges of
 
-    g(u) = integral over [0, 1] of u . h(su) ds = u . (a x e) integral of W(su) ds.
+    g(u) = integral over [0, 1] of u . h(su) ds = u . (a x e) integral over [0, 1] of W(su) ds.
 
 Each g is harmonic in the ball by itself: u . h(u) = e . (u x grad) phi(u), with phi(u) the integral
-of dt/|a + te - u|, and u x grad maps harmonic functions to harmonic functions, degree by degree;
-the integral over s divides the part of degree l by l.
+of dt/|a + te - u|. The operator u x grad maps harmonic functions to harmonic functions, degree by
+degree, and the integral over s divides the part of degree l by l.
 
 - `EdgeExpansions.of`: the sum over the edges of cycles, for many balls at once.
 - `tail_bounds`: the bound of the terms of higher degree.
@@ -38,7 +39,6 @@ if TYPE_CHECKING:
     from harnack.backend.record_table import RecordTable
     from harnack.fields.solid_angles.edge_runs import CellEdges
 
-# Harmonics have degree j.
 
 DEGREE = 6
 COEFFICIENTS = (DEGREE + 1) ** 2
@@ -54,9 +54,9 @@ _ROUNDED_UP = 1 + 1e-9
 
 @dataclass(frozen=True)
 class EdgeExpansions:
-    """Sums over cycles of edges for n balls.
+    """Sums over cycles of edges, for n balls.
 
-    coefficients: (n, COEFFICIENTS) of the polynomial (`local_expansion.coefficient_keys`); its
+    coefficients: (n, COEFFICIENTS) of the polynomial (`local_expansion.coefficient_keys`). Its
         value at the center is known modulo 4 pi.
     error, slope: (n,) bounds of the truncation errors of value and gradient, anywhere in the ball.
     """
@@ -81,14 +81,15 @@ class EdgeExpansions:
         return EdgeExpansions(*(values[rows] for values in vars(self).values()))
 
     def to_octants(self, is_split: BoolArray, shifts: FloatArray, radius: float) -> EdgeExpansions:
-        """The same cycles about the centers of the octants of the cells that are split; the balls
-        of the octants lie in the balls of the cells.
+        """The same sums about the centers of the eight octants of each cell that is split. The
+        balls of the octants lie in the balls of the cells, so the bounds of errors hold there.
 
+        is_split: the mask of the cells that are split.
         shifts: `local_expansion.local_to_local_matrices`.
         radius: the radius of the cells' balls.
 
-        In double precision sums of 49 products lose less than 2^-46 of the sum of absolute values;
-        harmonics R_jk are at most 1 in the ball, and count twice at most.
+        Rounding: in double precision, sums of 49 products lose less than 2^-46 of the sum of
+        absolute values. Harmonics R_jk are at most 1 in the ball, and count twice at most.
         """
         coefficients, matrix = self.coefficients[is_split], shifts.reshape(-1, COEFFICIENTS)
         shifted = (coefficients @ matrix.T).reshape(-1, COEFFICIENTS)
@@ -101,23 +102,23 @@ class EdgeExpansions:
     def of(
         cls, points: RecordTable, edges: CellEdges, c: Vec3, radius: Real, n: int
     ) -> EdgeExpansions:
-        """The sums over edges, for balls around c, n lanes.
+        """The sums over the edges of each of n cells, for balls of this radius around c (n lanes).
 
-        points: rows (x, y, z).
+        points: rows (x, y, z), to which the edges refer.
 
         Rounding of the angle at the center, as in `LoopEdges.rounding`: each edge is off by less
-        than 2^-46 and by the effect of moving its ends by 2^-50 of coordinates below 2^3, which is
-        less than 2^-46 over the distance; all edges are farther than 2^-9, the radius of the finest
-        cells.
+        than 2^-46, and by the effect of moving its ends by 2^-50 of coordinates below 2^3. The
+        second is less than 2^-46 over the distance of the edge. All edges are farther than 2^-9,
+        the radius of the finest cells.
         """
         if not len(edges.cell):
             return cls.zero(n)
         backend = points.backend
         count = np.bincount(edges.cell, minlength=n)
-        first = upload_integers(backend, np.cumsum(count) - count)
-        lengths = upload_integers(backend, count)
+        first_edge = upload_integers(backend, np.cumsum(count) - count)
+        edge_count = upload_integers(backend, count)
         start, end = (upload_integers(backend, values) for values in (edges.start, edges.end))
-        sums = _over_pieces(points, start, end, first, lengths, c, radius)
+        sums = _over_pieces(points, start, end, first_edge, edge_count, c, radius)
         dr.eval(*sums)
         zr, zi, error, slope, *coefficients = (
             np.broadcast_to(to_numpy(values), n) for values in sums
@@ -129,15 +130,26 @@ class EdgeExpansions:
 def _over_pieces(
     points: RecordTable, start: Any, end: Any, first: Any, count: Any, c: Vec3, radius: Real
 ) -> tuple[Any, ...]:
-    """The product of spinors of edges (real and imaginary part), bounds of errors of value and
-    gradient, and all coefficients after the first."""
+    """Sum over the edges of each lane, cut into short pieces.
+
+    points: rows (x, y, z).
+    start, end: for each edge, the rows of its end points.
+    first, count: the first edge of each lane, and the number of its edges.
+    c, radius: the centers and the radius of the balls.
+
+    Returns the product of spinors of the edges (real and imaginary part), bounds of the truncation
+    errors of value and gradient, and all coefficients after the first.
+    """
     backend = points.backend
     index, real, vector = backend.UInt32, backend.Float, backend.Array3f
 
     def runs(j: Any, *_: Any) -> Mask:
+        """Whether the lane has further edges."""
         return j < count
 
     def body(j: Any, t: Real, zr: Real, zi: Real, *sums: Real) -> tuple[Any, ...]:
+        """Add the piece of edge j that begins at the parameter t, and, with its first piece, the
+        edge's factor of the product (zr, zi). Returns the state for the next piece."""
         active = j < count
         point_ids = (dr.gather(index, values, first + j, active) for values in (start, end))
         rows = (points.read_record(point_id, active) for point_id in point_ids)
@@ -163,9 +175,9 @@ def _over_pieces(
 class _EdgePiece:
     """A piece of an edge.
 
-    middle: its middle, relative to the center of the ball.
+    middle: the midpoint of the piece, relative to the center of the ball.
     e: the vector from its start to its end.
-    stop: the parameter, from 0 to 1, at which the piece ends on the edge.
+    stop: the parameter on the edge, from 0 to 1, at which the piece ends.
     """
 
     middle: Vec3
@@ -174,7 +186,9 @@ class _EdgePiece:
 
     @classmethod
     def of(cls, a: Vec3, b: Vec3, t: Real, radius: Real) -> _EdgePiece:
-        """The piece that begins at the parameter t of the edge from a to b."""
+        """The piece that begins at the parameter t of the edge from a to b, both relative to the
+        center of the ball. Its half length is at most `_MAX_PIECE` times its distance from the ball
+        of this radius."""
         vector, e = cast("Any", type(a)), b - a
         start = dr.fma(vector(t), e, a)
         max_length = (2 * _MAX_PIECE / (1 + _MAX_PIECE)) * (dr.norm(start) - radius)
@@ -184,12 +198,13 @@ class _EdgePiece:
         return cls(dr.fma(vector(0.5 * (t + stop)), e, a), (stop - t) * e, stop)
 
     def sums(self, radius: Real) -> list[Real]:
-        """Bounds of errors of value and gradient, and all coefficients after the first.
+        """Bounds of the truncation errors of value and gradient, and all coefficients after the
+        first, for a ball of this radius.
 
         Rounding: each product of a coefficient with a harmonic of the ball passes through fewer
-        than 2^9 roundings, of 2^-53 each, and the sum of their absolute values is below 2^14 |e|/D
-        (tests compute it), D the distance of a point of the rule. So the value, and the gradient
-        times the radius, are off by at most 2^-29 of that.
+        than 2^9 roundings of 2^-53 each. The sum of the absolute values of these products is below
+        2^14 |e|/D (tests compute it), with D the distance of a node of Gauss's rule from the
+        center. So the value, and the gradient times the radius, are off by at most 2^-29 |e|/D.
         """
         half = 0.5 * dr.norm(self.e)
         area = dr.norm(dr.cross(self.middle, self.e))
@@ -211,12 +226,16 @@ class _EdgePiece:
 
 
 def tail_bounds(q: Any) -> tuple[Any, Any]:
-    """Bounds of all terms of degree above p = DEGREE of a single point of an edge, and of their
-    gradient times rho, as multiples of |d x dp|/|d|^2; q = rho/|d|.
+    """Bounds of the truncation errors of value and gradient for an infinitesimal edge dp at d,
+    relative to the center of a ball of radius rho: of the sum of all terms of degree above
+    p = DEGREE, and of the gradient of this sum times rho. Both are multiples of |d x dp|/|d|^2.
 
-    Proof. With phi = sum over j of |u|^j P_j(s)/|d|^(j+1), s the cosine of the angle between u and
-    d, u x grad phi = sum of |u|^j P_j'(s)/|d|^(j+1) (u x d)/(|u||d|), so that the term of degree j
-    of g is at most |d x dp|/|d|^2 (|u|/|d|)^j sqrt(1-s^2)|P_j'(s)|/j. By the addition theorem the
+    q: rho/|d|.
+
+    Proof. For a point u of the ball, phi = sum over j of |u|^j P_j(s)/|d|^(j+1), with s the cosine
+    of the angle between u and d and Legendre's polynomials P_j. So u x grad phi = sum of
+    |u|^j P_j'(s)/|d|^(j+1) (u x d)/(|u||d|), and the term of degree j of g is at most
+    |d x dp|/|d|^2 (|u|/|d|)^j sqrt(1-s^2)|P_j'(s)|/j. By the addition theorem the
     squares of the orthonormal harmonics of degree j add up to (2j+1)/(4 pi); those with m = 1 alone
     are 2 (2j+1)/(4 pi) (1-s^2) P_j'^2/(j (j+1)). So sqrt(1-s^2)|P_j'|/j <= sqrt((j+1)/(2j)), which
     falls with j. The sums over j > p of q^j and j q^j are q^(p+1)/(1-q) and
@@ -234,22 +253,24 @@ def tail_bounds(q: Any) -> tuple[Any, Any]:
 
 
 def _quadrature_errors(distance: Real, half: Real, area: Real, radius: Real) -> tuple[Real, Real]:
-    """Bounds of the error of Gauss's rule on a piece, for value and gradient.
+    """Bounds of the error of Gauss's rule on a piece, for the value and for the gradient.
 
     distance: D, the distance of the middle of the piece from the ball.
     half: h, half the length of the piece.
-    area: |a x e|.
+    area: |a x e|, with a the start of the piece and e the vector from its start to its end.
+    radius: the radius of the ball.
 
-    Proof. With b from the point su to the middle and v the unit vector along the piece, W is the
-    mean of |b + zv|^-3 over real z in [-h, h]. For complex z, (b + zv)^2 has two roots of modulus
-    |b| >= D, so that |(b + zv)^2| >= (D - |z|)^2. On the ellipse with foci -h and h and half axes
-    that add up to hr, |z| <= h (r + 1/r)/2 =: S. With S = 8/11 D the integrand is at most M =
-    (11/(3D))^3, and its Chebyshev coefficients are at most 2 M r^-k. The rule with n nodes is exact
-    up to degree 2n - 1; beyond, odd terms vanish, and for even k >= 8 the mean of T_k over [-1, 1]
-    is at most 1/63 and the rule gives at most 1: in all the mean is off by at most 2.04 M r^-2n/(1
-    - r^-2). g is |u||a x e| times such a mean. The gradient is a x e times the same mean, plus u .
-    (a x e) times a mean of s times the gradient of W: 3 times the mean of (b + zv)/|b + zv|^5,
-    which on the ellipse is at most 3 (D+S)/(D-S)^5 (which falls with D), and the mean of s is 1/2.
+    Proof. Let b be the vector from the point su to the middle of the piece, and v the unit vector
+    along the piece. W is the mean of |b + zv|^-3 over real z in [-h, h]. For complex z, (b + zv)^2
+    has two roots of modulus |b| >= D, so that |(b + zv)^2| >= (D - |z|)^2. On the ellipse with foci
+    -h and h and half axes that add up to hr, |z| <= h (r + 1/r)/2 =: S. With S = 8/11 D the
+    integrand is at most M = (11/(3D))^3, and its Chebyshev coefficients are at most 2 M r^-k. The
+    rule with n nodes is exact up to degree 2n - 1. Of the terms of higher degree, the odd ones
+    vanish; for even k >= 8 the mean of T_k over [-1, 1] is at most 1/63, and the rule gives at most
+    1. In all the mean is off by at most 2.04 M r^-2n/(1 - r^-2). g is at most |u||a x e| times such
+    a mean. The gradient is a x e times the same mean, plus u . (a x e) times a mean over s of s
+    times the gradient of W. This gradient is 3 times the mean of (b + zv)/|b + zv|^5, which on the
+    ellipse is at most 3 (D+S)/(D-S)^5. That falls with D, and the mean of s is 1/2.
     """
     x = (8 / 11) * distance / half
     r = x + dr.sqrt(dr.square(x) - 1)
@@ -265,16 +286,23 @@ def _quadrature_errors(distance: Real, half: Real, area: Real, radius: Real) -> 
 
 
 def _rotated_coefficients(phi: dict[Any, list[Any]], e: Vec3, radius: Real) -> list[Real]:
-    """The coefficients of the integral over s of e . (u x grad) phi(su)/s, after the first.
+    """The coefficients L'_jk, except the first, of the integral over s of
+    e . (u x grad) phi(su)/s, times radius^j.
 
-    d/d(angle) about the z axis of conj R_jk is -ik conj R_jk, and with (d/dx +- i d/dy) of
-    `multipole` the turns about x and y lead to the neighbors k - 1 and k + 1:
+    phi: the coefficients L_jk of phi, as pairs of real and imaginary part.
+    e: the vector along the edge.
 
-        L'_jk = -ik e_z L_jk + (j+k)/2 (i e_x - e_y) L_j,k-1 + (j-k)/2 (i e_x + e_y) L_j,k+1.
+    The derivative of conj R_jk by the angle about the z axis is -ik conj R_jk. The derivatives by
+    the angles about x and y follow from those of (d/dx +- i d/dy) in `multipole`, and lead to the
+    orders k - 1 and k + 1:
+
+        L'_jk = -ik e_z L_jk + (j+k)/2 (i e_x - e_y) L_j,k-1 + (j-k)/2 (i e_x + e_y) L_j,k+1,
+
+    divided by j for the integral over s.
     """
-    powers: list[Any] = [1.0]
+    radius_powers: list[Any] = [1.0]
     for _ in range(DEGREE):
-        powers.append(powers[-1] * radius)
+        radius_powers.append(radius_powers[-1] * radius)
     coefficients: list[Real] = []
     for j, k, part in coefficient_keys(DEGREE):
         if j == 0:
@@ -286,9 +314,9 @@ def _rotated_coefficients(phi: dict[Any, list[Any]], e: Vec3, radius: Real) -> l
             a, b = phi[j, k - 1]
         else:  # L_j,-1 = -conj L_j1
             a, b = -phi[j, 1][0], phi[j, 1][1]
-        real, imag = real + down * (-e.x * b - e.y * a), imag + down * (e.x * a - e.y * b)
+        real, imag = (real + down * (-e.x * b - e.y * a), imag + down * (e.x * a - e.y * b))
         if k < j:
             a, b = phi[j, k + 1]
-            real, imag = real + up * (-e.x * b + e.y * a), imag + up * (e.x * a + e.y * b)
-        coefficients.append(powers[j] / j * (imag if part else real))
+            real, imag = (real + up * (-e.x * b + e.y * a), imag + up * (e.x * a + e.y * b))
+        coefficients.append(radius_powers[j] / j * (imag if part else real))
     return coefficients

@@ -1,16 +1,16 @@
 """The lifted solid angle of boundary edges: a real number that has no jumps along a ray.
 
-The antipodal method (Martens, Trettner and Bessmeltsev 2026): with the apex of every edge's
-triangle at infinity, opposite to the direction d, an edge e from a to b (relative to x) has the
-solid angle Omega_e = 2 arg F_e with F_e = (s_a s_b + a'.b') - i (a' x b'), where a' is a projected
-along d (two numbers) and s_a = |a| - a.d. Then
+The antipodal method (Martens, Trettner and Bessmeltsev 2026) adds up triangles from every edge to
+an apex at infinity, opposite to a direction d. Let an edge e run from a to b, relative to x. Its
+triangle has the solid angle Omega_e = 2 arg F_e with F_e = (s_a s_b + a'.b') - i (a' x b'). Here a'
+is a projected along d (two numbers), and s_a = |a| - a.d. Then
 
-    w(x) = signs of all crossings of the ray from x along d  +  1/(4 pi) sum_e Omega_e(x)
+    w(x) = sum of signs of all crossings of the ray from x along d  +  1/(4 pi) sum_e Omega_e(x)
 
-is the winding number of *any* triangles with these boundary edges: F_e crosses the negative axis
-exactly where the ray from x along d passes through e, and there the sum of the signs changes by as
-much. As x moves along d itself, that ray only gets shorter, so that sum_e Omega_e is continuous on
-the whole ray off the edges, and the jumps of w are those of the triangles passed.
+is the winding number of *any* triangles with these boundary edges. For F_e crosses the negative
+axis exactly where the ray from x along d passes through e, and there the sum of the signs changes
+by as much. As x moves along d itself, that ray only gets shorter. So sum_e Omega_e is continuous
+on the whole ray off the edges, and the jumps of w are those of the triangles passed.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ if TYPE_CHECKING:
     from harnack.tree.balanced_tree import FloatArray, IntArray
     from harnack.tree.triangle_tree import RayFrame
 
-# The number of edges in a trip of the loop; edges that pad the last trip have length and direction
-# 0.
+# The number of edges that each pass through the loop adds. Edges that pad the last pass have length
+# and direction 0.
 _EDGES_PER_TRIP = 4
-# The size of the imaginary part of a factor where it would be zero.
+# An imaginary part of a factor that would be zero is replaced by plus or minus this number.
 _TINY = 1e-36
-# A bound of the rounding of a product's angle Omega = 2 arg, in units u of half the distance from 1
-# to the next number: for each factor `FACTOR_ROUNDINGS` units, and `STEEP_ROUNDINGS` units times L
-# e' of `LiftedEdge.bounds` besides.
+# Bounds of the rounding of a product's angle Omega = 2 arg, in units of u, the unit roundoff. Each
+# factor adds `FACTOR_ROUNDINGS` units, and also `STEEP_ROUNDINGS` units times L e' (see
+# `LiftedEdge.bounds`).
 #
 # Proof. Errors of arguments add up, as each step is compared with the exact product of its rounded
 # inputs. (1) `times` multiplies by F: each part of the result is off by at most u times the size of
@@ -60,24 +60,25 @@ FACTOR_ROUNDINGS, STEEP_ROUNDINGS = 16.5, 7.5
 
 @dataclass(frozen=True)
 class LiftedEdges:
-    """Directed edges on a backend, one packet each: see `edge_records`."""
+    """Directed edges on a backend, one record for each: see `edge_records`."""
 
     records: RecordTable
 
     @classmethod
     def upload(cls, backend: Backend, vertices: FloatArray, edges: IntArray) -> LiftedEdges:
-        """Edges (k, 2) between vertices (n, 3); an edge of weight w is repeated w times."""
+        """Upload edges (k, 2) between vertices (n, 3). An edge of weight w is repeated w times."""
         table = edge_records(vertices, edges)
         padding = np.concatenate([table[0, :3], [0.0], table[0, :3], table[0, 7:]])
         return cls(RecordTable.upload(backend, table, padding, _EDGES_PER_TRIP))
 
 
 def edge_records(vertices: FloatArray, edges: IntArray) -> FloatArray:
-    """(k, 8) for directed edges (k, 2): lower end, direction, higher end, 1/length^2.
+    """Records (k, 8) of directed edges (k, 2) between vertices (n, 3): lower end, direction, higher
+    end, 1/length^2.
 
-    The ends are ordered by vertex index, like the ends of edges of triangles
-    (`tree.triangle_tree`), so that `edge_function` gives the same bits for both; direction is 1 if
-    the edge runs from the lower to the higher index, -1 if it runs back.
+    The lower end is the one with the lower vertex index. Edges of triangles have the same order of
+    ends (`tree.triangle_tree`), so that `edge_function` gives the same bits for both. The direction
+    is 1 if the edge runs from the lower to the higher index, and -1 if it runs back.
     """
     low, high = vertices[edges.min(axis=1)], vertices[edges.max(axis=1)]
     direction = np.where(edges[:, 0] < edges[:, 1], 1.0, -1.0)
@@ -91,8 +92,8 @@ class LiftedEdge:
     edge: the edge relative to x.
     ends: its end points, in the order of their indices.
     frame: the frame of the rays.
-    direction: 1 if the boundary runs from the first end to the second, -1 if it runs back; the sign
-        of all terms of the edge.
+    direction: 1 if the boundary runs from the first end to the second, -1 if it runs back. All
+        terms of the edge are multiplied by it.
     """
 
     edge: Edge
@@ -110,11 +111,12 @@ class LiftedEdge:
         frame: RayFrame | VerticalRayFrame,
         x: Vec3,
     ) -> LiftedEdge:
-        """The edge from p to q, inverse = 1/|q-p|^2, relative to x on a ray of the frame."""
+        """The edge from p to q relative to x, which lies on a ray of the frame. inverse:
+        1/|q-p|^2."""
         return cls(Edge.between(p, q, inverse, x), (p, q), frame, direction)
 
     def factor(self) -> tuple[Real, Real]:
-        """F_e: real and imaginary part."""
+        """Real and imaginary part of F_e."""
         vector, frame, edge = cast("Any", type(self.edge.a)), self.frame, self.edge
         pairs = zip(self.ends, (edge.a, edge.b), strict=True)
         a, b = (vector(*frame.transverse(p), frame.component(a)) for p, a in pairs)
@@ -122,8 +124,8 @@ class LiftedEdge:
         return re, self.direction * im
 
     def terms(self, derivatives: int, active: Mask) -> SourceTerm:
-        """The edge's terms of the derivatives of the sum of angles, up to order `derivatives`; 0
-        where it is not active."""
+        """The edge's terms of the gradient and the Hessian of the sum of angles, up to order
+        `derivatives`. They are 0 where the edge is not active. There is no term of the value."""
         if derivatives == 0:
             return SourceTerm(None)
         weight, c = self.edge.biot_savart()
@@ -137,24 +139,27 @@ class LiftedEdge:
         )
 
     def bounds(self, unit: Real) -> tuple[Real, Real, Real]:
-        """A bound of the rounding of Omega_e and of its factor in the product, and the edge's terms
-        of s4 and s5 of `SourceSums`.
+        """Bounds of the edge's rounding, and of its effect on higher derivatives.
 
         unit: the rounding of a coordinate, `coordinate_rounding`, which is twice that of correct
             rounding.
 
-        Rounding. The ends of the edge, x and their differences are off by half a unit together, and
-        the angle by that times Biot and Savart's field, which is at most twice the first number e'
-        of `edge_variation`; roundings of s act like moving the ends by another half unit, and the
-        same bits of an end serve both of its edges. The rest is the rounding of the factor's own
-        sums and of the product: `FACTOR_ROUNDINGS`, and `STEEP_ROUNDINGS` L e' if the edge, of
-        length L, subtends more than a right angle. It is less than 4 pi in any case.
+        Returns a bound of the rounding of Omega_e and of its factor in the product, and the edge's
+        terms of s4 and s5 of `SourceSums`.
 
-        Variation. Taylor's remainder after the linear term is at most 3/4 t^2 times the integral of
-        |dp|/(rho^3 (1-t/rho)) (`curve_queries.remainder_promises`). With a = L/2 and distance d an
-        edge has int rho^-3 <= 2a/(d^2 sqrt(d^2+a^2)) =: 2e, int rho^-4 <= 2e/d; and 1/(1-q) <= 1 +
-        q/(1-b) <= 1 + q rise/4 on [0, b] (`SourceSums.sample`). So the terms s4 += e/2 and s5 +=
-        3e/(8d) bound the edge's part of the remainder. d is reduced by its rounding.
+        Rounding. The ends of the edge, x and their differences are off by half a unit together. The
+        angle is off by that times Biot and Savart's field, which is at most twice the first number
+        e' of `edge_variation`. Roundings of s act like moving the ends by another half unit, and
+        the same bits of an end serve both of its edges. The rest is the rounding of the factor's
+        own sums and of the product: `FACTOR_ROUNDINGS`, and `STEEP_ROUNDINGS` L e' if the edge, of
+        length L, subtends more than a right angle. The rounding is less than 4 pi in any case.
+
+        Variation. Let rho be the distance of a point of the edge. Taylor's remainder after the
+        linear term is at most 3/4 t^2 times the integral of |dp|/(rho^3 (1-t/rho))
+        (`curve_queries.remainder_promises`). With a = L/2 and distance d an edge has int
+        rho^-3 <= 2a/(d^2 sqrt(d^2+a^2)) =: 2e and int rho^-4 <= 2e/d. On [0, b],
+        1/(1-q) <= 1 + q/(1-b) <= 1 + q rise/4 (`SourceSums.sample`). So the terms s4 += e/2 and
+        s5 += 3e/(8d) bound the edge's part of the remainder. d is reduced by its rounding.
         """
         distance = fmax(dr.sqrt(self.edge.squared_distance) - 2 * unit, 0)
         first, e = edge_variation(distance * distance, self.edge.inverse_square_length)
@@ -170,22 +175,26 @@ class LiftedEdge:
 
 @dataclass(frozen=True)
 class LiftedSums:
-    """Sums over terms and edges, in which the angles of the edges are still a product of
-    factors."""
+    """Sums over terms and edges. The angles of the edges are kept as a product of factors, and are
+    not yet part of the value.
+
+    sums: all other sums.
+    product: the product of the factors F_e.
+    """
 
     sums: SourceSums
     product: LiftedProduct
 
     @classmethod
     def zero(cls, backend: Backend, derivatives: int) -> LiftedSums:
-        """Empty sums; derivatives: as for `SourceSums.zero`."""
+        """Sums without terms. derivatives: as for `SourceSums.zero`."""
         return cls(
             SourceSums.zero(backend, dr.inf, derivatives), LiftedProduct.identity(backend.Float)
         )
 
     @classmethod
     def of(cls, parts: tuple[Any, ...]) -> LiftedSums:
-        """The sums with these `parts`."""
+        """The sums with these `parts`, as the method `parts` returns them."""
         return cls(SourceSums.from_state(parts[0]), LiftedProduct(*parts[1]))
 
     def parts(self) -> tuple[Any, ...]:
@@ -193,7 +202,7 @@ class LiftedSums:
         return self.sums.to_state(), self.product.parts()
 
     def add_edge(self, edge: LiftedEdge, unit: Real, active: Mask) -> LiftedSums:
-        """The sums with an edge added where active; unit: as for `LiftedEdge.bounds`."""
+        """The sums with an edge added, where active. unit: as for `LiftedEdge.bounds`."""
         (re, im), terms = edge.factor(), edge.terms(self.sums.derivatives, active)
         sums = self.sums.add_term(terms, True)
         rounding, s4, s5 = edge.bounds(unit)
@@ -221,15 +230,16 @@ class LiftedSums:
 
 
 def lifted_sums(edges: LiftedEdges, x: Vec3, derivatives: int) -> LiftedSums:
-    """All sums at points x in one loop over the edges, for the direction d = z.
+    """Sum over all edges at points x in one loop, for the direction d = z.
 
-    derivatives: 0 for the angle only, 1 with the gradient, 2 with the Hessian. Results that are
-        not used are not computed.
+    derivatives: 0 for the angle only, 1 with the gradient, 2 with the Hessian. Results that are not
+        used are not computed.
     """
     backend, unit = edges.records.backend, coordinate_rounding(x)
     vector = backend.Array3f
 
     def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+        """The sums `state`, with the edge of a record added."""
         p, q = vector(*row[:3]), vector(*row[4:7])
         edge = LiftedEdge.between(p, q, row[3], row[7], VerticalRayFrame(x), x)
         return LiftedSums.of(state).add_edge(edge, unit, row[3] != 0).parts()
@@ -239,12 +249,13 @@ def lifted_sums(edges: LiftedEdges, x: Vec3, derivatives: int) -> LiftedSums:
 
 
 def edge_rates(edges: LiftedEdges, x: Vec3, derivatives: int) -> SourceSums:
-    """The sums of `lifted_sums` without the value: gradient and, for derivatives = 2, Hessian of
-    the solid angle of closed edges, by Biot and Savart's law."""
+    """The sums of `lifted_sums` without the value: the gradient and, for derivatives = 2, the
+    Hessian of the solid angle of closed edges, by Biot and Savart's law."""
     backend, unit = edges.records.backend, coordinate_rounding(x)
     vector = backend.Array3f
 
     def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+        """The sums `state`, with the edge of a record added."""
         p, q, active = vector(*row[:3]), vector(*row[4:7]), row[3] != 0
         edge = LiftedEdge.between(p, q, row[3], row[7], VerticalRayFrame(x), x)
         sums = SourceSums.from_state(state).add_term(edge.terms(derivatives, active), True)
@@ -274,7 +285,7 @@ class VertexView:
 
 
 def view_vertex(p: Vec3, frame: RayFrame, x: Vec3) -> VertexView:
-    """A vertex p relative to x and to the rays of a frame."""
+    """The vertex p, relative to x and to the rays of a frame."""
     offset = p - x
     length = dr.norm(offset)
     u, v = frame.transverse(p)
@@ -283,9 +294,11 @@ def view_vertex(p: Vec3, frame: RayFrame, x: Vec3) -> VertexView:
 
 
 def ends_factor(a: VertexView, b: VertexView, direction: Real) -> tuple[Real, Real]:
-    """F_e of the edge from a to b; direction: positive if a has the lower index, else negative.
+    """Real and imaginary part of the factor F_e of the edge from a to b.
 
-    `edge_function` takes the ends in the order of their indices, as everywhere.
+    direction: positive if a has the lower index, else negative. `edge_function` must get the ends
+        in the order of their indices, so that both triangles at an edge, and its record, decide by
+        the same bits.
     """
     rises = direction > 0
     low, high = (dr.select(rises, a.u, b.u), dr.select(rises, a.v, b.v)), (
@@ -296,8 +309,11 @@ def ends_factor(a: VertexView, b: VertexView, direction: Real) -> tuple[Real, Re
 
 
 def edge_factor(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Real, Real]:
-    """F_e of the edge from a to b, both given as (u, v, z): two coordinates across the direction,
-    and the coordinate along it. la, lb: |a| and |b|.
+    """Real and imaginary part of the factor F_e of the edge from a to b.
+
+    a, b: the ends as (u, v, z), with two coordinates across the direction d and the coordinate
+        along it.
+    la, lb: |a| and |b|.
 
     s_a is computed as |a'|^2/(|a| + a.d) where a.d > 0, so that nothing cancels.
     """
@@ -305,10 +321,14 @@ def edge_factor(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Real, Real]:
 
 
 def _factor(a: tuple[Real, Real], b: tuple[Real, Real], sa: Real, sb: Real) -> tuple[Real, Real]:
-    """F_e from the coordinates of the ends across the direction, and s of each end.
+    """Real and imaginary part of F_e.
 
-    A ray exactly through an edge or a vertex is treated as by `tree.triangle_tree.signed_crossing`:
-    as if it passed at a v, and then a u, infinitely little below zero.
+    a, b: the coordinates of both ends across the direction.
+    sa, sb: the numbers s of both ends.
+
+    If the ray passes exactly through an edge or a vertex, it is treated as by
+    `tree.triangle_tree.signed_crossing`: as if its v were smaller than zero by an infinitesimal
+    amount, and its u by a much smaller infinitesimal amount.
     """
     real, (au, av), (bu, bv) = cast("Any", type(sa)), a, b
     on_ray = (au == 0) & (av == 0), (bu == 0) & (bv == 0)
@@ -324,16 +344,16 @@ def _factor(a: tuple[Real, Real], b: tuple[Real, Real], sa: Real, sb: Real) -> t
 
 
 def _length_less_axial(a: Vec3, length: Real) -> Real:
-    """s = |a| - a.d of a vector a = (u, v, z) with z along the direction d, without
-    cancellation."""
+    """s = |a| - a.d, without cancellation, of a vector a = (u, v, z) with z along the direction d.
+    length: |a|."""
     square = dr.fma(a.x, a.x, a.y * a.y)
     return dr.select(a.z > 0, square / (length + a.z), length - a.z)
 
 
 @dataclass(frozen=True)
 class LiftedProduct:
-    """A product re + i im of factors, scaled to a length of about 1, and the number of its full
-    turns."""
+    """A product re + i im of factors, scaled to a length of about 1. turns: the number of full
+    turns by which the sum of the factors' arguments differs from the argument of re + i im."""
 
     re: Real
     im: Real
@@ -341,7 +361,7 @@ class LiftedProduct:
 
     @classmethod
     def identity(cls, real: Any) -> LiftedProduct:
-        """The product of no factors; real: the type of its numbers."""
+        """The product of no factors. real: the type of its numbers."""
         return cls(real(1), real(0), real(0))
 
     def parts(self) -> tuple[Real, Real, Real]:
@@ -351,25 +371,26 @@ class LiftedProduct:
     def times(self, re: Real, im: Real) -> LiftedProduct:
         """The product with a further factor re + i im.
 
-        Arguments lie in (-pi, pi]. The argument of the product is their sum if they have different
-        signs; otherwise the sum has left the interval exactly if its imaginary part has the other
-        sign. For two factors of argument -pi/2 it has: the sum -pi is pi and a turn less.
+        Arguments lie in (-pi, pi]. If the arguments of both factors have different signs, the
+        argument of the product is their sum. Otherwise the sum has left the interval exactly if the
+        product's imaginary part has the other sign. That is so for two factors of argument -pi/2:
+        their sum -pi counts as pi and one turn less.
         """
-        pr = dr.fma(self.re, re, -(self.im * im))
-        pi = dr.fma(self.re, im, self.im * re)
-        scale = dr.rcp(dr.abs(pr) + dr.abs(pi))
-        unit = type(pr)(1)
-        pi = dr.select(pi == 0, 0, pi)  # no zero with a sign, which would be -pi
+        new_re = dr.fma(self.re, re, -(self.im * im))
+        new_im = dr.fma(self.re, im, self.im * re)
+        scale = dr.rcp(dr.abs(new_re) + dr.abs(new_im))
+        unit = type(new_re)(1)
+        new_im = dr.select(new_im == 0, 0, new_im)  # no zero with a sign, which would be -pi
         # The sum can leave the interval only if one of the arguments is at least pi/2 in size;
         # testing for this keeps underflow from counting.
         may_wrap = (self.re <= 0) | (re <= 0)
-        over = dr.select((self.im >= 0) & (im >= 0) & (pi < 0) & may_wrap, unit, 0)
-        under = dr.select((self.im < 0) & (im < 0) & (pi >= 0) & may_wrap, unit, 0)
+        turns_up = dr.select((self.im >= 0) & (im >= 0) & (new_im < 0) & may_wrap, unit, 0)
+        turns_down = dr.select((self.im < 0) & (im < 0) & (new_im >= 0) & may_wrap, unit, 0)
         is_finite = dr.isfinite(scale)
         return LiftedProduct(
-            dr.select(is_finite, pr * scale, self.re),
-            dr.select(is_finite, pi * scale, self.im),
-            self.turns + over - under,
+            dr.select(is_finite, new_re * scale, self.re),
+            dr.select(is_finite, new_im * scale, self.im),
+            self.turns + turns_up - turns_down,
         )
 
     def angle(self) -> Real:

@@ -1,14 +1,14 @@
-"""Runs of consecutive edges of closed loops that are near to cells, each closed by a further
-vertex.
+"""Runs of consecutive edges of closed loops that are near to cells. Each run is closed by a further
+vertex, its apex.
 
-A run with its closing edges, from its last vertex to its apex and on to its first, is a closed
-loop. So the solid angle of a curve is that of the closed near runs, modulo 4 pi, plus that of the
-remaining edges: far edges and the closing edges, reversed. These are a cycle, too: each vertex is
-entered as often as it is left.
+A run together with its two closing edges, from its last vertex to its apex and on to its first
+vertex, is a closed loop. So the solid angle of a curve is that of the closed near runs, modulo 4
+pi, plus that of the remaining edges. The remaining edges are the far edges and the closing edges,
+reversed. They form a cycle, too: they enter each vertex as often as they leave it.
 
-- `VertexTable`: the vertices of loops, such that every run is consecutive.
+- `VertexTable`: the vertices of loops, in an order in which every run is consecutive.
 - `EdgeRuns`: the runs of many cells. `EdgeRuns.restrict_to_near` gives the runs of smaller cells,
-  and the edges in them.
+and the edges in them.
 - `subtract_runs`: the remaining edges.
 """
 
@@ -22,8 +22,8 @@ import numpy as np
 if TYPE_CHECKING:
     from harnack.backend import BoolArray, FloatArray, IntArray
 
-# Runs with at most this many far edges in between are joined: closing a run takes two edges and
-# begins another run.
+# Runs with at most this many far edges in between are joined: it takes two closing edges to end a
+# run.
 _MAX_GAP = 3
 # The distance of an apex from the center, in units of the radius beyond which edges are far.
 _APEX_RATIO = 2.5
@@ -33,8 +33,8 @@ _APEX_RATIO = 2.5
 class VertexTable:
     """Vertices of closed loops, in a table in which every run of edges is consecutive.
 
-    points: (m, 3) the vertices of each loop, twice in a row, and its first vertex a third time, so
-        that a run that continues across the end of a loop is consecutive.
+    points: (m, 3) the vertices of each loop, twice in a row, and its first vertex a third time. So
+        a run that continues across the end of a loop is consecutive.
     first, sizes: for each loop the row of its first vertex, and the number of its edges.
     """
 
@@ -44,7 +44,7 @@ class VertexTable:
 
     @classmethod
     def of(cls, loops: tuple[FloatArray, ...]) -> VertexTable:
-        """The vertices of loops, each of shape (n, 3)."""
+        """The table of the vertices of loops, each of shape (n, 3)."""
         rows = [np.concatenate([loop, loop, loop[:1]]) for loop in loops]
         sizes = np.array([len(loop) for loop in loops], np.int64)
         ends = np.cumsum(2 * sizes + 1)
@@ -53,10 +53,10 @@ class VertexTable:
 
 @dataclass(frozen=True)
 class CellEdges:
-    """Directed edges of n cells, sorted by cell, between rows of a table of points.
+    """Directed edges of n cells, sorted by cell. Their ends are rows of a table of points.
 
     start, end: (k,) rows of the table.
-    cell: (k,) indices of cells.
+    cell: (k,) the index of the cell that each edge belongs to.
     """
 
     start: IntArray
@@ -68,10 +68,10 @@ class CellEdges:
 class EdgeRuns:
     """Runs of the edges of loops, sorted by cell.
 
-    cell: (m,) the cell that a run belongs to.
+    cell: (m,) the cell that each run belongs to.
     first, count: (m,) the row of its first vertex in the table, and the number of its edges.
     is_whole: (m,) whether it is a whole loop, which needs no apex.
-    apex: (m, 3) points that close runs; unused for whole loops.
+    apex: (m, 3) the points that close the runs; unused for whole loops.
     """
 
     cell: IntArray
@@ -88,7 +88,8 @@ class EdgeRuns:
         return cls(np.zeros(n, np.int64), table.first, table.sizes, is_whole, np.zeros((n, 3)))
 
     def to_octants(self, is_split: BoolArray) -> EdgeRuns:
-        """The runs of cells that are split, for each of their eight children."""
+        """The runs of the cells that are split, repeated for each of their eight octants. is_split:
+        the mask of these cells."""
         is_chosen = is_split[self.cell]
         split_index = np.cumsum(is_split) - 1
         parent, count = split_index[self.cell[is_chosen]], int(is_chosen.sum())
@@ -96,10 +97,10 @@ class EdgeRuns:
         cell = 8 * parent[repeated] + np.repeat(np.arange(8), count)
         order = np.argsort(cell, kind="stable")
         rows = np.flatnonzero(is_chosen)[repeated[order]]
-        return self._select_runs(rows, cell[order])
+        return self._some(rows, cell[order])
 
-    def _select_runs(self, rows: IntArray, cell: IntArray) -> EdgeRuns:
-        """The runs at these rows, of the cells `cell`."""
+    def _some(self, rows: IntArray, cell: IntArray) -> EdgeRuns:
+        """The runs at these rows, assigned to the cells `cell`."""
         return EdgeRuns(
             cell, self.first[rows], self.count[rows], self.is_whole[rows], self.apex[rows]
         )
@@ -111,64 +112,74 @@ class EdgeRuns:
         return run, np.arange(len(run)) - start[run] + self.first[run]
 
     def restrict_to_near(self, run: IntArray, is_near: BoolArray) -> tuple[EdgeRuns, BoolArray]:
-        """The runs of near edges, and for each edge whether it is in such a run.
+        """Cut the runs down to the runs of near edges. Short gaps of far edges between near edges
+        stay in a run.
 
-        run, is_near: (k,) for each of `edges`, its run, and whether it is near.
+        run, is_near: (k,) for each edge in the order of `edges`, the index of its run, and whether
+            it is near.
 
-        The apexes of the new runs are still to be chosen (`with_apexes`).
+        Returns the new runs, whose apexes are still to be chosen (`with_apexes`), and for each edge
+        (k,) whether it is in one of them.
         """
-        start = np.cumsum(self.count) - self.count
+        first_edge = np.cumsum(self.count) - self.count
         near_ids = np.flatnonzero(is_near)
-        owner = run[near_ids]
-        breaks = np.ones(len(near_ids), np.bool_)
-        breaks[1:] = (owner[1:] != owner[:-1]) | (np.diff(near_ids) > _MAX_GAP + 1)
-        starts = np.flatnonzero(breaks)
-        ends = np.append(starts[1:], len(near_ids))[: len(starts)] - 1
-        first_near, last_near, owner = near_ids[starts], near_ids[ends], owner[starts]
-        offset, count = first_near - start[owner], last_near - first_near + 1
-        # Runs of whole loops may continue across the end of the loop.
-        is_first, is_last = np.ones((2, len(owner)), np.bool_)
-        is_first[1:] = is_last[:-1] = owner[1:] != owner[:-1]
-        first_of = np.maximum.accumulate(np.where(is_first, np.arange(len(owner)), 0))
-        size = self.count[owner]
-        gap = offset[first_of] + size - (offset + count)
-        may_join = is_last & self.is_whole[owner] & (gap <= _MAX_GAP)
-        closes_itself = may_join & is_first
+        old_run = run[near_ids]
+        begins_run = np.ones(len(near_ids), np.bool_)
+        begins_run[1:] = (old_run[1:] != old_run[:-1]) | (np.diff(near_ids) > _MAX_GAP + 1)
+        begin = np.flatnonzero(begins_run)
+        finish = np.append(begin[1:], len(near_ids))[: len(begin)] - 1
+        first_near, last_near, old_run = near_ids[begin], near_ids[finish], old_run[begin]
+        offset, count = first_near - first_edge[old_run], last_near - first_near + 1
+        # Runs of whole loops may continue across the end of the loop. `offset` and `count` are each
+        # run's first edge in its old run and the number of its edges, first_of the first new run of
+        # the same old run, and gap_around the number of far edges from a run across the end to it.
+        is_first, is_last = np.ones((2, len(old_run)), np.bool_)
+        is_first[1:] = is_last[:-1] = old_run[1:] != old_run[:-1]
+        first_of = np.maximum.accumulate(np.where(is_first, np.arange(len(old_run)), 0))
+        size = self.count[old_run]
+        gap_around = offset[first_of] + size - (offset + count)
+        may_join = is_last & self.is_whole[old_run] & (gap_around <= _MAX_GAP)
+        is_cyclic = may_join & is_first
         is_joined = may_join & ~is_first
-        length = count + np.where(is_joined, gap + count[first_of], 0)
-        is_kept = np.ones(len(owner), np.bool_)
+        length = count + np.where(is_joined, gap_around + count[first_of], 0)
+        is_kept = np.ones(len(old_run), np.bool_)
         is_kept[first_of[is_joined]] = False
-        offset, length = np.where(closes_itself, 0, offset), np.where(closes_itself, size, length)
-        is_whole = self.is_whole[owner] & (length >= size)
-        marks = np.zeros(len(run) + 1, np.int64)
-        stop = offset + length
-        np.add.at(marks, start[owner[is_kept]] + offset[is_kept], 1)
-        inside = np.minimum(stop, size)
-        np.add.at(marks, start[owner[is_kept]] + inside[is_kept], -1)
-        wraps = is_kept & (stop > size)
-        np.add.at(marks, start[owner[wraps]], 1)
-        np.add.at(marks, start[owner[wraps]] + (stop - size)[wraps], -1)
-        in_run = np.cumsum(marks[:-1]) > 0
-        cell, first = self.cell[owner][is_kept], (self.first[owner] + offset)[is_kept]
+        offset, length = np.where(is_cyclic, 0, offset), np.where(is_cyclic, size, length)
+        is_whole = self.is_whole[old_run] & (length >= size)
+        depth_change = np.zeros(len(run) + 1, np.int64)
+        offset_end = offset + length
+        np.add.at(depth_change, first_edge[old_run[is_kept]] + offset[is_kept], 1)
+        inside_end = np.minimum(offset_end, size)
+        np.add.at(depth_change, first_edge[old_run[is_kept]] + inside_end[is_kept], -1)
+        passes_end = is_kept & (offset_end > size)
+        np.add.at(depth_change, first_edge[old_run[passes_end]], 1)
+        np.add.at(
+            depth_change, first_edge[old_run[passes_end]] + (offset_end - size)[passes_end], -1
+        )
+        in_run = np.cumsum(depth_change[:-1]) > 0
+        cell, first = self.cell[old_run][is_kept], (self.first[old_run] + offset)[is_kept]
         apexes = np.zeros((int(is_kept.sum()), 3))
         return EdgeRuns(cell, first, length[is_kept], is_whole[is_kept], apexes), in_run
 
     def with_apexes(
         self, table: VertexTable, centers: FloatArray, radius: FloatArray, number: np.dtype[Any]
     ) -> EdgeRuns:
-        """The same runs with apexes; radius: the distance from the centers beyond which edges are
-        far.
+        """The same runs with apexes.
 
-        With unit vectors to both ends, the apex lies in the direction of their sum, or if that is
-        short in a direction at right angles to their difference: so at most at a right angle to
-        both ends, which are farther than the radius r, and the closing edges are no nearer than
-        2.5/sqrt(1 + 2.5^2) = 0.928 r.
+        centers: (n, 3) of the cells.
+        radius: (n,) the distance from the centers beyond which edges are far.
+        number: the type of numbers to which apexes are rounded.
+
+        Take unit vectors from the center to both ends of a run. The apex lies in the direction of
+        their sum, or if the sum is short, in a direction perpendicular to their difference. So the
+        apex is at most at a right angle to both ends, which are farther than the radius r.
+        Therefore the closing edges are no nearer to the center than 2.5/sqrt(1 + 2.5^2) = 0.928 r.
         """
         center = centers[self.cell]
-        first = _unit(table.points[self.first] - center)
-        last = _unit(table.points[self.first + self.count] - center)
-        mean = first + last
-        difference = _unit(first - last)
+        to_first = _unit(table.points[self.first] - center)
+        to_last = _unit(table.points[self.first + self.count] - center)
+        mean = to_first + to_last
+        difference = _unit(to_first - to_last)
         axis = np.eye(3)[np.abs(difference).argmin(axis=1)]
         perpendicular = _unit(axis - (axis * difference).sum(axis=1, keepdims=True) * difference)
         perpendicular *= np.where((perpendicular * mean).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
@@ -180,8 +191,9 @@ class EdgeRuns:
         return EdgeRuns(self.cell, self.first, self.count, self.is_whole, apex)
 
     def closing_edges(self, apexes: int) -> tuple[CellEdges, CellEdges]:
-        """The edges from the ends of runs to their apexes, and the edges from the apexes to the
-        beginnings of the runs; apexes: the row of the first apex in the table of points."""
+        """The closing edges of all runs that are no whole loops: first those from the ends of runs
+        to their apexes, then those from the apexes to the beginnings of the runs. apexes: the
+        row of the first apex in the table of points."""
         run_ids = np.flatnonzero(~self.is_whole)
         first, last = self.first[run_ids], self.first[run_ids] + self.count[run_ids]
         cell = self.cell[run_ids]
@@ -189,6 +201,7 @@ class EdgeRuns:
 
 
 def _unit(vectors: FloatArray) -> FloatArray:
+    """The vectors (n, 3), divided by their lengths; a vector 0 stays 0."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return vectors / np.maximum(length, 1e-300)
 
@@ -196,21 +209,21 @@ def _unit(vectors: FloatArray) -> FloatArray:
 def subtract_runs(
     before: EdgeRuns,
     edges: tuple[IntArray, IntArray],
-    is_kept: BoolArray,
+    kept: BoolArray,
     after: EdgeRuns,
     vertices: int,
 ) -> CellEdges:
     """The edges that remain when the closed runs `after` are subtracted from the closed runs
     `before`, sorted by cell.
 
-    edges: the edges of the runs `before` (`EdgeRuns.edges`).
-    is_kept: for each of these edges, whether it is in a run of `after`.
-    vertices: the number of vertices.
+    edges: the edges of the runs `before`, as `EdgeRuns.edges` gives them.
+    kept: (k,) for each of these edges, whether it is in a run of `after`.
+    vertices: the number of vertices in the table.
 
-    The edges refer to a table of points with the vertices first, then the apexes of `before`, then
-    the apexes of `after`.
+    The resulting edges refer to a table of points that has the vertices first, then the apexes of
+    `before`, then the apexes of `after`.
     """
-    remaining = np.flatnonzero(~is_kept)
+    remaining = np.flatnonzero(~kept)
     run, vertex = (part[remaining] for part in edges)
     closing = after.closing_edges(vertices + len(before.cell))
     return _merged(
@@ -227,11 +240,11 @@ def _merged(groups: list[CellEdges]) -> CellEdges:
     cell_count = 1 + max((int(group.cell[-1]) for group in groups if len(group.cell)), default=0)
     counts = [np.bincount(group.cell, minlength=cell_count) for group in groups]
     total = np.sum(counts, axis=0)
-    position = np.cumsum(total) - total
+    next_slot = np.cumsum(total) - total
     start, end, cell = np.empty((3, int(total.sum())), np.int64)
     for group, count in zip(groups, counts, strict=True):
         rank = np.arange(len(group.cell)) - np.repeat(np.cumsum(count) - count, count)
-        slot = np.repeat(position, count) + rank
+        slot = np.repeat(next_slot, count) + rank
         start[slot], end[slot], cell[slot] = group.start, group.end, group.cell
-        position = position + count
+        next_slot = next_slot + count
     return CellEdges(start, end, cell)

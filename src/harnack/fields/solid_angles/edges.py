@@ -5,8 +5,8 @@
 - `Edge`: distance, field and derivatives of one edge at a point.
 - `sum_over_edges`: solid angle, gradient, distance and integrals in one pass.
 
-The solid angle is a product of spinors, not a fan of triangles: a fan is 0/0 along the lines from
-its apex, the product only on the curve itself.
+The solid angle is computed as a product of spinors and not as a fan of triangles: a fan is 0/0 on
+lines through its apex, the product only on the curve itself.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Edge", "edge_variation"]
 
-# A function of p, q, 1/length^2 of the edge from p to q, and a state, that returns the state with
-# that edge added.
+# A function that adds an edge to the state of a loop. Its arguments are the ends p and q of the
+# edge, 1/|q - p|^2, and the state; it returns the new state.
 EachEdge: TypeAlias = "Callable[[Vec3, Vec3, Real, tuple[Any, ...]], tuple[Any, ...]]"
 
 # The largest 1/length^2 of a record, within the range of float32. Edges of length 0, as padding or
@@ -40,18 +40,20 @@ _MAX_INVERSE_SQUARE = 1e30
 
 
 def inverse_squares(edges: FloatArray) -> FloatArray:
-    """1/length^2 (k,) of edges (k, 3), limited to the largest number that records hold.
+    """1/length^2 (k,) of edge vectors (k, 3), limited to the largest number that records hold.
 
-    A number that is too small harms neither distances, as the nearest point of the line is off by
-    less than the edge's length, at most 1e-15, far below the rounding of distances; nor bounds of
-    the variation, as 1/sqrt(d^2 (1 + 4 d^2/length^2)) grows.
+    For edges shorter than 1e-15 the result is too small. That harms neither distances nor bounds:
+    the nearest point of the line is off by less than the edge's length, far below the rounding of
+    distances, and bounds of the variation contain 1/sqrt(d^2 (1 + 4 d^2/length^2)), which only
+    grows.
     """
     squared = (edges * edges).sum(axis=1)
     return 1 / np.maximum(squared, 1 / _MAX_INVERSE_SQUARE)
 
 
 def single_edges(start: FloatArray, end: FloatArray, direction: Any = 1.0) -> FloatArray:
-    """(k, 8) records of edges from start (k, 3) to end (k, 3): start, direction, end, 1/length^2.
+    """Records (k, 8) of edges from start (k, 3) to end (k, 3). A record holds start, direction,
+    end, 1/length^2.
 
     direction: (k,) 1 if the edge runs from start to end, -1 if it runs back.
     """
@@ -61,10 +63,11 @@ def single_edges(start: FloatArray, end: FloatArray, direction: Any = 1.0) -> Fl
 
 @dataclass(frozen=True)
 class LoopEdges:
-    """Records of `edges_per_record` consecutive edges each, of closed loops.
+    """Edges of closed loops on a backend, in records of `edges_per_record` consecutive edges.
 
-    A record holds `edges_per_record` + 1 vertices as (x, y, z, 1/|edge to the next|^2). Records do
-    not depend on each other, so several loops need no special case.
+    A record holds `edges_per_record` + 1 vertices. Each vertex has four numbers: x, y, z, and
+    1/length^2 of the edge to the next vertex. Records do not depend on each other, so several loops
+    need no special case.
     """
 
     records: RecordTable
@@ -74,10 +77,11 @@ class LoopEdges:
     def upload(
         cls, backend: Backend, loops: tuple[FloatArray, ...], run: int | None = None
     ) -> LoopEdges:
-        """The edges of closed loops, each of shape (n, 3); run: None to choose it by the loops."""
+        """The edges of closed loops, each of shape (n, 3). run: the number of edges of a record;
+        None to choose it by the loops."""
         run, dtype = run or _edges_per_record(loops), backend.dtype
         rounded = (loop.astype(dtype).astype(np.float64) for loop in loops)
-        table = np.concatenate([_runs(loop, run) for loop in rounded])
+        table = np.concatenate([_loop_records(loop, run) for loop in rounded])
         return cls(RecordTable.upload(backend, table), run)
 
     @property
@@ -85,44 +89,54 @@ class LoopEdges:
         return self.records.backend
 
     def rounding(self, records: Any) -> Any:
-        """A bound of the rounding of the angle of `records` records, to which `vertex_rounding` is
-        to be added.
+        """A bound of the rounding of the solid angle, for loops of this many records, without
+        `vertex_rounding`, which is to be added.
 
         Proof, with u = epsilon/2. Omega = 2 arg of a product of n factors, including the factors of
-        padding; errors of arguments add up, as each step is compared with the exact product of its
-        rounded inputs. (1) Multiplying by a factor F: each part of the result is off by at most u
-        times the size of a single product and u times itself, the result by 2 u of its length, and
-        by another u where it is scaled, after every second factor. (2) F = <chi_a, chi_b>,
-        |chi|^2 = 2 s |a|, has the length P c, P = |chi_a||chi_b|, c the cosine of half the angle
-        that the edge subtends. One of the four numbers of chi is 0. By Cauchy and Schwarz no
-        partial sum is more than P: the real part has at most three roundings, of at most u P each,
-        and the imaginary part two, of at most u P together where the real part has three and of 1.7
-        u P otherwise: F is off by 3.2 u P, and turned by 3.2 u/c. Together Omega is off by 2 (2.5 +
-        3.2/c) u for each factor. If the edge subtends at most a right angle, 1/c <= sqrt(2): by
-        7.1 epsilon. If it subtends more, x lies in the ball over it: with half length h <= 1 and
-        distance d <= h, 1/c <= sqrt(2) h/d, and the integral of |dp|/D^2 is at least pi/2/d: by 2.9
-        epsilon times that besides. (3) |a| and s = |a| + |a_z| have relative errors of 2.5 u and
-        3.5 u, which turn chi as if the vertex had moved by 3.5 u |a|; the rounding of p - x moves
-        it by u |a|. The same bits serve both edges of a vertex, so that Omega is that of a curve
-        moved by at most 2.25 epsilon |a|, and off by that times the integral of |dp|/D^2. In unit
-        coordinates |a| <= 1 + |x|. (4) The arc tangent and the last operations: 16 epsilon.
+        padding. Errors of arguments add up, as each step is compared with the exact product of its
+        rounded inputs.
+
+        (1) Multiplying by a factor F: each part of the result is off by at most u times the size of
+        a single product and u times itself, the result by 2 u of its length, and by another u where
+        it is scaled, after every second factor.
+
+        (2) F = <chi_a, chi_b> with |chi|^2 = 2 s |a| has the length P c, with P = |chi_a||chi_b|
+        and the cosine c of half the angle that the edge subtends. One of the four numbers of chi is
+        0. By Cauchy and Schwarz no partial sum is more than P: the real part has at most three
+        roundings, of at most u P each, and the imaginary part two, of at most u P together where
+        the real part has three and of 1.7 u P otherwise. So F is off by 3.2 u P, and turned by 3.2
+        u/c. Together Omega is off by 2 (2.5 + 3.2/c) u for each factor. If the edge subtends at
+        most a right angle, 1/c <= sqrt(2), and Omega is off by 7.1 epsilon. If it subtends more, x
+        lies in the ball over it: with half length h <= 1 and distance d <= h, 1/c <= sqrt(2) h/d,
+        and the integral of |dp|/D^2 is at least pi/2/d. Then Omega is also off by 2.9 epsilon times
+        that integral.
+
+        (3) |a| and s = |a| + |a_z| have relative errors of 2.5 u and 3.5 u, which turn chi as if
+        the vertex had moved by 3.5 u |a|; the rounding of p - x moves it by u |a|. The same bits
+        serve both edges of a vertex. So Omega is that of a curve moved by at most 2.25 epsilon |a|,
+        and off by that times the integral of |dp|/D^2. In unit coordinates |a| <= 1 + |x|.
+
+        (4) The arc tangent and the last operations: 16 epsilon.
         """
         return self.backend.machine_epsilon * (16 + 7.25 * self.edges_per_record * records)
 
     def records_of(self, first: Any, trips: Any) -> LoopEdges:
-        """The edges of `trips` records from `first` on, which may differ from lane to lane."""
+        """The edges of `trips` records, beginning with record `first`. Both may differ from lane to
+        lane."""
         return replace(self, records=self.records.view(first, trips))
 
     def vertex(self, row: list[Real], k: int) -> Vec3:
-        """Vertex k of a record, at which its edge k starts."""
+        """Vertex k of a record, where its edge k starts."""
         return self.backend.Array3f(*row[4 * k : 4 * k + 3])
 
     def for_each(
         self, body: EachEdge, state: tuple[Any, ...], label: str, active: Mask = True
     ) -> tuple[Any, ...]:
-        """The state after `body` has been applied to all edges: see `RecordTable.for_each`."""
+        """The state after `body` has been applied to all edges, one after the other. label, active:
+        as for `RecordTable.for_each`."""
 
         def of_record(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+            """Apply `body` to the edges of a record."""
             for k in range(self.edges_per_record):
                 p, q = self.vertex(row, k), self.vertex(row, k + 1)
                 state = body(p, q, row[4 * k + 3], state)
@@ -132,20 +146,22 @@ class LoopEdges:
 
 
 def vertex_rounding(epsilon: float, x: Vec3, squares: Real) -> Real:
-    """The rounding of the angle near the curve, to be added to `LoopEdges.rounding`; squares:
-    `EdgeSums.squares`."""
+    """A bound of the rounding of the angle near the curve, to be added to `LoopEdges.rounding`.
+    squares: `EdgeSums.squares`."""
     return epsilon * dr.fma(2.25, dr.norm(x), 2.9 + 2.25) * squares
 
 
 def _edges_per_record(loops: tuple[FloatArray, ...]) -> int:
-    """Eight edges per record, or four where eight would be mostly padding."""
+    """Eight edges per record, or four if padding to multiples of eight would add more than a fifth
+    to the number of edges."""
     edges = sum(len(loop) for loop in loops)
     padded = sum(-(-len(loop) // 8) * 8 for loop in loops)
     return 8 if padded <= 1.2 * edges else 4
 
 
-def _runs(loop: FloatArray, run: int) -> FloatArray:
-    """Records of consecutive edges of a closed loop (n, 3), with `run` edges each."""
+def _loop_records(loop: FloatArray, run: int) -> FloatArray:
+    """Records of a closed loop (n, 3), with `run` consecutive edges each. Edges of length 0 pad the
+    last record."""
     record_count = -(-len(loop) // run)
     padding = np.repeat(loop[:1], record_count * run + 1 - len(loop), axis=0)
     path = np.concatenate([loop, padding])  # back to the start, then edges of length 0
@@ -157,8 +173,9 @@ def _runs(loop: FloatArray, run: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class Edge:
-    """The edge from p to q, relative to a point x: a = p - x and b = q - x.
+    """The edge from p to q, relative to a point x.
 
+    a, b: p - x and q - x.
     e: q - p, which is free of the rounding of x.
     inverse_square_length: 1/|e|^2; any finite number for an edge of length 0, which has no field.
 
@@ -202,7 +219,7 @@ class Edge:
 
     @classmethod
     def between(cls, p: Vec3, q: Vec3, inverse: Real, x: Vec3) -> Edge:
-        """The edge from p to q, relative to x."""
+        """The edge from p to q, relative to x. inverse: 1/|q - p|^2."""
         return cls(p - x, q - x, q - p, inverse)
 
     @functools.cached_property
@@ -216,14 +233,14 @@ class Edge:
         return squared_distance_to_segment(self.a, self.e, self.inverse_square_length)
 
     def biot_savart(self) -> tuple[Real, Vec3]:
-        """w and c of Biot and Savart's field w c, the edge's term of the gradient; w = 0 at points
-        in line with the edge."""
+        """w and c of Biot and Savart's field w c, which is the edge's term of the gradient. w is 0
+        at points in line with the edge."""
         (la, lb), c = self.lengths, dr.cross(self.a, self.e)
         square = dr.squared_norm(c)
         return dr.select(square > 0, (la + lb) / (la * lb * self._denominator(square)), 0), c
 
     def biot_savart_of_lengths(self, la: Real, lb: Real) -> tuple[Real, Vec3]:
-        """The same as `biot_savart`, from la = |a| and lb = |b|, with one division."""
+        """w and c as from `biot_savart`, with one division. la, lb: |a| and |b|."""
         c, product, dot = dr.cross(self.a, self.e), la * lb, dr.dot(self.a, self.b)
         square, is_obtuse = dr.squared_norm(c), dot < 0
         numerator = (la + lb) * dr.select(is_obtuse, product - dot, 1)
@@ -231,29 +248,29 @@ class Edge:
         return dr.select(square > 0, numerator / denominator, 0), c
 
     def hessian_factors(self) -> tuple[Vec3, Vec3]:
-        """c and grad w: the edge's term of the Hessian is (c grad w^T + grad w c^T)/2.
+        """c and grad w. The edge's term of the Hessian is (c grad w^T + grad w c^T)/2.
 
-        Lengths should be of order one, to stay far from overflow: the terms fall like distance^-5
-        and grow like distance^-3.
+        Lengths should be of order one, to stay far from overflow: at the distance d, the terms fall
+        like d^-5 far away and grow like d^-3 near the edge.
         """
         a, e, vector = self.a, self.e, cast("Any", type(self.a))
         h = dr.fma(vector(-dr.dot(a, e) * self.inverse_square_length), e, a)
         h = dr.fma(vector(-dr.dot(h, e) * self.inverse_square_length), e, h)
         c, (la, lb) = dr.cross(h, e), self.lengths
-        alpha, beta, total, difference = 1 / la, 1 / lb, la + lb, la - lb
-        inverse, ratio = alpha * beta, total / self._denominator(dr.squared_norm(c))
+        inverse_a, inverse_b, total, difference = 1 / la, 1 / lb, la + lb, la - lb
+        inverse, ratio = inverse_a * inverse_b, total / self._denominator(dr.squared_norm(c))
         h_factor = (
             inverse
             * inverse
             * ratio
             * (dr.fma(difference * difference, inverse, 1) + total * ratio)
         )
-        cubes = inverse * dr.fma(alpha, alpha, dr.fma(beta, beta, inverse))
+        cubes = inverse * dr.fma(inverse_a, inverse_a, dr.fma(inverse_b, inverse_b, inverse))
         e_factor = dr.dot(e, a + self.b) / total * cubes * self.inverse_square_length
         return c, h_factor * h + e_factor * e
 
     def _denominator(self, square: Real) -> Real:
-        """D; square: |c|^2."""
+        """D, in the form that does not cancel. square: |c|^2."""
         (la, lb), dot = self.lengths, dr.dot(self.a, self.b)
         return dr.select(dot < 0, square / (la * lb - dot), la * lb + dot)
 
@@ -264,7 +281,7 @@ def edge_variation(square: Real, inverse: Real) -> tuple[Real, Real]:
     square: d^2.
     inverse: 1/(2h)^2.
 
-    `LiftedEdge.bounds` explains which quantities these two bound.
+    `LiftedEdge.bounds` explains which integrals these two numbers bound.
     """
     first = dr.rsqrt(square * dr.fma(square, 4 * inverse, 1))
     return first, first * dr.rsqrt(square)
@@ -284,8 +301,8 @@ class EdgeSums:
 
     angle, gradient: Omega in (-2pi, 2pi], and its gradient.
     distance: the distance to the nearest edge.
-    squares, cubes, fourths: integrals of |dp|/D^k along the edges, D the distance from x to p: an
-        upper bound for k = 2, the integral for k = 3, and an upper bound for k = 4.
+    squares, cubes, fourths: integrals of |dp|/D^k along the edges, with D the distance from x to p:
+        an upper bound for k = 2, the integral for k = 3, and an upper bound for k = 4.
     """
 
     angle: Real
@@ -297,10 +314,10 @@ class EdgeSums:
 
 
 def sum_over_edges(edges: LoopEdges, x: Vec3, active: Mask = True) -> EdgeSums:
-    """All sums at x in one loop, on lanes that are active.
+    """Sum over all edges at x in one loop, on lanes that are active.
 
     Nearly all of the time of tracing a curve is spent in this loop, so it is written for
-    throughput: eight edges per trip, vertices fetched in aligned packets of eight floats, one
+    throughput: records of eight edges, vertices fetched in aligned packets of eight floats, one
     square root, one division and about eighty additions and multiplications for each edge. For its
     rounding see `LoopEdges.rounding`.
 
@@ -317,15 +334,18 @@ def sum_over_edges(edges: LoopEdges, x: Vec3, active: Mask = True) -> EdgeSums:
 
     Integrals. Biot and Savart's field of an edge of length L at distance h from its line is h times
     the integral of |dp|/D^3, and |a x b| = h L: so that integral is L times the weight of a x b in
-    the gradient. With d, the distance to the edge, the integral of |dp|/D^4 is at most 1/d of it,
-    and that of |dp|/D^2 at most 2d times it: in polar angles around the point of the line nearest
-    to x, both are integrals from t1, cos t1 = h/d, to t2, and
-    2 (sin t2 - sin t1) >= (t2 - t1) cos t1, since the difference is concave in t2, 0 at t1, and at
-    pi/2 not less than 0 (tan(u/2) >= u/2).
+    the gradient. With the distance d to the edge, the integral of |dp|/D^4 is at most 1/d of it,
+    and that of |dp|/D^2 at most 2d times it. For the last: write both as integrals over the polar
+    angle at x, measured from the direction of the nearest point of the line, from t1 with
+    cos t1 = h/d to t2. Then 2 (sin t2 - sin t1) >= (t2 - t1) cos t1, since the difference is
+    concave in t2, 0 at t1, and at pi/2 not less than 0 (tan(u/2) >= u/2).
     """
     real, x = edges.backend.Float, edges.backend.Array3f(x)
 
     def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+        """Add the edges of a record to the state: the product of spinors (zr, zi), half the
+        gradient g, the least squared distance d2, and a quarter or half of the three
+        integrals."""
         zr, zi, g, d2, squares, cubes, fourths = state
         p = edges.vertex(row, 0)
         a = p - x
@@ -363,6 +383,7 @@ def hessian_over_edges(edges: LoopEdges, x: Vec3) -> tuple[Vec3, Vec3, Vec3]:
     x = edges.backend.Array3f(x)
 
     def add(p: Vec3, q: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
+        """The entries `state` of the Hessian, with those of an edge added."""
         return (
             SymmetricMatrix(*state)
             .add_outer_product(*Edge.between(p, q, inverse, x).hessian_factors())
@@ -374,14 +395,15 @@ def hessian_over_edges(edges: LoopEdges, x: Vec3) -> tuple[Vec3, Vec3, Vec3]:
 
 
 def inner_product(a: Spinor, b: Spinor) -> tuple[Real, Real]:
-    """<a, b> as (real, imaginary), conjugate-linear in a."""
+    """The inner product <a, b> of two spinors as (real, imaginary), conjugate-linear in a."""
     re = dr.fma(a[0], b[0], dr.fma(a[1], b[1], dr.fma(a[2], b[2], a[3] * b[3])))
     im = dr.fma(a[0], b[1], dr.fma(a[2], b[3], -dr.fma(a[1], b[0], a[3] * b[2])))
     return re, im
 
 
 def spinor(a: Vec3) -> tuple[Real, Real, Spinor]:
-    """|a|, |a| + |a_z| and the (unnormalized) spinor of direction a as four reals."""
+    """a|, |a| + |a_z|, and the spinor of the direction of a, as four reals. The spinor is not
+    normalized."""
     length = dr.sqrt(dr.fma(a.z, a.z, dr.fma(a.x, a.x, a.y * a.y)))
     s = length + dr.abs(a.z)
     is_up = a.z >= 0

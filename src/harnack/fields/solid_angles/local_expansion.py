@@ -3,7 +3,7 @@
 With the harmonics of `multipole` and coefficients L_jk about the center c of a ball of radius rho,
 every f that is harmonic in the ball is
 
-    f(c + u) = sum_{j>=0} sum_k conj(R_jk(u)) L_jk,      L_j,-k = (-1)^k conj L_jk.
+    f(c + u) = sum_{j>=0} sum_{|k|<=j} conj(R_jk(u)) L_jk,      L_j,-k = (-1)^k conj L_jk.
 
 - `multipole_to_local`: L_jk of dipoles from their moments about a point outside of the ball.
 - `local_to_local_matrices`: L_jk about the centers of the eight octants of a cell.
@@ -33,7 +33,8 @@ if TYPE_CHECKING:
 
 
 def coefficient_keys(degree: int) -> list[tuple[int, int, int]]:
-    """(j, k, 0 for the real or 1 for the imaginary part) of the (degree + 1)^2 coefficients."""
+    """The keys (j, k, part) of the (degree + 1)^2 coefficients, in order. part: 0 for the real
+    part, 1 for the imaginary part."""
     return [
         (j, k, part)
         for j in range(degree + 1)
@@ -43,7 +44,8 @@ def coefficient_keys(degree: int) -> list[tuple[int, int, int]]:
 
 
 def irregular_harmonics(x: Any, y: Any, z: Any, inverse: Any, degree: int) -> Pairs:
-    """I_lm at (x, y, z) for l <= degree and 0 <= m <= l; inverse: one over the length.
+    """I_lm at (x, y, z) for l <= degree and 0 <= m <= l, as pairs of real and imaginary part.
+    inverse: one over the length of (x, y, z).
 
     By definition I_lm = (l+m)! (l-m)! R_lm / r^(2l+1), and R_lm(v / r^2) = R_lm(v) / r^(2l).
     """
@@ -56,24 +58,26 @@ def irregular_harmonics(x: Any, y: Any, z: Any, inverse: Any, degree: int) -> Pa
 
 
 def _signed(values: Pairs, l: int, m: int) -> tuple[Any, Any]:
-    """The entry (l, m) for either sign of m: (-1)^m times the conjugate of (l, -m)."""
+    """The entry (l, m) for m of either sign. For m < 0 it is (-1)^m times the conjugate of the
+    entry (l, -m)."""
     re, im = values[l, abs(m)]
     if m >= 0:
         return re, im
     return (re, -im) if m % 2 == 0 else (-re, im)
 
 
-def multipole_to_local(moments: Pairs, irregular: Pairs, degree: int) -> list[Any]:
-    """L_jk, in the order of `coefficient_keys`, of dipoles with these moments about a point y;
-    moments of degrees that are not in `moments` count as 0.
+def multipole_to_local(moments: Pairs, seen: Pairs, degree: int) -> list[Any]:
+    """L_jk about c, up to `degree` and in the order of `coefficient_keys`, of dipoles with these
+    moments.
 
-    irregular: I_lm (`irregular_harmonics`) at c - y, up to the degree `degree` plus the largest
-        degree of the moments.
+    moments: M_lm about a point y; moments of other degrees count as 0.
+    seen: I_lm (`irregular_harmonics`) at c - y, up to the degree `degree` plus the largest degree
+        of the moments.
 
     Proof. f(x) = -sum conj(M_lm) I_lm(x - y). The addition theorem of R, applied to both arguments
-    of 1/|r + u - y| = sum conj(R_lm(y)) I_lm(r + u) = sum conj(R_lm(y - u)) I_lm(r), gives I_lm(r +
-    u) = sum_jk conj(R_jk(-u)) I_(l+j),(m+k)(r), as the R_lm are linearly independent, and R_jk(-u)
-    = (-1)^j R_jk(u). So L_jk = -(-1)^j sum_lm conj(M_lm) I_(l+j),(m+k)(c - y).
+    of 1/|r + u - y| = sum conj(R_lm(y)) I_lm(r + u) = sum conj(R_lm(y - u)) I_lm(r), gives
+    I_lm(r + u) = sum_jk conj(R_jk(-u)) I_(l+j),(m+k)(r), as the R_lm are linearly independent, and
+    R_jk(-u) = (-1)^j R_jk(u). So L_jk = -(-1)^j sum_lm conj(M_lm) I_(l+j),(m+k)(c - y).
     """
     coefficients: list[Any] = []
     degrees = sorted({l for l, _ in moments})
@@ -83,7 +87,7 @@ def multipole_to_local(moments: Pairs, irregular: Pairs, degree: int) -> list[An
             for l in degrees:
                 for m in range(-l, l + 1):
                     a, b = _signed(moments, l, m)
-                    u, v = _signed(irregular, l + j, m + k)
+                    u, v = _signed(seen, l + j, m + k)
                     re = re + (a * u + b * v)
                     if k:
                         im = im + (a * v - b * u)
@@ -93,14 +97,17 @@ def multipole_to_local(moments: Pairs, irregular: Pairs, degree: int) -> list[An
 
 
 def local_to_local_matrices(degree: int, offset: float) -> FloatArray:
-    """(8, n, n) matrices T, one for each octant of a cube in the order of its corners, z fastest: T
-    @ L are the coefficients about the octant's center, in units of its own radius, which is half
-    that of the cube.
+    """Matrices T (8, n, n) that shift a local expansion from the center of a cube to the centers of
+    its eight octants. Octants have the order of the cube's corners, z fastest.
+
+    If L are the n coefficients about the cube's center, T @ L are those about an octant's center.
+    They are in units of the octant's radius, which is half that of the cube.
 
     offset: the offset of an octant's center along each axis, in units of the cube's radius.
 
-    R_jk(s + v) = sum R_ab(v) R_(j-a),(k-b)(s), so that L'_ab = sum_jk L_jk conj(R_(j-a),(k-b)(s)):
-    exact, as all are polynomials.
+    For the offset s of the octant's center and the offset v of a point from there,
+    R_jk(s + v) = sum R_ab(v) R_(j-a),(k-b)(s). So L'_ab = sum_jk L_jk conj(R_(j-a),(k-b)(s)). This
+    is exact, as all are polynomials.
     """
     order = coefficient_keys(degree)
     index = {key: i for i, key in enumerate(order)}
@@ -110,14 +117,14 @@ def local_to_local_matrices(degree: int, offset: float) -> FloatArray:
         shifted = regular_harmonics(x, y, z, degree)
         for (j, k, part), column in index.items():
             for sign in (1, -1) if k else (1,):  # L_j,-k = (-1)^k conj L_jk counts too
-                unit = 1j if part else 1.0
+                phase = 1j if part else 1.0
                 if sign < 0:
-                    unit = (-1) ** k * np.conj(unit)
+                    phase = (-1) ** k * np.conj(phase)
                 for a, b in {(a, b) for a, b, _ in order if a <= j}:
                     if abs(sign * k - b) > j - a:
                         continue
-                    u, v = _signed(shifted, j - a, sign * k - b)
-                    term = unit * (u - 1j * v) * 0.5**a
+                    re, im = _signed(shifted, j - a, sign * k - b)
+                    term = phase * (re - 1j * im) * 0.5**a
                     matrices[octant, index[a, b, 0], column] += term.real
                     if b:
                         matrices[octant, index[a, b, 1], column] += term.imag
@@ -125,12 +132,12 @@ def local_to_local_matrices(degree: int, offset: float) -> FloatArray:
 
 
 def evaluate_expansion(coefficients: Sequence[Any], y: Sequence[Any], degree: int) -> list[Any]:
-    """The polynomial and its three first derivatives at y, all in units of the radius.
+    """The value and the three first derivatives of the polynomial at y, in units of the radius.
 
-    With A_jk = w_k conj L_jk, w_0 = 1 and w_k = 2 otherwise, f = Re sum A_jk R_jk over k >= 0. By
-    the derivatives of R_jk (`multipole`), and as R_j,-1 = -conj R_j1, each derivative is Re sum
-    B_jk R_jk, with B^z_jk = A_j+1,k and, up to factors 2 where k + 1 or k - 1 is 0, B^x_jk =
-    (A_j+1,k+1 - A_j+1,k-1)/2, B^y_jk = i (A_j+1,k+1 + A_j+1,k-1)/2.
+    With A_jk = w_k conj L_jk, w_0 = 1 and w_k = 2 otherwise, f = Re sum A_jk R_jk over k >= 0.
+    R_j,-1 = -conj R_j1. So by the derivatives of R_jk (`multipole`), each derivative of f is Re sum
+    B_jk R_jk. For d/dz, B_jk = A_j+1,k. Up to factors 2 where k + 1 or k - 1 is 0, B_jk is
+    (A_j+1,k+1 - A_j+1,k-1)/2 for d/dx, and i (A_j+1,k+1 + A_j+1,k-1)/2 for d/dy.
     """
     r, a = (
         regular_harmonics(y[0], y[1], y[2], degree),
@@ -156,22 +163,27 @@ def evaluate_expansion(coefficients: Sequence[Any], y: Sequence[Any], degree: in
 
 
 class _AbsoluteValues:
-    """Numbers whose arithmetic sums absolute values: differences are sums."""
+    """Numbers for which every sum or difference is the sum of absolute values, so that an
+    expression gives the sum of the absolute values of its terms."""
 
     def __init__(self, number: Any) -> None:
+        """number: a number or an array, not negative."""
         self.number = number
 
     def __add__(self, other: Any) -> _AbsoluteValues:
+        """The sum of absolute values; also for differences."""
         return _AbsoluteValues(
             self.number + np.abs(other.number if isinstance(other, _AbsoluteValues) else other)
         )
 
     def __mul__(self, other: Any) -> _AbsoluteValues:
+        """The product of absolute values."""
         return _AbsoluteValues(
             self.number * np.abs(other.number if isinstance(other, _AbsoluteValues) else other)
         )
 
     def __neg__(self) -> _AbsoluteValues:
+        """The number itself, as its sign does not count."""
         return self
 
     __radd__ = __sub__ = __rsub__ = __add__
@@ -179,14 +191,16 @@ class _AbsoluteValues:
 
 
 def rounding_tables(degree: int, largest: float) -> FloatArray:
-    """(n, 4) numbers. Their products with |L_jk|, summed up and multiplied by the backend's
-    epsilon, bound the rounding of `evaluate_expansion` for coordinates up to `largest`.
+    """Numbers (n, 4) that bound the rounding of `evaluate_expansion` for coordinates up to
+    `largest`. Multiply |L_jk| (n,) by each column, sum up, and multiply by the backend's epsilon:
+    this gives bounds for the value and the three derivatives.
 
-    Proof. Value and derivatives are sums of products of coefficients, coordinates and constants,
-    each of which passes through at most n = 9 degree + 2 (degree + 1)^2 roundings: 6 per degree in
+    Proof. Value and derivatives are sums of products of coefficients, coordinates and constants.
+    Each product passes through at most n = 9 degree + 2 (degree + 1)^2 roundings: 6 per degree in
     the recurrence of R_jk, 3 per degree of the coordinates, and the roundings of the sums. So they
-    are off by at most 1.01 n u times the sum of the absolute values of the products (u =
-    epsilon/2), which is the same expression with all signs positive, at the largest coordinates.
+    are off by at most 1.01 n u times the sum of the absolute values of the products, with
+    u = epsilon/2. This sum is the same expression with all signs positive, at the largest
+    coordinates.
     """
     count = (degree + 1) ** 2
     coordinate = _AbsoluteValues(np.full(count, largest))
@@ -197,17 +211,21 @@ def rounding_tables(degree: int, largest: float) -> FloatArray:
 
 
 def tail_factors(degree: int, l: int) -> tuple[float, float]:
-    """(b, c): on the ball of radius rho, the terms of degree above p of the local expansion of the
-    multipole term of degree l at distance D, which is at most B/r^(l+1), are with q = rho/D at most
+    """Factors (b, c) of a bound of the truncation error of a local expansion.
 
-        B/D^(l+1) b q^(p+1)/(1 - c q),   b = C(l+p+1, p+1), c = (l+p+2)/(p+2).
+    Take a multipole term of degree l that is at most B/r^(l+1) at distance r from the multipole's
+    center. Expand it up to the degree p = `degree` in a ball of radius rho, whose center is at the
+    distance D. With q = rho/D, the sum of the omitted terms is in the ball at most
 
-    Their gradient is at most (p+1)/rho times that, with (l+p+2)/(p+1) for c.
+        B/D^(l+1) b q^(p+1)/(1 - c q),   b = C(l+p+1, p+1), c = (l+p+2)/(p+2),
 
-    Proof. The derivative of order j along a line is at most (l+j)!/l! B/D^(l+1+j) at c
-    (`multipole.truncation_bounds`), so that the term of degree j is at most C(l+j, j) q^j
-    B/D^(l+1). From j = p+1 on, each of these is at most c q times the term before. By Bernstein and
-    Szego's inequality a harmonic polynomial of degree j has a gradient of at most j/rho times its
-    largest value on the sphere; and j C(l+j, j) grows by (l+j+1)/j at most.
+    with binomial coefficients C. The gradient of this sum is at most (p+1)/rho times that, with
+    (l+p+2)/(p+1) for c.
+
+    Proof. At the ball's center, the derivative of order j along a line is at most
+    (l+j)!/l! B/D^(l+1+j) (`multipole.truncation_bounds`), so that the term of degree j is at most
+    C(l+j, j) q^j B/D^(l+1). From j = p+1 on, each of these is at most c q times the term before. By
+    Bernstein and Szego's inequality a harmonic polynomial of degree j has a gradient of at most
+    j/rho times its largest value on the sphere; and j C(l+j, j) grows by (l+j+1)/j at most.
     """
     return float(math.comb(l + degree + 1, degree + 1)), (l + degree + 2) / (degree + 2)

@@ -27,34 +27,35 @@ class Morph(BatchedField):
     """The slice at height w of a shape between solid a, at height 0, and solid b, at height `gap`.
 
     U_a(x, w) = w int_a dV/(|y-x|^2 + w^2)^2 is the solid angle that a, as a flat solid in four
-    dimensions, subtends at (x, w): harmonic in (x, w); for w -> 0 half of all directions, pi^2,
-    inside a, and 0 outside. The morph is the solid f > 1/2,
+    dimensions, subtends at (x, w). It is harmonic in (x, w). For w -> 0 it is pi^2, half of all
+    directions, inside a, and 0 outside. The morph is the solid f > 1/2,
 
         f(x) = (U_a(x, w) + U_b(x, gap - w))/(2 pi^2).
 
     For w -> 0 that is a, as 0 < U_b < pi^2, and for w -> gap it is b. (This is the 'solid angle in
     four dimensions' of the talk on Gillespie et al. 2024, with level pi^2 of the sum.)
 
-    At w = 0 and w = gap the field is the winding number of the mesh itself, with jumps across its
-    triangles. Between the ends the surface is that of a *quadrature*: each mesh is replaced by
-    oriented points at the centroids of its triangles, cut so that their edges are at most `spacing`
-    times the height; where triangles are much smaller than that, a single point stands for several
-    triangles. The sum over these points is harmonic, like the integral, and the surface of that sum
-    is traced with proof; `quadrature_displacement` bounds its distance from the surface of the
-    integral.
+    For w = 0 and w = gap the field is the winding number of the mesh itself, with jumps across its
+    triangles. For w between these, the surface is that of a *quadrature*. Each mesh is replaced by
+    oriented points at the centroids of its triangles. Triangles are first cut so that their edges
+    are at most `spacing` times the height. If triangles are much smaller than that, a single point
+    stands for several triangles. The sum over these points is harmonic, like the integral, and the
+    surface of that sum is traced with proof. `quadrature_displacement` bounds its distance from the
+    surface that exact integration would give.
 
     mesh_a, mesh_b: pairs (vertices (n, 3), faces (m, 3)), counter-clockwise seen from outside.
-        Holes are allowed: between the ends a dent reaches into the solid there, as the surface is
-        where both winding numbers, blurred, add up to 1; at the ends the level 1/2 spans them.
+        Holes are allowed. For w between 0 and gap the surface has a dent at a hole, as it is the
+        set on which both winding numbers, blurred, add up to 1. For w = 0 and w = gap the surface
+        of level 1/2 spans the hole.
     gap: the distance between the solids, in the unit of the meshes. With a large gap the slices in
         the middle are small, or empty: for solids of half-diagonal 1, 0.1 to 0.2 is good.
     w: in [0, gap]. Like `gap` it is a kernel parameter: other numbers compile nothing.
     spacing: see above, at most 2. A smaller spacing gives sharper surfaces, and needs 1/spacing^2
         times as many points. For real meshes surfaces were off by at most 0.02, 0.04 and 0.09 of w
         for 1, 1.4 and 2.
-    accuracy: between the ends, the sum uses the moments of a cluster of points beyond `accuracy`
-        times its radius. Bounds of the truncation are part of every promise, and tracing uses a
-        higher accuracy where the tolerance needs it. At least 2.
+    accuracy: for w between 0 and gap, the sum uses the moments of a cluster of points beyond
+        `accuracy` times its radius; at least 2. Bounds of the truncation error are part of every
+        promise, and tracing uses a higher accuracy where the tolerance needs it.
 
     Raises:
         MeshError: a ValueError, as `validate_mesh`; or an argument is no pair.
@@ -100,11 +101,13 @@ class Morph(BatchedField):
     def quadrature_displacement(
         self, points: Any, *, precision: Precision | None = None
     ) -> FloatArray:
-        """A bound (n,), to first order, of the distance of the surface through points (n, 3) from
-        the surface of the integral over the triangles, in the unit of the meshes; 0 at the ends.
+        """A bound (n,), to first order, of how far quadrature displaces the surface.
 
-        It is a bound of the error of the quadrature, far above the true error for meshes of regular
-        triangles, divided by the length of the gradient.
+        The surface is compared with the one that exact integration over the triangles would give,
+        at points (n, 3) of the surface. The bound is the bound of the error of the quadrature,
+        divided by the length of the gradient. For meshes of regular triangles the true displacement
+        is far smaller. It is a length in the unit of the meshes, and 0 if w is 0 or `gap`, where
+        there is no quadrature.
         """
         if isinstance(self._slice, MorphSlice):
             return self._slice.quadrature_displacement(points, precision)
@@ -166,7 +169,7 @@ class Morph(BatchedField):
 
 
 def _checked(mesh: Any, name: str) -> tuple[FloatArray, IntArray]:
-    """A validated mesh (vertices, faces); raises MeshError with the name of the argument."""
+    """The validated mesh (vertices, faces). Raises MeshError with the name of the argument."""
     try:
         vertices, faces = mesh
     except (TypeError, ValueError):

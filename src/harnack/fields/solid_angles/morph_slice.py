@@ -1,9 +1,10 @@
-"""A slice of the sum of two solid angles in four dimensions, strictly between its ends.
+"""A slice of the sum of two solid angles in four dimensions, at a height strictly between 0 and the
+gap.
 
 - `MorphSlice`: the field.
 - `SlicedKernel`: its kernel, with the proof of its bounds.
-- `quadrature_points`: triangle meshes as oriented points; large triangles are cut, small triangles
-  are merged.
+- `quadrature_points`: triangle meshes as oriented points. Large triangles are cut, small triangles
+are merged.
 """
 
 from __future__ import annotations
@@ -51,19 +52,20 @@ if TYPE_CHECKING:
     from harnack.tree.empty_space import OccupancyGrid
 
 GRADIENT_BOUND = 1.1855
-"""Half the largest gradient of a dipole in four dimensions, times D^3, used as Q_2."""
+"""Half the largest gradient of a dipole in four dimensions, times D^3. It is Q_2 of
+`SlicedKernel`."""
 
-# Degrees of the polynomial for the last i_n, by the number of bytes of a number: the singularity at
-# c = -1 makes coefficients fall as 5.8^-k.
+# Degrees of the polynomial for the last i_n of `SlicedKernel`, by the number of bytes of a number.
+# The function is singular at c = -1, so that the coefficients of degree k fall as 5.8^-k.
 _DEGREES = {4: 12, 8: 22}
 
 
 class SlicedKernel(RadialKernel):
-    """(4/pi) K(r, w) on a backend, at a height w > 0: a Newton kernel of four dimensions,
-    restricted to a slice.
+    """The kernel (4/pi) K(r, w) on a backend, at a height w > 0. It comes from the Newton kernel of
+    four dimensions, restricted to a slice of three dimensions.
 
     Kernel. 1/|X|^2 is harmonic in R^4. The solid angle of a flat solid A x {0} at (x, w) is
-    U = w int_A dV/(r^2 + w^2)^2 with r = |y-x|; by the divergence theorem it is the integral over
+    U = w int_A dV/(r^2 + w^2)^2 with r = |y-x|. By the divergence theorem U is the integral over
     the boundary of A of -n.grad_y K, with
 
         K(r, w) = (1/2) int_w^oo dv/(r^2 + v^2) = atan(r/w)/(2r),   pi/(4r) for w = 0.
@@ -79,10 +81,12 @@ class SlicedKernel(RadialKernel):
     The last i_n = int_0^1 (sin(phi t)/sin phi)^(2n-2) dt phi/sin phi, cos phi = c, is a function of
     c that is analytic except for c <= -1: on [0, 1] it is computed as a polynomial.
 
-    Bound. |d^m K[u_1, ..., u_m]| <= m!/D^(m+1) for unit vectors, as for 1/r at the distance D;
-    attained for w = 0. Proof. Equal vectors u are the worst (Banach 1938). The m-th derivative of
-    1/|X|^2 along a line is (-1)^m m! U_m(cos)/|X|^(m+2) (Gegenbauer), so that, with
-    x = D/sqrt(r^2 + v^2) and a = u.z/D, |a| <= s, that of K is +-m!/D^(m+1) times (2/pi) I,
+    Bound. |d^m K[u_1, ..., u_m]| <= m!/D^(m+1) for unit vectors, as for 1/r at the distance D. The
+    bound is attained for w = 0. Proof. Equal vectors u are the worst (Banach 1938). The m-th
+    derivative of 1/|X|^2 along a line is (-1)^m m! U_m(cos)/|X|^(m+2), with Chebyshev's polynomial
+    U_m of the cosine of the angle between X and the line (Gegenbauer). Let z = y - x,
+    x = D/sqrt(r^2 + v^2) and a = u.z/D, |a| <= s. Then the derivative of K is +-m!/D^(m+1) times
+    (2/pi) I, with
 
         I = int_0^1 U_m(a x) x^m (1 - s^2 x^2)^(-1/2) dx.
 
@@ -99,19 +103,22 @@ class SlicedKernel(RadialKernel):
     """
 
     def __init__(self, backend: Backend, height: float) -> None:
+        """height: w, in the unit of the distances."""
         self.height = dr.opaque(backend.Float, height)
         self.height_square = dr.opaque(backend.Float, height * height)
         self._degree = _DEGREES[np.dtype(backend.dtype).itemsize]
 
     def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
+        """psi_0 to psi_last, from the last i_n, which is a polynomial, and the recurrence for the
+        others."""
         del distance
         c = self.height * inverse
         s2 = dr.fma(-c, c, 1)
         moment = _horner(dr.fma(2, c, -1), moment_polynomial(last + 1, self._degree))
-        thetas = [_factor(last) * moment]
+        thetas = [_psi_factor(last) * moment]
         for k in range(last, 0, -1):
             moment = dr.fma(2 * k * s2, moment, c) * (1 / (2 * k - 1))
-            thetas.insert(0, _factor(k - 1) * moment)
+            thetas.insert(0, _psi_factor(k - 1) * moment)
         return KernelValues(inverse, thetas)
 
     def bounds(self, distance: Real, last: int) -> list[Real]:
@@ -128,11 +135,13 @@ class SlicedKernel(RadialKernel):
 
 @functools.cache
 def moment_polynomial(n: int, degree: int) -> tuple[float, ...]:
-    """i_n as a polynomial in 2c - 1 on [-1, 1], with coefficients in ascending order."""
+    """i_n of `SlicedKernel` as a polynomial of this degree in 2c - 1, for c in [0, 1]. Returns its
+    coefficients in ascending order."""
     t, weight = legendre.leggauss(48)
     t, weight = 0.5 * (t + 1), 0.5 * weight
 
     def moment(x: FloatArray) -> FloatArray:
+        """i_n at x = 2c - 1, an array in [-1, 1]."""
         phi = np.arccos(0.5 * (x + 1))[:, None]
         ratio = np.sin(phi * t) / np.sin(phi)
         return phi[:, 0] / np.sin(phi[:, 0]) * (ratio ** (2 * n - 2) @ weight)
@@ -143,34 +152,36 @@ def moment_polynomial(n: int, degree: int) -> tuple[float, ...]:
 
 
 def _horner(x: Real, coefficients: tuple[float, ...]) -> Real:
-    """The polynomial at x, with coefficients in ascending order."""
+    """The value at x of the polynomial with these coefficients, in ascending order."""
     total: Real = coefficients[-1]
     for coefficient in coefficients[-2::-1]:
         total = dr.fma(total, x, coefficient)
     return total
 
 
-def _factor(k: int) -> float:
-    """(2/pi) 2^k k!."""
+def _psi_factor(k: int) -> float:
+    """The factor (2/pi) 2^k k! of psi_k (`SlicedKernel`)."""
     return 2 / math.pi * 2.0**k * math.factorial(k)
 
 
-# The size of the cells in which triangles are merged, and the longest edge of triangles to merge,
-# both as a fraction of the longest edge of pieces.
-_CELL = 0.54
+# The size of the cells in which triangles are merged, and the longest edge of triangles that are
+# merged: both as a fraction of the longest edge that pieces may have.
+_CELL_FRACTION = 0.54
 
 
 @dataclass(frozen=True)
 class QuadraturePoints:
-    """Points that stand for pieces of triangles, or for several small triangles.
+    """Points that stand for pieces of triangles, or for several small triangles. Each point and its
+    triangles form a group.
 
     points: (n, 3) centroids.
     moments: (n, 3) sums of area times normal.
-    farthest: the largest distance of a point of a triangle from the quadrature point that stands
-        for it.
-    second_moment_ratio: the largest ratio, over all points, of the integral of |d|^2 over the
-        triangles of the point, d the offset from the point, to the length of its moment.
-    first_moment_ratio: the same for the Frobenius norm of the sum of moment times d.
+    farthest: the largest distance, in all groups, between a point of a triangle and the quadrature
+        point that stands for it.
+    second_moment_ratio: the largest ratio, over all groups, of the integral of |d|^2 over the
+        triangles to the length of the moment, with d the offset from the quadrature point.
+    first_moment_ratio: the same ratio for the Frobenius norm of the sum of the products of moment
+        and d.
     """
 
     points: FloatArray
@@ -181,16 +192,16 @@ class QuadraturePoints:
 
 
 def piece_counts(corners: FloatArray, longest: float) -> IntArray:
-    """The number of pieces (m,) to cut each edge of triangles (m, 3, 3) into, so that no piece is
-    longer than `longest`."""
+    """The number of pieces (m,) into which each edge of the triangles (m, 3, 3) is cut, so that no
+    piece is longer than `longest`."""
     return np.maximum(np.ceil(_longest_edges(corners) / longest), 1).astype(np.int64)
 
 
 def quadrature_points(corners: FloatArray, longest: float) -> QuadraturePoints:
-    """Centroids of triangles (m, 3, 3), cut into similar pieces with edges of at most `longest`;
-    for triangles much smaller than that, a single point for all triangles in a cell that face the
-    same way."""
-    is_small = _longest_edges(corners) <= _CELL * longest
+    """Points for triangles (m, 3, 3): centroids of similar pieces with edges of at most `longest`.
+    For triangles much smaller than that, there is a single point for all triangles in a cell of
+    space that face the same way."""
+    is_small = _longest_edges(corners) <= _CELL_FRACTION * longest
     parts = [
         sample(rows, longest)
         for sample, rows in ((_subdivide, corners[~is_small]), (_merge_small, corners[is_small]))
@@ -210,24 +221,26 @@ def _longest_edges(corners: FloatArray) -> FloatArray:
     return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
 
 
-def _farthest(corners: FloatArray, points: FloatArray) -> FloatArray:
-    """(m,) the largest distance of a corner of each triangle (m, 3, 3) from its point (m, 3)."""
+def _corner_distances(corners: FloatArray, points: FloatArray) -> FloatArray:
+    """The largest distance (m,) of a corner of each triangle (m, 3, 3) from the point (m, 3) that
+    belongs to it."""
     return np.linalg.norm(corners - points[:, None], axis=2).max(axis=1)
 
 
 def _areas(corners: FloatArray) -> FloatArray:
-    """(m, 3) area times normal of triangles (m, 3, 3)."""
+    """Area times normal (m, 3) of triangles (m, 3, 3)."""
     a, b, c = np.moveaxis(corners, 1, 0)
     return 0.5 * np.cross(b - a, c - a)
 
 
 def _mean_squares(corners: FloatArray) -> FloatArray:
-    """(m,) the mean square distance from the centroid over each triangle (m, 3, 3)."""
+    """The mean square distance (m,) from the centroid over each triangle (m, 3, 3)."""
     return ((corners - np.roll(corners, 1, axis=1)) ** 2).sum(axis=(1, 2)) / 36
 
 
 def _subdivide(corners: FloatArray, longest: float) -> QuadraturePoints:
-    """Triangles cut into counts^2 similar pieces each, whose first moments vanish."""
+    """Points for triangles (m, 3, 3), each cut into count^2 similar pieces, where count is its
+    number from `piece_counts`. The first moments of the pieces about their centroids vanish."""
     counts = piece_counts(corners, longest)
     points: list[FloatArray] = []
     moments: list[FloatArray] = []
@@ -245,35 +258,37 @@ def _subdivide(corners: FloatArray, longest: float) -> QuadraturePoints:
         points.append(middle.reshape(-1, 3))
         moments.append(np.repeat(_areas(triangles) / count**2, count**2, axis=0))
     spread = float((_mean_squares(corners) / counts**2).max())
-    farthest = float((_farthest(corners, corners.mean(axis=1)) / counts).max())
+    farthest = float((_corner_distances(corners, corners.mean(axis=1)) / counts).max())
     return QuadraturePoints(np.concatenate(points), np.concatenate(moments), farthest, spread, 0.0)
 
 
 def _merge_small(corners: FloatArray, longest: float) -> QuadraturePoints:
-    """A single point for all triangles whose centroids are in the same cell and whose normals have
-    the same largest component: their moments add up to at least 1/sqrt(3) of their area."""
+    """Points for small triangles (m, 3, 3). There is a single point for all triangles whose
+    centroids are in the same cell of space, and whose normals have the same largest component with
+    the same sign. So the length of their total moment is at least 1/sqrt(3) of their area."""
     moments, centroids = _areas(corners), corners.mean(axis=1)
     axis = np.abs(moments).argmax(axis=1)
-    side = np.take_along_axis(moments, axis[:, None], axis=1)[:, 0] > 0
-    cells = np.floor(centroids / (_CELL * longest)).astype(np.int64)
-    keys = np.column_stack([cells, 2 * axis + side])
+    is_positive = np.take_along_axis(moments, axis[:, None], axis=1)[:, 0] > 0
+    cells = np.floor(centroids / (_CELL_FRACTION * longest)).astype(np.int64)
+    keys = np.column_stack([cells, 2 * axis + is_positive])
     _, group = np.unique(keys, axis=0, return_inverse=True)
     group = group.ravel()
     area = np.linalg.norm(moments, axis=1)
     points = _sums(group, area[:, None] * centroids) / _sums(group, area[:, None])
-    d = centroids - points[group]
+    offset = centroids - points[group]
     total = _sums(group, moments)
     length = np.linalg.norm(total, axis=1)
-    square = area * (_mean_squares(corners) + (d * d).sum(axis=1))
-    outer = np.einsum("ki,kj->kij", moments, d).reshape(-1, 9)
+    square = area * (_mean_squares(corners) + (offset * offset).sum(axis=1))
+    outer = np.einsum("ki,kj->kij", moments, offset).reshape(-1, 9)
     first = np.linalg.norm(_sums(group, outer), axis=1)
     spread = float((_sums(group, square[:, None])[:, 0] / length).max())
-    farthest = float(_farthest(corners, points[group]).max())
+    farthest = float(_corner_distances(corners, points[group]).max())
     return QuadraturePoints(points, total, farthest, spread, float((first / length).max()))
 
 
 def _sums(group: IntArray, values: FloatArray) -> FloatArray:
-    """The sums (groups, k) of the rows of `values` (m, k) that belong to the same group."""
+    """The sums (groups, k) of the rows of `values` (m, k) that belong to the same group. group:
+    (m,) the index of each row's group."""
     columns: list[FloatArray] = [
         np.bincount(group, column).astype(np.float64) for column in values.T
     ]
@@ -285,21 +300,21 @@ MOST_POINTS = 4_000_000
 
 _SMALLEST_LEVEL = 1e-6
 # The largest number of cells that are tested in one round for an extent.
-_MAX_CELLS = 40_000
+_MOST_CELLS = 40_000
 # The number of cells of the grid along its longest side, by experiment.
-_ACROSS = 128
+_CELLS_ACROSS = 128
 
 
 class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
-    """f(x) = (U_a(x, w) + U_b(x, gap - w))/(2 pi^2), 0 < w < gap: see `Morph`.
+    """The field f(x) = (U_a(x, w) + U_b(x, gap - w))/(2 pi^2) with 0 < w < gap: see `Morph`.
 
     corners: two arrays (m, 3, 3) of triangles.
     w, gap, spacing, accuracy: as for `Morph`.
 
-    Promises, with the 4D distances D of all points and d the smallest of them (`SlicedKernel` has
-    the proof that second derivatives are no larger than those of dipoles at a distance D):
-    `TaylorRemainder` within 0.45 d, and a `HarmonicBall` of dimension 4 and radius 0.35 d, which
-    proves shorter steps.
+    Promises. Let d be the smallest distance, in four dimensions, of a quadrature point from x. The
+    promises are `TaylorRemainder` within 0.45 d, and a `HarmonicBall` of dimension 4 and radius
+    0.35 d, which proves shorter steps. `SlicedKernel` has the proof that second derivatives are no
+    larger than those of dipoles at the distances in four dimensions.
     """
 
     default_level = 0.5
@@ -329,8 +344,8 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         self._occupied: TransientCache[tuple[float, ...], OccupancyGrid] = TransientCache()
 
     def _clustered(self, pieces: QuadraturePoints) -> ClusteredDipoles:
-        """The dipoles of the pieces in unit coordinates, scaled so that f is the sum over both
-        meshes."""
+        """The dipoles of the quadrature points, in unit coordinates, scaled so that f is the sum
+        over both meshes."""
         scale = 1 / (8 * math.pi * self._size**2)
         points = (pieces.points - self._center) / self._size
         return ClusteredDipoles.of(dipole_records(points, scale * pieces.moments))
@@ -341,6 +356,7 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         return tuple(len(dipoles.rows) for dipoles in self._dipoles)
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
+        """Values and derivatives at points x: see `BatchedField.values_at`."""
         buffers = self._batch_data(backend_of(x))
         x = buffers.to_unit(x)
         sums = buffers.sums(x, closer, derivatives).sums
@@ -354,14 +370,16 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
     ) -> FloatArray:
         """As `Morph.quadrature_displacement`.
 
-        Let a point at distance D stand for a part of the mesh with moment m. Its error is at most 2
-        |T|_*/D^3, |T|_* the nuclear norm of T = sum of m_i times d_i, at most sqrt(3) times the
-        Frobenius norm, plus the remainder of Taylor's formula: |m| times the mean of |d|^2
-        (3-2q)/((1-q)^2 D^4), q = |d|/D (`RadialSums.remainder`). It is infinite where a point of
-        the part may be as far as D from the quadrature point.
+        Let a quadrature point at distance D stand for a part of the mesh with moment m, made of
+        triangles with moments m_i at offsets d_i from it. Its error is at most 2 |T|_*/D^3 plus the
+        remainder of Taylor's formula. Here T is the sum of the products m_i d_i^T, and |T|_* its
+        nuclear norm, at most sqrt(3) times the Frobenius norm. The remainder is at most |m| times
+        the mean of |d|^2 (3-2q)/((1-q)^2 D^4) with q = |d|/D (`RadialSums.remainder`). The bound is
+        infinite where a point of the part may be as far as D from the quadrature point.
         """
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Real]:
+            """The bound at points x, in the unit of the meshes."""
             data = self._batch_data(backend)
             x = data.to_unit(x)
             error, gradient = backend.Float(0), backend.Array3f(0)
@@ -381,6 +399,8 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         return evaluate_points(points, kernel, precision)[0]
 
     def _upload(self, backend: Backend, *, traced: bool) -> _SliceBuffers:
+        """The quadrature points on a backend. They are the same for tracing and for values at
+        points."""
         del traced
         clouds = tuple(
             RadialTreecode(
@@ -391,6 +411,7 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         return _SliceBuffers(*frame_parameters(backend, self._center, self._size), clouds)
 
     def _sample(self, on: _SliceBuffers, p: Vec3, detail: Real) -> Sample:
+        """The sample at p, from the data `on` of a backend, at the accuracy scale `detail`."""
         return on.sample(p, detail)
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
@@ -399,38 +420,44 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
                 raise ValueError("level 0 of a morph reaches to infinity; the surface is at 0.5")
 
     def extent(self, levels: tuple[float, ...]) -> Volume:
-        """A box without its cells that are proved empty (`tight_extent`): at a distance rho from
-        all points |f| is at most the sum of their weights over rho^2."""
+        """A volume that contains the level sets: a box without those of its cells that are proved
+        empty (`tight_extent`). At a distance rho from all points |f| is at most the sum of
+        their weights over rho^2, which gives the box."""
         if levels not in self._extents:
             weight = sum(float(dipoles.rows[:, 6].sum()) for dipoles in self._dipoles)
-            reach = 1.0001 * self._size * math.sqrt(weight / min(abs(level) for level in levels))
+            margin = 1.0001 * self._size * math.sqrt(weight / min(abs(level) for level in levels))
             low, high = self._box
             self._extents[levels] = tight_extent(
-                self, levels, low - reach, high + reach, _MAX_CELLS
+                self, levels, low - margin, high + margin, _MOST_CELLS
             )
         return self._extents[levels]
 
     def occupied_cells(self, levels: tuple[float, ...]) -> OccupancyGrid:
+        """Cells over the extent, without those that are proved to contain no level; computed
+        once."""
         if levels not in self._occupied:
-            self._occupied[levels] = occupied_cells(self, levels, self.extent(levels), _ACROSS)
+            self._occupied[levels] = occupied_cells(
+                self, levels, self.extent(levels), _CELLS_ACROSS
+            )
         return self._occupied[levels]
 
 
 @dataclass(frozen=True)
 class _SliceBuffers(UnitFrame):
-    """The points of both meshes on a backend, for each mesh at its own height."""
+    """The quadrature points of both meshes on a backend. clouds: the sum over the points of each
+    mesh, at its own height."""
 
     clouds: tuple[RadialTreecode, ...]
 
     def sums(self, x: Vec3, closer: Real, derivatives: int) -> RadialSums:
-        """The sums over the points of both meshes."""
+        """The sums over the points of both meshes. closer: the accuracy scale."""
         sums = RadialSums.zero(self.backend, derivatives)
         for cloud in self.clouds:
             sums = cloud.accumulate(sums, x, closer)
         return sums
 
     def sample(self, p: Vec3, detail: Real) -> Sample:
-        """The sample of f at points p, in units of `size`."""
+        """The sample of f at points p, in the unit of the meshes. detail: the accuracy scale."""
         x = self.to_unit(p)
         radial = self.sums(x, detail, 1)
         sums = radial.sums
@@ -454,7 +481,8 @@ class _SliceBuffers(UnitFrame):
 
 
 def _check_count(counts: Sequence[Any], w: float, gap: float) -> None:
-    """Raise ValueError if the quadrature would need more than `MOST_POINTS` points."""
+    """Raise ValueError if the quadrature would need more than `MOST_POINTS` points. counts: for
+    each mesh the numbers of `piece_counts`."""
     count = sum(int((pieces.astype(float) ** 2).sum()) for pieces in counts)
     if count > MOST_POINTS:
         raise ValueError(

@@ -6,9 +6,10 @@ The potential of dipoles a_i n_i at y_i = c + d_i at a point x = c + r is
          = -sum_{l>=1} sum_m conj(M_lm) I_lm(r),      M_lm = sum_i a_i n_i.grad R_lm(d_i)
 
 with solid harmonics R_lm = r^l P_lm(cos t) e^(im p)/(l+m)! and I_lm = (l-m)! P_lm e^(im p)/r^(l+1)
-(no Condon-Shortley phase; R_l,-m = (-1)^m conj R_lm). 1/|x-y| = sum conj(R_lm(y)) I_lm(x),
+in spherical coordinates (r, t, p), with associated Legendre functions P_lm (no Condon-Shortley
+phase; R_l,-m = (-1)^m conj R_lm). They satisfy 1/|x-y| = sum conj(R_lm(y)) I_lm(x),
 R_lm(a+b) = sum R_l'm'(a) R_l-l',m-m'(b), d/dz R_lm = R_l-1,m, (d/dx + i d/dy) R_lm = -R_l-1,m+1,
-(d/dx - i d/dy) R_lm = R_l-1,m-1. Tests check all of these.
+and (d/dx - i d/dy) R_lm = R_l-1,m-1. Tests check all of these.
 
 - `regular_harmonics`, `dipole_moments`, `multipole_to_multipole`: harmonics, moments of a dipole,
   and moments about another point.
@@ -54,7 +55,8 @@ MOMENT_KEYS = tuple((l, m) for l in range(1, MAX_DEGREE + 1) for m in range(l + 
 
 
 def regular_harmonics(x: Any, y: Any, z: Any, order: int) -> Pairs:
-    """R_lm for l <= order and 0 <= m <= l; the imaginary part is the number 0 if m = 0."""
+    """R_lm at (x, y, z) for l <= order and 0 <= m <= l, as pairs of real and imaginary part. The
+    imaginary part is the number 0 if m = 0."""
     r2 = x * x + y * y + z * z
     harmonics: Pairs = {(0, 0): (0 * x + 1, 0.0)}
     for m in range(order + 1):
@@ -75,8 +77,11 @@ def regular_harmonics(x: Any, y: Any, z: Any, order: int) -> Pairs:
 
 
 def dipole_moments(harmonics: Pairs, nx: Any, ny: Any, nz: Any) -> Pairs:
-    """M_lm of a dipole n, whose length is its area, at d, from R_lm(d) for l < MAX_DEGREE; or of a
-    dipole that is spread out, from the means of R_lm."""
+    """M_lm of a dipole at d, from the harmonics R_lm(d) for l < MAX_DEGREE. For a dipole that is
+    spread out over points, `harmonics` holds the means of R_lm.
+
+    nx, ny, nz: the dipole's normal, whose length is its area.
+    """
     r, x, y = _with_negative_orders(harmonics), 0.5 * nx, 0.5 * ny
     moments: Pairs = {}
     for l, m in MOMENT_KEYS:
@@ -111,33 +116,34 @@ def multipole_to_multipole(moments: Pairs, x: Any, y: Any, z: Any) -> Pairs:
 
 
 def _with_negative_orders(values: Pairs) -> Pairs:
-    """R_lm or M_lm together with the entries for m < 0."""
+    """R_lm or M_lm, together with the entries for m < 0."""
     negative = {
         (l, -m): (re, -im) if m % 2 == 0 else (-re, im) for (l, m), (re, im) in values.items() if m
     }
     return values | negative
 
 
-# Moments of nodes, all in double precision: sums over dipoles and over children in Dr.Jit, on many
-# threads and without temporaries; the rest, with a row for each node, in NumPy.
+# Moments of nodes, all in double precision. Sums over dipoles and over children are computed in
+# Dr.Jit, on many threads and without temporaries; the rest in NumPy, with a row for each node.
 
 Moments = dict[tuple[int, int], npt.NDArray[np.complex128]]
-# Degree, order, and 0 for the real or 1 for the imaginary part.
-_PARTS = tuple((l, m, part) for l, m in MOMENT_KEYS for part in range(2 if m else 1))
-# The number of numbers that `_powers` returns.
-_POWERS = 10
+# The keys (degree, order, part) of the real numbers that moments consist of; part is 0 for the real
+# part, 1 for the imaginary part.
+_MOMENT_PARTS = tuple((l, m, part) for l, m in MOMENT_KEYS for part in range(2 if m else 1))
+# How many numbers `_power_terms` returns.
+_POWER_COUNT = 10
 
 
 @dataclass(frozen=True)
 class NodeMoments:
-    """The nodes of a level of the tree.
+    """The moments of the k nodes at one level of a tree.
 
     center: (k, 3) the point about which the moments are taken: the mean position of the dipoles,
         weighted by area.
-    radius: (k,) of a ball around the center that contains all dipoles.
-    area: (k,) sum of a_i = |a_i n_i|.
+    radius: (k,) the radius of a ball around the center that contains all dipoles.
+    area: (k,) the sum of the areas a_i.
     second_moment, third_moment, fourth_moment: (k, 3, 3), (k, 3) and (k,) sums of a_i d_i d_i^T, of
-        a_i |d_i|^2 d_i and of a_i |d_i|^4.
+        a_i |d_i|^2 d_i and of a_i |d_i|^4, with d_i the offset of a dipole from the center.
     moments: M_lm, (k,) each, for 1 <= l <= 5 and m >= 0.
     """
 
@@ -155,41 +161,48 @@ def dipole_tree_moments(
 ) -> list[NodeMoments]:
     """Moments of the nodes of all levels, from the leaves to the root.
 
-    points, normals: (n, s, 3) the s dipoles of each of n primitives; a normal's length is its area.
-    low, high: (n, 3) boxes that contain the primitives.
+    points, normals: (n, s, 3) the s dipoles of each of n primitives. The length of a normal is its
+        area.
+    low, high: (n, 3) corners of boxes that contain the primitives.
     """
     backend, each = choose_backend("double"), points.shape[1]
     p, n, lows, highs = (upload_floats(backend, x.ravel()) for x in (points, normals, low, high))
 
     def primitive(i: Any) -> _DipolePrimitive:
+        """The dipoles and the box of primitive i."""
         dipoles = [
             _Dipole(_row(backend, n, i * each + k), ((1.0, _row(backend, p, i * each + k)),))
             for k in range(each)
         ]
         return _DipolePrimitive(dipoles, _row(backend, lows, i), _row(backend, highs, i))
 
-    return _levels(backend, tree, primitive)
+    return _all_levels(backend, tree, primitive)
 
 
 def triangle_tree_moments(tree: BalancedTree, corners: FloatArray) -> list[NodeMoments]:
-    """Moments of the nodes of all levels, for triangles (n, 3, 3): exact up to rounding."""
+    """Moments of the nodes of all levels, from the leaves to the root, for triangles (n, 3, 3).
+    They are exact up to rounding."""
     backend = choose_backend("double")
     buffer = upload_floats(backend, corners.ravel())
     rule = tuple(zip(*(part.tolist() for part in triangle_rule()), strict=True))
 
     def primitive(i: Any) -> _DipolePrimitive:
+        """Triangle i as a dipole that is spread over the points of `triangle_rule`, and its box."""
         a, b, c = (_row(backend, buffer, 3 * i + k) for k in range(3))
         points = [(weight, a * u + b * v + c * w) for (u, v, w), weight in rule]
         dipole = _Dipole(0.5 * dr.cross(b - a, c - a), points)
         return _DipolePrimitive([dipole], fmin(fmin(a, b), c), fmax(fmax(a, b), c))
 
-    return _levels(backend, tree, primitive)
+    return _all_levels(backend, tree, primitive)
 
 
 @dataclass(frozen=True)
 class _Dipole:
-    """A dipole that is spread over points, with weights of sum 1. The length of its normal is its
-    area."""
+    """A dipole that is spread over points.
+
+    normal: its direction, with its area as length.
+    points: pairs of a weight and a point; the weights add up to 1.
+    """
 
     normal: Vec3
     points: Sequence[tuple[float, Vec3]]
@@ -197,7 +210,7 @@ class _Dipole:
 
 @dataclass(frozen=True)
 class _DipolePrimitive:
-    """The dipoles of a primitive, and a box that contains it."""
+    """The dipoles of a primitive, and the corners of a box that contains it."""
 
     dipoles: Sequence[_Dipole]
     low: Vec3
@@ -205,29 +218,34 @@ class _DipolePrimitive:
 
 
 def _row(backend: Backend, buffer: Real, i: Any) -> Vec3:
-    """Vector i of a buffer of vectors."""
+    """Vector i of a buffer that holds three numbers for each vector."""
     return backend.Array3f(*(dr.gather(backend.Float, buffer, 3 * i + k) for k in range(3)))
 
 
-def _levels(
+def _all_levels(
     backend: Backend, tree: BalancedTree, primitive: Callable[[Any], _DipolePrimitive]
 ) -> list[NodeMoments]:
-    """Moments of the nodes of all levels, from the leaves to the root; primitive: from the index of
-    a primitive, its dipoles."""
-    level, parts, low, high = _leaves(backend, tree, primitive)
+    """Moments of the nodes of all levels, from the leaves to the root. primitive: a function that
+    returns the dipoles of a primitive from its index."""
+    level, parts, low, high = _leaf_moments(backend, tree, primitive)
     levels = [level]
     for arity in tree.arities:
         low = low.reshape(-1, arity, 3).min(axis=1)
         high = high.reshape(-1, arity, 3).max(axis=1)
-        level, parts = _parents(backend, level, parts, low, high)
+        level, parts = _parent_moments(backend, level, parts, low, high)
         levels.append(level)
     return levels
 
 
-def _leaves(
+def _leaf_moments(
     backend: Backend, tree: BalancedTree, primitive: Callable[[Any], _DipolePrimitive]
 ) -> tuple[NodeMoments, list[Real], FloatArray, FloatArray]:
-    """The leaves, their `_PARTS` on the backend, and boxes around them.
+    """The moments of the leaves.
+
+    primitive: a function that returns the dipoles of a primitive from its index.
+
+    Returns the moments; their numbers on the backend, in the order of `_MOMENT_PARTS`; and the
+    lower and upper corners (n, 3) of boxes around the leaves.
 
     Each lane is a leaf, which visits its primitives twice: for the center, and for the moments
     about it.
@@ -240,24 +258,32 @@ def _leaves(
     end = first + dr.gather(index, upload_integers(backend, filled.sum(axis=1)), leaf)
 
     def visit(body: Callable[..., tuple[Any, ...]], state: tuple[Any, ...]) -> tuple[Any, ...]:
+        """The state after `body` was applied to all primitives of each leaf."""
+
         def step(slot: Any, *state: Any) -> tuple[Any, ...]:
+            """Apply `body` to the primitive in a slot."""
             return slot + 1, *body(primitive(dr.gather(index, slots, slot)), *state)
 
         def more(slot: Any, *_: Any) -> Any:
+            """Whether the leaf has further slots."""
             return slot < end
 
         return dr.while_loop((first, *state), more, step, label="slots")[1:]
 
     def measure(source: _DipolePrimitive, low: Vec3, high: Vec3, area: Real, weighted: Vec3) -> Any:
+        """Add a primitive to the box from low to high, to the area, and to the sum of positions
+        weighted by area."""
         for dipole in source.dipoles:
             size = dr.norm(dipole.normal)
             area, weighted = area + size, weighted + size * sum(w * p for w, p in dipole.points)
         return fmin(low, source.low), fmax(high, source.high), area, weighted
 
     def sum_up(source: _DipolePrimitive, *parts: Real) -> tuple[Any, ...]:
+        """Add the terms of a primitive about the leaf's center to the sums `parts`: first those of
+        `_power_terms`, then the moments."""
         for dipole in source.dipoles:
             offsets = [(weight, point - center) for weight, point in dipole.points]
-            more = _powers(dr.norm(dipole.normal), offsets) + _as_real_list(
+            more = _power_terms(dr.norm(dipole.normal), offsets) + _flatten(
                 _spread_dipole_moments(dipole.normal, offsets)
             )
             parts = tuple(a + b for a, b in zip(parts, more, strict=True))
@@ -267,8 +293,8 @@ def _leaves(
     low, high, area, weighted = visit(measure, start)
     # The mean position weighted by area, or the box's center if there is no area.
     center = dr.select(area > 0, weighted / dr.select(area > 0, area, 1), 0.5 * (low + high))
-    sums = visit(sum_up, (real(0),) * (_POWERS + len(_PARTS)))
-    powers, parts = sums[:_POWERS], sums[_POWERS:]
+    sums = visit(sum_up, (real(0),) * (_POWER_COUNT + len(_MOMENT_PARTS)))
+    powers, parts = sums[:_POWER_COUNT], sums[_POWER_COUNT:]
     dr.eval(low, high, area, center, *sums)
     boxes = to_numpy(low), to_numpy(high)
     middle, (xx, yy, zz, xy, xz, yz, *third, fourth) = to_numpy(center), map(to_numpy, powers)
@@ -281,10 +307,10 @@ def _leaves(
     )
 
 
-def _powers(area: Real, points: Sequence[tuple[float, Vec3]]) -> list[Real]:
+def _power_terms(area: Real, points: Sequence[tuple[float, Vec3]]) -> list[Real]:
     """The terms of a dipole in `second_moment` (xx, yy, zz, xy, xz, yz), `third_moment` and
-    `fourth_moment`."""
-    total: list[Real] = [area * 0] * _POWERS
+    `fourth_moment` of `NodeMoments`. points: pairs of a weight and an offset from the center."""
+    total: list[Real] = [area * 0] * _POWER_COUNT
     for weight, d in points:
         square, weighted_area = dr.squared_norm(d), weight * area
         pairs = (d.x * d.x, d.y * d.y, d.z * d.z, d.x * d.y, d.x * d.z, d.y * d.z)
@@ -296,7 +322,8 @@ def _powers(area: Real, points: Sequence[tuple[float, Vec3]]) -> list[Real]:
 
 
 def _spread_dipole_moments(normal: Vec3, points: Sequence[tuple[float, Vec3]]) -> Pairs:
-    """The moments of a dipole that is spread over points with weights."""
+    """The moments of a dipole that is spread over points. points: pairs of a weight and an offset
+    from the center."""
     means: Pairs = {}
     for weight, d in points:
         for key, (re, im) in regular_harmonics(d.x, d.y, d.z, MAX_DEGREE - 1).items():
@@ -305,15 +332,16 @@ def _spread_dipole_moments(normal: Vec3, points: Sequence[tuple[float, Vec3]]) -
     return dipole_moments(means, normal.x, normal.y, normal.z)
 
 
-def _as_real_list(moments: Pairs) -> list[Any]:
-    """Real and imaginary parts, in the order of `_PARTS`."""
-    return [moments[l, m][part] for l, m, part in _PARTS]
+def _flatten(moments: Pairs) -> list[Any]:
+    """The real and imaginary parts of moments, in the order of `_MOMENT_PARTS`."""
+    return [moments[l, m][part] for l, m, part in _MOMENT_PARTS]
 
 
 def _moments_of(parts: Sequence[Real]) -> Moments:
-    """`Moments` from `_PARTS` on the backend."""
+    """Complex moments by (l, m) in NumPy, from their parts on the backend in the order of
+    `_MOMENT_PARTS`."""
     moments = {key: np.zeros(dr.width(parts[0]), np.complex128) for key in MOMENT_KEYS}
-    for (l, m, part), values in zip(_PARTS, parts, strict=True):
+    for (l, m, part), values in zip(_MOMENT_PARTS, parts, strict=True):
         if part:
             moments[l, m].imag = to_numpy(values)
         else:
@@ -321,20 +349,28 @@ def _moments_of(parts: Sequence[Real]) -> Moments:
     return moments
 
 
-def _parents(
-    backend: Backend, below: NodeMoments, parts: list[Real], low: FloatArray, high: FloatArray
+def _parent_moments(
+    backend: Backend, children: NodeMoments, parts: list[Real], low: FloatArray, high: FloatArray
 ) -> tuple[NodeMoments, list[Real]]:
-    """The level of the parents, with boxes from low to high (n, 3), and its `_PARTS`."""
-    count, arity = len(low), len(below.area) // len(low)
-    area = below.area.reshape(-1, arity).sum(axis=1)
-    weighted = (below.area[:, None] * below.center).reshape(-1, arity, 3).sum(axis=1)
+    """The moments of the next higher level of the tree.
+
+    children: the moments of the level below.
+    parts: the children's moments on the backend, in the order of `_MOMENT_PARTS`.
+    low, high: (n, 3) corners of boxes around the parents.
+
+    Returns the parents' moments, and their numbers on the backend, which the next call takes as
+    `parts`.
+    """
+    count, arity = len(low), len(children.area) // len(low)
+    area = children.area.reshape(-1, arity).sum(axis=1)
+    weighted = (children.area[:, None] * children.center).reshape(-1, arity, 3).sum(axis=1)
     has_area = (area > 0)[:, None]
     center = np.where(has_area, weighted / np.where(has_area, area[:, None], 1), 0.5 * (low + high))
-    shift = below.center - np.repeat(center, arity, axis=0)
+    shift = children.center - np.repeat(center, arity, axis=0)
     pairs: Pairs = dict.fromkeys(MOMENT_KEYS, (0.0, 0.0))
-    for (l, m, part), values in zip(_PARTS, parts, strict=True):
+    for (l, m, part), values in zip(_MOMENT_PARTS, parts, strict=True):
         pairs[l, m] = (pairs[l, m][0], values) if part else (values, 0.0)
-    shifted = _as_real_list(
+    shifted = _flatten(
         multipole_to_multipole(pairs, *(upload_floats(backend, column) for column in shift.T))
     )
     dr.eval(*shifted)
@@ -345,17 +381,15 @@ def _parents(
     dr.eval(*sums)
     second, third, fourth = (
         column.reshape(count, arity, *column.shape[1:]).sum(axis=1)
-        for column in _shifted_moments(below, shift)
+        for column in _shifted_powers(children, shift)
     )
     radius, moments = _bounding_radius(center, low, high), _moments_of(sums)
     return NodeMoments(center, radius, area, second, third, fourth, moments), sums
 
 
-def _shifted_moments(
-    level: NodeMoments, s: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Second, third and fourth moments about center - s, that is, with d + s for d. About its own
-    center a node's first moment is 0."""
+def _shifted_powers(level: NodeMoments, s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The second, third and fourth moments of nodes about center - s, that is, with d + s in place
+    of d. s: (k, 3). About its own center a node's first moment is 0."""
     a, square = level.area[:, None], (s * s).sum(axis=1)
     trace, m2_s = (
         np.einsum("kii->k", level.second_moment),
@@ -368,16 +402,18 @@ def _shifted_moments(
 
 
 def _bounding_radius(center: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """(k,) the distance from the center to the farthest corner of the box."""
+    """The distance (k,) from the center to the farthest corner of the box from low to high."""
     return np.linalg.norm(np.maximum(high - center, center - low), axis=1)
 
 
 def cartesian_coefficients(moments: Moments, order: int = 2) -> FloatArray:
-    """(k, 15) coefficients of the terms l <= order + 1, as `treecode.multipole_terms` reads them.
+    """Coefficients (k, 15) of the terms of degree l <= order + 1, as `treecode.multipole_terms`
+    reads them. Those of higher degree are 0.
 
-    Term l is P_l(r)/r^(2l+1) with harmonic polynomials P_1 = D.r; P_2 with the coefficients of xx,
-    yy, 2xy, 2xz, 2yz (zz follows: the trace is zero); P_3 with the coefficients of xyy, xzz, xxy,
-    yzz, xxz, yyz, xyz (x^3, y^3, z^3 follow).
+    The term of degree l is P_l(r)/r^(2l+1) with a harmonic polynomial P_l. P_1 = D.r with the
+    coefficients D. P_2 has the coefficients of xx, yy, 2xy, 2xz, 2yz; that of zz follows, as the
+    trace is zero. P_3 has the coefficients of xyy, xzz, xxy, yzz, xxz, yyz, xyz; those of x^3, y^3,
+    z^3 follow.
     """
     real = {key: value.real for key, value in moments.items()}
     imag = {key: value.imag for key, value in moments.items()}
@@ -403,10 +439,11 @@ def cartesian_coefficients(moments: Moments, order: int = 2) -> FloatArray:
 
 
 def triangle_rule() -> tuple[FloatArray, FloatArray]:
-    """Barycentric coordinates (6, 3) of points in a triangle, and their weights (6,), sum 1.
+    """Barycentric coordinates (6, 3) of points in a triangle, and their weights (6,), whose sum is
+    1.
 
-    They integrate polynomials of degree at most four exactly, and so give exact moments for
-    l <= 5: Dunavant's six-point rule (1985).
+    They integrate polynomials of degree at most four exactly, and so give exact moments for l <= 5.
+    This is Dunavant's six-point rule (1985).
     """
     rule = ((0.445948490915965, 0.223381589678011), (0.091576213509771, 0.109951743655322))
     points: list[tuple[float, float, float]] = []
@@ -423,10 +460,11 @@ _ROUND_UP = 1 + 2.0**-20
 
 
 def sup_norm(moments: Moments, l: int) -> FloatArray:
-    """A bound of |term l| r^(l+1) over all directions.
+    """A bound (k,) of r^(l+1) times the absolute value of the term of degree l, over all
+    directions.
 
-    For unit x, y the addition theorem gives sum_m |I_lm(x)|^2 / ((l+m)!(l-m)!) = P_l(1) = 1, so
-    by Cauchy and Schwarz |sum_m conj(M_lm) I_lm|^2 <= sum_m (l+m)! (l-m)! |M_lm|^2.
+    For unit x, y the addition theorem gives sum_m |I_lm(x)|^2 / ((l+m)!(l-m)!) = P_l(1) = 1, so by
+    Cauchy and Schwarz |sum_m conj(M_lm) I_lm|^2 <= sum_m (l+m)! (l-m)! |M_lm|^2.
     """
     total = 0.0
     for m in range(l + 1):
@@ -438,10 +476,15 @@ def sup_norm(moments: Moments, l: int) -> FloatArray:
 def truncation_bounds(
     level: NodeMoments, nearest: FloatArray, order: int = 2
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """(E, G, H): at distances r >= nearest, the terms l >= order + 2 =: k add to f at most
-    E/r^(k+1), to its gradient G/r^(k+2) and to second derivatives along lines H/r^(k+3).
+    """Bounds (E, G, H), each (n,), of the terms that are left out if the terms of degree up to
+    order + 1 are used.
 
-    A dipole of area a at d gives the term l at most a l |d|^(l-1)/r^(l+1): on the sphere
+    nearest: (n,) the bounds hold at distances r >= nearest from the centers of the nodes.
+
+    At such distances the omitted terms, of degree l >= k = order + 2, add at most E/r^(k+1) to f,
+    at most G/r^(k+2) to its gradient, and at most H/r^(k+3) to second derivatives along lines.
+
+    Proof. A dipole of area a at d gives the term l at most a l |d|^(l-1)/r^(l+1): on the sphere
     rho^l P_l is a trigonometric polynomial of degree l along each great circle, so by Bernstein's
     and Szego's inequality its gradient is at most l rho^(l-1). Terms up to 5 are known exactly and
     bounded by `sup_norm`; for the rest |d|^(l-1) <= R^(l-5) |d|^4 and
@@ -472,18 +515,19 @@ def truncation_bounds(
 
 
 def remainder_constants(level: NodeMoments, rough: float) -> tuple[FloatArray, FloatArray]:
-    """A and K (k,) of nodes for points beyond r0 = `rough` times their radius R.
+    """Numbers A and K, each (k,), that bound the remainder of a node's field after its linear part.
 
-    At such points, over a step of length t = q r, q <= Q = `max_step_fraction(rough)`, a node's
-    field differs from its linear part by at most
+    They hold at points whose distance r from the node's center is at least r0, which is `rough`
+    times the node's radius R. Over a step of length t = q r with
+    q <= Q = `max_step_fraction(rough)`, the field differs from its linear part by at most
 
         (A + K/r^2) t^2/r^4 Phi_1(q),   Phi_l(q) = ((1-q)^-(l+1) - 1 - (l+1)q)/q^2.
 
     The term l, a harmonic function of degree -(l+1), is at most B_l/r^(l+1), and its k-th
     derivative along a line (l+k)!/l! B_l/r^(l+1+k) (the argument of `truncation_bounds`, k times).
     So Taylor's remainder is at most B_l Phi_l(q) t^2/r^(l+3). In Phi_l/Phi_1 the ratio of
-    coefficients, (l+k)!/(l! (k+1)!), grows with k, so that the quotient grows with q, and W_l =
-    Phi_l(Q)/Phi_1(Q) is a bound. With r >= r0: A = B_1 + W_2 B_2/r0 and K = sum_{l>=3} W_l
+    coefficients, (l+k)!/(l! (k+1)!), grows with k, so that the quotient grows with q, and
+    W_l = Phi_l(Q)/Phi_1(Q) is a bound. With r >= r0: A = B_1 + W_2 B_2/r0 and K = sum_{l>=3} W_l
     B_l/r0^(l-3), for l >= 6 of B_l <= l R^(l-5) sum a |d|^4, with Phi_l(Q) < (1-Q)^-(l+1)/Q^2.
     """
     r0, q = np.maximum(rough * level.radius, 1e-50), max_step_fraction(rough)

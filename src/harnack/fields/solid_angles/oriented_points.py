@@ -9,11 +9,12 @@ if TYPE_CHECKING:
 
 
 class OrientedPoints:
-    """Points (n, 3), unit normals (n, 3) and areas (n,). They cannot be set, since all other data
-    are computed from them once: other points make another field. Subclasses set them by
-    `_set_points`."""
+    """Points (n, 3), unit normals (n, 3) and areas (n,). Subclasses set them once, by
+    `_set_points`. Users cannot set them, because all other data are computed from them once: other
+    points make another field."""
 
     def _set_points(self, points: FloatArray, normals: FloatArray, areas: FloatArray) -> None:
+        """Set points, normals and areas, and make these arrays read-only."""
         for array in (points, normals, areas):
             array.setflags(write=False)
         self._points, self._normals, self._areas = points, normals, areas

@@ -2,11 +2,11 @@
 wrote of a `SolidAngle`.
 
 Off its triangles the winding number w of a mesh is, modulo 1, the solid angle of its boundary over
-4 pi, and the level set of that spans the boundary. If the triangles themselves lie on this level
-set, w has the level right beside all of them: the side of it on which w is, and so whether w passes
-the level at the jump, depends on rounding, or on the distance of a flat triangle from a curved
-surface. The points with the level then form a checkerboard; but up to the coarseness of the
-triangles the level set is the mesh itself.
+4 pi. The level set of this solid angle spans the boundary. If the triangles themselves lie on this
+level set, w is nearly the level right beside all of them. Then it depends on rounding, or on the
+distance of a flat triangle from a curved surface, on which side of the level w is, and so whether w
+passes the level at the jump. The points with the level form a checkerboard. But up to the
+coarseness of the triangles the level set is the mesh itself.
 """
 
 from __future__ import annotations
@@ -24,88 +24,96 @@ if TYPE_CHECKING:
 
 __all__ = ["lies_on_own_level"]
 
-# Vertices are on the surface within this fraction of the mesh's size, the rounding of single
-# precision and of decimals in files. A box of this height without a bottom is such a sheet.
+# Vertices count as on the surface if they are within this fraction of the mesh's size from it. This
+# allows for the rounding of single precision and of decimals in files. A box of this height without
+# a bottom also counts as such a mesh.
 _ON_SURFACE = 1e-5
-# If all vertices are on the boundary, w at centers of triangles is the level up to this number:
-# beside a thin triangle w is so steep that every surface is near it.
+# If all vertices are on the boundary, w at the centers of triangles must be the level up to this
+# number. Distances do not decide then: beside a thin triangle w is so steep that every surface is
+# near.
 _ROUNDING = 1e-7
-# Centers of triangles are within this fraction of the longest edge from the surface; of triangles
-# that `mesh` makes within a twentieth.
-_FLAT = 0.1
-# Of at most `_MAX_POINTS` vertices and centers, the fraction `_MIN_NEAR_FRACTION` has to be near
-# the surface; the first `_FIRST_POINTS` points decide most meshes.
-_MAX_POINTS, _MIN_NEAR_FRACTION, _FIRST_POINTS = 400, 0.99, 1
-# At `_COMPARED_POINTS` points the sum over all triangles is compared, within the fraction
-# `_MAX_WINDING_DIFFERENCE` of a turn.
-_COMPARED_POINTS, _MAX_WINDING_DIFFERENCE = 8, 0.25
-_AT_ONCE = 1 << 20
-# The apex of the triangles of all edges: a direction that edges are not likely to have.
+# Centers of triangles must be within this fraction of the longest edge from the surface. For
+# triangles that `mesh` makes they are within a twentieth.
+_MAX_CENTER_DISTANCE = 0.1
+# At most `_MAX_TESTED` vertices or centers are tested, and the fraction `_REQUIRED_FRACTION` of
+# these must be near the surface. The first `_TESTED_FIRST` points already rule out most meshes.
+_MAX_TESTED, _REQUIRED_FRACTION, _TESTED_FIRST = 400, 0.99, 1
+# At `_SUMMED_POINTS` points the winding number of all triangles is computed; it must have the
+# expected value up to `_MAX_DIFFERENCE`.
+_SUMMED_POINTS, _MAX_DIFFERENCE = 8, 0.25
+_MAX_PAIRS = 1 << 20
+# The direction of the apex, far away, of the triangles from all edges. Edges are not likely to have
+# this direction.
 _APEX: FloatArray = np.array([0.3017, 0.5043, 0.8091]) / math.sqrt(
     0.3017**2 + 0.5043**2 + 0.8091**2
 )
 
 
 def lies_on_own_level(mesh: WindingMesh, level: float) -> bool:
-    """Whether the triangles of an open mesh lie on the surface that spans its boundary, with this
-    level of w modulo 1, and are the points at which w jumps from the level by one.
+    """Whether the triangles of an open mesh lie on the surface that spans its boundary and on which
+    w modulo 1 has this level, and are the points at which w jumps from the level by one.
 
-    This is a numerical test and no proof: 99 % of the vertices that are not on the boundary are on
-    that surface within the rounding of files, in first order; if there are no such vertices, w has
-    the level at centers of triangles, up to rounding; centers are within a fraction of the
-    triangles' edges. Then the mesh is all of the surface: from each edge of the boundary, which
-    belongs to a single triangle, one sheet of the surface begins, and every part of it ends there
-    (a harmonic function has no closed level set except about its poles).
+    This is a numerical test and no proof. It tests three things. 99 % of the vertices that are not
+    on the boundary are on that surface within the rounding of files, to first order; if there are
+    no such vertices, w has the level at centers of triangles, up to rounding. The centers of
+    triangles are near the surface, within a fraction of the triangles' edges. And the winding
+    number of all triangles is right at a few points. Then the mesh is all of the surface: one sheet
+    of the surface begins from each edge of the boundary, which belongs to a single triangle, and
+    every part of the surface ends there, because a harmonic function has no closed level set except
+    around its poles.
     """
     if not len(mesh.singular_edges) or (mesh.multiplicity != 1).any():
         return False
-    inner = np.zeros(len(mesh.vertices), np.bool_)
-    inner[mesh.faces] = True
-    inner[mesh.singular_edges] = False
+    is_inner = np.zeros(len(mesh.vertices), np.bool_)
+    is_inner[mesh.faces] = True
+    is_inner[mesh.singular_edges] = False
     x = mesh.unit_vertices
     edges = x[mesh.singular_edges]
     corners = mesh.corners
-    is_filled = inner.any()
-    points = _evenly_spaced_rows(x[inner] if is_filled else corners.mean(axis=1), _MAX_POINTS)
+    has_inner = is_inner.any()
+    points = _spaced_rows(x[is_inner] if has_inner else corners.mean(axis=1), _MAX_TESTED)
     # In units in which the mesh has a size of one to two.
-    limit = 2 * _ON_SURFACE if is_filled else _ROUNDING
+    limit = 2 * _ON_SURFACE if has_inner else _ROUNDING
 
     def is_on(queries: FloatArray) -> BoolArray:
-        gap, distance = _offsets(edges, queries, level)
-        return (distance if is_filled else gap) < limit
+        """Whether points (k, 3) are on the surface: a mask (k,)."""
+        gap, distance = _level_gaps(edges, queries, level)
+        return (distance if has_inner else gap) < limit
 
-    if not is_on(points[:_FIRST_POINTS]).all() or np.mean(is_on(points)) < _MIN_NEAR_FRACTION:
+    if not is_on(points[:_TESTED_FIRST]).all() or np.mean(is_on(points)) < _REQUIRED_FRACTION:
         return False
-    corners = _evenly_spaced_rows(corners, _MAX_POINTS)
+    corners = _spaced_rows(corners, _MAX_TESTED)
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    _, far = _offsets(edges, corners.mean(axis=1), level)
-    if np.mean(far < _FLAT * longest) < _MIN_NEAR_FRACTION:
+    _, center_distance = _level_gaps(edges, corners.mean(axis=1), level)
+    if np.mean(center_distance < _MAX_CENTER_DISTANCE * longest) < _REQUIRED_FRACTION:
         return False
     # The mean of w on both sides, where w is the level, and the level plus or minus 1.
     mean = np.array(
-        [
-            _mean_winding(mesh.corners, point)
-            for point in _evenly_spaced_rows(points, _COMPARED_POINTS)
-        ]
+        [_mean_winding(mesh.corners, point) for point in _spaced_rows(points, _SUMMED_POINTS)]
     )
-    return any(
-        bool((np.abs(mean - level - side) < _MAX_WINDING_DIFFERENCE).all()) for side in (-0.5, 0.5)
-    )
+    return any(bool((np.abs(mean - level - side) < _MAX_DIFFERENCE).all()) for side in (-0.5, 0.5))
 
 
-def _evenly_spaced_rows(rows: FloatArray, max_count: int) -> FloatArray:
-    """At most `max_count` rows, evenly spaced."""
+def _spaced_rows(rows: FloatArray, max_count: int) -> FloatArray:
+    """At most `max_count` of the rows, evenly spaced."""
     return rows[:: -(-len(rows) // max_count)]
 
 
-def _offsets(edges: FloatArray, points: FloatArray, level: float) -> tuple[FloatArray, FloatArray]:
-    """The difference of w modulo 1 from a level at points (n, 3), and the distance of the
-    points, to first order, from the surface that spans closed edges (k, 2, 3). w and its
-    gradient come from the solid angle of the edges, the sum of those of triangles from each edge
-    to an apex far away."""
+def _level_gaps(
+    edges: FloatArray, points: FloatArray, level: float
+) -> tuple[FloatArray, FloatArray]:
+    """Compare w modulo 1 with a level, at points (n, 3).
+
+    edges: (k, 2, 3) the directed edges of closed curves.
+
+    Returns the absolute difference (n,) of w modulo 1 from the level, and the distance (n,) of the
+    points, to first order, from the surface with this level that spans the edges. w and its
+    gradient come from the solid angle of the edges, which is the sum of the solid angles of
+    triangles from each edge to an apex far away.
+    """
     gaps: list[FloatArray] = []
     slopes: list[FloatArray] = []
-    step = max(1, _AT_ONCE // len(edges))
+    step = max(1, _MAX_PAIRS // len(edges))
     for first in range(0, len(points), step):
         batch = points[first : first + step, None]
         p, q = edges[None, :, 0] - batch, edges[None, :, 1] - batch
@@ -124,7 +132,7 @@ def _offsets(edges: FloatArray, points: FloatArray, level: float) -> tuple[Float
 
 
 def _mean_winding(corners: FloatArray, point: FloatArray) -> float:
-    """The mean of the winding numbers on both sides of a mesh (m, 3, 3) at a point of it: the
+    """The mean of the winding numbers on both sides of a mesh (m, 3, 3) at a point of it. It is the
     winding number of all triangles except those that contain the point, which fill half of all
     directions."""
     angles = solid_angles(corners, point)

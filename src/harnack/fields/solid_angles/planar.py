@@ -1,22 +1,23 @@
 """Curves that bound a region of a plane, and the range of their solid angle near a point.
 
-Let disjoint simple loops of a single plane have winding numbers 0 and 1 only, such as an outline
-with holes, each of opposite orientation: they bound a region S of the plane. Above the plane f is
-minus the solid angle of S and lies in (-2 pi, 0); below, it lies in (0, 2 pi). Let d be the
-distance from x to the curves and h the distance to the plane, h <= d. On the ball B(x, d), which
-meets no curve, f has a continuous lift; the ball meets the plane in a disk D of radius sqrt(d^2 -
-h^2), inside of S or outside of it.
+Let disjoint simple loops of a single plane have winding numbers 0 and 1 only. An example is an
+outline with holes, each of opposite orientation. They bound a region S of the plane. Above the
+plane the solid angle f of the loops is minus that of S and lies in (-2 pi, 0); below, it lies in
+(0, 2 pi). Let d be the distance from x to the curves and h the distance to the plane, h <= d. On
+the ball B(x, d), which meets no curve, f has a continuous lift. The ball meets the plane in a disk
+D of radius sqrt(d^2 - h^2), which is inside of S or outside of it.
 
-- Outside, the lift is f on both sides of the plane: it lies in (-2 pi, 2 pi).
-- Inside, it continues f of one side by f of the other side minus or plus 4 pi: from above it lies
-  in (-4 pi, 0), from below in (0, 4 pi), whichever side x is on.
+- If D is outside, the lift is f on both sides of the plane: it lies in (-2 pi, 2 pi).
+- If D is inside, the lift is f on the side of the plane on which x is, and f minus or plus 4 pi on
+  the other side. It lies in (-4 pi, 0) if x is above the plane, and in (0, 4 pi) if x is below.
 - B(x, h) does not meet the plane: there the lift lies in (-2 pi, 0) or in (0, 2 pi).
 
-f itself tells where D is. At x, D has the solid angle 2 pi (1 - h/d). Inside, |f| is at least that,
-for S contains D; outside, |f| is at most 2 pi minus that, for S is in the rest of the plane. If h <
-d/2, |f| = pi separates the two cases; otherwise either case may be proved, and if neither is, B(x,
-h) is used, whose radius is at least d/2. In rounded arithmetic the error of f is large near the
-curve: if h < d/2 and neither case is certain, the lift lies in (-4 pi, 4 pi) in either case.
+f itself tells where D is. At x, D has the solid angle 2 pi (1 - h/d). If D is inside, |f| is at
+least that, for S contains D. If D is outside, |f| is at most 2 pi minus that, for S is in the rest
+of the plane. If h < d/2, |f| = pi separates the two cases. Otherwise f may prove one of the cases;
+if it proves neither, B(x, h) is used, whose radius is at least d/2. In rounded arithmetic the error
+of f is large near the curve: if h < d/2 and neither case is certain, the lift lies in
+(-4 pi, 4 pi) in either case.
 
 The range is 4 pi wide, whereas the range for a curve in convex position is 12 pi wide.
 """
@@ -43,15 +44,16 @@ if TYPE_CHECKING:
 __all__ = ["PlanarRegion", "planar_region"]
 
 # All relative to the size of the curves.
-_FLAT = 1e-12  # the largest distance of a vertex from the plane
+_MAX_PLANE_DISTANCE = 1e-12  # the largest distance of a vertex from the plane
 _MIN_LOOP_DISTANCE = 1e-6  # the least distance of two loops
-_TILT = 1e-6  # the largest slope of a loop's own plane, relative to the size of the loop
+_MAX_TILT = 1e-6  # the largest slope of a loop's own plane, relative to the size of the loop
 _MAX_VERTICES = 2048  # the tests take quadratic time
 
 
 @dataclass(frozen=True)
 class PlanarRegion:
-    """The plane n.x = offset of a region, n (3,) such that the solid angle is negative above it."""
+    """The plane n.x = offset of a region that curves bound. normal: n (3,), oriented such that the
+    solid angle is negative above the plane."""
 
     normal: FloatArray
     offset: float
@@ -59,13 +61,14 @@ class PlanarRegion:
     def lift_range(
         self, angle: Real, height: Real, distance: Real, slack: Real, error: Real = 0.0
     ) -> HarmonicBall:
-        """A ball and a range of the lift on it: see the module.
+        """A ball around a point and a range of the lift on it: see this module.
 
-        angle: f modulo 4 pi.
-        height: the height over the plane, along its normal, off by at most `slack`.
-        distance: the distance to the curves, or less.
+        angle: f modulo 4 pi, at the point.
+        height: the height of the point above the plane, along its normal. It is off by at most
+            `slack`.
+        distance: the distance of the point from the curves, or a lower bound of it.
         slack: a length that bounds the rounding of positions.
-        error: a bound of the error of the angle, beyond rounding.
+        error: a bound of the error of the angle, in addition to its rounding.
         """
         turn = 2 * math.pi
         f = angle - 2 * turn * dr.round(angle / (2 * turn))
@@ -104,7 +107,7 @@ class _PlanarLoop:
     sign: int
 
     def contains(self, point: FloatArray) -> bool:
-        """Whether a point (2,), not on the loop, is inside."""
+        """Whether a point (2,) is inside the loop. The point must not lie on the loop."""
         if self.radius > 0:
             return bool(np.linalg.norm(point - self.points[0]) < self.radius)
         a, b = self.points - point, np.roll(self.points, -1, axis=0) - point
@@ -119,11 +122,12 @@ class _PlanarLoop:
 
 
 def planar_region(loops: Loops, circles: Sequence[Circle]) -> PlanarRegion | None:
-    """The region that the curves bound in their plane, or None.
+    """The region that the curves bound in their plane; None if they do not bound one, or if that
+    cannot be tested.
 
-    It is None if the loops do not lie in one plane up to 1e-12 of their size, cross or come nearer
-    to each other than 1e-6 of it, have winding numbers other than 0 and 1 (or 0 and -1), or have
-    more than 2048 vertices.
+    The result is None in these cases: the loops do not lie in one plane up to 1e-12 of their size;
+    they cross, or come nearer to each other than 1e-6 of their size; they have winding numbers
+    other than 0 and 1 (or 0 and -1); or they have more than 2048 vertices.
     """
     if sum(map(len, loops)) > _MAX_VERTICES or len(loops) + len(circles) > _MAX_VERTICES // 8:
         return None
@@ -148,22 +152,25 @@ def planar_region(loops: Loops, circles: Sequence[Circle]) -> PlanarRegion | Non
     if not all(_are_separated(loop, other) for loop, other in itertools.combinations(outlines, 2)):
         return None
     # The winding number just inside each loop: the sum of the signs of all loops around it.
-    inside = [
+    winding_inside = [
         sum(other.sign for other in outlines if other is loop or other.contains(loop.some_point))
         for loop in outlines
     ]
-    lowest, highest = min(0, *inside), max(0, *inside)
-    if highest - lowest != 1:
+    min_winding, max_winding = min(0, *winding_inside), max(0, *winding_inside)
+    if max_winding - min_winding != 1:
         return None
-    side = 1.0 if highest == 1 else -1.0
-    return PlanarRegion(side * normal, side * float(normal @ origin))
+    orientation = 1.0 if max_winding == 1 else -1.0
+    return PlanarRegion(orientation * normal, orientation * float(normal @ origin))
 
 
 def _plane_of(
     loops: Loops, circles: Sequence[Circle]
 ) -> tuple[FloatArray, FloatArray, float, FloatArray] | None:
-    """Normal, origin, size and two axes (2, 3), right-handed, of a plane that contains all curves;
-    None if there is no such plane."""
+    """A plane that contains all curves; None if there is none.
+
+    Returns its unit normal, a point of it as the origin, the size of the curves, and two
+    perpendicular unit vectors (2, 3) in it, right-handed together with the normal.
+    """
     points = np.concatenate([*loops, *(circle.polygon(4) for circle in circles)])
     lower, upper = points.min(axis=0), points.max(axis=0)
     size = float((upper - lower).max())
@@ -180,12 +187,12 @@ def _plane_of(
         normal = np.linalg.svd(x - x.mean(axis=0), full_matrices=False)[2][2]
         origin = points.mean(axis=0)
         x = (points - origin) / size
-    if not np.abs(x @ normal).max() <= _FLAT:
+    if not np.abs(x @ normal).max() <= _MAX_PLANE_DISTANCE:
         return None
     # Small loops must not be tilted more than large ones.
     for loop in (*loops, *(circle.polygon(4) for circle in circles)):
         span = loop - loop[0]
-        if not np.abs(span @ normal).max() <= _TILT * np.abs(span).max():
+        if not np.abs(span @ normal).max() <= _MAX_TILT * np.abs(span).max():
             return None
     first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
     first = first / np.linalg.norm(first)
@@ -193,18 +200,18 @@ def _plane_of(
 
 
 def _are_separated(first: _PlanarLoop, second: _PlanarLoop) -> bool:
-    """Whether two loops are at least _MIN_LOOP_DISTANCE from each other."""
+    """Whether the distance of two loops is at least `_MIN_LOOP_DISTANCE`."""
     if first.radius > 0 and second.radius > 0:
         distance = float(np.linalg.norm(first.points[0] - second.points[0]))
         outer_gap = distance - (first.radius + second.radius)
         return max(outer_gap, abs(first.radius - second.radius) - distance) >= _MIN_LOOP_DISTANCE
     if second.radius > 0:
         first, second = second, first
-    p, q = second.points, np.roll(second.points, -1, axis=0)
+    start, stop = second.points, np.roll(second.points, -1, axis=0)
     if first.radius > 0:
-        e, offset = q - p, first.points[0] - p
-        fraction = np.clip((offset * e).sum(axis=1) / (e * e).sum(axis=1), 0, 1)
-        nearest = float(np.linalg.norm(offset - fraction[:, None] * e, axis=1).min())
+        edge, offset = stop - start, first.points[0] - start
+        fraction = np.clip((offset * edge).sum(axis=1) / (edge * edge).sum(axis=1), 0, 1)
+        nearest = float(np.linalg.norm(offset - fraction[:, None] * edge, axis=1).min())
         farthest = float(np.linalg.norm(offset, axis=1).max())
         return (
             nearest - first.radius >= _MIN_LOOP_DISTANCE

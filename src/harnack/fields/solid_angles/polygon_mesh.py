@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 __all__ = ["PERIOD", "FaceData", "FaceLoops", "FaceSolidAngle", "PolygonMesh", "face_boxes"]
 
 PERIOD = 4 * math.pi
-# The number of edges of a record, which is fixed so that all meshes share kernels.
+# The number of edges of a record. It is the same for all meshes, so that they share kernels.
 EDGES_PER_RECORD = 4
 # Records are counted in floats; single precision holds no larger integers without gaps.
 _MAX_RECORDS = 2**24
@@ -56,9 +56,10 @@ _MAX_RECORDS = 2**24
 class FaceLoops:
     """Records of all faces of a mesh, and of their edges.
 
-    heads: for each face its center and size, the first record of its edges, the number of these
-        records (negative if the face is in convex position), and bounds of the rounding of a point,
-        in units of the face, and of the value.
+    heads: one record per face. In this order it holds: the center (3,) and the size of the face;
+        the index of the first record of its edges; the number of these records, negative if the
+        face is in convex position; and bounds of the rounding of a point, in units of the face, and
+        of the rounding of the value.
     edges: the edges of all faces, each face in its own unit coordinates.
     """
 
@@ -67,10 +68,10 @@ class FaceLoops:
 
     @classmethod
     def upload(cls, backend: Backend, faces: PolygonFaces) -> FaceLoops:
-        """All faces, each centered and scaled to unit size.
+        """Upload all faces, each relative to its center and scaled to unit size.
 
-        Centers are numbers that the backend's precision holds exactly, so that subtracting them
-        near a face is exact.
+        The backend's precision holds the centers exactly, so that subtracting them near a face is
+        exact. Raises ValueError if there are too many corners.
         """
         low, high = faces.face_boxes()
         center = (0.5 * (low + high)).astype(backend.dtype).astype(np.float64)
@@ -101,7 +102,7 @@ class FaceLoops:
         return cls(RecordTable.upload(backend, heads), edges)
 
     def face(self, index: Any) -> FaceSolidAngle:
-        """The solid angle of the face with index `index`, which may differ from lane to lane."""
+        """The solid angle of the face with this index, which may differ from lane to lane."""
         row = self.heads.read_record(index)
         backend = self.heads.backend
         count = backend.UInt32
@@ -111,11 +112,12 @@ class FaceLoops:
 
 @dataclass(frozen=True)
 class FaceData(UnitFrame):
-    """The head of a face, which may differ from lane to lane, with its edges.
+    """The head of a face, with its edges. The face may differ from lane to lane.
 
-    trips: the number of records of edges, negative if the face is in convex position.
+    edges: the records of its edges.
+    trips: the number of these records, negative if the face is in convex position.
     rounding, value_rounding: bounds of the rounding of a point, in units of the face, and of the
-        value.
+        rounding of the value.
     """
 
     edges: LoopEdges
@@ -127,8 +129,8 @@ class FaceData(UnitFrame):
 class FaceSolidAngle(Field):
     """The solid angle of a face, which may differ from lane to lane.
 
-    Its promises are those of `SolidAngle`, which has their proofs. The ball is that of "convex" if
-    the face is in convex position, else that of "edges".
+    Its promises are those of `SolidAngle`, which has their proofs. The ball is that of
+    `lift_bound="convex"` if the face is in convex position, else that of "edges".
     """
 
     period: ClassVar[float | None] = PERIOD
@@ -145,6 +147,8 @@ class FaceSolidAngle(Field):
         return path.enclose(self._sample(path.point(t), path.direction))
 
     def _sample(self, p: Vec3, direction: Vec3 | None) -> Sample:
+        """The sample at points p. direction: a unit vector (3,), along which the sample gets
+        further promises; None for none."""
         face = self.face
         backend, x, rounding = face.backend, face.to_unit(p), face.rounding
         sums = sum_over_edges(face.edges, x)
@@ -169,6 +173,7 @@ class FaceSolidAngle(Field):
             line = RayLine(x, backend.Array3f(direction), rounding)
 
             def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
+                """Bounds of the derivative along the line for these lengths (`line_rates`)."""
                 return line_rates(face.edges, line, lengths, active)
 
             ray_promises = lipschitz_along(line, sums.gradient, sums.distance, rates)
@@ -184,11 +189,11 @@ class FaceSolidAngle(Field):
         return space_scaled(sample, face.size)
 
 
-# All cells are split `_MIN_DEPTH` times, cells at the sides of a box up to `_MAX_DEPTH` times; in
-# at most `_ROUNDS` rounds, and for at most `_MAX_PAIRS` pairs of an edge and a cell.
+# All cells are split `_MIN_DEPTH` times. Cells at the faces of a box are split up to `_MAX_DEPTH`
+# times, in at most `_ROUNDS` rounds, and for at most `_MAX_PAIRS` pairs of an edge and a cell.
 _MIN_DEPTH, _MAX_DEPTH, _ROUNDS, _MAX_PAIRS = 2, 7, 24, 30_000_000
 # Boxes are enlarged by this fraction of the size of a face.
-_SLACK = 1e-4
+_BOX_MARGIN = 1e-4
 _CORNERS = np.array(list(itertools.product((0, 1), repeat=3)), dtype=np.float64)
 
 
@@ -196,53 +201,57 @@ def face_boxes(faces: PolygonFaces, levels: tuple[float, ...]) -> tuple[FloatArr
     """Lower and upper corners (m, 3) of boxes that contain the level sets of the faces' solid
     angles.
 
-    In double precision, for all faces at once; computed once for a mesh and its levels.
+    They are computed in double precision, for all faces at once. `PolygonMesh.boxes` computes them
+    once for a mesh and its levels.
 
     The 2 pi level of a face in convex position lies in its convex hull (paper, Theorem B.1), which
     lies in the box of its vertices. Other surfaces lie in the isoperimetric box of
-    `SolidAngle.extent`; the cells of this box that are proved empty are removed (`_are_empty`), and
-    the result is the box around the other cells.
+    `SolidAngle.extent`. Cells of this box that are proved empty are removed (`_are_empty`), and the
+    result is the box around the other cells.
     """
     low, high = faces.face_boxes()
     nearest = min(abs(math.remainder(level, PERIOD)) for level in levels)
     size = 0.5 * np.linalg.norm(high - low, axis=1)[:, None]
-    in_hull = faces.in_convex_position & (nearest > 2 * math.pi * (1 - 1e-9))
-    reach = 1.0001 * faces.face_perimeters()[:, None] / math.sqrt(nearest * (PERIOD - nearest))
-    lower = np.where(in_hull[:, None], low, low - reach)
-    upper = np.where(in_hull[:, None], high, high + reach)
-    carved = np.flatnonzero(~in_hull)
-    if carved.size:
-        lower[carved], upper[carved] = _carve_boxes(faces, carved, lower, upper, levels)
-    return lower - _SLACK * size, upper + _SLACK * size
+    is_in_hull = faces.in_convex_position & (nearest > 2 * math.pi * (1 - 1e-9))
+    margin = 1.0001 * faces.face_perimeters()[:, None] / math.sqrt(nearest * (PERIOD - nearest))
+    lower = np.where(is_in_hull[:, None], low, low - margin)
+    upper = np.where(is_in_hull[:, None], high, high + margin)
+    carved_ids = np.flatnonzero(~is_in_hull)
+    if carved_ids.size:
+        lower[carved_ids], upper[carved_ids] = _carve_boxes(faces, carved_ids, lower, upper, levels)
+    return lower - _BOX_MARGIN * size, upper + _BOX_MARGIN * size
 
 
 def _carve_boxes(
     faces: PolygonFaces, carved: IntArray, lower: FloatArray, upper: FloatArray,
     levels: tuple[float, ...],
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-    """Boxes of the faces `carved`, around the cells that are not proved empty.
+    """Lower and upper corners (k, 3) of smaller boxes for the faces of indices `carved`. They are
+    the boxes around the cells of the old boxes that are not proved empty.
 
-    Only the cells at the sides of a box can make it smaller, so only these are split further.
+    lower, upper: (m, 3) corners of the old boxes of all faces.
+
+    Only cells at the faces of a box can make it smaller, so only these are split further.
     """
     curves = FaceLoops.upload(choose_backend("double"), faces)
-    sides, pairs = upper - lower, 0
-    corners = np.bincount(faces.face_of_corner)
+    box_sizes, pair_count = upper - lower, 0
+    corner_counts = np.bincount(faces.face_of_corner)
     cells = _FaceCells(carved, lower[carved], np.zeros(len(carved), dtype=np.int64))
-    low, high = cells.boxes(sides)
-    for step in range(_ROUNDS):
+    low, high = cells.boxes(box_sizes)
+    for round_index in range(_ROUNDS):
         is_split = cells.depth < _MIN_DEPTH
-        if step >= _MIN_DEPTH:
+        if round_index >= _MIN_DEPTH:
             rows = np.searchsorted(carved, cells.face)
-            is_split = cells.touch(low[rows], high[rows], sides) & (cells.depth < _MAX_DEPTH)
-        pairs += 8 * int(corners[cells.face[is_split]].sum())
-        if not is_split.any() or pairs > _MAX_PAIRS:
+            is_split = cells.touch(low[rows], high[rows], box_sizes) & (cells.depth < _MAX_DEPTH)
+        pair_count += 8 * int(corner_counts[cells.face[is_split]].sum())
+        if not is_split.any() or pair_count > _MAX_PAIRS:
             break
-        octants = cells.subset(is_split).split(sides)
-        size = octants.sizes(sides)
+        octants = cells.subset(is_split).split(box_sizes)
+        size = octants.sizes(box_sizes)
         half = 0.5 * np.linalg.norm(size, axis=1)
         is_empty = _are_empty(curves, octants.face, octants.corner + 0.5 * size, half, levels)
         cells = cells.subset(~is_split).joined(octants.subset(~is_empty))
-        low, high = cells.boxes(sides)
+        low, high = cells.boxes(box_sizes)
     return low, high
 
 
@@ -250,8 +259,9 @@ def _carve_boxes(
 class _FaceCells:
     """Cells of the boxes of faces.
 
-    face: (k,) the face of each cell, increasing; every face has at least one cell.
-    corner: (k, 3) lower corners.
+    face: (k,) the index of the face that each cell belongs to, in increasing order. Every face has
+        at least one cell.
+    corner: (k, 3) the lower corners of the cells.
     depth: (k,) the number of splits of the face's box that gave the cell.
     """
 
@@ -260,53 +270,58 @@ class _FaceCells:
     depth: IntArray
 
     def sizes(self, sides: FloatArray) -> FloatArray:
-        """(k, 3) sizes of the cells, if the boxes of the faces have these sides (m, 3)."""
+        """Sizes (k, 3) of the cells, if the boxes of the faces have the sizes `sides` (m, 3)."""
         return sides[self.face] * (0.5**self.depth)[:, None]
 
     def boxes(self, sides: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corners of the boxes around the cells of each face."""
+        """Lower and upper corners of the boxes around the cells of each face. sides: as for
+        `sizes`."""
         first = np.flatnonzero(np.diff(self.face, prepend=-1))
         low = np.minimum.reduceat(self.corner, first)
         return low, np.maximum.reduceat(self.corner + self.sizes(sides), first)
 
     def touch(self, low: FloatArray, high: FloatArray, sides: FloatArray) -> BoolArray:
-        """(k,) whether a cell lies at a side of the box from low to high (k, 3), up to a quarter of
-        the cell's size."""
+        """A mask (k,) of the cells that lie at a side of a box, up to a quarter of the cell's size.
+        low, high: (k, 3) corners of the box for each cell."""
         size = self.sizes(sides)
         at_low = self.corner < low + 0.25 * size
         at_high: BoolArray = self.corner > high - 1.25 * size
         return np.logical_or.reduce(at_low | at_high, axis=1)
 
-    def subset(self, mask: BoolArray) -> _FaceCells:
+    def subset(self, chosen: BoolArray) -> _FaceCells:
         """The cells selected by a mask (k,)."""
-        return _FaceCells(self.face[mask], self.corner[mask], self.depth[mask])
+        return _FaceCells(self.face[chosen], self.corner[chosen], self.depth[chosen])
 
     def split(self, sides: FloatArray) -> _FaceCells:
-        """The eight octants of each cell."""
+        """The eight octants of each cell. sides: as for `sizes`."""
         depth = np.repeat(self.depth + 1, 8)
         face = np.repeat(self.face, 8)
         half = sides[face] * (0.5**depth)[:, None]
         steps = np.tile(_CORNERS, (len(self.face), 1))
         return _FaceCells(face, np.repeat(self.corner, 8, axis=0) + steps * half, depth)
 
-    def joined(self, other: _FaceCells) -> _FaceCells:
-        """The cells of both operands."""
-        face = np.concatenate([self.face, other.face])
+    def joined(self, others: _FaceCells) -> _FaceCells:
+        """The cells of both operands, sorted by face."""
+        face = np.concatenate([self.face, others.face])
         order = np.argsort(face, kind="stable")
-        corner = np.concatenate([self.corner, other.corner])
-        return _FaceCells(face[order], corner[order], np.append(self.depth, other.depth)[order])
+        corner = np.concatenate([self.corner, others.corner])
+        return _FaceCells(face[order], corner[order], np.append(self.depth, others.depth)[order])
 
 
 def _are_empty(
     curves: FaceLoops, face: IntArray, centers: FloatArray, half: FloatArray,
     levels: tuple[float, ...],
 ) -> BoolArray:  # fmt: skip
-    """Whether no level set of a face comes within `half` of points: faces (k,), centers (k, 3),
-    half (k,).
+    """A mask (k,) of the balls in which no level set of a face is proved to lie.
 
-    Let h be `half`, less than the distance d_e to every edge e, of length 2a. A cell is empty if no
-    level lies in [f - S, f + S], where S bounds the change of the lift within h. The smaller of two
-    bounds is used:
+    curves: the boundary curves of all faces.
+    face: (k,) the face for each ball.
+    centers, half: (k, 3) centers and (k,) radii of the balls.
+
+    Proof. Let h be the radius, less than the distance d_e of the center from every edge e, of
+    length 2a. There is no level in the ball if no level lies in [f - S, f + S], where f is the
+    value at the center and S bounds the change of the lift within h. The smaller of two bounds is
+    used:
 
     - At distance s from the center, an edge's field is at most
       2a/((d_e - s) sqrt((d_e - s)^2 + a^2)) (`LiftedEdge.bounds`), whose integral is
@@ -325,7 +340,9 @@ def _are_empty(
     h = upload_floats(backend, half) / data.size
 
     def add(p: Vec3, q: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
-        zr, zi, slope, nearest, change, second = state
+        """Add the edge from p to q to the state: the product of spinors (zr, zi), the gradient, the
+        distance of the nearest edge, and the sums of both bounds."""
+        zr, zi, gradient, nearest, change, second = state
         edge = Edge.between(p, q, inverse, x)
         re, im = inner_product(spinor(edge.a)[2], spinor(edge.b)[2])
         zr, zi = dr.fma(zr, re, -(zi * im)), dr.fma(zr, im, zi * re)
@@ -335,24 +352,24 @@ def _are_empty(
         gap = distance - h
         change = change + 2 * (dr.asinh(a / gap) - dr.asinh(a / distance))
         second = second + 2 * a / (gap * gap * dr.sqrt(gap * gap + a * a))
-        slope = dr.fma(type(slope)(weight), c, slope)
-        return zr * scale, zi * scale, slope, fmin(distance, nearest), change, second
+        gradient = dr.fma(type(gradient)(weight), c, gradient)
+        return zr * scale, zi * scale, gradient, fmin(distance, nearest), change, second
 
     start = (real(1), real(0), backend.Array3f(0), real(dr.inf), real(0), real(0))
-    zr, zi, slope, nearest, change, second = data.edges.for_each(add, start, "face boxes")
-    variation = fmin(change, h * dr.fma(h, second, dr.norm(slope)))
-    f, is_off, s = (
+    zr, zi, gradient, nearest, change, second = data.edges.for_each(add, start, "face boxes")
+    variation = fmin(change, h * dr.fma(h, second, dr.norm(gradient)))
+    f, is_off_curve, max_change = (
         to_numpy(column) for column in (2 * dr.atan2(zi, zr), nearest > 1.001 * h, variation)
     )
     level_gap = np.full(len(f), math.inf)
     for level in levels:
         offset = np.remainder(f - level + 0.5 * PERIOD, PERIOD) - 0.5 * PERIOD
         level_gap = np.minimum(level_gap, np.abs(offset))
-    return is_off & (level_gap > s * (1 + 1e-9) + 1e-9)
+    return is_off_curve & (level_gap > max_change * (1 + 1e-9) + 1e-9)
 
 
 # Levels nearer than this to a multiple of 4 pi are refused: their surfaces are unbounded.
-_NARROW = 1e-9 * PERIOD
+_LEVEL_MARGIN = 1e-9 * PERIOD
 
 
 class PolygonMesh(PatchField["_MeshBuffers"]):
@@ -360,16 +377,16 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
     of the solid angle of its boundary curve (paper, Sections 4.2.1 and 4.2.4).
 
     vertices: (n, 3).
-    faces: a list of faces, each a list of at least three indices of vertices, counter-clockwise
-        seen from outside; or a list of such loops, of which holes run clockwise. Faces may have
-        different numbers of corners, and need not be joined.
+    faces: a list of faces. A face is a list of at least three indices of vertices, in
+        counter-clockwise order seen from outside; or it is a list of such loops, in which holes run
+        clockwise. Faces may have different numbers of corners, and need not be joined.
 
-    The surface of a face is the set on which its solid angle is 2 pi, modulo 4 pi; another `level`
-    bulges it to one side. The faces are separate surfaces that meet in their common edges:
-    `Hits.primitive_index` is the index of the face that was hit, the normal is that of its surface,
-    to the positive side. Each face is traced by itself, with the proofs of `SolidAngle`, so that a
-    ray pays only for faces whose boxes it enters (`harnack.fields.capabilities`). `face(k)` is the
-    solid angle of face k.
+    The surface of a face is the set on which its solid angle is 2 pi, modulo 4 pi. With another
+    `level` the surface bulges to one side. The faces are separate surfaces that meet in their
+    common edges. `Hits.primitive_index` is the index of the face that was hit; the normal is that
+    of its surface, towards the positive side of the face. Each face is traced by itself, with the
+    proofs of `SolidAngle`, so that a ray pays only for faces whose boxes it enters
+    (`harnack.fields.capabilities`). `face(k)` is the solid angle of face k.
 
     Raises:
         MeshError: a ValueError, for vertices and faces that `geometry.validate_polygons` refuses.
@@ -399,11 +416,12 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
 
     @property
     def edges(self) -> IntArray:
-        """(e, 2) pairs of vertices joined by an edge of some face, each once."""
+        """Pairs (e, 2) of vertices that an edge of some face joins. Each pair occurs once."""
         return self.faces.edges
 
     def face(self, index: int) -> SolidAngle:
-        """The solid angle of the boundary of the face with this index."""
+        """The solid angle of the boundary of the face with this index. Raises IndexError if there
+        is no such face."""
         if not 0 <= index < self.faces.face_count:
             last = self.faces.face_count - 1
             raise IndexError(f"there is no face {index}: they are counted from 0 to {last}")
@@ -420,7 +438,8 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
         return self._boxes[levels]
 
     def evaluate(self, p: Vec3) -> NoReturn:
-        """Raises TypeError: there is a function for each face, but none for the mesh."""
+        """Not defined: there is a function for each face, but none for the mesh. Always raises
+        TypeError."""
         del p
         raise TypeError(
             "a polygon mesh is no level set of one function, but of one for each face: ask a "
@@ -428,15 +447,18 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
         )
 
     def _upload(self, backend: Backend) -> _MeshBuffers:
+        """The faces' boxes and boundary curves on a backend."""
         boxes = PatchBoxes.upload(backend, *self.boxes())
         return _MeshBuffers(boxes, FaceLoops.upload(backend, self.faces))
 
     def patch(self, index: Any) -> Field:
+        """The solid angle of the face with this index, which may differ from lane to lane."""
         return self._require_data().curves.face(index)
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
+        """Raise ValueError for a level that is a multiple of 4 pi."""
         for level in levels:
-            if abs(math.remainder(float(level), PERIOD)) < _NARROW:
+            if abs(math.remainder(float(level), PERIOD)) < _LEVEL_MARGIN:
                 raise ValueError(
                     f"level {level:g} is a multiple of 4 pi, which the solid angle of every face "
                     "comes near far away: its surfaces have no bounds; choose another level, such "
@@ -454,7 +476,7 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
 
 @dataclass(frozen=True)
 class _MeshBuffers:
-    """The faces' boxes and curves on a backend."""
+    """The faces' boxes and boundary curves on a backend."""
 
     boxes: PatchBoxes
     curves: FaceLoops

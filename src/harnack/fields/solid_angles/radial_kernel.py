@@ -1,17 +1,19 @@
 """The terms of a dipole, or of a cluster of dipoles, of a radial potential K(r) in a sum, and their
 bounds.
 
-With psi_0 = K and psi_(k+1) = -psi_k'/r a dipole m at y = x + z has the term -m.grad_y K = m.z
-psi_1, and a polynomial P(z) times psi_k has the gradient grad P psi_k - P psi_(k+1) z and the
-Hessian HP psi_k - (grad P z^T + z grad P^T) psi_(k+1) - P psi_(k+1) I + P psi_(k+2) z z^T (in z;
-the gradient in x has the opposite sign). A `RadialKernel` defines K and bounds of its derivatives;
-all else is shared by screened sums (`screened.YukawaKernel`), smoothed sums
-(`smoothed.SmoothedKernel`) and slices of four dimensions (`morph_slice.SlicedKernel`).
+Let psi_0 = K and psi_(k+1) = -psi_k'/r. A dipole m at y = x + z has the term -m.grad_y K = m.z
+psi_1. A polynomial P(z) times psi_k has the gradient grad P psi_k - P psi_(k+1) z and, with the
+Hessian HP of P, the Hessian HP psi_k - (grad P z^T + z grad P^T) psi_(k+1) - P psi_(k+1) I + P
+psi_(k+2) z z^T. These are derivatives in z; the gradient in x has the opposite sign. A
+`RadialKernel` defines K and bounds of its derivatives. All else is shared by screened sums
+(`screened.YukawaKernel`), smoothed sums (`smoothed.SmoothedKernel`) and slices of four dimensions
+(`morph_slice.SlicedKernel`).
 
-Distances. A kernel may be regular at r = 0: it uses D = sqrt(r^2 + height^2) for all distances, the
-distances in four dimensions to a point at that height over the space of the dipoles. Its bounds are
-|d^m K[u_1, ..., u_m]| <= m! Q_m/D^(m+1) for unit vectors u_i, with Q_m at most 1, growing with m,
-and falling with D if not constant.
+Distances. A kernel may be regular at r = 0. Then it uses D = sqrt(r^2 + height^2) for all
+distances: the distance in four dimensions to a point at that height above the space of the dipoles.
+Its bounds are |d^m K[u_1, ..., u_m]| <= m! Q_m/D^(m+1) for the m-th derivative in the directions of
+unit vectors u_i. The numbers Q_m are at most 1, unless the kernel says otherwise, grow with m, and
+are constant or fall with D.
 """
 
 from __future__ import annotations
@@ -34,16 +36,16 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Mask, Real, Vec3
 
 
-# Radii of the `TaylorRemainder` promises, in distances to the nearest dipole: each proves the
-# longest steps for some rays.
-_REACHES = (0.1, 0.25, 0.45)
+# Radii of the `TaylorRemainder` promises, as fractions of the distance to the nearest dipole. Each
+# of them proves the longest steps for some rays.
+_RADIUS_FRACTIONS = (0.1, 0.25, 0.45)
 # `RadialSums.variation` holds within this fraction of the distance to the nearest dipole.
 BALL_FRACTION = 0.35
 
 
 @dataclass(frozen=True)
 class KernelValues:
-    """A kernel at a distance D: psi_k = scale thetas[k]/D^(2k), for k from 0 to the requested
+    """A kernel at a distance D. psi_k is scale * thetas[k]/D^(2k), for k from 0 to the requested
     order."""
 
     scale: Real
@@ -53,34 +55,37 @@ class KernelValues:
 class RadialKernel(abc.ABC):
     """A radial potential K on a backend, for sums over dipoles and their trees.
 
-    height_square: the square of the height of the points over the space of the dipoles; 0 for
-        points of that space.
+    height_square: the square of the height of the points above the space of the dipoles, in four
+        dimensions; 0 for points of that space.
     """
 
     height_square: Real = 0.0
 
     @abc.abstractmethod
     def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
-        """psi_0 to psi_last at a distance D; inverse: 1/D."""
+        """The numbers psi_0 to psi_last at a distance D. inverse: 1/D."""
 
     @abc.abstractmethod
     def bounds(self, distance: Real, last: int) -> list[Real]:
-        """Q_2 to Q_last, at least Q_3, which hold at all distances from `distance` on; last is at
-        most 6."""
+        """The bounds Q_2 to Q_last, and at least Q_3, which hold at all distances that are at least
+        `distance`. last: at most 6."""
 
     @abc.abstractmethod
     def growth(self, r: Real) -> Real:
-        """The factor by which Q_m may be larger at a distance shorter by r."""
+        """The factor by which Q_m may be larger if the distance is shorter by r."""
 
     @abc.abstractmethod
     def accepting_distance(self, radius: FloatArray, accuracy: float) -> FloatArray:
-        """The distances D from which on the moments of clusters of these radii are used."""
+        """For clusters of these radii (k,), the distances D beyond which their moments are used."""
 
 
 @dataclass(frozen=True)
 class PolynomialTerm:
-    """A term P(z) psi_k: P, its gradient and its Hessian, all times D^(-2k); k = 1, 2, 3 is its
-    position in a list."""
+    """A term P(z) psi_k, without psi_k. k = 1, 2, 3 is its position in a list.
+
+    value, gradient, hessian: P, its gradient and its Hessian (xx, yy, zz, xy, xz, yz), all times
+        D^(-2k). The Hessian is None if it is 0.
+    """
 
     value: Real
     gradient: Vec3
@@ -89,12 +94,12 @@ class PolynomialTerm:
 
 @dataclass(frozen=True)
 class RadialSums:
-    """Sums over all dipoles with weights w_i = |m_i| and distances d_i, with Q_m at d_i; clusters
-    add bounds of the sums over their dipoles.
+    """Sums over all dipoles i, with weights w_i = |m_i| and distances d_i from x. A cluster adds
+    bounds of the sums over its dipoles.
 
-    sums: value, derivatives and bounds; s4 and s5 are the sums of w Q_3/d^4 and w Q_3/d^5, which
-        for Q_3 = 1 are those of `SourceSums`.
-    q2_d3, q2_d4: sums of w Q_2/d^3 and w Q_2/d^4.
+    sums: value, derivatives and bounds. Here s4 and s5 are the sums of w_i Q_3/d_i^4 and w_i
+        Q_3/d_i^5, with Q_3 at d_i; for Q_3 = 1 these are those of `SourceSums`.
+    q2_d3, q2_d4: the sums of w_i Q_2/d_i^3 and w_i Q_2/d_i^4, with Q_2 at d_i.
     """
 
     sums: SourceSums
@@ -109,7 +114,7 @@ class RadialSums:
 
     @classmethod
     def of(cls, parts: tuple[Any, ...]) -> RadialSums:
-        """The sums with these `parts`."""
+        """The sums with these `parts`, as the method `parts` returns them."""
         return cls(SourceSums.from_state(parts[0]), *parts[1:])
 
     def parts(self) -> tuple[Any, ...]:
@@ -119,8 +124,8 @@ class RadialSums:
     def plus(self, source: SourceAtPoint, rounding: Real, active: Mask) -> RadialSums:
         """The sums with a further dipole or cluster, where active.
 
-        rounding: the rounding of the term, as a fraction of w Q_2/d^2, which is at least its
-            absolute value. The rounding of positions adds 6 epsilon w Q_2/d^3;
+        rounding: a bound of the rounding of its term, as a fraction of w Q_2/d^2, which is at least
+            the term's absolute value. The rounding of positions adds 6 epsilon w Q_2/d^3;
             `SourceSums.add_term` counts the rounding of the sum.
         """
         tail, sums = source.tail, self.sums.add_term(source.terms, active)
@@ -131,7 +136,10 @@ class RadialSums:
         q2_d3, q2_d4, q3_d4, q3_d5, error, slope, second = (
             dr.select(active, bound, 0) for bound in (*bounds, *errors)
         )
-        nearest, old = fmin(tail.distance, sums.singularity_distance), sums.hessian_truncation
+        nearest, old_second = (
+            fmin(tail.distance, sums.singularity_distance),
+            sums.hessian_truncation,
+        )
         # Dr.Jit's epsilon is half the distance from 1 to the next number; the epsilon of the bounds
         # is the whole distance.
         shift = 6 * 2 * float(dr.epsilon(q2_d3))
@@ -139,7 +147,7 @@ class RadialSums:
             sums,
             truncation=sums.truncation + error,
             gradient_truncation=sums.gradient_truncation + slope,
-            hessian_truncation=None if old is None else old + second,
+            hessian_truncation=None if old_second is None else old_second + second,
             rounding=dr.fma(q2_d3, dr.fma(rounding, tail.distance, shift), sums.rounding),
             singularity_distance=dr.select(active, nearest, sums.singularity_distance),
             s4=sums.s4 + q3_d4,
@@ -147,32 +155,41 @@ class RadialSums:
         )
         return RadialSums(sums, self.q2_d3 + q2_d3, self.q2_d4 + q2_d4)
 
-    def remainder(self, fraction: float, r: Real, growth: Real) -> Real:
-        """A bound of |f(y) - f(x) - grad f.(y-x)|/|y-x|^2 for |y-x| <= r, with r at most `fraction`
-        times the distance to the nearest dipole; growth: the growth of the kernel for r.
+    def remainder(self, share: float, r: Real, growth: Real) -> Real:
+        """A bound of |f(y) - f(x) - grad f.(y-x)|/|y-x|^2 for |y-x| <= r.
 
-        Each term's second derivatives are at most |K^(3)| = 6 Q_3/(d_i-s)^4 at distance s from x,
-        and by Taylor the integral of (t-s) times that bounds the term's remainder, t = |y-x|. With
-        t/d_i = q it is at most growth Q_3 (3-2q)/(1-q)^2 t^2/d_i^4; (3-2q)/(1-q)^2 is convex, hence
-        below its chord on [0, share].
+        share: r must be at most `share` times the distance to the nearest dipole.
+        growth: the result of `RadialKernel.growth` for r.
+
+        Proof. At distance s from x, each term's second derivatives are at most |K^(3)| = 6
+        Q_3/(d_i-s)^4. By Taylor the integral of (t-s) times that, with t = |y-x|, bounds the term's
+        remainder. With q = t/d_i it is at most growth Q_3 (3-2q)/(1-q)^2 t^2/d_i^4. (3-2q)/(1-q)^2
+        is convex in q, and so at most its chord on [0, share].
         """
-        return (1 + SUM_MARGIN) * growth * self.sums.remainder(fraction, r)
+        return (1 + SUM_MARGIN) * growth * self.sums.remainder(share, r)
 
     def curvatures(
-        self, growth: Callable[[Real], Real], nearest: Real, size: Real
+        self, growth: Callable[[Real], Real], most: Real, size: Real
     ) -> tuple[TaylorRemainder, ...]:
-        """`remainder` as promises, in units of `size`; nearest: a lower bound of the distance to
-        the nearest dipole."""
-        radii = [(fraction, fraction * nearest) for fraction in _REACHES]
+        """The bounds of `remainder` as promises, for several radii.
+
+        growth: the function `RadialKernel.growth`.
+        most: a lower bound of the distance to the nearest dipole.
+        size: the length, in the user's unit, that is 1 in the coordinates of the sums.
+        """
+        radii = [(fraction, fraction * most) for fraction in _RADIUS_FRACTIONS]
         return tuple(
             TaylorRemainder(2 * self.remainder(fraction, r, growth(r)) / (size * size), r * size)
             for fraction, r in radii
         )
 
     def variation(self, r: Real, growth: Real) -> Real:
-        """A bound of |f(y) - f(x)| on B(x, r), with r at most `BALL_FRACTION` times the distance to
-        the nearest dipole. It is the integral of |K^(2)| = 2 Q_2/(d_i-s)^3, where 1/(1-q)^2 - 1 =
-        2q + ... is convex as well."""
+        """A bound of |f(y) - f(x)| on the ball B(x, r). r must be at most `BALL_FRACTION` times the
+        distance to the nearest dipole. growth: the result of `RadialKernel.growth` for r.
+
+        It is the integral of |K^(2)| = 2 Q_2/(d_i-s)^3 over s from 0 to r, where 1/(1-q)^2 - 1 = 2q
+        + ... is bounded by its chord: 1/(1-q)^2 - 1 - 2q over q^2 grows with q.
+        """
         chord = (1 / (1 - BALL_FRACTION) ** 2 - 1 - 2 * BALL_FRACTION) / BALL_FRACTION**2
         change = dr.fma(chord * r, self.q2_d4, 2 * self.q2_d3)
         return (1 + SUM_MARGIN) * growth * r * change
@@ -180,7 +197,11 @@ class RadialSums:
 
 @dataclass(frozen=True)
 class KernelBounds:
-    """Q_2 and Q_3 that hold at a distance and beyond, and powers of that distance."""
+    """Bounds Q_2 and Q_3 that hold at a distance and beyond, and powers of that distance.
+
+    distance, inverse, cube: the distance, one over it, and one over its cube.
+    second, third: Q_2 and Q_3.
+    """
 
     distance: Real
     inverse: Real
@@ -190,19 +211,23 @@ class KernelBounds:
 
     @classmethod
     def of(cls, distance: Real, inverse: Real, bounds: Sequence[Real]) -> KernelBounds:
-        """The bounds at a distance; bounds: Q_2, Q_3, ... there."""
+        """The bounds at a distance. inverse: one over the distance. bounds: Q_2, Q_3, ... there."""
         return cls(distance, inverse, inverse * inverse * inverse, bounds[0], bounds[1])
 
 
 def _type_of(vector: object) -> Any:
+    """The type of a vector, as a constructor of vectors."""
     return type(vector)
 
 
 def combine_terms(
     parts: Sequence[PolynomialTerm], z: Vec3, inverse: Real, radial: KernelValues, derivatives: int
 ) -> SourceTerm:
-    """The sum of terms at z, inverse = 1/D, with psi_0 to psi_(len(parts) + derivatives).
+    """The sum of the terms of a source at z.
 
+    parts: the terms for k = 1, 2, ...
+    inverse: 1/D.
+    radial: psi_0 to psi_(len(parts) + derivatives).
     derivatives: 0 for the value, 1 with the gradient, 2 with the Hessian.
 
     Powers of 1/D are spread over the factors, so that no factor overflows.
@@ -245,6 +270,7 @@ def combine_terms(
 class SourceAtPoint:
     """The terms of a dipole or a cluster at x, with bounds of its derivatives near x.
 
+    terms: value, gradient and Hessian.
     weight: the sum of the weights of all its dipoles.
     tail: bounds of the kernel at a lower bound of the distance to its nearest dipole.
     error, gradient_error, hessian_error: the truncation errors of a cluster.
@@ -261,7 +287,8 @@ class SourceAtPoint:
 def dipole_source(
     row: Sequence[Real], x: Vec3, kernel: RadialKernel, derivatives: int
 ) -> SourceAtPoint:
-    """A dipole at x, from eight numbers (position, moment, weight = |moment|, 0)."""
+    """A dipole at x. row: its record of eight numbers, position, moment, weight = |moment|, and
+    0."""
     vector = _type_of(x)
     z, m = vector(row[0], row[1], row[2]) - x, vector(row[3], row[4], row[5])
     squared = dr.squared_norm(z) + kernel.height_square
@@ -278,16 +305,19 @@ def dipole_source(
 
 
 def cluster_parts(c: Sequence[Real], z: Vec3, inverse: Real) -> list[PolynomialTerm]:
-    """The terms of a cluster with coefficients c (`radial_tree.coefficients`) and center x + z;
-    inverse = 1/D.
+    """The terms P_k of a cluster with the center x + z.
 
-    P_1 = c0.z + c3; P_2 = z.(A z + b); P_3 = C[z, z, z] with symmetric A, C.
+    c: its coefficients (`radial_tree.coefficients`).
+    inverse: 1/D.
+
+    P_1 = c0.z + c3; P_2 = z.(A z + b); P_3 = C[z, z, z] with symmetric A, C, where c0 is `c[0:3]`,
+    c3 is `c[3]`, and A, b and C are the following coefficients.
     """
     vector = _type_of(z)
     u2 = inverse * inverse
     u4 = u2 * u2
     u6 = u4 * u2
-    dipole, b = vector(c[0], c[1], c[2]), vector(c[10], c[11], c[12])
+    c0, b = vector(c[0], c[1], c[2]), vector(c[10], c[11], c[12])
     axx, ayy, azz, axy, axz, ayz = c[4:10]
     az = _times((axx, ayy, azz, axy, axz, ayz), z)
     xxx, yyy, zzz, xxy, xxz, xyy, yyz, xzz, yzz, xyz = c[13:23]
@@ -300,7 +330,7 @@ def cluster_parts(c: Sequence[Real], z: Vec3, inverse: Real) -> list[PolynomialT
     )  # fmt: skip
     czz = _times(cz, z)
     return [
-        PolynomialTerm((dr.dot(dipole, z) + c[3]) * u2, dipole * u2),
+        PolynomialTerm((dr.dot(c0, z) + c[3]) * u2, c0 * u2),
         PolynomialTerm(
             dr.dot(az + b, z) * u4,
             dr.fma(2, az, b) * u4,
@@ -311,7 +341,7 @@ def cluster_parts(c: Sequence[Real], z: Vec3, inverse: Real) -> list[PolynomialT
 
 
 def _times(matrix: Sequence[Real], z: Vec3) -> Vec3:
-    """A symmetric matrix (xx, yy, zz, xy, xz, yz) times z."""
+    """The product of z with a symmetric matrix (xx, yy, zz, xy, xz, yz)."""
     xx, yy, zz, xy, xz, yz = matrix
     return _type_of(z)(
         dr.fma(xx, z.x, dr.fma(xy, z.y, xz * z.z)),

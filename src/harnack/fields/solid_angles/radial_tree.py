@@ -1,29 +1,32 @@
-"""Sums of dipoles of a radial potential: direct sums, or sums with clusters of far dipoles by a
-tree.
+"""Sums of dipoles of a radial potential: direct sums, or sums by a tree with clusters of far
+dipoles.
 
-Expansion. Dipoles m_i at c + d_i, |d_i| <= R, at the point x = c - z, r = D of z: by Taylor in d_i
+Expansion. A cluster consists of dipoles m_i at c + d_i with |d_i| <= R. At the point x = c - z, at
+the distance r = D of z, Taylor's formula in d_i gives
 
     w = -sum_i m_i.grad K(z + d_i) = -(T1[D] + T2[D^2] + T3[D^3]/2) K(z) + (rest),
 
-T1 = sum m, T2 = sym sum m d, T3 = sym sum m d d. With psi_k as in `radial_kernel`, D K = -z psi_1,
+with T1 = sum m_i, T2 = sym sum m_i d_i, T3 = sym sum m_i d_i d_i, where in brackets D stands for
+the derivative and sym for the symmetric part. With psi_k as in `radial_kernel`, D K = -z psi_1,
 T2[D^2] K = T2[z,z] psi_2 - tr T2 psi_1, T3[D^3] K = 3 z.tr T3 psi_2 - T3[z,z,z] psi_3. K is not
-harmonic in three dimensions, so that traces count: 19 numbers instead of 15.
+harmonic in three dimensions, so that traces count: there are 19 numbers instead of 15.
 
 Truncation. The rest of Taylor's formula is an integral of the fourth derivative of K along the
-segment from c to c + d_i, which is at most 4! Q_4/(r - s |d_i|)^5. In that, Q_4 is at most its
-value at r - R; the integral of the other factor is the rest of the Taylor series of 1/(r - .)^2:
-with q = |d|/r
+segment from c to c + d_i. At the fraction s of the segment this derivative is at most 4!
+Q_4/(r - s |d_i|)^5. There Q_4 is at most its value at r - R. The integral of the other factor is
+the rest of the Taylor series of 1/(r - .)^2: with q = |d_i|/r
 
-    |rest| <= Q_4 |m| (1/(1-q)^2 - 1 - 2q - 3q^2)/r^2 = Q_4 |m| |d|^3 (4-3q)/((1-q)^2 r^5),
+    |rest| <= Q_4 |m_i| (1/(1-q)^2 - 1 - 2q - 3q^2)/r^2 = Q_4 |m_i| |d_i|^3 (4-3q)/((1-q)^2 r^5).
 
-for Q_4 = 1 attained by a dipole on the line to x that points along it. (4-3q)/(1-q)^2 grows with q,
-so that q = R/r gives a bound for all dipoles. For the gradient, likewise from 2/(r - .)^3,
+For Q_4 = 1 the bound is attained by a dipole on the line to x that points along it. (4-3q)/(1-q)^2
+grows with q, so that q = R/r gives a bound for all dipoles. For the gradient, likewise from
+2/(r - .)^3,
 
-    Q_5 |m| |d|^3 (20 - 30q + 12q^2)/((1-q)^3 r^6),
+    Q_5 |m_i| |d_i|^3 (20 - 30q + 12q^2)/((1-q)^3 r^6),
 
 and for second derivatives from 6/(r - .)^4,
 
-    Q_6 |m| |d|^3 (120 - 270q + 216q^2 - 60q^3)/((1-q)^4 r^7).
+    Q_6 |m_i| |d_i|^3 (120 - 270q + 216q^2 - 60q^3)/((1-q)^4 r^7).
 """
 
 from __future__ import annotations
@@ -63,34 +66,39 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
 
 
-# The number of dipoles in a trip of the direct sum, by experiment.
+# The number of dipoles that each pass through the loop of a direct sum adds, by experiment.
 _DIPOLES_PER_TRIP = 4
 
 
 class RadialSum(abc.ABC):
     """Dipoles on a backend, and sums over them.
 
-    rounding: the rounding of a dipole's term, as `RadialSums.plus` takes it.
+    kernel: the radial potential.
+    rounding: a bound of the rounding of a dipole's term, as `RadialSums.plus` takes it.
     """
 
     def __init__(self, backend: Backend, rows: FloatArray, kernel: RadialKernel) -> None:
+        """rows: (n, 8) the records of the dipoles, from `dipole_records`."""
         self.backend, self.kernel = backend, kernel
         self.rounding = dr.opaque(backend.Float, 12 * backend.machine_epsilon)
 
     def sums(self, x: Vec3, closer: Real, derivatives: int) -> RadialSums:
-        """Value, derivatives and bounds at x; the moments of clusters are used from `closer` times
-        the `accepting_distance` on. derivatives: as for `SourceSums.zero`."""
+        """Value, derivatives and bounds at x.
+
+        closer: the moments of clusters are used beyond `closer` times their `accepting_distance`.
+        derivatives: as for `SourceSums.zero`.
+        """
         return self.accumulate(RadialSums.zero(self.backend, derivatives), x, closer)
 
     @abc.abstractmethod
     def accumulate(self, sums: RadialSums, x: Vec3, closer: Real) -> RadialSums:
-        """The sums over other dipoles, with the terms of these dipoles at x added; `closer` as for
+        """The sums over other dipoles, with the terms of these dipoles at x added. closer: as for
         `sums`."""
 
     def _with_dipole(
         self, row: list[Real], x: Vec3, derivatives: int, state: tuple[Any, ...]
     ) -> tuple[Any, ...]:
-        """The state of the sums with a dipole added."""
+        """The state of the sums, with the dipole of a record added."""
         dipole = dipole_source(row, x, self.kernel, derivatives)
         return RadialSums.of(state).plus(dipole, self.rounding, True).parts()
 
@@ -103,34 +111,40 @@ class DirectSum(RadialSum):
         self._records = RecordTable.upload(backend, rows, empty_record(rows[0]), _DIPOLES_PER_TRIP)
 
     def accumulate(self, sums: RadialSums, x: Vec3, closer: Real) -> RadialSums:
+        """The sums with the terms of all dipoles added; `closer` has no effect."""
         del closer
         derivatives = sums.sums.derivatives
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+            """The state with the dipole of a record added."""
             return self._with_dipole(row, x, derivatives, state)
 
         return RadialSums.of(self._records.for_each(add, sums.parts(), "radial dipoles"))
 
 
 class RadialTreecode(RadialSum):
-    """The direct sum over near dipoles, and the moments of clusters of far dipoles, from the
-    kernel's `accepting_distance` on."""
+    """The sum by a tree: near dipoles are added one by one, far clusters by their moments. A
+    cluster is far beyond the kernel's `accepting_distance`."""
 
     def __init__(
         self, backend: Backend, dipoles: ClusteredDipoles, kernel: RadialKernel, accuracy: float
     ) -> None:
+        """accuracy: as for `RadialKernel.accepting_distance`."""
         super().__init__(backend, dipoles.rows, kernel)
         self._tree = dipoles.packed(backend, kernel, accuracy)
 
     def accumulate(self, sums: RadialSums, x: Vec3, closer: Real) -> RadialSums:
+        """The sums with the terms of near dipoles and far clusters added."""
         closer = fmax(self.backend.Float(closer), self.backend.Float(1))
         derivatives = sums.sums.derivatives
 
         def near(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
+            """The state with the dipole of a record added; it is in a leaf that is not far."""
             del active
             return self._with_dipole(row, x, derivatives, state)
 
         def far(node: ClusterView, state: tuple[Any, ...]) -> tuple[Any, ...]:
+            """The state with a cluster added, where it is far."""
             length = dr.sqrt(node.square)
             cluster = cluster_source(
                 node.head, node.payload, -node.r, length, self.kernel, derivatives
@@ -148,8 +162,12 @@ def cluster_source(
     head: Sequence[Real], c: Sequence[Real], z: Vec3, length: Real, kernel: RadialKernel,
     derivatives: int,
 ) -> SourceAtPoint:  # fmt: skip
-    """A node with the numbers of `node_records`, its center at z, D = length, with its truncation
-    errors."""
+    """A cluster at a point, with its truncation errors.
+
+    head, c: the numbers of `node_records`: the six numbers of the head, and the others.
+    z: the vector from the point to the cluster's center.
+    length: D, the distance of the center.
+    """
     radius, weight = head[4], head[5]
     inverse = dr.rcp(length)
     parts = cluster_parts(c, z, inverse)
@@ -163,18 +181,20 @@ def cluster_source(
     q = radius * inverse
     common = c[23] * inverse * inverse * inverse * inverse_nearest * inverse_nearest
     error = common * fourth * dr.fma(-3, q, 4)
-    slope = common * inverse_nearest * fifth * dr.fma(q, dr.fma(12, q, -30), 20)
+    gradient_error = common * inverse_nearest * fifth * dr.fma(q, dr.fma(12, q, -30), 20)
     polynomial = dr.fma(q, dr.fma(q, dr.fma(-60, q, 216), -270), 120)
-    second = common * inverse_nearest * inverse_nearest * sixth * polynomial
-    return SourceAtPoint(terms, weight, tail, error, slope, second)
+    hessian_error = common * inverse_nearest * inverse_nearest * sixth * polynomial
+    return SourceAtPoint(terms, weight, tail, error, gradient_error, hessian_error)
 
 
 @dataclass(frozen=True)
 class ClusteredDipoles:
-    """A tree over dipoles with its moments: all data of the sum that do not depend on the kernel.
+    """A tree over dipoles with its moments. These are all data of the sum that do not depend on the
+    kernel.
 
-    rows: the dipoles (n, 8), from `dipole_records`, which are the leaves of the tree.
-    levels: the moments of the nodes of each level.
+    rows: (n, 8) the records of the dipoles, from `dipole_records`.
+    tree: the hierarchy of the dipoles.
+    levels: the moments of the nodes of each level, from the leaves to the root.
     """
 
     rows: FloatArray
@@ -183,13 +203,13 @@ class ClusteredDipoles:
 
     @classmethod
     def of(cls, rows: FloatArray) -> ClusteredDipoles:
-        """A tree over the dipoles."""
+        """Build a tree over dipoles with these records."""
         tree = dipole_hierarchy(rows[:, :3])
         return cls(rows, tree, taylor_tree_moments(tree, rows))
 
     def packed(self, backend: Backend, kernel: RadialKernel, accuracy: float) -> PackedTree:
-        """The tree on a backend; the kernel decides from which distance on the moments of clusters
-        are used."""
+        """The tree on a backend. kernel, accuracy: they decide beyond which distance the moments of
+        a cluster are used (`RadialKernel.accepting_distance`)."""
         numbers = [
             node_records(level, kernel.accepting_distance(level.radius, accuracy))
             for level in self.levels
@@ -199,11 +219,13 @@ class ClusteredDipoles:
 
 @dataclass(frozen=True)
 class TaylorMoments:
-    """The nodes of a level.
+    """The moments of the k nodes at one level of a tree.
 
-    center: (k, 3).
-    radius, weight, third: (k,) each; third = sum w |d|^3.
-    t1, t2, t3: T1 (k, 3), T2 (k, 3, 3), T3 (k, 3, 3, 3), symmetric.
+    center: (k, 3) the mean position of the dipoles, by weight.
+    radius, weight: (k,) the largest |d|, and the sum of the weights w = |m|, with d the offset of a
+        dipole m from the center.
+    third: (k,) the sum of w |d|^3.
+    t1, t2, t3: T1 (k, 3), T2 (k, 3, 3), T3 (k, 3, 3, 3), symmetric, as defined in this module.
     """
 
     center: FloatArray
@@ -216,34 +238,37 @@ class TaylorMoments:
 
 
 def taylor_tree_moments(tree: BalancedTree, rows: FloatArray) -> list[TaylorMoments]:
-    """Moments of all levels, from the leaves to the root.
+    """Moments of all levels, from the leaves to the root. rows: the records of the dipoles.
 
-    T1, T2, T3 are translated from a child's center to its parent's, d -> d + s: T2 gains sym(T1 s)
-    and T3 sym(2 T2 s + T1 s s). Everything else is computed from the dipoles themselves.
+    T1, T2, T3 are moved from a child's center to its parent's, by replacing d with d + s: T2 gains
+    sym(T1 s), and T3 gains sym(2 T2 s + T1 s s). All other numbers are computed from the dipoles
+    themselves.
     """
     slots = records_in_slots(tree, rows)
     levels: list[TaylorMoments] = []
     for count, arity in zip(tree.counts, (0, *tree.arities), strict=True):
-        p, m, w = np.split(slots.reshape(count, -1, slots.shape[2])[..., :7], [3, 6], axis=2)
-        weight = w.sum(axis=(1, 2))
-        center = (w * p).sum(axis=1) / np.where(weight > 0, weight, 1)[:, None]
-        d = p - center[:, None]
-        length = np.where(w[..., 0] > 0, np.linalg.norm(d, axis=2), 0)
-        third = (w[..., 0] * length**3).sum(axis=1)
+        position, moment, weights = np.split(
+            slots.reshape(count, -1, slots.shape[2])[..., :7], [3, 6], axis=2
+        )
+        weight = weights.sum(axis=(1, 2))
+        center = (weights * position).sum(axis=1) / np.where(weight > 0, weight, 1)[:, None]
+        offset = position - center[:, None]
+        length = np.where(weights[..., 0] > 0, np.linalg.norm(offset, axis=2), 0)
+        third = (weights[..., 0] * length**3).sum(axis=1)
         if not levels:
-            d = np.where(w > 0, d, 0)
+            offset = np.where(weights > 0, offset, 0)
             moments = _symmetric(
-                m.sum(axis=1),
-                np.einsum("ksi,ksj->kij", m, d),
-                np.einsum("ksi,ksj,ksl->kijl", m, d, d),
+                moment.sum(axis=1),
+                np.einsum("ksi,ksj->kij", moment, offset),
+                np.einsum("ksi,ksj,ksl->kijl", moment, offset, offset),
             )
         else:
-            moments = _moved(levels[-1], center, arity)
+            moments = _moved_to_parents(levels[-1], center, arity)
         levels.append(TaylorMoments(center, length.max(axis=1), weight, third, *moments))
     return levels
 
 
-def _moved(
+def _moved_to_parents(
     children: TaylorMoments, center: FloatArray, arity: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """T1, T2, T3 of the parents of groups of `arity` children, about the parents' centers (k,
@@ -259,14 +284,15 @@ def _moved(
 def _symmetric(
     t1: FloatArray, t2: FloatArray, t3: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The symmetric parts of the three tensors."""
+    """The symmetric parts of the tensors (k, 3), (k, 3, 3) and (k, 3, 3, 3)."""
     orders = itertools.permutations((1, 2, 3))
     total = sum((t3.transpose(0, *order) for order in orders), start=np.zeros_like(t3))
     return t1, 0.5 * (t2 + t2.transpose(0, 2, 1)), total / 6
 
 
 def coefficients(level: TaylorMoments) -> FloatArray:
-    """(k, 23) numbers as `cluster_parts` reads them: T1; tr T2; -T2; -3/2 tr T3; T3/2."""
+    """The numbers (k, 23) of nodes as `cluster_parts` reads them: T1; tr T2; -T2; -3/2 tr T3;
+    T3/2."""
     t2, t3 = -level.t2, 0.5 * level.t3
     i, j = np.array([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]).T
     a, b, c = np.array(
@@ -279,7 +305,8 @@ def coefficients(level: TaylorMoments) -> FloatArray:
 
 
 def node_records(level: TaylorMoments, accept: FloatArray) -> FloatArray:
-    """(k, 30): center, accepting distance, radius, weight | coefficients, third."""
+    """Records (k, 30) of nodes: center, accepting distance, radius, weight; then coefficients and
+    third moment. accept: (k,) the accepting distances."""
     # The ball must contain all dipoles in spite of the rounding of center and radius.
     head = np.stack([accept, level.radius * (1 + 1e-5) + 1e-6, level.weight], axis=1)
     return np.concatenate([level.center, head, coefficients(level), level.third[:, None]], axis=1)

@@ -53,21 +53,21 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
 
 MAX_LENGTHS = 80.0
-"""Beyond this many screening lengths exponentials keep the value exp(-80) = 2e-35, near the end of
-the range of single precision: bounds are then too large, and values off by less than
-1e-33 area/(4 pi rho^2)."""
+"""At distances rho beyond this many screening lengths, exponentials are set to exp(-80) = 2e-35, as
+single precision holds hardly any smaller numbers. Bounds are then too large, and values off by less
+than 1e-33 area/(4 pi rho^2)."""
 
 # The factor that makes the harmonic ball smaller where the kernel falls fast.
 _BALL_SHRINKAGE = 0.1
 # The moments of a cluster are never used nearer than this many radii.
 _MIN_ACCEPTANCE = 1.5
-# For the default level: the number of pairs of a point and a dipole, and the largest and the
-# smallest number of points.
-_PAIRS, _MAX_PROBES, _MIN_PROBES = 8_000_000, 512, 24
+# For the default level w is computed at several points. These bound the number of pairs of a point
+# and a dipole, and the number of points, which has a largest and a smallest value.
+_MAX_LEVEL_PAIRS, _MAX_LEVEL_POINTS, _MIN_LEVEL_POINTS = 8_000_000, 512, 24
 
 
 class YukawaKernel(RadialKernel):
-    """exp(-kappa r)/r on a backend; kappa: one over the screening length.
+    """The kernel exp(-kappa r)/r on a backend, with kappa one over the screening length.
 
     Kernel. K(rho) = exp(-kappa rho)/rho is the Yukawa potential: Delta K = kappa^2 K away from 0.
     With psi_0 = K and psi_(k+1) = -psi_k'/rho one has psi_k = theta_k(kappa rho) exp(-kappa rho)/
@@ -79,10 +79,11 @@ class YukawaKernel(RadialKernel):
 
     Bound. |d^m K[u_1, ..., u_m]| <= |K^(m)(rho)| for unit vectors: a derivative of K along a line
     is no larger than along the line to its pole. Proof: d^m K is a symmetric form, so equal vectors
-    u are the worst (Banach 1938). Write s^m as sum_j b_mj P_j(s) in Legendre polynomials, b_mj >=
-    0; then (u.grad)^m = sum_j b_mj |grad|^(m-j) Y_j(grad) with j = m, m-2, ... and solid harmonics
-    Y_j about u. On K, |grad|^2 is kappa^2, and Y_j(grad) K = (-1)^j psi_j Y_j(z) =
-    (-1)^j rho^j psi_j P_j(cos) (Hobson 1892). Every coefficient has the sign (-1)^m, and
+    u are the worst (Banach 1938). Write s^m as sum_j b_mj P_j(s) in Legendre polynomials,
+    b_mj >= 0; then (u.grad)^m = sum_j b_mj |grad|^(m-j) Y_j(grad) with j = m, m-2, ... and solid
+    harmonics Y_j about u. Applied to K, |grad|^2 is kappa^2, and
+    Y_j(grad) K = (-1)^j psi_j Y_j(z) = (-1)^j rho^j psi_j P_j(cos) (Hobson 1892), with cos the
+    cosine of the angle between u and z. Every coefficient has the sign (-1)^m, and
     |P_j| <= 1 = P_j(1).
 
         |K^(m)(rho)| = m! Q_m(kappa rho)/rho^(m+1),   Q_m(t) = exp(-t) sum_(j<=m) t^j/j!,
@@ -92,14 +93,17 @@ class YukawaKernel(RadialKernel):
     """
 
     def __init__(self, backend: Backend, kappa: float) -> None:
+        """kappa: one over the screening length, in the unit of the distances."""
         self._number = kappa
         self.kappa = dr.opaque(backend.Float, kappa)
 
     def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
+        """psi_0 to psi_last at a distance, by the polynomials theta_k."""
         t = fmin(self.kappa * distance, MAX_LENGTHS)
         return KernelValues(dr.exp(-t) * inverse, thetas(t, last))
 
     def bounds(self, distance: Real, last: int) -> list[Real]:
+        """Q_2 to Q_last for t = kappa times the distance, by their sums of powers of t."""
         t = fmin(self.kappa * distance, MAX_LENGTHS)
         decay = dr.exp(-t)
         sum2 = dr.fma(t, dr.fma(t, 0.5, 1), 1)
@@ -119,7 +123,7 @@ class YukawaKernel(RadialKernel):
 
 
 def thetas(t: Real, last: int) -> list[Real]:
-    """theta_0(t), ..., theta_last(t)."""
+    """The numbers theta_0(t), ..., theta_last(t) of `YukawaKernel`."""
     square = t * t
     values: list[Real] = [1.0, 1 + t]
     for k in range(2, last + 1):
@@ -130,13 +134,16 @@ def thetas(t: Real, last: int) -> list[Real]:
 def screened_promises(
     radial: RadialSums, f: Real, gradient: Vec3, kernel: YukawaKernel, size: Real, epsilon: float
 ) -> tuple[tuple[TaylorRemainder, ...], HarmonicBall]:
-    """The promises of `ScreenedWindingNumber`: of second derivatives, and a ball, which proves
-    shorter steps.
+    """The promises of `ScreenedWindingNumber`: several of second derivatives; and a ball, which
+    proves shorter steps.
 
+    radial: the sums at the point.
     f, gradient: value and gradient at the point, in units of `size`.
+    size: the length, in the user's unit, that is 1 in the coordinates of the sums.
+    epsilon: the machine epsilon of the backend.
 
-    Radii stay below 36 screening lengths, so that exp(kappa r) times sums in which exponentials are
-    at least exp(-80) neither overflows nor grows.
+    Radii stay below 36 screening lengths. So exp(kappa r) times sums in which exponentials are at
+    least exp(-80) neither overflows nor grows.
     """
     sums, kappa = radial.sums, kernel.kappa
     nearest = fmax(sums.singularity_distance * (1 - SUM_MARGIN) - 8 * epsilon, 0)
@@ -157,12 +164,12 @@ def screened_promises(
 
 
 def accepting_distance(radius: FloatArray, kappa: float, accuracy: float) -> FloatArray:
-    """The distance r from which on the moments of a cluster are used: accuracy R Q_4(kappa
-    (r-R))^(1/5) <= r.
+    """For clusters of these radii R (k,), the distance r beyond which their moments are used: the
+    smallest r with accuracy R Q_4(kappa (r-R))^(1/5) <= r.
 
     For each unit of area, clusters of radius R on a surface cost 1/R^2 and have an error of R^3/r^5
-    Q_4; the sum of errors is smallest at a fixed cost if R is proportional to r Q_4^(-1/5).
-    Computed by bisection, from the safe side.
+    Q_4. The sum of errors is smallest at a fixed cost if R is proportional to r Q_4^(-1/5). r is
+    computed by bisection, and is never too small.
     """
     low, high = _MIN_ACCEPTANCE * radius, accuracy * radius
     for _ in range(40):
@@ -175,10 +182,10 @@ def accepting_distance(radius: FloatArray, kappa: float, accuracy: float) -> Flo
 
 
 def mean_at_dipoles(rows: FloatArray, kappa: float) -> float:
-    """The mean of w over the dipoles, or a sample of them, weighted, each without the dipoles at
-    its own position."""
+    """The mean, weighted by area, of w at the positions of the dipoles, or of some of them. Each
+    value is computed without the dipoles at its own position. rows: the records of the dipoles."""
     n = len(rows)
-    count = min(n, max(_MIN_PROBES, min(_MAX_PROBES, _PAIRS // n)))
+    count = min(n, max(_MIN_LEVEL_POINTS, min(_MAX_LEVEL_POINTS, _MAX_LEVEL_PAIRS // n)))
     probes = np.unique(np.linspace(0, n - 1, count).astype(np.int64))
     x, y, z, *moment = np.ascontiguousarray(rows[:, :6].T)
     values: list[float] = []
@@ -200,28 +207,32 @@ _MAX_SUMMED = 2000
 # The largest number of cells that are tested in one round for an extent.
 _MAX_CELLS = 4096
 _SMALLEST_LEVEL = 1e-20
-# Nearer to a dipole than `_ON_DIPOLE` roundings w may be any number up to `_ANY_LEVEL`.
+# A point nearer to a dipole than `_ON_DIPOLE` roundings counts as on it. There w may be any number
+# up to `_ANY_LEVEL`.
 _ON_DIPOLE, _ANY_LEVEL = 32, 1e5
 
 
 class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuffers"]):
     """w(x) = (1/4 pi) sum_i a_i n_i.(y_i - x) (1 + rho_i/l) exp(-rho_i/l)/rho_i^3, rho_i = |y_i-x|.
 
-    Minus the derivative of the Yukawa kernel exp(-rho/l)/rho along n_i at y_i; as l grows, the
-    winding number of the points (Barill et al. 2018). (Without the factor 1 + rho/l, as the kernel
-    is sometimes written, it would solve no screened equation.) Away from the points
+    Points y_i with unit normals n_i stand for areas a_i of a surface, and l is the screening
+    length. A term is minus the derivative of the Yukawa kernel exp(-rho/l)/rho along n_i at y_i. As
+    l grows, w becomes the winding number of the points (Barill et al. 2018). The kernel is
+    sometimes written without the factor 1 + rho/l; then w would solve no screened equation. Away
+    from the points
 
         Laplacian w = w/l^2:   w is not harmonic.
 
     Meaning. For dense samples of a closed surface with outward normals, w is 1 - u inside and
-    -u outside, where u, between 0 and 1, is the blurred indicator of the inside: u - l^2 Laplacian
-    u = 1 inside, 0 outside (Green's second identity). So w falls from 1 - u to -u at the surface
-    and decays like exp(-distance/l) on both sides: far points have no effect, holes wider than a
+    -u outside. Here u, between 0 and 1, is the blurred indicator of the inside: u - l^2 Laplacian u
+    is 1 inside and 0 outside (Green's second identity). So w falls from 1 - u to -u at the surface
+    and decays like exp(-distance/l) on both sides. Far points have no effect, holes wider than a
     few l stay open, and deep inside w is near 0 again. The level that lies on the surface is the
-    mean of the two limits: 1/2 for l much larger than the surface, 0 for l much smaller.
-    `default_level` is the mean of w over all points or a part of them, each without its own term,
-    weighted by area, as Kazhdan et al. 2006 choose theirs. l should be longer than the distance
-    between neighboring points: else the level sets are those of single dipoles.
+    mean of 1 - u and -u there: 1/2 for l much larger than the surface, 0 for l much smaller.
+    `default_level` is the mean of w, weighted by area, over all points or some of them, where the
+    value at a point leaves out its own term; Kazhdan et al. 2006 choose their level in this way. l
+    should be longer than the distance between neighboring points: else the level sets are those of
+    single dipoles.
 
     points, normals: (n, 3), normals of any length, to the outside.
     areas: (n,) the areas that the points stand for; None estimates them.
@@ -231,20 +242,21 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         is as small as that of an unscreened cluster at distance accuracy * R. The error is bounded
         and part of every promise. Tracing uses a higher accuracy where the tolerance needs it.
 
-    Promises (`screened_promises` has the formulas), for d_i the distances from x, d the smallest
-    of them:
+    Promises (`screened_promises` has the formulas). Let d_i be the distances of the points from x,
+    and d the smallest of them.
 
-    - Curvature. On B(x, r), r < d, each term's second derivatives are at most |K'''|(d_i - s) =
-      6 Q_3(kappa (d_i-s))/(d_i-s)^4 at distance s from x (`YukawaKernel`, kappa = 1/l). By
+    - `TaylorRemainder` bounds second derivatives. On the ball B(x, r) with r < d, each term's
+      second derivatives at distance s from x are at most
+      |K'''|(d_i - s) = 6 Q_3(kappa (d_i-s))/(d_i-s)^4, with `YukawaKernel` K and kappa = 1/l. By
       Taylor the integral of (t-s) times that bounds w(y) - w(x) - grad w.(y-x), t = |y-x|. With
-      Q_3(kappa (d_i-s)) <= exp(kappa r) Q_3(kappa d_i) and t/d_i = q it is at most
-      exp(kappa r) Q_3(kappa d_i) (3-2q)/(1-q)^2 t^2/d_i^4; (3-2q)/(1-q)^2 is convex, hence below
-      its chord on [0, r/d].
-    - HarmonicBall of dimension 4. w(y) cos(s/l) is harmonic in (y, s). For |y-x|^2 + s^2 < R^2 <
-      d^2 it is the product of a number in [w-S, w+S] and a number in [cos(min(R/l, pi)), 1], so it
-      lies between the smallest and the largest product of ends. S bounds the change of w on
-      B(x, R), by the integral of |K''|(d_i-s) = 2 Q_2/(d_i-s)^3, where 1/(1-q)^2 - 1 = 2q + ... is
-      bounded by its chord, too.
+      Q_3(kappa (d_i-s)) <= exp(kappa r) Q_3(kappa d_i) and q = t/d_i it is at most
+      exp(kappa r) Q_3(kappa d_i) (3-2q)/(1-q)^2 t^2/d_i^4. The function (3-2q)/(1-q)^2 is convex,
+      and so at most its chord on [0, r/d].
+    - `HarmonicBall` of dimension 4. w(y) cos(s/l) is harmonic in (y, s). For
+      |y-x|^2 + s^2 < R^2 < d^2 it is the product of a number in [w(x)-S, w(x)+S] and a number in
+      [cos(min(R/l, pi)), 1]. So it lies between the smallest and the largest product of the ends
+      of these intervals. S bounds the change of w on B(x, R), by the integral of
+      |K''|(d_i-s) = 2 Q_2/(d_i-s)^3, where 1/(1-q)^2 - 1 = 2q + ... is bounded by its chord, too.
 
     By default only the first promise is used: it took 14 to 30 evaluations per ray, and the second
     took 20 to 65 (spheres and tori of 270 to 2000 points, l from 0.03 to 100).
@@ -304,15 +316,19 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         method: MethodName = "auto",
         accuracy: float = 6.0,
     ) -> ScreenedWindingNumber:
-        """Dipoles at the centroids of triangles, each cut into 4 triangles `subdivide` times first.
+        """The field of dipoles at the centroids of the triangles of a mesh.
 
-        This is quadrature by the midpoint rule, not the integral over the triangles. At a distance
-        r > R, R the distance from the centroid to the farthest corner, a triangle of area a and
-        edges e contributes an error of at most a (e1^2+e2^2+e3^2)/36 (3-2q)/((1-q)^2 r^4)/(4 pi), q
-        = R/r (the first moment about the centroid vanishes; `radial_tree`, with one order less).
-        Nearer than about an edge's length the result is not that of the mesh at all: w is smooth
-        where a triangle would make it jump, and infinite at the centroids. Each subdivision divides
-        that range by 2 and the error beyond it by 4.
+        subdivide: how many times each triangle is cut into 4 triangles first.
+        length, method, accuracy: as for `ScreenedWindingNumber`.
+
+        This is quadrature by the midpoint rule, not the integral over the triangles. Let R be the
+        distance from the centroid to the farthest corner of a triangle of area a and edges of
+        lengths e1, e2, e3. At a distance r > R the triangle contributes an error of at most
+        a (e1^2+e2^2+e3^2)/36 (3-2q)/((1-q)^2 r^4)/(4 pi) with q = R/r. (The first moment about the
+        centroid vanishes; the proof is that of `radial_tree`, with one order less.) Nearer than
+        about an edge's length the result is not that of the mesh at all: w is smooth where a
+        triangle would make it jump, and infinite at the centroids. Each subdivision divides that
+        distance by 2, and the error beyond it by 4.
 
         Raises MeshError (a ValueError) as `validate_mesh`.
         """
@@ -333,6 +349,7 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         )
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
+        """Values and derivatives at points x: see `BatchedField.values_at`."""
         data = self._batch_data(backend_of(x))
         x = data.to_unit(x)
         sums, epsilon = data.dipoles.sums(x, closer, derivatives).sums, data.backend.machine_epsilon
@@ -350,11 +367,14 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
     def _cutoff_errors(
         self, data: _ScreenedBuffers, sums: SourceSums, unit: Real
     ) -> tuple[Real, Real, Real]:
-        """The additional errors of value, gradient and second derivatives by screening.
+        """The additional errors of value, gradient and second derivatives that screening causes.
 
-        Exponentials are at least exp(-80) = 2e-35 (`MAX_LENGTHS`), times at most Q_3(80) exp(80) =
-        9e4. Fourth derivatives of the kernel have Q_4(t) <= (1 + t/4) Q_3(t), and a coordinate is
-        off by `unit`.
+        sums: the sums at the points.
+        unit: the rounding of a coordinate.
+
+        Exponentials are at least exp(-80) = 2e-35 (`MAX_LENGTHS`), times at most Q_3(80)
+        exp(80) = 9e4. Fourth derivatives of the kernel have Q_4(t) <= (1 + t/4) Q_3(t), and a
+        coordinate is off by `unit`.
         """
         inverse = dr.rcp(sums.singularity_distance)
         value_error = 2e-30 * float(self._rows[:, 6].sum()) * inverse * inverse
@@ -363,6 +383,8 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         return value_error, 2 * value_error * inverse, hessian_error
 
     def _upload(self, backend: Backend, *, traced: bool) -> _ScreenedBuffers:
+        """The kernel and the dipoles on a backend. They are the same for tracing and for values at
+        points."""
         del traced
         kernel = YukawaKernel(backend, self._kappa)
         if self.method == "sum":
@@ -376,6 +398,7 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         )
 
     def _sample(self, on: _ScreenedBuffers, p: Vec3, detail: Real) -> Sample:
+        """The sample at p, from the data `on` of a backend, at the accuracy scale `detail`."""
         x = on.to_unit(p)
         screened, epsilon = on.dipoles.sums(x, detail, 1), on.backend.machine_epsilon
         sums, unit = screened.sums, coordinate_rounding(x)
@@ -400,36 +423,37 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         )
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
-        """Raises ValueError for a level too small for rounding. All other levels occur next to
-        every dipole."""
+        """Raises ValueError for a level that is too small to be told from 0 by its rounding. All
+        other levels are valid, as they occur next to every dipole."""
         for level in levels:
             if 0 < abs(level) < _SMALLEST_LEVEL:
                 raise ValueError(f"level {level:g} is too small to be told from 0")
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """A box proved to contain the level sets; None for level 0, which may be unbounded.
+        """A box proved to contain the level sets; None for level 0, whose surface may be unbounded.
 
-        At distance D from the points |w| <= sum_i w_i Q_1(D/l)/D^2, which falls with D: beyond the
-        D where that is the smallest |level| there is no level. Cells of that box that are proved
-        empty are removed (`tight_extent`).
+        At distance D from the points |w| <= sum_i w_i Q_1(D/l)/D^2, with w_i = a_i/(4 pi). This
+        falls with D, so there is no level beyond the D at which it is the smallest |level|. Cells
+        of that box that are proved empty are removed (`tight_extent`).
         """
         if levels not in self._extents:
             self._extents[levels] = self._extent(levels)
         return self._extents[levels]
 
     def _extent(self, levels: tuple[float, ...]) -> Volume | None:
+        """`extent`, computed anew."""
         min_level = min(abs(level) for level in levels)
         if min_level < _SMALLEST_LEVEL:
             return None
         total = float(self._rows[:, 6].sum())
         low, high = 0.0, math.sqrt(total / min_level) * 1.001 + 1e-6
         for _ in range(60):
-            reach = 0.5 * (low + high)
-            t = self._kappa * reach
-            inside = total * (1 + t) * math.exp(-t) > min_level * reach * reach
-            low, high = (reach, high) if inside else (low, reach)
-        reach = 1.001 * high * self._size
-        lower, upper = self.points.min(axis=0) - reach, self.points.max(axis=0) + reach
+            distance = 0.5 * (low + high)
+            t = self._kappa * distance
+            may_have_level = total * (1 + t) * math.exp(-t) > min_level * distance * distance
+            low, high = (distance, high) if may_have_level else (low, distance)
+        distance = 1.001 * high * self._size
+        lower, upper = self.points.min(axis=0) - distance, self.points.max(axis=0) + distance
         return tight_extent(self, levels, lower, upper, _MAX_CELLS)
 
     def describe(self) -> dict[str, Any]:

@@ -27,25 +27,26 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Real, Vec3
     from harnack.tree import BalancedTree
 
-# Bounds of the kernel at a distance hold from this fraction of it on: promises hold up to 0.45 of
-# the distance (`radial_kernel._REACHES`).
+# Bounds of the kernel for a distance hold at all distances of at least this fraction of it, because
+# promises hold on balls of up to 0.45 of the distance (`radial_kernel`).
 _BOUND_FRACTION = 0.55
 
 
 class SmoothedKernel(RadialKernel):
-    """1/D + h^2/(2 D^3) on a backend, D = sqrt(rho^2 + h^2); h: the smoothing length.
+    """The kernel K = 1/D + h^2/(2 D^3) on a backend, with D = sqrt(rho^2 + h^2) and the smoothing
+    length h.
 
-    Kernel. The first two terms of 1/rho = (D^2 - h^2)^(-1/2) in powers of h^2. With psi_0 = K and
-    psi_(k+1) = -psi_k'/rho
+    Kernel. K consists of the first two terms of 1/rho = (D^2 - h^2)^(-1/2) in powers of h^2. With
+    psi_0 = K and psi_(k+1) = -psi_k'/rho
 
         psi_k = (2k-1)!! (1 + (2k+1) q/2)/D^(2k+1),   q = h^2/D^2,
 
     sums of positive terms; a dipole m at y = x + z gives -m.grad_y K = m.z (rho^2 + 5 h^2/2)/D^5.
-    Since Laplacian D^p = p D^(p-2) (p + 1 - (p-2) q) in three dimensions, -Laplacian K/(4 pi) =
-    15 h^4/(8 pi D^7): positive, with integral 1 and second moment 3 h^2/2. So a sum over dipoles
-    is the sum over plain dipoles averaged with this weight. (1/D by itself has the weight
-    3 h^2/(4 pi D^5), whose second moment is infinite: at equal noise its surfaces were farther
-    off.)
+    Since Laplacian D^p = p D^(p-2) (p + 1 - (p-2) q) in three dimensions,
+    -Laplacian K/(4 pi) = 15 h^4/(8 pi D^7). This is positive, with integral 1 and second moment
+    3 h^2/2. So a sum over these dipoles is the sum over plain dipoles, averaged with this weight.
+    (The kernel 1/D has the weight 3 h^2/(4 pi D^5), which has an infinite second moment: at equal
+    noise its surfaces were farther off.)
 
     Bound. |d^m K[u_1, ..., u_m]| <= m! Q_m/D^(m+1), Q_m = 1 + q (m+1)(m+2)/4, for unit vectors.
     Proof. Equal vectors u are the worst (Banach 1938). D is the length of Z = (z, h), and along a
@@ -57,9 +58,11 @@ class SmoothedKernel(RadialKernel):
     """
 
     def __init__(self, backend: Backend, height: float) -> None:
+        """height: the smoothing length h."""
         self.height_square = dr.opaque(backend.Float, height * height)
 
     def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
+        """psi_0 to psi_last, by the closed form above: `factor` is (2k-1)!!, `half` is q/2."""
         del distance
         half = 0.5 * self.height_square * inverse * inverse
         thetas: list[Real] = []
@@ -70,6 +73,7 @@ class SmoothedKernel(RadialKernel):
         return KernelValues(inverse, thetas)
 
     def bounds(self, distance: Real, last: int) -> list[Real]:
+        """Q_2 to Q_last, for all distances of at least `_BOUND_FRACTION` times `distance`."""
         ratio = dr.sqrt(self.height_square) / (_BOUND_FRACTION * fmax(distance, 1e-30))
         q = fmin(ratio * ratio, 1)
         return [dr.fma(0.25 * (m + 1) * (m + 2), q, 1) for m in range(2, last + 1)]
@@ -84,8 +88,11 @@ class SmoothedKernel(RadialKernel):
 
 @dataclass(frozen=True)
 class SmoothedSum:
-    """The sum of m_i.z_i (rho_i^2 + 5 h^2/2)/(rho_i^2 + h^2)^(5/2) over dipoles i, z_i = y_i - x,
-    rho_i = |z_i|."""
+    """The sum of m_i.z_i (rho_i^2 + 5 h^2/2)/(rho_i^2 + h^2)^(5/2) over dipoles m_i at y_i, with
+    z_i = y_i - x and rho_i = |z_i|.
+
+    dipoles: the sum by a tree.
+    """
 
     dipoles: RadialTreecode
 
@@ -95,28 +102,30 @@ class SmoothedSum:
     ) -> SmoothedSum:
         """The sum over dipoles.
 
+        tree: the result of `dipole_hierarchy` for their points, or for the same points at earlier
+            positions.
         rows: (n, 8), from `dipole_records`.
-        tree: `dipole_hierarchy` of their points, or of the same points at earlier positions.
         height: the smoothing length, in the units of the dipoles.
+        accuracy: the moments of a node are used beyond this many times its radius.
         """
         clustered = ClusteredDipoles(rows, tree, taylor_tree_moments(tree, rows))
         return cls(RadialTreecode(backend, clustered, SmoothedKernel(backend, height), accuracy))
 
     @property
     def coarsest_accuracy(self) -> float:
-        """The accuracy scale of coarse samples (`Field.coarsest_accuracy`): there are no coarse
-        samples."""
+        """The accuracy scale of coarse samples (`Field.coarsest_accuracy`). It is 1, as there are
+        no coarse samples."""
         return 1.0
 
     def values(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:
-        """Value and derivatives up to order `derivatives` at x; closer: the accuracy scale, at
+        """Value and derivatives up to order `derivatives` at x. closer: the accuracy scale, at
         least 1."""
         sums = self.dipoles.sums(x, closer, derivatives).sums
         rounding = 8 * self.dipoles.backend.machine_epsilon * dr.abs(sums.value)
         return sums.values(1.0, coordinate_rounding(x), rounding)
 
     def sample(self, x: Vec3, detail: Real) -> Sample:
-        """Value, gradient and promises at x."""
+        """Value, gradient and promises at x. detail: the accuracy scale."""
         radial = self.dipoles.sums(x, detail, 1)
         sums = radial.sums
         slope_error = dr.fma(

@@ -72,13 +72,13 @@ _PERIOD = 4 * math.pi
 _LEVEL_MARGIN = 1e-9 * _PERIOD
 # The largest number of pairs of a cell and a vertex in one round for an extent.
 _MAX_PAIRS = 3_000_000
-# Sides of the polygons that stand for circles where a boundary is drawn.
-_SIDES = 256
-# Cells pay if the number of rays times the number of edges is at least `_PAYS`, and there are at
-# least `_LEAST_RAYS` rays and `_MIN_EDGES` edges. To trace these takes five times as long as to
-# build the cells of a knot; the cells of a tangle of a thousand edges take ten times as long as
-# those of a knot.
-_PAYS, _LEAST_RAYS, _MIN_EDGES = 2.5e8, 1e6, 48
+# The number of sides of the polygons by which circles are drawn where a boundary is drawn.
+_CIRCLE_SIDES = 256
+# Cells pay if the number of rays times the number of edges is at least `_MIN_WORK`, and there are
+# at least `_MIN_RAYS` rays and `_MIN_EDGES` edges. To trace these rays takes five times as long as
+# to build the cells of a knot. The cells of a tangle of a thousand edges take ten times as long to
+# build as those of a knot.
+_MIN_WORK, _MIN_RAYS, _MIN_EDGES = 2.5e8, 1e6, 48
 # The largest number of planes of the extent of a curve in convex position with cells, by
 # experiment: with hundreds, clipping rays takes longer than the march.
 _MAX_PLANES = 48
@@ -97,34 +97,35 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
     is 0 everywhere, every ray a proved miss, and levels that are multiples of 4 pi are refused.
 
     Promises. Second derivatives are bounded near every curve (`curve_queries.remainder_promises`),
-    and steps rest on that. The other proofs, chosen by `enclosures`, need the range of the lift on
-    a
-    ball: on wavy polygons and knots they take 1.4 to 2 times as many evaluations.
+    and steps are proved by that bound. The other proofs, chosen by `enclosures`, need the range of
+    the lift on a ball. On wavy polygons and knots they take 1.4 to 2 times as many evaluations.
 
-    lift_bound: the bound of the lift on a ball. "auto" chooses "planar" if its hypothesis is
-    checked to hold, "convex" if that hypothesis holds, else "edges"; if loops are Dr.Jit arrays it
-    chooses "edges" in any case, so that curves that are moved step by step do not change kernels.
+    lift_bound: how the range of the lift on a ball is bounded. "auto" chooses "planar" if the
+    hypothesis of that bound is checked to hold, else "convex" if its hypothesis holds, else
+    "edges". If loops are Dr.Jit arrays it always chooses "edges", so that curves that are moved
+    step by step do not change kernels.
 
     - "edges" holds for **every** curve: |grad f| and the bound of second derivatives bound the
       change of f (`lift_ball`).
-    - "planar": on B(x, d), d the distance to the curve, the lift stays in a range 4 pi wide if all
-      loops together bound a region of a plane (`planar`); else, for circles only, in the sum of
-      one such range for each circle.
+    - "planar": let d be the distance from x to the curve. On the ball B(x, d) the lift stays in a
+      range 4 pi wide if all loops together bound a region of a plane (`planar`). If the curves are
+      circles only, it stays in the sum of one such range for each circle.
     - "convex": on B(x, d) the lift stays in (-6 pi, 6 pi) if the curve is one loop without
-      self-intersections on the boundary of a convex set: a segment crosses the 2 pi level, where
-      the principal value in (-2 pi, 2 pi) jumps by 4 pi, at most once net (paper, Theorem C.1).
-    - "paper" assumes that range for any curve and promises nothing else, as the paper does. It is
-      false for coils and links and exists for comparisons: hits can be missed.
+      self-intersections on the boundary of a convex set. For the principal value in (-2 pi, 2 pi)
+      jumps by 4 pi at the 2 pi level, and a segment crosses this level at most once net (paper,
+      Theorem C.1).
+    - "paper" assumes that range for any curve and promises nothing else, as the paper does. This is
+      false for coils and links, so that hits can be missed. It exists for comparisons.
 
-    cells: for many rays and curves of many vertices: FMM cells, in which near edges are summed
-    directly and all others are one polynomial, with a proved remainder, so that an evaluation for
-    tracing costs about the same whatever the number of edges; where the remainder decides, all
-    edges are summed. None builds them where they pay (`for_ray_count`), True always, False never.
-    They take some 2 to 10 MB, at most the number of megabytes of this argument (True: 256); if that
-    is too small, there are no cells, and `describe` of a prepared field reports this. Building
-    takes as long as tracing some 200,000 to 600,000 camera rays without cells, for each precision,
-    at the first trace. Circles have no cells. Values and derivatives at points are those of all
-    edges.
+    cells: whether to build FMM cells, for many rays and curves of many vertices. In a cell, near
+    edges are summed directly, and all others are one polynomial with a proved remainder. So an
+    evaluation for tracing costs about the same whatever the number of edges. Where the result
+    depends on the remainder, all edges are summed. None builds cells where they pay
+    (`for_ray_count`), True always, False never. They take some 2 to 10 MB, at most the number of
+    megabytes of this argument (True: 256). If that is too small, there are no cells, and `describe`
+    of a prepared field reports this. They are built at the first trace, for each precision, which
+    takes as long as tracing some 200,000 to 600,000 camera rays without cells. Circles have no
+    cells. Values and derivatives at points are those of all edges.
 
     Raises CurveError for loops that are not closed curves, ValueError for "convex" if the
     hypothesis fails, and for cells if a loop is a Dr.Jit array, as its vertices may move.
@@ -172,22 +173,24 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
 
     @property
     def loops(self) -> Loops:
-        """The loops of vertices, as in the argument. They cannot be set, as all other data are
+        """The loops of vertices, as in the argument. They cannot be set, because all other data are
         computed from them once: another curve is another field."""
         return self._loops
 
     @property
     def _all_cancel(self) -> bool:
-        """Whether all edges and circles cancel."""
+        """Whether all edges and circles cancel each other."""
         return not self._net_loops and not self._net_circles
 
     @property
     def boundary_curves(self) -> tuple[FloatArray, ...]:
-        return (*self._net_loops, *(circle.polygon(_SIDES) for circle in self._net_circles))
+        """The curves as polygons, without edges that cancel each other."""
+        return (*self._net_loops, *(circle.polygon(_CIRCLE_SIDES) for circle in self._net_circles))
 
     def _points_around(self) -> FloatArray:
-        """Points (n, 3) whose convex hull contains the curves: vertices, and polygons around
-        circles. If all curves cancel, the points of the curves of the arguments."""
+        """Points (n, 3) whose convex hull contains the curves: vertices, and corners of polygons
+        around circles. If all curves cancel each other, the points of the curves of the
+        arguments."""
         loops, circles = self._net_loops, self._net_circles
         if self._all_cancel:
             loops, circles = self.loops, self.circles
@@ -196,7 +199,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         )
 
     def _choose(self, option: LiftBoundName) -> Literal["edges", "planar", "range"]:
-        """The bound of the lift for an option. Raises ValueError if its hypothesis fails."""
+        """The kind of bound that the option `lift_bound` stands for. Raises ValueError if the
+        hypothesis of the option fails."""
         if option == "auto":
             if self._differentiable_loops:
                 return "edges"
@@ -224,6 +228,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return "edges" if option == "edges" else "range"
 
     def _upload(self, backend: Backend, *, traced: bool) -> _CurveData:
+        """The data on a backend. traced: whether they are for tracing, which may use cells, or for
+        values at points."""
         # Centered and scaled to unit size: products of eight lengths stay far from overflow. The
         # backend's precision holds the center exactly, so that subtracting it near the curve is
         # exact.
@@ -266,8 +272,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         )
 
     def _box(self, center: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The corners of a box that contains the curve and the default level, in unit
-        coordinates."""
+        """The corners of a box that contains the curve and the surface of the default level, in
+        unit coordinates. center: (3,) the center of these coordinates."""
         volume = self.extent((self.default_level,))
         corners = [] if volume is None else [np.stack(volume.bounds())]
         points = np.concatenate([*self._net_loops, *corners]) - center
@@ -281,7 +287,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return SolidAngle([*self.loops, *self.circles], lift_bound=self.lift_bound_option)
 
     def _data_for(self, p: Vec3) -> _CurveData:
-        """The data on the device; without cells if `prepare` was not called."""
+        """The data on the device. If `prepare` was not called, data without cells for the backend
+        of p."""
         if self._device is None:
             return self._upload(backend_of(p), traced=False)
         return self._device
@@ -289,6 +296,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
     def _evaluate_points(
         self, points: Any, precision: Precision | None, choose: Callable[[Sample], Any]
     ) -> npt.NDArray[Any]:
+        """As `Field._evaluate_points`, by a field without cells, because values at points are those
+        of all edges."""
         if self.has_variable_accuracy:
             return self._without_cells._evaluate_points(points, precision, choose)
         return super()._evaluate_points(points, precision, choose)
@@ -305,15 +314,16 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return self._sample(p, None)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The sample with promises along the ray, which prove long steps if the ray runs along an
-        edge."""
+        """The sample at the position t on a ray, with promises along the ray. These prove long
+        steps if the ray runs along an edge."""
         del ahead, back
         has_line_promises = not self._all_cancel and self.lift_bound_option != "paper"
         direction = path.direction if has_line_promises else None
         return path.enclose(self._sample(path.point(t), direction))
 
     def _sample(self, p: Vec3, direction: Vec3 | None) -> Sample:
-        """The sample at p; with promises along a unit direction, unless it is None."""
+        """The sample at points p. direction: a unit vector (3,), along which the sample gets
+        further promises; None for none."""
         data = self._data_for(p)
         if self._all_cancel:
             return self._zero_sample(data, p)
@@ -350,7 +360,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
             gradient_error = gradient_error + slope
         gradient_error = dr.select(on_curve, 0, gradient_error)
         error = dr.select(on_curve, 8 * _PERIOD, error)  # the steep gradient times 2 rounding
-        ray_promises = _along_curves(data, x, sums, errors, direction)
+        ray_promises = _ray_promises(data, x, sums, errors, direction)
         if self.lift_bound_option == "paper":
             promises = (ball,)
         value = dr.select(on_curve, 0, sums.angle)
@@ -369,7 +379,13 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
     def _planar_ball(
         self, data: _CurveData, x: Vec3, sums: CurveSums, distance: Real, error: Real
     ) -> HarmonicBall:
-        """The ball of `lift_bound="planar"`: of the region of a plane, or of circles."""
+        """The ball for `lift_bound="planar"`: that of the region of a plane, or of circles.
+
+        x: the points in unit coordinates.
+        sums: the sums at x.
+        distance: a lower bound of the distance to the curve.
+        error: a bound of the truncation error of the angle.
+        """
         if self._region is None:
             circles = sums.circles
             assert circles is not None
@@ -378,8 +394,9 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return self._region.lift_range(sums.angle, data.height(x), distance, slack, error)
 
     def _zero_sample(self, data: _CurveData, p: Vec3) -> Sample:
-        """The sample of f = 0, if all edges cancel: it holds on any ball. The range has a positive
-        width, as bounds divide by it; it contains no level (`validate_levels`)."""
+        """The sample of f = 0, for curves whose edges all cancel each other. It holds on any ball.
+        Its range has a positive width, because bounds divide by the width; it contains no level
+        (`validate_levels`)."""
         x = data.to_unit(p)
         radius = 1e6 * (1 + dr.norm(x)) * data.size
         zero = dr.zeros(data.backend.Float, dr.width(p))
@@ -387,8 +404,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return Sample(zero, data.backend.Array3f(zero), (ball,))
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """Rows of the Hessian, whose trace is 0 up to rounding. It grows without limit at the
-        curve."""
+        """Rows of the Hessian at p. Its trace is 0 up to rounding. The Hessian grows without limit
+        at the curve."""
         data = self._data_for(p)
         if self._all_cancel:
             zero = dr.zeros(data.backend.Array3f, dr.width(p))
@@ -407,9 +424,10 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return first, second, third
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """Bounds of the effect of the rounding of positions, as for sums over boundary edges
-        (`source_sums.SLOPE_ROUNDINGS`), with distances reduced by their rounding. Infinite at the
-        curve."""
+        """Bounds of the errors of the gradient and of second derivatives at p, by the rounding of
+        positions. They are computed as for sums over boundary edges
+        (`source_sums.SLOPE_ROUNDINGS`), with distances reduced by their rounding. They are infinite
+        at the curve."""
         del sample
         data = self._data_for(p)
         if self._all_cancel:
@@ -424,7 +442,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return slope, second / (data.size * data.size)
 
     def gradient_change_bound(self, p: Vec3, radius: Real) -> Real:
-        """See `curve_queries.gradient_change_bound`; the rounding of positions is included."""
+        """The bound of `curve_queries.gradient_change_bound`, with the rounding of positions
+        included."""
         data = self._data_for(p)
         if self._all_cancel:
             return 0 * p.x
@@ -434,7 +453,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return gradient_change_bound(sums.cubes, sums.fourths, distance, unit_radius) / data.size
 
     def closest_boundary_point(self, p: Vec3) -> Vec3 | None:
-        """The closest point of the curve, without edges that cancel (`remaining_edges`)."""
+        """The closest point of the curve, without edges that cancel each other (`remaining_edges`);
+        None if no edge is left."""
         if self._all_cancel:
             return None
         data = self._data_for(p)
@@ -454,6 +474,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return tuple(loop for loop in self._differentiable_loops if _is_drjit(loop))
 
     def differentiable_value(self, p: Vec3) -> Real:
+        """f at p as an expression that Dr.Jit can differentiate by p and by the vertices of
+        loops."""
         backend = backend_of(p)
         # If vertices can move one by one, all edges are summed: after a move they may not cancel.
         loops = self._differentiable_loops or self._net_loops
@@ -477,11 +499,14 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         edges = data.edges
 
         def changes(start: Vec3, end: Vec3) -> tuple[Real]:
+            """The change of the solid angle from start to end, in user coordinates."""
             return (continuous_change(edges, data.to_unit(start), data.to_unit(end)),)
 
         return map_batches(backend, changes, p, q)[0]
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
+        """Raise ValueError for a level that is a multiple of 4 pi, if all edges cancel each
+        other."""
         for level in levels:
             if self._all_cancel and abs(math.remainder(float(level), _PERIOD)) < _LEVEL_MARGIN:
                 raise ValueError(
@@ -494,19 +519,21 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         """A volume that contains the level sets.
 
         The 2 pi level of a curve in convex position lies in its convex hull (paper, Theorem B.1).
-        For any curves of total length L: at x, at distance rho from all of them, a loop has angular
-        length at most L_i/rho =: t_i; a closed spherical curve of length t < 2 pi, cut into simple
-        loops, bounds |area| <= 2 pi - sqrt(4 pi^2 - t^2) =: phi(t) (isoperimetry on the sphere; phi
-        is convex with phi(0) = 0, so the pieces add up to at most phi of the whole). So |Omega| < l
-        wherever L/rho < sqrt(l (4 pi - l)): a level at distance l from the multiples of 4 pi lies
-        within rho = L/sqrt(l (4 pi - l)) of the curves. Cells of that box that are proved to
-        contain no level are then cut away (`tight_extent`).
+        For any curves of total length L, let x be at the distance rho from all of them. Seen from
+        x, loop i of length L_i has an angular length t_i of at most L_i/rho. A closed spherical
+        curve of length t < 2 pi, cut into simple loops, bounds |area| <= 2 pi - sqrt(4 pi^2 - t^2)
+        =: phi(t), by isoperimetry on the sphere. phi is convex with phi(0) = 0, so the pieces add
+        up to at most phi of the whole. So |Omega| < l wherever L/rho < sqrt(l (4 pi - l)). It
+        follows that a level at distance l from the multiples of 4 pi lies within
+        rho = L/sqrt(l (4 pi - l)) of the curves. Cells of the box with this margin that are proved
+        to contain no level are then cut away (`tight_extent`).
         """
         if levels not in self._extents:
             self._extents[levels] = self._extent(levels)
         return self._extents[levels]
 
     def _extent(self, levels: tuple[float, ...]) -> Volume | None:
+        """`extent`, computed anew."""
         points = self._points_around()
         gaps = [abs(math.remainder(float(level), _PERIOD)) for level in levels]
         nearest = min(gaps)
@@ -516,19 +543,19 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
             return ConvexHull.from_points(points)  # there is no surface: any volume is right
         # Curves whose vertices may move share kernels: their extent is always computed the same
         # way.
-        in_hull = self.convex_position and nearest > 2 * math.pi * (1 - 1e-9)
+        is_in_hull = self.convex_position and nearest > 2 * math.pi * (1 - 1e-9)
         if (
-            in_hull and self.has_variable_accuracy
+            is_in_hull and self.has_variable_accuracy
         ):  # some half-spaces of the hull: all of it lies in them
             hull = ConvexHull.from_points(points).padded(1e-4 * self._size)
             planes = slice(_MAX_PLANES)
             return ConvexHull(hull.normals[planes], hull.offsets[planes], hull.lower, hull.upper)
-        if in_hull and not self._differentiable_loops:
+        if is_in_hull and not self._differentiable_loops:
             return ConvexHull.from_points(points).padded(1e-4 * self._size)
         length = sum(circle.length for circle in self._net_circles)
         length += total_length(self._net_loops) if self._net_loops else 0.0
-        reach = 1.0001 * length / math.sqrt(nearest * (_PERIOD - nearest))
-        lower, upper = points.min(axis=0) - reach, points.max(axis=0) + reach
+        margin = 1.0001 * length / math.sqrt(nearest * (_PERIOD - nearest))
+        lower, upper = points.min(axis=0) - margin, points.max(axis=0) + margin
         loops = [*self._net_loops, *self._net_circles]
         proved = self._without_cells if self.lift_bound_option != "paper" else SolidAngle(loops)
         vertices = sum(map(len, self._net_loops)) + 3 * len(self._net_circles)
@@ -540,10 +567,12 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return field
 
     def cells_pay_from(self) -> float:
+        """The smallest number of rays for which cells pay; infinite if they never pay, or if there
+        can be no cells."""
         edges = sum(map(len, self._net_loops))
         is_fixed = not self._differentiable_loops and self.lift_bound_option != "paper"
         never_pays = not is_fixed or edges < _MIN_EDGES
-        return math.inf if never_pays else max(_LEAST_RAYS, _PAYS / edges)
+        return math.inf if never_pays else max(_MIN_RAYS, _MIN_WORK / edges)
 
     def describe(self) -> dict[str, Any]:
         return {
@@ -561,12 +590,15 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
 class _CurveData(UnitFrame):
     """The data of curves on a backend.
 
-    edges, circles: None if there are no edges or no circles.
-    plane: normal (x, y, z) and offset of the `PlanarRegion`; None without a region.
-    rounding: the rounding of a point's position, in units of the curve. Near the curve p - center
-        is exact, division and the curve's own coordinates have a few roundings of size 1, and p
-        itself was rounded once, at the curve's distance from 0.
-    value_rounding: the rounding of the angle, by the number of its edges (`LoopEdges.rounding`).
+    edges, circles: the edges and the circles; None if there are none.
+    plane: normal (x, y, z) and offset of the `PlanarRegion`, in unit coordinates; None without a
+        region.
+    rounding: a bound of the rounding of a point's position, in units of the curve. Near the curve
+        p - center is exact, division and the curve's own coordinates have a few roundings of
+        size 1, and p itself was rounded once, at the curve's distance from 0.
+    value_rounding: a bound of the rounding of the angle, which depends on the number of edges
+        (`LoopEdges.rounding`).
+    cells: the FMM cells; None for none.
     """
 
     edges: LoopEdges | None
@@ -577,8 +609,8 @@ class _CurveData(UnitFrame):
     cells: CurveCells | None = None
 
     def at_detail(self, x: Vec3, detail: Real) -> tuple[CurveSums, CellErrors]:
-        """All sums at x, with their errors; by the cells if there are cells and the detail is at
-        most 1."""
+        """All sums at x, and their errors. They come from the cells where there are cells, x is in
+        one of them, and the accuracy scale `detail` is at most 1; elsewhere from all edges."""
         if self.cells is None or self.edges is None:
             return self.sums(x), CellErrors(0.0, 0.0, self.value_rounding)
         cell_sums, in_cells = self.cells.sums(x, detail <= 1)
@@ -600,7 +632,11 @@ class _CurveData(UnitFrame):
     def edge_rates(
         self, left_out: CellErrors, line: RayLine, lengths: tuple[Real, ...], active: Mask
     ) -> tuple[Real, ...]:
-        """`line_rates` of the edges, by the cells on the lanes whose sums are from the cells."""
+        """`line_rates` of the edges. On lanes whose sums come from the cells, these come from the
+        cells, too.
+
+        left_out: the errors of the sums at the line's x, as `at_detail` gave them.
+        """
         assert self.edges is not None
         if self.cells is None or left_out.cell is None:
             return line_rates(self.edges, line, lengths, active)
@@ -612,12 +648,12 @@ class _CurveData(UnitFrame):
         )
 
     def height(self, x: Vec3) -> Real:
-        """The height of x over the plane."""
+        """The height of x above the plane, in unit coordinates."""
         assert self.plane is not None
         return dr.dot(self.backend.Array3f(*self.plane[:3]), x) - self.plane[3]
 
     def sums(self, x: Vec3) -> CurveSums:
-        """All sums at x, in unit coordinates."""
+        """Sum over all edges and circles at x, in unit coordinates."""
         parts: list[CurveSums] = []
         if self.edges is not None:
             parts.append(CurveSums.of(sum_over_edges(self.edges, x)))
@@ -629,10 +665,12 @@ class _CurveData(UnitFrame):
 
 @dataclass(frozen=True)
 class CellErrors:
-    """Bounds of the truncation errors of value and gradient in FMM cells, and of the rounding of
-    the value.
+    """Errors of sums from cells, or from all edges.
 
-    cell, in_cells: the sums in cells, and the mask of the lanes on which they were used.
+    value, slope: bounds of the truncation errors of value and gradient.
+    rounding: a bound of the rounding of the value.
+    cell, in_cells: the sums in cells, and the mask of the lanes on which they were used; None
+        without cells.
     """
 
     value: Real
@@ -644,8 +682,8 @@ class CellErrors:
 
 @dataclass(frozen=True)
 class CurveSums:
-    """Sums over edges and circles, as `EdgeSums`; circles: the sums over circles only, None if
-    there are no circles."""
+    """Sums over edges and circles, with the attributes of `EdgeSums`. circles: the sums over
+    circles only, None if there are no circles."""
 
     angle: Real
     gradient: Vec3
@@ -657,7 +695,7 @@ class CurveSums:
 
     @classmethod
     def of(cls, sums: EdgeSums | CircleSums) -> CurveSums:
-        """The sums over edges or circles only."""
+        """The sums over edges only, or over circles only."""
         integrals = sums.squares, sums.cubes, sums.fourths
         return cls(sums.angle, sums.gradient, sums.distance, *integrals)
 
@@ -675,29 +713,33 @@ class CurveSums:
 
 
 def _convex_ball(angle: Real, distance: Real, error: Real) -> HarmonicBall:
-    """The ball for curves in convex position, whose lift stays in (-6 pi, 6 pi) if its value at the
+    """The ball for curves in convex position. The lift stays in (-6 pi, 6 pi) if its value at the
     center is the principal value, in (-2 pi, 2 pi).
 
-    angle: the value, which may differ from the principal value by a multiple of 4 pi.
-    error: a bound of the error of the angle: if two principal values are possible, the range
-        contains the ranges of both.
+    angle: the value at the center. It may differ from the principal value by a multiple of 4 pi.
+    distance: the radius of the ball.
+    error: a bound of the error of the angle. If it allows two principal values, the range contains
+        the ranges of both.
     """
     principal = angle - _PERIOD * dr.round(angle / _PERIOD)
     branch = angle - principal
-    period = dr.select(dr.abs(principal) > 0.5 * _PERIOD - error, _PERIOD, 0)
-    lower, upper = dr.select(principal < 0, period, 0), dr.select(principal > 0, period, 0)
-    return HarmonicBall(distance, branch - 1.5 * _PERIOD - lower, branch + 1.5 * _PERIOD + upper)
+    extra = dr.select(dr.abs(principal) > 0.5 * _PERIOD - error, _PERIOD, 0)
+    below, above = (dr.select(principal < 0, extra, 0), dr.select(principal > 0, extra, 0))
+    return HarmonicBall(distance, branch - 1.5 * _PERIOD - below, branch + 1.5 * _PERIOD + above)
 
 
-def _along_curves(
+def _ray_promises(
     data: _CurveData, x: Vec3, sums: CurveSums, errors: CellErrors, direction: Vec3 | None
 ) -> tuple[Lipschitz, ...]:
-    """Promises at x, in unit coordinates, along a direction; none if the direction is None."""
+    """Promises along a direction at points x, in unit coordinates; none if the direction is None.
+    sums, errors: the sums at x, and their errors."""
     if direction is None:
         return ()
     line = RayLine(x, data.backend.Array3f(direction), data.rounding)
 
     def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
+        """Bounds of the derivative along the line for these lengths, of edges and circles
+        together."""
         summands: list[tuple[Real, ...]] = []
         if data.edges is not None:
             summands.append(data.edge_rates(errors, line, lengths, active))
@@ -716,8 +758,12 @@ def _read_only(loop: FloatArray) -> FloatArray:
 
 
 def _movable_loops(loops: Any) -> tuple[Any, tuple[Any, ...]]:
-    """Curves as `validate_curves` takes them; and all loops, with Dr.Jit arrays as 3-vectors, if
-    there are Dr.Jit arrays among them."""
+    """Separate the argument `loops` into two forms.
+
+    Returns the curves as `validate_curves` takes them, with NumPy arrays instead of Dr.Jit arrays.
+    If there are Dr.Jit arrays among the loops, also returns a tuple of all loops, with tensors
+    converted to 3-vectors; otherwise an empty tuple.
+    """
     is_list = isinstance(loops, list | tuple)
     parts: list[Any] = [*loops] if is_list else [loops]
     if not any(map(_is_drjit, parts)):
@@ -732,4 +778,5 @@ def _movable_loops(loops: Any) -> tuple[Any, tuple[Any, ...]]:
 
 
 def _is_drjit(value: Any) -> bool:
+    """Whether a value is a Dr.Jit array."""
     return dr.is_array_v(type(value))

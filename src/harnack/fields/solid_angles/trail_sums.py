@@ -4,10 +4,11 @@
 - `TrailValues`: boundary parts of winding numbers at many points; values only, fast.
 - `LiftedTrails`: the same along rays, with derivatives and bounds.
 
-Balls beside a long edge are small, and a ray that runs along it would need thousands of them. But
-the term of an edge in the slope along a fixed line has constant sign and vanishes if edge and line
-are in one plane. The sums of these terms, over curves and over the trees of meshes alike, are
-computed only near the curve, on rays along which f hardly changes.
+Promises on balls are poor for a ray that runs along a long edge: the balls are small, and the ray
+would need thousands of them. But along a fixed line, an edge's term of the derivative of f has
+constant sign, and it vanishes if edge and line are in one plane. The sums of these terms, over
+curves and over the trees of meshes alike, are computed only near the curve, on rays along which f
+hardly changes.
 """
 
 from __future__ import annotations
@@ -42,22 +43,24 @@ if TYPE_CHECKING:
 
 __all__ = ["LiftedTrails", "RayLine", "add_edge_rates", "line_rates", "lipschitz_along"]
 
-# Bounds along the line of a ray are computed if the ray may run along the curve: if it is nearer to
-# it than `_NEAR_CURVE` times the curve's size, and its slope is below `_NEAR_SLOPE` times the
-# gradient. Elsewhere only if the ray may run along a flat part of the surface: if the slope is
-# below `_FAR_SLOPE` times the gradient.
+# Bounds along the line of a ray are computed in two cases. First, if the ray may run along the
+# curve: if it is nearer to the curve than `_NEAR_CURVE` times the curve's size, and the derivative
+# along the ray is below `_NEAR_SLOPE` times the length of the gradient. Second, if the ray may run
+# along a flat part of the surface: if this derivative is below `_FAR_SLOPE` times that length.
 _NEAR_CURVE, _NEAR_SLOPE, _FAR_SLOPE = 0.001, 0.25, 1e-3
-# The number of lengths for which bounds are computed: in geometric progression from half the
-# distance to the curve towards the size of the curve.
+# The number of lengths for which bounds are computed. They are in geometric progression from half
+# the distance to the curve towards the size of the curve.
 _LENGTHS = 6
 
-# A function of lengths and a mask: the rates for the lengths, on lanes that are active.
+# A function of lengths and a mask of active lanes. It returns, for each length T, a bound of the
+# derivative along a line at points within T, as `line_rates` does.
 Rates: TypeAlias = "Callable[[tuple[Real, ...], Mask], tuple[Real, ...]]"
 
 
 @dataclass(frozen=True)
 class RayLine:
-    """Lines x + s v, with lengths of order one; rounding: the rounding of their points."""
+    """Lines x + s v, with lengths of order one and unit vectors v. rounding: a bound of the
+    rounding of their points."""
 
     x: Vec3
     v: Vec3
@@ -65,18 +68,23 @@ class RayLine:
 
     @property
     def slack(self) -> Real:
-        """The rounding of the points and of differences p - x, which are about as long as x."""
+        """A bound of the rounding of points of the line and of differences p - x, which are about
+        as long as x."""
         return dr.fma(8 * float(dr.epsilon(self.x)), dr.norm(self.x), self.rounding)
 
 
 def lipschitz_along(
     line: RayLine, gradient: Vec3, distance: Real, rates: Rates
 ) -> tuple[Lipschitz, ...]:
-    """Lipschitz constants of f along lines, for lengths from half the distance to the curve towards
-    its size; finite only on lanes where they may be worth their cost.
+    """Lipschitz constants of f along lines, for several lengths from half the distance to the curve
+    towards its size. They are finite only on lanes on which they may be worth their cost.
 
-    Along a straight edge the longest length is of use, near its ends the other lengths; along a
-    flat part of the surface, bounded by a plane curve, the shortest.
+    line: the lines.
+    gradient, distance: the gradient of f at line.x, and the distance to the curve.
+    rates: computes the constants for lengths, on lanes that are active.
+
+    Along a straight edge the longest length is of use, near the ends of an edge the other lengths.
+    Along a flat part of the surface, bounded by a plane curve, the shortest length is of use.
     """
     slope, norm = dr.dot(gradient, line.v), dr.norm(gradient)
     max_slope = dr.select(distance < _NEAR_CURVE, _NEAR_SLOPE, _FAR_SLOPE) * norm
@@ -92,15 +100,19 @@ def lipschitz_along(
 def line_rates(
     edges: LoopEdges, line: RayLine, lengths: tuple[Real, ...], active: Mask
 ) -> tuple[Real, ...]:
-    """For each length T a constant K with |f(x + s v) - f(x)| <= |s| K for |s| <= T.
+    """For each length T, a constant K with |f(x + s v) - f(x)| <= |s| K for |s| <= T, where f is
+    the solid angle of the edges and x + s v are points of the line.
 
-    Infinite where the line meets the curve within T, up to rounding, and on lanes that are not
-    active, which cost nothing if their neighbors are not active either.
+    lengths: the lengths T.
 
-    A ball about a point near the curve is as small as the distance to it, so a ray that runs along
+    Returns a tuple with one constant for each length. It is infinite where the line meets the curve
+    within T, up to rounding, and on lanes that are not active. These cost nothing if their
+    neighbors are not active either.
+
+    A ball around a point near the curve is as small as the distance to it, so a ray that runs along
     a long edge would need thousands of balls. Along a *fixed* line there are better bounds. With
-    a = p - x, e the edge from p to q and v the unit direction, an edge's term of df/ds at x + s v
-    is
+    a = p - x, e the vector of the edge from p to q, and v the unit direction, an edge's term of
+    df/ds at x + s v is
 
         v . (a - s v) x e  w(s) = c w(s),   c = v . (a x e),   w(s) = integral over [0, 1] of
                                                                |a - s v + t e|^-3 dt:
@@ -110,17 +122,19 @@ def line_rates(
 
         w <= 1/(rho^2 sqrt(rho^2 + h^2)),
 
-    for a point of the edge at length l from the nearest point is at least sqrt(rho^2 + l^2) away,
-    and the integral over an interval of l of length 2h is largest if it is centered. From x to
-    x + s v, |s| <= T, the distance falls by at most T, and nowhere below the distance rho' of the
-    edge from the whole line, nor below the distance rho" of the segment from the line through the
-    edge (a ray may meet that line at a small angle, far ahead). So for |s| <= T
+    for a point of the edge at the length l from the nearest point is at least sqrt(rho^2 + l^2)
+    away, and the integral over an interval of l of length 2h is largest if the interval is centered
+    at l = 0. Let d_e be the distance of the edge from x. From x to x + s v, |s| <= T, it falls by
+    at most T. It falls nowhere below the distance rho' of the edge from the whole line, nor below
+    the distance rho" of the segment |s| <= T from the line through the edge (a ray may meet that
+    line at a small angle, far ahead). So for |s| <= T
 
         |f(x + s v) - f(x)| <= |s| K,   K = sum_e |c| / (rho^2 sqrt(rho^2 + h^2)),
                                         rho = max(d_e - T, rho', rho").
     """
 
     def add(p: Vec3, q: Vec3, inverse: Real, rates: tuple[Real, ...]) -> tuple[Real, ...]:
+        """The constants `rates`, with the term of the edge from p to q added."""
         return add_edge_rates(line, Edge.between(p, q, inverse, line.x), lengths, rates)
 
     start = tuple(edges.backend.Float(0) for _ in lengths)
@@ -131,12 +145,13 @@ def line_rates(
 def add_edge_rates(
     line: RayLine, edge: Edge, lengths: tuple[Real, ...], rates: tuple[Real, ...]
 ) -> tuple[Real, ...]:
-    """The rates with an edge added, relative to the line's x.
+    """The constants `rates` of `line_rates`, with the term of an edge added. edge: relative to the
+    line's x.
 
     m = a x v and n = e x v are a and e projected along the line and rotated by a right angle.
-    Distances in the plane across the line are computed from them, and so is c = v . m x n, which is
-    then small if both are, whatever the lengths of a and e: its error is at most 8 epsilon |m| |e|
-    and slack |n|.
+    Distances in the plane perpendicular to the line are computed from them, and so is
+    c = v . m x n. So c is small if m and n are, whatever the lengths of a and e: its error is at
+    most 8 epsilon |m| |e| plus slack |n|.
     """
     a, e, inverse, slack = edge.a, edge.e, edge.inverse_square_length, line.slack
     epsilon = float(dr.epsilon(type(inverse)))
@@ -170,23 +185,30 @@ def add_edge_rates(
 _EDGES_PER_RECORD = 4
 # The number of points of a lane: as many as registers hold, by experiment.
 _POINTS_PER_LANE = 3
-# Signs of imaginary parts of factors count as uncertain if they are closer to zero than this many
-# rounding errors of their products; their own errors are six at most, and
-# `tree.triangle_tree.edge_function` has one.
-_SIDE_ROUNDINGS = 16
-# Beyond this distance, in sizes of the mesh, the products of lengths could leave float32.
-_FAR = 1024.0
+# The sign of a factor's imaginary part counts as uncertain if this part is closer to zero than this
+# many rounding errors of the products in it. Its own error is at most six of these, and that of
+# `tree.triangle_tree.edge_function` is one.
+_SIGN_ROUNDINGS = 16
+# Beyond this distance, in units of the mesh's size, products of lengths could overflow in single
+# precision.
+_MAX_COORDINATE = 1024.0
 
 # A point, and 1 or -1 for the direction of its ray along the z axis.
 Point: TypeAlias = "tuple[Vec3, Real]"
 Complex: TypeAlias = "tuple[Real, Real]"
-# u (|a| + |z|), v (|a| + |z|) and s of a vertex.
+# A vertex a = (u, v, z) relative to a point: (u t, v t, s t) with t = |a| + |z| and s as in
+# `edge_lift`.
 Seen: TypeAlias = "tuple[Real, Real, Real]"
 
 
 @dataclass(frozen=True)
 class _FloatFormat:
-    """The parameters of a floating-point format, for operations on its bits."""
+    """A floating-point format, for operations on the bits of its numbers.
+
+    integer: the type of integers of the same size.
+    mantissa: the number of bits of the mantissa.
+    bias: the bias of the exponent.
+    """
 
     integer: Any
     mantissa: int
@@ -194,16 +216,17 @@ class _FloatFormat:
 
     @classmethod
     def of(cls, backend: Backend) -> _FloatFormat:
+        """The format of a backend's numbers."""
         mantissa, bias = (23, 127) if backend.precision == "single" else (52, 1023)
         return cls(dr.int_array_t(backend.Float), mantissa, bias)
 
     def sign(self, x: Real) -> Any:
-        """-1 where the sign bit is set, also for -0, else 0."""
+        """-1 where the sign bit of x is set, also for -0, else 0; an integer."""
         bits = dr.reinterpret_array(self.integer, x)
         return bits >> (self.mantissa + self.bias.bit_length() + 1)
 
     def reciprocal_power_of_two(self, x: Real) -> Real:
-        """The power of two that scales x > 0 to between one and two."""
+        """A power of two; multiplied by it, x > 0 lies between one and two."""
         exponent = dr.reinterpret_array(self.integer, x) & ((2 * self.bias + 1) << self.mantissa)
         return dr.reinterpret_array(type(x), (2 * self.bias << self.mantissa) - exponent)
 
@@ -212,8 +235,9 @@ class _FloatFormat:
 class _AngleProduct:
     """A product z = x + iy of complex factors, of any length, with the sum of their arguments.
 
-    half: the number of half turns: the sum theta of the factors' principal arguments lies in
-        [half pi, (half + 1) pi]. The sign bit of y is half's parity.
+    x, y: real and imaginary part.
+    half: the number of half turns. The sum theta of the factors' principal arguments lies in [half
+        pi, (half + 1) pi], and the sign bit of y is the parity of `half`.
     """
 
     x: Real
@@ -222,17 +246,19 @@ class _AngleProduct:
 
     @classmethod
     def of(cls, bits: _FloatFormat, factor: Complex) -> _AngleProduct:
+        """The product of a single factor."""
         return cls(*factor, bits.sign(factor[1]))
 
     def times(self, bits: _FloatFormat, factor: Complex) -> _AngleProduct:
         """The product with a further factor.
 
-        The factor's argument, in [-pi, pi], moves theta at most one half plane forward, or one back
-        if the sign bit of its imaginary part is set; and it does so exactly if the sign of y
-        changes. That holds for the computed y as well: its sign differs from that of the exact
-        value only if its two terms cancel, and then the exact theta is close to the very multiple
-        of pi that the count of half turns has crossed (arguments of like signs and y x' < 0: about
-        +-pi; of unlike signs: about 0). A term that underflows keeps its sign bit.
+        The factor's argument lies in [-pi, pi]. So it moves theta at most one half plane forward,
+        or, if the sign bit of its imaginary part is set, at most one back; and it does so exactly
+        if the sign of y changes. That holds for the computed y as well. Its sign differs from that
+        of the exact value only if the two terms of y cancel. Then the exact theta is close to the
+        same multiple of pi that the count of half turns has crossed: about +-pi for arguments of
+        like signs and y x' < 0, with x' the real part of the factor, and about 0 for arguments of
+        unlike signs. A term that underflows keeps its sign bit.
         """
         x = dr.fma(self.x, factor[0], -(self.y * factor[1]))
         y = dr.fma(self.x, factor[1], self.y * factor[0])
@@ -240,7 +266,7 @@ class _AngleProduct:
         return _AngleProduct(x, y, self.half + (changes & (bits.sign(factor[1]) | 1)))
 
     def times_product(self, bits: _FloatFormat, other: _AngleProduct) -> _AngleProduct:
-        """The product with another product, whose half turns are added."""
+        """The product with another product. The half turns of both are added."""
         z = self.times(bits, (other.x, other.y))
         return _AngleProduct(z.x, z.y, z.half + ((other.half + 1) & -2))
 
@@ -252,7 +278,7 @@ class _AngleProduct:
         return _AngleProduct(self.x * scale, self.y * scale, self.half), length
 
     def turns(self) -> Real:
-        """theta/(2 pi)."""
+        """theta/(2 pi), as a number of turns."""
         real = cast("Any", type(self.x))
         # atan2 ignores the sign of a zero.
         y = dr.copysign(fmax(dr.abs(self.y), real(1e-30)), self.y)
@@ -261,13 +287,13 @@ class _AngleProduct:
 
 @dataclass(frozen=True)
 class TrailValues:
-    """Directed edges on a backend, as records of consecutive edges of closed trails, for values of
-    the sum of `edge_lift` at many points.
+    """Directed edges on a backend, as records of consecutive edges of closed trails. They give
+    values of the sum of `edge_lift` at many points.
 
-    The formula is that of `edge_lift`, arranged so that little is computed twice. The boundary of a
-    chain of triangles enters every vertex as often as it leaves it, so that its edges form closed
-    trails. The part of a factor that belongs to a vertex is computed once and not for each of its
-    edges; a record of edges is fetched once for several points; there are no divisions. Points at
+    The formula is that of `edge_lift`, arranged so that little is computed twice. The boundary of
+    any set of triangles enters every vertex as often as it leaves it, so that its edges form closed
+    trails. The part of a factor that belongs to a vertex is computed once, and not for each of its
+    edges. A record of edges is fetched once for several points. There are no divisions. Points at
     which rounding could have changed a sign are marked, so that they can be computed again by
     `edge_lift`.
     """
@@ -276,8 +302,8 @@ class TrailValues:
 
     @classmethod
     def upload(cls, backend: Backend, vertices: FloatArray, edges: IntArray) -> TrailValues:
-        """Edges (k, 2) between vertices (n, 3), which leave each vertex as often as they enter
-        it."""
+        """Upload edges (k, 2) between vertices (n, 3). The edges must leave each vertex as often as
+        they enter it."""
         rows: list[FloatArray] = []
         for trail in closed_trails(edges):
             count = len(trail) - 1
@@ -291,13 +317,15 @@ class TrailValues:
         return cls(RecordTable.upload(backend, np.concatenate(rows)))
 
     def turns(self, x: Vec3, ray_sign: Real) -> tuple[Real, Mask]:
-        """1/(4 pi) times the sum of Omega_e at points x, and a mask of points to compute again.
+        """1/(4 pi) times the sum of Omega_e at points x, and a mask of the points that must be
+        computed again.
 
-        ray_sign: 1 for the direction d = z; -1 for x and the edges mirrored in a plane z = const.
+        ray_sign: 1 for the direction d = z; -1 if x and the edges are to be mirrored in a plane
+            z = const.
 
-        Each lane of the kernel computes several points. The mask is true where rounding could have
-        changed the sign of an imaginary part, where a product of factors nearly underflows (near an
-        edge or a short edge), and farther than 1024 mesh sizes away along any axis.
+        Each lane of the kernel computes several points. The mask is true in three cases: rounding
+        could have changed the sign of an imaginary part; a product of factors nearly underflows
+        (near an edge or at a short edge); or a coordinate of x is larger than 1024 mesh sizes.
         """
         dr.eval(x, ray_sign)
         backend, n = self.records.backend, dr.width(x)
@@ -317,55 +345,68 @@ class TrailValues:
         for point_id, turn, margin in zip(point_ids, turns, margins, strict=True):
             dr.scatter(all_turns, turn, point_id)
             dr.scatter(all_margins, margin, point_id)
-        is_far = max_norm(x) > _FAR
+        is_far = max_norm(x) > _MAX_COORDINATE
         return all_turns, (all_margins <= 0) | is_far
 
     def _over_records(self, points: list[Point]) -> tuple[list[_AngleProduct], list[Real]]:
-        """For each point the product of all factors, and a number that is at most 0 if the product
-        is uncertain."""
+        """For each point the product of all factors, and a number that is at most 0 if rounding
+        could have changed a sign or if the product nearly underflowed."""
         backend = self.records.backend
         real, bits = backend.Float, _FloatFormat.of(backend)
-        slack = real(-_SIDE_ROUNDINGS * 0.5 * backend.machine_epsilon)
+        slack = real(-_SIGN_ROUNDINGS * 0.5 * backend.machine_epsilon)
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+            """The products and numbers `state` of all points, with the edges of a record added."""
             # Edges that pad a record lead from a vertex to itself: they are never uncertain.
             slacks = [dr.select(row[15] > k, slack, 1) for k in range(_EDGES_PER_RECORD)]
             pairs = zip(points, state, strict=True)
-            return tuple(_with_record(bits, row, slacks, x, previous) for x, previous in pairs)
+            return tuple(
+                _multiplied_by_record(bits, row, slacks, x, previous) for x, previous in pairs
+            )
 
         entry = (real(1), real(0), bits.integer(0), real(1))
         products = self.records.for_each(add, tuple(entry for _ in points), "trails")
         return [_AngleProduct(*entry[:3]) for entry in products], [entry[3] for entry in products]
 
 
-def _with_record(
+def _multiplied_by_record(
     bits: _FloatFormat, row: list[Real], slacks: list[Real], x: Point, state: tuple[Any, ...]
 ) -> tuple[Any, ...]:
-    """The product (x, y, half) and the number of `_over_records`, with the four edges of a record
-    added.
+    """The state of a point, with the four edges of a record added.
 
-    The four factors are multiplied with each other first: their product has an argument of nearly
+    row: the record.
+    slacks: for each edge, minus the relative error of the products in a factor's imaginary part, or
+        1 if it is padding.
+    x: the point, with the direction of its ray.
+    state: the product (x, y, half) and the number of `_over_records`.
+
+    The four factors are multiplied with each other first. Their product has an argument of nearly
     zero, where rounding has the least effect.
     """
     z, margin = _AngleProduct(*state[:3]), state[3]
-    smallest = 2.0**-100 if bits.mantissa < 50 else 2.0**-800
+    min_length = 2.0**-100 if bits.mantissa < 50 else 2.0**-800
     a = _relative_vertex(bits, row[0:3], x)
-    part: _AngleProduct | None = None
+    record_product: _AngleProduct | None = None
     for k in range(_EDGES_PER_RECORD):
         b = _relative_vertex(bits, row[3 * k + 3 : 3 * k + 6], x)
         factor, sign_margin = _factor(a, b, slacks[k])
         margin = fmin(sign_margin, margin)
-        part = _AngleProduct.of(bits, factor) if part is None else part.times(bits, factor)
+        record_product = (
+            _AngleProduct.of(bits, factor)
+            if record_product is None
+            else record_product.times(bits, factor)
+        )
         if k == 1:
-            part, length = part.scaled(bits)
-            margin = fmin(length - smallest, margin)
+            record_product, length = record_product.scaled(bits)
+            margin = fmin(length - min_length, margin)
         a = b
-    z, length = z.times_product(bits, cast("_AngleProduct", part)).scaled(bits)
-    return z.x, z.y, z.half, fmin(length - smallest, margin)
+    z, length = z.times_product(bits, cast("_AngleProduct", record_product)).scaled(bits)
+    return z.x, z.y, z.half, fmin(length - min_length, margin)
 
 
 def _relative_vertex(bits: _FloatFormat, vertex: list[Real], point: Point) -> Seen:
-    """A vertex relative to a point: (u t, v t, s t) with t = |a| + |z| and s = |a| - ray_sign z.
+    """A vertex a = (u, v, z) relative to a point: (u t, v t, s t) with t = |a| + |z| and
+    s = |a| - ray_sign z.
 
     s t is (|a| + |z|)^2 or u^2 + v^2, so that no difference cancels.
     """
@@ -380,7 +421,12 @@ def _relative_vertex(bits: _FloatFormat, vertex: list[Real], point: Point) -> Se
 
 def _factor(a: Seen, b: Seen, slack: Real) -> tuple[Complex, Real]:
     """The conjugate of F_e times a positive number; and a number that is at most 0 if the sign of
-    its imaginary part is uncertain."""
+    its imaginary part is uncertain.
+
+    a, b: the ends of the edge.
+    slack: minus the relative error of the products in the imaginary part, or 1 for an edge that is
+        padding.
+    """
     product = a[1] * b[0]
     im = dr.fma(a[0], b[1], -product)
     re = dr.fma(a[2], b[2], dr.fma(a[0], b[0], a[1] * b[1]))
@@ -388,7 +434,8 @@ def _factor(a: Seen, b: Seen, slack: Real) -> tuple[Complex, Real]:
 
 
 def closed_trails(edges: IntArray) -> list[IntArray]:
-    """Directed edges (k, 2) as trails of vertices, each ending where it begins; each edge once.
+    """Directed edges (k, 2) as closed trails. A trail is an array of vertices that ends with the
+    vertex with which it begins. Each edge is in one trail, once.
 
     Raises:
         ValueError: an edge leads to a vertex that no further edge leaves.
@@ -410,20 +457,20 @@ def closed_trails(edges: IntArray) -> list[IntArray]:
 
 # Sums along rays.
 
-# Possible numbers of edges of a record; the number that wastes less memory for padding is used.
+# Possible numbers of edges of a record. The one for which padding wastes less memory is used.
 _RECORD_SIZES = 3, 4
 
 
 @dataclass(frozen=True)
 class LiftedTrails:
-    """Closed trails of edges on a backend, as records of `edges_per_record` consecutive edges.
+    """Closed trails of edges on a backend, in records of `edges_per_record` consecutive edges.
 
-    For the sum of `edge_lift` along rays, edge by edge, with decisions from the same bits. The part
-    of a factor that belongs to a vertex is computed once and not for each of its edges, and roots
-    and divisions, which cost most, are shared by edges where a bound allows it.
+    They give the sum of `edge_lift` along rays, edge by edge, with decisions from the same bits.
+    The part of a factor that belongs to a vertex is computed once, and not for each of its edges.
+    Roots and divisions cost most; several edges share them where a bound allows it.
 
-    With run = `edges_per_record`, a record holds run + 1 vertices, run numbers 1/length^2, and run
-    lengths: negative if the edge runs from a higher to a lower index, 0 if there is no edge.
+    A record holds `edges_per_record` + 1 vertices; then 1/length^2 of each edge; then the length of
+    each edge, negative if the edge runs from a higher to a lower index, and 0 if there is no edge.
     """
 
     records: RecordTable
@@ -431,27 +478,30 @@ class LiftedTrails:
 
     @classmethod
     def upload(cls, backend: Backend, vertices: FloatArray, trails: list[IntArray]) -> LiftedTrails:
-        """Trails of vertices (n, 3), each ending where it begins."""
+        """Upload closed trails over vertices (n, 3), as from `closed_trails`."""
         run = min(
             _RECORD_SIZES,
             key=lambda run: sum(-(-(len(t) - 1) // run) for t in trails) * (run + 0.5),
         )
         rounded = vertices.astype(backend.dtype).astype(np.float64)
-        rows = [_rows(rounded, trail, run) for trail in trails]
+        rows = [_trail_records(rounded, trail, run) for trail in trails]
         return cls(RecordTable.upload(backend, np.concatenate(rows)), run)
 
     def sum(self, frame: RayFrame, x: Vec3, active: Mask = True) -> SourceSums:
         """The sum of Omega_e at points x of rays, where active, and the sums that promises need.
 
-        Derivatives. With w of `Edge`, L w is the integral of |dp|/rho^3 over an edge, and 1/d times
-        that bounds the integral of |dp|/rho^4, d the distance to it; for all edges of a record the
-        d of the nearest edge gives a bound. So the terms s4 += L w/4 and s5 += 3 L w/(16 d) bound
-        their part of the remainder (`LiftedEdge.bounds`).
+        frame: the frame of the rays.
 
-        Rounding. As in `LiftedEdge.bounds`, with Biot and Savart's field, which is at most d L w,
-        for 2 e': |a x e| is the length of e times the distance from its line. By Cauchy and Schwarz
-        these add up over a record to at most the root of (sum of L w) (sum of d^2 L w). In all
-        bounds d is reduced by its rounding.
+        Derivatives. Let L be the length of an edge, d the distance to it, and w that of `Edge`. L w
+        is the integral of |dp|/rho^3 over the edge, and 1/d times that bounds the integral of
+        |dp|/rho^4. For all edges of a record the d of the nearest edge gives a bound. So the terms
+        s4 += L w/4 and s5 += 3 L w/(16 d) bound the part of the remainder that these edges cause
+        (`LiftedEdge.bounds`).
+
+        Rounding is bounded as in `LiftedEdge.bounds`, with Biot and Savart's field itself in place
+        of 2 e'. The field is at most d L w, because |a x e| is L times the distance from the line
+        of e. By Cauchy and Schwarz the fields add up over a record to at most the square root of
+        (sum of L w) (sum of d^2 L w). In all bounds d is reduced by its rounding.
         """
         backend = self.records.backend
         real, unit = backend.Float, fmax(coordinate_rounding(frame.o), coordinate_rounding(x))
@@ -459,10 +509,14 @@ class LiftedTrails:
         steep_rounding = 0.5 * backend.machine_epsilon * STEEP_ROUNDINGS
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+            """The state with the edges of a record added: the product of factors, the gradient, the
+            least squared distance, the bound of the rounding, s4 and s5."""
             product, g, min_square, rounding, s4, s5 = state
             product = LiftedProduct(*product)
             a = view_vertex(self._vertex(row, 0), frame, x)
-            total, weighted, nearest, longest = real(0), real(0), real(dr.inf), real(0)
+            total, weighted, nearest, longest = (real(0), real(0), real(dr.inf), real(0))
+            # Over the edges of the record, total is the sum of L w, weighted the sum of d^2 L w,
+            # nearest the least d^2, and longest the largest L.
             for k in range(self.edges_per_record):
                 p, q = self._vertex(row, k), self._vertex(row, k + 1)
                 inverse, length = self._edge(row, k)
@@ -483,7 +537,7 @@ class LiftedTrails:
             field = dr.fma(steep_rounding, longest, unit) * dr.sqrt(total * weighted)
             rounding = rounding + (field + factor_rounding)
             s5 = dr.fma(0.1875 * total, dr.rcp(distance), s5)
-            return product.parts(), g, fmin(nearest, min_square), rounding, s4 + 0.25 * total, s5
+            return (product.parts(), g, fmin(nearest, min_square), rounding, s4 + 0.25 * total, s5)
 
         identity = LiftedProduct.identity(real).parts()
         start = (identity, backend.Array3f(0), real(dr.inf), real(0), real(0), real(0))
@@ -502,6 +556,7 @@ class LiftedTrails:
         )
 
     def _vertex(self, row: list[Real], k: int) -> Vec3:
+        """Vertex k of a record."""
         return self.records.backend.Array3f(*row[3 * k : 3 * k + 3])
 
     def _edge(self, row: list[Real], k: int) -> tuple[Real, Real]:
@@ -510,8 +565,8 @@ class LiftedTrails:
         return row[first + k], row[first + self.edges_per_record + k]
 
 
-def _rows(vertices: FloatArray, trail: IntArray, run: int) -> FloatArray:
-    """Records of a trail; edges that pad the last record have length 0."""
+def _trail_records(vertices: FloatArray, trail: IntArray, run: int) -> FloatArray:
+    """Records of a trail, with `run` edges each. Edges of length 0 pad the last record."""
     count = len(trail) - 1
     record_count = -(-count // run)
     index = np.minimum(run * np.arange(record_count)[:, None] + np.arange(run + 1), count)

@@ -1,8 +1,8 @@
 """Sums over a tree of dipoles: multipole moments of far clusters, direct sums over near primitives.
 
-- `traverse_clusters`: a traversal of a tree with its far clusters.
+- `traverse_clusters`: a traversal of a tree that visits its far clusters.
 - `Treecode`: the sums over such a tree, shared by triangles and points. The caller adds the
-  primitives of near leaves.
+primitives of near leaves.
 - `multipole_terms`: the terms of a far node in value, gradient and Hessian.
 - `dipole_records`, `records_in_slots`: oriented points as records, also in the leaves of a tree.
 """
@@ -52,12 +52,12 @@ State: TypeAlias = "tuple[Any, ...]"
 class ClusterView:
     """A node of the tree relative to points x.
 
-    head: its numbers that every visit reads.
-    payload: its other numbers, fetched where it is far.
+    head: the numbers of the node that every visit reads.
+    payload: its other numbers, which are read where it is far.
     r: the vector from its center to x.
-    square: |r|^2, plus the square of the height.
+    square: |r|^2, plus the square of the height (`traverse_clusters`).
     inverse: 1/sqrt(square), or 0 where the node is not far.
-    far: whether it is far enough to use its moments.
+    far: the mask of the lanes on which the node is far enough for its moments to be used.
     """
 
     head: tuple[Real, ...]
@@ -75,18 +75,20 @@ def traverse_clusters(
     tree: PackedTree, x: Vec3, closer: Real, add_cluster: EachCluster,
     add_primitive: PrimitiveBody, state: State, active: Mask = True, height_square: Real = 0.0,
 ) -> State:  # fmt: skip
-    """The state after the traversal of a tree whose nodes begin with their center and the distance
-    from which on their moments may be used.
+    """The state after a traversal of a tree. Records of its nodes begin with the node's center and
+    its accepting distance, beyond which its moments may be used.
 
-    closer: the moments of nodes are used from this many times that distance on.
-    add_cluster: from a cluster and the state, the state with the node added where it is far.
-    add_primitive: as for `tree.for_each_primitive`, for the leaves that are not far.
-    height_square: added to the squares of all distances: in four dimensions, the square of the
+    closer: the moments of nodes are used beyond this many times the accepting distance.
+    add_cluster: returns the state with a node added where it is far.
+    add_primitive: as for `tree.for_each_primitive`, for the primitives of leaves that are not far.
+    height_square: added to the squares of all distances. In four dimensions it is the square of the
         distance of the point from the space of the tree.
     """
     vector = tree.backend.Array3f
 
     def visit(node: VisitedNode, state: State) -> tuple[Mask, State]:
+        """Add a node where it is far, and the primitives of a leaf where it is not. Returns the
+        mask of the lanes on which the walk enters the node, and the state."""
         r = x - vector(*node.head[:3])
         square = dr.squared_norm(r) + height_square
         is_far = square > dr.square(node.head[3] * closer)
@@ -103,12 +105,12 @@ _LEAF_SIZE, _ARITY = 8, 4
 
 
 def dipole_hierarchy(points: FloatArray) -> BalancedTree:
-    """The tree over points (n, 3)."""
+    """Build the tree over points (n, 3)."""
     return build_balanced_tree(points, leaf_size=_LEAF_SIZE, arity=_ARITY)
 
 
 def dipole_records(points: FloatArray, moments: FloatArray) -> FloatArray:
-    """(n, 8) records: position, moment, its length, 0.
+    """Records (n, 8) of dipoles: position, moment, length of the moment, 0.
 
     moments: (n, 3) area times normal.
     """
@@ -117,14 +119,16 @@ def dipole_records(points: FloatArray, moments: FloatArray) -> FloatArray:
 
 
 def empty_record(row: FloatArray) -> FloatArray:
-    """Records (..., 8) at the positions of dipoles (..., 8), with moment 0, which add nothing."""
+    """Records (..., 8) at the positions of the dipoles `row` (..., 8), with moment 0, so that they
+    add nothing."""
     empty = np.zeros_like(row)
     empty[..., :3] = row[..., :3]
     return empty
 
 
 def records_in_slots(tree: BalancedTree, rows: FloatArray) -> FloatArray:
-    """Records (leaves, leaf_size, 8); in empty slots the padding of the leaf's first record."""
+    """Records (leaves, leaf_size, 8) in the slots of the tree. Empty slots hold a record with
+    moment 0 at the position of the leaf's first record."""
     slots = tree.values_in_slots(rows)
     empty = tree.leaf_slots == NO_PRIMITIVE
     slots[empty] = np.broadcast_to(empty_record(slots[:, :1]), slots.shape)[empty]
@@ -132,9 +136,11 @@ def records_in_slots(tree: BalancedTree, rows: FloatArray) -> FloatArray:
 
 
 def multipole_terms(c: Sequence[Real], r: Vec3, inverse: Real, derivatives: int) -> SourceTerm:
-    """sum_l P_l(r)/r^(2l+1) for l = 1, 2, 3, and its derivatives, with the coefficients c in the
-    order of `multipole.cartesian_coefficients`; inverse = 1/|r|.
+    """The sum f of P_l(r)/|r|^(2l+1) over l = 1, 2, 3, and its derivatives.
 
+    c: the coefficients of the polynomials P_l, in the order of `multipole.cartesian_coefficients`.
+    r: the vector from the node's center to the point.
+    inverse: 1/|r|.
     derivatives: 0 for the value, 1 with the gradient, 2 with the Hessian, too.
 
     With u = 1/|r|, G_l = grad P_l (so that l P_l = G_l.r by Euler) and H_l the Hessian of P_l,
@@ -181,8 +187,12 @@ def multipole_terms(c: Sequence[Real], r: Vec3, inverse: Real, derivatives: int)
 def _hessian(
     c: Sequence[Real], r: Vec3, g: tuple[Vec3, ...], p: tuple[Real, ...], u: tuple[Real, Real]
 ) -> SymmetricMatrix:
-    """The Hessian of `multipole_terms`; g and p are scaled by powers of u to the size of the terms
-    with l = 1."""
+    """The Hessian of `multipole_terms`, with its arguments c and r.
+
+    g, p: the gradients G_l and the values P_l, times u^(2l-2), which makes them as large as those
+        of l = 1.
+    u: u^2 and u^3, with u = 1/|r|.
+    """
     x, y, z = r
     (g1, g2, g3), (p1, p2, p3), (u2, u3) = g, p, u
     u4 = u2 * u2
@@ -216,25 +226,29 @@ def _hessian(
 
 ExtraState: TypeAlias = "tuple[Any, ...]"
 
-# Coarse evaluations use the moments of nodes beyond this many times their radius.
+# Coarse evaluations use the moments of a node beyond this many times its radius.
 _COARSE_RATIO = 2.5
 # The number of roundings by which the gradient of a far node itself may be wrong.
 _FAR_GRADIENT_ROUNDINGS = 64.0
-# The distance that is free of sources, in units of coordinates, if no term bounds it.
+# If no term bounds the distance that is free of sources, it is taken to be this many times one plus
+# the largest coordinate.
 _NO_SOURCE_DISTANCE = 1e4
 
-# A function of a record, a mask, the sums, and a further state of the caller. It returns sums and
-# state with the record's primitive added on the lanes of the mask.
+# A function that adds a primitive. Its arguments are the primitive's record, the mask of the lanes
+# on which to add it, the sums, and a further state of the caller. It returns the new sums and the
+# new state.
 AddPrimitive: TypeAlias = (
     "Callable[[list[Real], Mask, SourceSums, ExtraState], tuple[SourceSums, ExtraState]]"
 )
 
 
 def node_records(level: NodeMoments, order: int, rough: float, error: FloatArray) -> FloatArray:
-    """Node records as `Treecode` reads them.
+    """Records of nodes as `Treecode` reads them.
 
-    Each has center, accepting distance (`rough` times the radius), remainder constants A and K
-    (`remainder_constants`), 15 coefficients, and the error bound E (k,) of the value.
+    A record holds center, accepting distance (`rough` times the radius), remainder constants A and
+    K (`remainder_constants`), 15 coefficients of moments up to the order, and the error bound E.
+
+    error: (k,) E, the bound of the truncation error of the value.
     """
     head = [rough * level.radius, *remainder_constants(level, rough)]
     parts = (level.center, *head, cartesian_coefficients(level.moments, order), error)
@@ -243,7 +257,7 @@ def node_records(level: NodeMoments, order: int, rough: float, error: FloatArray
 
 @dataclass(frozen=True)
 class Treecode:
-    """Sums over sources by a tree, whose far nodes count as a single source, on a backend.
+    """Sums over sources by a tree on a backend. A far node counts as a single source.
 
     tree: the nodes, with the records of `node_records`.
     accuracy: at accuracy scale 1, nodes are far beyond this many times their radius.
@@ -277,28 +291,34 @@ class Treecode:
     ) -> Treecode:
         """Upload a tree with its moments and sources.
 
+        levels: the moments of the nodes of all levels.
         primitives: the records of the sources in their slots, as `tree.pack_tree` takes them.
 
-        Each node has a single E for both kinds of evaluation: at least the bound at accuracy scale
-        1, and at least the bound of the coarse evaluation divided by `coarse_error_ratio`, which is
-        the median of the ratio of the two bounds.
+        Each node has a single bound E for both kinds of evaluation. E is at least the bound at
+        accuracy scale 1, and at least the bound of the coarse evaluation divided by
+        `coarse_error_ratio`. This ratio is the median, over the leaves, of the ratio of the two
+        bounds.
         """
         rough = min(accuracy, _COARSE_RATIO)
         fine_bounds = [truncation_bounds(level, accuracy * level.radius, order) for level in levels]
         coarse_bounds = [truncation_bounds(level, rough * level.radius, order) for level in levels]
-        factor = _median_ratio(coarse_bounds[0][0], fine_bounds[0][0])
+        error_ratio = _median_ratio(coarse_bounds[0][0], fine_bounds[0][0])
         nodes: list[FloatArray] = []
-        slope_max = second_max = 0.0
+        slope_ratio = second_ratio = 0.0
         for level, *bounds in zip(levels, fine_bounds, coarse_bounds, strict=True):
             error, slope, second = (
-                np.maximum(fine, coarse / factor) for fine, coarse in zip(*bounds, strict=True)
+                np.maximum(fine, coarse / error_ratio) for fine, coarse in zip(*bounds, strict=True)
             )
             nonzero = error > 0
-            slope_max = max(slope_max, float((slope[nonzero] / error[nonzero]).max(initial=0.0)))
-            second_max = max(second_max, float((second[nonzero] / error[nonzero]).max(initial=0.0)))
+            slope_ratio = max(
+                slope_ratio, float((slope[nonzero] / error[nonzero]).max(initial=0.0))
+            )
+            second_ratio = max(
+                second_ratio, float((second[nonzero] / error[nonzero]).max(initial=0.0))
+            )
             nodes.append(node_records(level, order, rough, error))
         packed = pack_tree(backend, tree, nodes, primitives)
-        ratios = factor, slope_max * (1 + 1e-6), second_max * (1 + 1e-6)
+        ratios = error_ratio, slope_ratio * (1 + 1e-6), second_ratio * (1 + 1e-6)
         uploaded = (dr.opaque(backend.Float, ratio) for ratio in ratios)
         return cls(backend, packed, accuracy, rough, order, *uploaded)
 
@@ -308,27 +328,29 @@ class Treecode:
         return self.coarse_ratio / self.accuracy
 
     def acceptance_ratio(self, detail: Real) -> Real:
-        """The distance from which on the moments of a node are used, in radii of the node."""
+        """The distance beyond which the moments of a node are used, in radii of the node. detail:
+        the accuracy scale."""
         return fmax(self.accuracy * detail, self.backend.Float(self.coarse_ratio))
 
     def sums(
-        self, x: Vec3, detail: Real, add: AddPrimitive, extra: ExtraState = (), active: Mask = True,
+        self, x: Vec3, detail: Real, add: AddPrimitive, own: ExtraState = (), active: Mask = True,
         derivatives: int = 1,
     ) -> tuple[SourceSums, ExtraState]:  # fmt: skip
-        """All sums at points x, and the caller's own state.
+        """Sum over all sources at points x. Returns the sums and the caller's own state.
 
         detail: the accuracy scale of `Field.at_accuracy`; infinity gives the direct sum.
         add: adds a primitive of a near leaf (`AddPrimitive`).
-        extra: the caller's own state, which `add` updates.
+        own: the caller's own state, which `add` updates.
         derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
         """
-        free, closer = (
+        free_fraction, closer = (
             free_radius_fraction(self.coarse_ratio),
             self.acceptance_ratio(detail) / self.coarse_ratio,
         )
         unit = coordinate_rounding(x)
 
         def add_cluster(node: ClusterView, state: ExtraState) -> ExtraState:
+            """The state with a node added where it is far."""
             c, inverse = node.payload, node.inverse
             error = c[15] * self._decay(inverse)
             slope = error * inverse
@@ -338,39 +360,41 @@ class Treecode:
                 inverse,
                 dr.fma(node.head[5], inverse * inverse, node.head[4]),
                 (error, slope, slope * inverse),
-                free * (node.square * inverse),
+                free_fraction * (node.square * inverse),
                 unit,
             )
             return sums.to_state(), state[1]
 
         def add_primitive(row: list[Real], active: Mask, state: ExtraState) -> ExtraState:
-            sums, extra = add(row, active, SourceSums.from_state(state[0]), state[1])
-            return sums.to_state(), extra
+            """The state with a primitive of a near leaf added, where active."""
+            sums, own = add(row, active, SourceSums.from_state(state[0]), state[1])
+            return sums.to_state(), own
 
-        far_off = _NO_SOURCE_DISTANCE * (1 + dr.max(dr.abs(x)))
-        start = (SourceSums.zero(self.backend, far_off, derivatives).to_state(), extra)
+        no_source = _NO_SOURCE_DISTANCE * (1 + dr.max(dr.abs(x)))
+        start = (SourceSums.zero(self.backend, no_source, derivatives).to_state(), own)
         state = traverse_clusters(self.tree, x, closer, add_cluster, add_primitive, start, active)
-        sums, factor = (
+        sums, error_ratio = (
             SourceSums.from_state(state[0]),
             dr.select(detail < 1, self.coarse_error_ratio, 1),
         )
         second = sums.hessian_truncation
         sums = dataclasses.replace(
             sums,
-            truncation=factor * sums.truncation,
-            gradient_truncation=factor * self.gradient_error_ratio * sums.gradient_truncation,
+            truncation=error_ratio * sums.truncation,
+            gradient_truncation=error_ratio * self.gradient_error_ratio * sums.gradient_truncation,
             hessian_truncation=None
             if second is None
-            else factor * self.hessian_error_ratio * second,
+            else error_ratio * self.hessian_error_ratio * second,
         )
         return sums, state[1]
 
-    def values(self, sums: SourceSums, scale: float, unit: Real, rounding: Real) -> PointValues:
-        """`SourceSums.values` of sums over the tree."""
-        return sums.values(scale, unit, rounding, _FAR_GRADIENT_ROUNDINGS)
+    def values(self, sums: SourceSums, share: float, unit: Real, rounding: Real) -> PointValues:
+        """`SourceSums.values` of sums over the tree, with the same arguments."""
+        return sums.values(share, unit, rounding, _FAR_GRADIENT_ROUNDINGS)
 
     def _decay(self, inverse: Real) -> Real:
-        """r^-(order + 3), to which the first term beyond the order is proportional."""
+        """r^-(order + 3), for inverse = 1/r. The first term beyond the order is proportional to
+        it."""
         decay = inverse * inverse * inverse
         for _ in range(self.order):
             decay = decay * inverse
@@ -378,6 +402,7 @@ class Treecode:
 
 
 def _median_ratio(larger: FloatArray, smaller: FloatArray) -> float:
-    """The median of the ratio larger/smaller, at least 1."""
+    """The median of the ratio larger/smaller, or 1 if the median is less. Entries with smaller = 0
+    do not count."""
     nonzero = smaller > 0
     return max(1.0, float(np.median(larger[nonzero] / smaller[nonzero]))) if nonzero.any() else 1.0

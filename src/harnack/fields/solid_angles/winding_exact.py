@@ -2,13 +2,14 @@
 
 `ExactWinding` is the winding number of a mesh, at points and along rays.
 
-See `edge_lift` for the formula. At points the cost is that of one ray through a tree of boxes plus
-one pass over the edges at which the triangles do not cancel, whatever the number of triangles.
+See `edge_lift` for the formula. A value at a point costs as much as one ray through a tree of boxes
+plus one pass over the edges at which the triangles do not cancel, whatever the number of triangles.
 
-Winding numbers have two evaluators. `winding_exact`: crossings of one ray plus the boundary edges
-(the antipodal method), no truncation. `winding_tree`: multipoles, for soups. The tree's truncation
-is bounded by the next two moments, which are computed, and an absolute rest; the bound is part of
-`Sample.value_error` and `gradient_error`, by which the tracer shortens its steps.
+Winding numbers have two evaluators. `winding_exact` adds the crossings of one ray and the boundary
+edges (the antipodal method), without truncation. `winding_tree` uses multipoles, for triangle
+soups. The tree's truncation error is bounded by the next two moments, which are computed, and an
+absolute remainder. The bound is part of `Sample.value_error` and `gradient_error`, by which the
+tracer shortens its steps.
 """
 
 from __future__ import annotations
@@ -42,14 +43,21 @@ if TYPE_CHECKING:
     from harnack.fields.capabilities import JumpCrossing
     from harnack.fields.solid_angles.winding_mesh import WindingMesh
 
-_SHARE = 1 / (4 * math.pi)
+# One over the solid angle of all directions.
+_PER_SPHERE = 1 / (4 * math.pi)
 
 
 @dataclass(frozen=True)
 class ExactWinding:
-    """w of a mesh on a backend, in units in which the mesh has a size of about one.
+    """The winding number w of a mesh on a backend, in units in which the mesh has a size of about
+    one.
 
-    rounding: the rounding of w, after all terms have been added.
+    rays: the tree of the triangles, in which crossings are counted.
+    edges, trails: the boundary edges, for values at points; None for a closed mesh.
+    ray_trails, loops: the boundary edges, for samples along rays; None for a closed mesh or without
+        tracing.
+    rounding: a bound of the rounding of w that the final operations cause, after all terms have
+        been added.
     """
 
     backend: Backend
@@ -64,8 +72,8 @@ class ExactWinding:
     def of(
         cls, backend: Backend, mesh: WindingMesh, rays: TriangleTree, traced: bool
     ) -> ExactWinding:
-        """The winding number of a mesh, uploaded; traced: also the data that `sample_interval`
-        needs."""
+        """Upload the data of a mesh. traced: whether `sample_interval` is to be called, which needs
+        more data."""
         if not len(mesh.singular_edges):
             return cls(backend, rays, None, None, None, None, final_rounding(backend))
         vertices, edges = mesh.unit_vertices, mesh.singular_edges
@@ -91,11 +99,12 @@ class ExactWinding:
     """`Field.coarsest_accuracy` of the boundary's cells: any number below 1 (`boundary_cells`)."""
 
     def fast_values(self, x: Vec3) -> Real:
-        """w at points, as by `values`, for a third of the work; not while a loop is being recorded.
+        """w at points, as from `values`, for a third of the work. It cannot be called while a loop
+        is being recorded.
 
         Crossings are decided by `tree.triangle_tree.signed_crossing`. Where `TrailValues` is
         uncertain about an edge, the sum over edges is computed again by `lifted_sums`, which
-        decides by the same bits.
+        decides by the same bits as the crossings.
         """
         # Rays lead away from the middle of the mesh, so that less of it lies ahead. For a mirrored
         # mesh the winding number changes its sign.
@@ -115,7 +124,7 @@ class ExactWinding:
         return value
 
     def values(self, x: Vec3, derivatives: int) -> PointValues:
-        """w and its derivatives up to order `derivatives` at points."""
+        """w and its derivatives up to order `derivatives` at points x."""
         real = self.backend.Float
         turns = self.rays.signed_crossings_vertical(x, real(1))
         if self.edges is None:
@@ -123,18 +132,25 @@ class ExactWinding:
             return PointValues(turns, real(self.rounding), *zeros, real(0), real(0))
         sums, unit = lifted_sums(self.edges, x, derivatives).total(), coordinate_rounding(x)
         sums = sums.add_term(SourceTerm(4 * math.pi * turns), True)
-        return sums.values(_SHARE, unit, self.rounding)
+        return sums.values(_PER_SPHERE, unit, self.rounding)
 
     def crossings_ahead(self, frame: RayFrame, t: Real, active: Mask) -> Real:
-        """The part of w that counts crossings, at the start t of a ray."""
+        """The sum of the signs of all crossings beyond the parameter t of rays. It is the part of w
+        that `sample_interval` takes as `turns`."""
         return self.rays.signed_crossings_ahead(frame, t, active)
 
     def sample_interval(
         self, frame: RayFrame, x: Vec3, behind: JumpCrossing, turns: Real, detail: Real,
         active: Mask = True,
     ) -> Sample:  # fmt: skip
-        """w continued along a ray interval, where active, with the promises of
-        `SourceSums.sample`."""
+        """w at x, continued along a ray interval without jumps, where active, with the promises of
+        `SourceSums.sample`.
+
+        frame: the frame of the rays on which the points x lie.
+        turns: the sum of the signs of all crossings ahead of the interval's start.
+        behind, detail: not used here, as no triangles are summed and every sample has full
+            accuracy.
+        """
         del behind, detail
         if self.edges is None:
             zero = self.backend.Array3f(0)
@@ -147,7 +163,8 @@ class ExactWinding:
         line, loops = RayLine(x, frame.d, 8 * unit), self.loops
 
         def rates(lengths: tuple[Real, ...], lanes: Mask) -> tuple[Real, ...]:
+            """Bounds of the derivative along the line for these lengths (`line_rates`)."""
             return line_rates(loops, line, lengths, lanes & active)
 
         promises = lipschitz_along(line, sums.gradient, sums.singularity_distance, rates)
-        return sums.sample(_SHARE, unit, self.rounding, along=promises)
+        return sums.sample(_PER_SPHERE, unit, self.rounding, along=promises)

@@ -1,4 +1,5 @@
-"""Meshes prepared for winding numbers: welded, duplicates canceled, scaled, in a tree."""
+"""Meshes prepared for winding numbers: vertices are welded, faces and their reversed copies are
+canceled, lengths are scaled, and triangles are sorted into a tree."""
 
 from __future__ import annotations
 
@@ -20,8 +21,9 @@ from harnack.tree.triangle_tree import MAX_TRIANGLES, PARITY_COLUMN, triangle_re
 
 # The largest number of triangles in a leaf, and the number of children of a node: by experiment.
 _LEAF_SIZE, _ARITY = 8, 4
-# Properties that stay valid when vertices move: they depend on faces only, or need not be optimal.
-_VERTEX_INDEPENDENT = ("triangles", "tree", "ray_tree", "singular_flags")
+# Cached properties that `WindingMesh.with_vertices` keeps. They depend only on the faces; or they
+# are trees, which stay valid, although not optimal, when vertices move.
+_KEPT_PROPERTIES = ("triangles", "tree", "ray_tree", "singular_flags")
 
 
 @dataclass(frozen=True)
@@ -30,17 +32,17 @@ class WindingMesh:
     NumPy.
 
     vertices: (n, 3), in the order of the input.
-    faces: (m, 3) indices of welded vertices, no two faces equal.
-    multiplicity: (m,) the number of copies of each face in the input minus the number of reversed
-        copies.
+    faces: (m, 3) indices of welded vertices. No two faces are equal.
+    multiplicity: (m,) for each face the number of its copies in the input minus the number of its
+        reversed copies.
     input_face: (m,) the index of the input face from which each face comes.
-    singular_edges: (k, 2) directed edges at which triangles do not cancel, an edge of weight 2
-        twice.
+    singular_edges: (k, 2) directed edges at which triangles do not cancel. An edge of weight 2
+        occurs twice.
     input_faces: (g, 3) all faces of the input.
-    weld_map: (n,) the vertex that stands for each vertex.
-    rounded: the number of positions that were joined with other positions, from which they differed
+    weld_map: (n,) for each vertex the index of the vertex that stands for it.
+    rounded: the number of positions that were joined with other positions from which they differed
         by rounding (`geometry.welding`).
-    center, size: `unit_vertices` = (vertices - center)/size; the size is a power of two, so that
+    center, size: `unit_vertices` = (vertices - center)/size. The size is a power of two, so that
         scaling lengths is exact.
     """
 
@@ -57,10 +59,10 @@ class WindingMesh:
 
     @classmethod
     def of(cls, vertices: npt.ArrayLike, faces: npt.ArrayLike) -> WindingMesh:
-        """The mesh of vertices (n, 3) and faces (m, 3).
+        """Prepare the mesh of vertices (n, 3) and faces (m, 3).
 
         Raises:
-            MeshError: as `validate_mesh`; or all faces cancel; or there are too many.
+            MeshError: as `validate_mesh`; or all faces cancel each other; or there are too many.
         """
         x, f = validate_mesh(vertices, faces)
         welded = Welded.of(x, f)
@@ -84,13 +86,13 @@ class WindingMesh:
         )
 
     def with_vertices(self, vertices: npt.ArrayLike) -> WindingMesh:
-        """The mesh with other positions of its vertices (n, 3). It shares the data that depend on
-        the faces only, and the shape of trees that have been built; positions, boxes and moments
+        """The mesh with other positions of its vertices (n, 3). It shares the data that depend only
+        on the faces, and the hierarchy of trees that have been built. Positions, boxes and moments
         are new.
 
         Raises:
-            MeshError: as `validate_mesh`; another number of vertices; or vertices that coincided,
-                so that faces were joined there, come apart.
+            MeshError: as `validate_mesh`; or there is another number of vertices; or vertices that
+                coincided, so that faces were joined there, come apart.
         """
         x, faces = validate_mesh(vertices, self.input_faces)
         if len(x) != len(self.vertices):
@@ -114,23 +116,24 @@ class WindingMesh:
         mesh = dataclasses.replace(self, vertices=x, center=center, size=size)
         properties = vars(self)
         vars(mesh).update(
-            {name: properties[name] for name in _VERTEX_INDEPENDENT if name in properties}
+            {name: properties[name] for name in _KEPT_PROPERTIES if name in properties}
         )
         return mesh
 
     @functools.cached_property
     def unit_vertices(self) -> FloatArray:
-        """(n, 3) the vertices in unit coordinates: about the origin, of size about one."""
+        """The vertices (n, 3) in unit coordinates, with the origin at the center and a size of
+        about one."""
         return (self.vertices - self.center) / self.size
 
     @functools.cached_property
     def triangles(self) -> IntArray:
-        """(k, 3) faces, each repeated by its multiplicity."""
+        """The faces (k, 3), each repeated by its multiplicity."""
         return np.repeat(self.faces, self.multiplicity, axis=0)
 
     @functools.cached_property
     def corners(self) -> FloatArray:
-        """(m, 3, 3) corners of the triangles, in unit coordinates."""
+        """The corners (k, 3, 3) of the triangles, in unit coordinates."""
         return self.unit_vertices[self.triangles]
 
     @functools.cached_property
@@ -141,8 +144,8 @@ class WindingMesh:
 
     @functools.cached_property
     def ray_tree(self) -> BalancedTree:
-        """The tree over the centroids of faces, each once: a ray crosses all copies of a face at
-        once."""
+        """The tree over the centroids of faces, each face once, because a ray crosses all copies of
+        a face at once."""
         if len(self.faces) == len(self.triangles):
             return self.tree
         centroids = self.unit_vertices[self.faces].mean(axis=1)
@@ -150,15 +153,15 @@ class WindingMesh:
 
     @functools.cached_property
     def ray_records(self) -> FloatArray:
-        """(m, 14) records of the faces (`tree.triangle_tree`), with the sign of crossings times the
-        multiplicity."""
+        """Records (m, 14) of the faces (`tree.triangle_tree`). The sign of crossings in a record is
+        multiplied by the multiplicity."""
         records = triangle_records(self.unit_vertices, self.faces)
         records[:, PARITY_COLUMN] *= self.multiplicity
         return records
 
     @functools.cached_property
     def records(self) -> FloatArray:
-        """(k, 14) records of the triangles, with the numbers of their faces."""
+        """Records (k, 14) of the triangles, with the indices of their faces."""
         if len(self.faces) == len(self.triangles):
             return self.ray_records
         return np.repeat(
@@ -167,52 +170,55 @@ class WindingMesh:
 
     @functools.cached_property
     def levels(self) -> list[NodeMoments]:
-        """Moments of the nodes of all levels of the tree."""
+        """Moments of the nodes of all levels of the tree, from the leaves to the root."""
         return triangle_tree_moments(self.tree, self.corners)
 
     @functools.cached_property
     def singular_flags(self) -> FloatArray:
-        """(m, 3): 1 for each edge 01, 12 and 02 of a record that is singular, else 0."""
+        """Numbers (k, 3), for the edges 01, 12 and 02 of each triangle's record: 1 if the edge is
+        singular, else 0."""
+        # An edge has the key low * count + high, with the indices of its ends. Only edges between
+        # two ends of singular edges need to be looked up.
         count = len(self.vertices)
         keys = np.sort(self.singular_edges.min(axis=1) * count + self.singular_edges.max(axis=1))
-        at_ends = np.zeros(count, np.bool_)
-        at_ends[self.singular_edges] = True
+        is_end = np.zeros(count, np.bool_)
+        is_end[self.singular_edges] = True
         flags = np.zeros((len(self.triangles), 3))
         ends = np.sort(self.triangles, axis=1)
         for k, (i, j) in enumerate(((0, 1), (1, 2), (0, 2))):
-            candidates = np.flatnonzero(at_ends[ends[:, i]] & at_ends[ends[:, j]])
-            edges: IntArray = ends[candidates, i] * count + ends[candidates, j]
-            flags[candidates, k] = keys.take(np.searchsorted(keys, edges), mode="clip") == edges
+            rows = np.flatnonzero(is_end[ends[:, i]] & is_end[ends[:, j]])
+            edges: IntArray = ends[rows, i] * count + ends[rows, j]
+            flags[rows, k] = keys.take(np.searchsorted(keys, edges), mode="clip") == edges
         return flags
 
     @functools.cached_property
     def box(self) -> tuple[Any, Any]:
-        """The lowest and the highest coordinates of the triangles."""
+        """The lowest and the highest coordinates (3,) of the triangles."""
         return _box(self.vertices, self.faces)
 
     @functools.cached_property
     def area(self) -> float:
-        """The area of all triangles."""
+        """The area of all triangles, in the unit of the input."""
         p, q, r = np.moveaxis(self.corners, 1, 0)
         cross = np.linalg.norm(np.cross(q - p, r - p), axis=1)
         return float(0.5 * cross.sum() * self.size**2)
 
     @functools.cached_property
     def boundary_length(self) -> float:
-        """The length of all singular edges."""
+        """The length of all singular edges, in the unit of the input."""
         ends = self.vertices[self.singular_edges]
         return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum())
 
 
 def _box(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, FloatArray]:
-    """The corners (3,) of the box around the vertices that faces use."""
+    """The lower and the upper corner (3,) of the box around the vertices that the faces use."""
     used = np.zeros(len(vertices), np.bool_)
     used[faces] = True
     return vertices[used].min(axis=0), vertices[used].max(axis=0)
 
 
 def _center_and_size(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, float]:
-    """`WindingMesh.center` and `WindingMesh.size`."""
+    """The attributes `center` and `size` of `WindingMesh`."""
     low, high = _box(vertices, faces)
     size = 2.0 ** np.ceil(np.log2(0.5 * float((high - low).max())))
     return round_to_single(0.5 * (low + high)), float(size)

@@ -1,13 +1,14 @@
-"""The generalized winding number of triangle meshes, whose level set closes holes and repairs
+"""The generalized winding number of triangle meshes. Its level set closes holes, and repairs
 triangle soups and overlaps.
 
 - `WindingNumber`: the field.
 - `winding_extent`, `winding_cells`: the volume and the cells that are proved to contain its level
-  sets, on its triangles and on the surfaces that span its holes.
+sets, on its triangles and on the surfaces that span its holes.
 
 Modulo 1 a winding number does not jump, and it takes a level only on the surfaces that span holes.
-Cells in which it is proved to take no level modulo 1 count as empty, whether or not they contain
-triangles: there rays sample the winding number only where they cross triangles.
+A cell counts as empty if the winding number is proved to take no level modulo 1 in it, whether or
+not it contains triangles. In empty cells rays sample the winding number only where they cross
+triangles.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ __all__ = ["WindingModuloOne", "winding_box", "winding_cells", "winding_extent"]
 # The largest number of cells that are tested in one round for an extent, and the number of times
 # that the box is halved.
 _MAX_CELLS = 20_000
-_FINEST = 6
+_MAX_HALVINGS = 6
 # The number of cells of the grid along its longest side, by experiment.
 _CELLS_ACROSS = 192
 
@@ -88,14 +89,14 @@ class ModuloOneEvaluable(Protocol):
 
 
 class WindingModuloOne(Field):
-    """The winding number w of a mesh modulo 1, as a field: continuous off the singular edges, also
-    across the triangles.
+    """The winding number w of a mesh modulo 1, as a field. It is continuous off the singular edges,
+    also across the triangles.
 
-    winding: the winding number. The promises of its samples are about w continued smoothly through
-        all triangles; that function and w differ by integers. Samples are coarse, which costs half
-        as much: at accuracy scale 1, only 2 % fewer cells are occupied.
+    winding: the winding number. The promises of its samples hold for a function that differs from w
+        by integers: the smooth continuation of w through all triangles. Samples are coarse, which
+        costs half as much. Accuracy scale 1 would give only 2 % fewer occupied cells.
 
-    Where w takes a level off its triangles this field takes it, too, but not the other way round.
+    Where w takes a level off its triangles this field takes it, too. The converse does not hold.
     """
 
     period: ClassVar[float | None] = 1.0
@@ -113,6 +114,7 @@ class WindingModuloOne(Field):
         return self._winding.evaluate_modulo_one(p)
 
     def at_accuracy(self, detail: Real) -> Field:
+        """The same field with samples of this accuracy scale."""
         return EvaluateOnly(lambda p: self._winding.evaluate_modulo_one(p, detail))
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
@@ -122,20 +124,21 @@ class WindingModuloOne(Field):
 def winding_cells(
     winding: ModuloOneEvaluable, extent: Volume, levels: tuple[float, ...]
 ) -> OccupancyGrid:
-    """Cells over an extent, empty if w modulo 1 is proved to stay off the levels in them."""
+    """Cells over an extent. A cell is empty if w modulo 1 is proved to take none of the levels in
+    it."""
     return occupied_cells(WindingModuloOne(winding), levels, extent, _CELLS_ACROSS)
 
 
 def winding_extent(
     winding: ModuloOneEvaluable, mesh: WindingMesh, levels: tuple[float, ...]
 ) -> Volume | None:
-    """A polytope that contains the level sets of the winding number of a mesh; for a closed mesh a
-    box.
+    """A polytope that contains the level sets of the winding number of a mesh. For a closed mesh it
+    is a box.
 
-    A point of a level set lies on a triangle, where w jumps over the level, or off the triangles,
-    and then w has the level there modulo 1, too. The polytope contains all triangles, and all cells
-    of `winding_box` in which w modulo 1, which does not jump at triangles, is not proved to be off
-    the level.
+    Proof. A point of a level set lies on a triangle, where w jumps over the level; or it lies off
+    the triangles, and then w modulo 1 has the level there, too. The polytope contains all
+    triangles. It also contains all cells of `winding_box` in which w modulo 1, which does not jump
+    at triangles, is not proved to be off the level.
     """
     box = winding_box(mesh, levels)
     if not len(mesh.singular_edges):
@@ -143,32 +146,35 @@ def winding_extent(
     corners = mesh.vertices[mesh.faces].reshape(-1, 3)
     lower, upper = box.bounds()
     return tight_extent(
-        WindingModuloOne(winding), levels, lower, upper, _MAX_CELLS, _FINEST, corners
+        WindingModuloOne(winding), levels, lower, upper, _MAX_CELLS, _MAX_HALVINGS, corners
     )
 
 
 def winding_box(mesh: WindingMesh, levels: tuple[float, ...]) -> Box:
-    """A box around the mesh that contains the level sets, wider than the mesh by the smaller of two
-    distances.
+    """A box around the mesh that contains the level sets. Its margin around the mesh is the smaller
+    of two distances.
 
-    (a) At distance rho from the mesh |w| <= area/(4 pi rho^2). (b) Off the triangles 4 pi w is the
-    solid angle of the singular edges mod 4 pi, and a level at distance l from the multiples of 4 pi
-    lies within L/sqrt(l (4 pi - l)) of edges of total length L (isoperimetry on the sphere: see
-    `SolidAngle.extent`).
+    (a) At distance rho from the mesh |w| <= area/(4 pi rho^2). (b) Off the triangles 4 pi w is,
+    modulo 4 pi, the solid angle of the singular edges. A level of this angle at distance l from the
+    multiples of 4 pi lies within L/sqrt(l (4 pi - l)) of edges of total length L (isoperimetry on
+    the sphere: see `SolidAngle.extent`).
     """
     low, high = mesh.box
     slack = 1e-4 * float((high - low).max())
-    nearest = min(abs(level) for level in levels)
-    by_area = math.sqrt(mesh.area / (4 * math.pi * max(nearest, 1e-12)))
-    gap = min(abs(math.remainder(level, 1.0)) for level in levels) * 4 * math.pi
-    by_edges = mesh.boundary_length / math.sqrt(max(gap * (4 * math.pi - gap), 1e-12))
+    min_level = min(abs(level) for level in levels)
+    area_margin = math.sqrt(mesh.area / (4 * math.pi * max(min_level, 1e-12)))
+    level_gap = min(abs(math.remainder(level, 1.0)) for level in levels) * 4 * math.pi
+    edge_margin = mesh.boundary_length / math.sqrt(
+        max(level_gap * (4 * math.pi - level_gap), 1e-12)
+    )
     box = low, high
     if len(mesh.singular_edges):
         ends = mesh.vertices[mesh.singular_edges].reshape(-1, 3)
-        edge_low = np.minimum(low, ends.min(axis=0) - by_edges)
-        box = edge_low, np.maximum(high, ends.max(axis=0) + by_edges)
+        edge_low = np.minimum(low, ends.min(axis=0) - edge_margin)
+        box = edge_low, np.maximum(high, ends.max(axis=0) + edge_margin)
     return Box(
-        np.maximum(box[0], low - by_area) - slack, np.minimum(box[1], high + by_area) + slack
+        np.maximum(box[0], low - area_margin) - slack,
+        np.minimum(box[1], high + area_margin) + slack,
     )
 
 
@@ -179,61 +185,61 @@ MethodName = Literal["auto", "exact", "tree"]
 _MAX_EXACT_EDGES = 2048
 # With fewer edges samples cost so little that cells do not pay.
 _MIN_CELL_EDGES = 64
-# Cells pay from `_PAYS` rays per edge and `_LEAST_RAYS` rays on, for at most `_MAX_CELL_EDGES`
-# edges.
-_PAYS, _LEAST_RAYS, _MAX_CELL_EDGES = 3.0, 5e3, 100_000
-# With more edges than `_SOUP_RATIO` times the triangles the mesh is a soup, whose cells sum over
-# near triangles, not edges; they pay from `_SOUP_PAYS` rays per triangle on, for at most
-# `_MOST_OF_SOUP` triangles.
-_SOUP_RATIO, _SOUP_PAYS, _MOST_OF_SOUP = 1.5, 12.0, 50_000
-# The cube of these cells is larger than the extent, where all rays begin, by this factor, for
-# values at points: this adds a few large cells.
+# Cells pay if there are at least `_PAYS_PER_EDGE` rays per edge and `_MIN_RAYS` rays, and at most
+# `_MAX_CELL_EDGES` edges.
+_PAYS_PER_EDGE, _MIN_RAYS, _MAX_CELL_EDGES = 3.0, 5e3, 100_000
+# A mesh is a soup if it has more singular edges than `_SOUP_RATIO` times the number of triangles.
+# The cells of a soup sum over near triangles, not edges. They pay if there are at least
+# `_PAYS_PER_TRIANGLE` rays per triangle, and at most `_MOST_OF_SOUP` triangles.
+_SOUP_RATIO, _PAYS_PER_TRIANGLE, _MOST_OF_SOUP = 1.5, 12.0, 50_000
+# The cube of a soup's cells is larger than the extent, where all rays begin, by this factor. So the
+# cells also serve values at points outside of the extent. This adds a few large cells.
 _CUBE_FACTOR = 2.002
-# The accuracy of values at points, and of traces, by experiment.
-_VALUES, _TRACED = 2.0, 4.0
+# The default accuracy for values at points, and for tracing, by experiment.
+_VALUES_ACCURACY, _TRACING_ACCURACY = 2.0, 4.0
 # See `WindingNumber._center_values`: 16.5 roundings of each of 100,000 edges, and as much for the
 # steep terms near a point, are less than 1e-6 (`edge_lift.FACTOR_ROUNDINGS`).
 _EXACT_ERROR = 1e-6
 # A point nearer to a triangle than this many roundings of a coordinate may be on either side of it.
-_ON_TRIANGLE = 8.0
+_TRIANGLE_ROUNDINGS = 8.0
 
 
 class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
     """The winding number w of a triangle mesh around a point (Jacobson et al. 2013).
 
-    For a closed mesh w is 1 inside and 0 outside; for a mesh with holes, cracks, duplicated or
-    flipped faces, self-intersections, or a triangle soup, it is a function that is harmonic off the
-    triangles and jumps by integers across them. Its 1/2-surface is the mesh where the mesh is
-    sound, and spans its holes. Faces are counter-clockwise seen from outside.
+    For a closed mesh w is 1 inside and 0 outside. For a mesh with holes, cracks, duplicated or
+    flipped faces or self-intersections, or for a triangle soup, w is harmonic off the triangles and
+    jumps by integers across them. The surface w = 1/2 is the mesh itself where the mesh is sound,
+    and spans its holes. Faces are counter-clockwise seen from outside.
 
     vertices: (n, 3).
     faces: (m, 3) indices into them.
     method: "exact" (`edge_lift`: no truncation, cost by boundary edges), "tree" (`winding_tree`),
         or "auto": exact up to 2048 boundary edges.
     accuracy: for the tree, the moments of a cluster of triangles are used beyond `accuracy` times
-        its radius; a larger accuracy is slower and has smaller errors. At least 1.5; by default 2
-        for values at points and 4 for tracing, which uses a higher accuracy where the tolerance
-        needs it. By default gradients and Hessians at points do not come from this tree but from
-        sums over the boundary edges, exact up to rounding, for up to 32,768 edges; for more edges,
-        the accuracy of gradients is increased until their error is about 1 % of their length in
-        most places (`gradient_error_bound` bounds it).
+        its radius; at least 1.5. A larger accuracy is slower and has smaller errors. By default it
+        is 2 for values at points and 4 for tracing. Tracing uses a higher accuracy where the
+        tolerance needs it. By default gradients and Hessians at points do not come from this tree.
+        For up to 32,768 boundary edges they come from sums over these edges, exact up to rounding.
+        For more edges, the accuracy of gradients is increased until their error is about 1 % of
+        their length in most places (`gradient_error_bound` bounds it).
     order: the order of the multipoles of the tree: 0 (dipoles), 1 or 2 (octupoles).
-    cells: for many rays: FMM cells in which w, up to an integer, is the solid angle of a few near
-        edges plus one polynomial for all others, with a proved remainder (`boundary_cells`), so
-        that a sample costs the same whatever the number of edges. In a soup, where triangles have
-        hardly an edge in common, near triangles take the place of edges, with the tree as method
-        (`dipole_cells`). None builds them where they pay (`for_ray_count`), True always, False
-        never; they take at most the number of megabytes of this argument (True: 256), and several
-        times as much while they are built. The cells of soups, if the user requested them, give
-        values and gradients at points, too, which pays from some 2,000 points per triangle on; all
-        other values and derivatives at points are those of `method`.
+    cells: whether to build FMM cells, for many rays. In a cell w is, up to an integer, the solid
+        angle of a few near edges plus one polynomial for all others, with a proved remainder
+        (`boundary_cells`). So a sample costs the same whatever the number of edges. In a soup,
+        where triangles have hardly an edge in common, near triangles take the place of edges if the
+        method is "tree" (`dipole_cells`). None builds cells if they pay (`for_ray_count`), True
+        always, False never. They take at most the number of megabytes of this argument (True: 256),
+        and several times as much while they are built. If the user requested the cells of a soup,
+        they also give values and gradients at points, which pays for more than some 2,000 points
+        per triangle. All other values and derivatives at points are computed by `method`.
 
-    A mesh that lies on its own spanning surface, such as a file that `mesh` wrote of a
-    `SolidAngle`, or any flat mesh, has the level right beside all of its triangles, where rounding
-    decides on which side. Then the surface is the mesh itself, every triangle and nothing else: so
-    it is traced, meshed and measured, while values do not change (`own_sheet`). Other open meshes
-    have the level where they lie before the surface that spans their boundary, and not where they
-    lie behind it.
+    Some meshes lie on their own spanning surface, such as any flat mesh, or a file that `mesh`
+    wrote of a `SolidAngle`. Such a mesh has the level right beside all of its triangles, and
+    rounding decides on which side. Then the surface is the mesh itself, every triangle and nothing
+    else. It is traced, meshed and measured as such, while values do not change (`own_sheet`). Other
+    open meshes have the level where they lie before the surface that spans their boundary, and not
+    where they lie behind it.
 
     Hits on triangles have `Hits.primitive_index`; `facet_faces` gives the face of each.
     `with_vertices` gives the field for the same faces when vertices have moved.
@@ -278,12 +284,13 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
 
     @no_derivatives
     def with_vertices(self, vertices: Any) -> WindingNumber:
-        """The winding number of the same faces with other positions of their vertices (n, 3), for
-        less work than a new field.
+        """The winding number of the same faces with other positions of their vertices (n, 3). This
+        takes less work than a new field.
 
-        Faces are not joined and sorted into a tree again: the tree keeps its shape, and gets new
-        centers, radii, moments and bounds. All promises are computed from the new positions, so a
-        tree whose vertices moved far is slower than a new tree, never wrong.
+        Faces are not joined and sorted into a tree again. The new tree has the same hierarchy of
+        triangles, with new centers, radii, moments and bounds. All promises are computed from the
+        new positions. So a tree whose vertices moved far is slower than a new tree, but never
+        wrong.
 
         Raises MeshError as for a new mesh, and for vertices that coincided and come apart.
         """
@@ -311,11 +318,14 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return self.mesh.input_face
 
     def prepare(self, backend: Backend) -> Self:
+        """A copy with its data on a backend, for tracing."""
         prepared = super().prepare(backend)
         prepared.coarsest_accuracy = prepared._require_data().winding.coarsest_detail
         return prepared
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
+        """Values and derivatives at points x: see `BatchedField.values_at`. With a tree, second
+        derivatives come from the boundary, unless the user chose the accuracy."""
         data = self._batch_data(backend_of(x))
         winding, x = data.winding, data.to_unit(x)
         if isinstance(winding, TreeWinding):
@@ -331,6 +341,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return self._stated(data, x, values)
 
     def sharp_values_at(self, x: Vec3) -> PointValues:
+        """Values and gradients at points x. With a tree, gradients come from the boundary, unless
+        the user chose the accuracy."""
         data = self._batch_data(backend_of(x))
         winding = data.winding
         if not isinstance(winding, TreeWinding) or self.accuracy is not None:
@@ -344,7 +356,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return self._stated(data, x, values)
 
     def _boundary_rates(self, data: _WindingData, winding: TreeWinding) -> BoundaryRates:
-        """The derivatives from the boundary, once for a backend."""
+        """The derivatives from the boundary, computed once for a backend."""
         if data.backend not in self._rates:
             self._rates[data.backend] = BoundaryRates.of(
                 data.backend, self.mesh, self.order, winding
@@ -352,9 +364,10 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return self._rates[data.backend]
 
     def _stated(self, data: _WindingData, x: Vec3, values: PointValues) -> PointValues:
-        """Values at unit coordinates x, with all parts of their errors, in the user's units."""
-        # Within rounding of a triangle, it is not known on which side of it x is.
-        on_triangle = jump_sum_within(data.rays, x, _ON_TRIANGLE * coordinate_rounding(x))
+        """Values at points x in unit coordinates, converted to the user's units, with all parts of
+        their errors."""
+        # If a triangle is within rounding of x, it is not known on which side of it x is.
+        on_triangle = jump_sum_within(data.rays, x, _TRIANGLE_ROUNDINGS * coordinate_rounding(x))
         values = dataclasses.replace(values, error=values.error + on_triangle)
         weight = self.mesh.area / (4 * math.pi * self.mesh.size**2)
         return values.with_far_field_errors(x, 64 + len(self.mesh.singular_edges), weight).rescaled(
@@ -362,7 +375,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         )
 
     def _upload(self, backend: Backend, *, traced: bool) -> _WindingData:
-        accuracy = self.accuracy or (_TRACED if traced else _VALUES)
+        """The data on a backend, for tracing or for values at points."""
+        accuracy = self.accuracy or (_TRACING_ACCURACY if traced else _VALUES_ACCURACY)
         mesh = self.mesh
         rays = TriangleTree.of(backend, mesh.ray_tree, mesh.ray_records)
         if self.method == "exact":
@@ -375,7 +389,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return self._add_cells(data, traced=traced)
 
     def _add_cells(self, data: _WindingData, *, traced: bool) -> _WindingData:
-        """The data with cells: cells of triangles, or for tracing cells of edges."""
+        """The data with cells: cells of triangles for a soup; otherwise, for tracing, cells of
+        edges. If the cells would take too much memory, there are none."""
         mesh, most_bytes, winding = self.mesh, self.max_bytes(), data.winding
         extent = self.extent((self.default_level,))
         assert extent is not None
@@ -399,9 +414,9 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return self.method == "tree" and edges > _SOUP_RATIO * triangles
 
     def _center_values(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """w at points (n, 3), and bounds of its error; the rounding of an exact sum, in double
-        precision and at points off triangles by many roundings in single precision, is far below
-        the bound."""
+        """w at points (n, 3), and bounds (n,) of its error. The exact sum is computed in double
+        precision, at points that are many roundings of single precision off triangles; so its
+        rounding is far below the bound."""
         field = self.with_cells(False)  # with cells, this would call itself
         value = np.array(field.value(points, precision="double"))
         if self.method == "exact":
@@ -410,19 +425,22 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
 
     @property
     def has_unknown_branch(self) -> bool:
+        """Whether samples along rays may know w only up to an integer, as those of cells of edges
+        do."""
         return self._device is not None and self._device.cells is not None
 
     def cells_pay_from(self) -> float:
+        """The smallest number of rays for which cells pay; infinite if they never pay."""
         edges, triangles = len(self.mesh.singular_edges), len(self.mesh.triangles)
         if self._is_soup:
             is_small = triangles <= _MOST_OF_SOUP
-            return max(_LEAST_RAYS, _SOUP_PAYS * triangles) if is_small else math.inf
+            return max(_MIN_RAYS, _PAYS_PER_TRIANGLE * triangles) if is_small else math.inf
         pays = _MIN_CELL_EDGES <= edges <= _MAX_CELL_EDGES
-        return max(_LEAST_RAYS, _PAYS * edges) if pays else math.inf
+        return max(_MIN_RAYS, _PAYS_PER_EDGE * edges) if pays else math.inf
 
     def occupied_cells(self, levels: tuple[float, ...]) -> OccupancyGrid | None:
-        """Cells by `winding_cells`, if there are many edges, for the exact method or with FMM
-        cells."""
+        """The cells of `winding_cells`; None if there are few edges, if the surface is the mesh
+        itself, or for the method "tree" without FMM cells."""
         is_small = len(self.mesh.singular_edges) < _MIN_CELL_EDGES
         if (
             is_small
@@ -438,8 +456,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return self._occupied[levels]
 
     def evaluate(self, p: Vec3) -> Sample:
-        """w itself, jumps included, with promises about w continued smoothly through all
-        triangles."""
+        """A sample of w itself, jumps included. Its promises hold for the smooth continuation of w
+        through all triangles."""
         data, frame = self._upward_rays(p)
         return _sample_at_start(data, frame, data.winding.crossings_ahead(frame, 0, True), 1.0)
 
@@ -447,8 +465,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return WindingModuloOne(self)
 
     def evaluate_modulo_one(self, p: Vec3, detail: Real = 0.0) -> Sample:
-        """A sample of w minus an unknown integer, which may differ from point to point; by default
-        the coarsest sample."""
+        """A sample of w minus an unknown integer, which may differ from point to point. detail: the
+        accuracy scale; by default the sample is the coarsest one."""
         data, frame = self._upward_rays(p)
         detail = data.backend.Float(detail)
         if data.cells is None:
@@ -460,6 +478,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return outside.select(inside, space_scaled(in_cells, data.size))
 
     def value_if_cheap(self, p: Vec3, rounding: Real, active: Mask) -> Real:
+        """w at p where it follows from the cell that contains p, else NaN. rounding: the rounding
+        of a coordinate of p."""
         data = self._data_for(p)
         if data.cells is None:
             return data.backend.Float(dr.nan)
@@ -469,13 +489,15 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         )
 
     def _upward_rays(self, p: Vec3) -> tuple[_WindingData, RayFrame]:
-        """The data, and rays from p, on which all triangles lie ahead."""
+        """The data on the device, and the frame of rays from p along z."""
         data = self._data_for(p)
         return data, RayFrame.along(data.backend, data.to_unit(p), data.backend.Array3f(0, 0, 1))
 
     def next_jump(
         self, o: Vec3, d: Vec3, after: JumpCrossing, t_max: Real, active: Mask
     ) -> JumpCrossing:
+        """The next crossing of a triangle on each ray, after the crossing `after` and up to
+        t_max."""
         data = self._data_for(o)
         frame = RayFrame.along(data.backend, data.to_unit(o), d)
         behind = (after.t / data.size, after.facet)
@@ -484,6 +506,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return JumpCrossing(t * data.size, facet, -sign, -normal)
 
     def initial_offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
+        """The sum of the signs of all crossings beyond t_min, for the exact method; otherwise 0."""
         data = self._data_for(o)
         if self.only_sheets:
             return data.backend.Float(0)
@@ -491,6 +514,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return data.winding.crossings_ahead(frame, t_min / data.size, active)
 
     def is_of_sheets_alone(self, levels: tuple[float, ...]) -> bool:
+        """Whether the surface of these levels is the mesh itself (`own_sheet`); computed once."""
         if len(levels) != 1:
             return False
         if levels not in self._own_levels:
@@ -498,6 +522,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return self._own_levels[levels]
 
     def with_levels(self, levels: tuple[float, ...]) -> WindingNumber:
+        """The field by which these levels are traced. If the surface is the mesh itself, this is a
+        copy that has the level only at its triangles."""
         if not self.is_of_sheets_alone(levels):
             return self
         field = self.with_cells(False)
@@ -507,6 +533,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
     def continuation(
         self, o: Vec3, d: Vec3, behind: JumpCrossing, ahead: JumpCrossing, offset: Real
     ) -> Field:
+        """w on a ray between the crossings `behind` and `ahead`, as a field without jumps."""
         if self.only_sheets:
             return _BesideSheets(self._data_for(o).backend, self._level_of_sheets, behind, ahead)
         data = self._data_for(o)
@@ -515,12 +542,14 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return _WindingOnInterval(data, frame, start, offset)
 
     def distance_to_jumps(self, p: Vec3) -> Real:
+        """A lower bound of the distance from p to the triangles."""
         data = self._data_for(p)
         return distance_lower_bound(data.rays, data.to_unit(p)) * data.size
 
     def nearest_facet(
         self, p: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
     ) -> NearestFacet:
+        """The nearest triangle after the one given by `after`, within the distance `limit`."""
         data = self._data_for(p)
         facet = next_closest_triangle(
             data.rays, data.to_unit(p), after, dr.square(limit / data.size), active
@@ -534,15 +563,18 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         )
 
     def jump_mesh(self) -> tuple[FloatArray, IntArray, bool] | None:
+        """Vertices, triangles, and whether the mesh is closed."""
         return self.mesh.vertices, self.mesh.triangles, not len(self.mesh.singular_edges)
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
+        """Raise ValueError for level 0, which is no surface."""
         for level in levels:
             if abs(level) < 1e-6:
                 raise ValueError("level 0 of a winding number is no surface; try 0.5")
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """All triangles, and cells around them that are not proved empty (`winding_extent`)."""
+        """A volume that contains the level sets: all triangles, and cells around them that are not
+        proved empty (`winding_extent`)."""
         if levels not in self._extents:
             self._extents[levels] = winding_extent(self.with_cells(False), self.mesh, levels)
         return self._extents[levels]
@@ -560,7 +592,12 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
 
 @dataclass(frozen=True)
 class _WindingData(UnitFrame):
-    """The data of a winding number on a backend."""
+    """The data of a winding number on a backend.
+
+    winding: the sum that gives w.
+    rays: the tree of the triangles, for rays and distances.
+    cells: the cells of edges; None for none.
+    """
 
     winding: ExactWinding | TreeWinding
     rays: TriangleTree
@@ -568,7 +605,7 @@ class _WindingData(UnitFrame):
 
     @property
     def built(self) -> BuiltCells | None:
-        """The cells, of edges or of triangles."""
+        """The cells, of edges or of triangles; None for none."""
         if self.cells is None and isinstance(self.winding, TreeWinding):
             return self.winding.cells
         return self.cells
@@ -577,8 +614,12 @@ class _WindingData(UnitFrame):
 def _sample_at_start(
     data: _WindingData, frame: RayFrame, turns: Real, detail: Real, active: Mask = True
 ) -> Sample:
-    """The sample at the start of rays, where active; turns: the sum of the signs of all crossings
-    ahead."""
+    """The sample at the start of rays, where active.
+
+    frame: the frame of the rays.
+    turns: the sum of the signs of all crossings ahead.
+    detail: the accuracy scale.
+    """
     start = JumpCrossing(0.0, data.backend.UInt32(NO_FACET), 0.0, data.backend.Array3f(0, 0, 1))
     detail = data.backend.Float(detail)
     sample = data.winding.sample_interval(frame, frame.o, start, turns, detail, active)
@@ -586,31 +627,42 @@ def _sample_at_start(
 
 
 class _WindingOnInterval(Field):
-    """A winding number on a ray interval; behind: the crossing at the start of the interval, in
-    unit lengths."""
+    """A winding number on a ray interval between two crossings of triangles.
+
+    on: the data of the winding number.
+    frame: the frame of the rays.
+    behind: the crossing at the start of the interval, in unit lengths.
+    offset: the sum of the signs of all crossings ahead of the start; only the exact method uses it.
+    detail: the accuracy scale.
+    """
 
     def __init__(
         self,
-        data: _WindingData,
+        on: _WindingData,
         frame: RayFrame,
         behind: JumpCrossing,
         offset: Real,
         detail: Real = 1.0,
     ) -> None:
-        self.has_variable_accuracy = data.winding.has_detail or data.cells is not None
-        self.coarsest_accuracy = data.winding.coarsest_detail
-        self._data, self._frame, self._detail = data, frame, data.backend.Float(detail)
+        """The arguments are those of the class."""
+        self.has_variable_accuracy = on.winding.has_detail or on.cells is not None
+        self.coarsest_accuracy = on.winding.coarsest_detail
+        self._on, self._frame, self._detail = on, frame, on.backend.Float(detail)
         self._behind, self._offset = behind, offset
 
     @property
     def has_unknown_branch(self) -> bool:
-        return self._data.cells is not None
+        """Whether samples may know w only up to an integer."""
+        return self._on.cells is not None
 
     def at_accuracy(self, detail: Real) -> Field:
-        return _WindingOnInterval(self._data, self._frame, self._behind, self._offset, detail)
+        """The same function with samples of this accuracy scale."""
+        return _WindingOnInterval(self._on, self._frame, self._behind, self._offset, detail)
 
     def evaluate(self, p: Vec3) -> Sample:
-        data, frame = self._data, self._frame
+        """A sample of w, from the cells where they are used. There it is w up to an integer, and
+        marked as such."""
+        data, frame = self._on, self._frame
         x, detail = data.to_unit(p), self._detail
         if data.cells is None:
             sample = data.winding.sample_interval(frame, x, self._behind, self._offset, detail)
@@ -624,9 +676,14 @@ class _WindingOnInterval(Field):
 
 
 class _BesideSheets(Field):
-    """The field on a ray interval of a mesh that is the surface as a whole: constant, and so far
-    from the level that it passes the level at the jump at the triangle ahead; or, if no triangle is
-    ahead, at the triangle behind."""
+    """The field on a ray interval beside a mesh that is the surface as a whole (`own_sheet`).
+
+    It is constant, and half a unit from the level, on the side from which the jump at the triangle
+    ahead passes the level. If no triangle is ahead, the jump at the triangle behind decides.
+
+    level: the level of the surface.
+    behind, ahead: the crossings at the ends of the interval.
+    """
 
     def __init__(
         self, backend: Backend, level: float, behind: JumpCrossing, ahead: JumpCrossing
@@ -636,4 +693,5 @@ class _BesideSheets(Field):
         self._value = dr.select(jump > 0, real(level + 0.5), level - 0.5)
 
     def evaluate(self, p: Vec3) -> Sample:
+        """The sample of the constant."""
         return Sample(self._value, 0 * p, (Lipschitz(0.0),), 0.0)

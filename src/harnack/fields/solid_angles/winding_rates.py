@@ -1,9 +1,9 @@
 """Gradients and Hessians of winding numbers at points, from the boundary only.
 
-Off the triangles w is, up to an integer, the solid angle of its boundary edges over 4 pi. So all
-surfaces with these edges have the same derivatives. The triangles of a mesh with small holes nearly
-cancel: the truncation error of a tree over them is many times its gradient. Two other sums have no
-such error:
+Off the triangles the winding number w of a mesh is, up to an integer, the solid angle of its
+boundary edges over 4 pi. So all surfaces with these edges have the same derivatives. If a mesh has
+only small holes, the terms of its triangles nearly cancel, and the truncation error of a tree over
+them is many times the gradient. Two other sums have no such error:
 
 - a direct sum over the edges (Biot and Savart's law), for few edges;
 - a sum by a tree over *caps*, fans of triangles over the loops that the edges form.
@@ -36,45 +36,47 @@ __all__ = ["BoundaryRates", "with_rates"]
 # sufficient accuracy.
 _FEW = 32_768
 # A tree over caps uses the moments of clusters beyond this many times their radius.
-_ACCURACY = 2.0
+_CAPS_ACCURACY = 2.0
 # Caps are of use if their area is less than this fraction of the area of the mesh.
-_SMALLER = 0.5
+_MAX_AREA_RATIO = 0.5
 
 
 @dataclass(frozen=True)
 class BoundaryRates:
     """The derivatives of w off the triangles, in units in which the mesh has a size of about one.
 
-    summed: the edges; or a tree of caps, or of the triangles themselves; None for a closed mesh.
+    summed: what is summed: the edges, or a tree of caps, or a tree of the triangles themselves;
+        None for a closed mesh.
     """
 
     summed: LiftedEdges | TreeWinding | None
 
     @classmethod
     def of(
-        cls, backend: Backend, mesh: WindingMesh, order: int, tree: TreeWinding
+        cls, backend: Backend, mesh: WindingMesh, order: int, whole: TreeWinding
     ) -> BoundaryRates:
         """The derivatives of the winding number of a mesh.
 
-        tree: a tree over the mesh's triangles, which is used if it has cells, and if caps would be
-            no smaller, as for a soup.
+        order: the order of the multipoles of a tree over caps.
+        whole: a tree over the mesh's triangles. It is used if it has cells, and if caps would be no
+            smaller than the mesh, as for a triangle soup.
         """
         if not len(mesh.singular_edges):
             return cls(None)
-        if tree.cells is not None:
-            return cls(tree)
+        if whole.cells is not None:
+            return cls(whole)
         if len(mesh.singular_edges) <= _FEW:
             return cls(LiftedEdges.upload(backend, mesh.unit_vertices, mesh.singular_edges))
         if len(mesh.singular_edges) > len(mesh.triangles):
-            return cls(tree)
+            return cls(whole)
         caps = caps_of(mesh)
-        if caps.area > _SMALLER * mesh.area:
-            return cls(tree)
-        return cls(TreeWinding.of(backend, caps, _ACCURACY, order))
+        if caps.area > _MAX_AREA_RATIO * mesh.area:
+            return cls(whole)
+        return cls(TreeWinding.of(backend, caps, _CAPS_ACCURACY, order))
 
     def at(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:
-        """The derivatives up to order `derivatives` at the accuracy scale `closer`; the value has
-        no meaning."""
+        """The derivatives up to order `derivatives` at points x. The value in the result has no
+        meaning. closer: the accuracy scale."""
         if isinstance(self.summed, TreeWinding):
             return self.summed.values(x, derivatives, closer)
         real = cast("Any", type(x.x))
@@ -86,20 +88,22 @@ class BoundaryRates:
         return sums.values(1 / (4 * math.pi), coordinate_rounding(x), real(0))
 
     def sharp(self, x: Vec3) -> PointValues:
-        """As `at`, with an error of the gradient of about 1 % of its length (`sharpened`)."""
+        """The gradient at points x, as from `at`, with an error of about 1 % of its length
+        (`sharpened`)."""
         if isinstance(self.summed, TreeWinding):
             return sharpened(lambda points, accuracy: self.at(points, 1, accuracy), x)
         return self.at(x, 1, 1.0)
 
 
 def with_rates(value: PointValues, rates: PointValues) -> PointValues:
-    """The value of one evaluation with the derivatives of another."""
+    """The value from `value`, and the derivatives from `rates`."""
     return dataclasses.replace(rates, value=value.value, error=value.error)
 
 
 def caps_of(mesh: WindingMesh) -> WindingMesh:
-    """Triangles with the same boundary as a mesh, in the same unit coordinates: a fan over each of
-    the loops that its singular edges form, about the mean of the loop's vertices."""
+    """Triangles with the same boundary as a mesh, in the same unit coordinates. They form a fan
+    over each of the loops that the mesh's singular edges form; the apex of a fan is the mean of the
+    loop's vertices."""
     loops = simple_loops(mesh.singular_edges)
     centers = [mesh.vertices[loop].mean(axis=0) for loop in loops]
     vertices = np.concatenate([mesh.vertices, centers])
@@ -118,8 +122,8 @@ def caps_of(mesh: WindingMesh) -> WindingMesh:
 
 
 def simple_loops(edges: IntArray) -> list[IntArray]:
-    """Closed directed edges (k, 2) as loops of vertices that visit each of their vertices once: the
-    smallest loops that a walk along the edges closes."""
+    """Closed directed edges (k, 2) as loops, each an array of different vertices. A walk along the
+    edges cuts off a loop as soon as it comes back to a vertex."""
     loops: list[IntArray] = []
     for trail in closed_trails(edges):
         path: list[int] = []

@@ -5,15 +5,15 @@ Barill et al. 2018 ("Fast winding numbers for soups and clouds") with orders 0 t
 Hessians from the same moments, a bound of the truncation, and promises.
 
 Near triangles. By Stokes' theorem the field of a set of triangles is that of the boundary of their
-union, so only edges at which they do not cancel are summed. `edge_lift` explains how crossings and
-edges together give the winding number: both are decided by the same bits, so that an edge that two
-triangles share contributes no rounding error.
+union, so only the edges at which they do not cancel are summed. `edge_lift` explains how crossings
+and edges together give the winding number. Both are decided by the same bits, so that an edge that
+two triangles share contributes no rounding error.
 
-Soups have the same cells as clouds: if triangles have hardly an edge in common, cells of edges
-would have three near edges for each triangle. Near triangles are added as in the leaves of the
-tree, and far triangles are sheets of dipoles with two more moments, so that a sample in a cell
-gives all of w, including its integer. These cells are built in a quarter of the time of cells of
-edges. Soups of few triangles, each as large as the whole soup, have cells of edges.
+Cells. If triangles have hardly an edge in common (a soup), cells of edges would have three near
+edges for each triangle. So soups have the same cells as clouds. Near triangles are added as in the
+leaves of the tree, and far triangles are sheets of dipoles with two more moments. So a sample in a
+cell gives all of w, including its integer. These cells are built in a quarter of the time of cells
+of edges. Soups of few triangles, each as large as the whole soup, have cells of edges.
 """
 
 from __future__ import annotations
@@ -56,10 +56,11 @@ if TYPE_CHECKING:
     from harnack.fields.solid_angles.treecode import AddPrimitive
     from harnack.fields.solid_angles.winding_mesh import WindingMesh
 
-# The first of three columns of a record after the columns of `tree.triangle_tree`: 1 if an edge is
-# singular.
+# The first of three columns that a record has after the columns of `tree.triangle_tree`. They hold
+# for each edge 1 if it is singular, else 0.
 SINGULAR = INVERSE_SQUARES_COLUMN + 3
-# The corners that edges join, and 1 if they run in the triangle's direction, else -1.
+# For each edge of a triangle, the two corners that it joins, and 1 if it runs in the triangle's
+# direction, else -1.
 _EDGES = ((0, 1, 1.0), (1, 2, 1.0), (0, 2, -1.0))
 
 
@@ -68,7 +69,7 @@ class NearEdge:
     """An edge of a near triangle.
 
     edge: the edge relative to a point.
-    is_singular: whether the triangles at it do not cancel.
+    is_singular: whether the triangles at this edge do not cancel.
     """
 
     edge: LiftedEdge
@@ -77,21 +78,25 @@ class NearEdge:
     def is_open(self, reach: Real) -> Mask:
         """Whether the edge may be part of the boundary of the triangles near x.
 
-        It is not if it is not singular and nearer than (reach - 1)/2 times its length L: a far node
-        with a triangle at it has radius R >= L/2 and is farther than reach R, hence the edge
-        farther than (reach - 1) R. So all triangles at it are near, and they cancel there.
+        reach: nodes are far beyond `reach` times their radius.
 
-        In a cell the same holds of a triangle that is far from it, with `TRIANGLE_RATIO` for the
-        reach: the point is nearer to the center by less than the k > 1 radii of `dipole_expansion`.
-        Far nodes are farther.
+        The edge is no part of it if it is not singular, and nearer than (reach - 1)/2 times its
+        length L. Proof: a far node that has a triangle at this edge has a radius R >= L/2 and is
+        farther than reach R, and so the edge is farther than (reach - 1) R. Hence all triangles at
+        a nearer edge are near, and cancel there.
+
+        In a cell the same holds for a triangle that is far from the cell, with `TRIANGLE_RATIO` for
+        `reach`, because x is nearer to the cell's center than the k > 1 radii of
+        `dipole_expansion`. Far nodes are even farther.
         """
         square, inverse = self.edge.edge.squared_distance, self.edge.edge.inverse_square_length
-        closed = ~self.is_singular & (square * inverse < dr.square(0.5 * (reach - 1)))
-        return (inverse > 0) & ~closed
+        is_closed = ~self.is_singular & (square * inverse < dr.square(0.5 * (reach - 1)))
+        return (inverse > 0) & ~is_closed
 
 
 def edges_of(row: list[Real], x: Vec3, frame: RayFrame | VerticalRayFrame) -> Iterator[NearEdge]:
-    """The edges of the triangle of a record, relative to x; in an empty slot they have length 0."""
+    """The three edges of the triangle of a record, relative to x and to rays of the frame. In an
+    empty slot they have length 0."""
     ends = corners_of(row, cast("Any", type(x)))
     for k, (i, j, sign) in enumerate(_EDGES):
         inverse = dr.select(row[NUMBER_COLUMN] >= 0, row[INVERSE_SQUARES_COLUMN + k], 0)
@@ -99,16 +104,22 @@ def edges_of(row: list[Real], x: Vec3, frame: RayFrame | VerticalRayFrame) -> It
         yield NearEdge(edge, row[SINGULAR + k] > 0)
 
 
+# A function of a triangle's record and the parameter t of a crossing with it: whether the crossing
+# is ahead.
 IsAhead: TypeAlias = "Callable[[list[Real], Real], Mask]"
 
-_SHARE = 1 / (4 * math.pi)
+# One over the solid angle of all directions.
+_PER_SPHERE = 1 / (4 * math.pi)
 
 
 @dataclass(frozen=True)
 class TreeWinding:
-    """w of a mesh on a backend, in units in which the mesh has a size of about one.
+    """The winding number w of a mesh on a backend, in units in which the mesh has a size of about
+    one.
 
-    cells: for samples with gradients up to detail 1; None for no cells.
+    clusters: the sum by a tree over the triangles.
+    rounding: a bound of the rounding of w that the final operations cause.
+    cells: FMM cells for samples with gradients at accuracy scales up to 1; None for no cells.
     """
 
     clusters: Treecode
@@ -119,7 +130,11 @@ class TreeWinding:
     def of(
         cls, backend: Backend, mesh: WindingMesh, accuracy: float, order: int,
     ) -> TreeWinding:  # fmt: skip
-        """The winding number of a mesh, uploaded, without cells."""
+        """Upload the data of a mesh, without cells.
+
+        accuracy: the moments of a node are used beyond this many times its radius.
+        order: the order of the multipoles.
+        """
         records = np.concatenate([mesh.records, mesh.singular_flags], axis=1)
         slots = records_in_slots(mesh.tree, records)
         rounding = final_rounding(backend)
@@ -128,7 +143,8 @@ class TreeWinding:
         return cls(clusters, rounding)
 
     def build_cells(self, mesh: WindingMesh, half: float, most_bytes: int) -> DipoleCells | None:
-        """Cells of the cube [-half, half]^3, of at most `most_bytes` bytes: see `dipole_cells`."""
+        """Build cells of the cube [-half, half]^3, of at most `most_bytes` bytes (`dipole_cells`);
+        None if they would need more."""
         sources, triangles = (
             mesh.tree.values_in_slots(triangle_sources(mesh.corners)),
             self.clusters.tree,
@@ -140,7 +156,7 @@ class TreeWinding:
 
     @property
     def has_detail(self) -> bool:
-        """Whether coarse samples cost less."""
+        """Whether coarse samples cost less. It is true."""
         return True
 
     @property
@@ -149,12 +165,12 @@ class TreeWinding:
 
     @property
     def coarsest_detail(self) -> float:
-        """`Field.coarsest_accuracy`."""
+        """The accuracy scale of coarse samples (`Field.coarsest_accuracy`)."""
         return self.clusters.coarsest_accuracy if self.cells is None else 1.0
 
     def values(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:
-        """w and its derivatives up to order `derivatives` at points; closer: the accuracy scale, at
-        least 1.
+        """w and its derivatives up to order `derivatives` at points x. closer: the accuracy scale,
+        at least 1.
 
         Near triangles add their crossings with the rays from x along z, and their open edges.
         """
@@ -164,11 +180,12 @@ class TreeWinding:
         )
 
         def is_ahead(row: list[Real], t: Real) -> Mask:
+            """Whether a crossing at t is ahead of x."""
             del row
             return t > 0
 
         sums = self._sums(VerticalRayFrame(x), x, detail, unit, is_ahead, derivatives)
-        return self.clusters.values(sums, _SHARE, unit, self.rounding)
+        return self.clusters.values(sums, _PER_SPHERE, unit, self.rounding)
 
     def _sums(
         self,
@@ -180,17 +197,26 @@ class TreeWinding:
         derivatives: int,
         where: Mask = True,
     ) -> SourceSums:
-        """4 pi w: far clusters, the crossings of near triangles that are ahead of x on rays of the
-        frame, and the open edges of near triangles (`NearEdge.is_open`).
+        """Sums whose value is 4 pi w: far clusters, the crossings of near triangles that are ahead
+        of x on rays of the frame, and the open edges of near triangles (`NearEdge.is_open`).
 
-        is_ahead(row, t): whether a crossing at t with the triangle of a record is ahead.
+        x: points of the rays.
+        detail: the accuracy scale.
+        unit: the rounding of a coordinate.
+        is_ahead: a function; is_ahead(row, t) tells whether a crossing at t with the triangle of
+            the record `row` is ahead.
+        where: the mask of the active lanes.
         """
         start = LiftedProduct.identity(self.backend.Float).parts()
 
         def adder(reach: Real) -> AddPrimitive:
+            """Returns a function that adds a near triangle. reach: as for `NearEdge.is_open`."""
+
             def add(
                 row: list[Real], active: Mask, sums: SourceSums, state: tuple[Any, ...]
             ) -> tuple[SourceSums, tuple[Any, ...]]:
+                """Add the triangle of a record to the sums, where active. state: the product of the
+                factors of edges, as `LiftedProduct.parts`."""
                 t, sign = signed_crossing(row, frame)
                 # A crossing is a full turn of the product, which counts them without rounding.
                 re, im, turns = state
@@ -209,10 +235,12 @@ class TreeWinding:
         self, x: Vec3, detail: Real, adder: Callable[[Real], AddPrimitive], state: tuple[Any, ...],
         where: Mask, derivatives: int = 1,
     ) -> tuple[SourceSums, tuple[Any, ...]]:  # fmt: skip
-        """The sums, and the caller's own state, by the cells if there are cells, the detail is at
-        most 1 and no second derivatives are requested.
+        """The sums and the caller's own state. They come from the cells if there are cells and no
+        second derivatives are requested, at accuracy scales up to 1; otherwise from the tree.
 
-        adder: from the reach of `NearEdge.is_open`, a function that adds a near triangle.
+        adder: returns a function that adds a near triangle, from `reach` of `NearEdge.is_open`.
+        own: the caller's own state.
+        where: the mask of the active lanes.
         """
         if self.cells is None or derivatives == 2:
             add = adder(self.clusters.acceptance_ratio(detail))
@@ -222,7 +250,8 @@ class TreeWinding:
         return self.cells.sums_with_tree(self.clusters, x, detail, adders, state, where)
 
     def crossings_ahead(self, frame: RayFrame, t: Real, active: Mask) -> Real:
-        """0: this method does not count crossings along rays, as every sum gives all of w."""
+        """Always 0. Crossings along rays need not be counted before, as every sum gives all of
+        w."""
         del frame, t, active
         return self.backend.Float(0)
 
@@ -230,11 +259,16 @@ class TreeWinding:
         self, frame: RayFrame, x: Vec3, behind: JumpCrossing, turns: Real, detail: Real,
         active: Mask = True,
     ) -> Sample:  # fmt: skip
-        """w on a ray interval, where active, with promises.
+        """w at points x of a ray interval, where active, with promises.
+
+        frame: the frame of the rays.
+        behind: the crossing at which the interval starts.
+        turns: not used here.
+        detail: the accuracy scale.
 
         Near triangles add their crossings ahead of x along the ray, and their open edges
         (`NearEdge.is_open`). Crossings that the tracer has passed up to the start of the interval
-        count as behind x, all others as ahead: so it does not matter on which side of a triangle
+        count as behind x, all others as ahead. So it does not matter on which side of a triangle
         rounding puts x.
 
         Promises. For far dipoles see `SourceSums.sample`. The near triangles' field is that of
@@ -248,6 +282,8 @@ class TreeWinding:
         )
 
         def is_ahead(row: list[Real], t: Real) -> Mask:
+            """Whether the crossing at t with a record's triangle is after the start of the
+            interval."""
             number = index(fmax(row[NUMBER_COLUMN], self.backend.Float(0)))
             return ~((t < behind.t) | ((t == behind.t) & (number <= behind.facet)))
 
@@ -256,18 +292,25 @@ class TreeWinding:
         promises = lipschitz_along(
             line, sums.gradient, sums.singularity_distance, self._rates(line, active)
         )
-        return sums.sample(_SHARE, unit, self.rounding, along=promises)
+        return sums.sample(_PER_SPHERE, unit, self.rounding, along=promises)
 
     def _rates(self, line: RayLine, where: Mask) -> Rates:
-        """The rates of `trail_sums.line_rates` for 4 pi w on a line."""
+        """Returns a function that computes bounds of the derivative of 4 pi w along a line, as
+        `trail_sums.line_rates`. where: the mask of the active lanes."""
 
         def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
+            """Bounds of the derivative along the line, one for each length."""
             active = active & where
 
             def adder(reach: Real) -> AddPrimitive:
+                """Returns a function that adds the open edges of a near triangle. reach: as for
+                `NearEdge.is_open`."""
+
                 def add(
                     row: list[Real], active: Mask, sums: SourceSums, old: tuple[Any, ...]
                 ) -> tuple[SourceSums, tuple[Any, ...]]:
+                    """Add the open edges of a record's triangle to the bounds `old`, where
+                    active."""
                     for near in edges_of(row, line.x, VerticalRayFrame(line.x)):
                         is_open = active & near.is_open(reach)
                         new = add_edge_rates(line, near.edge.edge, lengths, old)
