@@ -125,8 +125,8 @@ class RiemannSurface(Field):
     With several branches f = s min_j |phi_j|, where phi_j = h - Im g_j at a point of height h, and
     s is the sign of the product of all phi_j. f is continuous and single-valued, as that product
     is, and zero only on the surface. With one branch f = phi; for a logarithm it is determined up
-    to the period. level=(-w, w) with side="between" draws a solid: all points that are at most w above
-    or below the surface.
+    to the period. level=(-w, w) with side="between" draws a solid: all points that are at most w
+    above or below the surface.
 
     Proof. Along a ray the set of branches can be continued as long as no singular point is met. So
     branch cuts and the numbering of branches do not matter. For each branch
@@ -212,7 +212,7 @@ class RiemannSurface(Field):
         return VolumeIntersection((self.domain, slab))
 
     def _max_height(self) -> float:
-        """A bound of the height |h| of the surface over the domain; infinite if no bound is known."""
+        """A bound of the height |h| of the surface over the domain; infinite if none is known."""
         assert self.domain is not None
         lower, upper = self.domain.bounds()
         corners = [complex(x, y) for x in (lower[0], upper[0]) for y in (lower[1], upper[1])]
