@@ -98,9 +98,7 @@ class HarmonicRounding:
             sums = (terms - 1) + (orders - 1)
             size = amplitude * legendre_weight(l, m)
             value_near, value_anywhere = _value_errors(l, m, sums, is_divided)
-            steep_near, steep_anywhere = (
-                _gradient_errors(l, m, sums, is_divided) if l else (0.0, 0.0)
-            )
+            steep_near, steep_anywhere = _slope_errors(l, m, sums, is_divided) if l else (0.0, 0.0)
             power = max(m - 1, 0)
             for table, i, degree, constant in (
                 (tables[0], m, l, value_near),
@@ -178,7 +176,7 @@ def _value_errors(l: int, m: int, sums: int, is_divided: bool) -> tuple[float, f
     return _largest_sample(total), _largest_sample(total * s**m)
 
 
-def _gradient_errors(l: int, m: int, sums: int, is_divided: bool) -> tuple[float, float]:  # noqa: E741
+def _slope_errors(l: int, m: int, sums: int, is_divided: bool) -> tuple[float, float]:  # noqa: E741
     """Two bounds for the error of the gradient of r^l Y_lm / `legendre_weight`, as a length.
 
     The first one is in units of u rho^(m-1) r^(l-m) (for m = 0: of u r^(l-1)), the second one in
@@ -263,7 +261,7 @@ class WaveRounding:
 
     @classmethod
     def of(cls, terms: Sequence[Term]) -> WaveRounding:
-        """The bounds for the operations by which `evaluate_terms` evaluates the sum of these terms."""
+        """The bounds for the operations of `evaluate_terms` for the sum of these terms."""
         common_frequencies = [_common_frequency(terms, axis) for axis in range(3)]
         value, gradient, total_slopes, second = ([0.0] * 4 for _ in range(4))
         sizes, slopes, seconds = 0.0, 0.0, 0.0
