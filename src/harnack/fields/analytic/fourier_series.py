@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 
 __all__ = ["FourierSeries", "SurfaceDisplacement"]
 
-_MOST_TERMS = 24
-# The default number of samples along a side for each term, and its minimum; the largest number of
-# samples in all.
-_SAMPLES, _LEAST_SAMPLES, _MOST_SAMPLES = 4, 64, 1 << 25
+_MAX_TERMS = 24
+# The default number of samples along a side of the box for each term; the smallest default number
+# of samples along a side; the largest number of samples in all.
+_SAMPLES, _MIN_SAMPLES, _MAX_SAMPLES = 4, 64, 1 << 25
 # The number of points at which the error of a fit is measured; the number of Newton steps that move
 # them to the surface, and their tolerance.
 _CHECK_POINTS, _NEWTON_STEPS, _CONVERGED = 20_000, 12, 1e-9
@@ -46,11 +46,12 @@ Function: TypeAlias = Callable[["FloatArray"], Any]
 
 @dataclass(frozen=True)
 class SurfaceDisplacement:
-    """The distance between the surface of a series and the surface of the function it was fitted
-    to: sampled, and to first order, |function - level|/|gradient of the series| at points of its
-    surface.
+    """An estimate of the distance between the surface of a series and that of the function it fits.
 
-    mean, largest: lengths.
+    At points of the series' surface the distance is estimated, to first order, by |function -
+    level|/|gradient of the series|.
+
+    mean, largest: the mean and the largest distance, lengths.
     count: the number of points.
     """
 
@@ -75,9 +76,9 @@ class FourierSeries(Field):
 
     Promises: bounds of the second derivatives (`CosineBounds` has the proof), on the whole box and,
     if local bounds are smaller, on balls around the cells of grids over it. Rounding, in units of
-    u: an angle k u is off by 3 roundings of u, which move the point, and a rounding of the product,
-    k pi at most; a sine or cosine by 2; a coefficient by 1; a term takes part in i + j + k + 3
-    sums.
+    the unit roundoff: an angle k u has the error of u (3 roundings, which move the point) and that
+    of the product, at most k pi; a sine or cosine has 2; a coefficient has 1; a term takes part in
+    i + j + k + 3 sums.
 
     Raises:
         ValueError: coefficients of another shape, not finite, or all zero except the first; a box
@@ -138,10 +139,10 @@ class FourierSeries(Field):
         space = _finite_box(box)
         lower, upper = space.bounds()
         if callable(function):
-            chosen = tuple(max(_SAMPLES * n, _LEAST_SAMPLES) for n in numbers)
+            chosen = tuple(max(_SAMPLES * n, _MIN_SAMPLES) for n in numbers)
             shape = _as_triple(chosen if samples is None else samples, "samples")
-            if math.prod(shape) > _MOST_SAMPLES:
-                raise ValueError(f"{shape} samples are too many: at most {_MOST_SAMPLES} in all")
+            if math.prod(shape) > _MAX_SAMPLES:
+                raise ValueError(f"{shape} samples are too many: at most {_MAX_SAMPLES} in all")
             _check_samples(numbers, shape)
             grid = _values(function, midpoints(lower, upper, shape)).reshape(shape)
         else:
@@ -201,8 +202,13 @@ class FourierSeries(Field):
         return SurfaceDisplacement(float(distances.mean()), float(distances.max()), len(points))
 
     def _near(self, level: float, rng: int) -> tuple[FloatArray, FloatArray]:
-        """Points of the surface, or next to it, and the function minus the series at these
-        points."""
+        """Points (n, 3) of the surface, or next to it, and the differences (n,) between function
+        and series.
+
+        level: the level of the surface.
+        rng: the seed of the random points, for a function; for a grid the points are those of the
+            grid.
+        """
         if not callable(self._source):
             grid = cast("FloatArray", self._source)
             points = midpoints(self._lower, self._lower + self._size, grid.shape)
@@ -226,7 +232,7 @@ class FourierSeries(Field):
         return x, (_values(self._source, x) if len(x) else np.zeros(0)) - level
 
     def _largest_difference(self) -> float:
-        """The largest difference between series and function at random points, or all of a grid."""
+        """The largest |series - function| at random points; for a grid, at all of its points."""
         if callable(self._source):
             x = self._lower + self._size * np.random.default_rng(0).random((_CHECK_POINTS, 3))
             values = _values(self._source, x)
@@ -245,12 +251,13 @@ class FourierSeries(Field):
         return prepared
 
     def _upload(self, backend: Backend) -> CosineSums:
+        """The series on a backend."""
         return CosineSums.upload(
             backend, self.coefficients, self._lower, self._size, self._bounds, self._rounding
         )
 
     def _on(self, p: Vec3) -> CosineSums:
-        """The series on the backend of p."""
+        """The series on the backend of p; `prepare` makes this free."""
         return self._upload(backend_of(p)) if self._device is None else self._device
 
     def evaluate(self, p: Vec3) -> Sample:
@@ -266,11 +273,12 @@ class FourierSeries(Field):
         return Sample(value, gradient, sums.curvatures(p), error, slope_error)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """Rows of the Hessian of the series."""
+        """The three rows of the Hessian of the series."""
         return self._on(p).hessian(p)
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """The part of the box with the cells in which the series may take a level."""
+        """The part of the box that consists of the cells in which the series may take one of the
+        levels."""
         fractions = self._bounds.extent(levels)
         if fractions is None:
             return self.domain
@@ -292,7 +300,13 @@ class FourierSeries(Field):
 
 
 def _as_triple(numbers: Any, name: str) -> tuple[int, int, int]:
-    """Three integers, from one integer or three."""
+    """Three integers, from one integer or from three.
+
+    name: what the integers are, for the messages.
+
+    Raises:
+        TypeError, ValueError: neither one integer nor three.
+    """
     try:
         number = operator.index(numbers)
     except TypeError:
@@ -309,14 +323,24 @@ def _as_triple(numbers: Any, name: str) -> tuple[int, int, int]:
 
 
 def _check_terms(terms: tuple[int, ...]) -> None:
-    if min(terms) < 1 or max(terms) > _MOST_TERMS:
+    """Check the numbers of terms along the axes.
+
+    Raises:
+        ValueError: one of them is not from 1 to 24.
+    """
+    if min(terms) < 1 or max(terms) > _MAX_TERMS:
         raise ValueError(
-            f"terms must be 1 to {_MOST_TERMS} along each axis, not {tuple(terms)}: an evaluation "
+            f"terms must be 1 to {_MAX_TERMS} along each axis, not {tuple(terms)}: an evaluation "
             "takes about 2 K^3 products. Fit a smaller box or a smoother function instead"
         )
 
 
 def _check_samples(terms: tuple[int, int, int], shape: tuple[int, int, int]) -> None:
+    """Check that there are as many samples as terms along each axis.
+
+    Raises:
+        ValueError: there are fewer.
+    """
     if any(k > n for k, n in zip(terms, shape, strict=True)):
         raise ValueError(
             f"{terms} terms cannot be told apart by {shape} samples: take fewer terms or more "
@@ -325,7 +349,11 @@ def _check_samples(terms: tuple[int, int, int], shape: tuple[int, int, int]) -> 
 
 
 def _finite_box(box: Any) -> Box:
-    """A box with finite sides longer than 0, from a `Box` or two corners."""
+    """A box with finite sides longer than 0, from a `Box` or from two corners.
+
+    Raises:
+        TypeError, ValueError: it is no such box.
+    """
     try:
         volume = box if isinstance(box, Box) else Box(*box)
     except TypeError:
@@ -337,7 +365,11 @@ def _finite_box(box: Any) -> Box:
 
 
 def _values(function: Function, points: FloatArray) -> FloatArray:
-    """The function's values (n,) at points (n, 3), checked."""
+    """The values (n,) of the user's function at points (n, 3).
+
+    Raises:
+        TypeError, ValueError: they are not n finite numbers.
+    """
     values = as_real_array(function(points), "values of the function", type_error=TypeError)
     if values.shape != (len(points),):
         raise ValueError(
@@ -354,8 +386,13 @@ def _values(function: Function, points: FloatArray) -> FloatArray:
 
 
 def _rounding(a: FloatArray, size: FloatArray) -> tuple[float, float]:
-    """The rounding of value and gradient, in units of u, without the rounding that moves the point:
-    see `FourierSeries`."""
+    """Bounds of the rounding errors of value and gradient, in units of u: see `FourierSeries`.
+
+    The error that moves the point is left out.
+
+    a: the coefficients (K_x, K_y, K_z).
+    size: (3,) the lengths of the box's sides.
+    """
     i, j, k = np.indices(a.shape)
     roundings = (i + j + k) * (math.pi + 1) + 10
     sizes = np.abs(a)

@@ -297,8 +297,11 @@ class Lobes(Field):
         return r * r * (error + 8 * unit * r), r * (slope + 2 * error + 24 * unit * r)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """Rows of the Hessian of f; see `_of_power`. At the origin its limit depends on the
-        direction of approach: the result is the limit along z."""
+        """The three rows of the Hessian of f; see `_of_power`.
+
+        At the origin its limit depends on the direction of approach; the result is the limit along
+        z.
+        """
         distance = safe_norm(p)
         at_origin = distance == 0
         u = dr.select(at_origin, type(p)(0, 0, 1), p / dr.select(at_origin, 1, distance))
@@ -324,18 +327,21 @@ class Lobes(Field):
         return scale * rows[0], scale * rows[1], scale * rows[2]
 
     def _of_power(self, u: Vec3, n: int) -> tuple[Real, Vec3, tuple[Vec3, Vec3, Vec3]]:
-        """Value, gradient and Hessian at unit vectors of r^n Y(x/r), a sum of r^(n-l) P_l with P_l
-        solid harmonics. With k = n - l, the Hessian of r^k P is, at r = 1,
+        """Value, gradient and Hessian of r^n Y(x/r) at unit vectors u.
 
-            H + k (x g^T + g x^T) + k P (I + (k-2) x x^T),   H and g of P.
+        The function is the sum of r^(n-l) P_l, where P_l is the solid harmonic part of degree l of
+        Y. With k = n - l and P = P_l, whose gradient is g and Hessian H, the Hessian of r^k P at a
+        unit vector x is
+
+            H + k (x g^T + g x^T) + k P (I + (k-2) x x^T).
         """
         vector = cast("Any", type(u))
         value, gradient = 0 * u.x, 0 * u
         rows = [0 * u, 0 * u, 0 * u]
         for l in {l for l, _ in self.weights}:  # noqa: E741
-            part = {key: c for key, c in self.weights.items() if key[0] == l}
-            k, (y, slope) = n - l, evaluate(part, u.x, u.y, u.z)
-            g, (xx, yy, zz, xy, xz, yz) = vector(*slope), hessian(part, u.x, u.y, u.z)
+            harmonics = {key: c for key, c in self.weights.items() if key[0] == l}
+            k, (y, slope) = n - l, evaluate(harmonics, u.x, u.y, u.z)
+            g, (xx, yy, zz, xy, xz, yz) = vector(*slope), hessian(harmonics, u.x, u.y, u.z)
             value, gradient = value + y, gradient + g + (k * y) * u
             for i, row in enumerate(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))):
                 new_row = vector(*row) + k * (u[i] * g + g[i] * u) + (k * (k - 2) * y * u[i]) * u
