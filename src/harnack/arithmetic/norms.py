@@ -35,6 +35,11 @@ def minimum(*values: Any) -> Any:
 
 
 def _reduce_extremum(name: str, values: tuple[Any, ...]) -> Any:
+    """The maximum or minimum (`name`) of two or more numbers of any kind.
+
+    Raises:
+        TypeError: there are fewer than two numbers.
+    """
     if len(values) < 2:
         raise TypeError(f"{name} compares two numbers or more, and {len(values)} was given")
     if any(isinstance(value, FormulaNumber) for value in values):
@@ -44,6 +49,7 @@ def _reduce_extremum(name: str, values: tuple[Any, ...]) -> Any:
     of_arrays, of_others = _EXTREMUM_FUNCTIONS[name]
 
     def plain(a: Any, b: Any) -> Any:
+        """The maximum or minimum of two arrays or Python numbers."""
         is_array = any(dr.is_array_v(cast("Any", type(value))) for value in (a, b))
         return of_arrays(a, b) if is_array else of_others(a, b)
 
@@ -95,11 +101,11 @@ def norm(*values: Any, p: float = 2.0) -> Any:
     if not jets:
         return _plain_norm(values, p)
     operands = [term if isinstance(term, Jet) else jets[0].coerce(term) for term in values]
-    return _norm(operands, p)
+    return _jet_norm(operands, p)
 
 
 def _plain_norm(values: tuple[Any, ...], p: float) -> Any:
-    """The norm of arrays and numbers, in a form whose derivative at 0 is finite."""
+    """The p-norm of arrays and Python numbers, in a form whose derivative at 0 is finite."""
     if not any(dr.is_array_v(cast("Any", type(value))) for value in values):
         sizes = np.array(np.broadcast_arrays(*(np.abs(value) for value in values)))
         largest = sizes.max(axis=0)
@@ -118,10 +124,12 @@ def _plain_norm(values: tuple[Any, ...], p: float) -> Any:
 
 
 def _plain_power(x: Any, p: float) -> Any:
+    """x^p for Dr.Jit arrays x >= 0; 0 at x = 0, with derivative 0."""
     return dr.select(x > 0, dr.power(dr.select(x > 0, x, 1), p), 0)
 
 
-def _norm(xs: list[Jet], p: float) -> Jet:
+def _jet_norm(xs: list[Jet], p: float) -> Jet:
+    """The p-norm of jets, for 1 < p < infinity; `norm` has the proof of its ranges."""
     like = next((f.value.lower for f in xs if not f.value.is_literal), None)
     like = xs[0].backend_number() if like is None else like
     values = [as_backend_interval(f.value, like) for f in xs]
@@ -156,13 +164,21 @@ def _norm(xs: list[Jet], p: float) -> Jet:
     starts = [f.jet_at_start for f in xs]
     if any(f is None for f in starts):
         return jet
-    return jet.narrowed_from_start(_norm(cast("list[Jet]", starts), p), xs[0].piece_length)
+    return jet.narrowed_from_start(_jet_norm(cast("list[Jet]", starts), p), xs[0].piece_length)
 
 
 def _wronskian_term(
     xs: list[Jet], values: list[Interval], over: Interval, i: int, j: int
 ) -> Interval:
-    """sum_(k<l) w_kl,i w_kl,j / N^3."""
+    """The range of sum_(k<l) w_kl,i w_kl,j / N^3, the first part of N'' for p = 2: see `norm`.
+
+    w_kl,i is the function w_kl = x_k x_l' - x_l x_k' with derivatives by the variable i.
+
+    xs: the functions x_k.
+    values: the ranges of their values.
+    over: the range of 1/N.
+    i, j: the two variables of the second derivative.
+    """
     parts: list[Interval] = []
     for k, m in itertools.combinations(range(len(xs)), 2):
         pair = xs[k], xs[m], values[k], values[m]
@@ -172,7 +188,7 @@ def _wronskian_term(
 
 
 def _norm_range(values: list[Interval], p: float) -> Interval:
-    """The range of the norm of independent numbers."""
+    """The range of the p-norm of independent numbers in these intervals."""
     smallest, largest = [value.min_abs for value in values], [value.max_abs for value in values]
     low = _norm_of_magnitudes(smallest, p).lower
     floor = functools.reduce(fmax, smallest)  # rounding and underflow cannot make it shorter
@@ -180,7 +196,7 @@ def _norm_range(values: list[Interval], p: float) -> Interval:
 
 
 def _norm_of_magnitudes(sizes: list[Any], p: float) -> Interval:
-    """The norm of numbers >= 0."""
+    """The range of the p-norm of the numbers `sizes`, which are >= 0, with its rounding."""
     if p == 2.0:
         return sqrt.ranges(_total([Interval.point(size).square() for size in sizes]))[0]
     largest = functools.reduce(lambda a, b: dr.select((a > b) | dr.isnan(a), a, b), sizes)
@@ -196,16 +212,17 @@ def _norm_of_magnitudes(sizes: list[Any], p: float) -> Interval:
 
 
 def _signed_power(x: Interval, q: float) -> Interval:
-    """The range of sign(x) |x|^q, q > 0, which increases."""
+    """The range of sign(y) |y|^q for y in x, q > 0; this function increases."""
 
-    def of(v: Any) -> Interval:
+    def at(v: Any) -> Interval:
+        """The range at a single number v, with its rounding."""
         size = power(q).ranges(Interval.point(dr.abs(v)))[0]
         return Interval(
             dr.select(v >= 0, size.lower, -size.upper), dr.select(v >= 0, size.upper, -size.lower)
         )
 
-    low = of(x.lower)
-    return low if x.lower is x.upper else Interval(low.lower, of(x.upper).upper)
+    low = at(x.lower)
+    return low if x.lower is x.upper else Interval(low.lower, at(x.upper).upper)
 
 
 def _reciprocal_norm(length: Interval) -> Interval:
@@ -216,22 +233,23 @@ def _reciprocal_norm(length: Interval) -> Interval:
 
 
 def _clip_magnitude(x: Interval, limit: Interval) -> Interval:
-    """The interval x clipped to numbers whose absolute value is at most the upper end of
-    `limit`."""
+    """The interval x clipped to numbers whose absolute value is at most the upper end of `limit`."""
     bound = limit.upper
     return Interval(fmax(x.lower, -bound), fmin(x.upper, bound))
 
 
 def _product(a: Interval, b: Interval) -> Interval:
+    """The range of a product; that of a square if both are the same interval object."""
     return a.square() if a is b else a * b
 
 
 def _total(parts: list[Interval]) -> Interval:
+    """The sum of the intervals."""
     return functools.reduce(lambda a, b: a + b, parts)
 
 
 def as_backend_interval(x: Interval, like: Any) -> Interval:
-    """An interval of numbers of the backend."""
+    """The interval with ends of the type of `like`, if its ends are Python numbers."""
     if not x.is_literal:
         return x
     kind = cast("Any", type(like))
