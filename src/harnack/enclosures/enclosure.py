@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PathPiece:
-    """Ranges of F' and F'' on a piece of the path, for the function F along the path.
+    """A piece of a path, with ranges of F' and F'' on it, where F is the function along the path.
 
-    length: of the piece.
+    length: the length of the piece.
     slope_range: the range of F' on the piece.
     min_second_derivative, max_second_derivative: the range of F''; an end may be infinite, for
         functions with kinks.
@@ -42,16 +42,17 @@ class PathPiece:
 
 
 class PathRestriction(Protocol):
-    """The restriction of f to a path, with computable ranges of its derivatives.
+    """A function f restricted to a path, with computable ranges of its derivatives.
 
-    piece_count: the number of pieces into which to cut the path for the least time, by experiment.
+    piece_count: the number of pieces into which to cut the path; the fastest number, by experiment.
     """
 
     @property
     def piece_count(self) -> int: ...
 
     def derivative_ranges(self, knots: Sequence[Real]) -> tuple[PathPiece, ...]:
-        """Ranges of the derivatives of F(s) = f(path(t+s)) between each knot and the next.
+        """Ranges of the derivatives of F(s) = f(path(t+s)) on the pieces between each knot and the
+        next.
 
         knots: increasing lengths s, the first of them 0.
         """
@@ -63,8 +64,11 @@ class EvaluableRestriction(Protocol):
     """A restriction given by a formula, which can be evaluated in any arithmetic."""
 
     def evaluate_with(self, coordinates: Callable[[Vec3, Vec3], tuple[Any, Any, Any]]) -> Any:
-        """Evaluate the formula at x, y and z = coordinates(p, d), for a point p and the direction d
-        of the path. The type of the coordinates chooses the arithmetic."""
+        """Evaluate the formula at x, y, z = coordinates(p, d).
+
+        coordinates: a function of a point p and the direction d of the path. The type of the three
+            numbers that it returns chooses the arithmetic.
+        """
         ...
 
 
@@ -75,12 +79,11 @@ STEP_SAFETY = 1.0 - 1e-6
 
 @dataclass(frozen=True)
 class LevelGaps:
-    """The differences in value, >= 0, between f and the next level below and above.
+    """The differences in value, >= 0, between f and the next level below and the next level above.
 
-    A difference is infinite where there is no level on that side.
-
+    below, above: the two differences; infinite if there is no level on that side.
     is_one_sided: whether at most one of the two is finite on every lane, as with a single level.
-        This is known while a kernel is being recorded, and saves the proof of the other side.
+        This is known while a kernel is being recorded, and saves the proof for the other side.
     """
 
     below: Real
@@ -89,16 +92,16 @@ class LevelGaps:
 
     @property
     def nearest(self) -> Real:
-        """The distance in value to the nearest level."""
+        """The difference in value to the nearest level."""
         return fmin(self.below, self.above)
 
     def reduced_by(self, error: Real) -> LevelGaps:
-        """The gaps that remain at least if the value may be wrong by `error`."""
+        """Lower bounds of the gaps, if the value may be wrong by `error`."""
         below, above = fmax(self.below - error, 0), fmax(self.above - error, 0)
         return LevelGaps(below, above, self.is_one_sided)
 
     def swapped(self) -> LevelGaps:
-        """The gaps of -f."""
+        """The gaps of -f: below and above exchanged."""
         return LevelGaps(self.above, self.below, self.is_one_sided)
 
 
@@ -111,36 +114,42 @@ class SlopeRange:
 
     @classmethod
     def around(cls, slope: Real, error: Real) -> SlopeRange:
-        """The slopes within `error` of a slope. An error that is the Python float 0.0 costs
-        nothing."""
+        """The interval of slopes within `error` of `slope`.
+
+        An error that is the Python float 0.0 costs no operation.
+        """
         if isinstance(error, float) and error == 0.0:
             return cls(slope, slope)
         return cls(slope - error, slope + error)
 
     def negated(self) -> SlopeRange:
-        """The slopes in the opposite direction."""
+        """The range of the derivative along the opposite direction."""
         return SlopeRange(-self.upper, -self.lower)
 
 
 class Enclosure(abc.ABC):
-    """A proof that F stays within an interval for 0 <= s < reach.
+    """A proof that F stays within an interval that depends on s, for 0 <= s < reach.
 
-    F(s) = f(path(t+s)) - f(path(t)) is the movement of f relative to its value at a sample, so that
-    two large numbers are never subtracted: in float32 that is the difference between a march and a
-    stall. From the differences in value to the next levels (`LevelGaps`), an enclosure proves a
-    length free of levels (`free_length`), or decides whether a given length is free (`is_free`),
-    which takes one evaluation of the proof and no solver: the tracer uses it looking back.
+    F(s) = f(path(t+s)) - f(path(t)) is the movement of f relative to its value at a sample. In this
+    form two large numbers are never subtracted; in float32 rays would stall otherwise.
 
-    Neither end of the interval may fall as the slope grows, and every proof says why: then the
-    interval for the upper end of `SlopeRange` bounds F from above and that for the lower end bounds
-    it from below, whatever the slope in between is. In particular slopes in [-|grad f|, |grad f|]
-    bound F in every direction.
+    Its input are the differences in value to the next levels (`LevelGaps`). From them an enclosure
+    proves a length free of levels (`free_length`), or decides whether a given length is free
+    (`is_free`). The latter takes one evaluation of the proof and no solver; the tracer uses it for
+    the way back from a sample.
+
+    Each end of the interval must be an increasing function of the slope at the sample, or constant,
+    and every proof says why it is. Then the interval for the upper end of a `SlopeRange` bounds F
+    from above, and that for the lower end bounds F from below, whatever the slope in between is. In
+    particular slopes in [-|grad f|, |grad f|] bound F in every direction.
     """
 
     @property
     def reach_growth(self) -> float:
-        """The reach to ask for at the next sample, as a multiple of the length proved at this one;
-        by experiment."""
+        """The reach to ask for at the next sample, as a multiple of the length proved at this one.
+
+        The best values were found by experiment.
+        """
         return 2.0
 
     @classmethod
@@ -150,8 +159,9 @@ class Enclosure(abc.ABC):
         """The enclosure that this class proves from a promise; None if it does not use promises of
         that kind.
 
-        value: f at the sample, known up to `error`.
-        slopes: of f along the path, at the sample.
+        value: f at the sample.
+        error: a bound of the error of this value.
+        slopes: the range of the derivative of f along the path at the sample.
         """
         del promise, value, error, slopes
         return None
@@ -160,18 +170,20 @@ class Enclosure(abc.ABC):
     def from_restriction(
         cls, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> Self | None:
-        """The enclosure that this class proves from ranges of the derivatives of f along the path;
-        None if it does not use ranges.
+        """The enclosure that this class proves from ranges of the derivatives of f along the path.
 
-        length: the requested reach.
-        slopes: of f along the path, at its start.
+        None if this class does not use such ranges.
+
+        function: f along the path.
+        slopes: the range of its derivative at the start of the path.
+        length: the reach that is asked for.
         """
         del function, slopes, length
         return None
 
     @abc.abstractmethod
     def free_length(self, gaps: LevelGaps) -> Real:
-        """A length L >= 0 such that f meets no level for 0 < s < L. NaN proves nothing."""
+        """A length L >= 0 such that f is proved to meet no level for 0 < s < L; NaN proves nothing."""
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
         """Whether f is proved to meet no level for 0 < s < length."""
