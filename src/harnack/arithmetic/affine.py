@@ -50,6 +50,7 @@ class AffineForm(FormulaNumber):
         """The three coordinates of p + s d for 0 <= s <= length."""
 
         def coordinate(x: Real, rate: Real) -> AffineForm:
+            """The function x + s rate."""
             half = 0.5 * length * rate
             return cls(x + half, half, _rounding_bound(dr.abs(x) + dr.abs(half)))
 
@@ -75,6 +76,7 @@ class AffineForm(FormulaNumber):
         return AffineForm(-self.center, -self.slope, self.error)
 
     def sum(self, other: Any) -> AffineForm:
+        """The sum of two functions: exact up to rounding, which goes into the error."""
         center, slope = self.center + other.center, self.slope + other.slope
         return AffineForm(
             center,

@@ -90,7 +90,8 @@ def _twice(x: Interval) -> Interval:
 
 
 def _unbounded_where_undefined(defined: Mask, ranges: DerivativeRanges) -> DerivativeRanges:
-    """The ranges; where `defined` is False, those of the derivatives are replaced by all numbers."""
+    """The ranges; where `defined` is False, those of the derivatives are replaced by all
+    numbers."""
     value, *derivatives = ranges
     slope, second = (
         Interval(
@@ -159,7 +160,8 @@ def _half(x: Interval) -> Interval:
 
 
 def _positive_reciprocal(x: Interval) -> Interval:
-    """The range of 1/y for the numbers y >= 0 of x; its upper end is infinite if 0 is one of them."""
+    """The range of 1/y for the numbers y >= 0 of x; its upper end is infinite if 0 is one of
+    them."""
     above = Interval(x.upper, x.upper).reciprocal()
     return Interval(fmax(above.lower, 0), Interval(fmax(x.lower, 0), x.upper).reciprocal().upper)
 
@@ -488,6 +490,10 @@ def clipped_power(n: int) -> ClippedPower:
         raise ValueError(f"the exponent of a clipped power must be an integer >= 1, not {n}")
 
     def ranges(x: Interval) -> DerivativeRanges:
+        """The ranges of max(x, 0)^n and of its derivatives.
+
+        At 0 the second derivative has no upper bound for n = 1, and jumps from 0 to 2 for n = 2.
+        """
         low = fmax(x.lower, 0)
         u = Interval(low, low if x.lower is x.upper else fmax(x.upper, 0))
         value, slope, second = power(n).ranges(u)

@@ -4,9 +4,9 @@ The result of every operation contains the exact result for all numbers of its o
 rounded arithmetic of the backend too. So the ranges of a function and of its derivatives are proved
 (Moore 1966).
 
-Ranges are rounded outwards since an enclosure that is violated by a single rounding in float32 is a
-missed hit. A single piece of the path is the fastest choice for formulas, and four pieces for
-blobs, whose ranges share the search for nearby blobs (measured; `PathRestriction.piece_count`).
+Ranges are rounded outwards because a single rounding in float32 that violates an enclosure may
+cause a missed hit. By measurement, a path is best divided into four pieces for blobs, which then
+share the search for nearby blobs, and not divided for formulas (`PathRestriction.piece_count`).
 """
 
 from __future__ import annotations
@@ -28,7 +28,9 @@ Number: TypeAlias = "Interval | float"
 
 @dataclass(frozen=True)
 class Interval:
-    """All numbers from `lower` to `upper`, Dr.Jit numbers of the same type or Python floats.
+    """All numbers from `lower` to `upper`.
+
+    The ends are Dr.Jit numbers of the same type, or Python floats.
 
     An end that is NaN stands for an infinite end: nothing is known on that side. Python floats are
     constants known while a kernel is recorded, so that some operations with them can be left out.
@@ -37,11 +39,12 @@ class Interval:
         must be if they meet arrays of single precision: there other numbers would be rounded,
         perhaps inwards.
 
-    Proof of the rounding. An operation of the backend is off by half a unit in the last place, or
-    by less than the smallest normal number where the result is no normal number. Each end is moved
-    outwards by a whole unit (`_round_down`, `_round_up`), which covers its own rounding and that of
-    the move. A sum that is no normal number is exact, or 0 on a backend that flushes it: it may be
-    off by less than the smallest normal number, which the tracer adds to every value.
+    Proof of the rounding. An operation of the backend has an error of at most half a unit in the
+    last place, or less than the smallest normal number if the result is not a normal number. Each
+    end is moved outwards by a whole unit (`_round_down`, `_round_up`), which covers its own
+    rounding and that of the move. A sum that is not a normal number is exact, or 0 on a backend
+    that flushes it. In this case its error is less than the smallest normal number, which the
+    tracer adds to every value.
     """
 
     lower: Real
@@ -284,7 +287,8 @@ def _minimum(a: Real, b: Real) -> Real:
 
 
 def _maximum(a: Real, b: Real) -> Real:
-    """The larger number, a Python float if both are; the other number where one is NaN in an array."""
+    """The larger number, a Python float if both are; the other number where one is NaN in an
+    array."""
     if isinstance(a, float) and isinstance(b, float):
         return max(a, b)
     return fmax(a, b)

@@ -72,7 +72,8 @@ class Jet(FormulaNumber):
 
     @classmethod
     def over_ball(cls, p: Vec3, radius: Real) -> tuple[Jet, Jet, Jet]:
-        """The three coordinates as functions of themselves, on boxes around the balls B(p, radius)."""
+        """The three coordinates as functions of themselves, on boxes around the balls B(p,
+        radius)."""
         x, y, z = cls.at_point(p)
         ends = Interval(-radius, radius)
         x, y, z = (dataclasses.replace(jet, value=jet.value + ends) for jet in (x, y, z))
@@ -97,6 +98,7 @@ class Jet(FormulaNumber):
         """
 
         def coordinate(x: Real, slope: Real) -> Jet:
+            """The jet of x + s slope on the piece, with its jet at the start."""
             rate = Interval.point(slope)
             base = Interval.point(x)
             if is_rounded:
@@ -471,15 +473,18 @@ class Dual(FormulaNumber):
         return Dual(cast("Any", type(self.value))(x), (0.0, 0.0, 0.0))
 
     def sum(self, other: Dual) -> Dual:
+        """The sum of two functions."""
         return Dual(
             self.value + other.value,
             _map_partials(operator.add, self.first_derivatives, other.first_derivatives),
         )
 
     def product(self, other: Dual) -> Dual:
+        """The product of two functions, by the product rule."""
         x, y = self.value, other.value
 
         def rule(a: Any, b: Any) -> Any:
+            """The partial derivative of the product, from those of the two factors."""
             return a * y + x * b
 
         return Dual(x * y, _map_partials(rule, self.first_derivatives, other.first_derivatives))
@@ -497,14 +502,17 @@ class Dual(FormulaNumber):
         real = cast("Any", type(self.value))
 
         def rule(a: Any) -> Any:
+            """The partial derivative of the result, from that of this function."""
             return dr.select(real(a) == 0, 0, a * slope)
 
         return Dual(function.on_drjit(self.value), _map_partials(rule, self.first_derivatives))
 
     def polar_angle(self, x: Dual) -> Dual:
+        """The polar angle of the point (x, y), where y is this function."""
         u, v = x.value, self.value
 
         def rule(a: Any, b: Any) -> Any:
+            """The partial derivative of the angle, from those of x and y."""
             return (u * b - v * a) / (u * u + v * v)
 
         return Dual(
@@ -512,9 +520,11 @@ class Dual(FormulaNumber):
         )
 
     def pointwise_maximum(self, other: Dual) -> Dual:
+        """The larger of two functions; at a tie, the other one."""
         is_own = self.value > other.value
 
         def rule(a: Any, b: Any) -> Any:
+            """The partial derivative of the larger function, from those of both."""
             return dr.select(is_own, a, b)
 
         value = dr.select(is_own, self.value, other.value)

@@ -1,7 +1,8 @@
 """Functions of several numbers: maxima, minima, norms and blends (Hart 1996, appendix B).
 
-They take jets, numbers of the other arithmetics, Dr.Jit and NumPy arrays and Python numbers, also
-mixed. Blends combine distances, with a sharp or with a rounded edge.
+Their arguments are jets, numbers of the other arithmetics, Dr.Jit and NumPy arrays or Python
+numbers, also of different kinds in one call. Blends combine distances, with a sharp or with a
+rounded edge.
 """
 
 from __future__ import annotations
@@ -63,17 +64,21 @@ _EXTREMUM_FUNCTIONS: dict[str, tuple[Callable[[Any, Any], Any], Callable[[Any, A
 
 
 def norm(*values: Any, p: float = 2.0) -> Any:
-    """The p-norm (|x|^p + |y|^p + ...)^(1/p), with p = 2 the Euclidean length.
+    """The p-norm (|x|^p + |y|^p + ...)^(1/p) of numbers of any kind.
 
-    p: at least 1, `math.inf` for the largest absolute value.
+    p: at least 1; 2 for the Euclidean length, `math.inf` for the largest absolute value.
 
-    Proof of the ranges. With N the norm and u_i = |x_i|/N <= 1, N' is the sum of
-    sign(x_i) u_i^(p-1) x_i', at most the p-norm of the x_i' (Hoelder's and Minkowski's
-    inequalities), and N'' = (p-1)/N (sum_i u_i^(p-2) x_i'^2 - N'^2) + sum_i sign(x_i) u_i^(p-1)
-    x_i''. Its first part is not negative, for N is convex; where N = 0 it has a kink upwards,
-    which has no upper bound. For p = 2 the first part is sum_(i<j) w_ij^2 / N^3 with w_ij = x_i
-    x_j' - x_j x_i' (Lagrange's identity), and w_ij' = x_i x_j'' - x_j x_i'' is 0 along straight
-    lines: the range of w_ij is narrowed from the start of the piece.
+    Proof of the ranges. Let N be the norm of functions x_i, and u_i = |x_i|/N <= 1. Then
+    N' = sum_i sign(x_i) u_i^(p-1) x_i'. By Hoelder's and Minkowski's inequalities |N'| is at most
+    the p-norm of the x_i'. And
+
+        N'' = (p-1)/N (sum_i u_i^(p-2) x_i'^2 - N'^2) + sum_i sign(x_i) u_i^(p-1) x_i''.
+
+    The first part is not negative, because N is a convex function of the x_i. At N = 0 the norm has
+    a kink upwards, so the first part has no upper bound there. For p = 2 the first part is
+    sum_(i<j) w_ij^2 / N^3 with w_ij = x_i x_j' - x_j x_i' (Lagrange's identity). Along straight
+    lines w_ij' = x_i x_j'' - x_j x_i'' is 0, so the range of w_ij is narrowed from the start of the
+    piece.
 
     Raises:
         TypeError: there are no numbers.
@@ -233,7 +238,8 @@ def _reciprocal_norm(length: Interval) -> Interval:
 
 
 def _clip_magnitude(x: Interval, limit: Interval) -> Interval:
-    """The interval x clipped to numbers whose absolute value is at most the upper end of `limit`."""
+    """The interval x clipped to numbers whose absolute value is at most the upper end of
+    `limit`."""
     bound = limit.upper
     return Interval(fmax(x.lower, -bound), fmin(x.upper, bound))
 
@@ -258,21 +264,25 @@ def as_backend_interval(x: Interval, like: Any) -> Interval:
 
 
 def blend_union(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
-    """The union of {a <= 0} and {b <= 0}, its inner edge filled by a superellipse.
+    """The function of a union with a rounded edge: it is <= 0 where a <= 0, where b <= 0, and in the
+    inner edge between the two sets, which a superellipse fills.
 
+    a, b: numbers of any kind, such as signed distances.
     radius: the blend changes the union where both a and b are less than this.
-    power: at least 1; with 2 the edge is a circular arc where the surfaces meet at right angles,
-        larger ones are sharper.
+    power: at least 1. With 2 the edge is a circular arc if the surfaces meet at right angles;
+        larger powers make it sharper.
 
-    With g_a = max(0, 1 - a/r) it is r (1 - |(g_a, g_b)|_p); Hart (1996, equation 43) prints the
-    root around everything. Where both a and b are at least r it is their minimum. Between the two
-    it is continuous: where the smaller one is r, both are r.
+    Let r be the radius, p the power, g_a = max(0, 1 - a/r), and g_b the same for b. Where a or b is
+    less than r, the function is r (1 - |(g_a, g_b)|_p); Hart (1996, equation 43) prints the root
+    around everything. Where both are at least r, it is their minimum. It is continuous: where the
+    smaller one is r, both formulas give r.
 
-    Proof of its Lipschitz constant. If those of a and b are at most 1, the gradient is
-    sum_k u_k^(p-1) grad k with u = g/|g|_p, and u_a^(p-1) + u_b^(p-1) is at most 2^(1/p), by
-    Hoelder's inequality, with equality at a = b: so 2^(1/p) holds, and is attained where the
-    gradients are equal. Where they are orthogonal and p >= 2, it is 1. With two radii, as Hart has
-    it, the function is not continuous at g = 0, and there is no constant at all.
+    Proof of its Lipschitz constant, for a and b with constants of at most 1. The gradient is
+    u_a^(p-1) grad a + u_b^(p-1) grad b with u = g/|g|_p. By Hoelder's inequality
+    u_a^(p-1) + u_b^(p-1) is at most 2^(1/p), with equality at a = b. So 2^(1/p) is a Lipschitz
+    constant, which is attained where the gradients are equal. If they are orthogonal and p >= 2, it
+    is 1. With two radii, as in Hart's paper, the function is not continuous at g = 0, and there is
+    no constant at all.
     """
     g_a, g_b = (maximum(1.0 - operand / radius, 0.0) for operand in (a, b))
     near = (1.0 - norm(g_a, g_b, p=power)) * radius
@@ -287,17 +297,21 @@ def blend_union(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
 
 
 def blend_intersection(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
-    """The intersection of {a <= 0} and {b <= 0}, its outer edge rounded: see `blend_union`."""
+    """The same for the intersection of {a <= 0} and {b <= 0}, whose outer edge is rounded: see
+    `blend_union`."""
     return -blend_union(-a, -b, radius, power)
 
 
 def orthogonal_intersection(*sides: Any) -> Any:
-    """The signed distance of the set where all sides are <= 0, if these are signed distances with
-    gradients at right angles to each other.
+    """The signed distance from the set of points where all of the functions `sides` are <= 0.
 
-    Proof. Outside, the nearest point is found separately along each of the directions: the distance
-    is the norm of the positive ones (Pythagoras); inside, the nearest side decides. Where a single
-    side is positive the norm is that side, the largest.
+    sides: signed distances whose gradients are at right angles to each other, such as those of
+        planes at right angles.
+
+    Proof. Outside of the set, the nearest point is found separately along each of the gradients. So
+    the distance is the norm of the positive ones of these functions (Pythagoras); if a single one
+    is positive, it is that one, the largest. Inside, the largest of the functions is minus the
+    distance to the nearest boundary.
     """
     largest = maximum(*sides)
     outside = norm(*(maximum(side, 0.0) for side in sides))

@@ -90,7 +90,8 @@ class FormulaNumber(abc.ABC):
 
     @abc.abstractmethod
     def polar_angle(self, x: Any) -> Self:
-        """The angle of the point (x, y), where y is this number: see `harnack.arithmetic.angles`."""
+        """The angle of the point (x, y), where y is this number: see
+        `harnack.arithmetic.angles`."""
 
     def norm_of_powers(self, p: float) -> Self:
         """The p-norm of some numbers, where this number is the sum of their p-th powers."""
@@ -330,6 +331,7 @@ class OperationCounter(FormulaNumber):
     rate: float = 1.0
 
     def constant(self, x: Any) -> OperationCounter:
+        """A constant, whose absolute value is recorded as a size within which numbers may turn."""
         is_number = isinstance(x, int | float)
         size = min(abs(float(x)), _MAX_SIZE) if is_number else 1.0
         if size > 0.0:
@@ -340,6 +342,7 @@ class OperationCounter(FormulaNumber):
         )
 
     def sum(self, other: OperationCounter) -> OperationCounter:
+        """The sum of two numbers; the absolute value of a constant that is added is recorded."""
         for number in (self, other):
             if number.is_constant:
                 self.tally.farthest = max(self.tally.farthest, number.size)
@@ -365,6 +368,8 @@ class OperationCounter(FormulaNumber):
         return self.apply(sqrt if n == 0.5 else power(n))
 
     def apply(self, function: ElementaryFunction) -> OperationCounter:
+        """A function of this number. A power of at least 1 does not bend it; every other function
+        does."""
         self._note(function)
         name, _, exponent = function.name.partition(" ")
         if name == "power" and float(exponent) >= 1.0:
@@ -379,6 +384,7 @@ class OperationCounter(FormulaNumber):
         return self._bent(_FUNCTION, other, max(self.size, other.size), rate)
 
     def polar_angle(self, x: OperationCounter) -> OperationCounter:
+        """The polar angle, which may jump and be steep unless both numbers are constant."""
         if not (self.is_constant and x.is_constant):
             self.tally.may_jump = self.tally.is_steep = True
         return self._bent(_FUNCTION + _PRODUCT, x, 1.0, self.rate + x.rate)

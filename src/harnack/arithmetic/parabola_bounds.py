@@ -69,6 +69,7 @@ class ParabolaBounds(FormulaNumber):
         2."""
 
         def coordinate(x: Real, slope: Real) -> ParabolaBounds:
+            """The function x + s slope."""
             line = slope, 0.0
             return cls(Interval.point(x), line, line, length, degree, 1)
 
@@ -619,6 +620,7 @@ def _sum(first: Quadratic, second: Quadratic, sign: int) -> Quadratic:
     """The sum of two bounds, rounded upwards (sign 1) or downwards (sign -1)."""
 
     def plus(x: Real, y: Real) -> Real:
+        """The sum of two coefficients, rounded to the side of `sign`; exact if one is 0."""
         if _is_zero(y):
             return x
         return y if _is_zero(x) else _shift_by_rounding(x + y, sign, 0.0)
@@ -650,7 +652,8 @@ def _midpoint_and_half_width(low: Real, high: Real) -> tuple[Real, Real]:
 
 
 def _midpoint_and_radius(x: Interval) -> tuple[Real, Real]:
-    """The middle of an interval, and an upper bound of the distance of its numbers from the middle."""
+    """The middle of an interval, and an upper bound of the distance of its numbers from the
+    middle."""
     return x.midpoint, _radius(x)
 
 

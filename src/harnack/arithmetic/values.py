@@ -105,7 +105,8 @@ class Values(FormulaNumber):
         return Values(value, nowhere, self.jumps | _is_lost(x) | pole, gaps)
 
     def checked(self) -> Values:
-        """The same range, which counts as jumping if numbers overflowed so that no range is known."""
+        """The same range, which counts as jumping if numbers overflowed so that no range is
+        known."""
         return replace(self, jumps=self.jumps | _is_lost(self.value))
 
     def pointwise_maximum(self, other: Values) -> Values:

@@ -183,7 +183,8 @@ class Enclosure(abc.ABC):
 
     @abc.abstractmethod
     def free_length(self, gaps: LevelGaps) -> Real:
-        """A length L >= 0 such that f is proved to meet no level for 0 < s < L; NaN proves nothing."""
+        """A length L >= 0 such that f is proved to meet no level for 0 < s < L; NaN proves
+        nothing."""
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
         """Whether f is proved to meet no level for 0 < s < length."""

@@ -50,6 +50,8 @@ class MaximumEnclosure(Enclosure):
     operands: tuple[MaximumOperand, ...]
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """The shorter of two lengths: that on which no operand rises to the level above, and the
+        longest one on which an operand is proved not to fall to the level below."""
         infty = type(gaps.above)(dr.inf)
         rise_length, fall_length = infty, type(gaps.above)(0)
         for operand in self.operands:
@@ -199,6 +201,7 @@ class NearestBranchEnclosure(Enclosure):
     reach: Real
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """The shortest of the lengths that the two parts of the proof give, over all branches."""
         towards = dr.select(self.is_positive, gaps.below, gaps.above)
         away = dr.select(self.is_positive, gaps.above, gaps.below)
         length = first_reach(away, self.nearest.slopes.upper, self.second_derivative_bound)
@@ -265,6 +268,8 @@ class BranchPointEnclosure(Enclosure):
     is_positive: Mask
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """The longest length of the proof over the values of q that are tried; 0 if there is a
+        level away from zero."""
         towards = dr.select(self.is_positive, gaps.below, gaps.above)
         away = dr.select(self.is_positive, gaps.above, gaps.below)
         w = self.distance_to_limit - fmax(self.distance - towards, 0)

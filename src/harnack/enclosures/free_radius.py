@@ -53,7 +53,8 @@ class FreeRadiusCondition(Protocol):
 
 
 def condition_rounding(real: Any) -> float:
-    """The number that is added to k to cover rounding; real: the type of numbers of the precision."""
+    """The number that is added to k to cover rounding; real: the type of numbers of the
+    precision."""
     return _ROUNDINGS * float(dr.epsilon(real))
 
 

@@ -172,6 +172,8 @@ class HarnackSlopeEnclosure(HarmonicBallEnclosure):
     """Rounds of `largest_free_fraction`."""
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """The shorter of the lengths proved for the two levels; for each level, the longest of
+        those that its conditions prove."""
         q = type(gaps.above)(1)
         for alternatives in self._conditions(gaps):
             best = type(q)(0)
@@ -181,6 +183,7 @@ class HarnackSlopeEnclosure(HarmonicBallEnclosure):
         return dr.select(self.is_valid(gaps), q * self.radius, 0)
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
+        """Whether, for each of the two levels, at least one condition proves the length free."""
         q = length / self.radius
         is_covered = q <= 1
         q = clamp(q, 0, 1)

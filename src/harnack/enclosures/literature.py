@@ -46,6 +46,8 @@ class BottomUpQuadraticEnclosure(ParabolaEnclosure):
     def from_restriction(
         cls, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> Self | None:
+        """The enclosure from evaluating the formula in bottom-up arithmetic; None if f is no
+        formula."""
         if not isinstance(function, EvaluableRestriction):
             return None
         parabolas = _parabolas(function, length, cls.degree)
@@ -53,8 +55,11 @@ class BottomUpQuadraticEnclosure(ParabolaEnclosure):
         return cls(SlopeRange(a, c), 2 * b, 2 * d, length)
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        # All of the length, not shortened for rounding: else a ray that misses needs one more
-        # sample.
+        """The whole length if it is proved free; otherwise that of `ParabolaEnclosure`.
+
+        The whole length is not shortened for rounding: else a ray that misses would need one more
+        sample.
+        """
         smaller_gaps = LevelGaps(gaps.below * STEP_SAFETY, gaps.above * STEP_SAFETY)
         is_finite = dr.isfinite(self.slopes.lower + self.slopes.upper)
         is_finite &= dr.isfinite(self.min_second_derivative + self.max_second_derivative) & (
@@ -91,6 +96,7 @@ class LongestOfEnclosure(Enclosure):
     def from_restriction(
         cls, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> Self | None:
+        """All enclosures that the classes in `kinds` prove for f; None if there is none."""
         candidates = [kind.from_restriction(function, slopes, length) for kind in cls.kinds]
         enclosures = tuple(enclosure for enclosure in candidates if enclosure is not None)
         return cls(enclosures) if enclosures else None
@@ -144,6 +150,7 @@ class AffineEnclosure(BandEnclosure):
     def from_restriction(
         cls, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> Self | None:
+        """The band from evaluating the formula with affine forms; None if f is no formula."""
         if not isinstance(function, EvaluableRestriction):
             return None
         form = function.evaluate_with(lambda p, d: AffineForm.along_ray(p, d, length))
@@ -166,6 +173,7 @@ class IntervalEnclosure(BandEnclosure):
     def from_restriction(
         cls, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> Self | None:
+        """The band from evaluating the formula with intervals; None if f is no formula."""
         if not isinstance(function, EvaluableRestriction):
             return None
         jet = function.evaluate_with(lambda p, d: Jet.along_ray(p, d, 0.0, length, anchored=False))

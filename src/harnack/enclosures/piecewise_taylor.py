@@ -198,6 +198,7 @@ class SegmentTracingEnclosure(SinglePieceEnclosure):
     def from_restriction(
         cls, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> Self | None:
+        """The enclosure from the largest |F'| on the whole length."""
         (piece,) = function.derivative_ranges([0.0, length])
         max_slope = fmax(piece.slope_range.upper, -piece.slope_range.lower)
         interval = SlopeRange(-max_slope, max_slope)

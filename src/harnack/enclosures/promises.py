@@ -389,7 +389,8 @@ class TaylorRemainder(Promise):
         return slopes.lower * length - curved, slopes.upper * length + curved
 
     def implied_second_derivative_bound(self, value: Real) -> tuple[Real, Real] | None:
-        """The constant, if the promise has no radius: then it holds at every point. Otherwise None."""
+        """The constant, if the promise has no radius: then it holds at every point. Otherwise
+        None."""
         del value
         return (self.constant, self.radius) if _is_infinite(self.radius) else None
 
@@ -401,5 +402,6 @@ class TaylorRemainder(Promise):
 
 
 def _is_infinite(end: Any) -> bool:
-    """Whether `end` is an infinite Python float, which is known while a kernel is being recorded."""
+    """Whether `end` is an infinite Python float, which is known while a kernel is being
+    recorded."""
     return isinstance(end, float) and math.isinf(end)

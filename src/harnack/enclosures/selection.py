@@ -107,9 +107,10 @@ class EnclosureKinds:
         slopes: SlopeRange,
         ray_promises: tuple[Lipschitz, ...] = (),
     ) -> tuple[Enclosure, ...]:
-        """The enclosures of f along a direction in which it has these slopes.
+        """The enclosures of f along a direction, one for each promise that a class can use.
 
         promises, alternative_promises, value, error, ray_promises: as in `Sample`.
+        slopes: the range of the derivative of f along the direction.
 
         Raises:
             ValueError: no class of enclosures applies to a promise.
@@ -137,7 +138,8 @@ class EnclosureKinds:
     def _nothing_applies_message(
         self, promises: tuple[Promise, ...], value: Real, error: Real, slopes: SlopeRange
     ) -> str:
-        """The message for promises that no class can use, with the names of enclosures that could."""
+        """The message for promises that no class can use, with the names of enclosures that
+        could."""
         requested = ", ".join(kind.__name__ for kind in self.kinds)
         if not promises:
             kinds = ", ".join(kind.__name__ for kind in Promise.__subclasses__())
@@ -180,16 +182,26 @@ EnclosureChoice: TypeAlias = (
 
 
 def choose_enclosures(enclosures: EnclosureChoice = None) -> EnclosureKinds:
-    """The classes of enclosures for the option `enclosures`: a name, one or several classes, or
-    None for all that are worth their time.
+    """The classes of enclosures for the option `enclosures` of other functions.
 
-    Names: "classic" (the published rule), "slope", "caps" (caps where both ends are known, the
-    slope bound elsewhere), "laplacian" (where the Laplacian is bounded), "lipschitz", and
-    "curvature" (Taylor's formula where second derivatives are bounded, else as "caps"); for fields
-    with a formula "pieces", and for comparison "quadratic-taylor", "linear-taylor" and "segment",
-    and by the formula's own arithmetic "bottom-up-linear", "bottom-up-quadratic", "mixed", "affine"
-    and "interval". None means "pieces", which for fields without a formula means "curvature", but
-    without the promises that a field declares weaker than its others.
+    enclosures: a name, one or several classes of enclosures, or None for all that are worth their
+        time.
+
+    Names for all fields:
+
+    - "classic": the published rule.
+    - "slope": Harnack's inequality with the slope.
+    - "caps": spherical caps if a function is bounded on both sides, else as "slope".
+    - "laplacian": the bound for functions with a bounded Laplacian.
+    - "lipschitz": the Lipschitz cone.
+    - "curvature": Taylor's formula if second derivatives are bounded, else as "caps".
+
+    Names for fields with a formula: "pieces", and for comparison "quadratic-taylor",
+    "linear-taylor" and "segment", and by the formula's own arithmetic "bottom-up-linear",
+    "bottom-up-quadratic", "mixed", "affine" and "interval".
+
+    None means "pieces", but without the promises that a field declares weaker than its others. For
+    fields without a formula "pieces" means "curvature".
 
     Raises:
         ValueError: another name.

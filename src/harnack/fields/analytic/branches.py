@@ -125,7 +125,8 @@ class PreparedBranchPoint:
 
 @dataclass(frozen=True)
 class Branch:
-    """The value g(z), the derivative g'(z) and, if it is known, g"(z) of one branch g at a point z."""
+    """The value g(z), the derivative g'(z) and, if it is known, g"(z) of one branch g at a
+    point z."""
 
     value: Complex
     first: Complex
@@ -240,6 +241,7 @@ class Branches(abc.ABC):
         """A copy of these branches whose numbers are kernel parameters of the backend."""
 
         def number(value: float) -> Real:
+            """The number as a kernel parameter."""
             return dr.opaque(backend.Float, value)
 
         make_complex = complex_type(backend)
@@ -341,6 +343,9 @@ class PowerProduct(Branches):
 
     @property
     def branch_points(self) -> tuple[BranchPoint, ...]:
+        """The a_i whose exponent is no positive integer. For a positive exponent alpha the bound is
+        C |z - a_i|^alpha within half the distance to the nearest other a_j, C a bound of the other
+        factors."""
         points: list[BranchPoint] = []
         for i, (a, alpha) in enumerate(zip(self.centers, self.exponents, strict=True)):
             if alpha > 0 and alpha.is_integer():
@@ -383,6 +388,11 @@ class PowerProduct(Branches):
         return z
 
     def evaluate(self, z: Complex) -> tuple[Branch, ...]:
+        """All q branches at z, computed from the logarithm of the product.
+
+        With the logarithmic derivative e = sum alpha_i/(z - a_i), g' = g e and g" = g (e^2 - sum
+        alpha_i/(z - a_i)^2).
+        """
         log_size, angle = 0 * z.real, 0 * z.real
         log_derivative = type(z)(log_size, log_size)
         square_sum = log_derivative
@@ -405,6 +415,7 @@ class PowerProduct(Branches):
         return tuple(branches)
 
     def second_derivative_bound(self, part: PlaneRegion) -> Real:
+        """The bound of the class docstring, each term computed from logarithms of distances."""
         log_nearest: list[Real] = []
         log_farthest: list[Real] = []
         for a in self._centers(part.disk()[0]):
@@ -427,6 +438,7 @@ class PowerProduct(Branches):
         return total * _BOUND_MARGIN
 
     def max_abs(self, middle: complex, reach: float) -> float:
+        """The product of bounds of all factors on the disk; infinite if it contains a pole."""
         product = 1.0
         for a, alpha in zip(self.centers, self.exponents, strict=True):
             distance = abs(a - middle)
@@ -496,6 +508,7 @@ class Logarithm(Branches):
         return total * _BOUND_MARGIN
 
     def value_rounding(self, z: Complex, branches: tuple[Branch, ...]) -> Real:
+        """The rounding of the logarithms and of the angles, which are at most pi."""
         del branches
         roundings = 0 * z.real
         for a, n in zip(self._centers(z), self.multiplicities, strict=True):
@@ -580,6 +593,7 @@ class UserBranches(Branches):
         return self.shift
 
     def evaluate(self, z: Complex) -> tuple[Branch, ...]:
+        """The branches that the user's function returns, with plain numbers made Dr.Jit numbers."""
         branches: list[Branch] = []
         for numbers in self.function(z):
             parts = [part if dr.is_array_v(type(part)) else type(z)(part) for part in numbers]

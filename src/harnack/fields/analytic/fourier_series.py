@@ -61,17 +61,20 @@ class SurfaceDisplacement:
 
 
 class FourierSeries(Field):
-    """sum a_ijk cos(i u) cos(j v) cos(k w) on a box, u, v, w from 0 to pi along its sides.
+    """The sum of a_ijk cos(i u) cos(j v) cos(k w) on a box.
+
+    The angles u, v and w go from 0 to pi along the sides of the box.
 
     `fit` computes the series of any function or grid of values. **All proofs are about the
     series**, not about the function that it was fitted to: `fit_error` is the difference of their
-    values and `displacement` the distance of their surfaces, both by sampling. The series continues
-    the function by reflection at the walls of the box. It converges quickly if the function is
-    smooth and has no slope across the walls; kinks, such as those of distances, cost accuracy, and
-    so do functions that are very steep far from the surface: compress such functions first, for
+    values and `displacement` the distance of their surfaces, both by sampling.
+
+    Beyond the faces of the box the series is a reflection of itself. It converges quickly if the
+    function is smooth and has no slope across the faces. Kinks, such as those of distances, cost
+    accuracy. So does a function that is very steep far from the surface: compress it first, for
     example by tanh.
 
-    coefficients: (K_x, K_y, K_z), at most 24 each.
+    coefficients: (K_x, K_y, K_z) the a_ijk; each of the three sizes is at most 24.
     box: a finite `Box`.
 
     Promises: bounds of the second derivatives (`CosineBounds` has the proof), on the whole box and,
@@ -182,11 +185,14 @@ class FourierSeries(Field):
         return self._bounds.curvature
 
     def displacement(self, level: float | None = None, *, rng: int = 0) -> SurfaceDisplacement:
-        """An estimate of the distance between the surfaces of the series and of the fitted
-        function, at a level.
+        """Estimate the distance between the surfaces of the series and of the fitted function, at a
+        level.
 
-        For a function, at random points of the surface; for a grid, at its points next to the
-        surface.
+        level: by default `default_level`.
+        rng: the seed of the random points.
+
+        For a function the points are random points of the series' surface; for a grid, those of its
+        points that are next to the surface.
 
         Raises:
             ValueError: the series was not computed by `fit`, or no point of the level was found.
@@ -261,6 +267,8 @@ class FourierSeries(Field):
         return self._upload(backend_of(p)) if self._device is None else self._device
 
     def evaluate(self, p: Vec3) -> Sample:
+        """The sample at p: value and gradient of the series, local bounds of second derivatives as
+        promises, and bounds of the rounding of both."""
         sums = self._on(p)
         value, gradient = sums.value(p)
         unit = float(dr.epsilon(type(value))) * _SECOND_ORDER

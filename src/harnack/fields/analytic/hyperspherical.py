@@ -202,6 +202,7 @@ class HypersphericalHarmonic(Field):
         return self._known.low, self._known.high
 
     def evaluate(self, p: Vec3) -> Sample:
+        """The sample at p, with bounds of the Hessian on several balls and a Lipschitz constant."""
         square = dr.squared_norm(p)
         value, gradient, error, gradient_error = self._values(p, 1 + square)
         promises = (*self._remainder_near_zero(p, square), *self._curvatures(square))

@@ -70,7 +70,8 @@ def gegenbauer(n: int, k: int, w: Any) -> Any:
 
 
 def _coefficients(i: int, k: int) -> tuple[float, float]:
-    """The coefficients (a, b) of the step C_i = a w C_(i-1) - b C_(i-2) of the recurrence, k fixed."""
+    """The coefficients (a, b) of the step C_i = a w C_(i-1) - b C_(i-2) of the recurrence, k
+    fixed."""
     return 2 * (i + k - 1) / i, (i + 2 * k - 2) / i
 
 

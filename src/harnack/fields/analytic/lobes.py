@@ -156,6 +156,11 @@ class Lobes(Field):
         return self.scale * ends[self.part]
 
     def prepare(self, backend: Backend) -> Field:
+        """A copy whose scale is a kernel parameter.
+
+        Raises:
+            ValueError: the scale or the largest |Y| is too small or too large for the precision.
+        """
         limit, largest = _LARGEST_SIZE[backend.precision], max(map(abs, self.value_range))
         if not (1 / limit <= self.scale <= limit and 1 / limit <= largest <= limit):
             raise ValueError(

@@ -246,6 +246,8 @@ class EigenfunctionSum(Field):
         return self.waves.largest_curvature
 
     def evaluate(self, p: Vec3) -> Sample:
+        """The sample at p: see `EigenfunctionSum` for its promises and for the bound of its
+        rounding."""
         value, components = evaluate_terms(self.terms, p)
         gradient = type(p)(*components)
         epsilon = float(dr.epsilon(type(value)))
@@ -264,7 +266,8 @@ class EigenfunctionSum(Field):
         return Sample(value, gradient, promises, error, alternative_promises=alternatives)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """The three rows of the Hessian. Its trace is the Laplacian of the sum, which is not zero."""
+        """The three rows of the Hessian. Its trace is the Laplacian of the sum, which is not
+        zero."""
         x, y, z = (type(p)(*row) for row in hessian_of_terms(self.terms, p))
         return x, y, z
 
@@ -349,6 +352,8 @@ class _CubicSurface(EigenfunctionSum):
         super().__init__(terms, domain=Ball(radius=self.cell) if domain is None else domain)
 
     def _bounds(self) -> WaveBounds:
+        """The bounds of the sum of waves, with the proved constants of the class in place of two of
+        them."""
         return replace(
             super()._bounds(),
             largest_value=self._largest_value,
@@ -362,9 +367,10 @@ class Gyroid(_CubicSurface):
     cell: the edge length of the cubic cell of periodicity, 2 pi by default (so X = x).
     domain: the volume in which f is drawn, by default the ball of radius `cell` about the origin.
 
-    |f| <= 3/2: 2 sin a cos b <= sin^2 a + cos^2 b, and the three right sides add up to 3.
-    |grad f| <= sqrt 3 (2 pi/cell): f_X = cos X cos Y - sin Z sin X has, by Cauchy-Schwarz,
-    f_X^2 <= cos^2 Y + sin^2 Z; the three right sides add up to 3. Both are attained.
+    Proof of |f| <= 3/2: each term obeys 2 sin a cos b <= sin^2 a + cos^2 b, and the three right
+    sides add up to 3. Proof of |grad f| <= sqrt 3 (2 pi/cell): the derivative by X is
+    f_X = cos X cos Y - sin Z sin X. By Cauchy-Schwarz f_X^2 <= cos^2 Y + sin^2 Z, and the three
+    right sides add up to 3. Both bounds are attained.
     """
 
     _largest_value = 1.5
@@ -380,8 +386,10 @@ class Gyroid(_CubicSurface):
 class SchwarzP(_CubicSurface):
     """cos X + cos Y + cos Z with (X, Y, Z) = 2 pi p/cell: Schwarz's primitive surface.
 
-    cell, domain: as for `Gyroid`. |f| <= 3 and |grad f|^2 = sum sin^2 <= 3 (2 pi/cell)^2, both
-    attained.
+    cell, domain: as for `Gyroid`.
+
+    |f| <= 3, and |grad f| <= sqrt 3 (2 pi/cell) since the derivatives by X, Y and Z are sines. Both
+    bounds are attained.
     """
 
     _largest_value = 3.0
@@ -395,16 +403,21 @@ class SchwarzP(_CubicSurface):
 
 
 class SchwarzD(_CubicSurface):
-    """Schwarz's diamond surface, with s and c for sin and cos of (X, Y, Z) = 2 pi p/cell:
+    """Schwarz's diamond surface, the level 0 of
 
-        s s s + s c c + c s c + c c s.
+        f = s s s + s c c + c s c + c c s,
 
-    cell, domain: as for `Gyroid`. |f| <= sqrt 2, attained: f = sin X cos(Y-Z) + cos X sin(Y+Z),
-    at most sqrt(cos^2(Y-Z) + sin^2(Y+Z)) by Cauchy-Schwarz.
-    |grad f| <= sqrt 3 (2 pi/cell), attained: with A, B, C the cosines and P, Q, R the sines of
-    2X, 2Y, 2Z, |grad f|^2 = 3/2 (1 + ABC) - (PQ + QR + RP)/2. Here
-    -2(PQ + QR + RP) <= P^2 + Q^2 + R^2 = 3 - S with S = A^2 + B^2 + C^2, and
-    |ABC| <= (S/3)^(3/2) <= S/3, so |grad f|^2 <= 3/2 + S/2 + (3 - S)/4 <= 3.
+    where the first, second and third s or c of each term is sin or cos of X, Y and Z, and
+    (X, Y, Z) = 2 pi p/cell.
+
+    cell, domain: as for `Gyroid`.
+
+    Proof of |f| <= sqrt 2: f = sin X cos(Y-Z) + cos X sin(Y+Z), which is at most
+    sqrt(cos^2(Y-Z) + sin^2(Y+Z)) by Cauchy-Schwarz. Proof of |grad f| <= sqrt 3 (2 pi/cell): let A,
+    B, C be the cosines and P, Q, R the sines of 2X, 2Y, 2Z. For cell 2 pi,
+    |grad f|^2 = 3/2 (1 + ABC) - (PQ + QR + RP)/2. Here -2(PQ + QR + RP) <= P^2 + Q^2 + R^2 = 3 - S
+    with S = A^2 + B^2 + C^2, and |ABC| <= (S/3)^(3/2) <= S/3, so
+    |grad f|^2 <= 3/2 + S/2 + (3 - S)/4 <= 3. Both bounds are attained.
     """
 
     _largest_value = math.sqrt(2.0)

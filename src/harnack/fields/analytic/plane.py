@@ -342,6 +342,7 @@ class LevelCurves(Field):
         return field
 
     def evaluate(self, p: Vec3) -> Sample:
+        """The sample at p, with two promises for each of two disks: see `LevelCurves`."""
         rounding, z, branch = self._at(p)
         slope_x, slope_y = derivatives(branch.first, self.part)
         vector = cast("Any", type(p))

@@ -262,6 +262,7 @@ class _SolidHarmonics(Field):
         return max(degree for degree, _ in self._weights)
 
     def evaluate(self, p: Vec3) -> Sample:
+        """The sample at p, computed at p/size and scaled back: see `HarmonicPromises`."""
         s, size = self._local(p), self._size
         value, gradient = evaluate(self._weights, s.x, s.y, s.z)
         rho, r = dr.norm(type(s)(s.x, s.y, 0)), dr.norm(s)
@@ -279,7 +280,8 @@ class _SolidHarmonics(Field):
         return Sample(value, slope, promises, error, alternative_promises=tuple(alternatives))
 
     def _local(self, p: Vec3) -> Vec3:
-        """The point in the coordinates of the solid harmonics: axes rotated, divided by the size."""
+        """The point in the coordinates of the solid harmonics: axes rotated, divided by the
+        size."""
         return type(p)(*_rotate_axes((p.x, p.y, p.z), self._axis + 1)) / self._size
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:

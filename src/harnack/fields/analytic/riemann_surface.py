@@ -223,6 +223,12 @@ class RiemannSurface(Field):
         return abs(self.height) * self.branches.max_abs(middle, reach)
 
     def evaluate(self, p: Vec3) -> Sample:
+        """The sample at p, with promises on disks that contain no singular point.
+
+        The bound of second derivatives holds within the radius in which no other branch can become
+        the nearest, the Lipschitz constant on the whole disk. If a single branch is nearest, f is
+        harmonic there.
+        """
         local = self._branches_at(p)
         sample = self._sample(local)
         clearance = self.branches.clearance(local.z)

@@ -56,7 +56,8 @@ def normalization(l: int, m: int) -> float:  # noqa: E741
 
 
 def odd_factorial(m: int) -> float:
-    """The product of the odd numbers (2m-1)!! = 1 * 3 * ... * (2m-1), which is the value of Q_m^m."""
+    """The product of the odd numbers (2m-1)!! = 1 * 3 * ... * (2m-1), which is the value of
+    Q_m^m."""
     return float(math.prod(range(1, 2 * m, 2)))
 
 

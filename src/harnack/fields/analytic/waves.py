@@ -149,7 +149,8 @@ class _FactorEvaluator:
 
 
 def evaluate_terms(terms: Sequence[Term], p: Vec3) -> tuple[Real, list[Real]]:
-    """Value and the three components of the gradient of the sum of the terms at p, a Dr.Jit vector."""
+    """Value and the three components of the gradient of the sum of the terms at p, a Dr.Jit
+    vector."""
     evaluate_factor = _FactorEvaluator(p)
     value, gradient = p[0] * 0.0, [p[0] * 0.0 for _ in range(3)]
     for term in terms:
