@@ -1,10 +1,9 @@
-"""The polar angle of a point of the plane, `atan2`: in (-pi, pi], with a cut along the negative x
-axis.
+"""The polar angle `atan2` of a point of the plane, from -pi (excluded) to pi.
 
-On the cut, {y = 0, x <= 0}, the angle jumps by 2 pi, and at the origin it has no value at all
-(there it counts as 0). On a box that meets the cut, the range is [-pi, pi], and the ranges of
-derivatives are all numbers: so no arithmetic takes the angle for a continuous function there, and
-no step leads across the cut.
+It has a cut {y = 0, x <= 0} along the negative x axis, where it jumps by 2 pi. At the origin it has
+no value (there it counts as 0). On a box that meets the cut, its range is [-pi, pi], and the ranges
+of its derivatives are all numbers. So no arithmetic takes the angle for a continuous function
+there, and no step leads across the cut.
 """
 
 from __future__ import annotations
@@ -30,10 +29,12 @@ _PI = math.nextafter(math.pi, 4.0)
 
 
 def atan2(y: Any, x: Any) -> Any:
-    """The angle of the point (x, y), in radians, -pi < angle <= pi, of numbers of any kind.
+    """The polar angle of the point (x, y) in radians, -pi < angle <= pi.
 
-    It jumps along the negative x axis, where nothing is proved: a ray stops there. Where only the
-    cosine or sine of the angle is wanted, x / norm(x, y) and y / norm(x, y) have no cut.
+    y, x: numbers of any kind.
+
+    The angle jumps along the negative x axis, where nothing is proved: a ray stops there. If you
+    need only its cosine or sine, x / norm(x, y) and y / norm(x, y) have no such cut.
     """
     if isinstance(y, FormulaNumber):
         return y.atan2(x)

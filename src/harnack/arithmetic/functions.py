@@ -1,8 +1,8 @@
-"""Elementary functions: their ranges, and those of their first two derivatives, on intervals.
+"""Elementary functions: the ranges of their values and of their first two derivatives on intervals.
 
-An `ElementaryFunction` serves every arithmetic: it evaluates the function for plain numbers, and
-bounds the ranges of the function and of its first two derivatives on an interval. `sin(x)` and the
-like take numbers of any arithmetic, Dr.Jit and NumPy arrays, and Python numbers.
+An `ElementaryFunction` serves every arithmetic. It evaluates the function for plain numbers, and
+bounds the ranges of the function and of its first two derivatives on an interval. The functions
+`sin`, `exp` and so on take numbers of any arithmetic, Dr.Jit and NumPy arrays, and Python numbers.
 """
 
 from __future__ import annotations
@@ -329,7 +329,7 @@ def _abs(x: Interval) -> DerivativeRanges:
 
 
 def integer_power(x: Interval, n: int) -> Interval:
-    """The range of x^n, n >= 0."""
+    """The range of y^n for y in the interval x; n >= 0."""
     if n == 0:
         return ONE
     if n == 1:
@@ -481,10 +481,10 @@ class ClippedPower(ElementaryFunction):
 
 
 def clipped_power(n: int) -> ClippedPower:
-    """The function max(x, 0)^n.
+    """The function x -> max(x, 0)^n for an integer n >= 1: see `ClippedPower`.
 
     Raises:
-        ValueError: n is less than 1.
+        ValueError: n is less than 1 or no integer.
     """
     if int(n) != n or n < 1:
         raise ValueError(f"the exponent of a clipped power must be an integer >= 1, not {n}")

@@ -92,12 +92,12 @@ class Interval:
 
     @property
     def max_abs(self) -> Real:
-        """The largest absolute value."""
+        """The largest absolute value of a number of the interval; NaN if an end is NaN."""
         return _maximum_or_nan(_absolute(self.lower), _absolute(self.upper))
 
     @property
     def min_abs(self) -> Real:
-        """The smallest absolute value."""
+        """The smallest absolute value of a number of the interval."""
         return _maximum(-self.upper, _maximum(self.lower, 0.0))
 
     def contains(self, x: Real) -> Mask:
@@ -105,7 +105,7 @@ class Interval:
         return ~((x < self.lower) | (x > self.upper))
 
     def hull(self, other: Interval) -> Interval:
-        """The smallest interval that contains both."""
+        """The smallest interval that contains this and the other interval."""
         low = -_maximum_or_nan(-self.lower, -other.lower)
         high = _maximum_or_nan(self.upper, other.upper)
         return Interval(low, high, self.is_single or other.is_single)
@@ -188,7 +188,7 @@ class Interval:
         return self._rounded_outward(_pad_underflow(low, -1), _pad_underflow(high, 1), constant)
 
     def square(self) -> Interval:
-        """The range of the squares."""
+        """The range of x^2 for x in the interval."""
         low, high = self.min_abs, self.max_abs
         if self.lower is self.upper:
             low = high
@@ -244,8 +244,10 @@ def machine_epsilon(x: Real) -> float:
 
 
 def typed_select(condition: Mask, a: Real, b: Real, like: Real) -> Real:
-    """a or b as numbers of the type of `like`: from two Python numbers, Dr.Jit would make integers
-    or numbers of single precision."""
+    """a where the condition holds, else b, with numbers of the type of `like`.
+
+    From two Python numbers Dr.Jit's select would make integers or numbers of single precision.
+    """
     kind = cast("Any", type(like))
     return dr.select(condition, kind(a) if dr.is_array_v(kind) else a, b)
 

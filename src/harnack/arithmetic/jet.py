@@ -130,7 +130,7 @@ class Jet(FormulaNumber):
         return Jet(value, *zeros, start, self.piece_length)
 
     def backend_number(self) -> Any:
-        """A number of the backend's type in use; a Python number if there is none."""
+        """A number of the backend's type that the ranges use; a Python number if there is none."""
         for jet in (self.value, *self.first_derivatives):
             if dr.is_array_v(cast("Any", type(jet.lower))):
                 return jet.lower
@@ -256,9 +256,9 @@ class Jet(FormulaNumber):
     def pointwise_maximum(self, other: Jet) -> Jet:
         """The larger of two functions at each point.
 
-        Proof. If one function is larger everywhere, it is the maximum. Otherwise each derivative is
-        that of one of the two, except where they cross: there the first derivative jumps up, so
-        that the second derivative has no upper bound.
+        Proof. If one function is larger everywhere in the box, it is the maximum. Otherwise each
+        derivative of the maximum is that of one of the two, except where they cross. There the
+        first derivative jumps up, so that the second derivative has no upper bound.
         """
         x, y = self.value_on_backend(), other.value_on_backend(self.backend_number())
         is_x, is_y = x.lower > y.upper, y.lower > x.upper

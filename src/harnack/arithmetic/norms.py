@@ -231,7 +231,8 @@ def _signed_power(x: Interval, q: float) -> Interval:
 
 
 def _reciprocal_norm(length: Interval) -> Interval:
-    """The range of 1/N for N >= 0; its upper end is infinite where N may be 0."""
+    """The range of 1/N, where `length` is the range of N >= 0; the upper end is infinite if N may
+    be 0."""
     over = reciprocal.ranges(length)[0]
     from_upper = Interval.point(length.upper).reciprocal()
     return Interval(fmax(from_upper.lower, 0), over.upper)
@@ -264,8 +265,10 @@ def as_backend_interval(x: Interval, like: Any) -> Interval:
 
 
 def blend_union(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
-    """The function of a union with a rounded edge: it is <= 0 where a <= 0, where b <= 0, and in the
-    inner edge between the two sets, which a superellipse fills.
+    """The function of a union with a rounded edge.
+
+    It is <= 0 where a <= 0, where b <= 0, and in the inner edge between the two sets, which a
+    superellipse fills.
 
     a, b: numbers of any kind, such as signed distances.
     radius: the blend changes the union where both a and b are less than this.

@@ -1,7 +1,8 @@
-"""Operators that numbers of every arithmetic share, so that any of them can evaluate a formula.
+"""The operators of the numbers of all arithmetics, with which each arithmetic evaluates formulas.
 
-`tally_of` says, before anything is recorded, about how large a formula's kernel will be, and
-whether the formula may jump, have a vertical tangent, or turn within the rounding of coordinates.
+`tally_of` estimates, before a kernel is recorded, how large the kernel of a formula will be. It
+also tells whether the formula may jump, have a vertical tangent, or turn within the rounding of
+coordinates.
 """
 
 from __future__ import annotations
@@ -109,7 +110,7 @@ class FormulaNumber(abc.ABC):
             return None
 
     def coerce(self, other: Any) -> Self:
-        """A number of any kind as one of this arithmetic.
+        """A number of any kind as a number of this arithmetic.
 
         Raises:
             TypeError: it is no number.

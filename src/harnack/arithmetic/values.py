@@ -1,11 +1,11 @@
 """`Values`: the range of a formula on a box, and whether the formula is continuous there.
 
-Ranges of derivatives prove long steps where a formula is smooth. Beside a vertical tangent, as that
-of sqrt(|x|) at x = 0, they are unbounded, and where the formula has no value at all they prove
+Ranges of derivatives prove long steps where a formula is smooth. Near a vertical tangent, such as
+that of sqrt(|x|) at x = 0, they are unbounded, and where the formula has no value they prove
 nothing. The range of values does prove steps there: sqrt(|x|) + 0.5 is at least 0.5, whatever its
 slope.
 
-`tally_of` determines the formulas for which this may be needed, before anything is recorded.
+`tally_of` finds out, before a kernel is recorded, whether a formula may need this.
 """
 
 from __future__ import annotations

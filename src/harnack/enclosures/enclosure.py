@@ -61,7 +61,7 @@ class PathRestriction(Protocol):
 
 @runtime_checkable
 class EvaluableRestriction(Protocol):
-    """A restriction given by a formula, which can be evaluated in any arithmetic."""
+    """A function given by a formula along a path, which can be evaluated in any arithmetic."""
 
     def evaluate_with(self, coordinates: Callable[[Vec3, Vec3], tuple[Any, Any, Any]]) -> Any:
         """Evaluate the formula at x, y, z = coordinates(p, d).
@@ -198,14 +198,16 @@ class Enclosure(abc.ABC):
 
 @dataclass(frozen=True)
 class Levels:
-    """A finite set of levels, repeated with `period` if there is one.
+    """The levels that rays look for: a finite set, repeated with `period` if there is one.
 
-    An angle-valued function is known modulo its period. Its levels are then periodic: each of the
-    values plus every multiple of the period (paper, Alg. 2, with the reduction that the printed
-    algorithm omits: both neighboring levels are computed from the reduced difference).
+    An angle-valued function is known up to multiples of its period. Its levels are then each of the
+    values plus every multiple of the period (paper, Alg. 2). The printed algorithm omits a
+    reduction: here both neighboring levels are computed from the difference reduced to half a
+    period.
 
-    values: Python floats, or Dr.Jit arrays of size 1 of the backend in use (so that a level can
-        change without a kernel being compiled again, or carry derivatives).
+    values: Python floats, or Dr.Jit arrays of size 1 of the backend in use. As arrays, levels can
+        change without a kernel being compiled again, and can carry derivatives.
+    period: the period, or None.
     """
 
     values: tuple[Real, ...]
@@ -214,9 +216,9 @@ class Levels:
     def gaps(self, f: Real) -> LevelGaps:
         """The differences in value between f and the next level below and above.
 
-        Either is infinite if there is no such level. If f is a level, the gap on one side is zero,
-        and with a period the gap on the other is at most the period. Where f is NaN, the gaps are
-        NaN.
+        A difference is infinite if there is no such level. If f is a level, the gap on one side is
+        0, and with a period the gap on the other side is at most the period. The gaps are NaN where
+        f is NaN.
         """
         below: Real = math.inf
         above: Real = math.inf
@@ -236,6 +238,6 @@ class Levels:
         return LevelGaps(below, above, len(self.values) == 1 and self.period is None)
 
     def offset_to_nearest(self, f: Real) -> Real:
-        """level - f for the level nearest to f."""
+        """The difference level - f for the level nearest to f."""
         gaps = self.gaps(f)
         return dr.select(gaps.above < gaps.below, gaps.above, -gaps.below)

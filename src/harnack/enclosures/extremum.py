@@ -1,4 +1,4 @@
-"""Enclosures of maxima and of nearest branches of several functions, and of mapped functions.
+"""Enclosures of functions that are made of several functions, or of one by a map.
 
 - `MaximumEnclosure`, with `NegatedEnclosure` and `ScaledEnclosure`: unions, intersections and
   differences of solids, and solids that were moved and scaled.

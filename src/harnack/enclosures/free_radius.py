@@ -44,11 +44,11 @@ class FreeRadiusCondition(Protocol):
     def gap(self) -> Real: ...
 
     def __call__(self, q: Real) -> Real:
-        """k(q)."""
+        """The value k(q)."""
         ...
 
     def expansion_at_zero(self) -> tuple[Real, Real]:
-        """k(0) and k'(0), for a first guess; no proof relies on them."""
+        """k(0) and k'(0), which give the first candidate; no proof relies on them."""
         ...
 
 

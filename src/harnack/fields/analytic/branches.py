@@ -542,7 +542,7 @@ class ArcSine(Branches):
         return None if imaginary else 2 * math.pi
 
     def evaluate(self, z: Complex) -> tuple[Branch, ...]:
-        """The branches by Kahan's formulas (1987), in which nothing cancels."""
+        """Both branches at z, by Kahan's formulas (1987), in which nothing cancels."""
         root_minus, root_plus = dr.sqrt(1 - z), dr.sqrt(1 + z)
         product = root_minus * root_plus
         real = dr.atan2(z.real, product.real)

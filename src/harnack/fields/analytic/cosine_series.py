@@ -2,8 +2,8 @@
 
     f(p) = sum a_ijk cos(i u) cos(j v) cos(k w),   (u, v, w) = pi (p - lower)/(upper - lower),
 
-0 <= i < K_x and so on. `fit_cosines` and `CosineBounds` are NumPy in double precision, computed
-once for a series; `CosineSums` evaluates it.
+with 0 <= i < K_x, 0 <= j < K_y and 0 <= k < K_z. `fit_cosines` and `CosineBounds` are computed once
+for a series, with NumPy in double precision; `CosineSums` evaluates the series.
 """
 
 from __future__ import annotations
@@ -328,7 +328,7 @@ class CosineSums:
         return (self.backend.Array3f(p) - self.lower) * self.rate
 
     def value(self, p: Vec3) -> tuple[Real, Vec3]:
-        """Value and gradient at points."""
+        """Value and gradient at points p."""
         angles = self.angles(p)
         y, z = _waves(angles.y, self.shape[1]), _waves(angles.z, self.shape[2])
 

@@ -97,7 +97,7 @@ class _OrderTerm:
         return slope * c + value * first, curvature * c + slope * first + value * second
 
     def axial(self, w: Real) -> tuple[Real, Real, Real]:
-        """C_n^k(w) and its first two derivatives."""
+        """The values at w of C_n^k and of its first two derivatives."""
         n, k = self.n, self.k
         first = 2 * k * gegenbauer(n - 1, k + 1, w)
         return gegenbauer(n, k, w), first, 4 * k * (k + 1) * gegenbauer(n - 2, k + 2, w)
@@ -163,13 +163,17 @@ class HypersphericalHarmonic(Field):
     def from_polynomial(
         cls, coefficients: Monomials, *, domain: Volume | None = None
     ) -> HypersphericalHarmonic:
-        """The function of a homogeneous harmonic polynomial of R^4, from its coefficients.
+        """The function of a homogeneous harmonic polynomial of R^4, from the polynomial's
+        coefficients.
 
-        coefficients: (a, b, c, d) -> coefficient of x^a y^b z^c w^d, a + b + c + d = l for all, l
-            <= 6; x, y, z are 2p/(1 + |p|^2) and w = (|p|^2 - 1)/(1 + |p|^2).
+        coefficients: (a, b, c, d) -> coefficient of x^a y^b z^c w^d. The degree a + b + c + d = l
+            is the same for all, l <= 6. At a point p of space, (x, y, z) is 2p/(1 + |p|^2) and w is
+            (|p|^2 - 1)/(1 + |p|^2).
+        domain: as for the class.
 
         Raises:
-            ValueError: not homogeneous, of a degree above 6, zero, not finite, or not harmonic.
+            ValueError: the polynomial is not homogeneous, of a degree above 6, zero, not finite, or
+                not harmonic.
             TypeError: a key is not four integers.
         """
         terms: dict[tuple[int, int, int, int], float] = {}

@@ -1,13 +1,12 @@
-"""Harmonic functions on the sphere S^3: the (l+1)^2 functions of degree l, their sums and their
-ranges.
+"""Harmonic functions on the sphere S^3: the (l+1)^2 functions of degree l, their sums and ranges.
 
-With X = (y, w), y in R^3, the homogeneous harmonic polynomials of degree l of R^4 are spanned by
+Let X = (y, w) with y in R^3. The homogeneous harmonic polynomials of degree l of R^4 are spanned by
 
-    P_ljm(X) = N_lj S_jm(y) |X|^(l-j) C_(l-j)^(j+1)(w/|X|),   0 <= j <= l, -j <= m <= j,
+    P_ljm(X) = N_lj S_jm(y) |X|^(l-j) C_(l-j)^(j+1)(w/|X|),   0 <= j <= l, -j <= m <= j.
 
-S_jm = |y|^j Y_jm the solid harmonics of `solid_harmonics`, C_n^k Gegenbauer polynomials (with n C_n
-= 2 (n+k-1) w C_(n-1) - (n+2k-2) C_(n-2)) and N_lj such that the integral of P^2 over S^3 is 1: with
-n = l-j, k = j+1 (DLMF 18.3),
+Here S_jm = |y|^j Y_jm is a solid harmonic of `solid_harmonics`. C_n^k is a Gegenbauer polynomial;
+it obeys n C_n = 2 (n+k-1) w C_(n-1) - (n+2k-2) C_(n-2) for fixed k. N_lj is the factor for which
+the integral of P^2 over S^3 is 1: with n = l-j and k = j+1 (DLMF 18.3),
 
     N^-2 = integral of sin(a)^(2k) C_n^k(cos a)^2 = pi 2^(1-2k) (n+2k-1)!/(n! (n+k) ((k-1)!)^2).
 

@@ -149,8 +149,7 @@ class Lobes(Field):
         return max(l for l, _ in self.weights)  # noqa: E741
 
     def extent_radius(self) -> float:
-        """A proved upper bound of the length of the longest lobe; not positive if there is no
-        lobe."""
+        """A proved upper bound of the length of the longest lobe; 0 or less if there is no lobe."""
         low, high = self.value_range
         ends = {"both": max(-low, high), "positive": high, "negative": -low}
         return self.scale * ends[self.part]

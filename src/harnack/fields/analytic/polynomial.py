@@ -334,13 +334,13 @@ class SphericalHarmonic(_SolidHarmonics):
 class HarmonicPolynomial(_SolidHarmonics):
     """A harmonic polynomial from its monomials, up to degree 12.
 
-    coefficients: {(i, j, k): c} stands for the sum of c x^i y^j z^k; the paper's Eq. 8 is
+    coefficients: {(i, j, k): c}, for the sum of c x^i y^j z^k; the paper's Eq. 8 is
         HarmonicPolynomial({(2, 1, 0): 1, (0, 1, 2): -1}).
     domain: the bounded volume to which it is clipped; by default the ball of radius 1.
 
     The Laplacian must vanish, up to 1e-9 of the terms that cancel in it. The polynomial is
-    evaluated as a sum of solid harmonics, which agrees with it in value and z-derivative on the
-    plane z = 0, thus everywhere if it is harmonic.
+    evaluated as a sum of solid harmonics. The sum has the same values and z-derivatives on the
+    plane z = 0 as the polynomial, and so, both being harmonic, agrees with it everywhere.
 
     Raises:
         ValueError: the polynomial is not harmonic (the message shows its Laplacian), its degree is

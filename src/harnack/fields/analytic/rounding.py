@@ -1,8 +1,9 @@
 """Bounds of the rounding of sums of solid harmonics, and of sums of waves.
 
-Everything here is to first order in u, the unit roundoff (eps/2 of the precision in use): each
-operation is exact up to a factor 1 + d, |d| <= u, so errors of factors add up. Terms of second
-order are below 1e-4 of that in single precision and covered by `_SECOND_ORDER`.
+All bounds here are to first order in u, the unit roundoff (half of the machine epsilon of the
+precision in use). Each operation is exact up to a factor 1 + d with |d| <= u, so the relative
+errors of factors add up. In single precision the terms of second order are below 1e-4 of those of
+first order; `_SECOND_ORDER` covers them.
 
 - `HarmonicRounding`: the rounding of `solid_harmonics.evaluate`.
 - `WaveRounding`: the rounding of `waves.evaluate_terms`.

@@ -1,8 +1,9 @@
 """Sums of sine waves: their terms, values and gradients, and proved bounds of the sum.
 
 Every Laplacian eigenfunction that separates in Cartesian coordinates is a product of sines and
-cosines, and every such product is a sum of plane waves. Terms are evaluated in the user's form (a
-product needs one sine and one cosine for each coordinate), and bounded as plane waves.
+cosines, and every such product is a sum of plane waves. Terms are evaluated as the user wrote them,
+because a product needs only one sine and one cosine for each coordinate. They are bounded as sums
+of plane waves.
 """
 
 from __future__ import annotations
@@ -34,7 +35,14 @@ __all__ = [
 
 @dataclass(frozen=True)
 class WaveFactor:
-    """sin or cos of (frequency * coordinate + phase); see `sine_factor` and `cosine_factor`."""
+    """The factor sin(frequency * coordinate + phase), or cos, if `is_cosine`.
+
+    frequency: in radians per unit length, not 0.
+    phase: in radians.
+
+    Raises:
+        TypeError, ValueError: a number is not finite, or the frequency is 0.
+    """
 
     frequency: float
     phase: float
@@ -87,7 +95,7 @@ class WaveProduct:
 
     @property
     def factors(self) -> tuple[tuple[int, WaveFactor], ...]:
-        """(axis, factor) for each coordinate that has a factor."""
+        """The pairs (axis, factor) for the coordinates that have a factor; axis is 0, 1 or 2."""
         named = enumerate((self.x, self.y, self.z))
         return tuple((axis, factor) for axis, factor in named if factor is not None)
 
