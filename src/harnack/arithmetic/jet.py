@@ -305,6 +305,9 @@ class Jet(FormulaNumber):
 
             theta_i = (x y_i - y x_i)/r^2,   rho_i = (x x_i + y y_i)/r^2,
             theta_ij = (x y_ij - y x_ij)/r^2 - theta_i rho_j - theta_j rho_i.
+
+        Symbols in the code: u and v are the ranges of x and y, `over` that of 1/r, c and s those of
+        x/r and y/r.
         """
         like = x.backend_number() if self.value.is_literal else self.backend_number()
         v, u = self.value_on_backend(like), x.value_on_backend(like)

@@ -134,7 +134,11 @@ def _plain_power(x: Any, p: float) -> Any:
 
 
 def _jet_norm(xs: list[Jet], p: float) -> Jet:
-    """The p-norm of jets, for 1 < p < infinity; `norm` has the proof of its ranges."""
+    """The p-norm of jets, for 1 < p < infinity; `norm` has the proof of its ranges.
+
+    Symbols: over is the range of 1/N, ratios are those of x_i/N, and pulls those of sign(x_i)
+    u_i^(p-1).
+    """
     like = next((f.value.lower for f in xs if not f.value.is_literal), None)
     like = xs[0].backend_number() if like is None else like
     values = [as_backend_interval(f.value, like) for f in xs]

@@ -177,7 +177,11 @@ class ParabolaBounds(FormulaNumber):
         )
 
     def _product_of_lines(self, other: ParabolaBounds) -> tuple[Quadratic, Quadratic]:
-        """Bounds of the product of two polynomials of degree 1: exact up to rounding."""
+        """Bounds of the product of two polynomials of degree 1: exact up to rounding.
+
+        Symbols: v and w are the midpoints of the two values at s = 0, a and c those of the two
+        slopes; rv, rw, ra and rc are their radii.
+        """
         a, ra = _midpoint_and_half_width(self.lower[0], self.upper[0])
         c, rc = _midpoint_and_half_width(other.lower[0], other.upper[0])
         v, rv, w, rw = *_midpoint_and_radius(self.value), *_midpoint_and_radius(other.value)
@@ -189,7 +193,11 @@ class ParabolaBounds(FormulaNumber):
         return (linear - error_1, quadratic - error_2), (linear + error_1, quadratic + error_2)
 
     def _straight_product(self, other: ParabolaBounds) -> tuple[Quadratic, Quadratic]:
-        """Bounds of a product by lines: see `product`."""
+        """Bounds of a product f g by lines: see `product`.
+
+        Symbols: v and w are the midpoints of f(0) and g(0), rv and rw their radii. a and c are the
+        slopes of a bound of f and of one of g.
+        """
         h = self.piece_length
         v, rv, w, rw = *_midpoint_and_radius(self.value), *_midpoint_and_radius(other.value)
         lows: list[Real] = []
@@ -204,7 +212,11 @@ class ParabolaBounds(FormulaNumber):
         return (_minimum_or_inf(*lows), 0.0), (_maximum_or_inf(*highs), 0.0)
 
     def _curved_product(self, other: ParabolaBounds) -> tuple[Quadratic, Quadratic]:
-        """Bounds of a product by parabolas: see `product`."""
+        """Bounds of a product f g by parabolas: see `product`.
+
+        Symbols: v and w are the midpoints of f(0) and g(0), rv and rw their radii. (a, b) is a
+        bound of f and (c, d) one of g, with the radii ra, rb, rc, rd of their coefficients.
+        """
         h = self.piece_length
         v, rv, w, rw = *_midpoint_and_radius(self.value), *_midpoint_and_radius(other.value)
         lows: list[Real] = []

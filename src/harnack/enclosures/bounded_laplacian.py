@@ -212,6 +212,7 @@ class _GreenCondition:
         return self.gap + 0.5 * first, second
 
     def __call__(self, q: Real) -> Real:
+        """The value k(q), in a form that does not cancel near q = 0."""
         s, r, p = q * q, 1 / (1 + q), 1 - q
         log = 2 - dr.log(fmax(q, 1e-30))
         inner = q * dr.fma(self.weight, 5 - s, GREEN_KERNEL_BOUND * self.spread * log)

@@ -261,6 +261,7 @@ class _ChordCondition:
         return self.gap + n * self.mean / k, second
 
     def __call__(self, q: Real) -> Real:
+        """The value k(q), in a form that does not cancel near q = 0."""
         m, r, s = self.mean, 1 / (1 + q), q * q
         if self.dimension == 2:
             return self.gap + 2 * (q + m) * r
@@ -299,6 +300,8 @@ class _JensenCondition:
         return -weight * n * m, dr.fma(weight, second, self.gap)
 
     def __call__(self, q: Real) -> Real:
+        """The value k(q), in a form that does not cancel near q = 0. `rise` is (D^(n/2) - 1 +
+        q^2)/q."""
         e = q - 2 * self.mean
         d = dr.fma(q, e, 1)
         if self.dimension == 2:
@@ -423,6 +426,7 @@ class _CapCondition:
 
     def __call__(self, q: Real) -> Real:
         # s = 1 + q x with x = e/(s+1), as s^2 = 1 + q e.
+        """The value k(q), in a form that does not cancel near q = 0. `rise` is (S - 1 + q^2)/q."""
         e1, e2 = q - 2 * (self.rest - self.shift), q + 2 * (self.rest + self.shift)
         one_minus_q, one_plus_q = 1 - q, 1 + q
         s1 = dr.sqrt(dr.fma(one_minus_q, one_minus_q, 2 * q * (self.p + self.shift)))

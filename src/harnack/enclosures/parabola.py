@@ -223,6 +223,10 @@ class SphereArcEnclosure(Enclosure):
     squared_radius: Real
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """The length that the angle of the proof becomes on the line; infinite if no level is met.
+
+        Symbols: total is S = c^2 + t^2, rate is dt/da, half is psi/2.
+        """
         c = dr.sqrt(self.squared_radius)
         total = dr.fma(self.offset, self.offset, self.squared_radius)
         rate = 0.5 * total / c
@@ -232,9 +236,11 @@ class SphereArcEnclosure(Enclosure):
         is_valid = (up >= 0) & (down >= 0) & (self.curvature >= 0)  # and not NaN
         is_valid &= dr.isfinite(total)  # its square does not overflow
         is_full_turn = half >= _PI_BELOW  # once around the circle
-        s, k = sincos(dr.select(is_full_turn, 0, half))
-        divisor = dr.fma(c, k, -self.offset * s)
-        length = dr.select((divisor > 0) & ~is_full_turn, total * s / divisor * _ARC_SAFETY, dr.inf)
+        sin, cos = sincos(dr.select(is_full_turn, 0, half))
+        divisor = dr.fma(c, cos, -self.offset * sin)
+        length = dr.select(
+            (divisor > 0) & ~is_full_turn, total * sin / divisor * _ARC_SAFETY, dr.inf
+        )
         return dr.select(is_valid, fmax(length, 0), 0)
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:

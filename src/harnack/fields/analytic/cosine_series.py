@@ -138,6 +138,9 @@ class CosineBounds:
         """The bounds of the series with these coefficients (K_x, K_y, K_z).
 
         size: (3,) the lengths of the box's sides.
+
+        Symbols: for each axis n is the degree and m, in `densities`, the number of nodes per half
+        wave. factor is the product of all 1/cos(pi n/N), and error the sum of all pi^2/(8 m^2).
         """
         degrees: list[int] = [n - 1 for n in coefficients.shape]
         densities = [min(max(_MIN_NODES, _AXIS_NODES // max(n, 1)), _MAX_NODES) for n in degrees]

@@ -357,6 +357,9 @@ class HypersphericalHarmonic(Field):
         - first derivatives dy_i/dx_k = 2s (d_ik - 2s x_i x_k) and dw/dx_k = 4 s^2 x_k;
         - second derivatives 4 s^2 (4s x_i x_k x_m - x_m d_ik - x_k d_im - x_i d_km) of y_i and 4
           s^2 (d_km - 4s x_k x_m) of w.
+
+        Symbols in the code: `rows` and `slopes` are the Hessian (its upper triangle) and the
+        gradient of the function of (y, w) in R^4.
         """
         vector = cast("Any", type(p))
         s = 1 / (1 + dr.squared_norm(p))

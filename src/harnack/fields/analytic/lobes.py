@@ -261,6 +261,9 @@ class Lobes(Field):
         """Bounds (lower, upper) of the second derivatives along any line, for scale 1: see `Lobes`.
 
         farthest: they hold at distances up to this from the origin.
+
+        Symbols: [low, high] is the range of W, degree is N, `swing` bounds |2 c q T' + q^2 T"|, and
+        `power` is the largest second derivative of r^3 or r^4.
         """
         low, high = self.value_range
         if self.part == "both":

@@ -286,10 +286,10 @@ class _SolidHarmonics(Field):
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """The three rows of the Hessian; its trace is 0 up to rounding."""
-        s, scale, k = self._local(p), 1 / self._size**2, -self._axis - 1
+        s, scale, turns = self._local(p), 1 / self._size**2, -self._axis - 1
         xx, yy, zz, xy, xz, yz = (scale * entry for entry in hessian(self._weights, s.x, s.y, s.z))
         rows = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
-        x, y, z = _rotate_axes([type(p)(*_rotate_axes(row, k)) for row in rows], k)
+        x, y, z = _rotate_axes([type(p)(*_rotate_axes(row, turns)) for row in rows], turns)
         return x, y, z
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
