@@ -149,11 +149,11 @@ class BoundedLaplacianEnclosure(Enclosure):
         """The condition for f not to reach the level above, and that for the level below."""
         fall, rise, slopes = self.max_fall, self.max_rise, self.slopes
         return (
-            self._for_rise(gaps.above, fall, rise, self.laplacian_mean, slopes.upper),
-            self._for_rise(gaps.below, rise, fall, -self.laplacian_mean, slopes.negated().upper),
+            self._growth(gaps.above, fall, rise, self.laplacian_mean, slopes.upper),
+            self._growth(gaps.below, rise, fall, -self.laplacian_mean, slopes.negated().upper),
         )
 
-    def _for_rise(self, gap: Real, u: Real, rise: Real, mean: Real, slope: Real) -> _GreenCondition:
+    def _growth(self, gap: Real, u: Real, rise: Real, mean: Real, slope: Real) -> _GreenCondition:
         """The condition for f not to rise to the level above; for -f, not to fall to the level
         below.
 
