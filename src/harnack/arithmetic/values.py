@@ -105,8 +105,7 @@ class Values(FormulaNumber):
         return Values(value, nowhere, self.jumps | _is_lost(x) | pole, gaps)
 
     def checked(self) -> Values:
-        """The same range, which counts as jumping if numbers overflowed so that no range is
-        known."""
+        """The same range, with `jumps` set where numbers overflowed so that no range is known."""
         return replace(self, jumps=self.jumps | _is_lost(self.value))
 
     def pointwise_maximum(self, other: Values) -> Values:
@@ -157,5 +156,5 @@ def _is_lost(x: Interval, large: float = _LARGE_EXPONENT) -> Mask:
 
 
 def _unless(condition: Mask, x: Interval, y: Interval) -> Interval:
-    """The interval x; y on lanes where the condition holds."""
+    """The interval x on lanes where the condition does not hold, y where it does."""
     return Interval(dr.select(condition, y.lower, x.lower), dr.select(condition, y.upper, x.upper))

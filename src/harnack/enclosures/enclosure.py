@@ -107,7 +107,10 @@ class LevelGaps:
 
 @dataclass(frozen=True)
 class SlopeRange:
-    """An interval that contains the derivative of f along a unit direction, in f per length."""
+    """An interval that contains the derivative of f along a unit direction.
+
+    lower, upper: its ends, in units of f per length.
+    """
 
     lower: Real
     upper: Real
@@ -187,11 +190,11 @@ class Enclosure(abc.ABC):
         nothing."""
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
-        """Whether f is proved to meet no level for 0 < s < length."""
+        """Whether f is proved to meet no level for 0 < s < length, a mask."""
         return length <= self.free_length(gaps)
 
     def arrives(self, gaps: LevelGaps, length: Real) -> Mask:
-        """Whether f is proved to take a level for some 0 <= s <= length."""
+        """Whether f is proved to take a level for some 0 <= s <= length, a mask."""
         del length
         return (gaps.above == gaps.above) & False
 

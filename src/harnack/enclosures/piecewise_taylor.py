@@ -173,7 +173,7 @@ class QuadraticTaylorEnclosure(SinglePieceEnclosure):
 
 
 class LinearTaylorEnclosure(SinglePieceEnclosure):
-    """The line from the range of F'.
+    """The line from the range of F' on the whole length.
 
     Source: Aydinlilar and Zanni 2023, section 4.1, with the exact range. Proof: that of
     `PiecewiseTaylorEnclosure`, without the parabola.

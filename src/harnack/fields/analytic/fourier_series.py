@@ -123,14 +123,14 @@ class FourierSeries(Field):
         *,
         samples: int | tuple[int, int, int] | None = None,
     ) -> Self:
-        """The series of `terms` cosines along each axis that is closest to a function.
+        """The cosine series that is closest to a function in mean square.
 
         function: a callable that takes points (n, 3) and gives values (n,); or a grid (n_x, n_y,
             n_z) of values at the midpoints of that many cells of the box.
         box: a finite `Box`, or its two corners.
-        terms: 1 to 24, along each axis.
-        samples: the number of cells per side on which a function is sampled; by default 4 for each
-            term, at least 64.
+        terms: the number of cosines along each axis, one number or three, each from 1 to 24.
+        samples: the number of cells along each side on which a callable is sampled, one number or
+            three; by default 4 for each term, at least 64.
 
         Raises:
             ValueError: values that are NaN or infinite, or of another shape; more terms than 24 or
@@ -176,12 +176,13 @@ class FourierSeries(Field):
 
     @property
     def value_range(self) -> tuple[float, float]:
-        """Proved: the values of the series stay within this interval."""
+        """The ends (low, high) of an interval that is proved to contain all values of the series on
+        its box."""
         return self._bounds.low, self._bounds.high
 
     @property
     def curvature(self) -> float:
-        """Proved: no directional second derivative of the series exceeds it in size."""
+        """A proved bound of the absolute directional second derivatives of the series on its box."""
         return self._bounds.curvature
 
     def displacement(self, level: float | None = None, *, rng: int = 0) -> SurfaceDisplacement:

@@ -202,7 +202,7 @@ class HypersphericalHarmonic(Field):
 
     @property
     def value_range(self) -> tuple[float, float]:
-        """Proved: the values of f stay within this interval."""
+        """The ends (low, high) of an interval that is proved to contain all values of f."""
         return self._known.low, self._known.high
 
     def evaluate(self, p: Vec3) -> Sample:

@@ -231,18 +231,18 @@ class EigenfunctionSum(Field):
 
     @property
     def value_range(self) -> tuple[float, float]:
-        """Proved: the values of f stay within this interval."""
+        """The ends (low, high) of an interval that is proved to contain all values of f."""
         middle, largest = self.waves.constant, self.waves.largest_value
         return middle - largest, middle + largest
 
     @property
     def max_gradient(self) -> float:
-        """Proved: |grad f| never exceeds it."""
+        """A proved bound of |grad f| everywhere."""
         return self.waves.largest_gradient
 
     @property
     def curvature(self) -> float:
-        """Proved: no directional second derivative of f exceeds it in size."""
+        """A proved bound of the absolute directional second derivatives of f."""
         return self.waves.largest_curvature
 
     def evaluate(self, p: Vec3) -> Sample:
