@@ -182,7 +182,7 @@ class FourierSeries(Field):
 
     @property
     def curvature(self) -> float:
-        """A proved bound of the absolute directional second derivatives of the series on its box."""
+        """A proved bound of all |directional second derivatives| of the series on its box."""
         return self._bounds.curvature
 
     def displacement(self, level: float | None = None, *, rng: int = 0) -> SurfaceDisplacement:
