@@ -1,9 +1,9 @@
-"""Revised affine arithmetic along a path: a line and a constant bound of the error.
+"""Revised affine arithmetic along a path: a function is a line plus a bounded error.
 
-A function of 0 <= s <= h is c + l e + r, with e = 2s/h - 1 and |r| <= error. Sums are exact;
-products and functions put the terms that are not linear in s into the error. Unlike
-`ParabolaBounds` it is not exact at s = 0, so the march tries shorter lengths where it proves
-nothing.
+A function of 0 <= s <= h is written as c + l e + r, with e = 2s/h - 1 between -1 and 1, and |r| <=
+error. Sums are exact. Products and functions put the terms that are not linear in s into the error.
+Unlike `ParabolaBounds` such a number is not exact at s = 0, so the march tries shorter lengths
+where it proves nothing.
 
 Source: Vu, Sam-Haroud and Faltings 2009; Fryazinov, Pasko and Comninos 2010.
 """
@@ -26,12 +26,15 @@ if TYPE_CHECKING:
     from harnack.arithmetic.functions import ElementaryFunction
     from harnack.backend import Real, Vec3
 
+# The number of units in the last place, of the sum of all absolute values, that bounds rounding.
 _ROUNDINGS = 16.0
 
 
 @dataclass(frozen=True, eq=False)
 class AffineForm(FormulaNumber):
-    """center + slope e + r for -1 <= e <= 1, with |r| <= error.
+    """A function center + slope e + r for -1 <= e <= 1, with an unknown r, |r| <= error.
+
+    e = 2s/h - 1 for the length s along a path, 0 <= s <= h.
 
     center, slope, error: numbers of the backend.
     """
@@ -44,9 +47,10 @@ class AffineForm(FormulaNumber):
     def along_ray(
         cls, p: Vec3, direction: Vec3, length: Real
     ) -> tuple[AffineForm, AffineForm, AffineForm]:
-        """The coordinates of p + s d for 0 <= s <= length."""
+        """The three coordinates of p + s d for 0 <= s <= length."""
 
         def coordinate(x: Real, rate: Real) -> AffineForm:
+            """The function x + s rate."""
             half = 0.5 * length * rate
             return cls(x + half, half, _rounding_bound(dr.abs(x) + dr.abs(half)))
 
@@ -55,12 +59,13 @@ class AffineForm(FormulaNumber):
 
     @property
     def range(self) -> Interval:
-        """The range of the function."""
-        room = dr.abs(self.slope) + self.error
-        rounding = _rounding_bound(dr.abs(self.center) + room)
-        return Interval(self.center - room - rounding, self.center + room + rounding)
+        """The range of the function on the whole length."""
+        half_width = dr.abs(self.slope) + self.error
+        rounding = _rounding_bound(dr.abs(self.center) + half_width)
+        return Interval(self.center - half_width - rounding, self.center + half_width + rounding)
 
     def constant(self, x: float | Real) -> AffineForm:
+        """A constant number as a function along the same path."""
         kind = cast("Any", type(self.center))
         value = kind(x)
         exact = not isinstance(x, int | float) or (float(x).is_integer() and abs(x) < 2**20)
@@ -71,6 +76,7 @@ class AffineForm(FormulaNumber):
         return AffineForm(-self.center, -self.slope, self.error)
 
     def sum(self, other: Any) -> AffineForm:
+        """The sum of two functions: exact up to rounding, which goes into the error."""
         center, slope = self.center + other.center, self.slope + other.slope
         return AffineForm(
             center,
@@ -79,22 +85,27 @@ class AffineForm(FormulaNumber):
         )
 
     def product(self, other: Any) -> AffineForm:
-        """The product of two functions. Proof. Of (c + l e + r)(d + m e + q), e^2 lies in [0, 1],
-        so l m e^2 within l m/2 of l m/2; everything else that is not linear in e is an error."""
+        """The product of two functions.
+
+        Proof. In (c + l e + r)(d + m e + q), e^2 lies in [0, 1], so l m e^2 is within |l m|/2 of l
+        m/2. The other terms that are not linear in e go into the error.
+        """
         c, l, r = self.center, self.slope, self.error  # noqa: E741
         d, m, q = other.center, other.slope, other.error
-        both = 0.5 * l * m
-        error = (dr.abs(c) + dr.abs(l)) * q + (dr.abs(d) + dr.abs(m)) * r + r * q + dr.abs(both)
+        half = 0.5 * l * m
+        error = (dr.abs(c) + dr.abs(l)) * q + (dr.abs(d) + dr.abs(m)) * r + r * q + dr.abs(half)
         size = (dr.abs(c) + dr.abs(l) + r) * (dr.abs(d) + dr.abs(m) + q)
-        return AffineForm(c * d + both, c * m + d * l, error + _rounding_bound(size))
+        return AffineForm(c * d + half, c * m + d * l, error + _rounding_bound(size))
 
     def apply(self, function: ElementaryFunction) -> AffineForm:
-        """phi(f), by the best of three lines: its chord, its mean slope, a constant.
+        """The composition phi(f), by the best of three lines for phi: its chord, its mean slope, a
+        constant.
 
-        Proof. On a range [x, y] of width w, phi lies above its chord by -phi''(z) (t - x)(y - t)/2
-        for some z, so by at most -min phi'' w^2/8 and at least -max phi'' w^2/8, or 0. With D the
-        range of phi', it is within (D+ - D-)/2 |t - m| of phi(m) + (D+ + D-)/2 (t - m), m half way.
-        And it stays within its range.
+        Proof. Let f have the range [x, y] of width w, and let m be the middle of the range. Chord:
+        phi(t) is above its chord by -phi''(z) (t - x)(y - t)/2 for some z. This is at most max(0,
+        -min phi'' w^2/8) and at least min(0, -max phi'' w^2/8). Mean slope: if phi' is in [D-, D+],
+        phi(t) is within (D+ - D-)/2 |t - m| of phi(m) + (D+ + D-)/2 (t - m). Constant: phi stays
+        within its range.
         """
         x = self.range
         value, slopes, curvature = function.ranges(x)
@@ -122,16 +133,17 @@ class AffineForm(FormulaNumber):
         flat = (value.midpoint, 0 * width, value.radius + _rounding_bound(dr.abs(value.midpoint)))
         best = _smaller_error(_smaller_error(chord, mean), flat)
         center, rate, error = best
-        moved = rate * (self.center - middle)
+        shift = rate * (self.center - middle)
         rounding = _rounding_bound(
             dr.abs(center) + dr.abs(rate) * (dr.abs(self.center) + dr.abs(self.slope) + self.error)
         )
         return AffineForm(
-            center + moved, rate * self.slope, error + dr.abs(rate) * self.error + rounding
+            center + shift, rate * self.slope, error + dr.abs(rate) * self.error + rounding
         )
 
     def pointwise_maximum(self, other: Any) -> AffineForm:
-        """max(f, g) = g + max(f - g, 0); f or g itself where it is proved to be the larger."""
+        """The maximum max(f, g) = g + max(f - g, 0) of two functions; f or g itself where it is
+        proved to be the larger one."""
         difference = self.sum(-other)
         x = difference.range
         self_larger, other_larger = x.lower >= 0, x.upper <= 0
@@ -155,24 +167,22 @@ class AffineForm(FormulaNumber):
         )
 
     def polar_angle(self, x: Any) -> AffineForm:
-        """The polar angle atan2(y, x) of z = (x, y): the angle of the middle c of z's range, plus
-        the angle of z relative to c.
+        """The polar angle atan2(y, x) of z = (x, y), where y is this function: the angle of the
+        middle c of z's range, plus the angle of z relative to c.
 
-        Proof. With c = (a, b) any vector, the angle of z = (x, y) is that of c plus that of (x a +
-        y b, y a - x b), up to a multiple of 2 pi. Where the box of z does not meet the cut, z and c
-        lie in one of the half-planes x > 0, y > 0, y < 0, so that their angles differ by at most
-        pi; and where x a + y b > 0 that of the second vector is an arc tangent, less than pi/2 in
-        size: so there is no such multiple. Elsewhere only [-pi, pi] is known.
+        Proof. For any vector c = (a, b), the angle of z = (x, y) is that of c plus that of (x a + y
+        b, y a - x b), up to a multiple of 2 pi. If the box of z does not meet the cut, z and c lie
+        in one of the half-planes x > 0, y > 0 and y < 0, so their angles differ by at most pi.
+        Where x a + y b > 0, the angle of the second vector is an arc tangent, less than pi/2 in
+        size. So the multiple is 0. Elsewhere only [-pi, pi] is known.
         """
         a, b = approximate_direction(x.center, self.center)
         ahead, aside = x * a + self * b, self * a - x * b
         offset = aside.product(ahead.apply(reciprocal)).apply(atan)
-        turned, _ = angle_range(Interval.point(b), Interval.point(a))
+        base, _ = angle_range(Interval.point(b), Interval.point(a))
         is_valid = ~meets_branch_cut(self.range, x.range) & (ahead.range.lower > 0)
-        center = offset.center + turned.midpoint
-        error = (
-            offset.error + turned.radius + _rounding_bound(dr.abs(center) + dr.abs(turned.midpoint))
-        )
+        center = offset.center + base.midpoint
+        error = offset.error + base.radius + _rounding_bound(dr.abs(center) + dr.abs(base.midpoint))
         is_valid &= dr.isfinite(center) & dr.isfinite(offset.slope) & dr.isfinite(error)
         half_turn = math.pi * (1 + 1e-6)
         return AffineForm(
@@ -183,13 +193,15 @@ class AffineForm(FormulaNumber):
 
 
 def _entries(x: AffineForm) -> tuple[Real, Real, Real]:
+    """Center, slope and error as a tuple."""
     return x.center, x.slope, x.error
 
 
 def _smaller_error(
     first: tuple[Real, Real, Real], second: tuple[Real, Real, Real]
 ) -> tuple[Real, Real, Real]:
-    """The line and error with the smaller error; if one of them is not finite, the other."""
+    """Of two tuples (center, slope, error) the one with the smaller error; if one is not finite,
+    the other."""
     first_finite = dr.isfinite(first[0]) & dr.isfinite(first[1]) & dr.isfinite(first[2])
     second_finite = dr.isfinite(second[0]) & dr.isfinite(second[1]) & dr.isfinite(second[2])
     use_first = first_finite & ((first[2] <= second[2]) | ~second_finite)
@@ -198,6 +210,7 @@ def _smaller_error(
 
 
 def _rounding_bound(size: Real) -> Real:
-    """A bound of the rounding and underflow in a sum of numbers with this sum of sizes."""
+    """A bound of the rounding and underflow in a sum; size: the sum of the absolute values of its
+    terms."""
     smallest = float(dr.smallest(cast("Any", type(size))))
     return dr.fma(size, _ROUNDINGS * machine_epsilon(size), _ROUNDINGS * smallest)

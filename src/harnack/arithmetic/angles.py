@@ -1,10 +1,9 @@
-"""The polar angle of a point of the plane, `atan2`: in (-pi, pi], with a cut along the negative x
-axis.
+"""The polar angle `atan2` of a point of the plane, from -pi (excluded) to pi.
 
-On the cut, {y = 0, x <= 0}, the angle jumps by 2 pi, and at the origin it has no value at all
-(there it counts as 0). On a box that meets the cut, the range is [-pi, pi], and the ranges of
-derivatives are all numbers: so no arithmetic takes the angle for a continuous function there, and
-no step leads across the cut.
+It has a cut {y = 0, x <= 0} along the negative x axis, where it jumps by 2 pi. At the origin it has
+no value (there it counts as 0). On a box that meets the cut, its range is [-pi, pi], and the ranges
+of its derivatives are all numbers. So no arithmetic takes the angle for a continuous function
+there, and no step leads across the cut.
 """
 
 from __future__ import annotations
@@ -30,10 +29,12 @@ _PI = math.nextafter(math.pi, 4.0)
 
 
 def atan2(y: Any, x: Any) -> Any:
-    """The angle of the point (x, y), in radians, -pi < angle <= pi, of numbers of any kind.
+    """The polar angle of the point (x, y) in radians, -pi < angle <= pi.
 
-    It jumps along the negative x axis, where nothing is proved: a ray stops there. Where only the
-    cosine or sine of the angle is wanted, x / norm(x, y) and y / norm(x, y) have no cut.
+    y, x: numbers of any kind.
+
+    The angle jumps along the negative x axis, where nothing is proved: a ray stops there. If you
+    need only its cosine or sine, x / norm(x, y) and y / norm(x, y) have no such cut.
     """
     if isinstance(y, FormulaNumber):
         return y.atan2(x)
@@ -45,21 +46,26 @@ def atan2(y: Any, x: Any) -> Any:
 
 
 def meets_branch_cut(y: Interval, x: Interval) -> Mask:
-    """Whether a box of numbers of the backend may meet the cut; also where an end is NaN."""
+    """Whether the box of all points (x, y) may meet the cut {y = 0, x <= 0}; also true if an end is
+    NaN.
+
+    The ends of the intervals are numbers of the backend.
+    """
     return ~((x.lower > 0) | (y.lower > 0) | (y.upper < 0))
 
 
 def angle_range(y: Interval, x: Interval) -> tuple[Interval, Mask]:
-    """The range of the angle on a box of numbers of the backend, and whether that meets the cut.
+    """The range of the angle on the box of all points (x, y), and whether the box meets the cut.
 
-    A single point of the cut other than the origin has the angle pi, though it meets the cut.
+    The ends of the intervals are numbers of the backend. A box that is a single point of the cut
+    other than the origin has the angle pi, though it meets the cut.
 
-    Proof. On an edge of the box the angle is monotone, for its derivatives y'x - x'y have one sign
-    there, and it has no extremum inside: so the ends of the range are at corners. It falls with x
-    where y > 0 and rises with y where x > 0, which tells the corner. Of an infinite end the angle
-    is the limit; no corner is infinite in both coordinates, since a box that does not meet the cut
-    has x > 0 where y may be of either sign, and at most one coordinate of its corner is an end of
-    the kind that may be infinite.
+    Proof. Along an edge of the box the angle is monotone, because its derivative there has one
+    sign: it is (y'x - x'y)/(x^2 + y^2). It has no extremum inside. So the ends of the range are at
+    corners. The angle falls with x where y > 0 and rises with y where x > 0, which tells the
+    corner. At an infinite end the angle is the limit. No corner is infinite in both coordinates: a
+    box that does not meet the cut has x > 0 where y may have either sign, and at most one
+    coordinate of its corner is an end of the kind that may be infinite.
     """
     met = meets_branch_cut(y, x)
     is_point = x.lower is x.upper and y.lower is y.upper
@@ -79,25 +85,27 @@ def angle_range(y: Interval, x: Interval) -> tuple[Interval, Mask]:
 
 
 def _largest_angle(y: Interval, x: Interval) -> Real:
-    """The largest angle on a box that does not meet the cut."""
-    at_x = dr.select(y.upper > 0, x.lower, x.upper)
-    at_y = dr.select(at_x > 0, y.upper, y.lower)
+    """The largest angle on a box of points (x, y) that does not meet the cut."""
+    corner_x = dr.select(y.upper > 0, x.lower, x.upper)
+    corner_y = dr.select(corner_x > 0, y.upper, y.lower)
     # The limit at infinity, along one axis.
-    far_x, far_y = dr.isinf(at_x), dr.isinf(at_y)
-    at_x, at_y = (
-        dr.select(far_x, dr.sign(at_x), dr.select(far_y, 0, at_x)),
-        dr.select(far_x, 0, dr.select(far_y, dr.sign(at_y), at_y)),
+    far_x, far_y = dr.isinf(corner_x), dr.isinf(corner_y)
+    corner_x, corner_y = (
+        dr.select(far_x, dr.sign(corner_x), dr.select(far_y, 0, corner_x)),
+        dr.select(far_x, 0, dr.select(far_y, dr.sign(corner_y), corner_y)),
     )
-    return dr.atan2(at_y, at_x)
+    return dr.atan2(corner_y, corner_x)
 
 
 def _widened(low: Real, high: Real) -> tuple[Real, Real]:
+    """The interval [low, high] of computed angles, moved outwards by the error of atan2."""
     tiny = float(dr.smallest(cast("Any", type(low))))
     wide = Interval(low, high).widened(_MAX_ULP_ERROR * machine_epsilon(low), tiny)
     return wide.lower, wide.upper
 
 
 def _nan_to_infinite(x: Interval) -> Interval:
+    """The interval with infinite ends in place of those that are NaN."""
     return Interval(
         dr.select(x.lower == x.lower, x.lower, -dr.inf),
         dr.select(x.upper == x.upper, x.upper, dr.inf),
@@ -105,11 +113,13 @@ def _nan_to_infinite(x: Interval) -> Interval:
 
 
 def approximate_direction(x: Real, y: Real) -> tuple[Real, Real]:
-    """A vector about along (x, y), of a length between 1/2 and 2; (1, 0) if (x, y) has no
-    direction."""
+    """A vector in about the direction of (x, y), of a length between 1/2 and 2.
+
+    It is (1, 0) if (x, y) is 0 or not finite.
+    """
     size = dr.maximum(dr.abs(x), dr.abs(y))
     is_valid = (size > 0) & dr.isfinite(size)
     scale = dr.select(is_valid, 1 / size, 0)
     a, b = x * scale, y * scale
-    over = dr.rsqrt(dr.maximum(a * a + b * b, 1))
-    return dr.select(is_valid, a * over, 1), dr.select(is_valid, b * over, 0)
+    inverse_length = dr.rsqrt(dr.maximum(a * a + b * b, 1))
+    return dr.select(is_valid, a * inverse_length, 1), dr.select(is_valid, b * inverse_length, 0)

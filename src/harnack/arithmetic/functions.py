@@ -1,8 +1,8 @@
-"""Elementary functions: their ranges, and those of their first two derivatives, on intervals.
+"""Elementary functions: the ranges of their values and of their first two derivatives on intervals.
 
-An `ElementaryFunction` serves every arithmetic: it evaluates the function for plain numbers, and
-bounds the ranges of the function and of its first two derivatives on an interval. `sin(x)` and the
-like take numbers of any arithmetic, Dr.Jit and NumPy arrays, and Python numbers.
+An `ElementaryFunction` serves every arithmetic. It evaluates the function for plain numbers, and
+bounds the ranges of the function and of its first two derivatives on an interval. The functions
+`sin`, `exp` and so on take numbers of any arithmetic, Dr.Jit and NumPy arrays, and Python numbers.
 """
 
 from __future__ import annotations
@@ -25,8 +25,9 @@ DerivativeRanges: TypeAlias = "tuple[Interval, Interval, Interval]"
 
 # The domain of roots, powers that are no integers, and logarithms.
 _POSITIVE = (0.0, math.inf)
-# No function here overflows below this fraction of the largest number: LLVM's exp does at 0.7.
-_OVERFLOWS = 1 / 16
+# No function here overflows if its exact value is below this fraction of the largest number; LLVM's
+# exp overflows from 0.7 on.
+_SAFE_FRACTION = 1 / 16
 # A bound of the error of exp, log and the like on every backend, in units in the last place.
 _MAX_ULP_ERROR = 8.0
 
@@ -35,11 +36,12 @@ _MAX_ULP_ERROR = 8.0
 class ElementaryFunction:
     """A function of a single variable.
 
-    ranges: of the function, its derivative and its second derivative on an interval. Where the
-        interval contains a pole, or a point at which the function is not defined, the ranges of
-        derivatives are all numbers: f(s) = f(0) + s f'(r) does not hold across such a point.
-    on_drjit: the function of Dr.Jit numbers.
-    on_numpy: the function of NumPy arrays and Python numbers.
+    ranges: a callable that returns the ranges of the function, of its derivative and of its second
+        derivative on an interval whose ends are Dr.Jit numbers. If the interval contains a pole, or
+        a point at which the function is not defined, the ranges of derivatives are all numbers:
+        f(s) = f(0) + s f'(r) does not hold across such a point.
+    on_drjit: evaluates the function for Dr.Jit numbers.
+    on_numpy: evaluates the function for NumPy arrays and Python numbers.
     domain: the smallest and the largest number at which it has a value.
     is_steep: whether its slope is unbounded near a point: a pole, or a vertical tangent.
     has_pole: whether there is a point at which it is not continuous.
@@ -58,7 +60,8 @@ class ElementaryFunction:
         return "absolute" if self.name == "abs" else self.name
 
     def __call__(self, x: Any) -> Any:
-        """The function of a number of any kind."""
+        """The function of x, a number of any arithmetic, a Dr.Jit or NumPy array or a Python
+        number."""
         if hasattr(x, "apply"):
             return x.apply(self)
         if dr.is_array_v(type(x)):
@@ -67,7 +70,8 @@ class ElementaryFunction:
 
 
 def _increasing_range(f: Callable[[Any], Any], x: Interval) -> Interval:
-    """The range of an increasing function that is accurate to `_MAX_ULP_ERROR`."""
+    """The range on x of an increasing function f, whose computed values have an error of
+    `_MAX_ULP_ERROR`."""
     low = f(x.lower)
     high = low if x.lower is x.upper else f(x.upper)
     return Interval(low, high).widened(
@@ -76,15 +80,17 @@ def _increasing_range(f: Callable[[Any], Any], x: Interval) -> Interval:
 
 
 def _smallest_normal(x: Interval) -> float:
+    """The smallest normal number in the precision of x."""
     return float(dr.smallest(cast("Any", type(x.lower))))
 
 
-def _two(x: Interval) -> Interval:
+def _twice(x: Interval) -> Interval:
+    """The interval of all 2 y for y in x."""
     return x + x
 
 
 def _unbounded_where_undefined(defined: Mask, ranges: DerivativeRanges) -> DerivativeRanges:
-    """The ranges; on lanes where the function is not defined, the ranges of its derivatives are all
+    """The ranges; where `defined` is False, those of the derivatives are replaced by all
     numbers."""
     value, *derivatives = ranges
     slope, second = (
@@ -98,18 +104,23 @@ def _unbounded_where_undefined(defined: Mask, ranges: DerivativeRanges) -> Deriv
 
 
 def _exp(x: Interval) -> DerivativeRanges:
+    """The ranges of exp and of its derivatives."""
     e = _exponential_range(dr.exp, x)
     e = Interval(fmax(e.lower, 0), e.upper)
     return e, e, e
 
 
 def _exponential_range(f: Callable[[Any], Any], x: Interval) -> Interval:
-    """The range of an increasing function computed from 2^y, whose exponent is rounded: on CUDA the
-    result is off by |x| further units in the last place. A result that overflows is known to be
-    large, so that 1/(1 + exp(x)) is known to be small."""
-    large = _OVERFLOWS * float(dr.largest(type(x.lower)))
+    """The range on x of an increasing function f that is computed by exp.
+
+    exp is computed as 2^y with a rounded exponent y: on CUDA the error is larger by |x| units in
+    the last place. A result that overflows is known to be large: the end is then a large number, so
+    that 1/(1 + exp(x)) is known to be small.
+    """
+    large = _SAFE_FRACTION * float(dr.largest(type(x.lower)))
 
     def end(v: Real, sign: int) -> Real:
+        """A bound of f(v), above it for sign 1, below it for sign -1."""
         result = f(v)
         error = machine_epsilon(v) * (_MAX_ULP_ERROR + dr.abs(v))
         moved = dr.fma(dr.abs(result), sign * error, result) + sign * _smallest_normal(x)
@@ -119,6 +130,7 @@ def _exponential_range(f: Callable[[Any], Any], x: Interval) -> Interval:
 
 
 def _log(x: Interval) -> DerivativeRanges:
+    """The ranges of log and of its derivatives."""
     inverse = x.reciprocal()
     # Near 1 the error of a logarithm is four units of 1 on CUDA.
     value = _increasing_range(dr.log, x).widened(0.0, 4 * machine_epsilon(x.lower))
@@ -126,6 +138,7 @@ def _log(x: Interval) -> DerivativeRanges:
 
 
 def _sqrt(x: Interval) -> DerivativeRanges:
+    """The ranges of the square root and of its derivatives."""
     low = fmax(x.lower, 0)
     high = low if x.lower is x.upper else x.upper
     root = _increasing_range(dr.sqrt, Interval(low, high))
@@ -142,42 +155,47 @@ def _sqrt(x: Interval) -> DerivativeRanges:
 
 
 def _half(x: Interval) -> Interval:
+    """The interval of all y/2 for y in x."""
     return x * Interval(0.5, 0.5)
 
 
 def _positive_reciprocal(x: Interval) -> Interval:
-    """1/x for numbers >= 0; its upper end is infinite if 0 is one of them."""
+    """The range of 1/y for the numbers y >= 0 of x; its upper end is infinite if 0 is one of
+    them."""
     above = Interval(x.upper, x.upper).reciprocal()
     return Interval(fmax(above.lower, 0), Interval(fmax(x.lower, 0), x.upper).reciprocal().upper)
 
 
 def _reciprocal(x: Interval) -> DerivativeRanges:
+    """The ranges of 1/x and of its derivatives."""
     inverse = x.reciprocal()
     slope = -inverse.square()
     return _unbounded_where_undefined(
-        (x.lower > 0) | (x.upper < 0), (inverse, slope, _two(-slope * inverse))
+        (x.lower > 0) | (x.upper < 0), (inverse, slope, _twice(-slope * inverse))
     )
 
 
 def _sine(x: Interval) -> DerivativeRanges:
+    """The ranges of sin and of its derivatives."""
     s, c = _sine_and_cosine(x)
     return s, c, -s
 
 
 def _cosine(x: Interval) -> DerivativeRanges:
+    """The ranges of cos and of its derivatives."""
     s, c = _sine_and_cosine(x)
     return c, -s, -c
 
 
 def _sine_and_cosine(x: Interval) -> tuple[Interval, Interval]:
-    """Ranges of sin and cos.
+    """The ranges of sin and cos on the interval x.
 
-    Proof. Both are monotone between the multiples of pi/2 at which they are 1 or -1: the range is
-    given by the ends, and by such points inside. Whether such a point is inside is tested for an
-    interval widened by the rounding of the test; a point that is counted wrongly is within that
-    rounding of an end. Beyond `max_sincos_argument` sines are not known: on pieces the range is
-    [-1, 1] there; at a point it is all numbers, as the value at a point is taken half way between
-    the ends, and 0 would look like a value.
+    Proof. Both are monotone between the points at which they are 1 or -1, which are multiples of
+    pi/2. So the range is given by the values at the ends and by such points inside the interval.
+    The test for a point inside widens the interval by the rounding of the test; a point that is
+    counted although it is outside is within that rounding of an end. Beyond `max_sincos_argument`
+    sines are not known. There the range is [-1, 1] on intervals. At a single point it is all
+    numbers: the value at a point is taken half way between the ends, and 0 would look like a value.
     """
     epsilon, max_argument = machine_epsilon(x.lower), max_sincos_argument(type(x.lower))
     s0, c0 = sincos(x.lower)
@@ -185,6 +203,7 @@ def _sine_and_cosine(x: Interval) -> tuple[Interval, Interval]:
         is_valid = dr.abs(x.lower) <= max_argument
 
         def at_point(value: Real) -> Interval:
+            """The range of a sine or cosine at a single point, from its computed value."""
             plain = Interval(value, value).widened(4 * epsilon, 4 * epsilon)
             low = dr.select(is_valid, fmax(plain.lower, -1), -dr.inf)
             return Interval(low, dr.select(is_valid, fmin(plain.upper, 1), dr.inf))
@@ -194,20 +213,24 @@ def _sine_and_cosine(x: Interval) -> tuple[Interval, Interval]:
     scale = 1 / (2 * math.pi)
     rounding = 8 * epsilon * (fmax(dr.abs(x.lower), dr.abs(x.upper)) + 1) * scale
     low, high = x.lower * scale - rounding, x.upper * scale + rounding
-    wide = ~(fmax(dr.abs(x.lower), dr.abs(x.upper)) <= max_argument) | ~(high - low < 1)
+    is_unknown = ~(fmax(dr.abs(x.lower), dr.abs(x.upper)) <= max_argument) | ~(high - low < 1)
 
     def passes(phase: float) -> Mask:
+        """Whether x/(2 pi) takes the value phase + k for an integer k."""
         return dr.floor(high - phase) > dr.floor(low - phase)
 
-    def over(a: Real, b: Real, top: float, bottom: float) -> Interval:
+    def range_between(a: Real, b: Real, top: float, bottom: float) -> Interval:
+        """The range, from the values a and b at the ends; it is 1 at `top` and -1 at `bottom`
+        turns."""
         plain = Interval(fmin(a, b), fmax(a, b)).widened(4 * epsilon, 4 * epsilon)
         lowest = dr.select(passes(bottom), -1, plain.lower)
-        return _clip_to_unit(Interval(lowest, dr.select(passes(top), 1, plain.upper)), wide)
+        return _clip_to_unit(Interval(lowest, dr.select(passes(top), 1, plain.upper)), is_unknown)
 
-    return over(s0, s1, 0.25, 0.75), over(c0, c1, 0.0, 0.5)
+    return range_between(s0, s1, 0.25, 0.75), range_between(c0, c1, 0.0, 0.5)
 
 
 def _clip_to_unit(x: Interval, wide: Mask) -> Interval:
+    """The interval x, clipped to [-1, 1]; [-1, 1] itself where `wide` is set."""
     return Interval(
         dr.select(wide, -1, fmax(x.lower, -1)),
         dr.select(wide, 1, fmin(x.upper, 1)),
@@ -215,6 +238,7 @@ def _clip_to_unit(x: Interval, wide: Mask) -> Interval:
 
 
 def _tan(x: Interval) -> DerivativeRanges:
+    """The ranges of tan and of its derivatives."""
     s, c = _sine_and_cosine(x)
     t = s * c.reciprocal()
     # Monotone where the cosine has no zero: the ends are the range.
@@ -230,34 +254,39 @@ def _tan(x: Interval) -> DerivativeRanges:
         dr.select(no_pole, ends[0].lower, t.lower), dr.select(no_pole, ends[1].upper, t.upper)
     )
     slope = ONE + t.square()
-    return _unbounded_where_undefined(no_pole, (t, slope, _two(t * slope)))
+    return _unbounded_where_undefined(no_pole, (t, slope, _twice(t * slope)))
 
 
 def _hyperbolic_tangent(x: Real) -> Real:
-    """The range of tanh, since Dr.Jit's is accurate to only 11 bits on CUDA. From 20 on it is 1 up
-    to rounding."""
+    """tanh x, from sinh and cosh, since Dr.Jit's tanh is accurate to only 11 bits on CUDA.
+
+    From 20 on it is 1 up to rounding.
+    """
     x = clamp(x, -20.0, 20.0)
     return dr.sinh(x) / dr.cosh(x)
 
 
 def _tanh(x: Interval) -> DerivativeRanges:
+    """The ranges of tanh and of its derivatives."""
     t = _increasing_range(_hyperbolic_tangent, x).widened(_MAX_ULP_ERROR * machine_epsilon(x.lower))
     high = dr.select(x.upper == x.upper, fmin(t.upper, 1), 1)  # also if an end is NaN
     t = Interval(fmax(t.lower, -1), high)
     slope = ONE - t.square()
     slope = Interval(fmax(slope.lower, 0), slope.upper)
-    return t, slope, -_two(t * slope)
+    return t, slope, -_twice(t * slope)
 
 
 def _atan(x: Interval) -> DerivativeRanges:
+    """The ranges of the arc tangent and of its derivatives."""
     slope = (ONE + x.square()).reciprocal()
     max_second = 3 * math.sqrt(3) / 8 * (1 + 1e-6)  # of |2x/(1+x^2)^2|, at x = 1/sqrt(3)
-    second = -_two(x * slope.square())
+    second = -_twice(x * slope.square())
     second = Interval(fmax(second.lower, -max_second), fmin(second.upper, max_second))
     return _increasing_range(dr.atan, x), slope, second
 
 
 def _asin(x: Interval) -> DerivativeRanges:
+    """The ranges of the arc sine and of its derivatives."""
     inside = Interval(fmax(x.lower, -1), fmin(x.upper, 1))
     slope = _positive_reciprocal(_sqrt(ONE - inside.square())[0])
     second = inside * slope * slope.square()
@@ -267,27 +296,32 @@ def _asin(x: Interval) -> DerivativeRanges:
 
 
 def _acos(x: Interval) -> DerivativeRanges:
+    """The ranges of the arc cosine and of its derivatives."""
     value, slope, second = _asin(x)
     quarter = Interval.enclosing(math.pi / 2, type(x.lower))
     return quarter - value, -slope, -second
 
 
 def _sinh(x: Interval) -> DerivativeRanges:
+    """The ranges of sinh and of its derivatives."""
     s, c = _exponential_range(dr.sinh, x), _cosh_range(x)
     return s, c, s
 
 
 def _cosh(x: Interval) -> DerivativeRanges:
+    """The ranges of cosh and of its derivatives."""
     s, c = _exponential_range(dr.sinh, x), _cosh_range(x)
     return c, s, c
 
 
 def _cosh_range(x: Interval) -> Interval:
+    """The range of cosh, which increases with |x|."""
     return _exponential_range(dr.cosh, Interval(x.min_abs, x.max_abs))
 
 
 def _abs(x: Interval) -> DerivativeRanges:
-    """|x|: its second derivative at 0 is a Dirac impulse, upwards."""
+    """The ranges of |x| and of its derivatives. The second derivative at 0 is a Dirac impulse,
+    upwards."""
     positive, negative = x.lower > 0, x.upper < 0
     slope = Interval(typed_select(positive, 1, -1, x.lower), typed_select(negative, -1, 1, x.lower))
     kink = typed_select(positive | negative, 0, dr.inf, x.lower)
@@ -295,7 +329,7 @@ def _abs(x: Interval) -> DerivativeRanges:
 
 
 def integer_power(x: Interval, n: int) -> Interval:
-    """The range of x^n, n >= 0."""
+    """The range of y^n for y in the interval x; n >= 0."""
     if n == 0:
         return ONE
     if n == 1:
@@ -314,6 +348,7 @@ def integer_power(x: Interval, n: int) -> Interval:
 
 
 def _power_by_squaring(x: Real, n: int) -> Real:
+    """x^n by products, for n >= 1."""
     result: Real = None
     while n:
         if n & 1:
@@ -324,12 +359,13 @@ def _power_by_squaring(x: Real, n: int) -> Real:
 
 
 def power(n: float) -> ElementaryFunction:
-    """The function x -> x^n; for x >= 0 if n is no integer."""
+    """The function x -> x^n. For an n that is no integer it is defined for x >= 0 only."""
     if float(n).is_integer():
         k = int(n)
         if k < 0:
 
             def inverse(x: Interval) -> DerivativeRanges:
+                """The ranges for a negative integer k."""
                 inv = x.reciprocal()
                 slope = Interval.enclosing(k, type(x.lower)) * integer_power(inv, 1 - k)
                 second = Interval.enclosing(k * (k - 1), type(x.lower)) * integer_power(inv, 2 - k)
@@ -344,6 +380,7 @@ def power(n: float) -> ElementaryFunction:
             )
 
         def ranges(x: Interval) -> DerivativeRanges:
+            """The ranges for an integer k >= 0."""
             like = cast("Any", type(x.lower))
             slope, second = Interval.enclosing(k, like), Interval.enclosing(k * (k - 1), like)
             return (
@@ -358,6 +395,7 @@ def power(n: float) -> ElementaryFunction:
         return ElementaryFunction(f"power {k}", ranges, of_numbers, _numpy_power(k))
 
     def real(x: Interval) -> DerivativeRanges:
+        """The ranges for an n that is no integer."""
         like = cast("Any", type(x.lower))
         slope = Interval.enclosing(n, like) * _real_power(x, n - 1)
         second = Interval.enclosing(n * (n - 1), like) * _real_power(x, n - 2)
@@ -378,14 +416,15 @@ def power(n: float) -> ElementaryFunction:
 
 
 def _numpy_power(n: float) -> Callable[[Any], Any]:
+    """The function x -> x^n for NumPy arrays and Python numbers."""
     return lambda x: np.power(x, float(n))
 
 
 def _real_power(x: Interval, n: float) -> Interval:
-    """The range of x^n for x >= 0 and any n: exp2(n log2 x), with an error of n log2(x) units and a
-    few.
+    """The range of y^n for the numbers y >= 0 of x and any n.
 
-    An x below the smallest normal number may stand for any number from 0 to that.
+    The power is computed as exp2(n log2 y), with an error of n log2(y) units in the last place and
+    a few more. A y below the smallest normal number may stand for any number from 0 to that.
     """
     lower = fmax(x.lower, 0)
     upper = (
@@ -395,6 +434,7 @@ def _real_power(x: Interval, n: float) -> Interval:
     )
 
     def end(v: Real, sign: int) -> Real:
+        """A bound of v^n, above it for sign 1, below it for sign -1."""
         result = dr.power(v, n)
         error = machine_epsilon(v) * (_MAX_ULP_ERROR + abs(n) * (4 + 2 * dr.abs(dr.log2(v))))
         return result + sign * (error * result + _smallest_normal(x))
@@ -430,26 +470,30 @@ absolute = ElementaryFunction("abs", _abs, dr.abs, np.abs)
 
 @dataclass(frozen=True)
 class ClippedPower(ElementaryFunction):
-    """The function x -> max(x, 0)^n, n >= 1: convex, and n - 1 times continuously differentiable. A
-    kernel of blobs with compact support.
+    """The function x -> max(x, 0)^n, n >= 1, a kernel of blobs with compact support.
 
-    Written as maximum(x, 0)**n its second derivative would have no bound, since that of the maximum
-    has none. An arithmetic may use that it is 0 for x <= 0.
+    It is convex and n - 1 times continuously differentiable. Written as maximum(x, 0)**n, no bound
+    of its second derivative would be known, since that of the maximum has none. An arithmetic may
+    use that the function is 0 for x <= 0.
     """
 
     exponent: int = 1
 
 
 def clipped_power(n: int) -> ClippedPower:
-    """The function max(x, 0)^n.
+    """The function x -> max(x, 0)^n for an integer n >= 1: see `ClippedPower`.
 
     Raises:
-        ValueError: n is less than 1.
+        ValueError: n is less than 1 or no integer.
     """
     if int(n) != n or n < 1:
         raise ValueError(f"the exponent of a clipped power must be an integer >= 1, not {n}")
 
     def ranges(x: Interval) -> DerivativeRanges:
+        """The ranges of max(x, 0)^n and of its derivatives.
+
+        At 0 the second derivative has no upper bound for n = 1, and jumps from 0 to 2 for n = 2.
+        """
         low = fmax(x.lower, 0)
         u = Interval(low, low if x.lower is x.upper else fmax(x.upper, 0))
         value, slope, second = power(n).ranges(u)

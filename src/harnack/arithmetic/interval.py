@@ -4,9 +4,9 @@ The result of every operation contains the exact result for all numbers of its o
 rounded arithmetic of the backend too. So the ranges of a function and of its derivatives are proved
 (Moore 1966).
 
-Ranges are rounded outwards since an enclosure that is violated by a single rounding in float32 is a
-missed hit. A single piece of the path is the fastest choice for formulas, and four pieces for
-blobs, whose ranges share the search for nearby blobs (measured; `PathRestriction.piece_count`).
+Ranges are rounded outwards because a single rounding in float32 that violates an enclosure may
+cause a missed hit. By measurement, a path is best divided into four pieces for blobs, which then
+share the search for nearby blobs, and not divided for formulas (`PathRestriction.piece_count`).
 """
 
 from __future__ import annotations
@@ -28,19 +28,23 @@ Number: TypeAlias = "Interval | float"
 
 @dataclass(frozen=True)
 class Interval:
-    """All numbers from `lower` to `upper`, Dr.Jit numbers of the same type or Python floats.
+    """All numbers from `lower` to `upper`.
+
+    The ends are Dr.Jit numbers of the same type, or Python floats.
 
     An end that is NaN stands for an infinite end: nothing is known on that side. Python floats are
     constants known while a kernel is recorded, so that some operations with them can be left out.
 
-    is_single: whether Python floats must be numbers of single precision, as they will meet arrays
-        of such numbers: there they would be rounded, perhaps inwards.
+    is_single: whether ends that are Python floats are kept at numbers of single precision. They
+        must be if they meet arrays of single precision: there other numbers would be rounded,
+        perhaps inwards.
 
-    Proof of the rounding. An operation of the backend is off by half a unit in the last place, or
-    by less than the smallest normal number where the result is no normal number. Each end is moved
-    outwards by a whole unit (`_round_down`, `_round_up`), which covers its own rounding and that of
-    the move. A sum that is no normal number is exact, or 0 on a backend that flushes it: it may be
-    off by less than the smallest normal number, which the tracer adds to every value.
+    Proof of the rounding. An operation of the backend has an error of at most half a unit in the
+    last place, or less than the smallest normal number if the result is not a normal number. Each
+    end is moved outwards by a whole unit (`_round_down`, `_round_up`), which covers its own
+    rounding and that of the move. A sum that is not a normal number is exact, or 0 on a backend
+    that flushes it. In this case its error is less than the smallest normal number, which the
+    tracer adds to every value.
     """
 
     lower: Real
@@ -88,12 +92,12 @@ class Interval:
 
     @property
     def max_abs(self) -> Real:
-        """The largest absolute value."""
+        """The largest absolute value of a number of the interval; NaN if an end is NaN."""
         return _maximum_or_nan(_absolute(self.lower), _absolute(self.upper))
 
     @property
     def min_abs(self) -> Real:
-        """The smallest absolute value."""
+        """The smallest absolute value of a number of the interval."""
         return _maximum(-self.upper, _maximum(self.lower, 0.0))
 
     def contains(self, x: Real) -> Mask:
@@ -101,14 +105,16 @@ class Interval:
         return ~((x < self.lower) | (x > self.upper))
 
     def hull(self, other: Interval) -> Interval:
-        """The smallest interval that contains both."""
+        """The smallest interval that contains this and the other interval."""
         low = -_maximum_or_nan(-self.lower, -other.lower)
         high = _maximum_or_nan(self.upper, other.upper)
         return Interval(low, high, self.is_single or other.is_single)
 
     def intersect(self, other: Interval) -> Interval:
-        """The intersection with an interval that is known to overlap this one. An end that is NaN
-        is unknown: the other interval's end is taken."""
+        """The intersection with an interval that is known to overlap this one.
+
+        An end that is NaN is unknown; the other interval's end is taken instead.
+        """
         return Interval(
             _maximum_ignoring_nan(self.lower, other.lower),
             _minimum_ignoring_nan(self.upper, other.upper),
@@ -116,7 +122,7 @@ class Interval:
         )
 
     def shifted(self, x: Real) -> Interval:
-        """The interval plus an exact number x."""
+        """The interval of all sums with the exact number x."""
         return self + Interval(x, x)
 
     def __neg__(self) -> Interval:
@@ -162,7 +168,8 @@ class Interval:
         return Interval(_round_down(_pad_underflow(low, -1)), _round_up(_pad_underflow(high, 1)))
 
     def _times(self, constant: Interval) -> Interval:
-        """The product with an interval of Python floats."""
+        """The product with an interval of Python floats, which may have been computed while
+        recording."""
         a, b = cast("tuple[float, float]", (constant.lower, constant.upper))
         if a == b == 1.0:
             return self
@@ -181,7 +188,7 @@ class Interval:
         return self._rounded_outward(_pad_underflow(low, -1), _pad_underflow(high, 1), constant)
 
     def square(self) -> Interval:
-        """The range of the squares."""
+        """The range of x^2 for x in the interval."""
         low, high = self.min_abs, self.max_abs
         if self.lower is self.upper:
             low = high
@@ -191,7 +198,7 @@ class Interval:
         return Interval(_maximum(result.lower, 0.0), result.upper, self.is_single)
 
     def reciprocal(self) -> Interval:
-        """1/x; all numbers where 0 lies in the interval."""
+        """The range of 1/x; all numbers if 0 lies in the interval."""
         if self.is_literal:
             if self.lower <= 0.0 <= self.upper:
                 return Interval(-math.inf, math.inf, self.is_single)
@@ -203,7 +210,11 @@ class Interval:
         return Interval(dr.select(has_zero, -dr.inf, low), dr.select(has_zero, dr.inf, high))
 
     def _rounded_outward(self, low: Real, high: Real, other: Interval | None = None) -> Interval:
-        """The result of an operation on this and another interval, its ends moved outwards."""
+        """The interval [low, high], computed by a rounded operation, with its ends moved outwards.
+
+        other: the second operand of the operation, if there is one. If it or this interval is of
+            single precision, so is the result.
+        """
         single = self.is_single or (other is not None and other.is_single)
         low, high = _round_down(low), _round_up(high)
         if single and isinstance(low, float) and isinstance(high, float):
@@ -211,8 +222,11 @@ class Interval:
         return Interval(low, high, single)
 
     def widened(self, relative: float, absolute: float = 0.0) -> Interval:
-        """The interval with each end moved outwards by a fraction of itself and by an absolute
-        length: the range of a function of the backend with these relative and absolute errors."""
+        """The interval with each end x moved outwards by relative * |x| + absolute.
+
+        So it contains the results of a function of the backend that has these relative and absolute
+        errors.
+        """
         low, high = self.lower, self.upper
         return Interval(
             _round_down(low - relative * _absolute(low) - absolute),
@@ -230,72 +244,82 @@ def machine_epsilon(x: Real) -> float:
 
 
 def typed_select(condition: Mask, a: Real, b: Real, like: Real) -> Real:
-    """a or b as numbers of the type of `like`: from two Python numbers, Dr.Jit would make integers
-    or numbers of single precision."""
+    """a where the condition holds, else b, with numbers of the type of `like`.
+
+    From two Python numbers Dr.Jit's select would make integers or numbers of single precision.
+    """
     kind = cast("Any", type(like))
     return dr.select(condition, kind(a) if dr.is_array_v(kind) else a, b)
 
 
 def _round_down(x: Real, units: float = 1.0) -> Real:
-    """A number below x by at least `units` units in the last place."""
+    """A number below x by at least `units` units in the last place of x."""
     return dr.fma(dr.abs(x), -units * machine_epsilon(x), x)
 
 
 def _round_up(x: Real, units: float = 1.0) -> Real:
-    """A number above x by at least `units` units in the last place."""
+    """A number above x by at least `units` units in the last place of x."""
     return dr.fma(dr.abs(x), units * machine_epsilon(x), x)
 
 
 def _pad_underflow(x: Real, sign: int) -> Real:
-    """A product x, moved outwards by the largest error that underflow causes."""
+    """A product x, moved up (sign 1) or down (-1) by the largest error that underflow causes."""
     kind = cast("Any", type(x))
     return x + sign * float(dr.smallest(kind)) if dr.is_array_v(kind) else x
 
 
 def _outward_single(low: float, high: float) -> tuple[float, float]:
-    """The nearest numbers of single precision, at most `lower` and at least `upper`."""
+    """The largest number of single precision that is at most `low`, and the smallest that is at
+    least `high`."""
     with np.errstate(over="ignore"):
-        a, b = np.float32(low), np.float32(high)
-    if float(a) > low:
-        a = np.nextafter(a, np.float32(-np.inf))
-    if float(b) < high:
-        b = np.nextafter(b, np.float32(np.inf))
-    return float(a), float(b)
+        single_low, single_high = np.float32(low), np.float32(high)
+    if float(single_low) > low:
+        single_low = np.nextafter(single_low, np.float32(-np.inf))
+    if float(single_high) < high:
+        single_high = np.nextafter(single_high, np.float32(np.inf))
+    return float(single_low), float(single_high)
 
 
 def _minimum(a: Real, b: Real) -> Real:
+    """The smaller number, a Python float if both are; the other number where one is NaN in an
+    array."""
     if isinstance(a, float) and isinstance(b, float):
         return min(a, b)
     return fmin(a, b)
 
 
 def _maximum(a: Real, b: Real) -> Real:
+    """The larger number, a Python float if both are; the other number where one is NaN in an
+    array."""
     if isinstance(a, float) and isinstance(b, float):
         return max(a, b)
     return fmax(a, b)
 
 
 def _maximum_or_nan(a: Real, b: Real) -> Real:
-    """The larger number; NaN where either is NaN."""
+    """The larger number; NaN if either is NaN."""
     if isinstance(a, float) and isinstance(b, float):
         return math.nan if a != a or b != b else max(a, b)
     return dr.select((a > b) | dr.isnan(a), a, b)
 
 
 def _minimum_ignoring_nan(a: Real, b: Real) -> Real:
-    """The smaller number; a where b is NaN, and b where a is."""
+    """The smaller number; if one is NaN, the other."""
     return dr.select((a <= b) | dr.isnan(b), a, b)
 
 
 def _maximum_ignoring_nan(a: Real, b: Real) -> Real:
+    """The larger number; if one is NaN, the other."""
     return dr.select((a >= b) | dr.isnan(b), a, b)
 
 
 def _absolute(x: Real) -> Real:
+    """|x|, a Python float if x is one."""
     return abs(x) if isinstance(x, float) else dr.abs(x)
 
 
 def _none_is_nan(numbers: tuple[Real, ...]) -> Mask | None:
+    """Whether none of the numbers is NaN, nor two of them opposite infinities."""
     total = numbers[0]
     for number in numbers[1:]:
         total = total + number

@@ -1,5 +1,5 @@
-"""A function with its derivatives as a single number: `Jet`, with proved ranges, and `Dual`,
-without.
+"""A function and its derivatives as a single number: `Jet` holds proved ranges, `Dual` plain
+numbers.
 
 A formula that is evaluated with jets as its coordinates returns the jet of its value. So the same
 formula serves for values, gradients and Hessians at a point, with proved bounds of rounding, and
@@ -29,24 +29,25 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Jet(FormulaNumber):
-    """Ranges of a function of n variables and of its derivatives on a box of them; mostly n = 1,
-    the length along a path, or n = 3 at a point.
+    """Ranges of a function of n variables, and of its derivatives, on a box of the variables.
 
-    Interval arithmetic of value, first and second derivatives at once (Moore 1966; the Taylor forms
-    of Aydinlilar and Zanni 2023, section 6.1, consist of it).
+    Mostly n = 1, the length along a path, or n = 3, the coordinates at a point. The arithmetic is
+    interval arithmetic of value, first and second derivatives at once (Moore 1966). The Taylor
+    forms of Aydinlilar and Zanni (2023, section 6.1) consist of it.
 
     value: the range of the function.
     first_derivatives: (n,) the ranges of the partial derivatives.
-    second_derivatives: (n (n+1) / 2,) the ranges of the second derivatives, rows of the upper
-        triangle; empty if they are not needed. In the sense of distributions: at a kink, where the
-        first derivative jumps, the range has no upper or no lower end.
-    jet_at_start: with n = 1, the jet at the start of the piece, from which ranges are narrowed;
-        None for the jet at a point.
-    piece_length: the length of the piece; 0 at a point. A number of the backend, which tells the
-        precision where all ranges are Python numbers.
-    roots: the functions of whose squares the function is known to be the sum; empty if it is not
-        known to be such a sum. The root of a sum of squares is a norm, whose slopes are bounded; by
-        the chain rule they would not be where all squares are 0.
+    second_derivatives: (n (n+1) / 2,) the ranges of the second derivatives, the rows of the upper
+        triangle of the Hessian; empty if they are not needed. They are derivatives of
+        distributions: if the first derivative jumps, at a kink, the range has no upper or no lower
+        end.
+    jet_at_start: with n = 1, the jet at the start of the piece of the path, from which ranges on
+        the piece are narrowed; None for the jet at a point.
+    piece_length: the length of the piece; 0 at a point. It is a number of the backend, and tells
+        the precision if all ranges are Python numbers.
+    roots: functions such that this function is the sum of their squares; empty if none are known.
+        The square root of a sum of squares is a norm, whose slopes are bounded. By the chain rule
+        they would be unbounded where all squares are 0.
     """
 
     value: Interval
@@ -58,8 +59,11 @@ class Jet(FormulaNumber):
 
     @classmethod
     def at_point(cls, p: Vec3, *, order: int = 1) -> tuple[Jet, Jet, Jet]:
-        """The coordinates as functions of themselves, at points p, up to derivatives of an order:
-        for gradients and Hessians."""
+        """The three coordinates as functions of themselves, at points p, for gradients and
+        Hessians.
+
+        order: the highest order of derivatives, 1 or 2.
+        """
         second = (ZERO,) * 6 if order > 1 else ()
         units = [tuple(ONE if i == k else ZERO for i in range(3)) for k in range(3)]
         zero = 0 * p.x
@@ -68,7 +72,8 @@ class Jet(FormulaNumber):
 
     @classmethod
     def over_ball(cls, p: Vec3, radius: Real) -> tuple[Jet, Jet, Jet]:
-        """The coordinates as functions of themselves, on boxes around the balls B(p, radius)."""
+        """The three coordinates as functions of themselves, on boxes around the balls B(p,
+        radius)."""
         x, y, z = cls.at_point(p)
         ends = Interval(-radius, radius)
         x, y, z = (dataclasses.replace(jet, value=jet.value + ends) for jet in (x, y, z))
@@ -85,13 +90,15 @@ class Jet(FormulaNumber):
         anchored: bool = True,
         is_rounded: bool = False,
     ) -> tuple[Jet, Jet, Jet]:
-        """The coordinates of p + s d as functions of s, start <= s <= end.
+        """The three coordinates of p + s d as functions of s, for start <= s <= end.
 
-        is_rounded: whether the path passes p only up to the rounding of p's coordinates: ranges
+        anchored: whether ranges are narrowed from their values at the start of the piece.
+        is_rounded: whether the path passes p only up to the rounding of p's coordinates. Ranges
             then hold for all such paths, each along d.
         """
 
         def coordinate(x: Real, slope: Real) -> Jet:
+            """The jet of x + s slope on the piece, with its jet at the start."""
             rate = Interval.point(slope)
             base = Interval.point(x)
             if is_rounded:
@@ -113,6 +120,7 @@ class Jet(FormulaNumber):
         return self._constant(Interval.enclosing(float(x), type(self.backend_number())))
 
     def _constant(self, value: Interval) -> Jet:
+        """A constant with a known range as a function of the same variables."""
         zeros = (ZERO,) * len(self.first_derivatives), (ZERO,) * len(self.second_derivatives)
         start = (
             None
@@ -122,13 +130,14 @@ class Jet(FormulaNumber):
         return Jet(value, *zeros, start, self.piece_length)
 
     def backend_number(self) -> Any:
-        """A number of the backend's type in use; a Python number if there is none."""
+        """A number of the backend's type that the ranges use; a Python number if there is none."""
         for jet in (self.value, *self.first_derivatives):
             if dr.is_array_v(cast("Any", type(jet.lower))):
                 return jet.lower
         return self.piece_length
 
     def sum(self, other: Jet) -> Jet:
+        """The sum of two functions."""
         jet = Jet(
             self.value + other.value,
             tuple(
@@ -156,6 +165,7 @@ class Jet(FormulaNumber):
         )
 
     def product(self, other: Jet) -> Jet:
+        """The product of two functions, by the product rule."""
         if other is self:  # a square, whose range is sharper than that of a product
             return self.apply(power(2))
         x, y = self.value, other.value
@@ -179,7 +189,11 @@ class Jet(FormulaNumber):
         return dataclasses.replace(jet, roots=roots) if roots else jet
 
     def _scaled_roots(self, factor: Interval) -> tuple[Jet, ...]:
-        """The roots of the product with a positive constant, if there are any."""
+        """The roots of the product of this function with a constant; none if it is not known to be
+        positive.
+
+        factor: the range of the constant.
+        """
         if not (self.roots and factor.is_literal and factor.lower > 0):
             return ()
         low, high = (math.sqrt(cast("float", number)) for number in (factor.lower, factor.upper))
@@ -212,7 +226,10 @@ class Jet(FormulaNumber):
     # Functions.
 
     def apply(self, function: ElementaryFunction) -> Jet:
-        """The composition f(g) with this function g: f(g)'' = f'' g' g' + f' g''."""
+        """The composition f(g) of an elementary function f with this function g.
+
+        Its derivatives are f(g)' = f' g' and f(g)'' = f'' g' g' + f' g''.
+        """
         if function is sqrt and self.roots:
             from harnack.arithmetic.norms import norm
 
@@ -239,14 +256,16 @@ class Jet(FormulaNumber):
     def pointwise_maximum(self, other: Jet) -> Jet:
         """The larger of two functions at each point.
 
-        Proof. If one function is larger everywhere, it is the maximum. Otherwise each derivative is
-        that of one of the two, except where they cross: there the first derivative jumps up, so
-        that the second derivative has no upper bound.
+        Proof. If one function is larger everywhere in the box, it is the maximum. Otherwise each
+        derivative of the maximum is that of one of the two, except where they cross. There the
+        first derivative jumps up, so that the second derivative has no upper bound.
         """
         x, y = self.value_on_backend(), other.value_on_backend(self.backend_number())
         is_x, is_y = x.lower > y.upper, y.lower > x.upper
 
         def chosen(u: Interval, v: Interval, *, kink: bool) -> Interval:
+            """The range u or v of the larger function; their hull where neither is known to be
+            larger, without an upper end if the derivative may have a kink there."""
             if u.is_literal and v.is_literal and u == v and not kink:
                 return u
             both = u.hull(v)
@@ -278,17 +297,21 @@ class Jet(FormulaNumber):
         )
 
     def polar_angle(self, x: Jet) -> Jet:
-        """The polar angle of the point (x, y), y this function.
+        """The polar angle of the point (x, y), where y is this function.
 
-        Proof. The angle is the imaginary part of log z, z = x + i y, whose derivatives are z_i/z
-        and z_ij/z - (z_i/z)(z_j/z). With z_i/z = rho_i + i theta_i these are
+        Proof. The angle is the imaginary part of log z with z = x + i y. The derivatives of log z
+        are z_i/z and z_ij/z - (z_i/z)(z_j/z), where an index is a derivative by a variable. With
+        z_i/z = rho_i + i theta_i and r^2 = x^2 + y^2 these are
 
             theta_i = (x y_i - y x_i)/r^2,   rho_i = (x x_i + y y_i)/r^2,
             theta_ij = (x y_ij - y x_ij)/r^2 - theta_i rho_j - theta_j rho_i.
+
+        Symbols in the code: u and v are the ranges of x and y, `over` that of 1/r, c and s those of
+        x/r and y/r.
         """
         like = x.backend_number() if self.value.is_literal else self.backend_number()
         v, u = self.value_on_backend(like), x.value_on_backend(like)
-        value, met = angle_range(v, u)
+        value, on_cut = angle_range(v, u)
         over = sqrt.ranges(u.square() + v.square())[0]
         over = Interval(0 * over.lower, dr.inf).intersect(reciprocal.ranges(over)[0])
         c, s = (bound * over for bound in (u, v))
@@ -302,15 +325,16 @@ class Jet(FormulaNumber):
             for k, (i, j) in enumerate(self.hessian_indices())
         ]
 
-        def off_cut(bound: Interval) -> Interval:
+        def uncut(bound: Interval) -> Interval:
+            """The range of a derivative; all numbers where the box meets the cut of the angle."""
             return Interval(
-                typed_select(met, -dr.inf, bound.lower, like),
-                typed_select(met, dr.inf, bound.upper, like),
+                typed_select(on_cut, -dr.inf, bound.lower, like),
+                typed_select(on_cut, dr.inf, bound.upper, like),
             )
 
-        first = tuple(off_cut(bound) for bound in theta)
+        first = tuple(uncut(bound) for bound in theta)
         jet = Jet(
-            value, first, tuple(off_cut(bound) for bound in second), piece_length=self.piece_length
+            value, first, tuple(uncut(bound) for bound in second), piece_length=self.piece_length
         )
         if self.jet_at_start is None or x.jet_at_start is None:
             return jet
@@ -323,6 +347,7 @@ class Jet(FormulaNumber):
         kind = self.backend_number()
 
         def chosen(u: Interval, v: Interval) -> Interval:
+            """The range u on lanes where the condition holds, v on all others."""
             if u.is_literal and v.is_literal and u == v:
                 return u
             low = typed_select(condition, u.lower, v.lower, kind)
@@ -346,7 +371,10 @@ class Jet(FormulaNumber):
         )
 
     def value_on_backend(self, like: Any = None) -> Interval:
-        """The range of the value as numbers of the backend."""
+        """The range of the value with ends that are numbers of the backend.
+
+        like: a number of the type to use; by default one of this jet.
+        """
         if not self.value.is_literal:
             return self.value
         kind = cast("Any", type(self.backend_number() if like is None else like))
@@ -356,15 +384,20 @@ class Jet(FormulaNumber):
         )
 
     def hessian_indices(self) -> list[tuple[int, int]]:
-        """Indices of the variables of each second derivative."""
+        """The pairs (i, j) of variables of the second derivatives, in the order in which they are
+        stored."""
         n = len(self.first_derivatives)
         return [(i, j) for i in range(n) for j in range(i, n)][: len(self.second_derivatives)]
 
     def narrowed_from_start(self, start: Jet | None, width: Real) -> Jet:
         """The same jet, narrowed by the ranges at the start of the piece.
 
-        Proof. f(s) = f(0) + s f'(r) for some r in between, so f stays within f(0) + [0, w] f'; the
-        same holds for f' and f'', also where f' jumps, by at most what f'' allows.
+        start: the jet at the start; None leaves the jet unchanged.
+        width: the length w of the piece.
+
+        Proof. f(s) = f(0) + s f'(r) for some r between 0 and s, so f stays within f(0) + [0, w] f'.
+        The same holds for f' and f''. It also holds if f' jumps, since the range of f'' then allows
+        the jump.
         """
         if start is None:
             return self
@@ -380,10 +413,13 @@ class Jet(FormulaNumber):
 
 
 def wronskian_range(x: Jet, y: Jet, u: Interval, v: Interval, i: int) -> Interval:
-    """The range of w = x y_i - y x_i, for the ranges u and v of x and y, as numbers of the backend.
+    """The range of w = x y_i - y x_i, where y_i and x_i are derivatives by the variable i.
 
-    Its derivative x y_ii - y x_ii is 0 along straight lines: the range of w is narrowed from the
-    start of the piece.
+    x, y: the two functions.
+    u, v: the ranges of their values, as numbers of the backend.
+
+    On a piece of a path, the derivative x y_ii - y x_ii of w is 0 along straight lines. So the
+    range of w is narrowed from its value at the start of the piece.
     """
     w = u * y.first_derivatives[i] - v * x.first_derivatives[i]
     if x.jet_at_start is None or y.jet_at_start is None:
@@ -397,18 +433,20 @@ def wronskian_range(x: Jet, y: Jet, u: Interval, v: Interval, i: int) -> Interva
 
 
 def range_times_length(slope: Interval, width: Real) -> Interval:
-    """The range of s times numbers of an interval, for 0 <= s <= width.
+    """The range of s t for 0 <= s <= width and t in the interval `slope`: it contains 0.
 
-    An end that is NaN, as the product overflowed to the other side, becomes 0, which is right.
+    If the product at the lower end overflows to +infinity, or at the upper end to -infinity,
+    rounding outwards makes that end NaN. The right end is 0 in this case, since s t = 0 at s = 0,
+    and fmin and fmax return it.
     """
     if slope.is_zero:
         return ZERO
-    moved = slope * Interval(width, width)
-    return Interval(fmin(moved.lower, 0.0), fmax(moved.upper, 0.0))
+    product = slope * Interval(width, width)
+    return Interval(fmin(product.lower, 0.0), fmax(product.upper, 0.0))
 
 
 def _moved(base: Interval, rate: Interval, s: Real) -> Interval:
-    """base + rate s."""
+    """The range of base + rate s for a single number s."""
     if isinstance(s, float) and s == 0.0:
         return base
     return base + rate * Interval.point(s)
@@ -419,11 +457,11 @@ _Partials = tuple[Any, Any, Any]
 
 @dataclass(frozen=True, eq=False)
 class Dual(FormulaNumber):
-    """A function at a point: its value and partial derivatives, as plain numbers. There are no
-    ranges, so nothing is proved.
+    """A function at a point: its value and its three partial derivatives, as plain numbers.
 
-    At a tie, such as in max(x, 0) at x = 0, ranges of derivatives contain all slopes nearby. A dual
-    number has the slope on one side, as each comparison is decided by the values.
+    There are no ranges, so nothing is proved. At a tie, such as in max(x, 0) at x = 0, ranges of
+    derivatives contain all slopes nearby. A dual number has the slope on one side, since each
+    comparison is decided by the values.
     """
 
     value: Real
@@ -431,22 +469,25 @@ class Dual(FormulaNumber):
 
     @classmethod
     def at_point(cls, p: Vec3) -> tuple[Dual, Dual, Dual]:
-        """The coordinates as functions of themselves."""
+        """The three coordinates as functions of themselves, at points p."""
         return cls(p.x, (1.0, 0.0, 0.0)), cls(p.y, (0.0, 1.0, 0.0)), cls(p.z, (0.0, 0.0, 1.0))
 
     def constant(self, x: float | Real) -> Dual:
         return Dual(cast("Any", type(self.value))(x), (0.0, 0.0, 0.0))
 
     def sum(self, other: Dual) -> Dual:
+        """The sum of two functions."""
         return Dual(
             self.value + other.value,
             _map_partials(operator.add, self.first_derivatives, other.first_derivatives),
         )
 
     def product(self, other: Dual) -> Dual:
+        """The product of two functions, by the product rule."""
         x, y = self.value, other.value
 
         def rule(a: Any, b: Any) -> Any:
+            """The partial derivative of the product, from those of the two factors."""
             return a * y + x * b
 
         return Dual(x * y, _map_partials(rule, self.first_derivatives, other.first_derivatives))
@@ -455,20 +496,26 @@ class Dual(FormulaNumber):
         return Dual(-self.value, _map_partials(operator.neg, self.first_derivatives))
 
     def apply(self, function: ElementaryFunction) -> Dual:
-        """A function f of this number. Where this number is constant, so is the result, even where
-        the slope of f is infinite, as that of the root in a norm of zeros."""
+        """The composition of an elementary function with this function.
+
+        If this function is constant, so is the result, even where the slope of the elementary
+        function is infinite, such as that of the root in a norm of zeros.
+        """
         slope = function.ranges(Interval.point(self.value))[1].midpoint
         real = cast("Any", type(self.value))
 
         def rule(a: Any) -> Any:
+            """The partial derivative of the result, from that of this function."""
             return dr.select(real(a) == 0, 0, a * slope)
 
         return Dual(function.on_drjit(self.value), _map_partials(rule, self.first_derivatives))
 
     def polar_angle(self, x: Dual) -> Dual:
+        """The polar angle of the point (x, y), where y is this function."""
         u, v = x.value, self.value
 
         def rule(a: Any, b: Any) -> Any:
+            """The partial derivative of the angle, from those of x and y."""
             return (u * b - v * a) / (u * u + v * v)
 
         return Dual(
@@ -476,9 +523,11 @@ class Dual(FormulaNumber):
         )
 
     def pointwise_maximum(self, other: Dual) -> Dual:
+        """The larger of two functions; at a tie, the other one."""
         is_own = self.value > other.value
 
         def rule(a: Any, b: Any) -> Any:
+            """The partial derivative of the larger function, from those of both."""
             return dr.select(is_own, a, b)
 
         value = dr.select(is_own, self.value, other.value)
@@ -486,5 +535,7 @@ class Dual(FormulaNumber):
 
 
 def _map_partials(function: Callable[..., Any], *partials: _Partials) -> _Partials:
+    """The results of `function` for each of the three partial derivatives of one or several
+    functions."""
     x, y, z = (function(*of_axis) for of_axis in zip(*partials, strict=True))
     return x, y, z

@@ -1,7 +1,8 @@
 """Functions of several numbers: maxima, minima, norms and blends (Hart 1996, appendix B).
 
-They take jets, numbers of the other arithmetics, Dr.Jit and NumPy arrays and Python numbers, also
-mixed. Blends combine distances, with a sharp or with a rounded edge.
+Their arguments are jets, numbers of the other arithmetics, Dr.Jit and NumPy arrays or Python
+numbers, also of different kinds in one call. Blends combine distances, with a sharp or with a
+rounded edge.
 """
 
 from __future__ import annotations
@@ -35,6 +36,11 @@ def minimum(*values: Any) -> Any:
 
 
 def _reduce_extremum(name: str, values: tuple[Any, ...]) -> Any:
+    """The maximum or minimum (`name`) of two or more numbers of any kind.
+
+    Raises:
+        TypeError: there are fewer than two numbers.
+    """
     if len(values) < 2:
         raise TypeError(f"{name} compares two numbers or more, and {len(values)} was given")
     if any(isinstance(value, FormulaNumber) for value in values):
@@ -44,6 +50,7 @@ def _reduce_extremum(name: str, values: tuple[Any, ...]) -> Any:
     of_arrays, of_others = _EXTREMUM_FUNCTIONS[name]
 
     def plain(a: Any, b: Any) -> Any:
+        """The maximum or minimum of two arrays or Python numbers."""
         is_array = any(dr.is_array_v(cast("Any", type(value))) for value in (a, b))
         return of_arrays(a, b) if is_array else of_others(a, b)
 
@@ -57,17 +64,21 @@ _EXTREMUM_FUNCTIONS: dict[str, tuple[Callable[[Any, Any], Any], Callable[[Any, A
 
 
 def norm(*values: Any, p: float = 2.0) -> Any:
-    """The p-norm (|x|^p + |y|^p + ...)^(1/p), with p = 2 the Euclidean length.
+    """The p-norm (|x|^p + |y|^p + ...)^(1/p) of numbers of any kind.
 
-    p: at least 1, `math.inf` for the largest absolute value.
+    p: at least 1; 2 for the Euclidean length, `math.inf` for the largest absolute value.
 
-    Proof of the ranges. With N the norm and u_i = |x_i|/N <= 1, N' is the sum of
-    sign(x_i) u_i^(p-1) x_i', at most the p-norm of the x_i' (Hoelder's and Minkowski's
-    inequalities), and N'' = (p-1)/N (sum_i u_i^(p-2) x_i'^2 - N'^2) + sum_i sign(x_i) u_i^(p-1)
-    x_i''. Its first part is not negative, for N is convex; where N = 0 it has a kink upwards,
-    which has no upper bound. For p = 2 the first part is sum_(i<j) w_ij^2 / N^3 with w_ij = x_i
-    x_j' - x_j x_i' (Lagrange's identity), and w_ij' = x_i x_j'' - x_j x_i'' is 0 along straight
-    lines: the range of w_ij is narrowed from the start of the piece.
+    Proof of the ranges. Let N be the norm of functions x_i, and u_i = |x_i|/N <= 1. Then
+    N' = sum_i sign(x_i) u_i^(p-1) x_i'. By Hoelder's and Minkowski's inequalities |N'| is at most
+    the p-norm of the x_i'. And
+
+        N'' = (p-1)/N (sum_i u_i^(p-2) x_i'^2 - N'^2) + sum_i sign(x_i) u_i^(p-1) x_i''.
+
+    The first part is not negative, because N is a convex function of the x_i. At N = 0 the norm has
+    a kink upwards, so the first part has no upper bound there. For p = 2 the first part is
+    sum_(i<j) w_ij^2 / N^3 with w_ij = x_i x_j' - x_j x_i' (Lagrange's identity). Along straight
+    lines w_ij' = x_i x_j'' - x_j x_i'' is 0, so the range of w_ij is narrowed from the start of the
+    piece.
 
     Raises:
         TypeError: there are no numbers.
@@ -95,11 +106,11 @@ def norm(*values: Any, p: float = 2.0) -> Any:
     if not jets:
         return _plain_norm(values, p)
     operands = [term if isinstance(term, Jet) else jets[0].coerce(term) for term in values]
-    return _norm(operands, p)
+    return _jet_norm(operands, p)
 
 
 def _plain_norm(values: tuple[Any, ...], p: float) -> Any:
-    """The norm of arrays and numbers, in a form whose derivative at 0 is finite."""
+    """The p-norm of arrays and Python numbers, in a form whose derivative at 0 is finite."""
     if not any(dr.is_array_v(cast("Any", type(value))) for value in values):
         sizes = np.array(np.broadcast_arrays(*(np.abs(value) for value in values)))
         largest = sizes.max(axis=0)
@@ -118,10 +129,16 @@ def _plain_norm(values: tuple[Any, ...], p: float) -> Any:
 
 
 def _plain_power(x: Any, p: float) -> Any:
+    """x^p for Dr.Jit arrays x >= 0; 0 at x = 0, with derivative 0."""
     return dr.select(x > 0, dr.power(dr.select(x > 0, x, 1), p), 0)
 
 
-def _norm(xs: list[Jet], p: float) -> Jet:
+def _jet_norm(xs: list[Jet], p: float) -> Jet:
+    """The p-norm of jets, for 1 < p < infinity; `norm` has the proof of its ranges.
+
+    Symbols: over is the range of 1/N, ratios are those of x_i/N, and pulls those of sign(x_i)
+    u_i^(p-1).
+    """
     like = next((f.value.lower for f in xs if not f.value.is_literal), None)
     like = xs[0].backend_number() if like is None else like
     values = [as_backend_interval(f.value, like) for f in xs]
@@ -156,13 +173,21 @@ def _norm(xs: list[Jet], p: float) -> Jet:
     starts = [f.jet_at_start for f in xs]
     if any(f is None for f in starts):
         return jet
-    return jet.narrowed_from_start(_norm(cast("list[Jet]", starts), p), xs[0].piece_length)
+    return jet.narrowed_from_start(_jet_norm(cast("list[Jet]", starts), p), xs[0].piece_length)
 
 
 def _wronskian_term(
     xs: list[Jet], values: list[Interval], over: Interval, i: int, j: int
 ) -> Interval:
-    """sum_(k<l) w_kl,i w_kl,j / N^3."""
+    """The range of sum_(k<l) w_kl,i w_kl,j / N^3, the first part of N'' for p = 2: see `norm`.
+
+    w_kl,i is the function w_kl = x_k x_l' - x_l x_k' with derivatives by the variable i.
+
+    xs: the functions x_k.
+    values: the ranges of their values.
+    over: the range of 1/N.
+    i, j: the two variables of the second derivative.
+    """
     parts: list[Interval] = []
     for k, m in itertools.combinations(range(len(xs)), 2):
         pair = xs[k], xs[m], values[k], values[m]
@@ -172,7 +197,7 @@ def _wronskian_term(
 
 
 def _norm_range(values: list[Interval], p: float) -> Interval:
-    """The range of the norm of independent numbers."""
+    """The range of the p-norm of independent numbers in these intervals."""
     smallest, largest = [value.min_abs for value in values], [value.max_abs for value in values]
     low = _norm_of_magnitudes(smallest, p).lower
     floor = functools.reduce(fmax, smallest)  # rounding and underflow cannot make it shorter
@@ -180,7 +205,7 @@ def _norm_range(values: list[Interval], p: float) -> Interval:
 
 
 def _norm_of_magnitudes(sizes: list[Any], p: float) -> Interval:
-    """The norm of numbers >= 0."""
+    """The range of the p-norm of the numbers `sizes`, which are >= 0, with its rounding."""
     if p == 2.0:
         return sqrt.ranges(_total([Interval.point(size).square() for size in sizes]))[0]
     largest = functools.reduce(lambda a, b: dr.select((a > b) | dr.isnan(a), a, b), sizes)
@@ -196,20 +221,22 @@ def _norm_of_magnitudes(sizes: list[Any], p: float) -> Interval:
 
 
 def _signed_power(x: Interval, q: float) -> Interval:
-    """The range of sign(x) |x|^q, q > 0, which increases."""
+    """The range of sign(y) |y|^q for y in x, q > 0; this function increases."""
 
-    def of(v: Any) -> Interval:
+    def at(v: Any) -> Interval:
+        """The range at a single number v, with its rounding."""
         size = power(q).ranges(Interval.point(dr.abs(v)))[0]
         return Interval(
             dr.select(v >= 0, size.lower, -size.upper), dr.select(v >= 0, size.upper, -size.lower)
         )
 
-    low = of(x.lower)
-    return low if x.lower is x.upper else Interval(low.lower, of(x.upper).upper)
+    low = at(x.lower)
+    return low if x.lower is x.upper else Interval(low.lower, at(x.upper).upper)
 
 
 def _reciprocal_norm(length: Interval) -> Interval:
-    """The range of 1/N for N >= 0; its upper end is infinite where N may be 0."""
+    """The range of 1/N, where `length` is the range of N >= 0; the upper end is infinite if N may
+    be 0."""
     over = reciprocal.ranges(length)[0]
     from_upper = Interval.point(length.upper).reciprocal()
     return Interval(fmax(from_upper.lower, 0), over.upper)
@@ -223,15 +250,17 @@ def _clip_magnitude(x: Interval, limit: Interval) -> Interval:
 
 
 def _product(a: Interval, b: Interval) -> Interval:
+    """The range of a product; that of a square if both are the same interval object."""
     return a.square() if a is b else a * b
 
 
 def _total(parts: list[Interval]) -> Interval:
+    """The sum of the intervals."""
     return functools.reduce(lambda a, b: a + b, parts)
 
 
 def as_backend_interval(x: Interval, like: Any) -> Interval:
-    """An interval of numbers of the backend."""
+    """The interval with ends of the type of `like`, if its ends are Python numbers."""
     if not x.is_literal:
         return x
     kind = cast("Any", type(like))
@@ -240,21 +269,27 @@ def as_backend_interval(x: Interval, like: Any) -> Interval:
 
 
 def blend_union(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
-    """The union of {a <= 0} and {b <= 0}, its inner edge filled by a superellipse.
+    """The function of a union with a rounded edge.
 
+    It is <= 0 where a <= 0, where b <= 0, and in the inner edge between the two sets, which a
+    superellipse fills.
+
+    a, b: numbers of any kind, such as signed distances.
     radius: the blend changes the union where both a and b are less than this.
-    power: at least 1; with 2 the edge is a circular arc where the surfaces meet at right angles,
-        larger ones are sharper.
+    power: at least 1. With 2 the edge is a circular arc if the surfaces meet at right angles;
+        larger powers make it sharper.
 
-    With g_a = max(0, 1 - a/r) it is r (1 - |(g_a, g_b)|_p); Hart (1996, equation 43) prints the
-    root around everything. Where both a and b are at least r it is their minimum. Between the two
-    it is continuous: where the smaller one is r, both are r.
+    Let r be the radius, p the power, g_a = max(0, 1 - a/r), and g_b the same for b. Where a or b is
+    less than r, the function is r (1 - |(g_a, g_b)|_p); Hart (1996, equation 43) prints the root
+    around everything. Where both are at least r, it is their minimum. It is continuous: where the
+    smaller one is r, both formulas give r.
 
-    Proof of its Lipschitz constant. If those of a and b are at most 1, the gradient is
-    sum_k u_k^(p-1) grad k with u = g/|g|_p, and u_a^(p-1) + u_b^(p-1) is at most 2^(1/p), by
-    Hoelder's inequality, with equality at a = b: so 2^(1/p) holds, and is attained where the
-    gradients are equal. Where they are orthogonal and p >= 2, it is 1. With two radii, as Hart has
-    it, the function is not continuous at g = 0, and there is no constant at all.
+    Proof of its Lipschitz constant, for a and b with constants of at most 1. The gradient is
+    u_a^(p-1) grad a + u_b^(p-1) grad b with u = g/|g|_p. By Hoelder's inequality
+    u_a^(p-1) + u_b^(p-1) is at most 2^(1/p), with equality at a = b. So 2^(1/p) is a Lipschitz
+    constant, which is attained where the gradients are equal. If they are orthogonal and p >= 2, it
+    is 1. With two radii, as in Hart's paper, the function is not continuous at g = 0, and there is
+    no constant at all.
     """
     g_a, g_b = (maximum(1.0 - operand / radius, 0.0) for operand in (a, b))
     near = (1.0 - norm(g_a, g_b, p=power)) * radius
@@ -269,17 +304,21 @@ def blend_union(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
 
 
 def blend_intersection(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
-    """The intersection of {a <= 0} and {b <= 0}, its outer edge rounded: see `blend_union`."""
+    """The same for the intersection of {a <= 0} and {b <= 0}, whose outer edge is rounded: see
+    `blend_union`."""
     return -blend_union(-a, -b, radius, power)
 
 
 def orthogonal_intersection(*sides: Any) -> Any:
-    """The signed distance of the set where all sides are <= 0, if these are signed distances with
-    gradients at right angles to each other.
+    """The signed distance from the set of points where all of the functions `sides` are <= 0.
 
-    Proof. Outside, the nearest point is found separately along each of the directions: the distance
-    is the norm of the positive ones (Pythagoras); inside, the nearest side decides. Where a single
-    side is positive the norm is that side, the largest.
+    sides: signed distances whose gradients are at right angles to each other, such as those of
+        planes at right angles.
+
+    Proof. Outside of the set, the nearest point is found separately along each of the gradients. So
+    the distance is the norm of the positive ones of these functions (Pythagoras); if a single one
+    is positive, it is that one, the largest. Inside, the largest of the functions is minus the
+    distance to the nearest boundary.
     """
     largest = maximum(*sides)
     outside = norm(*(maximum(side, 0.0) for side in sides))

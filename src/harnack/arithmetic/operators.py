@@ -1,7 +1,8 @@
-"""Operators that numbers of every arithmetic share, so that any of them can evaluate a formula.
+"""The operators of the numbers of all arithmetics, with which each arithmetic evaluates formulas.
 
-`tally_of` says, before anything is recorded, about how large a formula's kernel will be, and
-whether the formula may jump, have a vertical tangent, or turn within the rounding of coordinates.
+`tally_of` estimates, before a kernel is recorded, how large the kernel of a formula will be. It
+also tells whether the formula may jump, have a vertical tangent, or turn within the rounding of
+coordinates.
 """
 
 from __future__ import annotations
@@ -44,7 +45,8 @@ _UFUNCS = {
     "sinh": sinh, "cosh": cosh, "arctan": atan, "arcsin": asin, "arccos": acos,
     "absolute": absolute, "fabs": absolute, "square": power(2),
 }  # fmt: skip
-# The method for such a number on the left, and for one on the right only.
+# For each of NumPy's functions of two numbers: the method to call if the left operand is such a
+# number, and the method of the right operand to call if only that one is.
 _OPERATORS = {
     "add": ("__add__", "__radd__"), "subtract": ("__sub__", "__rsub__"),
     "multiply": ("__mul__", "__rmul__"), "divide": ("__truediv__", "__rtruediv__"),
@@ -60,11 +62,11 @@ _NAMES = (
 
 
 class FormulaNumber(abc.ABC):
-    """Base of the numbers of all arithmetics: the operators + - * / **, abs, NumPy's functions,
-    maximum, minimum and atan2. A subclass defines sums, products, functions of a single number, the
-    larger of two numbers, and the angle.
+    """Base of the numbers of all arithmetics. It defines their operators.
 
-    A formula is written once and evaluated with numbers of any subclass, such as `Jet`.
+    These are + - * / **, abs, NumPy's functions, maximum, minimum and atan2. A subclass defines
+    sums, products, functions of a single number, the larger of two numbers, and the polar angle. A
+    formula is written once and evaluated with numbers of any subclass, such as `Jet`.
     """
 
     @abc.abstractmethod
@@ -82,21 +84,22 @@ class FormulaNumber(abc.ABC):
 
     @abc.abstractmethod
     def apply(self, function: ElementaryFunction) -> Self:
-        """A function of this number."""
+        """The elementary function, applied to this number."""
 
     @abc.abstractmethod
     def pointwise_maximum(self, other: Any) -> Self: ...
 
     @abc.abstractmethod
     def polar_angle(self, x: Any) -> Self:
-        """The angle of the point (x, y) with this y: see `harnack.arithmetic.angles`."""
+        """The angle of the point (x, y), where y is this number: see
+        `harnack.arithmetic.angles`."""
 
     def norm_of_powers(self, p: float) -> Self:
-        """The p-norm of some numbers; this number is the sum of their p-th powers."""
+        """The p-norm of some numbers, where this number is the sum of their p-th powers."""
         return self.apply(sqrt if p == 2.0 else power(1 / p))
 
     def _coerce_or_none(self, other: Any) -> Self | None:
-        """Another operand as a number of this arithmetic; None if it is no number."""
+        """Another operand as a number of this arithmetic; None if it is not a number."""
         if isinstance(other, type(self)):
             return other
         if dr.is_array_v(cast("Any", type(other))):
@@ -107,7 +110,7 @@ class FormulaNumber(abc.ABC):
             return None
 
     def coerce(self, other: Any) -> Self:
-        """A number of any kind as one of this arithmetic.
+        """A number of any kind as a number of this arithmetic.
 
         Raises:
             TypeError: it is no number.
@@ -163,7 +166,7 @@ class FormulaNumber(abc.ABC):
         )
 
     def _power_by_squaring(self, n: int) -> Self:
-        """x^n by products, n >= 0."""
+        """This number to the power n >= 0, by products."""
         if n == 0:
             return self.constant(1.0)
         if n == 1:
@@ -191,18 +194,19 @@ class FormulaNumber(abc.ABC):
         return self.apply(absolute)
 
     def maximum(self, other: Any) -> Self:
-        """The larger of two functions at each point."""
+        """The larger of this and another number of any kind, at each point."""
         return self.pointwise_maximum(self.coerce(other))
 
     def minimum(self, other: Any) -> Self:
-        """The smaller of two functions at each point."""
+        """The smaller of this and another number of any kind, at each point."""
         return -((-self).pointwise_maximum(-self.coerce(other)))
 
     def atan2(self, x: Any) -> Self:
-        """The angle of the point (x, y) with this y."""
+        """The angle of the point (x, y), where y is this number and x a number of any kind."""
         return self.polar_angle(self.coerce(x))
 
     def _atan2_of(self, y: Any) -> Self:
+        """The angle of the point (x, y), where x is this number and y a number of any kind."""
         return self.coerce(y).polar_angle(self)
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **settings: Any) -> Any:
@@ -232,6 +236,7 @@ class FormulaNumber(abc.ABC):
         )
 
     def _undecided(self, *operands: Any) -> Any:
+        """Raise TypeError: a formula cannot compare its numbers or use them as conditions."""
         del operands
         raise TypeError(
             "a formula cannot decide by its coordinates: use harnack.math.maximum and "
@@ -261,13 +266,14 @@ def exponent_of(n: Any) -> float:
         raise TypeError(f"the exponent of x**n must be a number, not of type {kind}") from None
 
 
-# Operations of Dr.Jit, measured for one piece of a path with its sample and slopes.
+# The numbers of Dr.Jit operations for a sum, a product and a function, measured for one piece of a
+# path with its sample and slopes.
 _SUM, _PRODUCT, _FUNCTION = 60, 220, 300
-# Functions this steep may turn within the rounding of coordinates that are no larger than this:
-# 1/4096 is 16 roundings of single precision there.
+# A function with a slope of `_ABRUPT` or more may turn within the rounding of coordinates, if these
+# are up to `_FAR`: 1/4096 is 16 roundings of single precision there.
 _ABRUPT, _FAR = 4096.0, 128.0
-# Sizes and slopes are not counted beyond this number, whose square does not overflow.
-_MOST = 1e100
+# Sizes and slopes above this number count as this number, whose square does not overflow.
+_MAX_SIZE = 1e100
 
 
 @dataclass(eq=False)
@@ -276,11 +282,11 @@ class Tally:
 
     operations: about how many operations of Dr.Jit their ranges take.
     may_jump: whether a function was used that is not continuous everywhere.
-    is_steep: whether the slope may have no bound in a bounded box, as where roots, powers below 1,
-        quotients or logarithms are used.
-    steepest: the largest slope, where coordinates are at most 1, of a number that was bent: by a
-        maximum, an absolute value, or a function that is no power.
-    finest: the smallest nonzero constant, at most 1: a bent number may turn within that.
+    is_steep: whether the slope may have no bound in a bounded box, as it may with roots, powers
+        below 1, quotients or logarithms.
+    steepest: the largest slope, for coordinates up to 1, of any number that was bent. A number is
+        bent by a maximum, an absolute value, or a function that is no power.
+    finest: the smallest nonzero constant, at most 1. A bent number may turn within this.
     farthest: the largest constant that was added.
     """
 
@@ -292,28 +298,31 @@ class Tally:
     farthest: float = 0.0
 
     def turns_within(self, finest: float) -> bool:
-        """Whether f may change within the rounding of coordinates by far more than its slopes on
-        both sides say, as max(-1, min(1, 1e9 y)) does: flat, steep, and flat again.
+        """Whether f may change by far more within the rounding of coordinates than its slopes on
+        both sides say.
+
+        max(-1, min(1, 1e9 y)) is an example: flat, steep, and flat again.
 
         finest: the smallest change within which a bent number may turn.
 
-        An estimate from the numbers of the formula, and no proof: sums and products of coordinates
-        alone do not get flat again; a function of 1e9 y does, such as tanh, and so does a maximum
-        with 1e-9.
+        This is an estimate from the numbers of the formula, and no proof. Sums and products of
+        coordinates alone do not get flat again. A function of 1e9 y does, such as tanh, and so does
+        a maximum with 1e-9.
         """
         return self.steepest * max(self.farthest / _FAR, 1.0) >= _ABRUPT * finest
 
 
 @dataclass(frozen=True, eq=False)
 class OperationCounter(FormulaNumber):
-    """A number that counts operations, in a tally that all numbers of a formula share.
+    """A number without a value that counts the operations on it.
 
-    is_constant: whether it is the same everywhere, so that functions of it have no slope.
-    is_square: whether it is a sum of squares. The root of one has no vertical tangent: with
-        f = sqrt(u^2 + v^2), |grad f| <= |grad u| + |grad v|.
-    size, rate: bounds of it and of its slope where coordinates are at most 1, and functions that
-        have a pole or grow faster than a power count as about 1 and no steeper than their argument
-        (`Tally.turns_within`). A constant that is an array counts as 1.
+    tally: the summary of all operations, which all numbers of a formula share.
+    is_constant: whether the number is the same everywhere, so that functions of it have no slope.
+    is_square: whether it is a sum of squares. The root of such a sum has no vertical tangent:
+        f = sqrt(u^2 + v^2) has |grad f| <= |grad u| + |grad v|.
+    size, rate: estimated bounds of the number and of its slope, for coordinates up to 1
+        (`Tally.turns_within`). A function that has a pole or grows faster than a power counts as
+        about 1, and as no steeper than its argument. A constant that is an array counts as 1.
     """
 
     tally: Tally
@@ -323,8 +332,9 @@ class OperationCounter(FormulaNumber):
     rate: float = 1.0
 
     def constant(self, x: Any) -> OperationCounter:
+        """A constant, whose absolute value is recorded as a size within which numbers may turn."""
         is_number = isinstance(x, int | float)
-        size = min(abs(float(x)), _MOST) if is_number else 1.0
+        size = min(abs(float(x)), _MAX_SIZE) if is_number else 1.0
         if size > 0.0:
             self.tally.finest = min(self.tally.finest, size)
         is_positive = is_number and x >= 0
@@ -333,6 +343,7 @@ class OperationCounter(FormulaNumber):
         )
 
     def sum(self, other: OperationCounter) -> OperationCounter:
+        """The sum of two numbers; the absolute value of a constant that is added is recorded."""
         for number in (self, other):
             if number.is_constant:
                 self.tally.farthest = max(self.tally.farthest, number.size)
@@ -358,6 +369,8 @@ class OperationCounter(FormulaNumber):
         return self.apply(sqrt if n == 0.5 else power(n))
 
     def apply(self, function: ElementaryFunction) -> OperationCounter:
+        """A function of this number. A power of at least 1 does not bend it; every other function
+        does."""
         self._note(function)
         name, _, exponent = function.name.partition(" ")
         if name == "power" and float(exponent) >= 1.0:
@@ -372,6 +385,7 @@ class OperationCounter(FormulaNumber):
         return self._bent(_FUNCTION, other, max(self.size, other.size), rate)
 
     def polar_angle(self, x: OperationCounter) -> OperationCounter:
+        """The polar angle, which may jump and be steep unless both numbers are constant."""
         if not (self.is_constant and x.is_constant):
             self.tally.may_jump = self.tally.is_steep = True
         return self._bent(_FUNCTION + _PRODUCT, x, 1.0, self.rate + x.rate)
@@ -381,7 +395,7 @@ class OperationCounter(FormulaNumber):
         return self._bent(_FUNCTION, self, size, self.rate / (p * size ** (p - 1)))
 
     def _note(self, function: ElementaryFunction) -> None:
-        """Record in the tally whether a function of this number may jump or be steep."""
+        """Record in the tally whether this function of this number may jump or be steep."""
         if not self.is_constant:
             is_norm = function is sqrt and self.is_square
             self.tally.may_jump |= function.has_pole
@@ -390,8 +404,11 @@ class OperationCounter(FormulaNumber):
     def _bent(
         self, operations: int, other: OperationCounter, size: float, rate: float
     ) -> OperationCounter:
-        """The result of this and another number by an operation that may be flat on both sides of a
-        place."""
+        """The result of an operation on this and another number that may be flat on both sides of a
+        place.
+
+        Records the slopes of both numbers. Parameters as for `_after`.
+        """
         if not (self.is_constant and other.is_constant):
             self.tally.steepest = max(self.tally.steepest, self.rate, other.rate)
         return self._after(operations, other, size, rate)
@@ -405,22 +422,29 @@ class OperationCounter(FormulaNumber):
         *,
         is_square: bool = False,
     ) -> OperationCounter:
-        """The result of this and another number, after `operations` operations."""
+        """The result of an operation on this and another number.
+
+        operations: the number of Dr.Jit operations, which is added to the tally.
+        size, rate, is_square: those of the result.
+        """
         self.tally.operations += operations
         is_constant = self.is_constant and other.is_constant
-        rate = 0.0 if is_constant else min(rate, _MOST)
-        return OperationCounter(self.tally, is_constant, is_square, min(size, _MOST), rate)
+        rate = 0.0 if is_constant else min(rate, _MAX_SIZE)
+        return OperationCounter(self.tally, is_constant, is_square, min(size, _MAX_SIZE), rate)
 
 
 def _power(x: float, n: float) -> float:
-    """x^n for x >= 1, at most `_MOST`."""
-    return math.exp(min(n * math.log(x), math.log(_MOST)))
+    """x^n for x >= 1, but at most `_MAX_SIZE`."""
+    return math.exp(min(n * math.log(x), math.log(_MAX_SIZE)))
 
 
 def tally_of(formula: Callable[[Any, Any, Any], Any]) -> Tally:
-    """The tally of a formula of three coordinates. A formula that does not accept numbers of this
-    kind has no operations and may jump; it accepts only ranges of derivatives, as the formulas of
-    the library's shapes do, which are bounded."""
+    """The tally of a formula of three coordinates.
+
+    A formula that does not accept numbers of this kind gets a tally without operations that may
+    jump. Such a formula accepts only ranges of derivatives, as those of the library's shapes do,
+    which are bounded.
+    """
     tally = Tally()
     x, y, z = (
         OperationCounter(tally) for _ in range(3)

@@ -1,15 +1,15 @@
-"""Parabolas through a function's value: the bottom-up linear and quadratic arithmetic along a path.
+"""Bounds of a function along a path by two parabolas, computed operation by operation.
 
-A number of this arithmetic is a function f of the length s along a path, 0 <= s <= h, known by its
-value at 0 and by
+This is the bottom-up linear and quadratic arithmetic of Aydinlilar and Zanni (2023, sections 5.2
+and 6.2, appendices B and C). A number of this arithmetic stands for a function f of the length s
+along a path, 0 <= s <= h. It holds the value at s = 0, and the coefficients of two parabolas with
 
     a- s + b- s^2  <=  f(s) - f(0)  <=  a+ s + b+ s^2.
 
-Sums, products, functions and maxima of such numbers are such numbers again, so that a formula
-evaluated with such numbers as its coordinates proves its own parabolas (Aydinlilar and Zanni 2023,
-sections 5.2 and 6.2, appendices B and C). Two details improve on the published method: functions
-are bounded by chords through the value itself, which need no validity interval; and the tighter of
-chords and Taylor's formula is used.
+Sums, products, functions and maxima of such numbers are such numbers again. So a formula that is
+evaluated with such numbers as its coordinates proves parabolas for itself. Two details improve on
+the published method: functions are bounded by chords from the value at the start, which need no
+validity interval; and the tighter of chords and Taylor's formula is used.
 
 Rounding. Coefficients are computed in rounded arithmetic; each result is moved outwards by
 `_ROUNDINGS` units in the last place of the sum of the absolute values of all terms, which is more
@@ -34,24 +34,24 @@ if TYPE_CHECKING:
     from harnack.arithmetic.functions import ElementaryFunction
     from harnack.backend import Real, Vec3
 
-# a s + b s^2, as (a, b).
+# The coefficients (a, b) of a s + b s^2.
 Quadratic: TypeAlias = "tuple[Real, Real]"
 
 _ROUNDINGS = 32.0
-# Two bounds are compared at this fraction of the length to choose the tighter.
+# The fraction of the length at which two bounds are compared, to choose the tighter one.
 _COMPARED_AT = 0.6
 
 
 @dataclass(frozen=True, eq=False)
 class ParabolaBounds(FormulaNumber):
-    """A function along a path between two parabolas through its value at the start.
+    """A function f along a path, and two parabolas through its value at the start that bound it.
 
-    value: at s = 0.
-    lower, upper: (a, b) of the parabolas a s + b s^2 around f(s) - f(0).
-    piece_length: h; the bounds hold for 0 <= s <= h.
+    value: the range of f at s = 0.
+    lower, upper: (a, b) for the parabolas a s + b s^2 below and above f(s) - f(0).
+    piece_length: the length h; the bounds hold for 0 <= s <= h.
     bound_degree: 1 if the bounds are lines (bottom-up linear arithmetic), else 2.
-    polynomial_degree: the degree of f, at most 2, if it is a polynomial: then the two parabolas
-        differ by rounding alone. None for other functions.
+    polynomial_degree: the degree of f, if f is a polynomial of degree at most 2: then the two
+        parabolas differ by rounding alone. None for other functions.
     """
 
     value: Interval
@@ -65,9 +65,11 @@ class ParabolaBounds(FormulaNumber):
     def along_ray(
         cls, p: Vec3, direction: Vec3, length: Real, *, degree: int = 2
     ) -> tuple[ParabolaBounds, ParabolaBounds, ParabolaBounds]:
-        """The coordinates of p + s d for 0 <= s <= length."""
+        """The three coordinates of p + s d for 0 <= s <= length; degree: the `bound_degree`, 1 or
+        2."""
 
         def coordinate(x: Real, slope: Real) -> ParabolaBounds:
+            """The function x + s slope."""
             line = slope, 0.0
             return cls(Interval.point(x), line, line, length, degree, 1)
 
@@ -76,21 +78,27 @@ class ParabolaBounds(FormulaNumber):
 
     @property
     def bounds(self) -> tuple[Quadratic, Quadratic]:
-        """The parabolas below and above, straight if the degree is 1."""
+        """The parabolas below and above f(s) - f(0); lines, with b = 0, if `bound_degree` is 1."""
         if self.bound_degree == 2:
             return self.lower, self.upper
         return _lines_bounding_parabolas(self.lower, self.upper, self.piece_length)
 
     def constant(self, x: float | Real) -> ParabolaBounds:
+        """A constant number as a function along the same path."""
         if isinstance(x, int | float):
             value = Interval.enclosing(float(x), cast("Any", type(self.piece_length)))
         else:
             value = Interval.point(x)
-        return self._made(value, (0.0, 0.0), (0.0, 0.0), 0)
+        return self._new(value, (0.0, 0.0), (0.0, 0.0), 0)
 
-    def _made(
+    def _new(
         self, value: Interval, lower: Quadratic, upper: Quadratic, polynomial: int | None = None
     ) -> ParabolaBounds:
+        """A function on the same piece with this value and these bounds, made lines if
+        `bound_degree` is 1.
+
+        polynomial: its degree if it is a polynomial, whose bounds stay parabolas; else None.
+        """
         new = ParabolaBounds(value, lower, upper, self.piece_length, self.bound_degree, polynomial)
         if polynomial is None and self.bound_degree == 1:
             lower, upper = new.bounds
@@ -102,23 +110,26 @@ class ParabolaBounds(FormulaNumber):
         return dataclasses.replace(self, value=-self.value, lower=(-c, -d), upper=(-a, -b))
 
     def sum(self, other: Any) -> ParabolaBounds:
+        """The sum of two functions: values and bounds are added."""
         value = self.value + other.value
-        lower = _added(self.lower, other.lower, -1)
-        upper = _added(self.upper, other.upper, 1)
+        lower = _sum(self.lower, other.lower, -1)
+        upper = _sum(self.upper, other.upper, 1)
         if self.polynomial_degree is None or other.polynomial_degree is None:
-            return self._made(value, lower, upper)
-        return self._made(value, lower, upper, max(self.polynomial_degree, other.polynomial_degree))
+            return self._new(value, lower, upper)
+        return self._new(value, lower, upper, max(self.polynomial_degree, other.polynomial_degree))
 
     # Products.
 
     def product(self, other: Any) -> ParabolaBounds:
-        """f g - f(0) g(0) = f(0) G + g(0) F + F G.
+        """The product f g.
 
-        Proof. F and G lie between two parabolas each, and F G is linear in each of them: f g lies
-        between the least and the largest of the products of one bound of f with one of g. Each of
-        those is a quartic. Straight bounds: f(0) c + g(0) a + a c s is the slope of a chord, which
-        is between its values at both ends. Parabolas: the derivative of the quartic is a cubic,
-        which `_lines_bounding_cubic` puts between two lines; their integrals are parabolas.
+        Proof. Let F = f - f(0) and G = g - g(0). Then f g - f(0) g(0) = f(0) G + g(0) F + F G. Each
+        of F and G lies between two parabolas, and this is linear in F and in G. So it lies between
+        the smallest and the largest of the four functions in which a bound takes the place of F and
+        one the place of G; each is a quartic. If the bounds are lines, a s of F and c s of G, the
+        quartic is s (f(0) c + g(0) a + a c s), and the factor of s lies between its values at both
+        ends. For parabolas, the derivative of the quartic is a cubic. `_lines_bounding_cubic` puts
+        it between two lines, and the integrals of these are parabolas.
         """
         if other.polynomial_degree == 0:
             return self._scaled(other.value)
@@ -127,26 +138,26 @@ class ParabolaBounds(FormulaNumber):
         value = self.value * other.value
         if self is other:
             value = self.value.square()
-        both = None
+        degree = None
         if self.polynomial_degree is not None and other.polynomial_degree is not None:
-            both = self.polynomial_degree + other.polynomial_degree
-        if both == 2:
+            degree = self.polynomial_degree + other.polynomial_degree
+        if degree == 2:
             lower, upper = self._product_of_lines(other)
-            return self._made(value, lower, upper, 2)
+            return self._new(value, lower, upper, 2)
         if self.bound_degree == 1:
-            return self._made(value, *self._straight_product(other))
-        return self._made(value, *self._curved_product(other))
+            return self._new(value, *self._straight_product(other))
+        return self._new(value, *self._curved_product(other))
 
     def _scaled(self, factor: Interval) -> ParabolaBounds:
-        """The product with a constant.
+        """The product k f with a constant k in the interval `factor`.
 
-        Proof. k f for k = m + e, |e| <= r: m f has the bounds of f times m, swapped if m < 0, and
-        |e f| <= r max(|lower|, |upper|), coefficient by coefficient.
+        Proof. Let k = m + e with |e| <= r. The bounds of m f are those of f times m, exchanged if m
+        < 0; and |e f| <= r max(|lower|, |upper|), for each coefficient.
         """
         value = self.value * factor
         middle, radius = factor.midpoint, factor.radius
         if factor.is_zero:
-            return self._made(value, (0.0, 0.0), (0.0, 0.0), 0)
+            return self._new(value, (0.0, 0.0), (0.0, 0.0), 0)
         low, high = self.lower, self.upper
         moved = [(middle * bound[0], middle * bound[1]) for bound in (low, high)]
         falls = middle < 0
@@ -158,7 +169,7 @@ class ParabolaBounds(FormulaNumber):
             else radius * sizes[k] + _rounding_bound(dr.abs(middle) * sizes[k])
             for k in range(2)
         ]  # fmt: skip
-        return self._made(
+        return self._new(
             value,
             (lower[0] - rounding[0], lower[1] - rounding[1]),
             (upper[0] + rounding[0], upper[1] + rounding[1]),
@@ -166,7 +177,11 @@ class ParabolaBounds(FormulaNumber):
         )
 
     def _product_of_lines(self, other: ParabolaBounds) -> tuple[Quadratic, Quadratic]:
-        """The product of two polynomials of degree 1: exact, up to rounding."""
+        """Bounds of the product of two polynomials of degree 1: exact up to rounding.
+
+        Symbols: v and w are the midpoints of the two values at s = 0, a and c those of the two
+        slopes; rv, rw, ra and rc are their radii.
+        """
         a, ra = _midpoint_and_half_width(self.lower[0], self.upper[0])
         c, rc = _midpoint_and_half_width(other.lower[0], other.upper[0])
         v, rv, w, rw = *_midpoint_and_radius(self.value), *_midpoint_and_radius(other.value)
@@ -178,6 +193,11 @@ class ParabolaBounds(FormulaNumber):
         return (linear - error_1, quadratic - error_2), (linear + error_1, quadratic + error_2)
 
     def _straight_product(self, other: ParabolaBounds) -> tuple[Quadratic, Quadratic]:
+        """Bounds of a product f g by lines: see `product`.
+
+        Symbols: v and w are the midpoints of f(0) and g(0), rv and rw their radii. a and c are the
+        slopes of a bound of f and of one of g.
+        """
         h = self.piece_length
         v, rv, w, rw = *_midpoint_and_radius(self.value), *_midpoint_and_radius(other.value)
         lows: list[Real] = []
@@ -192,6 +212,11 @@ class ParabolaBounds(FormulaNumber):
         return (_minimum_or_inf(*lows), 0.0), (_maximum_or_inf(*highs), 0.0)
 
     def _curved_product(self, other: ParabolaBounds) -> tuple[Quadratic, Quadratic]:
+        """Bounds of a product f g by parabolas: see `product`.
+
+        Symbols: v and w are the midpoints of f(0) and g(0), rv and rw their radii. (a, b) is a
+        bound of f and (c, d) one of g, with the radii ra, rb, rc, rd of their coefficients.
+        """
         h = self.piece_length
         v, rv, w, rw = *_midpoint_and_radius(self.value), *_midpoint_and_radius(other.value)
         lows: list[Real] = []
@@ -216,22 +241,25 @@ class ParabolaBounds(FormulaNumber):
             # The uncertainty of the values, and the difference of the bounds of a polynomial.
             size_f = dr.abs(ah) + 2 * dr.abs(bh)
             size_g = dr.abs(ch) + 2 * dr.abs(dh)
-            loose = rv * size_g + rw * size_f
-            off_f, off_g = ra * h + 2 * rb * h * h, rc * h + 2 * rd * h * h
-            loose += off_f * (dr.abs(w) + rw + size_g + off_g)
-            loose += off_g * (dr.abs(v) + rv + size_f)
-            rounding = _rounding_bound(size) + loose
+            uncertainty = rv * size_g + rw * size_f
+            radius_f, radius_g = ra * h + 2 * rb * h * h, rc * h + 2 * rd * h * h
+            uncertainty += radius_f * (dr.abs(w) + rw + size_g + radius_g)
+            uncertainty += radius_g * (dr.abs(v) + rv + size_f)
+            rounding = _rounding_bound(size) + uncertainty
             l0, l1, u0, u1 = _lines_bounding_cubic(c0, c1, c2, c3)
             lows += [l0 - rounding, l1 - rounding]
             highs += [u0 + rounding, u1 + rounding]
         return (
-            _integral(_minimum_or_inf(*lows[::2]), _minimum_or_inf(*lows[1::2]), h),
-            _integral(_maximum_or_inf(*highs[::2]), _maximum_or_inf(*highs[1::2]), h),
+            _parabola_of_slopes(_minimum_or_inf(*lows[::2]), _minimum_or_inf(*lows[1::2]), h),
+            _parabola_of_slopes(_maximum_or_inf(*highs[::2]), _maximum_or_inf(*highs[1::2]), h),
         )
 
     def _bound_coefficients(self) -> list[tuple[Real, Real, Real, Real]]:
-        """The two bounds as (a, b, 0, 0); for a polynomial a single bound, (a, b, radius of a,
-        radius of b)."""
+        """The bounds from which products are formed.
+
+        In general, two tuples (a, b, 0, 0) for the parabolas below and above. For a polynomial a
+        single tuple (a, b, radius of a, radius of b) for the parabola in the middle.
+        """
         if self.polynomial_degree is None:
             return [(*self.lower, 0.0, 0.0), (*self.upper, 0.0, 0.0)]
         a, ra = _midpoint_and_half_width(self.lower[0], self.upper[0])
@@ -241,27 +269,29 @@ class ParabolaBounds(FormulaNumber):
     # Functions.
 
     def apply(self, function: ElementaryFunction) -> ParabolaBounds:
-        """phi(f), by the tighter of two proofs on either side.
+        """The composition phi(f) with an elementary function phi, by the tighter of two proofs on
+        each side.
 
-        Chords. With x = f(s) - f(0) between x- and x+, phi(f(0) + x) - phi(f(0)) = m x, where m is
-        the slope of a chord from f(0). It lies in the range of phi' and, for convex phi, between
-        the slopes of the chords to x- and to x+. For an upper bound of a convex phi the two chords
-        themselves are enough, and for a lower bound the tangent at f(0), as phi lies above it; for
-        concave phi the two are exchanged. So f's two parabolas times the ends of the range of m
-        bound phi, and one parabola bounds several (`_common_upper_bound`).
+        Chords. Let x = f(s) - f(0), which is between x- and x+. Then phi(f(0) + x) - phi(f(0)) = m
+        x, where m is the slope of a chord of phi from f(0). m lies in the range of phi' and, for
+        convex phi, between the slopes of the chords to x- and to x+. For a convex phi these two
+        chords give the upper bound. The tangent at f(0) gives the lower bound, as phi lies above
+        it. For concave phi the two are exchanged. So the two parabolas of f, times the two ends of
+        the range of m, bound phi(f) - phi(f(0)). One parabola bounds these four
+        (`_common_upper_bound`).
 
-        Taylor. It is phi'(f(0)) x + phi''(z) x^2/2, and x^2 lies in s^2 times the squares of the
-        slopes of f's own chords.
+        Taylor. The same difference is phi'(f(0)) x + phi''(z) x^2/2 for some z. Here x^2 is between
+        s^2 times the squares of the slopes of f's own chords.
         """
         if self.polynomial_degree == 0:
-            value = function.ranges(_dynamic(self.value, self.piece_length))[0]
-            return self._made(value, (0.0, 0.0), (0.0, 0.0), 0)
+            value = function.ranges(_on_backend(self.value, self.piece_length))[0]
+            return self._new(value, (0.0, 0.0), (0.0, 0.0), 0)
         if isinstance(function, ClippedPower) and self.polynomial_degree is not None:
             return self._clipped_power(function)
         lower, upper = self.bounds
         h = self.piece_length
-        start = _dynamic(self.value, h)
-        fall, rise = -_maximum_on_piece(_negative(lower), h), _maximum_on_piece(upper, h)
+        start = _on_backend(self.value, h)
+        fall, rise = -_maximum_on_piece(_negate(lower), h), _maximum_on_piece(upper, h)
         value, slope, _ = function.ranges(start)
         _, slopes, curvature = function.ranges(
             Interval((start + Interval(fall, fall)).lower, (start + Interval(rise, rise)).upper)
@@ -270,112 +300,120 @@ class ParabolaBounds(FormulaNumber):
             ((function.ranges(start.shifted(x))[0] - value) * Interval.point(x).reciprocal())
             for x in (fall, rise)
         ]
-        first, last = (bound.intersect(slopes) for bound in chords)
+        to_min, to_max = (bound.intersect(slopes) for bound in chords)
         convex, concave = curvature.lower >= 0, curvature.upper <= 0
 
         # For convex phi, x > 0 needs the upper chord and x < 0 the lower one.
         upper_slopes = (
-            dr.select(concave, slope.lower, dr.select(convex, first.lower, slopes.lower)),
-            dr.select(concave, slope.upper, dr.select(convex, last.upper, slopes.upper)),
+            dr.select(concave, slope.lower, dr.select(convex, to_min.lower, slopes.lower)),
+            dr.select(concave, slope.upper, dr.select(convex, to_max.upper, slopes.upper)),
         )
         lower_slopes = (
-            dr.select(convex, slope.lower, dr.select(concave, last.lower, slopes.lower)),
-            dr.select(convex, slope.upper, dr.select(concave, first.upper, slopes.upper)),
+            dr.select(convex, slope.lower, dr.select(concave, to_max.lower, slopes.lower)),
+            dr.select(convex, slope.upper, dr.select(concave, to_min.upper, slopes.upper)),
         )
         above = _common_upper_bound(
-            [_times(m, bound) for m in upper_slopes for bound in (lower, upper)], h
+            [_scale(m, bound) for m in upper_slopes for bound in (lower, upper)], h
         )
         below = _common_lower_bound(
-            [_times(m, bound) for m in lower_slopes for bound in (lower, upper)], h
+            [_scale(m, bound) for m in lower_slopes for bound in (lower, upper)], h
         )
-        by_taylor = self._taylor(slope, curvature)
+        by_taylor = self._taylor_bounds(slope, curvature)
         if self.bound_degree == 1:
             by_taylor = _lines_bounding_parabolas(*by_taylor, h)
             below, above = _lines_bounding_parabolas(below, above, h)
-        return self._made(
+        return self._new(
             value,
-            _tighter(below, by_taylor[0], h, -1),
-            _tighter(above, by_taylor[1], h, 1),
+            _tighter_bound(below, by_taylor[0], h, -1),
+            _tighter_bound(above, by_taylor[1], h, 1),
         )
 
-    def _taylor(self, slope: Interval, curvature: Interval) -> tuple[Quadratic, Quadratic]:
+    def _taylor_bounds(self, slope: Interval, curvature: Interval) -> tuple[Quadratic, Quadratic]:
+        """The bounds of phi(f) by Taylor's formula: see `apply`.
+
+        slope: the range of phi' at f(0).
+        curvature: the range of phi'' on the range of f.
+        """
         moved = self._scaled(slope)
         (low, _), (high, _) = _lines_bounding_parabolas(self.lower, self.upper, self.piece_length)
         half = Interval(0.5 * curvature.lower, 0.5 * curvature.upper)
         remainder = half * Interval(low, high).square()
         return (
-            _added(moved.lower, (0.0, remainder.lower), -1),
-            _added(moved.upper, (0.0, remainder.upper), 1),
+            _sum(moved.lower, (0.0, remainder.lower), -1),
+            _sum(moved.upper, (0.0, remainder.upper), 1),
         )
 
     def pointwise_maximum(self, other: Any) -> ParabolaBounds:
-        """max(f, g).
+        """The maximum of two functions f and g at each point.
 
-        Proof. Above: f <= f(0) + F+ and g the same; with V = max(f(0), g(0)) both lie below V
-        + (f(0) - V) + F+, and one parabola bounds both (`_common_upper_bound`), unless one is
-        larger on the whole length. Below: max(f, g) is at least whichever is the larger at 0.
+        Proof. Let f(s) <= f(0) + F+(s), the same for g, and V = max(f(0), g(0)). Above: f is below
+        V + (f(0) - V) + F+, and g likewise. One parabola bounds both (`_common_upper_bound`),
+        unless one function is larger on the whole length. Below: the maximum is at least the
+        function that is larger at s = 0.
         """
         f, g = self.value, other.value
         h = self.piece_length
         (f_low, f_high), (g_low, g_high) = self.bounds, other.bounds
-        left, right = (f - g).lower >= 0, (g - f).lower >= 0  # proved to be larger at 0
+        f_larger, g_larger = (f - g).lower >= 0, (g - f).lower >= 0  # proved to be larger at 0
         below = _common_lower_bound([f_low, g_low], h)
-        below = _where(left, f_low, _where(right, g_low, below))
+        below = _select(f_larger, f_low, _select(g_larger, g_low, below))
         # Proved to be larger on the whole length: f's least is above g's largest.
-        f_least, f_most = -_maximum_on_piece(_negative(f_low), h), _maximum_on_piece(f_high, h)
-        g_least, g_most = -_maximum_on_piece(_negative(g_low), h), _maximum_on_piece(g_high, h)
+        f_fall, f_rise = -_maximum_on_piece(_negate(f_low), h), _maximum_on_piece(f_high, h)
+        g_fall, g_rise = -_maximum_on_piece(_negate(g_low), h), _maximum_on_piece(g_high, h)
         always_f = (f - g).lower + _shift_by_rounding(
-            f_least - g_most, -1, dr.abs(f_least) + g_most
+            f_fall - g_rise, -1, dr.abs(f_fall) + g_rise
         ) >= 0
         always_g = (g - f).lower + _shift_by_rounding(
-            g_least - f_most, -1, dr.abs(g_least) + f_most
+            g_fall - f_rise, -1, dr.abs(g_fall) + f_rise
         ) >= 0
         offsets = fmin((f - g).upper, 0), fmin((g - f).upper, 0)
         above = _common_upper_bound([f_high, g_high], h, offsets)
-        above = _where(always_f, f_high, _where(always_g, g_high, above))
-        below = _where(always_f, f_low, _where(always_g, g_low, below))
+        above = _select(always_f, f_high, _select(always_g, g_high, above))
+        below = _select(always_f, f_low, _select(always_g, g_low, below))
         value = Interval(fmax(f.lower, g.lower), fmax(f.upper, g.upper))
-        return self._made(value, below, above)
+        return self._new(value, below, above)
 
     def polar_angle(self, x: Any) -> ParabolaBounds:
-        """The polar angle atan2(y, x) of z = (x, y): at the start of the path, and its change
-        relative to a fixed direction c.
+        """The polar angle atan2(y, x) of z = (x, y), where y is this function: its value at the
+        start of the path, and bounds of its change, which is that of the angle relative to a fixed
+        direction c.
 
-        Proof. For any vector c = (a, b) the angle of z = (x, y) differs from that of (x a + y b, y
-        a - x b) by a constant along a path that does not meet the cut, and where x a + y b > 0 the
+        Proof. For any vector c = (a, b), the angle of z = (x, y) and the angle of (x a + y b, y a -
+        x b) differ by a constant along a path that does not meet the cut. Where x a + y b > 0 the
         latter is an arc tangent. Elsewhere nothing is known beyond the start.
         """
         h = self.piece_length
-        v, u = (_dynamic(bounds.value, h) for bounds in (self, x))
+        v, u = (_on_backend(bounds.value, h) for bounds in (self, x))
         value, _ = angle_range(v, u)
         a, b = approximate_direction(u.midpoint, v.midpoint)
         ahead, aside = x * a + self * b, self * a - x * b
         relative = aside.product(ahead.apply(reciprocal)).apply(atan)
         is_valid = ~meets_branch_cut(self._range(), x._range()) & (ahead._range().lower > 0)
         zero = 0 * h
-        return self._made(
+        return self._new(
             value,
-            _where(is_valid, relative.lower, (zero - dr.inf, zero)),
-            _where(is_valid, relative.upper, (zero + dr.inf, zero)),
+            _select(is_valid, relative.lower, (zero - dr.inf, zero)),
+            _select(is_valid, relative.upper, (zero + dr.inf, zero)),
         )
 
     def _range(self) -> Interval:
         """The range of the function on the whole length."""
-        h, value = self.piece_length, _dynamic(self.value, self.piece_length)
-        fall, rise = _maximum_on_piece(_negative(self.lower), h), _maximum_on_piece(self.upper, h)
+        h, value = self.piece_length, _on_backend(self.value, self.piece_length)
+        fall, rise = _maximum_on_piece(_negate(self.lower), h), _maximum_on_piece(self.upper, h)
         return Interval(
             (value + Interval(-fall, -fall)).lower, (value + Interval(rise, rise)).upper
         )
 
     def _clipped_power(self, function: ClippedPower) -> ParabolaBounds:
-        """max(f, 0)^n for a polynomial f.
+        """Bounds of max(f, 0)^n for a polynomial f = v + a s + b s^2.
 
-        Proof. If f = v + a s + b s^2 is concave, f > 0 on at most one interval [s0, s1] of [0, h].
-        There f^n is a product, whose derivative lies between two lines. Elsewhere the derivative is
-        0. A line above the first, raised to at least 0 at both ends of [0, h], is above both; its
-        integral is the bound. Rounding may put s0 and s1 where f is as large as r, a few
-        units of |v| + |a| h + |b| h^2: there the derivative is at most n r^(n-1) (|a| + 2 |b| h).
-        Where f is convex, the general bounds of `apply` are used.
+        Proof. If f is concave, f > 0 on at most one interval [s0, s1] of [0, h]. There f^n is a
+        product, whose derivative lies between two lines. Elsewhere the derivative is 0. Take the
+        upper line and raise it to at least 0 at both ends of [0, h]: it is then above the
+        derivative everywhere, and its integral is the bound. The lower bound is found likewise. By
+        rounding, s0 and s1 may be put where f is as large as r, a few units in the last place of
+        |v| + |a| h + |b| h^2; there the derivative is at most n r^(n-1) (|a| + 2 |b| h). If f is
+        convex, the general bounds of `apply` are used.
 
         Source: Aydinlilar and Zanni 2023, section 6.2.1, with a corrected extension to [0, h].
         """
@@ -394,43 +432,49 @@ class ParabolaBounds(FormulaNumber):
         root_1 = dr.select(dr.isfinite(root_1), root_1, 0)
         root_2 = dr.select(dr.isfinite(root_2), root_2, 0)
         start, end = clamp(fmin(root_1, root_2), 0, h), clamp(fmax(root_1, root_2), 0, h)
-        empty = (square <= 0) | (end <= start)
-        start, end = dr.select(empty, 0, start), dr.select(empty, h, end)
+        is_empty = (square <= 0) | (end <= start)
+        start, end = dr.select(is_empty, 0, start), dr.select(is_empty, h, end)
 
         n = function.exponent
         inner = fmax(v + start * (a + b * start), 0)
-        turned = a + 2 * b * start
-        on_it = ParabolaBounds(
+        slope = a + 2 * b * start
+        inner_power = ParabolaBounds(
             Interval(fmax(inner - value_error, 0), inner + value_error),
-            (turned - _rounding_bound(dr.abs(a) + 2 * dr.abs(b) * h) - ra - 2 * rb * h, b - rb),
-            (turned + _rounding_bound(dr.abs(a) + 2 * dr.abs(b) * h) + ra + 2 * rb * h, b + rb),
+            (slope - _rounding_bound(dr.abs(a) + 2 * dr.abs(b) * h) - ra - 2 * rb * h, b - rb),
+            (slope + _rounding_bound(dr.abs(a) + 2 * dr.abs(b) * h) + ra + 2 * rb * h, b + rb),
             end - start,
             self.bound_degree,
             2,
         )._power_by_squaring(n)
-        value, _, _ = function.ranges(_dynamic(self.value, h))
-        tail = n * (2 * value_error) ** (n - 1) * (dr.abs(a) + ra + 2 * (dr.abs(b) + rb) * h)
+        value, _, _ = function.ranges(_on_backend(self.value, h))
+        outer_slope = n * (2 * value_error) ** (n - 1) * (dr.abs(a) + ra + 2 * (dr.abs(b) + rb) * h)
         is_cut = (start > 0) | (end < h)
         if self.bound_degree == 1:
-            lower, upper = on_it._extend_lines(start, end, h, value, is_cut, tail)
+            lower, upper = inner_power._extend_lines(start, end, h, value, is_cut, outer_slope)
         else:
-            lower, upper = on_it._extend_parabolas(start, h, is_cut, tail)
-        lower = _where(empty, (-tail, 0.0), lower)
-        upper = _where(empty, (tail, 0.0), upper)
+            lower, upper = inner_power._extend_parabolas(start, h, is_cut, outer_slope)
+        lower = _select(is_empty, (-outer_slope, 0.0), lower)
+        upper = _select(is_empty, (outer_slope, 0.0), upper)
         general = ParabolaBounds(self.value, self.lower, self.upper, h, self.bound_degree)
         general = ParabolaBounds.apply(general, function)
         bends_down = b + rb < 0
-        return self._made(
+        return self._new(
             value,
-            _where(bends_down, lower, general.lower),
-            _where(bends_down, upper, general.upper),
+            _select(bends_down, lower, general.lower),
+            _select(bends_down, upper, general.upper),
         )
 
     def _extend_parabolas(
         self, start: Real, length: Real, is_cut: Any, tail: Real
     ) -> tuple[Quadratic, Quadratic]:
-        """Bounds, on all of [0, length], of a function that equals this function on an interval
-        that begins at `start`, and is constant elsewhere."""
+        """Extend bounds from an interval to all of [0, length]: parabolas.
+
+        This function is known on an interval that begins at `start`. The bounds are for a function
+        that equals it there and is constant before and after.
+
+        is_cut: whether the interval is not all of [0, length].
+        tail: a bound of the derivative outside of the interval, which rounding may cause.
+        """
         bounds: list[Quadratic] = []
         for sign, (a, b) in ((-1, self.lower), (1, self.upper)):
             at_start = a - 2 * b * start
@@ -439,41 +483,49 @@ class ParabolaBounds(FormulaNumber):
             ends = [end + sign * rounding for end in (at_start, at_end)]
             extreme = _maximum_or_inf if sign > 0 else _minimum_or_inf
             ends = [dr.select(is_cut, extreme(end, 0 * end), end) * length for end in ends]
-            bounds.append(_integral(ends[0], ends[1], length))
+            bounds.append(_parabola_of_slopes(ends[0], ends[1], length))
         return bounds[0], bounds[1]
 
     def _extend_lines(
         self, start: Real, end: Real, length: Real, value: Interval, is_cut: Any, tail: Real
     ) -> tuple[Quadratic, Quadratic]:
-        """As `_extend_parabolas`, with straight bounds.
+        """Extend bounds from an interval to all of [0, length]: lines; see `_extend_parabolas`.
 
-        Proof. Before `start` f is 0 and so is its value there: a line from 0 at 0 to the bound at
-        `end` lies above. Behind `end` f is 0: a slope of at least -value/s is above -value for all
-        s >= end, if it is at least -value/length.
+        start, end: the ends of the interval.
+        value: the range of the extended function at s = 0.
+
+        Proof. Before `start` the extended function is 0, as at s = 0. So a line from 0 at s = 0 to
+        the bound at `end` lies above it. Behind `end` the function is 0, that is, its change is
+        -value. A line of slope at least -value/s is above -value at s; slope -value/length is
+        enough for all s >= end.
         """
         (low, _), (high, _) = self.bounds
-        part = (end - start) / end * (1 + 8 * machine_epsilon(length))
-        behind = -(value.lower / length)
-        behind = behind + _rounding_bound(dr.abs(behind))
+        fraction = (end - start) / end * (1 + 8 * machine_epsilon(length))
+        slope_behind = -(value.lower / length)
+        slope_behind = slope_behind + _rounding_bound(dr.abs(slope_behind))
         before = start > 0
-        high = dr.select(before, _maximum_or_inf(high, 0 * high) * part, high)
-        low = dr.select(before, _minimum_or_inf(low, 0 * low) * part, low)
-        high = dr.select(end < length, _maximum_or_inf(high, behind), high)
+        high = dr.select(before, _maximum_or_inf(high, 0 * high) * fraction, high)
+        low = dr.select(before, _minimum_or_inf(low, 0 * low) * fraction, low)
+        high = dr.select(end < length, _maximum_or_inf(high, slope_behind), high)
         low = dr.select(end < length, _minimum_or_inf(low, -(value.upper / end) * (1 + 1e-6)), low)
         margin = dr.select(is_cut, tail, 0)
         return (low - margin, 0.0), (high + margin, 0.0)
 
 
 def _lines_bounding_cubic(c0: Real, c1: Real, c2: Real, c3: Real) -> tuple[Real, Real, Real, Real]:
-    """Lines below and above c0 + c1 r + c2 r^2 + c3 r^3 on [0, 1]: their values at 0 and 1.
+    """Lines below and above the cubic c0 + c1 r + c2 r^2 + c3 r^3 on [0, 1].
 
-    Proof. On either side of its inflection the cubic is convex or concave, so it lies between a
-    chord and the tangent at the end nearer to 0. The line through the larger values of two lines at
-    0 and 1 is above both. A second derivative whose sign is mistaken is as small as its rounding.
+    Returns l0, l1, u0, u1: the values of the lower line at 0 and 1, and of the upper line at 0 and
+    1.
+
+    Proof. On either side of its inflection the cubic is convex or concave. So it lies there between
+    a chord and the tangent at the end nearer to 0. The line through the larger values of two lines
+    at 0 and 1 is above both. If rounding mistakes the sign of a second derivative, that derivative
+    is as small as its rounding error.
     """
     t = -c2 / (3 * c3)
-    two = (t > 0) & (t < 1)
-    t = dr.select(two, t, 1)
+    is_divided = (t > 0) & (t < 1)
+    t = dr.select(is_divided, t, 1)
 
     chord = c1 + t * (c2 + t * c3)
     convex = c2 + 1.5 * c3 * t >= 0
@@ -487,18 +539,21 @@ def _lines_bounding_cubic(c0: Real, c1: Real, c2: Real, c3: Real) -> tuple[Real,
     convex = c2 + 1.5 * c3 * (1 + t) >= 0
     steep = dr.select(convex, chord, tangent)
     flat = dr.select(convex, tangent, chord)
-    u0 = dr.select(two, fmax(u0, value - steep * t), u0)
-    u1 = dr.select(two, fmax(u1, value + steep * (1 - t)), u1)
-    l0 = dr.select(two, fmin(l0, value - flat * t), l0)
-    l1 = dr.select(two, fmin(l1, value + flat * (1 - t)), l1)
+    u0 = dr.select(is_divided, fmax(u0, value - steep * t), u0)
+    u1 = dr.select(is_divided, fmax(u1, value + steep * (1 - t)), u1)
+    l0 = dr.select(is_divided, fmin(l0, value - flat * t), l0)
+    l1 = dr.select(is_divided, fmin(l1, value + flat * (1 - t)), l1)
     return l0, l1, u0, u1
 
 
 def _lines_bounding_parabolas(
     lower: Quadratic, upper: Quadratic, h: Real
 ) -> tuple[Quadratic, Quadratic]:
-    """Lines below and above two parabolas: a parabola through 0 lies between its tangent at 0 and
-    its chord to h."""
+    """A line below the parabola `lower` and one above the parabola `upper` on [0, h], as (slope,
+    0).
+
+    A parabola through 0 lies between its tangent at 0 and its chord to h.
+    """
     (a, b), (c, d) = lower, upper
     if _is_zero(b) and _is_zero(d):
         return lower, upper
@@ -507,8 +562,9 @@ def _lines_bounding_parabolas(
     return (low, 0.0), (high, 0.0)
 
 
-def _integral(at_start: Real, at_end: Real, length: Real) -> Quadratic:
-    """The parabola through 0 whose derivative, times h, has these values at 0 and at h."""
+def _parabola_of_slopes(at_start: Real, at_end: Real, length: Real) -> Quadratic:
+    """The parabola (a, b) through 0 whose derivative, times `length`, is `at_start` at 0 and
+    `at_end` at `length`."""
     nonempty = length > 0
     a = dr.select(nonempty, at_start / length, 0)
     b = dr.select(nonempty, (at_end - at_start) / (2 * length * length), 0)
@@ -518,10 +574,14 @@ def _integral(at_start: Real, at_end: Real, length: Real) -> Quadratic:
 def _common_upper_bound(
     parabolas: list[Quadratic], length: Real, offsets: tuple[Real, ...] = ()
 ) -> Quadratic:
-    """A parabola through 0 above several parabolas, each with an offset <= 0, on [0, length].
+    """A parabola through 0 that is above several parabolas on [0, length].
 
-    Proof. On [0, h] c + a s + b s^2 is a mean, with weights >= 0, of the control values c,
-    c + a h/2, c + a h + b h^2 (Bernstein 1912): larger control values make a larger parabola.
+    parabolas: the parabolas (a, b).
+    offsets: a number c <= 0 for each, for the parabola c + a s + b s^2; by default 0.
+
+    Proof. On [0, h] the value of c + a s + b s^2 is a weighted mean, with weights >= 0, of the
+    control values c, c + a h/2 and c + a h + b h^2 (Bernstein 1912). So larger control values make
+    a larger parabola.
     """
     h = length
     middles: list[Real] = []
@@ -541,19 +601,22 @@ def _common_upper_bound(
 
 
 def _common_lower_bound(parabolas: list[Quadratic], length: Real) -> Quadratic:
-    return _negative(_common_upper_bound([_negative(parabola) for parabola in parabolas], length))
+    """A parabola through 0 that is below several parabolas on [0, length]."""
+    return _negate(_common_upper_bound([_negate(parabola) for parabola in parabolas], length))
 
 
-def _tighter(first: Quadratic, second: Quadratic, length: Real, sign: int) -> Quadratic:
-    """The tighter of two bounds on one side, compared at one point; if one bound is NaN, the
-    other."""
+def _tighter_bound(first: Quadratic, second: Quadratic, length: Real, sign: int) -> Quadratic:
+    """The tighter of two bounds on one side, compared at one point; if one bound is NaN, the other.
+
+    sign: 1 for upper bounds, -1 for lower bounds.
+    """
     r = _COMPARED_AT * length
     first_value, second_value = (sign * r * (a + b * r) for a, b in (first, second))
-    return _where((first_value <= second_value) | ~dr.isfinite(second_value), first, second)
+    return _select((first_value <= second_value) | ~dr.isfinite(second_value), first, second)
 
 
 def _maximum_on_piece(q: Quadratic, length: Real) -> Real:
-    """The largest value of a s + b s^2 on [0, length]."""
+    """An upper bound of a s + b s^2 on [0, length], where q = (a, b); infinite if it is NaN."""
     a, b = q
     if _is_zero(a) and _is_zero(b):
         return 0 * length
@@ -565,8 +628,11 @@ def _maximum_on_piece(q: Quadratic, length: Real) -> Real:
     return _maximum_or_inf(0 * length, last, vertex)
 
 
-def _added(first: Quadratic, second: Quadratic, sign: int) -> Quadratic:
+def _sum(first: Quadratic, second: Quadratic, sign: int) -> Quadratic:
+    """The sum of two bounds, rounded upwards (sign 1) or downwards (sign -1)."""
+
     def plus(x: Real, y: Real) -> Real:
+        """The sum of two coefficients, rounded to the side of `sign`; exact if one is 0."""
         if _is_zero(y):
             return x
         return y if _is_zero(x) else _shift_by_rounding(x + y, sign, 0.0)
@@ -574,20 +640,23 @@ def _added(first: Quadratic, second: Quadratic, sign: int) -> Quadratic:
     return plus(first[0], second[0]), plus(first[1], second[1])
 
 
-def _times(m: Real, q: Quadratic) -> Quadratic:
+def _scale(m: Real, q: Quadratic) -> Quadratic:
+    """The parabola q times the number m, without rounding outwards."""
     return m * q[0], m * q[1]
 
 
-def _negative(q: Quadratic) -> Quadratic:
+def _negate(q: Quadratic) -> Quadratic:
+    """The parabola -q."""
     return -q[0], -q[1]
 
 
-def _where(mask: Any, first: Quadratic, second: Quadratic) -> Quadratic:
+def _select(mask: Any, first: Quadratic, second: Quadratic) -> Quadratic:
+    """The first parabola on lanes where the mask is set, the second one elsewhere."""
     return dr.select(mask, first[0], second[0]), dr.select(mask, first[1], second[1])
 
 
 def _midpoint_and_half_width(low: Real, high: Real) -> tuple[Real, Real]:
-    """The middle of two numbers and the distance of both from it."""
+    """The middle of two numbers, and an upper bound of the distance of both from it."""
     if low is high or (_is_zero(low) and _is_zero(high)):
         return low, 0.0
     middle = 0.5 * low + 0.5 * high
@@ -595,20 +664,21 @@ def _midpoint_and_half_width(low: Real, high: Real) -> tuple[Real, Real]:
 
 
 def _midpoint_and_radius(x: Interval) -> tuple[Real, Real]:
+    """The middle of an interval, and an upper bound of the distance of its numbers from the
+    middle."""
     return x.midpoint, _radius(x)
 
 
 def _radius(x: Interval) -> Real:
-    """The largest distance of numbers of an interval from its middle, including the rounding of the
-    middle."""
+    """An upper bound of the distance of an interval's numbers from its rounded middle."""
     if x.lower is x.upper or x.is_zero:
         return 0.0
     radius = x.radius
     return radius if isinstance(radius, float) else radius + _rounding_bound(dr.abs(x.midpoint))
 
 
-def _dynamic(x: Interval, like: Real) -> Interval:
-    """The interval as numbers of the backend."""
+def _on_backend(x: Interval, like: Real) -> Interval:
+    """The interval with ends of the type of `like`, if its ends are Python numbers."""
     if not x.is_literal:
         return x
     kind = cast("Any", type(like))
@@ -617,16 +687,21 @@ def _dynamic(x: Interval, like: Real) -> Interval:
 
 
 def _is_zero(x: Real) -> bool:
+    """Whether x is the Python number 0.0, which is known while a kernel is being recorded."""
     return isinstance(x, float) and x == 0.0
 
 
 def _shift_by_rounding(x: Real, sign: int, size: Real) -> Real:
-    """x, computed from numbers of that size, moved up (sign 1) or down by its rounding."""
+    """x, moved up (sign 1) or down (sign -1) by a bound of its rounding error.
+
+    size: the sum of the absolute values of the numbers from which x was computed.
+    """
     return x + sign * _rounding_bound(dr.abs(x) + size)
 
 
 def _rounding_bound(size: Real) -> Real:
-    """A bound of the rounding and underflow in a sum of numbers with this sum of sizes."""
+    """A bound of the rounding and underflow in a sum; size: the sum of the absolute values of its
+    terms."""
     if isinstance(size, float):
         assert size == 0.0
         return 0.0
@@ -643,4 +718,5 @@ def _maximum_or_inf(*numbers: Real) -> Real:
 
 
 def _minimum_or_inf(*numbers: Real) -> Real:
+    """The smallest number; minus infinity if one is NaN."""
     return -_maximum_or_inf(*(-number for number in numbers))

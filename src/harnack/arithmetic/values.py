@@ -1,11 +1,11 @@
 """`Values`: the range of a formula on a box, and whether the formula is continuous there.
 
-Ranges of derivatives prove long steps where a formula is smooth. Beside a vertical tangent, as that
-of sqrt(|x|) at x = 0, they are unbounded, and where the formula has no value at all they prove
+Ranges of derivatives prove long steps where a formula is smooth. Near a vertical tangent, such as
+that of sqrt(|x|) at x = 0, they are unbounded, and where the formula has no value they prove
 nothing. The range of values does prove steps there: sqrt(|x|) + 0.5 is at least 0.5, whatever its
 slope.
 
-`tally_of` determines the formulas for which this may be needed, before anything is recorded.
+`tally_of` finds out, before a kernel is recorded, whether a formula may need this.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
 
 
-# Ranges beyond this power of the largest number belong to numbers that overflow, whatever their
-# other end.
-_LARGE = 0.5
+# The exponent e of `_is_lost`: a range with an infinite end counts as known to be large if its
+# other end exceeds (largest number)^e.
+_LARGE_EXPONENT = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Values(FormulaNumber):
     """The range of a function on a box of its variables.
 
-    value: its range, over the points of the box at which it has a value.
+    value: the range of its values, over the points of the box at which it has one.
     nowhere: whether it has a value at no point of the box.
-    jumps: whether it may jump, or have a pole, in the box: it is not proved to be continuous where
-        it has a value. It also counts as jumping where numbers overflowed on the way to the value,
-        unless they are known to be large: its range may then be far larger than its values.
+    jumps: whether it may jump or have a pole in the box, that is, whether it is not proved to be
+        continuous where it has a value. This is also set if numbers overflowed on the way to the
+        value, unless they are known to be large: the range may then be far larger than the values.
     gaps: whether there may be points of the box at which it has no value.
     """
 
@@ -50,7 +50,10 @@ class Values(FormulaNumber):
 
     @classmethod
     def between(cls, p: Vec3, q: Vec3, slack: Real | None) -> tuple[Values, Values, Values]:
-        """The coordinates on the smallest box around two points, `slack` larger on all sides."""
+        """The three coordinates on the smallest box that contains the points p and q.
+
+        slack: a length by which the box is larger on all sides; None for 0.
+        """
         no = p.x != p.x
         no = no & ~no
         padding = ZERO if slack is None else Interval(-slack, slack)
@@ -61,6 +64,7 @@ class Values(FormulaNumber):
         return x, y, z
 
     def constant(self, x: float | Real) -> Values:
+        """A constant number as a function on the same box."""
         no = self.nowhere & ~self.nowhere
         kind = cast("Any", type(self.value.lower))
         if dr.is_array_v(cast("Any", type(x))):
@@ -88,6 +92,7 @@ class Values(FormulaNumber):
         return self.apply(power(exponent_of(exponent)))
 
     def apply(self, function: ElementaryFunction) -> Values:
+        """The composition of an elementary function with this function."""
         x = self.value
         value, (low, high) = function.ranges(x)[0], function.domain
         nowhere, gaps = self.nowhere, self.gaps
@@ -96,16 +101,19 @@ class Values(FormulaNumber):
         if high < math.inf:
             nowhere, gaps = nowhere | (x.lower > high), gaps | ~(x.upper <= high)
         # The range of a box with a pole is all numbers.
-        pole = _is_lost(value, 0.0 if function.has_pole else _LARGE)
+        pole = _is_lost(value, 0.0 if function.has_pole else _LARGE_EXPONENT)
         return Values(value, nowhere, self.jumps | _is_lost(x) | pole, gaps)
 
     def checked(self) -> Values:
-        """The same range; it may jump where numbers that overflowed left no range."""
+        """The same range, with `jumps` set where numbers overflowed so that no range is known."""
         return replace(self, jumps=self.jumps | _is_lost(self.value))
 
     def pointwise_maximum(self, other: Values) -> Values:
-        """The larger of two functions. Where only one of them has a value, the result may count as
-        that value or have none: the range holds both, and may jump."""
+        """The larger of two functions at each point.
+
+        Where only one of them has a value, the result may count as that value or as having none. So
+        the range then contains both ranges, and may jump.
+        """
         x, y = self.value, other.value
         gaps = self.gaps | other.gaps
         either = _unless(self.nowhere, x, y).hull(_unless(other.nowhere, y, x))
@@ -124,7 +132,8 @@ class Values(FormulaNumber):
         return Values(value, angle.nowhere, jumps, angle.gaps)
 
     def _with(self, value: Interval, other: Values) -> Values:
-        """The range of a function of this and another function."""
+        """A function with this range, computed from this and another function: it has no value
+        where one of the two has none, and may jump where one of the two may."""
         return Values(
             value,
             self.nowhere | other.nowhere,
@@ -133,9 +142,12 @@ class Values(FormulaNumber):
         )
 
 
-def _is_lost(x: Interval, large: float = _LARGE) -> Mask:
-    """Whether a range has an infinite end, and is not altogether beyond this power of the largest
-    number; 0 for no such power."""
+def _is_lost(x: Interval, large: float = _LARGE_EXPONENT) -> Mask:
+    """Whether a range has an infinite end or NaN, and is not known to be large.
+
+    large: the exponent e. The range is known to be large if all of it is beyond (largest number)^e,
+        on the positive or on the negative side. With 0.0, no range with such an end is.
+    """
     lost = ~(dr.isfinite(x.lower) & dr.isfinite(x.upper))
     if large == 0.0:
         return lost
@@ -144,5 +156,5 @@ def _is_lost(x: Interval, large: float = _LARGE) -> Mask:
 
 
 def _unless(condition: Mask, x: Interval, y: Interval) -> Interval:
-    """The interval x, or y where the condition holds."""
+    """The interval x on lanes where the condition does not hold, y where it does."""
     return Interval(dr.select(condition, y.lower, x.lower), dr.select(condition, y.upper, x.upper))

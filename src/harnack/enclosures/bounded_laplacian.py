@@ -1,7 +1,7 @@
 """An enclosure of functions that are not harmonic but have a bounded Laplacian.
 
-The talk on Gillespie, Yang, Botsch, Crane 2024 names it as future work; the proof below and its
-constant are new in harnack.
+The talk on Gillespie, Yang, Botsch, Crane 2024 names such functions as future work; the proof below
+and its constant are new in harnack.
 """
 
 from __future__ import annotations
@@ -27,14 +27,15 @@ if TYPE_CHECKING:
     from harnack.backend import Mask, Real
 
 GREEN_KERNEL_BOUND = 0.394
-"""kappa <= GREEN_KERNEL_BOUND q^2 (2 + ln(1/q))/(1-q^2)^2, proved by
-`tests/oracles/green_kernel.py`."""
+"""The constant in kappa <= GREEN_KERNEL_BOUND q^2 (2 + ln(1/q))/(1-q^2)^2, for the kappa of
+`BoundedLaplacianEnclosure`; proved by `tests/oracles/green_kernel.py`."""
 
 GREEN_SLOPE_BOUND = 0.1907
 """The integral of |G(0,.) + d_v G(0,.)/3| over the unit ball, (19 - 6 ln 3 - 2 sqrt(3) pi)/8,
 rounded up."""
 
-# A gap of this many times the scale of the bound is reached only within 1e-6 of the sphere.
+# Gaps above this multiple of the scale of the bound count as this multiple, which is reached only
+# within 1e-6 of the sphere.
 _UNREACHABLE_GAP = 1e18
 
 
@@ -42,39 +43,45 @@ _UNREACHABLE_GAP = 1e18
 class BoundedLaplacianEnclosure(Enclosure):
     """An enclosure of f with c <= f <= C and a <= Laplacian f <= b on B(p, R) of space.
 
-    Proof, R = 1, x = p + q v. With G the Green function of the ball, f = h - integral of G Lap f,
-    where h is harmonic with the boundary values of f, so c <= h <= C. As in `HarnackSlopeEnclosure`
-    the chord of the Poisson kernel gives h(x) <= c + (h(p)-c) A + (h_v(p)/3) B with A =
-    (1+3q^2)/(1-q^2)^2 and B = (3q+q^3)/(1-q^2)^2. Put h = f + integral of G Lap f in all three
-    places:
+    radius: R.
+    max_fall, max_rise: f(p) - c and C - f(p).
+    laplacian_mean, laplacian_spread: m R^2 and l R^2, with m = (a+b)/2 and l = (b-a)/2.
+    slopes: the range of the derivative of f along the path at p.
+
+    Proof for R = 1, at the point x = p + q v for a unit direction v. Let G be the Green function of
+    the ball. Then f = h - integral of G Lap f, where h is harmonic with the boundary values of f,
+    so c <= h <= C. As in `HarnackSlopeEnclosure`, the chord of the Poisson kernel gives
+    h(x) <= c + (h(p)-c) A + (h_v(p)/3) B with A = (1+3q^2)/(1-q^2)^2 and B = (3q+q^3)/(1-q^2)^2.
+    Put h = f + integral of G Lap f in all three places:
 
         f(x) <= c + (f(p)-c) A + (f_v(p)/3) B + integral of K Lap f,
         K = -G(x,.) + A G(p,.) + (B/3) d_v G(p,.).
 
-    With m = (a+b)/2 and l = (b-a)/2 the integral is at most m (A-1+q^2)/6 + l kappa(q), since the
-    integral of G(x,.) is (1-q^2)/6 and that of d_v G(p,.) is 0; kappa is the integral of |K|, and
+    Let kappa be the integral of |K|. The integral of K Lap f is at most m (A-1+q^2)/6 + l kappa(q),
+    since the integral of G(x,.) is (1-q^2)/6 and that of d_v G(p,.) is 0. And
 
         kappa(q) <= 0.394 q^2 (2 + ln(1/q))/(1-q^2)^2  for all 0 < q < 1,
 
-    proved by a quadrature with an error bound (`tests/oracles/green_kernel.py`); numerically no
-    constant below 0.391 would do, and the logarithm is needed. From below the same holds of -f,
-    with -C, -b and -a.
+    which is proved by a quadrature with an error bound (`tests/oracles/green_kernel.py`).
+    Numerically no constant below 0.391 would do, and the logarithm is needed. The bound of f from
+    below is that of -f from above, with -C, -b and -a.
 
-    The first crossing is unique. Let w = f(p)-c + m/6 be at least 0 and m q^2/6 at most 0 left out,
-    both of which only raise the bound. As h-c is positive, |h_v(p)|/3 <= h(p)-c, that is |f_v(p)|/3
-    <= w + 0.1907 l (the norm of G(p,.) + d_v G(p,.)/3); a larger slope is clamped to it. Then the
-    bound, w (A-1) + (f_v/3) B + l kappa + m q^2/6, is convex in q, since A'' >= |B''| and kappa''
-    >= 0.1907 B'' (checked in the same place), and it is 0 at q = 0.
+    The first crossing of a level is unique. Let w = f(p)-c + m/6, but at least 0; and leave out
+    m q^2/6 if it is negative. Both only raise the bound. As h-c is positive, |h_v(p)|/3 <= h(p)-c,
+    hence |f_v(p)|/3 <= w + 0.1907 l, where 0.1907 bounds the integral of |G(p,.) + d_v G(p,.)/3|.
+    A larger slope is clamped to this. Then the bound of f - f(p), w (A-1) + (f_v/3) B + l kappa +
+    m q^2/6, is convex in q, since A'' >= |B''| and kappa'' >= 0.1907 B'' (checked in the same
+    place), and it is 0 at q = 0.
 
-    Neither end falls as the slope grows: the slope enters the upper end as +f_v B/3 with B >= 0,
-    and the lower end, which is the upper end of -f negated, in the same way.
+    Both ends increase with the slope, or stay: the slope enters the upper end as f_v B/3 with
+    B >= 0, and the lower end, which is the upper end of -f negated, in the same way.
     """
 
     radius: Real
     max_fall: Real
     max_rise: Real
-    laplacian_mean: Real  # m R^2
-    laplacian_spread: Real  # l R^2
+    laplacian_mean: Real
+    laplacian_spread: Real
     slopes: SlopeRange
 
     solver_iterations: ClassVar[int] = 5
@@ -100,8 +107,13 @@ class BoundedLaplacianEnclosure(Enclosure):
         laplacian: tuple[Real, Real],
         slopes: SlopeRange,
     ) -> Self:
-        """The enclosure of a function that may fall and rise by the two `ranges` in the ball, with
-        these bounds (lower, upper) of its Laplacian."""
+        """The enclosure from bounds on a ball.
+
+        ranges: how far the function may fall, and how far it may rise, from its value at the
+            center.
+        laplacian: a lower and an upper bound of its Laplacian.
+        slopes: the range of its derivative along the path at the center.
+        """
         half = 0.5 * radius * radius
         lower, upper = half * laplacian[0], half * laplacian[1]
         mean, spread = lower + upper, upper - lower
@@ -126,14 +138,15 @@ class BoundedLaplacianEnclosure(Enclosure):
         return (length <= 0) | (is_inside & is_free_fraction(above, q) & is_free_fraction(below, q))
 
     def _is_known(self, gaps: LevelGaps) -> Mask:
-        """Whether ranges, Laplacian and gaps are numbers, and not too large or small."""
+        """Whether the bounds and the gaps are numbers, and neither too large nor too small to
+        divide by."""
         is_valid = (gaps.below >= 0) & (gaps.above >= 0) & dr.isfinite(self.laplacian_mean)
         for x in (self.max_fall + self.max_rise, self.laplacian_spread):
             is_valid = is_valid & ((x == 0) | (dr.isfinite(1 / x) & dr.isfinite(4 * x)))
         return is_valid
 
     def _conditions(self, gaps: LevelGaps) -> tuple[_GreenCondition, _GreenCondition]:
-        """The conditions for f not to reach the level above, and the level below."""
+        """The condition for f not to reach the level above, and that for the level below."""
         fall, rise, slopes = self.max_fall, self.max_rise, self.slopes
         return (
             self._growth(gaps.above, fall, rise, self.laplacian_mean, slopes.upper),
@@ -141,7 +154,17 @@ class BoundedLaplacianEnclosure(Enclosure):
         )
 
     def _growth(self, gap: Real, u: Real, rise: Real, mean: Real, slope: Real) -> _GreenCondition:
-        """The condition in units of w + l. u: f - c at p. rise: the largest rise of f."""
+        """The condition for f not to rise to the level above; for -f, not to fall to the level
+        below.
+
+        All its numbers are divided by w + l R^2, with w as in the proof.
+
+        gap: the difference in value to the level.
+        u: f(p) - c.
+        rise: the largest rise of f.
+        mean: m R^2.
+        slope: the largest derivative along the path.
+        """
         w = fmax(dr.fma(mean, 1 / 6, u), 0)
         scale = w + self.laplacian_spread
         inverse = dr.select(scale > 0, 1 / scale, 0)
@@ -161,17 +184,24 @@ class BoundedLaplacianEnclosure(Enclosure):
 
 @dataclass(frozen=True)
 class _GreenCondition:
-    """w (A-1) + s B + l kappa + m q^2/6 <= gap, with `gap` for sqrt(1 + gap) - 1.
+    """The condition w (A-1) + s B + l kappa + m q^2/6 <= d: see `BoundedLaplacianEnclosure`.
 
-    With S = (1-q)^2 (1 + left side), which has no pole, it says sqrt(S) <= (1 + gap) (1-q), that is
-    q k(q) <= gap with k = gap + 1 + (sqrt(S) - 1)/q.
+    d is the gap in value. Let S = (1-q)^2 (1 + left side), which has no pole, and
+    g = sqrt(1 + d) - 1. The condition is sqrt(S) <= (1 + g) (1-q), that is, q k(q) <= g with
+    k = g + 1 + (sqrt(S) - 1)/q.
+
+    gap: g.
+    weight: w.
+    slope: s = R f_v/3.
+    spread: l R^2.
+    mean: m R^2 where it is positive, else 0.
     """
 
     gap: Real
-    weight: Real  # w
-    slope: Real  # s, R f_v/3
+    weight: Real
+    slope: Real
     spread: Real
-    mean: Real  # m where positive, else 0
+    mean: Real
 
     def expansion_at_zero(self) -> tuple[Real, Real]:
         # The logarithm, taken at about the root for slope 0.
@@ -182,6 +212,7 @@ class _GreenCondition:
         return self.gap + 0.5 * first, second
 
     def __call__(self, q: Real) -> Real:
+        """The value k(q), in a form that does not cancel near q = 0."""
         s, r, p = q * q, 1 / (1 + q), 1 - q
         log = 2 - dr.log(fmax(q, 1e-30))
         inner = q * dr.fma(self.weight, 5 - s, GREEN_KERNEL_BOUND * self.spread * log)

@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PathPiece:
-    """Ranges of F' and F'' on a piece of the path, for the function F along the path.
+    """A piece of a path, with ranges of F' and F'' on it, where F is the function along the path.
 
-    length: of the piece.
+    length: the length of the piece.
     slope_range: the range of F' on the piece.
     min_second_derivative, max_second_derivative: the range of F''; an end may be infinite, for
         functions with kinks.
@@ -42,16 +42,17 @@ class PathPiece:
 
 
 class PathRestriction(Protocol):
-    """The restriction of f to a path, with computable ranges of its derivatives.
+    """A function f restricted to a path, with computable ranges of its derivatives.
 
-    piece_count: the number of pieces into which to cut the path for the least time, by experiment.
+    piece_count: the number of pieces into which to cut the path; the fastest number, by experiment.
     """
 
     @property
     def piece_count(self) -> int: ...
 
     def derivative_ranges(self, knots: Sequence[Real]) -> tuple[PathPiece, ...]:
-        """Ranges of the derivatives of F(s) = f(path(t+s)) between each knot and the next.
+        """Ranges of the derivatives of F(s) = f(path(t+s)) on the pieces between each knot and the
+        next.
 
         knots: increasing lengths s, the first of them 0.
         """
@@ -60,11 +61,14 @@ class PathRestriction(Protocol):
 
 @runtime_checkable
 class EvaluableRestriction(Protocol):
-    """A restriction given by a formula, which can be evaluated in any arithmetic."""
+    """A function given by a formula along a path, which can be evaluated in any arithmetic."""
 
     def evaluate_with(self, coordinates: Callable[[Vec3, Vec3], tuple[Any, Any, Any]]) -> Any:
-        """Evaluate the formula at x, y and z = coordinates(p, d), for a point p and the direction d
-        of the path. The type of the coordinates chooses the arithmetic."""
+        """Evaluate the formula at x, y, z = coordinates(p, d).
+
+        coordinates: a function of a point p and the direction d of the path. The type of the three
+            numbers that it returns chooses the arithmetic.
+        """
         ...
 
 
@@ -75,12 +79,11 @@ STEP_SAFETY = 1.0 - 1e-6
 
 @dataclass(frozen=True)
 class LevelGaps:
-    """The differences in value, >= 0, between f and the next level below and above.
+    """The differences in value, >= 0, between f and the next level below and the next level above.
 
-    A difference is infinite where there is no level on that side.
-
+    below, above: the two differences; infinite if there is no level on that side.
     is_one_sided: whether at most one of the two is finite on every lane, as with a single level.
-        This is known while a kernel is being recorded, and saves the proof of the other side.
+        This is known while a kernel is being recorded, and saves the proof for the other side.
     """
 
     below: Real
@@ -89,58 +92,67 @@ class LevelGaps:
 
     @property
     def nearest(self) -> Real:
-        """The distance in value to the nearest level."""
+        """The difference in value to the nearest level."""
         return fmin(self.below, self.above)
 
     def reduced_by(self, error: Real) -> LevelGaps:
-        """The gaps that remain at least if the value may be wrong by `error`."""
+        """Lower bounds of the gaps, if the value may be wrong by `error`."""
         below, above = fmax(self.below - error, 0), fmax(self.above - error, 0)
         return LevelGaps(below, above, self.is_one_sided)
 
     def swapped(self) -> LevelGaps:
-        """The gaps of -f."""
+        """The gaps of -f: below and above exchanged."""
         return LevelGaps(self.above, self.below, self.is_one_sided)
 
 
 @dataclass(frozen=True)
 class SlopeRange:
-    """An interval that contains the derivative of f along a unit direction, in f per length."""
+    """An interval that contains the derivative of f along a unit direction.
+
+    lower, upper: its ends, in units of f per length.
+    """
 
     lower: Real
     upper: Real
 
     @classmethod
     def around(cls, slope: Real, error: Real) -> SlopeRange:
-        """The slopes within `error` of a slope. An error that is the Python float 0.0 costs
-        nothing."""
+        """The interval of slopes within `error` of `slope`.
+
+        An error that is the Python float 0.0 costs no operation.
+        """
         if isinstance(error, float) and error == 0.0:
             return cls(slope, slope)
         return cls(slope - error, slope + error)
 
     def negated(self) -> SlopeRange:
-        """The slopes in the opposite direction."""
+        """The range of the derivative along the opposite direction."""
         return SlopeRange(-self.upper, -self.lower)
 
 
 class Enclosure(abc.ABC):
-    """A proof that F stays within an interval for 0 <= s < reach.
+    """A proof that F stays within an interval that depends on s, for 0 <= s < reach.
 
-    F(s) = f(path(t+s)) - f(path(t)) is the movement of f relative to its value at a sample, so that
-    two large numbers are never subtracted: in float32 that is the difference between a march and a
-    stall. From the differences in value to the next levels (`LevelGaps`), an enclosure proves a
-    length free of levels (`free_length`), or decides whether a given length is free (`is_free`),
-    which takes one evaluation of the proof and no solver: the tracer uses it looking back.
+    F(s) = f(path(t+s)) - f(path(t)) is the movement of f relative to its value at a sample. In this
+    form two large numbers are never subtracted; in float32 rays would stall otherwise.
 
-    Neither end of the interval may fall as the slope grows, and every proof says why: then the
-    interval for the upper end of `SlopeRange` bounds F from above and that for the lower end bounds
-    it from below, whatever the slope in between is. In particular slopes in [-|grad f|, |grad f|]
-    bound F in every direction.
+    Its input are the differences in value to the next levels (`LevelGaps`). From them an enclosure
+    proves a length free of levels (`free_length`), or decides whether a given length is free
+    (`is_free`). The latter takes one evaluation of the proof and no solver; the tracer uses it for
+    the way back from a sample.
+
+    Each end of the interval must be an increasing function of the slope at the sample, or constant,
+    and every proof says why it is. Then the interval for the upper end of a `SlopeRange` bounds F
+    from above, and that for the lower end bounds F from below, whatever the slope in between is. In
+    particular slopes in [-|grad f|, |grad f|] bound F in every direction.
     """
 
     @property
     def reach_growth(self) -> float:
-        """The reach to ask for at the next sample, as a multiple of the length proved at this one;
-        by experiment."""
+        """The reach to ask for at the next sample, as a multiple of the length proved at this one.
+
+        The best values were found by experiment.
+        """
         return 2.0
 
     @classmethod
@@ -150,8 +162,9 @@ class Enclosure(abc.ABC):
         """The enclosure that this class proves from a promise; None if it does not use promises of
         that kind.
 
-        value: f at the sample, known up to `error`.
-        slopes: of f along the path, at the sample.
+        value: f at the sample.
+        error: a bound of the error of this value.
+        slopes: the range of the derivative of f along the path at the sample.
         """
         del promise, value, error, slopes
         return None
@@ -160,39 +173,44 @@ class Enclosure(abc.ABC):
     def from_restriction(
         cls, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> Self | None:
-        """The enclosure that this class proves from ranges of the derivatives of f along the path;
-        None if it does not use ranges.
+        """The enclosure that this class proves from ranges of the derivatives of f along the path.
 
-        length: the requested reach.
-        slopes: of f along the path, at its start.
+        None if this class does not use such ranges.
+
+        function: f along the path.
+        slopes: the range of its derivative at the start of the path.
+        length: the reach that is asked for.
         """
         del function, slopes, length
         return None
 
     @abc.abstractmethod
     def free_length(self, gaps: LevelGaps) -> Real:
-        """A length L >= 0 such that f meets no level for 0 < s < L. NaN proves nothing."""
+        """A length L >= 0 such that f is proved to meet no level for 0 < s < L; NaN proves
+        nothing."""
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
-        """Whether f is proved to meet no level for 0 < s < length."""
+        """Whether f is proved to meet no level for 0 < s < length, a mask."""
         return length <= self.free_length(gaps)
 
     def arrives(self, gaps: LevelGaps, length: Real) -> Mask:
-        """Whether f is proved to take a level for some 0 <= s <= length."""
+        """Whether f is proved to take a level for some 0 <= s <= length, a mask."""
         del length
         return (gaps.above == gaps.above) & False
 
 
 @dataclass(frozen=True)
 class Levels:
-    """A finite set of levels, repeated with `period` if there is one.
+    """The levels that rays look for: a finite set, repeated with `period` if there is one.
 
-    An angle-valued function is known modulo its period. Its levels are then periodic: each of the
-    values plus every multiple of the period (paper, Alg. 2, with the reduction that the printed
-    algorithm omits: both neighboring levels are computed from the reduced difference).
+    An angle-valued function is known up to multiples of its period. Its levels are then each of the
+    values plus every multiple of the period (paper, Alg. 2). The printed algorithm omits a
+    reduction: here both neighboring levels are computed from the difference reduced to half a
+    period.
 
-    values: Python floats, or Dr.Jit arrays of size 1 of the backend in use (so that a level can
-        change without a kernel being compiled again, or carry derivatives).
+    values: Python floats, or Dr.Jit arrays of size 1 of the backend in use. As arrays, levels can
+        change without a kernel being compiled again, and can carry derivatives.
+    period: the period, or None.
     """
 
     values: tuple[Real, ...]
@@ -201,9 +219,9 @@ class Levels:
     def gaps(self, f: Real) -> LevelGaps:
         """The differences in value between f and the next level below and above.
 
-        Either is infinite if there is no such level. If f is a level, the gap on one side is zero,
-        and with a period the gap on the other is at most the period. Where f is NaN, the gaps are
-        NaN.
+        A difference is infinite if there is no such level. If f is a level, the gap on one side is
+        0, and with a period the gap on the other side is at most the period. The gaps are NaN where
+        f is NaN.
         """
         below: Real = math.inf
         above: Real = math.inf
@@ -223,6 +241,6 @@ class Levels:
         return LevelGaps(below, above, len(self.values) == 1 and self.period is None)
 
     def offset_to_nearest(self, f: Real) -> Real:
-        """level - f for the level nearest to f."""
+        """The difference level - f for the level nearest to f."""
         gaps = self.gaps(f)
         return dr.select(gaps.above < gaps.below, gaps.above, -gaps.below)

@@ -1,4 +1,4 @@
-"""Enclosures of maxima and of nearest branches of several functions, and of mapped functions.
+"""Enclosures of functions that are made of several functions, or of one by a map.
 
 - `MaximumEnclosure`, with `NegatedEnclosure` and `ScaledEnclosure`: unions, intersections and
   differences of solids, and solids that were moved and scaled.
@@ -24,10 +24,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MaximumOperand:
-    """An operand f_i of max f_i, at a sample.
+    """One of the functions f_i of max f_i, at a sample.
 
-    min_deficit, max_deficit: bounds, with rounding, of the difference max f_j - f_i at the sample.
-    enclosures: of the movement of f_i along the path.
+    min_deficit, max_deficit: bounds, rounding included, of the difference max f_j - f_i at the
+        sample.
+    enclosures: enclosures of the movement of f_i along the path.
     """
 
     min_deficit: Real
@@ -39,28 +40,30 @@ class MaximumOperand:
 class MaximumEnclosure(Enclosure):
     """The movement of max f_i, from enclosures of the movements of all f_i.
 
-    Proof. The maximum rises by a gap g only where some f_i rises by g plus its deficit, the
-    difference between the maximum and f_i at the start: as long as no f_i does, each by its own
-    proof, the maximum does not. It falls by g only where all f_i are that low: as long as one of
-    them is proved not to have fallen so far, the maximum has not. The proofs of the operands may be
-    of any kind, and of different kinds.
+    Proof. Let the deficit of f_i be the difference between the maximum and f_i at the start. The
+    maximum rises by a gap g only where some f_i rises by g plus its deficit. As long as no f_i
+    does, each by its own proof, the maximum does not rise so far. The maximum falls by g only where
+    all f_i are that low. As long as one of them is proved not to have fallen so far, the maximum
+    has not. The operands may have proofs of different kinds.
     """
 
     operands: tuple[MaximumOperand, ...]
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        inf = type(gaps.above)(dr.inf)
-        rise_length, fall_length = inf, type(gaps.above)(0)
+        """The shorter of two lengths: that on which no operand rises to the level above, and the
+        longest one on which an operand is proved not to fall to the level below."""
+        infty = type(gaps.above)(dr.inf)
+        rise_length, fall_length = infty, type(gaps.above)(0)
         for operand in self.operands:
             rise, fall = self._gaps(gaps, operand)
             rise_length = fmin(longest_free_length(operand.enclosures, rise), rise_length)
             length = longest_free_length(operand.enclosures, fall)
             # An operand that may lie below the level already proves nothing, whatever its slope.
             fall_length = fmax(dr.select(fall.below > 0, length, 0), fall_length)
-        rise_length = dr.select(gaps.above == dr.inf, inf, rise_length)
-        fall_length = dr.select(gaps.below == dr.inf, inf, fall_length)
-        reach = fmin(rise_length, fall_length)
-        return dr.select(reach == dr.inf, self._reach(inf), reach)
+        rise_length = dr.select(gaps.above == dr.inf, infty, rise_length)
+        fall_length = dr.select(gaps.below == dr.inf, infty, fall_length)
+        free = fmin(rise_length, fall_length)
+        return dr.select(free == dr.inf, self._common_length(infty), free)
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
         free_above, free_below = gaps.above == gaps.above, gaps.below == dr.inf
@@ -70,27 +73,37 @@ class MaximumEnclosure(Enclosure):
             free_below |= (fall.below > 0) & any_is_free(operand.enclosures, fall, length)
         return (free_above | (gaps.above == dr.inf)) & free_below
 
-    def _reach(self, inf: Real) -> Real:
-        """The reach of the enclosures of all operands, if there is no level."""
-        reach = inf
+    def _common_length(self, infty: Real) -> Real:
+        """The length on which the enclosures of all operands hold; it is the free length if there
+        is no level.
+
+        infty: infinity, as a number of the backend.
+        """
+        length = infty
         for operand in self.operands:
-            reach = fmin(longest_free_length(operand.enclosures, LevelGaps(inf, inf)), reach)
-        return reach
+            length = fmin(longest_free_length(operand.enclosures, LevelGaps(infty, infty)), length)
+        return length
 
     @staticmethod
     def _gaps(gaps: LevelGaps, operand: MaximumOperand) -> tuple[LevelGaps, LevelGaps]:
-        """The gaps by which an operand must rise, and must fall, for the maximum to meet a
-        level."""
-        inf = type(gaps.above)(dr.inf)
+        """The gap by which an operand must rise for the maximum to meet the level above, and the
+        gap by which it must fall for the maximum to meet the level below.
+
+        Each is a `LevelGaps` with one finite side at most.
+        """
+        infty = type(gaps.above)(dr.inf)
         return (
-            LevelGaps(inf, gaps.above + operand.min_deficit, is_one_sided=True),
-            LevelGaps(fmax(gaps.below - operand.max_deficit, 0), inf, is_one_sided=True),
+            LevelGaps(infty, gaps.above + operand.min_deficit, is_one_sided=True),
+            LevelGaps(fmax(gaps.below - operand.max_deficit, 0), infty, is_one_sided=True),
         )
 
 
 @dataclass(frozen=True)
 class NegatedEnclosure(Enclosure):
-    """The movement of -f: that of f with the levels above and below exchanged."""
+    """The movement of -f: that of f, with the levels above and below exchanged.
+
+    inner: the enclosure of f.
+    """
 
     inner: Enclosure
 
@@ -105,9 +118,13 @@ class NegatedEnclosure(Enclosure):
 class ScaledEnclosure(Enclosure):
     """The movement of value_factor * f(map(path)), where the map stretches the path by `speed`.
 
-    Proof. A length s of the path is a length speed s of the path that `inner` is about, and a gap g
-    of value_factor f is a gap g/value_factor of f. speed and value_factor, positive, are known to
-    within a few roundings, by which steps are shortened.
+    inner: the enclosure of f along the mapped path.
+    speed: the length of the mapped path per length of the path, > 0.
+    value_factor: > 0.
+
+    Proof. A length s of the path is a length speed * s of the mapped path, and a gap g of
+    value_factor * f is a gap g/value_factor of f. speed and value_factor are known to within a few
+    roundings, by which steps are shortened.
     """
 
     inner: Enclosure
@@ -121,23 +138,24 @@ class ScaledEnclosure(Enclosure):
         return self.inner.is_free(self._gaps(gaps), length * self.speed / STEP_SAFETY)
 
     def _gaps(self, gaps: LevelGaps) -> LevelGaps:
+        """The gaps of f, from those of value_factor * f."""
         factor = STEP_SAFETY / self.value_factor
         below, above = _scaled(gaps.below, factor), _scaled(gaps.above, factor)
         return LevelGaps(below, above, gaps.is_one_sided)
 
 
 def _scaled(gap: Real, factor: Real) -> Real:
-    """The gap times a positive number; a finite gap stays finite, also if the product overflows."""
+    """The gap times a positive factor. A finite gap stays finite, even if the product overflows."""
     largest = type(gap)(dr.largest(type(gap)))
     return dr.select(gap == dr.inf, gap, fmin(largest, gap * factor))
 
 
 @dataclass(frozen=True)
 class BranchSample:
-    """A branch phi_j of a multivalued function at a sample, continued along the path.
+    """One branch phi_j of a multivalued function at a sample, continued along the path.
 
-    slopes: the range of the slope of |phi_j| at the sample.
-    excess: |phi_j| minus the smallest |phi_i| at the sample, less a bound of its rounding error.
+    slopes: the range of the derivative of |phi_j| along the path at the sample.
+    excess: |phi_j| minus the smallest |phi_i| at the sample, minus a bound of its rounding error.
     """
 
     slopes: SlopeRange
@@ -146,29 +164,33 @@ class BranchSample:
 
 @dataclass(frozen=True)
 class NearestBranchEnclosure(Enclosure):
-    """The movement of f = s min_j |phi_j|, s the sign of the product of all phi_j.
+    """The movement of f = s min_j |phi_j|, where s is the sign of the product of all phi_j.
 
     Such an f is continuous and single-valued wherever the set of all phi_j is, however the branches
-    are numbered, for s changes only where the minimum is 0. It is zero where one of the phi_j is.
-
-    Let |phi_j''| <= second_derivative_bound along the path for 0 <= s < reach, for continuations
-    without a jump; and let g_j be phi_j or -phi_j, whichever has the sign of f at the start.
-
-    Proof towards zero, from f > 0 to a level f - d; downwards is upwards for -f. As long as no g_j
-    has fallen by |phi_j| - f + d, to f - d, f stays above that: if all g_j are positive, no sign
-    has changed and f is the smallest g_j. Otherwise f - d < 0, and where f is negative an odd
-    number of the g_j is, so at least one g_j is, and f >= -|g_j| > f - d. A g_j falls along its
-    parabola at most.
-
-    Proof away from zero, to a level f + a: f stays below f + a as long as |g_i| does, for the phi_i
-    that is nearest at the start: as long as g_i has neither risen by a nor fallen by 2 f + a. So a
-    step is free of all branches, not of the nearest alone, and another branch may become the
-    nearest on the way.
+    are numbered, because s changes only where the minimum is 0. f is zero where one of the phi_j
+    is.
 
     branches: a sample of each phi_j.
     nearest: the sample of the phi_j with the smallest |phi_j|.
-    distance: |f|.
-    is_positive: whether f is positive.
+    distance: |f| at the sample.
+    is_positive: whether f is positive at the sample.
+    second_derivative_bound: a bound of all |phi_j''| along the path, for continuations without a
+        jump.
+    reach: the length on which this bound holds.
+
+    Proof. Let g_j be phi_j or -phi_j, whichever has the sign of f at the start. A g_j falls at most
+    along the parabola given by its slope and the bound of its second derivative.
+
+    Towards zero: let f > 0 at the start, and take a level f - d below it (for f < 0 the proof is
+    that of -f). As long as no g_j has fallen by |phi_j| - f + d, that is, to the value f - d, f
+    stays above the level. For if all g_j are positive, no sign has changed and f is the smallest
+    g_j. Otherwise the level is below 0, and where f is negative an odd number of the g_j is
+    negative, so at least one is, and f is at least -|g_j| and thus above the level.
+
+    Away from zero: f stays below a level f + a as long as |g_i| does, where phi_i is the nearest
+    branch at the start. This holds as long as g_i has neither risen by a nor fallen by 2 f + a. So
+    a step is proved free of all branches, not of the nearest one alone, and another branch may
+    become the nearest on the way.
     """
 
     branches: tuple[BranchSample, ...]
@@ -179,6 +201,7 @@ class NearestBranchEnclosure(Enclosure):
     reach: Real
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """The shortest of the lengths that the two parts of the proof give, over all branches."""
         towards = dr.select(self.is_positive, gaps.below, gaps.above)
         away = dr.select(self.is_positive, gaps.above, gaps.below)
         length = first_reach(away, self.nearest.slopes.upper, self.second_derivative_bound)
@@ -200,34 +223,37 @@ class NearestBranchEnclosure(Enclosure):
 
 # Powers may have larger rounding errors than `STEP_SAFETY` covers.
 _POWER_SAFETY = 1.0 - 1e-5
-# The values of q in the proof of `BranchPointEnclosure` that are tried.
+# The values of q, in the proof of `BranchPointEnclosure`, that are tried.
 _TRIED_FRACTIONS = (0.5, 0.95)
 
 
 @dataclass(frozen=True)
 class BranchPointEnclosure(Enclosure):
-    """The movement of f = s min_j |h - u_j| near a branch point a: around the line z = a the
-    branches u_j pass into each other.
+    """The movement of f = s min_j |h - u_j| near a branch point a, where all branches u_j are close
+    to one value c.
 
-    Within the radius R of that line |u_j - c| <= C r^alpha, alpha > 0, for all branches (up to a
-    period), r the distance from the line. A parabola proves only short lengths there, for second
-    derivatives grow without bound, though the branches hardly move.
+    h is the height of a point of space, s the sign of the product of all h - u_j. The branches pass
+    into each other around the line z = a. Let r be the distance from this line. Within a radius R
+    of it, |u_j - c| <= C r^alpha with alpha > 0, for all branches (up to a period). A parabola
+    proves only short lengths there: second derivatives grow without bound, though the branches
+    hardly move.
 
-    Proof. Let y = |h - c|, and v its largest rate of decrease along the path. On a disk of radius r
-    <= R about the line and for a length L of the path, all |h - u_j| are at least y - v L - C
-    r^alpha. For any 0 < q < 1 and w = y - (|f| - gap), r = (q w/C)^(1/alpha) and L = (1 - q) w/v
-    make that |f| - gap: so f, whose sign changes only where one of them is 0, does not fall by the
-    gap up to L, or up to where the path leaves the disk if that is earlier.
+    Proof. Let y = |h - c| at the start, and v the largest rate at which it decreases along the
+    path. On a disk of radius r <= R about the line, and for a length L of the path, all |h - u_j|
+    are at least y - v L - C r^alpha. Let w = y - (|f| - gap). For any 0 < q < 1, the choice r = (q
+    w/C)^(1/alpha) and L = (1 - q) w/v makes this |f| - gap. The sign of f changes only where one of
+    the h - u_j is 0. So |f| does not fall by the gap on the length L, as long as the path does not
+    leave the disk.
 
     distance_to_limit: y.
     max_fall_rate: v.
-    closest_parameter, closest_distance: the length at which the path is closest to the branch line,
-        and its distance from the line there; both are lengths in the plane.
-    speed: of the path in the plane.
+    closest_parameter, closest_distance: the length, in the plane, to the point of the path that is
+        closest to the branch line, and the distance from the line there.
+    speed: the length of the path's projection to the plane per length of the path.
     exponent, constant: alpha and C.
-    max_radius: the largest r that may be used, R less rounding.
-    distance: |f|.
-    is_positive: whether f is positive.
+    max_radius: the largest r that may be used, R minus rounding.
+    distance: |f| at the start.
+    is_positive: whether f is positive at the start.
     """
 
     distance_to_limit: Real
@@ -242,6 +268,8 @@ class BranchPointEnclosure(Enclosure):
     is_positive: Mask
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """The longest length of the proof over the values of q that are tried; 0 if there is a
+        level away from zero."""
         towards = dr.select(self.is_positive, gaps.below, gaps.above)
         away = dr.select(self.is_positive, gaps.above, gaps.below)
         w = self.distance_to_limit - fmax(self.distance - towards, 0)

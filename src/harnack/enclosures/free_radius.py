@@ -1,14 +1,12 @@
-"""The longest length proved by a proof on a ball: the solver that all such proofs share, and
-`HarmonicBallEnclosure`, for harmonic functions.
+"""The solver that all proofs on a ball share, and `HarmonicBallEnclosure`, for harmonic functions.
 
 A proof on a ball B(p, R) shows that all lengths up to q R are free of levels if
 
     q k(q) <= gap,
 
-with a k that has no poles on [0, 1] and a dimensionless gap. `largest_free_fraction` finds the
-largest such q from the safe side: large numbers are never subtracted, and the error of q is small
-relative to q. Near a surface the gap is tiny, and with a q of a small absolute error only, the
-march would stall.
+where k has no poles on [0, 1] and the gap has no unit. `largest_free_fraction` finds the largest
+such q from below. Large numbers are never subtracted, so the error of q is small relative to q.
+Near a surface the gap is tiny; if only the absolute error of q were small, rays would stall there.
 """
 
 from __future__ import annotations
@@ -36,44 +34,49 @@ _ROUNDINGS = 16.0
 
 
 class FreeRadiusCondition(Protocol):
-    """A condition q k(q) <= gap which proves that all of [0, q] is free of levels, where q is a
-    fraction of the radius. q k(q) crosses the gap upwards at most once on [0, 1]."""
+    """A condition q k(q) <= gap which proves that all of [0, q] is free of levels.
+
+    q is a length as a fraction of the ball's radius. q k(q) exceeds the gap on all of [0, 1] from
+    some place on, or nowhere: it crosses the gap at most once, upwards.
+    """
 
     @property
     def gap(self) -> Real: ...
 
     def __call__(self, q: Real) -> Real:
-        """k(q)."""
+        """The value k(q)."""
         ...
 
     def expansion_at_zero(self) -> tuple[Real, Real]:
-        """k(0) and k'(0), for a first guess; no proof relies on them."""
+        """k(0) and k'(0), which give the first candidate; no proof relies on them."""
         ...
 
 
 def condition_rounding(real: Any) -> float:
-    """The number that is added to k to cover rounding, in the precision of `real`."""
+    """The number that is added to k to cover rounding; real: the type of numbers of the
+    precision."""
     return _ROUNDINGS * float(dr.epsilon(real))
 
 
 def is_free_fraction(condition: FreeRadiusCondition, q: Real) -> Mask:
-    """Whether all of [0, q] is proved free, for 0 <= q <= 1."""
+    """Whether all of [0, q] is proved free, for fractions q of the radius, 0 <= q <= 1."""
     rounding = condition_rounding(type(q))
     return q * (condition(q) + rounding) <= condition.gap * CONDITION_SAFETY
 
 
 def largest_free_fraction(condition: FreeRadiusCondition, rounds: int) -> Real:
-    """The largest q in [0, 1) that is proved free, approached from below.
+    """The largest fraction q in [0, 1) of the radius that is proved free, found from below.
 
-    Four iterations come within 1e-5 of it for four balls in five, and within a few percent wherever
-    the extremal measure is not concentrated in 1e-3 of the sphere; twelve come within 1e-5.
+    rounds: the number of iterations. Four come within 1e-5 of the largest q for four balls in five,
+        and within a few percent unless the extremal measure is concentrated in 1e-3 of the sphere;
+        twelve come within 1e-5.
 
-    Why it is safe: only a q at which q k(q) <= gap was *evaluated* is returned; by the single
-    crossing, all smaller q are then free too. The choice of candidates affects the length alone:
-    each solves q (k_i + k' (q - q_i)) = gap, with k' the slope of k through the last two points (so
-    the parabola through them and the start), which converges like the secant method; the last one
-    is where the chord from the best covered to the best uncovered point reaches the gap, which
-    is covered if q k(q) is convex.
+    The result is safe, because only a q at which q k(q) <= gap was *evaluated* is returned. By the
+    single crossing, all smaller q are then free too. The choice of candidates affects the length
+    alone. Each candidate solves q (k_i + k' (q - q_i)) = gap, where k' is the slope of k through
+    the last two points (the left side is the parabola through them and the start). This converges
+    like the secant method. The last candidate is where the chord from the best proved point to the
+    best point that was not proved meets the gap; it is proved if q k(q) is convex.
     """
     real = cast("Any", type(condition.gap))
     gap, rounding = condition.gap, condition_rounding(real)
@@ -103,7 +106,7 @@ def largest_free_fraction(condition: FreeRadiusCondition, rounds: int) -> Real:
 
 
 def _root(gap: Real, constant: Real, slope: Real) -> Real:
-    """The positive root of x (constant + slope x) = gap, or 1 if there is none."""
+    """The positive root x of x (constant + slope x) = gap; 1 if there is none."""
     root = dr.sqrt(fmax(dr.fma(constant, constant, 4 * slope * gap), 0))
     # Two forms of the same root, each used where the other one cancels.
     is_rising = constant > 0
@@ -113,17 +116,19 @@ def _root(gap: Real, constant: Real, slope: Real) -> Real:
     return dr.select((denominator > 0) & dr.isfinite(candidate), candidate, 1)
 
 
-# A radius is multiplied by this, as distances carry a few roundings of float32.
+# A radius is multiplied by this number, since distances have a few rounding errors of float32.
 _RADIUS_SAFETY = 1.0 - 1e-6
 
 
 @dataclass(frozen=True)
 class HarmonicBallEnclosure(Enclosure):
-    """Base of enclosures of a harmonic f on B(p, radius) of R^dimension that falls and rises there
-    by less than two bounds.
+    """Base of enclosures of a function f that is harmonic and bounded on a ball B(p, radius) of
+    R^dimension.
 
-    max_fall, max_rise: f - lower and upper - f at p, so that two large numbers are never
-        subtracted. None for a side that is not bounded.
+    max_fall, max_rise: bounds f(p) - lower and upper - f(p) of how far f falls and rises on the
+        ball. They are kept in this form so that two large numbers are never subtracted. None for a
+        side that is not bounded.
+    slopes: the range of the derivative of f along the path at p.
     """
 
     radius: Real
@@ -144,7 +149,7 @@ class HarmonicBallEnclosure(Enclosure):
         return cls(radius, max_fall, max_rise, promise.dimension, slopes)
 
     def is_valid(self, gaps: LevelGaps) -> Mask:
-        """Whether ranges and gaps are numbers, and large enough to divide by."""
+        """Whether the bounds and the gaps are numbers, and the bounds large enough to divide by."""
         valid = (gaps.below >= 0) & (gaps.above >= 0)
         for movement in (self.max_fall, self.max_rise):
             if movement is not None:
@@ -153,7 +158,8 @@ class HarmonicBallEnclosure(Enclosure):
 
     @classmethod
     def applies_to(cls, dimension: int, is_bounded_below: bool, is_bounded_above: bool) -> bool:
-        """Whether this proof holds for balls of this dimension with these ends bounded."""
+        """Whether this class has a proof for balls of this dimension if f is bounded on these
+        sides."""
         del dimension
         return is_bounded_below or is_bounded_above
 
@@ -161,18 +167,22 @@ class HarmonicBallEnclosure(Enclosure):
 def allowed_movement(
     promise: HarmonicBall | BoundedLaplacian, value: Real, error: Real
 ) -> tuple[Real, Real | None, Real | None]:
-    """The radius of a promise, and bounds of the fall and of the rise of f that it implies (None:
-    that side is not bounded).
+    """The radius of a promise, and how far f may fall and rise from its value on the ball.
 
-    The ends of the promise are moved outwards by the error and by eight units in the last place of
-    f: if the two ends are equal up to rounding, the promise would otherwise prove f constant. A
-    radius that is not a positive number, or a NaN anywhere, proves nothing (radius 0).
+    value: f at the center.
+    error: a bound of the error of this value.
+
+    A fall or rise that is not bounded is None. The ends of the promise are moved outwards by the
+    error and by eight units in the last place of f. Otherwise a promise whose two ends are equal up
+    to rounding would prove f constant. The radius is 0, which proves nothing, if it is not a
+    positive number or if any number is NaN.
     """
     epsilon = 2 * float(dr.epsilon(type(value)))  # Dr.Jit's is half the distance to the next number
     total_error = dr.fma(8 * epsilon, dr.abs(value), error)
     is_valid = promise.radius > 0
 
     def movement(end: Real, sign: float) -> Real | None:
+        """The distance from the value to the upper end (sign 1) or to the lower end (-1)."""
         nonlocal is_valid
         if isinstance(end, float) and math.isinf(end):
             return None

@@ -1,9 +1,9 @@
-"""Proofs for functions that are harmonic and bounded on a ball: from the promise `HarmonicBall`.
+"""Enclosures of functions that are harmonic and bounded on a ball: from the promise `HarmonicBall`.
 
-- `HarnackEnclosure`: the published rule, Harnack's inequality with a lower bound alone.
+- `HarnackEnclosure`: the published rule, Harnack's inequality from a lower bound alone.
 - `HarnackSlopeEnclosure`: Harnack's inequality that also uses the directional derivative.
-- `SphericalCapEnclosure`: spherical caps, the sharpest enclosure where both a lower and an upper
-  bound are known.
+- `SphericalCapEnclosure`: the bound by spherical caps. If both a lower and an upper bound are
+  known, it is the sharpest of the three.
 """
 
 from __future__ import annotations
@@ -30,10 +30,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class HarnackEnclosure(HarmonicBallEnclosure):
-    """Harnack's inequality for u = f - lower > 0 on B(p, R), in every direction alike.
+    """Harnack's inequality for u = f - lower > 0 on B(p, R), the same in every direction.
 
-    Proof. u is a Poisson integral of a positive measure of mass u(p), and the kernel
-    P(q, s) = (1-q^2)/(1+q^2-2qs)^(n/2), q = |y-p|/R, lies between its values at s = -1 and 1:
+    Proof. u is a Poisson integral of a positive measure of mass u(p). Let n be the dimension,
+    q = |y-p|/R, and s the cosine of the angle between y - p and a boundary point. The kernel
+    P(q, s) = (1-q^2)/(1+q^2-2qs)^(n/2) lies between its values at s = -1 and s = 1, so
 
         u(p) (1-q)/(1+q)^(n-1) <= u(y) <= u(p) (1+q)/(1-q)^(n-1).
 
@@ -54,7 +55,7 @@ class HarnackEnclosure(HarmonicBallEnclosure):
         return dr.select(self.is_valid(gaps), self.radius * self._fraction(gaps), 0)
 
     def _fraction(self, gaps: LevelGaps) -> Real:
-        """The step divided by the radius, from the sides that are bounded."""
+        """The free length divided by the radius; the better one if f is bounded on both sides."""
         lower = upper = None
         if self.max_fall is not None:
             lower = _fraction_from_one_side(self.max_fall, gaps.above, gaps.below, self.dimension)
@@ -68,7 +69,13 @@ class HarnackEnclosure(HarmonicBallEnclosure):
 
 
 def _fraction_from_one_side(u: Real, gap_away: Real, gap_toward: Real, dimension: int) -> Real:
-    """A safe q for positive u, with levels `gap_away` above u and `gap_toward` below it."""
+    """A fraction of the radius that Harnack's inequality proves free, for a positive harmonic
+    function.
+
+    u: its value at the center.
+    gap_away, gap_toward: the differences from u to the next level above, and to the next level
+        below.
+    """
     growing, falling = _FRACTION_FORMULAS[dimension]
     # u = 0 forces u to vanish identically: no level is ever reached.
     up = dr.select((gap_away == dr.inf) | (u <= 0), 1, growing(u, u + gap_away, gap_away))
@@ -78,19 +85,24 @@ def _fraction_from_one_side(u: Real, gap_away: Real, gap_toward: Real, dimension
 
 
 def _fraction_2d(u: Real, v: Real, gap: Real) -> Real:
+    """The q at which u may first reach a level v, above or below, in the plane; gap = |v - u|."""
     return gap / (u + v)
 
 
 def _fraction_3d(u: Real, v: Real, gap: Real) -> Real:
     # Two square roots, as the product u (u + 8v) may underflow or overflow.
+    """The q at which u may first reach a level v, above or below, in space; gap = |v - u|."""
     return 2 * gap / (u + 2 * v + dr.sqrt(u) * dr.sqrt(u + 8 * v))
 
 
 def _fraction_4d_up(u: Real, v: Real, gap: Real) -> Real:
-    """(1+q)/(1-q)^3 = w, w = v/u, by Newton's method from the safe side, in two forms.
+    """The q at which u may first reach a level v > u in R^4, or slightly less; gap = v - u.
 
-    For w < 2, from the left: h(q) = gap - q (u + v (3 - 3q + q^2)) is decreasing and convex. That
-    cancels for large w; there y = 1-q, from the right, is the root of the convex w y^3 + y - 2."""
+    It solves (1+q)/(1-q)^3 = w with w = v/u by Newton's method from the safe side, in one of two
+    forms. For w < 2 it comes from the left, with h(q) = gap - q (u + v (3 - 3q + q^2)), which
+    decreases and is convex. This form cancels for large w. There y = 1-q is the root of the convex
+    w y^3 + y - 2, approached from the right.
+    """
     q = gap / (u + 3 * v)
     for _ in range(4):
         h = gap - q * (u + v * (3 - 3 * q + q * q))
@@ -103,9 +115,12 @@ def _fraction_4d_up(u: Real, v: Real, gap: Real) -> Real:
 
 
 def _fraction_4d_down(u: Real, v: Real, gap: Real) -> Real:
-    """(1-q)/(1+q)^3 = v/u: h(q) = gap - q (u + v (3 + 3q + q^2)) is decreasing and concave, so
-    Newton's method ends right of the root and the chord from (0, gap) to there ends left of it,
-    the safe side."""
+    """The q at which u may first reach a level v < u in R^4, or slightly less; gap = u - v.
+
+    It solves (1-q)/(1+q)^3 = v/u with h(q) = gap - q (u + v (3 + 3q + q^2)), which decreases and is
+    concave. So Newton's method ends on the right of the root. The chord from (0, gap) to this point
+    meets 0 on the left of the root, which is the safe side.
+    """
     q = fmin(gap / (u + 3 * v), 1)
     for _ in range(4):
         h = gap - q * (u + v * (3 + 3 * q + q * q))
@@ -114,6 +129,7 @@ def _fraction_4d_down(u: Real, v: Real, gap: Real) -> Real:
     return q * gap / (gap - h)
 
 
+# For each dimension the formula for levels above, and that for levels below.
 _FRACTION_FORMULAS = {
     2: (_fraction_2d, _fraction_2d),
     3: (_fraction_3d, _fraction_3d),
@@ -121,45 +137,53 @@ _FRACTION_FORMULAS = {
 }
 
 
-# A gap of this many times u is reached only within 1e-6 of the sphere.
+# Gaps above this multiple of u count as this multiple, which is reached only within 1e-6 of the
+# sphere.
 _UNREACHABLE_GAP = 1e18
 
 
 @dataclass(frozen=True)
 class HarnackSlopeEnclosure(HarmonicBallEnclosure):
-    """One- or two-sided slope bound in 2, 3 and 4 dimensions.
+    """Harnack's inequality with the directional derivative, in 2, 3 and 4 dimensions.
 
-    Proof. A positive harmonic u on B(p, R) is, along a unit direction v and with q = t/R,
-    u(p+tv) = integral of P(q, s) dnu(s) over s in [-1, 1], where P(q, s) =
-    (1-q^2)/(1+q^2-2qs)^(n/2), nu >= 0 has mass u(p) and first moment R u_v(p)/n (differentiate
-    at q = 0: dP/dq = n s). So the mean of s is m = R u_v/(n u), and P is convex in s, hence
+    f may be bounded on one side or on both sides.
+
+    Proof. Let u be positive and harmonic on B(p, R) of R^n, v a unit direction and q = t/R. Then
+    u(p+tv) is the integral of P(q, s) dnu(s) over s in [-1, 1], where P(q, s) =
+    (1-q^2)/(1+q^2-2qs)^(n/2) and the measure nu >= 0 has the mass u(p) and the first moment
+    R u_v(p)/n (differentiate at q = 0: dP/dq = n s). So the mean of s is m = R u_v/(n u). P is
+    convex in s, hence
 
         u P(q, m) <= u(p+tv) <= u [(1+m)/2 P(q, 1) + (1-m)/2 P(q, -1)]
 
-    (Jensen; chord), both attained: by a ring of mass at one latitude, and by two point masses at
-    the poles. The upper bound is convex in q. The lower one rises, then
-    falls: its derivative has the sign of m q^2 - 2q + m (n = 2), q^3 + m q^2 - 5q + 3m (n = 3)
-    or q^3 - 3q + 2m (n = 4), each decreasing on [0, 1]. So each first crossing is unique, and
-    what is free at q is free before it. With upper - f > 0 the same holds for its negative
-    slope; on each side the better of the two is used.
+    (Jensen's inequality; the chord). Both bounds are attained, by a ring of mass at one latitude
+    and by two point masses at the poles. The upper bound is convex in q. The lower bound rises,
+    then falls: its derivative has the sign of m q^2 - 2q + m (n = 2), q^3 + m q^2 - 5q + 3m (n = 3)
+    or q^3 - 3q + 2m (n = 4), each of which decreases on [0, 1]. So each bound crosses a level at
+    most once in its direction, and if q is free, all smaller q are. For upper - f > 0 the same
+    holds with the negated slope. On each side the better of the two bounds is used.
 
-    Neither end falls as the slope grows: the upper one rises with m as P(q, 1) >= P(q, -1), the
-    lower one as P(q, .) does. For upper - f, whose slope is negated, they change places and signs.
+    Both ends increase with the slope, or stay: the upper one because it grows with m, as
+    P(q, 1) >= P(q, -1); the lower one because P(q, .) increases. For upper - f, whose slope is
+    negated, the ends change places and signs.
     """
 
     solver_iterations: ClassVar[int] = 4
     """Rounds of `largest_free_fraction`."""
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """The shorter of the lengths proved for the two levels; for each level, the longest of
+        those that its conditions prove."""
         q = type(gaps.above)(1)
         for alternatives in self._conditions(gaps):
-            side = type(q)(0)
+            best = type(q)(0)
             for condition in alternatives:
-                side = fmax(side, largest_free_fraction(condition, self.solver_iterations))
-            q = fmin(q, side)
+                best = fmax(best, largest_free_fraction(condition, self.solver_iterations))
+            q = fmin(q, best)
         return dr.select(self.is_valid(gaps), q * self.radius, 0)
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
+        """Whether, for each of the two levels, at least one condition proves the length free."""
         q = length / self.radius
         is_covered = q <= 1
         q = clamp(q, 0, 1)
@@ -174,8 +198,10 @@ class HarnackSlopeEnclosure(HarmonicBallEnclosure):
     def _conditions(
         self, gaps: LevelGaps
     ) -> tuple[list[FreeRadiusCondition], list[FreeRadiusCondition]]:
-        """The conditions for f not to reach the level above, and the level below; on each side it
-        is enough that one holds."""
+        """The conditions for f not to reach the level above, and those for the level below.
+
+        For each level it is enough that one of the conditions holds.
+        """
         up: list[FreeRadiusCondition] = []
         down: list[FreeRadiusCondition] = []
         rising = self.slopes
@@ -202,19 +228,25 @@ class HarnackSlopeEnclosure(HarmonicBallEnclosure):
 
 @dataclass(frozen=True)
 class _ChordCondition:
-    """(1+m)/2 P(q,1) + (1-m)/2 P(q,-1) <= w = 1 + gap/u.
+    """The condition that the chord's bound stays below the level away from the bounded side.
 
-    The left side times (1-q)^K, K = n-1, is B = (1-q)^K + q A/(1+q)^K with a polynomial A, and
-    B^(1/K) <= w^(1/K) (1-q) has no pole: it says q k(q) <= g with g = w^(1/K) - 1 and
+    It is (1+m)/2 P(q,1) + (1-m)/2 P(q,-1) <= w with w = 1 + (gap of u)/u. The left side times
+    (1-q)^K, K = n-1, is B = (1-q)^K + q A/(1+q)^K with a polynomial A. So the condition is
+    B^(1/K) <= w^(1/K) (1-q), which has no pole. This is q k(q) <= g with g = w^(1/K) - 1 and
     k = g + 1 + (B^(1/K) - 1)/q.
+
+    gap: g.
+    mean: m, the mean of s.
+    dimension: n.
     """
 
-    gap: Real  # g
+    gap: Real
     mean: Real
     dimension: int
 
     @classmethod
     def of(cls, gap: Real, mean: Real, dimension: int) -> _ChordCondition:
+        """The condition for a gap that is given in units of u."""
         if dimension == 3:
             gap = gap / (dr.sqrt(1 + gap) + 1)
         elif dimension == 4:
@@ -229,6 +261,7 @@ class _ChordCondition:
         return self.gap + n * self.mean / k, second
 
     def __call__(self, q: Real) -> Real:
+        """The value k(q), in a form that does not cancel near q = 0."""
         m, r, s = self.mean, 1 / (1 + q), q * q
         if self.dimension == 2:
             return self.gap + 2 * (q + m) * r
@@ -246,10 +279,15 @@ class _ChordCondition:
 
 @dataclass(frozen=True)
 class _JensenCondition:
-    """P(q, m) >= 1 - gap/u.
+    """The condition that Jensen's bound stays above the level towards the bounded side.
 
-    With D = 1+q^2-2qm it says (1-g) D^(n/2) <= 1-q^2, that is q k(q) <= g with
-    k = (1-g) (D^(n/2) - 1 + q^2)/q + g q. q k(q) is convex.
+    It is P(q, m) >= 1 - g with g = (gap of u)/u. With D = 1+q^2-2qm this is
+    (1-g) D^(n/2) <= 1-q^2, that is, q k(q) <= g with k = (1-g) (D^(n/2) - 1 + q^2)/q + g q.
+    q k(q) is convex.
+
+    gap: g.
+    mean: m, the mean of s.
+    dimension: n.
     """
 
     gap: Real
@@ -262,6 +300,8 @@ class _JensenCondition:
         return -weight * n * m, dr.fma(weight, second, self.gap)
 
     def __call__(self, q: Real) -> Real:
+        """The value k(q), in a form that does not cancel near q = 0. `rise` is (D^(n/2) - 1 +
+        q^2)/q."""
         e = q - 2 * self.mean
         d = dr.fma(q, e, 1)
         if self.dimension == 2:
@@ -276,16 +316,16 @@ class _JensenCondition:
 
 @dataclass(frozen=True)
 class SphericalCapEnclosure(HarmonicBallEnclosure):
-    """The cap bound, for f bounded on both sides, in space: the extremal boundary values are the
-    indicator of two spherical caps.
+    """The bound by spherical caps, for f bounded on both sides, in space.
 
-    Proof. With values in [c, C], f = c + (C-c) g and g the Poisson integral of boundary values
-    in [0, 1] with mean p = (f-c)/(C-c) and first moment mu = R f_v/(3 (C-c)) along v. For fixed
-    q the kernel P(q, s) is convex in s, so among densities in [0, 1] with given mass and first
-    moment, integral P g is largest for the indicator of {s <= s1} u {s >= s2} (bathtub principle:
-    P minus the chord through s1, s2 is positive exactly there), two caps about v of heights
-    b = p + mu/(1-p) ahead and a = p - mu/(1-p) behind, which depend on p and mu alone. The
-    integral over caps is elementary,
+    Proof. Let f have values in [c, C]. Then f = c + (C-c) g, where g is the Poisson integral of
+    boundary values in [0, 1]. Their mean is p = (f-c)/(C-c), and their first moment along a unit
+    direction v is mu = R f_v/(3 (C-c)). For fixed q the kernel P(q, s) is convex in s. So among
+    densities in [0, 1] with this mass and first moment, the integral of P times the density is
+    largest for the indicator of {s <= s1} and {s >= s2}, because P minus its chord through s1 and
+    s2 is positive exactly there (bathtub principle). These are two spherical caps about v and -v of
+    heights b = p + mu/(1-p) and a = p - mu/(1-p), which depend on p and mu alone. The integral
+    over the caps is elementary. So f is at most
 
         U = c + (C-c) [1 - (1-q^2)/(2q) (1/s1 - 1/s2)],
         s1^2 = (1-q)^2 + 2qb,   s2^2 = (1+q)^2 - 2qa,
@@ -294,16 +334,18 @@ class SphericalCapEnclosure(HarmonicBallEnclosure):
 
         (1 - gap/(C-f)) s1 s2 (s1+s2)/2 <= 1-q^2.
 
-    The lower bound is the complement: C - (C-c)(...) with p -> 1-p, mu -> -mu. |mu| <= p (1-p)
+    The lower bound is that of C - f, negated: p becomes 1-p and mu becomes -mu. |mu| <= p (1-p)
     holds in exact arithmetic and is enforced.
 
-    Neither end falls as the slope grows: weight then moves from s = a-1 to s = 1-b, which is no
-    smaller as a + b = 2p <= 2, and P(q, .) rises. L is the complement, negated.
+    Both ends increase with the slope, or stay. As the slope grows, weight moves from s = a-1 to
+    s = 1-b, which is no smaller since a + b = 2p <= 2, and P(q, .) increases. For the lower bound
+    the same holds of C - f.
 
-    The first crossing is unique: (X-s)^(-3/2) with X = (1+q^2)/(2q) is a Laplace transform of
-    exp(-tX) exp(ts), hence totally positive in (q, s) on (0, 1) x (-1, 1) (Karlin 1968), hence
-    variation diminishing: U - level is the transform of values with signs (+, -, +), so it has
-    at most those sign changes, in that order, and where it starts negative it turns once.
+    The first crossing of a level is unique. With X = (1+q^2)/(2q), (X-s)^(-3/2) is a Laplace
+    transform of exp(-tX) exp(ts), hence totally positive in (q, s) on (0, 1) x (-1, 1) (Karlin
+    1968), hence variation diminishing. U - level is the transform of boundary values with signs
+    (+, -, +). So its signs change at most in this order, and if it starts negative, they change
+    once.
     """
 
     solver_iterations: ClassVar[int] = 4
@@ -329,7 +371,7 @@ class SphericalCapEnclosure(HarmonicBallEnclosure):
         return (length <= 0) | (is_inside & is_free_fraction(up, q) & is_free_fraction(down, q))
 
     def _conditions(self, gaps: LevelGaps) -> tuple[_CapCondition, _CapCondition]:
-        """The conditions for f not to reach the level above, and the level below."""
+        """The condition for f not to reach the level above, and that for the level below."""
         fall, rise = self.max_fall, self.max_rise
         assert fall is not None
         assert rise is not None
@@ -345,6 +387,15 @@ class SphericalCapEnclosure(HarmonicBallEnclosure):
 
 def _two_caps(gap: Real, max_rise: Real, p: Real, rest: Real, mu: Real) -> _CapCondition:
     # Without a range f is constant: no level is ever reached.
+    """The condition for f not to reach the level above.
+
+    gap: the difference in value to that level.
+    max_rise: C - f at the center.
+    p, rest: p and 1 - p.
+    mu: the largest first moment.
+
+    If the range of f is a point, f is constant and no level is ever reached.
+    """
     slack = condition_rounding(type(gap)) * p
     shift = dr.select(rest > 0, mu / rest, 0) + slack
     shift = fmax(fmin(shift, p), -p)  # the worst one, p, if the slope is not a number
@@ -353,15 +404,20 @@ def _two_caps(gap: Real, max_rise: Real, p: Real, rest: Real, mu: Real) -> _CapC
 
 @dataclass(frozen=True)
 class _CapCondition:
-    """(1-g) S(q) <= 1-q^2 with S = s1 s2 (s1+s2)/2, g = gap/(C-f) and heights b, a of the caps.
+    """The condition (1-g) S(q) <= 1-q^2 with S = s1 s2 (s1+s2)/2: see `SphericalCapEnclosure`.
 
     That is q k(q) <= g with k = (1-g) (S - 1 + q^2)/q + g q.
+
+    gap: g = (gap of f)/(C-f).
+    p: the mean of the boundary values.
+    rest: 1 - p, accurate where it is small.
+    shift: mu/(1-p), so that the heights of the caps are p + shift and p - shift.
     """
 
     gap: Real
     p: Real
-    rest: Real  # 1 - p, accurate where it is small
-    shift: Real  # mu/(1-p)
+    rest: Real
+    shift: Real
 
     def expansion_at_zero(self) -> tuple[Real, Real]:
         x, y, rest = self.rest - self.shift, self.rest + self.shift, 1 - self.gap
@@ -370,6 +426,7 @@ class _CapCondition:
 
     def __call__(self, q: Real) -> Real:
         # s = 1 + q x with x = e/(s+1), as s^2 = 1 + q e.
+        """The value k(q), in a form that does not cancel near q = 0. `rise` is (S - 1 + q^2)/q."""
         e1, e2 = q - 2 * (self.rest - self.shift), q + 2 * (self.rest + self.shift)
         one_minus_q, one_plus_q = 1 - q, 1 + q
         s1 = dr.sqrt(dr.fma(one_minus_q, one_minus_q, 2 * q * (self.p + self.shift)))

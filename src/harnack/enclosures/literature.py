@@ -2,7 +2,7 @@
 `PiecewiseTaylorEnclosure`.
 
 Parabolas come from the bottom-up arithmetic of `harnack.arithmetic.ParabolaBounds`, bands from
-affine forms and from intervals. All of them prove steps; benchmarks measure how many steps a ray
+affine forms and from intervals. All of them prove steps. Benchmarks measure how many steps a ray
 takes.
 """
 
@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class BottomUpQuadraticEnclosure(ParabolaEnclosure):
-    """The parabolas that a formula's arithmetic proves.
+    """The two parabolas that the bottom-up arithmetic of a formula proves.
 
-    Source: Aydinlilar and Zanni 2023, section 6.2. Proof: that of `ParabolaBounds`, then of
+    Source: Aydinlilar and Zanni 2023, section 6.2. Proof: that of `ParabolaBounds`, then that of
     `ParabolaEnclosure`.
     """
 
@@ -46,6 +46,8 @@ class BottomUpQuadraticEnclosure(ParabolaEnclosure):
     def from_restriction(
         cls, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> Self | None:
+        """The enclosure from evaluating the formula in bottom-up arithmetic; None if f is no
+        formula."""
         if not isinstance(function, EvaluableRestriction):
             return None
         parabolas = _parabolas(function, length, cls.degree)
@@ -53,8 +55,11 @@ class BottomUpQuadraticEnclosure(ParabolaEnclosure):
         return cls(SlopeRange(a, c), 2 * b, 2 * d, length)
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        # All of the length, not shortened for rounding: else a ray that misses needs one more
-        # sample.
+        """The whole length if it is proved free; otherwise that of `ParabolaEnclosure`.
+
+        The whole length is not shortened for rounding: else a ray that misses would need one more
+        sample.
+        """
         smaller_gaps = LevelGaps(gaps.below * STEP_SAFETY, gaps.above * STEP_SAFETY)
         is_finite = dr.isfinite(self.slopes.lower + self.slopes.upper)
         is_finite &= dr.isfinite(self.min_second_derivative + self.max_second_derivative) & (
@@ -65,7 +70,7 @@ class BottomUpQuadraticEnclosure(ParabolaEnclosure):
 
 
 class BottomUpLinearEnclosure(BottomUpQuadraticEnclosure):
-    """The lines that a formula's arithmetic proves.
+    """The two lines that the bottom-up arithmetic of a formula proves.
 
     Source: Aydinlilar and Zanni 2023, section 5.2.
     """
@@ -75,10 +80,10 @@ class BottomUpLinearEnclosure(BottomUpQuadraticEnclosure):
 
 @dataclass(frozen=True)
 class LongestOfEnclosure(Enclosure):
-    """The longest step that one of several enclosures of the same function proves.
+    """The longest of the steps that several enclosures of the same function prove.
 
-    Source: Aydinlilar and Zanni 2023, section 4 ("mixed"): bounds of derivatives where they are
-    tight, bottom-up arithmetic where they are not.
+    Source: Aydinlilar and Zanni 2023, section 4 ("mixed"). Bounds of derivatives are used if they
+    are tight, bottom-up arithmetic if they are not.
     """
 
     enclosures: tuple[Enclosure, ...]
@@ -91,6 +96,7 @@ class LongestOfEnclosure(Enclosure):
     def from_restriction(
         cls, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> Self | None:
+        """All enclosures that the classes in `kinds` prove for f; None if there is none."""
         candidates = [kind.from_restriction(function, slopes, length) for kind in cls.kinds]
         enclosures = tuple(enclosure for enclosure in candidates if enclosure is not None)
         return cls(enclosures) if enclosures else None
@@ -104,11 +110,13 @@ class LongestOfEnclosure(Enclosure):
 
 @dataclass(frozen=True)
 class BandEnclosure(Enclosure):
-    """offsets.lower + slopes.lower s <= F(s) <= offsets.upper + slopes.upper s: 0 <= s <= reach.
+    """An enclosure between two lines: for 0 <= s <= reach
 
-    Proof of the step: F cannot reach the gap before the upper line does. A band is not exact at
-    s = 0: where its offset exceeds the gap it proves nothing, and the march asks again for a third
-    of the length.
+        offsets.lower + slopes.lower s <= F(s) <= offsets.upper + slopes.upper s.
+
+    Proof of the step: F cannot reach a level before the line on that side does. A band is not exact
+    at s = 0. If its offset exceeds the gap it proves nothing, and the march tries a third of the
+    length.
     """
 
     offsets: Interval
@@ -116,11 +124,13 @@ class BandEnclosure(Enclosure):
     reach: Real
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        up = self._free(gaps.above, self.offsets.upper, self.slopes.upper)
-        down = self._free(gaps.below, -self.offsets.lower, -self.slopes.lower)
+        up = self._length_below(gaps.above, self.offsets.upper, self.slopes.upper)
+        down = self._length_below(gaps.below, -self.offsets.lower, -self.slopes.lower)
         return fmax(fmin(up, down), 0)
 
-    def _free(self, gap: Real, offset: Real, slope: Real) -> Real:
+    def _length_below(self, gap: Real, offset: Real, slope: Real) -> Real:
+        """The length on which the upper line, offset + slope s, stays below the gap; 0 if nothing
+        is proved."""
         no_level = gap == dr.inf
         remaining = gap - offset
         reach = dr.select(slope > 0, remaining / slope * STEP_SAFETY, self.reach)
@@ -129,8 +139,9 @@ class BandEnclosure(Enclosure):
 
 
 class AffineEnclosure(BandEnclosure):
-    """The band of revised affine arithmetic: a front part of the length may be proved free where
-    the whole is not.
+    """The band of revised affine arithmetic.
+
+    A part of the length at its start may be proved free although the whole is not.
 
     Source: Fryazinov, Pasko and Comninos 2010, as Aydinlilar and Zanni 2023 compare with it.
     """
@@ -139,6 +150,7 @@ class AffineEnclosure(BandEnclosure):
     def from_restriction(
         cls, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> Self | None:
+        """The band from evaluating the formula with affine forms; None if f is no formula."""
         if not isinstance(function, EvaluableRestriction):
             return None
         form = function.evaluate_with(lambda p, d: AffineForm.along_ray(p, d, length))
@@ -151,7 +163,8 @@ class AffineEnclosure(BandEnclosure):
 
 
 class IntervalEnclosure(BandEnclosure):
-    """The range of interval arithmetic on the whole length: all of it is free, or nothing is known.
+    """The range of interval arithmetic on the whole length: either all of it is proved free, or
+    nothing is.
 
     Source: Mitchell 1990.
     """
@@ -160,6 +173,7 @@ class IntervalEnclosure(BandEnclosure):
     def from_restriction(
         cls, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> Self | None:
+        """The band from evaluating the formula with intervals; None if f is no formula."""
         if not isinstance(function, EvaluableRestriction):
             return None
         jet = function.evaluate_with(lambda p, d: Jet.along_ray(p, d, 0.0, length, anchored=False))
@@ -168,15 +182,17 @@ class IntervalEnclosure(BandEnclosure):
 
 
 def _parabolas(function: EvaluableRestriction, length: Real, degree: int) -> ParabolaBounds:
+    """The bounds of the function along the path, by lines (degree 1) or parabolas (degree 2)."""
     return function.evaluate_with(
         lambda p, d: ParabolaBounds.along_ray(p, d, length, degree=degree)
     )
 
 
 def _value(function: EvaluableRestriction) -> Interval:
-    """f at the start of the path."""
+    """The range of f at the start of the path."""
 
     def at_start(p: Vec3, direction: Vec3) -> tuple[Jet, Jet, Jet]:
+        """The coordinates of the start of the path."""
         del direction
         return Jet.at_point(p)
 

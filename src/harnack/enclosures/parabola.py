@@ -1,8 +1,7 @@
-"""Enclosures by lines and parabolas: `ParabolaEnclosure`, enclosures derived from it,
-`ConvexityEnclosure` and `SphereArcEnclosure`.
+"""Enclosures by lines and parabolas.
 
-- `LipschitzEnclosure`: from a Lipschitz constant. `TaylorEnclosure`: from a bound of the second
-  derivatives.
+- `ParabolaEnclosure`: between two parabolas. `LipschitzEnclosure` follows from a Lipschitz
+  constant, `TaylorEnclosure` from a bound of the second derivatives.
 - `ConvexityEnclosure`: a convex function lies above its tangents.
 - `SphereArcEnclosure`: a parabola in the angle along a circle, for functions on the sphere S^3.
 """
@@ -29,17 +28,20 @@ _ROOT_OF_TWO = math.sqrt(2.0)
 
 @dataclass(frozen=True)
 class ParabolaEnclosure(Enclosure):
-    """slopes.lower s + min_second_derivative s^2/2 <= F(s) <= slopes.upper s +
-    max_second_derivative s^2/2, for 0 <= s < reach.
+    """An enclosure between two parabolas: for 0 <= s < reach
+
+        slopes.lower s + min_second_derivative s^2/2 <= F(s)
+        <= slopes.upper s + max_second_derivative s^2/2.
 
     The second derivatives may have either sign.
 
-    Proof of the step. The upper parabola starts a gap g > 0 below the level above and first reaches
-    it at the smallest positive root of a s + c s^2/2 = g, which is, without cancellation, 2g/(a +
-    r) where a > 0 and (r - a)/c where a <= 0 < c, with r = sqrt(a^2 + 2 c g); there is none where a
-    <= 0 and c <= 0, or where r is not real. For the level below the same holds of -F. If the second
-    derivatives are exact the step is exact to second order, so that steps converge quadratically at
-    the surface. The upper end rises with the largest slope, the lower end with the smallest.
+    Proof of the step. The upper parabola a s + c s^2/2 starts a gap g > 0 below the level above. It
+    first reaches the level at the smallest positive root of a s + c s^2/2 = g. With r = sqrt(a^2 +
+    2 c g) the root, in forms that do not cancel, is 2g/(a + r) if a > 0, and (r - a)/c if a <= 0 <
+    c. There is no root if a <= 0 and c <= 0, or if r is not real. For the level below the same
+    holds of -F. If the second derivatives are exact, the step is exact to second order, so that
+    steps converge quadratically at the surface. The upper end increases with the largest slope, the
+    lower end with the smallest.
     """
 
     slopes: SlopeRange
@@ -63,8 +65,8 @@ class ParabolaEnclosure(Enclosure):
 class LipschitzEnclosure(ParabolaEnclosure):
     """The Lipschitz cone: the step of sphere tracing.
 
-    Proof. |F(s)| <= K s for s < radius by the promise: a parabola without second-order term, whose
-    step is min(gap)/K. Source: Hart 1996, Theorem 1.
+    Proof. |F(s)| <= K s for s < radius by the promise. These are parabolas without a second-order
+    term, and the step is K^-1 times the smaller gap. Source: Hart 1996, Theorem 1.
     """
 
     @classmethod
@@ -93,8 +95,8 @@ class LipschitzEnclosure(ParabolaEnclosure):
 class TaylorEnclosure(ParabolaEnclosure):
     """Taylor's formula with a bound H of the second derivatives.
 
-    Proof. With a slope in [low, high], F(s) lies between low s - H s^2/2 and high s + H s^2/2 for
-    s < radius, by the promise along a line.
+    Proof. If the slope at the sample is in [low, high], the promise says that F(s) lies between low
+    s - H s^2/2 and high s + H s^2/2 for s < radius.
     """
 
     @classmethod
@@ -108,7 +110,7 @@ class TaylorEnclosure(ParabolaEnclosure):
 
 
 def _nan_if_negative(constant: Real) -> Real:
-    """The constant; NaN where it is negative, so that nothing is proved."""
+    """The constant; NaN if it is negative, so that nothing is proved."""
     return dr.select(constant >= 0, constant, dr.nan)
 
 
@@ -116,8 +118,8 @@ def first_reach(gap: Real, slope: Real, curvature: Real) -> Real:
     """The first s > 0 at which slope s + curvature s^2/2 reaches the gap; infinite if there is
     none.
 
-    In a form whose squares neither overflow nor underflow: near a zero of high order, slope,
-    curvature and gap are all far below the square root of the smallest number.
+    It is computed in a form whose squares neither overflow nor underflow: near a zero of high
+    order, slope, curvature and gap are all far below the square root of the smallest number.
     """
     no_level = gap == dr.inf  # there is no level on this side
     turns_away = curvature < 0
@@ -135,7 +137,9 @@ def first_reach(gap: Real, slope: Real, curvature: Real) -> Real:
 def _stays_below(gap: Real, slope: Real, curvature: Real, length: Real) -> Mask:
     """Whether slope s + curvature s^2/2 <= gap for 0 <= s <= length.
 
-    The largest value is at an end, or at the vertex of a parabola that rises and then falls."""
+    The largest value is at an end of the length or, if the parabola rises and then falls, at its
+    vertex.
+    """
     half_change = 0.5 * curvature * length
     turns_back = (slope > 0) & (slope + 2 * half_change < 0)
     max_slope = _max_turning_slope(_rounded_down_where(turns_back, gap), curvature)
@@ -143,24 +147,28 @@ def _stays_below(gap: Real, slope: Real, curvature: Real, length: Real) -> Mask:
 
 
 def _max_turning_slope(gap: Real, curvature: Real) -> Real:
-    """sqrt(2 |curvature| gap): a parabola with a smaller slope falls again before the gap."""
+    """sqrt(2 |curvature| gap). If curvature < 0, a parabola with a smaller slope falls again before
+    it reaches the gap."""
     return dr.sqrt(dr.abs(curvature)) * (_ROOT_OF_TWO * dr.sqrt(gap))
 
 
 def _rounded_down_where(turns: Mask, gap: Real) -> Real:
-    """The gap, smaller by eight roundings where a parabola bends away from the level: if its vertex
-    is close to the level, rounding decides whether a^2 + 2 c g is negative."""
+    """The gap, smaller by eight roundings on lanes where `turns` is set.
+
+    These are lanes where a parabola bends away from the level. If its vertex is close to the level,
+    rounding would decide whether a^2 + 2 c g is negative.
+    """
     return dr.select(turns, gap * (1 - 8 * float(dr.epsilon(type(gap)))), gap)
 
 
 @dataclass(frozen=True)
 class ConvexityEnclosure(Enclosure):
-    """F(s) >= slopes.lower s for all s >= 0: f is convex along the path.
+    """F(s) >= slopes.lower s for all s >= 0, because f is convex along the path.
 
-    Proof. A convex function lies above its tangents, so f does not fall to a level g below before
-    g/|slope|, and never if it rises here. Nothing is proved about levels above. f itself must be
-    convex; a convex solid, with f a bound of its distance, is not enough (Hart 1996, equation 21:
-    1 - e^-d is not convex). The lower end rises with the slope.
+    Proof. A convex function lies above its tangents. So f does not fall to a level at a gap g below
+    before s = g/|slope|, and never if it rises at the start. Nothing is proved about levels above.
+    f itself must be convex. A convex solid, with f a bound of its distance, is not enough (Hart
+    1996, equation 21: 1 - e^-d is not convex). The lower end increases with the slope.
     """
 
     slopes: SlopeRange
@@ -172,39 +180,41 @@ class ConvexityEnclosure(Enclosure):
         return dr.select(gaps.above == dr.inf, fmax(length, 0), 0)
 
 
-# Covers the roundings, in single precision, of the angle and of the length that it becomes.
+# Covers the rounding errors, in single precision, of the angle and of the length computed from it.
 _ARC_SAFETY = 1.0 - 1e-5
 _PI_BELOW = 3.14159
 
 
 @dataclass(frozen=True)
 class SphereArcEnclosure(Enclosure):
-    """|F - slope psi| <= curvature psi^2/2, psi the angle traveled along the path's circle.
+    """|F - slope psi| <= curvature psi^2/2, where psi is the angle traveled along the path's image,
+    a circle.
 
-    For functions of points on a sphere: by stereographic projection a line of space becomes a
-    circle of the unit sphere S^3, and a function that is a trigonometric polynomial on the circle
-    has a bounded second derivative in its angle, from one end of the line to the other. A step in
-    that angle, taken back to the line, may be infinite.
+    It is for functions of points on the sphere S^3. By stereographic projection a line of space
+    becomes a circle on S^3. A function that is a trigonometric polynomial on the circle has a
+    bounded second derivative by its angle, from one end of the line to the other. A step in this
+    angle, taken back to the line, may be infinite.
 
-    slopes: of f along the path, in f per length, where it starts.
-    curvature: a bound of the second derivative of f in the angle, on the whole circle.
-    offset: the path's parameter from the point of the line that is closest to the origin.
-    squared_radius: 1 + (that point's distance to the origin)^2, called c^2.
+    slopes: the range of the derivative of f along the path, by length, where it starts.
+    curvature: a bound of the second derivative of f by the angle, on the whole circle.
+    offset: the parameter t of the start, measured from the point q of the line closest to the
+        origin.
+    squared_radius: c^2 = 1 + |q|^2.
 
-    Proof. The line q + t v, q.v = 0, becomes the circle of the points
+    Proof. The line x = q + t v with q . v = 0 becomes the circle of the points
 
         y = 2x/(1 + |x|^2) = (q (1 + cos a) + c v sin a)/c^2,   w = 1 - (1 + cos a)/c^2,
 
-    with t = c tan(a/2) and c^2 = 1 + |q|^2, at speed da/dt = 2c/S, S = c^2 + t^2. So the slope in
-    the angle is S/(2c) times the slope, f keeps within the parabola of `curvature`, and the first
-    psi at which that meets a gap is `first_reach`. From t the angle psi leads to t + s with
+    with t = c tan(a/2), at speed da/dt = 2c/S, where S = c^2 + t^2. So the slope by the angle is
+    S/(2c) times the slope, and f stays within the parabola of `curvature`. `first_reach` gives the
+    first psi at which that parabola meets a gap. From t the angle psi leads to t + s with
 
         s = S sin(psi/2)/(c cos(psi/2) - t sin(psi/2)),
 
     and to infinity, where the path ends, as soon as the denominator is not positive: then no level
-    is ever met. Relative errors of slope, curvature, gap and length change psi by as much at most,
-    and an error of the denominator is one of psi of the same relative size: `_ARC_SAFETY`.
-    The range rises and falls with the slope at both ends.
+    is ever met. Relative errors of slope, curvature, gap and length change psi by at most as much,
+    and an error of the denominator acts as one of psi of the same relative size. `_ARC_SAFETY`
+    covers them. Both ends increase with the slope.
     """
 
     slopes: SlopeRange
@@ -213,6 +223,10 @@ class SphereArcEnclosure(Enclosure):
     squared_radius: Real
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """The length that the angle of the proof becomes on the line; infinite if no level is met.
+
+        Symbols: total is S = c^2 + t^2, rate is dt/da, half is psi/2.
+        """
         c = dr.sqrt(self.squared_radius)
         total = dr.fma(self.offset, self.offset, self.squared_radius)
         rate = 0.5 * total / c
@@ -222,9 +236,11 @@ class SphereArcEnclosure(Enclosure):
         is_valid = (up >= 0) & (down >= 0) & (self.curvature >= 0)  # and not NaN
         is_valid &= dr.isfinite(total)  # its square does not overflow
         is_full_turn = half >= _PI_BELOW  # once around the circle
-        s, k = sincos(dr.select(is_full_turn, 0, half))
-        divisor = dr.fma(c, k, -self.offset * s)
-        length = dr.select((divisor > 0) & ~is_full_turn, total * s / divisor * _ARC_SAFETY, dr.inf)
+        sin, cos = sincos(dr.select(is_full_turn, 0, half))
+        divisor = dr.fma(c, cos, -self.offset * sin)
+        length = dr.select(
+            (divisor > 0) & ~is_full_turn, total * sin / divisor * _ARC_SAFETY, dr.inf
+        )
         return dr.select(is_valid, fmax(length, 0), 0)
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:

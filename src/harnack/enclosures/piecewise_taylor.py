@@ -1,5 +1,4 @@
-"""Piecewise Taylor enclosures: the path cut at a few lengths, with ranges of the first two
-derivatives on each piece."""
+"""Enclosures from ranges of the first two derivatives on pieces of the path."""
 
 from __future__ import annotations
 
@@ -22,18 +21,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PiecewiseTaylorEnclosure(Enclosure):
-    """F' and F'' stay within ranges on successive pieces of the path.
+    """An enclosure from ranges of F' and F'' on successive pieces of the path.
 
-    slopes: of F at s = 0.
+    slopes: the range of F' at s = 0.
+    pieces: the pieces, in their order along the path.
 
-    Proof of the step. Let F <= A at the start of a piece, with F' <= D there, and F' <= k, F'' <= c
-    on the piece. Then F <= A + min(k s, D s + c s^2/2) on it. The next piece starts with at most
-    the value of this bound at its end, and with a slope of at most min(D + c w, k), where w is the
-    length of the piece. The first s at which the bound reaches the gap is the root of a line or of
-    a parabola. For the level below the same holds of -F. With exact ranges the bound converges to F
-    with the third power of the length of the pieces, so that one sample may prove much of a ray.
+    Proof of the step. At the start of a piece let F <= A and F' <= D, and on the piece let F' <= k
+    and F'' <= c. Then F <= A + min(k s, D s + c s^2/2) on the piece, s measured from its start. The
+    next piece starts with the value of this bound at the end of the piece, and with a slope of at
+    most min(D + c w, k), where w is the length of the piece. The first s at which the bound reaches
+    the gap is the root of a line or of a parabola. For the level below the same holds of -F. With
+    exact ranges the bound converges to F with the third power of the length of the pieces, so that
+    one sample may prove much of a ray.
 
-    Source: new in harnack; one piece is the linear and the quadratic Taylor form together
+    Source: new in harnack. One piece is the linear and the quadratic Taylor form together
     (Aydinlilar and Zanni 2023, section 6.1).
     """
 
@@ -44,14 +45,18 @@ class PiecewiseTaylorEnclosure(Enclosure):
     def from_restriction(
         cls, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> Self | None:
-        """The first two pieces are equally long, each of the others is twice as long as the one
-        before it."""
-        count = cls._count(function)
+        """The enclosure from ranges on a few pieces of the path up to `length`.
+
+        The first two pieces are equally long; each of the others is twice as long as the one before
+        it.
+        """
+        count = cls._piece_count(function)
         knots = [length * 2.0 ** (k + 1 - count) for k in range(count)]
         return cls(slopes, function.derivative_ranges([0.0, *knots]))
 
     @classmethod
-    def _count(cls, function: PathRestriction) -> int:
+    def _piece_count(cls, function: PathRestriction) -> int:
+        """The number of pieces into which the path is divided."""
         return function.piece_count
 
     @property
@@ -72,18 +77,30 @@ class PiecewiseTaylorEnclosure(Enclosure):
         return dr.select(is_free, reach, reach * STEP_SAFETY)
 
     def arrives(self, gaps: LevelGaps, length: Real) -> Mask:
-        """Proof. On the first piece F' is known, so F is continuous, and F <= s times the upper end
-        of F': it falls to the level by s = gap over that, if that end is negative."""
+        """Whether f is proved to take a level for some 0 <= s <= length.
+
+        Proof. On the first piece F' is known, so F is continuous, and F(s) is at most s times the
+        upper end of the range of F'. If that end is negative, F falls to the level below by s =
+        gap/|end|. For the level above the same holds with the lower end.
+        """
         first = self.pieces[0]
         reach = fmin(first.length, length) * STEP_SAFETY
         falls = -first.slope_range.upper * reach >= gaps.below
         return falls | (first.slope_range.lower * reach >= gaps.above)
 
     def _free_on_pieces(self, gap: Real, rises: Mask | bool) -> tuple[Real, Mask]:
-        """The first s at which F, or -F, may reach the gap, or the whole length if it is proved
-        that there is no such s; and whether that is proved."""
+        """The length on which F does not reach a level on one side, and whether it is that of all
+        pieces.
+
+        gap: the difference in value to the level.
+        rises: whether the level is above. Otherwise -F is bounded in place of F.
+
+        Returns the first s at which the bound of F reaches the gap, or the length of all pieces if
+        there is no such s; and a mask of the lanes on which there is none.
+        """
 
         def one_sided(upper: Real, lower: Real) -> Real:
+            """The upper end for F, minus the lower end for -F."""
             return dr.select(rises, upper, -lower)
 
         slope = one_sided(self.slopes.upper, self.slopes.lower)
@@ -106,8 +123,16 @@ class PiecewiseTaylorEnclosure(Enclosure):
     def _advance_piece(
         cls, gap: Real, slope: Real, max_slope: Real, curvature: Real, length: Real
     ) -> tuple[Real, Real, Real]:
-        """The slope at the end of a piece, the length of the piece that is proved free, and the gap
-        that remains at its end."""
+        """Advance the bound of F over one piece.
+
+        gap: the gap that remains at the start of the piece.
+        slope: the largest F' at the start.
+        max_slope, curvature: the largest F' and F'' on the piece.
+        length: the length of the piece.
+
+        Returns the largest F' at the end of the piece, the part of the length that is proved free,
+        and the gap that remains at the end.
+        """
         # A range that is NaN is unknown.
         slope = dr.select((slope <= max_slope) | dr.isnan(max_slope), slope, max_slope)
         by_line = dr.select(max_slope > 0, gap / max_slope, dr.select(max_slope <= 0, dr.inf, 0))
@@ -124,10 +149,10 @@ class PiecewiseTaylorEnclosure(Enclosure):
 
 
 class SinglePieceEnclosure(PiecewiseTaylorEnclosure, abc.ABC):
-    """Base of the enclosures of the literature that use ranges on the whole length at once."""
+    """Base of the enclosures of the literature that use ranges on the whole length as one piece."""
 
     @classmethod
-    def _count(cls, function: PathRestriction) -> int:
+    def _piece_count(cls, function: PathRestriction) -> int:
         del function
         return 1
 
@@ -148,7 +173,7 @@ class QuadraticTaylorEnclosure(SinglePieceEnclosure):
 
 
 class LinearTaylorEnclosure(SinglePieceEnclosure):
-    """The line from the range of F'.
+    """The line from the range of F' on the whole length.
 
     Source: Aydinlilar and Zanni 2023, section 4.1, with the exact range. Proof: that of
     `PiecewiseTaylorEnclosure`, without the parabola.
@@ -163,16 +188,17 @@ class LinearTaylorEnclosure(SinglePieceEnclosure):
 
 
 class SegmentTracingEnclosure(SinglePieceEnclosure):
-    """The largest |F'| on the length: segment tracing.
+    """The cone of the largest |F'| on the length: segment tracing.
 
     Source: Galin, Guerin, Paris and Peytavie 2020; Aydinlilar and Zanni 2023, equation 10. Proof:
-    |F(s)| <= K s with K the bound of |F'| on the piece.
+    |F(s)| <= K s, where K bounds |F'| on the length.
     """
 
     @classmethod
     def from_restriction(
         cls, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> Self | None:
+        """The enclosure from the largest |F'| on the whole length."""
         (piece,) = function.derivative_ranges([0.0, length])
         max_slope = fmax(piece.slope_range.upper, -piece.slope_range.lower)
         interval = SlopeRange(-max_slope, max_slope)

@@ -3,10 +3,10 @@
 A promise is stated in the field's own units and must be *true*: every step that the tracer takes
 relies on it. Enclosures are derived from promises, once the slope along a direction is known.
 
-This module alone derives promises of other functions from a promise of f. For f scaled, shifted,
-negated and stretched in space they follow from the units of the promise's numbers. A new kind of
-promise defines those units, the bounds of f that it implies (`movement_bounds`), and further
-consequences.
+This module alone derives promises of other functions from a promise of f. If f is scaled, shifted,
+negated or stretched in space, the new promise follows from the units of the old promise's numbers.
+A new kind of promise defines these units, the bounds of f that it implies (`movement_bounds`), and
+further consequences.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from harnack.backend import Mask, Real
     from harnack.enclosures.enclosure import SlopeRange
 
-# For a harmonic f on a ball of radius 1 with upper - lower = 1: the largest |f''| at the center, in
-# up to three and in four dimensions, and a bound of |f'| within half the radius, in up to four. See
-# `HarmonicBall`.
+# For a harmonic f on a ball of radius 1 with upper - lower = 1: bounds of |f''| at the center, the
+# first for up to three dimensions, the second for four; and a bound of |f'| within half the radius,
+# for up to four. See `HarmonicBall`.
 _SECOND_DERIVATIVE_BOUND, _SECOND_DERIVATIVE_BOUND_4D, _FIRST_DERIVATIVE_BOUND = (
     10 / (3 * math.sqrt(3)),
     9 * math.sqrt(3) / (2 * math.pi),
@@ -40,20 +40,24 @@ _SECOND_DERIVATIVE_BOUND, _SECOND_DERIVATIVE_BOUND_4D, _FIRST_DERIVATIVE_BOUND =
 
 @dataclass(frozen=True)
 class Promise(abc.ABC):
-    """Base of all kinds of promises. A subclass is a frozen dataclass of its numbers; `radius` is
-    the distance from the point within which the promise holds."""
+    """Base of all kinds of promises about a function f near a point p.
+
+    A subclass is a frozen dataclass of its numbers. `radius` is the distance from p within which
+    the promise holds.
+    """
 
     units: ClassVar[tuple[tuple[str, int, int], ...]]
-    """The names of its numbers, and the powers of the units of f and of length that each is in."""
+    """(name, i, j) for each of its numbers, whose unit is (unit of f)^i (length)^j."""
 
     interval_pairs: ClassVar[tuple[tuple[str, str], ...]] = ()
-    """The pairs of numbers that are a lower and an upper end; the first pair bounds f itself."""
+    """The names of numbers that are the lower and the upper end of a range. The first pair bounds f
+    itself."""
 
     holds_outside_domain: ClassVar[bool] = False
-    """Whether it holds on the whole ball, also where that leaves the field's domain."""
+    """Whether it holds on the whole ball, also outside of the field's domain."""
 
     implies_smooth: ClassVar[bool] = True
-    """Whether it says that f has no creases within the radius."""
+    """Whether the promise implies that f has no creases within the radius."""
 
     if TYPE_CHECKING:
 
@@ -62,37 +66,52 @@ class Promise(abc.ABC):
 
     @abc.abstractmethod
     def movement_bounds(self, value: Any, slopes: SlopeRange, length: Any) -> tuple[Any, Any]:
-        """Lower and upper bound of f(y) - f(p), for y at a length, less than the radius, from p
-        along a direction in which f has these slopes at p.
+        """Lower and upper bound of f(y) - f(p) for a point y along a direction from p.
 
-        value: f(p). For NumPy and Dr.Jit arrays alike.
+        value: f(p).
+        slopes: the range of the derivative of f along the direction at p.
+        length: |y - p|, less than the radius.
+
+        All are NumPy or Dr.Jit arrays.
         """
 
     def taylor_remainder_bound(self, value: Real, length: Real, degree: int = 1) -> Real:
-        """A bound of |f(y) - T(y)| for |y - p| <= length, T the Taylor polynomial of f about p of a
-        degree (1 or 2); infinite if none follows. As the length decreases, it decreases at least as
-        length^(degree + 1)."""
+        """A bound of |f(y) - T(y)| for |y - p| <= length; infinite if the promise implies none.
+
+        T is the Taylor polynomial of f about p.
+
+        value: f(p).
+        degree: the degree of T, 1 or 2. As the length decreases, the bound decreases at least as
+            length^(degree + 1).
+        """
         del value, length, degree
         return dr.inf
 
     def implied_lipschitz(self, value: Real) -> Lipschitz | None:
-        """A Lipschitz promise that follows from this one; None if none does."""
+        """A Lipschitz promise that follows from this one; None if none does. value: f(p)."""
         del value
         return None
 
     def implied_second_derivative_bound(self, value: Real) -> tuple[Real, Real] | None:
-        """A bound of |f_vv| for all unit vectors v, and the radius of the ball about p in which it
-        holds at every point; None if none follows. (`taylor_remainder_bound` is smaller: it is
-        about the Taylor polynomial at p alone.)"""
+        """A bound of |f_vv| for all unit vectors v that holds everywhere in a ball, and the radius
+        of the ball.
+
+        None if the promise implies no such bound. (`taylor_remainder_bound` is smaller: it is about
+        the Taylor polynomial at p alone.)
+
+        value: f(p).
+        """
         del value
 
     def weakened_for_linear_maps(self, value: Real) -> Promise:
-        """A weaker promise of a kind that survives every linear map A of space: if f makes it, f(A
-        x) makes it in a transformed form.
+        """A weaker promise, of a kind that is preserved by every linear map A of space.
 
-        Harmonic functions and bounds of the Laplacian survive similarities only: HarmonicBall
-        returns a TaylorRemainder, and BoundedLaplacian a Lipschitz promise. Other kinds return
-        themselves.
+        If f makes a promise of such a kind, f(A x) makes it with other numbers (`linearly_mapped`).
+        Harmonic functions and bounds of the Laplacian are preserved by similarities only. So
+        HarmonicBall returns a TaylorRemainder, and BoundedLaplacian a Lipschitz promise. Other
+        kinds return themselves.
+
+        value: f(p).
         """
         del value
         return self
@@ -118,9 +137,10 @@ class Promise(abc.ABC):
         return dataclasses.replace(self, **numbers)
 
     def space_scaled(self, size: Real) -> Self:
-        """The promise of x -> f(x / size), at size * p."""
+        """The promise that x -> f(x / size) makes at the point size * p."""
 
         def rescaled(number: Real, power: int) -> Real:
+            """number * size^power."""
             if power == 0:
                 return number
             return number * size if power > 0 else number / _power(size, -power)
@@ -128,10 +148,13 @@ class Promise(abc.ABC):
         return self.map_numbers(lambda number, _, power: rescaled(number, power))
 
     def linearly_mapped(self, stretch: Real) -> Self:
-        """The promise of x -> f(A x) for a linear map A that stretches no length by more than the
-        factor `stretch`."""
+        """The promise of x -> f(A x) for a linear map A.
+
+        stretch: A stretches no length by more than this factor.
+        """
 
         def rescaled(number: Real, power: int) -> Real:
+            """number / stretch^power, for power <= 1."""
             if power > 0:
                 return number / stretch
             for _ in range(-power):
@@ -141,13 +164,16 @@ class Promise(abc.ABC):
         return self.map_numbers(lambda number, _, power: rescaled(number, power))
 
     def map_numbers(self, change: Callable[[Any, int, int], Any]) -> Self:
-        """The promise with other numbers. change: a function of a number and the powers of its
-        unit, which returns the new number."""
+        """A promise of the same kind with other numbers.
+
+        change: a function (number, i, j) -> new number, where the number's unit is (unit of f)^i
+            (length)^j.
+        """
         numbers = {name: change(getattr(self, name), *powers) for name, *powers in self.units}
         return dataclasses.replace(self, **numbers)
 
     def select(self, mask: Mask, other: Self) -> Self:
-        """The other promise, of the same kind, on lanes where the mask is set; this promise
+        """The other promise, which is of the same kind, on lanes where the mask is set; this one
         elsewhere."""
         numbers: dict[str, Any] = {}
         for name, *_ in self.units:
@@ -158,6 +184,7 @@ class Promise(abc.ABC):
 
 
 def _power(number: Real, exponent: int) -> Real:
+    """number^exponent for an integer exponent >= 1."""
     return number if exponent == 1 else number * _power(number, exponent - 1)
 
 
@@ -165,9 +192,12 @@ def _power(number: Real, exponent: int) -> Real:
 class HarmonicBall(Promise):
     """f extends to a harmonic function on the ball B(p, radius) of R^dimension that stays in range.
 
-    The continuous lift of f that agrees with `Sample.value` at p is harmonic on the open ball and
-    stays within [lower, upper] there. Either end may be infinite, not both. dimension is 2, 3 or
-    4: a function of the plane extended constantly, of space, or a slice of a function of R^4.
+    If f has a period, this is about its continuous branch that agrees with `Sample.value` at p.
+
+    lower, upper: bounds of the harmonic function on the open ball. Either may be infinite, not
+        both.
+    dimension: 2 for a function of the plane, extended constantly along z; 3 for a function of
+        space; 4 if f is a slice of a function of R^4.
     """
 
     radius: Real
@@ -183,12 +213,16 @@ class HarmonicBall(Promise):
         return self.lower - value, self.upper - value
 
     def taylor_remainder_bound(self, value: Real, length: Real, degree: int = 1) -> Real:
-        """Proof for a harmonic f >= c on a ball of radius R in n dimensions: f - c is the integral
-        of Poisson's kernel P(q, s) = sum over l of the zonal harmonics, all largest at s = 1, with
-        a measure of mass f(p) - c; those of degree 0 and 1 are the value and the gradient. The rest
-        is between -(P - 1 - n q) and P - 1 - n q at s = 1, P = (1 + q)/(1 - q)^(n - 1), times
-        f(p) - c. The same holds for C - f, and the smaller of the two bounds is returned. For
-        degree 2 that harmonic is left out, too: at s = 1 it is 2, 5 and 9 times q^2.
+        """A bound of the error of Taylor's formula: see `Promise`.
+
+        Proof for a harmonic f >= c on a ball of radius R in n dimensions. f - c is the integral of
+        Poisson's kernel P(q, s), q = length/R, with a measure of mass f(p) - c. P is the sum over l
+        of the zonal harmonics, which are all largest at s = 1. Those of degree 0 and 1 are the
+        value and the gradient. The rest of P is at most P - 1 - n q at s = 1, in absolute value,
+        where P = (1 + q)/(1 - q)^(n - 1). So the error is at most this number times f(p) - c. The
+        same holds for C - f with f <= C, and the smaller of the two bounds is returned. For degree
+        2, the harmonic of degree 2 is left out, too: at s = 1 it is 2, 5 and 9 times q^2 for n = 2,
+        3 and 4.
         """
         mass = fmin(value - self.lower, self.upper - value)
         q = length / self.radius
@@ -203,9 +237,11 @@ class HarmonicBall(Promise):
         return dr.select((q < 1) & (mass < dr.inf), mass * remainder, dr.inf)
 
     def implied_lipschitz(self, value: Real) -> Lipschitz | None:
-        """On half the ball. Proof. Let f be within M of a constant on a ball of radius r in R^n. At
-        its center f_v is n/r times the mean of f s over the sphere, s the cosine of the angle to v,
-        so at most n M/r times the mean of |s|: 1.28, 1.5 and 1.7 M/r for n = 2, 3, 4. Points within
+        """A Lipschitz promise on half the ball; None if f is not bounded on both sides.
+
+        Proof. Let f be within M of a constant on a ball of radius r in R^n. At the center f_v is
+        n/r times the mean of f s over the sphere, where s is the cosine of the angle to v. So |f_v|
+        is at most n M/r times the mean of |s|: 1.28, 1.5 and 1.7 M/r for n = 2, 3, 4. Points within
         R/2 are centers of balls of radius R/2, on which M is half of upper - lower.
         """
         if _is_infinite(self.lower) or _is_infinite(self.upper):
@@ -215,17 +251,19 @@ class HarmonicBall(Promise):
         )
 
     def weakened_for_linear_maps(self, value: Real) -> Promise:
-        """`TaylorRemainder` on half the ball. Proof in space (and so in the plane). At the center
-        of a ball of radius R, f_vv = R^-2 times the mean of f 5 (3 s^2 - 1) over the sphere, s the
-        cosine of the angle to v; for f between lower and upper that is at most 10/(3 sqrt 3)
-        (upper - lower)/R^2. Points within R/2 are centers of balls of radius R/2.
+        """A `TaylorRemainder` on half the ball.
 
-        In R^4 the factor is 6 (4 s^2 - 1), and c = 2.49 takes the place of 10/(3 sqrt 3) = 1.92.
-        There |f_vv| <= c (upper - lower)/(R - u)^2 at the distance u from p, and by Taylor's
-        formula the remainder at t <= R/2 is at most (upper - lower) times the integral of
-        c (t - u)/(R - u)^2 over [0, t]. As one factor falls and the other rises, that is at most
-        t^2/2 times the mean of c/(R - u)^2, which is c/(R (R - t)) <= 2 c/R^2: less than the
-        constant, 7.7/R^2.
+        Proof in space (and so in the plane). At the center of a ball of radius R, f_vv is R^-2
+        times the mean of 5 (3 s^2 - 1) f over the sphere, where s is the cosine of the angle to v.
+        For f between lower and upper this is at most 10/(3 sqrt 3) (upper - lower)/R^2. Points
+        within R/2 are centers of balls of radius R/2.
+
+        Proof in R^4. Here the factor is 6 (4 s^2 - 1), and c = 2.49 takes the place of 10/(3 sqrt
+        3) = 1.92. At the distance u from p, |f_vv| <= c (upper - lower)/(R - u)^2. By Taylor's
+        formula the remainder at a length t <= R/2 is at most (upper - lower) times the integral of
+        c (t - u)/(R - u)^2 over [0, t]. As one factor falls and the other rises, this is at most
+        t^2/2 times the mean of c/(R - u)^2, which is c/(R (R - t)) <= 2 c/R^2. That is less than
+        the constant 7.7/R^2 of the promise.
         """
         half = 0.5 * self.radius
         return TaylorRemainder(
@@ -233,9 +271,12 @@ class HarmonicBall(Promise):
         )
 
     def implied_second_derivative_bound(self, value: Real) -> tuple[Real, Real] | None:
-        """As for `weakened_for_linear_maps`, at the centers of balls of radius R/2. In R^4, where
-        f_vv is R^-2 times the mean of f 6 (4 s^2 - 1), the mean of the positive part of that kernel
-        is 9 sqrt(3)/(2 pi) = 2.48, which is half the mean of its absolute value."""
+        """A bound of |f_vv| on half the ball; None if f is not bounded on both sides.
+
+        As for `weakened_for_linear_maps`, at the centers of balls of radius R/2. In R^4, where f_vv
+        is R^-2 times the mean of 6 (4 s^2 - 1) f, the mean of the positive part of this kernel is 9
+        sqrt(3)/(2 pi) = 2.48, which is half the mean of its absolute value.
+        """
         if _is_infinite(self.lower) or _is_infinite(self.upper):
             return None
         half = 0.5 * self.radius
@@ -243,19 +284,21 @@ class HarmonicBall(Promise):
         return 1.0001 * constant * self._span(value) / (half * half), half
 
     def _span(self, value: Real) -> Real:
-        """upper - lower, as the sum of the distances of both from the value."""
+        """upper - lower, as the sum of the distances of both from the value f(p)."""
         return (self.upper - value) + (value - self.lower)
 
 
 @dataclass(frozen=True)
 class BoundedLaplacian(Promise):
-    """On the ball B(p, radius) of space f stays within [lower, upper] and its Laplacian within
-    [laplacian_lower, laplacian_upper].
+    """f and its Laplacian stay within ranges on the ball B(p, radius) of space.
 
-    f is continuously differentiable there and its Laplacian a bounded function, which may jump. All
-    four ends are needed: a subharmonic function has laplacian_lower = 0, but nothing follows unless
-    laplacian_upper is known as well, for it may have spikes. Units: those of f, and of f over
-    length squared.
+    f is continuously differentiable there, and its Laplacian is a bounded function, which may jump.
+
+    lower, upper: the range of f.
+    laplacian_lower, laplacian_upper: the range of the Laplacian, in units of f over length squared.
+
+    All four ends are needed. A subharmonic function, for example, has laplacian_lower = 0, but
+    nothing follows unless laplacian_upper is known as well, because f may have spikes.
     """
 
     radius: Real
@@ -275,10 +318,12 @@ class BoundedLaplacian(Promise):
         return self.lower - value, self.upper - value
 
     def implied_lipschitz(self, value: Real) -> Lipschitz:
-        """On half the ball. Proof. Points within R/2 are centers of balls of radius r = R/2. There
-        f is a harmonic h with the same boundary values, which are between lower and upper, less the
-        integral of G Laplacian f: so |h_v| <= 3/2 (upper - lower)/(2 r), and the integral of
-        |d_v G| is 3 r/8.
+        """A Lipschitz promise on half the ball.
+
+        Proof. Points within R/2 are centers of balls of radius r = R/2. On such a ball f = h -
+        integral of G Laplacian f, where G is the Green function and h is harmonic with the boundary
+        values of f, which are between lower and upper. So |h_v| <= 3/2 (upper - lower)/(2 r), and
+        the integral of |d_v G| is 3 r/8.
         """
         half = 0.5 * self.radius
         max_laplacian = fmax(dr.abs(self.laplacian_lower), dr.abs(self.laplacian_upper))
@@ -289,8 +334,11 @@ class BoundedLaplacian(Promise):
         return self.implied_lipschitz(value)
 
     def linearly_mapped(self, stretch: Real) -> BoundedLaplacian:
-        """For a similarity A: the Laplacian of f(A x) is that of f times the square of the factor
-        by which A stretches lengths, which is `stretch` up to some roundings."""
+        """The promise of x -> f(A x) for a similarity A.
+
+        The Laplacian of f(A x) is that of f times the square of the factor by which A stretches
+        lengths. This factor is `stretch` up to some roundings.
+        """
         slack = 5e-6 * (dr.abs(self.laplacian_lower) + dr.abs(self.laplacian_upper))
         lower, upper = self.laplacian_lower - slack, self.laplacian_upper + slack
         widened = dataclasses.replace(self, laplacian_lower=lower, laplacian_upper=upper)
@@ -301,8 +349,8 @@ class BoundedLaplacian(Promise):
 class Lipschitz(Promise):
     """|f(y) - f(p)| <= constant * |y - p| for every y with |y - p| < radius (default: all y).
 
-    For a field with a domain: for every such y in it. Without a radius the constant is that of the
-    field, the same at every point, so that it bounds all second derivatives.
+    If the field has a domain, this holds for every such y in the domain. Without a radius the
+    constant must be the same at every point of the field.
     """
 
     constant: Real
@@ -323,8 +371,11 @@ class Lipschitz(Promise):
 class TaylorRemainder(Promise):
     """|f(y) - f(p) - grad f(p).(y-p)| <= constant |y-p|^2/2 for every y with |y-p| < radius.
 
-    For a field with a domain: for every such y in it. There too, the remainder of Taylor's
-    polynomial of second degree is at most cubic_constant |y-p|^3/6, if that constant is known.
+    If the field has a domain, this holds for every such y in the domain. Without a radius the
+    constant must be the same at every point of the field; it then bounds all second derivatives.
+
+    cubic_constant: if it is finite, the remainder of Taylor's polynomial of second degree is at
+        most cubic_constant |y-p|^3/6 for the same y.
     """
 
     constant: Real
@@ -338,7 +389,8 @@ class TaylorRemainder(Promise):
         return slopes.lower * length - curved, slopes.upper * length + curved
 
     def implied_second_derivative_bound(self, value: Real) -> tuple[Real, Real] | None:
-        """By definition, at every point that promises it; without a radius all do."""
+        """The constant, if the promise has no radius: then it holds at every point. Otherwise
+        None."""
         del value
         return (self.constant, self.radius) if _is_infinite(self.radius) else None
 
@@ -350,4 +402,6 @@ class TaylorRemainder(Promise):
 
 
 def _is_infinite(end: Any) -> bool:
+    """Whether `end` is an infinite Python float, which is known while a kernel is being
+    recorded."""
     return isinstance(end, float) and math.isinf(end)

@@ -1,4 +1,4 @@
-"""The choice of enclosures, by name or by class; the longest length that several enclosures
+"""The choice of enclosures, by name or by class, and the longest length that several of them
 prove."""
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ if TYPE_CHECKING:
     from harnack.enclosures.enclosure import PathRestriction
     from harnack.enclosures.promises import Lipschitz
 
-# Enclosures from promises, from the sharpest proof to the fallback of all. `trace` takes
-# `_CURVATURE` by default, and so do clearances.
+# Classes of enclosures that use promises, each tuple from the sharpest proof to the fallback.
+# `trace` and clearances take `_CURVATURE` by default.
 _FALLBACK = (LipschitzEnclosure,)
 _SLOPE = (HarnackSlopeEnclosure, BoundedLaplacianEnclosure, *_FALLBACK)
 _CURVATURE = (TaylorEnclosure, SphericalCapEnclosure, *_SLOPE)
@@ -72,8 +72,8 @@ _NAMES_USING_RANGES = [
 class EnclosureKinds:
     """Ordered classes of enclosures. For each promise the first class that can use it is chosen.
 
-    kinds: from the sharpest to the weakest: a later class would only prove less from the same
-        promise.
+    kinds: the classes from the sharpest to the weakest. A later class would only prove less from
+        the same promise.
     uses_alternative_promises: whether to use promises that the field declares weaker than its
         others (`Sample.alternative_promises`).
     """
@@ -84,8 +84,14 @@ class EnclosureKinds:
     def from_restriction(
         self, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> tuple[Enclosure, ...]:
-        """The enclosures of a function whose ranges along the path are known; empty if no class
-        uses ranges."""
+        """The enclosure of a function from ranges of its derivatives along the path, as a tuple of
+        one.
+
+        It is that of the first class that uses ranges; the tuple is empty if no class does.
+
+        slopes: the range of the derivative at the start of the path.
+        length: the reach that is asked for.
+        """
         for kind in self.kinds:
             enclosure = kind.from_restriction(function, slopes, length)
             if enclosure is not None:
@@ -101,9 +107,10 @@ class EnclosureKinds:
         slopes: SlopeRange,
         ray_promises: tuple[Lipschitz, ...] = (),
     ) -> tuple[Enclosure, ...]:
-        """The enclosures of f along a direction in which it has these slopes.
+        """The enclosures of f along a direction, one for each promise that a class can use.
 
         promises, alternative_promises, value, error, ray_promises: as in `Sample`.
+        slopes: the range of the derivative of f along the direction.
 
         Raises:
             ValueError: no class of enclosures applies to a promise.
@@ -121,6 +128,7 @@ class EnclosureKinds:
     def _enclosure(
         self, promise: Promise, value: Real, error: Real, slopes: SlopeRange
     ) -> Enclosure | None:
+        """The enclosure of the first class that can use the promise; None if no class can."""
         for kind in self.kinds:
             enclosure = kind.from_promise(promise, value, error, slopes)
             if enclosure is not None:
@@ -130,7 +138,8 @@ class EnclosureKinds:
     def _nothing_applies_message(
         self, promises: tuple[Promise, ...], value: Real, error: Real, slopes: SlopeRange
     ) -> str:
-        """The reason why no proof applies, and the names of proofs that would."""
+        """The message for promises that no class can use, with the names of enclosures that
+        could."""
         requested = ", ".join(kind.__name__ for kind in self.kinds)
         if not promises:
             kinds = ", ".join(kind.__name__ for kind in Promise.__subclasses__())
@@ -173,16 +182,26 @@ EnclosureChoice: TypeAlias = (
 
 
 def choose_enclosures(enclosures: EnclosureChoice = None) -> EnclosureKinds:
-    """The classes of enclosures for the option `enclosures`: a name, one or several classes, or
-    None for all that are worth their time.
+    """The classes of enclosures for the option `enclosures` of other functions.
 
-    Names: "classic" (the published rule), "slope", "caps" (caps where both ends are known, the
-    slope bound elsewhere), "laplacian" (where the Laplacian is bounded), "lipschitz", and
-    "curvature" (Taylor's formula where second derivatives are bounded, else as "caps"); for fields
-    with a formula "pieces", and for comparison "quadratic-taylor", "linear-taylor" and "segment",
-    and by the formula's own arithmetic "bottom-up-linear", "bottom-up-quadratic", "mixed", "affine"
-    and "interval". None means "pieces", which for fields without a formula means "curvature", but
-    without the promises that a field declares weaker than its others.
+    enclosures: a name, one or several classes of enclosures, or None for all that are worth their
+        time.
+
+    Names for all fields:
+
+    - "classic": the published rule.
+    - "slope": Harnack's inequality with the slope.
+    - "caps": spherical caps if a function is bounded on both sides, else as "slope".
+    - "laplacian": the bound for functions with a bounded Laplacian.
+    - "lipschitz": the Lipschitz cone.
+    - "curvature": Taylor's formula if second derivatives are bounded, else as "caps".
+
+    Names for fields with a formula: "pieces", and for comparison "quadratic-taylor",
+    "linear-taylor" and "segment", and by the formula's own arithmetic "bottom-up-linear",
+    "bottom-up-quadratic", "mixed", "affine" and "interval".
+
+    None means "pieces", but without the promises that a field declares weaker than its others. For
+    fields without a formula "pieces" means "curvature".
 
     Raises:
         ValueError: another name.
@@ -212,15 +231,14 @@ def choose_enclosures(enclosures: EnclosureChoice = None) -> EnclosureKinds:
 
 
 def _is_proof(kind: Any) -> bool:
-    """Whether this is a class of enclosures that can be instantiated."""
+    """Whether `kind` is a class of enclosures that can be instantiated."""
     return isinstance(kind, type) and issubclass(kind, Enclosure) and not inspect.isabstract(kind)
 
 
 def longest_free_length(enclosures: tuple[Enclosure, ...], gaps: LevelGaps) -> Real:
-    """The longest length that any of the enclosures proves free. Each length is proved, so their
-    maximum is.
+    """The longest length that any of the enclosures proves free.
 
-    It is at least 0, also where an enclosure gives NaN.
+    Each length is proved, so their maximum is. It is at least 0, even if an enclosure gives NaN.
     """
     best: Real = type(gaps.above)(0)
     for enclosure in enclosures:
@@ -229,7 +247,7 @@ def longest_free_length(enclosures: tuple[Enclosure, ...], gaps: LevelGaps) -> R
 
 
 def any_is_free(enclosures: tuple[Enclosure, ...], gaps: LevelGaps, length: Real) -> Mask:
-    """Whether any of the enclosures proves the length free."""
+    """Whether at least one of the enclosures proves the length free."""
     is_free = length <= 0
     for enclosure in enclosures:
         is_free |= enclosure.is_free(gaps, length)

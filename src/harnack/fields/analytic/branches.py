@@ -25,29 +25,38 @@ Complex = Any
 # Points nearer than this to a singular point are moved away from it: squares of such distances do
 # not underflow.
 _MIN_DISTANCE = 1e-12
-# About the smallest number whose square, and the inverse of that, exist in single precision.
-_MIN_SQUARED = 1e-18
-# The distance to the nearest singular point, if there is none.
-_NO_POINT = 2.0
+# The smallest distance to a zero, added to the rounding: in single precision its square and the
+# inverse of its square are still finite numbers other than 0.
+_MIN_ZERO_DISTANCE = 1e-18
+# What counts as the distance to the nearest singular point if there are no singular points.
+_CLEARANCE_WITHOUT_POINTS = 2.0
 # Bounds of second derivatives are multiplied by this factor, for the rounding of logarithms and
 # powers.
 _BOUND_MARGIN = 1 + 2e-4
 
 
 def complex_type(backend: Backend) -> Any:
-    """The type of complex numbers of a backend."""
+    """The Dr.Jit type of complex numbers (`Complex2f` or `Complex2f64`) of the backend and
+    precision."""
     suffix = "64" if backend.precision == "double" else ""
     return getattr(importlib.import_module(f"drjit.{backend.name}.ad"), f"Complex2f{suffix}")
 
 
 def complex_of(x: Real, y: Real) -> Complex:
-    """x + i y."""
+    """x + i y as a Dr.Jit complex number; x and y may differ from lane to lane."""
     return complex_type(backend_of(x))(x, y)
 
 
 def derivatives(number: Complex, part: str) -> tuple[Real, Real]:
-    """d/dx and d/dy of the part, "imag" or "real", of an analytic function whose derivative is
-    `number`."""
+    """The derivatives d/dx and d/dy of the real or imaginary part of an analytic function g(x + i
+    y).
+
+    number: the derivative g'(z).
+    part: "imag" or "real", the part of g that is differentiated.
+
+    By the Cauchy-Riemann equations they are Im g' and Re g' for the imaginary part, and Re g' and
+    -Im g' for the real part.
+    """
     if part == "imag":
         return number.imag, number.real
     return number.real, -number.imag
@@ -55,12 +64,17 @@ def derivatives(number: Complex, part: str) -> tuple[Real, Real]:
 
 @dataclass(frozen=True)
 class BranchPoint:
-    """A point of the plane where branches are not analytic.
+    """A point of the plane where branches are not analytic, with a bound of the branches near it.
 
     location: the point.
-    power, constant, radius, value: within the radius of the point, all branches g have |g - value|
-        <= constant |z - location|^power, with a power > 0 (up to the period of the part that is
-        drawn). The power is None if no such bound is known, as at poles and logarithms.
+    power, constant, radius, value: all branches g obey |g - value| <= constant |z - location|^power
+        at all z within the radius of the point, power > 0. If the drawn part of g has a period,
+        this holds after a shift by whole periods. The power is None if no such bound is known, as
+        at poles and logarithms.
+
+    Raises:
+        TypeError, ValueError: a number is not finite (the radius may be infinite), or the power,
+            constant or radius is not positive.
     """
 
     location: complex
@@ -84,7 +98,11 @@ class BranchPoint:
 
 @dataclass(frozen=True)
 class PreparedBranchPoint:
-    """A `BranchPoint` as kernel parameters of a backend."""
+    """A `BranchPoint` whose numbers are kernel parameters of a backend.
+
+    at: the location of the point.
+    power, constant, radius, value: as for `BranchPoint`.
+    """
 
     at: Complex
     power: float | None
@@ -94,23 +112,21 @@ class PreparedBranchPoint:
 
     @classmethod
     def of(
-        cls, point: BranchPoint, make_number: Callable[[float], Real], make_complex: Any
+        cls, point: BranchPoint, number: Callable[[float], Real], made: Any
     ) -> PreparedBranchPoint:
-        """The point on a backend.
+        """Convert a branch point to numbers of a backend.
 
-        make_number: makes a number of the backend.
-        make_complex: makes a complex number of the backend from its two parts.
+        number: makes a real number of the backend from a Python float.
+        made: makes a complex number of the backend from its real and its imaginary part.
         """
-        at, value = (
-            make_complex(make_number(z.real), make_number(z.imag))
-            for z in (point.location, point.value)
-        )
-        return cls(at, point.power, make_number(point.constant), make_number(point.radius), value)
+        at, value = (made(number(z.real), number(z.imag)) for z in (point.location, point.value))
+        return cls(at, point.power, number(point.constant), number(point.radius), value)
 
 
 @dataclass(frozen=True)
 class Branch:
-    """A branch at z: its value, derivative and, if it is known, second derivative."""
+    """The value g(z), the derivative g'(z) and, if it is known, g"(z) of one branch g at a
+    point z."""
 
     value: Complex
     first: Complex
@@ -118,12 +134,15 @@ class Branch:
 
 
 class PlaneRegion(abc.ABC):
-    """A region of the plane on which second derivatives are bounded. All its numbers are rounded
-    outwards."""
+    """A region of the complex plane, on which `Branches.second_derivative_bound` bounds |g"|.
+
+    The numbers that its methods return are rounded outwards: they hold for the exact region.
+    """
 
     @abc.abstractmethod
     def distances(self, at: Complex) -> tuple[Real, Real]:
-        """The smallest and the largest distance from a point."""
+        """A lower bound of the smallest, and an upper bound of the largest distance from the point
+        `at` to points of the region."""
 
     @abc.abstractmethod
     def disk(self) -> tuple[Complex, Real]:
@@ -132,9 +151,11 @@ class PlaneRegion(abc.ABC):
 
 @dataclass(frozen=True)
 class PlaneSegment(PlaneRegion):
-    """The segment from z to z + length w, w a Dr.Jit complex number.
+    """The segment of the complex plane from z to z + length w.
 
-    rounding: a bound of the rounding of z.
+    z, w: Dr.Jit complex numbers; w need not have length 1.
+    length: a multiple of w, >= 0.
+    rounding: a bound of the rounding error of z, as a distance.
     """
 
     z: Complex
@@ -143,18 +164,22 @@ class PlaneSegment(PlaneRegion):
     rounding: Real
 
     def distances(self, at: Complex) -> tuple[Real, Real]:
-        """The smallest distance is that of the foot of the perpendicular, or of the end nearer to
-        it; the largest is that of an end, as distances are convex."""
+        """A lower bound of the smallest, and an upper bound of the largest distance from `at`.
+
+        The smallest distance is that of the foot of the perpendicular from `at`, or, if the foot is
+        not on the segment, of the end nearer to it. The largest distance is that of an end, since
+        the distance from a point is a convex function along a line.
+        """
         x, y = self.z.real - at.real, self.z.imag - at.imag
         speed = dr.square(self.w.real) + dr.square(self.w.imag)
-        closest = -(x * self.w.real + y * self.w.imag) / speed
-        closest = dr.select(speed > 0, fmin(fmax(closest, 0), self.length), 0)
-        start, middle, end = (
-            dr.sqrt(dr.square(x + s * self.w.real) + dr.square(y + s * self.w.imag))
-            for s in (0.0, closest, self.length)
+        foot_position = -(x * self.w.real + y * self.w.imag) / speed
+        foot_position = dr.select(speed > 0, fmin(fmax(foot_position, 0), self.length), 0)
+        start, foot_distance, end = (
+            dr.sqrt(dr.square(x + position * self.w.real) + dr.square(y + position * self.w.imag))
+            for position in (0.0, foot_position, self.length)
         )
         slack = self.rounding + 1e-6 * start
-        return fmax(fmin(middle, start) - slack, 0), fmax(end, start) * (1 + 1e-6) + slack
+        return fmax(fmin(foot_distance, start) - slack, 0), fmax(end, start) * (1 + 1e-6) + slack
 
     def disk(self) -> tuple[Complex, Real]:
         half = 0.5 * self.length
@@ -163,16 +188,19 @@ class PlaneSegment(PlaneRegion):
 
 @dataclass(frozen=True)
 class Disk(PlaneRegion):
-    """The disk of a radius about z; rounding: a bound of the rounding of z."""
+    """The disk of the complex plane with center z and this radius.
+
+    rounding: a bound of the rounding error of z, as a distance.
+    """
 
     z: Complex
     radius: Real
     rounding: Real
 
     def distances(self, at: Complex) -> tuple[Real, Real]:
-        middle = abs(self.z - at)
-        slack = self.rounding + 1e-6 * middle + self.radius
-        return fmax(middle - slack, 0), middle + slack
+        center_distance = abs(self.z - at)
+        slack = self.rounding + 1e-6 * center_distance + self.radius
+        return fmax(center_distance - slack, 0), center_distance + slack
 
     def disk(self) -> tuple[Complex, Real]:
         return self.z, self.radius + self.rounding
@@ -180,7 +208,10 @@ class Disk(PlaneRegion):
 
 @dataclass(frozen=True)
 class Branches(abc.ABC):
-    """All branches of an analytic function, with proved bounds."""
+    """All branches g of an analytic function of a complex variable, with proved bounds.
+
+    Branches that differ by whole periods of the drawn part (`period`) count as one.
+    """
 
     _prepared: tuple[PreparedBranchPoint, ...] = field(
         default=(), kw_only=True, repr=False, compare=False
@@ -189,24 +220,28 @@ class Branches(abc.ABC):
     @property
     @abc.abstractmethod
     def branch_points(self) -> tuple[BranchPoint, ...]:
-        """The points where branches are not analytic; everywhere else each branch can be
-        continued."""
+        """The points where branches are not analytic. Along every curve that avoids them each
+        branch can be continued."""
 
     def period(self, imaginary: bool) -> float | None:
-        """A number by which the drawn part of each branch may be shifted to give a branch again;
-        None if there is no such number."""
+        """A number by which the drawn part of any branch may be shifted to give the drawn part of a
+        branch again; None if there is no such number.
+
+        imaginary: True if the imaginary part is drawn, False if the real part is drawn.
+        """
         del imaginary
         return None
 
     @property
     def count(self) -> int:
-        """The number of branches, up to the period."""
+        """The number of branches, where those that differ by whole periods count as one."""
         return 1
 
     def prepare(self, backend: Backend) -> Branches:
-        """The same branches with their numbers as kernel parameters of the backend."""
+        """A copy of these branches whose numbers are kernel parameters of the backend."""
 
         def number(value: float) -> Real:
+            """The number as a kernel parameter."""
             return dr.opaque(backend.Float, value)
 
         make_complex = complex_type(backend)
@@ -218,7 +253,8 @@ class Branches(abc.ABC):
         )
 
     def points_on(self, z: Complex) -> tuple[PreparedBranchPoint, ...]:
-        """The branch points as numbers of the type of z."""
+        """The branch points as Dr.Jit numbers of the same types as the point z: kernel parameters
+        after `prepare`, else literals."""
         if self._prepared:
             return self._prepared
         real, make_complex = cast("Any", type(z.real)), cast("Any", type(z))
@@ -228,14 +264,21 @@ class Branches(abc.ABC):
 
     @abc.abstractmethod
     def evaluate(self, z: Complex) -> tuple[Branch, ...]:
-        """All branches at z, up to the period, in any order."""
+        """All branches at z, one for each set of branches that differ by whole periods, in any
+        order."""
 
     @abc.abstractmethod
     def second_derivative_bound(self, part: PlaneRegion) -> Real:
-        """A bound of |g''| for all branches on the region `part` of the plane."""
+        """A bound of |g"|, for all branches g, on the region `part` of the plane; infinite if no
+        bound is known."""
 
     def move_off_singularities(self, z: Complex, rounding: Real) -> Complex:
-        """z, moved by its rounding away from singular points, where derivatives are NaN."""
+        """z, moved away from singular points, where derivatives are NaN.
+
+        rounding: a bound of the rounding error of z, as a distance. If z is nearer to a singular
+            point than this (plus 1e-12), it is replaced by a point at that distance; else it is
+            unchanged.
+        """
         min_distance = rounding + _MIN_DISTANCE
         for point in self.points_on(z):
             moved = type(z)(point.at.real + min_distance, point.at.imag)
@@ -243,21 +286,24 @@ class Branches(abc.ABC):
         return z
 
     def clearance(self, z: Complex) -> Real:
-        """The distance to the nearest singular point."""
-        nearest = 0 * z.real + (dr.inf if self.branch_points else _NO_POINT)
+        """The distance from z to the nearest singular point; 2 if there are no singular points."""
+        nearest = 0 * z.real + (dr.inf if self.branch_points else _CLEARANCE_WITHOUT_POINTS)
         for point in self.points_on(z):
             nearest = fmin(abs(z - point.at), nearest)
         return nearest
 
     def max_abs(self, middle: complex, reach: float) -> float:
-        """A bound of |g| on the disk of radius `reach` about a point; infinite if no bound is
-        known."""
+        """A bound of |g|, for all branches g, on the disk about `middle` with the radius `reach`;
+        infinite if no bound is known."""
         del middle, reach
         return math.inf
 
     def value_rounding(self, z: Complex, branches: tuple[Branch, ...]) -> Real:
-        """A bound of the rounding of values, in units (2^-23 in single precision) of the number
-        1."""
+        """A bound of the rounding error of the values of all branches, as a multiple of the machine
+        epsilon (2^-23 in single precision).
+
+        z: the point at which `branches` were evaluated.
+        """
         del z
         largest: Real = 0.0
         for branch in branches:
@@ -267,19 +313,23 @@ class Branches(abc.ABC):
 
 @dataclass(frozen=True)
 class PowerProduct(Branches):
-    """The product of (z - a_i)^alpha_i, with rational exponents: q branches, q the least common
-    denominator.
+    """The product g of (z - a_i)^alpha_i, with rational exponents alpha_i.
 
-    A full turn around a_i multiplies g by exp(2 pi i alpha_i): these factors generate the q-th
-    roots of unity.
+    It has q branches, where q is the least common denominator of the exponents: a full turn around
+    a_i multiplies g by exp(2 pi i alpha_i), and these factors generate the q-th roots of unity.
 
-    Bound of g'': with e_i = alpha_i/(z - a_i), g'' = g ((sum e_i)^2 - sum alpha_i/(z - a_i)^2), so
+    centers: the points a_i.
+    exponents: the exponents alpha_i, in the same order.
+    denominator: q.
 
-        |g''|/|g| <= sum_i |alpha_i (alpha_i - 1)|/d_i^2 + 2 sum_(i<j) |alpha_i alpha_j|/(d_i d_j),
+    Bound of |g"|. With e_i = alpha_i/(z - a_i) one has g" = g ((sum e_i)^2 - sum alpha_i/(z -
+    a_i)^2). So, if d_i is the distance of z from a_i,
 
-    d_i the distances from the a_i. Times |g| each term is a product of powers of them: powers below
-    0 are largest at the smallest d_i of the region and the others at the largest. Equality for a
-    single factor.
+        |g"|/|g| <= sum_i |alpha_i (alpha_i - 1)|/d_i^2 + 2 sum_(i<j) |alpha_i alpha_j|/(d_i d_j).
+
+    Each term of this times |g| is a product of powers of the d_i. On a region a power with an
+    exponent below 0 is largest at the smallest d_i of the region, and any other power at the
+    largest d_i. For a single factor the bound is attained.
     """
 
     centers: tuple[complex, ...]
@@ -293,6 +343,9 @@ class PowerProduct(Branches):
 
     @property
     def branch_points(self) -> tuple[BranchPoint, ...]:
+        """The a_i whose exponent is no positive integer. For a positive exponent alpha the bound is
+        C |z - a_i|^alpha within half the distance to the nearest other a_j, C a bound of the other
+        factors."""
         points: list[BranchPoint] = []
         for i, (a, alpha) in enumerate(zip(self.centers, self.exponents, strict=True)):
             if alpha > 0 and alpha.is_integer():
@@ -314,48 +367,61 @@ class PowerProduct(Branches):
         return replace(super().prepare(backend), _on=_uploaded(self.centers, backend))
 
     def _centers(self, z: Complex) -> tuple[Complex, ...]:
+        """The points a_i as Dr.Jit numbers of the type of z: kernel parameters after `prepare`,
+        else literals."""
         return self._on or tuple(type(z)(a.real, a.imag) for a in self.centers)
 
     def move_off_singularities(self, z: Complex, rounding: Real) -> Complex:
-        """Also away from zeros, where the logarithm of the product is infinite, by one rounding."""
+        """z, moved away from singular points and from the zeros of g.
+
+        A zero a_i with a positive integer exponent is no singular point of g. But `evaluate`
+        computes the logarithm of g, which is infinite there. A point at a zero is moved by a few
+        roundings of the zero's coordinates (at least 1e-18).
+        """
         z = super().move_off_singularities(z, rounding)
         unit = 4 * float(dr.epsilon(z.real))
         for a, alpha in zip(self._centers(z), self.exponents, strict=True):
             if alpha > 0 and alpha.is_integer():
-                min_distance = _MIN_SQUARED + unit * fmax(dr.abs(a.real), dr.abs(a.imag))
+                min_distance = _MIN_ZERO_DISTANCE + unit * fmax(dr.abs(a.real), dr.abs(a.imag))
                 moved = type(z)(a.real + min_distance, a.imag)
                 z = dr.select(abs(z - a) < min_distance, moved, z)
         return z
 
     def evaluate(self, z: Complex) -> tuple[Branch, ...]:
-        scale, angle = 0 * z.real, 0 * z.real
-        ratio = type(z)(scale, scale)
-        squares = ratio
+        """All q branches at z, computed from the logarithm of the product.
+
+        With the logarithmic derivative e = sum alpha_i/(z - a_i), g' = g e and g" = g (e^2 - sum
+        alpha_i/(z - a_i)^2).
+        """
+        log_size, angle = 0 * z.real, 0 * z.real
+        log_derivative = type(z)(log_size, log_size)
+        square_sum = log_derivative
         for a, alpha in zip(self._centers(z), self.exponents, strict=True):
             offset = z - a
-            scale = scale + alpha * dr.log(abs(offset))
+            log_size = log_size + alpha * dr.log(abs(offset))
             angle = angle + alpha * dr.atan2(offset.imag, offset.real)
             inverse = dr.rcp(offset)
-            ratio = ratio + alpha * inverse
-            squares = squares + alpha * (inverse * inverse)
-        size = dr.exp(scale)
+            log_derivative = log_derivative + alpha * inverse
+            square_sum = square_sum + alpha * (inverse * inverse)
+        size = dr.exp(log_size)
         sine, cosine = sincos(angle)
         g = type(z)(size * cosine, size * sine)
-        second_ratio = ratio * ratio - squares
+        second_ratio = log_derivative * log_derivative - square_sum
         branches: list[Branch] = []
         for k in range(self.denominator):
             rotation = 2 * math.pi * k / self.denominator
             value = g * type(z)(math.cos(rotation), math.sin(rotation)) if k else g
-            branches.append(Branch(value, value * ratio, value * second_ratio))
+            branches.append(Branch(value, value * log_derivative, value * second_ratio))
         return tuple(branches)
 
     def second_derivative_bound(self, part: PlaneRegion) -> Real:
-        nearest: list[Real] = []
-        farthest: list[Real] = []
+        """The bound of the class docstring, each term computed from logarithms of distances."""
+        log_nearest: list[Real] = []
+        log_farthest: list[Real] = []
         for a in self._centers(part.disk()[0]):
-            low, high = part.distances(a)
-            nearest.append(dr.log(low))
-            farthest.append(dr.log(high))
+            smallest, largest = part.distances(a)
+            log_nearest.append(dr.log(smallest))
+            log_farthest.append(dr.log(largest))
         alphas, total = self.exponents, 0 * part.disk()[1]
         for i, alpha_i in enumerate(alphas):
             for j, alpha_j in enumerate(alphas[: i + 1]):
@@ -363,25 +429,30 @@ class PowerProduct(Branches):
                 if factor == 0:
                     continue
                 powers = [alpha - (k == i) - (k == j) for k, alpha in enumerate(alphas)]
-                sizes = [
-                    power * (nearest if power < 0 else farthest)[k]
+                logs = [
+                    power * (log_nearest if power < 0 else log_farthest)[k]
                     for k, power in enumerate(powers)
                     if power != 0
                 ]
-                total = total + factor * dr.exp(sum(sizes)) if sizes else factor
+                total = total + factor * dr.exp(sum(logs)) if logs else factor
         return total * _BOUND_MARGIN
 
     def max_abs(self, middle: complex, reach: float) -> float:
-        bound = 1.0
+        """The product of bounds of all factors on the disk; infinite if it contains a pole."""
+        product = 1.0
         for a, alpha in zip(self.centers, self.exponents, strict=True):
             distance = abs(a - middle)
             if alpha < 0 and distance <= reach:
                 return math.inf
-            bound *= (distance + math.copysign(reach, alpha)) ** alpha
-        return bound
+            product *= (distance + math.copysign(reach, alpha)) ** alpha
+        return product
 
     def value_rounding(self, z: Complex, branches: tuple[Branch, ...]) -> Real:
-        """The rounding of exp and of the angle: a few units of their arguments."""
+        """A bound of the rounding error of the values, as a multiple of the machine epsilon.
+
+        Each value is exp of a sum of logarithms and angles, so its relative error is a few
+        roundings of the terms of these sums.
+        """
         roundings = 12 + 4 * math.pi * sum(abs(alpha) for alpha in self.exponents)
         for a, alpha in zip(self._centers(z), self.exponents, strict=True):
             roundings = roundings + 4 * abs(alpha) * dr.abs(dr.log(abs(z - a)))
@@ -390,10 +461,14 @@ class PowerProduct(Branches):
 
 @dataclass(frozen=True)
 class Logarithm(Branches):
-    """sum n_i log(z - a_i), the logarithm of a product of integer powers, whose imaginary part is
-    determined up to 2 pi.
+    """g = sum n_i log(z - a_i), the logarithm of a product of integer powers.
 
-    |g''| = |sum n_i/(z - a_i)^2| <= sum |n_i|/d_i^2, with the smallest distances of the region.
+    centers: the points a_i.
+    multiplicities: the integers n_i, in the same order.
+
+    The imaginary part of g is determined up to multiples of 2 pi gcd(n_i); these branches count as
+    one. |g"| = |sum n_i/(z - a_i)^2| <= sum |n_i|/d_i^2 on a region, if d_i is the smallest
+    distance of the region from a_i.
     """
 
     centers: tuple[complex, ...] = (0j,)
@@ -411,6 +486,8 @@ class Logarithm(Branches):
         return replace(super().prepare(backend), _on=_uploaded(self.centers, backend))
 
     def _centers(self, z: Complex) -> tuple[Complex, ...]:
+        """The points a_i as Dr.Jit numbers of the type of z: kernel parameters after `prepare`,
+        else literals."""
         return self._on or tuple(type(z)(a.real, a.imag) for a in self.centers)
 
     def evaluate(self, z: Complex) -> tuple[Branch, ...]:
@@ -431,6 +508,7 @@ class Logarithm(Branches):
         return total * _BOUND_MARGIN
 
     def value_rounding(self, z: Complex, branches: tuple[Branch, ...]) -> Real:
+        """The rounding of the logarithms and of the angles, which are at most pi."""
         del branches
         roundings = 0 * z.real
         for a, n in zip(self._centers(z), self.multiplicities, strict=True):
@@ -440,12 +518,14 @@ class Logarithm(Branches):
 
 @dataclass(frozen=True)
 class ArcSine(Branches):
-    """asin: its branches are g and pi - g modulo 2 pi, with g the principal branch.
+    """asin: its branches are g and pi - g plus multiples of 2 pi, with g the principal branch.
 
-    g' = (1 - z^2)^(-1/2) and g'' = z g'^3, so |g''| <= |z|/(d_1 d_2)^(3/2), d_i the distances from
-    1 and -1. At both points, asin(1 - w) = pi/2 - 2 asin sqrt(w/2), whose series has positive
-    coefficients: |g - pi/2| <= 2 asin sqrt(|w|/2), and for |w| <= 1/2 at most (pi/3)/sqrt(1/2)
-    sqrt|w|, as asin is convex.
+    Bound of |g"|. g' = (1 - z^2)^(-1/2) and g" = z g'^3, so |g"| <= |z|/(d_1 d_2)^(3/2), where d_1
+    and d_2 are the distances of z from 1 and -1.
+
+    Bound at the branch points 1 and -1. At 1, asin(1 - w) = pi/2 - 2 asin sqrt(w/2), and the series
+    of asin has positive coefficients, so |g - pi/2| <= 2 asin sqrt(|w|/2). As asin is convex on [0,
+    1], for |w| <= 1/2 this is at most (pi/3)/sqrt(1/2) sqrt|w|. At -1 the same holds by symmetry.
     """
 
     @property
@@ -462,7 +542,7 @@ class ArcSine(Branches):
         return None if imaginary else 2 * math.pi
 
     def evaluate(self, z: Complex) -> tuple[Branch, ...]:
-        """The branches by Kahan's formulas (1987), in which nothing cancels."""
+        """Both branches at z, by Kahan's formulas (1987), in which nothing cancels."""
         root_minus, root_plus = dr.sqrt(1 - z), dr.sqrt(1 + z)
         product = root_minus * root_plus
         real = dr.atan2(z.real, product.real)
@@ -473,19 +553,25 @@ class ArcSine(Branches):
 
     def second_derivative_bound(self, part: PlaneRegion) -> Real:
         complex_number = cast("Any", type(part.disk()[0]))
-        low1, _ = part.distances(complex_number(1, 0))
-        low2, _ = part.distances(complex_number(-1, 0))
-        _, largest = part.distances(complex_number(0, 0))
-        inverse = 1 / (low1 * low2)
-        return largest * inverse * dr.sqrt(inverse) * _BOUND_MARGIN
+        distance_from_1, _ = part.distances(complex_number(1, 0))
+        distance_from_minus_1, _ = part.distances(complex_number(-1, 0))
+        _, max_abs_z = part.distances(complex_number(0, 0))
+        inverse_product = 1 / (distance_from_1 * distance_from_minus_1)
+        return max_abs_z * inverse_product * dr.sqrt(inverse_product) * _BOUND_MARGIN
 
 
 @dataclass(frozen=True)
 class UserBranches(Branches):
-    """Branches of a user's function: see `RiemannSurface`.
+    """The branches of a user's function; see `RiemannSurface` for what the user gives.
 
-    On a region g'' is bounded by the user's bound on a disk around it, if no singular point lies in
-    that disk; around a segment, the smallest disk.
+    function: returns all branches at z, each as (g, g') or (g, g', g").
+    singular: the points where a branch is not analytic.
+    second_bound: second_bound(z, r) bounds |g"| on the disk of radius r about z.
+    branch_count: the number of branches.
+    shift: the period of the drawn part, or None.
+
+    A bound of |g"| on a region is the user's bound on a disk that contains the region (for a
+    segment, the smallest such disk). It is infinite if a singular point lies in that disk.
     """
 
     function: Callable[[Any], Any]
@@ -507,6 +593,7 @@ class UserBranches(Branches):
         return self.shift
 
     def evaluate(self, z: Complex) -> tuple[Branch, ...]:
+        """The branches that the user's function returns, with plain numbers made Dr.Jit numbers."""
         branches: list[Branch] = []
         for numbers in self.function(z):
             parts = [part if dr.is_array_v(type(part)) else type(z)(part) for part in numbers]
@@ -523,14 +610,20 @@ class UserBranches(Branches):
 
 
 def _uploaded(points: tuple[complex, ...], backend: Backend) -> tuple[Complex, ...]:
-    """Points of the plane as kernel parameters of a backend."""
+    """The points of the complex plane as kernel parameters of a backend."""
     make_complex = complex_type(backend)
     real = backend.Float
     return tuple(make_complex(dr.opaque(real, a.real), dr.opaque(real, a.imag)) for a in points)
 
 
 def _finite(value: Any, name: str) -> complex:
-    """A finite complex number. Raises TypeError or ValueError, with this name, for other values."""
+    """`value` as a complex number.
+
+    name: what the value is, for the messages.
+
+    Raises:
+        TypeError, ValueError: it is no complex number, or not finite.
+    """
     try:
         number = complex(value)
     except (TypeError, ValueError):

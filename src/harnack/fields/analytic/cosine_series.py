@@ -2,8 +2,8 @@
 
     f(p) = sum a_ijk cos(i u) cos(j v) cos(k w),   (u, v, w) = pi (p - lower)/(upper - lower),
 
-0 <= i < K_x and so on. `fit_cosines` and `CosineBounds` are NumPy in double precision, computed
-once for a series; `CosineSums` evaluates it.
+with 0 <= i < K_x, 0 <= j < K_y and 0 <= k < K_z. `fit_cosines` and `CosineBounds` are computed once
+for a series, with NumPy in double precision; `CosineSums` evaluates the series.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 
 __all__ = ["CellBounds", "CosineBounds", "evaluate_on_grid", "fit_cosines", "midpoints"]
 
-# Nodes for each half wave of the highest frequency: at least `_MIN_NODES`, at most `_FINEST`, and
-# between these limits so many that an axis has about `_ALONG_AXIS` nodes.
-_MIN_NODES, _ALONG_AXIS, _FINEST = 8, 112, 32
-# Sides, in cells, of the grids of local bounds. A grid is used if its bounds are on average below
-# `_MAX_RATIO` times the global bound, so that they are worth the time of a lookup.
+# The numbers of nodes for each half wave of the highest frequency: at least `_MIN_NODES`, at most
+# `_MAX_NODES`, and between these limits so many that an axis has about `_AXIS_NODES` nodes.
+_MIN_NODES, _AXIS_NODES, _MAX_NODES = 8, 112, 32
+# The numbers of cells along each side of the grids of local bounds. A grid is used if its bounds
+# are on average below `_MAX_RATIO` times the global bound: only then are they worth a lookup.
 _CELLS, _MAX_RATIO = (16, 8, 4), 0.9
 # The number of cells along a side of the grid by which the extent of a level is bounded.
 _EXTENT_CELLS = 32
@@ -39,8 +39,13 @@ _ROUNDING = 1e-9
 
 
 def midpoints(lower: FloatArray, upper: FloatArray, shape: tuple[int, ...]) -> FloatArray:
-    """The midpoints (n, 3) of the cells of a box, in the order of a flattened array of this
-    shape."""
+    """The midpoints (n, 3) of the cells of a box that is divided into shape[0] x shape[1] x
+    shape[2] cells.
+
+    lower, upper: (3,) the corners of the box.
+
+    Their order is that of a flattened array of this shape.
+    """
     axes = [
         lower[a] + (upper[a] - lower[a]) * (np.arange(n) + 0.5) / n for a, n in enumerate(shape)
     ]
@@ -48,11 +53,15 @@ def midpoints(lower: FloatArray, upper: FloatArray, shape: tuple[int, ...]) -> F
 
 
 def fit_cosines(grid: FloatArray, terms: tuple[int, int, int]) -> FloatArray:
-    """The first coefficients of the series through values at the midpoints of cells.
+    """The coefficients (K_x, K_y, K_z) of the cosine series that fits values at the midpoints of
+    cells.
 
-    They come from the discrete cosine transform of type 2: the whole series passes through all
-    values, and its first terms are the best fit to the values in mean square, since the cosines are
-    orthogonal on the midpoints.
+    grid: (n_x, n_y, n_z) the values.
+    terms: the numbers of terms (K_x, K_y, K_z).
+
+    They come from the discrete cosine transform of type 2. With as many terms as values the series
+    passes through all values. Its first terms are the best fit in mean square, since the cosines
+    are orthogonal on the midpoints.
     """
     from scipy import fft  # imported here, as it takes time and is rarely needed
 
@@ -69,8 +78,13 @@ def evaluate_on_grid(
     coefficients: FloatArray, angles: tuple[FloatArray, FloatArray, FloatArray],
     orders: tuple[int, int, int] = (0, 0, 0),
 ) -> FloatArray:  # fmt: skip
-    """Derivatives of these orders with respect to the angles, on the grid of angles (n_x, n_y,
-    n_z)."""
+    """The series, or a derivative of it by the angles, on a grid of angles; an array (n_x, n_y,
+    n_z).
+
+    coefficients: (K_x, K_y, K_z).
+    angles: the angles u, v and w of the grid, arrays (n_x,), (n_y,) and (n_z,).
+    orders: how often the series is differentiated by u, by v and by w.
+    """
     values = coefficients
     for angle, order in zip(angles, orders, strict=True):
         k: FloatArray = np.arange(values.shape[0], dtype=np.float64)
@@ -82,10 +96,11 @@ def evaluate_on_grid(
 
 @dataclass(frozen=True)
 class CellBounds:
-    """Bounds of all second derivatives around each cell of a grid of n^3 cells over the box.
+    """Local bounds of the absolute directional second derivatives, on a grid of cells over the box.
 
-    count: n.
-    bounds: (n^3,), x fastest: a bound on the cell and all its neighbors.
+    count: the number n of cells along each side of the box.
+    bounds: (n^3,) for each cell a bound that holds on the cell and all its neighbors; the index
+        along x runs fastest.
     """
 
     count: int
@@ -96,18 +111,19 @@ class CellBounds:
 class CosineBounds:
     """Proved bounds of a cosine series.
 
-    low, high: f stays between them.
-    curvature: |v.H v| for unit v never exceeds it, H the Hessian.
-    cells: local bounds of |v.H v|, finest grid first; only grids that are worth a lookup.
-    cell_low, cell_high: (32, 32, 32) ranges of f on the cells of the box.
+    low, high: the values of f on the box are between them.
+    curvature: a bound of |v . H v| for unit vectors v and the Hessian H, on the box.
+    cells: local bounds of |v . H v|, finest grid first; only grids that are worth a lookup.
+    cell_low, cell_high: (32, 32, 32) the ranges of f on 32^3 cells of the box.
 
-    Proof. Along each axis f is a trigonometric polynomial of the angle of degree n = K - 1, and so
-    is v.H v for any fixed v. Take a grid of N = 2 n m > 2 n angles per full turn, of which the
-    angles from 0 to pi suffice by symmetry (f is even in each angle, and v.H v becomes v'.H v' with
-    other signs in v). Then by Ehlich and Zeller (1964) |T| <= max over the grid / cos(pi n/N), one
-    axis after the other. With G that bound, Bernstein gives |T_uu| <= n^2 G, and linear
-    interpolation between nodes h = pi/(n m) apart is off by at most h^2/8 n^2 G = pi^2 G/(8 m^2)
-    along each axis: a bound at the nodes of a cell, plus these errors, is a bound on the cell.
+    Proof. Let T be f, or v . H v for a fixed v. Along each axis T is a trigonometric polynomial of
+    the angle, of degree n = K - 1. Take a grid of N = 2 n m > 2 n angles per full turn. The angles
+    from 0 to pi suffice by symmetry: f is even in each angle, and a change of the sign of an angle
+    turns v . H v into v' . H v' with other signs in v. By Ehlich and Zeller (1964), |T| <=
+    (maximum over the grid)/cos(pi n/N), for one axis after the other. Let G be this bound. Then
+    |T_uu| <= n^2 G (Bernstein), so the error of linear interpolation between nodes h = pi/(n m)
+    apart is at most h^2/8 n^2 G = pi^2 G/(8 m^2) along each axis. A bound at the nodes of a cell,
+    plus these errors, is a bound on the cell.
     """
 
     low: float
@@ -119,9 +135,15 @@ class CosineBounds:
 
     @classmethod
     def of(cls, coefficients: FloatArray, size: FloatArray) -> CosineBounds:
-        """The bounds of the series with these coefficients; size: (3,) of the box."""
+        """The bounds of the series with these coefficients (K_x, K_y, K_z).
+
+        size: (3,) the lengths of the box's sides.
+
+        Symbols: for each axis n is the degree and m, in `densities`, the number of nodes per half
+        wave. factor is the product of all 1/cos(pi n/N), and error the sum of all pi^2/(8 m^2).
+        """
         degrees: list[int] = [n - 1 for n in coefficients.shape]
-        densities = [min(max(_MIN_NODES, _ALONG_AXIS // max(n, 1)), _FINEST) for n in degrees]
+        densities = [min(max(_MIN_NODES, _AXIS_NODES // max(n, 1)), _MAX_NODES) for n in degrees]
         angles: list[FloatArray] = [
             math.pi * np.arange(n * m + 1) / max(n * m, 1) if n else np.zeros(1)
             for n, m in zip(degrees, densities, strict=True)
@@ -158,8 +180,8 @@ class CosineBounds:
         )
 
     def extent(self, levels: tuple[float, ...]) -> tuple[FloatArray, FloatArray] | None:
-        """Corners, as fractions of the box, of a box that contains the level sets; None if there
-        are no level sets."""
+        """The corners (3,), (3,) of a box that contains the level sets, as fractions of the whole
+        box from 0 to 1; None if there are no level sets."""
         is_met = np.zeros(self.cell_low.shape, dtype=bool)
         for level in levels:
             is_met |= (self.cell_low <= level) & (level <= self.cell_high)
@@ -178,8 +200,15 @@ def _spectral_norms(
     nodes: tuple[FloatArray, FloatArray, FloatArray],
     rates: FloatArray,
 ) -> FloatArray:
-    """The largest |eigenvalue| of the Hessian at each node, a slab at a time; rates: angles per
-    length. Eigenvalues of symmetric 3x3 matrices by Smith's formula (1961)."""
+    """The largest absolute eigenvalue of the Hessian at each node of a grid, an array (n_x, n_y,
+    n_z).
+
+    nodes: the angles of the grid along each axis.
+    rates: (3,) the derivatives of the angles by the coordinates, pi over the sides of the box.
+
+    The grid is evaluated in slabs, to save memory. The eigenvalues of symmetric 3x3 matrices are
+    computed by Smith's formula (1961).
+    """
     norms = np.empty(tuple(len(values) for values in nodes))
     slab = max(1, 400_000 // (norms.shape[1] * norms.shape[2]))
     for start in range(0, len(nodes[0]), slab):
@@ -212,8 +241,14 @@ def _spectral_norms(
 def _cell_extremes(
     values: FloatArray, angles: list[FloatArray], count: int, margin: int, ufunc: Any
 ) -> FloatArray:
-    """The extremes over the nodes on and next to each of count^3 cells, with `margin` neighbors on
-    each side; ufunc: np.minimum or np.maximum."""
+    """The extremes of values at nodes, for each of count^3 cells of the box, (count, count, count).
+
+    values: the values at the nodes, an array over the three axes.
+    angles: the angles of the nodes along each axis, evenly spaced from 0 to pi.
+    margin: the number of neighboring cells, on each side, whose nodes are included; 0 for the nodes
+        in and next to the cell only.
+    ufunc: np.minimum or np.maximum.
+    """
     for axis in range(3):
         intervals = len(angles[axis]) - 1
         columns: list[FloatArray] = []
@@ -232,19 +267,24 @@ _KERNEL_ROUNDING = 1e-5
 
 @dataclass(frozen=True)
 class CosineSums:
-    """The coefficients and local bounds of a series on a backend.
+    """The coefficients and local bounds of a series on a backend, which evaluates it.
 
-    Sums over k are computed for each i and j, sums over j for each i, and the sum over i last (sum
-    factorization): about 2 K^3 products in all, whereas a sum of terms would need 7 K^3. i runs in
-    a recorded loop over rows of a table, j and k are unrolled, so that the coefficients are kernel
-    parameters: another function fitted by as many terms compiles no other kernel. Each sum begins
-    with the highest frequency, so that the large terms, of low frequency, take part in the fewest
-    roundings.
-
+    backend: the backend.
+    shape: (K_x, K_y, K_z).
     lower: the lower corner of the box.
-    rate: pi over its size, angles per length.
-    rounding: the rounding of value and gradient, in units of u, without the rounding that moves the
-        point.
+    rate: pi over the sides of the box, the change of the angles per length.
+    rows: a record (i, a_i00, a_i01, ...) for each i, the highest i first.
+    rounding: bounds of the rounding errors of value and gradient, in units of u, without the error
+        that moves the point.
+    curvature: a bound of the absolute directional second derivatives on the box.
+    cells: local bounds of them, finest grid first.
+
+    Evaluation. Sums over k are computed for each i and j, then sums over j for each i, and the sum
+    over i last (sum factorization). This takes about 2 K^3 products, whereas a sum of terms would
+    need 7 K^3. i runs in a recorded loop over the records, while the sums over j and k are
+    unrolled. The coefficients are kernel parameters, so another function fitted by as many terms
+    compiles no other kernel. Each sum begins with the highest frequency, so that the large terms,
+    of low frequency, take part in the fewest roundings.
     """
 
     backend: Backend
@@ -266,7 +306,12 @@ class CosineSums:
         bounds: CosineBounds,
         rounding: tuple[float, float],
     ) -> CosineSums:
-        """The series of these coefficients (K_x, K_y, K_z)."""
+        """The series with these coefficients (K_x, K_y, K_z) on a backend.
+
+        lower, size: (3,) the lower corner and the sides of the box.
+        bounds: the bounds of the series.
+        rounding: of value and gradient, as the attribute.
+        """
         count, along_y, along_z = coefficients.shape
         first = np.arange(count, dtype=np.float64)[:, None]
         table = np.concatenate([first, coefficients.reshape(count, -1)], axis=1)[::-1]
@@ -282,15 +327,16 @@ class CosineSums:
         )
 
     def angles(self, p: Vec3) -> Vec3:
-        """The angles (u, v, w) of points, from 0 to pi on the box."""
+        """The angles (u, v, w) of points p; on the box they are from 0 to pi."""
         return (self.backend.Array3f(p) - self.lower) * self.rate
 
     def value(self, p: Vec3) -> tuple[Real, Vec3]:
-        """Value and gradient at points."""
+        """Value and gradient at points p."""
         angles = self.angles(p)
         y, z = _waves(angles.y, self.shape[1]), _waves(angles.z, self.shape[2])
 
         def add(row: list[Real], state: tuple[Real, ...]) -> tuple[Real, ...]:
+            """The sums of value and gradient after the terms of one i are added."""
             b, by, bz = _sum_plane(row, y, z)
             s, c = sincos(row[0] * angles.x)
             f, gx, gy, gz = state
@@ -306,11 +352,12 @@ class CosineSums:
         return f, self.rate * self.backend.Array3f(gx, gy, gz)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """Rows of the matrix of second derivatives."""
+        """The three rows of the Hessian at points p."""
         angles = self.angles(p)
         y, z = _waves(angles.y, self.shape[1]), _waves(angles.z, self.shape[2])
 
         def add(row: list[Real], state: tuple[Real, ...]) -> tuple[Real, ...]:
+            """The sums xx, yy, zz, xy, xz, yz after the terms of one i are added."""
             b, by, bz, byy, byz, bzz = _sum_plane(row, y, z, second=True)
             s, c = sincos(row[0] * angles.x)
             d, e = -row[0] * s, -row[0] * row[0] * c
@@ -327,8 +374,8 @@ class CosineSums:
         )
 
     def curvatures(self, p: Vec3) -> tuple[TaylorRemainder, ...]:
-        """Bounds of second derivatives around p, the bound on the smallest ball first; the last
-        bound holds everywhere."""
+        """Bounds of second derivatives around p, the smallest ball first; the last one holds
+        everywhere."""
         everywhere = TaylorRemainder(self.curvature + 0 * p.x, dr.inf)
         if not self.cells:
             return (everywhere,)
@@ -338,7 +385,12 @@ class CosineSums:
 
 @dataclass(frozen=True)
 class _CellCurvatures:
-    """Local bounds of second derivatives on a backend; sides: the sides of a cell."""
+    """Local bounds of second derivatives on a backend.
+
+    count: the number of cells along each side of the box.
+    sides: the lengths of a cell's sides.
+    bounds: the bounds of the cells, as in `CellBounds`.
+    """
 
     backend: Backend
     count: int
@@ -347,13 +399,18 @@ class _CellCurvatures:
 
     @classmethod
     def upload(cls, backend: Backend, cells: CellBounds, size: FloatArray) -> _CellCurvatures:
+        """The bounds `cells` on a backend; size: (3,) the lengths of the box's sides."""
         bounds = upload_floats(backend, cells.bounds * (1 + _KERNEL_ROUNDING))
         return cls(backend, cells.count, _vector_parameters(backend, size / cells.count), bounds)
 
-    def curvature(self, fractions: Vec3) -> TaylorRemainder:
-        """The bound of the cell in which a point lies, on a ball within the cell's neighbors;
-        fractions: the point as fractions of the box."""
-        position, index = fractions * float(self.count), self.backend.UInt32(0)
+    def curvature(self, share: Vec3) -> TaylorRemainder:
+        """The bound of the cell that contains a point, on a ball about the point.
+
+        share: the point, as fractions of the box from 0 to 1.
+
+        The radius is the distance from the point to the boundary of the cell's neighbors, or less.
+        """
+        position, index = share * float(self.count), self.backend.UInt32(0)
         radius: Real = dr.inf
         for axis in (2, 1, 0):
             cell = clamp(dr.floor(position[axis]), 0, self.count - 1)
@@ -365,12 +422,12 @@ class _CellCurvatures:
 
 
 def _vector_parameters(backend: Backend, numbers: FloatArray) -> Vec3:
-    """Three numbers as kernel parameters."""
+    """Three numbers as a vector of kernel parameters."""
     return backend.Array3f(*(dr.opaque(backend.Float, float(number)) for number in numbers))
 
 
 def _waves(angle: Real, count: int) -> tuple[list[Real], list[Real]]:
-    """cos(k angle) and its derivative -k sin(k angle) for k < count."""
+    """cos(k angle), and its derivative -k sin(k angle) by the angle, for 0 <= k < count."""
     values, slopes = [0 * angle + 1], [0 * angle]
     for k in range(1, count):
         s, c = sincos(float(k) * angle)
@@ -386,8 +443,14 @@ def _sum_plane(
     *,
     second: bool = False,
 ) -> tuple[Any, ...]:
-    """The sum over j and k for one i, its derivatives by y and z, and with `second` its derivatives
-    by y twice, by y and z, and by z twice."""
+    """The sum over j and k for one i, and its derivatives by the angles v and w.
+
+    row: the record (i, a_i00, a_i01, ...).
+    y, z: cos(j v) and its derivative for each j, and the same for cos(k w).
+    second: whether to compute second derivatives, too.
+
+    Returns the sum S, S_v and S_w; with `second` also S_vv, S_vw and S_ww.
+    """
     (cos_y, slope_y), (cos_z, slope_z) = y, z
     count = len(cos_z)
     sums: list[Any] = [0 * cos_y[0]] * (6 if second else 3)

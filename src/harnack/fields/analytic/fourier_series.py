@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 __all__ = ["FourierSeries", "SurfaceDisplacement"]
 
 _MAX_TERMS = 24
-# The default number of samples along a side for each term, and its minimum; the largest number of
-# samples in all.
+# The default number of samples along a side of the box for each term; the smallest default number
+# of samples along a side; the largest number of samples in all.
 _SAMPLES, _MIN_SAMPLES, _MAX_SAMPLES = 4, 64, 1 << 25
 # The number of points at which the error of a fit is measured; the number of Newton steps that move
 # them to the surface, and their tolerance.
@@ -46,11 +46,12 @@ Function: TypeAlias = Callable[["FloatArray"], Any]
 
 @dataclass(frozen=True)
 class SurfaceDisplacement:
-    """The distance between the surface of a series and the surface of the function it was fitted
-    to: sampled, and to first order, |function - level|/|gradient of the series| at points of its
-    surface.
+    """An estimate of the distance between the surface of a series and that of the function it fits.
 
-    mean, largest: lengths.
+    At points of the series' surface the distance is estimated, to first order, by |function -
+    level|/|gradient of the series|.
+
+    mean, largest: the mean and the largest distance, lengths.
     count: the number of points.
     """
 
@@ -60,24 +61,27 @@ class SurfaceDisplacement:
 
 
 class FourierSeries(Field):
-    """sum a_ijk cos(i u) cos(j v) cos(k w) on a box, u, v, w from 0 to pi along its sides.
+    """The sum of a_ijk cos(i u) cos(j v) cos(k w) on a box.
+
+    The angles u, v and w go from 0 to pi along the sides of the box.
 
     `fit` computes the series of any function or grid of values. **All proofs are about the
     series**, not about the function that it was fitted to: `fit_error` is the difference of their
-    values and `displacement` the distance of their surfaces, both by sampling. The series continues
-    the function by reflection at the walls of the box. It converges quickly if the function is
-    smooth and has no slope across the walls; kinks, such as those of distances, cost accuracy, and
-    so do functions that are very steep far from the surface: compress such functions first, for
+    values and `displacement` the distance of their surfaces, both by sampling.
+
+    Beyond the faces of the box the series is a reflection of itself. It converges quickly if the
+    function is smooth and has no slope across the faces. Kinks, such as those of distances, cost
+    accuracy. So does a function that is very steep far from the surface: compress it first, for
     example by tanh.
 
-    coefficients: (K_x, K_y, K_z), at most 24 each.
+    coefficients: (K_x, K_y, K_z) the a_ijk; each of the three sizes is at most 24.
     box: a finite `Box`.
 
     Promises: bounds of the second derivatives (`CosineBounds` has the proof), on the whole box and,
     if local bounds are smaller, on balls around the cells of grids over it. Rounding, in units of
-    u: an angle k u is off by 3 roundings of u, which move the point, and a rounding of the product,
-    k pi at most; a sine or cosine by 2; a coefficient by 1; a term takes part in i + j + k + 3
-    sums.
+    the unit roundoff: an angle k u has the error of u (3 roundings, which move the point) and that
+    of the product, at most k pi; a sine or cosine has 2; a coefficient has 1; a term takes part in
+    i + j + k + 3 sums.
 
     Raises:
         ValueError: coefficients of another shape, not finite, or all zero except the first; a box
@@ -119,14 +123,14 @@ class FourierSeries(Field):
         *,
         samples: int | tuple[int, int, int] | None = None,
     ) -> Self:
-        """The series of `terms` cosines along each axis that is closest to a function.
+        """The cosine series that is closest to a function in mean square.
 
         function: a callable that takes points (n, 3) and gives values (n,); or a grid (n_x, n_y,
             n_z) of values at the midpoints of that many cells of the box.
         box: a finite `Box`, or its two corners.
-        terms: 1 to 24, along each axis.
-        samples: the number of cells per side on which a function is sampled; by default 4 for each
-            term, at least 64.
+        terms: the number of cosines along each axis, one number or three, each from 1 to 24.
+        samples: the number of cells along each side on which a callable is sampled, one number or
+            three; by default 4 for each term, at least 64.
 
         Raises:
             ValueError: values that are NaN or infinite, or of another shape; more terms than 24 or
@@ -172,20 +176,24 @@ class FourierSeries(Field):
 
     @property
     def value_range(self) -> tuple[float, float]:
-        """Proved: the values of the series stay within this interval."""
+        """The ends (low, high) of an interval that is proved to contain all values of the series on
+        its box."""
         return self._bounds.low, self._bounds.high
 
     @property
     def curvature(self) -> float:
-        """Proved: no directional second derivative of the series exceeds it in size."""
+        """A proved bound of all |directional second derivatives| of the series on its box."""
         return self._bounds.curvature
 
     def displacement(self, level: float | None = None, *, rng: int = 0) -> SurfaceDisplacement:
-        """An estimate of the distance between the surfaces of the series and of the fitted
-        function, at a level.
+        """Estimate the distance between the surfaces of the series and of the fitted function, at a
+        level.
 
-        For a function, at random points of the surface; for a grid, at its points next to the
-        surface.
+        level: by default `default_level`.
+        rng: the seed of the random points.
+
+        For a function the points are random points of the series' surface; for a grid, those of its
+        points that are next to the surface.
 
         Raises:
             ValueError: the series was not computed by `fit`, or no point of the level was found.
@@ -201,8 +209,13 @@ class FourierSeries(Field):
         return SurfaceDisplacement(float(distances.mean()), float(distances.max()), len(points))
 
     def _near(self, level: float, rng: int) -> tuple[FloatArray, FloatArray]:
-        """Points of the surface, or next to it, and the function minus the series at these
-        points."""
+        """Points (n, 3) of the surface, or next to it, and the differences (n,) between function
+        and series.
+
+        level: the level of the surface.
+        rng: the seed of the random points, for a function; for a grid the points are those of the
+            grid.
+        """
         if not callable(self._source):
             grid = cast("FloatArray", self._source)
             points = midpoints(self._lower, self._lower + self._size, grid.shape)
@@ -226,7 +239,7 @@ class FourierSeries(Field):
         return x, (_values(self._source, x) if len(x) else np.zeros(0)) - level
 
     def _largest_difference(self) -> float:
-        """The largest difference between series and function at random points, or all of a grid."""
+        """The largest |series - function| at random points; for a grid, at all of its points."""
         if callable(self._source):
             x = self._lower + self._size * np.random.default_rng(0).random((_CHECK_POINTS, 3))
             values = _values(self._source, x)
@@ -245,15 +258,18 @@ class FourierSeries(Field):
         return prepared
 
     def _upload(self, backend: Backend) -> CosineSums:
+        """The series on a backend."""
         return CosineSums.upload(
             backend, self.coefficients, self._lower, self._size, self._bounds, self._rounding
         )
 
     def _on(self, p: Vec3) -> CosineSums:
-        """The series on the backend of p."""
+        """The series on the backend of p; `prepare` makes this free."""
         return self._upload(backend_of(p)) if self._device is None else self._device
 
     def evaluate(self, p: Vec3) -> Sample:
+        """The sample at p: value and gradient of the series, local bounds of second derivatives as
+        promises, and bounds of the rounding of both."""
         sums = self._on(p)
         value, gradient = sums.value(p)
         unit = float(dr.epsilon(type(value))) * _SECOND_ORDER
@@ -266,11 +282,12 @@ class FourierSeries(Field):
         return Sample(value, gradient, sums.curvatures(p), error, slope_error)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """Rows of the Hessian of the series."""
+        """The three rows of the Hessian of the series."""
         return self._on(p).hessian(p)
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """The part of the box with the cells in which the series may take a level."""
+        """The part of the box that consists of the cells in which the series may take one of the
+        levels."""
         fractions = self._bounds.extent(levels)
         if fractions is None:
             return self.domain
@@ -292,7 +309,13 @@ class FourierSeries(Field):
 
 
 def _as_triple(numbers: Any, name: str) -> tuple[int, int, int]:
-    """Three integers, from one integer or three."""
+    """Three integers, from one integer or from three.
+
+    name: what the integers are, for the messages.
+
+    Raises:
+        TypeError, ValueError: neither one integer nor three.
+    """
     try:
         number = operator.index(numbers)
     except TypeError:
@@ -309,6 +332,11 @@ def _as_triple(numbers: Any, name: str) -> tuple[int, int, int]:
 
 
 def _check_terms(terms: tuple[int, ...]) -> None:
+    """Check the numbers of terms along the axes.
+
+    Raises:
+        ValueError: one of them is not from 1 to 24.
+    """
     if min(terms) < 1 or max(terms) > _MAX_TERMS:
         raise ValueError(
             f"terms must be 1 to {_MAX_TERMS} along each axis, not {tuple(terms)}: an evaluation "
@@ -317,6 +345,11 @@ def _check_terms(terms: tuple[int, ...]) -> None:
 
 
 def _check_samples(terms: tuple[int, int, int], shape: tuple[int, int, int]) -> None:
+    """Check that there are as many samples as terms along each axis.
+
+    Raises:
+        ValueError: there are fewer.
+    """
     if any(k > n for k, n in zip(terms, shape, strict=True)):
         raise ValueError(
             f"{terms} terms cannot be told apart by {shape} samples: take fewer terms or more "
@@ -325,7 +358,11 @@ def _check_samples(terms: tuple[int, int, int], shape: tuple[int, int, int]) -> 
 
 
 def _finite_box(box: Any) -> Box:
-    """A box with finite sides longer than 0, from a `Box` or two corners."""
+    """A box with finite sides longer than 0, from a `Box` or from two corners.
+
+    Raises:
+        TypeError, ValueError: it is no such box.
+    """
     try:
         volume = box if isinstance(box, Box) else Box(*box)
     except TypeError:
@@ -337,7 +374,11 @@ def _finite_box(box: Any) -> Box:
 
 
 def _values(function: Function, points: FloatArray) -> FloatArray:
-    """The function's values (n,) at points (n, 3), checked."""
+    """The values (n,) of the user's function at points (n, 3).
+
+    Raises:
+        TypeError, ValueError: they are not n finite numbers.
+    """
     values = as_real_array(function(points), "values of the function", type_error=TypeError)
     if values.shape != (len(points),):
         raise ValueError(
@@ -354,8 +395,13 @@ def _values(function: Function, points: FloatArray) -> FloatArray:
 
 
 def _rounding(a: FloatArray, size: FloatArray) -> tuple[float, float]:
-    """The rounding of value and gradient, in units of u, without the rounding that moves the point:
-    see `FourierSeries`."""
+    """Bounds of the rounding errors of value and gradient, in units of u: see `FourierSeries`.
+
+    The error that moves the point is left out.
+
+    a: the coefficients (K_x, K_y, K_z).
+    size: (3,) the lengths of the box's sides.
+    """
     i, j, k = np.indices(a.shape)
     roundings = (i + j + k) * (math.pi + 1) + 10
     sizes = np.abs(a)

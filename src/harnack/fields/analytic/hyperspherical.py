@@ -45,21 +45,29 @@ __all__ = ["HypersphericalHarmonic"]
 
 # Constants are increased by this fraction for the roundings of float32.
 _ROUNDING = 1e-5
-# Radii of the balls on which the Hessian is bounded, in units of sqrt(1 + |p|^2).
-_SHARES = _SMALL_RADIUS, _LARGE_RADIUS = 0.2, 0.6
-# Near zeros of high order: the chord of the ball on the sphere, in units of the distance to the
-# zero over (order - 2); the largest radius, in units of sqrt(1 + |p|^2); and the radius of a ball
-# in space whose image lies within a chord, in units of the chord times 1 + |p|^2.
-_ZERO_CHORD, _MAX_ZERO_RADIUS, _BALL_OF_CHORD = 0.5, 0.3, 0.349
+# Radii of the two balls on which the Hessian is bounded, in units of sqrt(1 + |p|^2).
+_BALL_RADII = _SMALL, _BIG = 0.2, 0.6
+# For the ball near a zero of high order. First, the chord on the sphere S^3 that contains the image
+# of the ball: in units of (distance of the zero)/(order - 2). Second, the largest radius, in units
+# of sqrt(1 + |p|^2). Third, the radius of a ball in space whose image lies within a chord: in units
+# of the chord times 1 + |p|^2.
+_ZERO_CHORD, _MAX_RADIUS, _RADIUS_OF_CHORD = 0.5, 0.3, 0.349
 # A factor that covers terms of second order in the unit roundoff, and the rounding of the bounds.
 _SECOND_ORDER = 1.05
-# Roundings, in units of u: the relative rounding of 1/(1 + |p|^2), and the rounding of w.
-_SCALE_ROUNDINGS, _HEIGHT_ROUNDINGS = 6.0, 13.0
+# Rounding errors, in units of u: the relative error of 1/(1 + |p|^2), and the error of w.
+_SCALE_ERROR, _W_ERROR = 6.0, 13.0
 
 
 @dataclass(frozen=True)
 class _OrderTerm:
-    """The terms of one j: a sum of solid harmonics S(y) times C_n^k(w), with bounds of both."""
+    """The part S(y) C_n^k(w) of the function that belongs to one j, with bounds of its factors.
+
+    j: the degree of S.
+    n, k: l - j and j + 1, the indices of the Gegenbauer polynomial C_n^k.
+    weights: (j, m) -> coefficient of the sum S of solid harmonics.
+    value, gradient, hessian: bounds of |S|, of its gradient and of its second derivatives.
+    rounding: the rounding of S as it is evaluated.
+    """
 
     j: int
     n: int
@@ -72,19 +80,24 @@ class _OrderTerm:
 
     @classmethod
     def of(cls, l: int, j: int, weights: Weights) -> _OrderTerm:  # noqa: E741
+        """The part with this j of a function of degree l; weights: those of S, N_lj included."""
         bounds = value_bound(weights), gradient_bound(weights), hessian_bound(weights)
         rounding = HarmonicRounding.of(weights, is_divided=True)
         return cls(j, l - j, j + 1, weights, *bounds, rounding)
 
     def largest(self, rho: Real, r: Real) -> tuple[Real, Real]:
-        """Bounds of first and second derivatives of S(y) C(w) in R^4, for y within rho of the third
-        axis and r of 0: C and its derivatives are largest at w = 1."""
+        """Bounds of the first and second derivatives of S(y) C(w) in R^4, for |w| <= 1.
+
+        rho, r: y is within rho of the third axis and within r of 0.
+
+        C and its derivatives are largest at w = 1.
+        """
         c, first, second = (float(number) for number in self.axial(1.0))
         value, slope, curvature = self.value(rho, r), self.gradient(rho, r), self.hessian(rho, r)
         return slope * c + value * first, curvature * c + slope * first + value * second
 
     def axial(self, w: Real) -> tuple[Real, Real, Real]:
-        """C_n^k(w) and its first two derivatives."""
+        """The values at w of C_n^k and of its first two derivatives."""
         n, k = self.n, self.k
         first = 2 * k * gegenbauer(n - 1, k + 1, w)
         return gegenbauer(n, k, w), first, 4 * k * (k + 1) * gegenbauer(n - 2, k + 2, w)
@@ -93,10 +106,11 @@ class _OrderTerm:
 class HypersphericalHarmonic(Field):
     """A harmonic function of the sphere S^3 at its point (2p, |p|^2 - 1)/(1 + |p|^2).
 
-    P_ljm(X) = N S_jm(y) |X|^(l-j) C_(l-j)^(j+1)(w/|X|) with X = (y, w): S_jm the solid harmonic of
-    `SphericalHarmonic`, C a Gegenbauer polynomial, the integral of P^2 over S^3 being 1. The origin
-    is at w = -1, the unit sphere at w = 0, and far away f tends to the value at w = 1, which is 0
-    for j > 0. No level set needs to be clipped: rays that leave are proved to meet nothing.
+    The function is P_ljm(X) = N S_jm(y) |X|^(l-j) C_(l-j)^(j+1)(w/|X|) with X = (y, w). Here S_jm
+    is the solid harmonic of `SphericalHarmonic`, C is a Gegenbauer polynomial, and N is such that
+    the integral of P^2 over S^3 is 1. The origin of space is the point w = -1 of S^3, the unit
+    sphere is w = 0, and far away f tends to the value at w = 1, which is 0 for j > 0. No level set
+    needs to be clipped: rays that leave are proved to meet nothing.
 
     l, j, m: degree 0 <= l <= 6, and 0 <= j <= l, -j <= m <= j: (l+1)^2 functions for each l.
         For more general functions see `from_polynomial`.
@@ -104,24 +118,26 @@ class HypersphericalHarmonic(Field):
         tends far away (0 for j > 0) may be unbounded, and so may rays along them: they need a
         domain, or a t_max.
 
-    Proofs. Let P be of degree l with |P| <= M and half of its range A on S^3 (`HypersphereRange`).
-    P is harmonic and homogeneous, so |grad P| <= l M there and |v.H v| <= l (l-1) M for unit
-    vectors v (`BallRange.curvature` has the proof). Let S = 1 + |p|^2.
+    Proofs. Let P be of degree l. On S^3 let |P| <= M, and let A be half the length of the range of
+    P (`HypersphereRange`). P is harmonic and homogeneous, so |grad P| <= l M on S^3 and
+    |v . H v| <= l (l-1) M for unit vectors v and the Hessian H (`BallRange.curvature` has the
+    proof). Let S = 1 + |p|^2.
 
-    - `TaylorRemainder`. A line runs on S^3 at speed 2/S, and its second derivative in t has the
-      length 4/S^1.5 (`SphereArcEnclosure` has the circle: it is sqrt(c^2 + t^2) 4/S^2). By the
-      chain rule |f''| <= M l (4 (l-1)/S^2 + 4/S^1.5) with the smallest S on the ball, and
-      |grad f| <= 2 l A/S (Bernstein on the great circle along the line).
-    - Where f vanishes to an order above 2, at y = 0 or for |m| > 2 on the circle y_1 = y_2 = 0,
-      another `TaylorRemainder`, on a ball whose radius is a fraction of the distance to that zero.
-      With bounds of S_jm, its gradient and its Hessian at such distances (`AxialBound`), and 2ab <=
-      1 for the components (a, b) of unit vectors, it follows by the same chain rule for
-      S_jm(y) C(w). The ball: for R <= 0.3 sqrt(S), 1 + |q|^2 >= 0.49 S at its points q, so that on
-      the sphere it is within the chord 2R/(0.7 S).
-    - Along a ray: `SphereArcEnclosure`. On the circle of radius 1/c, in its angle, the first
-      derivative of the point has length 1/c and so has the second, so |f_aa| <=
-      M l ((l-1)/c^2 + 1/c); and f is a trigonometric polynomial of degree l of the angle, so
-      |f_aa| <= l^2 A (Bernstein).
+    - `TaylorRemainder` on a ball. The image on S^3 of a line with parameter t moves at speed 2/S,
+      and its second derivative by t has the length 4/S^1.5 (for the circle in `SphereArcEnclosure`
+      it is sqrt(c^2 + t^2) 4/S^2). By the chain rule |f''| <= M l (4 (l-1)/S^2 + 4/S^1.5) with the
+      smallest S on the ball, and |grad f| <= 2 l A/S (Bernstein on the great circle along the
+      line).
+    - A further `TaylorRemainder` near places where f vanishes to an order above 2: the point y = 0,
+      and for |m| > 2 the circle y_1 = y_2 = 0. Its ball has a radius that is a fraction of the
+      distance to that place. `AxialBound` bounds S_jm, its gradient and its Hessian at such
+      distances. The bound for S_jm(y) C(w) follows by the same chain rule, with 2ab <= 1 for the
+      components (a, b) of unit vectors. The ball's image: for R <= 0.3 sqrt(S), 1 + |q|^2 >= 0.49 S
+      at all points q of the ball, so on S^3 the image is within the chord 2R/(0.7 S).
+    - `SphereArcEnclosure` along a ray. The image of the ray lies on a circle of radius 1/c. The
+      first and the second derivative of its point by the angle have the length 1/c, so
+      |f_aa| <= M l ((l-1)/c^2 + 1/c) for derivatives by the angle. And f is a trigonometric
+      polynomial of degree l of the angle, so |f_aa| <= l^2 A (Bernstein).
 
     Raises:
         ValueError: l, j or m outside these ranges.
@@ -147,13 +163,17 @@ class HypersphericalHarmonic(Field):
     def from_polynomial(
         cls, coefficients: Monomials, *, domain: Volume | None = None
     ) -> HypersphericalHarmonic:
-        """The function of a homogeneous harmonic polynomial of R^4, from its coefficients.
+        """The function of a homogeneous harmonic polynomial of R^4, from the polynomial's
+        coefficients.
 
-        coefficients: (a, b, c, d) -> coefficient of x^a y^b z^c w^d, a + b + c + d = l for all, l
-            <= 6; x, y, z are 2p/(1 + |p|^2) and w = (|p|^2 - 1)/(1 + |p|^2).
+        coefficients: (a, b, c, d) -> coefficient of x^a y^b z^c w^d. The degree a + b + c + d = l
+            is the same for all, l <= 6. At a point p of space, (x, y, z) is 2p/(1 + |p|^2) and w is
+            (|p|^2 - 1)/(1 + |p|^2).
+        domain: as for the class.
 
         Raises:
-            ValueError: not homogeneous, of a degree above 6, zero, not finite, or not harmonic.
+            ValueError: the polynomial is not homogeneous, of a degree above 6, zero, not finite, or
+                not harmonic.
             TypeError: a key is not four integers.
         """
         terms: dict[tuple[int, int, int, int], float] = {}
@@ -172,38 +192,40 @@ class HypersphericalHarmonic(Field):
         return field
 
     def _initialize(self, l: int, weights: SphereWeights, domain: Volume | None) -> None:  # noqa: E741
+        """Set up the sum of P_ljm of degree l with these weights, (j, m) -> coefficient."""
         self.domain = domain
         self.degree = l
         self._orders = [
             _OrderTerm.of(l, j, sums) for j, sums in weights_by_order(l, weights).items()
         ]
-        self._range = HypersphereRange.of(l, weights)
+        self._known = HypersphereRange.of(l, weights)
 
     @property
     def value_range(self) -> tuple[float, float]:
-        """Proved: the values of f stay within this interval."""
-        return self._range.low, self._range.high
+        """The ends (low, high) of an interval that is proved to contain all values of f."""
+        return self._known.low, self._known.high
 
     def evaluate(self, p: Vec3) -> Sample:
+        """The sample at p, with bounds of the Hessian on several balls and a Lipschitz constant."""
         square = dr.squared_norm(p)
         value, gradient, error, gradient_error = self._values(p, 1 + square)
         promises = (*self._remainder_near_zero(p, square), *self._curvatures(square))
         slope = self.degree * (self._known.high - self._known.low) * (1 + _ROUNDING)
-        lipschitz = Lipschitz(
-            slope / self._min_square(square, _LARGE_RADIUS), self._reach(square, _LARGE_RADIUS)
-        )
+        lipschitz = Lipschitz(slope / self._min_square(square, _BIG), self._radius(square, _BIG))
         return Sample(
             value, gradient, promises, error, gradient_error, alternative_promises=(lipschitz,)
         )
 
     def _values(self, p: Vec3, total: Real) -> tuple[Real, Vec3, Real, Real]:
-        """Value, gradient, and the rounding of both, total = 1 + |p|^2.
+        """Value and gradient at p, and bounds of the rounding errors of both.
 
-        With s = 1/total, y = 2 s p, w = 1 - 2 s, f = sum of S(y) C(w): since S is homogeneous of
-        degree j, grad f = 2 s (sum of C grad S + p S (2 s C' - j C)). To first order in u: y is off
-        by `_SCALE_ROUNDINGS` of its size, all coordinates alike, and by two roundings of each
-        coordinate (`is_divided`); w by `_HEIGHT_ROUNDINGS`; S, grad S and C by the errors of their
-        recurrences.
+        total: 1 + |p|^2.
+
+        Let s = 1/total, y = 2 s p and w = 1 - 2 s. f is a sum of S(y) C(w). Since S is homogeneous
+        of degree j, grad f = 2 s (sum of C grad S + p S (2 s C' - j C)). The errors, to first order
+        in u, are those of y: `_SCALE_ERROR` of its size, the same for all coordinates, and two
+        roundings of each coordinate (`is_divided`); that of w: `_W_ERROR`; and those of S, grad S
+        and C by their recurrences.
         """
         s = 1 / total
         y, w, size = 2 * s * p, 1 - 2 * s, dr.norm(p)
@@ -221,21 +243,21 @@ class HypersphericalHarmonic(Field):
             outer = outer + harmonic * radial
             # Rounding.
             upper, slope_max = term.value(rho, r), term.gradient(rho, r)
-            value_off = term.rounding.value(rho, r) + _SCALE_ROUNDINGS * term.j * upper
-            slope_off = (
+            value_error = term.rounding.value(rho, r) + _SCALE_ERROR * term.j * upper
+            slope_error = (
                 term.rounding.gradient(rho, r)
-                + (_SCALE_ROUNDINGS * max(term.j - 1, 0) + roundings) * slope_max
+                + (_SCALE_ERROR * max(term.j - 1, 0) + roundings) * slope_max
             )
-            c_off = dr.fma(_HEIGHT_ROUNDINGS, dr.abs(first), gegenbauer_rounding(term.n, term.k))
-            next_off = 2 * term.k * gegenbauer_rounding(term.n - 1, term.k + 1)
-            first_off = dr.fma(_HEIGHT_ROUNDINGS, dr.abs(second), next_off)
-            radial_off = 2 * s * dr.fma(8.0, dr.abs(first), first_off)
-            radial_off = radial_off + term.j * (c_off + 3 * dr.abs(c))
+            c_error = dr.fma(_W_ERROR, dr.abs(first), gegenbauer_rounding(term.n, term.k))
+            next_error = 2 * term.k * gegenbauer_rounding(term.n - 1, term.k + 1)
+            first_error = dr.fma(_W_ERROR, dr.abs(second), next_error)
+            radial_error = 2 * s * dr.fma(8.0, dr.abs(first), first_error)
+            radial_error = radial_error + term.j * (c_error + 3 * dr.abs(c))
             c = dr.abs(c)
-            error = error + c * (value_off + roundings * upper) + upper * c_off
-            slope = slope + c * slope_off + slope_max * c_off
+            error = error + c * (value_error + roundings * upper) + upper * c_error
+            slope = slope + c * slope_error + slope_max * c_error
             slope = slope + size * (
-                dr.abs(radial) * (value_off + roundings * upper) + upper * radial_off
+                dr.abs(radial) * (value_error + roundings * upper) + upper * radial_error
             )
         unit = float(dr.epsilon(type(zero))) * _SECOND_ORDER
         gradient = 2 * s * (inner + p * outer)
@@ -243,48 +265,56 @@ class HypersphericalHarmonic(Field):
         return value, gradient, dr.fma(error, unit, underflow), 2 * s * unit * slope
 
     def _min_square(self, square: Real, fraction: float) -> Real:
-        """A lower bound of 1 + |y|^2 on the ball of radius fraction sqrt(1 + |p|^2) about p;
-        square: |p|^2."""
+        """A lower bound of 1 + |y|^2 for y in the ball of radius fraction * sqrt(1 + |p|^2) about
+        p.
+
+        square: |p|^2.
+        """
         inner = fmax(dr.sqrt(square) - fraction * dr.sqrt(1 + square), 0)
         return dr.fma(inner, inner, 1) * (1 - _ROUNDING)
 
-    def _reach(self, square: Real, fraction: float) -> Real:
-        """The radius fraction sqrt(1 + |p|^2); square: |p|^2."""
+    def _radius(self, square: Real, fraction: float) -> Real:
+        """The radius fraction * sqrt(1 + |p|^2) of a ball about p; square: |p|^2."""
         return fraction * dr.sqrt(1 + square)
 
     def _curvatures(self, square: Real) -> list[TaylorRemainder]:
-        """Bounds of the Hessian on three balls, the last of which is all of space."""
+        """Bounds of the Hessian on two balls about p and on all of space; square: |p|^2."""
         l = self.degree  # noqa: E741
-        size = l * self._range.largest * (1 + _ROUNDING)
+        size = l * self._known.largest * (1 + _ROUNDING)
         promises: list[TaylorRemainder] = []
-        for fraction in _SHARES:
+        for fraction in _BALL_RADII:
             lower = self._min_square(square, fraction)
             second = (4 * (l - 1) / lower + 4 / dr.sqrt(lower)) / lower
-            promises.append(TaylorRemainder(fmax(size * second, 0), self._reach(square, fraction)))
+            promises.append(TaylorRemainder(fmax(size * second, 0), self._radius(square, fraction)))
         return [*promises, TaylorRemainder(0 * square + max(size * 4.0 * l, 0.0), dr.inf)]
 
     def _remainder_near_zero(self, p: Vec3, square: Real) -> tuple[TaylorRemainder, ...]:
-        """The bound of the Hessian near a zero of high order; empty if there is no such zero."""
-        by_axis = min(abs(m) for term in self._orders for _, m in term.weights)
-        by_center = min(term.j for term in self._orders)
-        if by_center < 3:
+        """A bound of the Hessian on a ball near a zero of high order; an empty tuple if there is
+        none.
+
+        square: |p|^2.
+        """
+        axis_order = min(abs(m) for term in self._orders for _, m in term.weights)
+        center_order = min(term.j for term in self._orders)
+        if center_order < 3:
             return ()
         y = (2 / (1 + square)) * p
         r, rho = dr.norm(y), dr.norm(type(y)(y.x, y.y, 0))
-        chord = _ZERO_CHORD / (by_center - 2) * r
-        if by_axis > 2:
-            chord = fmin(chord, _ZERO_CHORD / (by_axis - 2) * rho)
-        lower = self._min_square(square, _MAX_ZERO_RADIUS)
+        chord = _ZERO_CHORD / (center_order - 2) * r
+        if axis_order > 2:
+            chord = fmin(chord, _ZERO_CHORD / (axis_order - 2) * rho)
+        lower = self._min_square(square, _MAX_RADIUS)
         root = dr.rcp(dr.sqrt(lower))
         second_max = 0 * square
         for term in self._orders:
             first, second = term.largest(rho + chord, r + chord)
             second_max = second_max + 4 * root * root * root * dr.fma(root, second, first)
-        radius = fmin(_BALL_OF_CHORD * chord * (1 + square), _MAX_ZERO_RADIUS * dr.sqrt(1 + square))
+        radius = fmin(_RADIUS_OF_CHORD * chord * (1 + square), _MAX_RADIUS * dr.sqrt(1 + square))
         return (TaylorRemainder(second_max * (1 + _ROUNDING), radius),)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The sample, with `SphereArcEnclosure` enclosures if the ray uses the sharpest proofs."""
+        """The sample on a ray, with `SphereArcEnclosure` enclosures if the ray uses the sharpest
+        proofs."""
         del ahead, back
         p = path.point(t)
         sample = self.evaluate(p)
@@ -299,7 +329,7 @@ class HypersphericalHarmonic(Field):
         square = 1 + dr.squared_norm(closest)
         position = dr.dot(p, path.direction)
         l, c = self.degree, dr.sqrt(square)  # noqa: E741
-        bounds = self._range
+        bounds = self._known
         limit = l * l * 0.5 * (bounds.high - bounds.low)
         second = fmin(bounds.largest * l * ((l - 1) / square + 1 / c), limit) * (1 + _ROUNDING)
         forward = SphereArcEnclosure(slopes, second, position, square)
@@ -307,7 +337,7 @@ class HypersphericalHarmonic(Field):
         curvatures = [
             promise for promise in sample.promises if isinstance(promise, TaylorRemainder)
         ]
-        near_zero = curvatures[: -len(_SHARES) - 1]
+        near_zero = curvatures[: -len(_BALL_RADII) - 1]
         ahead_near = [
             ParabolaEnclosure(slopes, -promise.constant, promise.constant, promise.radius)
             for promise in near_zero
@@ -319,11 +349,17 @@ class HypersphericalHarmonic(Field):
         return RaySample(sample, (forward, *ahead_near), (backward, *back_near), slope)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """Rows of the Hessian, whose trace is not 0: f is harmonic on S^3 and not in space.
+        """The three rows of the Hessian. Its trace is not 0: f is harmonic on S^3 and not in space.
 
-        By the chain rule with dy_i/dx_k = 2s (d_ik - 2s x_i x_k), dw/dx_k = 4 s^2 x_k, and second
-        derivatives 4 s^2 (4s x_i x_k x_m - x_m d_ik - x_k d_im - x_i d_km) of y_i and 4 s^2 (d_km -
-        4s x_k x_m) of w.
+        Let s = 1/(1 + |x|^2) at the point x, and d_ik = 1 for i = k, else 0. The chain rule is
+        applied with
+
+        - first derivatives dy_i/dx_k = 2s (d_ik - 2s x_i x_k) and dw/dx_k = 4 s^2 x_k;
+        - second derivatives 4 s^2 (4s x_i x_k x_m - x_m d_ik - x_k d_im - x_i d_km) of y_i and 4
+          s^2 (d_km - 4s x_k x_m) of w.
+
+        Symbols in the code: `rows` and `slopes` are the Hessian (its upper triangle) and the
+        gradient of the function of (y, w) in R^4.
         """
         vector = cast("Any", type(p))
         s = 1 / (1 + dr.squared_norm(p))
@@ -365,10 +401,11 @@ class HypersphericalHarmonic(Field):
         return result[0], result[1], result[2]
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """A ball about the origin; None for levels whose surface may reach to infinity."""
+        """The domain, or a ball about the origin that contains the level sets; None if they may be
+        unbounded."""
         if self.domain is not None:
             return self.domain
-        radius = max((self._range.radius(level) for level in levels), default=0.0)
+        radius = max((self._known.radius(level) for level in levels), default=0.0)
         return Ball(radius=radius) if 0 < radius < math.inf else None
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
@@ -383,5 +420,5 @@ class HypersphericalHarmonic(Field):
             "degree": self.degree,
             "harmonics": sum(len(term.weights) for term in self._orders),
             "range": self.value_range,
-            "value far away": self._range.pole,
+            "value far away": self._known.pole,
         }

@@ -1,13 +1,12 @@
-"""Harmonic functions on the sphere S^3: the (l+1)^2 functions of degree l, their sums and their
-ranges.
+"""Harmonic functions on the sphere S^3: the (l+1)^2 functions of degree l, their sums and ranges.
 
-With X = (y, w), y in R^3, the homogeneous harmonic polynomials of degree l of R^4 are spanned by
+Let X = (y, w) with y in R^3. The homogeneous harmonic polynomials of degree l of R^4 are spanned by
 
-    P_ljm(X) = N_lj S_jm(y) |X|^(l-j) C_(l-j)^(j+1)(w/|X|),   0 <= j <= l, -j <= m <= j,
+    P_ljm(X) = N_lj S_jm(y) |X|^(l-j) C_(l-j)^(j+1)(w/|X|),   0 <= j <= l, -j <= m <= j.
 
-S_jm = |y|^j Y_jm the solid harmonics of `solid_harmonics`, C_n^k Gegenbauer polynomials (with n C_n
-= 2 (n+k-1) w C_(n-1) - (n+2k-2) C_(n-2)) and N_lj such that the integral of P^2 over S^3 is 1: with
-n = l-j, k = j+1 (DLMF 18.3),
+Here S_jm = |y|^j Y_jm is a solid harmonic of `solid_harmonics`. C_n^k is a Gegenbauer polynomial;
+it obeys n C_n = 2 (n+k-1) w C_(n-1) - (n+2k-2) C_(n-2) for fixed k. N_lj is the factor for which
+the integral of P^2 over S^3 is 1: with n = l-j and k = j+1 (DLMF 18.3),
 
     N^-2 = integral of sin(a)^(2k) C_n^k(cos a)^2 = pi 2^(1-2k) (n+2k-1)!/(n! (n+k) ((k-1)!)^2).
 
@@ -44,14 +43,14 @@ LARGEST_DEGREE = 6
 SphereWeights: TypeAlias = Mapping[tuple[int, int], float]  #: (j, m) -> coefficient of P_ljm
 Monomials: TypeAlias = Mapping[tuple[int, int, int, int], float]  #: of x^a y^b z^c w^d
 
-# The number of spheres |y| = const of S^3 on which ranges are proved.
+# The number of zones of equal width in the angle from the pole on which ranges are proved.
 _SLICES = 256
 # The product of degree and grid spacing on each of these spheres.
 _RESOLUTION = 0.1
 
 
 def norm(l: int, j: int) -> float:  # noqa: E741
-    """N_lj."""
+    """The factor N_lj, for which the integral of P_ljm^2 over S^3 is 1."""
     n, k = l - j, j + 1
     square = math.pi * 2.0 ** (1 - 2 * k) * math.factorial(n + 2 * k - 1)
     square /= math.factorial(n) * (n + k) * math.factorial(k - 1) ** 2
@@ -59,7 +58,7 @@ def norm(l: int, j: int) -> float:  # noqa: E741
 
 
 def gegenbauer(n: int, k: int, w: Any) -> Any:
-    """C_n^k(w), for NumPy or Dr.Jit numbers; 0 for n < 0."""
+    """The Gegenbauer polynomial C_n^k(w), for NumPy or Dr.Jit numbers w; 0 for n < 0."""
     if n < 0:
         return 0.0 * w
     previous, value = 0.0 * w, 0.0 * w + 1.0
@@ -70,35 +69,41 @@ def gegenbauer(n: int, k: int, w: Any) -> Any:
 
 
 def _coefficients(i: int, k: int) -> tuple[float, float]:
-    """The two coefficients of the recurrence to C_i^k."""
+    """The coefficients (a, b) of the step C_i = a w C_(i-1) - b C_(i-2) of the recurrence, k
+    fixed."""
     return 2 * (i + k - 1) / i, (i + 2 * k - 2) / i
 
 
 @functools.cache
 def gegenbauer_rounding(n: int, k: int) -> float:
-    """A bound, to first order, of the rounding of `gegenbauer` for a number in [-1, 1], in units of
+    """A bound, to first order in u, of the rounding error of `gegenbauer` on [-1, 1], in units of
     u.
 
-    A step commits 4u |a w C_(i-1)| + 3u |b C_(i-2)| and propagates the errors of earlier steps by
-    the same recurrence; the sum of the sizes is sampled, and changes little between samples (1.03).
+    A step of the recurrence adds an error of 4u |a w C_(i-1)| + 3u |b C_(i-2)|, and propagates the
+    errors of earlier steps by the same recurrence. The sum of the absolute errors is sampled at
+    4001 angles; the factor 1.03 covers values between samples.
     """
     w = np.cos(np.linspace(0, math.pi, 4001))
     total = np.zeros_like(w)
-    for start in range(1, n + 1):
-        a, b = _coefficients(start, k)
-        committed = 4 * np.abs(a * w * gegenbauer(start - 1, k, w))
-        committed += 3 * np.abs(b * gegenbauer(start - 2, k, w))
-        previous, value = np.zeros_like(w), np.ones_like(w)
-        for i in range(start + 1, n + 1):
+    for step in range(1, n + 1):
+        a, b = _coefficients(step, k)
+        step_error = 4 * np.abs(a * w * gegenbauer(step - 1, k, w))
+        step_error += 3 * np.abs(b * gegenbauer(step - 2, k, w))
+        last_growth, growth = np.zeros_like(w), np.ones_like(w)
+        for i in range(step + 1, n + 1):
             a, b = _coefficients(i, k)
-            previous, value = value, a * w * value - b * previous
-        total += np.abs(value) * committed
+            last_growth, growth = growth, a * w * growth - b * last_growth
+        total += np.abs(growth) * step_error
     return 1.03 * float(total.max())
 
 
 def weights_by_order(l: int, weights: SphereWeights) -> dict[int, dict[tuple[int, int], float]]:  # noqa: E741
-    """For each j, the weights of the solid harmonics (j, m) in the factor of C_(l-j)^(j+1), N_lj
-    included."""
+    """For each j, the weights of the solid harmonics in the factor S(y) of C_(l-j)^(j+1)(w).
+
+    weights: (j, m) -> coefficient of P_ljm.
+
+    Returns j -> {(j, m): weight}, where the weights contain the factor N_lj.
+    """
     orders: dict[int, dict[tuple[int, int], float]] = {}
     for (j, m), weight in sorted(weights.items()):
         orders.setdefault(j, {})[j, m] = norm(l, j) * weight
@@ -106,14 +111,17 @@ def weights_by_order(l: int, weights: SphereWeights) -> dict[int, dict[tuple[int
 
 
 def from_monomials(coefficients: Monomials) -> tuple[int, dict[tuple[int, int], float]]:
-    """The degree and the weights of a homogeneous harmonic polynomial of R^4.
+    """The degree l and the weights (j, m) -> c of a homogeneous harmonic polynomial, sum of c
+    P_ljm.
 
-    The weights are integrals over S^3 of products of degree 2l <= 12, exact by quadrature: Gauss
-    and Chebyshev's rule in w, Gauss and Legendre's on S^2, even steps in longitude. A polynomial
-    that is not harmonic differs from the sum of these projections.
+    coefficients: (a, b, c, d) -> coefficient of x^a y^b z^c w^d.
+
+    The weights are integrals over S^3 of products of degree 2l <= 12. The quadrature is exact for
+    them: Gauss and Chebyshev's rule in w, Gauss and Legendre's on S^2, even steps in longitude. A
+    polynomial that is not harmonic differs from the sum of these projections.
 
     Raises:
-        ValueError: not homogeneous, of a degree above 6, zero, or not harmonic.
+        ValueError: the polynomial is not homogeneous, of a degree above 6, zero, or not harmonic.
     """
     degrees = sorted({sum(powers) for powers, c in coefficients.items() if c != 0})
     if not degrees:
@@ -161,16 +169,20 @@ def from_monomials(coefficients: Monomials) -> tuple[int, dict[tuple[int, int], 
 
 @dataclass(frozen=True)
 class HypersphereRange:
-    """Proved ranges of a sum of degree l on S^3, and on the spheres of angle a from the pole w = 1.
+    """Proved ranges of a sum of P_ljm on S^3, and on zones of S^3 about the pole w = 1.
 
+    degree: the degree l of the sum P.
     low, high: the range on all of S^3.
-    lower, upper: (n,) the ranges for angles from i pi/n to (i+1) pi/n.
+    lower, upper: (n,) the ranges on the zones of points whose angle from the pole w = 1 is from i
+        pi/n to (i+1) pi/n.
     pole: the value at w = 1, to which f tends far away.
 
-    Proof. On the sphere in the middle of each pair of angles P is a polynomial of degree l on S^2,
-    and on S^3 all points are within `covering` + half a step of a sample: `proved_range`, whose
-    proof is along great circles. Between spheres P changes by l A pi/(2n) at most (Bernstein), A
-    half the range on S^3.
+    Proof. P is sampled on the sphere in the middle of each zone, where it is a polynomial of degree
+    l on S^2, at points within the angle `covering` of all others: `proved_range` gives its range
+    there. Each point of S^3 is within `covering` plus half a step of angle of a sample, so
+    `proved_range`, whose proof is along great circles, also gives the range on S^3. From the middle
+    of a zone to its ends P changes by at most l A pi/(2n) (Bernstein), where A is half the length
+    of the range on S^3.
     """
 
     degree: int
@@ -182,24 +194,24 @@ class HypersphereRange:
 
     @classmethod
     def of(cls, l: int, weights: SphereWeights) -> HypersphereRange:  # noqa: E741
-        """The ranges of the sum of P_ljm with these weights."""
+        """The ranges of the sum of P_ljm of degree l with the weights (j, m) -> coefficient."""
         covering = _RESOLUTION / max(1, l)
-        unit = unit_sphere(covering)
-        h = math.pi / _SLICES
-        a = h * (np.arange(_SLICES) + 0.5)
-        values = np.zeros((_SLICES, unit.shape[1]))
+        sphere = unit_sphere(covering)
+        step = math.pi / _SLICES
+        a = step * (np.arange(_SLICES) + 0.5)
+        values = np.zeros((_SLICES, sphere.shape[1]))
         pole = 0.0
         for j, sums in weights_by_order(l, weights).items():
-            harmonic = evaluate(sums, *unit)[0] + 0.0 * unit[0]
+            harmonic = evaluate(sums, *sphere)[0] + 0.0 * sphere[0]
             values += (np.sin(a) ** j * gegenbauer(l - j, j + 1, np.cos(a)))[:, None] * harmonic
             if j == 0:
                 pole += float(harmonic[0]) * float(gegenbauer(l, 1, np.ones(1))[0])
         lower, upper = values.min(axis=1), values.max(axis=1)
         low, high = float(lower.min()), float(upper.max())
-        low, high = proved_range(low, high, l, covering + 0.5 * h)
+        low, high = proved_range(low, high, l, covering + 0.5 * step)
         e = 0.5 * (l * covering) ** 2
         margin = 0.5 * (upper - lower) * e / (1 - e)
-        margin = margin + 0.5 * (high - low) * (0.5 * h * l) + 1e-11 * (high - low)
+        margin = margin + 0.5 * (high - low) * (0.5 * step * l) + 1e-11 * (high - low)
         return cls(l, low, high, lower - margin, upper + margin, pole)
 
     @property
@@ -208,12 +220,14 @@ class HypersphereRange:
         return max(-self.low, self.high)
 
     def radius(self, level: float) -> float:
-        """The radius of a ball about the origin that contains all points with this level; infinite
-        if there is no such ball.
+        """The radius of a ball about the origin of space that contains all points with this level.
 
-        An angle a from the pole is a distance cot(a/2) from the origin. If the level may occur on
-        the first sphere, write P = A cos(b) along a great circle from the pole, A >= |P|: b changes
-        at a rate of at most l (Szego), so the level is at least |b(level) - b(pole)|/l away.
+        It is infinite if there is no such ball, and 0 if the level does not occur.
+
+        Points at the angle a from the pole w = 1 have the distance cot(a/2) from the origin. If the
+        level may occur in the first zone, write P = A cos(b) along a great circle from the pole,
+        with A >= |P|. Then b changes at a rate of at most l (Szego), so the level is at an angle of
+        at least |b(level) - b(pole)|/l.
         """
         slices = np.flatnonzero((self.lower <= level) & (level <= self.upper))
         if slices.size and slices[0] > 0:

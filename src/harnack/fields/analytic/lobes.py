@@ -34,13 +34,14 @@ if TYPE_CHECKING:
 __all__ = ["Lobes"]
 
 LobeSign = Literal["both", "positive", "negative"]
-_PARTS: tuple[LobeSign, ...] = ("both", "positive", "negative")
+_SIGNS: tuple[LobeSign, ...] = ("both", "positive", "negative")
 # Ends of promised ranges are moved outwards by this fraction for the roundings of float32.
 _ROUNDING = 1e-5
-# Scales and harmonics between 1/limit and limit have fourth powers within the range of a precision.
-_REACH = {"single": 1e6, "double": 1e60}
-# The smallest bound of second derivatives, so that it is not 0.
-_SMALLEST = 1e-20
+# For each precision a number m. The scale and the largest |Y| must be from 1/m to m: the fourth
+# powers of such numbers neither overflow nor underflow.
+_LARGEST_SIZE = {"single": 1e6, "double": 1e60}
+# Added to bounds of second derivatives, so that they are not 0.
+_MIN_BOUND = 1e-20
 
 
 class Lobes(Field):
@@ -63,18 +64,19 @@ class Lobes(Field):
     scale: a positive number, the length of a lobe in which Y reaches 1.
     sign: "both", "positive" or "negative".
 
-    Second derivatives. The sum of the harmonics is W = Y^2, Y or -Y, and f = r^4 - r^2 W or
-    r^3 - r^2 W. Along a great circle W is a trigonometric polynomial T of degree N (2 L or L),
-    within A of its middle, so that T' = N A a and T" = N^2 A b with a^2 + b^2 <= 1 (Bernstein and
-    Szego, for T and then T'). r^2 W has the same second derivatives at x as at u; along the unit
-    vector c u + q v, v at right angles to u and c^2 + q^2 = 1, they are
+    Bounds of second derivatives, for scale 1. Let W be Y^2 for both signs, else Y or -Y, so that
+    f = r^4 - r^2 W or f = r^3 - r^2 W. Let L be the degree of Y and N that of W (2 L or L). Along a
+    great circle W is a trigonometric polynomial T of degree N, whose values lie within A of the
+    middle of its range. So T' = N A a and T" = N^2 A b with a^2 + b^2 <= 1 (Bernstein and Szego,
+    for T and then T'). r^2 W has the same second derivatives at x as at u = x/|x|. Take the unit
+    vector c u + q v, where v is at right angles to u and c^2 + q^2 = 1: along it they are
 
         2 W + 2 c q T' + q^2 T",   and   |2 c q T' + q^2 T"| <= q N A sqrt(4 c^2 + q^2 N^2)
 
     (Cauchy and Schwarz), at most N^2 A for N >= 2 and 2 A/sqrt(3) for N = 1. The second derivatives
     of r^3 are in [0, 6 r], those of r^4 in [0, 12 r^2]. So those of f along a segment are bounded
-    on both sides by the distances of its ends from the origin. The gradient is continuous, 0 at the
-    origin, so that this holds for segments through it as well.
+    on both sides by functions of the larger distance of its ends from the origin. The gradient is
+    continuous and 0 at the origin, so this also holds for segments through the origin.
 
     Raises:
         ValueError: l, m, scale or sign out of range; no direction with that sign.
@@ -94,17 +96,25 @@ class Lobes(Field):
         scale: float = 1.0,
         sign: LobeSign = "both",
     ) -> Lobes:
-        """The lobes of a sum of real spherical harmonics; weights: {(l, m): c} for the sum of c
-        Y_lm."""
+        """The lobes of a sum of real spherical harmonics.
+
+        weights: {(l, m): c}, for the sum of c Y_lm.
+        scale, sign: as for `Lobes`.
+
+        Raises:
+            ValueError: a weight, the scale or the sign is out of range; no direction has that sign.
+            TypeError: the weights are no mapping of pairs of integers to numbers.
+        """
         field = cls.__new__(cls)
         field._initialize(weights, scale, sign)
         return field
 
     def _initialize(self, weights: Any, scale: Any, sign: LobeSign) -> None:
+        """Check the parameters, which are those of `combined`, and compute the range of Y."""
         self.weights = _checked(weights)
         scale = as_positive(scale, "the scale of lobes")
-        if not is_one_of(sign, _PARTS):
-            raise ValueError(f"part must be one of {', '.join(_PARTS)}, not {sign!r}")
+        if not is_one_of(sign, _SIGNS):
+            raise ValueError(f"part must be one of {', '.join(_SIGNS)}, not {sign!r}")
         self.scale, self.part = scale, sign
         self._size: Any = self.scale
         (first, *further) = self.weights
@@ -130,6 +140,7 @@ class Lobes(Field):
         return self._only("negative")
 
     def _only(self, sign: LobeSign) -> Lobes:
+        """The lobes of the same Y and scale with another choice of sign."""
         return Lobes.combined(self.weights, scale=self.scale, sign=sign)
 
     @property
@@ -138,14 +149,18 @@ class Lobes(Field):
         return max(l for l, _ in self.weights)  # noqa: E741
 
     def extent_radius(self) -> float:
-        """A proved upper bound of the length of the longest lobe; not positive if there is no
-        lobe."""
+        """A proved upper bound of the length of the longest lobe; 0 or less if there is no lobe."""
         low, high = self.value_range
         ends = {"both": max(-low, high), "positive": high, "negative": -low}
         return self.scale * ends[self.part]
 
     def prepare(self, backend: Backend) -> Field:
-        limit, largest = _REACH[backend.precision], max(map(abs, self.value_range))
+        """A copy whose scale is a kernel parameter.
+
+        Raises:
+            ValueError: the scale or the largest |Y| is too small or too large for the precision.
+        """
+        limit, largest = _LARGEST_SIZE[backend.precision], max(map(abs, self.value_range))
         if not (1 / limit <= self.scale <= limit and 1 / limit <= largest <= limit):
             raise ValueError(
                 f"lobes in {backend.precision} precision need a scale and a largest |Y| from "
@@ -157,11 +172,11 @@ class Lobes(Field):
         return field
 
     def extent(self, levels: tuple[float, ...]) -> Volume:
-        """A ball about the origin.
+        """A ball about the origin that contains the level sets.
 
-        With a the length of the longest lobe and scale 1, f > c beyond a + c^(1/4) or, for a single
-        sign, a + c^(1/3), for c > 0: there r^2 - W >= (r - a)^2 or r - W >= r - a, and r^2 is at
-        least (r - a)^2. Levels c <= 0 are within a.
+        Proof for scale 1 and a level c > 0, with a the length of the longest lobe. For r >= a, r^2
+        - W >= (r - a)^2 for both signs and r - W >= r - a for one sign, and r^2 >= (r - a)^2. So f
+        > c where r > a + c^(1/4) or, for one sign, r > a + c^(1/3). Levels c <= 0 are within a.
         """
         beyond = max(*levels, 0.0) ** (1 / 4 if self.part == "both" else 1 / 3)
         return Ball(radius=(self.extent_radius() + self.scale * beyond) * (1 + 1e-6))
@@ -170,13 +185,13 @@ class Lobes(Field):
         return space_scaled(self._unscaled(p / self._size), self._size)
 
     def _unscaled(self, x: Vec3) -> Sample:
-        """The sample at a point of lobes of scale 1."""
+        """The sample at points x, for lobes of scale 1."""
         r = safe_norm(x)
         at_origin = r <= float(dr.smallest(type(r))) ** 0.25  # f is 0 up to rounding
         u = dr.select(at_origin, type(x)(0, 0, 1), x / dr.select(at_origin, 1, r))
         r = dr.select(at_origin, 0, r)
-        y, slope = evaluate(self.weights, u.x, u.y, u.z)
-        tangential = type(x)(*slope)
+        y, y_gradient = evaluate(self.weights, u.x, u.y, u.z)
+        tangential = type(x)(*y_gradient)
         tangential -= dr.dot(tangential, u) * u  # the gradient of Y(x/r), times r
         if self.part == "both":
             value = r * r * ((r - y) * (r + y))
@@ -185,24 +200,32 @@ class Lobes(Field):
             y, tangential = (y, tangential) if self.part == "positive" else (-y, -tangential)
             value = r * r * (r - y)
             gradient = r * ((3 * r - 2 * y) * u - tangential)
-        slope_norm = safe_norm(tangential)
-        error, gradient_error = self._errors(r, y, slope_norm, dr.sqrt(u.x * u.x + u.y * u.y))
+        slope = safe_norm(tangential)
+        error, gradient_error = self._errors(r, y, slope, dr.sqrt(u.x * u.x + u.y * u.y))
         lower, upper = self._second_derivatives(1.5 * r + 0.5)
         promises = [TaylorRemainder(fmax(-lower, upper), 0.5 * (r + 1))]
         if self.part == "both" and self.degree > 0:
-            promises.append(self._local_remainder(r, y, slope_norm))
+            promises.append(self._local_remainder(r, y, slope))
         return Sample(value, gradient, tuple(promises), error, gradient_error)
 
     def _local_remainder(self, r: Real, y: Real, slope: Real) -> TaylorRemainder:
-        """A bound of second derivatives on a small ball, on which Y and its slope may be far
-        smaller than elsewhere: between lobes that come close to each other.
+        """A bound of second derivatives on a small ball, for both signs and scale 1.
 
-        Proof, for B(x, q r) with q <= 1/4, whose directions from the origin are within the angle
-        1.05 q of u. With M and L the largest size and the degree of Y, second derivatives along the
-        sphere are at most L^2 M, so slopes are at most G = |slope| + 1.05 q L^2 M there, and |Y| <=
-        H = |Y(u)| + 1.05 q G. Second derivatives of r^2 Y^2 are 2 Y^2 + 2 Y (2 c q Y' + q^2 Y") + 2
-        q^2 Y'^2 with the c and q of `Lobes`, so at most 2 H^2 + 2 H b + 2 G^2, b being N^2 A of Y.
-        The second derivatives of r^4 are at most 12 r^2.
+        It is sharp where Y and its slope are far smaller than elsewhere: between lobes that come
+        close to each other.
+
+        r: the distance of the point x from the origin.
+        y: Y(u) at the direction u of the point.
+        slope: the length of the gradient of Y on the unit sphere at u.
+
+        Proof, for the ball B(x, q r) with q <= 1/4. The directions of its points from the origin
+        are within the angle 1.05 q of u. Let M be the largest |Y| and L the degree of Y. Second
+        derivatives of Y along the sphere are at most L^2 M, so at these directions slopes are at
+        most G = |slope| + 1.05 q L^2 M, and |Y| <= H = |Y(u)| + 1.05 q G. With c and q as in the
+        proof of `Lobes` (q is the tangential component there), the second derivatives of r^2 Y^2
+        are 2 Y^2 + 2 Y (2 c q Y' + q^2 Y") + 2 q^2 Y'^2. This is at most 2 H^2 + 2 H b + 2 G^2,
+        where b is the bound N^2 A of `Lobes` for Y itself. The second derivatives of r^4 are at
+        most 12 r^2.
         """
         max_value, degree = max(map(abs, self.value_range)), self.degree
         q = fmin(0.8 * dr.sqrt(r / max_value), 0.25) / degree
@@ -212,30 +235,36 @@ class Lobes(Field):
         swing = second_max if degree > 1 else 2 / math.sqrt(3) * max_value
         constant = 2 * (max_abs * (max_abs + swing) + max_slope * max_slope)
         constant = fmax(constant, 12 * dr.square(r * (1 + q)) + 2 * max_abs * swing)
-        return TaylorRemainder(constant * (1 + _ROUNDING) + _SMALLEST, q * r)
+        return TaylorRemainder(constant * (1 + _ROUNDING) + _MIN_BOUND, q * r)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The sample, with parabolas from ranges of second derivatives on the lengths `ahead` and
-        `back`."""
+        """The sample on a ray, with parabolas from ranges of second derivatives on the lengths
+        `ahead` and `back`."""
         p = path.point(t)
         sample = self.evaluate(p)
         base = path.enclose(sample)
         slopes = SlopeRange.around(base.slope, sample.gradient_error)
 
-        def enclosure(reach: Real, sign: int, along: SlopeRange) -> ParabolaEnclosure:
-            reach = dr.select(dr.isfinite(reach), reach, 4 * (safe_norm(p) + self._size))
-            end = dr.fma(type(p)(sign * reach), path.direction, p)
+        def enclosure(length: Real, sign: int, slope_range: SlopeRange) -> ParabolaEnclosure:
+            """The parabola on a length of the ray, forward (sign 1) or backward (-1)."""
+            length = dr.select(dr.isfinite(length), length, 4 * (safe_norm(p) + self._size))
+            end = dr.fma(type(p)(sign * length), path.direction, p)
             farthest = fmax(safe_norm(p), safe_norm(end)) * ((1 + _ROUNDING) / self._size)
             scale = 1 / dr.square(self._size)
             lower, upper = self._second_derivatives(farthest)
-            return ParabolaEnclosure(along, scale * lower, scale * upper, reach)
+            return ParabolaEnclosure(slope_range, scale * lower, scale * upper, length)
 
         forward, backward = enclosure(ahead, 1, slopes), enclosure(back, -1, slopes.negated())
         return RaySample(sample, (*base.forward, forward), (*base.backward, backward), base.slope)
 
     def _second_derivatives(self, farthest: Real) -> tuple[Real, Real]:
-        """The smallest and the largest second derivative along any line within r <= farthest, for
-        scale 1: see `Lobes`."""
+        """Bounds (lower, upper) of the second derivatives along any line, for scale 1: see `Lobes`.
+
+        farthest: they hold at distances up to this from the origin.
+
+        Symbols: [low, high] is the range of W, degree is N, `swing` bounds |2 c q T' + q^2 T"|, and
+        `power` is the largest second derivative of r^3 or r^4.
+        """
         low, high = self.value_range
         if self.part == "both":
             upper, degree = max(low * low, high * high), 2 * self.degree
@@ -250,11 +279,17 @@ class Lobes(Field):
         return lower - margin, upper + margin
 
     def _errors(self, r: Real, y: Real, slope_norm: Real, rho: Real) -> tuple[Real, Real]:
-        """Bounds of the rounding of value and gradient, to first order in the unit roundoff e.
+        """Bounds of the rounding errors of value and gradient, for scale 1, to first order in u.
 
-        The unit vector is off by 4 e of itself: that changes Y by at most 4 e L M, M = max |Y|, its
-        radial continuation by as much, and its gradient by 4 e L^2 M each. `HarmonicRounding`
-        bounds the error of the evaluation of Y. The products after that have a few roundings each.
+        r: the distance of the point from the origin.
+        y: Y at the direction of the point.
+        slope_norm: the length of the gradient of Y on the unit sphere there.
+        rho: the distance of the direction from the z axis.
+
+        The computed unit vector has a relative error of 4u. With M the largest |Y| and L the
+        degree, this changes Y by at most 4u L M, its extension along the radius by as much, and the
+        gradient by 4u L^2 M for each of the two. `HarmonicRounding` bounds the error of the
+        evaluation of Y. Each product after that adds a few roundings.
         """
         unit = float(dr.epsilon(type(r)))
         max_value, degree = max(map(abs, self.value_range)), self.degree
@@ -269,8 +304,11 @@ class Lobes(Field):
         return r * r * (error + 8 * unit * r), r * (slope + 2 * error + 24 * unit * r)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """Rows of the Hessian of f; see `_of_power`. At the origin its limit depends on the
-        direction of approach: the result is the limit along z."""
+        """The three rows of the Hessian of f; see `_of_power`.
+
+        At the origin its limit depends on the direction of approach; the result is the limit along
+        z.
+        """
         distance = safe_norm(p)
         at_origin = distance == 0
         u = dr.select(at_origin, type(p)(0, 0, 1), p / dr.select(at_origin, 1, distance))
@@ -296,18 +334,21 @@ class Lobes(Field):
         return scale * rows[0], scale * rows[1], scale * rows[2]
 
     def _of_power(self, u: Vec3, n: int) -> tuple[Real, Vec3, tuple[Vec3, Vec3, Vec3]]:
-        """Value, gradient and Hessian at unit vectors of r^n Y(x/r), a sum of r^(n-l) P_l with P_l
-        solid harmonics. With k = n - l, the Hessian of r^k P is, at r = 1,
+        """Value, gradient and Hessian of r^n Y(x/r) at unit vectors u.
 
-            H + k (x g^T + g x^T) + k P (I + (k-2) x x^T),   H and g of P.
+        The function is the sum of r^(n-l) P_l, where P_l is the solid harmonic part of degree l of
+        Y. With k = n - l and P = P_l, whose gradient is g and Hessian H, the Hessian of r^k P at a
+        unit vector x is
+
+            H + k (x g^T + g x^T) + k P (I + (k-2) x x^T).
         """
         vector = cast("Any", type(u))
         value, gradient = 0 * u.x, 0 * u
         rows = [0 * u, 0 * u, 0 * u]
         for l in {l for l, _ in self.weights}:  # noqa: E741
-            part = {key: c for key, c in self.weights.items() if key[0] == l}
-            k, (y, slope) = n - l, evaluate(part, u.x, u.y, u.z)
-            g, (xx, yy, zz, xy, xz, yz) = vector(*slope), hessian(part, u.x, u.y, u.z)
+            harmonics = {key: c for key, c in self.weights.items() if key[0] == l}
+            k, (y, slope) = n - l, evaluate(harmonics, u.x, u.y, u.z)
+            g, (xx, yy, zz, xy, xz, yz) = vector(*slope), hessian(harmonics, u.x, u.y, u.z)
             value, gradient = value + y, gradient + g + (k * y) * u
             for i, row in enumerate(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))):
                 new_row = vector(*row) + k * (u[i] * g + g[i] * u) + (k * (k - 2) * y * u[i]) * u
@@ -320,11 +361,13 @@ class Lobes(Field):
 
 
 def _checked(weights: Any) -> dict[tuple[int, int], float]:
-    """The coefficients that are not zero.
+    """The weights that are not zero, as Python numbers.
+
+    weights: the mapping {(l, m): c} that a user gave.
 
     Raises:
-        TypeError: a key is no pair of integers, or a coefficient no number.
-        ValueError: there is no coefficient, or a key names no harmonic.
+        TypeError: it is no mapping, a key is no pair of integers, or a weight no number.
+        ValueError: no weight differs from 0, or a key names no harmonic of degree up to 12.
     """
     if not isinstance(weights, Mapping):
         raise TypeError(f"weights must be {{(l, m): coefficient}}, not {weights!r}")

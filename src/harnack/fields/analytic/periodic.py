@@ -57,33 +57,38 @@ _ROUNDING_EXTENSION = 1e-5
 
 @dataclass(frozen=True)
 class ExtensionBounds:
-    """Bounds of the harmonic extension of a sum of waves on B(p, R) of R^4.
+    """Bounds of the harmonic extension of a sum of waves f on balls B(p, R) of R^4.
 
-    With f = sum f_i, Laplacian f_i = -kappa_i^2 f_i and |f_i| <= A_i, the extension is
-    F(y, w) = sum cosh(kappa_i w) f_i(y): harmonic, F(., 0) = f, and smaller than the paper's
-    exp(kappa w) f. Take any wavenumber kappa, and alpha = cosh(kappa R) - 1,
-    E = sum A_i |cosh(kappa_i R) - cosh(kappa R)|. Then
+    radius: R.
+    alpha, spread: the numbers alpha and E of the proof.
+    largest: a bound of |F| on the ball, without the constant term.
+    constant: the constant term of f. It is its own extension; it is left out of all other numbers
+        and added in the end.
+    largest_gradient, curvature: bounds G of |grad f| and H of the second derivatives of f.
+
+    Proof. Let f = sum f_i with Laplacian f_i = -kappa_i^2 f_i and |f_i| <= A_i. The extension is
+    F(y, w) = sum cosh(kappa_i w) f_i(y): it is harmonic, F(., 0) = f, and it is smaller than the
+    paper's exp(kappa w) f. Take any wavenumber kappa, and let alpha = cosh(kappa R) - 1 and E = sum
+    A_i |cosh(kappa_i R) - cosh(kappa R)|. Then
 
         F = cosh(kappa w) f + (rest),   |rest| <= E w^2/R^2,   cosh(kappa w) <= 1 + alpha w^2/R^2,
 
-    as (cosh(a w) - cosh(b w))/w^2 is a power series in w^2 with coefficients of one sign. Put
-    x = |y-p|/R, so w^2/R^2 <= 1 - x^2. By Taylor |f(y) - f(p)| <= D x with
-    D = min(G R, |grad f(p)| R + H R^2/2), G and H bounds of the gradient and the Hessian. Hence
-    -F <= Dx - f + (1-x^2) E where Dx <= f (there f(y) >= 0), at most
-    D - f or, if D < 2E, E + D^2/(4E) - f; and where Dx > f
+    as (cosh(a w) - cosh(b w))/w^2 is a power series in w^2 with coefficients of one sign. Let x =
+    |y-p|/R, so that w^2/R^2 <= 1 - x^2, and write f for f(p). By Taylor's formula |f(y) - f| <= D x
+    with D = min(G R, |grad f(p)| R + H R^2/2). If Dx <= f, then f(y) >= 0 and -F <= Dx - f +
+    (1-x^2) E, which is at most D - f or, if D < 2E, at most E + D^2/(4E) - f. If Dx > f,
 
-        -F <= h(x) = (1 + alpha (1-x^2)) (Dx - f) + (1-x^2) E,
+        -F <= h(x) = (1 + alpha (1-x^2)) (Dx - f) + (1-x^2) E.
 
-    a cubic that on x >= 0 is largest at its only critical point
-    x* = D(1+alpha) / (sqrt((alpha f - E)^2 + 3 alpha (1+alpha) D^2) - (alpha f - E)) or, if that
-    is beyond 1, at x = 1. The upper end is the same with -f. Neither end need exceed
-    cosh(kappa R) sup|f| + E. A constant term, which is its own extension, is excluded from all this
-    and added in the end.
+    On x >= 0 this cubic is largest at its only critical point x* = D(1+alpha) / (sqrt((alpha f -
+    E)^2 + 3 alpha (1+alpha) D^2) - (alpha f - E)) or, if x* > 1, at x = 1. This bounds F from
+    below. The upper bound is the same with -f. Neither bound need exceed cosh(kappa R) sup|f| + E
+    in size.
     """
 
     radius: float
     alpha: float
-    spread: float  # E
+    spread: float
     largest: float
     constant: float
     largest_gradient: float
@@ -91,35 +96,37 @@ class ExtensionBounds:
 
     @classmethod
     def with_best_radius(cls, waves: WaveBounds) -> ExtensionBounds:
-        """The bounds for the radius that gives the longest steps near level 0 at a gradient of mean
-        size.
+        """The bounds for the radius that gives the longest steps near level 0, for a gradient of
+        mean length.
 
         There a step is shortened by the second-order term of the bound, which is proportional to (f
-        - lower)/R^2. For the gyroid (cell 2 pi) the result is R = 1.1, in the middle of the best
-        radii: with the slope bound, 0.8 to 1.4 took 11.5 to 11.9 evaluations per ray, the paper's
-        exp with the range +-3/2 at its best radius 21.4.
+        - lower)/R^2, so the radius minimizes this. For the gyroid (cell 2 pi) the result is R =
+        1.1, in the middle of the best radii: with the slope bound, radii from 0.8 to 1.4 took 11.5
+        to 11.9 evaluations per ray. The paper's exp with the range +-3/2 took 21.4 at its best
+        radius.
         """
         k, a = np.array(waves.wavenumbers), np.array(waves.amplitudes)
-        typical = math.sqrt(0.5 * float(a**2 @ k**2))
-        scale = 1 / math.sqrt(float(a**2 @ k**2) / float(a @ a))
-        steps = (scale * 0.02 * 1.02**n for n in range(300))
+        mean_slope = math.sqrt(0.5 * float(a**2 @ k**2))
+        length_unit = 1 / math.sqrt(float(a**2 @ k**2) / float(a @ a))
+        steps = (length_unit * 0.02 * 1.02**n for n in range(300))
         radii = [r for r in steps if r * float(k.max()) < 30.0]  # cosh stays far from overflow
         trials = [cls.at(waves, r) for r in radii]
-        return min(trials, key=lambda trial: trial._below_host(typical) / trial.radius**2)
+        return min(trials, key=lambda trial: trial._descent_at_zero(mean_slope) / trial.radius**2)
 
     @classmethod
     def at(cls, waves: WaveBounds, radius: float) -> ExtensionBounds:
-        """The bounds for a radius; kappa is the weighted median, which makes E smallest."""
+        """The bounds for a radius; kappa is the weighted median of the wavenumbers, which makes E
+        smallest."""
         growth: npt.NDArray[np.float64] = np.cosh(radius * np.array(waves.wavenumbers))
         amplitudes = np.array(waves.amplitudes)
         order = np.argsort(growth)
-        mass: npt.NDArray[np.float64] = np.cumsum(amplitudes[order])
-        middle = float(growth[order][np.argmax(mass >= 0.5 * mass[-1])])
-        spread = float(amplitudes @ np.abs(growth - middle)) * (1 + 1e-12)
-        largest = middle * waves.largest_value + spread
+        amplitude_sums: npt.NDArray[np.float64] = np.cumsum(amplitudes[order])
+        median_growth = float(growth[order][np.argmax(amplitude_sums >= 0.5 * amplitude_sums[-1])])
+        spread = float(amplitudes @ np.abs(growth - median_growth)) * (1 + 1e-12)
+        largest = median_growth * waves.largest_value + spread
         return cls(
             radius=radius,
-            alpha=middle - 1,
+            alpha=median_growth - 1,
             spread=spread,
             largest=largest,
             constant=waves.constant,
@@ -128,31 +135,40 @@ class ExtensionBounds:
         )
 
     def ball(self, f: Real, slope: Real) -> HarmonicBall:
-        """The promise at a point with value f and |grad f| = slope."""
+        """The promise at a point p: a ball of R^4 with bounds of the harmonic extension on it.
+
+        f: the value at p.
+        slope: |grad f(p)|.
+        """
         r = self.radius
         rise = fmin(self.largest_gradient * r, slope * r + 0.5 * self.curvature * r * r)
-        out = 1 + _ROUNDING_EXTENSION
+        widening = 1 + _ROUNDING_EXTENSION
         real = backend_of(f).Float
         f = f - self.constant
-        lower = self.constant - out * self._lower_bound(f, rise)
-        upper = self.constant + out * self._lower_bound(-f, rise)
+        lower = self.constant - widening * self._max_descent(f, rise)
+        upper = self.constant + widening * self._max_descent(-f, rise)
         return HarmonicBall(real(r), lower, upper, dimension=4)
 
-    def _lower_bound(self, f: Real, rise: Real) -> Real:
-        """A bound of -F on the ball, if |f(y) - f| <= rise |y-p|/R."""
+    def _max_descent(self, f: Real, rise: Real) -> Real:
+        """A bound of -F on the ball about p; with -f instead of f, a bound of F.
+
+        f: the value at p, without the constant term.
+        rise: the number D, for which |f(y) - f(p)| <= D |y-p|/R.
+        """
         alpha, e = self.alpha, self.spread
         b = alpha * f - e
         root = dr.sqrt(b * b + 3 * alpha * (1 + alpha) * rise * rise)
         x = fmin((1 + alpha) * rise / (root - b), 1.0)
         weight = 1 - x * x
         falling = (1 + alpha * weight) * (rise * x - f) + weight * e
-        level = rise
+        near = rise
         if e > 0:
-            level = dr.select(rise < 2 * e, e + rise * rise / (4 * e), rise)
-        return fmin(fmax(falling, level - f), self.largest)
+            near = dr.select(rise < 2 * e, e + rise * rise / (4 * e), rise)
+        return fmin(fmax(falling, near - f), self.largest)
 
-    def _below_host(self, slope: float) -> float:
-        """The bound of -F at f = 0 in Python floats, for choosing the radius."""
+    def _descent_at_zero(self, slope: float) -> float:
+        """`_max_descent` for f = 0 and a gradient of length `slope`, in Python floats, to choose
+        the radius."""
         r, alpha, e = self.radius, self.alpha, self.spread
         rise = min(self.largest_gradient * r, slope * r + 0.5 * self.curvature * r * r)
         x = np.linspace(0.0, 1.0, 101)
@@ -173,21 +189,21 @@ class EigenfunctionSum(Field):
     domain: the volume in which f is drawn; by default the ball about the origin whose radius is the
         longest wavelength.
 
-    Each term is an eigenfunction of the Laplacian, so cosh(kappa w) f with kappa^2 = -eigenvalue
-    is harmonic in R^4 and equals f at w = 0: see `ExtensionBounds` for its bounds. The Lipschitz
-    constant is local, |grad f(p)| + H r / 2 on the ball of radius r (Taylor), where `curvature` H
-    bounds the Hessian, and never above `max_gradient`.
+    Promises. Each term f_i is an eigenfunction of the Laplacian, so cosh(kappa w) f_i with
+    kappa^2 = -eigenvalue is harmonic in R^4 and equals f_i at w = 0; `ExtensionBounds` has the
+    bounds. Let H be the bound `curvature` of the Hessian. The Lipschitz constant is local,
+    |grad f(p)| + H r / 2 on the ball of radius r (Taylor), and never above `max_gradient`.
 
-    The rounding of the value is bounded at the point (`WaveRounding`). The rounding of the
-    gradient, E, is included in `Sample.value_error`. `TaylorRemainder` is promised as (1 + h) H, h
-    = `_SLOPE_SHARE`, and for all t
+    Rounding. The rounding error of the value is bounded at the point (`WaveRounding`). The effect
+    of the rounding error E of the gradient is included in `Sample.value_error`. For the
+    `TaylorRemainder`, the constant (1 + h) H with h = `_SLOPE_SHARE` is promised. For all t
 
-        E t <= E^2/(2 h H) + h H t^2/2   (2 a b <= a^2 + b^2):
+        E t <= E^2/(2 h H) + h H t^2/2   (since 2 a b <= a^2 + b^2),
 
-    the larger H and E^2/(2 h H) cover the error of Taylor's formula with a rounded gradient. On the
-    harmonic ball of radius R this error is E R, of which
-    `enclosures.free_radius.condition_rounding` covers 16 u of the mean 4 (f - lower)/R in units of
-    which the slope enters, f - lower being about H R^2/2 or more; only the rest is added.
+    so the larger constant and E^2/(2 h H), added to the value's error, cover the error of Taylor's
+    formula with a rounded gradient. For the harmonic ball of radius R this error is E R. The slope
+    enters there in units of 4 (f - lower)/R, where f - lower is about H R^2/2 or more, and
+    `enclosures.free_radius.condition_rounding` covers 16 u of this unit. Only the rest is added.
 
     Raises:
         ValueError: terms that are not finite, or a sum that is constant.
@@ -210,25 +226,28 @@ class EigenfunctionSum(Field):
         )
 
     def _bounds(self) -> WaveBounds:
+        """The bounds of the sum; classes with sharper proved constants override it."""
         return WaveBounds.of(self.terms)
 
     @property
     def value_range(self) -> tuple[float, float]:
-        """Proved: the values of f stay within this interval."""
+        """The ends (low, high) of an interval that is proved to contain all values of f."""
         middle, largest = self.waves.constant, self.waves.largest_value
         return middle - largest, middle + largest
 
     @property
     def max_gradient(self) -> float:
-        """Proved: |grad f| never exceeds it."""
+        """A proved bound of |grad f| everywhere."""
         return self.waves.largest_gradient
 
     @property
     def curvature(self) -> float:
-        """Proved: no directional second derivative of f exceeds it in size."""
+        """A proved bound of the absolute directional second derivatives of f."""
         return self.waves.largest_curvature
 
     def evaluate(self, p: Vec3) -> Sample:
+        """The sample at p: see `EigenfunctionSum` for its promises and for the bound of its
+        rounding."""
         value, components = evaluate_terms(self.terms, p)
         gradient = type(p)(*components)
         epsilon = float(dr.epsilon(type(value)))
@@ -247,7 +266,8 @@ class EigenfunctionSum(Field):
         return Sample(value, gradient, promises, error, alternative_promises=alternatives)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """Rows of the Hessian; its trace is the Laplacian of the sum, which is not zero."""
+        """The three rows of the Hessian. Its trace is the Laplacian of the sum, which is not
+        zero."""
         x, y, z = (type(p)(*row) for row in hessian_of_terms(self.terms, p))
         return x, y, z
 
@@ -256,16 +276,17 @@ class EigenfunctionSum(Field):
         return self._rounding.derivative_errors(p)
 
     def gradient_change_bound(self, p: Vec3, radius: Real) -> Real:
-        """radius * `curvature`, which bounds the norm of the Hessian."""
+        """A bound of |grad f(y) - grad f(p)| for |y - p| <= radius: radius times `curvature`, which
+        bounds the norm of the Hessian."""
         return 0 * p.x + radius * (self.curvature * (1 + _ROUNDING))
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
         validate_levels_in_range(levels, self.value_range)
 
     def wall_levels(self, half_width: float, *, level: float | None = None) -> tuple[float, float]:
-        """The two levels of the wall |f - level| <= half_width, for the argument `solid=`.
+        """The two levels that bound the wall |f - level| <= half_width, for the argument `solid=`.
 
-        half_width: a difference of values of f, not a length: see `levels_of_thickness`.
+        half_width: a difference of values of f, and no length: see `levels_of_thickness`.
         level: the middle of the wall, by default `default_level`.
         """
         middle = self.default_level if level is None else float(level)
@@ -283,11 +304,12 @@ class EigenfunctionSum(Field):
     def levels_of_thickness(
         self, thickness: float, *, level: float | None = None
     ) -> tuple[float, float]:
-        """The two levels of a wall about `level` that is proved to be at least this thick.
+        """The two levels that bound a wall about `level` that is proved to be at least this thick.
 
-        thickness is a length. The wall contains every point within thickness/2 of the middle
-        surface, since there |f - level| <= `max_gradient` * thickness/2; where f is less steep than
-        at its steepest the wall is thicker.
+        thickness: a length. The wall contains every point within thickness/2 of the middle surface,
+            since there |f - level| <= `max_gradient` * thickness/2. Where f is less steep than at
+            its steepest, the wall is thicker.
+        level: the middle of the wall, by default `default_level`.
         """
         return self.wall_levels(0.5 * self.max_gradient * float(thickness), level=level)
 
@@ -301,7 +323,11 @@ class EigenfunctionSum(Field):
 
 
 def _wavenumber(cell: Any) -> float:
-    """The wavenumber 2 pi/cell of a cell with this edge length."""
+    """The wavenumber 2 pi/cell for a cell with this edge length.
+
+    Raises:
+        TypeError, ValueError: cell is not a positive finite number.
+    """
     if not isinstance(cell, numbers.Real):
         raise TypeError(f"the edge length of the cell must be a number, not {cell!r}")
     edge = float(cell)
@@ -311,7 +337,11 @@ def _wavenumber(cell: Any) -> float:
 
 
 class _CubicSurface(EigenfunctionSum):
-    """A surface with cubic symmetry and proved constants: bounds of |f|, |grad f| at cell 2 pi."""
+    """A sum of waves with the periods `cell` along x, y and z, and with proved constants.
+
+    _largest_value: a bound of |f|.
+    _steepness: a bound of |grad f| for cell 2 pi.
+    """
 
     _largest_value: float
     _steepness: float
@@ -322,6 +352,8 @@ class _CubicSurface(EigenfunctionSum):
         super().__init__(terms, domain=Ball(radius=self.cell) if domain is None else domain)
 
     def _bounds(self) -> WaveBounds:
+        """The bounds of the sum of waves, with the proved constants of the class in place of two of
+        them."""
         return replace(
             super()._bounds(),
             largest_value=self._largest_value,
@@ -335,9 +367,10 @@ class Gyroid(_CubicSurface):
     cell: the edge length of the cubic cell of periodicity, 2 pi by default (so X = x).
     domain: the volume in which f is drawn, by default the ball of radius `cell` about the origin.
 
-    |f| <= 3/2: 2 sin a cos b <= sin^2 a + cos^2 b, and the three right sides add up to 3.
-    |grad f| <= sqrt 3 (2 pi/cell): f_X = cos X cos Y - sin Z sin X has, by Cauchy-Schwarz,
-    f_X^2 <= cos^2 Y + sin^2 Z; the three right sides add up to 3. Both are attained.
+    Proof of |f| <= 3/2: each term obeys 2 sin a cos b <= sin^2 a + cos^2 b, and the three right
+    sides add up to 3. Proof of |grad f| <= sqrt 3 (2 pi/cell): the derivative by X is
+    f_X = cos X cos Y - sin Z sin X. By Cauchy-Schwarz f_X^2 <= cos^2 Y + sin^2 Z, and the three
+    right sides add up to 3. Both bounds are attained.
     """
 
     _largest_value = 1.5
@@ -353,8 +386,10 @@ class Gyroid(_CubicSurface):
 class SchwarzP(_CubicSurface):
     """cos X + cos Y + cos Z with (X, Y, Z) = 2 pi p/cell: Schwarz's primitive surface.
 
-    cell, domain: as for `Gyroid`. |f| <= 3 and |grad f|^2 = sum sin^2 <= 3 (2 pi/cell)^2, both
-    attained.
+    cell, domain: as for `Gyroid`.
+
+    |f| <= 3, and |grad f| <= sqrt 3 (2 pi/cell) since the derivatives by X, Y and Z are sines. Both
+    bounds are attained.
     """
 
     _largest_value = 3.0
@@ -368,16 +403,21 @@ class SchwarzP(_CubicSurface):
 
 
 class SchwarzD(_CubicSurface):
-    """Schwarz's diamond surface, with s and c for sin and cos of (X, Y, Z) = 2 pi p/cell:
+    """Schwarz's diamond surface, the level 0 of
 
-        s s s + s c c + c s c + c c s.
+        f = s s s + s c c + c s c + c c s,
 
-    cell, domain: as for `Gyroid`. |f| <= sqrt 2, attained: f = sin X cos(Y-Z) + cos X sin(Y+Z),
-    at most sqrt(cos^2(Y-Z) + sin^2(Y+Z)) by Cauchy-Schwarz.
-    |grad f| <= sqrt 3 (2 pi/cell), attained: with A, B, C the cosines and P, Q, R the sines of
-    2X, 2Y, 2Z, |grad f|^2 = 3/2 (1 + ABC) - (PQ + QR + RP)/2. Here
-    -2(PQ + QR + RP) <= P^2 + Q^2 + R^2 = 3 - S with S = A^2 + B^2 + C^2, and
-    |ABC| <= (S/3)^(3/2) <= S/3, so |grad f|^2 <= 3/2 + S/2 + (3 - S)/4 <= 3.
+    where the first, second and third s or c of each term is sin or cos of X, Y and Z, and
+    (X, Y, Z) = 2 pi p/cell.
+
+    cell, domain: as for `Gyroid`.
+
+    Proof of |f| <= sqrt 2: f = sin X cos(Y-Z) + cos X sin(Y+Z), which is at most
+    sqrt(cos^2(Y-Z) + sin^2(Y+Z)) by Cauchy-Schwarz. Proof of |grad f| <= sqrt 3 (2 pi/cell): let A,
+    B, C be the cosines and P, Q, R the sines of 2X, 2Y, 2Z. For cell 2 pi,
+    |grad f|^2 = 3/2 (1 + ABC) - (PQ + QR + RP)/2. Here -2(PQ + QR + RP) <= P^2 + Q^2 + R^2 = 3 - S
+    with S = A^2 + B^2 + C^2, and |ABC| <= (S/3)^(3/2) <= S/3, so
+    |grad f|^2 <= 3/2 + S/2 + (3 - S)/4 <= 3. Both bounds are attained.
     """
 
     _largest_value = math.sqrt(2.0)

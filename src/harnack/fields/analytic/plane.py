@@ -1,8 +1,8 @@
-"""Functions of the plane: level curves of analytic functions, height fields, and functions by name.
+"""Functions of the plane: analytic functions chosen by name, their level curves, and height fields.
 
-- `make_branches`: the `Branches` of a name, a mapping or a user's function.
-- `LevelCurves`: level curves of harmonic functions of the plane, extended to walls: Harnack tracing
-  in two dimensions.
+- `make_branches`: the `Branches` of a function given by name, by a mapping or by the user's code.
+- `LevelCurves`: surfaces over the level curves of harmonic functions of the plane, which is Harnack
+  tracing in two dimensions.
 - `HeightField`: the graph of a formula over the plane.
 """
 
@@ -69,11 +69,18 @@ def make_branches(
     second_bound: Callable[[Any, Any], Any] | None = None,
     period: float | None = None,
 ) -> Branches:
-    """The branches of a function by its name, a mapping, or a user's function: see
-    `RiemannSurface`.
+    """Make the `Branches` of an analytic function that may have several values at a point.
+
+    function: "log", "sqrt", "cbrt", "power" or "asin"; or a mapping {a_i: alpha_i}, for the product
+        of (z - a_i)^alpha_i; or a callable that returns the branches at a point.
+    exponent: only, and always, with "power": the rational exponent.
+    argument: only with "log", "sqrt", "cbrt" and "power": a mapping {a_i: n_i} with integers n_i
+        other than 0. The function is then applied to the product of (z - a_i)^n_i instead of to z.
+    singular_points, second_bound, period: only with a callable, as for `RiemannSurface`.
 
     Raises:
-        TypeError, ValueError: settings that do not belong together, or an invalid function.
+        TypeError, ValueError: a parameter is given that does not belong to this function, or is
+            missing; or the function is invalid.
     """
     user_settings = {"singular": singular_points, "second": second_bound, "period": period}
     if callable(function):
@@ -101,24 +108,24 @@ def make_branches(
     if function == "asin":
         _refuse_settings('"asin"', argument=argument)
         return ArcSine()
-    inner = {
-        complex(a): _nonzero_integer(n)
-        for a, n in ({0: 1} if argument is None else argument).items()
-    }
+    roots = {complex(a): _integer(n) for a, n in ({0: 1} if argument is None else argument).items()}
     if function == "log":
-        if not inner:
+        if not roots:
             raise ValueError("argument: give at least one zero or pole, such as {1: 1, -1: -1}")
-        return Logarithm(tuple(inner), tuple(inner.values()))
+        return Logarithm(tuple(roots), tuple(roots.values()))
     power = {"sqrt": Fraction(1, 2), "cbrt": Fraction(1, 3)}.get(function)
     power = _fraction(exponent) if power is None else power
-    return power_product({a: n * power for a, n in inner.items()})
+    return power_product({a: n * power for a, n in roots.items()})
 
 
 def power_product(exponents: Mapping[complex, Any]) -> PowerProduct:
-    """The product of (z - a)^alpha for a mapping {a: alpha}.
+    """The product of (z - a)^alpha over the items a: alpha of a mapping.
+
+    Items with exponent 0 are left out.
 
     Raises:
-        TypeError, ValueError: the mapping is invalid.
+        TypeError, ValueError: a point is not finite, an exponent is not a rational number with a
+            small denominator, no exponent differs from 0, or there are more than 24 branches.
     """
     chosen: dict[complex, Fraction] = {}
     for a, alpha in exponents.items():
@@ -140,10 +147,12 @@ def power_product(exponents: Mapping[complex, Any]) -> PowerProduct:
 
 
 def _fraction(value: Any) -> Fraction:
-    """A number as a fraction with a small denominator.
+    """`value` as a fraction with a denominator of at most 24, the largest number of branches.
+
+    A float is rounded to such a fraction if that is within 1e-12.
 
     Raises:
-        TypeError, ValueError: it is no such fraction.
+        TypeError, ValueError: it is no such fraction, or above 6 in size.
     """
     try:
         exact = Fraction(value)
@@ -161,8 +170,12 @@ def _fraction(value: Any) -> Fraction:
     return fraction
 
 
-def _nonzero_integer(value: Any) -> int:
-    """A nonzero integer. Raises TypeError or ValueError for other values."""
+def _integer(value: Any) -> int:
+    """`value` as an int, if it is an integer other than 0.
+
+    Raises:
+        TypeError, ValueError: for any other value.
+    """
     number = _fraction(value)
     if number.denominator != 1 or number == 0:
         raise ValueError(
@@ -174,8 +187,14 @@ def _nonzero_integer(value: Any) -> int:
 def _user_branches(
     function: Any, singular_points: Any, second_bound: Any, period: Any
 ) -> UserBranches:
-    """The branches of a user's function, evaluated once as a test. Raises TypeError or
-    ValueError."""
+    """The branches of a user's function, after a test evaluation of all that the user gave.
+
+    The parameters are those of `RiemannSurface`.
+
+    Raises:
+        TypeError, ValueError: a parameter is missing or invalid, or a function returns something
+            else than it should.
+    """
     if singular_points is None or second_bound is None:
         raise ValueError(
             "a function of your own needs singular_points=, where it is not analytic, such as [0], "
@@ -227,7 +246,11 @@ def _user_branches(
 
 
 def _try_bound(second_bound: Callable[[Any, Any], Any], z: Any, radius: Any) -> Any:
-    """The user's bound at a point. Raises TypeError if it does not take z and a radius."""
+    """The value of the user's second_bound(z, radius).
+
+    Raises:
+        TypeError: it cannot be called with a point and a radius.
+    """
     try:
         return second_bound(z, radius)
     except TypeError as error:
@@ -237,33 +260,41 @@ def _try_bound(second_bound: Callable[[Any, Any], Any], z: Any, radius: Any) -> 
 
 
 def _refuse_settings(context: str, **settings: Any) -> None:
-    """Raise ValueError if any of the settings is not None."""
+    """Check that none of the settings was given, that is, that all of them are None.
+
+    context: what they do not belong to, for the message.
+
+    Raises:
+        ValueError: a setting is not None.
+    """
     names = [name for name, value in settings.items() if value is not None]
     if names:
         raise ValueError(f"{' and '.join(names)} cannot be given for {context}")
 
 
 # Radii of the disks on which the function is bounded, as fractions of the distance to the nearest
-# singular point, and the largest radius.
+# singular point; and the largest such distance that is used.
 _DISK_FRACTIONS = (0.4, 0.8)
-_LONGEST = 1e6
+_MAX_CLEARANCE = 1e6
 
 
 class LevelCurves(Field):
-    """f(x, y, z) = Re g(x + i y), or Im g(x + i y), with an analytic function g. Its level sets are
-    walls over level curves of the plane.
+    """f(x, y, z) = Re g(x + i y), or Im g(x + i y), with an analytic function g.
 
-    function, exponent, argument, singular_points, second_bound, period: an analytic function g with
-        a single branch, up to a period, as for `RiemannSurface`: {a_i: n_i} with integers n_i for a
-        rational function, "log" with argument={a_i: n_i} for charges n_i at a_i.
+    f does not depend on z: its level sets stand upright on level curves of the plane.
+
+    function, exponent, argument, singular_points, second_bound, period: the analytic function g,
+        given as for `RiemannSurface`. It must have a single branch, up to a period: for example
+        {a_i: n_i} with integers n_i for a rational function, or "log" with argument={a_i: n_i} for
+        the potential of charges n_i at a_i.
     part: "real" or "imag".
     level: the default level.
     domain: the volume in which f is drawn; by default the box |x|, |y| <= 2, |z| <= 1/4.
 
-    Re g is harmonic in the plane: Harnack's inequality of dimension 2 holds in disks up to the
-    nearest singular point, and as |g''| is bounded there (`Branches.second_derivative_bound`) f
-    changes by at most |g'| r + |g''| r^2/2 on a disk of radius r. The promises are this range, as a
-    ball of dimension 2, and the bound of second derivatives.
+    Promises. f is harmonic in the plane, so Harnack's inequality of dimension 2 holds in disks that
+    contain no singular point. There |g"| is bounded (`Branches.second_derivative_bound`), so f
+    changes by at most |g'| r + max|g"| r^2/2 on a disk of radius r. Each disk gives two promises:
+    this range, as a `HarmonicBall` of dimension 2, and the bound of second derivatives.
 
     Raises:
         TypeError, ValueError: an invalid function, or a function with several branches.
@@ -311,16 +342,17 @@ class LevelCurves(Field):
         return field
 
     def evaluate(self, p: Vec3) -> Sample:
+        """The sample at p, with two promises for each of two disks: see `LevelCurves`."""
         rounding, z, branch = self._at(p)
-        x, y = derivatives(branch.first, self.part)
+        slope_x, slope_y = derivatives(branch.first, self.part)
         vector = cast("Any", type(p))
-        gradient = vector(x, y, 0 * x)
+        gradient = vector(slope_x, slope_y, 0 * slope_x)
         slope, error = dr.norm(gradient), self.branches.value_rounding(z, (branch,))
         clearance = self.branches.clearance(z)
         promises: list[TaylorRemainder | HarmonicBall] = []
         value = branch.value.imag if self.part == "imag" else branch.value.real
         for fraction in _DISK_FRACTIONS:
-            radius = fraction * dr.minimum(clearance, _LONGEST)
+            radius = fraction * dr.minimum(clearance, _MAX_CLEARANCE)
             second = self.branches.second_derivative_bound(Disk(z, radius, rounding)) * (1 + 1e-4)
             change = (slope * radius + 0.5 * second * radius * radius) * (1 + 1e-5)
             promises += [
@@ -330,7 +362,7 @@ class LevelCurves(Field):
         return Sample(value, gradient, tuple(promises), backend_of(p).machine_epsilon * error)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """Rows of the Hessian, free of trace.
+        """The three rows of the Hessian; its trace is 0.
 
         Raises:
             NotImplementedError: the user's function does not return its second derivative.
@@ -345,42 +377,48 @@ class LevelCurves(Field):
         return vector(xx, xy, zero), vector(xy, -xx, zero), vector(zero, zero, zero)
 
     def _at(self, p: Vec3) -> tuple[Real, Complex, Branch]:
-        """The rounding of the point, the point in the plane, and the branch at that point."""
+        """Evaluate g at the points p.
+
+        Returns a bound of the rounding error of the point of the plane (a distance), the point as a
+        complex number, moved off singular points, and the branch at that point.
+        """
         rounding = 4 * backend_of(p).machine_epsilon * max_norm(p)
         z = self.branches.move_off_singularities(complex_of(p.x, p.y), rounding)
         return rounding, z, self.branches.evaluate(z)[0]
 
 
-# The number of cells along a side of the grid on which the heights over the domain are bounded.
+# The number of cells along each side of the grid on which a height field is bounded.
 _CELLS = 32
 
 
-def _around_the_origin() -> Volume:
+def _unit_box() -> Volume:
+    """The default domain of a height field: the box of all points with coordinates from -1 to 1."""
     return Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 
 
 @dataclass(frozen=True, eq=False)
 class HeightField(Formula):
-    """The surface z = u(x, y): the level 0 of f = z - u, which is negative below it.
+    """The surface z = u(x, y): the level 0 of f = z - u, which is negative below the surface.
 
     function: u, written with plain operators and functions such as `harnack.math.sin` (see
-        `expression`); called while a kernel is being recorded, its numbers are literals of that
-        kernel.
-    domain: the volume in which the surface is drawn, by default the box of all points with
-        coordinates up to 1.
-
-    Along a ray f'' depends on u only, and steps are proved from its ranges. Rays are clipped to
-    the range of heights that u has over the domain, which is proved on a grid of cells.
+        `expression`). It is called while a kernel is being recorded; numbers in it become literals
+        of that kernel.
+    domain: the volume in which the surface is drawn; by default the box of all points with
+        coordinates from -1 to 1.
 
         hk.fields.HeightField(lambda x, y: 0.3 * hk.math.sin(3 * x) * hk.math.cos(3 * y))
+
+    The second derivative of f along a ray depends on u only; steps are proved from its ranges. Rays
+    are clipped to the range of u over the domain, which is proved on a grid of cells.
 
     Raises:
         TypeError: function cannot be called with two coordinates, or uses operations without
             ranges.
+        ValueError: the domain is unbounded.
     """
 
     function: Callable[[Any, Any], Any]
-    domain: Volume | None = field(default_factory=_around_the_origin)
+    domain: Volume | None = field(default_factory=_unit_box)
 
     def __post_init__(self) -> None:
         if not callable(self.function):
@@ -403,7 +441,7 @@ class HeightField(Formula):
         return self
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """The domain, cut to the heights that the levels can have over it."""
+        """The part of the domain within the heights that the level sets can have over it."""
         assert self.domain is not None
         lower, upper = self.domain.bounds()
         low, high = self._heights(lower, upper)
@@ -420,13 +458,18 @@ class HeightField(Formula):
         return VolumeIntersection((self.domain, slab))
 
     def _heights(self, lower: FloatArray, upper: FloatArray) -> tuple[float, float]:
-        """Proved bounds of u over the domain's box."""
+        """Proved bounds (lowest, highest) of u over a box.
+
+        lower, upper: (3,) the corners of the box; their z does not matter.
+
+        The box is divided into 32 x 32 cells, and u is bounded on a ball around each.
+        """
         backend = choose_backend("double")
         size = (upper - lower)[:2] / _CELLS
         cells = np.indices((_CELLS, _CELLS)).reshape(2, -1).T + 0.5
         centers = np.column_stack([cells * size + lower[:2], np.zeros(len(cells))])
-        half = backend.Float(0.5 * float(size.max()) * (1 + 1e-9))
-        jets = Jet.over_ball(to_vector3(backend, centers, "points"), half)
+        half_side = backend.Float(0.5 * float(size.max()) * (1 + 1e-9))
+        jets = Jet.over_ball(to_vector3(backend, centers, "points"), half_side)
         heights = as_jet(self.function(*jets[:2]), jets[0], "HeightField").value
-        low = to_numpy(0 * half + dr.min(heights.lower)).min()
-        return float(low), float(to_numpy(0 * half + dr.max(heights.upper)).max())
+        low = to_numpy(0 * half_side + dr.min(heights.lower)).min()
+        return float(low), float(to_numpy(0 * half_side + dr.max(heights.upper)).max())

@@ -52,41 +52,42 @@ _ROUNDING = 1e-5
 _SLOPE_SHARE = 1e-5
 # Radii of harmonic balls that are tried, in units of the radius of the ball about the domain.
 _RADII = np.geomspace(0.1, 8.0, 200)
-# Radii of the balls on which the Hessian is bounded, by experiment: a smaller and a larger radius
-# in units of |p|/(l-2), and the smallest value of the larger radius; near an axis of high order m,
-# in units of rho/(m-2).
-_SMALL_RADIUS, _LARGE_RADIUS, _MIN_LARGE_RADIUS, _AXIS_RADIUS = 0.4, 0.75, 0.1, 0.5
+# Radii of the balls on which the Hessian is bounded, by experiment. The first two are in units of
+# |p|/(l-2), l the degree; the third is the smallest value of the second one. The fourth is for
+# points near an axis of high order m, in units of rho/(m-2).
+_NEAR, _WIDE, _FLOOR, _BESIDE_AXIS = 0.4, 0.75, 0.1, 0.5
 # The distance to a zero of high order counts as at least this, so that no ball has the radius 0.
-_ORIGIN = 1e-9
+_MIN_DISTANCE = 1e-9
 
 
 @dataclass(frozen=True)
 class HarmonicPromises:
-    """Promises of a sum of solid harmonics at a point of the unit ball, at the distances rho from
-    the z axis and r from the origin.
+    """The promises of a sum f of solid harmonics at points of the unit ball.
 
-    The promise at p is for a ball B(p, R), in the ball of radius |p| + R about the origin, where
-    `BallRange` bounds the polynomial. The paper uses the fixed ball |y| <= 1.25. Near level 0
-    steps are shortened by the second-order term of the bound, which is proportional to
-    (range on |y| <= |p|+R)/R^2, so R is chosen to minimize that: 2|p|/(l-2) for a single degree
-    l > 2. With the slope bound Y_(8,4) took 19 evaluations per ray, with the fixed ball 30 (27 at
-    best, for 1.15); Y_(12,5) took 24 and 61 (50).
+    They depend on the distances rho of the point p from the z axis and r from the origin.
 
-    Where f vanishes to a high order, at the origin or along the z axis, R goes to zero with the
-    distance from there, and the range on the ball goes to zero as f does: every step is then a
-    fraction of that distance. With any other radius or range, steps would become smaller than such
-    a fraction, and rays that pass by would never arrive. Levels other than the level of the origin
-    need a wide ball there: one promise (`TaylorRemainder`, or `Lipschitz` for proofs that do not
-    use it) has a smallest radius.
-
-    ball_range: ranges on balls about the origin.
+    ball_range: ranges of f on balls about the origin.
     degree, lowest_degree: the largest degree of a term, and the smallest degree above 0.
-    order: the order to which the sum minus its constant vanishes along the z axis.
+    order: the order to which f minus its constant term vanishes along the z axis.
     center_radius, boundary_radius: radii of harmonic balls at r = 0 and r = 1.
     axis_share: if rho is less than this fraction of r, rho determines the radius of the ball.
-    axial: bounds of value, gradient and Hessian near an axis of order 3 or more; None if the order
-        is less.
-    rounding: the rounding of value and gradient as they are evaluated.
+    axial: bounds of value, gradient and Hessian in powers of rho and r, if the order is 3 or more;
+        else None.
+    rounding: bounds of the rounding of value and gradient.
+
+    The radius R. A promise at p is for a ball B(p, R). That ball lies in the ball of radius |p| + R
+    about the origin, where `BallRange` bounds f. The paper uses the fixed ball |y| <= 1.25. Near
+    level 0 steps are shortened by the second-order term of the bound, which is proportional to
+    (range on |y| <= |p|+R)/R^2, so R is chosen to minimize that: it is 2|p|/(l-2) for a single
+    degree l > 2. With the slope bound Y_(8,4) took 19 evaluations per ray, and 30 with the fixed
+    ball (27 with the best fixed radius, 1.15); Y_(12,5) took 24, and 61 (50) with a fixed ball.
+
+    Zeros of high order. Where f vanishes to a high order, at the origin or along the z axis, R goes
+    to zero with the distance from there, and the range on the ball goes to zero as f does. So every
+    step is a fraction of that distance. With any other radius or range, steps would become smaller
+    than such a fraction, and rays that pass by would never arrive. Levels other than the value of f
+    at the origin need a large ball there. So one promise has a smallest radius: the
+    `TaylorRemainder`, and for proofs that do not use it the `Lipschitz` promise.
     """
 
     ball_range: BallRange
@@ -100,13 +101,13 @@ class HarmonicPromises:
     rounding: HarmonicRounding
 
     @classmethod
-    def of(cls, weights: Weights, ranges: BallRange, *, is_divided: bool) -> HarmonicPromises:
-        """The promises of a sum with these weights.
+    def of(cls, weights: Weights, known: BallRange, *, is_divided: bool) -> HarmonicPromises:
+        """The promises of the sum of solid harmonics with these weights, (l, m) -> coefficient.
 
-        ranges: the ranges of the degrees.
-        is_divided: whether points are divided by a size other than 1 first.
+        known: the ranges of its parts of each degree.
+        is_divided: whether points are divided by a size other than 1 before, which adds rounding.
         """
-        inner, outer = _best_radius(ranges, 0.0), _best_radius(ranges, 1.0)
+        inner, outer = _best_radius(known, 0.0), _best_radius(known, 1.0)
         order, axial, axis_share = order_on_axis(weights), None, 0.0
         if order > 2:
             nonconstant = {key: weight for key, weight in weights.items() if key[0] > 0}
@@ -115,12 +116,12 @@ class HarmonicPromises:
                 gradient_bound(nonconstant),
                 hessian_bound(nonconstant),
             )
-            lower, upper = ranges.by_degree(1.0)
-            max_value = max(upper - ranges.constant, ranges.constant - lower)
+            lower, upper = known.by_degree(1.0)
+            max_value = max(upper - known.constant, known.constant - lower)
             # If rho = axis_share r, both bounds of a single term are the same.
             axis_share = (max_value / float(axial[0](1.0, 1.0))) ** (1 / order)
         return cls(
-            ranges.with_spheres(weights, 1.01 * max(inner, 1.0 + outer)),
+            known.with_spheres(weights, 1.01 * max(inner, 1.0 + outer)),
             max(degree for degree, _ in weights),
             min((degree for degree, _ in weights if degree > 0), default=0),
             order,
@@ -132,73 +133,76 @@ class HarmonicPromises:
         )
 
     def ball(self, rho: Real, r: Real) -> HarmonicBall:
-        """The harmonic ball at a point."""
+        """The harmonic ball at distances rho from the z axis and r from the origin."""
         radius = self._radius(rho, r)
         lower, upper = self.ball_range.at(r + radius)
         if self.axial is not None:
             axial = self.axial[0](rho + radius, r + radius) * (1 + _ROUNDING)
             lower = fmax(lower, self.ball_range.constant - axial)
             upper = fmin(upper, self.ball_range.constant + axial)
-        margin = dr.fma(upper - lower, _ROUNDING, self._smallest(r))
+        margin = dr.fma(upper - lower, _ROUNDING, self._underflow(r))
         return HarmonicBall(radius, lower - margin, upper + margin)
 
     def curvatures(self, rho: Real, r: Real) -> list[TaylorRemainder]:
-        """Bounds of the Hessian H, the bound of the smallest ball first."""
+        """Bounds of the Hessian on balls of different radii, the smallest ball first."""
         radii = [dr.inf]  # where the Hessian is constant
         if self.degree > 2:
             scale = r / (self.degree - 2)
-            radii = [_SMALL_RADIUS * scale, fmax(_LARGE_RADIUS * scale, _MIN_LARGE_RADIUS)]
+            radii = [_NEAR * scale, fmax(_WIDE * scale, _FLOOR)]
             if self.axial is not None:
-                radii.insert(0, fmin(rho * (_AXIS_RADIUS / (self.order - 2)), radii[0]))
+                radii.insert(0, fmin(rho * (_BESIDE_AXIS / (self.order - 2)), radii[0]))
         return [TaylorRemainder(self._curvature(rho, r, radius), radius) for radius in radii]
 
     def _curvature(self, rho: Real, r: Real, radius: Real) -> Real:
-        """A bound of the Hessian on the ball of this radius."""
+        """A bound of the Hessian on the ball of this radius about the point."""
         if self.degree < 3:
             constant = self.ball_range.curvature(0.0 * r)
         else:
             constant = self.ball_range.curvature(r + radius)
         if self.axial is not None:
             constant = fmin(constant, self.axial[2](rho + radius, r + radius))
-        return dr.fma(constant, 1 + _ROUNDING + _SLOPE_SHARE, self._smallest(r))
+        return dr.fma(constant, 1 + _ROUNDING + _SLOPE_SHARE, self._underflow(r))
 
     def lipschitz(self, rho: Real, r: Real) -> Lipschitz | None:
-        """A Lipschitz constant on a ball with a smallest radius, if the harmonic ball has none;
-        else None."""
+        """A Lipschitz constant on a ball that has a smallest radius; None if the harmonic ball has
+        one, too."""
         if self.lowest_degree < 3:
             return None
-        radius = fmax(r * (_LARGE_RADIUS / (self.degree - 2)), _MIN_LARGE_RADIUS)
+        radius = fmax(r * (_WIDE / (self.degree - 2)), _FLOOR)
         constant = self.ball_range.gradient(r + radius)
         if self.axial is not None:
             constant = fmin(constant, self.axial[1](rho + radius, r + radius))
-        return Lipschitz(dr.fma(constant, 1 + _ROUNDING, self._smallest(r)), radius)
+        return Lipschitz(dr.fma(constant, 1 + _ROUNDING, self._underflow(r)), radius)
 
     def error(self, rho: Real, r: Real, curvature: TaylorRemainder) -> Real:
-        """A bound of the rounding of the value, with the effect of the rounding of the gradient.
+        """A bound of the rounding error of the value, plus the effect of that of the gradient.
 
-        curvature: the promise of the smallest ball. With E, a bound of the rounding of the
-        gradient, and H, of the Hessian, promised as (1 + h) H with h = `_SLOPE_SHARE`,
+        curvature: the bound of the Hessian for the smallest ball.
 
-            E t <= E^2/(2 h H) + h H t^2/2   for all t   (2 a b <= a^2 + b^2),
+        Let E bound the rounding error of the gradient, and let H bound the Hessian. The promised
+        constant is (1 + h) H with h = `_SLOPE_SHARE`. For all t
 
-        so the difference of the exact Taylor polynomial from the rounded one is covered by the
-        larger promise and by E^2/(2 h H) added to the error of the value. Without second
-        derivatives the gradient is constant and right to a few u of itself, less than the tracer
-        allows for the rounding of points (8 u |grad f| times their size). For a harmonic ball E R
-        is a few u of the range, of which `enclosures.free_radius.condition_rounding` covers 16 u.
+            E t <= E^2/(2 h H) + h H t^2/2   (since 2 a b <= a^2 + b^2),
+
+        so the larger constant and E^2/(2 h H), added to the error of the value, cover the
+        difference between the exact and the rounded Taylor polynomial. If the degree is below 2,
+        the gradient is constant and has a relative error of a few u, less than the tracer allows
+        for the rounding of points (8 u |grad f| times their size). For a harmonic ball of radius R,
+        E R is a few u times the range; `enclosures.free_radius.condition_rounding` covers 16 u.
         """
         unit = float(dr.epsilon(type(r)))  # u, half the distance from 1 to the next number
-        error = dr.fma(self.rounding.value(rho, r), unit, self._smallest(r))
+        error = dr.fma(self.rounding.value(rho, r), unit, self._underflow(r))
         if self.degree < 2:
             return error
         slope = unit * self.rounding.gradient(rho, r)
         return dr.fma(slope * (0.5 / _SLOPE_SHARE), slope / curvature.constant, error)
 
     def _radius(self, rho: Real, r: Real) -> Real:
-        """The radius of the harmonic ball.
+        """The radius of the harmonic ball at distances rho from the z axis and r from the origin.
 
-        Near an axis of order m, with (range on the ball) ~ (rho + R)^m (r + R)^(l-m), the best R is
-        2/((m-2)/rho + (l-m)/r) if rho is a small fraction of r, as it is there.
+        Near an axis of order m the range on the ball is about proportional to (rho + R)^m (r +
+        R)^(l-m). The best R is then 2/((m-2)/rho + (l-m)/r) if rho is a small fraction of r, as it
+        is there.
         """
         if self.lowest_degree < 3:
             if self.center_radius < self.boundary_radius:
@@ -210,17 +214,20 @@ class HarmonicPromises:
         radius = self.boundary_radius * r
         if self.axial is not None:
             order, remaining = self.order - 2.0, float(self.degree - self.order)
-            by_axis = 2 / (order / rho + remaining / fmax(r, _ORIGIN))
-            radius = dr.select(rho < self.axis_share * r, fmin(by_axis, radius), radius)
-        return fmax(radius, _ORIGIN * self.boundary_radius)
+            axis_radius = 2 / (order / rho + remaining / fmax(r, _MIN_DISTANCE))
+            radius = dr.select(rho < self.axis_share * r, fmin(axis_radius, radius), radius)
+        return fmax(radius, _MIN_DISTANCE * self.boundary_radius)
 
-    def _smallest(self, r: Real) -> float:
-        """A bound of the error of any sum here by underflow."""
+    def _underflow(self, r: Real) -> float:
+        """A bound of the error of any of these sums by underflow."""
         return self.rounding.underflow * max(1, self.degree) ** 2 * float(dr.smallest(type(r)))
 
 
 def _best_radius(known: BallRange, distance: float) -> float:
-    """The radius R that minimizes (range on |y| <= distance + R)/R^2."""
+    """The radius R that minimizes (range on |y| <= distance + R)/R^2.
+
+    known: the ranges on balls about the origin.
+    """
     lower, upper = known.by_degree(distance + _RADII)
     return float(_RADII[np.argmin((upper - lower) / _RADII**2)])
 
@@ -232,19 +239,22 @@ class _SolidHarmonics(Field):
     over_relaxation = 1.6
 
     def __init__(
-        self, weights: Weights, ranges: BallRange, size: float, domain: Volume, axis: int = 2
+        self, weights: Weights, known: BallRange, size: float, domain: Volume, axis: int = 2
     ) -> None:
-        """A field of these weights, with these ranges of the degrees, for |p| <= size.
+        """Set up a field.
 
-        axis: the coordinate of p that is the z of the solid harmonics; x and y follow it
-            cyclically.
+        weights: (l, m) -> coefficient.
+        known: the ranges of the parts of each degree on the unit sphere.
+        size: the radius of a ball about the origin that contains the domain.
+        axis: the index of the coordinate of p that is the z of the solid harmonics. Their x and y
+            are the next two coordinates, cyclically.
         """
         self.domain = domain
         self._axis = axis
         self._weights = weights
         self._size = size
-        self._promises = HarmonicPromises.of(weights, ranges, is_divided=size != 1.0)
-        self.value_range = ranges.with_spheres(weights, 1.0).on_ball(1.0)
+        self._promises = HarmonicPromises.of(weights, known, is_divided=size != 1.0)
+        self.value_range = known.with_spheres(weights, 1.0).on_ball(1.0)
 
     @property
     def degree(self) -> int:
@@ -252,6 +262,7 @@ class _SolidHarmonics(Field):
         return max(degree for degree, _ in self._weights)
 
     def evaluate(self, p: Vec3) -> Sample:
+        """The sample at p, computed at p/size and scaled back: see `HarmonicPromises`."""
         s, size = self._local(p), self._size
         value, gradient = evaluate(self._weights, s.x, s.y, s.z)
         rho, r = dr.norm(type(s)(s.x, s.y, 0)), dr.norm(s)
@@ -269,15 +280,16 @@ class _SolidHarmonics(Field):
         return Sample(value, slope, promises, error, alternative_promises=tuple(alternatives))
 
     def _local(self, p: Vec3) -> Vec3:
-        """The point in the coordinates of the solid harmonics."""
+        """The point in the coordinates of the solid harmonics: axes rotated, divided by the
+        size."""
         return type(p)(*_rotate_axes((p.x, p.y, p.z), self._axis + 1)) / self._size
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """Rows of the Hessian, whose trace is 0 up to rounding."""
-        s, scale, k = self._local(p), 1 / self._size**2, -self._axis - 1
+        """The three rows of the Hessian; its trace is 0 up to rounding."""
+        s, scale, turns = self._local(p), 1 / self._size**2, -self._axis - 1
         xx, yy, zz, xy, xz, yz = (scale * entry for entry in hessian(self._weights, s.x, s.y, s.z))
         rows = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
-        x, y, z = _rotate_axes([type(p)(*_rotate_axes(row, k)) for row in rows], k)
+        x, y, z = _rotate_axes([type(p)(*_rotate_axes(row, turns)) for row in rows], turns)
         return x, y, z
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
@@ -294,9 +306,9 @@ class _SolidHarmonics(Field):
 class SphericalHarmonic(_SolidHarmonics):
     """The solid harmonic (|p|/radius)^l Y_lm(p/|p|), a homogeneous polynomial, in a ball.
 
-    Y_lm is the real spherical harmonic with unit mean square *integral* (orthonormal: the
-    integral of Y^2 over the unit sphere is 1), without the Condon-Shortley phase: Y_11 is a
-    positive multiple of x, Y_1-1 of y, Y_10 of z. m > 0 has cos(m phi), m < 0 sin(|m| phi).
+    Y_lm is the real spherical harmonic, orthonormal: the integral of Y_lm^2 over the unit sphere is
+    1. It is without the Condon-Shortley phase: Y_11 is a positive multiple of x, Y_1-1 of y, Y_10
+    of z. Orders m > 0 contain cos(m phi), orders m < 0 contain sin(|m| phi).
 
     l, m: degree 0 <= l <= 12 and order -l <= m <= l.
     radius: the radius of the ball about the origin to which it is clipped.
@@ -322,13 +334,13 @@ class SphericalHarmonic(_SolidHarmonics):
 class HarmonicPolynomial(_SolidHarmonics):
     """A harmonic polynomial from its monomials, up to degree 12.
 
-    coefficients: {(i, j, k): c} stands for the sum of c x^i y^j z^k; the paper's Eq. 8 is
+    coefficients: {(i, j, k): c}, for the sum of c x^i y^j z^k; the paper's Eq. 8 is
         HarmonicPolynomial({(2, 1, 0): 1, (0, 1, 2): -1}).
     domain: the bounded volume to which it is clipped; by default the ball of radius 1.
 
     The Laplacian must vanish, up to 1e-9 of the terms that cancel in it. The polynomial is
-    evaluated as a sum of solid harmonics, which agrees with it in value and z-derivative on the
-    plane z = 0, thus everywhere if it is harmonic.
+    evaluated as a sum of solid harmonics. The sum has the same values and z-derivatives on the
+    plane z = 0 as the polynomial, and so, both being harmonic, agrees with it everywhere.
 
     Raises:
         ValueError: the polynomial is not harmonic (the message shows its Laplacian), its degree is
@@ -355,15 +367,18 @@ class HarmonicPolynomial(_SolidHarmonics):
 
 
 def _rotate_axes(values: Sequence[Any], n: int) -> tuple[Any, Any, Any]:
-    """Three values rotated by n positions: (x, y, z) becomes (y, z, x) for n = 1."""
+    """Three values rotated by n positions; for n = 1, (x, y, z) becomes (y, z, x)."""
     return values[n % 3], values[(n + 1) % 3], values[(n + 2) % 3]
 
 
 def _checked(coefficients: Any) -> dict[tuple[int, int, int], float]:
-    """The coefficients that are not zero.
+    """The coefficients that are not zero, as Python numbers.
+
+    coefficients: the mapping {(i, j, k): c} that a user gave.
 
     Raises:
-        TypeError, ValueError: they are no coefficients of a harmonic polynomial.
+        TypeError, ValueError: it is no mapping of exponents to finite numbers, all are zero, the
+            degree is above 12, or the polynomial is not harmonic.
     """
     if not isinstance(coefficients, Mapping):
         raise TypeError(
@@ -398,13 +413,17 @@ def _checked(coefficients: Any) -> dict[tuple[int, int, int], float]:
 
 
 def _monomial(powers: tuple[int, int, int]) -> str:
-    """A monomial as text, such as "x^2 y"."""
+    """The monomial x^i y^j z^k with powers (i, j, k) as text, such as "x^2 y"."""
     factors = zip("xyz", powers, strict=True)
     return " ".join(name if n == 1 else f"{name}^{n}" for name, n in factors if n)
 
 
 def _enclosing_radius(domain: Volume) -> float:
-    """The radius of a ball about the origin that contains the domain."""
+    """The radius of a ball about the origin that contains the domain.
+
+    Raises:
+        ValueError: the domain is unbounded.
+    """
     if isinstance(domain, Ball):
         return float(np.linalg.norm(domain.center)) + domain.radius
     corners = np.abs(np.array(domain.bounds())).max(axis=0)

@@ -29,24 +29,26 @@ if TYPE_CHECKING:
     from harnack.fields.analytic.branches import Branch, Complex, PreparedBranchPoint
     from harnack.geometry import Volume
 
-# Second derivatives along the ray are bounded on the whole requested length, and on these fractions
-# of the distance to the nearest singular point; the best of several sets, by experiment.
-_PARTS = (0.4, 0.8)
+# Second derivatives along the ray are bounded on the whole requested length, and on lengths that
+# cross these fractions of the distance to the nearest singular point. By experiment this is the
+# best of several sets of fractions.
+_FRACTIONS = (0.4, 0.8)
 # Promises hold in disks whose radius is this fraction of that distance.
-_DISK = 0.5
-# The largest length of a ray on which anything is proved.
-_LONGEST = 1e6
+_DISK_FRACTION = 0.5
+# The largest length of a ray, and the largest distance to a singular point, that proofs use.
+_MAX_LENGTH = 1e6
 # Bounds of second derivatives are multiplied by this factor, for the rounding of slopes.
-_WIDENED = 1 + 1e-4
+_BOUND_MARGIN = 1 + 1e-4
 
 
 @dataclass(frozen=True)
 class _BranchValue:
-    """A branch at a point.
+    """One branch at a point p of space: phi = h - u, where h is the height of p and u that of the
+    branch.
 
-    phi: h - u.
-    x, y: the gradient of phi in the plane, which is the gradient of -u.
-    sign_factor: its sign in the product of all phi.
+    phi: the value of phi.
+    x, y: the derivatives of phi by x and y, which are those of -u. The derivative by z is 1.
+    sign_factor: 1 or -1, the factor of this branch in the sign of the product of all phi.
     """
 
     phi: Real
@@ -56,27 +58,34 @@ class _BranchValue:
 
     @property
     def steepness(self) -> Real:
-        """|grad phi|."""
+        """The length of the gradient of phi."""
         return dr.sqrt(dr.fma(self.x, self.x, dr.fma(self.y, self.y, 1)))
 
     def slope(self, direction: Vec3) -> Real:
+        """The derivative of phi along a direction."""
         return dr.fma(self.x, direction.x, dr.fma(self.y, direction.y, direction.z))
 
     def coincides_with(self, other: _BranchValue) -> Mask:
-        """Whether phi and its gradient equal those of the other branch, as for a branch and itself.
-        On a line of symmetry two branches agree in all but y, and f has a crease."""
+        """Whether phi and its gradient equal those of the other branch, as they do for a branch and
+        itself.
+
+        On a line of symmetry two branches agree in phi and in its derivative by x but not by y;
+        they do not coincide, and f has a crease there.
+        """
         return (self.phi == other.phi) & (self.x == other.x) & (self.y == other.y)
 
 
 @dataclass(frozen=True)
 class _PointBranches:
-    """All branches at a point.
+    """All branches at a point of space.
 
-    z, h: the position of the point in the plane, and its height.
+    z: the projection of the point to the complex plane, moved off singular points.
+    h: the height of the point.
+    branches: phi and its gradient for each branch.
     nearest: the branch with the smallest |phi|.
-    sign: f is sign times the phi of that branch.
-    error: a bound of the error of all phi, by arithmetic.
-    rounding: a bound of the rounding of the position of the point.
+    sign: 1 or -1; f is this sign times phi of the nearest branch.
+    error: a bound of the error of all phi by the arithmetic of their evaluation.
+    rounding: a bound of the rounding error of z, as a distance.
     """
 
     z: Complex
@@ -89,6 +98,7 @@ class _PointBranches:
 
     @property
     def value(self) -> Real:
+        """The value of f."""
         return self.sign * self.nearest.phi
 
 
@@ -106,33 +116,37 @@ class RiemannSurface(Field):
         numbers, or `BranchPoint`s, which describe how all branches meet there.
     second_bound: for a function of your own, a bound second_bound(z, r) of |g''|, of all branches,
         on the disk of radius r about z; used only if no singular point lies in the disk.
-    period: for a function of your own with one branch, the number by which its drawn part may be
-        shifted.
-    height: a factor of g.
+    period: for a function of your own with one branch, a number such that the drawn part plus any
+        whole multiple of it also belongs to the surface.
+    height: a factor of g other than 0, which scales the height of the surface.
     domain: the volume in which the surface is drawn; by default the ball of radius 1 about the
         origin, of radius 4 for "log" and 2 for "asin".
 
-    With several branches f = s min_j |phi_j|, phi_j = h - Im g_j, s the sign of the product of all
-    phi_j: it is continuous and single-valued, as the product is, and zero only on the surface. With
-    one branch f = phi, for a logarithm up to its period. level=(-w, w) with side="between" makes
-    the surface a wall whose points are at most w above or below it.
+    With several branches f = s min_j |phi_j|, where phi_j = h - Im g_j at a point of height h, and
+    s is the sign of the product of all phi_j. f is continuous and single-valued, as that product
+    is, and zero only on the surface. With one branch f = phi; for a logarithm it is determined up
+    to the period. level=(-w, w) with side="between" draws a solid: all points that are at most w
+    above or below the surface.
 
-    Proof. Along a ray the set of branches is continued as long as no singular point is met: so
-    branch cuts and the numbering of branches do not matter. `NearestBranchEnclosure` takes the
-    minimum over all branches of the step in which the branch could be reached, from their slopes
-    and a bound of |g''| on the segment of the plane below the ray, which is the same for all
-    (`Branches.second_derivative_bound`): |d^2 phi_j/ds^2| <= |g''| |w|^2, w the projection of the
-    ray's direction to the plane, for h is linear. So the nearest branch may change between two
-    samples: from each of the samples, ahead or back, all branches are proved to be out of reach.
-    Near branch points with a power > 0 all branches are near one value, and for a ray that passes
-    at another height `BranchPointEnclosure` proves the step.
+    Proof. Along a ray the set of branches can be continued as long as no singular point is met. So
+    branch cuts and the numbering of branches do not matter. For each branch
+    `NearestBranchEnclosure` computes the length of the ray within which the surface of this branch
+    cannot be met, and takes the minimum over all branches. It uses the slopes of the branches at
+    the sample, and a bound of |g''| on the segment of the plane below the ray, which holds for all
+    branches (`Branches.second_derivative_bound`): since h is linear along the ray,
+    |d^2 phi_j/ds^2| <= |g''| |w|^2, where w is the projection of the ray's direction to the plane.
+    The nearest branch may change between two samples, because the proof covers all branches.
+    Near branch points with a power > 0 all branches are near one value; `BranchPointEnclosure`
+    proves the step of a ray that passes such a point at another height.
 
-    A point is a hit if f is within the tolerance times |grad f| of 0 and, near such a branch point,
-    if the surface is not proved to be farther away: where the slope grows without bound, f/|grad f|
-    is no distance. Near poles and logarithms every height is near the surface.
+    A point is a hit if |f| is at most the tolerance times |grad f| and, near such a branch point,
+    the surface is not proved to be farther away than the tolerance: there the slope grows without
+    bound, and |f|/|grad f| is no distance. Near poles and logarithms every height is near the
+    surface.
 
     Raises:
-        TypeError, ValueError: settings that do not belong together, or an invalid function.
+        TypeError, ValueError: a parameter is given that does not belong to this function, or is
+            missing; or the function is invalid.
     """
 
     is_global = True
@@ -183,13 +197,13 @@ class RiemannSurface(Field):
         return field
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """The domain, cut to the heights that the surface can have over it."""
+        """The part of the domain within the heights that the level sets can have over it."""
         if self.domain is None or self._shift is not None:
             return self.domain
-        highest = self._highest()
-        if not highest < math.inf:
+        max_height = self._max_height()
+        if not max_height < math.inf:
             return self.domain
-        limit = highest * (1 + 1e-5) + max(abs(level) for level in levels)
+        limit = max_height * (1 + 1e-5) + max(abs(level) for level in levels)
         lower, upper = self.domain.bounds()
         if limit >= min(-lower[2], upper[2]):
             return self.domain
@@ -197,8 +211,8 @@ class RiemannSurface(Field):
         slab = Box((low[0], low[1], -limit), (high[0], high[1], limit))
         return VolumeIntersection((self.domain, slab))
 
-    def _highest(self) -> float:
-        """A bound of |h| over the domain; infinite if no bound is known."""
+    def _max_height(self) -> float:
+        """A bound of the height |h| of the surface over the domain; infinite if none is known."""
         assert self.domain is not None
         lower, upper = self.domain.bounds()
         corners = [complex(x, y) for x in (lower[0], upper[0]) for y in (lower[1], upper[1])]
@@ -209,14 +223,20 @@ class RiemannSurface(Field):
         return abs(self.height) * self.branches.max_abs(middle, reach)
 
     def evaluate(self, p: Vec3) -> Sample:
-        local = self._point_branches(p)
+        """The sample at p, with promises on disks that contain no singular point.
+
+        The bound of second derivatives holds within the radius in which no other branch can become
+        the nearest, the Lipschitz constant on the whole disk. If a single branch is nearest, f is
+        harmonic there.
+        """
+        local = self._branches_at(p)
         sample = self._sample(local)
         clearance = self.branches.clearance(local.z)
-        radius = _DISK * fmin(clearance, _LONGEST)
+        radius = _DISK_FRACTION * fmin(clearance, _MAX_LENGTH)
         second = (
             self._height_factor
             * self.branches.second_derivative_bound(Disk(local.z, radius, local.rounding))
-            * _WIDENED
+            * _BOUND_MARGIN
         )
         steepest: Real = 0.0
         for branch in local.branches:
@@ -226,9 +246,9 @@ class RiemannSurface(Field):
         # parabola; but the nearest of two branches is not harmonic.
         free_radius, touching = radius, 0 * radius
         for branch in local.branches:
-            lead = fmax(dr.abs(branch.phi) - dr.abs(local.nearest.phi), 0)
+            excess = fmax(dr.abs(branch.phi) - dr.abs(local.nearest.phi), 0)
             rate = branch.steepness + local.nearest.steepness
-            change_radius = 2 * lead / (rate + dr.sqrt(rate * rate + 4 * second * lead))
+            change_radius = 2 * excess / (rate + dr.sqrt(rate * rate + 4 * second * excess))
             is_touching = branch.coincides_with(local.nearest)
             free_radius = fmin(dr.select(is_touching, radius, change_radius), free_radius)
             touching += dr.select(is_touching, 1, 0)
@@ -247,29 +267,32 @@ class RiemannSurface(Field):
         )
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The ray sample with enclosures that are proved from all branches, instead of from
-        promises."""
+        """The sample on a ray, with enclosures that are proved from all branches instead of from
+        promises.
+
+        If the ray does not use the sharpest proofs, the enclosures follow from promises.
+        """
         p, d = path.point(t), path.direction
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return path.enclose(self.evaluate(p))
-        local = self._point_branches(p)
+        local = self._branches_at(p)
         sample = self._sample(local)
         slope = local.sign * local.nearest.slope(d)
         projection = complex_of(d.x, d.y)
         speed = abs(projection)
-        longest = fmin(ahead, _LONGEST * (1 + max_norm(p)))
+        longest = fmin(ahead, _MAX_LENGTH * (1 + max_norm(p)))
         clearance = self.branches.clearance(local.z)
-        lengths = [longest, *(fmin(longest, fraction * clearance / speed) for fraction in _PARTS)]
+        lengths = [longest, *(fmin(longest, share * clearance / speed) for share in _FRACTIONS)]
         forwards = [self._enclosure(local, d, projection, length) for length in lengths]
         if not self._is_single:
             forwards += self._cusp_enclosures(local, d, projection)
         # Slightly longer than the requested length, as steps are rounded down.
-        back = fmin(back, _LONGEST) * (1 + 1e-5)
+        back = fmin(back, _MAX_LENGTH) * (1 + 1e-5)
         backwards = (self._enclosure(local, -d, -projection, back),)
         return RaySample(sample, tuple(forwards), backwards, slope)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """Rows of the Hessian, free of trace.
+        """The three rows of the Hessian; its trace is 0.
 
         Raises:
             NotImplementedError: the user's branches come without second derivatives.
@@ -286,9 +309,9 @@ class RiemannSurface(Field):
                     "the branches of this Riemann surface come without second derivatives: return "
                     "(g, g', g'') for each"
                 )
-            new_xx, new_xy = derivatives(second, self.part)
+            branch_xx, branch_xy = derivatives(second, self.part)
             is_nearest = graph.coincides_with(local.nearest)
-            xx, xy = dr.select(is_nearest, new_xx, xx), dr.select(is_nearest, new_xy, xy)
+            xx, xy = dr.select(is_nearest, branch_xx, xx), dr.select(is_nearest, branch_xy, xy)
         scale = -local.sign * self._height
         xx, xy, zero = scale * xx, scale * xy, 0 * p.x
         vector = cast("Any", type(p))
@@ -305,18 +328,24 @@ class RiemannSurface(Field):
 
     @property
     def _height_factor(self) -> Real:
+        """The absolute value of the factor of g."""
         return dr.abs(self._height)
 
     def _rounding(self, p: Vec3) -> Real:
-        """A generous bound of the rounding of a point in the plane."""
+        """A generous bound of the rounding error of a point of the plane, as a distance."""
         return 4 * backend_of(p).machine_epsilon * max_norm(p)
 
     def _graphs(self, p: Vec3, branches: tuple[Branch, ...]) -> list[_BranchValue]:
-        """phi of all sheets; with a period and several branches, phi of the two sheets of each
-        branch next to the point.
+        """phi, its gradient and its sign factor for each branch at p.
 
-        In that case the product is that of sin(pi phi/period), with phi not shifted: sin u - sin h
-        for asin.
+        branches: the branches of g at the projection of p.
+
+        With a period and several branches, as for asin, each branch g gives the graphs of g plus
+        all whole periods. For each branch the list then has the graph nearest to p (the first half
+        of the list) and the next graph on the other side of p (the second half). In that case the
+        sign factors are not those of the phi in the list, but those of sin(pi phi/period) with phi
+        before the shift by whole periods: for asin their product has the sign of sin u - sin h. The
+        graphs in the second half have factor 1.
         """
         values: list[_BranchValue] = []
         neighbors: list[_BranchValue] = []
@@ -325,19 +354,19 @@ class RiemannSurface(Field):
             x, y = derivatives(branch.first, self.part)
             phi, x, y = p.z - self._height * u, -self._height * x, -self._height * y
             real = cast("Any", type(phi))
-            side = dr.select(phi < 0, real(-1), 1)
+            sign_factor = dr.select(phi < 0, real(-1), 1)
             if self._shift is not None and not self._is_single:
                 periods = dr.floor(phi / self._shift)
-                side = dr.select(periods == 2 * dr.floor(0.5 * periods), real(1), -1)
+                sign_factor = dr.select(periods == 2 * dr.floor(0.5 * periods), real(1), -1)
                 phi = phi - self._shift * dr.round(phi / self._shift)
                 neighbors.append(
                     _BranchValue(phi - dr.mulsign(real(self._shift), phi), x, y, real(1))
                 )
-            values.append(_BranchValue(phi, x, y, side))
+            values.append(_BranchValue(phi, x, y, sign_factor))
         return values + neighbors
 
-    def _point_branches(self, p: Vec3) -> _PointBranches:
-        """All branches at a point, with the bounds of their errors."""
+    def _branches_at(self, p: Vec3) -> _PointBranches:
+        """All branches at the point p, with the bounds of their errors."""
         rounding = self._rounding(p)
         z = self.branches.move_off_singularities(complex_of(p.x, p.y), rounding)
         branches = self.branches.evaluate(z)
@@ -358,7 +387,12 @@ class RiemannSurface(Field):
     def _nearest_branch(
         self, z: Complex, h: Real, graphs: list[_BranchValue], error: Real, rounding: Real
     ) -> _PointBranches:
-        """The branches `graphs` at the point (z, h), with the nearest of them and the sign of f."""
+        """Find the nearest branch at a point, and the sign of f.
+
+        z, h: the projection of the point to the plane, and its height.
+        graphs: all branches at the point.
+        error, rounding: kept in the result, see `_PointBranches`.
+        """
         nearest, sign = graphs[0], type(graphs[0].phi)(1)
         if not self._is_single:
             for graph in graphs[1:]:
@@ -376,7 +410,11 @@ class RiemannSurface(Field):
         return _PointBranches(z, h, tuple(graphs), nearest, sign, error, rounding)
 
     def _sample(self, local: _PointBranches) -> Sample:
-        """The sample without promises."""
+        """The sample of f at a point, without promises.
+
+        Near a branch point its gradient error is so large that the point is no hit if the surface
+        is proved to be farther away than |f|/|grad f|.
+        """
         nearest, sign = local.nearest, local.sign
         vector = backend_of(nearest.phi).Array3f
         gradient = vector(sign * nearest.x, sign * nearest.y, sign)
@@ -388,14 +426,18 @@ class RiemannSurface(Field):
 
     # Near branch points.
 
-    def _ends_of_branches(
+    def _bounded_branch_points(
         self, local: _PointBranches
     ) -> list[tuple[PreparedBranchPoint, Complex, Real]]:
-        """Branch points with a power, z relative to each, and the height of the point over their
-        value."""
-        ends: list[tuple[PreparedBranchPoint, Complex, Real]] = []
+        """The branch points with a bound |g - value| <= constant |z - location|^power; none for one
+        branch.
+
+        For each of them: the branch point, z minus its location, and the height of the point of
+        space above the value of g at the branch point (by the nearest whole number of periods).
+        """
+        points: list[tuple[PreparedBranchPoint, Complex, Real]] = []
         if self._is_single:
-            return ends
+            return points
         for point in self.branches.points_on(local.z):
             if point.power is None:
                 continue
@@ -403,22 +445,27 @@ class RiemannSurface(Field):
             y = local.h - self._height * value
             if self._shift is not None:
                 y -= self._shift * dr.round(y / self._shift)
-            ends.append((point, local.z - point.at, y))
-        return ends
+            points.append((point, local.z - point.at, y))
+        return points
 
     def _cusp_enclosures(
         self, local: _PointBranches, d: Vec3, projection: Complex
     ) -> list[Enclosure]:
-        """Enclosures near branch points where all branches meet."""
+        """Enclosures along a ray from branch points where all branches meet.
+
+        local: all branches at the sample on the ray.
+        d: the direction of the ray.
+        projection: its projection to the complex plane.
+        """
         enclosures: list[Enclosure] = []
         speed = abs(projection)
-        for point, offset, y in self._ends_of_branches(local):
+        for point, offset, y in self._bounded_branch_points(local):
             t_closest = -(offset.real * projection.real + offset.imag * projection.imag) / speed
             t_closest = dr.select(speed > 0, t_closest, 0)
-            offset_norm = (
+            min_offset = (
                 dr.abs(offset.real * projection.imag - offset.imag * projection.real) / speed
             )
-            offset_norm = dr.select(speed > 0, offset_norm, abs(offset)) + local.rounding
+            min_offset = dr.select(speed > 0, min_offset, abs(offset)) + local.rounding
             fall = dr.abs(d.z)
             if self._shift is None:
                 fall = fmax(-dr.mulsign(d.z, y), 0)
@@ -428,7 +475,7 @@ class RiemannSurface(Field):
             distance = dr.abs(local.nearest.phi)
             enclosures.append(
                 BranchPointEnclosure(
-                    gap, fall, t_closest, offset_norm, speed, *cone, distance, local.value >= 0
+                    gap, fall, t_closest, min_offset, speed, *cone, distance, local.value >= 0
                 )
             )
         return enclosures
@@ -437,19 +484,21 @@ class RiemannSurface(Field):
         """A proved lower bound of the distance to the surface near a branch point; 0 if there is no
         such point.
 
-        With y the height over the value at the branch point a, a ball of radius r about p contains
-        no point of the surface if C (|z - a| + r)^alpha <= y - r: so if r <= m and that power is y
-        - m, for any m. Two m are tried: y/2, and the m for which that power is y at r = m, which is
+        Let a be the branch point, p the sample above z, y the absolute height of p above the value
+        at a,  C and alpha the constant and the power of the bound at a. A ball of radius r about p
+        contains no point of the surface if C (|z - a| + r)^alpha <= y - r. So for any height m this
+        holds for each r with r <= m and C (|z - a| + r)^alpha <= y - m. The largest such r is
+        computed for two m: for y/2, and for the m at which C (|z - a| + m)^alpha is y, which is
         nearly sharp where the surface is steep.
         """
         proved = 0 * local.h
-        for point, offset, y in self._ends_of_branches(local):
+        for point, offset, y in self._bounded_branch_points(local):
             power, constant = point.power, self._height_factor * point.constant
             assert power is not None
-            y, r = dr.abs(y), abs(offset)
-            for height in (0.5 * y, dr.power(y / constant, 1 / power) - r):
-                radius = dr.power(fmax(y - height, 0) / constant, 1 / power) - r
-                radius = fmin(fmin(radius, point.radius - r), height)
+            y, norm = dr.abs(y), abs(offset)
+            for m in (0.5 * y, dr.power(y / constant, 1 / power) - norm):
+                radius = dr.power(fmax(y - m, 0) / constant, 1 / power) - norm
+                radius = fmin(fmin(radius, point.radius - norm), m)
                 proved = fmax(radius, proved)
         return proved
 
@@ -458,17 +507,23 @@ class RiemannSurface(Field):
     def _enclosure(
         self, local: _PointBranches, d: Vec3, projection: Complex, length: Real
     ) -> Enclosure:
-        """The enclosure for a length along a ray with direction d; projection: the projection of d
-        to the plane."""
+        """The enclosure of f from a sample along a ray, from all branches.
+
+        local: all branches at the sample.
+        d: the direction of the ray.
+        projection: its projection to the complex plane.
+        length: the length of the ray on which the enclosure holds.
+        """
         segment = PlaneSegment(local.z, projection, length, local.rounding)
         second = self._height_factor * self.branches.second_derivative_bound(segment)
         speed = abs(projection)
         # For the rounding of slopes, and of the position of the point.
         epsilon = backend_of(d).machine_epsilon
         slope_error = dr.select(speed > 0, second * local.rounding, 0)
-        second = dr.select(speed > 0, second * dr.square(speed) * _WIDENED, 0)
+        second = dr.select(speed > 0, second * dr.square(speed) * _BOUND_MARGIN, 0)
 
         def slopes(branch: _BranchValue, sign: Real) -> SlopeRange:
+            """The range of the derivative of sign * phi along the ray at the sample."""
             slope = branch.slope(d)
             size = dr.abs(branch.x * d.x) + dr.abs(branch.y * d.y) + dr.abs(d.z)
             return SlopeRange.around(sign * slope, 16 * epsilon * size + slope_error * speed)
@@ -491,6 +546,6 @@ class RiemannSurface(Field):
 
     @staticmethod
     def _extra_rounding(branch: _BranchValue, local: _PointBranches) -> Real:
-        """The difference between the changes of phi of a branch and of the nearest branch by the
-        rounding of the point; at least 0."""
+        """By how much more phi of a branch may change than phi of the nearest branch by the
+        rounding of z; at least 0."""
         return fmax(branch.steepness - local.nearest.steepness, 0) * local.rounding

@@ -1,8 +1,9 @@
 """Bounds of the rounding of sums of solid harmonics, and of sums of waves.
 
-Everything here is to first order in u, the unit roundoff (eps/2 of the precision in use): each
-operation is exact up to a factor 1 + d, |d| <= u, so errors of factors add up. Terms of second
-order are below 1e-4 of that in single precision and covered by `_SECOND_ORDER`.
+All bounds here are to first order in u, the unit roundoff (half of the machine epsilon of the
+precision in use). Each operation is exact up to a factor 1 + d with |d| <= u, so the relative
+errors of factors add up. In single precision the terms of second order are below 1e-4 of those of
+first order; `_SECOND_ORDER` covers them.
 
 - `HarmonicRounding`: the rounding of `solid_harmonics.evaluate`.
 - `WaveRounding`: the rounding of `waves.evaluate_terms`.
@@ -43,30 +44,35 @@ _SECOND_ORDER = 1.03
 
 @dataclass(frozen=True)
 class HarmonicRounding:
-    """Rounding of value and gradient of a sum of solid harmonics, in units of u, at a point of the
-    unit ball with the distances rho from the z axis and r from the origin.
+    """Bounds of the rounding errors of value and gradient of a sum of solid harmonics, in units of
+    u.
 
-    value_bounds, gradient_bounds: two bounds each, the smaller of which is used: a bound that is
-        sharp near the axis, in powers of rho and r, and a bound in powers of r only (the largest
-        c rho^m on the sphere, and not the largest c).
+    They hold at a point of the unit ball, and depend on its distances rho from the z axis and r
+    from the origin.
+
+    value_bounds, gradient_bounds: two bounds each, of which the smaller one is used. The first is
+        sharp near the z axis: it is a sum of terms c rho^m r^(l-m). The second is a sum of terms c
+        r^l, whose c are computed from the largest error on the unit sphere; away from the axis it
+        is smaller.
     underflow: the error of the value by underflow, in smallest normal numbers.
 
-    With z = r c:
+    Let z = r c, so that c is the cosine of the polar angle.
 
-    - r^2 = x^2 + y^2 + z^2 is off by 3u of itself.
-    - q_l = A z q_(l-1) - B r^2 q_(l-2), A and B the rounded coefficients of the recurrence: a step
-      adds an error of up to g_l = 4u |A z q_(l-1)| + 7u |B r^2 q_(l-2)|, and propagates the errors
-      of earlier steps by the same recurrence, so the error of q_l is at most the sum over k of
-      |G_lk| g_k, where G_lk is the recurrence that begins with G_kk = 1 and 0 before. In units of
-      u r^(l-m) it is a function of c only, whose largest value is computed by sampling
-      (`_recurrence`).
-    - (x + iy)^m: a product of complex numbers is off by at most 2 sqrt(2) u of its size (each
-      component by 2u (|x c| + |y s|) or 2u (|x s| + |y c|), and 4 |x c y s| <= rho^2 |w|^2), and
-      the first factor is exact: 2 sqrt(2) (m-1) u rho^m.
+    - r^2 = x^2 + y^2 + z^2 has a relative error of 3u.
+    - One step of the recurrence for Q is q_l = A z q_(l-1) - B r^2 q_(l-2), where A and B are
+      rounded coefficients. It adds an error of at most g_l = 4u |A z q_(l-1)| + 7u |B r^2 q_(l-2)|,
+      and propagates the errors of earlier steps by the same recurrence. So the error of q_l is at
+      most the sum over k of |G_lk| g_k, where G_lk is the solution of the recurrence that begins
+      with G_kk = 1 and 0 before. In units of u r^(l-m) this is a function of c only; `_recurrence`
+      computes it at samples of c.
+    - (x + iy)^m: a product of complex numbers has an error of at most 2 sqrt(2) u of its absolute
+      value (each component has at most 2u (|x c| + |y s|) or 2u (|x s| + |y c|) if c + is is the
+      other factor w, and 4 |x c y s| <= rho^2 |w|^2). The first factor is exact, so m - 1 products
+      make 2 sqrt(2) (m-1) u rho^m.
     - A term of the sum: 3u for its weight and two products; then u for each further term of its
       order and for each further order.
-    - A point divided by the size of the domain: 3u of each coordinate, that is 3u (rho |f_rho| +
-      |z f_z|).
+    - If the point was divided by the size of the domain: 3u of each coordinate, which changes a
+      function f by at most 3u (rho |f_rho| + |z f_z|).
 
     Numbers that underflow are lost altogether: the error is the smallest normal number for each
     operation, times the factor by which the recurrence may enlarge it.
@@ -78,8 +84,12 @@ class HarmonicRounding:
 
     @classmethod
     def of(cls, weights: Weights, *, is_divided: bool) -> HarmonicRounding:
-        """The rounding of a sum with these weights; is_divided: whether points are divided by a
-        size other than 1 first."""
+        """The bounds for the sum of solid harmonics with these weights, as
+        `solid_harmonics.evaluate` computes it.
+
+        weights: (l, m) -> coefficient.
+        is_divided: whether points are divided by a size other than 1 before.
+        """
         tables: list[dict[tuple[int, int], float]] = [{}, {}, {}, {}]
         orders = len({m for _, m in weights})
         underflow = 1.0
@@ -88,12 +98,12 @@ class HarmonicRounding:
             terms = max(sum(order == k for _, order in weights) for k in (m, -m))
             sums = (terms - 1) + (orders - 1)
             size = amplitude * legendre_weight(l, m)
-            near, anywhere = _of_value(l, m, sums, is_divided)
-            steep_near, steep_anywhere = _of_gradient(l, m, sums, is_divided) if l else (0.0, 0.0)
+            value_near, value_anywhere = _value_errors(l, m, sums, is_divided)
+            steep_near, steep_anywhere = _slope_errors(l, m, sums, is_divided) if l else (0.0, 0.0)
             power = max(m - 1, 0)
             for table, i, degree, constant in (
-                (tables[0], m, l, near),
-                (tables[1], 0, l, anywhere),
+                (tables[0], m, l, value_near),
+                (tables[1], 0, l, value_anywhere),
                 (tables[2], power, l - 1, steep_near),
                 (tables[3], 0, l - 1, steep_anywhere),
             ):
@@ -104,93 +114,110 @@ class HarmonicRounding:
         return cls((a, b), (c, d), underflow)
 
     def value(self, rho: Real, r: Real) -> Real:
-        """The bound for the value, in units of u."""
+        """The bound for the value, in units of u, at distances rho from the z axis and r from the
+        origin."""
         near, anywhere = self.value_bounds
         return fmin(near(rho, r), anywhere(rho, r))
 
     def gradient(self, rho: Real, r: Real) -> Real:
-        """The bound for the gradient, as a length, in units of u."""
+        """The bound for the length of the gradient's error, in units of u, at distances rho from
+        the z axis and r from the origin."""
         near, anywhere = self.gradient_bounds
         return fmin(near(rho, r), anywhere(rho, r))
 
 
 @functools.cache
 def _recurrence(l: int, m: int) -> tuple[FloatArray, FloatArray, float]:  # noqa: E741
-    """|Q| and its error in units of u, on the grid of c; and the sum over k of the largest |G_lk|
-    times coefficients."""
+    """|Q|, the rounding error of Q, and the sensitivity of its recurrence, for Q = Q_l^m/(2m-1)!!,
+    r = 1.
+
+    Returns, at `_SAMPLES` + 1 polar angles, the arrays |Q| and a bound of its error in units of u;
+    and the factor for underflow: the sum over the steps k of the recurrence of the largest |G_lk|
+    (see `HarmonicRounding`) times the sum of the step's coefficients plus 2.
+    """
     c, _ = polar_samples(_SAMPLES)
     q = Legendre(c, 1.0)
     zeros, ones = 0.0 * c, 0.0 * c + 1.0
     if l < m:
         return zeros, zeros, 0.0
-    error, factors = zeros.copy(), 0.0
+    error, underflow_factor = zeros.copy(), 0.0
     for k in range(m + 1, l + 1):
         a, b = (2 * k - 1) / (k - m), (k + m - 1) / (k - m)
-        committed = 4 * np.abs(a * c * q(k - 1, m))
+        step_error = 4 * np.abs(a * c * q(k - 1, m))
         if k > m + 1:
-            committed = committed + 7 * np.abs(b * q(k - 2, m))
-        previous, current = zeros, ones
+            step_error = step_error + 7 * np.abs(b * q(k - 2, m))
+        last_growth, growth = zeros, ones
         for j in range(k + 1, l + 1):
-            step = (2 * j - 1) / (j - m) * c * current - (j + m - 1) / (j - m) * previous
-            previous, current = current, step
-        error = error + np.abs(current) * committed
-        factors += float(np.abs(current).max()) * (a + b + 2.0)
-    return np.abs(q(l, m) + zeros), error, factors
+            next_growth = (2 * j - 1) / (j - m) * c * growth - (j + m - 1) / (j - m) * last_growth
+            last_growth, growth = growth, next_growth
+        error = error + np.abs(growth) * step_error
+        underflow_factor += float(np.abs(growth).max()) * (a + b + 2.0)
+    return np.abs(q(l, m) + zeros), error, underflow_factor
 
 
-def _product(m: int) -> float:
-    """The error of (x + iy)^m in units of u of its size."""
+def _complex_power_error(m: int) -> float:
+    """A bound of the relative error of (x + iy)^m, in units of u."""
     return 2 * math.sqrt(2) * max(m - 1, 0)
 
 
-def _of_value(l: int, m: int, sums: int, is_divided: bool) -> tuple[float, float]:  # noqa: E741
-    """The two bounds for the value of a term, in units of u rho^m r^(l-m), and of u r^l."""
+def _value_errors(l: int, m: int, sums: int, is_divided: bool) -> tuple[float, float]:  # noqa: E741
+    """Two bounds for the error of the value of r^l Y_lm / `legendre_weight`.
+
+    The first one is in units of u rho^m r^(l-m), the second one in units of u r^l.
+
+    sums: the number of additions in which the term takes part.
+    is_divided: whether the point was divided by a size.
+    """
     q, error, _ = _recurrence(l, m)
     c, s = polar_samples(_SAMPLES)
-    total = error + (3 + sums + _product(m)) * q
+    total = error + (3 + sums + _complex_power_error(m)) * q
     if is_divided:
-        at_next, below = _recurrence(l - 1, m + 1)[0], _recurrence(l - 1, m)[0]
-        total = total + 3 * (m * q + (2 * m + 1) * s * s * at_next + np.abs(c) * (l + m) * below)
-    return _largest(total), _largest(total * s**m)
+        at_next, at_lower = _recurrence(l - 1, m + 1)[0], _recurrence(l - 1, m)[0]
+        total = total + 3 * (m * q + (2 * m + 1) * s * s * at_next + np.abs(c) * (l + m) * at_lower)
+    return _largest_sample(total), _largest_sample(total * s**m)
 
 
-def _of_gradient(l: int, m: int, sums: int, is_divided: bool) -> tuple[float, float]:  # noqa: E741
-    """The two bounds for the gradient of a term, in units of u rho^(m-1) r^(l-m) (m = 0: u
-    r^(l-1)), and of u r^(l-1).
+def _slope_errors(l: int, m: int, sums: int, is_divided: bool) -> tuple[float, float]:  # noqa: E741
+    """Two bounds for the error of the gradient of r^l Y_lm / `legendre_weight`, as a length.
 
-    In the order in which `evaluate` computes it: 4u for weights, coefficients and products in each
-    component, 2u for the two terms of gx and gy, then the sums. If the point is divided by a size,
-    3u (rho |H| + |z grad f_z|), f_z = (l+m) Q_(l-1)^m B being of degree l-1 and order m; and 3u for
-    the division of the gradient by the size.
+    The first one is in units of u rho^(m-1) r^(l-m) (for m = 0: of u r^(l-1)), the second one in
+    units of u r^(l-1). Parameters as for `_value_errors`.
+
+    The errors in the order in which `solid_harmonics.evaluate` computes: 4u for weights,
+    coefficients and products in each component, 2u for the two terms of the x- and y-components,
+    then the sums. If the point was divided by a size, this adds 3u (rho |H| + |z grad f_z|), where
+    H is the Hessian and f_z = (l+m) Q_(l-1)^m B, with B = C_m or S_m, has the degree l-1 and the
+    order m; and 3u for the division of the gradient by the size.
     """
     _, s = polar_samples(_SAMPLES)
-    operations = 4 + 2 + 2 * sums + _product(m) + (3 if is_divided else 0)
+    operations = 4 + 2 + 2 * sums + _complex_power_error(m) + (3 if is_divided else 0)
     q, q_error, _ = _recurrence(l, m)
     at_next, next_error, _ = _recurrence(l - 1, m + 1)
-    below, below_error, _ = _recurrence(l - 1, m)
+    at_lower, lower_error, _ = _recurrence(l - 1, m)
     power = s if m > 0 else 0.0 * s + 1.0
     radial = s * power * (2 * m + 1) * (next_error + operations * at_next)
     azimuthal = m * (q_error + operations * q)
-    axial = power * (l + m) * (below_error + operations * below)
+    axial = power * (l + m) * (lower_error + operations * at_lower)
     total = np.hypot(radial + azimuthal, axial)
-    near, anywhere = _largest(total), _largest(total * s ** max(m - 1, 0))
+    near, anywhere = _largest_sample(total), _largest_sample(total * s ** max(m - 1, 0))
     if is_divided:
         # On the sphere |H| <= l (l-1) M and |grad f_z| <= (l-1) l M: see `BallRange.curvature`.
         division = 3 * largest_hessian(l, m) / legendre_weight(l, m)
         if l > m:
             division += 3 * (l + m) * largest_gradient(l - 1, m) / legendre_weight(l - 1, m)
         near += division
-        anywhere += min(division, 6 * l * (l - 1) * _largest(q * s**m))
+        anywhere += min(division, 6 * l * (l - 1) * _largest_sample(q * s**m))
     return near, anywhere
 
 
-def _largest(sampled: FloatArray) -> float:
-    """The largest sample, with the margin `_SECOND_ORDER`."""
+def _largest_sample(sampled: FloatArray) -> float:
+    """The largest sample, times `_SECOND_ORDER`, which covers values between samples."""
     return float(sampled.max()) * _SECOND_ORDER
 
 
 def _underflow(l: int, m: int) -> float:  # noqa: E741
-    """A bound of the error of a term by underflow, in smallest normal numbers."""
+    """A bound of the error of r^l Y_lm / `legendre_weight` by underflow, in smallest normal
+    numbers."""
     q, _, factors = _recurrence(l, m)
     return factors + (2 * m + 2) * float(q.max()) + 2
 
@@ -198,53 +225,54 @@ def _underflow(l: int, m: int) -> float:  # noqa: E741
 # The rounding of a sine or cosine in units of u (`backend.elementary.sincos`).
 _SINE = 2.0
 
-Share: TypeAlias = tuple[float, float, float, float]
+# (constant, x, y, z): the bound constant + x |p_x| + y |p_y| + z |p_z| at a point p.
+_LinearBound: TypeAlias = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
 class WaveRounding:
-    """Rounding of a sum of waves at a point p, in units of u.
+    """Bounds of the rounding errors of a sum of waves, as functions of the point p, in units of u.
 
-    move: (x, y, z): the rounding that is the same for all terms acts like a move of the point by
-        these multiples of the sizes of its coordinates.
-    value, gradient: (constant, x, y, z), the rest of the rounding: the constant, plus x, y and z
-        times the sizes of the coordinates.
-    slopes, hessian: the same for the whole rounding of the gradient and the Hessian, without
-        counting any of it as a move of the point.
+    move: (x, y, z). Rounding that is the same for all terms acts as if p were moved, in each
+        coordinate by this number times the absolute value of the coordinate.
+    value, gradient: the errors of value and gradient apart from this move, each as (constant, x, y,
+        z) for constant + x |p_x| + y |p_y| + z |p_z|.
+    slopes, hessian: in the same form, the whole errors of gradient and Hessian, where no error
+        counts as a move of the point.
 
     A sine or cosine has an error of 2u (`backend.elementary.sincos`).
 
-    - The angle of a factor, fl(fl(k) x + phase), is off by c u |k x|, c = 2 for the two roundings
-      of the product, 0 if k is a power of two; with a phase by 2u |phase| and u |k x| more. If all
-      factors of an axis have the same |k|, the first error is the same for all of them: a move of
-      the point by c u |x|, after which value *and* gradient are those of the moved point.
-    - The angle of a plane wave is off by 5u sum |k_i x_i| + 2u |phase|.
-    - A product of n factors is off by n times the error of a sine, by u for each product with a
-      factor and 2u for an amplitude other than 1; a partial sum by u of its size.
-    - A derivative along an axis contains the frequency as well: 2u more; a second derivative 6u.
-      The error of an entry i, j of the Hessian is at most d |k_i| |k_j|, which as a matrix has the
-      norm d |k|^2.
+    - The angle of a factor is k x + phase, with a rounded k. The two roundings of the product make
+      an error of 2u |k x|, or none if k is a power of two. A phase adds 2u |phase| + u |k x|. If
+      all factors of an axis have the same |k|, the error of the product is the same for all of
+      them: it moves the point by 2u |x|, and value *and* gradient are those of the moved point.
+    - The angle of a plane wave has an error of 5u sum |k_i x_i| + 2u |phase|.
+    - A product of n factors has n times the error of a sine, u for each product with a factor, and
+      2u for an amplitude other than 1. Each partial sum adds u of its size.
+    - A derivative along an axis contains the frequency as a further factor: 2u more. A second
+      derivative: 6u more. If d is the relative error, the error of the entry i, j of the Hessian is
+      at most d |k_i| |k_j|, and this matrix has the norm d |k|^2.
     """
 
     move: tuple[float, float, float]
-    value: Share
-    gradient: Share
-    slopes: Share
-    hessian: Share
+    value: _LinearBound
+    gradient: _LinearBound
+    slopes: _LinearBound
+    hessian: _LinearBound
 
     @classmethod
     def of(cls, terms: Sequence[Term]) -> WaveRounding:
-        """The rounding of the operations of `evaluate_terms`."""
-        common = [_shared_frequency(terms, axis) for axis in range(3)]
+        """The bounds for the operations of `evaluate_terms` for the sum of these terms."""
+        common_frequencies = [_common_frequency(terms, axis) for axis in range(3)]
         value, gradient, total_slopes, second = ([0.0] * 4 for _ in range(4))
         sizes, slopes, seconds = 0.0, 0.0, 0.0
         for n, term in enumerate(terms):
-            size, vector = abs(term.amplitude), _vector(term)
+            size, vector = abs(term.amplitude), _wave_vector(term)
             norm = math.sqrt(sum(k * k for k in vector))
             second_size = size * norm * norm
             sizes, slopes, seconds = sizes + size, slopes + size * norm, seconds + second_size
-            angle, per_axis, operations = _of_term(term, common)
-            _, all_per_axis, _ = _of_term(term, (None, None, None))
+            angle, per_axis, operations = _term_roundings(term, common_frequencies)
+            _, all_per_axis, _ = _term_roundings(term, (None, None, None))
             partial = (sizes, slopes, seconds) if n else (0.0, 0.0, 0.0)  # the first sum is exact
             value[0] += size * (angle + operations) + partial[0]
             gradient[0] += size * norm * (angle + operations + 2) + partial[1]
@@ -255,12 +283,16 @@ class WaveRounding:
                 total_slopes[axis + 1] += size * norm * all_per_axis[axis]
                 second[axis + 1] += second_size * all_per_axis[axis]
         total_slopes[0] = gradient[0]
-        moves = [0.0 if k is None else _rounded(k) for k in common]
+        moves = [0.0 if k is None else _product_rounding(k) for k in common_frequencies]
         a, b, c, d = ((s[0], s[1], s[2], s[3]) for s in (value, gradient, total_slopes, second))
         return cls((moves[0], moves[1], moves[2]), a, b, c, d)
 
     def errors(self, p: Vec3, gradient: Vec3) -> tuple[Real, Real]:
-        """Errors of value and gradient at p; of the gradient after the point is moved by `move`."""
+        """Bounds of the errors of value and gradient at p.
+
+        gradient: the computed gradient at p. The error of the gradient is that relative to the
+            exact gradient at the point moved by `move`.
+        """
         size = [dr.abs(p.x), dr.abs(p.y), dr.abs(p.z)]
         value, slope = self.value[0], self.gradient[0]
         for axis in range(3):
@@ -273,25 +305,30 @@ class WaveRounding:
         return unit * (value + 0 * p.x), unit * (slope + 0 * p.x)
 
     def derivative_errors(self, p: Vec3) -> tuple[Real, Real]:
-        """Errors of gradient and Hessian at p itself."""
+        """Bounds of the errors of gradient and Hessian, relative to the exact ones at p itself."""
         unit = float(dr.epsilon(type(p.x)))
 
-        def at(parts: Share) -> Real:
+        def at(parts: _LinearBound) -> Real:
+            """The bound at p."""
             terms = (rate * dr.abs(x) for rate, x in zip(parts[1:], p, strict=True))
             return unit * (parts[0] + sum(terms, 0 * p.x))
 
         return at(self.slopes), at(self.hessian)
 
 
-def _vector(term: Term) -> tuple[float, ...]:
-    """The wave vector of a term, or the frequencies of its factors."""
+def _wave_vector(term: Term) -> tuple[float, ...]:
+    """The wave vector of a plane wave, or the frequencies of the factors of a product."""
     if isinstance(term, PlaneWave):
         return term.wave_vector
     return tuple(factor.frequency for _, factor in term.factors)
 
 
-def _shared_frequency(terms: Sequence[Term], axis: int) -> float | None:
-    """The |frequency| that all terms share along an axis; None if there are several."""
+def _common_frequency(terms: Sequence[Term], axis: int) -> float | None:
+    """The absolute frequency that all factors along an axis have; None if they differ or there are
+    none.
+
+    None also if a plane wave has a component along the axis.
+    """
     frequencies: set[float] = set()
     for term in terms:
         if isinstance(term, PlaneWave):
@@ -304,27 +341,37 @@ def _shared_frequency(terms: Sequence[Term], axis: int) -> float | None:
     return frequencies.pop() if len(frequencies) == 1 else None
 
 
-def _rounded(frequency: float) -> float:
-    """The rounding of frequency and product together: none for powers of two."""
+def _product_rounding(frequency: float) -> float:
+    """The error of frequency times coordinate in units of u, the frequency's rounding included: 0
+    for powers of two, else 2."""
     return 0.0 if abs(math.frexp(frequency)[0]) == 0.5 else 2.0
 
 
-def _of_term(term: Term, common: Sequence[float | None]) -> tuple[float, list[float], float]:
-    """For a term of amplitude 1: the rounding of its angles, as a constant part and a part in units
-    of the coordinates' sizes, and the rounding of its operations."""
+def _term_roundings(term: Term, common: Sequence[float | None]) -> tuple[float, list[float], float]:
+    """The rounding errors of a term of amplitude 1, in units of u.
+
+    common: for each axis the frequency that all terms share, or None. The error of a product with a
+        shared frequency is left out, as it counts as a move of the point.
+
+    Returns the constant part of the errors of its angles, their part for each axis in units of the
+    absolute value of that coordinate, and the error of the other operations.
+    """
     if isinstance(term, PlaneWave):
         operations = _SINE + 2
         return 2 * abs(term.phase), [5 * abs(k) for k in term.wave_vector], operations
     angle, per_axis = 0.0, [0.0] * 3
     for axis, factor in term.factors:
         angle += 2 * abs(factor.phase)
-        per_axis[axis] = abs(factor.frequency) * _of_angle(factor, common[axis] is not None)
+        per_axis[axis] = abs(factor.frequency) * _angle_rounding(factor, common[axis] is not None)
     n = len(term.factors)
     return angle, per_axis, n * _SINE + max(n - 1, 0) + (0 if term.amplitude == 1.0 else 2)
 
 
-def _of_angle(factor: WaveFactor, is_common: bool) -> float:
-    """The rounding of a factor's angle in units of u |k x|, without the part that counts as a move
-    of the point if the frequency is common to all factors."""
-    total = 0.0 if is_common else _rounded(factor.frequency)
+def _angle_rounding(factor: WaveFactor, is_common: bool) -> float:
+    """The rounding error of a factor's angle, in units of u |k x|.
+
+    is_common: whether all factors of the axis have this frequency k. The error of the product k x
+        is then left out, as it counts as a move of the point.
+    """
+    total = 0.0 if is_common else _product_rounding(factor.frequency)
     return total + 1.0 if factor.phase else total

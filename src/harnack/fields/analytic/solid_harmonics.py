@@ -1,11 +1,17 @@
 """Real solid harmonics r^l Y_lm in Cartesian coordinates, up to degree 12, and their sums.
 
-r^l Y_lm = N_lm Q_l^m(z, r^2) C_m(x, y), where C_m + i S_m = (x + iy)^m (S_m for m < 0) and Q_l^m is
-r^(l-m) times the m-th derivative of the Legendre polynomial P_l, as a function of z/r: a polynomial
-in z and r^2. Both obey recurrences that lose no accuracy (the recurrence of Q is the upward
-recurrence of associated Legendre functions), whereas a sum of monomials cancels: at degree 12 by
-three digits. All operations are arithmetic, so the same code serves Dr.Jit arrays, NumPy arrays and
-Python floats.
+For m >= 0, r^l Y_lm = N_lm Q_l^m(z, r^2) C_m(x, y). For m < 0, |m| takes the place of m in Q, and
+S_|m| the place of C_m. Here
+
+- C_m + i S_m = (x + iy)^m;
+- Q_l^m is r^(l-m) times the m-th derivative of the Legendre polynomial P_l at z/r, which is a
+  polynomial in z and r^2;
+- N_lm is the factor for which the integral of Y_lm^2 over the unit sphere is 1.
+
+C_m, S_m and Q_l^m are computed by recurrences that lose no accuracy (for Q_l^m the upward
+recurrence of associated Legendre functions). A sum of monomials instead would lose three digits to
+cancellation at degree 12. All operations are arithmetic, so the same code serves Dr.Jit arrays,
+NumPy arrays and Python floats.
 """
 
 from __future__ import annotations
@@ -24,10 +30,12 @@ Monomials: TypeAlias = Mapping[tuple[int, int, int], float]  #: (i, j, k) -> tha
 
 
 def degree_and_order(key: Any) -> tuple[int, int]:
-    """The degree l and the order m from a pair.
+    """The degree l and the order m as two ints, from a pair of integers.
+
+    key: the pair (l, m), any value that a user gave.
 
     Raises:
-        TypeError: it is no pair of integers.
+        TypeError: key is not a pair of integers.
     """
     try:
         l, m = key  # noqa: E741
@@ -41,69 +49,83 @@ def degree_and_order(key: Any) -> tuple[int, int]:
 
 
 def normalization(l: int, m: int) -> float:  # noqa: E741
-    """N_lm, with which the integral of Y_lm^2 over the unit sphere is 1."""
+    """The factor N_lm, for which the integral of Y_lm^2 over the unit sphere is 1."""
     order = abs(m)
     ratio = math.factorial(l - order) / math.factorial(l + order)
     return math.sqrt((2 * l + 1) / (4 * math.pi) * ratio * (2 if order else 1))
 
 
 def odd_factorial(m: int) -> float:
-    """(2m-1)!! = 1 * 3 * ... * (2m-1), the value of Q_m^m."""
+    """The product of the odd numbers (2m-1)!! = 1 * 3 * ... * (2m-1), which is the value of
+    Q_m^m."""
     return float(math.prod(range(1, 2 * m, 2)))
 
 
 def legendre_weight(l: int, m: int) -> float:  # noqa: E741
-    """N_lm (2m-1)!!, the factor of r^l Y_lm that `Legendre` omits, m >= 0."""
+    """N_lm (2m-1)!! for m >= 0: `Legendre` times this is N_lm Q_l^m."""
     return normalization(l, m) * odd_factorial(m)
 
 
 class Legendre:
-    """Q_l^m / (2m-1)!! at a point, each value computed once.
+    """The polynomials Q_l^m / (2m-1)!! at given z and r^2, each computed once.
 
-    Without the size of Q_m^m all values are in the range of float32; the weights of a sum contain
-    that factor.
+    Without the division by (2m-1)!!, which is Q_m^m, values would leave the range of float32. The
+    factors `legendre_weight` of a sum contain it.
+
+    z, r2: z and r^2, numbers or arrays.
     """
 
     def __init__(self, z: Any, r2: Any) -> None:
         self.z = z
         self.r2 = r2
-        self._values: dict[tuple[int, int], Any] = {}
+        self._known: dict[tuple[int, int], Any] = {}
 
     def __call__(self, l: int, m: int) -> Any:  # noqa: E741
-        """The value; 0.0 for l < m."""
+        """Q_l^m / (2m-1)!! for m >= 0; 0.0 for l < m."""
         if l <= m:
             return 1.0 if l == m else 0.0
-        if (l, m) not in self._values:
-            below, below2 = self(l - 1, m), self(l - 2, m)
-            q = (2 * l - 1) / (l - m) * (self.z * below)
+        if (l, m) not in self._known:
+            previous, before_previous = self(l - 1, m), self(l - 2, m)
+            q = (2 * l - 1) / (l - m) * (self.z * previous)
             if l > m + 1:
-                q = q - (l + m - 1) / (l - m) * (self.r2 * below2)
-            self._values[l, m] = q
-        return self._values[l, m]
+                q = q - (l + m - 1) / (l - m) * (self.r2 * before_previous)
+            self._known[l, m] = q
+        return self._known[l, m]
 
 
 def evaluate(weights: Weights, x: Any, y: Any, z: Any) -> tuple[Any, tuple[Any, Any, Any]]:
-    """Value and gradient of sum c_lm r^l Y_lm.
+    """Value and gradient of the sum of c_lm r^l Y_lm at points.
 
-    With Q = Q_l^m: dQ/dz at fixed r^2 is Q_l^(m+1), and 2 dQ/d(r^2) = -Q_(l-1)^(m+1), whence
+    weights: the coefficients (l, m) -> c_lm.
+    x, y, z: the coordinates, numbers or arrays.
+
+    Returns the value and the three components of the gradient.
+
+    For m >= 0 let Q = Q_l^m. The derivative of Q by z at fixed r^2 is Q_l^(m+1), and by r^2 it is
+    -Q_(l-1)^(m+1)/2. So r^l Y_lm / N_lm = Q C_m has the derivatives
 
         d/dx = -x Q_(l-1)^(m+1) C_m + m Q C_(m-1),   d/dz = (l+m) Q_(l-1)^m C_m,
-        d/dy = -y Q_(l-1)^(m+1) C_m - m Q S_(m-1)    (S_m: S for C, C and + for -S).
+        d/dy = -y Q_(l-1)^(m+1) C_m - m Q S_(m-1),
+
+    and Q S_m, which belongs to the order -m,
+
+        d/dx = -x Q_(l-1)^(m+1) S_m + m Q S_(m-1),   d/dz = (l+m) Q_(l-1)^m S_m,
+        d/dy = -y Q_(l-1)^(m+1) S_m + m Q C_(m-1).
     """
     q = Legendre(z, x * x + y * y + z * z)
     zero = 0.0 * z
     f, gx, gy, gz = zero, zero, zero, zero
-    c, s, c_below, s_below = zero + 1.0, zero, zero, zero
+    c, s, c_lower, s_lower = zero + 1.0, zero, zero, zero
     for m in range(max(abs(m) for _, m in weights) + 1):
         if m > 0:
-            c_below, s_below, c, s = c, s, x * c - y * s, x * s + y * c
-        for order, basis, dx, dy in ((m, c, c_below, -s_below), (-m, s, s_below, c_below)):
+            c_lower, s_lower, c, s = c, s, x * c - y * s, x * s + y * c
+        for order, basis, dx, dy in ((m, c, c_lower, -s_lower), (-m, s, s_lower, c_lower)):
             if m == 0 and basis is s:
                 continue
             column = [(key[0], w) for key, w in weights.items() if key[1] == order]
             if not column:
                 continue
-            at_m, at_next, rate = _column(sorted(column), m, q)
+            at_m, at_next, rate = _slope_sums(sorted(column), m, q)
             f = f + at_m * basis
             gz = gz + rate * basis
             gx = gx - (x * at_next) * basis
@@ -114,15 +136,18 @@ def evaluate(weights: Weights, x: Any, y: Any, z: Any) -> tuple[Any, tuple[Any, 
 
 
 def hessian(weights: Weights, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any, Any, Any, Any]:
-    """xx, yy, zz, xy, xz, yz derivatives of sum c_lm r^l Y_lm.
+    """The second derivatives xx, yy, zz, xy, xz, yz of the sum of c_lm r^l Y_lm at points.
 
-    The rules of `evaluate` applied twice to Q B with B = C_m or S_m. With Q' = Q_(l-1)^(m+1),
-    Q" = Q_(l-2)^(m+2), and B_x etc. the derivatives of B (B_yy = -B_xx):
+    weights, x, y, z: as for `evaluate`.
+
+    The rules of `evaluate` are applied twice to Q B, where B is C_m or S_m. With Q' =
+    Q_(l-1)^(m+1), Q" = Q_(l-2)^(m+2) and the derivatives B_x, B_xx, ... of B, for which B_yy =
+    -B_xx,
 
         xx = (x^2 Q" - Q') B - 2 x Q' B_x + Q B_xx,   xy = xy Q" B - Q' (x B_y + y B_x) + Q B_xy,
-        xz = (l+m) (Q_(l-1)^m B_x - x Q_(l-2)^(m+1) B),   zz = (l+m) (l+m-1) Q_(l-2)^m B
-
-    and yy, yz alike.
+        yy = (y^2 Q" - Q') B - 2 y Q' B_y - Q B_xx,   zz = (l+m) (l+m-1) Q_(l-2)^m B,
+        xz = (l+m) (Q_(l-1)^m B_x - x Q_(l-2)^(m+1) B),
+        yz = (l+m) (Q_(l-1)^m B_y - y Q_(l-2)^(m+1) B).
     """
     q = Legendre(z, x * x + y * y + z * z)
     zero = 0.0 * z
@@ -141,18 +166,22 @@ def hessian(weights: Weights, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any, An
         for order, basis in bases[: 2 if m else 1]:
             column = [(key[0], w) for key, w in weights.items() if key[1] == order]
             if column:
-                terms = _second_rates(_second_column(sorted(column), m, q), basis, x, y)
+                terms = _hessian_of_sums(_hessian_sums(sorted(column), m, q), basis, x, y)
                 total = [entry + term for entry, term in zip(total, terms, strict=True)]
     return total[0], total[1], total[2], total[3], total[4], total[5]
 
 
 def unit_hessian(l: int, m: int, rho: Any, z: Any, b: float, drop: int) -> Any:  # noqa: E741
-    """The Hessian (n, 3, 3) of r^l Y_lm / rho^drop for m >= 0, with rho^drop counted as constant.
+    """The Hessians (n, 3, 3) of r^l Y_lm, divided by rho^drop, at n points of the unit sphere.
 
-    At n points of azimuth b on the unit sphere, rho and z (n,); m >= 2 + drop or drop = 0.
+    l, m: degree and order, m >= 0; either drop is 0, or m >= 2 + drop.
+    rho, z: (n,) the distances of the points from the z axis, and their z.
+    b: the azimuth of all points, in radians.
+    drop: the power of rho. The division is done after differentiation, without dividing by rho.
     """
 
     def power(n: int) -> Any:
+        """rho^n / rho^drop; 1 for n < drop, where it is multiplied by 0."""
         return rho ** max(n - drop, 0)
 
     x, y = rho * math.cos(b), rho * math.sin(b)
@@ -163,13 +192,17 @@ def unit_hessian(l: int, m: int, rho: Any, z: Any, b: float, drop: int) -> Any: 
         m * (m - 1) * power(m - 2) * math.cos((m - 2) * b),
         -m * (m - 1) * power(m - 2) * math.sin((m - 2) * b),
     )
-    sums = _second_column([(l, 1.0)], m, Legendre(z, 1.0))
-    xx, yy, zz, xy, xz, yz = (entry + 0.0 * z for entry in _second_rates(sums, basis, x, y))
+    sums = _hessian_sums([(l, 1.0)], m, Legendre(z, 1.0))
+    xx, yy, zz, xy, xz, yz = (entry + 0.0 * z for entry in _hessian_of_sums(sums, basis, x, y))
     return np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=-1).reshape(-1, 3, 3)
 
 
-def _second_rates(sums: Sequence[Any], basis: Sequence[Any], x: Any, y: Any) -> tuple[Any, ...]:
-    """The six derivatives from sums over l (`_second_column`) and B, B_x, B_y, B_xx, B_xy."""
+def _hessian_of_sums(sums: Sequence[Any], basis: Sequence[Any], x: Any, y: Any) -> tuple[Any, ...]:
+    """The derivatives xx, yy, zz, xy, xz, yz of Q B, summed over l with weights: see `hessian`.
+
+    sums: the six sums of `_hessian_sums`.
+    basis: B, B_x, B_y, B_xx, B_xy, where B is C_m or S_m.
+    """
     at_m, at_next, at_second, rate, rate_next, rate_twice = sums
     b, bx, by, bxx, bxy = basis
     return (
@@ -182,12 +215,19 @@ def _second_rates(sums: Sequence[Any], basis: Sequence[Any], x: Any, y: Any) -> 
     )
 
 
-def _second_column(
+def _hessian_sums(
     column: Sequence[tuple[int, float]], m: int, q: Legendre
 ) -> tuple[Any, Any, Any, Any, Any, Any]:
-    """Sums over l of c_lm N_lm times Q_l^m, Q_(l-1)^(m+1), Q_(l-2)^(m+2), (l+m) Q_(l-1)^m,
-    (l+m) Q_(l-2)^(m+1) and (l+m) (l+m-1) Q_(l-2)^m."""
-    at_m, at_next, rate = _column(column, m, q)
+    """The weighted sums over l that second derivatives need, for one order.
+
+    With c_l the weight of the degree l, the sums of c_l N_lm times Q_l^m, Q_(l-1)^(m+1),
+    Q_(l-2)^(m+2), (l+m) Q_(l-1)^m, (l+m) Q_(l-2)^(m+1) and (l+m) (l+m-1) Q_(l-2)^m.
+
+    degree_weights: (l, c_l) for all degrees l of the order.
+    m: the absolute value of the order.
+    q: the polynomials at the points.
+    """
+    at_m, at_next, rate = _slope_sums(column, m, q)
     at_second, rate_next, rate_twice = 0.0, 0.0, 0.0
     for l, weight in column:  # noqa: E741
         a = weight * legendre_weight(l, m)
@@ -200,8 +240,12 @@ def _second_column(
     return at_m, at_next, at_second, rate, rate_next, rate_twice
 
 
-def _column(column: Sequence[tuple[int, float]], m: int, q: Legendre) -> tuple[Any, Any, Any]:
-    """Sums over l of c_lm N_lm times Q_l^m, Q_(l-1)^(m+1) and (l+m) Q_(l-1)^m."""
+def _slope_sums(column: Sequence[tuple[int, float]], m: int, q: Legendre) -> tuple[Any, Any, Any]:
+    """The weighted sums over l that values and gradients need, for one order.
+
+    With c_l the weight of the degree l, the sums of c_l N_lm times Q_l^m, Q_(l-1)^(m+1) and (l+m)
+    Q_(l-1)^m. Parameters as for `_hessian_sums`.
+    """
     at_m, at_next, rate = 0.0, 0.0, 0.0
     for l, weight in column:  # noqa: E741
         a = weight * legendre_weight(l, m)
@@ -214,10 +258,16 @@ def _column(column: Sequence[tuple[int, float]], m: int, q: Legendre) -> tuple[A
 
 
 def laplacian(coefficients: Monomials) -> tuple[dict[tuple[int, int, int], float], float]:
-    """The coefficients of the Laplacian, and the largest of them relative to the terms whose sum it
-    is."""
+    """The Laplacian of a polynomial, and how large it is.
+
+    coefficients: (i, j, k) -> coefficient of x^i y^j z^k.
+
+    Returns the coefficients of the Laplacian, without those that are rounding errors; and the
+    largest ratio of the absolute value of a coefficient to the sum of the absolute values of the
+    terms of which it is the sum (0 to 1).
+    """
     total: dict[tuple[int, int, int], float] = {}
-    size: dict[tuple[int, int, int], float] = {}
+    abs_sum: dict[tuple[int, int, int], float] = {}
     for powers, coefficient in coefficients.items():
         for axis in range(3):
             n = powers[axis]
@@ -229,18 +279,22 @@ def laplacian(coefficients: Monomials) -> tuple[dict[tuple[int, int, int], float
                 )
                 term = n * (n - 1) * coefficient
                 total[lowered] = total.get(lowered, 0.0) + term
-                size[lowered] = size.get(lowered, 0.0) + abs(term)
-    worst = max((abs(total[k]) / size[k] for k in total if size[k] > 0), default=0.0)
-    return {k: v for k, v in total.items() if abs(v) > 1e-12 * size[k]}, worst
+                abs_sum[lowered] = abs_sum.get(lowered, 0.0) + abs(term)
+    largest_ratio = max((abs(total[k]) / abs_sum[k] for k in total if abs_sum[k] > 0), default=0.0)
+    return {k: v for k, v in total.items() if abs(v) > 1e-12 * abs_sum[k]}, largest_ratio
 
 
 def from_monomials(coefficients: Monomials) -> dict[tuple[int, int], float]:
-    """The weights of a harmonic polynomial.
+    """The weights (l, m) -> c_lm of a harmonic polynomial, given by its monomials.
 
-    A harmonic function is determined by its values and its z-derivatives on the plane z = 0. On the
-    circle r = 1 there they are the Fourier series with coefficients c_lm N_lm Q_l^m(0, 1) (l - m
-    even) and c_lm N_lm (l+m) Q_(l-1)^m(0, 1) (l - m odd), of degree at most 12: 64 samples
-    determine them exactly.
+    coefficients: (i, j, k) -> coefficient of x^i y^j z^k; their degree is at most 12, and the
+        polynomial must be harmonic.
+
+    A harmonic function is determined by its values and its z-derivatives on the plane z = 0. For
+    the part of degree l, these are Fourier series on the circle r = 1 of that plane, with
+    coefficients c_lm N_lm Q_l^m(0, 1) for even l - m (the values) and c_lm N_lm (l+m) Q_(l-1)^m(0,
+    1) for odd l - m (the z-derivatives). Their degree is at most 12, so 64 samples determine them
+    exactly.
     """
     n = 64
     angles = 2 * np.pi * np.arange(n) / n

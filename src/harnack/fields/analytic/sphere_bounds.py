@@ -1,6 +1,6 @@
-"""Proved bounds of sums of solid harmonics, from samples and Bernstein's inequality.
+"""Proved bounds of sums of solid harmonics, computed from samples by Bernstein's inequality.
 
-- `AxialBound`: bounds by the distances rho and r to the z axis and to the origin.
+- `AxialBound`: bounds that depend on the distances rho from the z axis and r from the origin.
 - `BallRange`: ranges on spheres and balls about the origin.
 """
 
@@ -39,34 +39,37 @@ __all__ = [
     "value_bound",
 ]
 
-_ANGLES = 720  # intervals of the polar angle from pole to pole
-_TURNS = 24  # samples of m b over half a turn
+# The number of intervals into which the polar angle from pole to pole is divided for samples.
+_POLAR_INTERVALS = 720
+# The number of samples of the angle m b over half a turn, b the azimuth.
+_AZIMUTH_SAMPLES = 24
 
 
 @dataclass(frozen=True)
 class AxialBound:
-    """A bound that is a sum of terms c rho^i r^j, c >= 0, rho and r the distances to the z axis and
-    to the origin.
+    """A bound of the form sum of c rho^i r^j with all c >= 0.
 
-    rows: (i, ((j, c), ...)) with i and j decreasing.
+    rho and r are the distances of a point from the z axis and from the origin.
 
-    r^l Y_lm vanishes to order |m| along the z axis and to order l at the origin. There it, its
-    derivatives and the rounding of both are far smaller than anywhere else on the sphere of radius
-    r, and a useful bound must shrink with both distances. As such a sum grows with rho and r, its
-    value at (rho(p) + R, |p| + R) is a bound on the whole ball B(p, R).
+    rows: (i, ((j, c), ...)) for each power i, with i and j decreasing.
 
-    Every r^l Y_lm is homogeneous, so a constant c need only be computed on the unit sphere. With
-    Q = Q_l^m of `solid_harmonics`, x + iy = sin(a) exp(i b) and z = cos(a), the functions to be
-    bounded are trigonometric polynomials of degree at most l in the polar angle a once the power of
-    sin(a) is divided out, and of degree 1 in m b: samples and Bernstein's inequality prove their
-    largest values, as in `proved_range`.
+    r^l Y_lm vanishes to order |m| along the z axis and to order l at the origin. Near these places
+    it, its derivatives and their rounding errors are far smaller than elsewhere on the sphere of
+    radius r, and a useful bound must become small there, too. Since such a sum grows with rho and
+    with r, its value at (rho(p) + R, |p| + R) is a bound on the whole ball B(p, R).
+
+    Every r^l Y_lm is homogeneous, so the constants c need only be computed on the unit sphere. Let
+    Q = Q_l^m as in `solid_harmonics`, and x + iy = sin(a) exp(i b), z = cos(a) on that sphere.
+    After division by a power of sin(a), the functions to be bounded are trigonometric polynomials
+    of degree at most l in the polar angle a, and of degree 1 in m b. Samples and Bernstein's
+    inequality prove their largest absolute values, as in `proved_range`.
     """
 
     rows: tuple[tuple[int, tuple[tuple[int, float], ...]], ...]
 
     @classmethod
     def of(cls, terms: dict[tuple[int, int], float]) -> AxialBound:
-        """The bound with these terms; terms: (i, j) -> c."""
+        """The bound with these terms, given as (i, j) -> c."""
         powers = sorted({i for i, _ in terms}, reverse=True)
         return cls(
             tuple(
@@ -81,13 +84,13 @@ class AxialBound:
         )
 
     def __call__(self, rho: Real, r: Real) -> Real:
-        """The value, by Horner's rule in both variables."""
+        """The value of the bound at distances rho and r, by Horner's rule in both variables."""
         outer = [(i, _horner([(j, 0.0 * r + c) for j, c in row], r)) for i, row in self.rows]
         return _horner(outer, rho) if outer else 0.0 * r
 
 
 def _horner(terms: list[tuple[int, Real]], x: Real) -> Real:
-    """The sum of c x^i over terms (i, c), i decreasing."""
+    """The sum of c x^i over the terms (i, c); i decreases from term to term."""
     (i, total), *rest = terms
     for j, c in rest:
         total, i = total * _power(x, i - j) + c, j
@@ -103,30 +106,45 @@ def _power(x: Real, n: int) -> Real:
 
 
 def order_on_axis(weights: Weights) -> int:
-    """The order to which a sum minus its constant vanishes along the z axis."""
+    """The order to which a sum of solid harmonics, minus its constant term, vanishes along the z
+    axis.
+
+    weights: (l, m) -> coefficient. The order is the smallest |m|.
+    """
     return min((abs(m) for l, m in weights if l > 0), default=0)  # noqa: E741
 
 
 def value_bound(weights: Weights) -> AxialBound:
-    """A bound of |f|: |r^l Y_lm| <= N |Q(cos a)| rho^m r^(l-m)."""
+    """A bound of |f| for the sum f with these weights, as |r^l Y_lm| <= max(N |Q(cos a)|) rho^m
+    r^(l-m)."""
     return _summed(weights, lambda l, m: (m, l, largest_value(l, m)))  # noqa: E741
 
 
 def gradient_bound(weights: Weights) -> AxialBound:
-    """A bound of |grad f|, of order m-1 in rho (0 for m = 0) for each term."""
+    """A bound of |grad f| for the sum f with these weights.
+
+    A term of order m contributes a power rho^(m-1) (for m = 0: rho^0).
+    """
     return _summed(weights, lambda l, m: (max(m - 1, 0), l - 1, largest_gradient(l, m)))  # noqa: E741
 
 
 def hessian_bound(weights: Weights) -> AxialBound:
-    """A bound of all directional second derivatives, of order m-2 in rho (0 for m < 2)."""
+    """A bound of the absolute directional second derivatives of the sum f with these weights.
+
+    A term of order m contributes a power rho^(m-2) (for m < 2: rho^0).
+    """
     return _summed(weights, lambda l, m: (max(m - 2, 0), l - 2, largest_hessian(l, m)))  # noqa: E741
 
 
 def _summed(weights: Weights, bound_of: Callable[[int, int], tuple[int, int, float]]) -> AxialBound:
-    """The sum over terms; bound_of: (l, m >= 0) -> power of rho, degree in both, constant for Y_lm.
+    """The sum of the bounds of all terms of a sum of solid harmonics.
 
-    cos(m b) and sin(m b) together have as amplitude the root of the sum of the squares of their
-    weights.
+    weights: (l, m) -> coefficient.
+    bound_of: a function (l, m >= 0) -> (i, d, c), for the bound c rho^i r^(d-i) of Y_lm; the term
+        is left out if d < i.
+
+    The orders m and -m are bounded together: their amplitude is the root of the sum of the squares
+    of their weights.
     """
     terms: dict[tuple[int, int], float] = {}
     for (l, m), amplitude in amplitudes(weights).items():  # noqa: E741
@@ -138,32 +156,38 @@ def _summed(weights: Weights, bound_of: Callable[[int, int], tuple[int, int, flo
 
 
 def amplitudes(weights: Weights) -> dict[tuple[int, int], float]:
-    """(l, m >= 0) -> the amplitude of the harmonics of orders m and -m together."""
+    """(l, m >= 0) -> the amplitude of the harmonics of degree l and orders m and -m together: the
+    root of the sum of the squares of their weights."""
     sizes: dict[tuple[int, int], float] = {}
     for (l, m), weight in weights.items():  # noqa: E741
         sizes[l, abs(m)] = math.hypot(sizes.get((l, abs(m)), 0.0), weight)
     return sizes
 
 
-def polar_samples(count: int = _ANGLES) -> tuple[FloatArray, FloatArray]:
-    """cos(a) and sin(a) at count + 1 polar angles, evenly spaced from 0 to pi."""
+def polar_samples(count: int = _POLAR_INTERVALS) -> tuple[FloatArray, FloatArray]:
+    """Arrays (count + 1,) of cos(a) and sin(a) for polar angles a evenly spaced from 0 to pi."""
     a = np.linspace(0.0, math.pi, count + 1)
     return np.cos(a), np.sin(a)
 
 
 def _proved_maximum(sampled: FloatArray, degree: int) -> float:
-    """The largest size of a trigonometric polynomial in a, from its samples at `polar_samples`.
+    """A bound of the largest absolute value of a trigonometric polynomial in the polar angle a.
 
-    At its maximum A its slope is 0 and its second derivative at most degree^2 A (Bernstein), and a
-    sample is within half a spacing, so the samples fall short of A by at most e A.
+    sampled: its values at the angles of `polar_samples`.
+    degree: its degree, or more.
+
+    Let A be the largest absolute value. Where it is taken, the slope is 0, and by Bernstein's
+    inequality the second derivative is at most degree^2 A everywhere. A sample is within half a
+    spacing of that place, so the samples fall short of A by at most e A, with e = (degree *
+    spacing/2)^2/2.
     """
-    e = 0.5 * (max(degree, 1) * 0.5 * math.pi / _ANGLES) ** 2
+    e = 0.5 * (max(degree, 1) * 0.5 * math.pi / _POLAR_INTERVALS) ** 2
     return float(np.abs(sampled).max()) / (1 - e) * (1 + 1e-12)
 
 
 @functools.cache
 def largest_value(l: int, m: int) -> float:  # noqa: E741
-    """The largest N |Q(cos a)|."""
+    """A bound of N |Q(cos a)| over all polar angles a."""
     z, _ = polar_samples()
     return legendre_weight(l, m) * _proved_maximum(
         np.broadcast_to(Legendre(z, 1.0)(l, m), z.shape), l
@@ -172,11 +196,11 @@ def largest_value(l: int, m: int) -> float:  # noqa: E741
 
 @functools.cache
 def largest_gradient(l: int, m: int) -> float:  # noqa: E741
-    """The largest |grad r^l Y_lm| / sin(a)^(m-1) on the unit sphere (m = 0: |grad|).
+    """A bound of |grad r^l Y_lm| / sin(a)^(m-1) on the unit sphere, for m >= 0 (m = 0: of |grad|).
 
-    With B = rho^m cos(m b) the components along rho and z are cos(m b) times (Q rho^m)_rho and
-    (l+m) Q_(l-1)^m rho^m, and the component along b is -sin(m b) m Q rho^(m-1): the length is at
-    most the larger of the two parts.
+    Let B = rho^m cos(m b). The components of the gradient along rho and z are cos(m b) times the
+    derivative of Q rho^m by rho and (l+m) Q_(l-1)^m rho^m; the component along the azimuth b is
+    -sin(m b) m Q rho^(m-1). So the length is at most the larger of the lengths of these two parts.
     """
     if l == 0:
         return 0.0
@@ -195,40 +219,46 @@ def largest_gradient(l: int, m: int) -> float:  # noqa: E741
 
 @functools.cache
 def largest_hessian(l: int, m: int) -> float:  # noqa: E741
-    """The largest |v . H v| / sin(a)^(m-2) on the unit sphere, v a unit vector (m < 2: |v . H v|).
+    """A bound of |v . H v| / sin(a)^(m-2) on the unit sphere for all unit vectors v (m < 2: of |v .
+    H v|).
 
-    For fixed v in cylindrical coordinates it is of degree l in a, and A cos(m b) + B sin(m b) in b,
-    whose largest value is at most the largest sample of m b at a spacing w, divided by cos(w/2).
+    H is the Hessian of r^l Y_lm, m >= 0. For fixed components of v in cylindrical coordinates, v .
+    H v is of degree l in the polar angle a, and A cos(m b) + B sin(m b) in the azimuth b. The
+    largest absolute value of the latter is at most the largest sample at a spacing w of m b,
+    divided by cos(w/2).
     """
     if l < 2:
         return 0.0
     z, rho = polar_samples()
-    worst = 0.0
-    for angle in np.pi * np.arange(_TURNS) / _TURNS:
+    largest = 0.0
+    for angle in np.pi * np.arange(_AZIMUTH_SAMPLES) / _AZIMUTH_SAMPLES:
         b = angle / max(m, 1)
-        rows = unit_hessian(l, m, rho, z, float(b), drop=max(m - 2, 0))
-        sizes = np.abs(np.linalg.eigvalsh(rows)).max(axis=1)
-        worst = max(worst, _proved_maximum(sizes, l))
+        hessians = unit_hessian(l, m, rho, z, float(b), drop=max(m - 2, 0))
+        sizes = np.abs(np.linalg.eigvalsh(hessians)).max(axis=1)
+        largest = max(largest, _proved_maximum(sizes, l))
         if m == 0:
             break
-    return worst / math.cos(0.5 * math.pi / _TURNS)
+    return largest / math.cos(0.5 * math.pi / _AZIMUTH_SAMPLES)
 
 
-# The product of degree and grid spacing: proved ranges are too wide by half of its square times the
-# half width.
+# The product of degree and grid spacing. Half of its square is the fraction by which proved ranges
+# are too wide at each end, in units of half their width.
 _RESOLUTION = 0.1
 # Radii of the spheres on which the whole polynomial is bounded, as fractions of the largest radius.
 _FRACTIONS = (0.25, 0.4, 0.55, 0.7, 0.85, 1.0)
 
 
 def unit_sphere(covering: float) -> FloatArray:
-    """Points (3, n) of the unit sphere such that every point of it is within `covering` of one of
-    them.
+    """Points (3, n) of the unit sphere. Each point of the sphere is within the angle `covering` of
+    one.
 
-    Distances are measured along great circles. Rings at equal steps h of latitude, at equal steps w
-    of longitude: the nearest point is within h/2 and w/2 of both, and for polar angles a, b the
-    chord obeys chord^2 = 4 sin^2((a-b)/2) + 4 sin a sin b sin^2(w/4) <= (h/2)^2 + sin a sin b
-    (w/2)^2 with sin b <= sin a + h/2.
+    The points lie on rings at equal steps h of latitude, on each ring at equal steps w of
+    longitude. The nearest one is within h/2 in latitude and w/2 in longitude. For two points with
+    polar angles a and b the chord obeys
+
+        chord^2 = 4 sin^2((a-b)/2) + 4 sin a sin b sin^2(w/4) <= (h/2)^2 + sin a sin b (w/2)^2,
+
+    with sin b <= sin a + h/2.
     """
     chord = 2 * math.sin(0.5 * min(covering, math.pi))
     rings = math.ceil(math.pi / (1.4 * chord)) + 1
@@ -236,8 +266,8 @@ def unit_sphere(covering: float) -> FloatArray:
     points: list[FloatArray] = []
     for ring in range(rings):
         a = (ring + 0.5) * h
-        room = math.sqrt(chord**2 - (h / 2) ** 2)
-        w = 2 * room / math.sqrt(math.sin(a) * (math.sin(a) + h / 2))
+        max_east_west = math.sqrt(chord**2 - (h / 2) ** 2)
+        w = 2 * max_east_west / math.sqrt(math.sin(a) * (math.sin(a) + h / 2))
         longitude = 2 * math.pi * np.arange(n := math.ceil(2 * math.pi / w)) / n
         sine = math.sin(a)
         points.append(
@@ -247,13 +277,22 @@ def unit_sphere(covering: float) -> FloatArray:
 
 
 def proved_range(low: float, high: float, degree: int, covering: float) -> tuple[float, float]:
-    """Bounds of a polynomial of this degree on a sphere, from its extremes over a point set.
+    """Bounds of a polynomial on a sphere, from its extremes over a set of points of the sphere.
 
-    Every point of the sphere is within `covering` (an angle) of the set. Proof: let the true
-    range be [c - A, c + A]. Along the great circle through a maximum and the nearest point of
-    the set, T - c is a trigonometric polynomial of degree L with |T - c| <= A, so by Bernstein's
-    inequality |T''| <= L^2 A. At the maximum T' = 0, hence `high` falls short of the maximum by at
-    most e A, e = (L covering)^2/2; in the same way `low`. So 2A <= high - low + 2 e A.
+    low, high: the smallest and the largest value on the set.
+    degree: the degree L of the polynomial.
+    covering: an angle. Every point of the sphere is within this angle of the set.
+
+    Returns the lower and the upper bound.
+
+    Proof. Let the true range be [c - A, c + A]. Take the great circle through a point with the
+    largest value and the point of the set nearest to it. On this circle the polynomial is a
+    trigonometric polynomial T of degree L with |T - c| <= A, so |T''| <= L^2 A by Bernstein's
+    inequality. At the maximum T' = 0, hence `high` falls short of the maximum by at most e A, e =
+    (L covering)^2/2. The same holds for `low`. So 2A <= high - low + 2 e A.
+
+    Raises:
+        ValueError: e >= 1, the points are too far apart.
     """
     e = 0.5 * (degree * covering) ** 2
     if e >= 1:
@@ -265,9 +304,9 @@ def proved_range(low: float, high: float, degree: int, covering: float) -> tuple
 
 
 def range_of_harmonic(l: int, m: int) -> tuple[float, float]:  # noqa: E741
-    """Proved range of Y_lm on the unit sphere, within 1e-5 of the true one.
+    """A proved range (low, high) of Y_lm on the unit sphere, within 1e-5 of the true one.
 
-    For m = 0 a circle through the poles takes every value. Elsewhere the factor cos(m phi) or
+    For m = 0 all values are taken on a circle through the poles. Otherwise the factor cos(m phi) or
     sin(m phi) takes both signs alike, so that the range is symmetric.
     """
     n = 8192
@@ -279,15 +318,18 @@ def range_of_harmonic(l: int, m: int) -> tuple[float, float]:  # noqa: E741
 
 @dataclass(frozen=True)
 class BallRange:
-    """Bounds of a harmonic polynomial f = f_0 + f_1 + ... (f_l homogeneous) on |y| <= s.
+    """Bounds of a harmonic polynomial f = f_0 + f_1 + ... on balls |y| <= s, f_l homogeneous of
+    degree l.
 
     By the maximum principle a range on a sphere is a range on its ball. The ranges are proved by
-    samples together with Bernstein's inequality.
+    samples and Bernstein's inequality.
 
-    ends: (l, lower, upper) of f_l on the unit sphere. f_l has mean 0 there, so lower <= 0 <=
-        upper, and f lies in f_0 + [sum s^l lower_l, sum s^l upper_l] for |y| <= s.
-    spheres: (s, lower, upper) of f itself on a few spheres of radius s. As the terms seldom have
-        their extremes at the same point, this is tighter. It holds on smaller balls, too.
+    constant: f_0.
+    ends: (l, lower, upper) for l > 0, the range of f_l on the unit sphere. f_l has mean 0 there, so
+        lower <= 0 <= upper, and f lies in f_0 + [sum s^l lower_l, sum s^l upper_l] for |y| <= s.
+    spheres: (s, lower, upper), the range of f itself on a few spheres of radius s, which also holds
+        for |y| <= s. As the f_l seldom have their extremes at the same point, this range is
+        tighter.
     """
 
     constant: float
@@ -296,7 +338,7 @@ class BallRange:
 
     @classmethod
     def of(cls, weights: Weights) -> BallRange:
-        """The ranges of the degrees of a sum of solid harmonics."""
+        """The bounds for the sum of solid harmonics with these weights, without `spheres`."""
         constant, ends = 0.0, list[tuple[int, float, float]]()
         points, covering = _points(weights)
         for degree, values in _values(weights, points).items():
@@ -308,8 +350,10 @@ class BallRange:
         return cls(constant, tuple(ends))
 
     def with_spheres(self, weights: Weights, largest: float) -> BallRange:
-        """The same bounds with the ranges of f on spheres up to the radius `largest`; unchanged for
-        a single f_l."""
+        """The same bounds with ranges of f on six spheres up to the radius `largest`.
+
+        weights: those of f. A polynomial with a single f_l besides f_0 is returned unchanged.
+        """
         if len(self.ends) < 2:
             return self
         points, covering = _points(weights)
@@ -320,7 +364,7 @@ class BallRange:
         return BallRange(self.constant, self.ends, tuple(spheres))
 
     def by_degree(self, s: Real) -> tuple[Real, Real]:
-        """Lower and upper bound on |y| <= s from `ends`; s is a number or an array."""
+        """Lower and upper bound on |y| <= s, from `ends` only; s is a number or an array."""
         lower = upper = 0.0 * s
         top = max((degree for degree, _, _ in self.ends), default=0)
         ends = {degree: (low, high) for degree, low, high in self.ends}
@@ -330,21 +374,23 @@ class BallRange:
         return lower + self.constant, upper + self.constant
 
     def curvature(self, s: Real) -> Real:
-        """A bound of all directional second derivatives on |y| <= s.
+        """A bound of the absolute directional second derivatives v . H v on |y| <= s, s a number or
+        array.
 
-        If |f_l| <= M on the unit sphere, |grad f_l| <= l M there: along a great circle f_l is a
-        trigonometric polynomial T of degree l, radially its derivative is l T, and
-        T'^2 + l^2 T^2 <= l^2 M^2 (Bernstein-Szego). A directional derivative of f_l is again
-        homogeneous and harmonic, of degree l-1, so |v.H v| <= l (l-1) M |y|^(l-2).
+        Let |f_l| <= M on the unit sphere. Then |grad f_l| <= l M there: along a great circle f_l is
+        a trigonometric polynomial T of degree l, its radial derivative is l T, and T'^2 + l^2 T^2
+        <= l^2 M^2 (Bernstein-Szego). A directional derivative of f_l is again homogeneous and
+        harmonic, of degree l-1, so |v . H v| <= l (l-1) M |y|^(l-2).
         """
         return self._derivative(s, 2)
 
     def gradient(self, s: Real) -> Real:
-        """A bound of the gradient on |y| <= s, |grad f_l| <= l M |y|^(l-1): see `curvature`."""
+        """A bound of |grad f| on |y| <= s, from |grad f_l| <= l M |y|^(l-1): see `curvature`."""
         return self._derivative(s, 1)
 
     def _derivative(self, s: Real, order: int) -> Real:
-        """The sum over l of l (l-1) .. (l-order+1) M |y|^(l-order), by Horner's rule."""
+        """The sum over l of l (l-1) .. (l-order+1) M_l s^(l-order), by Horner's rule, M_l = max
+        |f_l| on the unit sphere."""
         total = 0.0 * s
         max_abs = {degree: max(-low, high) for degree, low, high in self.ends}
         for degree in range(max(max_abs, default=0), order - 1, -1):
@@ -352,7 +398,7 @@ class BallRange:
         return total
 
     def at(self, s: Real) -> tuple[Real, Real]:
-        """Lower and upper bound on |y| <= s, a Dr.Jit array, from `ends` and `spheres`."""
+        """Lower and upper bound on |y| <= s, from `ends` and `spheres`; s is a Dr.Jit array."""
         lower, upper = self.by_degree(s)
         for radius, low, high in self.spheres:
             inside = s <= radius
@@ -361,19 +407,20 @@ class BallRange:
         return lower, upper
 
     def on_ball(self, s: float) -> tuple[float, float]:
-        """The range on |y| <= s, for a single number s."""
+        """Lower and upper bound on |y| <= s, from `ends` and `spheres`; s is a Python number."""
         bounds = [self.by_degree(s), *((low, high) for r, low, high in self.spheres if s <= r)]
         return max(low for low, _ in bounds), min(high for _, high in bounds)
 
 
 def _points(weights: Weights) -> tuple[FloatArray, float]:
-    """Sample points of the unit sphere, and their covering angle, for sums with these weights."""
+    """Sample points (3, n) of the unit sphere for sums with these weights, and the angle within
+    which each point of the sphere is near one of them."""
     covering = _RESOLUTION / max(1, max(degree for degree, _ in weights))
     return unit_sphere(covering), covering
 
 
 def _values(weights: Weights, points: FloatArray) -> dict[int, FloatArray]:
-    """The values of each f_l at points of the unit sphere."""
+    """The values (n,) of each f_l at points (3, n) of the unit sphere, by degree l."""
     degrees = sorted({degree for degree, _ in weights})
     return {
         degree: evaluate({k: w for k, w in weights.items() if k[0] == degree}, *points)[0]
@@ -382,7 +429,10 @@ def _values(weights: Weights, points: FloatArray) -> dict[int, FloatArray]:
 
 
 def sphere_range(values: dict[int, FloatArray], s: float, covering: float) -> tuple[float, float]:
-    """A proved range of the sum of f_l on the sphere of radius s; values: of each f_l on the unit
-    sphere."""
+    """A proved range (low, high) of the sum of all f_l on the sphere of radius s.
+
+    values: the values of each f_l at points of the unit sphere, by degree l.
+    covering: an angle. Every point of the unit sphere is within this angle of one of these points.
+    """
     total: FloatArray = np.sum([s**degree * v for degree, v in values.items()], axis=0)
     return proved_range(float(total.min()), float(total.max()), max(values), covering)

@@ -1,8 +1,9 @@
 """Sums of sine waves: their terms, values and gradients, and proved bounds of the sum.
 
 Every Laplacian eigenfunction that separates in Cartesian coordinates is a product of sines and
-cosines, and every such product is a sum of plane waves. Terms are evaluated in the user's form (a
-product needs one sine and one cosine for each coordinate), and bounded as plane waves.
+cosines, and every such product is a sum of plane waves. Terms are evaluated as the user wrote them,
+because a product needs only one sine and one cosine for each coordinate. They are bounded as sums
+of plane waves.
 """
 
 from __future__ import annotations
@@ -34,7 +35,14 @@ __all__ = [
 
 @dataclass(frozen=True)
 class WaveFactor:
-    """sin or cos of (frequency * coordinate + phase); see `sine_factor` and `cosine_factor`."""
+    """The factor sin(frequency * coordinate + phase), or cos, if `is_cosine`.
+
+    frequency: in radians per unit length, not 0.
+    phase: in radians.
+
+    Raises:
+        TypeError, ValueError: a number is not finite, or the frequency is 0.
+    """
 
     frequency: float
     phase: float
@@ -64,7 +72,7 @@ def cosine_factor(frequency: float = 1.0, phase: float = 0.0) -> WaveFactor:
 
 @dataclass(frozen=True)
 class WaveProduct:
-    """amplitude times a factor of each coordinate; coordinates without a factor do not enter.
+    """The product of the amplitude and of the factors for x, y and z. None stands for no factor.
 
     WaveProduct(2.0, x=sine_factor(3.0), y=cosine_factor(4.0)) is 2 sin(3x) cos(4y), an
     eigenfunction of the Laplacian with eigenvalue -(9 + 16).
@@ -87,14 +95,14 @@ class WaveProduct:
 
     @property
     def factors(self) -> tuple[tuple[int, WaveFactor], ...]:
-        """(axis, factor) for each coordinate that has a factor."""
+        """The pairs (axis, factor) for the coordinates that have a factor; axis is 0, 1 or 2."""
         named = enumerate((self.x, self.y, self.z))
         return tuple((axis, factor) for axis, factor in named if factor is not None)
 
 
 @dataclass(frozen=True)
 class PlaneWave:
-    """amplitude * cos(wave_vector . p + phase), eigenvalue -|wave_vector|^2."""
+    """amplitude * cos(wave_vector . p + phase): its Laplacian is -|wave_vector|^2 times itself."""
 
     amplitude: float
     wave_vector: tuple[float, float, float]
@@ -112,7 +120,7 @@ Term = WaveProduct | PlaneWave
 
 
 def checked_terms(terms: Iterable[Term]) -> tuple[Term, ...]:
-    """The terms as a tuple, of Python numbers.
+    """The terms as a tuple, with Python numbers as amplitudes and phases.
 
     Raises:
         ValueError, TypeError: there is no term, or a term is invalid; the message names the first
@@ -132,15 +140,15 @@ def checked_terms(terms: Iterable[Term]) -> tuple[Term, ...]:
     return tuple(checked)
 
 
-class _FactorRates:
-    """Factors and their derivatives at p; each sine and cosine is computed once."""
+class _FactorEvaluator:
+    """Evaluates factors and their derivatives at a point p; computes each sine and cosine once."""
 
     def __init__(self, p: Vec3) -> None:
         self._p = p
         self._sincos: dict[Any, tuple[Real, Real]] = {}
 
     def __call__(self, axis: int, factor: WaveFactor) -> tuple[Real, Real]:
-        """The factor and its derivative along the axis."""
+        """The values of the factor and of its derivative along the axis, at p."""
         key = (axis, factor.frequency, factor.phase)
         if key not in self._sincos:
             self._sincos[key] = sincos(_angle(factor.frequency * self._p[axis], factor.phase))
@@ -149,8 +157,9 @@ class _FactorRates:
 
 
 def evaluate_terms(terms: Sequence[Term], p: Vec3) -> tuple[Real, list[Real]]:
-    """Value and the three gradient components of the sum at p, a vector of Dr.Jit arrays."""
-    rates = _FactorRates(p)
+    """Value and the three components of the gradient of the sum of the terms at p, a Dr.Jit
+    vector."""
+    evaluate_factor = _FactorEvaluator(p)
     value, gradient = p[0] * 0.0, [p[0] * 0.0 for _ in range(3)]
     for term in terms:
         if isinstance(term, PlaneWave):
@@ -162,7 +171,7 @@ def evaluate_terms(terms: Sequence[Term], p: Vec3) -> tuple[Real, list[Real]]:
                 if k[axis] != 0:
                     gradient[axis] -= term.amplitude * k[axis] * s
             continue
-        values = [(axis, *rates(axis, factor)) for axis, factor in term.factors]
+        values = [(axis, *evaluate_factor(axis, factor)) for axis, factor in term.factors]
         value += _product([f for _, f, _ in values], term.amplitude)
         for axis, _, derivative in values:
             factors = [f for factor_axis, f, _ in values if factor_axis != axis]
@@ -171,12 +180,13 @@ def evaluate_terms(terms: Sequence[Term], p: Vec3) -> tuple[Real, list[Real]]:
 
 
 def hessian_of_terms(terms: Sequence[Term], p: Vec3) -> list[list[Real]]:
-    """The matrix of second derivatives of the sum at p, three rows of three.
+    """The matrix of second derivatives of the sum of the terms at p, as three rows of three.
 
-    A plane wave has -k k^T times itself. A factor of a product has -frequency^2 times itself as
-    its second derivative, and another axis differentiates another factor.
+    For a plane wave with wave vector k it is -k k^T times the wave. For a product, differentiating
+    twice along one axis multiplies it by -frequency^2; along two axes, each differentiates its own
+    factor.
     """
-    rates = _FactorRates(p)
+    evaluate_factor = _FactorEvaluator(p)
     upper = {(i, j): p[0] * 0.0 for i in range(3) for j in range(i, 3)}
     for term in terms:
         if isinstance(term, PlaneWave):
@@ -188,7 +198,7 @@ def hessian_of_terms(terms: Sequence[Term], p: Vec3) -> list[list[Real]]:
                     upper[i, j] -= k[i] * k[j] * wave
             continue
         frequency = {axis: factor.frequency for axis, factor in term.factors}
-        value = {axis: rates(axis, factor) for axis, factor in term.factors}
+        value = {axis: evaluate_factor(axis, factor) for axis, factor in term.factors}
         for i, j in upper:
             if i in value and j in value:
                 order = {axis: (axis == i) + (axis == j) for axis in value}
@@ -199,12 +209,12 @@ def hessian_of_terms(terms: Sequence[Term], p: Vec3) -> list[list[Real]]:
 
 
 def _angle(angle: Real, phase: float) -> Real:
-    """angle + phase, without an operation if the phase is 0."""
+    """angle + phase, without the addition if the phase is 0."""
     return angle + phase if phase else angle
 
 
 def _product(factors: Sequence[Real], amplitude: float) -> Real:
-    """The product of the factors and the amplitude."""
+    """The product of the amplitude and all factors, without a multiplication by 1."""
     product: Real = None
     for factor in factors:
         product = factor if product is None else product * factor
@@ -217,15 +227,19 @@ def _product(factors: Sequence[Real], amplitude: float) -> Real:
 class WaveBounds:
     """Proved bounds of a sum f = constant + sum_i A_i cos(k_i . p + phase_i), A_i > 0.
 
-    largest_value: |f - constant| <= sum A_i.
-    largest_curvature: |v . H v| <= sum A_i (k_i . v)^2 for the Hessian H and a unit v, at most
-        the largest eigenvalue of the matrix sum A_i k_i k_i^T.
-    largest_gradient: |v . grad f| <= sum A_i |k_i . v|, at most sum A_i |k_i|, and by
-        Cauchy-Schwarz at most sqrt(sum A_i) sqrt(sum A_i (k_i . v)^2).
-    max_third_derivative: |third derivative along v| <= sum A_i |k_i . v|^3, at most the largest
-        |k_i| times largest_curvature.
-    The gyroid's three terms give 3, 2, sqrt 6 and 2 sqrt 2 (true: 3/2, 2, sqrt 3, no more than
-    2.31).
+    wavenumbers: the |k_i|.
+    amplitudes: the A_i, in the same order.
+    largest_value: bounds |f - constant|; it is sum A_i.
+    largest_gradient: bounds |grad f|. For a unit vector v, |v . grad f| <= sum A_i |k_i . v|, which
+        is at most sum A_i |k_i| and, by Cauchy-Schwarz, at most sqrt(sum A_i) sqrt(sum A_i (k_i .
+        v)^2).
+    largest_curvature: bounds |v . H v| for unit vectors v and the Hessian H. It is the largest
+        eigenvalue of the matrix sum A_i k_i k_i^T, as |v . H v| <= sum A_i (k_i . v)^2.
+    max_third_derivative: bounds the absolute third derivative along v, which is at most sum A_i
+        |k_i . v|^3. It is the largest |k_i| times largest_curvature.
+
+    For the gyroid's three terms these bounds are 3, sqrt 6, 2 and 2 sqrt 2; the true largest values
+    are 3/2, sqrt 3, 2, and at most 2.31.
     """
 
     wavenumbers: tuple[float, ...]
@@ -238,7 +252,7 @@ class WaveBounds:
 
     @classmethod
     def of(cls, terms: Iterable[Term]) -> WaveBounds:
-        """The bounds of a sum, after adding up terms with equal wave vectors.
+        """The bounds of the sum of the terms. Waves with equal wave vectors are added first.
 
         Raises:
             ValueError: the sum is constant.
@@ -272,9 +286,12 @@ class WaveBounds:
 
 
 def mean_wavelength(amplitudes: npt.ArrayLike, wavenumbers: npt.ArrayLike) -> float:
-    """2 pi over the root mean square wavenumber, weighted by amplitudes: for a single wave its
-    length, for a sum the length of the waves that dominate its shape, and not of the shortest
-    wave."""
+    """2 pi over the root mean square of the wavenumbers, weighted by the absolute amplitudes.
+
+    amplitudes, wavenumbers: arrays (n,). For a single wave it is the wave's length; for a sum, the
+        length
+    of the waves that dominate its shape, and not that of the shortest wave.
+    """
     sizes, numbers = np.abs(amplitudes), np.asarray(wavenumbers, np.float64)
     largest = float(numbers.max())
     mean = float((sizes * (numbers / largest) ** 2).sum() / sizes.sum())
@@ -282,9 +299,10 @@ def mean_wavelength(amplitudes: npt.ArrayLike, wavenumbers: npt.ArrayLike) -> fl
 
 
 def _plane_waves(term: Term) -> list[tuple[tuple[float, ...], complex]]:
-    """(k, A) with term = sum of Re(A exp(i k . p)), k and -k written the same way.
+    """The plane waves of a term: pairs (k, A) with term = sum of Re(A exp(i k . p)), A complex.
 
-    A product cos a cos b cos c is the mean of cos(a +- b +- c) over the signs.
+    A product cos a cos b cos c is the mean of cos(a +- b +- c) over the signs. The wave vectors are
+    in the form of `_canonical`.
     """
     if isinstance(term, PlaneWave):
         phasor = term.amplitude * complex(math.cos(term.phase), math.sin(term.phase))
@@ -306,7 +324,11 @@ def _plane_waves(term: Term) -> list[tuple[tuple[float, ...], complex]]:
 
 
 def _canonical(k: Sequence[float], amplitude: complex) -> tuple[tuple[float, ...], complex]:
-    """The same wave with a positive first nonzero component of k: cos(k.p + t) = cos(-k.p - t)."""
+    """The wave vector k and the complex amplitude, in the form in which k and -k give the same
+    result.
+
+    The first nonzero component of the returned vector is positive: cos(k.p + t) = cos(-k.p - t).
+    """
     leading = next((v for v in k if v != 0), 0.0)
     if leading < 0:
         return tuple(-v + 0.0 for v in k), amplitude.conjugate()
