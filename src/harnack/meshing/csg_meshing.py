@@ -268,7 +268,7 @@ class CsgMesher:
             lattice,
             self.tolerance,
             self.report,
-            irrelevant=region or self._empty_region(),
+            elsewhere=region or self._empty_region(),
         )
 
     def _empty_region(self) -> IrrelevantRegion | None:

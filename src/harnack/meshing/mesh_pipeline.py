@@ -15,7 +15,7 @@ from harnack.fields.field import check_is_field
 from harnack.fields.solid_angles.dipole import DipolePotential
 from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.fields.solid_angles.winding_number import WindingNumber
-from harnack.geometry import Box, Volume, VolumeIntersection
+from harnack.geometry import Box, Volume
 from harnack.meshing.bcc_lattice import BccLattice
 from harnack.meshing.checks import (
     EmptySurfaceError,
@@ -60,6 +60,7 @@ from harnack.meshing.sign_isosurface import (
 )
 from harnack.progress import teller
 from harnack.tracer import Surface
+from harnack.tracer.surface import intersection_of
 from harnack.tracer.trace_options import SURFACE_OPTIONS, shows_keywords, surface_and_options
 
 if TYPE_CHECKING:
@@ -212,7 +213,7 @@ def mesh(
     is_closed = bool(solid) or thickness is not None
     if simplify and not is_closed:
         raise ValueError('simplify is for closed meshes: give side="below" or thickness as well')
-    volume = _volume(field, target.clip, target.section)
+    volume = intersection_of([field.domain, target.clip, target.section])
     asked = _MeshOptions(volume, accuracy, cell_size, seed, max_triangles, report)
     if uses_sign_meshing(field):
         made = _mesh_from_signs(field, level, solid, thickness is not None, asked)
@@ -308,6 +309,8 @@ def _mesh_from_signs(
         return _faces_alone(field, levels[0], solid, asked)
     volume, box = asked.volume, _box(field, levels, asked.volume)
     size = float((box.upper - box.lower).max())
+    if solid and _is_outside_inside(field, ends, box):
+        box = _unlimited_box(field, volume)
     cells, attempts = _cells_by_signs(field, size, asked.spacing)
     # Where nothing ends at the box, its cells should not lie along what is symmetrical.
     room = np.zeros(3) if box.has_walls else size * np.array([0.0037, 0.0053, 0.0029])
@@ -582,19 +585,6 @@ def _checked(field: Field) -> Field:
     return field
 
 
-def _volume(field: Field, clip: Volume | None, section: Volume | None) -> Volume | None:
-    """The intersection of the volumes that cut the level sets; None if there is none.
-
-    These are the clip, the section, and the domain of the field if the field ends there or there is
-    no clip."""
-    ends = field.domain is not None and not (field.is_global and clip is not None)
-    parts = dict.fromkeys((clip, field.domain if ends else None, section))
-    kept = [one for one in parts if one is not None]
-    if len(kept) < 2:
-        return kept[0] if kept else None
-    return VolumeIntersection(kept)
-
-
 def _mesh_solid(
     field: Field,
     level: float | None,
@@ -764,6 +754,36 @@ class _MeshingBox:
     lower: FloatArray
     upper: FloatArray
     has_walls: bool
+
+
+def _is_outside_inside(field: Field, ends: tuple[float, float], box: _MeshingBox) -> bool:
+    """Whether the outside of `box`, which contains all levels, belongs to the solid on which f lies
+    between both ends. No level passes there, so that the value at one point decides."""
+    center, half = 0.5 * (box.lower + box.upper), 0.5 * (box.upper - box.lower)
+    signs = np.array(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3)).reshape(3, -1).T
+    signs = signs[signs.any(axis=1)]
+    points = np.concatenate([center + factor * half * signs for factor in (1.5, 1.02)])
+    if field.domain is not None:
+        points = points[field.domain.contains_points(points)]
+    if not len(points):
+        return False
+    value = float(np.asarray(field.value(points[:1], precision="double"))[0])
+    return ends[0] <= value <= ends[1]
+
+
+def _unlimited_box(field: Field, volume: Volume | None) -> _MeshingBox:
+    """The box of the volume, for a solid that goes on outside of the box of its levels.
+
+    Raises:
+        MeshingError: the volume has no bounds, so that the solid has none.
+    """
+    bounds = None if volume is None else _bounds_of(volume)
+    if bounds is None or not np.isfinite(bounds).all():
+        raise MeshingError(
+            f"the solid on this side of the level of {type(field).__name__} reaches to infinity: "
+            "choose the other side, or give a clip with bounds, such as a box (harnack.Box)"
+        )
+    return _MeshingBox(*bounds, True)
 
 
 def _box(field: Field, levels: tuple[float, ...], volume: Volume | None) -> _MeshingBox:
