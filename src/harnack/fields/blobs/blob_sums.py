@@ -56,7 +56,7 @@ class SumValue:
 
 
 # The number of pieces of a path that is fastest: for a sum over all blobs, and for a sum over the
-# blobs of a grid cell. In a cell paths are short, and finding the blobs costs more than their ranges.
+# blobs of a grid cell. In a cell paths are short, and finding the blobs costs more than ranges.
 PIECES, PIECES_IN_CELL = 4, 3
 
 
@@ -318,12 +318,10 @@ def _second_derivative_range(
     at_a, at_b: the second derivative at a and at b.
     """
     has_minimum = (a <= 0) & (b >= 0)
-    has_right_maximum = (a <= chord.max_curvature_position) & (b >= chord.max_curvature_position)
-    has_left_maximum = (a <= -chord.max_curvature_position) & (b >= -chord.max_curvature_position)
+    has_right_peak = (a <= chord.max_curvature_position) & (b >= chord.max_curvature_position)
+    has_left_peak = (a <= -chord.max_curvature_position) & (b >= -chord.max_curvature_position)
     lower = dr.select(has_minimum, chord.min_second, fmin(at_a, at_b))
-    return lower, dr.select(
-        has_left_maximum | has_right_maximum, chord.max_second, fmax(at_a, at_b)
-    )
+    return lower, dr.select(has_left_peak | has_right_peak, chord.max_second, fmax(at_a, at_b))
 
 
 def _with_jumps(
