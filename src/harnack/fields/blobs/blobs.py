@@ -190,13 +190,13 @@ class Blobs(Formula):
             return path.enclose(self.evaluate(p))
         data = self._prepared(p)
         empty_length: Real | None = None
-        list_start, length = p, fmin(ahead, data.max_path_length)
+        start_point, length = p, fmin(ahead, data.max_path_length)
         if data.grid is not None:
             empty_length = skipped = data.grid.empty_run(p, d, ahead)
-            list_start = dr.fma(type(p)(skipped), d, p)
-            exit_distance = data.grid.cell(list_start).exit_distance(d)
+            start_point = dr.fma(type(p)(skipped), d, p)
+            to_exit = data.grid.cell(start_point).exit_distance(d)
             length = fmin(
-                dr.select(skipped > 0, exit_distance, fmin(ahead, exit_distance)),
+                dr.select(skipped > 0, to_exit, fmin(ahead, to_exit)),
                 data.max_path_length,
             )
         path.proofs.from_restriction(recorder, no_slope, length)
@@ -205,10 +205,10 @@ class Blobs(Formula):
             sums = sum_along(
                 self.kernel,
                 data.backend,
-                list_start,
+                start_point,
                 d,
                 recorder.knots,
-                data.near(list_start),
+                data.near(start_point),
                 signed=data.has_negative_weights,
             )
             start = (
@@ -222,8 +222,8 @@ class Blobs(Formula):
             slope = dr.dot(start.gradient, d)
             enclosures = (
                 GroupMaximumEnclosure(
-                    self.kernel, data.grouped(list_start), path, list_start, start.value, recorder.knots, length,
-                    data.has_negative_weights,
+                    self.kernel, data.grouped(start_point), path, start_point, start.value,
+                    recorder.knots, length, data.has_negative_weights,
                 ),
             )  # fmt: skip
         if empty_length is not None:
@@ -423,35 +423,31 @@ def _checked(
     Raises:
         BlobError: wrong shapes, or numbers that are not valid for a blob.
     """
-    center_array = as_real_array(centers, "centers", BlobError).astype(np.float64)
-    check_vectors(center_array, "centers", BlobError)
-    if not len(center_array):
+    c = as_real_array(centers, "centers", BlobError).astype(np.float64)
+    check_vectors(c, "centers", BlobError)
+    if not len(c):
         raise BlobError("centers: there are none; give at least one blob")
-    check_finite(center_array, "center {}", BlobError)
-    check_coordinate_size(center_array, BlobError)
-    radius_array = _numbers(radii, "radii", len(center_array))
-    bad = np.flatnonzero(~(radius_array > 0))
+    check_finite(c, "center {}", BlobError)
+    check_coordinate_size(c, BlobError)
+    r = _numbers(radii, "radii", len(c))
+    bad = np.flatnonzero(~(r > 0))
     if bad.size:
         raise BlobError(f"radius {bad[0]} is {r[bad[0]]:g}: radii must be positive")
-    check_coordinate_size(radius_array, BlobError)
-    weight_array = (
-        np.ones(len(center_array))
-        if weights is None
-        else _numbers(weights, "weights", len(center_array))
-    )
+    check_coordinate_size(r, BlobError)
+    w = np.ones(len(c)) if weights is None else _numbers(weights, "weights", len(c))
     if groups is None:
-        return center_array, radius_array, weight_array, None
-    group_array = as_real_array(groups, "groups", BlobError)
-    if group_array.shape != (len(center_array),) or group_array.dtype.kind not in "iu":
+        return c, r, w, None
+    g = as_real_array(groups, "groups", BlobError)
+    if g.shape != (len(c),) or g.dtype.kind not in "iu":
         raise BlobError(
             f"groups must be {len(c)} integers, one for each blob, not {g.dtype} of shape {g.shape}"
         )
-    order = np.argsort(group_array, kind="stable")
+    order = np.argsort(g, kind="stable")
     return (
-        center_array[order],
-        radius_array[order],
-        weight_array[order],
-        np.unique(group_array[order], return_inverse=True)[1],
+        c[order],
+        r[order],
+        w[order],
+        np.unique(g[order], return_inverse=True)[1],
     )
 
 

@@ -392,8 +392,8 @@ def _solve_coefficients(points: FloatArray, normals: FloatArray) -> tuple[FloatA
     """
     center, n = points.mean(axis=0), len(points)
     size = float(np.abs(points - center).max()) or 1.0
-    scaled_points = (points - center) / size
-    offsets = scaled_points[:, None] - scaled_points[None]  # from column to row
+    scaled = (points - center) / size
+    offsets = scaled[:, None] - scaled[None]  # from column to row
     r = np.linalg.norm(offsets, axis=2)
     with np.errstate(divide="ignore", invalid="ignore"):
         outer = np.where(
@@ -433,22 +433,22 @@ def _checked(points: Any, normals: Any) -> tuple[FloatArray, FloatArray]:
     Raises:
         ValueError: wrong shapes or numbers, or a repeated point.
     """
-    point_array = as_real_array(points, "points").astype(np.float64)
-    check_vectors(point_array, "points")
-    if not 2 <= len(point_array) <= _MOST_POINTS:
+    x = as_real_array(points, "points").astype(np.float64)
+    check_vectors(x, "points")
+    if not 2 <= len(x) <= _MOST_POINTS:
         raise ValueError(f"points: {len(x):,} given, but 2 to {_MOST_POINTS:,} can be used")
-    check_finite(point_array, "point {}", ValueError)
-    check_coordinate_size(point_array, ValueError)
-    normal_array = as_real_array(normals, "normals").astype(np.float64)
-    check_vectors(normal_array, "normals")
-    if len(normal_array) != len(point_array):
+    check_finite(x, "point {}", ValueError)
+    check_coordinate_size(x, ValueError)
+    n = as_real_array(normals, "normals").astype(np.float64)
+    check_vectors(n, "normals")
+    if len(n) != len(x):
         raise ValueError(f"{len(x)} points and {len(n)} normals: there must be one for each point")
-    check_finite(normal_array, "normal {}", ValueError, "normals must be finite")
-    length = np.linalg.norm(normal_array, axis=1)
+    check_finite(n, "normal {}", ValueError, "normals must be finite")
+    length = np.linalg.norm(n, axis=1)
     if not (length > 0).all():
         raise ValueError(f"normal {int(np.argmin(length))} is zero: it has no direction")
-    _, first, counts = np.unique(point_array, axis=0, return_index=True, return_counts=True)
+    _, first, counts = np.unique(x, axis=0, return_index=True, return_counts=True)
     if (counts > 1).any():
         index = int(first[np.argmax(counts > 1)])
         raise ValueError(f"point {index} is given more than once: leave out the others")
-    return point_array, normal_array / length[:, None]
+    return x, n / length[:, None]
