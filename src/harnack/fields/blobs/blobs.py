@@ -144,10 +144,8 @@ class Blobs(Formula):
         lists = self.cell_lists
         if lists is None:
             return float(gradients.sum())
-        running_sums = np.concatenate([[0.0], np.cumsum(gradients[lists.entries])])
-        return float((running_sums[lists.starts[1:]] - running_sums[lists.starts[:-1]]).max()) * (
-            1 + 1e-6
-        )
+        sums = np.concatenate([[0.0], np.cumsum(gradients[lists.entries])])
+        return float((sums[lists.starts[1:]] - sums[lists.starts[:-1]]).max()) * (1 + 1e-6)
 
     def extent(self, levels: tuple[float, ...]) -> Volume:
         """The box around all supports, for any levels: outside of it f is 0."""
@@ -341,9 +339,9 @@ class _BlobDeviceData:
 def _blob_records(backend: Backend, blobs: Blobs) -> FloatArray:
     """The records (n, 8) of blobs.
 
-    Columns: 0 to 2 the center, rounded to the precision of the backend; 3 to 5 the rest of the
-        center, which rounding has cut off; 6 the inverse of the support's radius; 7 the amplitude
-        w_i A.
+    A record holds, by columns: 0 to 2 the center, rounded to the precision of the backend; 3 to 5
+    the rest of the center, which rounding has cut off; 6 the inverse of the support's radius; 7 the
+    amplitude w_i A.
 
     Raises:
         BlobError: a blob that is too small, too large or too far away for the precision.

@@ -97,27 +97,24 @@ class HRBF(Formula):
     def _largest_gradient(self) -> float | None:
         """A bound of |grad f| in the domain; None for a domain without bounds.
 
-        It is the sum of bounds of the terms: |grad (a r^3 + b . grad r^3)| <= 3 |a| r^2 + 6 |b| r,
-            with r the largest distance of the domain from the point.
+        It adds up bounds of the terms: |grad (a r^3 + b . grad r^3)| <= 3 |a| r^2 + 6 |b| r, with r
+        the largest distance of the domain from the point.
         """
         if self.domain is None or not np.isfinite(corners := np.array(self.domain.bounds())).all():
             return None
         max_offsets = np.abs(corners[:, None] - self.points).max(axis=0)
-        max_distance = np.linalg.norm(max_offsets, axis=1)
+        r = np.linalg.norm(max_offsets, axis=1)
         vector_norms = np.linalg.norm(self.gradient_coefficients, axis=1)
-        return float(
-            (
-                3 * np.abs(self.value_coefficients) * max_distance * max_distance
-                + 6 * vector_norms * max_distance
-            ).sum()
-        ) * (1 + 1e-6)
+        return float((3 * np.abs(self.value_coefficients) * r * r + 6 * vector_norms * r).sum()) * (
+            1 + 1e-6
+        )
 
     def _uploaded(self, backend: Backend) -> tuple[Backend, RecordTable]:
         """The backend, and the records of the points on it.
 
-        Columns of a record: 0 to 2 the point, rounded to the precision of the backend; 3 to 5 the
-            rest of the point, which rounding has cut off; 6 the number a; 7 to 9 the vector 3 b; 10
-            to 15 zeros.
+        A record holds, by columns: 0 to 2 the point, rounded to the precision of the backend; 3 to
+        5 the rest of the point, which rounding has cut off; 6 the number a; 7 to 9 the vector 3 b;
+        10 to 15 zeros.
         """
         rounded = self.points.astype(backend.dtype).astype(np.float64)
         rows = np.column_stack(

@@ -96,23 +96,36 @@ def cell_noise(kind: Fade, t: Any, vectors: Any) -> tuple[Any, list[Any], list[A
     gradient: list[Any] = [0.0] * 3
     hessian: list[Any] = [0.0] * 6
 
-    def weight(corner: tuple[int, ...], orders: list[int]) -> Any:
+    def weight_derivative(corner: tuple[int, ...], orders: list[int]) -> Any:
+        """A product of three factors, one for each axis: the weight of a corner, or a derivative of
+        it.
+
+        corner: 0 or 1 for each axis.
+        orders: the order of the derivative along each axis, 0 to 2.
+        """
         return (
             weights[0][orders[0]][corner[0]]
             * weights[1][orders[1]][corner[1]]
             * weights[2][orders[2]][corner[2]]
         )
 
-    for corner, g in zip(CORNERS, vectors, strict=True):
-        dot = sum(g[k] * (t[k] - corner[k]) for k in range(3))
-        w = weight(corner, [0, 0, 0])
-        value = value + w * dot
-        dw = [weight(corner, [int(i == k) for i in range(3)]) for k in range(3)]
+    # The ramp of a corner is the linear function vector . (t - corner).
+    for corner, vector in zip(CORNERS, vectors, strict=True):
+        ramp = sum(vector[k] * (t[k] - corner[k]) for k in range(3))
+        corner_weight = weight_derivative(corner, [0, 0, 0])
+        value = value + corner_weight * ramp
+        weight_slopes = [
+            weight_derivative(corner, [int(i == k) for i in range(3)]) for k in range(3)
+        ]
         for k in range(3):
-            gradient[k] = gradient[k] + (w * g[k] + dw[k] * dot)
+            gradient[k] = gradient[k] + (corner_weight * vector[k] + weight_slopes[k] * ramp)
         for m, (i, j) in enumerate(itertools.combinations_with_replacement(range(3), 2)):
             orders = [int(i == k) + int(j == k) for k in range(3)]
-            hessian[m] = hessian[m] + (dw[i] * g[j] + dw[j] * g[i] + weight(corner, orders) * dot)
+            hessian[m] = hessian[m] + (
+                weight_slopes[i] * vector[j]
+                + weight_slopes[j] * vector[i]
+                + weight_derivative(corner, orders) * ramp
+            )
     return value, gradient, hessian
 
 
@@ -164,7 +177,8 @@ class FractalNoise(FormulaSolid):
             object.__setattr__(self, name, value)
 
     def _sum(self, power: float) -> float:
-        """The sum of a_i (2^i k)^power, rounded up."""
+        """The sum of a_i (2^i k)^power over the octaves i, rounded up. Times a bound of the noise's
+        derivatives of order `power`, it bounds those of f."""
         terms = (2.0 ** (i * (power - self.beta)) for i in range(self.octaves))
         return self.amplitude * self.frequency**power * sum(terms) * (1.0 + 1e-5)
 
@@ -199,7 +213,10 @@ class FractalNoise(FormulaSolid):
         return Lipschitz(0 * p.x + first), TaylorRemainder(0 * p.x + second)
 
     def _data(self, like: Real) -> dict[str, Any]:
-        """The attributes of the noise, prepared for the backend of a number."""
+        """The attributes of the noise as numbers of a backend.
+
+        like: any number of that backend.
+        """
         prepared = self if hasattr(self, "_falls") else self.prepare(backend_of(like))
         return vars(prepared)
 
@@ -222,23 +239,27 @@ class FractalNoise(FormulaSolid):
         return self._octaves([x, y, z])[0][0]
 
     def _octaves(self, q: list[Real], *, each: bool = False) -> list[tuple[Any, Any, Any]]:
-        """Value, gradient and Hessian of the sum; or, if `each`, of each octave."""
+        """A list of tuples (value, gradient (3,), Hessian (6,) as in `cell_noise`): a single tuple
+        for the sum of all octaves or, if `each`, one for each octave.
+
+        q: the coordinates x, y and z of the points.
+        """
         data = self._data(q[0])
         scale, amplitude = data["frequency"], data["amplitude"]
         octaves: list[tuple[Any, list[Any], list[Any]]] = []
         for octave in range(self.octaves):
             position = [entry * scale for entry in q]
             floors = [dr.floor(dr.detach(entry)) for entry in position]
-            t = [a - b for a, b in zip(position, floors, strict=True)]
+            cell_position = [a - b for a, b in zip(position, floors, strict=True)]
             integer = dr.int32_array_t(cast("Any", type(q[0])))
-            natural = dr.uint32_array_t(cast("Any", type(q[0])))
-            base = [natural(integer(entry)) for entry in floors]
+            unsigned = dr.uint32_array_t(cast("Any", type(q[0])))
+            cell_index = [unsigned(integer(entry)) for entry in floors]
             seed = data["_seed"] + octave
             vectors: list[Any] = []
             for corner in CORNERS:
-                i, j, k = (b + c for b, c in zip(base, corner, strict=True))
+                i, j, k = (b + c for b, c in zip(cell_index, corner, strict=True))
                 vectors.append(lattice_vector(i, j, k, seed, q[0]))
-            value, gradient, hessian = cell_noise(self.fade, t, vectors)
+            value, gradient, hessian = cell_noise(self.fade, cell_position, vectors)
             slope = amplitude * scale
             octaves.append(
                 (
@@ -260,37 +281,37 @@ class FractalNoise(FormulaSolid):
         return [total]
 
     def _ranges(self, coordinates: list[Jet]) -> Jet:
-        """The jet of the sum from jets of the coordinates: the sum of the octaves' jets."""
+        """The jet of f from jets of the coordinates: the sum of the octaves' jets."""
         like = coordinates[0].backend_number()
         like = like if coordinates[0].jet_at_start is None else coordinates[0].piece_length
         starts = [
             start if start.jet_at_start is None else start.jet_at_start for start in coordinates
         ]
-        at = [0 * like + start.value_on_backend(like).midpoint for start in starts]
+        center = [0 * like + start.value_on_backend(like).midpoint for start in starts]
         radii = [0 * like + start.value_on_backend(like).radius for start in starts]
-        data, constants = self._data(at[0]), CONSTANTS[self.fade]
-        epsilon = 2 * float(dr.epsilon(cast("Any", type(at[0]))))
+        data, constants = self._data(center[0]), CONSTANTS[self.fade]
+        epsilon = 2 * float(dr.epsilon(cast("Any", type(center[0]))))
         scale, amplitude = data["frequency"], data["amplitude"]
         total: Jet | None = None
-        for value, gradient, hessian in self._octaves(at, each=True):
+        for value, gradient, hessian in self._octaves(center, each=True):
             # Thirty operations for each corner. The position in the cell has the rounding error of
             # the coordinate, so that there is no bound where the lattice is finer than the spacing
             # of numbers.
-            size = fmax(fmax(dr.abs(at[0]), dr.abs(at[1])), dr.abs(at[2])) * scale
-            lost = dr.select(size < 2.0**30, epsilon * size, dr.inf)
+            size = fmax(fmax(dr.abs(center[0]), dr.abs(center[1])), dr.abs(center[2])) * scale
+            position_error = dr.select(size < 2.0**30, epsilon * size, dr.inf)
             octave = _Octave(
-                at=at,
+                center=center,
                 value=value,
                 gradient=gradient,
                 hessian=hessian,
                 slope=amplitude * scale * constants.max_gradient * (1 + 1e-5),
                 bend=amplitude * scale * scale * constants.max_second_derivative * (1 + 1e-5),
-                error=amplitude * (32 * epsilon + constants.max_gradient * 2 * lost),
+                error=amplitude * (32 * epsilon + constants.max_gradient * 2 * position_error),
                 slope_error=amplitude
                 * scale
-                * (64 * epsilon + constants.max_second_derivative * 2 * lost),
+                * (64 * epsilon + constants.max_second_derivative * 2 * position_error),
             )
-            jet = octave.jet(coordinates, starts, _length(radii))
+            jet = octave.jet(coordinates, starts, _norm3(radii))
             total = jet if total is None else total + jet
             amplitude, scale = amplitude * data["_falls"], 2 * scale
         return cast("Jet", total)
@@ -352,15 +373,16 @@ class DisplacedSolid(FormulaSolid):
 
 @dataclass(frozen=True)
 class _Octave:
-    """An octave of noise about a point.
+    """An octave of fractal noise, sampled at a point, with bounds that hold around it.
 
-    at: the point.
-    value, gradient, hessian: of the octave at the point.
-    slope, bend: bounds of the first and second derivatives everywhere.
-    error, slope_error: bounds of the errors of value and gradient.
+    center: the coordinates of the point.
+    value, gradient, hessian: of the octave at the point; the Hessian (6,) as in `cell_noise`.
+    slope: a bound of the length of the gradient, everywhere.
+    bend: a bound of all second derivatives, everywhere.
+    error, slope_error: bounds of the rounding errors of value and gradient at the point.
     """
 
-    at: list[Real]
+    center: list[Real]
     value: Real
     gradient: list[Real]
     hessian: list[Real]
@@ -369,35 +391,45 @@ class _Octave:
     error: Real
     slope_error: Real
 
-    def jet(self, coordinates: list[Jet], starts: list[Jet], off: Real) -> Jet:
-        """The octave's jet, from jets of the coordinates and from their starts, which are within
-        `off` of the point.
+    def jet(self, coordinates: list[Jet], starts: list[Jet], start_error: Real) -> Jet:
+        """The octave's jet, from jets of the coordinates.
 
-        Proof. Within m of the point the gradient differs from that at the point by at most bend m
-        (mean value theorem), and derivatives along a path follow by the chain rule. The value is
-        that at the start plus the integral of the slope.
+        coordinates: the jets, at a point or on a piece of a path.
+        starts: the jets where the piece starts, or `coordinates` themselves for a point. Their
+            values lie within `start_error` of the octave's point.
+
+        Proof. Within the distance m of the point, the gradient differs from that at the point by at
+        most bend m (mean value theorem). Derivatives along a path follow by the chain rule. The
+        value is that at the start plus the integral of the slope.
         """
-        error = self.error + self.slope * off * (1 + 1e-5)
+        error = self.error + self.slope * start_error * (1 + 1e-5)
         value = Interval(self.value - error, self.value + error)
         if coordinates[0].jet_at_start is None:
             # At points of space, not on pieces of length 0, the Hessian is known.
             is_point = len(coordinates[0].first_derivatives) > 1
-            return self._derivatives(coordinates, off, value, is_point=is_point)
-        start = self._derivatives(starts, off, value, is_point=False)
-        distances = [
+            return self._derivatives(coordinates, start_error, value, is_point=is_point)
+        start = self._derivatives(starts, start_error, value, is_point=False)
+        offsets = [
             fmax(dr.abs(coordinate.value.upper - q), dr.abs(coordinate.value.lower - q))
-            for coordinate, q in zip(coordinates, self.at, strict=True)
+            for coordinate, q in zip(coordinates, self.center, strict=True)
         ]
-        distance = _length(distances) * (1 + 1e-5)
+        distance = _norm3(offsets) * (1 + 1e-5)
         error = error + self.slope * distance
         piece_value = Interval(self.value - error, self.value + error)
         piece = self._derivatives(coordinates, distance, piece_value, is_point=False)
         return piece.narrowed_from_start(start, coordinates[0].piece_length)
 
-    def _derivatives(self, jets: list[Jet], reach: Real, value: Interval, *, is_point: bool) -> Jet:
-        """The jet from jets of the coordinates, which are within `reach` of the point, and from the
-        value's range. If `is_point`, second derivatives are those of the Hessian."""
-        change = self.bend * reach + self.slope_error
+    def _derivatives(
+        self, jets: list[Jet], distance: Real, value: Interval, *, is_point: bool
+    ) -> Jet:
+        """The jet from jets of the coordinates and from the range of the value.
+
+        jets: of the coordinates, whose values lie within `distance` of the octave's point.
+        value: the range of the value.
+        is_point: whether second derivatives are those of the Hessian; else they are bounded by
+            `bend`.
+        """
+        change = self.bend * distance + self.slope_error
         slopes = [
             Interval(fmax(g - change, -self.slope), -fmax(-g - change, -self.slope))
             for g in self.gradient
@@ -406,8 +438,8 @@ class _Octave:
         speeds: list[Real] = []
         for i in range(len(jets[0].first_derivatives)):
             rates = [jet.first_derivatives[i] for jet in jets]
-            speed = _length([0 * self.value + r.max_abs for r in rates]) * (1 + 1e-5)
-            rate = _sum([g * r for g, r in zip(slopes, rates, strict=True)])
+            speed = _norm3([0 * self.value + r.max_abs for r in rates]) * (1 + 1e-5)
+            rate = _interval_sum([g * r for g, r in zip(slopes, rates, strict=True)])
             limit = self.slope * speed
             first.append(Interval(fmax(rate.lower, -limit), -fmax(-rate.upper, -limit)))
             speeds.append(speed)
@@ -417,31 +449,37 @@ class _Octave:
             bound = self.bend * speeds[i] * speeds[j]
             quadratic = Interval(-bound, bound)
             if is_point:
-                quadratic = _quadratic(
+                quadratic = _hessian_form(
                     [Interval(h - rounding, h + rounding) for h in self.hessian], jets, i, j
                 )
             rate = [g * jet.second_derivatives[k] for g, jet in zip(slopes, jets, strict=True)]
-            second.append(_sum([quadratic, *rate]))
+            second.append(_interval_sum([quadratic, *rate]))
         return Jet(value, tuple(first), tuple(second))
 
 
-def _sum(parts: list[Interval]) -> Interval:
+def _interval_sum(parts: list[Interval]) -> Interval:
+    """The sum of intervals."""
     total = parts[0]
     for part in parts[1:]:
         total = total + part
     return total
 
 
-def _quadratic(hessian: list[Interval], jets: list[Jet], i: int, j: int) -> Interval:
-    """x_i^T H x_j."""
+def _hessian_form(hessian: list[Interval], jets: list[Jet], i: int, j: int) -> Interval:
+    """x_i^T H x_j, where x_i is the derivative of the coordinates by variable i.
+
+    hessian: the upper triangle (6,) of H, row by row.
+    jets: of the three coordinates.
+    """
     terms: list[Interval] = []
     for m, (a, b) in enumerate(itertools.combinations_with_replacement(range(3), 2)):
         across = jets[a].first_derivatives[i] * jets[b].first_derivatives[j]
         if a != b:
             across = across + jets[b].first_derivatives[i] * jets[a].first_derivatives[j]
         terms.append(hessian[m] * across)
-    return _sum(terms)
+    return _interval_sum(terms)
 
 
-def _length(parts: list[Real]) -> Real:
+def _norm3(parts: list[Real]) -> Real:
+    """The length of a vector with three components."""
     return dr.sqrt(parts[0] * parts[0] + parts[1] * parts[1] + parts[2] * parts[2])
