@@ -135,10 +135,13 @@ class CompactKernel(BlobKernel):
     """The compact polynomial kernel (1 - q)^3, whose second derivative is continuous (Aydinlilar
     and Zanni 2023, eq. 7 with n = 6).
 
-    Along a line, with w = S^2 - x^2: f' = -6 x w^2, f'' = 6 w (4 x^2 - w) and f''' = 24 x (3w -
-    2x^2). So f'' = 0 at x^2 = S^2/5, and f''' = 0 at x = 0 and at x^2 = 3 S^2/5.
-
     support: where a blob ends, in units of its radius.
+
+    Along a line, with w = S^2 - x^2,
+
+        f' = -6 x w^2,    f'' = 6 w (4 x^2 - w),    f''' = 24 x (3w - 2x^2).
+
+    So f'' = 0 at x^2 = S^2/5, and f''' = 0 at x = 0 and at x^2 = 3 S^2/5.
     """
 
     support: float = 1.6  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -166,11 +169,11 @@ class CompactKernel(BlobKernel):
 
     def chord(self, height: Real, inside: Real) -> ChordProfile:
         half, squared = dr.sqrt(inside), inside * inside
-        zero_position = math.sqrt(0.2) * half
+        zero_x = math.sqrt(0.2) * half
         return ChordProfile(
             half,
-            zero_position,
-            3.84 * squared * zero_position,
+            zero_x,
+            3.84 * squared * zero_x,
             math.sqrt(0.6) * half,
             4.8 * squared,
             -6 * squared,
@@ -196,13 +199,17 @@ class SexticKernel(BlobKernel):
     """The sextic kernel of soft objects, 1 - 22/9 q + 17/9 q^2 - 4/9 q^3 = w^2 (5 + 4w)/9 with w =
     1 - q (Wyvill, McPheeters and Wyvill 1986; Hart 1996, appendix D).
 
-    Along a line, with w = S^2 - x^2: f' = -4/9 x w (5 + 6w), f'' = -4/9 w (5 + 6w) + 8/9 x^2 (5 +
-    12w) and f''' = 4/9 x (15 + 36w - 24x^2). So f''' = 0 at x = 0 and at x^2 = 1/4 + 3/5 S^2. If
-    that second position lies outside of the chord, f'' rises from 0 until S. f'' = 0 is a quadratic
-    equation in x^2. The sum of its roots is 1/2 + 6/5 S^2, and their product is S^2 (5 + 6 S^2)/30;
-    the larger root lies outside of the chord.
-
     support: where a blob ends, in units of its radius.
+
+    Along a line, with w = S^2 - x^2,
+
+        f' = -4/9 x w (5 + 6w),    f'' = -4/9 w (5 + 6w) + 8/9 x^2 (5 + 12w),
+        f''' = 4/9 x (15 + 36w - 24x^2).
+
+    So f''' = 0 at x = 0 and at x^2 = 1/4 + 3/5 S^2. If that second position lies outside of the
+    chord, f'' rises from x = 0 until S. f'' = 0 is a quadratic equation in x^2. The sum of its
+    roots is 1/2 + 6/5 S^2, and their product is S^2 (5 + 6 S^2)/30; the larger root lies outside of
+    the chord.
     """
 
     support: float = 2.0  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -228,19 +235,17 @@ class SexticKernel(BlobKernel):
         return dr.select(q < 1, dr.fma(8 / 3, 1 - q, 10 / 9), 0)
 
     def chord(self, height: Real, inside: Real) -> ChordProfile:
-        root_sum = dr.fma(1.2, inside, 0.5)
-        root_product = inside * dr.fma(0.2, inside, 1 / 6)
-        zero_position = dr.sqrt(
-            2 * root_product / (root_sum + dr.sqrt(fmax(root_sum * root_sum - 4 * root_product, 0)))
-        )
-        peak_position = dr.sqrt(fmin(dr.fma(0.6, inside, 0.25), inside))
-        first_at_zero, _ = self.derivatives(height, inside, zero_position)
-        _, max_second = self.derivatives(height, inside, peak_position)
+        total = dr.fma(1.2, inside, 0.5)
+        product = inside * dr.fma(0.2, inside, 1 / 6)
+        zero_x = dr.sqrt(2 * product / (total + dr.sqrt(fmax(total * total - 4 * product, 0))))
+        peak_x = dr.sqrt(fmin(dr.fma(0.6, inside, 0.25), inside))
+        first, _ = self.derivatives(height, inside, zero_x)
+        _, max_second = self.derivatives(height, inside, peak_x)
         return ChordProfile(
             dr.sqrt(inside),
-            zero_position,
-            -first_at_zero,
-            peak_position,
+            zero_x,
+            -first,
+            peak_x,
             max_second,
             -inside * dr.fma(8 / 3, inside, 20 / 9),
         )
@@ -276,12 +281,14 @@ class CubicKernel(BlobKernel):
     """The cubic kernel of soft objects, 1 - 3 r^2 + 2 r^3 = (1 - r)^2 (1 + 2r) with r^2 = q (Hart
     1996, eq. 36).
 
-    Along a line at the distance h from the center, r^2 = h^2 + x^2, f' = -6 x (1 - r), f'' = -6 (1
-    - r - x^2/r) and f''' = 6 x/r (3 - x^2/r^2). So f'' rises from x = 0 until S. f'' = 0 where r +
-    x^2/r = 1, which is the quadratic equation with the solution x^2 = (1 - 4h^2 + sqrt(1 +
-    8h^2))/8.
-
     support: where a blob ends, in units of its radius.
+
+    Along a line at the distance h from the center, with r^2 = h^2 + x^2,
+
+        f' = -6 x (1 - r),    f'' = -6 (1 - r - x^2/r),    f''' = 6 x/r (3 - x^2/r^2).
+
+    So f'' rises from x = 0 until S. f'' = 0 where r + x^2/r = 1. This gives a quadratic equation
+    for x^2, whose solution is x^2 = (1 - 4h^2 + sqrt(1 + 8h^2))/8.
     """
 
     support: float = 2.0  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -309,12 +316,10 @@ class CubicKernel(BlobKernel):
 
     def chord(self, height: Real, inside: Real) -> ChordProfile:
         half = dr.sqrt(inside)
-        zero_position = dr.sqrt(fmax(1 + dr.sqrt(dr.fma(8, height, 1)) - 4 * height, 0) * 0.125)
-        zero_position = fmin(zero_position, half)
-        first_at_zero, _ = self.derivatives(height, inside, zero_position)
-        return ChordProfile(
-            half, zero_position, -first_at_zero, half, 6 * inside, 6 * dr.sqrt(height) - 6
-        )
+        zero_x = dr.sqrt(fmax(1 + dr.sqrt(dr.fma(8, height, 1)) - 4 * height, 0) * 0.125)
+        zero_x = fmin(zero_x, half)
+        first, _ = self.derivatives(height, inside, zero_x)
+        return ChordProfile(half, zero_x, -first, half, 6 * inside, 6 * dr.sqrt(height) - 6)
 
     def derivatives(self, height: Real, inside: Real, x: Real) -> tuple[Real, Real]:
         square = x * x
@@ -358,11 +363,13 @@ class GaussianKernel(BlobKernel):
     tail: the value of the Gaussian where the blob ends, as a fraction of its value at the radius.
     rate: b as a kernel parameter, which `prepare` sets; None otherwise.
 
-    Along a line, with z = b (S^2 - x^2) and y = b x^2: f' = -2 b x (e^z - 1), f'' = 2b (e^z (2y -
-    1) + 1) and f''' = 4 b^2 x e^z (3 - 2y). So the maximum of f'' is at y = 3/2, or at x = S if S
-    is nearer. f'' = 0 where e^-y (1 - 2y) = e^-(b S^2). So y is a function of the single number
-    e^-(b S^2), and is approximated by a polynomial. The polynomial's error e changes the extreme
-    value of f' by the order of e^2.
+    Along a line, with z = b (S^2 - x^2) and y = b x^2,
+
+        f' = -2 b x (e^z - 1),    f'' = 2b (e^z (2y - 1) + 1),    f''' = 4 b^2 x e^z (3 - 2y).
+
+    So the maximum of f'' is at y = 3/2, or at x = S if S is nearer. f'' = 0 where e^-y (1 - 2y) =
+    e^-(b S^2). So y is a function of the single number e^-(b S^2), and is approximated by a
+    polynomial. The polynomial's error e changes the extreme value of f' by the order of e^2.
     """
 
     sharpness: float = 1.0
@@ -415,30 +422,27 @@ class GaussianKernel(BlobKernel):
 
     def chord(self, height: Real, inside: Real) -> ChordProfile:
         b = self._rate
-        center_z = b * inside
-        center_exp = dr.exp(center_z)
-        inverse_exp = 1 / center_exp
+        z = b * inside
+        exp_z = dr.exp(z)
+        u = 1 / exp_z
         polynomial: Any = _ZERO_OF_SECOND[-1]
         for coefficient in reversed(_ZERO_OF_SECOND[:-1]):
-            polynomial = dr.fma(polynomial, inverse_exp, coefficient)
-        y = fmax((1 - inverse_exp) * polynomial, 0)
-        zero_position = dr.sqrt(y / b)
-        peak_is_at_end = center_z < 1.5
+            polynomial = dr.fma(polynomial, u, coefficient)
+        y = fmax((1 - u) * polynomial, 0)
+        zero_x = dr.sqrt(y / b)
+        is_at_end = z < 1.5
         max_second = (
             2
             * b
-            * (
-                2 * dr.select(peak_is_at_end, center_z, center_exp * math.exp(-1.5))
-                + dr.select(peak_is_at_end, 0, 1)
-            )
+            * (2 * dr.select(is_at_end, z, exp_z * math.exp(-1.5)) + dr.select(is_at_end, 0, 1))
         )
         return ChordProfile(
             dr.sqrt(inside),
-            zero_position,
-            2 * b * zero_position * (dr.exp(center_z - y) - 1),
-            dr.sqrt(fmin(1.5, center_z) / b),
+            zero_x,
+            2 * b * zero_x * (dr.exp(z - y) - 1),
+            dr.sqrt(fmin(1.5, z) / b),
             max_second,
-            -2 * b * (center_exp - 1),
+            -2 * b * (exp_z - 1),
         )
 
     def derivatives(self, height: Real, inside: Real, x: Real) -> tuple[Real, Real]:
