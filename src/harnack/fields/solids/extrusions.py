@@ -318,20 +318,20 @@ class ExtrusionEnclosure(Enclosure):
             self.value - end_distance + self.error,
             self.value - self.side.value + self.error,
         )
-        length_down = fmax(gaps.below, self._fall(gaps.below - end_deficit))
+        down = fmax(gaps.below, self._fall(gaps.below - end_deficit))
         side_gap = gaps.below - side_deficit
-        length_down = fmax(
-            dr.select(side_gap > 0, self.side.free_length(LevelGaps(side_gap, inf)), 0), length_down
+        down = fmax(
+            dr.select(side_gap > 0, self.side.free_length(LevelGaps(side_gap, inf)), 0), down
         )
         is_inside = self.value + gaps.above + self.error <= 0  # also for unrounded numbers
         error = 2 * self.error
-        length_up = fmin(
+        up = fmin(
             self._rise(gaps.above + end_deficit - error),
             self.side.free_length(LevelGaps(inf, fmax(gaps.above + side_deficit - error, 0))),
         )
-        length_up = fmax(gaps.above, dr.select(is_inside, length_up, 0))
+        up = fmax(gaps.above, dr.select(is_inside, up, 0))
         is_valid = (gaps.below >= 0) & (gaps.above >= 0)
-        return dr.select(is_valid, fmin(length_down, length_up) * (1 - 1e-6), 0)
+        return dr.select(is_valid, fmin(down, up) * (1 - 1e-6), 0)
 
     def _fall(self, gap: Real) -> Real:
         """A length of the path on which w falls by less than `gap`."""
@@ -375,13 +375,10 @@ def outline_distance_jet(nearest: Callable[[Real, Real], OutlineSample], x: Jet,
         limit = dr.sqrt(dr.fma(a, a, b * b)) * (1 + 1e-5)
         return Interval(-limit, limit)
 
-    def or_range_on_ball(at_point: Interval, on_ball: Interval) -> Interval:
-        """The interval `at_point` at a point, and the interval `on_ball` where the coordinates are
-        those of a ball."""
-        lower, upper = (
-            (zero + at_point.lower, on_ball.lower),
-            (zero + at_point.upper, on_ball.upper),
-        )
+    def or_range_on_ball(jet_u: Interval, limit: Interval) -> Interval:
+        """An interval: `jet_u` where the coordinates are those of a point, and `limit` where they
+        are ranges that stand for a ball."""
+        lower, upper = (zero + jet_u.lower, limit.lower), (zero + jet_u.upper, limit.upper)
         return Interval(*(dr.select(is_ball, b, a) for a, b in (lower, upper)))
 
     all_numbers = Interval(zero - dr.inf, zero + dr.inf)
@@ -479,8 +476,8 @@ class SolidOfRevolution(Solid):
     def _sample(self, p: Vec3, r: Real, outward: tuple[Real, Real], side: OutlineSample) -> Sample:
         """The sample at p, from that of the outline in the half-plane.
 
-        r, outward: the distance from the axis and the unit vector away from it, as `_from_axis` returns
-            them.
+        r: the distance of p from the axis.
+        outward: x and y of the unit vector from the axis to p.
         side: the sample of the distance from the outline.
         """
         epsilon = 2 * float(dr.epsilon(type(p.x)))

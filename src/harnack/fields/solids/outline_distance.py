@@ -27,8 +27,9 @@ if TYPE_CHECKING:
 
 # The number of edges from which on they are read by chains.
 _MIN_EDGES_FOR_CHAINS = 48
-# Along a line the distance is bounded at knots. The inner knots are these fractions of the requested
-# length or, if that is infinite, of this multiple of the largest coordinate and the outline's size.
+# Along a line the distance is bounded at knots. The inner knots are these fractions of the length
+# asked for or, if that is infinite, of this multiple of the largest coordinate and the outline's
+# size.
 _KNOT_FRACTIONS = (0.0625, 0.125, 0.25, 0.5)
 _ENDLESS_LENGTH = 8.0
 # The error of the vector between a point and an edge, in roundings of the terms of the vector.
@@ -184,10 +185,8 @@ class OutlineEdges:
 
         state: before any edge.
         """
-        (nearest_square,) = chains.for_each(
-            query.chain_upper_bound, (query.x + dr.inf,), "outline chains"
-        )
-        max_distance = dr.sqrt(nearest_square) * (1 + 1e-5) + query.error
+        (square,) = chains.for_each(query.chain_upper_bound, (query.x + dr.inf,), "outline chains")
+        max_distance = dr.sqrt(square) * (1 + 1e-5) + query.error
         index = type(chains.iteration_count)(0)
 
         def visit_chain(i: Any, *state: Any) -> tuple[Any, ...]:
@@ -196,16 +195,14 @@ class OutlineEdges:
             count, state = query.with_chain(record, max_distance, state)
             first, count = type(i)(record[6]), type(i)(count)
 
-            def visit_edge(j: Any, *edge_state: Any) -> tuple[Any, ...]:
+            def each(j: Any, *edge_state: Any) -> tuple[Any, ...]:
                 """The state with edge j of the chain added."""
                 return j + 1, *query.with_edge(self.edges.read_record(first + j), edge_state)
 
-            def has_more_edges(j: Any, *_: Any) -> Mask:
+            def has_more(j: Any, *_: Any) -> Mask:
                 return j < count
 
-            return i + 1, *dr.while_loop(
-                (type(i)(0), *state), has_more_edges, visit_edge, label="outline"
-            )[1:]
+            return i + 1, *dr.while_loop((type(i)(0), *state), has_more, each, label="outline")[1:]
 
         def has_more_chains(i: Any, *_: Any) -> Mask:
             return i < chains.iteration_count
@@ -245,11 +242,8 @@ class _OutlineQuery:
         from_x, from_y = self.x - row[0], self.y - row[1]
         edge_x, edge_y = row[2] - row[0], row[3] - row[1]
         fraction = dr.fma(from_x, edge_x, from_y * edge_y) * row[4]
-        nearest_fraction = clamp(fraction, 0, 1)
-        to_x, to_y = (
-            dr.fma(edge_x, -nearest_fraction, from_x),
-            dr.fma(edge_y, -nearest_fraction, from_y),
-        )
+        t = clamp(fraction, 0, 1)
+        to_x, to_y = dr.fma(edge_x, -t, from_x), dr.fma(edge_y, -t, from_y)
         inverse_length, cross_product = dr.sqrt(row[4]), dr.fma(edge_x, from_y, -edge_y * from_x)
         is_inner = (fraction > 0) & (fraction < 1)
         distance = dr.sqrt(dr.fma(to_x, to_x, to_y * to_y))
