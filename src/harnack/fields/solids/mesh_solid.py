@@ -128,7 +128,9 @@ class MeshSolid(Solid):
     than 1/2 times, which is the union where its parts overlap or touch. f is the distance from the
     boundary of that union.
 
-    f| is the distance from the nearest triangle, which is found in a tree; so its Lipschitz constant is 1. Its error is at most 16 epsilons of the size of the mesh and of the distance from its center (`tree.closest_triangles.ClosestPointOnTriangle`).
+    |f| is the distance from the nearest triangle, which is found in a tree; so its Lipschitz
+    constant is 1. Its error is at most 16 epsilons of the size of the mesh and of the distance from
+    its center (`tree.closest_triangles.ClosestPointOnTriangle`).
 
     Proof of the sign. The sign is that of the winding number less 1/2. The winding number is the
     sum of the signs of the crossings of the mesh with a ray along z
@@ -306,7 +308,7 @@ class _MeshData(UnitFrame):
         corners = self.corners.read_record(closest.triangle, closest.triangle != NO_TRIANGLE)
         to_corners = [vector(*corners[k : k + 3]) - (x + closest.offset) for k in (0, 3, 6)]
         rounding = _DISTANCE_ROUNDINGS * self.backend.machine_epsilon * (1 + dr.max(dr.abs(x)))
-        at_vertex, edge_direction, min_offset = (
+        at_vertex, along, min_distance = (
             self.backend.Bool(False),
             vector(0),
             self.backend.Float(dr.inf),
@@ -315,13 +317,13 @@ class _MeshData(UnitFrame):
             edge = to_corners[b] - to_corners[a]
             length = dr.norm(edge)
             edge_distance = dr.norm(dr.cross(to_corners[a], edge)) / length
-            edge_direction = dr.select(edge_distance < min_offset, edge / length, edge_direction)
-            min_offset = fmin(edge_distance, min_offset)
+            along = dr.select(edge_distance < min_distance, edge / length, along)
+            min_distance = fmin(edge_distance, min_distance)
             at_vertex |= dr.norm(to_corners[a]) <= rounding
         on_edge = ~closest.is_inner & ~at_vertex
         return (
             self._signed_sample(p, x, closest),
-            edge_direction,
+            along,
             on_edge,
             ~closest.is_inner & at_vertex,
         )
@@ -387,7 +389,7 @@ def _triangle_tree(
     """A tree of triangles for closest points and ray crossings.
 
     weights: (m,) or a number: the crossings of a face count this many times.
-    slabs: passed on to `TriangleTree.of`.
+    slabs: whether nodes have slabs besides boxes, for closest points from far away.
     """
     tree = build_balanced_tree(vertices[faces].mean(axis=1), leaf_size=_LEAF_SIZE)
     records = triangle_records(vertices, faces)
@@ -549,14 +551,14 @@ class ClosedSurface:
         center = round_to_single(0.5 * (lower + upper))
         unit = (vertices - center) / size
 
-        def describe_place(corners: FloatArray) -> str:
+        def place(corners: FloatArray) -> str:
             """The center of triangles, as text in the mesh's own units, for messages.
 
             corners: of one triangle (3, 3), in unit coordinates.
             """
             return format_vector(center + size * corners.mean(axis=0))
 
-        pieces, area = _boundary_pieces(unit, net.faces, net.multiplicity, describe_place)
+        pieces, area = _boundary_pieces(unit, net.faces, net.multiplicity, place)
         corners = unit[net.faces] if pieces is None else pieces
         box = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
         return cls(unit, net.faces, net.multiplicity, center, size, pieces, box, area * size**2)
@@ -566,13 +568,13 @@ def _boundary_pieces(
     unit: FloatArray,
     faces: IntArray,
     weights: IntArray,
-    describe_place: Callable[[FloatArray], str],
+    place: Callable[[FloatArray], str],
 ) -> tuple[FloatArray | None, float]:
     """The triangles between winding numbers below and above 1/2, and their area.
 
     unit: (n, 3) the vertices in unit coordinates.
     faces, weights: as in `ClosedSurface`.
-    describe_place: returns the text for a place near a triangle, for messages.
+    place: returns the text for a place near a triangle, for messages.
 
     Faces are cut into pieces where they meet other faces. The result is the corners (k, 3, 3) of
     the pieces that bound the solid, or None if these are all faces, uncut. Pieces run
@@ -599,28 +601,28 @@ def _boundary_pieces(
     is_thick = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) > _THIN_HEIGHT * longest
     front, back = windings_of_sides(rays, pieces)
     lower, upper = np.minimum(front, back), np.maximum(front, back)
-    if (is_wrong := is_thick & (lower < 0)).any():
+    if (wrong := is_thick & (lower < 0)).any():
         if (upper[is_thick] <= 0).all():
             raise MeshError(
                 "the mesh is inside out: its faces run clockwise as seen from outside; turn them "
                 "by mesh.invert() or faces[:, ::-1]"
             )
         raise MeshError(
-            f"a part of the mesh is inside out, such as near {describe_place(pieces[is_wrong][0])}: turn the "
+            f"a part of the mesh is inside out, such as near {place(pieces[wrong][0])}: turn the "
             "faces of that part (trimesh.repair.fix_normals(mesh, multibody=True) tries), or take "
             "harnack.WindingNumber, which asks for no sides"
         )
-    is_wrong = np.zeros(len(pieces), np.bool_)
+    wrong = np.zeros(len(pieces), np.bool_)
     for barycentric in _PROBE_POINTS:
         front_probe, back_probe = winding_numbers_of_sides(rays, pieces, barycentric)
-        is_wrong |= (front_probe != lower) | (back_probe != upper)
+        wrong |= (front_probe != lower) | (back_probe != upper)
     is_kept, jump = (lower < 0.5) & (upper > 0.5), upper - lower
     if not _is_closed(pieces[is_kept], jump[is_kept], is_thick[is_kept]):
-        is_wrong |= jump != 1  # where components are in contact, or faces are repeated
-    if (is_wrong := is_wrong & is_thick).any():
+        wrong |= jump != 1  # where components are in contact, or faces are repeated
+    if (wrong := wrong & is_thick).any():
         raise MeshError(
-            f"{int(is_wrong.sum()):,} faces of the mesh lie on parts of others, such as near "
-            f"{describe_place(pieces[is_wrong][0])}: join the parts that touch there, as trimesh.boolean.union "
+            f"{int(wrong.sum()):,} faces of the mesh lie on parts of others, such as near "
+            f"{place(pieces[wrong][0])}: join the parts that touch there, as trimesh.boolean.union "
             "does"
         )
     is_inward = front > back
