@@ -194,16 +194,11 @@ def field_jet(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
         TypeError: the field promises no bound of its second derivatives.
     """
     coordinates = (x, y, z)
-    starts = [
-        coordinate if coordinate.jet_at_start is None else coordinate.jet_at_start
-        for coordinate in coordinates
-    ]
-    q = _vector(*(0 * x.piece_length + coordinate.value.midpoint for coordinate in starts))
+    starts = [entry if entry.jet_at_start is None else entry.jet_at_start for entry in coordinates]
+    q = _vector(*(0 * x.piece_length + entry.value.midpoint for entry in starts))
     sample = field.evaluate(q)
     bound, radius = _second_derivative_bound(field, sample)
-    offset = safe_norm(
-        type(q)(*(0 * x.piece_length + coordinate.value.radius for coordinate in starts))
-    )
+    offset = safe_norm(type(q)(*(0 * x.piece_length + entry.value.radius for entry in starts)))
     rows = _hessian_rows(field, q) if len(x.second_derivatives) == _PAIR_COUNT else None
     second_error = 2 * bound
     if rows is not None:
@@ -222,23 +217,17 @@ def field_jet(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
         """
         limit = dr.select(distance <= radius, bound, dr.inf)
         spread = limit * distance * (1 + 1e-5) + sample.gradient_error
-        slopes = [
-            Interval(coordinate - spread, coordinate + spread) for coordinate in sample.gradient
-        ]
+        slopes = [Interval(entry - spread, entry + spread) for entry in sample.gradient]
         first = tuple(
             _interval_sum(
-                g * coordinate.first_derivatives[i]
-                for g, coordinate in zip(slopes, jets, strict=True)
+                g * entry.first_derivatives[i] for g, entry in zip(slopes, jets, strict=True)
             )
             for i in range(len(x.first_derivatives))
         )
         speeds = [
             safe_norm(
                 type(q)(
-                    *(
-                        0 * x.piece_length + coordinate.first_derivatives[i].max_abs
-                        for coordinate in jets
-                    )
+                    *(0 * x.piece_length + entry.first_derivatives[i].max_abs for entry in jets)
                 )
             )
             for i in range(len(x.first_derivatives))
@@ -248,8 +237,7 @@ def field_jet(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
             _variable_pairs(len(x.first_derivatives), len(x.second_derivatives))
         ):
             rate = _interval_sum(
-                g * coordinate.second_derivatives[k]
-                for g, coordinate in zip(slopes, jets, strict=True)
+                g * entry.second_derivatives[k] for g, entry in zip(slopes, jets, strict=True)
             )
             if rows is None:
                 margin = limit * speeds[i] * speeds[j] * (1 + 1e-5)
@@ -276,8 +264,8 @@ def field_jet(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
     if x.jet_at_start is None:
         return start
     offsets = (
-        fmax(dr.abs(coordinate.value.upper - m), dr.abs(coordinate.value.lower - m))
-        for coordinate, m in zip(coordinates, q, strict=True)
+        fmax(dr.abs(entry.value.upper - m), dr.abs(entry.value.lower - m))
+        for entry, m in zip(coordinates, q, strict=True)
     )
     first, second = derivative_ranges(list(coordinates), safe_norm(type(q)(*offsets)) * (1 + 1e-5))
     span = Interval(0 * x.piece_length, 0 * value.lower + x.piece_length)
@@ -298,8 +286,8 @@ def _variable_pairs(n: int, count: int) -> list[tuple[int, int]]:
     return [(i, j) for i in range(n) for j in range(i, n)][:count]
 
 
-# The number of second derivatives by three coordinates. And: if coordinates of jets have an error of
-# up to this many roundings, they stand for a point, else for a range.
+# The number of second derivatives by three coordinates. And the number of roundings: coordinates of
+# jets with an error of at most so many stand for a point, others for a range.
 _PAIR_COUNT, _MAX_POINT_ROUNDINGS = 6, 256.0
 
 
