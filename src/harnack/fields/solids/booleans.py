@@ -28,8 +28,9 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
     from harnack.geometry import Volume
 
-# The other operands narrow the range of the value only if that shifts it by more than this fraction
-# of its error; at creases the shift is nearly always smaller.
+# The bounds of other operands may narrow the range of the value, which moves the middle of the range.
+# This is done only if the middle moves by more than this fraction of the value's error; at creases it
+# nearly always moves less.
 _MIN_SHIFT = 0.25
 
 
@@ -49,7 +50,13 @@ def intersection(*solids: Solid) -> Solid:
 
 
 def _flatten_operands(solids: tuple[Solid, ...], *, is_union: bool) -> tuple[Solid, ...]:
-    """The operands, with those of nested unions (or intersections) in place of these."""
+    """The operands of a union (or intersection). An operand that is itself a union (or
+    intersection) is replaced by its own operands.
+
+    Raises:
+        ValueError: no solids.
+        TypeError: an argument that is not a solid.
+    """
     if not solids:
         raise ValueError("give at least one solid")
     flat: list[Solid] = []
@@ -65,11 +72,16 @@ def _flatten_operands(solids: tuple[Solid, ...], *, is_union: bool) -> tuple[Sol
 
 @dataclass(frozen=True, eq=False)
 class BooleanSolid(Solid):
-    """The union, min f_i, or the intersection, max f_i, of solids.
+    """The union of solids, with the function min f_i, or their intersection, with the function max
+    f_i.
 
-    If the f_i are distances, the minimum is exact outside and only a bound inside, and the maximum
-    is only a bound. Hart 1996, equation 16, calls the union exact inside too; unit discs at -1/2
-    and 1/2 show that it is not: the distance at 0 is 0.866, and not 0.5.
+    parts: the solids.
+    is_union: whether it is their union; else it is their intersection.
+
+    If the f_i are distances, the minimum is the exact distance outside and only a bound inside, and
+    the maximum is only a bound. Hart 1996, equation 16, calls the union exact inside too. Unit
+    discs about -1/2 and 1/2 are a counterexample: at 0 the distance is 0.866, but the minimum gives
+    0.5.
     """
 
     parts: tuple[Solid, ...]
@@ -105,25 +117,26 @@ class BooleanSolid(Solid):
             return VolumeIntersection(bounded) if len(bounded) > 1 else next(iter(bounded), None)
         if len(bounded) < len(extents):
             return None
-        return _around(bounded)
+        return _box_around_volumes(bounded)
 
     @property
     def is_steep(self) -> bool:
         return any(part.is_steep for part in self.parts)
 
     def prepare(self, backend: Backend) -> Solid:
-        return self._of([part.prepare(backend) for part in self.parts])
+        return self._with_parts([part.prepare(backend) for part in self.parts])
 
     def at_accuracy(self, detail: Real) -> Field:
-        return self._of([part.at_accuracy(detail) for part in self.parts])
+        return self._with_parts([part.at_accuracy(detail) for part in self.parts])
 
     def for_ray_count(self, count: int) -> Field:
         def make(parts: list[Any]) -> Solid:
+            """The combination of other operands."""
             return BooleanSolid(tuple(parts), self.is_union)
 
         return self._for_rays(self.parts, count, make)
 
-    def _of(self, parts: list[Field]) -> Solid:
+    def _with_parts(self, parts: list[Field]) -> Solid:
         """The same combination of other operands, which need not be solids."""
         combination = copy.copy(self)
         object.__setattr__(combination, "parts", tuple(parts))
@@ -153,70 +166,85 @@ class BooleanSolid(Solid):
         return rows
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """The largest derivative errors of the operands that may be the extreme one. They are
-        infinite where rounding leaves open which operand is extreme, since derivatives jump
-        there."""
+        """The largest derivative errors of the operands that may be the extreme one (for a union
+        the least, for an intersection the greatest). They are infinite where rounding leaves open
+        which operand is extreme, since derivatives jump there."""
         size = max_norm(p)
         sign = -1.0 if self.is_union else 1.0
         total_error = value_error_bound(sample, safe_norm(sample.gradient), size)
-        count, max_first, max_second = 0 * p.x, 0 * p.x, 0 * p.x
+        candidate_count, max_first, max_second = 0 * p.x, 0 * p.x, 0 * p.x
         for part in self.parts:
-            operand = part.evaluate(p)
-            error = value_error_bound(operand, safe_norm(operand.gradient), size)
-            is_open = ~(sign * (sample.value - operand.value) > error + total_error)
-            count = count + dr.select(is_open, 1.0, 0.0)
-            first, second = part.derivative_errors(p, operand)
+            part_sample = part.evaluate(p)
+            part_error = value_error_bound(part_sample, safe_norm(part_sample.gradient), size)
+            may_be_extreme = ~(sign * (sample.value - part_sample.value) > part_error + total_error)
+            candidate_count = candidate_count + dr.select(may_be_extreme, 1.0, 0.0)
+            first, second = part.derivative_errors(p, part_sample)
             # NaN is kept, as it bounds nothing.
-            max_first = dr.select(is_open & ~(first <= max_first), first, max_first)
-            max_second = dr.select(is_open & ~(second <= max_second), second, max_second)
-        is_single = count <= 1
+            max_first = dr.select(may_be_extreme & ~(first <= max_first), first, max_first)
+            max_second = dr.select(may_be_extreme & ~(second <= max_second), second, max_second)
+        is_single = candidate_count <= 1
         return dr.select(is_single, max_first, dr.inf), dr.select(is_single, max_second, dr.inf)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The ray sample of the combination, from those of all operands, by `MaximumEnclosure`."""
-        looks = [operand.sample_ray(path, t, ahead, back) for operand in self.parts]
+        """The ray sample of the combination, from the ray samples of all operands. Its enclosures
+        are `MaximumEnclosure`s."""
+        ray_samples = [operand.sample_ray(path, t, ahead, back) for operand in self.parts]
         size = max_norm(path.origin) + t
-        sample, below, extreme = self._combine_samples([operand.sample for operand in looks], size)
-        slope, slope_error = looks[-1].slope, looks[-1].slope_error_bound
-        for look in looks[:-1]:
-            is_chosen = look.sample.value == extreme
-            slope = dr.select(is_chosen, look.slope, slope)
-            slope_error = dr.select(is_chosen, look.slope_error_bound, slope_error)
-        front = self._enclosures([operand.forward for operand in looks], below)
-        behind = self._enclosures([operand.backward for operand in looks], below)
-        growth = max(operand.reach_growth for operand in looks)
-        return RaySample(sample, front, behind, slope, growth, slope_error)
+        sample, deficits, extreme = self._combine_samples(
+            [operand.sample for operand in ray_samples], size
+        )
+        slope, slope_error = ray_samples[-1].slope, ray_samples[-1].slope_error_bound
+        for ray_sample in ray_samples[:-1]:
+            is_chosen = ray_sample.sample.value == extreme
+            slope = dr.select(is_chosen, ray_sample.slope, slope)
+            slope_error = dr.select(is_chosen, ray_sample.slope_error_bound, slope_error)
+        forward = self._combine_enclosures([operand.forward for operand in ray_samples], deficits)
+        backward = self._combine_enclosures([operand.backward for operand in ray_samples], deficits)
+        growth = max(operand.reach_growth for operand in ray_samples)
+        return RaySample(sample, forward, backward, slope, growth, slope_error)
 
-    def _enclosures(
-        self, operands: list[tuple[Enclosure, ...]], below: list[tuple[Real, Real]]
+    def _combine_enclosures(
+        self, operands: list[tuple[Enclosure, ...]], deficits: list[tuple[Real, Real]]
     ) -> tuple[Enclosure, ...]:
         """The enclosures of the combination from those of its operands; () if an operand has none.
 
-        below: for each operand, bounds of the difference by which it is below the greatest operand.
+        operands: the enclosures of each operand.
+        deficits: for each operand, bounds (lower, upper) of how much it is below the greatest
+            operand. (For a union, operands are negated first.)
         """
         if not all(operands):
             return ()
         if self.is_union:
             operands = [tuple(NegatedEnclosure(kind) for kind in kinds) for kinds in operands]
         greatest = MaximumEnclosure(
-            tuple(MaximumOperand(*gaps, kinds) for gaps, kinds in zip(below, operands, strict=True))
+            tuple(
+                MaximumOperand(*bounds, kinds)
+                for bounds, kinds in zip(deficits, operands, strict=True)
+            )
         )
         return (NegatedEnclosure(greatest),) if self.is_union else (greatest,)
 
     def _combine_samples(
         self, samples: list[Sample], size: Real
     ) -> tuple[Sample, list[tuple[Real, Real]], Real]:
-        """The sample of the combination; for each operand bounds (lower, upper) of the difference
-        by which it is below the greatest operand; and the greatest (for a union, the least) value.
+        """The sample of the combination from those of the operands.
 
-        Proof of the errors. Let v_i be values with errors e_i (all rounding, `value_error_bound`),
-        v = v_k the greatest. max f_i <= max(v_i + e_i) = v + max(e_i - (v - v_i)), and max f_i >=
-        v_k - e_k. So max(e_i - (v - v_i)) is the error of the combination. As max f_i >= v_j - e_j
-        for every j, an operand with a smaller error may exclude most of that range. Then the value
-        is the middle of the remaining range, for otherwise a ray would hit, by the rounding of an
-        operand, a surface that lies inside of another operand. The tracer subtracts the error of
-        the combination from its gaps. If the error of an operand is larger, the excess is
-        subtracted from the difference by which the operand is below.
+        samples: of the operands, at one point.
+        size: a bound of the absolute values of the point's coordinates.
+
+        Returns the sample; for each operand, bounds (lower, upper) of how much it is below the
+        greatest operand; and the greatest value of an operand. For a union all this is about
+        negated operands, except that the least value itself is returned.
+
+        Proof of the errors. Let v_i be the values of the operands f_i, e_i bounds of their errors
+        (all rounding included, `value_error_bound`), and v = v_k the greatest value. Then max f_i
+        <= max(v_i + e_i) = v + max(e_i - (v - v_i)), and max f_i >= v_k - e_k. So max(e_i - (v -
+        v_i)) bounds the error of the combination. As max f_i >= v_j - e_j for every j, an operand
+        with a smaller error may exclude most of that range. Then the value is set to the middle of
+        the remaining range. Otherwise a ray would hit, by the rounding of one operand, a surface
+        that lies inside of another operand. The tracer subtracts the error of the combination from
+        its level gaps. If the error of an operand is larger, the excess is subtracted from the
+        bound of how much the operand is below.
         """
         sign = -1.0 if self.is_union else 1.0
         values = [sign * operand.value for operand in samples]
@@ -235,40 +263,40 @@ class BooleanSolid(Solid):
             value_error_bound(operand, safe_norm(operand.gradient), size) for operand in samples
         ]
         error, truncation = 0 * greatest, 0 * greatest
-        for sample, operand_value, value_error in zip(samples, values, errors, strict=True):
-            gap = greatest - operand_value
-            error = fmax(fmax(value_error - gap, sample.value_error - gap), error)
-            truncation = fmax(sample.truncation_error - gap, truncation)
+        for sample, operand_value, operand_error in zip(samples, values, errors, strict=True):
+            deficit = greatest - operand_value
+            error = fmax(fmax(operand_error - deficit, sample.value_error - deficit), error)
+            truncation = fmax(sample.truncation_error - deficit, truncation)
         lower_bound = values[0] - errors[0]
-        for operand_value, value_error in zip(values[1:], errors[1:], strict=True):
-            lower_bound = fmax(operand_value - value_error, lower_bound)
+        for operand_value, operand_error in zip(values[1:], errors[1:], strict=True):
+            lower_bound = fmax(operand_value - operand_error, lower_bound)
         shift = 0.5 * (lower_bound - (greatest - error))
         shift = dr.select(shift > _MIN_SHIFT * error, shift, 0)
         extreme, value = value, value + sign * shift
         greatest, error = greatest + shift, error - shift
         # `Sample.value_error` leaves out the rounding that follows from value and gradient.
-        unstated = Sample(value, gradient, ())
-        stated = value_error_bound(unstated, safe_norm(gradient), size)
-        joined = Sample(
-            value, gradient, self._common_lipschitz(samples), fmax(error - stated, 0), slope_error,
+        plain_sample = Sample(value, gradient, ())
+        plain_error = value_error_bound(plain_sample, safe_norm(gradient), size)
+        combined = Sample(
+            value, gradient, self._common_lipschitz(samples), fmax(error - plain_error, 0), slope_error,
             truncation_error=truncation,
         )  # fmt: skip
-        stated_error = value_error_bound(joined, safe_norm(gradient), size)
+        combined_error = value_error_bound(combined, safe_norm(gradient), size)
         return (
-            joined,
+            combined,
             [
                 (
-                    fmax(greatest - operand_value - fmax(value_error - stated_error, 0), 0),
-                    greatest - operand_value + fmax(value_error - stated_error, 0),
+                    fmax(greatest - operand_value - fmax(operand_error - combined_error, 0), 0),
+                    greatest - operand_value + fmax(operand_error - combined_error, 0),
                 )
-                for operand_value, value_error in zip(values, errors, strict=True)
+                for operand_value, operand_error in zip(values, errors, strict=True)
             ],
             extreme,
         )
 
     def _common_lipschitz(self, samples: list[Sample]) -> tuple[Lipschitz, ...]:
-        """The largest of the operands' Lipschitz constants, which is a constant of the combination;
-        () if an operand promises none."""
+        """The largest of the operands' Lipschitz constants on the smallest of their balls, as a
+        promise of the combination; () if an operand promises no constant."""
         constant: Any = 0.0
         radius: Any = math.inf
         for sample in samples:
@@ -295,8 +323,9 @@ def lipschitz_of(sample: Sample) -> Lipschitz | None:
     return next(stated, None) or next((promise for promise in implied if promise is not None), None)
 
 
-def _around(volumes: list[Volume]) -> Volume | None:
-    """A box around volumes; a volume itself if it is alone; None if they are unbounded."""
+def _box_around_volumes(volumes: list[Volume]) -> Volume | None:
+    """A box that contains several volumes. A single volume is returned as it is; None if the
+    volumes have no bounds."""
     corners = [volume.bounds() for volume in volumes]
     lower = np.min([volume for volume, _ in corners], axis=0)
     upper = np.max([volume for _, volume in corners], axis=0)
@@ -365,7 +394,10 @@ def negated_sample(sample: Sample) -> Sample:
 class OffsetSolid(SolidOfField):
     """An offset of a solid: the points where f <= distance.
 
-    Proof. f - distance has the enclosures of f, and its Lipschitz constant.
+    field: the solid with the function f.
+    distance: the level of f that becomes the surface. Where f is a distance, the solid grows by it.
+
+    Proof. The function f - distance has the enclosures of f, and its Lipschitz constant.
     """
 
     field: Solid
@@ -390,7 +422,8 @@ class OffsetSolid(SolidOfField):
         return self._shifted(self.field.evaluate(p))
 
     def _shifted(self, sample: Sample) -> Sample:
-        """The sample of f - distance, with the rounding of the difference."""
+        """The sample of f - distance from that of f. Its error includes the rounding of the
+        difference."""
         size = dr.abs(sample.value) + abs(self.distance)
         return sample.map_promises(
             lambda promise: promise.shifted(-self.distance),
@@ -454,10 +487,12 @@ class BlendedSolid(FormulaSolid):
         )
 
     def _min_operand_bound(self, level: float) -> float:
-        """A bound of the smaller of both functions where their blended union is at most `level`.
+        """A bound of the smaller of the two functions at all points where their blended union is at
+        most `level`.
 
-        Proof. The blend grows with both functions, so it is at least the blend of the smaller value
-        m with itself: r - 2^(1/p) (r - m) for m < r, and m for larger m.
+        Proof. The blend grows with both functions. So it is at least the blend of the smaller value
+        m with itself. With r the radius and p the power, that is r - 2^(1/p) (r - m) for m < r, and
+        m for larger m.
         """
         if level >= self.radius:
             return level
