@@ -144,15 +144,12 @@ class Julia(Solid):
         """f, its gradient, a bound of the error of f, and for each radius a bound of |grad f| on
         the ball of that radius about p.
 
-        radii: increasing or not; the first must be 0, so that the error is that of rounding alone.
+        radii: the first must be 0, so that the error of f is that of rounding alone.
 
-        The notation is that of `Julia`.
+        In the notation of `Julia`, `size` is |c|, b is B, and for each radius `change` holds e_n,
+        `slopes` d_n, `min_q` m_n and `rates` g_n.
         """
-        c, norm_c, escape_radius = (
-            self._parameter("_c"),
-            self._parameter("_size"),
-            self._parameter("_b"),
-        )
+        c, size, b = self._parameter("_c"), self._parameter("_size"), self._parameter("_b")
         real = cast("Any", type(p.x))
         is_single = dr.type_v(real) == dr.VarType.Float32
         escape = _ESCAPED_NORM["single" if is_single else "double"]
@@ -160,21 +157,21 @@ class Julia(Solid):
         zero, ones = 0 * p.x, 0 * p.x + 1
         q = [p.x, p.y, p.z, zero + self._parameter("_slice")]
         jac = [ones, zero, zero, zero, ones, zero, zero, zero, ones, zero, zero, zero]
-        changes = [zero + r for r in radii]
-        derivatives = [ones for _ in radii]
+        change = [zero + r for r in radii]
+        slopes = [ones for _ in radii]
         start = dr.sqrt(_squared_norm(q))
-        min_q = [fmax(start * (1 - 4 * epsilon) - r, 0) for r in changes]
+        min_q = [fmax(start * (1 - 4 * epsilon) - r, 0) for r in change]
         rates = [1 / m for m in min_q]
 
         def iterate(n: Any, *state: Any) -> tuple[Any, ...]:
             """The state after one more iteration.
 
-            The state consists of: the number n of iterations; the four components of q_n; the 12
-            entries of its Jacobian with respect to x, y and z, row by row; and for each radius e_n,
-            then for each radius d_n, then m_n, then the bound g_n.
+            The state consists of the number n of iterations; the four components of q_n; the 12
+            entries of its Jacobian with respect to x, y and z, row by row; and `change`, `slopes`,
+            `min_q` and `rates`.
             """
             q, jac = list(state[:4]), state[4:16]
-            changes, derivatives, min_q, rates = _split_in_four(state[16:])
+            change, slopes, min_q, rates = _split_in_four(state[16:])
             next_jac: list[Any] = [None] * 12
             for k in range(3):
                 a, *v = (jac[3 * i + k] for i in range(4))
@@ -184,22 +181,19 @@ class Julia(Solid):
             square = _squared_norm(q)
             norm = dr.sqrt(square) * (1 + 4 * epsilon)
             # The error of each component of q^2 + c is a few roundings of |q|^2 + |c|.
-            rounding_error = 8 * epsilon * (square + norm_c)
+            rounded = 8 * epsilon * (square + size)
             across = q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
             next_q = [q[0] * q[0] - across + c[0], *(2 * q[0] * q[i] + c[i] for i in (1, 2, 3))]
-            next_change = [
-                (2 * norm * e + e * e) * (1 + 8 * epsilon) + rounding_error for e in changes
-            ]
+            next_change = [(2 * norm * e + e * e) * (1 + 8 * epsilon) + rounded for e in change]
             next_slopes = [
-                2 * (norm + e) * d * (1 + 8 * epsilon)
-                for e, d in zip(changes, derivatives, strict=True)
+                2 * (norm + e) * d * (1 + 8 * epsilon) for e, d in zip(change, slopes, strict=True)
             ]
             next_norm = dr.sqrt(_squared_norm(next_q)) * (1 - 4 * epsilon)
             next_min_q: list[Real] = []
             next_rates: list[Real] = []
             for e, d, m, rate in zip(next_change, next_slopes, min_q, rates, strict=True):
-                next_m = m * m * (1 - 4 * epsilon) - norm_c
-                factor = 1 - norm_c / (m * m) * (1 + 4 * epsilon)
+                next_m = m * m * (1 - 4 * epsilon) - size
+                factor = 1 - size / (m * m) * (1 + 4 * epsilon)
                 by_rate = dr.select(factor > 0, 2 * rate / factor * (1 + 4 * epsilon), dr.inf)
                 next_min_q.append(fmax(fmax(next_norm - e, 0), next_m))
                 next_rates.append(fmin(by_rate, d / fmax(next_norm - e, 0) * (1 + epsilon)))
@@ -210,40 +204,32 @@ class Julia(Solid):
             return (n < self.iterations) & (_squared_norm(state[:4]) <= escape * escape)
 
         index = dr.uint32_array_t(real)
-        start_state = (
-            dr.zeros(index, dr.width(p)),
-            *q,
-            *jac,
-            *changes,
-            *derivatives,
-            *min_q,
-            *rates,
-        )
-        n, *state = dr.while_loop(start_state, is_active, iterate, label="quaternion Julia set")
+        begin = (dr.zeros(index, dr.width(p)), *q, *jac, *change, *slopes, *min_q, *rates)
+        n, *state = dr.while_loop(begin, is_active, iterate, label="quaternion Julia set")
         q, jac = state[:4], state[4:16]
-        changes, derivatives, min_q, rates = _split_in_four(state[16:])
+        change, slopes, min_q, rates = _split_in_four(state[16:])
         square = _squared_norm(q)
         norm = dr.sqrt(square)
         factor = dr.exp2(-real(n)) * (1 + 4 * epsilon)
         is_complete = n >= self.iterations
         last = 2.0**-self.iterations
-        offset = last * dr.log(escape_radius)
-        is_floor = norm <= escape_radius * math.exp(-1.0)
+        offset = last * dr.log(b)
+        is_floor = norm <= b * math.exp(-1.0)
         value = dr.select(is_floor, -last, factor * dr.log(norm) - offset)
         scale = dr.select(is_floor, 0, factor / square)
         gradient = type(p)(
             *(scale * sum(q[i] * jac[3 * i + k] for i in range(4)) for k in range(3))
         )
-        cut = escape_radius * (math.exp(-1.0) * (1 - 1e-6))  # f is constant where |q_N| is smaller
+        cut = b * (math.exp(-1.0) * (1 - 1e-6))  # f is constant where |q_N| is smaller
         constants: list[Real] = []
-        for e, d, m, rate in zip(changes, derivatives, min_q, rates, strict=True):
+        for e, d, m, rate in zip(change, slopes, min_q, rates, strict=True):
             at_end = fmin(rate, d / fmax(norm * (1 - 4 * epsilon) - e, cut))
-            escaped = dr.select(m >= 2 * escape_radius, rate * dr.exp(4 * norm_c / (m * m)), dr.inf)
+            escaped = dr.select(m >= 2 * b, rate * dr.exp(4 * size / (m * m)), dr.inf)
             constants.append(factor * dr.select(is_complete, at_end, escaped) * (1 + 8 * epsilon))
         # The error of logarithms is a few roundings of their size, or of 1.
         rounding = 16 * epsilon * (factor * (dr.abs(dr.log(norm)) + 1) + dr.abs(offset))
-        rounding += dr.select(is_complete, 0, factor * 2 * norm_c / square)
-        error = factor * changes[0] / fmax(norm - changes[0], cut)
+        rounding += dr.select(is_complete, 0, factor * 2 * size / square)
+        error = factor * change[0] / fmax(norm - change[0], cut)
         return value, gradient, error + rounding, constants
 
 

@@ -56,10 +56,10 @@ class AffineMap(SpaceMap):
             )
         if not (np.isfinite(m).all() and np.isfinite(b).all()):
             raise ValueError("matrix and offset must be finite")
-        singular_values = np.linalg.svd(m, compute_uv=False)
-        if not singular_values[-1] > 1e-12 * singular_values[0]:
+        sizes = np.linalg.svd(m, compute_uv=False)
+        if not sizes[-1] > 1e-12 * sizes[0]:
             raise ValueError(
-                f"the matrix is singular (singular values {singular_values[0]:g} to {singular_values[-1]:g}): it would "
+                f"the matrix is singular (singular values {sizes[0]:g} to {sizes[-1]:g}): it would "
                 "flatten the solid"
             )
         rows = tuple(tuple(float(number) for number in row) for row in m)
@@ -100,13 +100,9 @@ class AffineMap(SpaceMap):
                 )
             unit = unit / length
         angle = math.radians(float(degrees))
-        cross_matrix = np.cross(np.eye(3), unit)  # k v = unit x v
-        rotation_matrix = (
-            np.eye(3)
-            + math.sin(angle) * cross_matrix
-            + (1 - math.cos(angle)) * (cross_matrix @ cross_matrix)
-        )
-        return cls.of_arrays(rotation_matrix)
+        k = np.cross(np.eye(3), unit)  # k v = unit x v
+        turn = np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * (k @ k)
+        return cls.of_arrays(turn)
 
     @classmethod
     def scaling(cls, factors: float | Sequence[float]) -> AffineMap:
