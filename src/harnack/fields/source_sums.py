@@ -21,30 +21,37 @@ from harnack.fields.field import Sample
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
 
-# Radii of the `TaylorRemainder` promises, as fractions of the free distance: a smaller radius has a
-# smaller constant.
-_REACHES = (0.2, 0.4, 0.6)
-# The same as a fraction of the distance to the dipoles of far nodes.
+# Radii of the `TaylorRemainder` promises, as fractions of the distance to the nearest singular
+# point: a smaller radius has a smaller constant.
+_TAYLOR_RADII = (0.2, 0.4, 0.6)
+# The largest radius of a promise, as a fraction of the distance to the dipoles of far nodes.
 _MAX_STEP_FRACTION = 0.65
-# Sums of rounded terms: bounds are lengthened, and distances shortened, by this fraction of them.
+# Bounds are enlarged, and distances reduced, by this fraction, for the rounding of sums.
 SUM_MARGIN = 2e-5
-# A singular point within this many roundings of a coordinate counts as near.
-_NEAR_SINGULARITY = 256.0
-# Rounding of positions and of terms changes the gradient by at most the first number times s4, and
-# second derivatives by at most the second number times s5, times the rounding of a coordinate.
+# A singular point counts as near if its distance is at most this many roundings of a coordinate.
+_NEAR_ROUNDINGS = 256.0
+# The rounding of positions and of terms changes the gradient by at most the first number times s4
+# times the rounding of a coordinate, and second derivatives by at most the second number times s5
+# times that rounding.
 SLOPE_ROUNDINGS, SECOND_ROUNDINGS = 16.0, 320.0
 
 
 def max_step_fraction(coarse_ratio: float) -> float:
-    """The longest step that promises cover, as a fraction of the distance to a far node's center;
-    coarse_ratio: far nodes are farther away than this many times their radius."""
+    """The longest step that promises cover, as a fraction of the distance to the center of the
+    nearest far node.
+
+    coarse_ratio: far nodes are farther away than this many times their radius.
+    """
     return _MAX_STEP_FRACTION * (1 - 1 / coarse_ratio)
 
 
 def free_radius_fraction(coarse_ratio: float) -> float:
-    """The radius around x that counts as free of sources, as a fraction of the distance to the
-    center of a far node; coarse_ratio: as for `max_step_fraction`."""
-    return max_step_fraction(coarse_ratio) / _REACHES[-1]
+    """The radius of the ball around x that counts as free of a far node's sources, as a fraction of
+    the distance to the center of the node.
+
+    coarse_ratio: as for `max_step_fraction`.
+    """
+    return max_step_fraction(coarse_ratio) / _TAYLOR_RADII[-1]
 
 
 def remainder_factor(q: float) -> float:
@@ -174,14 +181,14 @@ class SourceSums:
         if hessian is not None and terms.hessian is not None:
             pairs = zip(hessian.components(), terms.hessian.components(), strict=True)
             hessian = SymmetricMatrix(*(old + dr.select(active, new, 0) for old, new in pairs))
-        total, lost, rounding = self.total, self.compensation, self.rounding
+        total, compensation, rounding = self.total, self.compensation, self.rounding
         if terms.value is not None:
             term = dr.select(active, terms.value, 0)
             total = self.total + term
-            grown = total - self.total
-            lost = lost + ((self.total - (total - grown)) + (term - grown))
+            added = total - self.total
+            compensation = compensation + ((self.total - (total - added)) + (term - added))
             rounding = dr.fma(float(dr.epsilon(total)) / 8, dr.abs(total), rounding)
-        new = {"total": total, "compensation": lost, "rounding": rounding}
+        new = {"total": total, "compensation": compensation, "rounding": rounding}
         return dataclasses.replace(self, gradient=gradient, hessian=hessian, **new)
 
     def add_far_node(
@@ -194,30 +201,32 @@ class SourceSums:
         free: Real,
         unit: Real,
     ) -> SourceSums:
-        """The sums with a tree node added on the lanes of `far`; its center is at distance
-        1/inverse.
+        """The sums with a tree node added, on the lanes where it is far.
 
+        terms: the node's terms in the sums.
+        far: the lanes on which the node is far.
+        inverse: 1 / the distance of the node's center.
         size: A + K/r^2 of `multipole.remainder_constants`.
         left_out: bounds of the truncation errors of value, gradient and second derivatives.
-        free: the distance that counts as free of the node's dipoles.
+        free: the distance within which there is none of the node's dipoles.
         unit: the rounding of a coordinate.
 
-        left_out and inverse are 0 on lanes on which the node is not far.
+        left_out and inverse must be 0 on the other lanes.
         """
-        fourth, second = size * dr.square(inverse * inverse), self.hessian_truncation
-        second = None if second is None else second + left_out[2]
+        s4_term, second_truncation = size * dr.square(inverse * inverse), self.hessian_truncation
+        second_truncation = None if second_truncation is None else second_truncation + left_out[2]
         sums = self.add_term(terms, far)
         return dataclasses.replace(
             sums,
             truncation=self.truncation + left_out[0],
             gradient_truncation=self.gradient_truncation + left_out[1],
-            hessian_truncation=second,
+            hessian_truncation=second_truncation,
             rounding=sums.rounding + dipole_rounding(size, inverse, unit),
             singularity_distance=dr.select(
                 far, fmin(free, self.singularity_distance), self.singularity_distance
             ),
-            s4=self.s4 + fourth,
-            s5=dr.fma(fourth, inverse, self.s5),
+            s4=self.s4 + s4_term,
+            s5=dr.fma(s4_term, inverse, self.s5),
         )
 
     def values(self, share: float, unit: Real, rounding: Real, outside: float = 0.0) -> PointValues:
@@ -231,15 +240,19 @@ class SourceSums:
         value, error = share * self.value, dr.fma(share, self.truncation + self.rounding, rounding)
         if self.gradient is None:
             return PointValues(value, error)
-        rounded = SLOPE_ROUNDINGS * unit
+        rounding_factor = SLOPE_ROUNDINGS * unit
         if outside:
-            rounded = rounded + outside * fmax(unit - 2 * float(dr.epsilon(self.value)), 0)
-        slope = share * dr.fma(rounded, self.s4, self.gradient_truncation)
+            rounding_factor = rounding_factor + outside * fmax(
+                unit - 2 * float(dr.epsilon(self.value)), 0
+            )
+        gradient_error = share * dr.fma(rounding_factor, self.s4, self.gradient_truncation)
         if self.hessian is None:
-            return PointValues(value, error, share * self.gradient, None, slope)
+            return PointValues(value, error, share * self.gradient, None, gradient_error)
         hessian = SymmetricMatrix(*(share * part for part in self.hessian.components()))
-        second = share * dr.fma(SECOND_ROUNDINGS * unit, self.s5, self.hessian_truncation)
-        return PointValues(value, error, share * self.gradient, hessian, slope, second)
+        hessian_error = share * dr.fma(SECOND_ROUNDINGS * unit, self.s5, self.hessian_truncation)
+        return PointValues(
+            value, error, share * self.gradient, hessian, gradient_error, hessian_error
+        )
 
     def sample(
         self,
@@ -265,35 +278,43 @@ class SourceSums:
         at most |g| r more, and is harmonic: dipoles of far nodes are farther away than 1 - 1/rough
         times the center, and `max_step_fraction` is less.
         """
-        g = share * self.gradient
+        gradient = share * self.gradient
         slope_error = share * dr.fma(SLOPE_ROUNDINGS * unit, self.s4, self.gradient_truncation)
         distance = self.singularity_distance * (1 - SUM_MARGIN) - 4 * unit
-        scale, radii = (2 + 2 * SUM_MARGIN) * share, [(b, b * distance) for b in _REACHES]
-        taylor = [TaylorRemainder(scale * self.remainder(b, r), r) for b, r in radii]
-        slope, widest = dr.norm(g) + slope_error, taylor[-1]
-        r = widest.radius
-        variation = (1 + SUM_MARGIN) * r * dr.fma(0.5 * r, widest.constant, slope)
+        taylor_scale, radii = (
+            (2 + 2 * SUM_MARGIN) * share,
+            [(b, b * distance) for b in _TAYLOR_RADII],
+        )
+        taylor = [
+            TaylorRemainder(taylor_scale * self.remainder(b, radius), radius) for b, radius in radii
+        ]
+        slope_bound, largest = dr.norm(gradient) + slope_error, taylor[-1]
+        radius = largest.radius
+        variation = (1 + SUM_MARGIN) * radius * dr.fma(0.5 * radius, largest.constant, slope_bound)
         value = share * self.value
-        ball = HarmonicBall(r, value - variation, value + variation)
+        ball = HarmonicBall(radius, value - variation, value + variation)
         # At a singular point f has all values: the sample has a gradient so steep that every level
         # is close to first order, and an error as large as the distance to such a level. Likewise
         # near a singular point, where rounding leaves nothing of the gradient.
-        reach, max_error = 16 * unit, share * 1.6e5 * math.pi
+        steep_distance, max_error = 16 * unit, share * 1.6e5 * math.pi
         is_regular = (
-            (self.singularity_distance > reach)
+            (self.singularity_distance > steep_distance)
             & dr.isfinite(value)
-            & dr.isfinite(dr.squared_norm(g))
+            & dr.isfinite(dr.squared_norm(gradient))
         )
-        is_lost = ~(slope_error <= dr.norm(g)) & (
-            self.singularity_distance <= _NEAR_SINGULARITY * unit
+        is_unreliable = ~(slope_error <= dr.norm(gradient)) & (
+            self.singularity_distance <= _NEAR_ROUNDINGS * unit
         )
-        is_regular, reach = is_regular & ~is_lost, fmax(self.singularity_distance, reach)
-        steep_gradient = type(g)(0, 0, max_error / reach)
+        is_regular, steep_distance = (
+            is_regular & ~is_unreliable,
+            fmax(self.singularity_distance, steep_distance),
+        )
+        steep_gradient = type(gradient)(0, 0, max_error / steep_distance)
         error = dr.fma(share, self.truncation + self.rounding, rounding)
         along = tuple(promise.scaled(share) for promise in along)
         return Sample(
             dr.select(is_regular, value, 0),
-            dr.select(is_regular, g, steep_gradient),
+            dr.select(is_regular, gradient, steep_gradient),
             tuple(taylor),
             dr.select(is_regular, error, max_error),
             dr.select(is_regular, slope_error, 0),
@@ -306,30 +327,35 @@ class SourceSums:
     def add_line_rates(
         self, v: Vec3, unit: Real, lengths: tuple[Real, ...], rates: tuple[Real, ...], active: Mask
     ) -> tuple[Real, ...]:
-        """The rates K of `trail_sums.line_rates` for some edges, plus those of these sums.
+        """Rates K with |f(x + s v) - f(x)| <= K |s| for lengths |s| up to each of `lengths`: the
+        sums' own rates added to `rates` (see `trail_sums.line_rates`). On lanes that are not active
+        they are infinite.
 
-        f changes by at most |s| |g . v| + s^2 (3 s4 + rise r s5) for |s| <= r (`sample`), with |g .
-        v| raised by the truncation and rounding of g. Infinite for lengths above r.
+        v: (3,) directions of the lines.
+        unit: the rounding of a coordinate of their points.
+        rates: the rates for some edges, one for each length.
 
-        v: directions of the lines. unit: the rounding of their points' coordinates.
+        Proof. f changes by at most |s| |g . v| + s^2 (3 s4 + rise r s5) for |s| <= r (see `sample`,
+        also for the symbols), with |g . v| raised by the truncation and rounding errors of the
+        gradient g. For lengths above r the rate is infinite.
         """
         slope = dr.abs(dr.dot(self.gradient, v)) + self.gradient_truncation
         slope = dr.fma(SLOPE_ROUNDINGS * unit, self.s4, slope)
-        b = _REACHES[-1]
-        r = b * (self.singularity_distance * (1 - SUM_MARGIN) - 4 * unit)
-        remainder = self.remainder(b, dr.select(self.s5 > 0, r, 0))
+        fraction = _TAYLOR_RADII[-1]
+        radius = fraction * (self.singularity_distance * (1 - SUM_MARGIN) - 4 * unit)
+        remainder = self.remainder(fraction, dr.select(self.s5 > 0, radius, 0))
         pairs = zip(lengths, rates, strict=True)
         sums = (
-            dr.select(active & (length <= r), rate + dr.fma(length, remainder, slope), dr.inf)
+            dr.select(active & (length <= radius), rate + dr.fma(length, remainder, slope), dr.inf)
             for length, rate in pairs
         )
         return tuple(sums)
 
     def remainder(self, b: float, r: Real) -> Real:
         """3 s4 + rise r s5 for r = b times the free distance, or less: see `sample`."""
-        return dr.fma(_rise(b) * r, self.s5, 3 * self.s4)
+        return dr.fma(_chord_slope(b) * r, self.s5, 3 * self.s4)
 
 
-def _rise(b: float) -> float:
-    """The slope of the chord of phi over [0, b]: see `SourceSums.sample`."""
+def _chord_slope(b: float) -> float:
+    """The slope (phi(b) - 3)/b of the chord of phi over [0, b]: see `SourceSums.sample`."""
     return (4 - 3 * b) / (1 - b) ** 2

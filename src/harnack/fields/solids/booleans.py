@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
     from harnack.geometry import Volume
 
-# The bounds of other operands may narrow the range of the value, which moves the middle of the range.
-# This is done only if the middle moves by more than this fraction of the value's error; at creases it
-# nearly always moves less.
+# The bounds of other operands may narrow the range of the value, which moves the middle of the
+# range. This is done only if the middle moves by more than this fraction of the value's error; at
+# creases it nearly always moves less.
 _MIN_SHIFT = 0.25
 
 
@@ -277,17 +277,17 @@ class BooleanSolid(Solid):
         # `Sample.value_error` leaves out the rounding that follows from value and gradient.
         plain_sample = Sample(value, gradient, ())
         plain_error = value_error_bound(plain_sample, safe_norm(gradient), size)
-        combined = Sample(
+        joined = Sample(
             value, gradient, self._common_lipschitz(samples), fmax(error - plain_error, 0), slope_error,
             truncation_error=truncation,
         )  # fmt: skip
-        combined_error = value_error_bound(combined, safe_norm(gradient), size)
+        joined_error = value_error_bound(joined, safe_norm(gradient), size)
         return (
-            combined,
+            joined,
             [
                 (
-                    fmax(greatest - operand_value - fmax(operand_error - combined_error, 0), 0),
-                    greatest - operand_value + fmax(operand_error - combined_error, 0),
+                    fmax(greatest - operand_value - fmax(operand_error - joined_error, 0), 0),
+                    greatest - operand_value + fmax(operand_error - joined_error, 0),
                 )
                 for operand_value, operand_error in zip(values, errors, strict=True)
             ],

@@ -84,8 +84,8 @@ class Sphere(FormulaSolid):
 
 
 def _box_of_radii(radii: tuple[float, float, float], level: float) -> Volume:
-    """The box around the points where m (g - 1) <= level, with m the least radius and g a norm that
-    is 1 on a surface which reaches the radii along the axes, and lies in the box of half sides
+    """A box that contains all points where m (g - 1) <= level, with m the smallest radius. Here g
+    is a norm. The surface g = 1 meets the axes at the radii, and lies in the box of half sides
     `radii`."""
     a, b, c = radii
     size = 1.0 + level / min(radii)
@@ -321,7 +321,9 @@ def lipschitz_of_norms(p: float, q: float) -> float:
 
 
 def _checked_powers(powers: Any, name: str) -> tuple[float, float]:
-    """The two powers as numbers.
+    """The two powers (p, q) as numbers.
+
+    name: of the shape, for messages.
 
     Raises:
         ValueError: not two numbers, or a power below 1.
@@ -339,7 +341,8 @@ def _checked_powers(powers: Any, name: str) -> tuple[float, float]:
 
 
 class _Powered(FormulaSolid):
-    """A shape with powers, which are literals of its kernel and not kernel parameters."""
+    """A shape whose formula has powers. They are literals of its kernel, and not kernel parameters,
+    so that other powers compile another kernel."""
 
     powers: tuple[float, float]
 

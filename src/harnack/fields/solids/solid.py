@@ -85,10 +85,12 @@ def not_a_solid(other: Any) -> str:
 
 
 def _with_source(prepare: Callable[[Any, Backend], Field]) -> Callable[[Any, Backend], Field]:
-    """Wrap `prepare` so that a prepared solid keeps a reference to the original."""
+    """Wrap a method `prepare` so that the prepared solid keeps a reference to the original in its
+    attribute `_source`."""
 
     @functools.wraps(prepare)
     def remembering(self: Any, backend: Backend) -> Field:
+        """See `Field.prepare`."""
         prepared = prepare(self, backend)
         if prepared is not self:
             object.__setattr__(prepared, "_source", vars(self).get("_source", self))
@@ -245,13 +247,18 @@ class Solid(Field):
 
     @functools.cached_property
     def _ray_count_variants(self) -> TransientCache[tuple[int, ...], Solid]:
+        """The combinations made by `_for_rays`, by the identities of their parts."""
         return TransientCache()
 
     def _for_rays(
         self, parts: Sequence[Field], count: int, make: Callable[[list[Field]], Solid]
     ) -> Field:
-        """This solid, or the same combination of its parts as they are for this number of rays
-        (`Field.for_ray_count`). The combination is cached, so that nothing is prepared twice."""
+        """The same combination of `parts`, each as it is for this number of rays
+        (`Field.for_ray_count`); this solid itself if no part changes. Combinations are cached, so
+        that nothing is prepared twice.
+
+        make: makes the combination from its parts.
+        """
         variants = [part.for_ray_count(count) for part in parts]
         key = tuple(map(id, variants))  # of objects that the solid keeps alive
         if key == tuple(map(id, parts)):
@@ -298,17 +305,21 @@ class Solid(Field):
         return self._apply_map(Taper(start, end, axis))
 
     def _apply_map(self, change: SpaceMap) -> Solid:
+        """The image of the solid under a map of space, which is applied to each operand."""
         return self.map_operands(change.apply)
 
 
 class SolidOfField(Solid):
-    """A solid whose function derives from another field, `field`. It takes over the field's
-    settings for the tracer."""
+    """A solid whose function derives from that of another field.
+
+    field: the other field. The solid takes over its settings for the tracer.
+    """
 
     field: Any
 
     def _copy_settings(self, *names: str) -> None:
-        """Copy the inner field's settings for the tracer, and the attributes of these names."""
+        """Copy attributes of the inner field to this solid: its settings for the tracer, and the
+        attributes with these names."""
         settings = (
             "has_variable_accuracy",
             "coarsest_accuracy",
@@ -333,13 +344,14 @@ class SolidOfField(Solid):
         return self._with_inner(self.field.at_accuracy(detail))
 
     def _with_inner(self, inner: Field) -> Solid:
-        """The same solid of another field."""
+        """The same solid, made of another field."""
         solid = copy.copy(self)
         object.__setattr__(solid, "field", inner)
         return solid
 
     def for_ray_count(self, count: int) -> Field:
         def make(parts: list[Field]) -> Solid:
+            """The same solid, made of the field parts[0]."""
             return dataclasses.replace(cast("Any", self), field=parts[0])
 
         return self._for_rays([self.field], count, make)

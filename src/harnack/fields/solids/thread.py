@@ -202,11 +202,8 @@ class Thread(Solid):
             inverse_length = dr.rsqrt(edge_z * edge_z + edge_r * edge_r)
             from_z, from_r = z - start_z, r - start_r
             fraction = (from_z * edge_z + from_r * edge_r) * inverse_length * inverse_length
-            minus_fraction = -clamp(fraction, 0, 1)
-            to_z, to_r = (
-                dr.fma(edge_z, minus_fraction, from_z),
-                dr.fma(edge_r, minus_fraction, from_r),
-            )
+            minus_t = -clamp(fraction, 0, 1)
+            to_z, to_r = dr.fma(edge_z, minus_t, from_z), dr.fma(edge_r, minus_t, from_r)
             line_distance = dr.abs(from_r * edge_z - from_z * edge_r) * inverse_length
             is_inner = (fraction > 0) & (fraction < 1)
             distance = dr.select(is_inner, line_distance, dr.sqrt(to_z * to_z + to_r * to_r))
