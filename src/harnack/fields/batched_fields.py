@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Precision, Real, Vec3
     from harnack.fields.samples import Sample
 
-# The rounding of dipoles' moments, which are summed up in double precision, as a fraction of the
-# total weight.
+# A bound of the rounding of the sums of dipoles' moments, as a fraction of the total weight. The sums
+# are made in double precision.
 _MOMENT_ROUNDING = 32 * 2.0**-53
 
 
@@ -173,7 +173,7 @@ class BatchedField(Field):
             if dr.grad_enabled(points):
                 return self.differentiable_value(points)
             return self.values_at(points, 0).value
-        return self._at(points, precision, 0, lambda at: (at.value,))[0]
+        return self._choose_at_points(points, precision, 0, lambda at: (at.value,))[0]
 
     @accepts_dask_arrays("points")
     @accepts_tensors
@@ -182,13 +182,15 @@ class BatchedField(Field):
             if dr.grad_enabled(points):
                 return super().gradient(points)
             return self.sharp_values_at(points).gradient
-        return self._at(points, precision, 1, lambda at: (at.gradient,))[0]
+        return self._choose_at_points(points, precision, 1, lambda at: (at.gradient,))[0]
 
     def value_and_gradient(
         self, points: Any, *, precision: Precision | None = None
     ) -> tuple[FloatArray, FloatArray]:
         """Values (n,) and gradients (n, 3) together, at hardly more cost than gradients alone."""
-        value, gradient = self._at(points, precision, 1, lambda at: (at.value, at.gradient))
+        value, gradient = self._choose_at_points(
+            points, precision, 1, lambda at: (at.value, at.gradient)
+        )
         return value, gradient
 
     def rough_value_and_gradient(
@@ -198,6 +200,7 @@ class BatchedField(Field):
         may be large: they are for estimates, and for points at which f is steep."""
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
+            """The values and gradients at the Dr.Jit points x."""
             del backend
             at = self.values_at(x, 1)
             return at.value, at.gradient
@@ -206,7 +209,7 @@ class BatchedField(Field):
         return value, gradient
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        return _hessian(self.values_at(p, 2)).rows(backend_of(p).Array3f)
+        return _required_hessian(self.values_at(p, 2)).rows(backend_of(p).Array3f)
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
         return sample.gradient_error, self.values_at(p, 2).hessian_error
@@ -218,7 +221,7 @@ class BatchedField(Field):
         They include the proved truncation error and the rounding error of f. The rounding of the
         points themselves, in single precision, is not included.
         """
-        return self._at(points, precision, 0, lambda at: (at.error,))[0]
+        return self._choose_at_points(points, precision, 0, lambda at: (at.error,))[0]
 
     @accepts_dask_arrays("points")
     def gradient_error_bound(
@@ -227,25 +230,30 @@ class BatchedField(Field):
         """Bounds (n,) of the error of `gradient`, as a length, at points (n, 3): see
         `error_bound`. For a sum over a tree the bound is about a hundred times the error itself:
         the accuracy of the sum is chosen by estimates (`sharpened`)."""
-        return self._at(points, precision, 1, lambda at: (at.gradient_error,))[0]
+        return self._choose_at_points(points, precision, 1, lambda at: (at.gradient_error,))[0]
 
     @accepts_dask_arrays("points")
     def hessian_error_bound(self, points: Any, *, precision: Precision | None = None) -> FloatArray:
         """Bounds (n,) of the error of `hessian`, in the spectral norm, at points (n, 3): see
         `error_bound`."""
-        return self._at(points, precision, 2, lambda at: (at.hessian_error,))[0]
+        return self._choose_at_points(points, precision, 2, lambda at: (at.hessian_error,))[0]
 
-    def _at(
+    def _choose_at_points(
         self,
         points: Any,
         precision: Precision | None,
         derivatives: int,
         choose: Callable[[PointValues], tuple[Any, ...]],
     ) -> tuple[FloatArray, ...]:
-        """The arrays that `choose` takes from the values at points, with this number of
-        derivatives."""
+        """The arrays that `choose` takes from the `PointValues` at points, in the order of the
+        points.
+
+        precision: as for `value`.
+        derivatives: the order up to which derivatives are computed, 0 to 2.
+        """
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
+            """The results of `choose` at the Dr.Jit points x."""
             del backend
             sharp = derivatives == 1
             return choose(self.sharp_values_at(x) if sharp else self.values_at(x, derivatives))
@@ -254,9 +262,11 @@ class BatchedField(Field):
 
 
 class SumAtDetail(EvaluateOnly):
-    """A sum over sources at one accuracy scale, with second derivatives.
+    """A sum over sources at one accuracy scale (`VariableAccuracy.at_accuracy`), with second
+    derivatives.
 
-    values: gives `PointValues` with the Hessian at that accuracy scale.
+    evaluate: returns the sample at a point.
+    values: returns the `PointValues` there, with the Hessian, at that accuracy scale.
     """
 
     def __init__(
@@ -266,19 +276,20 @@ class SumAtDetail(EvaluateOnly):
         self._values = values
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        return _hessian(self._values(p)).rows(backend_of(p).Array3f)
+        return _required_hessian(self._values(p)).rows(backend_of(p).Array3f)
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
         return sample.gradient_error, self._values(p).hessian_error
 
 
-# Gradients by a tree are computed again with these multiples of the distance at which clusters are
-# taken as a whole, in turn, as long as the last repetition changed them by more than the fraction
-# `_MOVED` of their length. (Measured: twice the distance leaves a sixteenth of the error or less.
-# So the error is 1 % of the length, with a reserve of a factor of four.)
-_CLOSELY, _MOVED = (2.0, 4.0, 8.0), 0.04
-# A gradient whose error is proved to be at most this fraction of its length is not refined.
-_PROVED = 0.01
+# Gradients of a sum over a tree are computed again with these multiples of the distance from which on
+# clusters are taken as one source. It is repeated with the next multiple as long as the last one
+# changed the gradient by more than the fraction `_MAX_CHANGE` of its length. (Measured: twice the
+# distance leaves a sixteenth of the error or less. So the error is 1 % of the length, with a reserve
+# of a factor of four.)
+_DISTANCE_MULTIPLES, _MAX_CHANGE = (2.0, 4.0, 8.0), 0.04
+# A gradient is not refined if its error is proved to be at most this fraction of its length.
+_ACCEPTED_ERROR = 0.01
 
 
 def sharpened(at: Callable[[Vec3, Real], PointValues], x: Vec3) -> PointValues:
@@ -300,25 +311,32 @@ def sharpened(at: Callable[[Vec3, Real], PointValues], x: Vec3) -> PointValues:
     gradient, error = as_kernel_parameters(values.gradient), real(values.gradient_error)
     gradient, error = gradient + dr.zeros(type(x), dr.width(x)), error + dr.zeros(real, dr.width(x))
     dr.eval(values.value, values.error, gradient, error)
-    rows = dr.compress(~(error <= _PROVED * dr.norm(gradient)))
-    for closer in _CLOSELY:
+    rows = dr.compress(~(error <= _ACCEPTED_ERROR * dr.norm(gradient)))
+    for closer in _DISTANCE_MULTIPLES:
         if not len(rows):
             break
-        place = dr.gather(type(x), x, rows)
-        dr.eval(place)
-        closely = at(place, dr.opaque(real, closer))
-        moved = dr.norm(closely.gradient - dr.gather(type(x), gradient, rows))
-        length = dr.norm(as_kernel_parameters(closely.gradient))
-        is_sharp = (moved <= _MOVED * length) | (closely.gradient_error <= _PROVED * length)
-        dr.scatter(gradient, closely.gradient, rows)
-        dr.scatter(error, closely.gradient_error, rows)
-        dr.eval(gradient, error, is_sharp)
-        rows = dr.gather(type(rows), rows, dr.compress(~is_sharp))
+        points = dr.gather(type(x), x, rows)
+        dr.eval(points)
+        refined = at(points, dr.opaque(real, closer))
+        change = dr.norm(refined.gradient - dr.gather(type(x), gradient, rows))
+        length = dr.norm(as_kernel_parameters(refined.gradient))
+        is_accurate = (change <= _MAX_CHANGE * length) | (
+            refined.gradient_error <= _ACCEPTED_ERROR * length
+        )
+        dr.scatter(gradient, refined.gradient, rows)
+        dr.scatter(error, refined.gradient_error, rows)
+        dr.eval(gradient, error, is_accurate)
+        rows = dr.gather(type(rows), rows, dr.compress(~is_accurate))
         dr.eval(rows)
     return dataclasses.replace(values, gradient=gradient, gradient_error=error)
 
 
-def _hessian(values: PointValues) -> SymmetricMatrix:
+def _required_hessian(values: PointValues) -> SymmetricMatrix:
+    """The Hessian of values that include it.
+
+    Raises:
+        RuntimeError: they do not.
+    """
     if values.hessian is None:
         raise RuntimeError("values_at(x, 2) gave no Hessian")
     return values.hessian
@@ -343,9 +361,13 @@ class FieldCache(Generic[Value]):
         set since it was computed; else `make()`, which is then cached."""
         if id(field) in self._kept:
             kept_key, attributes, value = self._kept[id(field)]
-            now = vars(field)
-            same = attributes.keys() == now.keys()
-            if same and kept_key == key and all(attributes[name] is now[name] for name in now):
+            current = vars(field)
+            has_same_names = attributes.keys() == current.keys()
+            if (
+                has_same_names
+                and kept_key == key
+                and all(attributes[name] is current[name] for name in current)
+            ):
                 return value
         value = make()
         if value is not field:
@@ -366,6 +388,7 @@ def cached_prepare(prepare: Prepare) -> Prepare:
 
     @functools.wraps(prepare)
     def cached(self: Field, backend: Backend) -> Field:
+        """The prepared field: from the cache, unless the field has parameters."""
         if self.parameters():
             return prepare(self, backend)
         return caches[backend].get(self, None, lambda: prepare(self, backend))

@@ -39,7 +39,8 @@ if TYPE_CHECKING:
 
 __all__ = ["clearance_function", "level_distance_lower_bound", "occupied_cells", "tight_extent"]
 
-# Uses all promises of a field: points are few, and the longest proof counts.
+# The enclosures by which clearances are proved. They use all promises of a field: there are few
+# points, and the longest proof counts.
 _PROOFS = choose_enclosures("curvature")
 
 
@@ -54,6 +55,7 @@ def clearance_function(
     targets = Levels(values, field.period)
 
     def clearance(points: FloatArray) -> FloatArray:
+        """The clearances (n,) of points (n, 3)."""
         p = to_vector3(backend, points)
         return to_numpy(
             level_distance_lower_bound(backend, prepared, targets, p, prepared.evaluate(p))
@@ -81,29 +83,35 @@ def tight_extent(
         tested: a ball inside of it may be left out as well.
     """
     clearance = clearance_function(field, levels)
-    slack = 1e-4 * float(np.linalg.norm(upper - lower))
+    margin = 1e-4 * float(np.linalg.norm(upper - lower))
     if points is not None:
-        held = kdop_of_points(points, slack)
-        cells = nonempty_cells(lower, upper, _outside(held, clearance), max_cells, finest)
-        return merge_kdops(held, cells.bounding_kdop(slack)) if len(cells.corners) else held
+        polytope = kdop_of_points(points, margin)
+        cells = nonempty_cells(
+            lower, upper, _clearance_outside(polytope, clearance), max_cells, finest
+        )
+        return (
+            merge_kdops(polytope, cells.bounding_kdop(margin)) if len(cells.corners) else polytope
+        )
     cells = nonempty_cells(lower, upper, clearance, max_cells, finest)
     if not len(cells.corners):  # no level anywhere: any box will do
         cells = BoxCells(np.array(lower)[None], np.array(upper) - np.array(lower))
-    return cells.bounding_kdop(slack)
+    return cells.bounding_kdop(margin)
 
 
-def _outside(held: ConvexHull, clearance: Clearance) -> Clearance:
-    """The clearance from the outside of a polytope: for points inside, the distance to its
-    faces."""
+def _clearance_outside(polytope: ConvexHull, clearance: Clearance) -> Clearance:
+    """A clearance for points outside of a polytope: it proves nothing about level sets inside. For
+    a point inside, it is the distance to the nearest face; for a point outside, that of
+    `clearance`."""
 
-    def beyond(points: FloatArray) -> FloatArray:
-        depth = (held.offsets - points @ held.normals.T).min(axis=1)
+    def clearance_outside(points: FloatArray) -> FloatArray:
+        """The clearances (n,) of points (n, 3)."""
+        depth = (polytope.offsets - points @ polytope.normals.T).min(axis=1)
         outside = depth <= 0
         if outside.any():
             depth[outside] = clearance(points[outside])
         return depth
 
-    return beyond
+    return clearance_outside
 
 
 def occupied_cells(
@@ -179,7 +187,10 @@ class DeviceField(Field, Generic[Uploaded]):
 
     @abc.abstractmethod
     def _upload(self, backend: Backend, *, traced: bool) -> Uploaded:
-        """The data, for tracing or for values at points."""
+        """The data on a backend.
+
+        traced: whether they are for tracing; else they are for values at points.
+        """
 
     @cached_prepare
     def prepare(self, backend: Backend) -> Self:
@@ -190,13 +201,18 @@ class DeviceField(Field, Generic[Uploaded]):
         return prepared
 
     def _data_for(self, p: Vec3) -> Uploaded:
-        """The data for tracing; on the backend of p if `prepare` was not called."""
+        """The data for tracing. If `prepare` was not called, they are uploaded to the backend of
+        p."""
         if self._device is None:
             return self._upload(backend_of(p), traced=True)
         return self._device
 
     def _require_data(self) -> Uploaded:
-        """The data for tracing; RuntimeError if `prepare` was not called."""
+        """The data for tracing.
+
+        Raises:
+            RuntimeError: `prepare` was not called.
+        """
         if self._device is None:
             raise RuntimeError("prepare(backend) comes first, before at_detail")
         return self._device
@@ -209,8 +225,8 @@ class DeviceField(Field, Generic[Uploaded]):
 
 
 class VariableAccuracyField(DeviceField[Uploaded], BatchedField):
-    """An uploaded sum with a choice of detail (`Field.at_accuracy`). Subclasses define
-    `_sample`."""
+    """A field that is a sum over sources on a backend, at any accuracy scale (`Field.at_accuracy`).
+    Subclasses define `_sample`."""
 
     has_variable_accuracy = True
 
@@ -219,7 +235,11 @@ class VariableAccuracyField(DeviceField[Uploaded], BatchedField):
 
     @abc.abstractmethod
     def _sample(self, on: Uploaded, p: Vec3, detail: Real) -> Sample:
-        """f at p from the data, at a detail (`Field.at_accuracy`)."""
+        """The sample of f at p.
+
+        on: the data.
+        detail: the accuracy scale (`Field.at_accuracy`).
+        """
 
     def evaluate(self, p: Vec3) -> Sample:
         on = self._data_for(p)
@@ -233,6 +253,7 @@ class VariableAccuracyField(DeviceField[Uploaded], BatchedField):
         )
 
     def _batch_data(self, backend: Backend) -> Uploaded:
+        """The data for values at points. They are those for tracing if the two do not differ."""
         device = self._device
         if self.has_separate_batch_data or device is None or device.backend is not backend:
             return super()._batch_data(backend)

@@ -30,16 +30,20 @@ __all__ = ["PatchBoxes", "PatchField"]
 
 @dataclass(frozen=True)
 class PatchBoxes(UnitFrame):
-    """A tree of boxes, one for each patch, in coordinates in which they have a size of about 1."""
+    """A tree of boxes, one for each patch, in unit coordinates (`UnitFrame`), in which all boxes
+    together have a size of about 1.
+
+    tree: of the boxes.
+    """
 
     tree: BoxTree
 
     @classmethod
     def upload(cls, backend: Backend, lower: FloatArray, upper: FloatArray) -> PatchBoxes:
-        """Boxes from their corners (n, 3).
+        """The boxes with these lowest and highest corners, each (n, 3).
 
-        The size is a power of two, so that positions along rays are scaled without rounding, and
-        keep their order.
+        The size of the unit coordinates is a power of two. So positions along rays are scaled
+        without rounding, and keep their order.
         """
         min_corner, max_corner = lower.min(axis=0), upper.max(axis=0)
         center = round_to_single(0.5 * (min_corner + max_corner))
@@ -92,7 +96,7 @@ class PatchField(Field, Generic[_Buffers]):
 
     @abc.abstractmethod
     def _upload(self, backend: Backend) -> _Buffers:
-        """The data on a backend."""
+        """The boxes and the data of the patches on a backend."""
 
     def with_levels(self, levels: tuple[float, ...]) -> Self:
         if levels == self.levels:
@@ -112,6 +116,11 @@ class PatchField(Field, Generic[_Buffers]):
         return prepared
 
     def _require_data(self) -> _Buffers:
+        """The data on the backend.
+
+        Raises:
+            RuntimeError: `prepare` was not called.
+        """
         if self._device is None:
             raise RuntimeError("prepare(backend) comes first")
         return self._device

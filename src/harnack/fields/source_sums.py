@@ -240,12 +240,10 @@ class SourceSums:
         value, error = share * self.value, dr.fma(share, self.truncation + self.rounding, rounding)
         if self.gradient is None:
             return PointValues(value, error)
-        rounding_factor = SLOPE_ROUNDINGS * unit
+        roundings = SLOPE_ROUNDINGS * unit
         if outside:
-            rounding_factor = rounding_factor + outside * fmax(
-                unit - 2 * float(dr.epsilon(self.value)), 0
-            )
-        gradient_error = share * dr.fma(rounding_factor, self.s4, self.gradient_truncation)
+            roundings = roundings + outside * fmax(unit - 2 * float(dr.epsilon(self.value)), 0)
+        gradient_error = share * dr.fma(roundings, self.s4, self.gradient_truncation)
         if self.hessian is None:
             return PointValues(value, error, share * self.gradient, None, gradient_error)
         hessian = SymmetricMatrix(*(share * part for part in self.hessian.components()))
@@ -278,43 +276,35 @@ class SourceSums:
         at most |g| r more, and is harmonic: dipoles of far nodes are farther away than 1 - 1/rough
         times the center, and `max_step_fraction` is less.
         """
-        gradient = share * self.gradient
+        g = share * self.gradient
         slope_error = share * dr.fma(SLOPE_ROUNDINGS * unit, self.s4, self.gradient_truncation)
         distance = self.singularity_distance * (1 - SUM_MARGIN) - 4 * unit
-        taylor_scale, radii = (
-            (2 + 2 * SUM_MARGIN) * share,
-            [(b, b * distance) for b in _TAYLOR_RADII],
-        )
-        taylor = [
-            TaylorRemainder(taylor_scale * self.remainder(b, radius), radius) for b, radius in radii
-        ]
-        slope_bound, largest = dr.norm(gradient) + slope_error, taylor[-1]
-        radius = largest.radius
-        variation = (1 + SUM_MARGIN) * radius * dr.fma(0.5 * radius, largest.constant, slope_bound)
+        scale, radii = (2 + 2 * SUM_MARGIN) * share, [(b, b * distance) for b in _TAYLOR_RADII]
+        taylor = [TaylorRemainder(scale * self.remainder(b, r), r) for b, r in radii]
+        slope, largest = dr.norm(g) + slope_error, taylor[-1]
+        r = largest.radius
+        variation = (1 + SUM_MARGIN) * r * dr.fma(0.5 * r, largest.constant, slope)
         value = share * self.value
-        ball = HarmonicBall(radius, value - variation, value + variation)
+        ball = HarmonicBall(r, value - variation, value + variation)
         # At a singular point f has all values: the sample has a gradient so steep that every level
         # is close to first order, and an error as large as the distance to such a level. Likewise
         # near a singular point, where rounding leaves nothing of the gradient.
-        steep_distance, max_error = 16 * unit, share * 1.6e5 * math.pi
+        near, max_error = 16 * unit, share * 1.6e5 * math.pi
         is_regular = (
-            (self.singularity_distance > steep_distance)
+            (self.singularity_distance > near)
             & dr.isfinite(value)
-            & dr.isfinite(dr.squared_norm(gradient))
+            & dr.isfinite(dr.squared_norm(g))
         )
-        is_unreliable = ~(slope_error <= dr.norm(gradient)) & (
+        is_unreliable = ~(slope_error <= dr.norm(g)) & (
             self.singularity_distance <= _NEAR_ROUNDINGS * unit
         )
-        is_regular, steep_distance = (
-            is_regular & ~is_unreliable,
-            fmax(self.singularity_distance, steep_distance),
-        )
-        steep_gradient = type(gradient)(0, 0, max_error / steep_distance)
+        is_regular, near = is_regular & ~is_unreliable, fmax(self.singularity_distance, near)
+        steep_gradient = type(g)(0, 0, max_error / near)
         error = dr.fma(share, self.truncation + self.rounding, rounding)
         along = tuple(promise.scaled(share) for promise in along)
         return Sample(
             dr.select(is_regular, value, 0),
-            dr.select(is_regular, gradient, steep_gradient),
+            dr.select(is_regular, g, steep_gradient),
             tuple(taylor),
             dr.select(is_regular, error, max_error),
             dr.select(is_regular, slope_error, 0),

@@ -275,10 +275,10 @@ class BooleanSolid(Solid):
         extreme, value = value, value + sign * shift
         greatest, error = greatest + shift, error - shift
         # `Sample.value_error` leaves out the rounding that follows from value and gradient.
-        plain_sample = Sample(value, gradient, ())
-        plain_error = value_error_bound(plain_sample, safe_norm(gradient), size)
+        plain = Sample(value, gradient, ())
+        stated = value_error_bound(plain, safe_norm(gradient), size)
         joined = Sample(
-            value, gradient, self._common_lipschitz(samples), fmax(error - plain_error, 0), slope_error,
+            value, gradient, self._common_lipschitz(samples), fmax(error - stated, 0), slope_error,
             truncation_error=truncation,
         )  # fmt: skip
         joined_error = value_error_bound(joined, safe_norm(gradient), size)
