@@ -28,8 +28,8 @@ __all__ = ["accepts_numpy_points", "evaluate_points", "map_batches", "morton_ord
 
 # The number of points of a batch: enough to keep a GPU busy, few enough to keep memory small.
 _BATCH_SIZE = 1 << 20
-# There are 2^5 cells along an axis. So three coordinates make a key of 15 bits, for which NumPy uses
-# radix sort.
+# There are 2^5 cells along an axis. So three coordinates make a key of 15 bits, for which NumPy
+# uses radix sort.
 _BITS_PER_AXIS = 5
 
 

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Precision, Real, Vec3
     from harnack.fields.samples import Sample
 
-# A bound of the rounding of the sums of dipoles' moments, as a fraction of the total weight. The sums
-# are made in double precision.
+# A bound of the rounding of the sums of dipoles' moments, as a fraction of the total weight. The
+# sums are made in double precision.
 _MOMENT_ROUNDING = 32 * 2.0**-53
 
 
@@ -282,11 +282,11 @@ class SumAtDetail(EvaluateOnly):
         return sample.gradient_error, self._values(p).hessian_error
 
 
-# Gradients of a sum over a tree are computed again with these multiples of the distance from which on
-# clusters are taken as one source. It is repeated with the next multiple as long as the last one
+# Gradients of a sum over a tree are computed again with these multiples of the distance from which
+# on clusters are taken as one source. It is repeated with the next multiple as long as the last one
 # changed the gradient by more than the fraction `_MAX_CHANGE` of its length. (Measured: twice the
-# distance leaves a sixteenth of the error or less. So the error is 1 % of the length, with a reserve
-# of a factor of four.)
+# distance leaves a sixteenth of the error or less. So the error is 1 % of the length, with a
+# reserve of a factor of four.)
 _DISTANCE_MULTIPLES, _MAX_CHANGE = (2.0, 4.0, 8.0), 0.04
 # A gradient is not refined if its error is proved to be at most this fraction of its length.
 _ACCEPTED_ERROR = 0.01
@@ -361,13 +361,9 @@ class FieldCache(Generic[Value]):
         set since it was computed; else `make()`, which is then cached."""
         if id(field) in self._kept:
             kept_key, attributes, value = self._kept[id(field)]
-            current = vars(field)
-            has_same_names = attributes.keys() == current.keys()
-            if (
-                has_same_names
-                and kept_key == key
-                and all(attributes[name] is current[name] for name in current)
-            ):
+            now = vars(field)
+            same = attributes.keys() == now.keys()
+            if same and kept_key == key and all(attributes[name] is now[name] for name in now):
                 return value
         value = make()
         if value is not field:

@@ -85,13 +85,11 @@ def tight_extent(
     clearance = clearance_function(field, levels)
     margin = 1e-4 * float(np.linalg.norm(upper - lower))
     if points is not None:
-        polytope = kdop_of_points(points, margin)
+        given = kdop_of_points(points, margin)
         cells = nonempty_cells(
-            lower, upper, _clearance_outside(polytope, clearance), max_cells, finest
+            lower, upper, _clearance_outside(given, clearance), max_cells, finest
         )
-        return (
-            merge_kdops(polytope, cells.bounding_kdop(margin)) if len(cells.corners) else polytope
-        )
+        return merge_kdops(given, cells.bounding_kdop(margin)) if len(cells.corners) else given
     cells = nonempty_cells(lower, upper, clearance, max_cells, finest)
     if not len(cells.corners):  # no level anywhere: any box will do
         cells = BoxCells(np.array(lower)[None], np.array(upper) - np.array(lower))

@@ -171,7 +171,13 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         raise AttributeError(message)
 
     def _is_no_number(self, *operands: Any) -> Any:
-        """Arithmetic and comparisons are refused. `Solid` defines -, and all fields keep ==."""
+        """Refuse arithmetic and comparisons with fields.
+
+        `Solid` defines -, and all fields keep ==.
+
+        Raises:
+            TypeError: always.
+        """
         raise TypeError(
             f"a {type(self).__name__} is a function of space, which is not computed with as "
             "numbers are: the level c of 2 f is the level c/2 of f, sums and products are written "
@@ -330,9 +336,13 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
     def _evaluate_points(
         self, points: Any, precision: Precision | None, choose: Callable[[Sample], Any]
     ) -> npt.NDArray[Any]:
-        """The array that `choose` takes from the samples at points."""
+        """What `choose` takes from the samples at points, as an array in the order of the points.
+
+        precision: as for `value`.
+        """
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
+            """What `choose` takes from the samples at the Dr.Jit points x."""
             return (choose(self.prepare(backend).evaluate(x)),)
 
         return evaluate_points(points, kernel, precision)[0]

@@ -1,11 +1,12 @@
-"""Fields defined by a formula of the coordinates, from which everything else follows.
+"""Fields that are defined by a formula of the coordinates. Everything else follows from the
+formula.
 
 A formula is evaluated in two ways. For jets of the coordinates at a point it returns value and
-gradient with bounds of their rounding. For jets along a piece of a path it returns ranges of its
+gradient, with bounds of their rounding. For jets along a piece of a path it returns ranges of its
 derivatives there, from which steps are proved.
 
-A formula's kernel is counted before it is compiled: LLVM's time grows faster than the number of
-operations, so that a warning comes before minutes of silence, with a remedy.
+The operations of a formula are counted before its kernel is compiled. LLVM's time grows faster than
+the number of operations, so a formula that would take minutes first gives a warning, with a remedy.
 """
 
 from __future__ import annotations
@@ -41,33 +42,36 @@ if TYPE_CHECKING:
     from harnack.enclosures import Promise
 
 
-# Radii of the balls on which a Lipschitz constant is promised, in multiples of |f|/|grad f|.
-_RADII, _LARGEST_RADIUS = (0.25, 1.0, 4.0), 1e12
-# At a tie the gradient is taken at a point this many roundings of coordinates and value away. The
-# direction to that point is the direction of the middle gradient (a unit vector or 0) plus the
-# vector `_TIE_DIRECTION`, so that it runs along no tie.
+# Radii of the balls on which a Lipschitz constant is promised, in multiples of |f|/|grad f|; and
+# the largest radius.
+_RADII, _MAX_RADIUS = (0.25, 1.0, 4.0), 1e12
+# At a tie of the formula (see `Formula._with_one_sided_gradient`) the gradient is taken at a point
+# this many roundings of coordinates and value away. The direction to that point is the direction of
+# the middle gradient (a unit vector or 0) plus the vector `_TIE_DIRECTION`, so that it runs along
+# no tie.
 _TIE_OFFSET, _TIE_DIRECTION = 64.0, (0.31, 0.19, 0.13)
-# Where the error of the gradient is at most this many roundings, there is no tie.
+# If the error of the gradient is at most this many roundings, there is no tie.
 _TIE_THRESHOLD = 1024.0
-# Where a formula may jump, or is abrupt, pieces begin this many roundings of t before the point.
-_ROUNDINGS = 8.0
+# If a formula may jump, or is abrupt, pieces of a ray begin this many roundings of t before the
+# point.
+_ROUNDINGS_BEFORE = 8.0
 # A warning announces a compilation that is expected to take longer than this many seconds.
 _SLOW_COMPILE_SECONDS = 10.0
 
 
 # Whether samples of formulas omit alternative promises (`without_alternatives`).
-_WITHOUT_WEAKER: ContextVar[bool] = ContextVar("without_alternatives", default=False)
+_WITHOUT_ALTERNATIVES: ContextVar[bool] = ContextVar("without_alternatives", default=False)
 
 
 @contextmanager
 def without_alternatives() -> Generator[None]:
     """Within this context, samples of formulas carry no alternative promises, which take several
     times as long to record as value and gradient. For callers that use value and gradient only."""
-    token = _WITHOUT_WEAKER.set(True)
+    token = _WITHOUT_ALTERNATIVES.set(True)
     try:
         yield
     finally:
-        _WITHOUT_WEAKER.reset(token)
+        _WITHOUT_ALTERNATIVES.reset(token)
 
 
 class Formula(Field):
@@ -118,22 +122,24 @@ class Formula(Field):
 
     def evaluate(self, p: Vec3) -> Sample:
         sample = self._with_one_sided_gradient(p, self.sample_without_alternatives(p))
-        if _WITHOUT_WEAKER.get():
+        if _WITHOUT_ALTERNATIVES.get():
             return sample
         return dataclasses.replace(sample, alternative_promises=self._local_lipschitz(p, sample))
 
     def _with_one_sided_gradient(self, p: Vec3, sample: Sample) -> Sample:
-        """Replace the gradient by a one-sided gradient where p lies on a tie of the formula.
+        """The sample at p, with a one-sided gradient if p lies on a tie of the formula.
 
-        At a tie, such as max(x, 0) at x = 0, the jet gives a range of gradients. The range contains
-        all gradients nearby, and others where terms of several ties are added, as on the faces of
-        `orthogonal_intersection`. Its middle is the gradient at no point, though its direction
-        mostly leads across the tie. A second sample (`Dual`), a few roundings away in about this
-        direction, decides which side to use.
+        A tie is a point at which two branches of a formula are equal, such as x = 0 for max(x, 0).
+        There the jet gives a range of gradients. The range contains all gradients nearby. It
+        contains others, too, if terms of several ties are added, as on the faces of
+        `orthogonal_intersection`. The middle of the range is the gradient at no point, but its
+        direction mostly leads across the tie. So f is evaluated once more (by `Dual`) at a point a
+        few roundings away, in about this direction, and the gradient there is used.
 
-        Proof of the error. The gradient at p lies within `gradient_error` of the middle. A gradient
-        that is farther from it does not come from a tie at p: the gradient of f changes that much
-        over these few roundings, as that of a sine of a large angle does. There the middle is used.
+        Proof of the error. The gradient at p lies within `gradient_error` of the middle. The second
+        gradient may be farther from the middle than twice that error. Then it does not come from a
+        tie at p: the gradient of f changes that much over these few roundings, as that of a sine of
+        a large angle does. In this case the middle is used.
         """
         epsilon = float(dr.epsilon(type(p.x)))
         is_bounded = dr.isfinite(sample.gradient_error + dr.sum(sample.gradient))
@@ -145,20 +151,18 @@ class Formula(Field):
         size = dr.select(size > 0, size, 1)
         coordinates = Dual.at_point(p + direction * (_TIE_OFFSET * epsilon * size))
         try:
-            dual = coordinates[0].coerce(self.formula(*coordinates))
+            nearby_value = coordinates[0].coerce(self.formula(*coordinates))
         except TypeError:  # a formula that accepts only ranges, as that of noise
             return sample
-        gradient = type(p)(*(0 * p.x + component for component in dual.first_derivatives))
-        distance = safe_norm(gradient - middle)
+        gradient = type(p)(*(0 * p.x + component for component in nearby_value.first_derivatives))
+        change = safe_norm(gradient - middle)
         is_tie = (
-            (error > _TIE_THRESHOLD * epsilon * norm)
-            & (distance <= 2 * error)
-            & dr.isfinite(distance)
+            (error > _TIE_THRESHOLD * epsilon * norm) & (change <= 2 * error) & dr.isfinite(change)
         )
         return dataclasses.replace(
             sample,
             gradient=dr.select(is_tie, gradient, sample.gradient),
-            gradient_error=dr.select(is_tie, error + distance, error),
+            gradient_error=dr.select(is_tie, error + change, error),
         )
 
     def sample_without_alternatives(self, p: Vec3) -> Sample:
@@ -167,7 +171,7 @@ class Formula(Field):
         return self._sample_of(self._jet(Jet.at_point(p), p.x), p)
 
     def _sample_of(self, jet: Jet, p: Vec3) -> Sample:
-        """The sample at p from the jet of f there."""
+        """The sample at p from the jet of f at p."""
         zero = 0 * p.x
         gradient = type(p)(*(zero + derivative.midpoint for derivative in jet.first_derivatives))
         gradient_error = zero
@@ -178,13 +182,16 @@ class Formula(Field):
         return Sample(value, gradient, promises, error, gradient_error)
 
     def _local_lipschitz(self, p: Vec3, sample: Sample) -> tuple[Lipschitz, ...]:
-        """Lipschitz constants on balls around p, each a bound of |grad f| on the box around the
-        ball. The radii are the multiples `_RADII` of Newton's estimate of the distance to level
-        0."""
-        steps = dr.abs(sample.value) / safe_norm(sample.gradient)
+        """Lipschitz constants on balls around p, as promises. Each is a bound of |grad f| on the
+        box around the ball.
+
+        sample: of f at p. The radii are the multiples `_RADII` of Newton's estimate |f|/|grad f| of
+            the distance to the level 0.
+        """
+        newton_length = dr.abs(sample.value) / safe_norm(sample.gradient)
         promises: list[Lipschitz] = []
         for multiple in _RADII:
-            radius = fmin(multiple * steps, _LARGEST_RADIUS)
+            radius = fmin(multiple * newton_length, _MAX_RADIUS)
             jet = self._jet(Jet.over_ball(p, radius), p.x)
             slopes = (0 * p.x + derivative.max_abs for derivative in jet.first_derivatives)
             constant = safe_norm(type(p)(*slopes)) * (1 + 1e-5)
@@ -255,12 +262,17 @@ class Formula(Field):
         return RaySample(sample, enclosures, (), slope, growth, slope_error, min_norm)
 
     def _slope(self, p: Vec3, direction: Vec3, *, is_rounded: bool = False) -> tuple[Real, Real]:
-        """The derivative along a direction and its error: in a crease, where the gradient is a
-        range, it is known for directions along the crease. Pieces of the path start from it, so it
-        takes no more work. is_rounded: the error is then that of all points that round to p."""
+        """The derivative of f at p along a direction, and a bound of its error. In a crease, where
+        the gradient is a range, it is a number for directions along the crease.
+
+        is_rounded: whether the error covers all points that round to p.
+
+        The pieces of the path start from the same jet, so that this takes no more work.
+        """
         zero = 0 * p.x
 
         def coordinate(k: int) -> Jet:
+            """The jet of coordinate k along the path."""
             at = Interval.point(p[k])
             at = at.widened(machine_epsilon(p[k])) if is_rounded else at
             return Jet(at, (Interval.point(direction[k]),), (), piece_length=zero)
@@ -287,6 +299,10 @@ class Formula(Field):
         return other
 
     def _jet(self, coordinates: tuple[Jet, Jet, Jet], like: Real) -> Jet:
+        """The jet of f at jets of the coordinates.
+
+        like: a number of the backend.
+        """
         return as_jet(self.formula(*coordinates), coordinates[0], type(self).__name__)
 
 
@@ -352,24 +368,26 @@ def as_jet(value: Any, like: Jet, name: str) -> Jet:
 
 @dataclass(frozen=True)
 class FormulaOnRay:
-    """A formula along the path p + s d.
+    """A formula along the path p + s d, as an `EvaluableRestriction`.
 
-    before: the distance before p at which its first piece begins. If that is not 0.0, its pieces
+    field: has the formula.
+    p, direction: (3,) p and d.
+    before: the distance before p at which the first piece begins. If it is not 0.0, the pieces
         cover all paths that lead through p up to rounding.
+    piece_count: see `PathRestriction`. The ranges of a formula cost as much as its value: one piece
+        takes the least time; four pieces take two thirds of the samples, but twice the time.
     """
 
     field: Formula
     p: Vec3
     direction: Vec3
     before: Real = 0.0
-    # Ranges of a formula cost as much as its value: one piece takes the least time, four pieces
-    # take two thirds of the samples and twice the time.
     piece_count: int = 1
 
     def rounded(self, t: Real) -> FormulaOnRay:
         """The formula along all paths that lead through p up to its rounding, from a little before
         p: by more than the rounding of t, of which p is the point."""
-        before = _ROUNDINGS * float(dr.epsilon(type(t))) * dr.abs(t)
+        before = _ROUNDINGS_BEFORE * float(dr.epsilon(type(t))) * dr.abs(t)
         return dataclasses.replace(self, before=before)
 
     def is_continuous(self, length: Real) -> Mask:
@@ -388,6 +406,7 @@ class FormulaOnRay:
         return x.constant(float(value)) if isinstance(value, int | float) else value
 
     def _piece(self, start: Real, end: Real) -> PathPiece:
+        """The ranges of the first two derivatives for start <= s <= end."""
         jet = self._jet(start, end)
         (slopes,), (curvatures,) = jet.first_derivatives, jet.second_derivatives
         zero = 0 * self.p.x
@@ -399,6 +418,7 @@ class FormulaOnRay:
         )
 
     def _jet(self, start: Real, end: Real) -> Jet:
+        """The jet of the formula for start <= s <= end."""
         is_exact = isinstance(self.before, float) and self.before == 0.0
         if not is_exact and isinstance(start, float):  # the first piece starts at 0.0
             start = -self.before

@@ -112,6 +112,7 @@ def validate_samples(
 
     @functools.wraps(evaluate)
     def checked(self: Any, p: Vec3) -> Sample:
+        """See `Field.evaluate`."""
         sample: Any = evaluate(self, p)
         name = f"{type(self).__name__}.evaluate"
         if not isinstance(sample, Sample):
@@ -146,7 +147,8 @@ def validate_samples(
 
 
 def _unbox_numpy(record: _R) -> _R:
-    """The record with its NumPy scalars as Python numbers: Dr.Jit takes no NumPy scalars."""
+    """The record, with attributes that are NumPy scalars turned into Python numbers, as Dr.Jit
+    takes no NumPy scalars."""
     scalars: dict[str, Any] = {
         key: value.item() for key, value in vars(record).items() if isinstance(value, np.generic)
     }
@@ -154,6 +156,7 @@ def _unbox_numpy(record: _R) -> _R:
 
 
 def _describe_type(value: Any) -> str:
+    """The type of a value in words, for messages."""
     return "nothing" if value is None else f"an object of type {type(value).__name__}"
 
 
