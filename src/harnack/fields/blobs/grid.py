@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, IntArray, Vec3
 
 # How far beyond a cell its list is valid, as a fraction of the cell's size.
-_CELL_MARGIN = 1 / 4
+_MARGIN = 1 / 4
 # The number of pairs (ball, cell) that are compared in one NumPy expression, to save memory.
 _PAIRS_AT_ONCE = 4_000_000
 # The maximal number of cells, and the maximal number of list entries per blob. If a grid would have
@@ -58,7 +58,7 @@ class CellLists(GridData):
         lower, upper = (centers - supports[:, None]).min(0), (centers + supports[:, None]).max(0)
         while True:
             size = round_to_short_float(size)
-            margin = _CELL_MARGIN * size
+            margin = _MARGIN * size
             origin = np.nextafter((lower - 2 * margin).astype(np.float32), np.float32(-np.inf))
             origin = origin.astype(np.float64)
             counts = np.ceil((upper + 2 * margin - origin) / size)
@@ -95,9 +95,9 @@ def _cell_ball_pairs(
     """
     enlarged_radii = radii * (1 + 1e-6)
     first_cell = np.floor(
-        (centers - enlarged_radii[:, None] - origin) / size - _CELL_MARGIN
+        (centers - enlarged_radii[:, None] - origin) / size - _MARGIN
     ).astype(np.int64)
-    last_cell = np.floor((centers + enlarged_radii[:, None] - origin) / size + _CELL_MARGIN).astype(
+    last_cell = np.floor((centers + enlarged_radii[:, None] - origin) / size + _MARGIN).astype(
         np.int64
     )
     cell_spans = (last_cell - first_cell).max(axis=1) + 1
@@ -109,8 +109,8 @@ def _cell_ball_pairs(
             balls_of_span, max(1, len(balls_of_span) * span**3 // _PAIRS_AT_ONCE)
         ):
             indices = first_cell[group, :, None] + np.arange(span)  # (m, 3, span)
-            lower = origin[:, None] + (indices - _CELL_MARGIN) * size
-            upper = origin[:, None] + (indices + 1 + _CELL_MARGIN) * size
+            lower = origin[:, None] + (indices - _MARGIN) * size
+            upper = origin[:, None] + (indices + 1 + _MARGIN) * size
             ball_centers = centers[group, :, None]
             axis_squares = (
                 np.maximum(np.maximum(lower - ball_centers, ball_centers - upper), 0) ** 2
@@ -145,7 +145,7 @@ class BlobGrid(EmptySpaceGrid):
         """The lists on a backend."""
         return cls(
             *cls.upload_layout(backend, lists),
-            _CELL_MARGIN,
+            _MARGIN,
             upload_integers(backend, lists.starts),
             upload_integers(backend, lists.entries),
         )
