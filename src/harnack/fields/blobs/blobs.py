@@ -472,20 +472,21 @@ def _numbers(values: Any, name: str, count: int) -> FloatArray:
 
 
 class Molecule(Blobs):
-    """The surface of a molecule: the level 1 of a sum of A exp(-s (d/r)^2) over its atoms, each
-    minus a tangent, so that its support is bounded (see `GaussianKernel`); r is the van der Waals
-    radius of the atom.
+    """The surface of a molecule: the level 1 of a sum of Gaussians A exp(-s (d/r)^2) over its
+    atoms. Here d is the distance from the atom, r its van der Waals radius, and s the sharpness.
+    From each Gaussian a tangent is subtracted, so that its support is bounded (`GaussianKernel`).
 
     source: a .pdb, .ent, .cif or .mmcif file, or `Atoms`.
-    sharpness: s; the larger it is, the closer the surface follows the single atoms.
+    sharpness: s. The larger it is, the closer the surface follows the single atoms.
     tail: an atom ends where its Gaussian is this fraction of its value at the radius. With 1/32
-        about ten atoms reach a point, with 1/1000 about twenty.
+        about ten atoms are nonzero at a point, with 1/1000 about twenty.
 
-    The usual viewers cut Gaussians off at 1/32: then f jumps by this value, and the surface has
-    seams. Here a tangent is subtracted, so that f is smooth where atoms end, and ranges of f along
-    a ray are exact; a single atom is still a ball of its radius.
+    Most viewers cut Gaussians off at 1/32. Then f jumps by this value, and the surface has seams.
+    With the tangent subtracted, f is smooth where atoms end, and ranges of f along a ray are exact.
+    A single atom is still a ball of its radius.
 
-    Raises FileFormatError for a file that is not of a molecule.
+    Raises:
+        FileFormatError: a file that does not hold a molecule.
     """
 
     def __init__(

@@ -1,16 +1,18 @@
 """Kernels of blobs: functions of the distance from the center, with their derivatives along lines.
 
-Lengths are in units of the support: a kernel is a function k(q) of the squared distance q, falling
-from the center to 0 at q = 1, where it ends with k' = 0. Along a line that passes the center at the
-distance h, x from the nearest point, it is k(h^2 + x^2): a function of x on the chord |x| <= S, S^2
-= 1 - h^2. Its derivatives in x all have the same shape, on which the proofs rest:
+Lengths are in units of the support, the radius at which a blob ends. A kernel is a function k(q) of
+the squared distance q from the center. It falls from the center to 0 at q = 1, where it ends with
+dk/dq = 0. Take a line that passes the center at the distance h, and let x be the position on the
+line, measured from the point nearest to the center. Along the line the kernel is f(x) = k(h^2 +
+x^2) on the chord |x| <= S, with S^2 = 1 - h^2. The derivatives of f have the same shape for all
+kernels, on which the proofs rest:
 
-- the first is odd and, for x > 0, falls to a single minimum at x = c1, then rises to 0 at S;
-- the second is even and rises from a minimum at 0 to a single maximum at c2, then falls until S.
+- f' is odd. For x > 0 it falls to a single minimum at x = c1, then rises to 0 at S.
+- f'' is even. It rises from a minimum at 0 to a single maximum at c2, then falls until S.
 
-So the ends of their ranges on any piece of the line are among the values at its two ends and three
-numbers of the chord. At S the second derivative of some kernels jumps to 0
-(`second_derivative_jumps`).
+So the ends of their ranges on any piece of the line are among the values at the two ends of the
+piece and three numbers that depend on the chord: f'(-c1), f''(0) and f''(c2). At S, f'' of some
+kernels jumps to 0 (`second_derivative_jumps`).
 """
 
 from __future__ import annotations
@@ -35,13 +37,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ChordProfile:
-    """The extrema of a kernel's derivatives along a line.
+    """The extreme values of a kernel's derivatives along a line, and where they are taken. See the
+    module for S, c1 and c2.
 
-    half_length: S, half the length of the chord; 0 where the line misses the support.
+    half_length: S, half the length of the chord; 0 if the line misses the support.
     steepest_position: c1.
     steepest: the first derivative at -c1, which is its largest value.
     max_curvature_position: c2.
-    max_second, min_second: the second derivative at c2 and at 0.
+    max_second: the second derivative at c2, its maximum.
+    min_second: the second derivative at 0, its minimum.
     """
 
     half_length: Real
@@ -54,10 +58,15 @@ class ChordProfile:
 
 @dataclass(frozen=True)
 class KernelLipschitz:
-    """Lipschitz constants of k and of its first two derivatives along a line, with respect to the
-    positions of the line and of the point on it, in units of the support (`slope` also bounds
-    |grad k|). They bound the effect of rounding. The jump of the second derivative at S is not
-    included."""
+    """Lipschitz constants of k and of its first two derivatives along lines. They say how fast
+    these change with the distance of the line from the center and with the position on the line, in
+    units of the support, and bound the effect of rounding.
+
+    value: of k.
+    slope: of the first derivative along a line; also a bound of |grad k|.
+    bend: of the second derivative along a line. The jump of the second derivative at S is not
+        included.
+    """
 
     value: float
     slope: float
@@ -65,8 +74,8 @@ class KernelLipschitz:
 
 
 class BlobKernel(abc.ABC):
-    """A kernel of blobs. Amplitudes are chosen so that a single blob of weight 1 has the value 1 at
-    its radius."""
+    """A kernel of blobs: see the module for k, q, S and x. Each blob multiplies the kernel by an
+    amplitude, so that a single blob of weight 1 has the value 1 at its radius."""
 
     name: ClassVar[str]
     second_derivative_jumps: ClassVar[bool] = True
@@ -88,30 +97,41 @@ class BlobKernel(abc.ABC):
 
     @abc.abstractmethod
     def profile(self, q: Real) -> tuple[Real, Real, Real]:
-        """k, dk/dq, and a number m such that the error of k is at most 16 roundings of m and of
-        dk/dq."""
+        """k(q); dk/dq; and a number m. The error of k is at most 16 roundings of m plus 16
+        roundings of dk/dq."""
 
     @abc.abstractmethod
     def second_derivative(self, q: Real) -> Real:
-        """d2k/dq2."""
+        """The second derivative of k by q."""
 
     @abc.abstractmethod
     def chord(self, height: Real, inside: Real) -> ChordProfile:
-        """The kernel along lines with h^2 = `height` <= 1 and S^2 = `inside` = 1 - h^2 >= 0."""
+        """The extreme values of the kernel's derivatives along lines.
+
+        height: h^2, at most 1.
+        inside: S^2 = 1 - h^2, at least 0.
+        """
 
     @abc.abstractmethod
     def derivatives(self, height: Real, inside: Real, x: Real) -> tuple[Real, Real]:
-        """The first two derivatives along the lines of `chord`, at |x| <= S."""
+        """The first two derivatives along the lines of `chord`, at the position x, |x| <= S.
+
+        height, inside: h^2 and S^2.
+        """
 
     def lipschitz_fraction(self, inside: Real, nearest: Real) -> Real:
-        """The fraction of `steepness` that is still a bound on lines with S^2 = `inside`, for x^2
-        >= `nearest`."""
+        """A factor, at most 1, by which the constants `steepness` may be multiplied for a part of a
+        line.
+
+        inside: S^2 of the line.
+        nearest: a lower bound of x^2 on the part.
+        """
         del inside, nearest
         return 1.0
 
     @abc.abstractmethod
     def derivative_ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
-        """Ranges of k and of its first two derivatives in q, on an interval of q >= 0."""
+        """Ranges of k, dk/dq and d2k/dq2 on an interval of q >= 0."""
 
     def prepare(self, backend: Backend) -> BlobKernel:
         """The same kernel with its numbers as kernel parameters of the backend."""
@@ -120,11 +140,11 @@ class BlobKernel(abc.ABC):
 
     @property
     def amplitude(self) -> float:
-        """1 / k at the radius of a blob."""
+        """1 / k at the radius of a blob, that is at q = 1/support^2."""
         return 1.0 / float(self.height(np.array([self.support**-2.0]))[0])
 
     def function(self) -> ElementaryFunction:
-        """The kernel as a function of jets of q."""
+        """The kernel as a function that can be applied to a jet of q."""
         return ElementaryFunction(
             self.name, self.derivative_ranges, lambda q: self.profile(q)[0], self.height
         )
@@ -488,10 +508,11 @@ KERNELS: dict[str, type[BlobKernel]] = {
 
 
 def choose_kernel(kernel: str | BlobKernel) -> BlobKernel:
-    """The kernel of this name, with its default parameters; a kernel is returned as it is.
+    """The kernel with a name, with its default parameters. A kernel is returned as it is.
 
-    Raises ValueError for an unknown name, TypeError for an argument that is neither a name nor a
-    kernel.
+    Raises:
+        ValueError: an unknown name.
+        TypeError: neither a name nor a kernel.
     """
     if isinstance(kernel, BlobKernel):
         return kernel

@@ -35,17 +35,18 @@ _MIN_SHIFT = 0.25
 
 
 def union(*solids: Solid) -> Solid:
-    """The union of the solids: all points that are in at least one of them.
+    """The union of solids: all points that are in at least one of them.
 
     Raises:
         ValueError: no solids.
-        TypeError: an argument is not a solid.
+        TypeError: an argument that is not a solid.
     """
     return BooleanSolid(_flatten_operands(solids, is_union=True), is_union=True)
 
 
 def intersection(*solids: Solid) -> Solid:
-    """The intersection of the solids: all points that are in each of them. Raises as `union`."""
+    """The intersection of solids: all points that are in each of them. It raises the errors of
+    `union`."""
     return BooleanSolid(_flatten_operands(solids, is_union=False), is_union=False)
 
 
@@ -309,15 +310,16 @@ class BooleanSolid(Solid):
 
 
 def min_wavelength(parts: Iterable[Solid]) -> float | None:
-    """The smallest `Field.min_wavelength` of any of the fields; None if no field has it."""
+    """The smallest `Field.min_wavelength` of solids. Solids for which it is None are left out; None
+    if there are no others."""
     return min(
         (part.min_wavelength for part in parts if part.min_wavelength is not None), default=None
     )
 
 
 def lipschitz_of(sample: Sample) -> Lipschitz | None:
-    """The Lipschitz constant that a sample promises, or one that follows from another of its
-    promises; None if there is neither."""
+    """A Lipschitz constant that a sample promises, or that follows from one of its promises; None
+    if there is neither."""
     implied = [promise.implied_lipschitz(sample.value) for promise in sample.all_promises]
     stated = (promise for promise in sample.all_promises if isinstance(promise, Lipschitz))
     return next(stated, None) or next((promise for promise in implied if promise is not None), None)
@@ -338,7 +340,10 @@ def _box_around_volumes(volumes: list[Volume]) -> Volume | None:
 
 @dataclass(frozen=True, eq=False)
 class Complement(SolidOfField):
-    """The complement of a solid: all points that are not inside it. Its function is -f."""
+    """The complement of a solid: all points that are not inside it. Its function is -f.
+
+    field: the solid with the function f.
+    """
 
     field: Solid
 
@@ -443,8 +448,14 @@ class OffsetSolid(SolidOfField):
 class BlendedSolid(FormulaSolid):
     """The union or intersection of two solids with a fillet: see `arithmetic.norms.blend_union`.
 
-    Its Lipschitz constant is 2^(1/p) times the larger of the solids' own. A union's fillet lies
-    where both functions are at most the radius: within the union of the solids grown by the radius.
+    parts: the two solids.
+    radius: how far the fillet extends along the surfaces, where the functions are distances.
+    power: the exponent p of the superellipse that the fillet is a part of.
+    is_union: whether it is their union; else it is their intersection.
+
+    Its Lipschitz constant is 2^(1/p) times the larger of the solids' constants. The fillet of a
+    union lies where both functions are at most the radius, so that it is within the union of the
+    solids grown by the radius.
     """
 
     is_cheap = False
