@@ -29,20 +29,27 @@ from harnack.fields.solids.solid import AXES, SpaceMap, axis_index
 
 
 class Deformation(SpaceMap):
-    """A map of space that does not keep lines straight, for solids with a formula.
+    """A map of space that does not keep lines straight. It applies only to solids with a formula.
 
-    axis: the coordinate on which the map depends.
+    axis: "x", "y" or "z", the coordinate on which the map depends.
     """
 
     def apply(self, solid: Solid) -> Solid:
+        """The image of a solid.
+
+        Raises:
+            TypeError: the solid has no formula.
+        """
         solid.formula(*probe_jets())  # raises TypeError for a solid without a formula
         return DeformedSolid(solid, self)
 
     @property
     def min_scale(self) -> float:
-        """The smallest factor by which the map multiplies lengths, and so wavelengths. It is 1 for
-        a map whose factor depends on the point, such as a twist, which compresses waves more the
-        farther they are from its axis."""
+        """The smallest factor by which the map multiplies lengths, and so wavelengths.
+
+        The default is 1, for maps whose factor has no positive lower bound: a twist compresses
+        waves more the farther they are from its axis.
+        """
         return 1.0
 
     @abc.abstractmethod
@@ -51,7 +58,8 @@ class Deformation(SpaceMap):
 
     @abc.abstractmethod
     def volume(self, volume: Volume | None) -> Volume | None:
-        """A volume that contains the image of another volume; None if no such volume is known."""
+        """A volume that contains the image of `volume` under the map; None if no such volume is
+        known."""
 
     @abc.abstractmethod
     def preimage_lipschitz(self, p: Vec3) -> tuple[Real, Real]:
@@ -64,10 +72,14 @@ class Deformation(SpaceMap):
 
 @dataclass(frozen=True, eq=False)
 class DeformedSolid(FormulaSolid):
-    """The image of a solid under a deformation: its formula at the preimage of p.
+    """The image of a solid under a deformation. f at a point p is the solid's formula at the
+    preimage of p.
 
-    No Lipschitz constant of the map is needed for a step: ranges of the local coordinates and of
-    their derivatives along the ray are passed on to the formula.
+    inner: the solid.
+    map: the deformation.
+
+    Steps need no Lipschitz constant of the map. The ranges of the preimage's coordinates along the
+    ray, and of their derivatives, are passed on to the formula.
     """
 
     inner: Solid
@@ -84,7 +96,7 @@ class DeformedSolid(FormulaSolid):
 
     @property
     def may_jump(self) -> bool:
-        """Whether the inner solid's formula may jump: the map itself is continuous."""
+        """Whether the inner solid's formula may jump; the map is continuous."""
         return tally_of(self.inner.formula).may_jump
 
     def promises(self, p: Vec3) -> tuple[Promise, ...]:
