@@ -46,27 +46,29 @@ _MAX_POINT_ROUNDINGS = 256.0
 
 @dataclass(frozen=True, eq=False)
 class Extrusion(Solid):
-    """An extruded region of the plane z = 0: the points above it with 0 <= z <= height.
+    """An extruded region of the plane z = 0: the points above the region, with 0 <= z <= height.
 
-    loops: the outline of the region: an array (n, 2) of the vertices of a closed loop, or several.
-        A point is inside if an odd number of loops runs around it (the even-odd rule), so that
-        loops in loops are holes, and loops in these are islands, whatever their orientation. Loops
-        that cross or touch are cut there. Stored as `harnack.geometry.make_outline` returns them.
+    loops: the outline of the region, an array (n, 2) of the vertices of a closed loop, or several
+        such arrays. A point is inside if an odd number of loops surrounds it (the even-odd rule).
+        So loops in loops are holes, and loops in holes are islands, whatever their orientation.
+        Loops that cross or touch are cut there. They are stored as `harnack.geometry.make_outline`
+        returns them.
     height: along z.
-    twist: the angle in degrees by which the end is turned against the start, counter-clockwise as
-        seen from above, about the z axis.
-    taper: the factor by which the end is scaled, about the z axis.
+    twist: the angle in degrees by which the top end is turned against the bottom end about the z
+        axis, counter-clockwise as seen from above.
+    taper: the factor by which the top end is scaled about the z axis.
 
-    With neither twist nor taper, f is the signed distance: the distance d from the outline in the
-    plane, exact over all edges, and the distance from the ends, combined as distances at right
-    angles (`orthogonal_intersection`). So its Lipschitz constant is 1. Along a path more is proved:
-    see `ExtrusionEnclosure`.
+    Without twist and taper, f is the signed distance. It combines the distance d from the outline
+    in the plane, which is exact over all edges, and the distance from the two ends, as distances at
+    right angles (`orthogonal_intersection`). So its Lipschitz constant is 1. Along a path more is
+    proved: see `ExtrusionEnclosure`.
 
-    Else f is this function at the preimage of p, which has the same z. Along a path it changes no
-    faster than the preimage moves, whose speed is bounded by ranges. Proof of the promise in all
-    directions. On a ball about p the inverse of the taper has the constant c within R, the inverse
-    of the twist, which acts on what the first returns, the constant b within S (proofs: `Taper`,
-    `Twist`); so both together have b c within min(R, S/c), and f, of constant 1, has it too.
+    With twist or taper, f at p is this function at the preimage of p, which has the same z. Along a
+    path f changes no faster than the preimage moves; ranges bound its speed. Proof of the promise
+    in all directions. Let c be the Lipschitz constant of the inverse of the taper on a ball about p
+    of radius R, and b that of the inverse of the twist on a ball of radius S about the point that
+    the first returns (proofs: `Taper`, `Twist`). Then both maps together have the constant b c
+    within min(R, S/c). So has f, because the signed distance has the constant 1.
 
     Raises:
         ValueError: loops that enclose no area; a height or a taper that is not positive.
@@ -348,14 +350,17 @@ class ExtrusionEnclosure(Enclosure):
 
 
 def outline_distance_jet(nearest: Callable[[Real, Real], OutlineSample], x: Jet, y: Jet) -> Jet:
-    """The jet of a signed distance in the plane, from jets of the coordinates.
+    """The jet of a signed distance d in the plane.
 
-    Proof. The distance has the Lipschitz constant 1, so its derivative in any variable is at most
-    the length of the derivative of (x, y), and the error of the value is at most that of the
-    coordinates at the start. On a piece there may be kinks, so that second derivatives have no
-    bound. At a point they are those of the distance from the nearest edge or vertex, and so is the
-    gradient. On a ball, where coordinates are ranges and not numbers with their rounding, another
-    edge may be nearest, as on a piece.
+    nearest: returns the sample of d at a point (u, v).
+    x, y: jets of the coordinates.
+
+    Proof. d has the Lipschitz constant 1. So its derivative by any variable is at most the length
+    of the derivative of (x, y) by it, and its value at the start is known up to the error of the
+    coordinates there. On a piece d may have kinks, so that second derivatives have no bound. At a
+    point, the gradient and the second derivatives are those of the distance from the nearest edge
+    or vertex. Where coordinates are ranges that stand for a ball, and not numbers with their
+    rounding, another edge may be nearest, as on a piece.
     """
     starts = [jet_u if jet_u.jet_at_start is None else jet_u.jet_at_start for jet_u in (x, y)]
     zero = 0 * x.piece_length
@@ -418,18 +423,19 @@ def outline_distance_jet(nearest: Callable[[Real, Real], OutlineSample], x: Jet,
 
 @dataclass(frozen=True, eq=False)
 class SolidOfRevolution(Solid):
-    """The solid of revolution of an outline in the half-plane (r, z), r >= 0, about the z axis.
+    """The solid of revolution, about the z axis, of an outline in the half-plane (r, z), r >= 0.
 
-    loops: as of `Extrusion`, with points (r, z). Edges on the axis are inside of the solid, and no
+    loops: as for `Extrusion`, with points (r, z). Edges on the axis are inside of the solid, and no
         part of its surface.
 
-    f is the signed distance, with the Lipschitz constant 1. Proof: the nearest point of a surface
-    of revolution lies in the half-plane of p. Along a path, (r, z) departs from its tangent line,
-    on which `OutlineEdges.sample` bounds the distance, in r alone: r is convex along the path, so
-    that it lies e(s) >= 0 above its tangent, and with e = (c/r)^2 s^2/(r(s) + r + r' s), where c/r
-    is the component of the direction across the half-plane. A distance of constant 1 is less by at
-    most e(s). The bound less a convex function is still concave, and `TangentEnclosure` needs
-    nothing else.
+    f is the signed distance, with the Lipschitz constant 1. Proof. The nearest point of a surface
+    of revolution lies in the half-plane of p, so f is the signed distance of (r, z) from the
+    outline. Along a path, `OutlineEdges.sample` bounds the distance on the tangent line of (r, z).
+    The point (r, z) departs from that line in r alone. r(s) is convex along the path, and lies
+    above its tangent by e(s) = (c/r)^2 s^2/(r(s) + r + r' s) >= 0, where c/r is the component of
+    the direction across the half-plane. As the distance has the constant 1, it is less by at most
+    e(s). A concave bound less a convex function is still concave, which is all that
+    `TangentEnclosure` needs.
 
     Raises:
         ValueError: loops that enclose no area, or with points of r < 0.

@@ -95,7 +95,7 @@ class OutlineEdges:
     def upload(cls, backend: Backend, outline: Outline, *, axis: bool = False) -> OutlineEdges:
         """The edges of an outline on a backend.
 
-        axis: leave out edges on the line x = 0, beyond which no point is sampled.
+        axis: whether edges on the line x = 0 are left out. No point with x < 0 may be sampled then.
         """
         points = np.concatenate(outline)
         center = 0.5 * (points.min(axis=0) + points.max(axis=0))
@@ -122,8 +122,8 @@ class OutlineEdges:
         return cls(RecordTable.upload(backend, rows), chains, (x, y), size)
 
     def knots(self, x: Real, y: Real, ahead: Real) -> tuple[Real, ...]:
-        """The lengths at which the distance along a line is bounded; the last is the length asked
-        for."""
+        """The positions on the lines from points (x, y) at which the distance is bounded. They
+        increase; the last is the length `ahead` that is asked for, which may be infinite."""
         max_length = _ENDLESS_LENGTH * (
             fmax(dr.abs(x), dr.abs(y)) + self.size + dr.abs(self.center[0])
         )
@@ -137,11 +137,14 @@ class OutlineEdges:
         velocity: tuple[Real, Real] | None = None,
         knots: tuple[Real, ...] = (),
     ) -> OutlineSample:
-        """The sample of the signed distance at points (x, y), and along lines from these with a
-        velocity of length 1 at most.
+        """The sample of the signed distance at points (x, y), with lower bounds along lines from
+        them.
+
+        velocity: (x, y) the direction of the lines, of length 1 at most; None without lines.
+        knots: increasing positions on the lines at which the distance is bounded.
 
         Proof of the lower bounds. The distance from an edge, or from the box of a chain, is a
-        convex function along a line, so that it stays above its tangent (`TangentEnclosure`).
+        convex function along a line, and lies above its tangent (`TangentEnclosure`).
         """
         real = cast("Any", type(x))
         epsilon = 2 * float(dr.epsilon(real))
@@ -363,6 +366,7 @@ class SignedDistanceEnclosure(Enclosure):
         """The enclosure from a sample of d.
 
         slope: the derivative of d along the path.
+        knots: the positions on the path of the sample's lower bounds.
         """
         distance = dr.abs(nearest.value)
         max_slope = fmin(dr.mulsign(slope, nearest.value) + nearest.gradient_error, 1.0)
