@@ -29,34 +29,37 @@ if TYPE_CHECKING:
 
 Fade: TypeAlias = Literal["quintic", "cubic"]
 
+# The corners of a cell: 0 or 1 along each axis, the last axis fastest.
 CORNERS = tuple(itertools.product((0, 1), repeat=3))
 
 
 @dataclass(frozen=True)
 class NoiseConstants:
-    """Bounds of gradient noise on a lattice of spacing 1, for any unit vectors at its points.
+    """Bounds of gradient noise on a lattice of spacing 1, for any unit vectors at the lattice
+    points.
 
     max_abs: of |noise|.
     max_gradient: of |grad noise|.
-    max_second_derivative: of all second derivatives.
+    max_second_derivative: of all second derivatives along lines.
 
-    Proof. With weights w_c of the corners c of a cell and r_c = x - c, noise is sum w_c g_c.r_c.
-    |noise| <= sum w_c |r_c| <= sqrt(sum w_c |r_c|^2), the root of a sum of three terms of at most
-    1/4: s(t) lies below the line (1 + 2t)/4 on the first half, for it is convex there. sqrt(3)/2 is
-    attained at the cell's center.
+    Proof. Let c run over the corners of a cell, with the weights w_c, the unit vectors g_c and r_c
+    = x - c. Then noise is the sum of w_c g_c . r_c. So |noise| <= sum w_c |r_c| <= sqrt(sum w_c
+    |r_c|^2). The last sum has one term for each axis, and each is at most 1/4: the weight s(t) lies
+    below the line (1 + 2t)/4 on the first half of the edge, where it is convex. The bound sqrt(3)/2
+    is attained at the cell's center.
 
-    The derivative along v is sum g_c.(A_c v) with A_c = w_c I + r_c grad w_c^T, at most sum |A_c v|
-    <= sqrt(v^T (sum A_c^T A_c / o_c) v) for weights o_c > 0 with the sum 1 (Cauchy and Schwarz).
-    With the spectral norms of the A_c as weights the root of the largest eigenvalue is at most
-    2.183 for the cubic and sqrt(499)/8 = 2.7923 for the quintic fade on a grid of the cell, and
-    changes slowly between its points: 2.2 and 2.82 leave room for that. At the center sqrt(19)/2 =
-    2.1794 and sqrt(499)/8 are attained. Hart's 3 (1996, appendix F) is a bound, but his argument
-    (3/2 of the fade times 2 of the vectors) does not prove it: values of a table have no Lipschitz
-    constant.
+    The derivative along v is the sum of g_c . (A_c v) with A_c = w_c I + r_c grad w_c^T. It is at
+    most sum |A_c v| <= sqrt(v^T (sum A_c^T A_c / o_c) v) for any weights o_c > 0 whose sum is 1
+    (Cauchy and Schwarz). The weights used are proportional to the spectral norms of the A_c. Then,
+    on a grid of points of the cell, the root of the largest eigenvalue is at most 2.183 for the
+    cubic fade and sqrt(499)/8 = 2.7923 for the quintic fade. Between the points it changes slowly;
+    2.2 and 2.82 leave room for that. At the center sqrt(19)/2 = 2.1794 and sqrt(499)/8 are
+    attained. Hart's 3 (1996, appendix F) is a bound, but his argument (3/2 of the fade times 2 of
+    the vectors) does not prove it: the values of a table have no Lipschitz constant.
 
-    A second derivative d_ij is, in the same way along the other axes, at most a sum over the
-    corners of one or two axes; the largest row sum of these bounds is a bound of the spectral norm
-    of the Hessian: 17.64 and 24.35 on a grid.
+    A second derivative d_ij is bounded in the same way: by a sum over the corners along one or two
+    axes, with the weights of the other axes. The largest row sum of these bounds is a bound of the
+    spectral norm of the Hessian: 17.64 (cubic) and 24.35 (quintic) on a grid.
     """
 
     max_abs: float
@@ -71,7 +74,8 @@ CONSTANTS: dict[Fade, NoiseConstants] = {
 
 
 def fade(kind: Fade, t: Any) -> tuple[Any, Any, Any]:
-    """The weight of the far end of an edge at t, 0 to 1, and its first two derivatives."""
+    """The weight of the far end of an edge at the position t from the near end, 0 <= t <= 1; and
+    its first two derivatives."""
     if kind == "cubic":
         return t * t * (3 - 2 * t), 6 * t * (1 - t), 6 - 12 * t
     rest = 1 - t
@@ -83,10 +87,11 @@ def fade(kind: Fade, t: Any) -> tuple[Any, Any, Any]:
 
 
 def cell_noise(kind: Fade, t: Any, vectors: Any) -> tuple[Any, list[Any], list[Any]]:
-    """Noise in a cell: its value, gradient (3,) and Hessian (6,), the upper triangle row by row.
+    """Noise in a cell: its value, its gradient (3,), and its Hessian (6,), the upper triangle row
+    by row.
 
-    t: (3,) the position in the cell, 0 to 1. vectors: (8,) unit vectors (3,) at the corners, in the
-        order of `CORNERS`.
+    t: (3,) the position in the cell, 0 to 1.
+    vectors: (8,) unit vectors (3,) at the corners, in the order of `CORNERS`.
     """
     weights: list[tuple[tuple[Any, Any], ...]] = []
     for fraction in t:
@@ -130,8 +135,11 @@ def cell_noise(kind: Fade, t: Any, vectors: Any) -> tuple[Any, list[Any], list[A
 
 
 def lattice_vector(x: Any, y: Any, z: Any, seed: Any, like: Real) -> list[Any]:
-    """A pseudo-random unit vector for a lattice point, from unsigned integers of 32 bits of
-    Dr.Jit."""
+    """A pseudo-random unit vector (3,) for a lattice point.
+
+    x, y, z, seed: Dr.Jit integers of 32 bits without sign.
+    like: a number of the type that the components are to have.
+    """
     h = x * 0x8DA6B343 + y * 0xD8163841 + z * 0xCB1AB31F + seed * 0x9E3779B1
     for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B)):
         h = (h ^ (h >> shift)) * factor
@@ -145,18 +153,19 @@ def lattice_vector(x: Any, y: Any, z: Any, seed: Any, like: Real) -> list[Any]:
 
 @dataclass(frozen=True)
 class FractalNoise(FormulaSolid):
-    """Fractal noise: the sum of a_i noise(2^i k p), a_i = amplitude 2^(-beta i), over octaves i.
+    """Fractal noise: f(p) is the sum of a_i noise(2^i k p), with a_i = amplitude 2^(-beta i), over
+    the octaves i = 0, 1, ...
 
-    octaves: the number of octaves.
+    octaves: their number.
     beta: how fast amplitudes fall: 0 for white noise, 1 for 1/f noise, 2 for Brownian motion.
-    frequency: k, the number of lattice points per unit of length.
+    frequency: k, the number of lattice points per unit of length of the first octave.
     amplitude: of the first octave.
     seed: an integer of 32 bits that chooses the noise.
     fade: "quintic", with a continuous second derivative, or "cubic", which is Hart's.
 
-    Hart 1996, equations 52 to 55. Its Lipschitz constant is at most the sum of the octaves'
-    constants; amplitudes 2^(-beta i) have the Hurst exponent beta, so that the graph has the
-    fractal dimension 3 - beta, where Hart's equation after 53 has 2 + (3 - beta)/2.
+    This is Hart 1996, equations 52 to 55. The Lipschitz constant is at most the sum of the octaves'
+    constants. The amplitudes 2^(-beta i) give the Hurst exponent beta, so that the graph has the
+    fractal dimension 3 - beta. (Hart's equation after 53 has 2 + (3 - beta)/2.)
     """
 
     octaves: int = 6
@@ -318,8 +327,8 @@ class FractalNoise(FormulaSolid):
 
 
 class Noise(FractalNoise):
-    """Gradient noise of a single octave: lattice noise with random unit vectors (Perlin 1985; Hart
-    1996, equation 52)."""
+    """Gradient noise of a single octave: noise with random unit vectors at the points of a lattice
+    (Perlin 1985; Hart 1996, equation 52). For the parameters see `FractalNoise`."""
 
     def __init__(
         self,
@@ -334,10 +343,14 @@ class Noise(FractalNoise):
 
 @dataclass(frozen=True)
 class DisplacedSolid(FormulaSolid):
-    """A displaced solid: noise is added to its function (Hart 1996, appendix F): f + noise <= 0.
+    """A displaced solid: the points where f + noise <= 0, with f the function of a solid (Hart
+    1996, appendix F).
 
-    Its Lipschitz constant is the sum of both constants; its surface lies where the solid's f is
-    within `max_abs` of 0.
+    solid: has the function f, which must be a formula.
+    noise: the displacement.
+
+    Its Lipschitz constant is the sum of the constants of both. Its surface lies where |f| is at
+    most the noise's `max_abs`.
     """
 
     solid: Formula
@@ -358,7 +371,7 @@ class DisplacedSolid(FormulaSolid):
 
     @property
     def may_jump(self) -> bool:
-        """Whether the solid's function may jump: noise is continuous."""
+        """Whether the solid's function may jump; noise is continuous."""
         return self.solid.may_jump
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:

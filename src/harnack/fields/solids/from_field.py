@@ -37,24 +37,24 @@ def solid(
     between: tuple[float, float] | None = None,
     around: tuple[float, float] | None = None,
 ) -> Solid:
-    """The solid of a closed mesh; or the solid of all points at which a field is below a level,
-    above it, or between two levels.
+    """The solid that a closed mesh bounds; or the solid of all points at which a field is below a
+    level, above a level, or between two levels.
 
-    field: a field; or, without a level, a mesh: a trimesh.Trimesh, a pair (vertices (n, 3), faces
-        (m, 3)), or the path of a surface file. The solid of a mesh is a `MeshSolid`, whose f is the
-        signed distance from the mesh.
+    field: a field, together with exactly one of the four level arguments; or, without these, a
+        mesh: a trimesh.Trimesh, a pair (vertices (n, 3), faces (m, 3)), or the path of a surface
+        file. The solid of a mesh is a `MeshSolid`, whose f is the signed distance from the mesh.
     below, above: a level.
-    between: (low, high).
+    between: (low, high), two levels.
     around: (level, half_width): the points at which the value is at most half_width from the level.
-        This is the argument for angle-valued fields, as for a thickened surface that spans a knot.
+        Use this for an angle-valued field, for example to thicken a surface that spans a knot.
 
         hk.solid(hk.Gyroid(1.0), between=(-0.3, 0.3)) & hk.Torus(0.8, 0.3)
         hk.solid("part.stl") - hk.Cylinder(2.0, 50.0)
 
     Raises:
-        ValueError: none, or more than one, of the four level arguments; numbers out of range; a
-            field with jumps, or an angle-valued one without `around`; a mesh that bounds no solid
-            (`MeshError`).
+        ValueError: none, or more than one, of the four level arguments for a field; numbers out of
+            range; a field with jumps; an angle-valued field without `around`; a mesh that bounds no
+            solid (`MeshError`).
     """
     bounds = [bound for bound in (below, above, between, around) if bound is not None]
     if looks_like_mesh(field):
@@ -111,7 +111,10 @@ def _levels(levels: Any, count: int) -> tuple[float, ...] | None:
 
 @dataclass(frozen=True, eq=False)
 class SublevelSolid(SolidOfField):
-    """The solid of the points where a field is at most 0."""
+    """The solid of the points where a field is at most 0.
+
+    field: any field.
+    """
 
     field: Field
 
@@ -150,14 +153,15 @@ class SublevelSolid(SolidOfField):
 def bounded_side_extent(
     field: Field, levels: tuple[float, ...], is_inside: Callable[[float], bool]
 ) -> Volume | None:
-    """A volume that contains all points inside, if one is proved; else the domain, outside of which
-    f is undefined.
+    """A volume that contains all points inside, if one is proved. Else the field's domain, outside
+    of which f is not defined, or None.
 
-    is_inside: whether a value of f belongs to a point inside.
+    levels: of f, on which the surface of the solid lies.
+    is_inside: takes a value of f, and returns whether points with this value are inside.
 
-    Proof. Level sets lie in `extent`, which is convex. If it has bounds, its complement is
-    connected and meets no level, so that one point decides on which side of the levels the whole
-    complement lies.
+    Proof. The level sets lie in `Field.extent`, which is convex. If it has bounds, its complement
+    is connected and meets no level. So a single point of the complement decides on which side of
+    the levels the whole complement lies.
     """
     extent = field.extent(levels)
     if (
@@ -180,15 +184,17 @@ def _vector(x: Real, y: Real, z: Real) -> Vec3:
 
 
 def field_jet(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
-    """The jet of a field whose second derivatives are bounded near a point.
+    """The jet of a field f whose second derivatives are bounded near a point.
 
-    Proof. Let |f''| <= H within r of q, the point where the piece starts (or the point itself). Let
-    the coordinates be within m of q on the piece, rounding included. If m <= r, the gradient on the
-    piece differs from that at q by at most H m, by the mean value theorem, and derivatives along
-    the path follow by the chain rule; the value is that at the start plus the length times the
-    derivative. Where m > r derivatives are not bounded. Second derivatives at a point (of
-    coordinates with all six) are those of the field where it has a Hessian, up to the error that it
-    states (without the effect of the rounding of coordinates), or up to 2 H, as both are at most H.
+    x, y, z: jets of the coordinates, at a point or on a piece of a path.
+
+    Proof. Let q be the point, or the start of the piece, and |f''| <= H within the distance r of q.
+    Let all points of the piece be within m of q, rounding included. If m <= r, the gradient on the
+    piece differs from that at q by at most H m, by the mean value theorem. Derivatives along the
+    path follow by the chain rule, and the value is that at the start plus the length times a
+    derivative. If m > r, derivatives are not bounded. Second derivatives at a point, if all six are
+    asked for, are those of the field's Hessian. Their error is the one that the field states
+    (without the effect of the rounding of coordinates), or else 2 H, as both are at most H.
 
     Raises:
         TypeError: the field promises no bound of its second derivatives.
