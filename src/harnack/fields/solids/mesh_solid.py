@@ -186,8 +186,9 @@ class MeshSolid(Solid):
         }
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
-        """The box of the mesh, grown by the level. Proof: the ball of radius -level about a point
-        where f < level is inside the solid, and so within the box."""
+        """The box of the mesh, grown by the level on each side. Proof for a negative level. The
+        ball of radius -level about a point where f < level is inside the solid, and so in the
+        box."""
         if above:
             return None
         surface = self.surface
@@ -236,10 +237,11 @@ _SAMPLE_CACHE: ContextVar[dict[tuple[int, ...], tuple[Vec3, Sample]] | None] = C
 
 @contextmanager
 def share_samples() -> Generator[None]:
-    """Within this context, a mesh is sampled only once at the same Dr.Jit points, so that a shell
-    and a lattice of the same mesh share a nearest-triangle search.
+    """Within this context, a mesh is sampled only once at the same Dr.Jit points. So a shell and a
+    lattice of the same mesh share one search for the nearest triangles.
 
-    Inactive while loops are recorded, as their values are defined inside the loop only.
+    While loops are recorded, samples are not shared, as their values are defined inside the loop
+    only.
     """
     token = _SAMPLE_CACHE.set({})
     try:
@@ -398,14 +400,16 @@ def _triangle_tree(
 
 
 def mesh_distance_jet(solid: MeshSolid, x: Jet, y: Jet, z: Jet) -> Jet:
-    """The jet of a signed distance, from jets of the coordinates.
+    """The jet of the signed distance d from a mesh.
 
-    Proof. The distance has the Lipschitz constant 1, so its derivative in any variable is at most
-    the length of the derivative of (x, y, z), and the error of the value is at most that of the
-    coordinates at the start. On a piece there may be kinks, so that second derivatives have no
-    bound. At a point they are those of the distance d from the nearest face, edge or vertex. They
-    are 0 for a face. For a vertex they are 1/d across the gradient; for an edge, 1/d across both
-    the gradient and the edge.
+    x, y, z: jets of the coordinates, at a point or on a piece of a path.
+
+    Proof. d has the Lipschitz constant 1. So its derivative by any variable is at most the length
+    of the derivative of (x, y, z) by it, and its value at the start is known up to the error of the
+    coordinates there. On a piece d may have kinks, so that second derivatives have no bound. At a
+    point they are those of the distance from the nearest face, edge or vertex. For a face they are
+    0. For a vertex they are 1/d across the gradient. For an edge they are 1/d across both the
+    gradient and the edge, and 0 along the edge.
     """
     coordinates = (x, y, z)
     starts = [coord if coord.jet_at_start is None else coord.jet_at_start for coord in coordinates]
