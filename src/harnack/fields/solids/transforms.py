@@ -33,9 +33,9 @@ class AffineMap(SpaceMap):
 
     matrix: (3, 3), row by row, not singular.
     translation_vector: (3,).
-    value_factor: the factor by which f is multiplied. For a similarity it is the factor by which
-        lengths grow, for other maps 1; for a composition of maps it is the product of their
-        factors.
+    value_factor: the factor by which the function of a solid is multiplied. For a similarity it is
+        the factor by which lengths grow; for other maps it is 1. For a composition of maps it is
+        the product of their factors.
     """
 
     matrix: tuple[tuple[float, ...], ...]
@@ -44,10 +44,11 @@ class AffineMap(SpaceMap):
 
     @classmethod
     def of_arrays(cls, matrix: npt.ArrayLike, offset: npt.ArrayLike = (0.0, 0.0, 0.0)) -> AffineMap:
-        """The map of these arrays.
+        """The map u -> matrix u + offset.
 
         Raises:
-            ValueError: arrays of other shapes, numbers that are not finite, or a singular matrix.
+            ValueError: arrays of other shapes than (3, 3) and (3,), numbers that are not finite, or
+                a singular matrix.
         """
         m, b = np.asarray(matrix, dtype=np.float64), np.asarray(offset, dtype=np.float64)
         if m.shape != (3, 3) or b.shape != (3,):
@@ -87,7 +88,8 @@ class AffineMap(SpaceMap):
 
     @classmethod
     def rotation(cls, degrees: float, axis: str | Sequence[float]) -> AffineMap:
-        """The rotation about an axis through the origin (Rodrigues' formula)."""
+        """The rotation about an axis through the origin, by Rodrigues' formula. For the parameters
+        see `Solid.rotated`."""
         if isinstance(axis, str):
             unit = np.eye(3)[axis_index(axis)]
         else:
@@ -134,11 +136,12 @@ class AffineMap(SpaceMap):
 
     @property
     def similarity(self) -> float | None:
-        """The factor by which all lengths grow; None if the map is not a similarity."""
+        """The factor by which the map multiplies all lengths; None if it is not a similarity."""
         return _length_factor(np.array(self.matrix))
 
     def volume(self, volume: Volume | None) -> Volume | None:
-        """A volume that contains the image of another volume; None for a volume without bounds."""
+        """A volume that contains the image of `volume` under the map; None for no volume or one
+        without bounds."""
         if volume is None:
             return None
         m, b = np.array(self.matrix), np.array(self.translation_vector)
@@ -200,7 +203,7 @@ class TransformedSolid(SolidOfField):
 
     @property
     def numbers(self) -> _InverseMap:
-        """The inverse map, as numbers of the backend once prepared."""
+        """The inverse map. Once the solid is prepared, its numbers are on the backend."""
         return cast("Any", self)._numbers
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
