@@ -1,5 +1,5 @@
-"""Screw threads: `Thread`, a profile wound along a helix; `metric_thread`, the metric threads of
-ISO."""
+"""Screw threads: `Thread` is a profile wound along a helix, and `metric_thread` makes the metric
+threads of ISO."""
 
 from __future__ import annotations
 
@@ -287,24 +287,27 @@ def metric_thread(
     clearance: float = 0.0,
     left_handed: bool = False,
 ) -> Solid:
-    """A metric screw thread of ISO about the z axis. Lengths are in millimeters.
+    """A metric ISO screw thread about the z axis. Lengths are in millimeters.
 
     name: "M8" for a coarse thread (ISO 261, from M1 to M68), "M8x1" for a thread of any other
         pitch.
-    length: an external thread reaches from z = 0 to z = length, both ends beveled by 45 degrees
-        down to its root. An internal thread is to be cut out of a nut, `nut - thread("M8", 20,
-        internal=True)`: it begins one pitch below z = 0, so that it opens a face there, with a
-        bevel, and ends at z = length. Let it reach a pitch beyond the other face, if the hole is to
-        go through.
+    length: an external thread extends from z = 0 to z = length. Both ends are beveled by 45 degrees
+        down to its root. An internal thread is to be cut out of a nut, as in `nut -
+        metric_thread("M8", 20, internal=True)`. It begins one pitch below z = 0, so that it opens a
+        face of the nut there, with a bevel, and ends at z = length. If the hole is to go through,
+        let the thread extend a pitch beyond the other face.
     internal: whether the thread is for a nut.
-    clearance: the distance by which the surface lies inside of the basic profile, or outside for an
-        internal thread, across both flanks, crests and roots; up to a tenth of the pitch. Printed
-        threads that are to fit want 0.05 to 0.1 on either side. Grooves stay in the middle, so that
-        the gap between a bolt and its nut is the sum of their clearances on both flanks.
+    clearance: the distance by which the surface lies inside of the basic profile, or outside of it
+        for an internal thread. It is measured across flanks, crests and roots, and is at most a
+        tenth of the pitch. Printed threads that are to fit need 0.05 to 0.1 for both bolt and nut.
+        The clearance does not move the thread along the axis: both flanks of a groove recede
+        equally. So the gap on each flank between a bolt and its nut is the sum of their clearances.
+    left_handed: whether the thread turns clockwise as it rises.
 
-    The profile is the basic one of ISO 68-1, for bolt and nut: flanks at 60 degrees to each other,
-    a crest of an eighth and a root of a quarter of the pitch P, and between their radii a depth of
-    5/8 H, H = sqrt(3)/2 P. It has no tolerances of ISO 965 and no rounded roots.
+    The profile is the basic one of ISO 68-1, for bolt and nut alike. With P the pitch and H =
+    sqrt(3)/2 P: the flanks are at 60 degrees to each other; the flats are P/8 wide at the major
+    diameter and P/4 at the minor diameter; the depth between the two radii is 5/8 H. It has no
+    tolerances of ISO 965 and no rounded roots.
 
     Raises:
         ValueError: an unknown thread, a length that leaves nothing between the bevels, or a
