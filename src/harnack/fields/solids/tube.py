@@ -56,13 +56,13 @@ _ENDLESS_LENGTH = 8.0
 class Tube(Solid):
     """A tube: the points within `radius` of a polyline.
 
-    points: (n, 3) the vertices of the polyline in order; repeat the first to close it.
-    starts: indices of vertices at which another polyline starts, not joined to the polyline before:
-        see `from_polylines`.
-    flattening_error: a bound of the distance of the polyline from the curve that it stands for, and
-        so of the distance between the surfaces: see `bezier`.
+    points: (n, 3) the vertices of the polyline in order. Repeat the first to close it.
+    starts: indices of vertices at which another polyline starts, which is not joined to the one
+        before: see `from_polylines`.
+    flattening_error: if the polyline stands for a curve, a bound of the distance between the two,
+        and so of the distance between the surfaces: see `bezier`.
 
-    f is the signed distance, whose Lipschitz constant is 1 (Hart 1996, equations 32 to 35, for
+    f is the signed distance, with the Lipschitz constant 1 (Hart 1996, equations 32 to 35, for
     cubic Bezier curves). Along a path a stronger bound is proved: see `TangentEnclosure`.
     """
 
@@ -101,8 +101,10 @@ class Tube(Solid):
 
     @classmethod
     def from_polylines(cls, polylines: Iterable[npt.ArrayLike], radius: float) -> Tube:
-        """The points within `radius` of any of the polylines (n_i, 3), as a single tube with one
-        distance function.
+        """One tube around several polylines: the points within `radius` of any of them. It has a
+        single distance function.
+
+        polylines: arrays (n_i, 3).
 
         Raises:
             ValueError: no polylines, or an array that is not a polyline.
@@ -122,12 +124,13 @@ class Tube(Solid):
     def bezier(
         cls, controls: npt.ArrayLike, radius: float, *, tolerance: float | None = None
     ) -> Tube:
-        """The tube around a chain of cubic Bezier curves, each of which ends where the next starts.
+        """The tube around a chain of cubic Bezier curves, each of which starts where the one before
+        ends.
 
         controls: (3 n + 1, 3) control points of n curves; two curves meet at every third point.
-        tolerance: the largest distance between the surface and the exact surface, in units of
-            length; by default a thousandth of the radius. The number of segments grows like its
-            square root.
+        tolerance: the largest distance allowed between the surface and the exact surface, in units
+            of length; None for a thousandth of the radius. The number of segments grows like the
+            inverse of its square root.
 
         Proof: `harnack.geometry.beziers.flatten_bezier`.
 
@@ -158,17 +161,19 @@ class Tube(Solid):
         cls, radius: float, pitch: float, turns: float, wire: float, *,
         left_handed: bool = False, tolerance: float | None = None,
     ) -> Tube:  # fmt: skip
-        """A coil of round wire about the z axis, from (radius, 0, 0) to z = pitch turns; its ends
-        are round.
+        """A coil of round wire about the z axis. The middle of the wire is a helix from (radius, 0,
+        0) to z = pitch turns; the ends of the wire are round.
 
-        radius: of the helix that is the middle of the wire. pitch: the rise along the axis in each
-            turn.
-        wire: the radius of the wire. left_handed: whether the helix turns clockwise as it rises.
-        tolerance: the largest distance between the surface and the exact surface, in units of
-            length; by default a thousandth of the radius of the wire.
+        radius: of the helix.
+        pitch: how far the helix rises along the axis in each turn.
+        turns: the number of turns.
+        wire: the radius of the wire.
+        left_handed: whether the helix turns clockwise as it rises.
+        tolerance: the largest distance allowed between the surface and the exact surface, in units
+            of length; None for a thousandth of the wire's radius.
 
-        Proof. A chord between two angles h apart is within h^2/8 max |c''| of the helix c, which is
-        parametrized by the angle, and |c''| is the radius.
+        Proof. The helix c is parametrized by the angle, so that |c''| is the radius. A chord
+        between two angles that differ by h is within h^2/8 max |c''| of the helix.
 
         Raises:
             ValueError: numbers that are not positive, or more than a million segments.
@@ -401,15 +406,17 @@ def min_with_tangent(
     rounding: Real,
     unit: float,
 ) -> list[Real]:
-    """At each knot, the smaller of the bound `lows` and of the value of a tangent. The last knot
-    may be infinite.
+    """At each knot, the smaller of the bound in `lows` and of the value of a tangent there.
 
+    lows: a bound for each knot.
+    knots: positions; the last may be infinite.
     start: the tangent's value at 0, with an error of up to `rounding`.
-    slope: of the tangent, at least -1; NaN, as on the segment itself, counts as -1.
+    slope: of the tangent, at least -1. NaN, which arises on the segment itself, counts as -1.
+    unit: the machine epsilon.
 
-    The slope is lowered by four roundings, for the rounding of the product with a knot. It is never
-    0, so that at infinity the tangent is infinite, with the slope's sign, and never 0 times
-    infinity.
+    The slope is lowered by four roundings, for the rounding of its product with a knot. It is never
+    0, since 0 times the infinite knot would be NaN: so the tangent at infinity is infinite, with
+    the sign of the slope.
     """
     slope = fmax(slope, -1) - 4 * unit
     slope = dr.select(slope == 0, -unit, slope)
@@ -473,20 +480,21 @@ _TAYLOR_RADIUS = 0.5
 
 
 class TubeNetwork(PatchField["_TubeBuffers"]):
-    """The surfaces at distance `radius` from a set of segments: edges of meshes, wires, struts.
+    """The surfaces at distance `radius` from a set of segments, such as edges of meshes, wires or
+    struts.
 
     points: (n, 3).
     segments: (m, 2) indices of points, counted from 0.
-    radius: a number, or (m,).
+    radius: a number, or (m,), one for each segment.
 
     Each segment is a patch, a tube with rounded ends (`harnack.fields.capabilities`). A ray
     evaluates only the patches whose boxes it enters, so that thousands of segments cost little more
-    than a single segment, and `Hits.primitive_index` is the index of the segment. A level is added
-    to the radius of all tubes. For a single polyline, and for combinations with other solids, there
-    is `Tube`.
+    than one. `Hits.primitive_index` is the index of the segment. A level is added to the radius of
+    all tubes. For a single polyline, and for combinations with other solids, use `Tube`.
 
-    Raises ValueError for arrays of other shapes, numbers that are not finite, an index that is out
-    of range, a segment without a length, or a radius that is not positive.
+    Raises:
+        ValueError: arrays of other shapes, numbers that are not finite, an index out of range, a
+            segment without a length, or a radius that is not positive.
     """
 
     default_level: float = 0.0
@@ -515,8 +523,12 @@ class TubeNetwork(PatchField["_TubeBuffers"]):
         return lower - slack, upper + slack
 
     def evaluate(self, p: Vec3) -> NoReturn:
-        """Raises TypeError: each segment has a function of its own, and there is none for all
-        segments together."""
+        """Not defined, as each segment has a function of its own, and there is none for all
+        segments together.
+
+        Raises:
+            TypeError: always.
+        """
         del p
         raise TypeError(
             "tubes are no level set of one function, but of one for each segment: take "
