@@ -37,7 +37,8 @@ _MOMENT_ROUNDING = 32 * 2.0**-53
 
 @dataclass(frozen=True)
 class SymmetricMatrix:
-    """The state of a sum of symmetric matrices, one in each lane."""
+    """A sum of symmetric matrices, one in each lane, for the state of a loop. xx, xy, ... are the
+    entries of the sum so far."""
 
     xx: Real
     yy: Real
@@ -48,11 +49,14 @@ class SymmetricMatrix:
 
     @classmethod
     def zero(cls, real: Any) -> SymmetricMatrix:
-        """The matrix of zeros; real: the type of its entries."""
+        """The matrix of zeros.
+
+        real: the type of its entries.
+        """
         return cls(*(real(0) for _ in range(6)))
 
     def add_outer_product(self, u: Vec3, v: Vec3) -> SymmetricMatrix:
-        """The sum with (u v^T + v u^T)/2."""
+        """This matrix plus the matrix (u v^T + v u^T)/2."""
         half = 0.5 * v
         return SymmetricMatrix(
             dr.fma(u.x, v.x, self.xx),
@@ -68,7 +72,10 @@ class SymmetricMatrix:
         return self.xx, self.yy, self.zz, self.xy, self.xz, self.yz
 
     def rows(self, vector: Any) -> tuple[Vec3, Vec3, Vec3]:
-        """The three rows; vector: the type of a row."""
+        """The three rows.
+
+        vector: the type of a row.
+        """
         return (
             vector(self.xx, self.xy, self.xz),
             vector(self.xy, self.yy, self.yz),
@@ -78,13 +85,14 @@ class SymmetricMatrix:
 
 @dataclass(frozen=True)
 class PointValues:
-    """Value and, if requested, gradient and Hessian of a field at points, in the units of the
-    field, with bounds of their truncation and rounding errors.
+    """The value of a field at points and, if requested, its gradient and Hessian, with bounds of
+    their truncation and rounding errors.
 
-    error: of the value.
-    gradient_error: of the gradient, as a length.
-    hessian_error: of second derivatives along lines, which is the spectral norm of the Hessian's
-        error.
+    error: a bound of the error of `value`.
+    gradient, hessian: None if they were not requested.
+    gradient_error: a bound of the error of `gradient`, as a length.
+    hessian_error: a bound of the error of second derivatives along lines, which is the spectral
+        norm of the Hessian's error.
     """
 
     value: Real
@@ -95,30 +103,31 @@ class PointValues:
     hessian_error: Real = 0.0
 
     def with_far_field_errors(self, x: Vec3, terms: int, weight: float) -> PointValues:
-        """The same values with error bounds that hold at points far away too.
+        """The same values, with error bounds that hold at points far away too.
 
-        x: the points, in coordinates in which the field's data have a size of about 1. terms: the
-            number of terms summed up. weight: of all dipoles together.
+        x: the points, in coordinates in which the field's data have a size of about 1.
+        terms: the number of terms that were summed.
+        weight: of all dipoles together.
 
-        Two errors matter only far away. A term of a derivative is a product of a factor that falls
-        like |x|^-5 and one that grows like |x|^2, and the first may underflow. And where dipoles
-        nearly cancel, their summed moments are rounded in proportion to the weight of all of them,
-        not to the small sum.
+        Two errors matter only far away. First, a term of a derivative is the product of a factor
+        that falls like |x|^-5 and one that grows like |x|^2, and the first may underflow. Second,
+        where dipoles nearly cancel, the rounding of their summed moments is proportional to the
+        weight of all dipoles, not to the small sum.
         """
         smallest = float(dr.smallest(type(x.x)))
-        lost = 4 * smallest * terms * (1 + dr.squared_norm(x))
+        underflow = 4 * smallest * terms * (1 + dr.squared_norm(x))
         inverse = dr.rcp(fmax(dr.norm(x), type(x.x)(4)))
-        moved = _MOMENT_ROUNDING * weight * dr.square(inverse)
+        moment_error = _MOMENT_ROUNDING * weight * dr.square(inverse)
         return dataclasses.replace(
             self,
-            error=self.error + lost + moved,
-            gradient_error=self.gradient_error + lost + 4 * moved * inverse,
-            hessian_error=self.hessian_error + lost + 24 * moved * dr.square(inverse),
+            error=self.error + underflow + moment_error,
+            gradient_error=self.gradient_error + underflow + 4 * moment_error * inverse,
+            hessian_error=self.hessian_error + underflow + 24 * moment_error * dr.square(inverse),
         )
 
     def rescaled(self, size: Real) -> PointValues:
-        """The values of x -> f(x / size) at `size` times the points. Where a number has overflowed
-        its error is infinite."""
+        """The values of the function x -> f(x / size) at the points `size` times x. Where a number
+        has overflowed, its error is infinite."""
         gradient, hessian, inverse = self.gradient, self.hessian, 1 / size
         gradient_error, hessian_error = self.gradient_error, self.hessian_error
         if gradient is not None:
@@ -134,31 +143,29 @@ class PointValues:
 
 
 class BatchedField(Field):
-    """A field that evaluates values, derivatives and error bounds at large numbers of points at
-    once.
-
-    Subclasses define `values_at`.
-    """
+    """A field that can be evaluated at large numbers of points at once: its values, derivatives and
+    error bounds. Subclasses define `values_at`."""
 
     @abc.abstractmethod
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
         """Values and derivatives at points x, a Dr.Jit 3-vector of any backend and precision.
 
-        Not called while a loop is being recorded, unless `derivatives` is 2.
-
         derivatives: 0 for values only, 1 for gradients too, 2 for Hessians too.
-        closer: clusters of far terms are approximated only beyond this multiple of the usual
-            distance, at least 1; with infinity nothing is approximated.
+        closer: a factor, at least 1. Clusters of far terms are approximated only beyond this
+            multiple of the usual distance; with infinity nothing is approximated.
+
+        It is not called while a loop is being recorded, unless `derivatives` is 2.
         """
 
     def sharp_values_at(self, x: Vec3) -> PointValues:
-        """`values_at` with the gradient, which subclasses may refine: `gradient` returns it to
-        users. Not called while a loop is being recorded."""
+        """Values and gradients at points x, as `gradient` returns them to users. The default is
+        `values_at`; subclasses may compute the gradient more accurately. It is not called while a
+        loop is being recorded."""
         return self.values_at(x, 1)
 
     def differentiable_value(self, p: Vec3) -> Real:
-        """f at p as an expression whose first derivative is the gradient of f, in reverse and in
-        forward mode."""
+        """f at p as an expression that Dr.Jit can differentiate once, in reverse and in forward
+        mode: its derivative is the gradient of f."""
         with dr.suspend_grad():
             at = self.sharp_values_at(dr.detach(p))
         # A literal 0, the gradient of a closed mesh, would have no derivative in Dr.Jit.
@@ -187,7 +194,8 @@ class BatchedField(Field):
     def value_and_gradient(
         self, points: Any, *, precision: Precision | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Values (n,) and gradients (n, 3) together, at hardly more cost than gradients alone."""
+        """Values (n,) and gradients (n, 3) at points (n, 3). They cost hardly more than gradients
+        alone."""
         value, gradient = self._choose_at_points(
             points, precision, 1, lambda at: (at.value, at.gradient)
         )
@@ -196,8 +204,9 @@ class BatchedField(Field):
     def rough_value_and_gradient(
         self, points: Any, *, precision: Precision | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Values (n,) and gradients (n, 3) of a single pass over a tree. Errors of the gradients
-        may be large: they are for estimates, and for points at which f is steep."""
+        """Values (n,) and gradients (n, 3) at points (n, 3), by a single pass over a tree. The
+        errors of the gradients may be large, so that they are for estimates, and for points at
+        which f is steep."""
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
             """The values and gradients at the Dr.Jit points x."""
@@ -227,9 +236,11 @@ class BatchedField(Field):
     def gradient_error_bound(
         self, points: Any, *, precision: Precision | None = None
     ) -> FloatArray:
-        """Bounds (n,) of the error of `gradient`, as a length, at points (n, 3): see
-        `error_bound`. For a sum over a tree the bound is about a hundred times the error itself:
-        the accuracy of the sum is chosen by estimates (`sharpened`)."""
+        """Bounds (n,) of the error of `gradient`, as a length, at points (n, 3): see `error_bound`.
+
+        For a sum over a tree the bound is about a hundred times the error itself, because the
+        accuracy of the sum is chosen by estimates (`sharpened`).
+        """
         return self._choose_at_points(points, precision, 1, lambda at: (at.gradient_error,))[0]
 
     @accepts_dask_arrays("points")
@@ -293,17 +304,17 @@ _ACCEPTED_ERROR = 0.01
 
 
 def sharpened(at: Callable[[Vec3, Real], PointValues], x: Vec3) -> PointValues:
-    """Value and gradient at points x by a sum over a tree, the gradient with an error of about 1 %
+    """Values and gradients at points x by a sum over a tree. The error of a gradient is about 1 %
     of its length.
 
-    at: evaluates values and gradients at points, with clusters expanded beyond this multiple of the
-        usual distance.
+    at: takes points and a factor, and returns values and gradients there. Clusters are taken as one
+        source only beyond this multiple of the usual distance.
 
     Far terms may nearly cancel, as the triangles of a mesh with small holes do. Then the gradient
-    is far smaller than the truncation error of its clusters. Bounds of the truncation error add up
-    absolute values and would demand all terms nearly everywhere. So the change of the gradient from
-    one distance to the next decides about refinement; the error bounds that are returned stay
-    proved.
+    is far smaller than the truncation errors of its clusters. Proved bounds of these errors add up
+    absolute values, and would demand that all terms are summed nearly everywhere. So the observed
+    change of the gradient, from one distance to the next, decides whether to refine it. The error
+    bounds that are returned stay proved.
     """
     real = cast("Any", type(x.x))
     dr.eval(x)
@@ -347,7 +358,8 @@ Value = TypeVar("Value")
 
 
 class FieldCache(Generic[Value]):
-    """A cache with one value per field: the value for the last key. It is dropped with the field.
+    """A cache that keeps one value per field: the value for the last key. It is dropped with the
+    field.
 
     A value must not refer to its field, or neither of them would ever be deleted.
     """
@@ -357,8 +369,8 @@ class FieldCache(Generic[Value]):
         self._kept: dict[int, tuple[Any, dict[str, Any], Value]] = {}
 
     def get(self, field: Field, key: Any, make: Callable[[], Value]) -> Value:
-        """The cached value of a field if it belongs to this key and no attribute of the field was
-        set since it was computed; else `make()`, which is then cached."""
+        """The cached value of a field, if it belongs to this key and no attribute of the field was
+        set since it was computed. Otherwise make(), which is then cached."""
         if id(field) in self._kept:
             kept_key, attributes, value = self._kept[id(field)]
             now = vars(field)
@@ -374,10 +386,10 @@ class FieldCache(Generic[Value]):
 
 
 def cached_prepare(prepare: Prepare) -> Prepare:
-    """Decorator of a field's method `prepare`, by which a field is uploaded to each backend only
+    """Decorator of a field's method `prepare`. With it, a field is uploaded to each backend only
     once.
 
-    Fields with parameters are uploaded at each call: a parameter may change in place, and its
+    A field with parameters is uploaded at each call, since a parameter may change in place, and its
     derivatives belong to a single trace.
     """
     caches: defaultdict[Backend, FieldCache[Field]] = defaultdict(FieldCache)

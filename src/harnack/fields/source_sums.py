@@ -1,4 +1,5 @@
-"""Sums over sources (edges, dipoles and far nodes of trees) at a point, and bounds of f near it.
+"""Sums over sources at a point, and bounds of f near it. Sources are edges, dipoles and far nodes
+of trees.
 
 All fields that are such sums accumulate the same record, `SourceSums`. It gives values with error
 bounds, or a sample with promises.
@@ -55,23 +56,28 @@ def free_radius_fraction(coarse_ratio: float) -> float:
 
 
 def remainder_factor(q: float) -> float:
-    """phi of `SourceSums.sample`: convex, and 3 at 0."""
+    """The function phi(q) = (3 - 2 q)/(1 - q)^2 of `SourceSums.sample`, for 0 <= q < 1. It is
+    convex, and 3 at 0."""
     return (3 - 2 * q) / (1 - q) ** 2
 
 
 def final_rounding(backend: Backend, size: float = 1.0) -> Real:
     """A bound of the rounding after the last term of a sum, as a kernel parameter: 16 roundings of
-    numbers of this size. The rounding of terms and of additions is counted by
-    `SourceSums.add_term`."""
+    numbers of the given size. (The rounding of terms and of additions is counted by
+    `SourceSums.add_term`.)"""
     return dr.opaque(backend.Float, backend.machine_epsilon * 16 * size)
 
 
 def dipole_rounding(area: Real, inverse: Real, unit: Real) -> Real:
-    """A bound of the rounding of the value of a dipole at distance rho = 1/inverse.
+    """A bound of the rounding of the value of a dipole at the distance rho.
 
-    unit: the rounding of a coordinate, at least epsilon. It changes the value by at most
-        2 unit area/rho^3, twice in the difference of two coordinates; the four roundings of the
-        term change it by 4 epsilon area/rho^2.
+    area: of the dipole.
+    inverse: 1/rho.
+    unit: the rounding of a coordinate, at least the machine epsilon.
+
+    The rounding of coordinates changes the value by at most 2 unit area/rho^3. It enters twice,
+    through the two coordinates of a difference. The four roundings of the term itself change it by
+    4 epsilon area/rho^2.
     """
     square = inverse * inverse
     return (unit * area) * dr.fma(4 * inverse, square, 4 * square)
@@ -79,9 +85,10 @@ def dipole_rounding(area: Real, inverse: Real, unit: Real) -> Real:
 
 @dataclass(frozen=True)
 class SourceTerm:
-    """The term of a dipole, edge or far node in the sums of f and of its derivatives.
+    """The term of a single source (a dipole, an edge or a far node) in the sums of f and of its
+    derivatives.
 
-    Derivatives that were not requested are None. The value of an edge is None, too: its angle is
+    Derivatives that were not requested are None. The value of an edge is None too, as its angle is
     added later.
     """
 
@@ -95,18 +102,18 @@ class SourceSums:
     """Sums over all sources at points x: f and its derivatives, error bounds, and bounds of higher
     derivatives near x.
 
-    total: the plain sum of the values; `value` adds `compensation`, the rounding errors of the
-        additions.
-    gradient, hessian: of f; the Hessian is None if it was not requested.
-    truncation, gradient_truncation, hessian_truncation: bounds of the truncation errors of value,
-        gradient and second derivatives along lines; the last is None without a Hessian.
+    total: the plain sum of the values. The property `value` adds `compensation` to it.
+    gradient, hessian: of f. They are None if they were not requested.
+    truncation, gradient_truncation, hessian_truncation: bounds of the truncation errors of the
+        value, the gradient and the second derivatives along lines. The last is None without a
+        Hessian.
     rounding: a bound of the rounding error of the value.
-    singularity_distance: the distance to the nearest singular point, a dipole or an edge, or
-        `free_radius_fraction` of the distance to the nearest far node's center if that is less.
-    s4, s5: sums of a/rho^4 and a/rho^5 over dipoles of area a at distance rho and, with A + K/r^2
-        of `multipole.remainder_constants` for a, over far nodes at r. For edges see
-        `LiftedEdge.bounds`.
-    compensation: the rounding errors of the additions to `total`: see `add_term`.
+    singularity_distance: the distance to the nearest singular point, a dipole or an edge; or
+        `free_radius_fraction` of the distance to the nearest far node's center, if that is smaller.
+    s4, s5: the sums of a/rho^4 and of a/rho^5. A dipole at the distance rho adds its area as a. A
+        far node whose center is at the distance r adds A + K/r^2 of `multipole.remainder_constants`
+        as a, with rho = r. For edges see `LiftedEdge.bounds`.
+    compensation: the sum of the rounding errors of the additions to `total`: see `add_term`.
     """
 
     total: Real
@@ -147,33 +154,37 @@ class SourceSums:
         return cls(total, gradient, None if hessian is None else SymmetricMatrix(*hessian), *bounds)
 
     def to_state(self) -> tuple[Any, ...]:
-        """The attributes in the order of the constructor, for the state of a loop. (Sums that were
-        not requested are None: Dr.Jit records a loop twice if a state in it never changes.)"""
+        """The attributes in the order of the constructor, as a tuple for the state of a loop; the
+        Hessian is a tuple of its entries. (Sums that were not requested are None, because Dr.Jit
+        records a loop twice if a part of its state never changes.)"""
         hessian = None if self.hessian is None else self.hessian.components()
         bounds = self.truncation, self.gradient_truncation, self.hessian_truncation, self.rounding
         ends = self.singularity_distance, self.s4, self.s5, self.compensation
         return self.total, self.gradient, hessian, *bounds, *ends
 
     def select(self, mask: Mask, other: SourceSums) -> SourceSums:
-        """The other sums where the mask holds, these elsewhere. Without Hessians."""
+        """The sums `other` on the lanes where the mask holds, these sums on all others. The sums
+        must be without Hessians."""
         pairs = zip(other.to_state(), self.to_state(), strict=True)
         return SourceSums(*(None if b is None else dr.select(mask, a, b) for a, b in pairs))
 
     @property
     def derivatives(self) -> int:
-        """The order of derivatives that were asked for: 0, 1 or 2."""
+        """The order of the derivatives that are summed: 0, 1 or 2."""
         return 0 if self.gradient is None else 1 if self.hessian is None else 2
 
     def add_term(self, terms: SourceTerm, active: Mask) -> SourceSums:
-        """The sums with terms added on active lanes; derivatives that the terms lack count as 0.
+        """The sums with the terms of another source added, on active lanes. Derivatives that are
+        None in the terms count as 0.
 
-        Rounding of the value. Errors of n additions add up like n, if they all have the same sign,
-        as where small terms are lost in a large sum. But the error of s = fl(a + b) is a number of
-        the same precision, and is computed exactly (Knuth's TwoSum; Higham 2002, Section 4.3): with
-        c = s - a it is (a - (s - c)) + (b - c). It is at most u |s|, u half the distance from 1 to
-        the next number. These numbers are summed in turn, and the error of that sum is at most n u
-        times the sum of their absolute values, hence by n u^2 times the sum of all |s|. Up to n =
-        2^20 terms n u is at most 1/16, and twice that covers the rounding of the bound itself.
+        Rounding of the value. If the errors of n additions all have the same sign, they add up like
+        n; this happens where small terms are lost in a large sum. But the error of a rounded sum s
+        = fl(a + b) is a number of the same precision, and can be computed exactly (Knuth's TwoSum;
+        Higham 2002, Section 4.3). With c = s - a it is (a - (s - c)) + (b - c). Its size is at most
+        u |s|, with u half the distance from 1 to the next number. These numbers are summed in turn.
+        The error of that second sum is at most n u times the sum of their absolute values, hence at
+        most n u^2 times the sum of all |s|. Up to n = 2^20 terms n u is at most 1/16, and twice
+        that covers the rounding of the bound itself.
         """
         gradient, hessian = self.gradient, self.hessian
         if gradient is not None and terms.gradient is not None:
@@ -265,16 +276,24 @@ class SourceSums:
         unit: the rounding of a coordinate. rounding: of the value, from other sources. along:
             further promises, for f along a line.
 
-        Proof of the promises. Along a line the k-th derivative of a dipole a at rho is at most
-        (k+1)! a/rho^(k+2) (it is a mixed derivative of a/rho, whose tensor is symmetric and takes
-        its largest value on equal vectors), so that Taylor's remainder after the linear term is at
-        most a ((rho-t)^-2 - rho^-2 - 2t rho^-3) = a t^2 rho^-4 phi(t/rho), phi(q) = (3-2q)/(1-q)^2.
-        The remainder of a far node is at most that of a dipole of area A + K/r^2 at its center, for
-        t/r <= `max_step_fraction` (`multipole.remainder_constants`). phi is convex: on [0, b] it
-        lies below 3 + rise q, rise = (phi(b)-3)/b = (4-3b)/(1-b)^2. With t <= r = b free_distance,
-        |f(y) - f(x) - g.(y-x)| <= t^2 (3 s4 + rise r s5). On the ball of that radius f changes by
-        at most |g| r more, and is harmonic: dipoles of far nodes are farther away than 1 - 1/rough
-        times the center, and `max_step_fraction` is less.
+        Proof of the promises. Consider a dipole of area a at the distance rho. The k-th derivative
+        of its value along a line is at most (k+1)! a/rho^(k+2): it is a mixed derivative of a/rho,
+        whose tensor is symmetric and takes its largest value on equal vectors. So at the distance
+        t < rho, Taylor's remainder after the linear term is at most
+
+            a ((rho-t)^-2 - rho^-2 - 2t rho^-3) = a t^2 rho^-4 phi(t/rho), phi(q) = (3-2q)/(1-q)^2.
+
+        The remainder of a far node whose center is at the distance r is at most that of a dipole of
+        area A + K/r^2 at its center, for t/r <= `max_step_fraction`
+        (`multipole.remainder_constants`). phi is convex: on [0, b] it lies below its chord 3 + rise
+        q, with rise = (phi(b)-3)/b = (4-3b)/(1-b)^2. Now let R be b times `singularity_distance`,
+        and g the gradient of f at x. For t = |y - x| <= R,
+
+            |f(y) - f(x) - g.(y-x)| <= t^2 (3 s4 + rise R s5).
+
+        On the ball of radius R, f changes by at most |g| R more than this bound for t = R. There f
+        is harmonic: the dipoles of far nodes are farther away than 1 - 1/coarse_ratio times the
+        distance of the center, and `max_step_fraction` is less than that.
         """
         g = share * self.gradient
         slope_error = share * dr.fma(SLOPE_ROUNDINGS * unit, self.s4, self.gradient_truncation)
@@ -318,16 +337,16 @@ class SourceSums:
         self, v: Vec3, unit: Real, lengths: tuple[Real, ...], rates: tuple[Real, ...], active: Mask
     ) -> tuple[Real, ...]:
         """Rates K with |f(x + s v) - f(x)| <= K |s| for lengths |s| up to each of `lengths`: the
-        sums' own rates added to `rates` (see `trail_sums.line_rates`). On lanes that are not active
-        they are infinite.
+        rates for some edges (see `trail_sums.line_rates`), plus those for the sources of these
+        sums. They are infinite on lanes that are not active.
 
         v: (3,) directions of the lines.
         unit: the rounding of a coordinate of their points.
-        rates: the rates for some edges, one for each length.
+        rates: for the edges, one for each length.
 
-        Proof. f changes by at most |s| |g . v| + s^2 (3 s4 + rise r s5) for |s| <= r (see `sample`,
-        also for the symbols), with |g . v| raised by the truncation and rounding errors of the
-        gradient g. For lengths above r the rate is infinite.
+        Proof. By these sources f changes by at most |s| |g . v| + s^2 (3 s4 + rise R s5) for |s| <=
+        R (see `sample`, also for the symbols). |g . v| is raised by the truncation and rounding
+        errors of the gradient g. For lengths above R the rate is infinite.
         """
         slope = dr.abs(dr.dot(self.gradient, v)) + self.gradient_truncation
         slope = dr.fma(SLOPE_ROUNDINGS * unit, self.s4, slope)
@@ -342,7 +361,11 @@ class SourceSums:
         return tuple(sums)
 
     def remainder(self, b: float, r: Real) -> Real:
-        """3 s4 + rise r s5 for r = b times the free distance, or less: see `sample`."""
+        """3 s4 + rise r s5 of `sample`.
+
+        b: the largest t/rho.
+        r: b times the distance to the nearest singular point, or less.
+        """
         return dr.fma(_chord_slope(b) * r, self.s5, 3 * self.s4)
 
 
