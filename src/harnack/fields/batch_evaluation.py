@@ -41,10 +41,12 @@ def evaluate_points(
     """The arrays that `kernel` returns for points (n, 3), in the order of the points; for a single
     point (3,), without the first axis.
 
-    precision: None for double precision if the points are an array of float64, else single.
+    kernel: takes a backend and a Dr.Jit 3-vector of points, and returns Dr.Jit arrays.
+    precision: "single" or "double"; None for double if the points are an array of float64, else
+        single.
 
-    The points are visited cell by cell along a Morton curve, so that neighboring lanes visit the
-    same nodes of a tree, which halves the time.
+    The points are visited cell by cell along a Morton curve. So neighboring lanes visit the same
+    nodes of a tree, which halves the time.
 
     Raises:
         TypeError, ValueError: points that are not an (n, 3) array of finite numbers.
@@ -65,8 +67,8 @@ def evaluate_points(
 
 
 def accepts_numpy_points(hessian: Callable[[Any, Vec3], Any]) -> Callable[..., Any]:
-    """Decorator of a field's method `hessian`, which then also takes NumPy points and gives NumPy
-    matrices."""
+    """Decorator of a field's method `hessian` for Dr.Jit points. The decorated method also takes
+    NumPy points (n, 3) or (3,), for which it returns NumPy matrices (n, 3, 3) or (3, 3)."""
 
     @accepts_dask_arrays("p")
     @functools.wraps(hessian)
@@ -156,9 +158,10 @@ def _restore_order(values: Any, order: Any, n: int) -> Any:
 
 
 def morton_order(backend: Backend, x: Vec3, bits: int = _BITS_PER_AXIS) -> Any:
-    """The indices (Dr.Jit UInt32) of points cell by cell, with the cells along a Morton curve.
+    """The order in which to visit points x cell by cell, with the cells along a Morton curve: their
+    indices, as Dr.Jit UInt32.
 
-    bits: cells along an axis, as a power of two, at most 10.
+    bits: there are 2^bits cells along an axis, and bits is at most 10.
     """
     index, vector = backend.UInt32, backend.Array3f
     n = dr.width(x)

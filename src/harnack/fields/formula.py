@@ -65,8 +65,9 @@ _WITHOUT_ALTERNATIVES: ContextVar[bool] = ContextVar("without_alternatives", def
 
 @contextmanager
 def without_alternatives() -> Generator[None]:
-    """Within this context, samples of formulas carry no alternative promises, which take several
-    times as long to record as value and gradient. For callers that use value and gradient only."""
+    """Within this context, samples of formulas carry no alternative promises. These take several
+    times as long to record as value and gradient. The context is for callers that use value and
+    gradient only."""
     token = _WITHOUT_ALTERNATIVES.set(True)
     try:
         yield
@@ -75,9 +76,9 @@ def without_alternatives() -> Generator[None]:
 
 
 class Formula(Field):
-    """A field that is defined by a formula of the coordinates, the method `formula`.
+    """A field that is defined by a formula of the coordinates, its method `formula`.
 
-    Value, gradient, rounding errors and enclosures along rays follow from the formula by automatic
+    Value, gradient, rounding errors and enclosures along rays follow from the formula, by automatic
     differentiation in interval arithmetic.
 
     lipschitz: a proved bound of |grad f| everywhere, for sphere tracing (enclosures="lipschitz");
@@ -94,20 +95,24 @@ class Formula(Field):
 
     @abc.abstractmethod
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        """f of the coordinates, which may be jets or Dr.Jit numbers: written with + - * / ** and
-        the functions of `harnack.arithmetic`. A Dr.Jit number comes second, as in x * radius: with
-        it first, Dr.Jit's own operators would refuse jets."""
+        """f as a function of the coordinates, which may be jets or Dr.Jit numbers.
+
+        It is written with + - * / ** and the functions of `harnack.arithmetic`. In a product or sum
+        with a Dr.Jit number, the coordinate comes first, as in x * radius. In the other order
+        Dr.Jit's own operators would refuse jets.
+        """
 
     @property
     def tally(self) -> Tally:
-        """The operations of the formula, counted; for a prepared formula, counted before it was
-        prepared, while its numbers were known."""
+        """The number of the formula's operations, by kind. For a prepared formula, they were
+        counted before it was prepared, while its numbers were known."""
         return tally_of(self.formula) if self._prepared_tally is None else self._prepared_tally
 
     @property
     def is_steep(self) -> bool:
-        """Whether the formula uses an operation that may have a vertical tangent or a pole, or that
-        is as steep as a pole for the rounding of coordinates."""
+        """Whether the formula uses an operation that may have a vertical tangent or a pole; or
+        whether f is so steep that it acts like a pole within the rounding of coordinates
+        (`is_abrupt`)."""
         return self.tally.is_steep or self.is_abrupt
 
     @property
@@ -115,7 +120,7 @@ class Formula(Field):
         """Whether f may change within the rounding of coordinates by far more than its slopes
         allow.
 
-        Where a Lipschitz constant is stated, as for the library's shapes, whose values are about
+        If a Lipschitz constant is stated, as for the library's shapes, whose values are about
         distances, small numbers in a formula are lengths, and only large numbers make it abrupt.
         """
         return self.tally.turns_within(1.0 if self.lipschitz is not None else self.tally.finest)
@@ -166,8 +171,8 @@ class Formula(Field):
         )
 
     def sample_without_alternatives(self, p: Vec3) -> Sample:
-        """The sample with the promises of `promises`, without alternative promises, which samples
-        on rays do not use."""
+        """The sample at p with the promises of `promises`, and without alternative promises, which
+        samples on rays do not use."""
         return self._sample_of(self._jet(Jet.at_point(p), p.x), p)
 
     def _sample_of(self, jet: Jet, p: Vec3) -> Sample:
@@ -212,29 +217,31 @@ class Formula(Field):
         return vector(xx, xy, xz), vector(xy, yy, yz), vector(xz, yz, zz)
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """The error of the gradient is that of the sample; the error of the Hessian follows from
+        """The error of the gradient is that of the sample. The error of the Hessian follows from
         its ranges, which include rounding and ties of the formula."""
         return sample.gradient_error, hessian_error(self._jet(Jet.at_point(p, order=2), p.x), p.x)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The sample, with the enclosures ahead that the ranges of the formula prove, and with no
-        enclosures behind. Without such enclosures, those of the sample's promises are used.
+        """The ray sample, with the enclosures ahead that the ranges of the formula prove, and with
+        no enclosures behind. If there are no such enclosures, those of the sample's promises are
+        used.
 
-        Proof that no jump of f is passed, given that the range of f' on a piece with a jump is all
-        numbers. A march steps to t + s rounded, which may lie beyond the s that was proved, and
-        goes on from a point that is rounded again: a jump between the two would be missed from
-        both. So where f may jump, the piece begins before t, by more than the rounding of t, and
-        covers all paths that lead through the point up to its rounding (`FormulaOnRay.rounded`).
-        The exact path up to t + s then lies in such pieces altogether, and they have no jump.
+        Proof that no jump of f is passed. If a piece of the path holds a jump, the range of f' on
+        it is all numbers. A march steps from t to t + s, rounded. This point may lie beyond the s
+        that was proved, and the march goes on from a point that is rounded again. A jump between
+        these two points would be missed from both. So if f may jump, the piece begins before t, by
+        more than the rounding of t, and covers all paths that lead through the point up to its
+        rounding (`FormulaOnRay.rounded`). Then the exact path up to t + s lies in such pieces
+        altogether, and they have no jump.
 
-        Proof that no level is passed where f is abrupt (`is_abrupt`), as max(-1, min(1, 1e9 y)) is.
-        At a rounded point f may be -1 with slope 0, and 1 at the point of the exact path. So the
-        slopes at the start, too, are those of all points that round to this point. They hold for
-        the exact path. Its values differ from f at the rounded point by no more than
-        `tracer.steep.SteepPlace.error`, and together they prove the claim for the exact path.
-        (Enclosures without such pieces prove the claim for the path through the rounded point; the
-        error covers the difference, except where a path passes the end of a surface that is thinner
-        than rounding.)
+        Proof that no level is passed if f is abrupt (`is_abrupt`), as max(-1, min(1, 1e9 y)) is. At
+        a rounded point f may be -1 with slope 0, although it is 1 at the point of the exact path.
+        So the slopes at the start, too, are those of all points that round to this point, and they
+        hold for the exact path. The values on the exact path differ from f at the rounded point by
+        no more than `tracer.steep.SteepPlace.error`. Together they prove the claim for the exact
+        path. (Enclosures without such pieces prove the claim for the path through the rounded
+        point. The error covers the difference, except where a path passes the end of a surface that
+        is thinner than rounding.)
         """
         del back
         p = path.point(t)
@@ -283,17 +290,17 @@ class Formula(Field):
 
     @property
     def may_jump(self) -> bool:
-        """Whether the formula has functions in it that are not continuous everywhere, or refuses
-        numbers that would tell."""
+        """Whether the formula has functions that are not continuous everywhere, or cannot be
+        evaluated with the numbers that count its operations."""
         return self.tally.may_jump
 
     def restrict(self, p: Vec3, direction: Vec3) -> FormulaOnRay:
-        """The field along the path from p, for enclosures."""
+        """The formula along the path p + s direction, for enclosures."""
         return FormulaOnRay(self, p, direction)
 
     def prepare(self, backend: Backend) -> Field:
-        """The same formula with its numbers as kernel parameters, so that other numbers compile no
-        other kernel."""
+        """The same formula with its numbers as kernel parameters, so that a formula with other
+        numbers uses the same compiled kernel."""
         other = with_device_numbers(self, backend)
         object.__setattr__(other, "_prepared_tally", self.tally)
         return other
@@ -312,17 +319,24 @@ def probe_jets() -> tuple[Jet, Jet, Jet]:
 
 
 def hessian_error(jet: Jet, like: Real) -> Real:
-    """A bound of the distance, in the spectral norm, of a Hessian at a point from the midpoints of
-    its ranges. Proof. The spectral norm of a matrix is at most the sum of the absolute values of
-    its entries."""
+    """A bound of the error of a Hessian whose entries are the midpoints of their ranges, in the
+    spectral norm.
+
+    jet: of f at a point, with all second derivatives.
+    like: a number of the backend.
+
+    Proof. The spectral norm of a matrix is at most the sum of the absolute values of its entries.
+    """
     xx, xy, xz, yy, yz, zz = (entry.radius for entry in jet.second_derivatives)
     return 0 * like + xx + yy + zz + 2 * (xy + xz + yz)
 
 
 def warn_if_slow_to_compile(field: Formula) -> None:
-    """Warn if compiling will take long. LLVM took 0.9 s for 11,000 operations on an idle core, 2.7
-    s for 32,000, 7.4 s for 53,000 and 30 s for 100,000: the time grows about as their number to the
-    power 2.2."""
+    """Warn if compiling a formula will take long.
+
+    On an idle core LLVM took 0.9 s for 11,000 operations, 2.7 s for 32,000, 7.4 s for 53,000 and 30
+    s for 100,000. So the time grows about as the number of operations to the power 2.2.
+    """
     operations = tally_of(field.formula).operations
     seconds = 30 * (operations / 1e5) ** 2.2
     if seconds > _SLOW_COMPILE_SECONDS:
@@ -336,10 +350,12 @@ def warn_if_slow_to_compile(field: Formula) -> None:
 
 
 def is_jet(x: Any, name: str) -> bool:
-    """Whether a coordinate is a jet, and not a plain number; for formulas that accept no others.
+    """Whether a coordinate x is a jet; it is False for a plain number.
+
+    name: of the field, for the message.
 
     Raises:
-        TypeError: it is a number of another arithmetic.
+        TypeError: x is a number of another arithmetic, which the formula does not accept.
     """
     if isinstance(x, FormulaNumber) and not isinstance(x, Jet):
         raise TypeError(
@@ -351,7 +367,10 @@ def is_jet(x: Any, name: str) -> bool:
 
 
 def as_jet(value: Any, like: Jet, name: str) -> Jet:
-    """The result of a formula as a jet; a constant becomes a constant jet.
+    """The result of a formula as a jet. A constant becomes a constant jet.
+
+    like: any jet of the same variables and piece.
+    name: of the field, for the message.
 
     Raises:
         TypeError: the result is neither a jet nor a constant.
@@ -385,13 +404,14 @@ class FormulaOnRay:
     piece_count: int = 1
 
     def rounded(self, t: Real) -> FormulaOnRay:
-        """The formula along all paths that lead through p up to its rounding, from a little before
-        p: by more than the rounding of t, of which p is the point."""
+        """The formula along all paths that lead through p up to its rounding, where p is the point
+        at parameter t. Its first piece begins before p, by more than the rounding of t."""
         before = _ROUNDINGS_BEFORE * float(dr.epsilon(type(t))) * dr.abs(t)
         return dataclasses.replace(self, before=before)
 
     def is_continuous(self, length: Real) -> Mask:
-        """Whether f is known to be continuous for 0 <= s <= length, as its slopes are bounded."""
+        """Whether f is proved to be continuous for 0 <= s <= length. It is if the range of its
+        slopes is bounded."""
         slopes = self._jet(0.0, length).first_derivatives[0]
         return dr.isfinite(0 * length + slopes.lower) & dr.isfinite(0 * length + slopes.upper)
 
@@ -427,8 +447,8 @@ class FormulaOnRay:
 
 
 def with_device_numbers(field: Any, backend: Backend) -> Any:
-    """A copy of a dataclass whose numbers, and the numbers of fields in it, are kernel parameters
-    of the backend."""
+    """A copy of a dataclass in which its numbers are kernel parameters of the backend, and fields
+    among its attributes are prepared."""
     other = copy.copy(field)
     for entry in dataclasses.fields(cast("Any", field)) if dataclasses.is_dataclass(field) else ():
         value = getattr(field, entry.name)
@@ -438,8 +458,8 @@ def with_device_numbers(field: Any, backend: Backend) -> Any:
 
 
 def prepare_value(value: Any, backend: Backend) -> Any:
-    """Numbers, also in tuples, as kernel parameters of the backend; fields prepared; all else
-    unchanged."""
+    """A float, or the floats in a tuple, as kernel parameters of the backend. A field is prepared.
+    All else, integers included, is returned unchanged."""
     if isinstance(value, float):
         return dr.opaque(backend.Float, value)
     if isinstance(value, tuple):

@@ -1,4 +1,4 @@
-"""Fields whose patches lie in boxes, and these boxes on a backend (see
+"""Fields whose surfaces are unions of patches in boxes, and these boxes on a backend (see
 `harnack.fields.capabilities`)."""
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class PatchBoxes(UnitFrame):
     def next(
         self, o: Vec3, d: Vec3, after: PatchEntry, start: Real, end: Real, active: Mask
     ) -> PatchEntry:
-        """As `Field.next_patch`."""
+        """See `Field.next_patch`."""
         behind = after.enter / self.size, after.patch
         enter, leave, box = self.tree.next_box(
             self.to_unit(o), d, behind, start / self.size, end / self.size, active
@@ -65,7 +65,7 @@ class PatchBoxes(UnitFrame):
 
 
 class HasPatchBoxes(Protocol):
-    """The data of a union of patches on a backend: the boxes, and the data of the patches."""
+    """Data of a union of patches on a backend: the boxes of the patches, and further data."""
 
     @property
     def boxes(self) -> PatchBoxes: ...
@@ -75,9 +75,9 @@ _Buffers = TypeVar("_Buffers", bound=HasPatchBoxes)
 
 
 class PatchField(Field, Generic[_Buffers]):
-    """A union of patches in boxes that depend on the levels.
+    """A union of patches, each in a box. The boxes depend on the levels.
 
-    levels: once the field is prepared, its boxes contain the patches of these levels.
+    levels: the boxes of the prepared field contain the patches of these levels.
     """
 
     has_patches: bool = True
@@ -89,7 +89,8 @@ class PatchField(Field, Generic[_Buffers]):
 
     @abc.abstractmethod
     def boxes(self, levels: tuple[float, ...] | None = None) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corners (m, 3) of boxes that are proved to contain each patch.
+        """The lowest and the highest corners (m, 3) of boxes. Each box is proved to contain its
+        patch.
 
         levels: of the patches; None for the attribute `levels`.
         """
