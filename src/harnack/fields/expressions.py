@@ -1,4 +1,5 @@
-"""A user's own formula as a field: a Python function, or a text such as "x^2 + y^2 + z^2 = 1"."""
+"""A user's own formula as a field. The formula is a Python function, or a text such as "x^2 + y^2 +
+z^2 = 1"."""
 
 from __future__ import annotations
 
@@ -131,8 +132,8 @@ class TextFormula:
 
 
 def looks_like_formula(text: str) -> bool:
-    """Whether a text looks like a formula: it is an equation, or has powers, products or
-    functions."""
+    """Whether a text looks like a formula: it has an equals sign, a power, a product or a
+    bracket."""
     return any(sign in text for sign in ("=", "^", "*", "("))
 
 
@@ -280,12 +281,13 @@ def _power(base: Any, exponent: Any) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Expression(Formula):
-    """A field f(x, y, z) that is a Python function, written with plain operators and the functions
-    of `harnack.math`.
+    """A field f(x, y, z) given by a Python function, which is written with plain operators and the
+    functions of `harnack.math`.
 
-    function: called with three coordinates while a kernel is being recorded; numbers in it are
-        literals of that kernel.
+    function: takes three coordinates. It is called while a kernel is being recorded, and numbers in
+        it are literals of that kernel.
     domain: the volume in which f is drawn; None for all of space.
+    default_level, is_convex: as in `Field` and `Formula`.
     """
 
     function: Callable[[Any, Any, Any], Any]
@@ -312,21 +314,22 @@ def expression(
 ) -> Expression:
     """The implicit surface f(x, y, z) = level of a user-defined formula.
 
-    function: of three coordinates, written with + - * / **, abs, and the functions of
+    function: takes three coordinates. It is written with + - * / **, abs, and the functions of
         `harnack.math`: `sin`, `cos`, `tan`, `exp`, `log`, `sqrt`, `tanh`, `atan`, `atan2`, `asin`,
-        `acos`, `sinh`, `cosh`, `maximum`, `minimum`, `norm`; NumPy's functions of the same names
-        work too. Or a text, such as "x^2 + y^2 = 1 + sin(2*z)", with `max` and `min`; an equation
-        means left - right.
-    parameters: numbers by their names in a text, such as {"a": 2.0} for "x^2 + y^2 = a".
+        `acos`, `sinh`, `cosh`, `maximum`, `minimum`, `norm`. NumPy's functions of the same names
+        work too. Or it is a text, such as "x^2 + y^2 = 1 + sin(2*z)", with `max` and `min` for the
+        last; an equation means left - right.
+    parameters: for a text, numbers by their names, such as {"a": 2.0} for "x^2 + y^2 = a".
     domain: the volume in which the surface is drawn, such as `harnack.Ball()`; None for all of
         space.
-    level: the level drawn by default.
-    is_convex: your promise that the function is convex, as quadrics and norms are: then steps
+    level: the level that is drawn by default.
+    is_convex: your promise that the function is convex, as quadrics and norms are. Then steps
         towards the surface are longer. `harnack.testing.check_field` tests the promise at samples.
 
         torus = hk.expression(lambda x, y, z: (hk.math.norm(x, y) - 1) ** 2 + z**2 - 0.1)
 
-    Warns of a formula so long that the first trace takes more than about ten seconds to compile.
+    It warns if the formula is so long that its first trace takes more than about ten seconds to
+    compile.
 
     Raises:
         TypeError: function cannot be called with three coordinates, or uses operations without
