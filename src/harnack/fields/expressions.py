@@ -317,8 +317,8 @@ def expression(
     function: takes three coordinates. It is written with + - * / **, abs, and the functions of
         `harnack.math`: `sin`, `cos`, `tan`, `exp`, `log`, `sqrt`, `tanh`, `atan`, `atan2`, `asin`,
         `acos`, `sinh`, `cosh`, `maximum`, `minimum`, `norm`. NumPy's functions of the same names
-        work too. Or it is a text, such as "x^2 + y^2 = 1 + sin(2*z)", with `max` and `min` for the
-        last; an equation means left - right.
+        work too. Or it is a text, such as "x^2 + y^2 = 1 + sin(2*z)", in which maximum and minimum
+        are `max` and `min`; an equation means left - right.
     parameters: for a text, numbers by their names, such as {"a": 2.0} for "x^2 + y^2 = a".
     domain: the volume in which the surface is drawn, such as `harnack.Ball()`; None for all of
         space.

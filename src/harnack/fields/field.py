@@ -89,8 +89,8 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
     inside is where f > level; else it is where f < level, as for signed distances."""
 
     over_relaxation: float = 1.4
-    """The over-relaxation factor (`TraceOptions.over_relaxation`) that takes the fewest evaluations,
-    by experiment. It is at least 1."""
+    """The over-relaxation factor (`TraceOptions.over_relaxation`) that needs the fewest
+    evaluations, by experiment. It is at least 1."""
 
     domain: Volume | None = None
     """The convex volume in which the field may be evaluated and is drawn; None for all of space.
