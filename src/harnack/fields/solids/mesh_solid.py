@@ -204,6 +204,8 @@ class MeshSolid(Solid):
         return prepared
 
     def evaluate(self, p: Vec3) -> Sample:
+        """The sample of the signed distance at p. Within `share_samples`, a sample at the same
+        Dr.Jit points is taken from the cache."""
         data, cache = _data_on_backend(self, p), _SAMPLE_CACHE.get()
         if cache is None or dr.flag(dr.JitFlag.SymbolicScope):
             return data.sample(p)
@@ -213,6 +215,8 @@ class MeshSolid(Solid):
         return cache[key][1]
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
+        """The ray sample, with the enclosures that the Lipschitz constant 1 proves, and with a
+        lower bound of |grad f|."""
         del ahead, back
         look = path.enclose(self.evaluate(path.point(t)))
         return RaySample(
