@@ -208,11 +208,13 @@ class Tube(Solid):
 
     @cached_prepare
     def prepare(self, backend: Backend) -> Tube:
+        """The same tube with its segments as records of the backend. If there are many, they are
+        grouped, and each group has a ball around it."""
         prepared = copy.copy(self)
         is_segment = np.ones(len(self.points) - 1, dtype=np.bool_)
         is_segment[[vertex - 1 for vertex in self.starts]] = False
-        start, side = self.points[:-1][is_segment], np.diff(self.points, axis=0)[is_segment]
-        rows = np.column_stack([start, side, 1.0 / np.sum(side * side, axis=1)])
+        start, segment = self.points[:-1][is_segment], np.diff(self.points, axis=0)[is_segment]
+        rows = np.column_stack([start, segment, 1.0 / np.sum(segment * segment, axis=1)])
         groups = None
         if len(rows) >= _MIN_SEGMENTS_FOR_GROUPS:
             rows, balls = _group_segments(rows)
@@ -228,14 +230,17 @@ class Tube(Solid):
         return self._sample_with_bounds(p, None, ())[0]
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
+        """The ray sample, whose enclosure is a `TangentEnclosure`. It has no enclosure looking
+        back. If the caller asks for other kinds of enclosures, those of the Lipschitz constant are
+        used."""
         del back
         p = path.point(t)
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return path.enclose(self.evaluate(p))
         if not hasattr(self, "_records"):
             return self.prepare(backend_of(p)).sample_ray(path, t, ahead, ahead)
-        far = _ENDLESS_LENGTH * (max_norm(p) + self._parameter("_size"))
-        length = dr.select(dr.isfinite(ahead), ahead, far)
+        endless_length = _ENDLESS_LENGTH * (max_norm(p) + self._parameter("_size"))
+        length = dr.select(dr.isfinite(ahead), ahead, endless_length)
         knots = (*(fraction * length for fraction in _KNOT_FRACTIONS), ahead)
         sample, distance, bounds = self._sample_with_bounds(p, path.direction, knots)
         slope = dr.dot(sample.gradient, path.direction)
@@ -453,6 +458,8 @@ class TangentEnclosure(Enclosure):
     lower_bounds: tuple[Real, ...]
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """See `Enclosure`: the smaller of the length up to which F does not rise to the level
+        above, and the length up to which its lower bound does not fall to the level below."""
         half_slope = self.distance * self.slope
         product = gaps.above * (gaps.above + 2 * self.distance)
         root = dr.sqrt(fmax(dr.fma(half_slope, half_slope, product), 0))
@@ -591,6 +598,8 @@ class _Segment(Field):
         self._boxes, self._row = boxes, row
 
     def evaluate(self, p: Vec3) -> Sample:
+        """The sample at p, with the Lipschitz constant 1 and a bound of second derivatives on a
+        ball."""
         backend, row = self._boxes.backend, self._row
         vector, epsilon = backend.Array3f, 2 * backend.machine_epsilon
         from_start = vector(p) - self._boxes.center - vector(*row[:3])
