@@ -112,6 +112,9 @@ class BooleanSolid(Solid):
         return BooleanSolid(tuple(part.map_operands(change) for part in self.parts), self.is_union)
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        """See `Solid.sublevel_extent`. Points where the extreme value is on the side asked for lie
+        either in each operand's volume, or in at least one of them: in the first case the volumes
+        are intersected, in the second a box is put around them."""
         extents = [part.sublevel_extent(level, above=above) for part in self.parts]
         bounded = [part for part in extents if part is not None]
         if self.is_union == above:
@@ -154,6 +157,7 @@ class BooleanSolid(Solid):
         return self._combine_samples(samples, max_norm(p))[0]
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        """The rows of the Hessian of the operand that is extreme at p."""
         extreme: Any = None
         rows: Any = None
         for part in self.parts:
@@ -484,6 +488,9 @@ class BlendedSolid(FormulaSolid):
         object.__setattr__(self, "domain", union(*self.parts).domain)
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        """See `Solid.sublevel_extent`. A fillet adds points to a union below a level, and takes
+        points from an intersection; so the volume is that of the combination without a fillet, at a
+        level shifted by `_min_operand_bound` if the fillet adds points."""
         sharp = union(*self.parts) if self.is_union else self.parts[0] & self.parts[1]
         if self.is_union:
             return (
