@@ -103,6 +103,8 @@ class Extrusion(Solid):
         return {"edges": sum(map(len, self.loops))}
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        """See `Solid.sublevel_extent`. A box around the outline, grown by the level; for a twisted
+        or tapered solid, around the image of that box at any height."""
         if above:
             return None
         points = np.concatenate(self.loops)
@@ -114,12 +116,16 @@ class Extrusion(Solid):
             radius = float(np.linalg.norm(points, axis=1).max()) + max(level, 0.0)
             upper = np.full(2, radius * max(1.0, self.taper))
             lower = -upper
-        (x, y), (a, b) = 0.5 * (upper - lower), 0.5 * (upper + lower)
-        half = 0.5 * self.height
-        return box_around((float(x), float(y), half + level), (float(a), float(b), half))
+        (half_x, half_y), (center_x, center_y) = 0.5 * (upper - lower), 0.5 * (upper + lower)
+        half_height = 0.5 * self.height
+        return box_around(
+            (float(half_x), float(half_y), half_height + level),
+            (float(center_x), float(center_y), half_height),
+        )
 
     @cached_prepare
     def prepare(self, backend: Backend) -> Extrusion:
+        """The same solid with its edges and numbers on the backend."""
         prepared = copy.copy(self)
         set_frozen(prepared, "_outline", OutlineEdges.upload(backend, self.loops))
         set_frozen(prepared, "_half", dr.opaque(backend.Float, 0.5 * self.height))
@@ -129,26 +135,40 @@ class Extrusion(Solid):
         return prepared
 
     def evaluate(self, p: Vec3) -> Sample:
+        """The sample at p. Without twist and taper it follows from that of the outline in the
+        plane. Otherwise the outline is sampled at the preimage of p. Ranges of the preimage and of
+        its derivatives then give the gradient by the chain rule, and the errors."""
         solid = _prepared_for(self, p)
         if self.is_straight:
-            side = solid._outline.sample(p.x, p.y)
-            return solid._sample_of_outline(p, side, cast("Any", type(p))(*side.gradient, 0))
+            outline_sample = solid._outline.sample(p.x, p.y)
+            return solid._sample_of_outline(
+                p, outline_sample, cast("Any", type(p))(*outline_sample.gradient, 0)
+            )
         x, y, _ = solid._preimage(*Jet.at_point(p))
         zero = 0 * p.x
         u, v = (zero + component.value.midpoint for component in (x, y))
-        side = solid._outline.sample(u, v)
-        spread = zero + x.value.radius + y.value.radius
-        slopes = [
-            Interval.point(side.gradient[0]) * a + Interval.point(side.gradient[1]) * b
+        outline_sample = solid._outline.sample(u, v)
+        preimage_error = zero + x.value.radius + y.value.radius
+        gradient_ranges = [
+            Interval.point(outline_sample.gradient[0]) * a
+            + Interval.point(outline_sample.gradient[1]) * b
             for a, b in zip(x.first_derivatives, y.first_derivatives, strict=True)
         ]
-        gradient = cast("Any", type(p))(*(zero + component.midpoint for component in slopes))
-        stretch, radius = solid._preimage_lipschitz(p)
-        error = (
-            sum((component.radius for component in slopes), zero) + side.gradient_error * stretch
+        gradient = cast("Any", type(p))(
+            *(zero + component.midpoint for component in gradient_ranges)
         )
-        moved = OutlineSample(side.value, side.gradient, side.error + 2 * spread, error)
-        return solid._sample_of_outline(p, moved, gradient, Lipschitz(stretch, radius))
+        constant, radius = solid._preimage_lipschitz(p)
+        error = (
+            sum((component.radius for component in gradient_ranges), zero)
+            + outline_sample.gradient_error * constant
+        )
+        moved_sample = OutlineSample(
+            outline_sample.value,
+            outline_sample.gradient,
+            outline_sample.error + 2 * preimage_error,
+            error,
+        )
+        return solid._sample_of_outline(p, moved_sample, gradient, Lipschitz(constant, radius))
 
     def _sample_of_outline(
         self, p: Vec3, side: OutlineSample, gradient: Vec3, promise: Lipschitz | None = None
@@ -176,26 +196,32 @@ class Extrusion(Solid):
         return Sample(value, gradient, promises, error, gradient_error)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
+        """The ray sample. Without twist and taper its enclosure is an `ExtrusionEnclosure`.
+        Otherwise its enclosures follow from a Lipschitz constant along the ray, the speed of the
+        preimage. It has no enclosure looking back. If the caller asks for other kinds of
+        enclosures, those of the promises are used."""
         del back
         p, d = path.point(t), path.direction
         if not self.is_straight:
             sample = self.evaluate(p)
             min_norm = self._min_gradient_norm(sample)
-            speed = _prepared_for(self, p)._path_lipschitz(
+            path_constant = _prepared_for(self, p)._path_lipschitz(
                 p, d, fmin(ahead, 2 * dr.abs(sample.value))
             )
-            look = path.enclose(replace(sample, ray_promises=(speed,)))
+            ray_sample = path.enclose(replace(sample, ray_promises=(path_constant,)))
             # The speed has no bound looking back.
-            return replace(look, backward=(), min_gradient_norm=min_norm)
+            return replace(ray_sample, backward=(), min_gradient_norm=min_norm)
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return path.enclose(self.evaluate(p))
         solid = _prepared_for(self, p)
         outline: OutlineEdges = solid._outline
         knots = outline.knots(p.x, p.y, ahead)
-        side = outline.sample(p.x, p.y, (d.x, d.y), knots)
-        sample = solid._sample_of_outline(p, side, cast("Any", type(p))(*side.gradient, 0))
-        rate = side.gradient[0] * d.x + side.gradient[1] * d.y
-        planar_enclosure = SignedDistanceEnclosure.around(side, rate, knots)
+        outline_sample = outline.sample(p.x, p.y, (d.x, d.y), knots)
+        sample = solid._sample_of_outline(
+            p, outline_sample, cast("Any", type(p))(*outline_sample.gradient, 0)
+        )
+        planar_slope = outline_sample.gradient[0] * d.x + outline_sample.gradient[1] * d.y
+        planar_enclosure = SignedDistanceEnclosure.around(outline_sample, planar_slope, knots)
         height = p.z - solid._half
         enclosure = ExtrusionEnclosure(
             sample.value, sample.value_error, planar_enclosure, height, solid._half, d.z
@@ -206,6 +232,7 @@ class Extrusion(Solid):
         )
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
+        """f at jets of the coordinates, or at Dr.Jit numbers."""
         if not is_jet(x, type(self).__name__):
             return self.differentiable_value(_vector(x, y, z))
         solid = _prepared_for(self, x.piece_length)
@@ -499,29 +526,32 @@ class SolidOfRevolution(Solid):
         )
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
+        """The ray sample. Its enclosure is that of the distance from the outline along the tangent
+        line of the path in the half-plane, whose lower bounds are reduced by `_tangent_gap`. It has
+        no enclosure looking back."""
         del back
         p, d = path.point(t), path.direction
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return path.enclose(self.evaluate(p))
         outline: OutlineEdges = _prepared_for(self, p)._outline
-        r, (x, y) = _from_axis(p)
+        r, (unit_x, unit_y) = _from_axis(p)
         knots = outline.knots(r, p.z, ahead)
-        rate, across = x * d.x + y * d.y, x * d.y - y * d.x
-        side = outline.sample(r, p.z, (rate, d.z), knots)
+        rate, across = unit_x * d.x + unit_y * d.y, unit_x * d.y - unit_y * d.x
+        outline_sample = outline.sample(r, p.z, (rate, d.z), knots)
         epsilon = 2 * float(dr.epsilon(type(r)))
         lower_bounds = tuple(
             bound - _tangent_gap(r, rate, across, knot, epsilon)
-            for bound, knot in zip(side.lower_bounds, knots, strict=True)
+            for bound, knot in zip(outline_sample.lower_bounds, knots, strict=True)
         )
         lower_bounds = tuple(dr.select(bound == bound, bound, -dr.inf) for bound in lower_bounds)
         rounding = 8 * epsilon * r
-        side = OutlineSample(
-            side.value, side.gradient, side.error + rounding, side.gradient_error + 8 * epsilon,
-            side.second_derivative, tuple(bound - rounding for bound in lower_bounds),
+        outline_sample = OutlineSample(
+            outline_sample.value, outline_sample.gradient, outline_sample.error + rounding, outline_sample.gradient_error + 8 * epsilon,
+            outline_sample.second_derivative, tuple(bound - rounding for bound in lower_bounds),
         )  # fmt: skip
-        sample = self._sample(p, r, (x, y), side)
+        sample = self._sample(p, r, (unit_x, unit_y), outline_sample)
         slope = dr.dot(sample.gradient, d)
-        enclosures = (SignedDistanceEnclosure.around(side, slope, knots),)
+        enclosures = (SignedDistanceEnclosure.around(outline_sample, slope, knots),)
         return RaySample(
             sample, enclosures, (), slope, _REACH_GROWTH, min_gradient_norm=_MIN_GRADIENT
         )
