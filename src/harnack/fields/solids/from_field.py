@@ -352,6 +352,8 @@ class BandSolid(SolidOfField):
         return prepared
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        """See `Solid.sublevel_extent`. The points where |f - level| - half_width is at most a
+        number lie between two levels of f."""
         ends = tuple(self.level + sign * (self.half_width + level) for sign in (-1, 1))
         if above or (self.field.is_global and self.field.period is None):
             return self.domain
@@ -387,8 +389,10 @@ class BandSolid(SolidOfField):
         return dr.select(is_clear, first_error, dr.inf), dr.select(is_clear, second_error, dr.inf)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        look = self.field.sample_ray(path, t, ahead, back)
-        sample, offset = self._sample_with_difference(look.sample)
+        """The ray sample of |f - level| - half_width, from that of f. Its enclosures are
+        `FoldedEnclosure`s."""
+        ray_sample = self.field.sample_ray(path, t, ahead, back)
+        sample, offset = self._sample_with_difference(ray_sample.sample)
 
         def folded(enclosures: tuple[Enclosure, ...]) -> tuple[Enclosure, ...]:
             """The enclosures of |f - level| from those of f."""
@@ -396,9 +400,11 @@ class BandSolid(SolidOfField):
                 FoldedEnclosure(enclosure, offset, self.field.period) for enclosure in enclosures
             )
 
-        slope = dr.mulsign(look.slope, offset)
-        forward, backward = folded(look.forward), folded(look.backward)
-        return RaySample(sample, forward, backward, slope, look.reach_growth, look.slope_error)
+        slope = dr.mulsign(ray_sample.slope, offset)
+        forward, backward = folded(ray_sample.forward), folded(ray_sample.backward)
+        return RaySample(
+            sample, forward, backward, slope, ray_sample.reach_growth, ray_sample.slope_error
+        )
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         if not isinstance(self.field, Formula | Solid):
