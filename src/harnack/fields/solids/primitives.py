@@ -227,13 +227,13 @@ class Capsule(FormulaSolid):
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         axis = [b - a for a, b in zip(self.start, self.end, strict=True)]
-        q = [v - a for v, a in zip((x, y, z), self.start, strict=True)]
+        from_start = [v - a for v, a in zip((x, y, z), self.start, strict=True)]
         square = axis[0] * axis[0] + axis[1] * axis[1] + axis[2] * axis[2]
-        t = (q[0] * axis[0] + q[1] * axis[1] + q[2] * axis[2]) / square
+        t = (from_start[0] * axis[0] + from_start[1] * axis[1] + from_start[2] * axis[2]) / square
         # The distance beyond the ends, along the axis; and the distance from the line, across it.
-        size = norm(*axis)
-        beyond = maximum(-t, t - 1.0, 0.0) * size
-        across = norm(*(v - t * a for v, a in zip(q, axis, strict=True)))
+        length = norm(*axis)
+        beyond = maximum(-t, t - 1.0, 0.0) * length
+        across = norm(*(v - t * a for v, a in zip(from_start, axis, strict=True)))
         return norm(across, beyond) - self.radius
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
