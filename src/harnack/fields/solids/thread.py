@@ -122,6 +122,7 @@ class Thread(Solid):
         return None
 
     def prepare(self, backend: Backend) -> Thread:
+        """The same thread with its numbers as kernel parameters."""
         prepared = with_device_numbers(self, backend)
         numbers: Any = cast("Any", self)
         points = tuple(
@@ -133,6 +134,8 @@ class Thread(Solid):
         return prepared
 
     def evaluate(self, p: Vec3) -> Sample:
+        """The sample at p: the signed distance of (r, u) from the profile, with u reduced to the
+        period from 0 to the pitch. Near the axis f is constant."""
         real, data = cast("Any", type(p.x)), cast("Any", self)
         epsilon = 2 * float(dr.epsilon(real))
         r = dr.sqrt(dr.fma(p.x, p.x, p.y * p.y))
@@ -141,32 +144,40 @@ class Thread(Solid):
         error = 8 * epsilon * (dr.abs(p.z) + r + data._size)
         is_outside = r >= self._profile_radius(axial)
         sign = dr.select(is_outside, real(1), real(-1))
-        distance, d_r, d_z, slope_error = self._distance_with_gradient(r, axial, sign, error)
+        distance, derivative_r, derivative_z, gradient_error = self._distance_with_gradient(
+            r, axial, sign, error
+        )
         value = sign * distance
         is_core = value <= -data._least
         value = dr.select(is_core, -data._least, value)
-        d_r, d_z = (dr.select(is_core, 0, derivative) for derivative in (d_r, d_z))
+        derivative_r, derivative_z = (
+            dr.select(is_core, 0, derivative) for derivative in (derivative_r, derivative_z)
+        )
         divisor = dr.select(r > 0, r, 1)
         x, y = p.x / divisor, p.y / divisor
-        tangential = -d_z * data._lead / divisor
-        gradient = cast("Any", type(p))(d_r * x - tangential * y, d_r * y + tangential * x, d_z)
+        tangential = -derivative_z * data._lead / divisor
+        gradient = cast("Any", type(p))(
+            derivative_r * x - tangential * y, derivative_r * y + tangential * x, derivative_z
+        )
         constant = 0 * p.x + self.lipschitz
-        slope_error = dr.select(is_core, 0, slope_error * constant + 16 * epsilon)
-        return Sample(value, gradient, (Lipschitz(constant),), error, slope_error)
+        gradient_error = dr.select(is_core, 0, gradient_error * constant + 16 * epsilon)
+        return Sample(value, gradient, (Lipschitz(constant),), error, gradient_error)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
+        """The ray sample, with the enclosures of the Lipschitz constant and, ahead, an
+        `OutsideCylinderEnclosure` of the cylinder around the thread."""
         del ahead, back
         p, d = path.point(t), path.direction
-        look = path.enclose(self.evaluate(p))
+        ray_sample = path.enclose(self.evaluate(p))
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
-            return look
+            return ray_sample
         numbers = cast("Any", self)
         cylinder = OutsideCylinderEnclosure(
-            look.sample.value, look.sample.value_error, dr.sqrt(dr.fma(p.x, p.x, p.y * p.y)),
+            ray_sample.sample.value, ray_sample.sample.value_error, dr.sqrt(dr.fma(p.x, p.x, p.y * p.y)),
             dr.fma(p.x, d.x, p.y * d.y), dr.fma(d.x, d.x, d.y * d.y), 0 * p.x + numbers._most,
             0 * p.x + self.lipschitz,
         )  # fmt: skip
-        return replace(look, forward=(*look.forward, cylinder))
+        return replace(ray_sample, forward=(*ray_sample.forward, cylinder))
 
     def _profile_radius(self, z: Real) -> Real:
         """The r of the polyline at z, a coordinate from 0 to the pitch."""
@@ -245,6 +256,8 @@ class OutsideCylinderEnclosure(Enclosure):
     constant: Real
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """See `Enclosure`: the smaller of the length to the cylinder grown by the level below, and
+        of the length up to which the Lipschitz constant excludes the level above."""
         level = self.value - gaps.below + self.error
         level_radius = self.radius + level
         excess = (self.r - level_radius) * (self.r + level_radius)
