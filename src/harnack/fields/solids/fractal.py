@@ -206,6 +206,7 @@ class FractalNoise(FormulaSolid):
         return self._sum(2.0) * CONSTANTS[self.fade].max_second_derivative
 
     def prepare(self, backend: Backend) -> Field:
+        """The same noise with its numbers and bounds as kernel parameters."""
         prepared = with_device_numbers(self, backend)
         constants = (self._sum(1.0) * CONSTANTS[self.fade].max_gradient, self.max_second_derivative)
         numbers = {
@@ -239,6 +240,7 @@ class FractalNoise(FormulaSolid):
         return None
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
+        """f at jets of the coordinates, or at Dr.Jit numbers."""
         jets = [axis for axis in (x, y, z) if is_jet(axis, type(self).__name__)]
         if jets:
             coordinates = [
