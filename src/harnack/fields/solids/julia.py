@@ -116,6 +116,9 @@ class Julia(Solid):
         return ball_around((0.0, 0.0, 0.0), math.sqrt(max(square, 0.0)))
 
     def evaluate(self, p: Vec3) -> Sample:
+        """The sample at p. A first orbit gives f and its gradient, and so the longest step that
+        could be proved. A second orbit gives Lipschitz constants on balls whose radii are fractions
+        of it."""
         if not hasattr(self, "_c"):
             from harnack.backend import backend_of
 
