@@ -100,6 +100,7 @@ class PatchField(Field, Generic[_Buffers]):
         """The boxes and the data of the patches on a backend."""
 
     def with_levels(self, levels: tuple[float, ...]) -> Self:
+        """See `PatchUnion.with_levels`. The fields for other levels are kept."""
         if levels == self.levels:
             return self
         if levels not in self._for_levels:

@@ -174,6 +174,7 @@ class HRBF(Formula):
         return sum_jets(term, x, backend.Float(0), for_each_record(records))
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        """The rows of the Hessian of f at p: a sum over the points."""
         backend, records = self._prepared_for(backend_of(p))
         pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
