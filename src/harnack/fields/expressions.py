@@ -118,6 +118,11 @@ class TextFormula:
         raise _formula_error(text, hint)
 
     def __call__(self, x: Any, y: Any, z: Any) -> Any:
+        """The value of the formula at coordinates of any kind.
+
+        Raises:
+            ValueError: a constant part divides by zero, is too large, or is not real.
+        """
         try:
             with np.errstate(all="ignore"):  # in constants; a result that is not finite is refused
                 return _value(self.tree, {"x": x, "y": y, "z": z, **_CONSTANTS, **self.parameters})
