@@ -537,21 +537,21 @@ class SolidOfRevolution(Solid):
         r, (unit_x, unit_y) = _from_axis(p)
         knots = outline.knots(r, p.z, ahead)
         rate, across = unit_x * d.x + unit_y * d.y, unit_x * d.y - unit_y * d.x
-        outline_sample = outline.sample(r, p.z, (rate, d.z), knots)
+        side = outline.sample(r, p.z, (rate, d.z), knots)
         epsilon = 2 * float(dr.epsilon(type(r)))
         lower_bounds = tuple(
             bound - _tangent_gap(r, rate, across, knot, epsilon)
-            for bound, knot in zip(outline_sample.lower_bounds, knots, strict=True)
+            for bound, knot in zip(side.lower_bounds, knots, strict=True)
         )
         lower_bounds = tuple(dr.select(bound == bound, bound, -dr.inf) for bound in lower_bounds)
         rounding = 8 * epsilon * r
-        outline_sample = OutlineSample(
-            outline_sample.value, outline_sample.gradient, outline_sample.error + rounding, outline_sample.gradient_error + 8 * epsilon,
-            outline_sample.second_derivative, tuple(bound - rounding for bound in lower_bounds),
+        side = OutlineSample(
+            side.value, side.gradient, side.error + rounding, side.gradient_error + 8 * epsilon,
+            side.second_derivative, tuple(bound - rounding for bound in lower_bounds),
         )  # fmt: skip
-        sample = self._sample(p, r, (unit_x, unit_y), outline_sample)
+        sample = self._sample(p, r, (unit_x, unit_y), side)
         slope = dr.dot(sample.gradient, d)
-        enclosures = (SignedDistanceEnclosure.around(outline_sample, slope, knots),)
+        enclosures = (SignedDistanceEnclosure.around(side, slope, knots),)
         return RaySample(
             sample, enclosures, (), slope, _REACH_GROWTH, min_gradient_norm=_MIN_GRADIENT
         )

@@ -173,9 +173,9 @@ class Thread(Solid):
             return ray_sample
         numbers = cast("Any", self)
         cylinder = OutsideCylinderEnclosure(
-            ray_sample.sample.value, ray_sample.sample.value_error, dr.sqrt(dr.fma(p.x, p.x, p.y * p.y)),
-            dr.fma(p.x, d.x, p.y * d.y), dr.fma(d.x, d.x, d.y * d.y), 0 * p.x + numbers._most,
-            0 * p.x + self.lipschitz,
+            ray_sample.sample.value, ray_sample.sample.value_error,
+            dr.sqrt(dr.fma(p.x, p.x, p.y * p.y)), dr.fma(p.x, d.x, p.y * d.y),
+            dr.fma(d.x, d.x, d.y * d.y), 0 * p.x + numbers._most, 0 * p.x + self.lipschitz,
         )  # fmt: skip
         return replace(ray_sample, forward=(*ray_sample.forward, cylinder))
 
