@@ -94,9 +94,9 @@ def _cell_ball_pairs(
     Returns the index of the cell and the index of the ball of each pair, sorted by balls.
     """
     enlarged_radii = radii * (1 + 1e-6)
-    first_cell = np.floor(
-        (centers - enlarged_radii[:, None] - origin) / size - _MARGIN
-    ).astype(np.int64)
+    first_cell = np.floor((centers - enlarged_radii[:, None] - origin) / size - _MARGIN).astype(
+        np.int64
+    )
     last_cell = np.floor((centers + enlarged_radii[:, None] - origin) / size + _MARGIN).astype(
         np.int64
     )

@@ -235,8 +235,8 @@ class GroupMaximumEnclosure(Enclosure):
 
         start = (real(0) + self.length, real(0))
         groups, (up, down) = self.blobs.each_group(add_group, start, "steps of groups")
-        # The sums of far groups stay 0.
-        stays_below = (groups < self.blobs.count) & (gaps.below > self.value)
-        down = dr.select(stays_below, self.length, down)
+        # The sums of far groups stay 0. If the level is below 0, the maximum never falls to it.
+        zero_is_above_level = (groups < self.blobs.count) & (gaps.below > self.value)
+        down = dr.select(zero_is_above_level, self.length, down)
         down = dr.select(gaps.below == dr.inf, self.length, down)
         return fmin(dr.select(gaps.above == dr.inf, self.length, up), down)

@@ -89,6 +89,8 @@ class BooleanSolid(Solid):
     is_union: bool
 
     def __post_init__(self) -> None:
+        """Set the attributes that follow from the operands: the domain, and the settings for the
+        tracer."""
         domains = list(dict.fromkeys(part.domain for part in self.parts if part.domain is not None))
         domain = None
         if domains:
@@ -470,6 +472,7 @@ class BlendedSolid(FormulaSolid):
     is_union: bool
 
     def __post_init__(self) -> None:
+        """Check the arguments, and set the attributes that follow from the operands."""
         for name, least, value in (("radius", 0.0, self.radius), ("power", 1.0, self.power)):
             is_valid = isinstance(value, numbers.Real) and least <= float(value) < math.inf
             if not is_valid or value == 0:

@@ -86,6 +86,8 @@ class DeformedSolid(FormulaSolid):
     map: Deformation
 
     def __post_init__(self) -> None:
+        """Set the domain and the smallest wavelength, which follow from those of the inner
+        solid."""
         if self.inner.domain is not None:
             domain = self.map.volume(self.inner.domain)
             object.__setattr__(self, "domain", domain)
@@ -192,6 +194,7 @@ class Taper(Deformation):
     axis: str = "z"
 
     def __post_init__(self) -> None:
+        """Check the arguments."""
         axis_index(self.axis)
         try:
             ends = (*self.start, *self.end)

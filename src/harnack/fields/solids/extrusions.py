@@ -80,6 +80,7 @@ class Extrusion(Solid):
     taper: float = 1.0
 
     def __post_init__(self) -> None:
+        """Check the arguments, and make the maps `Twist` and `Taper`."""
         set_frozen(self, "loops", make_outline(self.loops))
         height = as_positive(self.height, "the height of an extruded outline")
         twist = as_finite(self.twist, "the twist of an extruded outline, in degrees,")
@@ -473,6 +474,7 @@ class SolidOfRevolution(Solid):
     lipschitz = 1.0
 
     def __post_init__(self) -> None:
+        """Check the loops."""
         loops = make_outline(self.loops)
         min_radius = min(float(loop[:, 0].min()) for loop in loops)
         if min_radius < 0:

@@ -67,6 +67,7 @@ class Julia(Solid):
     fourth_coordinate: float = 0.0
 
     def __post_init__(self) -> None:
+        """Check the arguments."""
         try:
             numbers = tuple(self.c)
         except TypeError:

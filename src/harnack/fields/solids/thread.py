@@ -72,6 +72,8 @@ class Thread(Solid):
     left_handed: bool = False
 
     def __post_init__(self) -> None:
+        """Check the arguments, and compute the numbers that the formula needs, with three periods
+        of the profile."""
         set_frozen(self, "pitch", as_positive(self.pitch, "the pitch of a thread"))
         set_frozen(
             self,

@@ -183,6 +183,7 @@ class TransformedSolid(SolidOfField):
     map: AffineMap
 
     def __post_init__(self) -> None:
+        """Set the attributes that follow from those of the inner solid and from the map."""
         self._copy_settings()
         domain = self.map.volume(self.field.domain)
         if self.field.domain is not None and domain is None:

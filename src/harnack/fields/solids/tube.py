@@ -74,6 +74,7 @@ class Tube(Solid):
     lipschitz = 1.0
 
     def __post_init__(self) -> None:
+        """Check the arguments, and leave out points that repeat the point before."""
         array = as_real_array(self.points, "the points of a tube")
         check_vectors(array, "the points of a tube")
         points = np.array(array, dtype=np.float64)
@@ -87,8 +88,8 @@ class Tube(Solid):
             raise ValueError(f"flattening_error must be a length, not {self.flattening_error!r}")
         for part in np.split(points, starts):
             if len(part):
-                moves = np.any(part[1:] != part[:-1], axis=1)
-                part = part[np.concatenate([[True], moves])]
+                differs = np.any(part[1:] != part[:-1], axis=1)
+                part = part[np.concatenate([[True], differs])]
             if len(part) < 2:
                 raise ValueError("a tube needs two points or more that differ: use Sphere for one")
             parts.append(part)
@@ -517,10 +518,9 @@ class TubeNetwork(PatchField["_TubeBuffers"]):
         self.radius: FloatArray = _checked_radius(radius, len(self.segments))
 
     def boxes(self, levels: tuple[float, ...] | None = None) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corners (m, 3) of boxes that contain the tubes.
+        """Lower and upper corners (m, 3) of boxes, each of which contains a tube.
 
-        levels: by how much the radii are enlarged, the largest of them counts; None for those of
-            the field.
+        levels: the largest is added to the radii; None for the levels of the field.
         """
         level = max(self.levels if levels is None else levels)
         ends = self.points[self.segments]
