@@ -104,8 +104,9 @@ class Formula(Field):
 
     @property
     def tally(self) -> Tally:
-        """The number of the formula's operations, by kind. For a prepared formula, they were
-        counted before it was prepared, while its numbers were known."""
+        """The summary of the formula's operations: their number, and whether f may jump or is
+        steep. For a prepared formula, it was made before it was prepared, while its numbers were
+        known."""
         return tally_of(self.formula) if self._prepared_tally is None else self._prepared_tally
 
     @property

@@ -46,7 +46,8 @@ class Sample:
     truncation_error: the part of `value_error` that a sample of higher accuracy reduces
         (`Field.at_accuracy`).
     alternative_promises: promises that are also valid, but gave shorter steps than `promises` in
-        every measurement. They are used only if the caller names an enclosure that needs them.
+        every measurement. They are used only if the
+        caller names the enclosures to use.
     ray_promises: further promises, which hold only for points of the ray of a `Field.sample_ray`.
     branch_unknown: the lanes on which f is known only modulo 1 (`JumpSurface.has_unknown_branch`);
         None if there are none.
