@@ -273,8 +273,10 @@ class SourceSums:
     ) -> Sample:
         """`share` times f as a sample with promises.
 
-        unit: the rounding of a coordinate. rounding: of the value, from other sources. along:
-            further promises, for f along a line.
+        unit: the rounding of a coordinate.
+        rounding: a bound of the rounding of the value that these sums do not count.
+        normal: unit normal to shade with; None for the direction of the gradient.
+        along: further promises, for f along a line.
 
         Proof of the promises. Consider a dipole of area a at the distance rho. The k-th derivative
         of its value along a line is at most (k+1)! a/rho^(k+2): it is a mixed derivative of a/rho,
