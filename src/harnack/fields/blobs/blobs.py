@@ -194,8 +194,7 @@ class Blobs(Formula):
             start_point = dr.fma(type(p)(skipped), d, p)
             to_exit = data.grid.cell(start_point).exit_distance(d)
             length = fmin(
-                dr.select(skipped > 0, to_exit, fmin(ahead, to_exit)),
-                data.max_path_length,
+                dr.select(skipped > 0, to_exit, fmin(ahead, to_exit)), data.max_path_length
             )
         path.proofs.from_restriction(recorder, no_slope, length)
         enclosures: tuple[Enclosure, ...]
@@ -441,12 +440,7 @@ def _checked(
             f"groups must be {len(c)} integers, one for each blob, not {g.dtype} of shape {g.shape}"
         )
     order = np.argsort(g, kind="stable")
-    return (
-        c[order],
-        r[order],
-        w[order],
-        np.unique(g[order], return_inverse=True)[1],
-    )
+    return (c[order], r[order], w[order], np.unique(g[order], return_inverse=True)[1])
 
 
 def _numbers(values: Any, name: str, count: int) -> FloatArray:

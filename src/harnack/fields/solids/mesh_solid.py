@@ -327,12 +327,7 @@ class _MeshData(UnitFrame):
             min_distance = fmin(edge_distance, min_distance)
             at_vertex |= dr.norm(to_corners[a]) <= rounding
         on_edge = ~closest.is_inner & ~at_vertex
-        return (
-            self._signed_sample(p, x, closest),
-            along,
-            on_edge,
-            ~closest.is_inner & at_vertex,
-        )
+        return (self._signed_sample(p, x, closest), along, on_edge, ~closest.is_inner & at_vertex)
 
     def _closest_triangle(self, x: Vec3) -> ClosestTriangle:
         """The triangle closest to x, a point in unit coordinates."""
@@ -573,10 +568,7 @@ class ClosedSurface:
 
 
 def _boundary_pieces(
-    unit: FloatArray,
-    faces: IntArray,
-    weights: IntArray,
-    place: Callable[[FloatArray], str],
+    unit: FloatArray, faces: IntArray, weights: IntArray, place: Callable[[FloatArray], str]
 ) -> tuple[FloatArray | None, float]:
     """The triangles between winding numbers below and above 1/2, and their area.
 
