@@ -141,18 +141,15 @@ class Extrusion(Solid):
         its derivatives then give the gradient by the chain rule, and the errors."""
         solid = _prepared_for(self, p)
         if self.is_straight:
-            outline_sample = solid._outline.sample(p.x, p.y)
-            return solid._sample_of_outline(
-                p, outline_sample, cast("Any", type(p))(*outline_sample.gradient, 0)
-            )
+            planar = solid._outline.sample(p.x, p.y)
+            return solid._sample_of_outline(p, planar, cast("Any", type(p))(*planar.gradient, 0))
         x, y, _ = solid._preimage(*Jet.at_point(p))
         zero = 0 * p.x
         u, v = (zero + component.value.midpoint for component in (x, y))
-        outline_sample = solid._outline.sample(u, v)
-        preimage_error = zero + x.value.radius + y.value.radius
+        planar = solid._outline.sample(u, v)
+        spread = zero + x.value.radius + y.value.radius
         gradient_ranges = [
-            Interval.point(outline_sample.gradient[0]) * a
-            + Interval.point(outline_sample.gradient[1]) * b
+            Interval.point(planar.gradient[0]) * a + Interval.point(planar.gradient[1]) * b
             for a, b in zip(x.first_derivatives, y.first_derivatives, strict=True)
         ]
         gradient = cast("Any", type(p))(
@@ -161,15 +158,10 @@ class Extrusion(Solid):
         constant, radius = solid._preimage_lipschitz(p)
         error = (
             sum((component.radius for component in gradient_ranges), zero)
-            + outline_sample.gradient_error * constant
+            + planar.gradient_error * constant
         )
-        moved_sample = OutlineSample(
-            outline_sample.value,
-            outline_sample.gradient,
-            outline_sample.error + 2 * preimage_error,
-            error,
-        )
-        return solid._sample_of_outline(p, moved_sample, gradient, Lipschitz(constant, radius))
+        moved = OutlineSample(planar.value, planar.gradient, planar.error + 2 * spread, error)
+        return solid._sample_of_outline(p, moved, gradient, Lipschitz(constant, radius))
 
     def _sample_of_outline(
         self, p: Vec3, side: OutlineSample, gradient: Vec3, promise: Lipschitz | None = None
@@ -217,12 +209,10 @@ class Extrusion(Solid):
         solid = _prepared_for(self, p)
         outline: OutlineEdges = solid._outline
         knots = outline.knots(p.x, p.y, ahead)
-        outline_sample = outline.sample(p.x, p.y, (d.x, d.y), knots)
-        sample = solid._sample_of_outline(
-            p, outline_sample, cast("Any", type(p))(*outline_sample.gradient, 0)
-        )
-        planar_slope = outline_sample.gradient[0] * d.x + outline_sample.gradient[1] * d.y
-        planar_enclosure = SignedDistanceEnclosure.around(outline_sample, planar_slope, knots)
+        planar = outline.sample(p.x, p.y, (d.x, d.y), knots)
+        sample = solid._sample_of_outline(p, planar, cast("Any", type(p))(*planar.gradient, 0))
+        planar_slope = planar.gradient[0] * d.x + planar.gradient[1] * d.y
+        planar_enclosure = SignedDistanceEnclosure.around(planar, planar_slope, knots)
         height = p.z - solid._half
         enclosure = ExtrusionEnclosure(
             sample.value, sample.value_error, planar_enclosure, height, solid._half, d.z
@@ -280,11 +270,8 @@ class Extrusion(Solid):
             constant, radius = taper.preimage_lipschitz(p)
             p = cast("Any", type(p))(*taper.preimage(p.x, p.y, p.z))
         if twist is not None:
-            twist_constant, twist_radius = twist.preimage_lipschitz(p)
-            constant, radius = (
-                constant * twist_constant,
-                fmin(radius, twist_radius / constant * (1 - 1e-5)),
-            )
+            turn, inner_radius = twist.preimage_lipschitz(p)
+            constant, radius = (constant * turn, fmin(radius, inner_radius / constant * (1 - 1e-5)))
         return constant, radius
 
 
