@@ -146,21 +146,15 @@ class Thread(Solid):
         error = 8 * epsilon * (dr.abs(p.z) + r + data._size)
         is_outside = r >= self._profile_radius(axial)
         sign = dr.select(is_outside, real(1), real(-1))
-        distance, derivative_r, derivative_z, gradient_error = self._distance_with_gradient(
-            r, axial, sign, error
-        )
+        distance, d_r, d_z, gradient_error = self._distance_with_gradient(r, axial, sign, error)
         value = sign * distance
         is_core = value <= -data._least
         value = dr.select(is_core, -data._least, value)
-        derivative_r, derivative_z = (
-            dr.select(is_core, 0, derivative) for derivative in (derivative_r, derivative_z)
-        )
+        d_r, d_z = (dr.select(is_core, 0, derivative) for derivative in (d_r, d_z))
         divisor = dr.select(r > 0, r, 1)
         x, y = p.x / divisor, p.y / divisor
-        tangential = -derivative_z * data._lead / divisor
-        gradient = cast("Any", type(p))(
-            derivative_r * x - tangential * y, derivative_r * y + tangential * x, derivative_z
-        )
+        tangential = -d_z * data._lead / divisor
+        gradient = cast("Any", type(p))(d_r * x - tangential * y, d_r * y + tangential * x, d_z)
         constant = 0 * p.x + self.lipschitz
         gradient_error = dr.select(is_core, 0, gradient_error * constant + 16 * epsilon)
         return Sample(value, gradient, (Lipschitz(constant),), error, gradient_error)
