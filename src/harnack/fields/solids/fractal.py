@@ -101,7 +101,7 @@ def cell_noise(kind: Fade, t: Any, vectors: Any) -> tuple[Any, list[Any], list[A
     gradient: list[Any] = [0.0] * 3
     hessian: list[Any] = [0.0] * 6
 
-    def weight_derivative(corner: tuple[int, ...], orders: list[int]) -> Any:
+    def weight(corner: tuple[int, ...], orders: list[int]) -> Any:
         """A product of three factors, one for each axis: the weight of a corner, or a derivative of
         it.
 
@@ -117,19 +117,15 @@ def cell_noise(kind: Fade, t: Any, vectors: Any) -> tuple[Any, list[Any], list[A
     # The ramp of a corner is the linear function vector . (t - corner).
     for corner, vector in zip(CORNERS, vectors, strict=True):
         ramp = sum(vector[k] * (t[k] - corner[k]) for k in range(3))
-        corner_weight = weight_derivative(corner, [0, 0, 0])
-        value = value + corner_weight * ramp
-        weight_slopes = [
-            weight_derivative(corner, [int(i == k) for i in range(3)]) for k in range(3)
-        ]
+        w = weight(corner, [0, 0, 0])
+        value = value + w * ramp
+        dw = [weight(corner, [int(i == k) for i in range(3)]) for k in range(3)]
         for k in range(3):
-            gradient[k] = gradient[k] + (corner_weight * vector[k] + weight_slopes[k] * ramp)
+            gradient[k] = gradient[k] + (w * vector[k] + dw[k] * ramp)
         for m, (i, j) in enumerate(itertools.combinations_with_replacement(range(3), 2)):
             orders = [int(i == k) + int(j == k) for k in range(3)]
             hessian[m] = hessian[m] + (
-                weight_slopes[i] * vector[j]
-                + weight_slopes[j] * vector[i]
-                + weight_derivative(corner, orders) * ramp
+                dw[i] * vector[j] + dw[j] * vector[i] + weight(corner, orders) * ramp
             )
     return value, gradient, hessian
 
