@@ -93,35 +93,25 @@ def _cell_ball_pairs(
 
     Returns the index of the cell and the index of the ball of each pair, sorted by balls.
     """
-    enlarged_radii = radii * (1 + 1e-6)
-    first_cell = np.floor((centers - enlarged_radii[:, None] - origin) / size - _MARGIN).astype(
-        np.int64
-    )
-    last_cell = np.floor((centers + enlarged_radii[:, None] - origin) / size + _MARGIN).astype(
-        np.int64
-    )
-    cell_spans = (last_cell - first_cell).max(axis=1) + 1
+    padded = radii * (1 + 1e-6)
+    first = np.floor((centers - padded[:, None] - origin) / size - _MARGIN).astype(np.int64)
+    last = np.floor((centers + padded[:, None] - origin) / size + _MARGIN).astype(np.int64)
+    spans = (last - first).max(axis=1) + 1
     cells: list[IntArray] = []
     blobs: list[IntArray] = []
-    for span in cast("list[int]", np.unique(cell_spans).tolist()):
-        balls_of_span = np.flatnonzero(cell_spans == span)
-        for group in np.array_split(
-            balls_of_span, max(1, len(balls_of_span) * span**3 // _PAIRS_AT_ONCE)
-        ):
-            indices = first_cell[group, :, None] + np.arange(span)  # (m, 3, span)
+    for span in cast("list[int]", np.unique(spans).tolist()):
+        same_span = np.flatnonzero(spans == span)
+        for group in np.array_split(same_span, max(1, len(same_span) * span**3 // _PAIRS_AT_ONCE)):
+            indices = first[group, :, None] + np.arange(span)  # (m, 3, span)
             lower = origin[:, None] + (indices - _MARGIN) * size
             upper = origin[:, None] + (indices + 1 + _MARGIN) * size
-            ball_centers = centers[group, :, None]
-            axis_squares = (
-                np.maximum(np.maximum(lower - ball_centers, ball_centers - upper), 0) ** 2
-            )
+            c = centers[group, :, None]
+            squares = np.maximum(np.maximum(lower - c, c - upper), 0) ** 2
             is_inside = (indices >= 0) & (indices < np.array(shape)[:, None])
-            axis_squares[~is_inside] = np.inf
-            x, y, z = axis_squares[:, 0], axis_squares[:, 1], axis_squares[:, 2]
-            squared_distances = z[:, :, None, None] + y[:, None, :, None] + x[:, None, None, :]
-            ball, k, j, i = np.nonzero(
-                squared_distances <= (enlarged_radii[group] ** 2)[:, None, None, None]
-            )
+            squares[~is_inside] = np.inf
+            x, y, z = squares[:, 0], squares[:, 1], squares[:, 2]
+            square_sums = z[:, :, None, None] + y[:, None, :, None] + x[:, None, None, :]
+            ball, k, j, i = np.nonzero(square_sums <= (padded[group] ** 2)[:, None, None, None])
             cell_x, cell_y, cell_z = (indices[ball, axis, n] for axis, n in enumerate((i, j, k)))
             cells.append(cell_x + shape[0] * (cell_y + shape[1] * cell_z))
             blobs.append(group[ball])
