@@ -181,9 +181,9 @@ class HRBF(Formula):
         def add_point(row: list[Real], state: State) -> State:
             """The upper triangle of the Hessian, row by row, with the term of the point of record
             `row` added."""
-            offset, vector_b, r, inverse = _offset_of_point(p, row)
-            dot = dr.dot(vector_b, offset) * inverse
-            unit = offset * inverse
+            v, b, r, inverse = _offset_of_point(p, row)
+            dot = dr.dot(b, v) * inverse
+            e = v * inverse
 
             def entry(i: int, j: int) -> Real:
                 """The second derivative of the term by coordinates i and j.
@@ -192,12 +192,8 @@ class HRBF(Formula):
                 b_i e_j + b_j e_i, where b is three times the vector of the point.
                 """
                 delta = 1.0 if i == j else 0.0
-                vector_part = (
-                    dot * (delta - unit[i] * unit[j])
-                    + vector_b[i] * unit[j]
-                    + vector_b[j] * unit[i]
-                )
-                return 3 * row[6] * (r * delta + offset[i] * unit[j]) + vector_part
+                vector_part = dot * (delta - e[i] * e[j]) + b[i] * e[j] + b[j] * e[i]
+                return 3 * row[6] * (r * delta + v[i] * e[j]) + vector_part
 
             return tuple(total + entry(*pair) for total, pair in zip(state, pairs, strict=True))
 
