@@ -270,8 +270,11 @@ class Extrusion(Solid):
             constant, radius = taper.preimage_lipschitz(p)
             p = cast("Any", type(p))(*taper.preimage(p.x, p.y, p.z))
         if twist is not None:
-            turn, inner_radius = twist.preimage_lipschitz(p)
-            constant, radius = (constant * turn, fmin(radius, inner_radius / constant * (1 - 1e-5)))
+            inner_constant, inner_radius = twist.preimage_lipschitz(p)
+            constant, radius = (
+                constant * inner_constant,
+                fmin(radius, inner_radius / constant * (1 - 1e-5)),
+            )
         return constant, radius
 
 
