@@ -1,4 +1,4 @@
-"""Runs Dr.Jit kernels at large numbers of NumPy points, in batches; the results are NumPy
+"""Evaluates Dr.Jit kernels at large numbers of NumPy points, batch by batch. The results are NumPy
 arrays."""
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 
 __all__ = ["accepts_numpy_points", "evaluate_points", "map_batches", "morton_order"]
 
-# Points in one kernel: enough to keep a GPU busy, few enough to keep memory small.
+# The number of points of a batch: enough to keep a GPU busy, few enough to keep memory small.
 _BATCH_SIZE = 1 << 20
-# Cells along an axis, as a power of two. Three coordinates make a key of 15 bits, for which NumPy
+# There are 2^5 cells along an axis. So three coordinates make a key of 15 bits, for which NumPy
 # uses radix sort.
-_BITS = 5
+_BITS_PER_AXIS = 5
 
 
 def evaluate_points(
@@ -41,10 +41,12 @@ def evaluate_points(
     """The arrays that `kernel` returns for points (n, 3), in the order of the points; for a single
     point (3,), without the first axis.
 
-    precision: None for double precision if the points are an array of float64, else single.
+    kernel: takes a backend and a Dr.Jit 3-vector of points, and returns Dr.Jit arrays.
+    precision: "single" or "double"; None for double if the points are an array of float64, else
+        single.
 
-    The points are visited cell by cell along a Morton curve, so that neighboring lanes visit the
-    same nodes of a tree, which halves the time.
+    The points are visited cell by cell along a Morton curve. So neighboring lanes visit the same
+    nodes of a tree, which halves the time.
 
     Raises:
         TypeError, ValueError: points that are not an (n, 3) array of finite numbers.
@@ -52,6 +54,7 @@ def evaluate_points(
     backend = choose_backend(precision or precision_of_input(points))
 
     def visit(x: Vec3) -> tuple[Any, ...]:
+        """The results of `kernel` at points x, which it gets in the order of a Morton curve."""
         order = morton_order(backend, x)
         results = kernel(backend, dr.gather(backend.Array3f, x, order))
         return tuple(_restore_order(array, order, dr.width(x)) for array in results)
@@ -64,17 +67,19 @@ def evaluate_points(
 
 
 def accepts_numpy_points(hessian: Callable[[Any, Vec3], Any]) -> Callable[..., Any]:
-    """Decorator of a field's method `hessian`, which then also takes NumPy points and gives NumPy
-    matrices."""
+    """Decorator of a field's method `hessian` for Dr.Jit points. The decorated method also takes
+    NumPy points (n, 3) or (3,), for which it returns NumPy matrices (n, 3, 3) or (3, 3)."""
 
     @accepts_dask_arrays("p")
     @functools.wraps(hessian)
     def general(self: Any, p: Any, *, precision: Precision | None = None) -> Any:
+        """See `Field.hessian`."""
         if dr.is_array_v(type(p)):
             check_no_derivatives(f"the Hessian of {type(self).__name__}", p, self.parameters())
             return hessian(self, p)
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+            """The rows of the Hessian at the Dr.Jit points x."""
             return self.prepare(backend).hessian(x)
 
         return np.stack(evaluate_points(p, kernel, precision), axis=-2)
@@ -86,13 +91,13 @@ def map_batches(
     backend: Backend,
     compute: Callable[..., tuple[Any, ...]],
     points: Any,
-    *arguments: npt.NDArray[Any],
+    *others: npt.NDArray[Any],
     at_once: int = _BATCH_SIZE,
 ) -> tuple[npt.NDArray[Any], ...]:
     """The results of `compute` for points (n, 3), as arrays (n,) or (n, 3) in its precision.
 
     points: an array-like, or a Dr.Jit 3-vector.
-    arguments: further arguments of `compute`, vectors (n, 3) of any values, one row for each point.
+    others: further arguments of `compute`, vectors (n, 3) of any values, one row for each point.
     at_once: the number of points of a batch.
 
     Raises:
@@ -110,31 +115,40 @@ def map_batches(
         with dr.suspend_grad():
             results = compute(
                 *(
-                    _part(backend, array, start, lanes) if n else backend.Array3f(0)
-                    for array in (vectors, *arguments)
+                    _slice_vectors(backend, array, start, lanes) if n else backend.Array3f(0)
+                    for array in (vectors, *others)
                 )
             )
             dr.eval(*results)
-        parts.append(tuple(_repeated(to_numpy(array), max(lanes, 1)) for array in results))
+        parts.append(tuple(_repeat_single_row(to_numpy(array), max(lanes, 1)) for array in results))
     if len(parts) == 1:
         return tuple(array[:n] for array in parts[0])
     return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
 
 
-def _part(backend: Backend, vectors: Any, start: int, lanes: int) -> Vec3:
-    """Vectors `start` to `start + lanes` of a Dr.Jit vector, or of an array."""
+def _slice_vectors(backend: Backend, vectors: Any, start: int, lanes: int) -> Vec3:
+    """Vectors number `start` to `start + lanes`, the last excluded, as a Dr.Jit vector.
+
+    vectors: a Dr.Jit vector, or an array (n, 3).
+    """
     if dr.is_array_v(cast("Any", type(vectors))):
         return dr.gather(backend.Array3f, vectors, dr.arange(backend.UInt32, lanes) + start)
     return upload_vectors(backend, vectors[start : start + lanes], "points")
 
 
-def _repeated(values: npt.NDArray[Any], n: int) -> npt.NDArray[Any]:
+def _repeat_single_row(values: npt.NDArray[Any], n: int) -> npt.NDArray[Any]:
+    """The values as an array of n rows: a single row, of a result that is the same for all points,
+    is repeated."""
     return values if len(values) == n else np.repeat(values, n, axis=0)
 
 
 def _restore_order(values: Any, order: Any, n: int) -> Any:
-    """Values of the points in visiting order, brought back into the original order of the
-    points."""
+    """Values of points in the original order of the points.
+
+    values: in visiting order, as a Dr.Jit array, or vectors and matrices of such arrays.
+    order: the original index of each visited point.
+    n: the number of points.
+    """
     kind = cast("Any", type(values))
     if dr.depth_v(kind) == 1:
         out = dr.zeros(kind, n)
@@ -143,10 +157,11 @@ def _restore_order(values: Any, order: Any, n: int) -> Any:
     return kind([_restore_order(component, order, n) for component in values])
 
 
-def morton_order(backend: Backend, x: Vec3, bits: int = _BITS) -> Any:
-    """The indices (Dr.Jit UInt32) of points cell by cell, with the cells along a Morton curve.
+def morton_order(backend: Backend, x: Vec3, bits: int = _BITS_PER_AXIS) -> Any:
+    """The order in which to visit points x cell by cell, with the cells along a Morton curve: their
+    indices, as Dr.Jit UInt32.
 
-    bits: cells along an axis, as a power of two, at most 10.
+    bits: there are 2^bits cells along an axis, and bits is at most 10.
     """
     index, vector = backend.UInt32, backend.Array3f
     n = dr.width(x)

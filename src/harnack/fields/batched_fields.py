@@ -30,14 +30,15 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Precision, Real, Vec3
     from harnack.fields.samples import Sample
 
-# The rounding of dipoles' moments, which are summed up in double precision, as a fraction of the
-# total weight.
+# A bound of the rounding of the sums of dipoles' moments, as a fraction of the total weight. The
+# sums are made in double precision.
 _MOMENT_ROUNDING = 32 * 2.0**-53
 
 
 @dataclass(frozen=True)
 class SymmetricMatrix:
-    """The state of a sum of symmetric matrices, one in each lane."""
+    """A sum of symmetric matrices, one in each lane, for the state of a loop. xx, xy, ... are the
+    entries of the sum so far."""
 
     xx: Real
     yy: Real
@@ -48,11 +49,14 @@ class SymmetricMatrix:
 
     @classmethod
     def zero(cls, real: Any) -> SymmetricMatrix:
-        """The matrix of zeros; real: the type of its entries."""
+        """The matrix of zeros.
+
+        real: the type of its entries.
+        """
         return cls(*(real(0) for _ in range(6)))
 
     def add_outer_product(self, u: Vec3, v: Vec3) -> SymmetricMatrix:
-        """The sum with (u v^T + v u^T)/2."""
+        """This matrix plus the matrix (u v^T + v u^T)/2."""
         half = 0.5 * v
         return SymmetricMatrix(
             dr.fma(u.x, v.x, self.xx),
@@ -68,7 +72,10 @@ class SymmetricMatrix:
         return self.xx, self.yy, self.zz, self.xy, self.xz, self.yz
 
     def rows(self, vector: Any) -> tuple[Vec3, Vec3, Vec3]:
-        """The three rows; vector: the type of a row."""
+        """The three rows.
+
+        vector: the type of a row.
+        """
         return (
             vector(self.xx, self.xy, self.xz),
             vector(self.xy, self.yy, self.yz),
@@ -78,13 +85,14 @@ class SymmetricMatrix:
 
 @dataclass(frozen=True)
 class PointValues:
-    """Value and, if requested, gradient and Hessian of a field at points, in the units of the
-    field, with bounds of their truncation and rounding errors.
+    """The value of a field at points and, if requested, its gradient and Hessian, with bounds of
+    their truncation and rounding errors.
 
-    error: of the value.
-    gradient_error: of the gradient, as a length.
-    hessian_error: of second derivatives along lines, which is the spectral norm of the Hessian's
-        error.
+    error: a bound of the error of `value`.
+    gradient, hessian: None if they were not requested.
+    gradient_error: a bound of the error of `gradient`, as a length.
+    hessian_error: a bound of the error of second derivatives along lines, which is the spectral
+        norm of the Hessian's error.
     """
 
     value: Real
@@ -95,30 +103,31 @@ class PointValues:
     hessian_error: Real = 0.0
 
     def with_far_field_errors(self, x: Vec3, terms: int, weight: float) -> PointValues:
-        """The same values with error bounds that hold at points far away too.
+        """The same values, with error bounds that hold at points far away too.
 
-        x: the points, in coordinates in which the field's data have a size of about 1. terms: the
-            number of terms summed up. weight: of all dipoles together.
+        x: the points, in coordinates in which the field's data have a size of about 1.
+        terms: the number of terms that were summed.
+        weight: of all dipoles together.
 
-        Two errors matter only far away. A term of a derivative is a product of a factor that falls
-        like |x|^-5 and one that grows like |x|^2, and the first may underflow. And where dipoles
-        nearly cancel, their summed moments are rounded in proportion to the weight of all of them,
-        not to the small sum.
+        Two errors matter only far away. First, a term of a derivative is the product of a factor
+        that falls like |x|^-5 and one that grows like |x|^2, and the first may underflow. Second,
+        where dipoles nearly cancel, the rounding of their summed moments is proportional to the
+        weight of all dipoles, not to the small sum.
         """
         smallest = float(dr.smallest(type(x.x)))
-        lost = 4 * smallest * terms * (1 + dr.squared_norm(x))
+        underflow = 4 * smallest * terms * (1 + dr.squared_norm(x))
         inverse = dr.rcp(fmax(dr.norm(x), type(x.x)(4)))
-        moved = _MOMENT_ROUNDING * weight * dr.square(inverse)
+        moment_error = _MOMENT_ROUNDING * weight * dr.square(inverse)
         return dataclasses.replace(
             self,
-            error=self.error + lost + moved,
-            gradient_error=self.gradient_error + lost + 4 * moved * inverse,
-            hessian_error=self.hessian_error + lost + 24 * moved * dr.square(inverse),
+            error=self.error + underflow + moment_error,
+            gradient_error=self.gradient_error + underflow + 4 * moment_error * inverse,
+            hessian_error=self.hessian_error + underflow + 24 * moment_error * dr.square(inverse),
         )
 
     def rescaled(self, size: Real) -> PointValues:
-        """The values of x -> f(x / size) at `size` times the points. Where a number has overflowed
-        its error is infinite."""
+        """The values of the function x -> f(x / size) at the points `size` times x. Where a number
+        has overflowed, its error is infinite."""
         gradient, hessian, inverse = self.gradient, self.hessian, 1 / size
         gradient_error, hessian_error = self.gradient_error, self.hessian_error
         if gradient is not None:
@@ -134,31 +143,29 @@ class PointValues:
 
 
 class BatchedField(Field):
-    """A field that evaluates values, derivatives and error bounds at large numbers of points at
-    once.
-
-    Subclasses define `values_at`.
-    """
+    """A field that can be evaluated at large numbers of points at once: its values, derivatives and
+    error bounds. Subclasses define `values_at`."""
 
     @abc.abstractmethod
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
         """Values and derivatives at points x, a Dr.Jit 3-vector of any backend and precision.
 
-        Not called while a loop is being recorded, unless `derivatives` is 2.
-
         derivatives: 0 for values only, 1 for gradients too, 2 for Hessians too.
-        closer: clusters of far terms are approximated only beyond this multiple of the usual
-            distance, at least 1; with infinity nothing is approximated.
+        closer: a factor, at least 1. Clusters of far terms are approximated only beyond this
+            multiple of the usual distance; with infinity nothing is approximated.
+
+        It is not called while a loop is being recorded, unless `derivatives` is 2.
         """
 
     def sharp_values_at(self, x: Vec3) -> PointValues:
-        """`values_at` with the gradient, which subclasses may refine: `gradient` returns it to
-        users. Not called while a loop is being recorded."""
+        """Values and gradients at points x, as `gradient` returns them to users. The default is
+        `values_at`; subclasses may compute the gradient more accurately. It is not called while a
+        loop is being recorded."""
         return self.values_at(x, 1)
 
     def differentiable_value(self, p: Vec3) -> Real:
-        """f at p as an expression whose first derivative is the gradient of f, in reverse and in
-        forward mode."""
+        """f at p as an expression that Dr.Jit can differentiate once, in reverse and in forward
+        mode: its derivative is the gradient of f."""
         with dr.suspend_grad():
             at = self.sharp_values_at(dr.detach(p))
         # A literal 0, the gradient of a closed mesh, would have no derivative in Dr.Jit.
@@ -173,7 +180,7 @@ class BatchedField(Field):
             if dr.grad_enabled(points):
                 return self.differentiable_value(points)
             return self.values_at(points, 0).value
-        return self._at(points, precision, 0, lambda at: (at.value,))[0]
+        return self._choose_at_points(points, precision, 0, lambda at: (at.value,))[0]
 
     @accepts_dask_arrays("points")
     @accepts_tensors
@@ -182,22 +189,27 @@ class BatchedField(Field):
             if dr.grad_enabled(points):
                 return super().gradient(points)
             return self.sharp_values_at(points).gradient
-        return self._at(points, precision, 1, lambda at: (at.gradient,))[0]
+        return self._choose_at_points(points, precision, 1, lambda at: (at.gradient,))[0]
 
     def value_and_gradient(
         self, points: Any, *, precision: Precision | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Values (n,) and gradients (n, 3) together, at hardly more cost than gradients alone."""
-        value, gradient = self._at(points, precision, 1, lambda at: (at.value, at.gradient))
+        """Values (n,) and gradients (n, 3) at points (n, 3). They cost hardly more than gradients
+        alone."""
+        value, gradient = self._choose_at_points(
+            points, precision, 1, lambda at: (at.value, at.gradient)
+        )
         return value, gradient
 
     def rough_value_and_gradient(
         self, points: Any, *, precision: Precision | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Values (n,) and gradients (n, 3) of a single pass over a tree. Errors of the gradients
-        may be large: they are for estimates, and for points at which f is steep."""
+        """Values (n,) and gradients (n, 3) at points (n, 3), by a single pass over a tree. The
+        errors of the gradients may be large, so that they are for estimates, and for points at
+        which f is steep."""
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
+            """The values and gradients at the Dr.Jit points x."""
             del backend
             at = self.values_at(x, 1)
             return at.value, at.gradient
@@ -206,7 +218,7 @@ class BatchedField(Field):
         return value, gradient
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        return _hessian(self.values_at(p, 2)).rows(backend_of(p).Array3f)
+        return _required_hessian(self.values_at(p, 2)).rows(backend_of(p).Array3f)
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
         return sample.gradient_error, self.values_at(p, 2).hessian_error
@@ -218,34 +230,41 @@ class BatchedField(Field):
         They include the proved truncation error and the rounding error of f. The rounding of the
         points themselves, in single precision, is not included.
         """
-        return self._at(points, precision, 0, lambda at: (at.error,))[0]
+        return self._choose_at_points(points, precision, 0, lambda at: (at.error,))[0]
 
     @accepts_dask_arrays("points")
     def gradient_error_bound(
         self, points: Any, *, precision: Precision | None = None
     ) -> FloatArray:
-        """Bounds (n,) of the error of `gradient`, as a length, at points (n, 3): see
-        `error_bound`. For a sum over a tree the bound is about a hundred times the error itself:
-        the accuracy of the sum is chosen by estimates (`sharpened`)."""
-        return self._at(points, precision, 1, lambda at: (at.gradient_error,))[0]
+        """Bounds (n,) of the error of `gradient`, as a length, at points (n, 3): see `error_bound`.
+
+        For a sum over a tree the bound is about a hundred times the error itself, because the
+        accuracy of the sum is chosen by estimates (`sharpened`).
+        """
+        return self._choose_at_points(points, precision, 1, lambda at: (at.gradient_error,))[0]
 
     @accepts_dask_arrays("points")
     def hessian_error_bound(self, points: Any, *, precision: Precision | None = None) -> FloatArray:
         """Bounds (n,) of the error of `hessian`, in the spectral norm, at points (n, 3): see
         `error_bound`."""
-        return self._at(points, precision, 2, lambda at: (at.hessian_error,))[0]
+        return self._choose_at_points(points, precision, 2, lambda at: (at.hessian_error,))[0]
 
-    def _at(
+    def _choose_at_points(
         self,
         points: Any,
         precision: Precision | None,
         derivatives: int,
         choose: Callable[[PointValues], tuple[Any, ...]],
     ) -> tuple[FloatArray, ...]:
-        """The arrays that `choose` takes from the values at points, with this number of
-        derivatives."""
+        """The arrays that `choose` takes from the `PointValues` at points, in the order of the
+        points.
+
+        precision: as for `value`.
+        derivatives: the order up to which derivatives are computed, 0 to 2.
+        """
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
+            """The results of `choose` at the Dr.Jit points x."""
             del backend
             sharp = derivatives == 1
             return choose(self.sharp_values_at(x) if sharp else self.values_at(x, derivatives))
@@ -254,9 +273,11 @@ class BatchedField(Field):
 
 
 class SumAtDetail(EvaluateOnly):
-    """A sum over sources at one accuracy scale, with second derivatives.
+    """A sum over sources at one accuracy scale (`VariableAccuracy.at_accuracy`), with second
+    derivatives.
 
-    values: gives `PointValues` with the Hessian at that accuracy scale.
+    evaluate: returns the sample at a point.
+    values: returns the `PointValues` there, with the Hessian, at that accuracy scale.
     """
 
     def __init__(
@@ -266,33 +287,34 @@ class SumAtDetail(EvaluateOnly):
         self._values = values
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        return _hessian(self._values(p)).rows(backend_of(p).Array3f)
+        return _required_hessian(self._values(p)).rows(backend_of(p).Array3f)
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
         return sample.gradient_error, self._values(p).hessian_error
 
 
-# Gradients by a tree are computed again with these multiples of the distance at which clusters are
-# taken as a whole, in turn, as long as the last repetition changed them by more than the fraction
-# `_MOVED` of their length. (Measured: twice the distance leaves a sixteenth of the error or less.
-# So the error is 1 % of the length, with a reserve of a factor of four.)
-_CLOSELY, _MOVED = (2.0, 4.0, 8.0), 0.04
-# A gradient whose error is proved to be at most this fraction of its length is not refined.
-_PROVED = 0.01
+# Gradients of a sum over a tree are computed again with these multiples of the distance from which
+# on clusters are taken as one source. It is repeated with the next multiple as long as the last one
+# changed the gradient by more than the fraction `_MAX_CHANGE` of its length. (Measured: twice the
+# distance leaves a sixteenth of the error or less. So the error is 1 % of the length, with a
+# reserve of a factor of four.)
+_DISTANCE_MULTIPLES, _MAX_CHANGE = (2.0, 4.0, 8.0), 0.04
+# A gradient is not refined if its error is proved to be at most this fraction of its length.
+_ACCEPTED_ERROR = 0.01
 
 
 def sharpened(at: Callable[[Vec3, Real], PointValues], x: Vec3) -> PointValues:
-    """Value and gradient at points x by a sum over a tree, the gradient with an error of about 1 %
+    """Values and gradients at points x by a sum over a tree. The error of a gradient is about 1 %
     of its length.
 
-    at: evaluates values and gradients at points, with clusters expanded beyond this multiple of the
-        usual distance.
+    at: takes points and a factor, and returns values and gradients there. Clusters are taken as one
+        source only beyond this multiple of the usual distance.
 
     Far terms may nearly cancel, as the triangles of a mesh with small holes do. Then the gradient
-    is far smaller than the truncation error of its clusters. Bounds of the truncation error add up
-    absolute values and would demand all terms nearly everywhere. So the change of the gradient from
-    one distance to the next decides about refinement; the error bounds that are returned stay
-    proved.
+    is far smaller than the truncation errors of its clusters. Proved bounds of these errors add up
+    absolute values, and would demand that all terms are summed nearly everywhere. So the observed
+    change of the gradient, from one distance to the next, decides whether to refine it. The error
+    bounds that are returned stay proved.
     """
     real = cast("Any", type(x.x))
     dr.eval(x)
@@ -300,25 +322,32 @@ def sharpened(at: Callable[[Vec3, Real], PointValues], x: Vec3) -> PointValues:
     gradient, error = as_kernel_parameters(values.gradient), real(values.gradient_error)
     gradient, error = gradient + dr.zeros(type(x), dr.width(x)), error + dr.zeros(real, dr.width(x))
     dr.eval(values.value, values.error, gradient, error)
-    rows = dr.compress(~(error <= _PROVED * dr.norm(gradient)))
-    for closer in _CLOSELY:
+    rows = dr.compress(~(error <= _ACCEPTED_ERROR * dr.norm(gradient)))
+    for closer in _DISTANCE_MULTIPLES:
         if not len(rows):
             break
-        place = dr.gather(type(x), x, rows)
-        dr.eval(place)
-        closely = at(place, dr.opaque(real, closer))
-        moved = dr.norm(closely.gradient - dr.gather(type(x), gradient, rows))
-        length = dr.norm(as_kernel_parameters(closely.gradient))
-        is_sharp = (moved <= _MOVED * length) | (closely.gradient_error <= _PROVED * length)
-        dr.scatter(gradient, closely.gradient, rows)
-        dr.scatter(error, closely.gradient_error, rows)
-        dr.eval(gradient, error, is_sharp)
-        rows = dr.gather(type(rows), rows, dr.compress(~is_sharp))
+        points = dr.gather(type(x), x, rows)
+        dr.eval(points)
+        refined = at(points, dr.opaque(real, closer))
+        change = dr.norm(refined.gradient - dr.gather(type(x), gradient, rows))
+        length = dr.norm(as_kernel_parameters(refined.gradient))
+        is_accurate = (change <= _MAX_CHANGE * length) | (
+            refined.gradient_error <= _ACCEPTED_ERROR * length
+        )
+        dr.scatter(gradient, refined.gradient, rows)
+        dr.scatter(error, refined.gradient_error, rows)
+        dr.eval(gradient, error, is_accurate)
+        rows = dr.gather(type(rows), rows, dr.compress(~is_accurate))
         dr.eval(rows)
     return dataclasses.replace(values, gradient=gradient, gradient_error=error)
 
 
-def _hessian(values: PointValues) -> SymmetricMatrix:
+def _required_hessian(values: PointValues) -> SymmetricMatrix:
+    """The Hessian of values that include it.
+
+    Raises:
+        RuntimeError: they do not.
+    """
     if values.hessian is None:
         raise RuntimeError("values_at(x, 2) gave no Hessian")
     return values.hessian
@@ -329,43 +358,45 @@ Value = TypeVar("Value")
 
 
 class FieldCache(Generic[Value]):
-    """A cache with one value per field: the value for the last key. It is dropped with the field.
+    """A cache that keeps one value per field: the value for the last key. It is dropped with the
+    field.
 
     A value must not refer to its field, or neither of them would ever be deleted.
     """
 
     def __init__(self) -> None:
         # By identity: users' fields may be equal to others, or have no hash.
-        self._entries: dict[int, tuple[Any, dict[str, Any], Value]] = {}
+        self._kept: dict[int, tuple[Any, dict[str, Any], Value]] = {}
 
     def get(self, field: Field, key: Any, make: Callable[[], Value]) -> Value:
-        """The cached value of a field if it belongs to this key and no attribute of the field was
-        set since it was computed; else `make()`, which is then cached."""
-        if id(field) in self._entries:
-            kept_key, attributes, value = self._entries[id(field)]
+        """The cached value of a field, if it belongs to this key and no attribute of the field was
+        set since it was computed. Otherwise make(), which is then cached."""
+        if id(field) in self._kept:
+            kept_key, attributes, value = self._kept[id(field)]
             now = vars(field)
             same = attributes.keys() == now.keys()
             if same and kept_key == key and all(attributes[name] is now[name] for name in now):
                 return value
         value = make()
         if value is not field:
-            if id(field) not in self._entries:
-                finalize(field, self._entries.pop, id(field), None).atexit = False
-            self._entries[id(field)] = key, {**vars(field)}, value
+            if id(field) not in self._kept:
+                finalize(field, self._kept.pop, id(field), None).atexit = False
+            self._kept[id(field)] = key, {**vars(field)}, value
         return value
 
 
 def cached_prepare(prepare: Prepare) -> Prepare:
-    """Decorator of a field's method `prepare`, by which a field is uploaded to each backend only
+    """Decorator of a field's method `prepare`. With it, a field is uploaded to each backend only
     once.
 
-    Fields with parameters are uploaded at each call: a parameter may change in place, and its
+    A field with parameters is uploaded at each call, since a parameter may change in place, and its
     derivatives belong to a single trace.
     """
     caches: defaultdict[Backend, FieldCache[Field]] = defaultdict(FieldCache)
 
     @functools.wraps(prepare)
     def cached(self: Field, backend: Backend) -> Field:
+        """The prepared field: from the cache, unless the field has parameters."""
         if self.parameters():
             return prepare(self, backend)
         return caches[backend].get(self, None, lambda: prepare(self, backend))

@@ -9,14 +9,15 @@ Each is a base class of `Field`, with defaults for fields that lack the capabili
 - `VariableAccuracy`: the field can be sampled with different accuracy.
 
 How accurately a tree is summed. The smaller the truncation error of a sum over a tree, the higher
-its cost, and far from the surface a large error does no harm. So `VariableAccuracy.at_accuracy`
-takes any accuracy, from coarse to a direct sum. Where truncation decides about a step or a hit, the
+its cost; and far from the surface a large error does no harm. So `VariableAccuracy.at_accuracy`
+takes any accuracy, from coarse to a direct sum. If truncation decides about a step or a hit, the
 tracer samples the point again with higher accuracy, until a hit is within the tolerance minus the
 truncation error. The uncertainty that is due to rounding alone is reported in `Hits.uncertainty`.
-Where it is large, for example where grad f is 0 on the surface, `trace` searches for the surface
-around the hit after the march (`doubtful`), so that other hits cost nothing more. Near a point, the
-samples of such sums promise a bound of the second derivatives of f (`source_sums`): the ranges of
-the published proof add up absolute values to first order and reach only a fifth as far.
+If it is large, for example because grad f is 0 on the surface, `trace` searches for the surface
+around the hit after the march (`doubtful`), so that other hits cost nothing more. The samples of
+such sums promise a bound of the second derivatives of f near the point (`source_sums`). (The ranges
+of the published proof, which add up absolute values to first order, hold only on a fifth of that
+length.)
 """
 
 from __future__ import annotations
@@ -38,13 +39,14 @@ NO_FACET = 0xFFFFFFFF
 
 @dataclass(frozen=True)
 class JumpCrossing:
-    """A crossing of a ray with a jump surface; also an end of a ray, which lies on no facet.
+    """A crossing of a ray with a jump surface. An end of a ray, which lies on no facet, is
+    represented as a crossing too.
 
     t: ray parameter; inf if no facet is crossed.
     facet: index of the facet, a Dr.Jit UInt32; NO_FACET if there is none.
     jump: f just behind the facet minus f just before it, along the ray; 0 if there is no facet.
-    normal: (3,) unit normal of the facet, pointing to its side of larger f: (normal . d) jump >= 0.
-        Meaningless if there is no facet.
+    normal: (3,) unit normal of the facet, pointing to the side on which f is larger: (normal . d)
+        jump >= 0, with d the direction of the ray. It is meaningless if there is no facet.
     """
 
     t: Real
@@ -57,14 +59,14 @@ class JumpCrossing:
 class NearestFacet:
     """The facet nearest to a point x, among the facets of a query (`Field.nearest_facet`).
 
-    sort_key: a number that grows with the distance; facets are ordered by it, then by index. inf if
-        there is no facet.
+    sort_key: a number that grows with the distance. Facets are ordered by it, then by index. It is
+        inf if there is no facet.
     facet: index of the facet, a Dr.Jit UInt32; NO_FACET if there is none.
-    offset: (3,) from x to the closest point of the facet.
-    normal: (3,) unit normal of the facet at that point, to either side; any direction if it has
-        none.
+    offset: (3,) the vector from x to the closest point of the facet.
+    normal: (3,) unit normal of the facet at that point, to either side; any direction if the facet
+        has no normal.
     is_inner: whether that point lies inside the facet, so that a line through it along the normal
-        crosses the facet there in spite of rounding. False on the edges of a facet.
+        crosses the facet there in spite of rounding. It is False on the edges of a facet.
     """
 
     sort_key: Real
@@ -95,10 +97,9 @@ class JumpSurface:
     """Fields that jump across a surface of facets, such as triangles. Defaults: no facets.
 
     Away from its facets such a field is as smooth as any other. The facets cut a ray into
-    intervals. On each interval the values of f, continued to both of its ends, are the values of a
-    smooth function. The field's promises are about this function, and the tracer marches along it
-    as along any field. Where a ray crosses a facet, the values just before and just behind it are
-    compared with the levels.
+    intervals. On each interval f, continued to both of its ends, is a smooth function. The field's
+    promises are about this function, and the tracer marches along it as along any field. Where a
+    ray crosses a facet, the values just before and just behind it are compared with the levels.
 
     A field with jumps is real-valued (no period), has `has_jumps = True`, and defines two methods:
     `next_jump` gives the next crossing of a ray, and `continuation` gives the field on the interval
@@ -114,11 +115,13 @@ class JumpSurface:
 
     @property
     def has_unknown_branch(self) -> bool:
-        """Whether samples of `continuation` below `coarsest_accuracy` may give f only modulo 1.
+        """Whether samples of `continuation` at an accuracy below `coarsest_accuracy` may give f
+        only modulo 1.
 
-        They then set `Sample.branch_unknown`, and all jumps are integers. Let a set of levels
-        contain, for each of its levels, the one congruent to it modulo 1 that is nearest to 0.
-        Outside `extent` of this set, no periodic level lies between f and 0.
+        Then they set `Sample.branch_unknown`, and all jumps are integers. A condition on `extent`
+        must hold for sets of levels of this kind: with each level, the set contains the level that
+        is congruent to it modulo 1 and nearest to 0. Outside the extent of such a set, no periodic
+        level lies between f and 0.
         """
         return False
 
@@ -132,20 +135,20 @@ class JumpSurface:
     """Whether this field takes its levels at its facets only: see `is_of_sheets_alone`."""
 
     def without_jumps(self) -> Field | None:
-        """A field without jumps whose level sets contain all points of this field's level sets that
-        lie on no facet; None if none is known. Used by distances."""
+        """A field without jumps for distances; None if none is known. Its level sets contain all
+        points of this field's level sets that lie on no facet."""
         return None
 
     def evaluate_modulo_one(self, p: Vec3) -> Sample:
-        """A sample at p whose value is f minus an integer that is not known and may differ from
-        point to point, for less work than `evaluate`. Only for fields with `has_unknown_branch`;
-        the default is `evaluate`."""
+        """A sample at p whose value is f minus an integer. The integer is not known and may differ
+        from point to point, which takes less work than `evaluate`. It is used only for fields with
+        `has_unknown_branch`. The default is `evaluate`."""
         return cast("Field", self).evaluate(p)
 
     def value_if_cheap(self, p: Vec3, rounding: Real, active: Mask) -> Real:
-        """f at p on active lanes where it can be had for less work than `evaluate`; NaN on other
-        lanes and where p may lie on a facet. Only for fields with `has_unknown_branch`; the default
-        is NaN everywhere.
+        """f at p on active lanes, if it takes less work there than `evaluate`. NaN on all other
+        lanes, and where p may lie on a facet. It is used only for fields with `has_unknown_branch`.
+        The default is NaN everywhere.
 
         rounding: of the coordinates of p, and of the ray on which p lies.
         """
@@ -181,15 +184,15 @@ class JumpSurface:
     ) -> Field:
         """f between two consecutive jump crossings of a ray, as a field.
 
-        Its `evaluate` is called at points p = o + t d with behind.t <= t <= ahead.t, up to
-        rounding. At the two ends it gives the limit from inside the interval, even if rounding puts
-        p on the other side of the facet or the two t are equal. Its promises hold for the smooth
-        function that continues these values beyond both ends; the tracer uses them on the interval
-        only.
-
         behind: the crossing passed last, or the start of the ray with facet NO_FACET.
         ahead: the next crossing, or t = inf and facet NO_FACET.
         offset: `initial_offset` at the start of the ray plus all jumps since.
+
+        The field's `evaluate` is called at points p = o + t d with behind.t <= t <= ahead.t, up to
+        rounding. At the two ends it gives the limit from inside the interval, even if rounding puts
+        p on the other side of the facet, or if the two t are equal. Its promises are about the
+        smooth function that continues these values past both ends. The tracer uses them on the
+        interval only.
         """
         del o, d, behind, ahead, offset
         return cast("Field", self)
@@ -203,38 +206,42 @@ class JumpSurface:
     def nearest_facet(
         self, p: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
     ) -> NearestFacet | None:
-        """The next facet after `after` = (sort_key, index), in the order of distance from p, that
-        is nearer than `limit`.
+        """The facet that follows `after` in the order of distance from p, if it is nearer than
+        `limit`.
 
-        Facets are ordered by `NearestFacet.sort_key`, then by index. Repeated calls that begin with
-        (-1, NO_FACET) give each facet once. The default is None: distances then search for the
-        nearest facet only, by descent of `distance_to_jumps`.
+        after: (sort_key, index) of a facet, or (-1, NO_FACET) to begin with.
+
+        Facets are ordered by `NearestFacet.sort_key`, then by index. Repeated calls must give each
+        facet once. The default is None: distances then search for the nearest facet only, by
+        descent of `distance_to_jumps`.
         """
         del p, after, limit, active
         return None
 
     def jump_mesh(self) -> tuple[FloatArray, IntArray, bool] | None:
-        """The mesh, if f is the winding number of a mesh: its vertices (n, 3), its faces (m, 3),
-        repeated by their multiplicity, and whether f is an integer everywhere off the faces. None
-        for other fields. Used by distances."""
+        """The mesh, for a field that is the winding number of a mesh; None for other fields.
+        Distances use it.
+
+        Returns the vertices (n, 3); the faces (m, 3), each repeated by its multiplicity; and
+        whether f is an integer everywhere off the faces.
+        """
         return None
 
 
 class PatchUnion:
-    """A surface that is the union of many level sets (patches), each of its own function and inside
-    its own box. Defaults: no patches.
+    """A surface that is the union of many level sets (patches). Each is a level set of its own
+    function, inside its own box. Defaults: no patches.
 
-    In a polygon mesh, for example, each face is a level set of the solid angle of its boundary. No
-    single function describes all of them. The first hit of a ray is the first among the hits of all
-    patches. So the tracer marches the patches whose boxes the ray enters, in the order in which it
-    enters them, and no farther than the first hit so far.
+    In a polygon mesh, for example, each face is a level set of the solid angle of its boundary, and
+    no single function describes all of them. The first hit of a ray is the first of the hits of all
+    patches. So the tracer marches along the patches whose boxes the ray enters, in the order in
+    which it enters them, and no farther than the first hit so far.
 
-    A field with patches has `has_patches = True` and defines two methods: `next_patch` gives the
-    next patch along a ray, and `patch` gives the field of which that patch is a level set. The
-    patches share the period, the levels and the domain of the field, whose own `evaluate` has no
-    meaning.
+    A field with patches has `has_patches = True` and defines two methods. `next_patch` gives the
+    next patch along a ray. `patch` gives the function of a patch, as a field. The patches share the
+    period, the levels and the domain of the field. The field's own `evaluate` has no meaning.
 
-    `with_levels` is called first; the other methods may be called while a loop is being recorded.
+    `with_levels` is called first. The other methods may be called while a loop is being recorded.
     """
 
     has_patches: bool = False
@@ -249,22 +256,22 @@ class PatchUnion:
     def next_patch(
         self, o: Vec3, d: Vec3, after: PatchEntry, start: Real, end: Real, active: Mask
     ) -> PatchEntry:
-        """The first entry of a ray into a box after the entry `after`, at start <= t <= end.
+        """The first entry of a ray into a box after the entry `after`, for start <= t <= end.
 
         A ray that begins in a box enters it at `start`. Entries are ordered by (enter, patch).
-        Repeated calls that begin with an entry before `start` must give every box that the ray
-        meets between `start` and `end` in this order, once. If there is no further box, patch =
+        Repeated calls, the first of them with an entry before `start`, must give every box that the
+        ray meets between `start` and `end` once, in this order. If there is no further box, patch =
         NO_PATCH.
         """
         del o, d, after, start, end, active
         return PatchEntry(float("inf"), float("inf"), NO_PATCH)
 
     def patch(self, index: Any) -> Field:
-        """The field of which the patch with this index is a level set.
+        """The field one of whose level sets is the patch with this index.
 
-        index: a Dr.Jit UInt32, different from lane to lane.
+        index: a Dr.Jit UInt32, which may differ from lane to lane.
 
-        `evaluate` and `sample_ray` of the field may be called at points of any size; its promises
+        `evaluate` and `sample_ray` of the field may be called at points of any size. Its promises
         hold in all of space.
         """
         del index
@@ -281,10 +288,11 @@ class CommonBoundary:
         return ()
 
     def closest_boundary_point(self, p: Vec3) -> Vec3 | None:
-        """The point of the common boundary curves that is closest to p; None if there are none.
+        """The point of the common boundary curves that is closest to p; None if there are no such
+        curves.
 
-        Only distances use it, while no loop is being recorded. Curves in which level sets meet the
-        boundary of `domain` do not count.
+        Only distances use it, while no loop is being recorded. Curves at which `domain` cuts level
+        sets off do not count.
         """
         del p
         return None
@@ -292,27 +300,30 @@ class CommonBoundary:
     @property
     def singular_points(self) -> FloatArray:
         """Points (n, 3) to which all level sets come arbitrarily near, such as the dipoles of a
-        cloud. Used by distances."""
+        cloud. Distances use them."""
         return np.zeros((0, 3))
 
     def continuous_change(self, p: FloatArray, q: FloatArray) -> FloatArray | None:
-        """The change (n,) of an angle-valued f along the straight segments from p to q (n, 3), with
-        f followed continuously; None if only values modulo the period are known. Meshes use it on
-        long edges."""
+        """The change (n,) of an angle-valued f along the straight segments from p to q, if f is
+        followed continuously; None if only values modulo the period are known. Meshes use it on
+        long edges.
+
+        p, q: (n, 3).
+        """
         del p, q
         return None
 
 
-# An accuracy scale at which there is no truncation.
+# An accuracy scale that is so large that there is no truncation.
 EXACT = 1e9
 
 
 class VariableAccuracy:
     """A field that can be sampled with different accuracy. Defaults: a single accuracy.
 
-    A sum over a tree treats far clusters as one source; the farther they must be, the smaller the
-    truncation error and the higher the cost. The tracer starts with coarse samples and refines them
-    where truncation shortens steps.
+    A sum over a tree treats far clusters as one source. The farther clusters must be for that, the
+    smaller the truncation error and the higher the cost. The tracer starts with coarse samples and
+    refines them where truncation shortens steps.
     """
 
     has_variable_accuracy: bool = False
@@ -325,18 +336,18 @@ class VariableAccuracy:
     def at_accuracy(self, detail: Real) -> Field:
         """This field, sampled with another accuracy.
 
-        detail: the accuracy scale, which may differ from lane to lane: 0 for the coarsest samples
-            of the field, 1 for the samples of `evaluate`, above 1 for more accurate samples.
+        detail: the accuracy scale, which may differ from lane to lane. 0 gives the coarsest samples
+            of the field, 1 the samples of `evaluate`, and a number above 1 more accurate samples.
 
-        `Sample.truncation_error` falls about as detail^-3 and is 0 if detail is large enough. A
+        `Sample.truncation_error` falls about as detail^-3, and is 0 if detail is large enough. A
         coarse sample is valid all the same, with a larger `value_error`.
         """
         del detail
         return cast("Field", self)
 
     def exact(self, backend: Backend) -> Field:
-        """This field, already prepared for the backend, with samples that have no truncation error
-        (at the accuracy scale `EXACT`)."""
+        """This field, which must be prepared for the backend, with samples without truncation
+        error: at the accuracy scale `EXACT`."""
         if not self.has_variable_accuracy:
             return cast("Field", self)
         closely: Any = copy.copy(self)

@@ -1,7 +1,7 @@
-"""Clearances (proved lower bounds of the distance to a level set) and the extents they prove.
+"""Clearances (proved lower bounds of the distance to a level set) and the extents that they prove.
 
-`clearance_function` gives clearances at points. `tight_extent` and `occupied_cells` prove in which
-volume, and in which cells, the level sets lie. Also here: `DeviceField`, the base of fields whose
+`clearance_function` gives clearances at points. `tight_extent` proves in which volume the level
+sets lie, and `occupied_cells` in which cells. Also here: `DeviceField`, the base of fields whose
 data lie on a backend, in coordinates in which they have a size of about 1.
 """
 
@@ -39,14 +39,16 @@ if TYPE_CHECKING:
 
 __all__ = ["clearance_function", "level_distance_lower_bound", "occupied_cells", "tight_extent"]
 
-# Uses all promises of a field: points are few, and the longest proof counts.
+# The enclosures by which clearances are proved. They use all promises of a field: there are few
+# points, and the longest proof counts.
 _PROOFS = choose_enclosures("curvature")
 
 
 def clearance_function(
     field: Field, levels: tuple[float, ...], precision: Precision = "double"
 ) -> Clearance:
-    """`level_distance_lower_bound` at points (n, 3)."""
+    """A function that takes points (n, 3) and returns their clearances (n,):
+    `level_distance_lower_bound` of the nearest of the levels."""
     backend = choose_backend(precision)
     prepared = field.prepare(backend)
     # Kernel parameters, so that other levels compile nothing.
@@ -54,6 +56,7 @@ def clearance_function(
     targets = Levels(values, field.period)
 
     def clearance(points: FloatArray) -> FloatArray:
+        """The clearances (n,) of points (n, 3)."""
         p = to_vector3(backend, points)
         return to_numpy(
             level_distance_lower_bound(backend, prepared, targets, p, prepared.evaluate(p))
@@ -71,45 +74,53 @@ def tight_extent(
     finest: int = 5,
     points: FloatArray | None = None,
 ) -> ConvexHull:
-    """A polytope of few planes that contains every point of the level sets inside a box.
+    """A convex polytope of few planes that contains every point of the level sets inside a box.
 
-    Cells of the box are left out if the ball around them is within the clearance of its center; the
-    polytope contains the remaining cells.
+    The box is cut into cells. A cell is left out if the ball around it is within the clearance of
+    its center. The polytope contains the remaining cells.
 
+    lower, upper: (3,) corners of the box.
     max_cells, finest: as for `nonempty_cells`.
-    points: (n, 3) that the polytope is to contain in any case. The polytope around them need not be
-        tested: a ball inside of it may be left out as well.
+    points: (n, 3) that the polytope must contain in any case. A polytope is put around them first,
+        and no cells inside of it are tested.
     """
     clearance = clearance_function(field, levels)
-    slack = 1e-4 * float(np.linalg.norm(upper - lower))
+    margin = 1e-4 * float(np.linalg.norm(upper - lower))
     if points is not None:
-        held = kdop_of_points(points, slack)
-        cells = nonempty_cells(lower, upper, _outside(held, clearance), max_cells, finest)
-        return merge_kdops(held, cells.bounding_kdop(slack)) if len(cells.corners) else held
+        given = kdop_of_points(points, margin)
+        cells = nonempty_cells(
+            lower, upper, _clearance_outside(given, clearance), max_cells, finest
+        )
+        return merge_kdops(given, cells.bounding_kdop(margin)) if len(cells.corners) else given
     cells = nonempty_cells(lower, upper, clearance, max_cells, finest)
     if not len(cells.corners):  # no level anywhere: any box will do
         cells = BoxCells(np.array(lower)[None], np.array(upper) - np.array(lower))
-    return cells.bounding_kdop(slack)
+    return cells.bounding_kdop(margin)
 
 
-def _outside(held: ConvexHull, clearance: Clearance) -> Clearance:
-    """The clearance from the outside of a polytope: for points inside, the distance to its
-    faces."""
+def _clearance_outside(polytope: ConvexHull, clearance: Clearance) -> Clearance:
+    """A clearance for points outside of a polytope: it proves nothing about level sets inside. For
+    a point inside, it is the distance to the nearest face; for a point outside, that of
+    `clearance`."""
 
-    def beyond(points: FloatArray) -> FloatArray:
-        depth = (held.offsets - points @ held.normals.T).min(axis=1)
+    def clearance_outside(points: FloatArray) -> FloatArray:
+        """The clearances (n,) of points (n, 3)."""
+        depth = (polytope.offsets - points @ polytope.normals.T).min(axis=1)
         outside = depth <= 0
         if outside.any():
             depth[outside] = clearance(points[outside])
         return depth
 
-    return beyond
+    return clearance_outside
 
 
 def occupied_cells(
     field: Field, levels: tuple[float, ...], extent: Volume, cells_across: int
 ) -> OccupancyGrid:
-    """A grid over an extent, with about this number of cells along its longest side."""
+    """A grid over an extent, with the cells marked that may hold a level.
+
+    cells_across: the approximate number of cells along the longest side.
+    """
     return OccupancyGrid.from_clearance(
         *extent.bounds(), clearance_function(field, levels, "single"), cells_across
     )
@@ -118,19 +129,23 @@ def occupied_cells(
 def level_distance_lower_bound(
     backend: Backend, field: Field, levels: Levels, p: Vec3, sample: Sample
 ) -> Real:
-    """A proved lower bound of the distance from p to the nearest level. sample: of the field at p.
+    """A proved lower bound of the distance from the points p to the nearest level.
 
-    Proof. An enclosure holds f(p + tv) within [L(t, s), U(t, s)], with s the slope along a unit
-    direction v, and steps to the point where this interval first meets a level. Neither end falls
-    as s grows, as every enclosure has to prove (`Enclosure`).
+    field: prepared for the backend.
+    sample: of the field at p.
 
-    All slopes lie in [-G, G], with G = |grad f(p)| plus its error: an enclosure with that interval
-    of slopes holds in every direction. The distances to the level above and to the level below are
-    proved separately, each by the promise that proves the larger distance.
+    Proof. Let v be a unit direction and s the slope of f at p along v. An enclosure holds f(p + t
+    v) within an interval [L(t, s), U(t, s)], and its free length ends where this interval first
+    meets a level. Neither L nor U falls as s grows, which every enclosure has to prove
+    (`Enclosure`).
+
+    All slopes at p lie in [-G, G], where G is |grad f(p)| plus its error. So an enclosure with that
+    interval of slopes holds in every direction. The distances to the level above and to the level
+    below are proved separately, each by the promise that proves the larger distance.
 
     As in the tracer, the level gaps are reduced by the rounding of value and position, and the
     result is reduced by the rounding of p itself. If f jumps, the bound is for f continued smoothly
-    through all facets, which equals f as far as the nearest facet.
+    through all facets, which equals f up to the nearest facet.
     """
     steepest = safe_norm(sample.gradient) + sample.gradient_error
     size = max_norm(p)
@@ -155,15 +170,15 @@ def level_distance_lower_bound(
 
 @dataclass(frozen=True)
 class UnitFrame:
-    """Unit coordinates x of a field's data on a backend: the point is p = center + size * x.
-    Subclasses add the data."""
+    """Data of a field on a backend, in unit coordinates. A point x in unit coordinates stands for
+    the point p = center + size * x. Subclasses add the data."""
 
     backend: Backend
     center: Vec3
     size: Real
 
     def to_unit(self, p: Vec3) -> Vec3:
-        """A point p in unit coordinates."""
+        """The point p in unit coordinates."""
         return (self.backend.Array3f(p) - self.center) / self.size
 
 
@@ -179,7 +194,10 @@ class DeviceField(Field, Generic[Uploaded]):
 
     @abc.abstractmethod
     def _upload(self, backend: Backend, *, traced: bool) -> Uploaded:
-        """The data, for tracing or for values at points."""
+        """The data on a backend.
+
+        traced: whether they are for tracing; else they are for values at points.
+        """
 
     @cached_prepare
     def prepare(self, backend: Backend) -> Self:
@@ -190,13 +208,18 @@ class DeviceField(Field, Generic[Uploaded]):
         return prepared
 
     def _data_for(self, p: Vec3) -> Uploaded:
-        """The data for tracing; on the backend of p if `prepare` was not called."""
+        """The data for tracing. If `prepare` was not called, they are uploaded to the backend of
+        p."""
         if self._device is None:
             return self._upload(backend_of(p), traced=True)
         return self._device
 
     def _require_data(self) -> Uploaded:
-        """The data for tracing; RuntimeError if `prepare` was not called."""
+        """The data for tracing.
+
+        Raises:
+            RuntimeError: `prepare` was not called.
+        """
         if self._device is None:
             raise RuntimeError("prepare(backend) comes first, before at_detail")
         return self._device
@@ -209,8 +232,8 @@ class DeviceField(Field, Generic[Uploaded]):
 
 
 class VariableAccuracyField(DeviceField[Uploaded], BatchedField):
-    """An uploaded sum with a choice of detail (`Field.at_accuracy`). Subclasses define
-    `_sample`."""
+    """A field that is a sum over sources on a backend, at any accuracy scale (`Field.at_accuracy`).
+    Subclasses define `_sample`."""
 
     has_variable_accuracy = True
 
@@ -219,7 +242,11 @@ class VariableAccuracyField(DeviceField[Uploaded], BatchedField):
 
     @abc.abstractmethod
     def _sample(self, on: Uploaded, p: Vec3, detail: Real) -> Sample:
-        """f at p from the data, at a detail (`Field.at_accuracy`)."""
+        """The sample of f at p.
+
+        on: the data.
+        detail: the accuracy scale (`Field.at_accuracy`).
+        """
 
     def evaluate(self, p: Vec3) -> Sample:
         on = self._data_for(p)
@@ -233,6 +260,7 @@ class VariableAccuracyField(DeviceField[Uploaded], BatchedField):
         )
 
     def _batch_data(self, backend: Backend) -> Uploaded:
+        """The data for values at points. They are those for tracing if the two do not differ."""
         device = self._device
         if self.has_separate_batch_data or device is None or device.backend is not backend:
             return super()._batch_data(backend)
@@ -240,8 +268,8 @@ class VariableAccuracyField(DeviceField[Uploaded], BatchedField):
 
 
 def round_to_single(center: FloatArray) -> FloatArray:
-    """The center, rounded to numbers that single precision holds exactly: subtracting it from
-    nearby points is then exact, however far the origin is."""
+    """A center (3,), rounded to numbers that single precision represents exactly. Subtracting it
+    from nearby points is then exact, however far the origin is."""
     with np.errstate(over="ignore"):
         rounded = center.astype(np.float32).astype(np.float64)
     return np.where(np.isfinite(rounded), rounded, center)
@@ -256,5 +284,6 @@ def frame_parameters(
 
 
 def coordinate_rounding(x: Vec3) -> Real:
-    """The rounding of a coordinate of x, or of a vertex of size about 1."""
+    """The rounding of a coordinate of x, a point in unit coordinates, or of a vertex of size about
+    1."""
     return float(dr.epsilon(x)) * (1 + dr.max(dr.abs(x)))

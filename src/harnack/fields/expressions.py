@@ -1,4 +1,5 @@
-"""A user's own formula as a field: a Python function, or a text such as "x^2 + y^2 + z^2 = 1"."""
+"""A user's own formula as a field. The formula is a Python function, or a text such as "x^2 + y^2 +
+z^2 = 1"."""
 
 from __future__ import annotations
 
@@ -36,7 +37,7 @@ _FUNCTIONS: Mapping[str, Callable[..., Any]] = MappingProxyType(
         "min": lambda *several: functools.reduce(arithmetic.minimum, several),
     }
 )  # fmt: skip
-# Functions of more than one argument: the least and the largest number of arguments.
+# Functions of more than one argument: the smallest and the largest number of arguments.
 _ARGUMENT_COUNTS = {"max": (2, 99), "min": (2, 99), "norm": (2, 3), "atan2": (2, 2)}
 _OPERATORS: Mapping[type[ast.operator], Callable[[Any, Any], Any]] = MappingProxyType(
     {
@@ -46,8 +47,8 @@ _OPERATORS: Mapping[type[ast.operator], Callable[[Any, Any], Any]] = MappingProx
         ast.Div: lambda a, b: a / b,
     }
 )
-# Limits of the number of characters, and of nested operations: Python allows some 1000 nested
-# calls.
+# The largest number of characters of a text, and of operations that are nested in each other.
+# Python allows about 1000 nested calls.
 _MAX_LENGTH, _MAX_DEPTH = 4000, 200
 
 
@@ -55,9 +56,10 @@ _MAX_LENGTH, _MAX_DEPTH = 4000, 200
 class TextFormula:
     """A formula f(x, y, z) as a text. It is called like any function of three coordinates.
 
-    text: with + - * / ^ (or **), brackets, numbers, x, y, z, pi, e and the functions above. An
-        equation "left = right" means left - right. It is parsed to a tree and never run as Python,
-        so that texts from untrusted sources do no harm.
+    text: has + - * / ^ (or **), brackets, numbers, x, y, z, pi, e, parameters and the functions
+        `_FUNCTIONS`. An equation "left = right" means left - right.
+    tree: the text, parsed to a syntax tree. It is never run as Python, so that texts from untrusted
+        sources do no harm.
     parameters: numbers by their names in the text.
     """
 
@@ -69,9 +71,12 @@ class TextFormula:
     def parse(cls, text: str, parameters: Mapping[str, float] | None = None) -> TextFormula:
         """The formula that a text describes.
 
+        parameters: numbers by their names in the text.
+
         Raises:
-            ValueError: the text is not a formula (the message states the position and the mistake);
-                or a parameter is not in it, or has a name with another meaning.
+            ValueError: the text is not a formula (the message states the position and the mistake),
+                or a parameter is not in it, or the name of a parameter is already that of a
+                function, a constant or a coordinate.
         """
         parameters = {name: as_finite(number, name) for name, number in (parameters or {}).items()}
         if len(text) > _MAX_LENGTH:
@@ -79,11 +84,11 @@ class TextFormula:
         unknown = re.search(r"[^A-Za-z0-9\s.,+*/^()=<>!-]|\b0[xob]", text, re.IGNORECASE)
         if unknown:
             raise _formula_error(text, f"{unknown[0]!r} has no meaning here")
-        sides = [cls._side(text, side) for side in re.split(r"(?<![<>=!])=(?!=)", text)]
+        sides = [cls._parse_side(text, side) for side in re.split(r"(?<![<>=!])=(?!=)", text)]
         if len(sides) > 2:
             raise _formula_error(text, "more than one = sign")
         tree = sides[0] if len(sides) == 1 else ast.BinOp(sides[0], ast.Sub(), sides[1])
-        _check(text, tree, parameters)
+        _check_tree(text, tree, parameters)
         names = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
         for name in parameters:
             if name in _FUNCTIONS or name in (*_COORDINATES, *_CONSTANTS):
@@ -93,7 +98,14 @@ class TextFormula:
         return cls(text, tree, parameters)
 
     @staticmethod
-    def _side(text: str, side: str) -> ast.expr:
+    def _parse_side(text: str, side: str) -> ast.expr:
+        """The syntax tree of one side of an equation.
+
+        text: the whole formula, for messages.
+
+        Raises:
+            ValueError: the side is not an expression; the message guesses the mistake.
+        """
         try:
             return ast.parse(" ".join(side.replace("^", "**").split()), mode="eval").body
         except (SyntaxError, ValueError, RecursionError, MemoryError):
@@ -106,6 +118,11 @@ class TextFormula:
         raise _formula_error(text, hint)
 
     def __call__(self, x: Any, y: Any, z: Any) -> Any:
+        """The value of the formula at coordinates of any kind.
+
+        Raises:
+            ValueError: a constant part divides by zero, is too large, or is not real.
+        """
         try:
             with np.errstate(all="ignore"):  # in constants; a result that is not finite is refused
                 return _value(self.tree, {"x": x, "y": y, "z": z, **_CONSTANTS, **self.parameters})
@@ -120,32 +137,38 @@ class TextFormula:
 
 
 def looks_like_formula(text: str) -> bool:
-    """Whether a text looks like a formula: it is an equation, or has powers, products or
-    functions."""
+    """Whether a text looks like a formula: it has an equals sign, a power, a product or a
+    bracket."""
     return any(sign in text for sign in ("=", "^", "*", "("))
 
 
 def _formula_error(text: str, why: str) -> ValueError:
+    """The error that says that a text is not a formula, and why."""
     shown = text if len(text) <= 80 else text[:77] + "..."
     return ValueError(
         f'{shown!r} is no formula in x, y and z: {why}; write it as in "x^2 + y^2 = 1 + sin(2*z)"'
     )
 
 
-def _check(text: str, node: ast.expr, parameters: Iterable[str], depth: int = 0) -> None:
-    """Raise ValueError for anything in a tree that is not allowed or not known. parameters: their
-    names."""
+def _check_tree(text: str, node: ast.expr, parameters: Iterable[str], depth: int = 0) -> None:
+    """Raise ValueError if a syntax tree has a part that is not allowed, or a name that is not
+    known.
+
+    text: the formula, for messages.
+    parameters: the names of its parameters.
+    depth: how many operations the node is nested in.
+    """
     if depth > _MAX_DEPTH:
         raise _formula_error(text, f"more than {_MAX_DEPTH} operations are within each other")
     if isinstance(node, ast.BinOp):
         if not isinstance(node.op, ast.Pow) and type(node.op) not in _OPERATORS:
             raise _formula_error(text, "the operators are + - * / ^")
-        _check(text, node.left, parameters, depth + 1)
-        _check(text, node.right, parameters, depth + 1)
+        _check_tree(text, node.left, parameters, depth + 1)
+        _check_tree(text, node.right, parameters, depth + 1)
     elif isinstance(node, ast.UnaryOp):
         if not isinstance(node.op, ast.USub | ast.UAdd):
             raise _formula_error(text, "the signs are + and -")
-        _check(text, node.operand, parameters, depth + 1)
+        _check_tree(text, node.operand, parameters, depth + 1)
     elif isinstance(node, ast.Name):
         names = (*_COORDINATES, *_CONSTANTS, *parameters)
         if node.id in _FUNCTIONS:
@@ -174,6 +197,11 @@ def _check(text: str, node: ast.expr, parameters: Iterable[str], depth: int = 0)
 
 
 def _as_float(text: str, value: float) -> float:
+    """A number of a formula as a float.
+
+    Raises:
+        ValueError: it is too large.
+    """
     try:
         return float(value)
     except OverflowError:
@@ -181,7 +209,7 @@ def _as_float(text: str, value: float) -> float:
 
 
 def _check_call(text: str, node: ast.Call, parameters: Iterable[str], depth: int) -> None:
-    """Raise ValueError for a call of an unknown function, with a wrong number of arguments, or with
+    """Raise ValueError for a call of an unknown function, for a wrong number of arguments, and for
     arguments that are not allowed."""
     name = node.func.id if isinstance(node.func, ast.Name) else ast.unparse(node.func)
     if name in (*_COORDINATES, *_CONSTANTS, *parameters) or not isinstance(node.func, ast.Name):
@@ -200,14 +228,16 @@ def _check_call(text: str, node: ast.Call, parameters: Iterable[str], depth: int
         plural = "s" if largest > 1 else ""
         raise _formula_error(text, f"{name} takes {count} argument{plural}, not {len(node.args)}")
     for argument in node.args:
-        _check(text, argument, parameters, depth)
+        _check_tree(text, argument, parameters, depth)
 
 
 def _value(node: ast.expr, names: Mapping[str, Any]) -> Any:
-    """The value of a tree that was checked.
+    """The value of a syntax tree that `_check_tree` accepted.
+
+    names: the values of coordinates, constants and parameters.
 
     Raises:
-        OverflowError: a part that is constant is not finite.
+        OverflowError: a constant part of the tree is not finite.
     """
     value = _evaluate_node(node, names)
     if isinstance(value, float) and not math.isfinite(value):
@@ -216,6 +246,7 @@ def _value(node: ast.expr, names: Mapping[str, Any]) -> Any:
 
 
 def _evaluate_node(node: ast.expr, names: Mapping[str, Any]) -> Any:
+    """The value of a node, as in `_value`, which may be a constant that is not finite."""
     match node:
         case ast.BinOp(left, ast.Pow(), right):
             base, exponent = _value(left, names), _value(right, names)
@@ -237,8 +268,12 @@ def _evaluate_node(node: ast.expr, names: Mapping[str, Any]) -> Any:
 
 
 def _power(base: Any, exponent: Any) -> Any:
-    """base^exponent, where exponents without a fraction are integers: negative numbers have such
-    powers too."""
+    """base^exponent. An exponent that is a whole number is taken as an integer, because negative
+    numbers have such powers too.
+
+    Raises:
+        OverflowError: the power of two constants is not real.
+    """
     if isinstance(exponent, float) and exponent.is_integer():
         exponent = int(exponent) if abs(exponent) < 2**31 else exponent
     if isinstance(base, float) and isinstance(exponent, int | float):
@@ -251,12 +286,13 @@ def _power(base: Any, exponent: Any) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Expression(Formula):
-    """A field f(x, y, z) that is a Python function, written with plain operators and the functions
-    of `harnack.math`.
+    """A field f(x, y, z) given by a Python function, which is written with plain operators and the
+    functions of `harnack.math`.
 
-    function: called with three coordinates while a kernel is being recorded; numbers in it are
-        literals of that kernel.
+    function: takes three coordinates. It is called while a kernel is being recorded, and numbers in
+        it are literals of that kernel.
     domain: the volume in which f is drawn; None for all of space.
+    default_level, is_convex: as in `Field` and `Formula`.
     """
 
     function: Callable[[Any, Any, Any], Any]
@@ -283,21 +319,22 @@ def expression(
 ) -> Expression:
     """The implicit surface f(x, y, z) = level of a user-defined formula.
 
-    function: of three coordinates, written with + - * / **, abs, and the functions of
+    function: takes three coordinates. It is written with + - * / **, abs, and the functions of
         `harnack.math`: `sin`, `cos`, `tan`, `exp`, `log`, `sqrt`, `tanh`, `atan`, `atan2`, `asin`,
-        `acos`, `sinh`, `cosh`, `maximum`, `minimum`, `norm`; NumPy's functions of the same names
-        work too. Or a text, such as "x^2 + y^2 = 1 + sin(2*z)", with `max` and `min`; an equation
-        means left - right.
-    parameters: numbers by their names in a text, such as {"a": 2.0} for "x^2 + y^2 = a".
+        `acos`, `sinh`, `cosh`, `maximum`, `minimum`, `norm`. NumPy's functions of the same names
+        work too. Or it is a text, such as "x^2 + y^2 = 1 + sin(2*z)", in which maximum and minimum
+        are `max` and `min`; an equation means left - right.
+    parameters: for a text, numbers by their names, such as {"a": 2.0} for "x^2 + y^2 = a".
     domain: the volume in which the surface is drawn, such as `harnack.Ball()`; None for all of
         space.
-    level: the level drawn by default.
-    is_convex: your promise that the function is convex, as quadrics and norms are: then steps
+    level: the level that is drawn by default.
+    is_convex: your promise that the function is convex, as quadrics and norms are. Then steps
         towards the surface are longer. `harnack.testing.check_field` tests the promise at samples.
 
         torus = hk.expression(lambda x, y, z: (hk.math.norm(x, y) - 1) ** 2 + z**2 - 0.1)
 
-    Warns of a formula so long that the first trace takes more than about ten seconds to compile.
+    It warns if the formula is so long that its first trace takes more than about ten seconds to
+    compile.
 
     Raises:
         TypeError: function cannot be called with three coordinates, or uses operations without
@@ -327,7 +364,7 @@ def expression(
 
 
 def _check_arguments(function: Callable[..., Any]) -> None:
-    """Raise TypeError for a function that does not take three coordinates."""
+    """Raise TypeError if a function cannot be called with three coordinates."""
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):  # of what is not written in Python nothing may be known

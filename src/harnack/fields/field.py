@@ -1,6 +1,6 @@
 """The class `Field`: the interface between functions of space and the rest of the library.
 
-One evaluation of a field gives its value, its gradient and its promises near the point
+One evaluation of a field gives its value, its gradient, and promises that hold near the point
 (`harnack.enclosures.promises`). Promises must be *true*: every step of the tracer rests on them.
 `harnack.testing.check_field` tests whether a field fulfills this interface.
 """
@@ -71,11 +71,11 @@ _SOLID_METHODS = frozenset(
 
 
 class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
-    """A scalar function on R^3 whose level sets can be traced with a proof.
+    """A scalar function f on R^3 whose level sets can be traced with a proof.
 
-    Subclasses define `evaluate`; the class attributes are defaults that an instance may override.
-    The base classes declare optional capabilities (jumps, patches, variable accuracy, curves at
-    which level sets end); their defaults describe a field that has none of them.
+    Subclasses define `evaluate`. The class attributes are defaults, which an instance may override.
+    The base classes declare optional capabilities: jumps, patches, variable accuracy, and curves at
+    which level sets end. Their defaults describe a field that has none of these.
     """
 
     period: ClassVar[float | None] = None
@@ -85,25 +85,25 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
     """The level that is drawn if the user names none."""
 
     is_larger_inside: bool = False
-    """Whether f is larger inside of its surfaces than outside, as a winding number is. Signed
-    distances are negative inside: where f > level of such a field, where f < level of others."""
+    """Whether f is larger inside of its surfaces than outside, as a winding number is. Then the
+    inside is where f > level; else it is where f < level, as for signed distances."""
 
     over_relaxation: float = 1.4
-    """The over-relaxation factor (`TraceOptions.over_relaxation`) with the fewest evaluations, by
-    experiment; at least 1."""
+    """The over-relaxation factor (`TraceOptions.over_relaxation`) that needs the fewest
+    evaluations, by experiment. It is at least 1."""
 
     domain: Volume | None = None
     """The convex volume in which the field may be evaluated and is drawn; None for all of space.
-    Rays are clipped to it, and promises of a sample need only hold for p in it. As it is convex, a
-    ray from p stays in it up to where it is clipped; `Lipschitz` and `TaylorRemainder` need not
-    hold beyond."""
+    Rays are clipped to it, and samples need only be right at points p in it. As it is convex, a
+    ray from p stays in it up to where it is clipped. So `Lipschitz` and `TaylorRemainder` promises
+    need not hold outside of it."""
 
     is_global: bool = False
     """Whether f and its promises hold in all of space. `domain` then only limits what is drawn."""
 
     min_wavelength: float | None = None
     """The shortest wavelength of f that matters; None if it is not known. Code that samples f in
-    cells makes them smaller than this."""
+    cells makes the cells smaller than this."""
 
     is_cheap: bool = False
     """Whether a sample costs less than fetching the next ray from a queue
@@ -119,8 +119,8 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         return super().__new__(cls)
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Wrap methods of the subclass: the result of `evaluate` is checked, `hessian` also takes
-        NumPy arrays, and public class methods refuse arguments with derivatives as the constructor
+        """Wrap methods of the subclass. The result of `evaluate` is checked; `hessian` also takes
+        NumPy arrays; and public class methods refuse arguments with derivatives, as the constructor
         does."""
         super().__init_subclass__(**kwargs)
         if "__repr__" not in vars(cls):  # a dataclass would write out all numbers
@@ -144,9 +144,9 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         return other
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore a deep copy or a pickled field, and make its arrays read-only again. NumPy
-        forgets that arrays were read-only, and writing to them would not change the values computed
-        from them."""
+        """Restore a deep copy or a pickled field, and make its arrays read-only again. (NumPy
+        forgets that arrays were read-only. Writing to them would not change the values that were
+        computed from them.)"""
         vars(self).update(state)
         make_read_only(state)
 
@@ -163,15 +163,21 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         return f"{type(self).__name__}({', '.join(arguments)})"
 
     def __getattr__(self, name: str) -> Any:
-        """Raise AttributeError; for methods that only solids have, the message says how to make a
-        solid of the field."""
+        """Raise AttributeError. For the name of a method that only solids have, the message says
+        how to make a solid of the field."""
         message = f"{type(self).__name__!r} object has no attribute {name!r}"
         if name in _SOLID_METHODS:
             message += ": make a solid of the field first, by harnack.solid(field, below=level)"
         raise AttributeError(message)
 
     def _is_no_number(self, *operands: Any) -> Any:
-        """Arithmetic and comparisons are refused. `Solid` defines -, and all fields keep ==."""
+        """Refuse arithmetic and comparisons with fields.
+
+        `Solid` defines -, and all fields keep ==.
+
+        Raises:
+            TypeError: always.
+        """
         raise TypeError(
             f"a {type(self).__name__} is a function of space, which is not computed with as "
             "numbers are: the level c of 2 f is the level c/2 of f, sums and products are written "
@@ -185,15 +191,16 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
 
     @abc.abstractmethod
     def evaluate(self, p: Vec3) -> Sample:
-        """Value, gradient and promises at p, a Dr.Jit 3-vector of any backend and precision.
+        """The sample at p: value, gradient and promises. p is a Dr.Jit 3-vector of any backend and
+        precision.
 
-        Called while a loop is being recorded: use `drjit` functions of p, and no Python branches on
-        its values.
+        It is called while a loop is being recorded. So use `drjit` functions of p, and no Python
+        branches on its values.
         """
 
     def prepare(self, backend: Backend) -> Field:
-        """A field equal to this field whose data lie on the backend. Each call of the library calls
-        this method once.
+        """A field equal to this one whose data lie on the backend. Each function of the library
+        calls this method once.
 
         The default returns the field itself, which suits fields that hold only Python numbers.
         """
@@ -203,38 +210,39 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """A volume that is proved to contain every point of the level sets; None if none is known.
 
-        It may be smaller than `domain`. With it a ray without an end can be a proved miss.
+        It may be smaller than `domain`. With an extent, a ray without an end can be a proved miss.
         """
         del levels
         return self.domain
 
     def occupied_cells(self, levels: tuple[float, ...]) -> OccupancyGrid | None:
-        """A grid of cells. Cells not marked occupied are proved to contain no point of the level
-        sets, and first hits skip them, which pays for fields that are expensive to evaluate. None
-        if no grid is known.
+        """A grid of cells, or None if none is known. Cells that are not marked as occupied are
+        proved to contain no point of the level sets.
 
-        For a field with jumps, no continuation of f takes a level in those cells either.
+        Searches for first hits skip these cells, which pays for fields that are expensive to
+        evaluate. For a field with jumps, no continuation of f takes a level in these cells either.
         """
         del levels
         return None
 
     def for_ray_count(self, count: int) -> Field:
-        """The field to use for this many rays; it may spend more on preparation if that pays. Equal
-        counts return the same object, so that nothing is prepared twice. The default is the field
-        itself."""
+        """The field to use for this many rays. It may spend more on preparation if that pays. Equal
+        counts must return the same object, so that nothing is prepared twice. The default is the
+        field itself."""
         del count
         return self
 
     @property
     def is_steep(self) -> bool:
-        """Whether |grad f| may be unbounded in a bounded box, or has no bound that limits the
-        change of f within the rounding of coordinates, so that f may bend by any amount within the
-        tolerance of a hit. The tracer then also samples f beyond the hit."""
+        """Whether f may change by any amount within the tolerance of a hit. This is so if |grad f|
+        may be unbounded in a bounded box, or has no bound that limits the change of f within the
+        rounding of coordinates. The tracer then also samples f behind the hit."""
         return False
 
     def gradient_change_bound(self, p: Vec3, radius: Real) -> Real:
-        """A proved bound of |grad f(y) - grad f(p)| for all y with |y - p| <= radius; infinite (the
-        default) if none is known. Proofs that a mesh has the topology of the surface use it."""
+        """A proved bound of |grad f(y) - grad f(p)| for all y with |y - p| <= radius. It is
+        infinite, which is the default, if none is known. Proofs that a mesh has the topology of the
+        surface use it."""
         return 0 * p.x + radius + dr.inf
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
@@ -243,7 +251,7 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         del levels
 
     def parameters(self) -> tuple[Any, ...]:
-        """Dr.Jit arrays that the value depends on and that may carry derivatives.
+        """The Dr.Jit arrays on which the value depends and that may have derivatives enabled.
 
         A class that does not define this method has no such parameters, and its constructor refuses
         arguments with derivatives enabled.
@@ -252,24 +260,25 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
 
     @classmethod
     def has_no_parameters(cls) -> bool:
-        """Whether the class does not define `parameters`, so that derivatives with respect to its
+        """Whether the class does not define `parameters`. Then derivatives with respect to its
         numbers would be lost."""
         return cls.parameters is Field.parameters
 
     def refuse_hidden_parameters(self) -> None:
         """Raise NotImplementedError if a class without `parameters` holds numbers with derivatives
-        enabled, for example in its formula: these derivatives would be lost."""
+        enabled, for example in its formula. These derivatives would be lost."""
         if self.has_no_parameters():
             kind = type(self)
             is_own = not kind.__module__.startswith("harnack.")
             check_no_derivatives(kind.__name__, vars(self), kind.evaluate if is_own else None)
 
     def differentiable_value(self, p: Vec3) -> Real:
-        """f(p) as an expression that Dr.Jit can differentiate in p and in the field's parameters.
+        """f(p) as an expression that Dr.Jit can differentiate with respect to p and to the field's
+        parameters.
 
-        In p it can be differentiated once: the derivative of the value is the gradient of the
-        sample. So no derivative passes through `evaluate`, which may run a recorded loop, and at
-        ties of f's formula the derivative is the gradient of the sample, too. A field with
+        With respect to p it can be differentiated once: the derivative of the value is the gradient
+        of the sample. So no derivative passes through `evaluate`, which may run a recorded loop. At
+        ties of f's formula, too, the derivative is the gradient of the sample. A field with
         parameters overrides this method if `evaluate` cannot be differentiated in both modes.
         """
         if any(dr.grad_enabled(parameter) for parameter in self.parameters()):
@@ -330,9 +339,13 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
     def _evaluate_points(
         self, points: Any, precision: Precision | None, choose: Callable[[Sample], Any]
     ) -> npt.NDArray[Any]:
-        """The array that `choose` takes from the samples at points."""
+        """What `choose` takes from the samples at points, as an array in the order of the points.
+
+        precision: as for `value`.
+        """
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
+            """What `choose` takes from the samples at the Dr.Jit points x."""
             return (choose(self.prepare(backend).evaluate(x)),)
 
         return evaluate_points(points, kernel, precision)[0]
@@ -360,25 +373,26 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         return sample.gradient_error, math.inf
 
     def describe(self) -> dict[str, Any]:
-        """Names and values of the choices that the field made by itself, for users who need
-        them."""
+        """Names and values of the choices that the field made by itself, for users."""
         return {}
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         """A sample at parameter t of a ray, with enclosures of f ahead and behind.
 
+        path: the ray.
+        ahead, back: the lengths up to which enclosures are of use. An enclosure that is sharper on
+            a shorter length need not hold on all of it.
+
         The default evaluates the field at that point and applies its promises to the slope along
         the ray. A field that knows more about f along a ray than in all directions overrides this.
-
-        ahead, back: the lengths up to which enclosures are of use; an enclosure that is sharper on
-            a shorter length need reach no farther.
         """
         del ahead, back
         return path.enclose(self.evaluate(path.point(t)))
 
 
 class EvaluateOnly(Field):
-    """A field that has only its `evaluate`, such as the result of `Field.at_accuracy`."""
+    """A field that consists of its method `evaluate` only, such as the result of
+    `Field.at_accuracy`."""
 
     def __init__(self, evaluate: Callable[[Vec3], Sample]) -> None:
         self._evaluate = evaluate

@@ -1,11 +1,12 @@
-"""Fields defined by a formula of the coordinates, from which everything else follows.
+"""Fields that are defined by a formula of the coordinates. Everything else follows from the
+formula.
 
 A formula is evaluated in two ways. For jets of the coordinates at a point it returns value and
-gradient with bounds of their rounding. For jets along a piece of a path it returns ranges of its
+gradient, with bounds of their rounding. For jets along a piece of a path it returns ranges of its
 derivatives there, from which steps are proved.
 
-A formula's kernel is counted before it is compiled: LLVM's time grows faster than the number of
-operations, so that a warning comes before minutes of silence, with a remedy.
+The operations of a formula are counted before its kernel is compiled. LLVM's time grows faster than
+the number of operations, so a formula that would take minutes first gives a warning, with a remedy.
 """
 
 from __future__ import annotations
@@ -41,39 +42,43 @@ if TYPE_CHECKING:
     from harnack.enclosures import Promise
 
 
-# Radii of the balls on which a Lipschitz constant is promised, in multiples of |f|/|grad f|.
-_RADII, _LARGEST_RADIUS = (0.25, 1.0, 4.0), 1e12
-# At a tie the gradient is taken at a point this many roundings of coordinates and value away. The
-# direction to that point is the direction of the middle gradient (a unit vector or 0) plus the
-# vector `_TIE_DIRECTION`, so that it runs along no tie.
+# Radii of the balls on which a Lipschitz constant is promised, in multiples of |f|/|grad f|; and
+# the largest radius.
+_RADII, _MAX_RADIUS = (0.25, 1.0, 4.0), 1e12
+# At a tie of the formula (see `Formula._with_one_sided_gradient`) the gradient is taken at a point
+# this many roundings of coordinates and value away. The direction to that point is the direction of
+# the middle gradient (a unit vector or 0) plus the vector `_TIE_DIRECTION`, so that it runs along
+# no tie.
 _TIE_OFFSET, _TIE_DIRECTION = 64.0, (0.31, 0.19, 0.13)
-# Where the error of the gradient is at most this many roundings, there is no tie.
+# If the error of the gradient is at most this many roundings, there is no tie.
 _TIE_THRESHOLD = 1024.0
-# Where a formula may jump, or is abrupt, pieces begin this many roundings of t before the point.
-_ROUNDINGS = 8.0
+# If a formula may jump, or is abrupt, pieces of a ray begin this many roundings of t before the
+# point.
+_ROUNDINGS_BEFORE = 8.0
 # A warning announces a compilation that is expected to take longer than this many seconds.
 _SLOW_COMPILE_SECONDS = 10.0
 
 
 # Whether samples of formulas omit alternative promises (`without_alternatives`).
-_WITHOUT_WEAKER: ContextVar[bool] = ContextVar("without_alternatives", default=False)
+_WITHOUT_ALTERNATIVES: ContextVar[bool] = ContextVar("without_alternatives", default=False)
 
 
 @contextmanager
 def without_alternatives() -> Generator[None]:
-    """Within this context, samples of formulas carry no alternative promises, which take several
-    times as long to record as value and gradient. For callers that use value and gradient only."""
-    token = _WITHOUT_WEAKER.set(True)
+    """Within this context, samples of formulas carry no alternative promises. These take several
+    times as long to record as value and gradient. The context is for callers that use value and
+    gradient only."""
+    token = _WITHOUT_ALTERNATIVES.set(True)
     try:
         yield
     finally:
-        _WITHOUT_WEAKER.reset(token)
+        _WITHOUT_ALTERNATIVES.reset(token)
 
 
 class Formula(Field):
-    """A field that is defined by a formula of the coordinates, the method `formula`.
+    """A field that is defined by a formula of the coordinates, its method `formula`.
 
-    Value, gradient, rounding errors and enclosures along rays follow from the formula by automatic
+    Value, gradient, rounding errors and enclosures along rays follow from the formula, by automatic
     differentiation in interval arithmetic.
 
     lipschitz: a proved bound of |grad f| everywhere, for sphere tracing (enclosures="lipschitz");
@@ -90,20 +95,25 @@ class Formula(Field):
 
     @abc.abstractmethod
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        """f of the coordinates, which may be jets or Dr.Jit numbers: written with + - * / ** and
-        the functions of `harnack.arithmetic`. A Dr.Jit number comes second, as in x * radius: with
-        it first, Dr.Jit's own operators would refuse jets."""
+        """f as a function of the coordinates, which may be jets or Dr.Jit numbers.
+
+        It is written with + - * / ** and the functions of `harnack.arithmetic`. In a product or sum
+        with a Dr.Jit number, the coordinate comes first, as in x * radius. In the other order
+        Dr.Jit's own operators would refuse jets.
+        """
 
     @property
     def tally(self) -> Tally:
-        """The operations of the formula, counted; for a prepared formula, counted before it was
-        prepared, while its numbers were known."""
+        """The summary of the formula's operations: their number, and whether f may jump or is
+        steep. For a prepared formula, it was made before it was prepared, while its numbers were
+        known."""
         return tally_of(self.formula) if self._prepared_tally is None else self._prepared_tally
 
     @property
     def is_steep(self) -> bool:
-        """Whether the formula uses an operation that may have a vertical tangent or a pole, or that
-        is as steep as a pole for the rounding of coordinates."""
+        """Whether the formula uses an operation that may have a vertical tangent or a pole; or
+        whether f is so steep that it acts like a pole within the rounding of coordinates
+        (`is_abrupt`)."""
         return self.tally.is_steep or self.is_abrupt
 
     @property
@@ -111,29 +121,31 @@ class Formula(Field):
         """Whether f may change within the rounding of coordinates by far more than its slopes
         allow.
 
-        Where a Lipschitz constant is stated, as for the library's shapes, whose values are about
+        If a Lipschitz constant is stated, as for the library's shapes, whose values are about
         distances, small numbers in a formula are lengths, and only large numbers make it abrupt.
         """
         return self.tally.turns_within(1.0 if self.lipschitz is not None else self.tally.finest)
 
     def evaluate(self, p: Vec3) -> Sample:
         sample = self._with_one_sided_gradient(p, self.sample_without_alternatives(p))
-        if _WITHOUT_WEAKER.get():
+        if _WITHOUT_ALTERNATIVES.get():
             return sample
         return dataclasses.replace(sample, alternative_promises=self._local_lipschitz(p, sample))
 
     def _with_one_sided_gradient(self, p: Vec3, sample: Sample) -> Sample:
-        """Replace the gradient by a one-sided gradient where p lies on a tie of the formula.
+        """The sample at p, with a one-sided gradient if p lies on a tie of the formula.
 
-        At a tie, such as max(x, 0) at x = 0, the jet gives a range of gradients. The range contains
-        all gradients nearby, and others where terms of several ties are added, as on the faces of
-        `orthogonal_intersection`. Its middle is the gradient at no point, though its direction
-        mostly leads across the tie. A second sample (`Dual`), a few roundings away in about this
-        direction, decides which side to use.
+        A tie is a point at which two branches of a formula are equal, such as x = 0 for max(x, 0).
+        There the jet gives a range of gradients. The range contains all gradients nearby. It
+        contains others, too, if terms of several ties are added, as on the faces of
+        `orthogonal_intersection`. The middle of the range is the gradient at no point, but its
+        direction mostly leads across the tie. So f is evaluated once more (by `Dual`) at a point a
+        few roundings away, in about this direction, and the gradient there is used.
 
-        Proof of the error. The gradient at p lies within `gradient_error` of the middle. A gradient
-        that is farther from it does not come from a tie at p: the gradient of f changes that much
-        over these few roundings, as that of a sine of a large angle does. There the middle is used.
+        Proof of the error. The gradient at p lies within `gradient_error` of the middle. The second
+        gradient may be farther from the middle than twice that error. Then it does not come from a
+        tie at p: the gradient of f changes that much over these few roundings, as that of a sine of
+        a large angle does. In this case the middle is used.
         """
         epsilon = float(dr.epsilon(type(p.x)))
         is_bounded = dr.isfinite(sample.gradient_error + dr.sum(sample.gradient))
@@ -145,29 +157,27 @@ class Formula(Field):
         size = dr.select(size > 0, size, 1)
         coordinates = Dual.at_point(p + direction * (_TIE_OFFSET * epsilon * size))
         try:
-            dual = coordinates[0].coerce(self.formula(*coordinates))
+            nearby_value = coordinates[0].coerce(self.formula(*coordinates))
         except TypeError:  # a formula that accepts only ranges, as that of noise
             return sample
-        gradient = type(p)(*(0 * p.x + component for component in dual.first_derivatives))
-        distance = safe_norm(gradient - middle)
+        gradient = type(p)(*(0 * p.x + component for component in nearby_value.first_derivatives))
+        change = safe_norm(gradient - middle)
         is_tie = (
-            (error > _TIE_THRESHOLD * epsilon * norm)
-            & (distance <= 2 * error)
-            & dr.isfinite(distance)
+            (error > _TIE_THRESHOLD * epsilon * norm) & (change <= 2 * error) & dr.isfinite(change)
         )
         return dataclasses.replace(
             sample,
             gradient=dr.select(is_tie, gradient, sample.gradient),
-            gradient_error=dr.select(is_tie, error + distance, error),
+            gradient_error=dr.select(is_tie, error + change, error),
         )
 
     def sample_without_alternatives(self, p: Vec3) -> Sample:
-        """The sample with the promises of `promises`, without alternative promises, which samples
-        on rays do not use."""
+        """The sample at p with the promises of `promises`, and without alternative promises, which
+        samples on rays do not use."""
         return self._sample_of(self._jet(Jet.at_point(p), p.x), p)
 
     def _sample_of(self, jet: Jet, p: Vec3) -> Sample:
-        """The sample at p from the jet of f there."""
+        """The sample at p from the jet of f at p."""
         zero = 0 * p.x
         gradient = type(p)(*(zero + derivative.midpoint for derivative in jet.first_derivatives))
         gradient_error = zero
@@ -178,13 +188,16 @@ class Formula(Field):
         return Sample(value, gradient, promises, error, gradient_error)
 
     def _local_lipschitz(self, p: Vec3, sample: Sample) -> tuple[Lipschitz, ...]:
-        """Lipschitz constants on balls around p, each a bound of |grad f| on the box around the
-        ball. The radii are the multiples `_RADII` of Newton's estimate of the distance to level
-        0."""
-        steps = dr.abs(sample.value) / safe_norm(sample.gradient)
+        """Lipschitz constants on balls around p, as promises. Each is a bound of |grad f| on the
+        box around the ball.
+
+        sample: of f at p. The radii are the multiples `_RADII` of Newton's estimate |f|/|grad f| of
+            the distance to the level 0.
+        """
+        newton_length = dr.abs(sample.value) / safe_norm(sample.gradient)
         promises: list[Lipschitz] = []
         for multiple in _RADII:
-            radius = fmin(multiple * steps, _LARGEST_RADIUS)
+            radius = fmin(multiple * newton_length, _MAX_RADIUS)
             jet = self._jet(Jet.over_ball(p, radius), p.x)
             slopes = (0 * p.x + derivative.max_abs for derivative in jet.first_derivatives)
             constant = safe_norm(type(p)(*slopes)) * (1 + 1e-5)
@@ -205,29 +218,31 @@ class Formula(Field):
         return vector(xx, xy, xz), vector(xy, yy, yz), vector(xz, yz, zz)
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """The error of the gradient is that of the sample; the error of the Hessian follows from
+        """The error of the gradient is that of the sample. The error of the Hessian follows from
         its ranges, which include rounding and ties of the formula."""
         return sample.gradient_error, hessian_error(self._jet(Jet.at_point(p, order=2), p.x), p.x)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The sample, with the enclosures ahead that the ranges of the formula prove, and with no
-        enclosures behind. Without such enclosures, those of the sample's promises are used.
+        """The ray sample, with the enclosures ahead that the ranges of the formula prove, and with
+        no enclosures behind. If there are no such enclosures, those of the sample's promises are
+        used.
 
-        Proof that no jump of f is passed, given that the range of f' on a piece with a jump is all
-        numbers. A march steps to t + s rounded, which may lie beyond the s that was proved, and
-        goes on from a point that is rounded again: a jump between the two would be missed from
-        both. So where f may jump, the piece begins before t, by more than the rounding of t, and
-        covers all paths that lead through the point up to its rounding (`FormulaOnRay.rounded`).
-        The exact path up to t + s then lies in such pieces altogether, and they have no jump.
+        Proof that no jump of f is passed. If a piece of the path holds a jump, the range of f' on
+        it is all numbers. A march steps from t to t + s, rounded. This point may lie beyond the s
+        that was proved, and the march goes on from a point that is rounded again. A jump between
+        these two points would be missed from both. So if f may jump, the piece begins before t, by
+        more than the rounding of t, and covers all paths that lead through the point up to its
+        rounding (`FormulaOnRay.rounded`). Then the exact path up to t + s lies in such pieces
+        altogether, and they have no jump.
 
-        Proof that no level is passed where f is abrupt (`is_abrupt`), as max(-1, min(1, 1e9 y)) is.
-        At a rounded point f may be -1 with slope 0, and 1 at the point of the exact path. So the
-        slopes at the start, too, are those of all points that round to this point. They hold for
-        the exact path. Its values differ from f at the rounded point by no more than
-        `tracer.steep.SteepPlace.error`, and together they prove the claim for the exact path.
-        (Enclosures without such pieces prove the claim for the path through the rounded point; the
-        error covers the difference, except where a path passes the end of a surface that is thinner
-        than rounding.)
+        Proof that no level is passed if f is abrupt (`is_abrupt`), as max(-1, min(1, 1e9 y)) is. At
+        a rounded point f may be -1 with slope 0, although it is 1 at the point of the exact path.
+        So the slopes at the start, too, are those of all points that round to this point, and they
+        hold for the exact path. The values on the exact path differ from f at the rounded point by
+        no more than `tracer.steep.SteepPlace.error`. Together they prove the claim for the exact
+        path. (Enclosures without such pieces prove the claim for the path through the rounded
+        point. The error covers the difference, except where a path passes the end of a surface that
+        is thinner than rounding.)
         """
         del back
         p = path.point(t)
@@ -255,12 +270,17 @@ class Formula(Field):
         return RaySample(sample, enclosures, (), slope, growth, slope_error, min_norm)
 
     def _slope(self, p: Vec3, direction: Vec3, *, is_rounded: bool = False) -> tuple[Real, Real]:
-        """The derivative along a direction and its error: in a crease, where the gradient is a
-        range, it is known for directions along the crease. Pieces of the path start from it, so it
-        takes no more work. is_rounded: the error is then that of all points that round to p."""
+        """The derivative of f at p along a direction, and a bound of its error. In a crease, where
+        the gradient is a range, it is a number for directions along the crease.
+
+        is_rounded: whether the error covers all points that round to p.
+
+        The pieces of the path start from the same jet, so that this takes no more work.
+        """
         zero = 0 * p.x
 
         def coordinate(k: int) -> Jet:
+            """The jet of coordinate k along the path."""
             at = Interval.point(p[k])
             at = at.widened(machine_epsilon(p[k])) if is_rounded else at
             return Jet(at, (Interval.point(direction[k]),), (), piece_length=zero)
@@ -271,22 +291,26 @@ class Formula(Field):
 
     @property
     def may_jump(self) -> bool:
-        """Whether the formula has functions in it that are not continuous everywhere, or refuses
-        numbers that would tell."""
+        """Whether the formula has functions that are not continuous everywhere, or cannot be
+        evaluated with the numbers that count its operations."""
         return self.tally.may_jump
 
     def restrict(self, p: Vec3, direction: Vec3) -> FormulaOnRay:
-        """The field along the path from p, for enclosures."""
+        """The formula along the path p + s direction, for enclosures."""
         return FormulaOnRay(self, p, direction)
 
     def prepare(self, backend: Backend) -> Field:
-        """The same formula with its numbers as kernel parameters, so that other numbers compile no
-        other kernel."""
+        """The same formula with its numbers as kernel parameters, so that a formula with other
+        numbers uses the same compiled kernel."""
         other = with_device_numbers(self, backend)
         object.__setattr__(other, "_prepared_tally", self.tally)
         return other
 
     def _jet(self, coordinates: tuple[Jet, Jet, Jet], like: Real) -> Jet:
+        """The jet of f at jets of the coordinates.
+
+        like: a number of the backend.
+        """
         return as_jet(self.formula(*coordinates), coordinates[0], type(self).__name__)
 
 
@@ -296,17 +320,24 @@ def probe_jets() -> tuple[Jet, Jet, Jet]:
 
 
 def hessian_error(jet: Jet, like: Real) -> Real:
-    """A bound of the distance, in the spectral norm, of a Hessian at a point from the midpoints of
-    its ranges. Proof. The spectral norm of a matrix is at most the sum of the absolute values of
-    its entries."""
+    """A bound of the error of a Hessian whose entries are the midpoints of their ranges, in the
+    spectral norm.
+
+    jet: of f at a point, with all second derivatives.
+    like: a number of the backend.
+
+    Proof. The spectral norm of a matrix is at most the sum of the absolute values of its entries.
+    """
     xx, xy, xz, yy, yz, zz = (entry.radius for entry in jet.second_derivatives)
     return 0 * like + xx + yy + zz + 2 * (xy + xz + yz)
 
 
 def warn_if_slow_to_compile(field: Formula) -> None:
-    """Warn if compiling will take long. LLVM took 0.9 s for 11,000 operations on an idle core, 2.7
-    s for 32,000, 7.4 s for 53,000 and 30 s for 100,000: the time grows about as their number to the
-    power 2.2."""
+    """Warn if compiling a formula will take long.
+
+    On an idle core LLVM took 0.9 s for 11,000 operations, 2.7 s for 32,000, 7.4 s for 53,000 and 30
+    s for 100,000. So the time grows about as the number of operations to the power 2.2.
+    """
     operations = tally_of(field.formula).operations
     seconds = 30 * (operations / 1e5) ** 2.2
     if seconds > _SLOW_COMPILE_SECONDS:
@@ -320,10 +351,12 @@ def warn_if_slow_to_compile(field: Formula) -> None:
 
 
 def is_jet(x: Any, name: str) -> bool:
-    """Whether a coordinate is a jet, and not a plain number; for formulas that accept no others.
+    """Whether a coordinate x is a jet; it is False for a plain number.
+
+    name: of the field, for the message.
 
     Raises:
-        TypeError: it is a number of another arithmetic.
+        TypeError: x is a number of another arithmetic, which the formula does not accept.
     """
     if isinstance(x, FormulaNumber) and not isinstance(x, Jet):
         raise TypeError(
@@ -335,7 +368,10 @@ def is_jet(x: Any, name: str) -> bool:
 
 
 def as_jet(value: Any, like: Jet, name: str) -> Jet:
-    """The result of a formula as a jet; a constant becomes a constant jet.
+    """The result of a formula as a jet. A constant becomes a constant jet.
+
+    like: any jet of the same variables and piece.
+    name: of the field, for the message.
 
     Raises:
         TypeError: the result is neither a jet nor a constant.
@@ -352,28 +388,31 @@ def as_jet(value: Any, like: Jet, name: str) -> Jet:
 
 @dataclass(frozen=True)
 class FormulaOnRay:
-    """A formula along the path p + s d.
+    """A formula along the path p + s d, as an `EvaluableRestriction`.
 
-    before: the distance before p at which its first piece begins. If that is not 0.0, its pieces
+    field: has the formula.
+    p, direction: (3,) p and d.
+    before: the distance before p at which the first piece begins. If it is not 0.0, the pieces
         cover all paths that lead through p up to rounding.
+    piece_count: see `PathRestriction`. The ranges of a formula cost as much as its value: one piece
+        takes the least time; four pieces take two thirds of the samples, but twice the time.
     """
 
     field: Formula
     p: Vec3
     direction: Vec3
     before: Real = 0.0
-    # Ranges of a formula cost as much as its value: one piece takes the least time, four pieces
-    # take two thirds of the samples and twice the time.
     piece_count: int = 1
 
     def rounded(self, t: Real) -> FormulaOnRay:
-        """The formula along all paths that lead through p up to its rounding, from a little before
-        p: by more than the rounding of t, of which p is the point."""
-        before = _ROUNDINGS * float(dr.epsilon(type(t))) * dr.abs(t)
+        """The formula along all paths that lead through p up to its rounding, where p is the point
+        at parameter t. Its first piece begins before p, by more than the rounding of t."""
+        before = _ROUNDINGS_BEFORE * float(dr.epsilon(type(t))) * dr.abs(t)
         return dataclasses.replace(self, before=before)
 
     def is_continuous(self, length: Real) -> Mask:
-        """Whether f is known to be continuous for 0 <= s <= length, as its slopes are bounded."""
+        """Whether f is proved to be continuous for 0 <= s <= length. It is if the range of its
+        slopes is bounded."""
         slopes = self._jet(0.0, length).first_derivatives[0]
         return dr.isfinite(0 * length + slopes.lower) & dr.isfinite(0 * length + slopes.upper)
 
@@ -388,6 +427,7 @@ class FormulaOnRay:
         return x.constant(float(value)) if isinstance(value, int | float) else value
 
     def _piece(self, start: Real, end: Real) -> PathPiece:
+        """The ranges of the first two derivatives for start <= s <= end."""
         jet = self._jet(start, end)
         (slopes,), (curvatures,) = jet.first_derivatives, jet.second_derivatives
         zero = 0 * self.p.x
@@ -399,6 +439,7 @@ class FormulaOnRay:
         )
 
     def _jet(self, start: Real, end: Real) -> Jet:
+        """The jet of the formula for start <= s <= end."""
         is_exact = isinstance(self.before, float) and self.before == 0.0
         if not is_exact and isinstance(start, float):  # the first piece starts at 0.0
             start = -self.before
@@ -407,8 +448,8 @@ class FormulaOnRay:
 
 
 def with_device_numbers(field: Any, backend: Backend) -> Any:
-    """A copy of a dataclass whose numbers, and the numbers of fields in it, are kernel parameters
-    of the backend."""
+    """A copy of a dataclass in which its numbers are kernel parameters of the backend, and fields
+    among its attributes are prepared."""
     other = copy.copy(field)
     for entry in dataclasses.fields(cast("Any", field)) if dataclasses.is_dataclass(field) else ():
         value = getattr(field, entry.name)
@@ -418,8 +459,8 @@ def with_device_numbers(field: Any, backend: Backend) -> Any:
 
 
 def prepare_value(value: Any, backend: Backend) -> Any:
-    """Numbers, also in tuples, as kernel parameters of the backend; fields prepared; all else
-    unchanged."""
+    """A float, or the floats in a tuple, as kernel parameters of the backend. A field is prepared.
+    All else, integers included, is returned unchanged."""
     if isinstance(value, float):
         return dr.opaque(backend.Float, value)
     if isinstance(value, tuple):

@@ -1,4 +1,4 @@
-"""Fields whose patches lie in boxes, and these boxes on a backend (see
+"""Fields whose surfaces are unions of patches in boxes, and these boxes on a backend (see
 `harnack.fields.capabilities`)."""
 
 from __future__ import annotations
@@ -30,16 +30,20 @@ __all__ = ["PatchBoxes", "PatchField"]
 
 @dataclass(frozen=True)
 class PatchBoxes(UnitFrame):
-    """A tree of boxes, one for each patch, in coordinates in which they have a size of about 1."""
+    """A tree of boxes, one for each patch, in unit coordinates (`UnitFrame`), in which all boxes
+    together have a size of about 1.
+
+    tree: of the boxes.
+    """
 
     tree: BoxTree
 
     @classmethod
     def upload(cls, backend: Backend, lower: FloatArray, upper: FloatArray) -> PatchBoxes:
-        """Boxes from their corners (n, 3).
+        """The boxes with these lowest and highest corners, each (n, 3).
 
-        The size is a power of two, so that positions along rays are scaled without rounding, and
-        keep their order.
+        The size of the unit coordinates is a power of two. So positions along rays are scaled
+        without rounding, and keep their order.
         """
         min_corner, max_corner = lower.min(axis=0), upper.max(axis=0)
         center = round_to_single(0.5 * (min_corner + max_corner))
@@ -52,7 +56,7 @@ class PatchBoxes(UnitFrame):
     def next(
         self, o: Vec3, d: Vec3, after: PatchEntry, start: Real, end: Real, active: Mask
     ) -> PatchEntry:
-        """As `Field.next_patch`."""
+        """See `Field.next_patch`."""
         behind = after.enter / self.size, after.patch
         enter, leave, box = self.tree.next_box(
             self.to_unit(o), d, behind, start / self.size, end / self.size, active
@@ -61,7 +65,7 @@ class PatchBoxes(UnitFrame):
 
 
 class HasPatchBoxes(Protocol):
-    """The data of a union of patches on a backend: the boxes, and the data of the patches."""
+    """Data of a union of patches on a backend: the boxes of the patches, and further data."""
 
     @property
     def boxes(self) -> PatchBoxes: ...
@@ -71,9 +75,9 @@ _Buffers = TypeVar("_Buffers", bound=HasPatchBoxes)
 
 
 class PatchField(Field, Generic[_Buffers]):
-    """A union of patches in boxes that depend on the levels.
+    """A union of patches, each in a box. The boxes depend on the levels.
 
-    levels: once the field is prepared, its boxes contain the patches of these levels.
+    levels: the boxes of the prepared field contain the patches of these levels.
     """
 
     has_patches: bool = True
@@ -85,16 +89,18 @@ class PatchField(Field, Generic[_Buffers]):
 
     @abc.abstractmethod
     def boxes(self, levels: tuple[float, ...] | None = None) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corners (m, 3) of boxes that are proved to contain each patch.
+        """The lowest and the highest corners (m, 3) of boxes. Each box is proved to contain its
+        patch.
 
         levels: of the patches; None for the attribute `levels`.
         """
 
     @abc.abstractmethod
     def _upload(self, backend: Backend) -> _Buffers:
-        """The data on a backend."""
+        """The boxes and the data of the patches on a backend."""
 
     def with_levels(self, levels: tuple[float, ...]) -> Self:
+        """See `PatchUnion.with_levels`. The fields for other levels are kept."""
         if levels == self.levels:
             return self
         if levels not in self._for_levels:
@@ -112,6 +118,11 @@ class PatchField(Field, Generic[_Buffers]):
         return prepared
 
     def _require_data(self) -> _Buffers:
+        """The data on the backend.
+
+        Raises:
+            RuntimeError: `prepare` was not called.
+        """
         if self._device is None:
             raise RuntimeError("prepare(backend) comes first")
         return self._device

@@ -1,9 +1,9 @@
-"""The records that fields return: a `Sample` at a point, and a `RaySample`, a sample on a ray with
+"""The records that fields return: `Sample`, at a point, and `RaySample`, at a point of a ray with
 enclosures of f ahead and behind.
 
 Rounding is part of the proof. The enclosure ahead of a point and the enclosure behind the next
-point may be exact to first order, and then they meet right at a surface: with rounded arithmetic
-one ray in ten slipped through at tight tolerances. So every level gap is narrowed by the rounding
+point may be exact to first order. Then they meet right at a surface, and with rounded arithmetic
+one ray in ten slipped through at tight tolerances. So every level gap is reduced by the rounding
 error of f, and a tolerance below that error is raised to it.
 """
 
@@ -34,21 +34,23 @@ class Sample:
     value: f(p).
     gradient: (3,) the gradient of f at p.
     promises: what f guarantees near p.
-    value_error: a bound of the error of `value`: the truncation error, and the part of the rounding
-        error beyond eight units in the last place or eight times the smallest normal number (and
-        beyond |gradient| times the rounding of the point itself, which the tracer adds). Steps are
-        shortened by it.
-    gradient_error: a bound of the truncation and rounding error of `gradient`, as a length; 0 where
+    value_error: a bound of the error of `value`. It includes the truncation error. It includes
+        rounding errors only as far as they exceed eight units in the last place, or eight times the
+        smallest normal number; and it does not include |gradient| times the rounding of the point
+        itself. The tracer adds these. Steps are shortened by the error.
+    gradient_error: a bound of the truncation and rounding error of `gradient`, as a length; 0 if
         the error is only the rounding of a few operations.
-    shading_normal: (3,) unit normal to shade with, where the gradient is of no use (near a singular
-        point of the surface); None for the direction of the gradient. Steps do not depend on it.
+    shading_normal: (3,) unit normal to shade with, for points near a singular point of the surface,
+        where the gradient is of no use; None for the direction of the gradient. Steps do not depend
+        on it.
     truncation_error: the part of `value_error` that a sample of higher accuracy reduces
         (`Field.at_accuracy`).
     alternative_promises: promises that are also valid, but gave shorter steps than `promises` in
-        every measurement. Used only if the caller names a bound.
+        every measurement. They are used only if the
+        caller names the enclosures to use.
     ray_promises: further promises, which hold only for points of the ray of a `Field.sample_ray`.
-    branch_unknown: lanes on which f is known only modulo 1 (`JumpSurface.has_unknown_branch`); None
-        if on none.
+    branch_unknown: the lanes on which f is known only modulo 1 (`JumpSurface.has_unknown_branch`);
+        None if there are none.
     """
 
     value: Real
@@ -68,8 +70,8 @@ class Sample:
         return self.promises + self.alternative_promises
 
     def map_promises(self, change: Callable[[Promise], Promise], **numbers: Any) -> Sample:
-        """This sample with `change` applied to each promise, the alternative ones included, and
-        with the named attributes replaced. `ray_promises` stay as they are."""
+        """This sample with each promise replaced by change(promise), the alternative ones included,
+        and with the named attributes replaced by `numbers`. `ray_promises` stay as they are."""
         promises, alternatives = (
             tuple(map(change, group)) for group in (self.promises, self.alternative_promises)
         )
@@ -78,12 +80,12 @@ class Sample:
         )
 
     def shifted(self, offset: Real) -> Sample:
-        """The sample of f + offset at the same point. The sum is taken to add no error."""
+        """The sample of f + offset at the same point. The rounding of the sum is not counted."""
         return self.map_promises(lambda promise: promise.shifted(offset), value=self.value + offset)
 
     def select(self, mask: Mask, other: Sample) -> Sample:
-        """The other sample on the lanes of the mask, this sample on all others. The two must have
-        promises of the same kinds, in the same order. The result has no shading normal."""
+        """The sample `other` on the lanes of the mask, this sample on all others. The two must have
+        promises of the same kinds in the same order. The result has no shading normal."""
         names = "value", "gradient", "value_error", "gradient_error", "truncation_error"
         numbers = {k: dr.select(mask, getattr(other, k), getattr(self, k)) for k in names}
         groups: dict[str, Any] = {}
@@ -112,6 +114,7 @@ def validate_samples(
 
     @functools.wraps(evaluate)
     def checked(self: Any, p: Vec3) -> Sample:
+        """See `Field.evaluate`."""
         sample: Any = evaluate(self, p)
         name = f"{type(self).__name__}.evaluate"
         if not isinstance(sample, Sample):
@@ -146,7 +149,8 @@ def validate_samples(
 
 
 def _unbox_numpy(record: _R) -> _R:
-    """The record with its NumPy scalars as Python numbers: Dr.Jit takes no NumPy scalars."""
+    """The record, with attributes that are NumPy scalars turned into Python numbers, as Dr.Jit
+    takes no NumPy scalars."""
     scalars: dict[str, Any] = {
         key: value.item() for key, value in vars(record).items() if isinstance(value, np.generic)
     }
@@ -154,14 +158,15 @@ def _unbox_numpy(record: _R) -> _R:
 
 
 def _describe_type(value: Any) -> str:
+    """The type of a value in words, for messages."""
     return "nothing" if value is None else f"an object of type {type(value).__name__}"
 
 
 def space_scaled(sample: Sample, size: Real) -> Sample:
-    """Convert a sample of f at p to the sample of x -> f(x / size) at size * p.
+    """The sample of the function x -> f(x / size) at the point size * p, from the sample of f at p.
 
     Values stay the same. Radii are multiplied by the size. Gradients and Lipschitz constants are
-    divided by it; bounds of second derivatives and of Laplacians are divided by its square.
+    divided by it. Bounds of second derivatives and of Laplacians are divided by its square.
     """
     return sample.map_promises(
         lambda promise: promise.space_scaled(size),
@@ -172,8 +177,8 @@ def space_scaled(sample: Sample, size: Real) -> Sample:
 
 
 def value_error_bound(sample: Sample, gradient_norm: Real, size: Real) -> Real:
-    """A bound of the rounding and truncation error of the value of a sample, the rounding of the
-    point included.
+    """A bound of the error of a sample's value: truncation, rounding, and the effect of the
+    rounding of the point.
 
     gradient_norm: |gradient| of the sample.
     size: a bound of the absolute values of the point's coordinates.
@@ -193,14 +198,14 @@ class RaySample:
     Below, x(t) = o + t d is the ray and s >= 0 a length along it.
 
     sample: the sample at x(t).
-    forward: enclosures of f(x(t + s)) - f(x(t)).
+    forward: enclosures of f(x(t + s)) - f(x(t)), as functions of s.
     backward: enclosures of f(x(t - s)) - f(x(t)), from the same evaluation.
-    slope: the derivative of f along the ray at x(t), known up to `slope_error_bound`.
-    reach_growth: how far the enclosures of the next sample should reach, as a multiple of the step
-        that this sample proves.
+    slope: the derivative of f along the ray at x(t), with an error of at most `slope_error_bound`.
+    reach_growth: up to which length the enclosures of the next sample should be computed, as a
+        multiple of the step that this sample proves.
     slope_error: a bound of the error of `slope` that is smaller than `Sample.gradient_error`; None
-        if no such bound is known. On a crease the gradient is a range, and the derivative along a
-        ray that runs in the crease may still be a number.
+        if no such bound is known. (On a crease the gradient is a range, but the derivative along a
+        ray that runs in the crease may be a number.)
     min_gradient_norm: a lower bound of |grad f| that may be larger than |gradient| minus
         `Sample.gradient_error`, as on a crease; None if no such bound is known.
     """
@@ -215,13 +220,14 @@ class RaySample:
 
     @property
     def slope_error_bound(self) -> Real:
-        """A bound of the error of `slope`: `slope_error`, else the error of the gradient."""
+        """A bound of the error of `slope`: `slope_error` or, if that is None, the error of the
+        gradient."""
         return self.sample.gradient_error if self.slope_error is None else self.slope_error
 
 
 @dataclass(frozen=True)
 class Ray:
-    """Rays o + t d, |d| = 1, and the proofs that turn a sample on them into enclosures.
+    """Rays o + t d with |d| = 1, and the kinds of enclosures by which steps on them are proved.
 
     origin, direction: (3,) o and d, one ray per lane.
     proofs: the kinds of enclosures to use.
@@ -236,9 +242,9 @@ class Ray:
         return dr.fma(type(self.origin)(t), self.direction, self.origin)
 
     def enclose(self, sample: Sample) -> RaySample:
-        """The sample with the enclosures that its promises prove along the ray.
+        """The sample, with the enclosures along the ray that its promises prove.
 
-        The slope of f along the ray is known up to the error of the gradient, and enters the proofs
+        The slope of f along the ray is known up to the error of the gradient. It enters the proofs
         as an interval: see `Enclosure`.
         """
         slope = dr.dot(sample.gradient, self.direction)

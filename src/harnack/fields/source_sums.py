@@ -1,4 +1,5 @@
-"""Sums over sources (edges, dipoles and far nodes of trees) at a point, and bounds of f near it.
+"""Sums over sources at a point, and bounds of f near it. Sources are edges, dipoles and far nodes
+of trees.
 
 All fields that are such sums accumulate the same record, `SourceSums`. It gives values with error
 bounds, or a sample with promises.
@@ -21,50 +22,62 @@ from harnack.fields.field import Sample
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
 
-# Radii of the `TaylorRemainder` promises, as fractions of the free distance: a smaller radius has a
-# smaller constant.
-_REACHES = (0.2, 0.4, 0.6)
-# The same as a fraction of the distance to the dipoles of far nodes.
+# Radii of the `TaylorRemainder` promises, as fractions of the distance to the nearest singular
+# point: a smaller radius has a smaller constant.
+_TAYLOR_RADII = (0.2, 0.4, 0.6)
+# The largest radius of a promise, as a fraction of the distance to the dipoles of far nodes.
 _MAX_STEP_FRACTION = 0.65
-# Sums of rounded terms: bounds are lengthened, and distances shortened, by this fraction of them.
+# Bounds are enlarged, and distances reduced, by this fraction, for the rounding of sums.
 SUM_MARGIN = 2e-5
-# A singular point within this many roundings of a coordinate counts as near.
-_NEAR_SINGULARITY = 256.0
-# Rounding of positions and of terms changes the gradient by at most the first number times s4, and
-# second derivatives by at most the second number times s5, times the rounding of a coordinate.
+# A singular point counts as near if its distance is at most this many roundings of a coordinate.
+_NEAR_ROUNDINGS = 256.0
+# The rounding of positions and of terms changes the gradient by at most the first number times s4
+# times the rounding of a coordinate, and second derivatives by at most the second number times s5
+# times that rounding.
 SLOPE_ROUNDINGS, SECOND_ROUNDINGS = 16.0, 320.0
 
 
 def max_step_fraction(coarse_ratio: float) -> float:
-    """The longest step that promises cover, as a fraction of the distance to a far node's center;
-    coarse_ratio: far nodes are farther away than this many times their radius."""
+    """The longest step that promises cover, as a fraction of the distance to the center of the
+    nearest far node.
+
+    coarse_ratio: far nodes are farther away than this many times their radius.
+    """
     return _MAX_STEP_FRACTION * (1 - 1 / coarse_ratio)
 
 
 def free_radius_fraction(coarse_ratio: float) -> float:
-    """The radius around x that counts as free of sources, as a fraction of the distance to the
-    center of a far node; coarse_ratio: as for `max_step_fraction`."""
-    return max_step_fraction(coarse_ratio) / _REACHES[-1]
+    """The radius of the ball around x that counts as free of a far node's sources, as a fraction of
+    the distance to the center of the node.
+
+    coarse_ratio: as for `max_step_fraction`.
+    """
+    return max_step_fraction(coarse_ratio) / _TAYLOR_RADII[-1]
 
 
 def remainder_factor(q: float) -> float:
-    """phi of `SourceSums.sample`: convex, and 3 at 0."""
+    """The function phi(q) = (3 - 2 q)/(1 - q)^2 of `SourceSums.sample`, for 0 <= q < 1. It is
+    convex, and 3 at 0."""
     return (3 - 2 * q) / (1 - q) ** 2
 
 
 def final_rounding(backend: Backend, size: float = 1.0) -> Real:
     """A bound of the rounding after the last term of a sum, as a kernel parameter: 16 roundings of
-    numbers of this size. The rounding of terms and of additions is counted by
-    `SourceSums.add_term`."""
+    numbers of the given size. (The rounding of terms and of additions is counted by
+    `SourceSums.add_term`.)"""
     return dr.opaque(backend.Float, backend.machine_epsilon * 16 * size)
 
 
 def dipole_rounding(area: Real, inverse: Real, unit: Real) -> Real:
-    """A bound of the rounding of the value of a dipole at distance rho = 1/inverse.
+    """A bound of the rounding of the value of a dipole at the distance rho.
 
-    unit: the rounding of a coordinate, at least epsilon. It changes the value by at most
-        2 unit area/rho^3, twice in the difference of two coordinates; the four roundings of the
-        term change it by 4 epsilon area/rho^2.
+    area: of the dipole.
+    inverse: 1/rho.
+    unit: the rounding of a coordinate, at least the machine epsilon.
+
+    The rounding of coordinates changes the value by at most 2 unit area/rho^3. It enters twice,
+    through the two coordinates of a difference. The four roundings of the term itself change it by
+    4 epsilon area/rho^2.
     """
     square = inverse * inverse
     return (unit * area) * dr.fma(4 * inverse, square, 4 * square)
@@ -72,9 +85,10 @@ def dipole_rounding(area: Real, inverse: Real, unit: Real) -> Real:
 
 @dataclass(frozen=True)
 class SourceTerm:
-    """The term of a dipole, edge or far node in the sums of f and of its derivatives.
+    """The term of a single source (a dipole, an edge or a far node) in the sums of f and of its
+    derivatives.
 
-    Derivatives that were not requested are None. The value of an edge is None, too: its angle is
+    Derivatives that were not requested are None. The value of an edge is None too, as its angle is
     added later.
     """
 
@@ -88,18 +102,18 @@ class SourceSums:
     """Sums over all sources at points x: f and its derivatives, error bounds, and bounds of higher
     derivatives near x.
 
-    total: the plain sum of the values; `value` adds `compensation`, the rounding errors of the
-        additions.
-    gradient, hessian: of f; the Hessian is None if it was not requested.
-    truncation, gradient_truncation, hessian_truncation: bounds of the truncation errors of value,
-        gradient and second derivatives along lines; the last is None without a Hessian.
+    total: the plain sum of the values. The property `value` adds `compensation` to it.
+    gradient, hessian: of f. They are None if they were not requested.
+    truncation, gradient_truncation, hessian_truncation: bounds of the truncation errors of the
+        value, the gradient and the second derivatives along lines. The last is None without a
+        Hessian.
     rounding: a bound of the rounding error of the value.
-    singularity_distance: the distance to the nearest singular point, a dipole or an edge, or
-        `free_radius_fraction` of the distance to the nearest far node's center if that is less.
-    s4, s5: sums of a/rho^4 and a/rho^5 over dipoles of area a at distance rho and, with A + K/r^2
-        of `multipole.remainder_constants` for a, over far nodes at r. For edges see
-        `LiftedEdge.bounds`.
-    compensation: the rounding errors of the additions to `total`: see `add_term`.
+    singularity_distance: the distance to the nearest singular point, a dipole or an edge; or
+        `free_radius_fraction` of the distance to the nearest far node's center, if that is smaller.
+    s4, s5: the sums of a/rho^4 and of a/rho^5. A dipole at the distance rho adds its area as a. A
+        far node whose center is at the distance r adds A + K/r^2 of `multipole.remainder_constants`
+        as a, with rho = r. For edges see `LiftedEdge.bounds`.
+    compensation: the sum of the rounding errors of the additions to `total`: see `add_term`.
     """
 
     total: Real
@@ -140,33 +154,37 @@ class SourceSums:
         return cls(total, gradient, None if hessian is None else SymmetricMatrix(*hessian), *bounds)
 
     def to_state(self) -> tuple[Any, ...]:
-        """The attributes in the order of the constructor, for the state of a loop. (Sums that were
-        not requested are None: Dr.Jit records a loop twice if a state in it never changes.)"""
+        """The attributes in the order of the constructor, as a tuple for the state of a loop; the
+        Hessian is a tuple of its entries. (Sums that were not requested are None, because Dr.Jit
+        records a loop twice if a part of its state never changes.)"""
         hessian = None if self.hessian is None else self.hessian.components()
         bounds = self.truncation, self.gradient_truncation, self.hessian_truncation, self.rounding
         ends = self.singularity_distance, self.s4, self.s5, self.compensation
         return self.total, self.gradient, hessian, *bounds, *ends
 
     def select(self, mask: Mask, other: SourceSums) -> SourceSums:
-        """The other sums where the mask holds, these elsewhere. Without Hessians."""
+        """The sums `other` on the lanes where the mask holds, these sums on all others. The sums
+        must be without Hessians."""
         pairs = zip(other.to_state(), self.to_state(), strict=True)
         return SourceSums(*(None if b is None else dr.select(mask, a, b) for a, b in pairs))
 
     @property
     def derivatives(self) -> int:
-        """The order of derivatives that were asked for: 0, 1 or 2."""
+        """The order of the derivatives that are summed: 0, 1 or 2."""
         return 0 if self.gradient is None else 1 if self.hessian is None else 2
 
     def add_term(self, terms: SourceTerm, active: Mask) -> SourceSums:
-        """The sums with terms added on active lanes; derivatives that the terms lack count as 0.
+        """The sums with the terms of another source added, on active lanes. Derivatives that are
+        None in the terms count as 0.
 
-        Rounding of the value. Errors of n additions add up like n, if they all have the same sign,
-        as where small terms are lost in a large sum. But the error of s = fl(a + b) is a number of
-        the same precision, and is computed exactly (Knuth's TwoSum; Higham 2002, Section 4.3): with
-        c = s - a it is (a - (s - c)) + (b - c). It is at most u |s|, u half the distance from 1 to
-        the next number. These numbers are summed in turn, and the error of that sum is at most n u
-        times the sum of their absolute values, hence by n u^2 times the sum of all |s|. Up to n =
-        2^20 terms n u is at most 1/16, and twice that covers the rounding of the bound itself.
+        Rounding of the value. If the errors of n additions all have the same sign, they add up like
+        n; this happens where small terms are lost in a large sum. But the error of a rounded sum s
+        = fl(a + b) is a number of the same precision, and can be computed exactly (Knuth's TwoSum;
+        Higham 2002, Section 4.3). With c = s - a it is (a - (s - c)) + (b - c). Its size is at most
+        u |s|, with u half the distance from 1 to the next number. These numbers are summed in turn.
+        The error of that second sum is at most n u times the sum of their absolute values, hence at
+        most n u^2 times the sum of all |s|. Up to n = 2^20 terms n u is at most 1/16, and twice
+        that covers the rounding of the bound itself.
         """
         gradient, hessian = self.gradient, self.hessian
         if gradient is not None and terms.gradient is not None:
@@ -174,14 +192,14 @@ class SourceSums:
         if hessian is not None and terms.hessian is not None:
             pairs = zip(hessian.components(), terms.hessian.components(), strict=True)
             hessian = SymmetricMatrix(*(old + dr.select(active, new, 0) for old, new in pairs))
-        total, lost, rounding = self.total, self.compensation, self.rounding
+        total, compensation, rounding = self.total, self.compensation, self.rounding
         if terms.value is not None:
             term = dr.select(active, terms.value, 0)
             total = self.total + term
-            grown = total - self.total
-            lost = lost + ((self.total - (total - grown)) + (term - grown))
+            added = total - self.total
+            compensation = compensation + ((self.total - (total - added)) + (term - added))
             rounding = dr.fma(float(dr.epsilon(total)) / 8, dr.abs(total), rounding)
-        new = {"total": total, "compensation": lost, "rounding": rounding}
+        new = {"total": total, "compensation": compensation, "rounding": rounding}
         return dataclasses.replace(self, gradient=gradient, hessian=hessian, **new)
 
     def add_far_node(
@@ -194,103 +212,117 @@ class SourceSums:
         free: Real,
         unit: Real,
     ) -> SourceSums:
-        """The sums with a tree node added on the lanes of `far`; its center is at distance
-        1/inverse.
+        """The sums with a tree node added, on the lanes where it is far.
 
+        terms: the node's terms in the sums.
+        far: the lanes on which the node is far.
+        inverse: 1 / the distance of the node's center.
         size: A + K/r^2 of `multipole.remainder_constants`.
         left_out: bounds of the truncation errors of value, gradient and second derivatives.
-        free: the distance that counts as free of the node's dipoles.
+        free: the distance within which there is none of the node's dipoles.
         unit: the rounding of a coordinate.
 
-        left_out and inverse are 0 on lanes on which the node is not far.
+        left_out and inverse must be 0 on the other lanes.
         """
-        fourth, second = size * dr.square(inverse * inverse), self.hessian_truncation
-        second = None if second is None else second + left_out[2]
+        s4_term, second_truncation = size * dr.square(inverse * inverse), self.hessian_truncation
+        second_truncation = None if second_truncation is None else second_truncation + left_out[2]
         sums = self.add_term(terms, far)
         return dataclasses.replace(
             sums,
             truncation=self.truncation + left_out[0],
             gradient_truncation=self.gradient_truncation + left_out[1],
-            hessian_truncation=second,
+            hessian_truncation=second_truncation,
             rounding=sums.rounding + dipole_rounding(size, inverse, unit),
             singularity_distance=dr.select(
                 far, fmin(free, self.singularity_distance), self.singularity_distance
             ),
-            s4=self.s4 + fourth,
-            s5=dr.fma(fourth, inverse, self.s5),
+            s4=self.s4 + s4_term,
+            s5=dr.fma(s4_term, inverse, self.s5),
         )
 
-    def values(self, scale: float, unit: Real, rounding: Real, outside: float = 0.0) -> PointValues:
-        """`scale` times f and its derivatives, as far as they were summed, with error bounds.
+    def values(self, share: float, unit: Real, rounding: Real, outside: float = 0.0) -> PointValues:
+        """`share` times f and its derivatives, as far as they were summed, with error bounds.
 
         unit: the rounding of a coordinate, at least epsilon.
         rounding: a bound of the rounding of the value that these sums do not count.
         outside: the number of further roundings of gradients far from all terms, where distances
             are as long as coordinates: roundings of powers of the distance and of sums of moments.
         """
-        value, error = scale * self.value, dr.fma(scale, self.truncation + self.rounding, rounding)
+        value, error = share * self.value, dr.fma(share, self.truncation + self.rounding, rounding)
         if self.gradient is None:
             return PointValues(value, error)
-        rounded = SLOPE_ROUNDINGS * unit
+        roundings = SLOPE_ROUNDINGS * unit
         if outside:
-            rounded = rounded + outside * fmax(unit - 2 * float(dr.epsilon(self.value)), 0)
-        slope = scale * dr.fma(rounded, self.s4, self.gradient_truncation)
+            roundings = roundings + outside * fmax(unit - 2 * float(dr.epsilon(self.value)), 0)
+        gradient_error = share * dr.fma(roundings, self.s4, self.gradient_truncation)
         if self.hessian is None:
-            return PointValues(value, error, scale * self.gradient, None, slope)
-        hessian = SymmetricMatrix(*(scale * part for part in self.hessian.components()))
-        second = scale * dr.fma(SECOND_ROUNDINGS * unit, self.s5, self.hessian_truncation)
-        return PointValues(value, error, scale * self.gradient, hessian, slope, second)
+            return PointValues(value, error, share * self.gradient, None, gradient_error)
+        hessian = SymmetricMatrix(*(share * part for part in self.hessian.components()))
+        hessian_error = share * dr.fma(SECOND_ROUNDINGS * unit, self.s5, self.hessian_truncation)
+        return PointValues(
+            value, error, share * self.gradient, hessian, gradient_error, hessian_error
+        )
 
     def sample(
         self,
-        factor: float,
+        share: float,
         unit: Real,
         rounding: Real,
         normal: Vec3 | None = None,
         along: tuple[Lipschitz, ...] = (),
     ) -> Sample:
-        """`factor` times f as a sample with promises.
+        """`share` times f as a sample with promises.
 
-        unit: the rounding of a coordinate. rounding: of the value, from other sources. along:
-            further promises, for f along a line.
+        unit: the rounding of a coordinate.
+        rounding: a bound of the rounding of the value that these sums do not count.
+        normal: unit normal to shade with; None for the direction of the gradient.
+        along: further promises, for f along a line.
 
-        Proof of the promises. Along a line the k-th derivative of a dipole a at rho is at most
-        (k+1)! a/rho^(k+2) (it is a mixed derivative of a/rho, whose tensor is symmetric and takes
-        its largest value on equal vectors), so that Taylor's remainder after the linear term is at
-        most a ((rho-t)^-2 - rho^-2 - 2t rho^-3) = a t^2 rho^-4 phi(t/rho), phi(q) = (3-2q)/(1-q)^2.
-        The remainder of a far node is at most that of a dipole of area A + K/r^2 at its center, for
-        t/r <= `max_step_fraction` (`multipole.remainder_constants`). phi is convex: on [0, b] it
-        lies below 3 + rise q, rise = (phi(b)-3)/b = (4-3b)/(1-b)^2. With t <= r = b free_distance,
-        |f(y) - f(x) - g.(y-x)| <= t^2 (3 s4 + rise r s5). On the ball of that radius f changes by
-        at most |g| r more, and is harmonic: dipoles of far nodes are farther away than 1 - 1/rough
-        times the center, and `max_step_fraction` is less.
+        Proof of the promises. Consider a dipole of area a at the distance rho. The k-th derivative
+        of its value along a line is at most (k+1)! a/rho^(k+2): it is a mixed derivative of a/rho,
+        whose tensor is symmetric and takes its largest value on equal vectors. So at the distance
+        t < rho, Taylor's remainder after the linear term is at most
+
+            a ((rho-t)^-2 - rho^-2 - 2t rho^-3) = a t^2 rho^-4 phi(t/rho), phi(q) = (3-2q)/(1-q)^2.
+
+        The remainder of a far node whose center is at the distance r is at most that of a dipole of
+        area A + K/r^2 at its center, for t/r <= `max_step_fraction`
+        (`multipole.remainder_constants`). phi is convex: on [0, b] it lies below its chord 3 + rise
+        q, with rise = (phi(b)-3)/b = (4-3b)/(1-b)^2. Now let R be b times `singularity_distance`,
+        and g the gradient of f at x. For t = |y - x| <= R,
+
+            |f(y) - f(x) - g.(y-x)| <= t^2 (3 s4 + rise R s5).
+
+        On the ball of radius R, f changes by at most |g| R more than this bound for t = R. There f
+        is harmonic: the dipoles of far nodes are farther away than 1 - 1/coarse_ratio times the
+        distance of the center, and `max_step_fraction` is less than that.
         """
-        g = factor * self.gradient
-        slope_error = factor * dr.fma(SLOPE_ROUNDINGS * unit, self.s4, self.gradient_truncation)
+        g = share * self.gradient
+        slope_error = share * dr.fma(SLOPE_ROUNDINGS * unit, self.s4, self.gradient_truncation)
         distance = self.singularity_distance * (1 - SUM_MARGIN) - 4 * unit
-        scale, radii = (2 + 2 * SUM_MARGIN) * factor, [(b, b * distance) for b in _REACHES]
+        scale, radii = (2 + 2 * SUM_MARGIN) * share, [(b, b * distance) for b in _TAYLOR_RADII]
         taylor = [TaylorRemainder(scale * self.remainder(b, r), r) for b, r in radii]
-        slope, widest = dr.norm(g) + slope_error, taylor[-1]
-        r = widest.radius
-        variation = (1 + SUM_MARGIN) * r * dr.fma(0.5 * r, widest.constant, slope)
-        value = factor * self.value
+        slope, largest = dr.norm(g) + slope_error, taylor[-1]
+        r = largest.radius
+        variation = (1 + SUM_MARGIN) * r * dr.fma(0.5 * r, largest.constant, slope)
+        value = share * self.value
         ball = HarmonicBall(r, value - variation, value + variation)
         # At a singular point f has all values: the sample has a gradient so steep that every level
         # is close to first order, and an error as large as the distance to such a level. Likewise
         # near a singular point, where rounding leaves nothing of the gradient.
-        reach, max_error = 16 * unit, factor * 1.6e5 * math.pi
+        near, max_error = 16 * unit, share * 1.6e5 * math.pi
         is_regular = (
-            (self.singularity_distance > reach)
+            (self.singularity_distance > near)
             & dr.isfinite(value)
             & dr.isfinite(dr.squared_norm(g))
         )
-        is_lost = ~(slope_error <= dr.norm(g)) & (
-            self.singularity_distance <= _NEAR_SINGULARITY * unit
+        is_unreliable = ~(slope_error <= dr.norm(g)) & (
+            self.singularity_distance <= _NEAR_ROUNDINGS * unit
         )
-        is_regular, reach = is_regular & ~is_lost, fmax(self.singularity_distance, reach)
-        steep_gradient = type(g)(0, 0, max_error / reach)
-        error = dr.fma(factor, self.truncation + self.rounding, rounding)
-        along = tuple(promise.scaled(factor) for promise in along)
+        is_regular, near = is_regular & ~is_unreliable, fmax(self.singularity_distance, near)
+        steep_gradient = type(g)(0, 0, max_error / near)
+        error = dr.fma(share, self.truncation + self.rounding, rounding)
+        along = tuple(promise.scaled(share) for promise in along)
         return Sample(
             dr.select(is_regular, value, 0),
             dr.select(is_regular, g, steep_gradient),
@@ -298,7 +330,7 @@ class SourceSums:
             dr.select(is_regular, error, max_error),
             dr.select(is_regular, slope_error, 0),
             normal,
-            dr.select(is_regular, factor * self.truncation, 0),
+            dr.select(is_regular, share * self.truncation, 0),
             (ball,),
             along,
         )
@@ -306,30 +338,39 @@ class SourceSums:
     def add_line_rates(
         self, v: Vec3, unit: Real, lengths: tuple[Real, ...], rates: tuple[Real, ...], active: Mask
     ) -> tuple[Real, ...]:
-        """The rates K of `trail_sums.line_rates` for some edges, plus those of these sums.
+        """Rates K with |f(x + s v) - f(x)| <= K |s| for lengths |s| up to each of `lengths`: the
+        rates for some edges (see `trail_sums.line_rates`), plus those for the sources of these
+        sums. They are infinite on lanes that are not active.
 
-        f changes by at most |s| |g . v| + s^2 (3 s4 + rise r s5) for |s| <= r (`sample`), with |g .
-        v| raised by the truncation and rounding of g. Infinite for lengths above r.
+        v: (3,) directions of the lines.
+        unit: the rounding of a coordinate of their points.
+        rates: for the edges, one for each length.
 
-        v: directions of the lines. unit: the rounding of their points' coordinates.
+        Proof. By these sources f changes by at most |s| |g . v| + s^2 (3 s4 + rise R s5) for |s| <=
+        R (see `sample`, also for the symbols). |g . v| is raised by the truncation and rounding
+        errors of the gradient g. For lengths above R the rate is infinite.
         """
         slope = dr.abs(dr.dot(self.gradient, v)) + self.gradient_truncation
         slope = dr.fma(SLOPE_ROUNDINGS * unit, self.s4, slope)
-        b = _REACHES[-1]
-        r = b * (self.singularity_distance * (1 - SUM_MARGIN) - 4 * unit)
-        remainder = self.remainder(b, dr.select(self.s5 > 0, r, 0))
+        fraction = _TAYLOR_RADII[-1]
+        radius = fraction * (self.singularity_distance * (1 - SUM_MARGIN) - 4 * unit)
+        remainder = self.remainder(fraction, dr.select(self.s5 > 0, radius, 0))
         pairs = zip(lengths, rates, strict=True)
         sums = (
-            dr.select(active & (length <= r), rate + dr.fma(length, remainder, slope), dr.inf)
+            dr.select(active & (length <= radius), rate + dr.fma(length, remainder, slope), dr.inf)
             for length, rate in pairs
         )
         return tuple(sums)
 
     def remainder(self, b: float, r: Real) -> Real:
-        """3 s4 + rise r s5 for r = b times the free distance, or less: see `sample`."""
+        """3 s4 + rise r s5 of `sample`.
+
+        b: the largest t/rho.
+        r: b times the distance to the nearest singular point, or less.
+        """
         return dr.fma(_chord_slope(b) * r, self.s5, 3 * self.s4)
 
 
 def _chord_slope(b: float) -> float:
-    """The slope of the chord of phi over [0, b]: see `SourceSums.sample`."""
+    """The slope (phi(b) - 3)/b of the chord of phi over [0, b]: see `SourceSums.sample`."""
     return (4 - 3 * b) / (1 - b) ** 2

@@ -1,19 +1,20 @@
-"""Sums of blobs: at a point; along a path, with ranges of both derivatives on its pieces; and as
-jets.
+"""Sums of blobs. They are evaluated at a point, along a path with ranges of both derivatives on its
+pieces, and as jets.
 
 Each is one loop over the blobs. Positions are relative to each blob and in units of its own
 support, so that the same bounds hold for blobs of every size. Jets allow blobs to be deformed and
 blended.
 
 Rounding. Let u be the unit roundoff, v the vector from the point to a center in units of the
-support, t = v.d. Centers are stored as the sum of two numbers, so that the error of v is at most
-4u|v|. Then the errors of t, of the distance h of the line from the center (as a length) and of the
-positions x = s - t are at most 8u(2 + |t|) where they matter. That is a displacement of the blob
-relative to the path, which also covers that |d| is 1 only up to 2u. A displacement by e changes f'
-by at most `KernelLipschitz.slope` times e, and f'' by `KernelLipschitz.bend` times e (its jumps at
-the end of the support are tested for within a margin), or by `BlobKernel.lipschitz_fraction` of
-these bounds. A sum of n terms adds n u times the sum of their largest absolute values. Both are
-added to the ranges, outwards. The error of the value at the point is at most 8u |dk/dq|, by the
+support, d the direction of the path and t = v.d. Centers are stored as the sum of two numbers, so
+that the error of v is at most 4u|v|. Then t, the distance h of the line from the center (as a
+length) and the positions x = s - t on the line have errors of at most 8u(2 + |t|), wherever the
+blob is not 0. That is a displacement of the blob relative to the path. It also covers that |d| is 1
+only up to 2u. A displacement by e changes f' by at most e times `KernelLipschitz.slope`, and f'' by
+at most e times `KernelLipschitz.bend`. (The jumps of f'' at the end of the support are tested for
+within a margin.) Where `BlobKernel.lipschitz_fraction` is less than 1, both bounds are multiplied
+by it. A sum of n terms adds n u times the sum of their largest absolute values. Both errors are
+added to the ranges, outwards. The error of the value at the point is at most 8u |dk/dq| by the
 rounding of q, plus (16 + n)u m, with m as in `BlobKernel.profile`.
 """
 
@@ -37,9 +38,10 @@ if TYPE_CHECKING:
     from harnack.fields.blobs.kernels import BlobKernel, ChordProfile
 
 State: TypeAlias = "tuple[Any, ...]"
-# A function of the record of a blob and of a state: the state with that blob added.
+# A function (record of a blob, state) that returns the state with that blob added.
 EachBlob: TypeAlias = "Callable[[list[Real], State], State]"
-# A function that applies an `EachBlob` to all blobs that matter, from an initial state.
+# A function (each_blob, state) that applies an `EachBlob` to one blob after another, starting with
+# this state, and returns the last state.
 ForEach: TypeAlias = "Callable[[EachBlob, State], State]"
 
 
@@ -53,15 +55,18 @@ class SumValue:
     gradient_error: Real
 
 
-# The fastest number of pieces of a path, for sums over all blobs, and for sums over the blobs of a
-# cell, where lengths are short. Finding the blobs costs more than ranges.
+# The number of pieces of a path that is fastest: for a sum over all blobs, and for a sum over the
+# blobs of a grid cell. In a cell paths are short, and finding the blobs costs more than ranges.
 PIECES, PIECES_IN_CELL = 4, 3
 
 
 @dataclass(frozen=True)
 class SumOnRay:
-    """A sum along the path from p: its value at p, and ranges of its derivatives on pieces (a
-    `PathRestriction`)."""
+    """A sum of blobs along a path p + s d, as a `PathRestriction`.
+
+    start: the sum at p.
+    parts: ranges of the first two derivatives, for each piece of the path.
+    """
 
     start: SumValue
     parts: tuple[PathPiece, ...]
@@ -72,36 +77,45 @@ class SumOnRay:
         return len(self.parts)
 
     def derivative_ranges(self, knots: Sequence[Real]) -> tuple[PathPiece, ...]:
-        """The ranges, for the same knots for which they were computed."""
+        """The ranges on the pieces. They hold only for the knots with which the sum was computed,
+        and these must be passed."""
         assert len(knots) == len(self.parts) + 1
         return self.parts
 
 
 class KnotRecorder:
-    """A stand-in for a `PathRestriction` that records the knots that a proof asks for."""
+    """A stand-in for a `PathRestriction`. It records the knots (positions on the path) at which a
+    proof asks for ranges, so that these can be computed afterwards.
+
+    knots: the recorded knots; None until a proof has asked.
+    """
 
     def __init__(self, piece_count: int = PIECES) -> None:
         self.piece_count = piece_count
         self.knots: tuple[Real, ...] | None = None
 
     def derivative_ranges(self, knots: Sequence[Real]) -> tuple[PathPiece, ...]:
-        """Record the knots; the ranges returned have no meaning."""
+        """Record the knots. The ranges that are returned are placeholders."""
         self.knots = tuple(knots)
         ends = itertools.pairwise(knots)
         return tuple(PathPiece(b - a, SlopeRange(0.0, 0.0), 0.0, 0.0) for a, b in ends)
 
 
 def value_at(kernel: BlobKernel, backend: Backend, p: Vec3, for_each: ForEach) -> SumValue:
-    """The sum at points p."""
+    """The sum at points p.
+
+    for_each: the loop over the blobs that may be nonzero at p.
+    """
     real = backend.Float
 
-    def body(row: list[Real], state: State) -> State:
+    def add_blob(row: list[Real], state: State) -> State:
+        """The state of `_add_value` with the blob of record `row` added."""
         inverse, amplitude = row[6], row[7]
-        v = _vector_to_center(p, row) * inverse
-        return _add_value(kernel, v, inverse, amplitude, state)
+        offset = _vector_to_center(p, row) * inverse
+        return _add_value(kernel, offset, inverse, amplitude, state)
 
-    state = for_each(body, tuple(real(0) for _ in range(_VALUE_STATE_SIZE)))
-    return _value(kernel, backend, state)
+    state = for_each(add_blob, tuple(real(0) for _ in range(_VALUE_STATE_SIZE)))
+    return _finished_value(kernel, backend, state)
 
 
 def sum_along(
@@ -114,8 +128,11 @@ def sum_along(
     *,
     signed: bool = True,
 ) -> SumOnRay:
-    """The sum along p + s d, with ranges of its derivatives on the pieces between knots.
+    """The sum along p + s d, with ranges of its first two derivatives on the pieces between knots.
 
+    d: unit vectors.
+    knots: increasing values of s, the first of them 0. There is one piece less than knots.
+    for_each: the loop over the blobs that may be nonzero on the path.
     signed: whether amplitudes may be negative.
     """
     real = backend.Float
@@ -123,37 +140,50 @@ def sum_along(
     u = 0.5 * backend.machine_epsilon
     jumps = kernel.second_derivative_jumps
 
-    def body(row: list[Real], state: State) -> State:
+    def add_blob(row: list[Real], state: State) -> State:
+        """The state with the blob of record `row` added.
+
+        The state is that of `_add_value`; then, for each piece, the ends of the ranges of the first
+        and of the second derivative; then, for the rounding errors, the sums of the slope scales
+        and of the scales of second derivatives, and the number of blobs near the path.
+        """
         start, sums = state[:_VALUE_STATE_SIZE], list(state[_VALUE_STATE_SIZE:])
         inverse, amplitude = row[6], row[7]
-        v = _vector_to_center(p, row) * inverse
-        start = _add_value(kernel, v, inverse, amplitude, start)
+        offset = _vector_to_center(p, row) * inverse
+        start = _add_value(kernel, offset, inverse, amplitude, start)
 
-        t = dr.dot(v, d)
-        across = v - t * d
-        squared = dr.dot(across, across)
-        height = fmin(squared, 1)
-        inside = 1 - height
-        chord = kernel.chord(height, inside)
-        size = 1 + dr.abs(t)
-        margin = (64 * u) * size
-        positions = [dr.fma(knot, inverse, -t) for knot in knots]
+        along = dr.dot(offset, d)
+        from_line = offset - along * d
+        line_distance_squared = dr.dot(from_line, from_line)
+        height_squared = fmin(line_distance_squared, 1)
+        half_chord_squared = 1 - height_squared
+        chord = kernel.chord(height_squared, half_chord_squared)
+        relative_size = 1 + dr.abs(along)
+        margin = (64 * u) * relative_size
+        positions = [dr.fma(knot, inverse, -along) for knot in knots]
         is_near = (
-            (squared < 1 + margin) & (positions[0] < 1 + margin) & (positions[-1] > -1 - margin)
+            (line_distance_squared < 1 + margin)
+            & (positions[0] < 1 + margin)
+            & (positions[-1] > -1 - margin)
         )
         slope_scale = amplitude * inverse
-        bend_scale = slope_scale * inverse
+        second_scale = slope_scale * inverse
 
         a = clamp(positions[0], -chord.half_length, chord.half_length)
-        first_a, second_a = kernel.derivatives(height, inside, a)
+        first_at_a, second_at_a = kernel.derivatives(height_squared, half_chord_squared, a)
         for k in range(count):
             b = clamp(positions[k + 1], -chord.half_length, chord.half_length)
-            first_b, second_b = kernel.derivatives(height, inside, b)
-            slopes = _slopes(chord, a, b, first_a, first_b)
-            bends = _second_derivative_range(chord, a, b, second_a, second_b)
+            first_at_b, second_at_b = kernel.derivatives(height_squared, half_chord_squared, b)
+            slopes = _first_derivative_range(chord, a, b, first_at_a, first_at_b)
+            seconds = _second_derivative_range(chord, a, b, second_at_a, second_at_b)
             if jumps:
-                bends = _with_jumps(bends, inside, margin, positions[k], positions[k + 1])
-            for index, (lower, upper), scale in ((0, slopes, slope_scale), (2, bends, bend_scale)):
+                seconds = _with_jumps(
+                    seconds, half_chord_squared, margin, positions[k], positions[k + 1]
+                )
+            for index, (lower, upper), scale in (
+                (0, slopes, slope_scale),
+                (2, seconds, second_scale),
+            ):
                 if signed:
                     positive = scale > 0
                     lower, upper = (
@@ -162,22 +192,22 @@ def sum_along(
                     )
                 sums[4 * k + index] = dr.fma(lower, scale, sums[4 * k + index])
                 sums[4 * k + index + 1] = dr.fma(upper, scale, sums[4 * k + index + 1])
-            a, first_a, second_a = b, first_b, second_b
+            a, first_at_a, second_at_a = b, first_at_b, second_at_b
 
         nearest = fmax(fmax(positions[0], -positions[-1]), 0)
-        share = kernel.lipschitz_fraction(inside, nearest * nearest)
-        weight = dr.select(is_near, (size + 1) * share, 0)
+        fraction = kernel.lipschitz_fraction(half_chord_squared, nearest * nearest)
+        weight = dr.select(is_near, (relative_size + 1) * fraction, 0)
         sums[-3] = dr.fma(dr.abs(slope_scale), weight, sums[-3])
-        sums[-2] = dr.fma(dr.abs(bend_scale), weight, sums[-2])
+        sums[-2] = dr.fma(dr.abs(second_scale), weight, sums[-2])
         sums[-1] = sums[-1] + dr.select(is_near, real(1), 0)
         return (*start, *sums)
 
-    state = for_each(body, tuple(real(0) for _ in range(_VALUE_STATE_SIZE + 4 * count + 3)))
+    state = for_each(add_blob, tuple(real(0) for _ in range(_VALUE_STATE_SIZE + 4 * count + 3)))
     steepness = kernel.steepness
-    slope_size, bend_size, terms = state[-3:]
-    rounding = u * (16 + terms)
+    slope_size, second_size, term_count = state[-3:]
+    rounding = u * (16 + term_count)
     slope_error = rounding * steepness.slope * slope_size
-    bend_error = rounding * steepness.bend * bend_size
+    second_error = rounding * steepness.bend * second_size
     pieces: list[PathPiece] = []
     for k, (begin, end) in enumerate(itertools.pairwise(knots)):
         lower, upper, min_second, max_second = state[
@@ -185,28 +215,32 @@ def sum_along(
         ]
         slopes = SlopeRange(lower - slope_error, upper + slope_error)
         pieces.append(
-            PathPiece(end - begin, slopes, min_second - bend_error, max_second + bend_error)
+            PathPiece(end - begin, slopes, min_second - second_error, max_second + second_error)
         )
-    return SumOnRay(_value(kernel, backend, state[:_VALUE_STATE_SIZE]), tuple(pieces))
+    return SumOnRay(_finished_value(kernel, backend, state[:_VALUE_STATE_SIZE]), tuple(pieces))
 
 
 def hessian_at(kernel: BlobKernel, backend: Backend, p: Vec3, for_each: ForEach) -> State:
-    """The second derivatives (6,) of the sum at points p: the upper triangle row by row."""
+    """The Hessian of the sum at points p: its upper triangle, row by row, as 6 numbers.
 
-    def body(row: list[Real], state: State) -> State:
+    for_each: the loop over the blobs that may be nonzero at p.
+    """
+
+    def add_blob(row: list[Real], state: State) -> State:
+        """The six sums with the second derivatives of the blob of record `row` added."""
         inverse, amplitude = row[6], row[7]
-        v = _vector_to_center(p, row) * inverse
-        q = dr.dot(v, v)
+        offset = _vector_to_center(p, row) * inverse
+        q = dr.dot(offset, offset)
         scale = amplitude * inverse * inverse
         diagonal = 2 * scale * kernel.profile(q)[1]
         mixed = 4 * scale * kernel.second_derivative(q)
         pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
         return tuple(
-            total + dr.select(q < 1, mixed * v[i] * v[j] + (diagonal if i == j else 0), 0)
+            total + dr.select(q < 1, mixed * offset[i] * offset[j] + (diagonal if i == j else 0), 0)
             for total, (i, j) in zip(state, pairs, strict=True)
         )
 
-    return for_each(body, tuple(backend.Float(0) for _ in range(6)))
+    return for_each(add_blob, tuple(backend.Float(0) for _ in range(6)))
 
 
 # The length of the part of the state for the value at the point: the value, the gradient, the sums
@@ -214,91 +248,124 @@ def hessian_at(kernel: BlobKernel, backend: Backend, p: Vec3, for_each: ForEach)
 _VALUE_STATE_SIZE = 8
 
 
-def _add_value(kernel: BlobKernel, v: Vec3, inverse: Real, amplitude: Real, state: State) -> State:
-    """The state, of `_VALUE_STATE_SIZE` numbers, with another blob added.
+def _add_value(
+    kernel: BlobKernel, offset: Vec3, inverse: Real, amplitude: Real, state: State
+) -> State:
+    """The state of the sum at a point p, with another blob added.
 
-    v: the vector from p to its center, in units of its support. inverse: of the support's radius.
+    The state consists of `_VALUE_STATE_SIZE` numbers: the value; the three components of the
+    gradient; the sums of |A dk/dq| and of |A| m, for the error of the value; the sum of the blobs'
+    bounds of the gradient, for its error; and the number of blobs near p. Here A is the amplitude,
+    and k and m are those of `BlobKernel.profile`.
+
+    offset: the vector from p to the blob's center, in units of its support's radius.
+    inverse: 1 / that radius.
     """
-    value, x, y, z, slopes, scales, gradient_size, terms = state
-    q = dr.dot(v, v)
-    k, dk, scale = kernel.profile(q)
+    value, x, y, z, slope_sum, rounding_sum, gradient_size, term_count = state
+    q = dr.dot(offset, offset)
+    k, dk, rounding_scale = kernel.profile(q)
     slope = amplitude * dk
-    radial = -2 * slope * inverse
+    gradient_factor = -2 * slope * inverse
     is_inside = q < 1.001
-    size = dr.abs(amplitude)
+    abs_amplitude = dr.abs(amplitude)
     return (
         dr.fma(amplitude, k, value),
-        dr.fma(radial, v.x, x),
-        dr.fma(radial, v.y, y),
-        dr.fma(radial, v.z, z),
-        slopes + dr.abs(slope),
-        dr.fma(size, scale, scales),
-        gradient_size + dr.select(is_inside, size * inverse * kernel.lipschitz_fraction(1.0, q), 0),
-        terms + dr.select(is_inside, type(q)(1), 0),
+        dr.fma(gradient_factor, offset.x, x),
+        dr.fma(gradient_factor, offset.y, y),
+        dr.fma(gradient_factor, offset.z, z),
+        slope_sum + dr.abs(slope),
+        dr.fma(abs_amplitude, rounding_scale, rounding_sum),
+        gradient_size
+        + dr.select(is_inside, abs_amplitude * inverse * kernel.lipschitz_fraction(1.0, q), 0),
+        term_count + dr.select(is_inside, type(q)(1), 0),
     )
 
 
-def _value(kernel: BlobKernel, backend: Backend, state: State) -> SumValue:
-    """The sum and its errors, from the state of the loop."""
-    value, x, y, z, slopes, scales, gradient_size, terms = state
+def _finished_value(kernel: BlobKernel, backend: Backend, state: State) -> SumValue:
+    """The sum, with bounds of its rounding errors, from the last state of `_add_value`."""
+    value, x, y, z, slope_sum, rounding_sum, gradient_size, term_count = state
     roundoff = 0.5 * backend.machine_epsilon
-    error = roundoff * dr.fma(16 + terms, scales, 8 * slopes)
-    gradient_error = roundoff * (32 + terms) * kernel.steepness.slope * gradient_size
+    error = roundoff * dr.fma(16 + term_count, rounding_sum, 8 * slope_sum)
+    gradient_error = roundoff * (32 + term_count) * kernel.steepness.slope * gradient_size
     return SumValue(value, backend.Array3f(x, y, z), error, gradient_error)
 
 
 def _vector_to_center(p: Vec3, row: list[Real]) -> Vec3:
-    """The vector from p to the center of a blob."""
+    """The vector from p to the center of the blob with record `row`."""
     return type(p)(*((row[k] - p[k]) + row[3 + k] for k in range(3)))
 
 
-def _slopes(chord: ChordProfile, a: Real, b: Real, at_a: Real, at_b: Real) -> tuple[Real, Real]:
-    """The range of the first derivative between a and b."""
-    falls = (a <= chord.steepest_position) & (b >= chord.steepest_position)
-    rises = (a <= -chord.steepest_position) & (b >= -chord.steepest_position)
-    lower = dr.select(falls, -chord.steepest, fmin(at_a, at_b))
-    return lower, dr.select(rises, chord.steepest, fmax(at_a, at_b))
+def _first_derivative_range(
+    chord: ChordProfile, a: Real, b: Real, at_a: Real, at_b: Real
+) -> tuple[Real, Real]:
+    """The lower and the upper end of the range of the first derivative for positions from a to b on
+    a chord.
+
+    at_a, at_b: the first derivative at a and at b.
+    """
+    has_minimum = (a <= chord.steepest_position) & (b >= chord.steepest_position)
+    has_maximum = (a <= -chord.steepest_position) & (b >= -chord.steepest_position)
+    lower = dr.select(has_minimum, -chord.steepest, fmin(at_a, at_b))
+    return lower, dr.select(has_maximum, chord.steepest, fmax(at_a, at_b))
 
 
 def _second_derivative_range(
     chord: ChordProfile, a: Real, b: Real, at_a: Real, at_b: Real
 ) -> tuple[Real, Real]:
-    """The range of the second derivative between a and b."""
-    center = (a <= 0) & (b >= 0)
-    right = (a <= chord.max_curvature_position) & (b >= chord.max_curvature_position)
-    left = (a <= -chord.max_curvature_position) & (b >= -chord.max_curvature_position)
-    lower = dr.select(center, chord.min_second, fmin(at_a, at_b))
-    return lower, dr.select(left | right, chord.max_second, fmax(at_a, at_b))
+    """The lower and the upper end of the range of the second derivative for positions from a to b
+    on a chord.
+
+    at_a, at_b: the second derivative at a and at b.
+    """
+    has_minimum = (a <= 0) & (b >= 0)
+    has_right_peak = (a <= chord.max_curvature_position) & (b >= chord.max_curvature_position)
+    has_left_peak = (a <= -chord.max_curvature_position) & (b >= -chord.max_curvature_position)
+    lower = dr.select(has_minimum, chord.min_second, fmin(at_a, at_b))
+    return lower, dr.select(has_left_peak | has_right_peak, chord.max_second, fmax(at_a, at_b))
 
 
 def _with_jumps(
-    bends: tuple[Real, Real], inside: Real, margin: Real, begin: Real, end: Real
+    inner_range: tuple[Real, Real], half_chord_squared: Real, margin: Real, begin: Real, end: Real
 ) -> tuple[Real, Real]:
-    """The range of the second derivative, with 0 included where the piece leaves the support, and 0
-    alone where it does not meet the support."""
-    low, high = bends
+    """The range (lower, upper) of the second derivative, for a kernel whose second derivative jumps
+    to 0 at the end of the support. It includes 0 where the piece of the path leaves the support,
+    and is 0 alone where the piece does not meet the support.
+
+    inner_range: the range inside the support.
+    half_chord_squared: S^2, with S half the length of the chord.
+    margin: a bound of the rounding of squared positions.
+    begin, end: the positions of the ends of the piece, measured from the middle of the chord.
+    """
+    low, high = inner_range
     nearest = fmax(fmax(begin, -end), 0)
-    meets = nearest * nearest < inside + margin
+    meets_support = nearest * nearest < half_chord_squared + margin
     farthest = fmax(dr.abs(begin), dr.abs(end))
-    leaves: Mask = ~(farthest * farthest <= inside - margin)
-    low, high = (dr.select(leaves, fmin(low, 0), low), dr.select(leaves, fmax(high, 0), high))
-    return dr.select(meets, low, 0), dr.select(meets, high, 0)
+    leaves_support: Mask = ~(farthest * farthest <= half_chord_squared - margin)
+    low, high = (
+        dr.select(leaves_support, fmin(low, 0), low),
+        dr.select(leaves_support, fmax(high, 0), high),
+    )
+    return dr.select(meets_support, low, 0), dr.select(meets_support, high, 0)
 
 
 def for_each_record(records: RecordTable, *, active: Mask = True) -> ForEach:
-    """A loop over all records."""
+    """A loop over all records of a table, on the active lanes."""
 
     def for_each(body: EachBlob, state: State) -> State:
+        """The state after all records."""
         return records.for_each(body, state, "blobs", active)
 
     return for_each
 
 
 def for_each_listed(records: RecordTable, entries: Any, begin: Any, end: Any) -> ForEach:
-    """A loop over the records of a list: `entries` from begin to end."""
+    """A loop over the records whose indices are entries[begin:end]. Each lane may have its own
+    begin and end."""
     kind = records.backend.UInt32
 
     def for_each(body: EachBlob, state: State) -> State:
+        """The state after the records of the list."""
+
         def step(i: Any, *state: Any) -> State:
             return i + 1, *body(records.read_record(dr.gather(kind, entries, i)), state)
 
@@ -315,24 +382,32 @@ Term: TypeAlias = "Callable[[list[Real]], Jet]"
 
 
 def sum_jets(term: Term, like: Jet, zero: Real, for_each: ForEach) -> Jet:
-    """The sum of a jet for each record, in a loop whose state is the ends of all intervals.
+    """The sum of the jets term(row) over all records, in a loop whose state is the bounds of all
+    intervals of the sum.
 
-    like: a jet of the same variables. zero: the number 0 on each lane.
+    like: any jet of the same variables and piece.
+    zero: the number 0 on each lane.
+    for_each: the loop over the records.
     """
 
-    def body(row: list[Real], state: State) -> State:
+    def add_term(row: list[Real], state: State) -> State:
+        """The bounds of the sum with the jet of record `row` added."""
         total = jet_from_bounds(like, iter(state)) + term(row)
         return tuple(jet_bounds(total, zero))
 
     start = tuple(jet_bounds(like.constant(0.0), zero))
-    return jet_from_bounds(like, iter(for_each(body, start)))
+    return jet_from_bounds(like, iter(for_each(add_term, start)))
 
 
 def blob_term(kernel: BlobKernel, coordinates: Coordinates) -> Term:
-    """The function of a record that returns the jet of its blob, at jets of the coordinates."""
+    """A function that takes the record of a blob and returns the jet of that blob.
+
+    coordinates: the jets of x, y and z at which the blob is evaluated.
+    """
     function = kernel.function()
 
     def term(row: list[Real]) -> Jet:
+        """The jet of the blob with record `row`: amplitude times k(q)."""
         inverse, amplitude = row[6], row[7]
         x, y, z = (((axis - row[k]) - row[3 + k]) * inverse for k, axis in enumerate(coordinates))
         return (x**2 + y**2 + z**2).apply(function) * amplitude
@@ -341,7 +416,11 @@ def blob_term(kernel: BlobKernel, coordinates: Coordinates) -> Term:
 
 
 def jet_bounds(jet: Jet, zero: Real) -> Iterator[Any]:
-    """The bounds of all intervals of a jet, as numbers of the backend."""
+    """The lower and upper bounds of all intervals of a jet, one after another, as numbers of the
+    backend.
+
+    zero: the number 0 on each lane.
+    """
     for interval in (jet.value, *jet.first_derivatives, *jet.second_derivatives):
         yield zero + interval.lower
         yield zero + interval.upper
@@ -350,8 +429,10 @@ def jet_bounds(jet: Jet, zero: Real) -> Iterator[Any]:
 
 
 def jet_from_bounds(like: Jet, ends: Iterator[Any]) -> Jet:
-    """The jet with these bounds, of the same variables as another jet: the inverse of
-    `jet_bounds`."""
+    """The jet whose bounds are the next numbers of `ends`: the inverse of `jet_bounds`.
+
+    like: any jet of the same variables and piece.
+    """
     value = Interval(next(ends), next(ends))
     first = tuple(Interval(next(ends), next(ends)) for _ in like.first_derivatives)
     second = tuple(Interval(next(ends), next(ends)) for _ in like.second_derivatives)

@@ -1,6 +1,7 @@
 """Blobs: metaballs, soft objects and densities of molecules, as level sets of sums of kernels.
 
-`Blobs` is the field; `Molecule` is the field of a molecule's atoms, with their van der Waals radii.
+`Blobs` is the field of any blobs. `Molecule` is the field of a molecule's atoms, with their van der
+Waals radii.
 """
 
 from __future__ import annotations
@@ -59,33 +60,35 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
     from harnack.geometry import Volume
 
-# For at least this number of blobs a grid is faster than a sum over all blobs, by experiment.
+# From this number of blobs on, a grid is faster than a sum over all blobs, by experiment.
 _MIN_BLOBS_FOR_GRID = 64
 
 
 class BlobError(ValueError):
-    """Arguments that are not valid blobs; the message states which blob, and why."""
+    """Raised for arguments that are not valid blobs. The message states which blob, and why."""
 
 
 class Blobs(Formula):
-    """f(x) = sum of w_i A k(|x - c_i|^2 / R_i^2): metaballs, whose surface is f = 1.
+    """f(x) = sum over i of w_i A k(|x - c_i|^2 / (s R_i)^2): metaballs. Their surface is f = 1, and
+    f is larger inside.
 
-    A single blob of weight 1 is the ball with its radius; where blobs meet, they flow together.
-    Inside f is larger.
+    Blob i has the center c_i, the radius R_i and the weight w_i. The kernel k falls from the center
+    to 0 at s R_i, where s is `BlobKernel.support`; A makes a single blob of weight 1 the ball of
+    its radius. Where blobs meet, they flow together.
 
     centers: (n, 3).
     radii: (n,) or one number, > 0.
     weights: (n,), or None for 1; negative weights carve.
     kernel: "compact" (a polynomial of the sixth degree), "gaussian", or the soft objects "cubic"
-        and "sextic"; or one with other parameters, such as `GaussianKernel(sharpness=2.0)`. Each
-        kernel ends at `BlobKernel.support` times the radius.
-    groups: (n,) integers: f is then the largest of the sums of the groups, so that groups meet in
-        creases; None for a single sum.
+        and "sextic"; or a kernel with other parameters, such as `GaussianKernel(sharpness=2.0)`.
+    groups: (n,) integers, the group of each blob. f is then the largest of the groups' sums, so
+        that groups meet in creases. None for a single sum.
 
-    Large numbers of blobs are kept in a uniform grid of lists, so that a sample reads only the
-    blobs nearby.
+    Large numbers of blobs are kept in a uniform grid, whose cells list the blobs nearby, so that a
+    sample reads only these.
 
-    Raises BlobError (a ValueError) for numbers that are not valid blobs.
+    Raises:
+        BlobError: numbers that are not valid blobs (a ValueError).
     """
 
     is_cheap = False
@@ -113,20 +116,20 @@ class Blobs(Formula):
 
     @property
     def _supports(self) -> FloatArray:
-        """(n,) The radii of the blobs' supports."""
+        """The radii (n,) of the supports: of the balls outside of which the blobs are 0."""
         return self.radii * self.kernel.support
 
     @functools.cached_property
     def cell_lists(self) -> CellLists | None:
-        """The lists of blobs near each cell of a grid; None for a small number of blobs."""
+        """The grid with a list of the blobs near each cell; None for a small number of blobs."""
         return (
             CellLists.of(self.centers, self._supports) if len(self) >= _MIN_BLOBS_FOR_GRID else None
         )
 
     @cached_prepare
     def prepare(self, backend: Backend) -> Blobs:
-        """The same field with its blobs as records of the backend. Other blobs need no other
-        kernel."""
+        """The same field with its blobs as records of the backend. Kernels compiled for it serve
+        other blobs as well."""
         prepared = copy.copy(self)
         prepared._on = _BlobDeviceData.upload(backend, self)
         prepared.kernel = self.kernel.prepare(backend)
@@ -134,17 +137,18 @@ class Blobs(Formula):
         return prepared
 
     def largest_gradient(self) -> float:
-        """A bound of |grad f|: the largest sum of the gradient bounds of overlapping blobs."""
+        """A bound of |grad f| everywhere. It is the largest sum, over any cell, of the gradient
+        bounds of the blobs in the cell's list; without a grid, the sum over all blobs."""
         gradients = np.abs(self.weights) * (self.kernel.amplitude * self.kernel.steepness.slope)
         gradients /= self._supports
         lists = self.cell_lists
         if lists is None:
             return float(gradients.sum())
-        ends = np.concatenate([[0.0], np.cumsum(gradients[lists.entries])])
-        return float((ends[lists.starts[1:]] - ends[lists.starts[:-1]]).max()) * (1 + 1e-6)
+        sums = np.concatenate([[0.0], np.cumsum(gradients[lists.entries])])
+        return float((sums[lists.starts[1:]] - sums[lists.starts[:-1]]).max()) * (1 + 1e-6)
 
     def extent(self, levels: tuple[float, ...]) -> Volume:
-        """The box around all supports: outside f is 0."""
+        """The box around all supports, for any levels: outside of it f is 0."""
         del levels
         reach = self._supports[:, None] * (1 + 1e-6)
         return Box((self.centers - reach).min(axis=0), (self.centers + reach).max(axis=0))
@@ -162,44 +166,46 @@ class Blobs(Formula):
         return self._sample(data.value_at(self.kernel, p))
 
     def _sample(self, sums: SumValue) -> Sample:
-        """The sample from the sum at points."""
+        """The sample at points, from the sum there, with the Lipschitz constant as its promise."""
         promises = () if self.lipschitz is None else (Lipschitz(0 * sums.value + self.lipschitz),)
         return Sample(sums.value, sums.gradient, promises, sums.error, sums.gradient_error)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         """The ray sample, by one loop over the blobs nearby. It has no enclosure looking back.
 
-        In a grid, enclosures reach to the end of the point's cell. From an empty cell, f is 0 until
-        the path comes to the first cell that is not empty; enclosures from there are proved from
-        that cell's list.
+        In a grid, enclosures end where the path leaves the enlarged cell of the point. If the cell
+        is empty, f is 0 until the path comes to the first cell that is not empty. The enclosures
+        then begin there and are proved from that cell's list (`DelayedEnclosure`).
         """
         del back
         p, d = path.point(t), path.direction
         data = self._prepared(p)
         count = PIECES if data.grid is None else PIECES_IN_CELL
-        probe = KnotRecorder(count)
+        recorder = KnotRecorder(count)
         no_slope = SlopeRange(0.0, 0.0)
-        path.proofs.from_restriction(probe, no_slope, ahead)
-        if probe.knots is None:
+        path.proofs.from_restriction(recorder, no_slope, ahead)
+        if recorder.knots is None:
             return path.enclose(self.evaluate(p))
         data = self._prepared(p)
         empty_length: Real | None = None
-        q, length = p, fmin(ahead, data.max_path_length)
+        start_point, length = p, fmin(ahead, data.max_path_length)
         if data.grid is not None:
             empty_length = skipped = data.grid.empty_run(p, d, ahead)
-            q = dr.fma(type(p)(skipped), d, p)
-            reach = data.grid.cell(q).exit_distance(d)
-            length = fmin(dr.select(skipped > 0, reach, fmin(ahead, reach)), data.max_path_length)
-        path.proofs.from_restriction(probe, no_slope, length)
+            start_point = dr.fma(type(p)(skipped), d, p)
+            to_exit = data.grid.cell(start_point).exit_distance(d)
+            length = fmin(
+                dr.select(skipped > 0, to_exit, fmin(ahead, to_exit)), data.max_path_length
+            )
+        path.proofs.from_restriction(recorder, no_slope, length)
         enclosures: tuple[Enclosure, ...]
         if data.groups is None:
             sums = sum_along(
                 self.kernel,
                 data.backend,
-                q,
+                start_point,
                 d,
-                probe.knots,
-                data.near(q),
+                recorder.knots,
+                data.near(start_point),
                 signed=data.has_negative_weights,
             )
             start = (
@@ -213,8 +219,8 @@ class Blobs(Formula):
             slope = dr.dot(start.gradient, d)
             enclosures = (
                 GroupMaximumEnclosure(
-                    self.kernel, data.grouped(q), path, q, start.value, probe.knots, length,
-                    data.has_negative_weights,
+                    self.kernel, data.grouped(start_point), path, start_point, start.value,
+                    recorder.knots, length, data.has_negative_weights,
                 ),
             )  # fmt: skip
         if empty_length is not None:
@@ -224,7 +230,8 @@ class Blobs(Formula):
         return RaySample(self._sample(start), enclosures, (), slope, float(count))
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        """f of jets of the coordinates, or of Dr.Jit numbers: a sum over all blobs."""
+        """f at jets of the coordinates, or at Dr.Jit numbers. For jets it is a sum over all
+        blobs."""
         if not is_jet(x, type(self).__name__):
             return self.differentiable_value(backend_of(x).Array3f(x, y, z))
         data = self._prepared_for(backend_of(_backend_number(x, y, z)))
@@ -235,7 +242,8 @@ class Blobs(Formula):
         return group_maximum_jet(term, x, zero, data.grouped(None))
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """The rows of the Hessian of the sum, or of the largest sum."""
+        """The rows of the Hessian of f. Where f is a largest sum of groups, it is the Hessian of
+        that sum."""
         data = self._prepared(p)
         if data.groups is not None:
             return super().hessian(p)
@@ -244,9 +252,12 @@ class Blobs(Formula):
         return vector(xx, xy, xz), vector(xy, yy, yz), vector(xz, yz, zz)
 
     def _prepared(self, p: Vec3) -> _BlobDeviceData:
+        """The data of the blobs on the backend of the point p."""
         return self._prepared_for(backend_of(p))
 
     def _prepared_for(self, backend: Backend) -> _BlobDeviceData:
+        """The data of the blobs on a backend. They are uploaded only if `prepare` has not done
+        so."""
         if self._on is None:
             return _BlobDeviceData.upload(backend, self)
         return self._on
@@ -264,6 +275,8 @@ class Blobs(Formula):
 class _BlobDeviceData:
     """The data of blobs on a backend.
 
+    records: one for each blob, as `_blob_records` describes.
+    grid: the lists of blobs near each cell; None for a small number of blobs.
     groups: the group of each blob, and the number of groups; None if all blobs are one sum.
     has_negative_weights: whether amplitudes may be negative.
     max_path_length: a length greater than that of any path through all supports.
@@ -278,7 +291,7 @@ class _BlobDeviceData:
 
     @classmethod
     def upload(cls, backend: Backend, blobs: Blobs) -> _BlobDeviceData:
-        """The blobs on a backend."""
+        """The data of `blobs`, uploaded to a backend."""
         lists = blobs.cell_lists
         groups = None
         if blobs.groups is not None:
@@ -287,7 +300,7 @@ class _BlobDeviceData:
         lower, upper = blobs.extent(()).bounds()
         return cls(
             backend,
-            RecordTable.upload(backend, _rows(backend, blobs)),
+            RecordTable.upload(backend, _blob_records(backend, blobs)),
             None if lists is None else BlobGrid.upload(backend, lists),
             groups,
             bool((blobs.weights < 0).any()),
@@ -295,45 +308,56 @@ class _BlobDeviceData:
         )
 
     def near(self, p: Vec3) -> ForEach:
-        """A loop over the blobs whose supports may contain p: those of its cell, or all without a
-        grid."""
+        """A loop over the blobs whose supports may contain p: those in the list of its cell or,
+        without a grid, all blobs."""
         if self.grid is None:
             return for_each_record(self.records)
         return for_each_listed(self.records, self.grid.entries, *self.grid.list_at(p))
 
     def grouped(self, p: Vec3 | None) -> GroupedList:
-        """The blobs whose supports may contain p, by groups; all blobs if p is None."""
+        """The blobs whose supports may contain p, as a list sorted by groups; all blobs if p is
+        None."""
         assert self.groups is not None
-        of, count = self.groups
+        group_of_blob, count = self.groups
         if self.grid is None or p is None:
             zero = self.backend.UInt32(0)
-            return GroupedList(self.records, of, None, zero, self.records.iteration_count, count)
+            return GroupedList(
+                self.records, group_of_blob, None, zero, self.records.iteration_count, count
+            )
         begin, end = self.grid.list_at(p)
-        return GroupedList(self.records, of, self.grid.entries, begin, end, count)
+        return GroupedList(self.records, group_of_blob, self.grid.entries, begin, end, count)
 
     def value_at(self, kernel: BlobKernel, p: Vec3) -> SumValue:
-        """The sum, or the largest sum, at points p."""
+        """f at points p: the sum of all blobs or, if there are groups, the largest of the groups'
+        sums."""
         if self.groups is None:
             return value_at(kernel, self.backend, p, self.near(p))
         return group_maximum_at(kernel, self.backend, p, self.grouped(p))
 
 
-def _rows(backend: Backend, blobs: Blobs) -> FloatArray:
-    """The records (n, 8) of blobs: the center, rounded; the rest of the center; the inverse of the
-    support's radius; and the amplitude."""
+def _blob_records(backend: Backend, blobs: Blobs) -> FloatArray:
+    """The records (n, 8) of blobs.
+
+    A record holds, by columns: 0 to 2 the center, rounded to the precision of the backend; 3 to 5
+    the rest of the center, which rounding has cut off; 6 the inverse of the support's radius; 7 the
+    amplitude w_i A.
+
+    Raises:
+        BlobError: a blob that is too small, too large or too far away for the precision.
+    """
     supports = blobs.radii * blobs.kernel.support
     info = np.finfo(backend.dtype)
     largest, smallest = float(info.max), float(info.smallest_normal)
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
         amplitude = blobs.weights * blobs.kernel.amplitude
         rounded = blobs.centers.astype(backend.dtype).astype(np.float64)
-        size = np.abs(amplitude) * max(1.0, blobs.kernel.steepness.bend)
+        largest_bound = np.abs(amplitude) * max(1.0, blobs.kernel.steepness.bend)
         inverse = 1 / supports
-        second = size * inverse * inverse
+        second_bound = largest_bound * inverse * inverse
     is_invalid = ~((np.abs(blobs.centers) <= largest) & (supports[:, None] * smallest < 1)).all(
         axis=1
     )
-    is_invalid |= ~((inverse < 1e30) & (size <= largest) & (second <= largest))
+    is_invalid |= ~((inverse < 1e30) & (largest_bound <= largest) & (second_bound <= largest))
     if is_invalid.any():
         worst = int(np.argmax(is_invalid))
         precision = "single" if backend.dtype == np.float32 else "double"
@@ -350,8 +374,10 @@ def _rows(backend: Backend, blobs: Blobs) -> FloatArray:
 
 @dataclass(frozen=True)
 class DelayedEnclosure(Enclosure):
-    """An enclosure of a function F along a path: F = 0 for 0 <= s <= run, and from there on `then`
-    holds."""
+    """An enclosure of a function F(s) along a path, with F = 0 for 0 <= s <= run.
+
+    then: the enclosure of F from s = run on.
+    """
 
     run: Real
     then: Enclosure
@@ -361,7 +387,7 @@ class DelayedEnclosure(Enclosure):
 
 
 def _zero_where(mask: Any, sums: SumValue) -> SumValue:
-    """The sum, replaced by 0 where the mask holds."""
+    """The sum at points, with value, gradient and errors replaced by 0 where the mask holds."""
     zero = 0 * sums.value
     return SumValue(
         dr.select(mask, zero, sums.value),
@@ -372,7 +398,7 @@ def _zero_where(mask: Any, sums: SumValue) -> SumValue:
 
 
 def _backend_number(*jets: Jet) -> Any:
-    """A number of the backend among the bounds of jets.
+    """Any number of the backend among the bounds of jets, for the backend and its number of lanes.
 
     Raises:
         TypeError: all bounds are constants.
@@ -388,7 +414,8 @@ def _backend_number(*jets: Jet) -> Any:
 def _checked(
     centers: Any, radii: Any, weights: Any, groups: Any
 ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray | None]:
-    """The centers, radii, weights and groups as arrays, sorted by groups.
+    """The centers (n, 3), radii (n,), weights (n,) and groups (n,) as arrays, sorted by groups.
+    Groups are numbered from 0 without gaps; they are None if none are given.
 
     Raises:
         BlobError: wrong shapes, or numbers that are not valid for a blob.
@@ -413,11 +440,13 @@ def _checked(
             f"groups must be {len(c)} integers, one for each blob, not {g.dtype} of shape {g.shape}"
         )
     order = np.argsort(g, kind="stable")
-    return c[order], r[order], w[order], np.unique(g[order], return_inverse=True)[1]
+    return (c[order], r[order], w[order], np.unique(g[order], return_inverse=True)[1])
 
 
 def _numbers(values: Any, name: str, count: int) -> FloatArray:
-    """The finite numbers (count,), from a number or an array.
+    """Finite numbers (count,), from an array of that shape, or from one number that is repeated.
+
+    name: of the argument, for messages.
 
     Raises:
         BlobError: a wrong shape, or a number that is not finite.
@@ -437,20 +466,21 @@ def _numbers(values: Any, name: str, count: int) -> FloatArray:
 
 
 class Molecule(Blobs):
-    """The surface of a molecule: the level 1 of a sum of A exp(-s (d/r)^2) over its atoms, each
-    minus a tangent, so that its support is bounded (see `GaussianKernel`); r is the van der Waals
-    radius of the atom.
+    """The surface of a molecule: the level 1 of a sum of Gaussians A exp(-s (d/r)^2) over its
+    atoms. Here d is the distance from the atom, r its van der Waals radius, and s the sharpness.
+    From each Gaussian a tangent is subtracted, so that its support is bounded (`GaussianKernel`).
 
     source: a .pdb, .ent, .cif or .mmcif file, or `Atoms`.
-    sharpness: s; the larger it is, the closer the surface follows the single atoms.
+    sharpness: s. The larger it is, the closer the surface follows the single atoms.
     tail: an atom ends where its Gaussian is this fraction of its value at the radius. With 1/32
-        about ten atoms reach a point, with 1/1000 about twenty.
+        about ten atoms are nonzero at a point, with 1/1000 about twenty.
 
-    The usual viewers cut Gaussians off at 1/32: then f jumps by this value, and the surface has
-    seams. Here a tangent is subtracted, so that f is smooth where atoms end, and ranges of f along
-    a ray are exact; a single atom is still a ball of its radius.
+    Most viewers cut Gaussians off at 1/32. Then f jumps by this value, and the surface has seams.
+    With the tangent subtracted, f is smooth where atoms end, and ranges of f along a ray are exact.
+    A single atom is still a ball of its radius.
 
-    Raises FileFormatError for a file that is not of a molecule.
+    Raises:
+        FileFormatError: a file that does not hold a molecule.
     """
 
     def __init__(

@@ -1,9 +1,9 @@
 """A uniform grid with a list of blobs for each cell, so that a sample reads only the blobs nearby.
 
-A cell's list holds every blob whose support meets the cell, enlarged by a margin on all sides: the
-function is that of the list until a path has left the enlarged cell. For a cell with an empty list,
-the grid stores the distance to the nearest cell whose list is not empty, so that a path passes
-empty cells in few jumps.
+A cell's list holds every blob whose support meets the cell, enlarged by a margin on all sides. So
+the list's sum is the function until a path has left the enlarged cell. For a cell with an empty
+list, the grid stores the distance to the nearest cell whose list is not empty, so that a path
+passes empty cells in few jumps.
 """
 
 from __future__ import annotations
@@ -25,21 +25,22 @@ from harnack.tree.empty_space import (
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, IntArray, Vec3
 
-# The margin, in cells, within which a cell's list is valid.
+# How far beyond a cell its list is valid, as a fraction of the cell's size.
 _MARGIN = 1 / 4
-# The number of pairs of a ball and a cell that are compared at once.
-_AT_ONCE = 4_000_000
-# The maximal number of cells, and of entries of all lists for each blob; beyond these, cells become
-# larger.
-_MAX_CELLS, _MAX_ENTRIES = 1 << 24, 200.0
+# The number of pairs (ball, cell) that are compared in one NumPy expression, to save memory.
+_PAIRS_AT_ONCE = 4_000_000
+# The maximal number of cells, and the maximal number of list entries per blob. If a grid would have
+# more, its cells are made larger.
+_MOST_CELLS, _MOST_ENTRIES = 1 << 24, 200.0
 
 
 @dataclass(frozen=True)
 class CellLists(GridData):
-    """A grid of lists of blobs in NumPy, in which a cell is empty if its list is.
+    """A grid with a list of blobs for each cell, as NumPy arrays. A cell is empty if its list is
+    empty.
 
-    starts: (cells + 1,) the index in `entries` at which each cell's list begins.
-    entries: the indices of blobs, in order within each list.
+    starts: (cells + 1,) the list of cell k is entries[starts[k]:starts[k + 1]].
+    entries: the lists, one after another: indices of blobs, increasing within each list.
     """
 
     starts: IntArray
@@ -47,8 +48,10 @@ class CellLists(GridData):
 
     @classmethod
     def of(cls, centers: FloatArray, supports: FloatArray, cell: float | None = None) -> CellLists:
-        """The lists of balls with centers (n, 3) and radii (n,), the supports of blobs.
+        """The grid for blobs whose supports are balls.
 
+        centers: (n, 3) centers of the balls.
+        supports: (n,) radii of the balls.
         cell: the approximate size of a cell; None for 3/5 of the median radius.
         """
         size = float(np.median(supports)) * 0.6 if cell is None else cell
@@ -60,12 +63,12 @@ class CellLists(GridData):
             origin = origin.astype(np.float64)
             counts = np.ceil((upper + 2 * margin - origin) / size)
             entries = float(((2 * supports / size + 1.1) ** 3).sum())
-            too_large = counts.prod() > _MAX_CELLS or entries > _MAX_ENTRIES * len(supports)
+            too_large = counts.prod() > _MOST_CELLS or entries > _MOST_ENTRIES * len(supports)
             if not too_large or counts.max() == 1:
                 break
             size *= 1.25
         shape = (int(counts[0]), int(counts[1]), int(counts[2]))
-        cells, blobs = _pairs(centers, supports, origin, size, shape)
+        cells, blobs = _cell_ball_pairs(centers, supports, origin, size, shape)
         order = np.argsort(cells, kind="stable")
         total = shape[0] * shape[1] * shape[2]
         starts = np.zeros(total + 1, dtype=np.int64)
@@ -74,15 +77,22 @@ class CellLists(GridData):
         return cls(origin, size, shape, distance_to_occupied(is_empty), starts, blobs[order])
 
 
-def _pairs(
+def _cell_ball_pairs(
     centers: FloatArray,
     radii: FloatArray,
     origin: FloatArray,
     size: float,
     shape: tuple[int, int, int],
 ) -> tuple[IntArray, IntArray]:
-    """The pairs of a cell, enlarged by the margin, and a ball that meets it: the indices of the
-    cells and of the balls, sorted by balls."""
+    """All pairs of a cell and a ball, for which the ball meets the cell enlarged by the margin.
+
+    centers, radii: (n, 3) and (n,), of the balls.
+    origin: the lowest corner of the grid.
+    size: of a cell.
+    shape: the number of cells along x, y and z.
+
+    Returns the index of the cell and the index of the ball of each pair, sorted by balls.
+    """
     padded = radii * (1 + 1e-6)
     first = np.floor((centers - padded[:, None] - origin) / size - _MARGIN).astype(np.int64)
     last = np.floor((centers + padded[:, None] - origin) / size + _MARGIN).astype(np.int64)
@@ -91,7 +101,7 @@ def _pairs(
     blobs: list[IntArray] = []
     for span in cast("list[int]", np.unique(spans).tolist()):
         same_span = np.flatnonzero(spans == span)
-        for group in np.array_split(same_span, max(1, len(same_span) * span**3 // _AT_ONCE)):
+        for group in np.array_split(same_span, max(1, len(same_span) * span**3 // _PAIRS_AT_ONCE)):
             indices = first[group, :, None] + np.arange(span)  # (m, 3, span)
             lower = origin[:, None] + (indices - _MARGIN) * size
             upper = origin[:, None] + (indices + 1 + _MARGIN) * size
@@ -100,10 +110,10 @@ def _pairs(
             is_inside = (indices >= 0) & (indices < np.array(shape)[:, None])
             squares[~is_inside] = np.inf
             x, y, z = squares[:, 0], squares[:, 1], squares[:, 2]
-            distances = z[:, :, None, None] + y[:, None, :, None] + x[:, None, None, :]
-            ball, k, j, i = np.nonzero(distances <= (padded[group] ** 2)[:, None, None, None])
-            px, py, pz = (indices[ball, axis, n] for axis, n in enumerate((i, j, k)))
-            cells.append(px + shape[0] * (py + shape[1] * pz))
+            square_sums = z[:, :, None, None] + y[:, None, :, None] + x[:, None, None, :]
+            ball, k, j, i = np.nonzero(square_sums <= (padded[group] ** 2)[:, None, None, None])
+            cell_x, cell_y, cell_z = (indices[ball, axis, n] for axis, n in enumerate((i, j, k)))
+            cells.append(cell_x + shape[0] * (cell_y + shape[1] * cell_z))
             blobs.append(group[ball])
     all_cells, all_blobs = np.concatenate(cells), np.concatenate(blobs)
     order = np.argsort(all_blobs, kind="stable")
@@ -112,7 +122,10 @@ def _pairs(
 
 @dataclass(frozen=True)
 class BlobGrid(EmptySpaceGrid):
-    """The cell lists of blobs on a backend."""
+    """The cell lists of blobs on a backend.
+
+    starts, entries: as in `CellLists`, as Dr.Jit integers.
+    """
 
     starts: Any
     entries: Any
@@ -128,7 +141,8 @@ class BlobGrid(EmptySpaceGrid):
         )
 
     def list_at(self, p: Vec3) -> tuple[Any, Any]:
-        """The indices at which the list of the cell of p begins and ends. Outside of the grid the
-        list of the nearest cell is valid too, since no support reaches beyond the grid."""
+        """The positions (begin, end) in `entries` of the list of the cell that contains p. For p
+        outside of the grid they are those of the nearest cell, whose list is valid too, since no
+        support extends beyond the grid."""
         kind, index = self.backend.UInt32, self.cell(p).index
         return dr.gather(kind, self.starts, index), dr.gather(kind, self.starts, index + 1)

@@ -1,7 +1,7 @@
-"""The largest of the sums of blobs of several groups: groups do not flow together but meet in
-creases.
+"""The largest of the sums of blobs of several groups. Blobs of one group flow together; different
+groups meet in creases.
 
-A group is 0 where none of its blobs is near.
+The sum of a group is 0 at points that are outside of the supports of its blobs.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class GroupedList:
-    """A list of records in the order of their groups: the records of `entries` from begin to end,
-    or those of the table itself if entries is None.
+    """A list of blobs, sorted by groups: the records with the indices entries[begin:end], or the
+    records begin to end of the table itself if `entries` is None.
 
-    of: the group of each record.
-    count: the number of all groups.
+    of: for each record of the table, the number of its group.
+    count: the number of all groups, also of those without a blob in the list.
     """
 
     records: RecordTable
@@ -52,21 +52,24 @@ class GroupedList:
     count: Any
 
     def record(self, i: Any) -> Any:
-        """The index, in the table, of the record at position i of the list."""
+        """The index in the table of the record at position i of the list."""
         if self.entries is None:
             return i
         return dr.gather(self.records.backend.UInt32, self.entries, i)
 
     def group(self, i: Any) -> Any:
-        """The group at position i of the list."""
+        """The number of the group of the blob at position i of the list."""
         kind = self.records.backend.UInt32
         return dr.gather(kind, self.of, self.record(i), i < self.end)
 
     def each_group(self, body: Any, state: State, label: str) -> tuple[Any, State]:
-        """The number of groups in the list, and the state after body(for_each, state) for each
-        group.
+        """Call body(for_each, state) for each group that has blobs in the list. It returns the next
+        state.
 
-        for_each: the loop over the blobs of the group.
+        for_each: the loop over the group's blobs. The body must run it.
+        label: the name of the recorded loop.
+
+        Returns the number of these groups, and the last state.
         """
         kind = self.records.backend.UInt32
 
@@ -85,13 +88,18 @@ class GroupedList:
 
 
 class _OneGroup:
-    """The loop over the blobs of the group that begins at a position of the list."""
+    """The loop over the blobs of one group, for `GroupedList.each_group`.
+
+    begin: the position in the list of the group's first blob.
+    end: the position after its last blob, once the loop has run.
+    """
 
     def __init__(self, blobs: GroupedList, begin: Any) -> None:
         self._blobs, self._begin = blobs, begin
         self.end: Any = None
 
     def __call__(self, body: EachBlob, state: State) -> State:
+        """The state after `body` for all blobs of the group."""
         blobs = self._blobs
         group = blobs.group(self._begin)
 
@@ -109,11 +117,13 @@ class _OneGroup:
 
 
 def group_maximum_at(kernel: BlobKernel, backend: Backend, p: Vec3, blobs: GroupedList) -> SumValue:
-    """The largest sum at points p, with its gradient. The errors are the largest errors of all
-    groups."""
+    """The largest of the groups' sums at points p, with its gradient. The error bounds are the
+    largest of all groups."""
     real = backend.Float
 
-    def body(for_each: ForEach, state: State) -> State:
+    def add_group(for_each: ForEach, state: State) -> State:
+        """The largest sum so far, its gradient and the largest errors so far, with another group's
+        sum included."""
         value, x, y, z, error, gradient_error = state
         sums = value_at(kernel, backend, p, for_each)
         is_larger = sums.value > value
@@ -127,7 +137,7 @@ def group_maximum_at(kernel: BlobKernel, backend: Backend, p: Vec3, blobs: Group
         )
 
     start = (real(-dr.inf), *(real(0) for _ in range(5)))
-    groups, final = blobs.each_group(body, start, "groups")
+    groups, final = blobs.each_group(add_group, start, "groups")
     value, x, y, z, error, gradient_error = final
     is_zero = (groups < blobs.count) & ~(value > 0)  # the largest sum is 0, that of a far group
     gradient = dr.select(is_zero, backend.Array3f(0), backend.Array3f(x, y, z))
@@ -135,9 +145,17 @@ def group_maximum_at(kernel: BlobKernel, backend: Backend, p: Vec3, blobs: Group
 
 
 def group_maximum_jet(term: Term, like: Jet, zero: Real, blobs: GroupedList) -> Jet:
-    """The jet of the largest sum, from the list of all blobs."""
+    """The jet of the largest of the groups' sums.
 
-    def body(for_each: ForEach, state: State) -> State:
+    term: returns the jet of a blob from its record.
+    like: any jet of the same variables and piece.
+    zero: the number 0 on each lane.
+    blobs: the list of all blobs.
+    """
+
+    def add_group(for_each: ForEach, state: State) -> State:
+        """The state with another group included. It consists of a number that is positive before
+        the first group, and the bounds of the maximum's jet."""
         jet = sum_jets(term, like, zero, for_each)
         maximum = jet_from_bounds(like, iter(state[1:]))
         new_maximum = maximum.maximum(jet)
@@ -151,22 +169,25 @@ def group_maximum_jet(term: Term, like: Jet, zero: Real, blobs: GroupedList) -> 
 
     real = cast("Any", type(zero))
     start = (real(1) + 0 * zero, *jet_bounds(like.constant(0.0), zero))
-    _, final = blobs.each_group(body, start, "groups")
+    _, final = blobs.each_group(add_group, start, "groups")
     return jet_from_bounds(like, iter(final[1:]))
 
 
 @dataclass(frozen=True)
 class GroupMaximumEnclosure(Enclosure):
-    """An enclosure of the largest sum along the path from p, for a length.
+    """An enclosure of the largest of the groups' sums, along the first `length` of the path from p.
 
-    value: at p.
-    knots: the ends of the pieces that the enclosures use.
+    blobs: the blobs that may be nonzero there.
+    path: gives the direction, and the proofs to use.
+    value: the largest sum at p.
+    knots: the ends of the pieces on which derivatives are bounded.
+    signed: whether amplitudes may be negative.
 
-    Along a path the largest sum reaches a level above as soon as one of the sums does, and falls to
-    a level below only when the last of the sums has. So a step upwards is the shortest step of the
-    groups, and a step downwards the longest. That is sharper than ranges of the maximum itself,
-    which do not use how far each group is from the level (Aydinlilar and Zanni 2023, equation 20,
-    take the maximum of two inclusion functions).
+    Along a path the largest sum reaches a level above it as soon as one of the sums does, and falls
+    to a level below it only when the last of the sums has. So the free length upwards is the
+    shortest of the groups' free lengths, and the free length downwards is the longest. That is
+    sharper than ranges of the maximum itself, because it uses how far each group is from the level.
+    (Aydinlilar and Zanni 2023, equation 20, take the maximum of two inclusion functions.)
     """
 
     kernel: BlobKernel
@@ -179,15 +200,20 @@ class GroupMaximumEnclosure(Enclosure):
     signed: bool
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """The shortest step upwards of the groups, and the longest downwards: see
-        `GroupMaximumEnclosure`. Proof. For a group whose sum is lower by g, the level above is
-        farther by g and the level below nearer by g; the error of g is that of both sums, the
-        larger of which the tracer has subtracted from the gaps already
-        (`samples.value_error_bound`)."""
+        """The smaller of two lengths: the shortest free length upwards of any group, and the
+        longest free length downwards of any group (see `GroupMaximumEnclosure`).
+
+        Proof. Take a group whose sum is lower than the largest by g. For this group the level above
+        is farther by g, and the level below is nearer by g. The error of g is that of both sums.
+        The larger of these errors has been subtracted from the gaps by the tracer
+        (`samples.value_error_bound`).
+        """
         backend = self.blobs.records.backend
         real = backend.Float
 
-        def body(for_each: ForEach, state: State) -> State:
+        def add_group(for_each: ForEach, state: State) -> State:
+            """The shortest length upwards and the longest downwards, with another group's
+            included."""
             up, down = state
             sums = sum_along(
                 self.kernel, backend, self.p, self.path.direction, self.knots, for_each,
@@ -196,21 +222,21 @@ class GroupMaximumEnclosure(Enclosure):
             slope = dr.dot(sums.start.gradient, self.path.direction)
             slopes = SlopeRange.around(slope, sums.start.gradient_error)
             enclosures = self.path.proofs.from_restriction(sums, slopes, self.length)
-            lower = self.value - sums.start.value
+            deficit = self.value - sums.start.value
             inf = real(dr.inf)
             rising = longest_free_length(
-                enclosures, LevelGaps(inf, gaps.above + lower, is_one_sided=True)
+                enclosures, LevelGaps(inf, gaps.above + deficit, is_one_sided=True)
             )
             falling = longest_free_length(
-                enclosures, LevelGaps(gaps.below - lower, inf, is_one_sided=True)
+                enclosures, LevelGaps(gaps.below - deficit, inf, is_one_sided=True)
             )
-            is_clear = gaps.below > lower
-            return fmin(rising, up), fmax(dr.select(is_clear, falling, 0), down)
+            is_above_level = gaps.below > deficit
+            return fmin(rising, up), fmax(dr.select(is_above_level, falling, 0), down)
 
         start = (real(0) + self.length, real(0))
-        groups, (up, down) = self.blobs.each_group(body, start, "steps of groups")
-        # The sums of far groups stay 0.
-        stays_below = (groups < self.blobs.count) & (gaps.below > self.value)
-        down = dr.select(stays_below, self.length, down)
+        groups, (up, down) = self.blobs.each_group(add_group, start, "steps of groups")
+        # The sums of far groups stay 0. If the level is below 0, the maximum never falls to it.
+        zero_is_above_level = (groups < self.blobs.count) & (gaps.below > self.value)
+        down = dr.select(zero_is_above_level, self.length, down)
         down = dr.select(gaps.below == dr.inf, self.length, down)
         return fmin(dr.select(gaps.above == dr.inf, self.length, up), down)

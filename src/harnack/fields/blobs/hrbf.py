@@ -1,4 +1,5 @@
-"""Hermite radial basis functions: a smooth surface through points, normal to prescribed vectors."""
+"""Hermite radial basis functions: a smooth surface through given points, with given normals
+there."""
 
 from __future__ import annotations
 
@@ -51,16 +52,20 @@ _MARGIN = 0.25
 
 
 class HRBF(Formula):
-    """Hermite radial basis functions: f = sum of a_i r_i^3 + b_i . grad r_i^3, r_i = |x - p_i|,
-    with f = 0 and grad f = n_i at all points p_i. The surface passes through the points and is
-    normal to the n_i (Aydinlilar and Zanni 2023, eq. 9; Wendland 2005).
+    """Hermite radial basis functions: f = sum over i of a_i r_i^3 + b_i . grad r_i^3, with r_i = |x
+    - p_i|. (Aydinlilar and Zanni 2023, eq. 9; Wendland 2005.)
 
-    points: (n, 3).
-    normals: (n, 3) of any length but 0, outward, so that f is negative inside.
+    The numbers a_i and the vectors b_i are chosen so that f = 0 and grad f = n_i at all points p_i.
+    So the surface f = 0 passes through the points and has the normals n_i there.
+
+    points: (n, 3), the p_i.
+    normals: (n, 3), the n_i, of any length but 0; they are made unit vectors. They point outward,
+        so that f is negative inside.
     domain: the volume in which f is drawn; None for the box around the points, enlarged by a
         quarter on each side. Far from all points such functions may have other zeros.
 
-    Raises ValueError for arguments that are not points with normals, or for a repeated point.
+    Raises:
+        ValueError: arguments that are not points with normals, or a repeated point.
     """
 
     is_cheap = False
@@ -81,8 +86,8 @@ class HRBF(Formula):
 
     @cached_prepare
     def prepare(self, backend: Backend) -> HRBF:
-        """The same function with its points as records of the backend. Other points need no other
-        kernel."""
+        """The same function with its points as records of the backend. Kernels compiled for it
+        serve other points as well."""
         prepared = copy.copy(self)
         prepared._on = self._uploaded(backend)
         if self.lipschitz is not None:
@@ -90,19 +95,27 @@ class HRBF(Formula):
         return prepared
 
     def _largest_gradient(self) -> float | None:
-        """A bound of |grad f| in the domain: |grad (a r^3 + b.grad r^3)| <= 3 |a| r^2 + 6 |b| r."""
+        """A bound of |grad f| in the domain; None for a domain without bounds.
+
+        It adds up bounds of the terms: |grad (a r^3 + b . grad r^3)| <= 3 |a| r^2 + 6 |b| r, with r
+        the largest distance of the domain from the point.
+        """
         if self.domain is None or not np.isfinite(corners := np.array(self.domain.bounds())).all():
             return None
-        distances = np.abs(corners[:, None] - self.points).max(axis=0)
-        r = np.linalg.norm(distances, axis=1)
-        norms = np.linalg.norm(self.gradient_coefficients, axis=1)
-        return float((3 * np.abs(self.value_coefficients) * r * r + 6 * norms * r).sum()) * (
+        max_offsets = np.abs(corners[:, None] - self.points).max(axis=0)
+        r = np.linalg.norm(max_offsets, axis=1)
+        vector_norms = np.linalg.norm(self.gradient_coefficients, axis=1)
+        return float((3 * np.abs(self.value_coefficients) * r * r + 6 * vector_norms * r).sum()) * (
             1 + 1e-6
         )
 
     def _uploaded(self, backend: Backend) -> tuple[Backend, RecordTable]:
-        """The backend, and the records of the points on it: the point, rounded; the rest of the
-        point; a; 3 b; and six zeros."""
+        """The backend, and the records of the points on it.
+
+        A record holds, by columns: 0 to 2 the point, rounded to the precision of the backend; 3 to
+        5 the rest of the point, which rounding has cut off; 6 the number a; 7 to 9 the vector 3 b;
+        10 to 15 zeros.
+        """
         rounded = self.points.astype(backend.dtype).astype(np.float64)
         rows = np.column_stack(
             [
@@ -116,7 +129,8 @@ class HRBF(Formula):
         return backend, RecordTable.upload(backend, rows)
 
     def _prepared_for(self, backend: Backend) -> tuple[Backend, RecordTable]:
-        """The backend, and the records of the points on it."""
+        """The backend, and the records of the points on it. They are uploaded only if `prepare` has
+        not done so."""
         return self._uploaded(backend) if self._on is None else self._on
 
     def evaluate(self, p: Vec3) -> Sample:
@@ -124,7 +138,7 @@ class HRBF(Formula):
         return self._sample(self._along(p, d, (0.0,)).start)
 
     def _sample(self, sums: SumValue) -> Sample:
-        """The sample from the sums at points."""
+        """The sample at points, from the sum there, with the Lipschitz constant as its promise."""
         promises = () if self.lipschitz is None else (Lipschitz(0 * sums.value + self.lipschitz),)
         return Sample(sums.value, sums.gradient, promises, sums.error, sums.gradient_error)
 
@@ -144,7 +158,7 @@ class HRBF(Formula):
         return RaySample(self._sample(sums.start), enclosures, (), slope, PIECES)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        """f of jets of the coordinates, or of Dr.Jit numbers."""
+        """f at jets of the coordinates, or at Dr.Jit numbers."""
         if not is_jet(x, type(self).__name__):
             return self.differentiable_value(backend_of(x).Array3f(x, y, z))
         numbers = (end for jet in (x, y, z) for entry in (jet.value, *jet.first_derivatives)
@@ -152,6 +166,7 @@ class HRBF(Formula):
         backend, records = self._prepared_for(backend_of(next(numbers)))
 
         def term(row: list[Real]) -> Jet:
+            """The jet of the term of the point with record `row`."""
             u, v, w = ((entry - row[k]) - row[3 + k] for k, entry in enumerate((x, y, z)))
             r = (u**2 + v**2 + w**2).apply(sqrt)
             return r**3 * row[6] + r * (u * row[7] + v * row[8] + w * row[9])
@@ -159,23 +174,31 @@ class HRBF(Formula):
         return sum_jets(term, x, backend.Float(0), for_each_record(records))
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        """The rows of the Hessian of f at p: a sum over the points."""
         backend, records = self._prepared_for(backend_of(p))
         pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
-        def body(row: list[Real], state: State) -> State:
-            v, b, r, inverse = _term(p, row)
+        def add_point(row: list[Real], state: State) -> State:
+            """The upper triangle of the Hessian, row by row, with the term of the point of record
+            `row` added."""
+            v, b, r, inverse = _offset_of_point(p, row)
             dot = dr.dot(b, v) * inverse
             e = v * inverse
 
             def entry(i: int, j: int) -> Real:
+                """The second derivative of the term by coordinates i and j.
+
+                With e = v/r, it is 3 a (r delta_ij + v_i e_j) plus (b . e) (delta_ij - e_i e_j) +
+                b_i e_j + b_j e_i, where b is three times the vector of the point.
+                """
                 delta = 1.0 if i == j else 0.0
-                third = dot * (delta - e[i] * e[j]) + b[i] * e[j] + b[j] * e[i]
-                return 3 * row[6] * (r * delta + v[i] * e[j]) + third
+                vector_part = dot * (delta - e[i] * e[j]) + b[i] * e[j] + b[j] * e[i]
+                return 3 * row[6] * (r * delta + v[i] * e[j]) + vector_part
 
             return tuple(total + entry(*pair) for total, pair in zip(state, pairs, strict=True))
 
         zero = tuple(backend.Float(0) for _ in pairs)
-        xx, xy, xz, yy, yz, zz = records.for_each(body, zero, "points")
+        xx, xy, xz, yy, yz, zz = records.for_each(add_point, zero, "points")
         vector = backend.Array3f
         return vector(xx, xy, xz), vector(xy, yy, yz), vector(xz, yz, zz)
 
@@ -183,23 +206,27 @@ class HRBF(Formula):
         """The sum along p + s d, with ranges of its first two derivatives on the pieces between
         knots.
 
-        Proof. Let b_i be three times the vector of the point, h the distance of the line from the
-        point, and c = b.w for w from the point to the nearest point of the line. Let x be the
-        position from there, r^2 = h^2 + x^2, u = x/r and B = b.d. Then a term and its derivatives
-        are
+        knots: increasing values of s, the first of them 0. If there is only that one, derivatives
+            along the line are left out.
+
+        Proof. Consider the term of one point. Let b be three times the vector of the point, h the
+        distance of the line from the point, w the vector from the point to the nearest point of the
+        line, c = b . w and B = b . d. Let x be the position on the line, measured from that nearest
+        point, r^2 = h^2 + x^2 and u = x/r. Then the term and its first two derivatives in x are
 
             a r^3 + r (c + B x),
             3 a r x + c u + B (h^2 + 2x^2)/r,
             3 a (h^2 + 2x^2)/r + c h^2/r^3 + B (3u - u^3).
 
-        r x, u and 3u - u^3 increase; (h^2 + 2x^2)/r and -h^2/r^3 decrease until x = 0 and increase
-        from there. So each function has its extreme values at the ends of a piece, or at 0.
+        The functions r x, u and 3u - u^3 increase. The functions (h^2 + 2x^2)/r and -h^2/r^3
+        decrease until x = 0 and increase from there. So each function has its extreme values on a
+        piece at the ends of the piece, or at 0.
 
         Rounding. The error of positions is at most e = 8 roundings of the largest distance m on the
         path, as in `harnack.fields.blobs.blob_sums`. It changes the three expressions by at most 3
-        |a| m^2 e + 2 |b| m e, 6 |a| m e + 4 |b| e and 10 |a| e + 8 |b| min(1, e/r), with r the
-        least distance on the path. Sums of n terms add n roundings of the sum of |a| m^3 + |b| m^2,
-        3 |a| m^2 + 3 |b| m and 6 |a| m + 3 |b|.
+        |a| m^2 e + 2 |b| m e, 6 |a| m e + 4 |b| e and 10 |a| e + 8 |b| min(1, e/r), where r is the
+        smallest distance on the path. A sum of n terms adds n roundings of the sum of |a| m^3 + |b|
+        m^2, of 3 |a| m^2 + 3 |b| m and of 6 |a| m + 3 |b|.
         """
         backend, records = self._prepared_for(backend_of(p))
         real = backend.Float
@@ -207,10 +234,18 @@ class HRBF(Formula):
         unit = 0.5 * backend.machine_epsilon
         tiny = float(dr.smallest(real))
 
-        def body(row: list[Real], state: State) -> State:
-            value, gx, gy, gz, value_size, gradient_size, terms, *sums = state
+        def add_point(row: list[Real], state: State) -> State:
+            """The state with the term of the point of record `row` added.
+
+            The state consists of the value; the three components of the gradient; the sums of |a|
+            r^3 + |b| r^2 and of |a| r^2 + |b| r, for the errors of both; and the number of terms.
+            If derivatives along the line are bounded, there follow for each piece the ends of the
+            ranges of the first and of the second derivative, and the sums for the errors of these
+            two ranges.
+            """
+            value, gx, gy, gz, value_size, gradient_size, term_count, *sums = state
             a = row[6]
-            v, b, r, inverse = _term(p, row)
+            v, b, r, inverse = _offset_of_point(p, row)
             along_b = dr.dot(b, v)
             radial = dr.fma(3 * a, r, along_b * inverse)
             value = value + r * dr.fma(a * r, r, along_b)
@@ -221,33 +256,37 @@ class HRBF(Formula):
             abs_a, norm_b = dr.abs(a), dr.norm(b)
             value_size = dr.fma(dr.fma(abs_a, r, norm_b), r * r, value_size)
             gradient_size = dr.fma(dr.fma(abs_a, r, norm_b), r, gradient_size)
-            terms = terms + 1
+            term_count = term_count + 1
             if not count:
-                return value, *gradient, value_size, gradient_size, terms
+                return value, *gradient, value_size, gradient_size, term_count
 
-            at = dr.dot(v, d)
-            w = v - at * d
+            position = dr.dot(v, d)
+            w = v - position * d
             h2 = dr.dot(w, w)
             h = dr.sqrt(h2)
-            c, rate = dr.dot(b, w), dr.dot(b, d)
-            start_shapes = _shapes(h2, at, tiny)
+            c, rate_b = dr.dot(b, w), dr.dot(b, d)
+            start_shapes = _term_functions(h2, position, tiny)
             # The values at x = 0 of the functions that are not monotone.
-            at_zero = (h, h2 / fmax(h2 * h, tiny))
+            values_at_zero = (h, h2 / fmax(h2 * h, tiny))
             for k in range(count):
-                end_at = at + knots[k + 1]
-                end_shapes = _shapes(h2, end_at, tiny)
-                crosses = (at + knots[k] <= 0) & (end_at >= 0)
-                bowl_min = dr.select(crosses, at_zero[0], fmin(start_shapes.bowl, end_shapes.bowl))
-                bell_max = dr.select(crosses, at_zero[1], fmax(start_shapes.bell, end_shapes.bell))
+                end_at = position + knots[k + 1]
+                end_shapes = _term_functions(h2, end_at, tiny)
+                crosses = (position + knots[k] <= 0) & (end_at >= 0)
+                bowl_min = dr.select(
+                    crosses, values_at_zero[0], fmin(start_shapes.bowl, end_shapes.bowl)
+                )
+                bell_max = dr.select(
+                    crosses, values_at_zero[1], fmax(start_shapes.bell, end_shapes.bell)
+                )
                 bowl = bowl_min, fmax(start_shapes.bowl, end_shapes.bowl)
                 bell = fmin(start_shapes.bell, end_shapes.bell), bell_max
                 for index, scale, (lower, upper) in (
                     (0, 3 * a, (start_shapes.lift, end_shapes.lift)),
                     (0, c, (start_shapes.sine, end_shapes.sine)),
-                    (0, rate, bowl),
+                    (0, rate_b, bowl),
                     (2, 3 * a, bowl),
                     (2, c, bell),
-                    (2, rate, (start_shapes.turn, end_shapes.turn)),
+                    (2, rate_b, (start_shapes.turn, end_shapes.turn)),
                 ):
                     is_positive = scale > 0
                     lower, upper = (
@@ -258,31 +297,33 @@ class HRBF(Formula):
                     sums[4 * k + index + 1] = dr.fma(upper, scale, sums[4 * k + index + 1])
                 start_shapes = end_shapes
 
-            largest = r + knots[-1]
+            max_distance = r + knots[-1]
             nearest = dr.select(
-                at >= 0,
+                position >= 0,
                 r,
-                dr.select(at + knots[-1] <= 0, dr.sqrt(h2 + dr.square(at + knots[-1])), h),
+                dr.select(
+                    position + knots[-1] <= 0, dr.sqrt(h2 + dr.square(position + knots[-1])), h
+                ),
             )
-            fraction = fmin(largest / fmax(nearest, tiny), 1 / (8 * unit))
-            sums[-2] = sums[-2] + largest * dr.fma(abs_a, largest, norm_b)
-            sums[-1] = sums[-1] + dr.fma(abs_a, largest, norm_b * fraction)
-            return value, *gradient, value_size, gradient_size, terms, *sums
+            fraction = fmin(max_distance / fmax(nearest, tiny), 1 / (8 * unit))
+            sums[-2] = sums[-2] + max_distance * dr.fma(abs_a, max_distance, norm_b)
+            sums[-1] = sums[-1] + dr.fma(abs_a, max_distance, norm_b * fraction)
+            return value, *gradient, value_size, gradient_size, term_count, *sums
 
         size = 7 + (4 * count + 2 if count else 0)
-        state = records.for_each(body, tuple(real(0) for _ in range(size)), "points")
-        value, gx, gy, gz, value_size, gradient_size, terms, *sums = state
+        state = records.for_each(add_point, tuple(real(0) for _ in range(size)), "points")
+        value, gx, gy, gz, value_size, gradient_size, term_count, *sums = state
         start = SumValue(
             value,
             backend.Array3f(gx, gy, gz),
-            unit * (24 + terms) * value_size,
-            unit * (64 + 3 * terms) * gradient_size,
+            unit * (24 + term_count) * value_size,
+            unit * (64 + 3 * term_count) * gradient_size,
         )
         pieces: list[PathPiece] = []
         for k, (a, b) in enumerate(itertools.pairwise(knots)):
             lower, upper, min_second, max_second = sums[4 * k : 4 * k + 4]
-            slope_error = unit * (64 + 3 * terms) * sums[-2]
-            second_error = unit * (100 + 6 * terms) * sums[-1]
+            slope_error = unit * (64 + 3 * term_count) * sums[-2]
+            second_error = unit * (100 + 6 * term_count) * sums[-1]
             slopes = SlopeRange(lower - slope_error, upper + slope_error)
             pieces.append(
                 PathPiece(b - a, slopes, min_second - second_error, max_second + second_error)
@@ -295,7 +336,9 @@ class HRBF(Formula):
 
 @dataclass(frozen=True)
 class _TermFunctions:
-    """The functions of a term along a line, for one point: see `HRBF._along`."""
+    """The functions of x whose ranges bound the derivatives of a term, at one position x of the
+    line. For h, r and u see `HRBF._along`. `bowl` and `bell` are named by the shapes of their
+    graphs."""
 
     lift: Real  # r x
     sine: Real  # u
@@ -304,21 +347,29 @@ class _TermFunctions:
     turn: Real  # 3u - u^3
 
 
-def _shapes(h2: Real, x: Real, tiny: float) -> _TermFunctions:
-    """The functions of a term at the position x of a line at the distance sqrt(h2)."""
-    square = x * x
-    r2 = h2 + square
-    r = dr.sqrt(r2)
+def _term_functions(h_squared: Real, x: Real, tiny: float) -> _TermFunctions:
+    """The functions of a term at the position x of a line that passes the point at the distance h.
+
+    h_squared: h^2.
+    tiny: the smallest positive number, below which no distance is divided by.
+    """
+    x_squared = x * x
+    r_squared = h_squared + x_squared
+    r = dr.sqrt(r_squared)
     inverse = 1 / fmax(r, tiny)
     u = x * inverse
     return _TermFunctions(
-        r * x, u, (r2 + square) * inverse, h2 * inverse * inverse * inverse, u * (3 - u * u)
+        r * x,
+        u,
+        (r_squared + x_squared) * inverse,
+        h_squared * inverse * inverse * inverse,
+        u * (3 - u * u),
     )
 
 
-def _term(p: Vec3, row: list[Real]) -> tuple[Vec3, Vec3, Real, Real]:
-    """The vector v from a point to p, the vector b of the point's record, the length of v, and the
-    inverse of that length."""
+def _offset_of_point(p: Vec3, row: list[Real]) -> tuple[Vec3, Vec3, Real, Real]:
+    """The vector v from a point to p; the vector 3 b of the point's record; the length of v; and
+    the inverse of that length."""
     v = type(p)(*((p[k] - row[k]) - row[3 + k] for k in range(3)))
     b = type(p)(row[7], row[8], row[9])
     r = dr.norm(v)
@@ -326,36 +377,40 @@ def _term(p: Vec3, row: list[Real]) -> tuple[Vec3, Vec3, Real, Real]:
 
 
 def _solve_coefficients(points: FloatArray, normals: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The factors a (n,) and vectors b (n, 3) of the function: see `HRBF`.
+    """The numbers a (n,) and the vectors b (n, 3) of the function: see `HRBF`.
+
+    They solve a linear system with four equations for each point: f = 0 and grad f = normal.
 
     Raises:
         ValueError: the system cannot be solved.
     """
     center, n = points.mean(axis=0), len(points)
     size = float(np.abs(points - center).max()) or 1.0
-    x = (points - center) / size
-    v = x[:, None] - x[None]  # from column to row
-    r = np.linalg.norm(v, axis=2)
+    scaled = (points - center) / size
+    offsets = scaled[:, None] - scaled[None]  # from column to row
+    r = np.linalg.norm(offsets, axis=2)
     with np.errstate(divide="ignore", invalid="ignore"):
         outer = np.where(
-            (r > 0)[..., None, None], v[..., :, None] * v[..., None, :] / r[..., None, None], 0
+            (r > 0)[..., None, None],
+            offsets[..., :, None] * offsets[..., None, :] / r[..., None, None],
+            0,
         )
     system = np.empty((n, 4, n, 4))
     system[:, 0, :, 0] = r**3
-    system[:, 0, :, 1:] = 3 * r[..., None] * v
-    system[:, 1:, :, 0] = np.moveaxis(3 * r[..., None] * v, 2, 1)
+    system[:, 0, :, 1:] = 3 * r[..., None] * offsets
+    system[:, 1:, :, 0] = np.moveaxis(3 * r[..., None] * offsets, 2, 1)
     hessian = 3 * (r[..., None, None] * np.eye(3) + outer)
     system[:, 1:, :, 1:] = np.moveaxis(hessian, 2, 1)
-    values = np.zeros((n, 4))
-    values[:, 1:] = normals
+    right_side = np.zeros((n, 4))
+    right_side[:, 1:] = normals
     matrix = system.reshape(4 * n, 4 * n)
     import scipy.linalg  # imported here, as it takes time that few programs need
 
     try:
-        solution = cast("Any", scipy.linalg).solve(matrix, values.ravel(), assume_a="gen")
+        solution = cast("Any", scipy.linalg).solve(matrix, right_side.ravel(), assume_a="gen")
     except np.linalg.LinAlgError:
         solution = np.full(4 * n, np.nan)
-    residual = np.abs(matrix @ solution - values.ravel()).max()
+    residual = np.abs(matrix @ solution - right_side.ravel()).max()
     if not residual <= 1e-6:
         raise ValueError(
             f"no function through these {n} points was found (it misses them by {residual:.1g} of "
@@ -367,7 +422,7 @@ def _solve_coefficients(points: FloatArray, normals: FloatArray) -> tuple[FloatA
 
 
 def _checked(points: Any, normals: Any) -> tuple[FloatArray, FloatArray]:
-    """The points and the unit normals, as arrays (n, 3).
+    """The points (n, 3), and the normals (n, 3) as unit vectors.
 
     Raises:
         ValueError: wrong shapes or numbers, or a repeated point.

@@ -1,16 +1,18 @@
 """Kernels of blobs: functions of the distance from the center, with their derivatives along lines.
 
-Lengths are in units of the support: a kernel is a function k(q) of the squared distance q, falling
-from the center to 0 at q = 1, where it ends with k' = 0. Along a line that passes the center at the
-distance h, x from the nearest point, it is k(h^2 + x^2): a function of x on the chord |x| <= S, S^2
-= 1 - h^2. Its derivatives in x all have the same shape, on which the proofs rest:
+Lengths are in units of the support, the radius at which a blob ends. A kernel is a function k(q) of
+the squared distance q from the center. It falls from the center to 0 at q = 1, where it ends with
+dk/dq = 0. Take a line that passes the center at the distance h, and let x be the position on the
+line, measured from the point nearest to the center. Along the line the kernel is f(x) = k(h^2 +
+x^2) on the chord |x| <= S, with S^2 = 1 - h^2. The derivatives of f have the same shape for all
+kernels, on which the proofs rest:
 
-- the first is odd and, for x > 0, falls to a single minimum at x = c1, then rises to 0 at S;
-- the second is even and rises from a minimum at 0 to a single maximum at c2, then falls until S.
+- f' is odd. For x > 0 it falls to a single minimum at x = c1, then rises to 0 at S.
+- f'' is even. It rises from a minimum at 0 to a single maximum at c2, then falls until S.
 
-So the ends of their ranges on any piece of the line are among the values at its two ends and three
-numbers of the chord. At S the second derivative of some kernels jumps to 0
-(`second_derivative_jumps`).
+So the ends of their ranges on any piece of the line are among the values at the two ends of the
+piece and three numbers that depend on the chord: f'(-c1), f''(0) and f''(c2). At S, f'' of some
+kernels jumps to 0 (`second_derivative_jumps`).
 """
 
 from __future__ import annotations
@@ -35,13 +37,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ChordProfile:
-    """The extrema of a kernel's derivatives along a line.
+    """The extreme values of a kernel's derivatives along a line, and where they are taken. See the
+    module for S, c1 and c2.
 
-    half_length: S, half the length of the chord; 0 where the line misses the support.
+    half_length: S, half the length of the chord; 0 if the line misses the support.
     steepest_position: c1.
     steepest: the first derivative at -c1, which is its largest value.
     max_curvature_position: c2.
-    max_second, min_second: the second derivative at c2 and at 0.
+    max_second: the second derivative at c2, its maximum.
+    min_second: the second derivative at 0, its minimum.
     """
 
     half_length: Real
@@ -54,10 +58,15 @@ class ChordProfile:
 
 @dataclass(frozen=True)
 class KernelLipschitz:
-    """Lipschitz constants of k and of its first two derivatives along a line, with respect to the
-    positions of the line and of the point on it, in units of the support (`slope` also bounds
-    |grad k|). They bound the effect of rounding. The jump of the second derivative at S is not
-    included."""
+    """Lipschitz constants of k and of its first two derivatives along lines. They say how fast
+    these change with the distance of the line from the center and with the position on the line, in
+    units of the support, and bound the effect of rounding.
+
+    value: of k.
+    slope: of the first derivative along a line; also a bound of |grad k|.
+    bend: of the second derivative along a line. The jump of the second derivative at S is not
+        included.
+    """
 
     value: float
     slope: float
@@ -65,8 +74,8 @@ class KernelLipschitz:
 
 
 class BlobKernel(abc.ABC):
-    """A kernel of blobs. Amplitudes are chosen so that a single blob of weight 1 has the value 1 at
-    its radius."""
+    """A kernel of blobs: see the module for k, q, S and x. Each blob multiplies the kernel by an
+    amplitude, so that a single blob of weight 1 has the value 1 at its radius."""
 
     name: ClassVar[str]
     second_derivative_jumps: ClassVar[bool] = True
@@ -88,30 +97,41 @@ class BlobKernel(abc.ABC):
 
     @abc.abstractmethod
     def profile(self, q: Real) -> tuple[Real, Real, Real]:
-        """k, dk/dq, and a number m such that the error of k is at most 16 roundings of m and of
-        dk/dq."""
+        """k(q); dk/dq; and a number m. The error of k is at most 16 roundings of m plus 16
+        roundings of dk/dq."""
 
     @abc.abstractmethod
     def second_derivative(self, q: Real) -> Real:
-        """d2k/dq2."""
+        """The second derivative of k by q."""
 
     @abc.abstractmethod
     def chord(self, height: Real, inside: Real) -> ChordProfile:
-        """The kernel along lines with h^2 = `height` <= 1 and S^2 = `inside` = 1 - h^2 >= 0."""
+        """The extreme values of the kernel's derivatives along lines.
+
+        height: h^2, at most 1.
+        inside: S^2 = 1 - h^2, at least 0.
+        """
 
     @abc.abstractmethod
     def derivatives(self, height: Real, inside: Real, x: Real) -> tuple[Real, Real]:
-        """The first two derivatives along the lines of `chord`, at |x| <= S."""
+        """The first two derivatives along the lines of `chord`, at the position x, |x| <= S.
+
+        height, inside: h^2 and S^2.
+        """
 
     def lipschitz_fraction(self, inside: Real, nearest: Real) -> Real:
-        """The fraction of `steepness` that is still a bound on lines with S^2 = `inside`, for x^2
-        >= `nearest`."""
+        """A factor, at most 1, by which the constants `steepness` may be multiplied for a part of a
+        line.
+
+        inside: S^2 of the line.
+        nearest: a lower bound of x^2 on the part.
+        """
         del inside, nearest
         return 1.0
 
     @abc.abstractmethod
     def derivative_ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
-        """Ranges of k and of its first two derivatives in q, on an interval of q >= 0."""
+        """Ranges of k, dk/dq and d2k/dq2 on an interval of q >= 0."""
 
     def prepare(self, backend: Backend) -> BlobKernel:
         """The same kernel with its numbers as kernel parameters of the backend."""
@@ -120,11 +140,11 @@ class BlobKernel(abc.ABC):
 
     @property
     def amplitude(self) -> float:
-        """1 / k at the radius of a blob."""
+        """1 / k at the radius of a blob, that is at q = 1/support^2."""
         return 1.0 / float(self.height(np.array([self.support**-2.0]))[0])
 
     def function(self) -> ElementaryFunction:
-        """The kernel as a function of jets of q."""
+        """The kernel as a function that can be applied to a jet of q."""
         return ElementaryFunction(
             self.name, self.derivative_ranges, lambda q: self.profile(q)[0], self.height
         )
@@ -132,11 +152,16 @@ class BlobKernel(abc.ABC):
 
 @dataclass(frozen=True)
 class CompactKernel(BlobKernel):
-    """The compact polynomial kernel (1 - q)^3, with a continuous second derivative (Aydinlilar and
-    Zanni 2023, eq. 7 with n = 6).
+    """The compact polynomial kernel (1 - q)^3, whose second derivative is continuous (Aydinlilar
+    and Zanni 2023, eq. 7 with n = 6).
 
-    Along a line w = S^2 - x^2 and f' = -6 x w^2, f'' = 6 w (4 x^2 - w), f''' = 24 x (3w - 2x^2). So
-    f'' = 0 at x^2 = S^2/5 and f''' = 0 at x = 0 and x^2 = 3 S^2/5.
+    support: where a blob ends, in units of its radius.
+
+    Along a line, with w = S^2 - x^2,
+
+        f' = -6 x w^2,    f'' = 6 w (4 x^2 - w),    f''' = 24 x (3w - 2x^2).
+
+    So f'' = 0 at x^2 = S^2/5, and f''' = 0 at x = 0 and at x^2 = 3 S^2/5.
     """
 
     support: float = 1.6  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -164,9 +189,14 @@ class CompactKernel(BlobKernel):
 
     def chord(self, height: Real, inside: Real) -> ChordProfile:
         half, squared = dr.sqrt(inside), inside * inside
-        turn = math.sqrt(0.2) * half
+        zero_x = math.sqrt(0.2) * half
         return ChordProfile(
-            half, turn, 3.84 * squared * turn, math.sqrt(0.6) * half, 4.8 * squared, -6 * squared
+            half,
+            zero_x,
+            3.84 * squared * zero_x,
+            math.sqrt(0.6) * half,
+            4.8 * squared,
+            -6 * squared,
         )
 
     def derivatives(self, height: Real, inside: Real, x: Real) -> tuple[Real, Real]:
@@ -178,9 +208,9 @@ class CompactKernel(BlobKernel):
         w = _one_minus(q)
         epsilon = machine_epsilon(w.lower)
         return (
-            _rising(w.lower * w.lower * w.lower, w.upper * w.upper * w.upper, 4 * epsilon),
-            _rising(-3 * w.upper * w.upper, -3 * w.lower * w.lower, 4 * epsilon),
-            _rising(6 * w.lower, 6 * w.upper, 2 * epsilon),
+            _widened_range(w.lower * w.lower * w.lower, w.upper * w.upper * w.upper, 4 * epsilon),
+            _widened_range(-3 * w.upper * w.upper, -3 * w.lower * w.lower, 4 * epsilon),
+            _widened_range(6 * w.lower, 6 * w.upper, 2 * epsilon),
         )
 
 
@@ -189,10 +219,17 @@ class SexticKernel(BlobKernel):
     """The sextic kernel of soft objects, 1 - 22/9 q + 17/9 q^2 - 4/9 q^3 = w^2 (5 + 4w)/9 with w =
     1 - q (Wyvill, McPheeters and Wyvill 1986; Hart 1996, appendix D).
 
-    Along a line f' = -4/9 x w (5 + 6w), f'' = -4/9 w (5 + 6w) + 8/9 x^2 (5 + 12w) and f''' = 4/9 x
-    (15 + 36w - 24x^2), which is 0 at 0 and at x^2 = 1/4 + 3/5 S^2. f'' = 0 is a quadratic equation
-    in x^2, with sum of roots 1/2 + 6/5 S^2 and product S^2 (5 + 6 S^2)/30; the larger root lies
-    outside the chord. Where the maximum of f'' would lie outside as well, f'' rises until S.
+    support: where a blob ends, in units of its radius.
+
+    Along a line, with w = S^2 - x^2,
+
+        f' = -4/9 x w (5 + 6w),    f'' = -4/9 w (5 + 6w) + 8/9 x^2 (5 + 12w),
+        f''' = 4/9 x (15 + 36w - 24x^2).
+
+    So f''' = 0 at x = 0 and at x^2 = 1/4 + 3/5 S^2. If that second position lies outside of the
+    chord, f'' rises from x = 0 until S. f'' = 0 is a quadratic equation in x^2. The sum of its
+    roots is 1/2 + 6/5 S^2, and their product is S^2 (5 + 6 S^2)/30; the larger root lies outside of
+    the chord.
     """
 
     support: float = 2.0  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -220,12 +257,17 @@ class SexticKernel(BlobKernel):
     def chord(self, height: Real, inside: Real) -> ChordProfile:
         total = dr.fma(1.2, inside, 0.5)
         product = inside * dr.fma(0.2, inside, 1 / 6)
-        turn = dr.sqrt(2 * product / (total + dr.sqrt(fmax(total * total - 4 * product, 0))))
-        peak = dr.sqrt(fmin(dr.fma(0.6, inside, 0.25), inside))
-        first, _ = self.derivatives(height, inside, turn)
-        _, largest = self.derivatives(height, inside, peak)
+        zero_x = dr.sqrt(2 * product / (total + dr.sqrt(fmax(total * total - 4 * product, 0))))
+        peak_x = dr.sqrt(fmin(dr.fma(0.6, inside, 0.25), inside))
+        first, _ = self.derivatives(height, inside, zero_x)
+        _, max_second = self.derivatives(height, inside, peak_x)
         return ChordProfile(
-            dr.sqrt(inside), turn, -first, peak, largest, -inside * dr.fma(8 / 3, inside, 20 / 9)
+            dr.sqrt(inside),
+            zero_x,
+            -first,
+            peak_x,
+            max_second,
+            -inside * dr.fma(8 / 3, inside, 20 / 9),
         )
 
     def derivatives(self, height: Real, inside: Real, x: Real) -> tuple[Real, Real]:
@@ -238,17 +280,19 @@ class SexticKernel(BlobKernel):
         w = _one_minus(q)
         epsilon = machine_epsilon(w.lower)
 
-        def k(w: Real) -> Real:
+        def value_at(w: Real) -> Real:
+            """k for w = 1 - q."""
             return w * w * (4 / 9 * w + 5 / 9)
 
-        def slope(w: Real) -> Real:
+        def slope_at(w: Real) -> Real:
+            """dk/dq for w = 1 - q."""
             return -w * (4 / 3 * w + 10 / 9)
 
-        second = _rising(8 / 3 * w.lower + 10 / 9, 8 / 3 * w.upper + 10 / 9, 4 * epsilon)
+        second = _widened_range(8 / 3 * w.lower + 10 / 9, 8 / 3 * w.upper + 10 / 9, 4 * epsilon)
         return (
-            _rising(k(w.lower), k(w.upper), 6 * epsilon),
-            _rising(slope(w.upper), slope(w.lower), 6 * epsilon),
-            _zero_outside(second, q),
+            _widened_range(value_at(w.lower), value_at(w.upper), 6 * epsilon),
+            _widened_range(slope_at(w.upper), slope_at(w.lower), 6 * epsilon),
+            _range_with_support_end(second, q),
         )
 
 
@@ -257,9 +301,14 @@ class CubicKernel(BlobKernel):
     """The cubic kernel of soft objects, 1 - 3 r^2 + 2 r^3 = (1 - r)^2 (1 + 2r) with r^2 = q (Hart
     1996, eq. 36).
 
-    Along a line r^2 = h^2 + x^2 and f' = -6 x (1 - r), f'' = -6 (1 - r - x^2/r), f''' = 6 x/r (3 -
-    x^2/r^2), so f'' rises until S. f'' = 0 where r + x^2/r = 1: a quadratic equation, x^2 = (1 -
-    4h^2 + sqrt(1 + 8h^2))/8.
+    support: where a blob ends, in units of its radius.
+
+    Along a line at the distance h from the center, with r^2 = h^2 + x^2,
+
+        f' = -6 x (1 - r),    f'' = -6 (1 - r - x^2/r),    f''' = 6 x/r (3 - x^2/r^2).
+
+    So f'' rises from x = 0 until S. f'' = 0 where r + x^2/r = 1. This gives a quadratic equation
+    for x^2, whose solution is x^2 = (1 - 4h^2 + sqrt(1 + 8h^2))/8.
     """
 
     support: float = 2.0  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -287,10 +336,10 @@ class CubicKernel(BlobKernel):
 
     def chord(self, height: Real, inside: Real) -> ChordProfile:
         half = dr.sqrt(inside)
-        turn = dr.sqrt(fmax(1 + dr.sqrt(dr.fma(8, height, 1)) - 4 * height, 0) * 0.125)
-        turn = fmin(turn, half)
-        first, _ = self.derivatives(height, inside, turn)
-        return ChordProfile(half, turn, -first, half, 6 * inside, 6 * dr.sqrt(height) - 6)
+        zero_x = dr.sqrt(fmax(1 + dr.sqrt(dr.fma(8, height, 1)) - 4 * height, 0) * 0.125)
+        zero_x = fmin(zero_x, half)
+        first, _ = self.derivatives(height, inside, zero_x)
+        return ChordProfile(half, zero_x, -first, half, 6 * inside, 6 * dr.sqrt(height) - 6)
 
     def derivatives(self, height: Real, inside: Real, x: Real) -> tuple[Real, Real]:
         square = x * x
@@ -301,18 +350,20 @@ class CubicKernel(BlobKernel):
         low, high = dr.sqrt(fmin(fmax(q.lower, 0), 1)), dr.sqrt(fmin(q.upper, 1))
         epsilon = machine_epsilon(low)
 
-        def k(r: Real) -> Real:
+        def value_at(r: Real) -> Real:
+            """k at the distance r = sqrt(q)."""
             return (1 - r) * (1 - r) * (1 + 2 * r)
 
         # Absolute errors: of r half an epsilon, of 1 - r at most as much.
         slope = Interval(-3 * (1 - low) - 8 * epsilon, fmin(-3 * (1 - high) + 8 * epsilon, 0))
-        value = Interval(fmax(k(high) - 8 * epsilon, 0), k(low) + 8 * epsilon)
+        value = Interval(fmax(value_at(high) - 8 * epsilon, 0), value_at(low) + 8 * epsilon)
         second = Interval(1.5 / high, dr.select(low > 0, 1.5 / low, dr.inf)).widened(8 * epsilon)
-        return value, slope, _zero_outside(second, q)
+        return value, slope, _range_with_support_end(second, q)
 
 
-# A polynomial P with y = (1 - u) P(u), e^-y (1 - 2y) = u, within 3e-5 for 0 <= u <= 1.
-_TURN = (
+# Coefficients of a polynomial P, constant term first. For 0 <= u <= 1 the solution y of
+# e^-y (1 - 2y) = u is (1 - u) P(u), within 3e-5.
+_ZERO_OF_SECOND = (
     0.49997092305737245, -0.3219978627536485, 0.32259825712084994,
     -0.30315186994209903, 0.18704273421313763, -0.051146934086341474,
 )  # fmt: skip
@@ -320,20 +371,25 @@ _TURN = (
 
 @dataclass(frozen=True)
 class GaussianKernel(BlobKernel):
-    """The Gaussian kernel exp(z) - 1 - z with z = b (1 - q): a Gaussian minus its tangent in q
-    where the blob ends (Aydinlilar and Zanni 2023, eq. 6, has no end).
+    """The Gaussian kernel exp(z) - 1 - z with z = b (1 - q). It is a Gaussian minus its tangent in
+    q where the blob ends. (Aydinlilar and Zanni 2023, eq. 6, use a Gaussian that does not end.)
 
-    A Gaussian that is only cut off jumps, and no step across the jump could be proved. Minus its
-    tangent it ends as smoothly as the other kernels, and its ranges are exact. It differs from the
-    Gaussian by a parabola that is small if the tail is.
+    A Gaussian that is only cut off jumps, and no step across the jump could be proved. With the
+    tangent subtracted, it ends as smoothly as the other kernels, and its ranges are exact. It
+    differs from the Gaussian by a parabola, which is small if the tail is small.
 
-    sharpness: s of exp(-s d^2/radius^2).
+    sharpness: the number s of the Gaussian exp(-s d^2/radius^2), with d the distance from the
+        center.
     tail: the value of the Gaussian where the blob ends, as a fraction of its value at the radius.
+    rate: b as a kernel parameter, which `prepare` sets; None otherwise.
 
-    Along a line z = b (S^2 - x^2), y = b x^2 and f' = -2 b x (e^z - 1), f'' = 2b (e^z (2y - 1) +
-    1), f''' = 4 b^2 x e^z (3 - 2y): the maximum of f'' is at y = 3/2, or at S if S is nearer. f'' =
-    0 where e^-y (1 - 2y) = e^-z at x = 0: a function of a single number, approximated by a
-    polynomial. Its error e changes the extreme value of f' by the order of e^2.
+    Along a line, with z = b (S^2 - x^2) and y = b x^2,
+
+        f' = -2 b x (e^z - 1),    f'' = 2b (e^z (2y - 1) + 1),    f''' = 4 b^2 x e^z (3 - 2y).
+
+    So the maximum of f'' is at y = 3/2, or at x = S if S is nearer. f'' = 0 where e^-y (1 - 2y) =
+    e^-(b S^2). So y is a function of the single number e^-(b S^2), and is approximated by a
+    polynomial. The polynomial's error e changes the extreme value of f' by the order of e^2.
     """
 
     sharpness: float = 1.0
@@ -356,6 +412,7 @@ class GaussianKernel(BlobKernel):
 
     @property
     def _rate(self) -> Any:
+        """b: as a kernel parameter if the kernel is prepared, else as a number."""
         return self.sharpness * self.support**2 if self.rate is None else self.rate
 
     @property
@@ -386,24 +443,26 @@ class GaussianKernel(BlobKernel):
     def chord(self, height: Real, inside: Real) -> ChordProfile:
         b = self._rate
         z = b * inside
-        top = dr.exp(z)
-        u = 1 / top
-        polynomial: Any = _TURN[-1]
-        for coefficient in reversed(_TURN[:-1]):
+        exp_z = dr.exp(z)
+        u = 1 / exp_z
+        polynomial: Any = _ZERO_OF_SECOND[-1]
+        for coefficient in reversed(_ZERO_OF_SECOND[:-1]):
             polynomial = dr.fma(polynomial, u, coefficient)
         y = fmax((1 - u) * polynomial, 0)
-        turn = dr.sqrt(y / b)
+        zero_x = dr.sqrt(y / b)
         is_at_end = z < 1.5
-        largest = (
-            2 * b * (2 * dr.select(is_at_end, z, top * math.exp(-1.5)) + dr.select(is_at_end, 0, 1))
+        max_second = (
+            2
+            * b
+            * (2 * dr.select(is_at_end, z, exp_z * math.exp(-1.5)) + dr.select(is_at_end, 0, 1))
         )
         return ChordProfile(
             dr.sqrt(inside),
-            turn,
-            2 * b * turn * (dr.exp(z - y) - 1),
+            zero_x,
+            2 * b * zero_x * (dr.exp(z - y) - 1),
             dr.sqrt(fmin(1.5, z) / b),
-            largest,
-            -2 * b * (top - 1),
+            max_second,
+            -2 * b * (exp_z - 1),
         )
 
     def derivatives(self, height: Real, inside: Real, x: Real) -> tuple[Real, Real]:
@@ -413,7 +472,9 @@ class GaussianKernel(BlobKernel):
         return -2 * b * x * (e - 1), 2 * b * dr.fma(e, dr.fma(2, y, -1), 1)
 
     def lipschitz_fraction(self, inside: Real, nearest: Real) -> Real:
-        """All constants are multiples of the largest e^z, and e^y >= (1 + y/32)^32."""
+        """See `BlobKernel`. Proof. All constants are multiples of the largest e^z with z = b (S^2 -
+        x^2), which is at most e^(b (S^2 - 1)) times the value for S = 1 and x = 0. The factor e^(-b
+        x^2) is bounded by e^y >= (1 + y/32)^32 with y = b x^2."""
         b = self._rate
         power = dr.fma(b / 32, nearest, 1)
         for _ in range(5):
@@ -435,7 +496,7 @@ class GaussianKernel(BlobKernel):
             -b * (high - 1) - error * b * high, fmin(-b * (low - 1) + error * b * low, 0)
         )
         second = Interval(b * b * low, b * b * high).widened(error)
-        return value, slope, _zero_outside(second, q)
+        return value, slope, _range_with_support_end(second, q)
 
 
 KERNELS: dict[str, type[BlobKernel]] = {
@@ -447,10 +508,11 @@ KERNELS: dict[str, type[BlobKernel]] = {
 
 
 def choose_kernel(kernel: str | BlobKernel) -> BlobKernel:
-    """The kernel of this name, with its default parameters; a kernel is returned as it is.
+    """The kernel with a name, with its default parameters. A kernel is returned as it is.
 
-    Raises ValueError for an unknown name, TypeError for an argument that is neither a name nor a
-    kernel.
+    Raises:
+        ValueError: an unknown name.
+        TypeError: neither a name nor a kernel.
     """
     if isinstance(kernel, BlobKernel):
         return kernel
@@ -465,7 +527,7 @@ def choose_kernel(kernel: str | BlobKernel) -> BlobKernel:
 
 
 def _check_support(support: float) -> None:
-    """Raise ValueError for a support that is not between 1 and 100."""
+    """Raise ValueError unless a support is above 1 and at most 100."""
     if not 1.0 < as_real(support, "support") <= 100.0:
         raise ValueError(
             f"support must lie between 1 and 100, not {support!r}: it is where a blob ends, in "
@@ -474,18 +536,26 @@ def _check_support(support: float) -> None:
 
 
 def _one_minus(q: Interval) -> Interval:
-    """The range of max(1 - q, 0)."""
+    """The range of max(1 - q, 0) for q in an interval."""
     w = Interval(1.0, 1.0) - q
     return Interval(fmax(w.lower, 0), fmax(w.upper, 0))
 
 
-def _rising(lower: Real, upper: Real, margin: float) -> Interval:
-    """The interval between the bounds, widened by a relative margin."""
-    return Interval(lower, upper).widened(margin)
+def _widened_range(lower: Real, upper: Real, relative_error: float) -> Interval:
+    """The interval [lower, upper], with each end moved outwards by a fraction of itself, for
+    rounding.
+
+    lower, upper: the values of an increasing function at both ends of a range.
+    """
+    return Interval(lower, upper).widened(relative_error)
 
 
-def _zero_outside(second: Interval, q: Interval) -> Interval:
-    """The range of a positive second derivative on an interval; it is 0 beyond the support."""
+def _range_with_support_end(second: Interval, q: Interval) -> Interval:
+    """The range of a second derivative d2k/dq2 that is positive for q < 1 and 0 beyond.
+
+    second: its range for q < 1.
+    q: the range of q. If it contains 1, the result contains 0.
+    """
     return Interval(
         dr.select(q.upper < 1, fmax(second.lower, 0), 0), dr.select(q.lower <= 1, second.upper, 0)
     )

@@ -28,28 +28,36 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
     from harnack.geometry import Volume
 
-# The other operands narrow the range of the value only if that shifts it by more than this fraction
-# of its error; at creases the shift is nearly always smaller.
+# The bounds of other operands may narrow the range of the value, which moves the middle of the
+# range. This is done only if the middle moves by more than this fraction of the value's error; at
+# creases it nearly always moves less.
 _MIN_SHIFT = 0.25
 
 
 def union(*solids: Solid) -> Solid:
-    """The union of the solids: all points that are in at least one of them.
+    """The union of solids: all points that are in at least one of them.
 
     Raises:
         ValueError: no solids.
-        TypeError: an argument is not a solid.
+        TypeError: an argument that is not a solid.
     """
     return BooleanSolid(_flatten_operands(solids, is_union=True), is_union=True)
 
 
 def intersection(*solids: Solid) -> Solid:
-    """The intersection of the solids: all points that are in each of them. Raises as `union`."""
+    """The intersection of solids: all points that are in each of them. It raises the errors of
+    `union`."""
     return BooleanSolid(_flatten_operands(solids, is_union=False), is_union=False)
 
 
 def _flatten_operands(solids: tuple[Solid, ...], *, is_union: bool) -> tuple[Solid, ...]:
-    """The operands, with those of nested unions (or intersections) in place of these."""
+    """The operands of a union (or intersection). An operand that is itself a union (or
+    intersection) is replaced by its own operands.
+
+    Raises:
+        ValueError: no solids.
+        TypeError: an argument that is not a solid.
+    """
     if not solids:
         raise ValueError("give at least one solid")
     flat: list[Solid] = []
@@ -65,168 +73,185 @@ def _flatten_operands(solids: tuple[Solid, ...], *, is_union: bool) -> tuple[Sol
 
 @dataclass(frozen=True, eq=False)
 class BooleanSolid(Solid):
-    """The union, min f_i, or the intersection, max f_i, of solids.
+    """The union of solids, with the function min f_i, or their intersection, with the function max
+    f_i.
 
-    If the f_i are distances, the minimum is exact outside and only a bound inside, and the maximum
-    is only a bound. Hart 1996, equation 16, calls the union exact inside too; unit discs at -1/2
-    and 1/2 show that it is not: the distance at 0 is 0.866, and not 0.5.
+    parts: the solids.
+    is_union: whether it is their union; else it is their intersection.
+
+    If the f_i are distances, the minimum is the exact distance outside and only a bound inside, and
+    the maximum is only a bound. Hart 1996, equation 16, calls the union exact inside too. Unit
+    discs about -1/2 and 1/2 are a counterexample: at 0 the distance is 0.866, but the minimum gives
+    0.5.
     """
 
     parts: tuple[Solid, ...]
     is_union: bool
 
     def __post_init__(self) -> None:
-        domains = list(
-            dict.fromkeys(operand.domain for operand in self.parts if operand.domain is not None)
-        )
+        """Set the attributes that follow from the operands: the domain, and the settings for the
+        tracer."""
+        domains = list(dict.fromkeys(part.domain for part in self.parts if part.domain is not None))
         domain = None
         if domains:
             domain = domains[0] if len(domains) == 1 else VolumeIntersection(domains)
         object.__setattr__(self, "domain", domain)
         object.__setattr__(
-            self,
-            "has_variable_accuracy",
-            any(operand.has_variable_accuracy for operand in self.parts),
+            self, "has_variable_accuracy", any(part.has_variable_accuracy for part in self.parts)
         )
-        coarsest = min((operand.coarsest_accuracy for operand in self.parts), default=1.0)
+        coarsest = min((part.coarsest_accuracy for part in self.parts), default=1.0)
         object.__setattr__(self, "coarsest_accuracy", coarsest)
         # An operand that proves nothing looking back would refuse all longer steps.
         object.__setattr__(
-            self, "over_relaxation", min(operand.over_relaxation for operand in self.parts)
+            self, "over_relaxation", min(part.over_relaxation for part in self.parts)
         )
         object.__setattr__(self, "min_wavelength", min_wavelength(self.parts))
-        constants = [operand.lipschitz for operand in self.parts]
-        all_known = all(constant is not None for constant in constants)
+        constants = [part.lipschitz for part in self.parts]
+        all_known = all(part is not None for part in constants)
         object.__setattr__(self, "lipschitz", max(constants) if all_known else None)
 
     def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
-        return BooleanSolid(
-            tuple(operand.map_operands(change) for operand in self.parts), self.is_union
-        )
+        return BooleanSolid(tuple(part.map_operands(change) for part in self.parts), self.is_union)
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
-        extents = [operand.sublevel_extent(level, above=above) for operand in self.parts]
-        bounded = [extent for extent in extents if extent is not None]
+        """See `Solid.sublevel_extent`. Points where the extreme value is on the side asked for lie
+        either in each operand's volume, or in at least one of them: in the first case the volumes
+        are intersected, in the second a box is put around them."""
+        extents = [part.sublevel_extent(level, above=above) for part in self.parts]
+        bounded = [part for part in extents if part is not None]
         if self.is_union == above:
             return VolumeIntersection(bounded) if len(bounded) > 1 else next(iter(bounded), None)
         if len(bounded) < len(extents):
             return None
-        return _enclosing_box(bounded)
+        return _box_around_volumes(bounded)
 
     @property
     def is_steep(self) -> bool:
-        return any(operand.is_steep for operand in self.parts)
+        return any(part.is_steep for part in self.parts)
 
     def prepare(self, backend: Backend) -> Solid:
-        return self._of([operand.prepare(backend) for operand in self.parts])
+        return self._with_parts([part.prepare(backend) for part in self.parts])
 
     def at_accuracy(self, detail: Real) -> Field:
-        return self._of([operand.at_accuracy(detail) for operand in self.parts])
+        return self._with_parts([part.at_accuracy(detail) for part in self.parts])
 
     def for_ray_count(self, count: int) -> Field:
-        def make(operands: list[Any]) -> Solid:
-            return BooleanSolid(tuple(operands), self.is_union)
+        def make(parts: list[Any]) -> Solid:
+            """The combination of other operands."""
+            return BooleanSolid(tuple(parts), self.is_union)
 
         return self._for_rays(self.parts, count, make)
 
-    def _of(self, operands: list[Field]) -> Solid:
+    def _with_parts(self, parts: list[Field]) -> Solid:
         """The same combination of other operands, which need not be solids."""
         combination = copy.copy(self)
-        object.__setattr__(combination, "parts", tuple(operands))
+        object.__setattr__(combination, "parts", tuple(parts))
         return combination
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        values = [operand.formula(x, y, z) for operand in self.parts]
+        values = [part.formula(x, y, z) for part in self.parts]
         if len(values) == 1:
             return values[0]
         return minimum(*values) if self.is_union else maximum(*values)
 
     def evaluate(self, p: Vec3) -> Sample:
-        samples = [operand.evaluate(p) for operand in self.parts]
+        samples = [part.evaluate(p) for part in self.parts]
         return self._combine_samples(samples, max_norm(p))[0]
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        """The rows of the Hessian of the operand that is extreme at p."""
         extreme: Any = None
         rows: Any = None
-        for operand in self.parts:
-            value, operand_rows = operand.evaluate(p).value, operand.hessian(p)
+        for part in self.parts:
+            value, part_rows = part.evaluate(p).value, part.hessian(p)
             if rows is None:
-                extreme, rows = value, operand_rows
+                extreme, rows = value, part_rows
                 continue
             is_chosen = (value < extreme) if self.is_union else (value > extreme)
-            rows = tuple(
-                dr.select(is_chosen, a, b) for a, b in zip(operand_rows, rows, strict=True)
-            )
+            rows = tuple(dr.select(is_chosen, a, b) for a, b in zip(part_rows, rows, strict=True))
             extreme = dr.select(is_chosen, value, extreme)
         return rows
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """The largest derivative errors of the operands that may be the extreme one. They are
-        infinite where rounding leaves open which operand is extreme, since derivatives jump
-        there."""
+        """The largest derivative errors of the operands that may be the extreme one (for a union
+        the least, for an intersection the greatest). They are infinite where rounding leaves open
+        which operand is extreme, since derivatives jump there."""
         size = max_norm(p)
         sign = -1.0 if self.is_union else 1.0
         total_error = value_error_bound(sample, safe_norm(sample.gradient), size)
-        count, max_first, max_second = 0 * p.x, 0 * p.x, 0 * p.x
-        for operand in self.parts:
-            operand_sample = operand.evaluate(p)
-            error = value_error_bound(operand_sample, safe_norm(operand_sample.gradient), size)
-            is_open = ~(sign * (sample.value - operand_sample.value) > error + total_error)
-            count = count + dr.select(is_open, 1.0, 0.0)
-            first, second = operand.derivative_errors(p, operand_sample)
+        candidate_count, max_first, max_second = 0 * p.x, 0 * p.x, 0 * p.x
+        for part in self.parts:
+            part_sample = part.evaluate(p)
+            part_error = value_error_bound(part_sample, safe_norm(part_sample.gradient), size)
+            may_be_extreme = ~(sign * (sample.value - part_sample.value) > part_error + total_error)
+            candidate_count = candidate_count + dr.select(may_be_extreme, 1.0, 0.0)
+            first, second = part.derivative_errors(p, part_sample)
             # NaN is kept, as it bounds nothing.
-            max_first = dr.select(is_open & ~(first <= max_first), first, max_first)
-            max_second = dr.select(is_open & ~(second <= max_second), second, max_second)
-        is_single = count <= 1
+            max_first = dr.select(may_be_extreme & ~(first <= max_first), first, max_first)
+            max_second = dr.select(may_be_extreme & ~(second <= max_second), second, max_second)
+        is_single = candidate_count <= 1
         return dr.select(is_single, max_first, dr.inf), dr.select(is_single, max_second, dr.inf)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The ray sample of the combination, from those of all operands, by `MaximumEnclosure`."""
+        """The ray sample of the combination, from the ray samples of all operands. Its enclosures
+        are `MaximumEnclosure`s."""
         ray_samples = [operand.sample_ray(path, t, ahead, back) for operand in self.parts]
         size = max_norm(path.origin) + t
-        sample, below, extreme = self._combine_samples(
-            [ray_sample.sample for ray_sample in ray_samples], size
+        sample, deficits, extreme = self._combine_samples(
+            [operand.sample for operand in ray_samples], size
         )
         slope, slope_error = ray_samples[-1].slope, ray_samples[-1].slope_error_bound
         for ray_sample in ray_samples[:-1]:
             is_chosen = ray_sample.sample.value == extreme
             slope = dr.select(is_chosen, ray_sample.slope, slope)
             slope_error = dr.select(is_chosen, ray_sample.slope_error_bound, slope_error)
-        front = self._enclosures([ray_sample.forward for ray_sample in ray_samples], below)
-        behind = self._enclosures([ray_sample.backward for ray_sample in ray_samples], below)
-        growth = max(ray_sample.reach_growth for ray_sample in ray_samples)
-        return RaySample(sample, front, behind, slope, growth, slope_error)
+        forward = self._combine_enclosures([operand.forward for operand in ray_samples], deficits)
+        backward = self._combine_enclosures([operand.backward for operand in ray_samples], deficits)
+        growth = max(operand.reach_growth for operand in ray_samples)
+        return RaySample(sample, forward, backward, slope, growth, slope_error)
 
-    def _enclosures(
-        self, operands: list[tuple[Enclosure, ...]], below: list[tuple[Real, Real]]
+    def _combine_enclosures(
+        self, operands: list[tuple[Enclosure, ...]], deficits: list[tuple[Real, Real]]
     ) -> tuple[Enclosure, ...]:
         """The enclosures of the combination from those of its operands; () if an operand has none.
 
-        below: for each operand, bounds of the difference by which it is below the greatest operand.
+        operands: the enclosures of each operand.
+        deficits: for each operand, bounds (lower, upper) of how much it is below the greatest
+            operand. (For a union, operands are negated first.)
         """
         if not all(operands):
             return ()
         if self.is_union:
             operands = [tuple(NegatedEnclosure(kind) for kind in kinds) for kinds in operands]
         greatest = MaximumEnclosure(
-            tuple(MaximumOperand(*gaps, kinds) for gaps, kinds in zip(below, operands, strict=True))
+            tuple(
+                MaximumOperand(*bounds, kinds)
+                for bounds, kinds in zip(deficits, operands, strict=True)
+            )
         )
         return (NegatedEnclosure(greatest),) if self.is_union else (greatest,)
 
     def _combine_samples(
         self, samples: list[Sample], size: Real
     ) -> tuple[Sample, list[tuple[Real, Real]], Real]:
-        """The sample of the combination; for each operand bounds (lower, upper) of the difference
-        by which it is below the greatest operand; and the greatest (for a union, the least) value.
+        """The sample of the combination from those of the operands.
 
-        Proof of the errors. Let v_i be values with errors e_i (all rounding, `value_error_bound`),
-        v = v_k the greatest. max f_i <= max(v_i + e_i) = v + max(e_i - (v - v_i)), and max f_i >=
-        v_k - e_k. So max(e_i - (v - v_i)) is the error of the combination. As max f_i >= v_j - e_j
-        for every j, an operand with a smaller error may exclude most of that range. Then the value
-        is the middle of the remaining range, for otherwise a ray would hit, by the rounding of an
-        operand, a surface that lies inside of another operand. The tracer subtracts the error of
-        the combination from its gaps. If the error of an operand is larger, the excess is
-        subtracted from the difference by which the operand is below.
+        samples: of the operands, at one point.
+        size: a bound of the absolute values of the point's coordinates.
+
+        Returns the sample; for each operand, bounds (lower, upper) of how much it is below the
+        greatest operand; and the greatest value of an operand. For a union all this is about
+        negated operands, except that the least value itself is returned.
+
+        Proof of the errors. Let v_i be the values of the operands f_i, e_i bounds of their errors
+        (all rounding included, `value_error_bound`), and v = v_k the greatest value. Then max f_i
+        <= max(v_i + e_i) = v + max(e_i - (v - v_i)), and max f_i >= v_k - e_k. So max(e_i - (v -
+        v_i)) bounds the error of the combination. As max f_i >= v_j - e_j for every j, an operand
+        with a smaller error may exclude most of that range. Then the value is set to the middle of
+        the remaining range. Otherwise a ray would hit, by the rounding of one operand, a surface
+        that lies inside of another operand. The tracer subtracts the error of the combination from
+        its level gaps. If the error of an operand is larger, the excess is subtracted from the
+        bound of how much the operand is below.
         """
         sign = -1.0 if self.is_union else 1.0
         values = [sign * operand.value for operand in samples]
@@ -245,40 +270,40 @@ class BooleanSolid(Solid):
             value_error_bound(operand, safe_norm(operand.gradient), size) for operand in samples
         ]
         error, truncation = 0 * greatest, 0 * greatest
-        for sample, operand_value, value_error in zip(samples, values, errors, strict=True):
-            gap = greatest - operand_value
-            error = fmax(fmax(value_error - gap, sample.value_error - gap), error)
-            truncation = fmax(sample.truncation_error - gap, truncation)
+        for sample, operand_value, operand_error in zip(samples, values, errors, strict=True):
+            deficit = greatest - operand_value
+            error = fmax(fmax(operand_error - deficit, sample.value_error - deficit), error)
+            truncation = fmax(sample.truncation_error - deficit, truncation)
         lower_bound = values[0] - errors[0]
-        for operand_value, value_error in zip(values[1:], errors[1:], strict=True):
-            lower_bound = fmax(operand_value - value_error, lower_bound)
+        for operand_value, operand_error in zip(values[1:], errors[1:], strict=True):
+            lower_bound = fmax(operand_value - operand_error, lower_bound)
         shift = 0.5 * (lower_bound - (greatest - error))
         shift = dr.select(shift > _MIN_SHIFT * error, shift, 0)
         extreme, value = value, value + sign * shift
         greatest, error = greatest + shift, error - shift
         # `Sample.value_error` leaves out the rounding that follows from value and gradient.
-        unstated = Sample(value, gradient, ())
-        stated = value_error_bound(unstated, safe_norm(gradient), size)
+        plain = Sample(value, gradient, ())
+        stated = value_error_bound(plain, safe_norm(gradient), size)
         joined = Sample(
             value, gradient, self._common_lipschitz(samples), fmax(error - stated, 0), slope_error,
             truncation_error=truncation,
         )  # fmt: skip
-        stated_error = value_error_bound(joined, safe_norm(gradient), size)
+        joined_error = value_error_bound(joined, safe_norm(gradient), size)
         return (
             joined,
             [
                 (
-                    fmax(greatest - operand_value - fmax(value_error - stated_error, 0), 0),
-                    greatest - operand_value + fmax(value_error - stated_error, 0),
+                    fmax(greatest - operand_value - fmax(operand_error - joined_error, 0), 0),
+                    greatest - operand_value + fmax(operand_error - joined_error, 0),
                 )
-                for operand_value, value_error in zip(values, errors, strict=True)
+                for operand_value, operand_error in zip(values, errors, strict=True)
             ],
             extreme,
         )
 
     def _common_lipschitz(self, samples: list[Sample]) -> tuple[Lipschitz, ...]:
-        """The largest of the operands' Lipschitz constants, which is a constant of the combination;
-        () if an operand promises none."""
+        """The largest of the operands' Lipschitz constants on the smallest of their balls, as a
+        promise of the combination; () if an operand promises no constant."""
         constant: Any = 0.0
         radius: Any = math.inf
         for sample in samples:
@@ -291,23 +316,24 @@ class BooleanSolid(Solid):
 
 
 def min_wavelength(parts: Iterable[Solid]) -> float | None:
-    """The smallest `Field.min_wavelength` of any of the fields; None if no field has it."""
+    """The smallest `Field.min_wavelength` of solids. Solids for which it is None are left out; None
+    if there are no others."""
     return min(
-        (operand.min_wavelength for operand in parts if operand.min_wavelength is not None),
-        default=None,
+        (part.min_wavelength for part in parts if part.min_wavelength is not None), default=None
     )
 
 
 def lipschitz_of(sample: Sample) -> Lipschitz | None:
-    """The Lipschitz constant that a sample promises, or one that follows from another of its
-    promises; None if there is neither."""
+    """A Lipschitz constant that a sample promises, or that follows from one of its promises; None
+    if there is neither."""
     implied = [promise.implied_lipschitz(sample.value) for promise in sample.all_promises]
     stated = (promise for promise in sample.all_promises if isinstance(promise, Lipschitz))
     return next(stated, None) or next((promise for promise in implied if promise is not None), None)
 
 
-def _enclosing_box(volumes: list[Volume]) -> Volume | None:
-    """A box around volumes; a volume itself if it is alone; None if they are unbounded."""
+def _box_around_volumes(volumes: list[Volume]) -> Volume | None:
+    """A box that contains several volumes. A single volume is returned as it is; None if the
+    volumes have no bounds."""
     corners = [volume.bounds() for volume in volumes]
     lower = np.min([volume for volume, _ in corners], axis=0)
     upper = np.max([volume for _, volume in corners], axis=0)
@@ -320,7 +346,10 @@ def _enclosing_box(volumes: list[Volume]) -> Volume | None:
 
 @dataclass(frozen=True, eq=False)
 class Complement(SolidOfField):
-    """The complement of a solid: all points that are not inside it. Its function is -f."""
+    """The complement of a solid: all points that are not inside it. Its function is -f.
+
+    field: the solid with the function f.
+    """
 
     field: Solid
 
@@ -347,18 +376,18 @@ class Complement(SolidOfField):
         return -x, -y, -z
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        return negated_ray_sample(self.field.sample_ray(path, t, ahead, back))
+        return negated_look(self.field.sample_ray(path, t, ahead, back))
 
 
-def negated_ray_sample(sample: RaySample) -> RaySample:
+def negated_look(look: RaySample) -> RaySample:
     """The ray sample of -f from that of f."""
     return RaySample(
-        negated_sample(sample.sample),
-        tuple(NegatedEnclosure(enclosure) for enclosure in sample.forward),
-        tuple(NegatedEnclosure(enclosure) for enclosure in sample.backward),
-        -sample.slope,
-        sample.reach_growth,
-        sample.slope_error,
+        negated_sample(look.sample),
+        tuple(NegatedEnclosure(enclosure) for enclosure in look.forward),
+        tuple(NegatedEnclosure(enclosure) for enclosure in look.backward),
+        -look.slope,
+        look.reach_growth,
+        look.slope_error,
     )
 
 
@@ -376,7 +405,10 @@ def negated_sample(sample: Sample) -> Sample:
 class OffsetSolid(SolidOfField):
     """An offset of a solid: the points where f <= distance.
 
-    Proof. f - distance has the enclosures of f, and its Lipschitz constant.
+    field: the solid with the function f.
+    distance: the level of f that becomes the surface. Where f is a distance, the solid grows by it.
+
+    Proof. The function f - distance has the enclosures of f, and its Lipschitz constant.
     """
 
     field: Solid
@@ -401,7 +433,8 @@ class OffsetSolid(SolidOfField):
         return self._shifted(self.field.evaluate(p))
 
     def _shifted(self, sample: Sample) -> Sample:
-        """The sample of f - distance, with the rounding of the difference."""
+        """The sample of f - distance from that of f. Its error includes the rounding of the
+        difference."""
         size = dr.abs(sample.value) + abs(self.distance)
         return sample.map_promises(
             lambda promise: promise.shifted(-self.distance),
@@ -421,8 +454,14 @@ class OffsetSolid(SolidOfField):
 class BlendedSolid(FormulaSolid):
     """The union or intersection of two solids with a fillet: see `arithmetic.norms.blend_union`.
 
-    Its Lipschitz constant is 2^(1/p) times the larger of the solids' own. A union's fillet lies
-    where both functions are at most the radius: within the union of the solids grown by the radius.
+    parts: the two solids.
+    radius: how far the fillet extends along the surfaces, where the functions are distances.
+    power: the exponent p of the superellipse that the fillet is a part of.
+    is_union: whether it is their union; else it is their intersection.
+
+    Its Lipschitz constant is 2^(1/p) times the larger of the solids' constants. The fillet of a
+    union lies where both functions are at most the radius, so that it is within the union of the
+    solids grown by the radius.
     """
 
     is_cheap = False
@@ -433,24 +472,28 @@ class BlendedSolid(FormulaSolid):
     is_union: bool
 
     def __post_init__(self) -> None:
+        """Check the arguments, and set the attributes that follow from the operands."""
         for name, least, value in (("radius", 0.0, self.radius), ("power", 1.0, self.power)):
             is_valid = isinstance(value, numbers.Real) and least <= float(value) < math.inf
             if not is_valid or value == 0:
                 bound = "above 0" if least == 0.0 else f"of at least {least:g}"
                 raise ValueError(f"{name} must be a number {bound}, not {value!r}")
             object.__setattr__(self, name, float(value))
-        for operand in self.parts:
-            if not isinstance(operand, Solid):  # pyright: ignore[reportUnnecessaryIsInstance]
-                raise TypeError(not_a_solid(operand))
-            operand.formula(*probe_jets())  # raises TypeError for a solid without a formula
-        constants = [operand.lipschitz for operand in self.parts]
-        all_known = all(constant is not None for constant in constants)
+        for part in self.parts:
+            if not isinstance(part, Solid):  # pyright: ignore[reportUnnecessaryIsInstance]
+                raise TypeError(not_a_solid(part))
+            part.formula(*probe_jets())  # raises TypeError for a solid without a formula
+        constants = [part.lipschitz for part in self.parts]
+        all_known = all(part is not None for part in constants)
         lipschitz = 2 ** (1 / self.power) * max(constants) * (1 + 1e-6) if all_known else None
         object.__setattr__(self, "lipschitz", lipschitz)
         object.__setattr__(self, "min_wavelength", min_wavelength(self.parts))
         object.__setattr__(self, "domain", union(*self.parts).domain)
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        """See `Solid.sublevel_extent`. A fillet adds points to a union below a level, and takes
+        points from an intersection; so the volume is that of the combination without a fillet, at a
+        level shifted by `_min_operand_bound` if the fillet adds points."""
         sharp = union(*self.parts) if self.is_union else self.parts[0] & self.parts[1]
         if self.is_union:
             return (
@@ -465,24 +508,26 @@ class BlendedSolid(FormulaSolid):
         )
 
     def _min_operand_bound(self, level: float) -> float:
-        """A bound of the smaller of both functions where their blended union is at most `level`.
+        """A bound of the smaller of the two functions at all points where their blended union is at
+        most `level`.
 
-        Proof. The blend grows with both functions, so it is at least the blend of the smaller value
-        m with itself: r - 2^(1/p) (r - m) for m < r, and m for larger m.
+        Proof. The blend grows with both functions. So it is at least the blend of the smaller value
+        m with itself. With r the radius and p the power, that is r - 2^(1/p) (r - m) for m < r, and
+        m for larger m.
         """
         if level >= self.radius:
             return level
         return self.radius - (self.radius - level) / 2 ** (1 / self.power) * (1 - 1e-9)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        a, b = (operand.formula(x, y, z) for operand in self.parts)
+        a, b = (part.formula(x, y, z) for part in self.parts)
         blend = blend_union if self.is_union else blend_intersection
         return blend(a, b, self.radius, self.power)
 
     def prepare(self, backend: Backend) -> Solid:
         prepared = copy.copy(self)
-        operands = tuple(operand.prepare(backend) for operand in self.parts)
-        object.__setattr__(prepared, "parts", operands)
+        parts = tuple(part.prepare(backend) for part in self.parts)
+        object.__setattr__(prepared, "parts", parts)
         # The power stays a literal: the ranges of x^p depend on the kind of number that p is.
         object.__setattr__(prepared, "radius", prepare_value(self.radius, backend))
         return prepared

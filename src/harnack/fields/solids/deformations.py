@@ -29,20 +29,27 @@ from harnack.fields.solids.solid import AXES, SpaceMap, axis_index
 
 
 class Deformation(SpaceMap):
-    """A map of space that does not keep lines straight, for solids with a formula.
+    """A map of space that does not keep lines straight. It applies only to solids with a formula.
 
-    axis: the coordinate on which the map depends.
+    axis: "x", "y" or "z", the coordinate on which the map depends.
     """
 
     def apply(self, solid: Solid) -> Solid:
+        """The image of a solid.
+
+        Raises:
+            TypeError: the solid has no formula.
+        """
         solid.formula(*probe_jets())  # raises TypeError for a solid without a formula
         return DeformedSolid(solid, self)
 
     @property
     def min_scale(self) -> float:
-        """The smallest factor by which the map multiplies lengths, and so wavelengths. It is 1 for
-        a map whose factor depends on the point, such as a twist, which compresses waves more the
-        farther they are from its axis."""
+        """The smallest factor by which the map multiplies lengths, and so wavelengths.
+
+        The default is 1, for maps whose factor has no positive lower bound: a twist compresses
+        waves more the farther they are from its axis.
+        """
         return 1.0
 
     @abc.abstractmethod
@@ -51,7 +58,8 @@ class Deformation(SpaceMap):
 
     @abc.abstractmethod
     def volume(self, volume: Volume | None) -> Volume | None:
-        """A volume that contains the image of another volume; None if no such volume is known."""
+        """A volume that contains the image of `volume` under the map; None if no such volume is
+        known."""
 
     @abc.abstractmethod
     def preimage_lipschitz(self, p: Vec3) -> tuple[Real, Real]:
@@ -64,16 +72,22 @@ class Deformation(SpaceMap):
 
 @dataclass(frozen=True, eq=False)
 class DeformedSolid(FormulaSolid):
-    """The image of a solid under a deformation: its formula at the preimage of p.
+    """The image of a solid under a deformation. f at a point p is the solid's formula at the
+    preimage of p.
 
-    No Lipschitz constant of the map is needed for a step: ranges of the local coordinates and of
-    their derivatives along the ray are passed on to the formula.
+    inner: the solid.
+    map: the deformation.
+
+    Steps need no Lipschitz constant of the map. The ranges of the preimage's coordinates along the
+    ray, and of their derivatives, are passed on to the formula.
     """
 
     inner: Solid
     map: Deformation
 
     def __post_init__(self) -> None:
+        """Set the domain and the smallest wavelength, which follow from those of the inner
+        solid."""
         if self.inner.domain is not None:
             domain = self.map.volume(self.inner.domain)
             object.__setattr__(self, "domain", domain)
@@ -84,7 +98,7 @@ class DeformedSolid(FormulaSolid):
 
     @property
     def may_jump(self) -> bool:
-        """Whether the inner solid's formula may jump: the map itself is continuous."""
+        """Whether the inner solid's formula may jump; the map is continuous."""
         return tally_of(self.inner.formula).may_jump
 
     def promises(self, p: Vec3) -> tuple[Promise, ...]:
@@ -112,13 +126,17 @@ class DeformedSolid(FormulaSolid):
 
 @dataclass(frozen=True)
 class Twist(Deformation):
-    """Rotates cross sections by `rate` radians for each unit of length along an axis (Hart 1996,
-    equation 50).
+    """Rotates cross sections about an axis by `rate` radians for each unit of length along it (Hart
+    1996, equation 50).
 
-    Proof of `preimage_lipschitz`. The derivative of the inverse is a rotation times [[1, 0, -y a],
-    [0, 1, x a], [0, 0, 1]], whose largest singular value is (m + sqrt(m^2 + 4))/2, with m = |a|
-    times the distance from the axis, a the rate. (Hart's equation 51 is too small where a is
-    large.)
+    rate: in radians per unit of length.
+    axis: "x", "y" or "z".
+
+    Proof of `preimage_lipschitz`. Let a be the rate, and x and y the coordinates across the axis.
+    The derivative of the inverse map is a rotation times the matrix [[1, 0, -y a], [0, 1, x a], [0,
+    0, 1]]. Its largest singular value is (m + sqrt(m^2 + 4))/2, where m is |a| times the distance
+    from the axis. On the ball m has its largest value. (Hart's equation 51 is too small for large
+    a.)
     """
 
     rate: Any
@@ -132,18 +150,20 @@ class Twist(Deformation):
     def preimage(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
         u, v, w = _axis_last((x, y, z), self.axis)
         angle = w * self.rate
-        c, s = cos(angle), sin(angle)
-        return _restore_axes((u * c + v * s, v * c - u * s, w), self.axis)
+        cosine, sine = cos(angle), sin(angle)
+        return _axis_in_place((u * cosine + v * sine, v * cosine - u * sine, w), self.axis)
 
     def volume(self, volume: Volume | None) -> Volume | None:
-        cylinder = _cylinder(volume, self.axis)
-        return None if cylinder is None else _box(cylinder[0], cylinder[1], self.axis)
+        cylinder = _cylinder_around(volume, self.axis)
+        return (
+            None if cylinder is None else _box_around_cylinder(cylinder[0], cylinder[1], self.axis)
+        )
 
     def preimage_lipschitz(self, p: Vec3) -> tuple[Real, Real]:
         rate = dr.abs(0 * p.x + self.rate)
-        rho = _from_axis(p, self.axis)
-        radius = 0.25 * rho + 0.25 / rate
-        m = (rho + radius) * rate
+        axis_distance = _distance_from_axis(p, self.axis)
+        radius = 0.25 * axis_distance + 0.25 / rate
+        m = (axis_distance + radius) * rate
         constant = 0.5 * (m + dr.sqrt(m * m + 4)) * (1 + 1e-5)
         # At the rate 0, m is NaN.
         return dr.select(rate > 0, constant, 1), dr.select(rate > 0, radius, dr.inf)
@@ -154,14 +174,19 @@ class Twist(Deformation):
 
 @dataclass(frozen=True)
 class Taper(Deformation):
-    """Scales cross sections by a factor r that is linear along an axis between two positions and
-    constant beyond them.
+    """Scales cross sections about an axis by a factor r that depends on the position along the
+    axis. It is linear between two positions and constant beyond them.
 
-    Proof of `preimage_lipschitz`. The derivative of the inverse acts on the radial and the axial
-    direction as [[k, m], [0, 1]], k = 1/r, m = rho |r'|/r^2 at the distance rho from the axis, and
-    on the third as k. Its largest singular value has sigma^2 = (S + sqrt(S^2 - 4 k^2))/2, S = k^2 +
-    m^2 + 1, which grows with k and m: here k and m have their largest values. (Hart's equation 49
-    has min 1/r.)
+    start, end: (position along the axis, factor r there); start lies before end, and factors are
+        positive.
+    axis: "x", "y" or "z".
+
+    Proof of `preimage_lipschitz`. Let rho be the distance from the axis, r' the derivative of r
+    along it, k = 1/r and m = rho |r'|/r^2. The derivative of the inverse map acts on the radial and
+    the axial direction as the matrix [[k, m], [0, 1]], and on the third direction as the factor k.
+    The square of its largest singular value is (S + sqrt(S^2 - 4 k^2))/2 with S = k^2 + m^2 + 1,
+    which grows with k and m. On the ball k and m are replaced by their largest values. (Hart's
+    equation 49 has min 1/r.)
     """
 
     start: tuple[Any, Any]
@@ -169,6 +194,7 @@ class Taper(Deformation):
     axis: str = "z"
 
     def __post_init__(self) -> None:
+        """Check the arguments."""
         axis_index(self.axis)
         try:
             ends = (*self.start, *self.end)
@@ -197,20 +223,22 @@ class Taper(Deformation):
         (a, r), (b, s) = self.start, self.end
         fraction = minimum(maximum((w - a) * (1.0 / (b - a)), 0.0), 1.0)
         inverse = 1.0 / (fraction * (s - r) + r)
-        return _restore_axes((u * inverse, v * inverse, w), self.axis)
+        return _axis_in_place((u * inverse, v * inverse, w), self.axis)
 
     def volume(self, volume: Volume | None) -> Volume | None:
-        cylinder = _cylinder(volume, self.axis)
+        cylinder = _cylinder_around(volume, self.axis)
         if cylinder is None:
             return None
-        return _box(cylinder[0] * max(self.start[1], self.end[1]), cylinder[1], self.axis)
+        return _box_around_cylinder(
+            cylinder[0] * max(self.start[1], self.end[1]), cylinder[1], self.axis
+        )
 
     def preimage_lipschitz(self, p: Vec3) -> tuple[Real, Real]:
         (a, r), (b, s) = ((0 * p.x + u, 0 * p.x + v) for u, v in (self.start, self.end))
-        rho = _from_axis(p, self.axis)
-        radius = 0.25 * rho + 0.25 * (b - a)
+        axis_distance = _distance_from_axis(p, self.axis)
+        radius = 0.25 * axis_distance + 0.25 * (b - a)
         k = 1 / fmin(r, s)
-        m = (rho + radius) * dr.abs(s - r) / (b - a) * k * k
+        m = (axis_distance + radius) * dr.abs(s - r) / (b - a) * k * k
         total = k * k + m * m + 1
         root = dr.sqrt(fmax(total * total - 4 * k * k, 0))
         return dr.sqrt(0.5 * (total + root)) * (1 + 1e-5), radius
@@ -219,28 +247,29 @@ class Taper(Deformation):
         return with_device_numbers(self, backend)
 
 
-def _from_axis(p: Vec3, axis: str) -> Real:
-    """The distance of p from the axis."""
+def _distance_from_axis(p: Vec3, axis: str) -> Real:
+    """The distance of p from a coordinate axis."""
     u, v, _ = _axis_last((p.x, p.y, p.z), axis)
     return dr.sqrt(u * u + v * v)
 
 
 def _axis_last(p: tuple[Any, Any, Any], axis: str) -> tuple[Any, Any, Any]:
-    """The coordinates in cyclic order, the axis last."""
+    """The coordinates of p in cyclic order, such that the coordinate along `axis` is the last. For
+    example (y, z, x) for the axis "x"."""
     k = AXES[axis]
     return p[(k + 1) % 3], p[(k + 2) % 3], p[k]
 
 
-def _restore_axes(p: tuple[Any, Any, Any], axis: str) -> tuple[Any, Any, Any]:
-    """The coordinates in the order x, y, z, from `_axis_last`'s order."""
+def _axis_in_place(p: tuple[Any, Any, Any], axis: str) -> tuple[Any, Any, Any]:
+    """The coordinates in the order x, y, z, from the order of `_axis_last`: its inverse."""
     k = AXES[axis]
     x, y, z = (p[(i - k - 1) % 3] for i in range(3))
     return x, y, z
 
 
-def _cylinder(volume: Volume | None, axis: str) -> tuple[float, tuple[float, float]] | None:
-    """A cylinder around a volume: its radius about an axis, and its range along the axis; None for
-    a volume without bounds."""
+def _cylinder_around(volume: Volume | None, axis: str) -> tuple[float, tuple[float, float]] | None:
+    """A cylinder about a coordinate axis that contains a volume: its radius, and the ends (low,
+    high) of its range along the axis. None for no volume or a volume without bounds."""
     if volume is None:
         return None
     lower, upper = volume.bounds()
@@ -256,8 +285,11 @@ def _cylinder(volume: Volume | None, axis: str) -> tuple[float, tuple[float, flo
     return radius, (float(lower[k]), float(upper[k]))
 
 
-def _box(radius: float, span: tuple[float, float], axis: str) -> Box:
-    """The box around a cylinder about an axis."""
+def _box_around_cylinder(radius: float, span: tuple[float, float], axis: str) -> Box:
+    """The box that contains a cylinder about a coordinate axis.
+
+    span: the ends (low, high) of the cylinder along the axis.
+    """
     lower = [-radius] * 3
     upper = [radius] * 3
     lower[AXES[axis]], upper[AXES[axis]] = span

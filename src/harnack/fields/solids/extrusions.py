@@ -35,37 +35,40 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
     from harnack.geometry import Volume
 
-# The cost of an evaluation allows a ray sample to reach farther than the last step by this factor.
-_GROWTH = 4.0
-# Of a signed distance the gradient is a unit vector wherever it exists.
+# The next ray sample is bounded up to this multiple of the last step: evaluations are expensive, so
+# that long proofs pay (`RaySample.reach_growth`).
+_REACH_GROWTH = 4.0
+# A lower bound of |gradient| of a signed distance, which is 1 wherever the gradient exists.
 _MIN_GRADIENT = 0.99
-# Coordinates of jets whose error is larger, in roundings, are ranges.
-_RANGE_ROUNDINGS = 256.0
+# If coordinates of jets have an error of more than this many roundings, they stand for a range.
+_MAX_POINT_ROUNDINGS = 256.0
 
 
 @dataclass(frozen=True, eq=False)
 class Extrusion(Solid):
-    """An extruded region of the plane z = 0: the points above it with 0 <= z <= height.
+    """An extruded region of the plane z = 0: the points above the region, with 0 <= z <= height.
 
-    loops: the outline of the region: an array (n, 2) of the vertices of a closed loop, or several.
-        A point is inside if an odd number of loops runs around it (the even-odd rule), so that
-        loops in loops are holes, and loops in these are islands, whatever their orientation. Loops
-        that cross or touch are cut there. Stored as `harnack.geometry.make_outline` returns them.
+    loops: the outline of the region, an array (n, 2) of the vertices of a closed loop, or several
+        such arrays. A point is inside if an odd number of loops surrounds it (the even-odd rule).
+        So loops in loops are holes, and loops in holes are islands, whatever their orientation.
+        Loops that cross or touch are cut there. They are stored as `harnack.geometry.make_outline`
+        returns them.
     height: along z.
-    twist: the angle in degrees by which the end is turned against the start, counter-clockwise as
-        seen from above, about the z axis.
-    taper: the factor by which the end is scaled, about the z axis.
+    twist: the angle in degrees by which the top end is turned against the bottom end about the z
+        axis, counter-clockwise as seen from above.
+    taper: the factor by which the top end is scaled about the z axis.
 
-    With neither twist nor taper, f is the signed distance: the distance d from the outline in the
-    plane, exact over all edges, and the distance from the ends, combined as distances at right
-    angles (`orthogonal_intersection`). So its Lipschitz constant is 1. Along a path more is proved:
-    see `ExtrusionEnclosure`.
+    Without twist and taper, f is the signed distance. It combines the distance d from the outline
+    in the plane, which is exact over all edges, and the distance from the two ends, as distances at
+    right angles (`orthogonal_intersection`). So its Lipschitz constant is 1. Along a path more is
+    proved: see `ExtrusionEnclosure`.
 
-    Else f is this function at the preimage of p, which has the same z. Along a path it changes no
-    faster than the preimage moves, whose speed is bounded by ranges. Proof of the promise in all
-    directions. On a ball about p the inverse of the taper has the constant c within R, the inverse
-    of the twist, which acts on what the first returns, the constant b within S (proofs: `Taper`,
-    `Twist`); so both together have b c within min(R, S/c), and f, of constant 1, has it too.
+    With twist or taper, f at p is this function at the preimage of p, which has the same z. Along a
+    path f changes no faster than the preimage moves; ranges bound its speed. Proof of the promise
+    in all directions. Let c be the Lipschitz constant of the inverse of the taper on a ball about p
+    of radius R, and b that of the inverse of the twist on a ball of radius S about the point that
+    the first returns (proofs: `Taper`, `Twist`). Then both maps together have the constant b c
+    within min(R, S/c). So has f, because the signed distance has the constant 1.
 
     Raises:
         ValueError: loops that enclose no area; a height or a taper that is not positive.
@@ -77,6 +80,7 @@ class Extrusion(Solid):
     taper: float = 1.0
 
     def __post_init__(self) -> None:
+        """Check the arguments, and make the maps `Twist` and `Taper`."""
         set_frozen(self, "loops", make_outline(self.loops))
         height = as_positive(self.height, "the height of an extruded outline")
         twist = as_finite(self.twist, "the twist of an extruded outline, in degrees,")
@@ -100,6 +104,8 @@ class Extrusion(Solid):
         return {"edges": sum(map(len, self.loops))}
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        """See `Solid.sublevel_extent`. A box around the outline, grown by the level; for a twisted
+        or tapered solid, around the image of that box at any height."""
         if above:
             return None
         points = np.concatenate(self.loops)
@@ -111,12 +117,16 @@ class Extrusion(Solid):
             radius = float(np.linalg.norm(points, axis=1).max()) + max(level, 0.0)
             upper = np.full(2, radius * max(1.0, self.taper))
             lower = -upper
-        (x, y), (a, b) = 0.5 * (upper - lower), 0.5 * (upper + lower)
-        half = 0.5 * self.height
-        return box_around((float(x), float(y), half + level), (float(a), float(b), half))
+        (half_x, half_y), (center_x, center_y) = 0.5 * (upper - lower), 0.5 * (upper + lower)
+        half_height = 0.5 * self.height
+        return box_around(
+            (float(half_x), float(half_y), half_height + level),
+            (float(center_x), float(center_y), half_height),
+        )
 
     @cached_prepare
     def prepare(self, backend: Backend) -> Extrusion:
+        """The same solid with its edges and numbers on the backend."""
         prepared = copy.copy(self)
         set_frozen(prepared, "_outline", OutlineEdges.upload(backend, self.loops))
         set_frozen(prepared, "_half", dr.opaque(backend.Float, 0.5 * self.height))
@@ -126,161 +136,190 @@ class Extrusion(Solid):
         return prepared
 
     def evaluate(self, p: Vec3) -> Sample:
-        solid = _on(self, p)
+        """The sample at p. Without twist and taper it follows from that of the outline in the
+        plane. Otherwise the outline is sampled at the preimage of p. Ranges of the preimage and of
+        its derivatives then give the gradient by the chain rule, and the errors."""
+        solid = _prepared_for(self, p)
         if self.is_straight:
-            side = solid._outline.sample(p.x, p.y)
-            return solid._joined(p, side, cast("Any", type(p))(*side.gradient, 0))
-        x, y, _ = solid._local(*Jet.at_point(p))
+            planar = solid._outline.sample(p.x, p.y)
+            return solid._sample_of_outline(p, planar, cast("Any", type(p))(*planar.gradient, 0))
+        x, y, _ = solid._preimage(*Jet.at_point(p))
         zero = 0 * p.x
         u, v = (zero + component.value.midpoint for component in (x, y))
-        side = solid._outline.sample(u, v)
+        planar = solid._outline.sample(u, v)
         spread = zero + x.value.radius + y.value.radius
-        slopes = [
-            Interval.point(side.gradient[0]) * a + Interval.point(side.gradient[1]) * b
+        gradient_ranges = [
+            Interval.point(planar.gradient[0]) * a + Interval.point(planar.gradient[1]) * b
             for a, b in zip(x.first_derivatives, y.first_derivatives, strict=True)
         ]
-        gradient = cast("Any", type(p))(*(zero + component.midpoint for component in slopes))
-        stretch, radius = solid._local_lipschitz_ball(p)
-        error = (
-            sum((component.radius for component in slopes), zero) + side.gradient_error * stretch
+        gradient = cast("Any", type(p))(
+            *(zero + component.midpoint for component in gradient_ranges)
         )
-        moved = OutlineSample(side.value, side.gradient, side.error + 2 * spread, error)
-        return solid._joined(p, moved, gradient, Lipschitz(stretch, radius))
+        constant, radius = solid._preimage_lipschitz(p)
+        error = (
+            sum((component.radius for component in gradient_ranges), zero)
+            + planar.gradient_error * constant
+        )
+        moved = OutlineSample(planar.value, planar.gradient, planar.error + 2 * spread, error)
+        return solid._sample_of_outline(p, moved, gradient, Lipschitz(constant, radius))
 
-    def _joined(
+    def _sample_of_outline(
         self, p: Vec3, side: OutlineSample, gradient: Vec3, promise: Lipschitz | None = None
     ) -> Sample:
-        """The sample of the solid from that of the outline in the plane, and the distance from the
-        ends.
+        """The sample of the solid at p, from that of the outline in the plane and the distance from
+        the ends.
 
-        gradient: the gradient in space of the distance from the side. promise: that of f; by
-            default the Lipschitz constant 1.
+        side: the sample of the distance from the outline.
+        gradient: the gradient of that distance as a function in space.
+        promise: a Lipschitz constant of f; None for the constant 1 everywhere.
         """
         epsilon = 2 * float(dr.epsilon(type(p.x)))
         half = cast("Any", self)._half
-        ends = dr.abs(p.z - half) - half
-        value, side_part, end_part = _corner(side.value, ends)
-        vertical = dr.mulsign(end_part, p.z - half)
-        gradient = gradient * side_part + cast("Any", type(p))(0, 0, vertical)
+        end_distance = dr.abs(p.z - half) - half
+        value, side_weight, end_weight = _corner(side.value, end_distance)
+        vertical = dr.mulsign(end_weight, p.z - half)
+        gradient = gradient * side_weight + cast("Any", type(p))(0, 0, vertical)
         error = side.error + 8 * epsilon * (dr.abs(p.z) + half)
-        slope_error = side.gradient_error + 8 * epsilon
+        gradient_error = side.gradient_error + 8 * epsilon
         # Where both distances count, their weights are as accurate as the distances.
-        slope_error = slope_error + dr.select(
-            (side_part > 0) & (end_part > 0), fmin(2 * error / value, 2), 0
+        gradient_error = gradient_error + dr.select(
+            (side_weight > 0) & (end_weight > 0), fmin(2 * error / value, 2), 0
         )
         promises = (Lipschitz(0 * p.x + 1) if promise is None else promise,)
-        return Sample(value, gradient, promises, error, slope_error)
+        return Sample(value, gradient, promises, error, gradient_error)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
+        """The ray sample. Without twist and taper its enclosure is an `ExtrusionEnclosure`.
+        Otherwise its enclosures follow from a Lipschitz constant along the ray, the speed of the
+        preimage. It has no enclosure looking back. If the caller asks for other kinds of
+        enclosures, those of the promises are used."""
         del back
         p, d = path.point(t), path.direction
         if not self.is_straight:
             sample = self.evaluate(p)
-            min_norm = self._least_slope(sample)
-            speed = _on(self, p)._speed(p, d, fmin(ahead, 2 * dr.abs(sample.value)))
-            ray_sample = path.enclose(replace(sample, ray_promises=(speed,)))
+            min_norm = self._min_gradient_norm(sample)
+            path_constant = _prepared_for(self, p)._path_lipschitz(
+                p, d, fmin(ahead, 2 * dr.abs(sample.value))
+            )
+            ray_sample = path.enclose(replace(sample, ray_promises=(path_constant,)))
             # The speed has no bound looking back.
             return replace(ray_sample, backward=(), min_gradient_norm=min_norm)
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return path.enclose(self.evaluate(p))
-        solid = _on(self, p)
+        solid = _prepared_for(self, p)
         outline: OutlineEdges = solid._outline
         knots = outline.knots(p.x, p.y, ahead)
-        side = outline.sample(p.x, p.y, (d.x, d.y), knots)
-        sample = solid._joined(p, side, cast("Any", type(p))(*side.gradient, 0))
-        rate = side.gradient[0] * d.x + side.gradient[1] * d.y
-        planar_enclosure = SignedDistanceEnclosure.around(side, rate, knots)
+        planar = outline.sample(p.x, p.y, (d.x, d.y), knots)
+        sample = solid._sample_of_outline(p, planar, cast("Any", type(p))(*planar.gradient, 0))
+        planar_slope = planar.gradient[0] * d.x + planar.gradient[1] * d.y
+        planar_enclosure = SignedDistanceEnclosure.around(planar, planar_slope, knots)
         height = p.z - solid._half
         enclosure = ExtrusionEnclosure(
             sample.value, sample.value_error, planar_enclosure, height, solid._half, d.z
         )
         slope = dr.dot(sample.gradient, d)
-        return RaySample(sample, (enclosure,), (), slope, _GROWTH, min_gradient_norm=_MIN_GRADIENT)
+        return RaySample(
+            sample, (enclosure,), (), slope, _REACH_GROWTH, min_gradient_norm=_MIN_GRADIENT
+        )
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
+        """f at jets of the coordinates, or at Dr.Jit numbers."""
         if not is_jet(x, type(self).__name__):
             return self.differentiable_value(_vector(x, y, z))
-        solid = _on(self, x.piece_length)
-        u, v, w = solid._local(x, y, z)
+        solid = _prepared_for(self, x.piece_length)
+        u, v, w = solid._preimage(x, y, z)
         return orthogonal_intersection(
             outline_distance_jet(solid._outline.sample, u, v), abs(w - solid._half) - solid._half
         )
 
-    def _local(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
-        """The preimage of (x, y, z): the point that taper and twist map to it."""
+    def _preimage(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
+        """The preimage of (x, y, z): the point that taper and twist map to it. Coordinates may be
+        of any kind."""
         for deform in (cast("Any", self)._tapering, cast("Any", self)._turning):
             if deform is not None:
                 x, y, z = deform.preimage(x, y, z)
         return x, y, z
 
-    def _speed(self, p: Vec3, direction: Vec3, length: Real) -> Lipschitz:
-        """The largest speed of the preimage of a path, up to a length of the path: as f has the
-        Lipschitz constant 1 in the preimage, that speed is a Lipschitz constant along the path."""
-        local = self._local(*Jet.along_ray(p, direction, 0.0, length))
+    def _path_lipschitz(self, p: Vec3, direction: Vec3, length: Real) -> Lipschitz:
+        """A Lipschitz constant of f along the path from p, up to the length `length`. It is the
+        largest speed of the preimage of the path's point, as f has the Lipschitz constant 1 in the
+        preimage."""
+        local = self._preimage(*Jet.along_ray(p, direction, 0.0, length))
         speeds = [0 * p.x + jet.first_derivatives[0].max_abs for jet in local]
         speed = dr.norm(cast("Any", type(p))(*speeds)) * (1 + 1e-5)
         is_known = dr.isfinite(speed) & (length > 0)
         return Lipschitz(dr.select(is_known, speed, dr.inf), dr.select(is_known, length, 0))
 
-    def _least_slope(self, sample: Sample) -> Real:
+    def _min_gradient_norm(self, sample: Sample) -> Real:
         """A lower bound of |grad f|, from the Lipschitz constant c that a sample promises.
 
-        Proof. |grad f| is at least the least singular value of the inverse map's derivative. For a
-        twist, whose singular values are s, 1 and 1/s, it is 1/s. For a taper, whose singular values
-        are k and those of a 2 x 2 matrix of determinant k, it is k/s, for s >= k, 1. c is at least
-        the product of both s, and k is at least 1/max(1, taper).
+        Proof. |grad f| is at least the smallest singular value of the derivative of the inverse
+        map, which is the product of those of its two factors. For the twist, the singular values
+        are s, 1 and 1/s, so the smallest is 1/s. For the taper, they are k and those of a 2 x 2
+        matrix of determinant k; if s is the larger of these two, s >= k and s >= 1, so the smallest
+        is at least k/s. c is at least the product of both s, and k is at least 1/max(1, taper).
         """
         (promise,) = sample.promises
         return _MIN_GRADIENT / (max(1.0, self.taper) * cast("Lipschitz", promise).constant)
 
-    def _local_lipschitz_ball(self, p: Vec3) -> tuple[Real, Real]:
-        """A Lipschitz constant of `_local` on a ball about p, and the radius of that ball."""
+    def _preimage_lipschitz(self, p: Vec3) -> tuple[Real, Real]:
+        """A Lipschitz constant of `_preimage` on a ball about p, and the radius of that ball."""
         taper, twist = cast("Any", self)._tapering, cast("Any", self)._turning
         constant, radius = 0 * p.x + 1, 0 * p.x + dr.inf
         if taper is not None:
             constant, radius = taper.preimage_lipschitz(p)
             p = cast("Any", type(p))(*taper.preimage(p.x, p.y, p.z))
         if twist is not None:
-            turn, reach = twist.preimage_lipschitz(p)
-            constant, radius = (constant * turn, fmin(radius, reach / constant * (1 - 1e-5)))
+            inner_constant, inner_radius = twist.preimage_lipschitz(p)
+            constant, radius = (
+                constant * inner_constant,
+                fmin(radius, inner_radius / constant * (1 - 1e-5)),
+            )
         return constant, radius
 
 
-def _on(solid: Any, like: Any) -> Any:
-    """The solid with its data on the backend of a number or a point."""
+def _prepared_for(solid: Any, like: Any) -> Any:
+    """The solid, prepared for the backend of `like`, a number or a point. A solid that is prepared
+    is returned as it is."""
     return solid if hasattr(solid, "_outline") else solid.prepare(backend_of(like))
 
 
 def _vector(x: Real, y: Real, z: Real) -> Vec3:
+    """The Dr.Jit 3-vector with these components."""
     return backend_of(x).Array3f(x, y, z)
 
 
 def _corner(d: Real, w: Real) -> tuple[Real, Real, Real]:
-    """The signed distance from two faces at right angles (`orthogonal_intersection`), from the
-    signed distances d and w from each; and its derivatives by d and by w."""
+    """The signed distance from two faces at right angles (`orthogonal_intersection`), and its
+    derivatives by d and by w.
+
+    d, w: the signed distances from each of the faces.
+    """
     is_outside = (d > 0) & (w > 0)
     length = dr.sqrt(dr.fma(d, d, w * w))
     is_first = d >= w
     value = dr.select(is_outside, length, fmax(d, w))
-    first_weight = dr.select(is_outside, d / length, dr.select(is_first, 1.0, 0.0))
-    second_weight = dr.select(is_outside, w / length, dr.select(is_first, 0.0, 1.0))
-    return value, first_weight, second_weight
+    derivative_d = dr.select(is_outside, d / length, dr.select(is_first, 1.0, 0.0))
+    derivative_w = dr.select(is_outside, w / length, dr.select(is_first, 0.0, 1.0))
+    return value, derivative_d, derivative_w
 
 
 @dataclass(frozen=True)
 class ExtrusionEnclosure(Enclosure):
     """An enclosure of the signed distance f from an extruded outline along a path.
 
-    value, error: of f. side: the enclosure of the distance d from the outline. height, half: z
-        above the middle, and half of the height, so that w = |height| - half is the distance from
-        the ends. rate: the rate of z along the path.
+    value, error: f at the start, and a bound of its error.
+    side: the enclosure of the distance d from the outline in the plane.
+    height: z above the middle of the solid.
+    half: half of the solid's height. So w = |height| - half is the distance from the ends.
+    rate: the derivative of z along the path.
 
     Proof. max(d, w) <= f, with equality where f <= 0. So f stays above a level as long as d does or
-    w does; and it stays below a level <= 0 as long as both do. The errors of d and w are at most
-    `error`. Besides, f changes by no more than the length of the path. Along a line w is |z| less a
-    constant. It reaches the value by g below after g/|rate| if it falls, and never if it rises, or
-    if z = 0 lies before. It reaches the value by g above after g/|rate| if it rises, and after (2
-    |z| + g)/|rate| if it falls first.
+    w does, and it stays below a level <= 0 as long as both do. The errors of d and w are at most
+    `error`. Besides, f changes by no more than the length of the path. Along a line w is |height|
+    less a constant. If w falls, it reaches the value lower by g at the length g/|rate|, unless the
+    height comes to 0 before. If it rises, it never reaches that value. It reaches the value higher
+    by g at the length g/|rate| if it rises, and at (2 |height| + g)/|rate| if it falls first.
     """
 
     value: Real
@@ -291,33 +330,37 @@ class ExtrusionEnclosure(Enclosure):
     rate: Real
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """See `Enclosure`. The deficits are by how much the distances w and d are less than f at
+        the start, error included."""
         inf = type(gaps.below)(dr.inf)
         end_distance = dr.abs(self.height) - self.half
-        below, beside = (
+        end_deficit, side_deficit = (
             self.value - end_distance + self.error,
             self.value - self.side.value + self.error,
         )
-        down = fmax(gaps.below, self._length_of_fall(gaps.below - below))
-        aside = gaps.below - beside
-        down = fmax(dr.select(aside > 0, self.side.free_length(LevelGaps(aside, inf)), 0), down)
-        inside = self.value + gaps.above + self.error <= 0  # also for unrounded numbers
+        down = fmax(gaps.below, self._fall(gaps.below - end_deficit))
+        side_gap = gaps.below - side_deficit
+        down = fmax(
+            dr.select(side_gap > 0, self.side.free_length(LevelGaps(side_gap, inf)), 0), down
+        )
+        is_inside = self.value + gaps.above + self.error <= 0  # also for unrounded numbers
         error = 2 * self.error
         up = fmin(
-            self._length_of_rise(gaps.above + below - error),
-            self.side.free_length(LevelGaps(inf, fmax(gaps.above + beside - error, 0))),
+            self._rise(gaps.above + end_deficit - error),
+            self.side.free_length(LevelGaps(inf, fmax(gaps.above + side_deficit - error, 0))),
         )
-        up = fmax(gaps.above, dr.select(inside, up, 0))
+        up = fmax(gaps.above, dr.select(is_inside, up, 0))
         is_valid = (gaps.below >= 0) & (gaps.above >= 0)
         return dr.select(is_valid, fmin(down, up) * (1 - 1e-6), 0)
 
-    def _length_of_fall(self, gap: Real) -> Real:
-        """A length on which w stays less than `gap` below its value."""
+    def _fall(self, gap: Real) -> Real:
+        """A length of the path on which w falls by less than `gap`."""
         is_unreached = (self.height * self.rate >= 0) | (gap > dr.abs(self.height))
         length = dr.select(is_unreached, dr.inf, gap / dr.abs(self.rate))
         return dr.select((gap > 0) & (length >= 0), length, 0)
 
-    def _length_of_rise(self, gap: Real) -> Real:
-        """A length on which w stays less than `gap` above its value."""
+    def _rise(self, gap: Real) -> Real:
+        """A length of the path on which w rises by less than `gap`."""
         is_falling = self.height * self.rate < 0
         path = gap + dr.select(is_falling, 2 * dr.abs(self.height), 0)
         length = dr.select(self.rate == 0, dr.inf, path / dr.abs(self.rate))
@@ -325,14 +368,17 @@ class ExtrusionEnclosure(Enclosure):
 
 
 def outline_distance_jet(nearest: Callable[[Real, Real], OutlineSample], x: Jet, y: Jet) -> Jet:
-    """The jet of a signed distance in the plane, from jets of the coordinates.
+    """The jet of a signed distance d in the plane.
 
-    Proof. The distance has the Lipschitz constant 1, so its derivative in any variable is at most
-    the length of the derivative of (x, y), and the error of the value is at most that of the
-    coordinates at the start. On a piece there may be kinks, so that second derivatives have no
-    bound. At a point they are those of the distance from the nearest edge or vertex, and so is the
-    gradient. On a ball, where coordinates are ranges and not numbers with their rounding, another
-    edge may be nearest, as on a piece.
+    nearest: returns the sample of d at a point (u, v).
+    x, y: jets of the coordinates.
+
+    Proof. d has the Lipschitz constant 1. So its derivative by any variable is at most the length
+    of the derivative of (x, y) by it, and its value at the start is known up to the error of the
+    coordinates there. On a piece d may have kinks, so that second derivatives have no bound. At a
+    point, the gradient and the second derivatives are those of the distance from the nearest edge
+    or vertex. Where coordinates are ranges that stand for a ball, and not numbers with their
+    rounding, another edge may be nearest, as on a piece.
     """
     starts = [jet_u if jet_u.jet_at_start is None else jet_u.jet_at_start for jet_u in (x, y)]
     zero = 0 * x.piece_length
@@ -340,28 +386,32 @@ def outline_distance_jet(nearest: Callable[[Real, Real], OutlineSample], x: Jet,
     nearest_sample = nearest(u, v)
     input_error = zero + starts[0].value.radius + starts[1].value.radius
     size = dr.abs(u) + dr.abs(v) + dr.abs(nearest_sample.value)
-    is_ball = input_error > _RANGE_ROUNDINGS * float(dr.epsilon(size)) * size
+    is_ball = input_error > _MAX_POINT_ROUNDINGS * float(dr.epsilon(size)) * size
     value_error = nearest_sample.error + input_error
     value = Interval(nearest_sample.value, nearest_sample.value).widened(1e-6, 0.0)
     value = value + Interval(-value_error, value_error)
 
-    def limits(i: int, jet_u: Jet, jet_v: Jet) -> Interval:
+    def lipschitz_range(i: int, jet_u: Jet, jet_v: Jet) -> Interval:
+        """The range of the distance's derivative by variable i that its Lipschitz constant proves,
+        from the jets of both coordinates."""
         a, b = zero + jet_u.first_derivatives[i].max_abs, zero + jet_v.first_derivatives[i].max_abs
-        range_ = dr.sqrt(dr.fma(a, a, b * b)) * (1 + 1e-5)
-        return Interval(-range_, range_)
+        limit = dr.sqrt(dr.fma(a, a, b * b)) * (1 + 1e-5)
+        return Interval(-limit, limit)
 
-    def off_ball(jet_u: Interval, range_: Interval) -> Interval:
-        lower, upper = (zero + jet_u.lower, range_.lower), (zero + jet_u.upper, range_.upper)
+    def or_range_on_ball(jet_u: Interval, limit: Interval) -> Interval:
+        """An interval: `jet_u` where the coordinates are those of a point, and `limit` where they
+        are ranges that stand for a ball."""
+        lower, upper = (zero + jet_u.lower, limit.lower), (zero + jet_u.upper, limit.upper)
         return Interval(*(dr.select(is_ball, b, a) for a, b in (lower, upper)))
 
-    any_ = Interval(zero - dr.inf, zero + dr.inf)
+    all_numbers = Interval(zero - dr.inf, zero + dr.inf)
     errors = Interval(zero - nearest_sample.gradient_error, zero + nearest_sample.gradient_error)
     gx, gy = (Interval.point(jet_u) + errors for jet_u in nearest_sample.gradient)
     count = range(len(x.first_derivatives))
     u, v = starts
-    ranges = tuple(limits(i, u, v) for i in count)
+    ranges = tuple(lipschitz_range(i, u, v) for i in count)
     slopes = tuple(
-        off_ball(
+        or_range_on_ball(
             (gx * u.first_derivatives[i] + gy * v.first_derivatives[i]).intersect(ranges[i]),
             ranges[i],
         )
@@ -372,37 +422,38 @@ def outline_distance_jet(nearest: Callable[[Real, Real], OutlineSample], x: Jet,
         1e-5 + nearest_sample.gradient_error
     )
     second = tuple(
-        off_ball(
+        or_range_on_ball(
             curvature * across[i] * across[j]
             + gx * u.second_derivatives[k]
             + gy * v.second_derivatives[k],
-            any_,
+            all_numbers,
         )
         for k, (i, j) in enumerate(u.hessian_indices())
     )
     start = Jet(value, slopes, second, piece_length=u.piece_length)
     if x.jet_at_start is None:
         return start
-    first = tuple(limits(i, x, y) for i in count)
+    first = tuple(lipschitz_range(i, x, y) for i in count)
     piece_value = value + range_times_length(first[0], x.piece_length)
-    unknown_second = (any_,) * len(x.second_derivatives)
+    unknown_second = (all_numbers,) * len(x.second_derivatives)
     return Jet(piece_value, first, unknown_second, start, x.piece_length)
 
 
 @dataclass(frozen=True, eq=False)
 class SolidOfRevolution(Solid):
-    """The solid of revolution of an outline in the half-plane (r, z), r >= 0, about the z axis.
+    """The solid of revolution, about the z axis, of an outline in the half-plane (r, z), r >= 0.
 
-    loops: as of `Extrusion`, with points (r, z). Edges on the axis are inside of the solid, and no
+    loops: as for `Extrusion`, with points (r, z). Edges on the axis are inside of the solid, and no
         part of its surface.
 
-    f is the signed distance, with the Lipschitz constant 1. Proof: the nearest point of a surface
-    of revolution lies in the half-plane of p. Along a path, (r, z) departs from its tangent line,
-    on which `OutlineEdges.sample` bounds the distance, in r alone: r is convex along the path, so
-    that it lies e(s) >= 0 above its tangent, and with e = (c/r)^2 s^2/(r(s) + r + r' s), where c/r
-    is the component of the direction across the half-plane. A distance of constant 1 is less by at
-    most e(s). The bound less a convex function is still concave, and `TangentEnclosure` needs
-    nothing else.
+    f is the signed distance, with the Lipschitz constant 1. Proof. The nearest point of a surface
+    of revolution lies in the half-plane of p, so f is the signed distance of (r, z) from the
+    outline. Along a path, `OutlineEdges.sample` bounds the distance on the tangent line of (r, z).
+    The point (r, z) departs from that line in r alone. r(s) is convex along the path, and lies
+    above its tangent by e(s) = (c/r)^2 s^2/(r(s) + r + r' s) >= 0, where c/r is the component of
+    the direction across the half-plane. As the distance has the constant 1, it is less by at most
+    e(s). A concave bound less a convex function is still concave, which is all that
+    `TangentEnclosure` needs.
 
     Raises:
         ValueError: loops that enclose no area, or with points of r < 0.
@@ -413,6 +464,7 @@ class SolidOfRevolution(Solid):
     lipschitz = 1.0
 
     def __post_init__(self) -> None:
+        """Check the loops."""
         loops = make_outline(self.loops)
         min_radius = min(float(loop[:, 0].min()) for loop in loops)
         if min_radius < 0:
@@ -444,16 +496,18 @@ class SolidOfRevolution(Solid):
 
     def evaluate(self, p: Vec3) -> Sample:
         r, outward = _from_axis(p)
-        return self._sample(p, r, outward, _on(self, p)._outline.sample(r, p.z))
+        return self._sample(p, r, outward, _prepared_for(self, p)._outline.sample(r, p.z))
 
-    def _sample(self, p: Vec3, r: Real, out: tuple[Real, Real], side: OutlineSample) -> Sample:
+    def _sample(self, p: Vec3, r: Real, outward: tuple[Real, Real], side: OutlineSample) -> Sample:
         """The sample at p, from that of the outline in the half-plane.
 
-        r, outward: as `_from_axis` returns them.
+        r: the distance of p from the axis.
+        outward: x and y of the unit vector from the axis to p.
+        side: the sample of the distance from the outline.
         """
         epsilon = 2 * float(dr.epsilon(type(p.x)))
         radial, up = side.gradient
-        gradient = cast("Any", type(p))(radial * out[0], radial * out[1], up)
+        gradient = cast("Any", type(p))(radial * outward[0], radial * outward[1], up)
         error = side.error + 8 * epsilon * r
         return Sample(
             side.value,
@@ -464,14 +518,17 @@ class SolidOfRevolution(Solid):
         )
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
+        """The ray sample. Its enclosure is that of the distance from the outline along the tangent
+        line of the path in the half-plane, whose lower bounds are reduced by `_tangent_gap`. It has
+        no enclosure looking back."""
         del back
         p, d = path.point(t), path.direction
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return path.enclose(self.evaluate(p))
-        outline: OutlineEdges = _on(self, p)._outline
-        r, (x, y) = _from_axis(p)
+        outline: OutlineEdges = _prepared_for(self, p)._outline
+        r, (unit_x, unit_y) = _from_axis(p)
         knots = outline.knots(r, p.z, ahead)
-        rate, across = x * d.x + y * d.y, x * d.y - y * d.x
+        rate, across = unit_x * d.x + unit_y * d.y, unit_x * d.y - unit_y * d.x
         side = outline.sample(r, p.z, (rate, d.z), knots)
         epsilon = 2 * float(dr.epsilon(type(r)))
         lower_bounds = tuple(
@@ -484,28 +541,34 @@ class SolidOfRevolution(Solid):
             side.value, side.gradient, side.error + rounding, side.gradient_error + 8 * epsilon,
             side.second_derivative, tuple(bound - rounding for bound in lower_bounds),
         )  # fmt: skip
-        sample = self._sample(p, r, (x, y), side)
+        sample = self._sample(p, r, (unit_x, unit_y), side)
         slope = dr.dot(sample.gradient, d)
         enclosures = (SignedDistanceEnclosure.around(side, slope, knots),)
-        return RaySample(sample, enclosures, (), slope, _GROWTH, min_gradient_norm=_MIN_GRADIENT)
+        return RaySample(
+            sample, enclosures, (), slope, _REACH_GROWTH, min_gradient_norm=_MIN_GRADIENT
+        )
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         if not is_jet(x, type(self).__name__):
             return self.differentiable_value(_vector(x, y, z))
-        return outline_distance_jet(_on(self, x.width)._outline.nearest, norm(x, y), z)
+        return outline_distance_jet(_prepared_for(self, x.width)._outline.nearest, norm(x, y), z)
 
 
 def _from_axis(p: Vec3) -> tuple[Real, tuple[Real, Real]]:
-    """The distance from the z axis, and the unit vector (x, y) away from it; on the axis, any unit
-    vector."""
+    """The distance of p from the z axis, and the unit vector (x, y) that points away from the axis;
+    for p on the axis, any unit vector."""
     r = dr.sqrt(dr.fma(p.x, p.x, p.y * p.y))
     is_off_axis = r > 0
     return r, (dr.select(is_off_axis, p.x / r, 1), dr.select(is_off_axis, p.y / r, 0))
 
 
 def _tangent_gap(r: Real, rate: Real, across: Real, s: Real, epsilon: float) -> Real:
-    """r(s) minus its tangent line at 0, for r(s)^2 = (r + rate s)^2 + (across s)^2; rounded
-    upwards."""
+    """By how much r(s) is above its tangent line at s = 0, rounded upwards, where r(s)^2 = (r +
+    rate s)^2 + (across s)^2 is the squared distance from the axis.
+
+    r: at s = 0.
+    rate, across: the components of the path's direction away from the axis and around it.
+    """
     line, sideways = r + rate * s, across * s
     length = dr.sqrt(dr.fma(line, line, sideways * sideways))
     gap = dr.select(line > 0, sideways / (length + line) * sideways, length - line)

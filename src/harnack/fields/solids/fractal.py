@@ -29,34 +29,37 @@ if TYPE_CHECKING:
 
 Fade: TypeAlias = Literal["quintic", "cubic"]
 
+# The corners of a cell: 0 or 1 along each axis, the last axis fastest.
 CORNERS = tuple(itertools.product((0, 1), repeat=3))
 
 
 @dataclass(frozen=True)
 class NoiseConstants:
-    """Bounds of gradient noise on a lattice of spacing 1, for any unit vectors at its points.
+    """Bounds of gradient noise on a lattice of spacing 1, for any unit vectors at the lattice
+    points.
 
     max_abs: of |noise|.
     max_gradient: of |grad noise|.
-    max_second_derivative: of all second derivatives.
+    max_second_derivative: of all second derivatives along lines.
 
-    Proof. With weights w_c of the corners c of a cell and r_c = x - c, noise is sum w_c g_c.r_c.
-    |noise| <= sum w_c |r_c| <= sqrt(sum w_c |r_c|^2), the root of a sum of three terms of at most
-    1/4: s(t) lies below the line (1 + 2t)/4 on the first half, for it is convex there. sqrt(3)/2 is
-    attained at the cell's center.
+    Proof. Let c run over the corners of a cell, with the weights w_c, the unit vectors g_c and r_c
+    = x - c. Then noise is the sum of w_c g_c . r_c. So |noise| <= sum w_c |r_c| <= sqrt(sum w_c
+    |r_c|^2). The last sum has one term for each axis, and each is at most 1/4: the weight s(t) lies
+    below the line (1 + 2t)/4 on the first half of the edge, where it is convex. The bound sqrt(3)/2
+    is attained at the cell's center.
 
-    The derivative along v is sum g_c.(A_c v) with A_c = w_c I + r_c grad w_c^T, at most sum |A_c v|
-    <= sqrt(v^T (sum A_c^T A_c / o_c) v) for weights o_c > 0 with the sum 1 (Cauchy and Schwarz).
-    With the spectral norms of the A_c as weights the root of the largest eigenvalue is at most
-    2.183 for the cubic and sqrt(499)/8 = 2.7923 for the quintic fade on a grid of the cell, and
-    changes slowly between its points: 2.2 and 2.82 leave room for that. At the center sqrt(19)/2 =
-    2.1794 and sqrt(499)/8 are attained. Hart's 3 (1996, appendix F) is a bound, but his argument
-    (3/2 of the fade times 2 of the vectors) does not prove it: values of a table have no Lipschitz
-    constant.
+    The derivative along v is the sum of g_c . (A_c v) with A_c = w_c I + r_c grad w_c^T. It is at
+    most sum |A_c v| <= sqrt(v^T (sum A_c^T A_c / o_c) v) for any weights o_c > 0 whose sum is 1
+    (Cauchy and Schwarz). The weights used are proportional to the spectral norms of the A_c. Then,
+    on a grid of points of the cell, the root of the largest eigenvalue is at most 2.183 for the
+    cubic fade and sqrt(499)/8 = 2.7923 for the quintic fade. Between the points it changes slowly;
+    2.2 and 2.82 leave room for that. At the center sqrt(19)/2 = 2.1794 and sqrt(499)/8 are
+    attained. Hart's 3 (1996, appendix F) is a bound, but his argument (3/2 of the fade times 2 of
+    the vectors) does not prove it: the values of a table have no Lipschitz constant.
 
-    A second derivative d_ij is, in the same way along the other axes, at most a sum over the
-    corners of one or two axes; the largest row sum of these bounds is a bound of the spectral norm
-    of the Hessian: 17.64 and 24.35 on a grid.
+    A second derivative d_ij is bounded in the same way: by a sum over the corners along one or two
+    axes, with the weights of the other axes. The largest row sum of these bounds is a bound of the
+    spectral norm of the Hessian: 17.64 (cubic) and 24.35 (quintic) on a grid.
     """
 
     max_abs: float
@@ -71,7 +74,8 @@ CONSTANTS: dict[Fade, NoiseConstants] = {
 
 
 def fade(kind: Fade, t: Any) -> tuple[Any, Any, Any]:
-    """The weight of the far end of an edge at t, 0 to 1, and its first two derivatives."""
+    """The weight of the far end of an edge at the position t from the near end, 0 <= t <= 1; and
+    its first two derivatives."""
     if kind == "cubic":
         return t * t * (3 - 2 * t), 6 * t * (1 - t), 6 - 12 * t
     rest = 1 - t
@@ -83,10 +87,11 @@ def fade(kind: Fade, t: Any) -> tuple[Any, Any, Any]:
 
 
 def cell_noise(kind: Fade, t: Any, vectors: Any) -> tuple[Any, list[Any], list[Any]]:
-    """Noise in a cell: its value, gradient (3,) and Hessian (6,), the upper triangle row by row.
+    """Noise in a cell: its value, its gradient (3,), and its Hessian (6,), the upper triangle row
+    by row.
 
-    t: (3,) the position in the cell, 0 to 1. vectors: (8,) unit vectors (3,) at the corners, in the
-        order of `CORNERS`.
+    t: (3,) the position in the cell, 0 to 1.
+    vectors: (8,) unit vectors (3,) at the corners, in the order of `CORNERS`.
     """
     weights: list[tuple[tuple[Any, Any], ...]] = []
     for fraction in t:
@@ -97,28 +102,40 @@ def cell_noise(kind: Fade, t: Any, vectors: Any) -> tuple[Any, list[Any], list[A
     hessian: list[Any] = [0.0] * 6
 
     def weight(corner: tuple[int, ...], orders: list[int]) -> Any:
+        """A product of three factors, one for each axis: the weight of a corner, or a derivative of
+        it.
+
+        corner: 0 or 1 for each axis.
+        orders: the order of the derivative along each axis, 0 to 2.
+        """
         return (
             weights[0][orders[0]][corner[0]]
             * weights[1][orders[1]][corner[1]]
             * weights[2][orders[2]][corner[2]]
         )
 
-    for corner, g in zip(CORNERS, vectors, strict=True):
-        dot = sum(g[k] * (t[k] - corner[k]) for k in range(3))
+    # The ramp of a corner is the linear function vector . (t - corner).
+    for corner, vector in zip(CORNERS, vectors, strict=True):
+        ramp = sum(vector[k] * (t[k] - corner[k]) for k in range(3))
         w = weight(corner, [0, 0, 0])
-        value = value + w * dot
+        value = value + w * ramp
         dw = [weight(corner, [int(i == k) for i in range(3)]) for k in range(3)]
         for k in range(3):
-            gradient[k] = gradient[k] + (w * g[k] + dw[k] * dot)
+            gradient[k] = gradient[k] + (w * vector[k] + dw[k] * ramp)
         for m, (i, j) in enumerate(itertools.combinations_with_replacement(range(3), 2)):
             orders = [int(i == k) + int(j == k) for k in range(3)]
-            hessian[m] = hessian[m] + (dw[i] * g[j] + dw[j] * g[i] + weight(corner, orders) * dot)
+            hessian[m] = hessian[m] + (
+                dw[i] * vector[j] + dw[j] * vector[i] + weight(corner, orders) * ramp
+            )
     return value, gradient, hessian
 
 
 def lattice_vector(x: Any, y: Any, z: Any, seed: Any, like: Real) -> list[Any]:
-    """A pseudo-random unit vector for a lattice point, from unsigned integers of 32 bits of
-    Dr.Jit."""
+    """A pseudo-random unit vector (3,) for a lattice point.
+
+    x, y, z, seed: Dr.Jit integers of 32 bits without sign.
+    like: a number of the type that the components are to have.
+    """
     h = x * 0x8DA6B343 + y * 0xD8163841 + z * 0xCB1AB31F + seed * 0x9E3779B1
     for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B)):
         h = (h ^ (h >> shift)) * factor
@@ -132,18 +149,19 @@ def lattice_vector(x: Any, y: Any, z: Any, seed: Any, like: Real) -> list[Any]:
 
 @dataclass(frozen=True)
 class FractalNoise(FormulaSolid):
-    """Fractal noise: the sum of a_i noise(2^i k p), a_i = amplitude 2^(-beta i), over octaves i.
+    """Fractal noise: f(p) is the sum of a_i noise(2^i k p), with a_i = amplitude 2^(-beta i), over
+    the octaves i = 0, 1, ...
 
-    octaves: the number of octaves.
+    octaves: their number.
     beta: how fast amplitudes fall: 0 for white noise, 1 for 1/f noise, 2 for Brownian motion.
-    frequency: k, the number of lattice points per unit of length.
+    frequency: k, the number of lattice points per unit of length of the first octave.
     amplitude: of the first octave.
     seed: an integer of 32 bits that chooses the noise.
     fade: "quintic", with a continuous second derivative, or "cubic", which is Hart's.
 
-    Hart 1996, equations 52 to 55. Its Lipschitz constant is at most the sum of the octaves'
-    constants; amplitudes 2^(-beta i) have the Hurst exponent beta, so that the graph has the
-    fractal dimension 3 - beta, where Hart's equation after 53 has 2 + (3 - beta)/2.
+    This is Hart 1996, equations 52 to 55. The Lipschitz constant is at most the sum of the octaves'
+    constants. The amplitudes 2^(-beta i) give the Hurst exponent beta, so that the graph has the
+    fractal dimension 3 - beta. (Hart's equation after 53 has 2 + (3 - beta)/2.)
     """
 
     octaves: int = 6
@@ -164,7 +182,8 @@ class FractalNoise(FormulaSolid):
             object.__setattr__(self, name, value)
 
     def _sum(self, power: float) -> float:
-        """The sum of a_i (2^i k)^power, rounded up."""
+        """The sum of a_i (2^i k)^power over the octaves i, rounded up. Times a bound of the noise's
+        derivatives of order `power`, it bounds those of f."""
         terms = (2.0 ** (i * (power - self.beta)) for i in range(self.octaves))
         return self.amplitude * self.frequency**power * sum(terms) * (1.0 + 1e-5)
 
@@ -183,6 +202,7 @@ class FractalNoise(FormulaSolid):
         return self._sum(2.0) * CONSTANTS[self.fade].max_second_derivative
 
     def prepare(self, backend: Backend) -> Field:
+        """The same noise with its numbers and bounds as kernel parameters."""
         prepared = with_device_numbers(self, backend)
         constants = (self._sum(1.0) * CONSTANTS[self.fade].max_gradient, self.max_second_derivative)
         numbers = {
@@ -199,7 +219,10 @@ class FractalNoise(FormulaSolid):
         return Lipschitz(0 * p.x + first), TaylorRemainder(0 * p.x + second)
 
     def _data(self, like: Real) -> dict[str, Any]:
-        """The attributes of the noise, prepared for the backend of a number."""
+        """The attributes of the noise as numbers of a backend.
+
+        like: any number of that backend.
+        """
         prepared = self if hasattr(self, "_falls") else self.prepare(backend_of(like))
         return vars(prepared)
 
@@ -213,6 +236,7 @@ class FractalNoise(FormulaSolid):
         return None
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
+        """f at jets of the coordinates, or at Dr.Jit numbers."""
         jets = [axis for axis in (x, y, z) if is_jet(axis, type(self).__name__)]
         if jets:
             coordinates = [
@@ -222,23 +246,27 @@ class FractalNoise(FormulaSolid):
         return self._octaves([x, y, z])[0][0]
 
     def _octaves(self, q: list[Real], *, each: bool = False) -> list[tuple[Any, Any, Any]]:
-        """Value, gradient and Hessian of the sum; or, if `each`, of each octave."""
+        """A list of tuples (value, gradient (3,), Hessian (6,) as in `cell_noise`): a single tuple
+        for the sum of all octaves or, if `each`, one for each octave.
+
+        q: the coordinates x, y and z of the points.
+        """
         data = self._data(q[0])
         scale, amplitude = data["frequency"], data["amplitude"]
         octaves: list[tuple[Any, list[Any], list[Any]]] = []
         for octave in range(self.octaves):
             position = [entry * scale for entry in q]
             floors = [dr.floor(dr.detach(entry)) for entry in position]
-            t = [a - b for a, b in zip(position, floors, strict=True)]
+            cell_position = [a - b for a, b in zip(position, floors, strict=True)]
             integer = dr.int32_array_t(cast("Any", type(q[0])))
-            natural = dr.uint32_array_t(cast("Any", type(q[0])))
-            base = [natural(integer(entry)) for entry in floors]
+            unsigned = dr.uint32_array_t(cast("Any", type(q[0])))
+            cell_index = [unsigned(integer(entry)) for entry in floors]
             seed = data["_seed"] + octave
             vectors: list[Any] = []
             for corner in CORNERS:
-                i, j, k = (b + c for b, c in zip(base, corner, strict=True))
+                i, j, k = (b + c for b, c in zip(cell_index, corner, strict=True))
                 vectors.append(lattice_vector(i, j, k, seed, q[0]))
-            value, gradient, hessian = cell_noise(self.fade, t, vectors)
+            value, gradient, hessian = cell_noise(self.fade, cell_position, vectors)
             slope = amplitude * scale
             octaves.append(
                 (
@@ -260,45 +288,45 @@ class FractalNoise(FormulaSolid):
         return [total]
 
     def _ranges(self, coordinates: list[Jet]) -> Jet:
-        """The jet of the sum from jets of the coordinates: the sum of the octaves' jets."""
+        """The jet of f from jets of the coordinates: the sum of the octaves' jets."""
         like = coordinates[0].backend_number()
         like = like if coordinates[0].jet_at_start is None else coordinates[0].piece_length
         starts = [
             start if start.jet_at_start is None else start.jet_at_start for start in coordinates
         ]
-        at = [0 * like + start.value_on_backend(like).midpoint for start in starts]
+        center = [0 * like + start.value_on_backend(like).midpoint for start in starts]
         radii = [0 * like + start.value_on_backend(like).radius for start in starts]
-        data, constants = self._data(at[0]), CONSTANTS[self.fade]
-        epsilon = 2 * float(dr.epsilon(cast("Any", type(at[0]))))
+        data, constants = self._data(center[0]), CONSTANTS[self.fade]
+        epsilon = 2 * float(dr.epsilon(cast("Any", type(center[0]))))
         scale, amplitude = data["frequency"], data["amplitude"]
         total: Jet | None = None
-        for value, gradient, hessian in self._octaves(at, each=True):
+        for value, gradient, hessian in self._octaves(center, each=True):
             # Thirty operations for each corner. The position in the cell has the rounding error of
             # the coordinate, so that there is no bound where the lattice is finer than the spacing
             # of numbers.
-            size = fmax(fmax(dr.abs(at[0]), dr.abs(at[1])), dr.abs(at[2])) * scale
-            lost = dr.select(size < 2.0**30, epsilon * size, dr.inf)
+            size = fmax(fmax(dr.abs(center[0]), dr.abs(center[1])), dr.abs(center[2])) * scale
+            position_error = dr.select(size < 2.0**30, epsilon * size, dr.inf)
             octave = _Octave(
-                at=at,
+                center=center,
                 value=value,
                 gradient=gradient,
                 hessian=hessian,
                 slope=amplitude * scale * constants.max_gradient * (1 + 1e-5),
                 bend=amplitude * scale * scale * constants.max_second_derivative * (1 + 1e-5),
-                error=amplitude * (32 * epsilon + constants.max_gradient * 2 * lost),
+                error=amplitude * (32 * epsilon + constants.max_gradient * 2 * position_error),
                 slope_error=amplitude
                 * scale
-                * (64 * epsilon + constants.max_second_derivative * 2 * lost),
+                * (64 * epsilon + constants.max_second_derivative * 2 * position_error),
             )
-            jet = octave.jet(coordinates, starts, _length(radii))
+            jet = octave.jet(coordinates, starts, _norm3(radii))
             total = jet if total is None else total + jet
             amplitude, scale = amplitude * data["_falls"], 2 * scale
         return cast("Jet", total)
 
 
 class Noise(FractalNoise):
-    """Gradient noise of a single octave: lattice noise with random unit vectors (Perlin 1985; Hart
-    1996, equation 52)."""
+    """Gradient noise of a single octave: noise with random unit vectors at the points of a lattice
+    (Perlin 1985; Hart 1996, equation 52). For the parameters see `FractalNoise`."""
 
     def __init__(
         self,
@@ -313,10 +341,14 @@ class Noise(FractalNoise):
 
 @dataclass(frozen=True)
 class DisplacedSolid(FormulaSolid):
-    """A displaced solid: noise is added to its function (Hart 1996, appendix F): f + noise <= 0.
+    """A displaced solid: the points where f + noise <= 0, with f the function of a solid (Hart
+    1996, appendix F).
 
-    Its Lipschitz constant is the sum of both constants; its surface lies where the solid's f is
-    within `max_abs` of 0.
+    solid: has the function f, which must be a formula.
+    noise: the displacement.
+
+    Its Lipschitz constant is the sum of the constants of both. Its surface lies where |f| is at
+    most the noise's `max_abs`.
     """
 
     solid: Formula
@@ -337,7 +369,7 @@ class DisplacedSolid(FormulaSolid):
 
     @property
     def may_jump(self) -> bool:
-        """Whether the solid's function may jump: noise is continuous."""
+        """Whether the solid's function may jump; noise is continuous."""
         return self.solid.may_jump
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
@@ -352,15 +384,16 @@ class DisplacedSolid(FormulaSolid):
 
 @dataclass(frozen=True)
 class _Octave:
-    """An octave of noise about a point.
+    """An octave of fractal noise, sampled at a point, with bounds that hold around it.
 
-    at: the point.
-    value, gradient, hessian: of the octave at the point.
-    slope, bend: bounds of the first and second derivatives everywhere.
-    error, slope_error: bounds of the errors of value and gradient.
+    center: the coordinates of the point.
+    value, gradient, hessian: of the octave at the point; the Hessian (6,) as in `cell_noise`.
+    slope: a bound of the length of the gradient, everywhere.
+    bend: a bound of all second derivatives, everywhere.
+    error, slope_error: bounds of the rounding errors of value and gradient at the point.
     """
 
-    at: list[Real]
+    center: list[Real]
     value: Real
     gradient: list[Real]
     hessian: list[Real]
@@ -369,35 +402,45 @@ class _Octave:
     error: Real
     slope_error: Real
 
-    def jet(self, coordinates: list[Jet], starts: list[Jet], offset: Real) -> Jet:
-        """The octave's jet, from jets of the coordinates and from their starts, which are within
-        `offset` of the point.
+    def jet(self, coordinates: list[Jet], starts: list[Jet], start_error: Real) -> Jet:
+        """The octave's jet, from jets of the coordinates.
 
-        Proof. Within m of the point the gradient differs from that at the point by at most bend m
-        (mean value theorem), and derivatives along a path follow by the chain rule. The value is
-        that at the start plus the integral of the slope.
+        coordinates: the jets, at a point or on a piece of a path.
+        starts: the jets where the piece starts, or `coordinates` themselves for a point. Their
+            values lie within `start_error` of the octave's point.
+
+        Proof. Within the distance m of the point, the gradient differs from that at the point by at
+        most bend m (mean value theorem). Derivatives along a path follow by the chain rule. The
+        value is that at the start plus the integral of the slope.
         """
-        error = self.error + self.slope * offset * (1 + 1e-5)
+        error = self.error + self.slope * start_error * (1 + 1e-5)
         value = Interval(self.value - error, self.value + error)
         if coordinates[0].jet_at_start is None:
             # At points of space, not on pieces of length 0, the Hessian is known.
             is_point = len(coordinates[0].first_derivatives) > 1
-            return self._derivatives(coordinates, offset, value, is_point=is_point)
-        start = self._derivatives(starts, offset, value, is_point=False)
-        distances = [
+            return self._derivatives(coordinates, start_error, value, is_point=is_point)
+        start = self._derivatives(starts, start_error, value, is_point=False)
+        offsets = [
             fmax(dr.abs(coordinate.value.upper - q), dr.abs(coordinate.value.lower - q))
-            for coordinate, q in zip(coordinates, self.at, strict=True)
+            for coordinate, q in zip(coordinates, self.center, strict=True)
         ]
-        distance = _length(distances) * (1 + 1e-5)
+        distance = _norm3(offsets) * (1 + 1e-5)
         error = error + self.slope * distance
         piece_value = Interval(self.value - error, self.value + error)
         piece = self._derivatives(coordinates, distance, piece_value, is_point=False)
         return piece.narrowed_from_start(start, coordinates[0].piece_length)
 
-    def _derivatives(self, jets: list[Jet], reach: Real, value: Interval, *, is_point: bool) -> Jet:
-        """The jet from jets of the coordinates, which are within `reach` of the point, and from the
-        value's range. If `is_point`, second derivatives are those of the Hessian."""
-        change = self.bend * reach + self.slope_error
+    def _derivatives(
+        self, jets: list[Jet], distance: Real, value: Interval, *, is_point: bool
+    ) -> Jet:
+        """The jet from jets of the coordinates and from the range of the value.
+
+        jets: of the coordinates, whose values lie within `distance` of the octave's point.
+        value: the range of the value.
+        is_point: whether second derivatives are those of the Hessian; else they are bounded by
+            `bend`.
+        """
+        change = self.bend * distance + self.slope_error
         slopes = [
             Interval(fmax(g - change, -self.slope), -fmax(-g - change, -self.slope))
             for g in self.gradient
@@ -406,8 +449,8 @@ class _Octave:
         speeds: list[Real] = []
         for i in range(len(jets[0].first_derivatives)):
             rates = [jet.first_derivatives[i] for jet in jets]
-            speed = _length([0 * self.value + r.max_abs for r in rates]) * (1 + 1e-5)
-            rate = _sum([g * r for g, r in zip(slopes, rates, strict=True)])
+            speed = _norm3([0 * self.value + r.max_abs for r in rates]) * (1 + 1e-5)
+            rate = _interval_sum([g * r for g, r in zip(slopes, rates, strict=True)])
             limit = self.slope * speed
             first.append(Interval(fmax(rate.lower, -limit), -fmax(-rate.upper, -limit)))
             speeds.append(speed)
@@ -417,31 +460,37 @@ class _Octave:
             bound = self.bend * speeds[i] * speeds[j]
             quadratic = Interval(-bound, bound)
             if is_point:
-                quadratic = _quadratic(
+                quadratic = _hessian_form(
                     [Interval(h - rounding, h + rounding) for h in self.hessian], jets, i, j
                 )
             rate = [g * jet.second_derivatives[k] for g, jet in zip(slopes, jets, strict=True)]
-            second.append(_sum([quadratic, *rate]))
+            second.append(_interval_sum([quadratic, *rate]))
         return Jet(value, tuple(first), tuple(second))
 
 
-def _sum(parts: list[Interval]) -> Interval:
+def _interval_sum(parts: list[Interval]) -> Interval:
+    """The sum of intervals."""
     total = parts[0]
     for part in parts[1:]:
         total = total + part
     return total
 
 
-def _quadratic(hessian: list[Interval], jets: list[Jet], i: int, j: int) -> Interval:
-    """x_i^T H x_j."""
+def _hessian_form(hessian: list[Interval], jets: list[Jet], i: int, j: int) -> Interval:
+    """x_i^T H x_j, where x_i is the derivative of the coordinates by variable i.
+
+    hessian: the upper triangle (6,) of H, row by row.
+    jets: of the three coordinates.
+    """
     terms: list[Interval] = []
     for m, (a, b) in enumerate(itertools.combinations_with_replacement(range(3), 2)):
         across = jets[a].first_derivatives[i] * jets[b].first_derivatives[j]
         if a != b:
             across = across + jets[b].first_derivatives[i] * jets[a].first_derivatives[j]
         terms.append(hessian[m] * across)
-    return _sum(terms)
+    return _interval_sum(terms)
 
 
-def _length(parts: list[Real]) -> Real:
+def _norm3(parts: list[Real]) -> Real:
+    """The length of a vector with three components."""
     return dr.sqrt(parts[0] * parts[0] + parts[1] * parts[1] + parts[2] * parts[2])

@@ -37,24 +37,24 @@ def solid(
     between: tuple[float, float] | None = None,
     around: tuple[float, float] | None = None,
 ) -> Solid:
-    """The solid of a closed mesh; or the solid of all points at which a field is below a level,
-    above it, or between two levels.
+    """The solid that a closed mesh bounds; or the solid of all points at which a field is below a
+    level, above a level, or between two levels.
 
-    field: a field; or, without a level, a mesh: a trimesh.Trimesh, a pair (vertices (n, 3), faces
-        (m, 3)), or the path of a surface file. The solid of a mesh is a `MeshSolid`, whose f is the
-        signed distance from the mesh.
+    field: a field, together with exactly one of the four level arguments; or, without these, a
+        mesh: a trimesh.Trimesh, a pair (vertices (n, 3), faces (m, 3)), or the path of a surface
+        file. The solid of a mesh is a `MeshSolid`, whose f is the signed distance from the mesh.
     below, above: a level.
-    between: (low, high).
+    between: (low, high), two levels.
     around: (level, half_width): the points at which the value is at most half_width from the level.
-        This is the argument for angle-valued fields, as for a thickened surface that spans a knot.
+        Use this for an angle-valued field, for example to thicken a surface that spans a knot.
 
         hk.solid(hk.Gyroid(1.0), between=(-0.3, 0.3)) & hk.Torus(0.8, 0.3)
         hk.solid("part.stl") - hk.Cylinder(2.0, 50.0)
 
     Raises:
-        ValueError: none, or more than one, of the four level arguments; numbers out of range; a
-            field with jumps, or an angle-valued one without `around`; a mesh that bounds no solid
-            (`MeshError`).
+        ValueError: none, or more than one, of the four level arguments for a field; numbers out of
+            range; a field with jumps; an angle-valued field without `around`; a mesh that bounds no
+            solid (`MeshError`).
     """
     bounds = [bound for bound in (below, above, between, around) if bound is not None]
     if looks_like_mesh(field):
@@ -100,7 +100,8 @@ def solid(
 
 
 def _levels(levels: Any, count: int) -> tuple[float, ...] | None:
-    """The levels as a tuple of `count` finite numbers; None if they are anything else."""
+    """The levels as a tuple of `count` finite numbers; None if they are not numbers, not finite or
+    not that many."""
     try:
         numbers = tuple(float(level) for level in levels)
     except (TypeError, ValueError):
@@ -110,7 +111,10 @@ def _levels(levels: Any, count: int) -> tuple[float, ...] | None:
 
 @dataclass(frozen=True, eq=False)
 class SublevelSolid(SolidOfField):
-    """The solid of the points where a field is at most 0."""
+    """The solid of the points where a field is at most 0.
+
+    field: any field.
+    """
 
     field: Field
 
@@ -124,6 +128,7 @@ class SublevelSolid(SolidOfField):
             return None
 
         def is_inside(value: float) -> bool:
+            """Whether a point at which f has this value is inside."""
             return value >= level if above else value <= level
 
         return bounded_side_extent(self.field, (level,), is_inside)
@@ -148,14 +153,15 @@ class SublevelSolid(SolidOfField):
 def bounded_side_extent(
     field: Field, levels: tuple[float, ...], is_inside: Callable[[float], bool]
 ) -> Volume | None:
-    """A volume that contains all points inside, if one is proved; else the domain, outside of which
-    f is undefined.
+    """A volume that contains all points inside, if one is proved. Else the field's domain, outside
+    of which f is not defined, or None.
 
-    is_inside: whether a value of f belongs to a point inside.
+    levels: of f, on which the surface of the solid lies.
+    is_inside: takes a value of f, and returns whether points with this value are inside.
 
-    Proof. Level sets lie in `extent`, which is convex. If it has bounds, its complement is
-    connected and meets no level, so that one point decides on which side of the levels the whole
-    complement lies.
+    Proof. The level sets lie in `Field.extent`, which is convex. If it has bounds, its complement
+    is connected and meets no level. So a single point of the complement decides on which side of
+    the levels the whole complement lies.
     """
     extent = field.extent(levels)
     if (
@@ -173,19 +179,22 @@ def bounded_side_extent(
 
 
 def _vector(x: Real, y: Real, z: Real) -> Vec3:
+    """The Dr.Jit 3-vector with these components."""
     return backend_of(x).Array3f(x, y, z)
 
 
 def field_jet(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
-    """The jet of a field whose second derivatives are bounded near a point.
+    """The jet of a field f whose second derivatives are bounded near a point.
 
-    Proof. Let |f''| <= H within r of q, the point where the piece starts (or the point itself). Let
-    the coordinates be within m of q on the piece, rounding included. If m <= r, the gradient on the
-    piece differs from that at q by at most H m, by the mean value theorem, and derivatives along
-    the path follow by the chain rule; the value is that at the start plus the length times the
-    derivative. Where m > r derivatives are not bounded. Second derivatives at a point (of
-    coordinates with all six) are those of the field where it has a Hessian, up to the error that it
-    states (without the effect of the rounding of coordinates), or up to 2 H, as both are at most H.
+    x, y, z: jets of the coordinates, at a point or on a piece of a path.
+
+    Proof. Let q be the point, or the start of the piece, and |f''| <= H within the distance r of q.
+    Let all points of the piece be within m of q, rounding included. If m <= r, the gradient on the
+    piece differs from that at q by at most H m, by the mean value theorem. Derivatives along the
+    path follow by the chain rule, and the value is that at the start plus the length times a
+    derivative. If m > r, derivatives are not bounded. Second derivatives at a point, if all six are
+    asked for, are those of the field's Hessian. Their error is the one that the field states
+    (without the effect of the rounding of coordinates), or else 2 H, as both are at most H.
 
     Raises:
         TypeError: the field promises no bound of its second derivatives.
@@ -194,19 +203,24 @@ def field_jet(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
     starts = [entry if entry.jet_at_start is None else entry.jet_at_start for entry in coordinates]
     q = _vector(*(0 * x.piece_length + entry.value.midpoint for entry in starts))
     sample = field.evaluate(q)
-    bound, radius = _second_derivatives(field, sample)
+    bound, radius = _second_derivative_bound(field, sample)
     offset = safe_norm(type(q)(*(0 * x.piece_length + entry.value.radius for entry in starts)))
-    rows = _second_derivatives_at(field, q) if len(x.second_derivatives) == _ALL_PAIRS else None
+    rows = _hessian_rows(field, q) if len(x.second_derivatives) == _PAIR_COUNT else None
     second_error = 2 * bound
     if rows is not None:
-        is_point = offset <= _AT_POINT * float(dr.epsilon(type(q.x))) * max_norm(q)
+        is_point = offset <= _MAX_POINT_ROUNDINGS * float(dr.epsilon(type(q.x))) * max_norm(q)
         second_error = dr.select(
             is_point, fmin(second_error, field.derivative_errors(q, sample)[1]), second_error
         )
 
-    def derivatives(
+    def derivative_ranges(
         jets: list[Jet], distance: Real
     ) -> tuple[tuple[Interval, ...], tuple[Interval, ...]]:
+        """The ranges of the first and of the second derivatives of f by the variables of the jets.
+
+        jets: of the coordinates.
+        distance: a bound of the distance of their points from q.
+        """
         limit = dr.select(distance <= radius, bound, dr.inf)
         spread = limit * distance * (1 + 1e-5) + sample.gradient_error
         slopes = [Interval(entry - spread, entry + spread) for entry in sample.gradient]
@@ -225,7 +239,9 @@ def field_jet(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
             for i in range(len(x.first_derivatives))
         ]
         second: list[Interval] = []
-        for k, (i, j) in enumerate(_pairs(len(x.first_derivatives), len(x.second_derivatives))):
+        for k, (i, j) in enumerate(
+            _variable_pairs(len(x.first_derivatives), len(x.second_derivatives))
+        ):
             rate = _interval_sum(
                 g * entry.second_derivatives[k] for g, entry in zip(slopes, jets, strict=True)
             )
@@ -249,7 +265,7 @@ def field_jet(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
         1 + 1e-5
     )
     value = Interval(sample.value - error, sample.value + error)
-    first, second = derivatives(starts, offset)
+    first, second = derivative_ranges(starts, offset)
     start = Jet(value, first, second, piece_length=starts[0].piece_length)
     if x.jet_at_start is None:
         return start
@@ -257,31 +273,33 @@ def field_jet(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
         fmax(dr.abs(entry.value.upper - m), dr.abs(entry.value.lower - m))
         for entry, m in zip(coordinates, q, strict=True)
     )
-    first, second = derivatives(list(coordinates), safe_norm(type(q)(*offsets)) * (1 + 1e-5))
+    first, second = derivative_ranges(list(coordinates), safe_norm(type(q)(*offsets)) * (1 + 1e-5))
     span = Interval(0 * x.piece_length, 0 * value.lower + x.piece_length)
     return Jet(value + first[0] * span, first, second, start, x.piece_length)
 
 
 def _interval_sum(terms: Iterable[Interval]) -> Interval:
+    """The sum of intervals."""
     total = Interval(0.0, 0.0)
     for term in terms:
         total = total + term
     return total
 
 
-def _pairs(n: int, count: int) -> list[tuple[int, int]]:
-    """The first `count` pairs (i, j), i <= j, of n variables: those of the entries of
+def _variable_pairs(n: int, count: int) -> list[tuple[int, int]]:
+    """The first `count` pairs (i, j) with i <= j of n variables, in the order of the entries of
     `Jet.second_derivatives`."""
     return [(i, j) for i in range(n) for j in range(i, n)][:count]
 
 
-# The number of second derivatives by three coordinates; and the error, in roundings, up to which
-# coordinates are those of a point.
-_ALL_PAIRS, _AT_POINT = 6, 256.0
+# The number of second derivatives by three coordinates. And the number of roundings: coordinates of
+# jets with an error of at most so many stand for a point, others for a range.
+_PAIR_COUNT, _MAX_POINT_ROUNDINGS = 6, 256.0
 
 
-def _second_derivatives_at(field: Field, q: Vec3) -> list[list[Interval]] | None:
-    """The Hessian of a field at a point; None for a field without one."""
+def _hessian_rows(field: Field, q: Vec3) -> list[list[Interval]] | None:
+    """The rows of the Hessian of a field at a point q, with each entry as an interval; None for a
+    field without a Hessian."""
     try:
         rows = field.hessian(q)
     except NotImplementedError:
@@ -289,11 +307,12 @@ def _second_derivatives_at(field: Field, q: Vec3) -> list[list[Interval]] | None
     return [[Interval.point(number) for number in row] for row in rows]
 
 
-def _second_derivatives(field: Field, sample: Sample) -> tuple[Real, Real]:
-    """A bound of all second derivatives, and the radius of a ball on which it holds.
+def _second_derivative_bound(field: Field, sample: Sample) -> tuple[Real, Real]:
+    """A bound of all second derivatives of a field near the point of a sample, and the radius of
+    the ball on which it holds.
 
     Raises:
-        TypeError: the field promises no such bound.
+        TypeError: the sample promises no such bound.
     """
     for promise in sample.all_promises:
         bound = promise.implied_second_derivative_bound(sample.value)
@@ -308,12 +327,13 @@ def _second_derivatives(field: Field, sample: Sample) -> tuple[Real, Real]:
 
 @dataclass(frozen=True, eq=False)
 class BandSolid(SolidOfField):
-    """The solid of the points where a field is at most half_width from a level: |f - level| -
-    half_width. For an angle-valued field, from the level plus any multiple of the period.
+    """The solid of the points where a field f is at most half_width from a level. Its function is
+    |f - level| - half_width. For an angle-valued field, f - level stands for its distance from the
+    nearest multiple of the period.
 
-    Proof. Its function changes as f does, up to the sign. So it does not reach a value v as long as
-    f stays away from level + v + half_width and level - v - half_width, and from these plus
-    multiples of the period (`FoldedEnclosure`).
+    Proof. The function of the solid changes as f does, up to the sign. So it does not reach a value
+    v as long as f stays away from level + v + half_width and from level - v - half_width, and from
+    these plus multiples of the period (`FoldedEnclosure`).
     """
 
     field: Field
@@ -332,11 +352,14 @@ class BandSolid(SolidOfField):
         return prepared
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        """See `Solid.sublevel_extent`. The points where |f - level| - half_width is at most a
+        number lie between two levels of f."""
         ends = tuple(self.level + sign * (self.half_width + level) for sign in (-1, 1))
         if above or (self.field.is_global and self.field.period is None):
             return self.domain
 
         def is_inside(value: float) -> bool:
+            """Whether a point at which f has this value is inside."""
             offset, period = value - self.level, self.field.period
             if period is not None:
                 offset -= period * round(offset / period)
@@ -345,7 +368,7 @@ class BandSolid(SolidOfField):
         return bounded_side_extent(self.field, ends, is_inside)
 
     def evaluate(self, p: Vec3) -> Sample:
-        return self._fold_sample(self.field.evaluate(p))[0]
+        return self._sample_with_difference(self.field.evaluate(p))[0]
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         is_below = self._level_difference(self.field.evaluate(p).value) < 0
@@ -353,30 +376,34 @@ class BandSolid(SolidOfField):
         return x, y, z
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """The bounds of the inner field. They are infinite where rounding leaves open on which side
-        of a fold the point is, since derivatives jump there."""
-        inner = self.field.evaluate(p)
-        first_error, second_error = self.field.derivative_errors(p, inner)
-        error = value_error_bound(inner, safe_norm(inner.gradient), max_norm(p))
-        fold_distance = dr.abs(self._level_difference(inner.value))
+        """The bounds of the field f. They are infinite where rounding leaves open whether f is
+        above or below the level (or, if f has a period, which multiple of it is nearest), since
+        derivatives jump there."""
+        inner_sample = self.field.evaluate(p)
+        first_error, second_error = self.field.derivative_errors(p, inner_sample)
+        error = value_error_bound(inner_sample, safe_norm(inner_sample.gradient), max_norm(p))
+        kink_distance = dr.abs(self._level_difference(inner_sample.value))
         if self.field.period is not None:
-            fold_distance = fmin(fold_distance, 0.5 * self.field.period - fold_distance)
-        is_clear = fold_distance > error
+            kink_distance = fmin(kink_distance, 0.5 * self.field.period - kink_distance)
+        is_clear = kink_distance > error
         return dr.select(is_clear, first_error, dr.inf), dr.select(is_clear, second_error, dr.inf)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
+        """The ray sample of |f - level| - half_width, from that of f. Its enclosures are
+        `FoldedEnclosure`s."""
         ray_sample = self.field.sample_ray(path, t, ahead, back)
-        sample, offset = self._fold_sample(ray_sample.sample)
+        sample, offset = self._sample_with_difference(ray_sample.sample)
 
         def folded(enclosures: tuple[Enclosure, ...]) -> tuple[Enclosure, ...]:
+            """The enclosures of |f - level| from those of f."""
             return tuple(
                 FoldedEnclosure(enclosure, offset, self.field.period) for enclosure in enclosures
             )
 
         slope = dr.mulsign(ray_sample.slope, offset)
-        ahead_, back_ = folded(ray_sample.forward), folded(ray_sample.backward)
+        forward, backward = folded(ray_sample.forward), folded(ray_sample.backward)
         return RaySample(
-            sample, ahead_, back_, slope, ray_sample.reach_growth, ray_sample.slope_error
+            sample, forward, backward, slope, ray_sample.reach_growth, ray_sample.slope_error
         )
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
@@ -385,13 +412,17 @@ class BandSolid(SolidOfField):
         return abs(self.field.formula(x, y, z) - self.level) - self.half_width
 
     def _level_difference(self, value: Real) -> Real:
-        """f - level, reduced by multiples of the period to at most half a period."""
+        """f - level; for a field with a period, less the multiple of the period that brings it
+        closest to 0.
+
+        value: f.
+        """
         offset, period = value - self.level, self.field.period
         return offset if period is None else offset - period * dr.round(offset / period)
 
-    def _fold_sample(self, sample: Sample) -> tuple[Sample, Real]:
+    def _sample_with_difference(self, sample: Sample) -> tuple[Sample, Real]:
         """The sample of |f - level| - half_width from that of f; and f - level, as
-        `_level_difference` reduces it."""
+        `_level_difference` gives it."""
         offset = self._level_difference(sample.value)
         negated = negated_sample(sample)
         is_below = offset < 0
@@ -412,15 +443,17 @@ class BandSolid(SolidOfField):
 
 @dataclass(frozen=True)
 class FoldedEnclosure(Enclosure):
-    """An enclosure of |r| from one of r, where r is known modulo a period and reduced to within
-    half a period of 0.
+    """An enclosure of |r| from an enclosure of r.
 
-    inner: the enclosure of r. offset: r.
+    inner: the enclosure of r.
+    offset: r at the start of the path.
+    period: if not None, r is known up to multiples of the period, and `offset` is within half a
+        period of 0; |r| then stands for the distance of r from the nearest multiple.
 
-    Proof. |r| rises to |r| + g, or falls to |r| - g >= 0, only where r reaches plus or minus that
-    value, or one of these plus a multiple of the period. The nearest of these above and below r are
-    the levels of r. Where |r| - g < 0, or |r| + g is beyond half a period, r never reaches such a
-    value.
+    Proof. |r| rises by g only where r reaches plus or minus |r| + g, or one of these plus a
+    multiple of the period. It falls by g only where r reaches plus or minus |r| - g, or one of
+    these plus a multiple of the period. The nearest of these numbers above and below r are the
+    levels of r. If |r| - g < 0, or |r| + g is more than half a period, |r| never takes this value.
     """
 
     inner: Enclosure
@@ -428,20 +461,24 @@ class FoldedEnclosure(Enclosure):
     period: float | None
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        return self.inner.free_length(self._gaps(gaps))
+        return self.inner.free_length(self._inner_gaps(gaps))
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
-        return self.inner.is_free(self._gaps(gaps), length)
+        return self.inner.is_free(self._inner_gaps(gaps), length)
 
-    def _gaps(self, gaps: LevelGaps) -> LevelGaps:
-        """The gaps of r. For r >= 0 (else mirrored), with s = |r|, they are how far r must move for
-        |r| to reach A = s + gaps.above or B = s - gaps.below: upwards to A or P - B, downwards to B
-        or -A, with P the period."""
+    def _inner_gaps(self, gaps: LevelGaps) -> LevelGaps:
+        """The gaps of r: how far r must rise, and how far it must fall, for |r| to leave its own
+        gaps.
+
+        Let s = |r| and P the period. |r| has reached an end of its gaps if it is A = s + gaps.above
+        or B = s - gaps.below. For r >= 0, upwards r first reaches A or P - B, and downwards B or
+        -A. For r < 0 this is mirrored.
+        """
         size, inf = dr.abs(self.offset), type(self.offset)(dr.inf)
-        has_below = gaps.below <= size * _SLACK
+        has_below = gaps.below <= size * _ROUNDING_FACTOR
         upwards, downwards = gaps.above, 2 * size + gaps.above
         if self.period is not None:
-            has_above = size + gaps.above <= 0.5 * self.period * _SLACK
+            has_above = size + gaps.above <= 0.5 * self.period * _ROUNDING_FACTOR
             upwards, downwards = (dr.select(has_above, gap, inf) for gap in (upwards, downwards))
             wrapped = self.period - 2 * size + gaps.below
             upwards = dr.select(has_below, fmin(wrapped, upwards), upwards)
@@ -455,5 +492,5 @@ class FoldedEnclosure(Enclosure):
         )
 
 
-# Covers the rounding of the tests whether r can reach a value.
-_SLACK = 1.0 + 1e-5
+# A factor that covers the rounding in tests whether |r| can take a value.
+_ROUNDING_FACTOR = 1.0 + 1e-5

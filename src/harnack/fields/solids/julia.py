@@ -22,41 +22,44 @@ if TYPE_CHECKING:
 
 Quaternion = tuple[float, float, float, float]
 
-# Radii of the balls, as fractions of the longest possible step.
-_RADII = (0.8, 0.6, 0.45, 0.3, 0.15)
-# Iterates beyond this absolute value have escaped; from there on only the logarithms of later
-# iterates are computed.
-_ESCAPE_RADIUS = {"single": 1e4, "double": 1e8}
+# Radii of the balls on which a Lipschitz constant is promised, as fractions of the longest possible
+# step.
+_RADIUS_FRACTIONS = (0.8, 0.6, 0.45, 0.3, 0.15)
+# An iterate whose absolute value is above this number has escaped: the logarithms of later iterates
+# are computed from it, and not these iterates themselves.
+_ESCAPED_NORM = {"single": 1e4, "double": 1e8}
 
 
 @dataclass(frozen=True)
 class Julia(Solid):
-    """A quaternion Julia set: the points whose orbit under q -> q^2 + c stays small for a number of
-    iterations.
+    """A filled quaternion Julia set: the points whose orbit q_0, q_1 = q_0^2 + c, q_2 = q_1^2 + c
+    ... stays small for a number of iterations.
 
     c: the constant, four numbers; the real part comes first.
     iterations: N. More iterations show finer details, and the solid shrinks to the Julia set.
-    fourth_coordinate: that of the slice shown; points of space are q = x + y i + z j +
-        fourth_coordinate k.
+    fourth_coordinate: that of the slice shown. The point (x, y, z) of space is the quaternion q_0 =
+        x + y i + z j + fourth_coordinate k.
 
-    f = 2^-N max(log(|q_N|/B), -1), with B = (1 + sqrt(1 + 4 |c|))/2: from |q| > B on an orbit
-    escapes, for |q|^2 - |c| > |q| there. So f <= 0 on the filled Julia set, for any N.
+    f = 2^-N max(log(|q_N|/B), -1), with B = (1 + sqrt(1 + 4 |c|))/2. Where |q| > B, |q|^2 - |c| >
+    |q|, so an orbit that leaves the ball of radius B escapes. So f <= 0 on the filled Julia set,
+    for any N.
 
-    Proof of the balls. In a ball of radius r, q_n changes by at most e_n, with e_0 = r and e_(n+1)
-    = 2 |q_n| e_n + e_n^2, for squares of quaternions differ by d q + q d + d^2; and its derivative
-    in any direction is at most d_n, with d_0 = 1 and d_(n+1) = 2 (|q_n| + e_n) d_n. So d_n/(|q_n| -
-    e_n) is a bound g_n of the derivative of log|q_n| there. Besides, |q_n| >= m_n implies |q_(n+1)|
-    >= m_n^2 - |c|, and g_(n+1) <= 2 g_n/(1 - |c|/m_n^2), for |q q' + q' q| <= 2 |q| |q'|; the
-    smaller bound is used. 2^-N g_N is a Lipschitz constant of f in the ball, and so is 2^-N d_N
-    e/B, as f is cut off at |q| = B/e; a constant is promised for each of a few radii. The rounding
-    of an iterate is another such change: e_n with r = 0 bounds the error of q_n. A ball with |q_n|
-    - e_n > B for an n <= N contains no point of the solid. The usual |z| log|z| / (2 |z'|) is not a
-    bound of the distance.
+    Proof of the Lipschitz constants. Consider a ball of radius r about a point. In it q_n changes
+    by at most e_n, where e_0 = r and e_(n+1) = 2 |q_n| e_n + e_n^2, since the squares of q and q +
+    d differ by d q + q d + d^2. The derivative of q_n in any direction is at most d_n, where d_0 =
+    1 and d_(n+1) = 2 (|q_n| + e_n) d_n. So g_n = d_n/(|q_n| - e_n) is a bound of the derivative of
+    log|q_n| in the ball. A second bound follows from a lower bound m_n of |q_n| in the ball:
+    |q_(n+1)| >= m_n^2 - |c|, and g_(n+1) <= 2 g_n/(1 - |c|/m_n^2), as |q q' + q' q| <= 2 |q| |q'|.
+    The smaller bound is used. 2^-N g_N is a Lipschitz constant of f in the ball. So is 2^-N d_N e/B
+    (here e is Euler's number), since f is constant where |q_N| < B/e. Constants are promised for a
+    few radii. The rounding of an iterate is another change of this kind: e_n with r = 0 bounds the
+    error of q_n. A ball with |q_n| - e_n > B for an n <= N contains no point of the solid. (The
+    usual estimate |z| log|z| / (2 |z'|) is not a bound of the distance.)
 
-    Where |q_n| > R (a large number) at n < N, f = 2^-n log|q_n| - 2^-N log B within 2^-n 2
-    |c|/|q_n|^2: each later iterate adds 2^-(j+1) log|1 + c/q_j^2|, and these fall. If m_n >= 2 B
-    there, later m_j at least double, and all factors 1/(1 - |c|/m_j^2) together are at most exp(4
-    |c|/m_n^2).
+    Where |q_n| > R at an n < N, for a large number R, f = 2^-n log|q_n| - 2^-N log B with an error
+    of at most 2^-n 2 |c|/|q_n|^2: each later iterate q_j adds 2^-(j+1) log|1 + c/q_j^2|, and these
+    terms decrease. If m_n >= 2 B there, later m_j at least double, and the product of all factors
+    1/(1 - |c|/m_j^2) is at most exp(4 |c|/m_n^2).
     """
 
     c: Quaternion = (-0.2, 0.8, 0.0, 0.0)
@@ -64,6 +67,7 @@ class Julia(Solid):
     fourth_coordinate: float = 0.0
 
     def __post_init__(self) -> None:
+        """Check the arguments."""
         try:
             numbers = tuple(self.c)
         except TypeError:
@@ -98,7 +102,7 @@ class Julia(Solid):
             ("_size", size),
             ("_b", self.escape_radius),
         ):
-            object.__setattr__(prepared, name, _data(backend, value))
+            object.__setattr__(prepared, name, _kernel_parameters(backend, value))
         return prepared
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
@@ -113,6 +117,9 @@ class Julia(Solid):
         return ball_around((0.0, 0.0, 0.0), math.sqrt(max(square, 0.0)))
 
     def evaluate(self, p: Vec3) -> Sample:
+        """The sample at p. A first orbit gives f and its gradient, and so the longest step that
+        could be proved. A second orbit gives Lipschitz constants on balls whose radii are fractions
+        of it."""
         if not hasattr(self, "_c"):
             from harnack.backend import backend_of
 
@@ -123,7 +130,7 @@ class Julia(Solid):
         # center.
         longest = dr.abs(value) / steepest
         longest = clamp(dr.select(dr.isfinite(longest), longest, 1), 1e-6, self._parameter("_b"))
-        radii = tuple(longest * fraction for fraction in _RADII)
+        radii = tuple(longest * fraction for fraction in _RADIUS_FRACTIONS)
         constants = self._orbit(p, radii)[3]
         promises: list[Lipschitz] = []
         for radius, constant in zip(radii, constants, strict=True):
@@ -134,15 +141,22 @@ class Julia(Solid):
         return Sample(value, gradient, tuple(promises), error)
 
     def _parameter(self, name: str) -> Any:
+        """The attribute `name`, which is a number of the backend."""
         return getattr(self, name)
 
     def _orbit(self, p: Vec3, radii: tuple[Real, ...]) -> tuple[Any, ...]:
-        """f, its gradient, a bound of the error of f, and bounds of |grad f| on the balls of these
-        radii. The first radius must be 0 for the error to be that of rounding alone."""
+        """f, its gradient, a bound of the error of f, and for each radius a bound of |grad f| on
+        the ball of that radius about p.
+
+        radii: the first must be 0, so that the error of f is that of rounding alone.
+
+        In the notation of `Julia`, `size` is |c|, b is B, and for each radius `change` holds e_n,
+        `slopes` d_n, `min_q` m_n and `rates` g_n.
+        """
         c, size, b = self._parameter("_c"), self._parameter("_size"), self._parameter("_b")
         real = cast("Any", type(p.x))
         is_single = dr.type_v(real) == dr.VarType.Float32
-        escape = _ESCAPE_RADIUS["single" if is_single else "double"]
+        escape = _ESCAPED_NORM["single" if is_single else "double"]
         epsilon = 2 * float(dr.epsilon(real))
         zero, ones = 0 * p.x, 0 * p.x + 1
         q = [p.x, p.y, p.z, zero + self._parameter("_slice")]
@@ -153,7 +167,13 @@ class Julia(Solid):
         min_q = [fmax(start * (1 - 4 * epsilon) - r, 0) for r in change]
         rates = [1 / m for m in min_q]
 
-        def body(n: Any, *state: Any) -> tuple[Any, ...]:
+        def iterate(n: Any, *state: Any) -> tuple[Any, ...]:
+            """The state after one more iteration.
+
+            The state consists of the number n of iterations; the four components of q_n; the 12
+            entries of its Jacobian with respect to x, y and z, row by row; and `change`, `slopes`,
+            `min_q` and `rates`.
+            """
             q, jac = list(state[:4]), state[4:16]
             change, slopes, min_q, rates = _split_in_four(state[16:])
             next_jac: list[Any] = [None] * 12
@@ -184,11 +204,12 @@ class Julia(Solid):
             return n + 1, *next_q, *next_jac, *next_change, *next_slopes, *next_min_q, *next_rates
 
         def is_active(n: Any, *state: Any) -> Any:
+            """Whether iterations are left and the orbit has not escaped."""
             return (n < self.iterations) & (_squared_norm(state[:4]) <= escape * escape)
 
         index = dr.uint32_array_t(real)
         begin = (dr.zeros(index, dr.width(p)), *q, *jac, *change, *slopes, *min_q, *rates)
-        n, *state = dr.while_loop(begin, is_active, body, label="quaternion Julia set")
+        n, *state = dr.while_loop(begin, is_active, iterate, label="quaternion Julia set")
         q, jac = state[:4], state[4:16]
         change, slopes, min_q, rates = _split_in_four(state[16:])
         square = _squared_norm(q)
@@ -217,17 +238,19 @@ class Julia(Solid):
 
 
 def _split_in_four(state: Any) -> tuple[Any, Any, Any, Any]:
-    """The four equal parts of a sequence."""
+    """A sequence cut into four parts of the same length."""
     k = len(state) // 4
     return state[:k], state[k : 2 * k], state[2 * k : 3 * k], state[3 * k :]
 
 
-def _data(backend: Backend, value: Any) -> Any:
-    """Numbers, or nested tuples of them, as kernel parameters of a backend."""
+def _kernel_parameters(backend: Backend, value: Any) -> Any:
+    """A number, or nested tuples of numbers, as kernel parameters of a backend."""
     if isinstance(value, tuple):
-        return tuple(_data(backend, part) for part in cast("tuple[Any, ...]", value))
+        return tuple(_kernel_parameters(backend, part) for part in cast("tuple[Any, ...]", value))
     return dr.opaque(backend.Float, float(value))
 
 
 def _squared_norm(q: Any) -> Any:
+    """The squared absolute value of a quaternion, or squared length of a vector of four
+    components."""
     return q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]

@@ -1,12 +1,13 @@
 """Solids bounded by closed triangle meshes: `MeshSolid`, whose function is the signed distance from
 the mesh.
 
-`ClosedSurface.of` returns the faces of a mesh that bound the solid, and refuses meshes that bound
+`ClosedSurface.of` returns the faces of a mesh that bound the solid, and refuses a mesh that bounds
 none.
 
-Signs of meshes come from crossings: normals of edges and vertices, weighted by angles, decide no
-side near triangles as thin as rounding. A ray decides it, as the two triangles at an edge compare
-it with the ray by the same bits, and takes a thirtieth of the time of the search for the nearest
+Whether a point is inside is decided by the crossings of a ray with the mesh. The normals of edges
+and vertices, weighted by angles, would be the usual way, but near triangles as thin as rounding
+they decide nothing. The ray decides there too, because the two triangles at an edge compare the
+edge with the ray by the same bits. It takes a thirtieth of the time of the search for the nearest
 triangle.
 """
 
@@ -65,19 +66,19 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
 
 _LEAF_SIZE = 4
-# Of a signed distance the gradient is a unit vector wherever it exists.
-_STEEP = 0.99
+# A lower bound of |gradient| of a signed distance, which is 1 wherever the gradient exists.
+_MIN_GRADIENT = 0.99
 # The rounding error of a distance, in machine epsilons of coordinates and of the mesh's size, as
 # `tree.closest_triangles.distance_lower_bound` proves.
-_ROUNDING = 16.0
-# Coordinates of jets whose error is larger, in roundings, are ranges.
-_ROUNDED_BY = 256.0
-# The nearest triangle decides the side only where the distance is larger than this multiple of its
-# error.
-_CLEAR_ROUNDINGS = 8.0
+_DISTANCE_ROUNDINGS = 16.0
+# If coordinates of jets have an error of more than this many roundings, they stand for a range.
+_MAX_POINT_ROUNDINGS = 256.0
+# The normal of the nearest triangle decides whether a point is inside only where the distance is
+# larger than this multiple of its error.
+_CLEAR_MULTIPLE = 8.0
 
 
-def solid_of_mesh(source: Any) -> MeshSolid:
+def solid_of_mesh(given: Any) -> MeshSolid:
     """The solid that a mesh bounds. A mesh is anything with `vertices` and `faces`, a pair of
     these, or the path of a surface file.
 
@@ -86,17 +87,17 @@ def solid_of_mesh(source: Any) -> MeshSolid:
         FileFormatError: a file that cannot be read.
         TypeError: the argument is not a mesh.
     """
-    if isinstance(source, str | os.PathLike):
-        surface = read_geometry(cast("Any", source), "winding")
+    if isinstance(given, str | os.PathLike):
+        surface = read_geometry(cast("Any", given), "winding")
         if not isinstance(surface, LoadedMesh):
-            raise MeshError(f"{source}: it holds no faces, so it bounds no solid")
+            raise MeshError(f"{given}: it holds no faces, so it bounds no solid")
         faces = np.concatenate([surface.faces, surface.zero_area_faces])
         return MeshSolid(surface.vertices, faces)
-    mesh: Any = source
+    mesh: Any = given
     if hasattr(mesh, "vertices") and hasattr(mesh, "faces"):
         return MeshSolid(mesh.vertices, mesh.faces)
-    if isinstance(source, tuple | list) and len(cast("Any", source)) == 2:
-        vertices, faces = cast("Any", source)
+    if isinstance(given, tuple | list) and len(cast("Any", given)) == 2:
+        vertices, faces = cast("Any", given)
         return MeshSolid(vertices, faces)
     raise TypeError(
         "a mesh is a trimesh.Trimesh, a pair (vertices, faces), or the path of a file, not of type "
@@ -104,55 +105,58 @@ def solid_of_mesh(source: Any) -> MeshSolid:
     )
 
 
-def looks_like_mesh(value: Any) -> bool:
+def looks_like_mesh(given: Any) -> bool:
     """Whether an argument is meant as a mesh: it has the attributes of a mesh, is a pair, or is the
     name of a surface file."""
-    if isinstance(value, str | os.PathLike):
-        return Path(cast("Any", value)).suffix.lower() in GEOMETRY_SUFFIXES
-    if hasattr(value, "vertices") and hasattr(value, "faces"):
+    if isinstance(given, str | os.PathLike):
+        return Path(cast("Any", given)).suffix.lower() in GEOMETRY_SUFFIXES
+    if hasattr(given, "vertices") and hasattr(given, "faces"):
         return True
-    return isinstance(value, tuple | list) and len(cast("Any", value)) == 2
+    return isinstance(given, tuple | list) and len(cast("Any", given)) == 2
 
 
 @dataclass(frozen=True, eq=False)
 class MeshSolid(Solid):
-    """The inside of a closed triangle mesh: f is the signed distance from its surface.
+    """The inside of a closed triangle mesh. f is the signed distance from its surface.
 
-    vertices: (n, 3). faces: (m, 3), indices of vertices, counter-clockwise as seen from outside.
-        Vertices at the same position count as one vertex, and so do, at open edges, vertices that
-        are apart by rounding (`geometry.welding`); faces may have zero area.
+    vertices: (n, 3). Vertices at the same position count as one vertex. At open edges, vertices
+        that differ by rounding count as one too (`geometry.welding`).
+    faces: (m, 3), indices of vertices, counter-clockwise as seen from outside. Faces may have zero
+        area.
 
     A mesh that crosses or contains itself is the solid of the points around which it winds more
-    than 1/2 times, the union where its parts overlap or touch; f is the distance from the boundary
-    of that union.
+    than 1/2 times, which is the union where its parts overlap or touch. f is the distance from the
+    boundary of that union.
 
-    |f| is the distance from the nearest triangle, which a tree finds; so its Lipschitz constant is
-    1. Its error is at most 16 epsilons of the size of the mesh and the distance from its center
-    (`tree.closest_triangles.ClosestPointOnTriangle`).
+    |f| is the distance from the nearest triangle, which is found in a tree; so its Lipschitz
+    constant is 1. Its error is at most 16 epsilons of the size of the mesh and of the distance from
+    its center (`tree.closest_triangles.ClosestPointOnTriangle`).
 
-    Proof of the sign. It is the sign of the winding number, the sum of the signs of the crossings
-    of a ray along z (`tree.triangle_tree.signed_crossing`), and is right wherever the distance is
-    more than its error e, also for rays through edges and vertices and for triangles without area.
-    Each triangle that the ray counts as crossed has a point within rounding of the ray, at the
-    depth that is compared with 0. Let C be a cylinder of that radius around the line; the ball of
-    radius e about x has no point of the surface. So the part of a triangle in C, which is convex,
-    lies ahead of x or behind it as a whole, and its depth decides which. Edges that meet C ahead of
-    x are edges of two triangles ahead, where the same bits decide on which side the ray passes, so
-    that they cancel; all other edges are passed at a distance greater than rounding. So the sum is
-    that of a ray in general position. Normals of edges and vertices, weighted by angles (Baerentzen
-    and Aanaes 2005), would need no ray, but have no reliable direction near triangles as thin as
-    rounding.
+    Proof of the sign. The sign is that of the winding number less 1/2. The winding number is the
+    sum of the signs of the crossings of the mesh with a ray along z
+    (`tree.triangle_tree.signed_crossing`). It is right wherever the distance is more than its error
+    e, also for rays through edges and vertices and for triangles without area. Each triangle that
+    counts as crossed has a point within rounding of the ray; the depth of this point is compared
+    with 0. Let C be a cylinder of that radius around the line of the ray. The ball of radius e
+    about the point x has no point of the surface. So the part of a triangle in C, which is convex,
+    lies ahead of x or behind x as a whole, and its depth decides which. An edge that meets C ahead
+    of x belongs to two triangles ahead. For both, the same bits decide on which side of the edge
+    the ray passes, so that they cancel. All other edges are passed at a distance greater than
+    rounding. So the sum is that of a ray in general position. Normals of edges and vertices,
+    weighted by angles (Baerentzen and Aanaes 2005), would need no ray, but have no reliable
+    direction near triangles as thin as rounding.
 
-    Where the nearest point is inside of a triangle, its normal decides the same without a ray.
-    Proof: from x down to that point, and beside it, the ball about x is free of the surface, so
-    that x is on that side of the triangle. If rounding has mistaken an edge for the inside, all
-    other triangles at that edge lie at more than a right angle from x (else they would be nearer),
-    so that this triangle is the first that is met, turning from x.
+    If the nearest point lies inside a triangle, the triangle's normal decides the same without a
+    ray. Proof. The ball about x through that point is free of the surface, so that x is on the side
+    of the triangle that the normal tells. Suppose that rounding has mistaken a point on an edge for
+    an inner point. Then all other triangles at that edge lie at more than a right angle from x
+    (else they would be nearer), so that this triangle is the first that is met, turning around the
+    edge from x.
 
     Raises:
         MeshError: a mesh that is not closed, whose faces do not agree on its two sides, that is
-            inside out somewhere, or whose faces lie on each other up to rounding and not exactly;
-            the message states a remedy.
+            inside out somewhere, or whose faces lie on each other up to rounding and not exactly.
+            The message states a remedy.
     """
 
     vertices: Any
@@ -182,8 +186,9 @@ class MeshSolid(Solid):
         }
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
-        """The box of the mesh, grown by the level. Proof: the ball of radius -level about a point
-        where f < level is inside the solid, and so within the box."""
+        """The box of the mesh, grown by the level on each side. Proof for a negative level. The
+        ball of radius -level about a point where f < level is inside the solid, and so in the
+        box."""
         if above:
             return None
         surface = self.surface
@@ -199,7 +204,9 @@ class MeshSolid(Solid):
         return prepared
 
     def evaluate(self, p: Vec3) -> Sample:
-        data, cache = _on(self, p), _SAMPLE_CACHE.get()
+        """The sample of the signed distance at p. Within `share_samples`, a sample at the same
+        Dr.Jit points is taken from the cache."""
+        data, cache = _data_on_backend(self, p), _SAMPLE_CACHE.get()
         if cache is None or dr.flag(dr.JitFlag.SymbolicScope):
             return data.sample(p)
         key = id(data), p.x.index, p.y.index, p.z.index
@@ -208,15 +215,17 @@ class MeshSolid(Solid):
         return cache[key][1]
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
+        """The ray sample, with the enclosures that the Lipschitz constant 1 proves, and with a
+        lower bound of |grad f|."""
         del ahead, back
-        ray_sample = path.enclose(self.evaluate(path.point(t)))
+        look = path.enclose(self.evaluate(path.point(t)))
         return RaySample(
-            ray_sample.sample,
-            ray_sample.forward,
-            ray_sample.backward,
-            ray_sample.slope,
-            ray_sample.reach_growth,
-            min_gradient_norm=_STEEP,
+            look.sample,
+            look.forward,
+            look.backward,
+            look.slope,
+            look.reach_growth,
+            min_gradient_norm=_MIN_GRADIENT,
         )
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
@@ -232,10 +241,11 @@ _SAMPLE_CACHE: ContextVar[dict[tuple[int, ...], tuple[Vec3, Sample]] | None] = C
 
 @contextmanager
 def share_samples() -> Generator[None]:
-    """Within this context, a mesh is sampled only once at the same Dr.Jit points, so that a shell
-    and a lattice of the same mesh share a nearest-triangle search.
+    """Within this context, a mesh is sampled only once at the same Dr.Jit points. So a shell and a
+    lattice of the same mesh share one search for the nearest triangles.
 
-    Inactive while loops are recorded, as their values are defined inside the loop only.
+    While loops are recorded, samples are not shared, as their values are defined inside the loop
+    only.
     """
     token = _SAMPLE_CACHE.set({})
     try:
@@ -244,8 +254,8 @@ def share_samples() -> Generator[None]:
         _SAMPLE_CACHE.reset(token)
 
 
-def _on(solid: Any, like: Any) -> _MeshData:
-    """The solid's data on the backend of a number or a point."""
+def _data_on_backend(solid: Any, like: Any) -> _MeshData:
+    """The data of a solid on the backend of `like`, a number or a point."""
     if not hasattr(solid, "_on_device"):
         solid = solid.prepare(backend_of(like))
     return solid._on_device
@@ -253,11 +263,12 @@ def _on(solid: Any, like: Any) -> _MeshData:
 
 @dataclass(frozen=True)
 class _MeshData(UnitFrame):
-    """The triangles of a mesh on a backend.
+    """The triangles of a mesh on a backend, in unit coordinates.
 
-    rays: tree of all faces, a closed mesh, for ray crossings. near: tree of the triangles that
-        bound the solid, for closest points.
-    corners: records of nine numbers, the corners of the triangles of `near`. low, high: their box.
+    rays: a tree of all faces, which form a closed mesh, for the crossings of rays.
+    near: a tree of the triangles that bound the solid, for closest points.
+    corners: a record of nine numbers for each triangle of `near`, its corners.
+    low, high: the lowest and the highest corner of the box of `near`.
     """
 
     rays: TriangleTree
@@ -268,14 +279,15 @@ class _MeshData(UnitFrame):
 
     @classmethod
     def upload(cls, backend: Backend, surface: ClosedSurface) -> _MeshData:
+        """The triangles of a surface on a backend."""
         vertices, faces, weights = surface.vertices, surface.faces, surface.weights
-        near = rays = _tree(
+        near = rays = _triangle_tree(
             backend, vertices, faces, weights, slabs=surface.boundary_triangles is None
         )
         if surface.boundary_triangles is not None:
             points = surface.boundary_triangles.reshape(-1, 3)
             indices = np.arange(len(points)).reshape(-1, 3)
-            near = _tree(backend, points, indices, np.ones(len(indices)), slabs=True)
+            near = _triangle_tree(backend, points, indices, np.ones(len(indices)), slabs=True)
         corners = RecordTable.upload(backend, surface.corners.reshape(-1, 9))
         low, high = (
             backend.Array3f(*(dr.opaque(backend.Float, float(coordinate)) for coordinate in corner))
@@ -287,62 +299,73 @@ class _MeshData(UnitFrame):
     def sample(self, p: Vec3) -> Sample:
         """The sample of the signed distance at p."""
         x = self.to_unit(p)
-        return self._sample(p, x, self._nearest(x))
+        return self._signed_sample(p, x, self._closest_triangle(x))
 
     def sample_with_feature(self, p: Vec3) -> tuple[Sample, Vec3, Mask, Mask]:
-        """The sample at p; a unit vector along the edge on which the closest point lies; whether
-        that is on an edge; and whether it is a vertex. Both are False where the closest point is
-        inside of a triangle."""
+        """The sample at p, and on what the closest point of the mesh lies.
+
+        Returns the sample; a unit vector along the edge that is nearest to the closest point;
+        whether the closest point is on that edge and no vertex; and whether it is a vertex. Both
+        are False where the closest point is inside a triangle.
+        """
         vector = self.backend.Array3f
         x = self.to_unit(p)
-        closest = self._nearest(x)
+        closest = self._closest_triangle(x)
         corners = self.corners.read_record(closest.triangle, closest.triangle != NO_TRIANGLE)
-        offsets = [vector(*corners[k : k + 3]) - (x + closest.offset) for k in (0, 3, 6)]
-        rounding = _ROUNDING * self.backend.machine_epsilon * (1 + dr.max(dr.abs(x)))
-        at_vertex, along, least = (self.backend.Bool(False), vector(0), self.backend.Float(dr.inf))
+        to_corners = [vector(*corners[k : k + 3]) - (x + closest.offset) for k in (0, 3, 6)]
+        rounding = _DISTANCE_ROUNDINGS * self.backend.machine_epsilon * (1 + dr.max(dr.abs(x)))
+        at_vertex, along, min_distance = (
+            self.backend.Bool(False),
+            vector(0),
+            self.backend.Float(dr.inf),
+        )
         for a, b in ((0, 1), (1, 2), (2, 0)):
-            edge = offsets[b] - offsets[a]
+            edge = to_corners[b] - to_corners[a]
             length = dr.norm(edge)
-            offset = dr.norm(dr.cross(offsets[a], edge)) / length
-            along = dr.select(offset < least, edge / length, along)
-            least = fmin(offset, least)
-            at_vertex |= dr.norm(offsets[a]) <= rounding
+            edge_distance = dr.norm(dr.cross(to_corners[a], edge)) / length
+            along = dr.select(edge_distance < min_distance, edge / length, along)
+            min_distance = fmin(edge_distance, min_distance)
+            at_vertex |= dr.norm(to_corners[a]) <= rounding
         on_edge = ~closest.is_inner & ~at_vertex
-        return self._sample(p, x, closest), along, on_edge, ~closest.is_inner & at_vertex
+        return (self._signed_sample(p, x, closest), along, on_edge, ~closest.is_inner & at_vertex)
 
-    def _nearest(self, x: Vec3) -> ClosestTriangle:
+    def _closest_triangle(self, x: Vec3) -> ClosestTriangle:
         """The triangle closest to x, a point in unit coordinates."""
         backend = self.backend
-        limit = initial_squared_distance(self.near, x)
+        upper_bound = initial_squared_distance(self.near, x)
         before = backend.Float(-1), backend.UInt32(NO_TRIANGLE)
-        return next_closest_triangle(self.near, x, before, limit, backend.Bool(True))
+        return next_closest_triangle(self.near, x, before, upper_bound, backend.Bool(True))
 
-    def _sample(self, p: Vec3, x: Any, closest: ClosestTriangle) -> Sample:
-        """The sample at p, which is x in unit coordinates, from the triangle closest to it."""
+    def _signed_sample(self, p: Vec3, x: Any, closest: ClosestTriangle) -> Sample:
+        """The sample of the signed distance at p.
+
+        x: p in unit coordinates.
+        closest: the triangle closest to it.
+        """
         backend = self.backend
         real, vector, epsilon = backend.Float, backend.Array3f, backend.machine_epsilon
         distance = dr.sqrt(closest.squared_distance)
-        error = _ROUNDING * epsilon * (1 + dr.max(dr.abs(x)))
+        error = _DISTANCE_ROUNDINGS * epsilon * (1 + dr.max(dr.abs(x)))
 
         double_area = dr.norm(closest.normal)
         has_area = double_area > 0
         normal = dr.select(has_area, closest.normal / double_area, vector(0, 0, 1))
         height = -dr.dot(closest.offset, normal)  # of x above the triangle's plane
-        is_by_normal = closest.is_inner & (distance > _CLEAR_ROUNDINGS * error)
-        is_by_normal &= 2 * dr.abs(height) > distance
-        inside = self._is_inside(x, ~is_by_normal)
-        inside = dr.select(is_by_normal, height < 0, inside)
+        normal_decides = closest.is_inner & (distance > _CLEAR_MULTIPLE * error)
+        normal_decides &= 2 * dr.abs(height) > distance
+        inside = self._is_inside(x, ~normal_decides)
+        inside = dr.select(normal_decides, height < 0, inside)
         sign = dr.select(inside, real(-1), real(1))
 
         # Across a face the direction is that of its normal, also where the distance is rounding.
         # Far from the face the sign decides the side, since both faces of a wall thinner than
         # rounding are near.
         on_face = (closest.is_inner & has_area) | (distance == 0)
-        side = dr.select(distance > error, sign * dr.mulsign(real(1), height), 1)
-        gradient = dr.select(on_face, normal * side, -closest.offset * (sign / distance))
+        normal_sign = dr.select(distance > error, sign * dr.mulsign(real(1), height), 1)
+        gradient = dr.select(on_face, normal * normal_sign, -closest.offset * (sign / distance))
         # Corners are rounded: that turns a triangle by the rounding over its height.
-        turn = 8 * epsilon / double_area
-        gradient_error = dr.select(on_face, fmin(turn, 2), fmin(2 * error / distance, 2))
+        normal_error = 8 * epsilon / double_area
+        gradient_error = dr.select(on_face, fmin(normal_error, 2), fmin(2 * error / distance, 2))
         gradient_error = dr.select((distance == 0) & ~has_area, 2, gradient_error)
         return Sample(
             sign * distance * self.size,
@@ -353,19 +376,22 @@ class _MeshData(UnitFrame):
         )
 
     def _is_inside(self, x: Vec3, active: Mask) -> Mask:
-        """Whether the winding number is above 1/2, for lanes that are active: by a ray along z, to
-        the side on which less of the mesh lies."""
+        """Whether the winding number at x, a point in unit coordinates, is above 1/2, on active
+        lanes. It is counted along a ray in direction z or -z, towards the nearer end of the box."""
         is_in_box = dr.all((x >= self.low) & (x <= self.high))
         ray_sign = dr.select(x.z > 0.5 * (self.low.z + self.high.z), self.backend.Float(1), -1)
         crossings = self.rays.signed_crossings_vertical(x, ray_sign, active & is_in_box)
         return is_in_box & (ray_sign * crossings > 0.5)
 
 
-def _tree(
+def _triangle_tree(
     backend: Backend, vertices: FloatArray, faces: IntArray, weights: Any, *, slabs: bool
 ) -> TriangleTree:
-    """A tree of triangles for closest points and ray crossings; the crossings of a face count as
-    often as its weight."""
+    """A tree of triangles for closest points and ray crossings.
+
+    weights: (m,) or a number: the crossings of a face count this many times.
+    slabs: whether nodes have slabs besides boxes, for closest points from far away.
+    """
     tree = build_balanced_tree(vertices[faces].mean(axis=1), leaf_size=_LEAF_SIZE)
     records = triangle_records(vertices, faces)
     records[:, PARITY_COLUMN] *= weights
@@ -373,29 +399,35 @@ def _tree(
 
 
 def mesh_distance_jet(solid: MeshSolid, x: Jet, y: Jet, z: Jet) -> Jet:
-    """The jet of a signed distance, from jets of the coordinates.
+    """The jet of the signed distance d from a mesh.
 
-    Proof. The distance has the Lipschitz constant 1, so its derivative in any variable is at most
-    the length of the derivative of (x, y, z), and the error of the value is at most that of the
-    coordinates at the start. On a piece there may be kinks, so that second derivatives have no
-    bound. At a point they are those of the distance d from the nearest face, edge or vertex. They
-    are 0 for a face. For a vertex they are 1/d across the gradient; for an edge, 1/d across both
-    the gradient and the edge.
+    x, y, z: jets of the coordinates, at a point or on a piece of a path.
+
+    Proof. d has the Lipschitz constant 1. So its derivative by any variable is at most the length
+    of the derivative of (x, y, z) by it, and its value at the start is known up to the error of the
+    coordinates there. On a piece d may have kinks, so that second derivatives have no bound. At a
+    point they are those of the distance from the nearest face, edge or vertex. For a face they are
+    0. For a vertex they are 1/d across the gradient. For an edge they are 1/d across both the
+    gradient and the edge, and 0 along the edge.
     """
     coordinates = (x, y, z)
     starts = [coord if coord.jet_at_start is None else coord.jet_at_start for coord in coordinates]
     zero = 0 * x.piece_length
     q = backend_of(zero).Array3f(*(zero + coord.value.midpoint for coord in starts))
-    sample, edge, on_edge, at_vertex = _on(solid, q).sample_with_feature(q)
+    sample, edge, on_edge, at_vertex = _data_on_backend(solid, q).sample_with_feature(q)
     input_error = sum((coord.value.radius for coord in starts), zero)
     error = sample.value_error + input_error
     # Where coordinates are ranges, and not numbers with their rounding, another face may be
     # nearest.
     size = max_norm(q) + dr.abs(sample.value)
-    is_range = input_error > _ROUNDED_BY * float(dr.epsilon(zero)) * size
+    is_range = input_error > _MAX_POINT_ROUNDINGS * float(dr.epsilon(zero)) * size
     value = Interval(sample.value, sample.value).widened(1e-6, 0.0) + Interval(-error, error)
 
     def speeds(jets: Any) -> list[Real]:
+        """For each variable, a bound of the length of the derivative of (x, y, z) by it.
+
+        jets: of the coordinates.
+        """
         return [
             dr.sqrt(sum(dr.square(zero + coord.first_derivatives[i].max_abs) for coord in jets))
             * (1 + 1e-5)
@@ -409,28 +441,33 @@ def mesh_distance_jet(solid: MeshSolid, x: Jet, y: Jet, z: Jet) -> Jet:
         rate = Interval(0.0, 0.0)
         for slope, coord in zip(slopes, starts, strict=True):
             rate = rate + slope * coord.first_derivatives[i]
-        range_ = Interval(-limit, limit)
-        narrowed = rate.intersect(range_)
+        lipschitz_range = Interval(-limit, limit)
+        narrowed = rate.intersect(lipschitz_range)
         lower, upper = (
             dr.select(is_range, a, b)
             for a, b in ((-limit, zero + narrowed.lower), (limit, zero + narrowed.upper))
         )
         first.append(Interval(lower, upper))
 
-    def component(direction: Vec3, jets: Any, i: int) -> Interval:
+    def rate_along(direction: Vec3, jets: Any, i: int) -> Interval:
+        """The range of the component, along `direction`, of the derivative of (x, y, z) by variable
+        i.
+
+        jets: of the coordinates.
+        """
         total = Interval(0.0, 0.0)
         for coord, jet in zip(direction, jets, strict=True):
             total = total + Interval.point(coord) * jet.first_derivatives[i]
         return total
 
     count = range(len(x.first_derivatives))
-    upward = [component(sample.gradient, starts, i) for i in count]
-    edge_rates = [component(edge, starts, i) for i in count]
+    gradient_rates = [rate_along(sample.gradient, starts, i) for i in count]
+    edge_rates = [rate_along(edge, starts, i) for i in count]
     curvature = dr.select(on_edge | at_vertex, 1 / sample.value, 0)
-    margin = dr.select(is_range, dr.inf, zero)
+    range_margin = dr.select(is_range, dr.inf, zero)
     second: list[Interval] = []
     for k, (i, j) in enumerate(starts[0].hessian_indices()):
-        across = -(upward[i] * upward[j])
+        across = -(gradient_rates[i] * gradient_rates[j])
         for coord in starts:
             across = across + coord.first_derivatives[i] * coord.first_derivatives[j]
         across = across - edge_rates[i] * edge_rates[j] * Interval.point(
@@ -439,7 +476,7 @@ def mesh_distance_jet(solid: MeshSolid, x: Jet, y: Jet, z: Jet) -> Jet:
         rate = Interval.point(zero + curvature).widened(1e-5 + sample.gradient_error) * across
         for slope, coord in zip(slopes, starts, strict=True):
             rate = rate + slope * coord.second_derivatives[k]
-        second.append(rate + Interval(-margin, margin))
+        second.append(rate + Interval(-range_margin, range_margin))
     start = Jet(value, tuple(first), tuple(second), piece_length=starts[0].piece_length)
     if x.jet_at_start is None:
         return start
@@ -451,11 +488,11 @@ def mesh_distance_jet(solid: MeshSolid, x: Jet, y: Jet, z: Jet) -> Jet:
 
 # The surface of a mesh.
 
-# Triangles whose height is a smaller fraction of the mesh's size are not tested for the winding
-# numbers beside them.
-_THIN = 1e-9
-# The integral of the normal over a closed surface is 0 up to this fraction of its area.
-_CLOSED = 1e-10
+# A triangle is thin if its height is below this fraction of the mesh's size. The winding numbers
+# beside thin triangles are not tested.
+_THIN_HEIGHT = 1e-9
+# The integral of the normal over a closed surface must be 0 up to this fraction of its area.
+_CLOSED_TOLERANCE = 1e-10
 # Barycentric coordinates of the points of a triangle at which the winding numbers of both sides are
 # compared.
 _PROBE_POINTS = ((0.98, 0.01, 0.01), (0.01, 0.98, 0.01), (0.01, 0.01, 0.98))
@@ -463,15 +500,18 @@ _PROBE_POINTS = ((0.98, 0.01, 0.01), (0.01, 0.98, 0.01), (0.01, 0.01, 0.98))
 
 @dataclass(frozen=True)
 class ClosedSurface:
-    """The boundary of the solid that a mesh bounds, in unit coordinates, of at most about 1: a
-    point u stands for center + size * u.
+    """The boundary of the solid that a mesh bounds, in unit coordinates.
 
-    vertices: (n, 3). faces: (m, 3), closed, no two alike. weights: (m,) the multiplicity of each
-        face.
+    A point u in unit coordinates stands for center + size * u; the coordinates are at most about 1.
+
+    vertices: (n, 3).
+    faces: (m, 3), indices of vertices. They form a closed mesh, and no two are alike.
+    weights: (m,) how many times each face is counted.
+    center: (3,), and size: the unit coordinates.
     boundary_triangles: (k, 3, 3) corners of the triangles that bound the points of a winding number
         above 1/2; None if these are just the faces.
-    box: the lowest and the highest coordinates of that boundary. area: of that boundary, not in
-        unit coordinates, where triangles that coincide count once.
+    box: the lowest and the highest corner (3,) of that boundary.
+    area: of that boundary in the mesh's own units; triangles that coincide count once.
     """
 
     vertices: FloatArray
@@ -496,6 +536,8 @@ class ClosedSurface:
     def of(cls, vertices: FloatArray, faces: IntArray) -> ClosedSurface:
         """The closed surface of a mesh.
 
+        vertices, faces: (n, 3) and (m, 3).
+
         Raises:
             MeshError: the mesh bounds no solid.
         """
@@ -513,64 +555,74 @@ class ClosedSurface:
         unit = (vertices - center) / size
 
         def place(corners: FloatArray) -> str:
+            """The center of triangles, as text in the mesh's own units, for messages.
+
+            corners: of one triangle (3, 3), in unit coordinates.
+            """
             return format_vector(center + size * corners.mean(axis=0))
 
-        pieces, area = _boundary(unit, net.faces, net.multiplicity, place)
+        pieces, area = _boundary_pieces(unit, net.faces, net.multiplicity, place)
         corners = unit[net.faces] if pieces is None else pieces
         box = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
         return cls(unit, net.faces, net.multiplicity, center, size, pieces, box, area * size**2)
 
 
-def _boundary(
+def _boundary_pieces(
     unit: FloatArray, faces: IntArray, weights: IntArray, place: Callable[[FloatArray], str]
 ) -> tuple[FloatArray | None, float]:
-    """The pieces of faces between winding numbers below and above 1/2, or None if these are all
-    faces, uncut; and their area, where pieces that coincide count once.
+    """The triangles between winding numbers below and above 1/2, and their area.
 
-    Pieces run counter-clockwise as seen from outside. Where faces coincide, and more of them are
-    turned one way than the other, each of these stands for the boundary.
+    unit: (n, 3) the vertices in unit coordinates.
+    faces, weights: as in `ClosedSurface`.
+    place: returns the text for a place near a triangle, for messages.
 
-    Triangles thinner than `_THIN` have no reliable normal, and so no winding numbers beside them.
-    If the boundary is all faces, it includes them; else whatever the winding numbers beside them
-    come out as moves the surface by no more than their height.
+    Faces are cut into pieces where they meet other faces. The result is the corners (k, 3, 3) of
+    the pieces that bound the solid, or None if these are all faces, uncut. Pieces run
+    counter-clockwise as seen from outside. In the area, pieces that coincide count once. Where
+    several faces coincide, and more of them are turned one way than the other, each of these is a
+    piece of the boundary.
+
+    Triangles thinner than `_THIN_HEIGHT` have no reliable normal, and so no reliable winding
+    numbers beside them. If the boundary is all faces, it includes them. Else their computed winding
+    numbers decide; a wrong decision moves the surface by no more than their height.
 
     Raises:
         MeshError: the mesh is inside out, or faces lie on each other.
     """
     faces = np.repeat(faces, weights, axis=0)
-    rays = _tree(choose_backend("double"), unit, faces, np.ones(len(faces)), slabs=False)
+    rays = _triangle_tree(choose_backend("double"), unit, faces, np.ones(len(faces)), slabs=False)
     proper = np.delete(faces, zero_area_faces(unit, faces), axis=0)
     proper_tree = rays
     if len(proper) < len(faces):
-        proper_tree = _tree(choose_backend("double"), unit, proper, 1.0, slabs=False)
+        proper_tree = _triangle_tree(choose_backend("double"), unit, proper, 1.0, slabs=False)
     pieces, _ = split_intersecting_faces(proper_tree, unit, proper)
     edges = pieces - np.roll(pieces, 1, axis=1)
     longest = np.linalg.norm(edges, axis=2).max(axis=1)
-    is_thick = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) > _THIN * longest
+    is_thick = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) > _THIN_HEIGHT * longest
     front, back = windings_of_sides(rays, pieces)
     lower, upper = np.minimum(front, back), np.maximum(front, back)
-    if (odd := is_thick & (lower < 0)).any():
+    if (wrong := is_thick & (lower < 0)).any():
         if (upper[is_thick] <= 0).all():
             raise MeshError(
                 "the mesh is inside out: its faces run clockwise as seen from outside; turn them "
                 "by mesh.invert() or faces[:, ::-1]"
             )
         raise MeshError(
-            f"a part of the mesh is inside out, such as near {place(pieces[odd][0])}: turn the "
+            f"a part of the mesh is inside out, such as near {place(pieces[wrong][0])}: turn the "
             "faces of that part (trimesh.repair.fix_normals(mesh, multibody=True) tries), or take "
             "harnack.WindingNumber, which asks for no sides"
         )
-    odd = np.zeros(len(pieces), np.bool_)
+    wrong = np.zeros(len(pieces), np.bool_)
     for barycentric in _PROBE_POINTS:
         front_probe, back_probe = winding_numbers_of_sides(rays, pieces, barycentric)
-        odd |= (front_probe != lower) | (back_probe != upper)
+        wrong |= (front_probe != lower) | (back_probe != upper)
     is_kept, jump = (lower < 0.5) & (upper > 0.5), upper - lower
     if not _is_closed(pieces[is_kept], jump[is_kept], is_thick[is_kept]):
-        odd |= jump != 1  # where components are in contact, or faces are repeated
-    if (odd := odd & is_thick).any():
+        wrong |= jump != 1  # where components are in contact, or faces are repeated
+    if (wrong := wrong & is_thick).any():
         raise MeshError(
-            f"{int(odd.sum()):,} faces of the mesh lie on parts of others, such as near "
-            f"{place(pieces[odd][0])}: join the parts that touch there, as trimesh.boolean.union "
+            f"{int(wrong.sum()):,} faces of the mesh lie on parts of others, such as near "
+            f"{place(pieces[wrong][0])}: join the parts that touch there, as trimesh.boolean.union "
             "does"
         )
     is_inward = front > back
@@ -590,25 +642,35 @@ def _boundary(
 
 
 def _is_closed(pieces: FloatArray, jump: FloatArray, is_thick: BoolArray) -> bool:
-    """Whether triangles (k, 3, 3), which may coincide, bound a volume, if the winding number jumps
-    by `jump` (k,) across each position.
+    """Whether triangles, some of which may coincide, bound a volume.
 
-    Proof. Over a closed surface the integral of the normal is 0 by Gauss's theorem, and that of x_i
-    n_j is the volume for i = j, else 0. The contribution of a piece that is in contact with another
-    and should be left out violates this. Of triangles that coincide, the number turned one way less
-    that turned the other way is the jump. Pieces that are not thick may count or not.
+    pieces: (k, 3, 3) corners.
+    jump: (k,) by how much the winding number changes across the position of each piece.
+    is_thick: (k,) whether the normal of each piece is reliable.
+
+    Proof. Over a closed surface the integral of the normal n is 0 by Gauss's theorem, and the
+    integral of x_i n_j is the volume for i = j, else 0. A piece that is in contact with another and
+    should be left out violates this. At each position of pieces that coincide, the number of those
+    turned one way less the number of those turned the other way is the jump. So each piece counts
+    with 1/jump. Pieces that are not thick may count or not.
     """
-    area = 0.5 * np.cross(pieces[:, 1] - pieces[:, 0], pieces[:, 2] - pieces[:, 0])
-    size = np.linalg.norm(area, axis=1)
-    area = area / np.maximum(jump, 1)[:, None]
-    moment = np.einsum("ki,kj->ij", pieces.mean(axis=1), area)
+    normal_integral = 0.5 * np.cross(pieces[:, 1] - pieces[:, 0], pieces[:, 2] - pieces[:, 0])
+    piece_area = np.linalg.norm(normal_integral, axis=1)
+    normal_integral = normal_integral / np.maximum(jump, 1)[:, None]
+    moment = np.einsum("ki,kj->ij", pieces.mean(axis=1), normal_integral)
     deviation = moment - np.trace(moment) / 3 * np.eye(3)
-    tolerance = _CLOSED * size.sum() + 4 * size[~is_thick].sum()
-    return bool(max(np.abs(area.sum(axis=0)).max(), np.abs(deviation).max()) <= tolerance)
+    tolerance = _CLOSED_TOLERANCE * piece_area.sum() + 4 * piece_area[~is_thick].sum()
+    return bool(
+        max(np.abs(normal_integral.sum(axis=0)).max(), np.abs(deviation).max()) <= tolerance
+    )
 
 
 def _check_closed(vertices: FloatArray, welded: Welded) -> None:
-    """Raise MeshError unless every edge is run equally often in both directions."""
+    """Raise MeshError unless every edge occurs as often in one direction as in the other.
+
+    vertices: (n, 3).
+    welded: the faces, and the edges at which this is not so.
+    """
     faces, edges, edge_weights = welded.net.faces, welded.edges, welded.weights
     if not len(edges):
         return

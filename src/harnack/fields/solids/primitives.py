@@ -1,8 +1,9 @@
 """Primitive solids: plane, sphere, ellipsoid, cylinder, cone, capsule, torus, box, superquadrics.
 
-Each is its signed distance, or a bound of it (Hart 1996, appendix A): negative inside and, with the
-Lipschitz constant 1, no larger than the distance outside. Superquadrics have a larger constant.
-Shapes lie at the origin with their axis along z, to be moved and rotated.
+The function f of each is its signed distance or a bound of it (Hart 1996, appendix A). f is
+negative inside. Except for superquadrics its Lipschitz constant is 1, so that it is no larger than
+the distance outside. Superquadrics have a larger constant. Shapes lie at the origin with their axis
+along z; they can be moved and rotated.
 """
 
 from __future__ import annotations
@@ -25,9 +26,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Plane(FormulaSolid):
-    """The half-space n.x <= distance, where n is the unit vector along the normal.
+    """The half-space n . x <= distance, where n is the unit vector along `normal`.
 
-    The signed distance (Hart, equation 23): its gradient is n, so that its Lipschitz constant is 1.
+    normal: (3,), of any length but 0.
+    distance: of the plane from the origin, along n.
+
+    f is the signed distance n . x - distance (Hart, equation 23). Its gradient is n, so that its
+    Lipschitz constant is 1.
     """
 
     is_convex = True
@@ -59,7 +64,8 @@ class Plane(FormulaSolid):
 class Sphere(FormulaSolid):
     """The ball |x - center| <= radius.
 
-    The signed distance (Hart, equation 24): by the triangle inequality the constant is 1.
+    f is the signed distance |x - center| - radius (Hart, equation 24). By the triangle inequality
+    its Lipschitz constant is 1.
     """
 
     is_convex = True
@@ -84,8 +90,8 @@ class Sphere(FormulaSolid):
 
 
 def _box_of_radii(radii: tuple[float, float, float], level: float) -> Volume:
-    """The box around the points where m (g - 1) <= level, with m the least radius and g a norm that
-    is 1 on a surface which reaches the radii along the axes, and lies in the box of half sides
+    """A box that contains all points where m (g - 1) <= level, with m the smallest radius. Here g
+    is a norm. The surface g = 1 meets the axes at the radii, and lies in the box of half sides
     `radii`."""
     a, b, c = radii
     size = 1.0 + level / min(radii)
@@ -94,11 +100,14 @@ def _box_of_radii(radii: tuple[float, float, float], level: float) -> Volume:
 
 @dataclass(frozen=True)
 class Ellipsoid(FormulaSolid):
-    """The points with |(x/a, y/b, z/c)| <= 1, radii = (a, b, c).
+    """The points with |(x/a, y/b, z/c)| <= 1.
 
-    f = m (|(x/a, y/b, z/c)| - 1) with m the least radius. Proof of the Lipschitz constant 1: the
-    norm has the constant 1, and the stretched coordinates have 1/m. It is attained along the
-    shortest axis. So f is no larger than the distance, which has no closed form.
+    radii: (a, b, c).
+
+    f = m (|(x/a, y/b, z/c)| - 1), with m the smallest radius. Proof of the Lipschitz constant 1.
+    The norm has the constant 1, and the stretched coordinates have 1/m, which is attained along the
+    shortest axis. So f is no larger than the distance outside. The distance itself has no closed
+    form.
     """
 
     is_convex = True
@@ -121,11 +130,11 @@ class Ellipsoid(FormulaSolid):
 
 @dataclass(frozen=True)
 class Cylinder(FormulaSolid):
-    """The points within `radius` of the z axis, and with |z| <= height/2 unless that is None.
+    """The points within `radius` of the z axis and, unless `height` is None, with |z| <= height/2.
 
-    Without ends f is the signed distance |(x, y)| - r (Hart, equation 25). With ends the distances
-    to the side and to the ends have gradients at right angles, so that `orthogonal_intersection` is
-    the signed distance; its Lipschitz constant is 1.
+    Without ends f is the signed distance |(x, y)| - radius (Hart, equation 25). With ends, the
+    distances from the side and from the ends have gradients at right angles, so that
+    `orthogonal_intersection` of both is the signed distance. The Lipschitz constant is 1.
     """
 
     is_convex = True
@@ -159,11 +168,13 @@ class Cylinder(FormulaSolid):
 
 @dataclass(frozen=True)
 class DoubleCone(FormulaSolid):
-    """The double cone around the z axis whose sides make an angle with it, in degrees.
+    """The double cone around the z axis with its apex at the origin.
 
-    f = |(x, y)| cos(angle) - |z| sin(angle) (Hart, equation 26). Off the axis and the plane z = 0
-    its gradient is a unit vector, so that its Lipschitz constant is 1. It is the signed distance
-    where the nearest point of a side is not beyond the apex, and smaller elsewhere.
+    angle: between the axis and the sides, in degrees, above 0 and below 90.
+
+    f = |(x, y)| cos(angle) - |z| sin(angle) (Hart, equation 26). Its gradient is a unit vector off
+    the axis and off the plane z = 0, so that its Lipschitz constant is 1. f is the signed distance
+    if the nearest point of the side's line is not past the apex, and smaller elsewhere.
     """
 
     angle: float = 30.0
@@ -190,11 +201,11 @@ class DoubleCone(FormulaSolid):
 
 @dataclass(frozen=True)
 class Capsule(FormulaSolid):
-    """The points within `radius` of the segment from start to end.
+    """The points within `radius` of the segment from `start` to `end`.
 
-    f is the signed distance |q - max(0, min(1, t)) (end - start)| - r, with q = x - start and t the
-    parameter of the nearest point of the line. As the distance from a set it has the Lipschitz
-    constant 1.
+    f is the signed distance |q - max(0, min(1, t)) (end - start)| - radius, where q = x - start,
+    and t is the position of the nearest point of the line, as a fraction of the segment. As the
+    distance from a set, it has the Lipschitz constant 1.
     """
 
     is_convex = True
@@ -216,13 +227,13 @@ class Capsule(FormulaSolid):
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         axis = [b - a for a, b in zip(self.start, self.end, strict=True)]
-        q = [v - a for v, a in zip((x, y, z), self.start, strict=True)]
+        from_start = [v - a for v, a in zip((x, y, z), self.start, strict=True)]
         square = axis[0] * axis[0] + axis[1] * axis[1] + axis[2] * axis[2]
-        t = (q[0] * axis[0] + q[1] * axis[1] + q[2] * axis[2]) / square
+        t = (from_start[0] * axis[0] + from_start[1] * axis[1] + from_start[2] * axis[2]) / square
         # The distance beyond the ends, along the axis; and the distance from the line, across it.
-        size = norm(*axis)
-        beyond = maximum(-t, t - 1.0, 0.0) * size
-        across = norm(*(v - t * a for v, a in zip(q, axis, strict=True)))
+        length = norm(*axis)
+        beyond = maximum(-t, t - 1.0, 0.0) * length
+        across = norm(*(v - t * a for v, a in zip(from_start, axis, strict=True)))
         return norm(across, beyond) - self.radius
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
@@ -239,8 +250,9 @@ class Capsule(FormulaSolid):
 class Torus(FormulaSolid):
     """The points within `minor` of the circle of radius `major` around the z axis.
 
-    f is the signed distance | (|(x, y)| - R, z) | - r (Hart, equation 27); the distance from a set,
-    so its Lipschitz constant is 1. With minor > major (a spindle torus) it is only a bound inside.
+    f is the signed distance | (|(x, y)| - major, z) | - minor (Hart, equation 27). As the distance
+    from a set, it has the Lipschitz constant 1. If minor > major (a spindle torus), it is only a
+    bound of the distance inside.
     """
 
     major: float = 1.0
@@ -264,10 +276,13 @@ class Torus(FormulaSolid):
 
 @dataclass(frozen=True)
 class Cuboid(FormulaSolid):
-    """The box |x| <= a/2, |y| <= b/2, |z| <= c/2 of sides (a, b, c), its edges rounded by `radius`.
+    """The box |x| <= a/2, |y| <= b/2, |z| <= c/2.
 
-    f is the signed distance: that of the box smaller by the radius (`orthogonal_intersection`),
-    less the radius.
+    sides: (a, b, c).
+    radius: with which the edges are rounded.
+
+    f is the signed distance: that of the box smaller by the radius on each side
+    (`orthogonal_intersection`), less the radius.
     """
 
     is_convex = True
@@ -302,15 +317,15 @@ class Cuboid(FormulaSolid):
 
 
 def lipschitz_of_norms(p: float, q: float) -> float:
-    """The Lipschitz constant of | (|(x, y)|_p, z) |_q, p, q >= 1.
+    """The Lipschitz constant of | (|(x, y)|_p, z) |_q, for p, q >= 1, where |.|_p is the p-norm.
 
-    Hart's constant (1996, equation 31) is right only for p = q < 2 or p, q >= 2. Proof. The
-    gradient has the components u^(q-1) grad |(x, y)|_p and v^(q-1), where (u, v) has the q-norm 1.
-    The gradient of the p-norm has the dual norm 1, so its length is at most c = 2^max(0, 1/p -
-    1/2). So the square of the length is at most c^2 u^(2q-2) + v^(2q-2). For q >= 2 both powers are
-    at most u^q and v^q, whose sum is 1: it is at most c^2, for c >= 1. For q < 2, Hoelder's
-    inequality with the exponents q/(2q-2) and q/(2-q) gives (c^m + 1)^(2/m) with m = 2q/(2-q). All
-    are attained.
+    Proof. Let (u, v) = (|(x, y)|_p, z), scaled to the q-norm 1. The gradient has the components
+    u^(q-1) grad |(x, y)|_p and v^(q-1). The gradient of the p-norm has the dual norm 1, so its
+    length is at most c = 2^max(0, 1/p - 1/2). So the square of the length of the whole gradient is
+    at most c^2 u^(2q-2) + v^(2q-2). For q >= 2 both powers are at most u^q and v^q, whose sum is 1;
+    so the square is at most c^2, as c >= 1. For q < 2, Hoelder's inequality with the exponents
+    q/(2q-2) and q/(2-q) gives (c^m + 1)^(2/m) with m = 2q/(2-q). All these bounds are attained.
+    (Hart's constant, 1996, equation 31, is right only for p = q < 2, or p >= 2 and q >= 2.)
     """
     c = 2.0 ** max(0.0, 1.0 / p - 0.5)
     if q >= 2.0:
@@ -320,7 +335,9 @@ def lipschitz_of_norms(p: float, q: float) -> float:
 
 
 def _checked_powers(powers: Any, name: str) -> tuple[float, float]:
-    """The two powers as numbers.
+    """The two powers (p, q) as numbers.
+
+    name: of the shape, for messages.
 
     Raises:
         ValueError: not two numbers, or a power below 1.
@@ -338,7 +355,8 @@ def _checked_powers(powers: Any, name: str) -> tuple[float, float]:
 
 
 class _Powered(FormulaSolid):
-    """A shape with powers, which are literals of its kernel and not kernel parameters."""
+    """A shape whose formula has powers. They are literals of its kernel, and not kernel parameters,
+    so that other powers compile another kernel."""
 
     powers: tuple[float, float]
 
@@ -350,11 +368,14 @@ class _Powered(FormulaSolid):
 
 @dataclass(frozen=True)
 class Superellipsoid(_Powered):
-    """The points with | (|(x/a, y/b)|_p, z/c) |_q <= 1, powers = (p, q), radii = (a, b, c).
+    """The points with | (|(x/a, y/b)|_p, z/c) |_q <= 1, where |.|_p is the p-norm.
 
-    f = m (that norm - 1) with m the least radius (Hart, equations 28 to 30), whose Lipschitz
-    constant is that of the norm for equal radii, and no larger for other radii: see
-    `lipschitz_of_norms`.
+    powers: (p, q), each at least 1.
+    radii: (a, b, c).
+
+    f = m (that norm - 1), with m the smallest radius (Hart, equations 28 to 30). For equal radii
+    its Lipschitz constant is that of the norm (`lipschitz_of_norms`); for other radii it is no
+    larger.
     """
 
     is_convex = True
@@ -381,10 +402,13 @@ class Superellipsoid(_Powered):
 
 @dataclass(frozen=True)
 class Supertorus(_Powered):
-    """The points with | (|(x, y)|_p - R, z) |_q <= r, powers = (p, q).
+    """The points with | (|(x, y)|_p - major, z) |_q <= minor, where |.|_p is the p-norm.
 
-    Its Lipschitz constant is that of the norms (`lipschitz_of_norms`): subtracting R changes no
-    gradient.
+    powers: (p, q), each at least 1.
+    major, minor: as for `Torus`.
+
+    The Lipschitz constant is that of the norms (`lipschitz_of_norms`), as subtracting `major`
+    changes no gradient.
     """
 
     powers: tuple[float, float] = (4.0, 4.0)

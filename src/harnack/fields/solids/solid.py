@@ -1,7 +1,8 @@
-"""Solids, the points at which a function is not positive, and their combinations.
+"""Solids: the points at which a function is not positive; and the operators that combine and move
+them.
 
-`Solid` is the base of all solids, `FormulaSolid` the base of solids with a formula, `SolidOfField`
-the base of solids of another field, and `SpaceMap` the base of maps of space.
+`Solid` is the base of all solids, `FormulaSolid` that of solids with a formula, and `SolidOfField`
+that of solids made of another field. `SpaceMap` is the base of maps of space.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ Point = tuple[float, float, float]
 
 
 def box_around(half: tuple[float, float, float], center: Any = (0.0, 0.0, 0.0)) -> Volume:
-    """The box with these half sides about a center. Negative half sides count as 0."""
+    """The box with the half sides `half` about a center, enlarged by `_EXTENT_MARGIN`. Negative
+    half sides count as 0."""
     sizes = [
         max(h, 0.0) + _EXTENT_MARGIN * (abs(h) + abs(c)) for h, c in zip(half, center, strict=True)
     ]
@@ -45,13 +47,13 @@ def box_around(half: tuple[float, float, float], center: Any = (0.0, 0.0, 0.0)) 
 
 
 def ball_around(center: tuple[float, float, float], radius: float) -> Volume:
-    """The ball about a center. A negative radius counts as 0."""
+    """The ball about a center, enlarged by `_EXTENT_MARGIN`. A negative radius counts as 0."""
     slack = _EXTENT_MARGIN * (abs(radius) + sum(abs(c) for c in center)) + 1e-30
     return Ball(center, max(radius, 0.0) + slack)
 
 
 def set_frozen(shape: Any, name: str, value: Any) -> None:
-    """Set an attribute of a frozen shape to a checked value."""
+    """Set an attribute of a shape that is a frozen dataclass."""
     object.__setattr__(shape, name, value)
 
 
@@ -63,18 +65,23 @@ class SpaceMap(abc.ABC):
 
     @abc.abstractmethod
     def apply(self, solid: Solid) -> Solid:
-        """The image of a solid that is not a combination of other solids."""
+        """The image of a solid under the map. The solid is not a combination of other solids."""
 
 
 def axis_index(axis: str) -> int:
-    """The index, 0 to 2, of an axis. Raises ValueError for a name that is not "x", "y" or "z"."""
+    """The index of an axis: 0, 1 or 2 for "x", "y" or "z".
+
+    Raises:
+        ValueError: another name.
+    """
     if axis not in AXES:
         raise ValueError(f'axis must be "x", "y" or "z", not {axis!r}')
     return AXES[axis]
 
 
 def not_a_solid(other: Any) -> str:
-    """The text of an error message: how to make a solid of an object that is not a solid."""
+    """The text of an error message about an object that is not a solid. For a field it says how to
+    make a solid of it."""
     kind = type(other).__name__
     if isinstance(other, Field):
         return (
@@ -85,10 +92,12 @@ def not_a_solid(other: Any) -> str:
 
 
 def _with_source(prepare: Callable[[Any, Backend], Field]) -> Callable[[Any, Backend], Field]:
-    """Wrap `prepare` so that a prepared solid keeps a reference to the original."""
+    """Wrap a method `prepare` so that the prepared solid keeps a reference to the original in its
+    attribute `_source`."""
 
     @functools.wraps(prepare)
     def remembering(self: Any, backend: Backend) -> Field:
+        """See `Field.prepare`."""
         prepared = prepare(self, backend)
         if prepared is not self:
             object.__setattr__(prepared, "_source", vars(self).get("_source", self))
@@ -100,12 +109,12 @@ def _with_source(prepare: Callable[[Any, Backend], Field]) -> Callable[[Any, Bac
 class Solid(Field):
     """A solid: the points where f <= 0. Its boundary is the level 0.
 
-    Solids are combined by operators, `a | b` (union), `a & b` (intersection), `a - b` (difference),
-    `~a` (complement), and are moved and deformed by methods. Every step is proved from enclosures
-    of the operands, never from a distance, as f of a combination is not a distance.
+    Solids are combined by operators: `a | b` (union), `a & b` (intersection), `a - b` (difference)
+    and `~a` (complement). They are moved and deformed by methods. Every step is proved from
+    enclosures of the operands, never from a distance, since f of a combination is not a distance.
 
-    lipschitz: a proved bound of |grad f| everywhere, so that outside f/lipschitz is a lower bound
-        of the distance (Hart 1996, definition 3); None if no such bound is known.
+    lipschitz: a proved bound of |grad f| everywhere; None if no such bound is known. Outside of the
+        solid f/lipschitz is a lower bound of the distance (Hart 1996, definition 3).
     """
 
     over_relaxation = 1.0
@@ -113,8 +122,8 @@ class Solid(Field):
     lipschitz: Any = None
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
-        """A volume proved to hold all points where f <= level, or f >= level if `above`; None if no
-        such volume is known."""
+        """A volume that is proved to contain all points where f <= level or, if `above`, all points
+        where f >= level. None if no such volume is known."""
         del level, above
         return self.domain
 
@@ -132,7 +141,7 @@ class Solid(Field):
             cls.prepare = _with_source(cls.prepare)  # type: ignore[method-assign]
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        """f of jets of the coordinates; see `Formula`.
+        """f at jets of the coordinates: see `Formula.formula`.
 
         Raises:
             TypeError: f has no formula.
@@ -145,8 +154,8 @@ class Solid(Field):
 
     @abc.abstractmethod
     def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
-        """The same combination, with each operand replaced by its image under `change`, such as a
-        map of space."""
+        """The same combination of other operands: each operand is replaced by change(operand). A
+        solid that is not a combination is its own operand."""
 
     # Combinations. Operands that are not solids are refused.
 
@@ -179,24 +188,25 @@ class Solid(Field):
     def blended(
         self, other: Solid, radius: float, *, power: float = 2.0, intersect: bool = False
     ) -> Solid:
-        """The union with another solid, with a fillet where the surfaces meet (or, with
-        intersect=True, the intersection with a rounded edge).
+        """The union with another solid, with a fillet where the surfaces meet; or, with
+        intersect=True, the intersection with a rounded edge.
 
-        The fillet fills the space where both surfaces are near, whatever the angle between them.
-        Where faces are flush, as of a plate and a rib of the same height, the blend bulges by
-        radius (1 - 2^(-1/power)), 0.29 radius for a circle. Cut it off by a slab of the same
-        height,
-
-            plate.blended(rib, 2.0) & hk.Cuboid((60.0, 60.0, 10.0))
-
-        of height 10, or let one of the solids end a radius below the other's face.
-
-        radius: the distance that the fillet reaches along both surfaces, where f is a distance.
+        radius: how far the fillet extends along both surfaces, where f is a distance.
         power: the exponent of the superellipse that the fillet is a part of: 2 for a circle, larger
             for a sharper corner (Hart 1996, appendix D.3, corrected).
 
+        The fillet fills the space where both surfaces are near, whatever the angle between them.
+        Where faces are flush, as those of a plate and a rib of the same height, the blend bulges by
+        radius (1 - 2^(-1/power)), which is 0.29 radius for a circle. To avoid this, cut the bulge
+        off by a slab of the same height, here 10,
+
+            plate.blended(rib, 2.0) & hk.Cuboid((60.0, 60.0, 10.0))
+
+        or let one of the solids end a radius below the face of the other.
+
         Raises:
-            ValueError: radius or power out of range. TypeError: a solid without a formula.
+            ValueError: radius or power out of range.
+            TypeError: a solid without a formula.
         """
         from harnack.fields.solids.booleans import BlendedSolid
 
@@ -204,7 +214,7 @@ class Solid(Field):
 
     @no_derivatives
     def offset(self, distance: float) -> Solid:
-        """The points where f <= distance. Where f is a distance, the solid grows by that length, or
+        """The points where f <= distance. Where f is a distance, the solid grows by this length, or
         shrinks if it is negative."""
         from harnack.fields.solids.booleans import OffsetSolid
 
@@ -212,7 +222,7 @@ class Solid(Field):
 
     @no_derivatives
     def shell(self, thickness: float) -> Solid:
-        """The hollow solid: the points where -thickness <= f <= 0. Where f is a distance, as for a
+        """The hollow solid: the points where -thickness <= f <= 0. If f is a distance, as for a
         mesh, a sphere or an outline, this is a wall of that thickness inside of the surface.
 
         Raises:
@@ -227,7 +237,7 @@ class Solid(Field):
 
     @no_derivatives
     def translated(self, offset: Sequence[float]) -> Solid:
-        """The solid, moved by a vector (x, y, z)."""
+        """The solid, moved by the vector offset = (x, y, z)."""
         from harnack.fields.solids.transforms import AffineMap
 
         return self._apply_map(AffineMap.translation(offset))
@@ -245,16 +255,21 @@ class Solid(Field):
 
     @functools.cached_property
     def _ray_count_variants(self) -> TransientCache[tuple[int, ...], Solid]:
+        """The combinations made by `_for_rays`, by the identities of their parts."""
         return TransientCache()
 
     def _for_rays(
-        self, operands: Sequence[Field], count: int, make: Callable[[list[Field]], Solid]
+        self, parts: Sequence[Field], count: int, make: Callable[[list[Field]], Solid]
     ) -> Field:
-        """This solid, or the same combination of its parts as they are for this number of rays
-        (`Field.for_ray_count`). The combination is cached, so that nothing is prepared twice."""
-        variants = [operand.for_ray_count(count) for operand in operands]
+        """The same combination of `parts`, each as it is for this number of rays
+        (`Field.for_ray_count`); this solid itself if no part changes. Combinations are cached, so
+        that nothing is prepared twice.
+
+        make: makes the combination from its parts.
+        """
+        variants = [part.for_ray_count(count) for part in parts]
         key = tuple(map(id, variants))  # of objects that the solid keeps alive
-        if key == tuple(map(id, operands)):
+        if key == tuple(map(id, parts)):
             return self
         if key not in self._ray_count_variants:
             self._ray_count_variants[key] = make(variants)
@@ -262,10 +277,12 @@ class Solid(Field):
 
     @no_derivatives
     def scaled(self, factors: float | Sequence[float]) -> Solid:
-        """The solid, scaled about the origin, by a factor, or by a factor for each axis.
+        """The solid, scaled about the origin.
 
-        If all factors are equal, f is multiplied by them, so that a distance stays a distance; else
-        f is not multiplied.
+        factors: one factor, or one for each axis.
+
+        If all factors are equal, f is multiplied by them, so that a distance stays a distance.
+        Otherwise f is not multiplied.
         """
         from harnack.fields.solids.transforms import AffineMap
 
@@ -273,7 +290,10 @@ class Solid(Field):
 
     @no_derivatives
     def transformed(self, matrix: npt.ArrayLike) -> Solid:
-        """The solid under a linear or an affine map: matrix (3, 3), (3, 4) or (4, 4)."""
+        """The image of the solid under a linear or an affine map.
+
+        matrix: (3, 3) for a linear map; (3, 4) or (4, 4) for an affine one.
+        """
         from harnack.fields.solids.transforms import AffineMap
 
         return self._apply_map(AffineMap.of_matrix(matrix))
@@ -289,26 +309,32 @@ class Solid(Field):
     def tapered(
         self, start: tuple[float, float], end: tuple[float, float], axis: str = "z"
     ) -> Solid:
-        """The solid, its cross sections scaled along an axis.
+        """The solid, with its cross sections scaled along an axis.
 
-        start, end: (coordinate along the axis, scale) at two positions; the scale is linear between
-        them and constant beyond. Scales are positive."""
+        start, end: (position along the axis, scale there), for two positions. The scale is linear
+            between them and constant beyond them. Scales are positive.
+        axis: "x", "y" or "z".
+        """
         from harnack.fields.solids.deformations import Taper
 
         return self._apply_map(Taper(start, end, axis))
 
     def _apply_map(self, change: SpaceMap) -> Solid:
+        """The image of the solid under a map of space, which is applied to each operand."""
         return self.map_operands(change.apply)
 
 
 class SolidOfField(Solid):
-    """A solid whose function derives from another field, `field`. It takes over the field's
-    settings for the tracer."""
+    """A solid whose function derives from that of another field.
+
+    field: the other field. The solid takes over its settings for the tracer.
+    """
 
     field: Any
 
     def _copy_settings(self, *names: str) -> None:
-        """Copy the inner field's settings for the tracer, and the attributes of these names."""
+        """Copy attributes of the inner field to this solid: its settings for the tracer, and the
+        attributes with these names."""
         settings = (
             "has_variable_accuracy",
             "coarsest_accuracy",
@@ -333,19 +359,20 @@ class SolidOfField(Solid):
         return self._with_inner(self.field.at_accuracy(detail))
 
     def _with_inner(self, inner: Field) -> Solid:
-        """The same solid of another field."""
+        """The same solid, made of another field."""
         solid = copy.copy(self)
         object.__setattr__(solid, "field", inner)
         return solid
 
     def for_ray_count(self, count: int) -> Field:
         def make(parts: list[Field]) -> Solid:
+            """The same solid, made of the field parts[0]."""
             return dataclasses.replace(cast("Any", self), field=parts[0])
 
         return self._for_rays([self.field], count, make)
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """The bounds of the inner field, which has the same derivatives up to their sign."""
+        """The bounds of the inner field, whose derivatives are the same up to their sign."""
         del sample
         return self.field.derivative_errors(p, self.field.evaluate(p))
 

@@ -1,5 +1,5 @@
-"""Screw threads: `Thread`, a profile wound along a helix; `metric_thread`, the metric threads of
-ISO."""
+"""Screw threads: `Thread` is a profile wound along a helix, and `metric_thread` makes the metric
+threads of ISO."""
 
 from __future__ import annotations
 
@@ -42,24 +42,24 @@ _MAX_STARTS = 32
 
 @dataclass(frozen=True, eq=False)
 class Thread(Solid):
-    """An endless screw along the z axis: the points nearer to the axis than a profile that moves
-    along the axis by `starts` pitches in each turn.
+    """An endless screw along the z axis. Its surface is made by a profile that moves along the axis
+    by `starts` pitches in each turn; the solid is all points nearer to the axis than the profile.
 
-    profile: (n, 2) points (z, r) of a polyline, r positive; z begins within half a pitch of 0 and
-        rises by less than a pitch. After the last point the polyline goes on to the first, one
-        pitch further. At most 32 points.
+    profile: (n, 2) points (z, r) of a polyline, at most 32. r is the distance from the axis and
+        positive. z begins within half a pitch of 0 and rises by less than a pitch. From the last
+        point the polyline goes on to the first, one pitch further.
     pitch: the period of the profile along the axis.
     starts: the number of parallel grooves.
     left_handed: whether the screw turns clockwise as it rises.
 
-    With (r, angle, z) the cylindrical coordinates of p, f is the signed distance d of (r, u), u = z
-    - starts pitch angle/(2 pi), from the periodic polyline in the plane; but f is at least -m/2,
-    with m the least r of the profile. The surface is exact; f is not a distance, but close to one
+    Let (r, angle, z) be the cylindrical coordinates of p, u = z - starts pitch angle/(2 pi), and m
+    the smallest r of the profile. f is the signed distance d of (r, u) from the periodic polyline
+    in the plane, but is at least -m/2. The surface is exact. f is not a distance, but close to one
     where the pitch is small compared to the radius.
 
-    Proof of the Lipschitz constant. |grad r| = 1, and grad u has the components 1 along the axis
-    and starts pitch/(2 pi r) around it, at right angles to grad r. So where r >= m/2, |grad f| is
-    at most sqrt(1 + (starts pitch/(pi m))^2). Where r < m/2, d < -m/2, so that f is constant. u
+    Proof of the Lipschitz constant. |grad r| = 1. grad u is at right angles to grad r. Its
+    components are 1 along the axis and starts pitch/(2 pi r) around it. So where r >= m/2, |grad f|
+    is at most sqrt(1 + (starts pitch/(pi m))^2). Where r < m/2, d < -m/2, so that f is constant. u
     jumps by multiples of the pitch, which do not change f.
 
     Raises:
@@ -72,6 +72,8 @@ class Thread(Solid):
     left_handed: bool = False
 
     def __post_init__(self) -> None:
+        """Check the arguments, and compute the numbers that the formula needs, with three periods
+        of the profile."""
         set_frozen(self, "pitch", as_positive(self.pitch, "the pitch of a thread"))
         set_frozen(
             self,
@@ -122,6 +124,7 @@ class Thread(Solid):
         return None
 
     def prepare(self, backend: Backend) -> Thread:
+        """The same thread with its numbers as kernel parameters."""
         prepared = with_device_numbers(self, backend)
         numbers: Any = cast("Any", self)
         points = tuple(
@@ -133,15 +136,17 @@ class Thread(Solid):
         return prepared
 
     def evaluate(self, p: Vec3) -> Sample:
+        """The sample at p: the signed distance of (r, u) from the profile, with u reduced to the
+        period from 0 to the pitch. Near the axis f is constant."""
         real, data = cast("Any", type(p.x)), cast("Any", self)
         epsilon = 2 * float(dr.epsilon(real))
         r = dr.sqrt(dr.fma(p.x, p.x, p.y * p.y))
         axial = p.z - dr.atan2(p.y, p.x) * data._lead
         axial = axial - dr.floor(axial / self.pitch) * self.pitch
         error = 8 * epsilon * (dr.abs(p.z) + r + data._size)
-        is_outside = r >= self._height(axial)
+        is_outside = r >= self._profile_radius(axial)
         sign = dr.select(is_outside, real(1), real(-1))
-        distance, d_r, d_z, slope_error = self._nearest(r, axial, sign, error)
+        distance, d_r, d_z, gradient_error = self._distance_with_gradient(r, axial, sign, error)
         value = sign * distance
         is_core = value <= -data._least
         value = dr.select(is_core, -data._least, value)
@@ -151,10 +156,12 @@ class Thread(Solid):
         tangential = -d_z * data._lead / divisor
         gradient = cast("Any", type(p))(d_r * x - tangential * y, d_r * y + tangential * x, d_z)
         constant = 0 * p.x + self.lipschitz
-        slope_error = dr.select(is_core, 0, slope_error * constant + 16 * epsilon)
-        return Sample(value, gradient, (Lipschitz(constant),), error, slope_error)
+        gradient_error = dr.select(is_core, 0, gradient_error * constant + 16 * epsilon)
+        return Sample(value, gradient, (Lipschitz(constant),), error, gradient_error)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
+        """The ray sample, with the enclosures of the Lipschitz constant and, ahead, an
+        `OutsideCylinderEnclosure` of the cylinder around the thread."""
         del ahead, back
         p, d = path.point(t), path.direction
         ray_sample = path.enclose(self.evaluate(p))
@@ -163,35 +170,44 @@ class Thread(Solid):
         numbers = cast("Any", self)
         cylinder = OutsideCylinderEnclosure(
             ray_sample.sample.value, ray_sample.sample.value_error,
-            dr.sqrt(dr.fma(p.x, p.x, p.y * p.y)),
-            dr.fma(p.x, d.x, p.y * d.y), dr.fma(d.x, d.x, d.y * d.y), 0 * p.x + numbers._most,
-            0 * p.x + self.lipschitz,
+            dr.sqrt(dr.fma(p.x, p.x, p.y * p.y)), dr.fma(p.x, d.x, p.y * d.y),
+            dr.fma(d.x, d.x, d.y * d.y), 0 * p.x + numbers._most, 0 * p.x + self.lipschitz,
         )  # fmt: skip
         return replace(ray_sample, forward=(*ray_sample.forward, cylinder))
 
-    def _height(self, z: Real) -> Real:
-        """The polyline's r at z."""
+    def _profile_radius(self, z: Real) -> Real:
+        """The r of the polyline at z, a coordinate from 0 to the pitch."""
         height = 0 * z
-        for (a, s), (b, t) in itertools.pairwise(self._corners()):
-            r = s + (z - a) / (b - a) * (t - s)
-            height = dr.select((z >= a) & (z <= b), r, height)
+        for (start_z, start_r), (end_z, end_r) in itertools.pairwise(self._corners()):
+            r = start_r + (z - start_z) / (end_z - start_z) * (end_r - start_r)
+            height = dr.select((z >= start_z) & (z <= end_z), r, height)
         return height
 
     def _corners(self) -> tuple[tuple[Real, Real], ...]:
-        """The corners (z, r) of three periods of the profile."""
+        """The corners (z, r) of three periods of the profile, as tuples."""
         return cast("Any", self)._points
 
-    def _nearest(self, r: Real, z: Real, sign: Real, error: Real) -> tuple[Real, Real, Real, Real]:
-        """The distance of (r, z) from the polyline; the derivatives of the signed distance by r and
-        by z, along the normal of an edge or away from a vertex; and a bound of the error of this
-        gradient."""
+    def _distance_with_gradient(
+        self, r: Real, z: Real, sign: Real, error: Real
+    ) -> tuple[Real, Real, Real, Real]:
+        """The distance of the points (r, z) from the polyline, and the gradient of the signed
+        distance there.
+
+        sign: 1 for points outside, -1 inside.
+        error: a bound of the rounding of the distance. Points that are nearer count as points on
+            the polyline.
+
+        Returns the distance; the derivatives of the signed distance by r and by z; and a bound of
+        the error of these derivatives. The gradient is the normal of the nearest edge, or the
+        direction away from the nearest vertex.
+        """
         zero = 0 * r
         nearest, d_r, d_z, gradient_error = zero + dr.inf, zero, zero, zero
         epsilon = 2 * float(dr.epsilon(cast("Any", type(r))))
-        for (a, s), (b, t) in itertools.pairwise(self._corners()):
-            edge_z, edge_r = zero + (b - a), zero + (t - s)
+        for (start_z, start_r), (end_z, end_r) in itertools.pairwise(self._corners()):
+            edge_z, edge_r = zero + (end_z - start_z), zero + (end_r - start_r)
             inverse_length = dr.rsqrt(edge_z * edge_z + edge_r * edge_r)
-            from_z, from_r = z - a, r - s
+            from_z, from_r = z - start_z, r - start_r
             fraction = (from_z * edge_z + from_r * edge_r) * inverse_length * inverse_length
             minus_t = -clamp(fraction, 0, 1)
             to_z, to_r = dr.fma(edge_z, minus_t, from_z), dr.fma(edge_r, minus_t, from_r)
@@ -211,18 +227,20 @@ class Thread(Solid):
 
 @dataclass(frozen=True)
 class OutsideCylinderEnclosure(Enclosure):
-    """An enclosure, along a path, of a function f that is at least the distance from an endless
-    cylinder, outside of it.
+    """An enclosure, along a path, of a function f that is, outside of an endless cylinder, at least
+    the distance from the cylinder.
 
-    value, error: of f. r, radial_slope, square: the distance from the axis is r(s), with r(s)^2 =
-        r^2 + 2 radial_slope s + square s^2. radius: of the cylinder. constant: a Lipschitz constant
-        of f.
+    value, error: f at the start of the path, and a bound of its error.
+    r, radial_slope, square: the distance from the axis along the path is r(s) with r(s)^2 = r^2 + 2
+        radial_slope s + square s^2.
+    radius: of the cylinder.
+    constant: a Lipschitz constant of f.
 
-    Proof. f stays above a level L >= 0 as long as r(s) > R + L, with R the radius: up to the
-    smaller root of the quadratic. The root is computed for a slightly larger discriminant, so that
-    it is not rounded upwards and no root is missed. A thread lies within the largest r of its
-    profile, so that (r, u) is at least r - R from it. And f rises no faster than its constant
-    allows.
+    Proof. Let R be the radius. f stays above a level L >= 0 as long as r(s) > R + L, which holds up
+    to the smaller root of a quadratic equation. The root is computed for a slightly larger
+    discriminant, so that it is not rounded upwards and no root is missed. f rises no faster than
+    its constant allows. (A thread lies within the largest r of its profile, R. So a point with r >
+    R is at least r - R from it.)
     """
 
     value: Real
@@ -234,15 +252,19 @@ class OutsideCylinderEnclosure(Enclosure):
     constant: Real
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """See `Enclosure`: the smaller of the length to the cylinder grown by the level below, and
+        of the length up to which the Lipschitz constant excludes the level above."""
         level = self.value - gaps.below + self.error
-        target = self.radius + level
-        excess = (self.r - target) * (self.r + target)
+        level_radius = self.radius + level
+        excess = (self.r - level_radius) * (self.r + level_radius)
         squared, product = self.radial_slope * self.radial_slope, self.square * excess
         discriminant = squared - product + 1e-5 * (squared + dr.abs(product))
         root = excess / (dr.sqrt(fmax(discriminant, 0)) - self.radial_slope)
         length = dr.select((self.radial_slope >= 0) | (discriminant < 0), dr.inf, root)
         is_known = (
-            (gaps.below <= self.value) & (excess > 1e-5 * target * target) & (gaps.above >= 0)
+            (gaps.below <= self.value)
+            & (excess > 1e-5 * level_radius * level_radius)
+            & (gaps.above >= 0)
         )
         is_known &= (length >= 0) & dr.isfinite(excess + squared + product)
         length = dr.select(gaps.below == dr.inf, dr.inf, dr.select(is_known, length, 0))
@@ -260,8 +282,8 @@ COARSE_PITCHES: Mapping[str, float] = MappingProxyType(
         "M52": 5.0, "M56": 5.5, "M60": 5.5, "M64": 6.0, "M68": 6.0,
     }
 )  # fmt: skip
-_NAME = re.compile(r"M(\d{1,4}(?:\.\d{1,3})?)(?:\s*[xX]\s*(\d{1,3}(?:\.\d{1,3})?))?")
-# As a fraction of the pitch. A larger clearance would leave next to nothing of the crests.
+_THREAD_NAME = re.compile(r"M(\d{1,4}(?:\.\d{1,3})?)(?:\s*[xX]\s*(\d{1,3}(?:\.\d{1,3})?))?")
+# The largest clearance, as a fraction of the pitch. A larger one would leave almost no crests.
 _MAX_CLEARANCE = 0.1
 
 
@@ -274,30 +296,33 @@ def metric_thread(
     clearance: float = 0.0,
     left_handed: bool = False,
 ) -> Solid:
-    """A metric screw thread of ISO about the z axis. Lengths are in millimeters.
+    """A metric ISO screw thread about the z axis. Lengths are in millimeters.
 
     name: "M8" for a coarse thread (ISO 261, from M1 to M68), "M8x1" for a thread of any other
         pitch.
-    length: an external thread reaches from z = 0 to z = length, both ends beveled by 45 degrees
-        down to its root. An internal thread is to be cut out of a nut, `nut - thread("M8", 20,
-        internal=True)`: it begins one pitch below z = 0, so that it opens a face there, with a
-        bevel, and ends at z = length. Let it reach a pitch beyond the other face, if the hole is to
-        go through.
+    length: an external thread extends from z = 0 to z = length. Both ends are beveled by 45 degrees
+        down to its root. An internal thread is to be cut out of a nut, as in `nut -
+        metric_thread("M8", 20, internal=True)`. It begins one pitch below z = 0, so that it opens a
+        face of the nut there, with a bevel, and ends at z = length. If the hole is to go through,
+        let the thread extend a pitch beyond the other face.
     internal: whether the thread is for a nut.
-    clearance: the distance by which the surface lies inside of the basic profile, or outside for an
-        internal thread, across both flanks, crests and roots; up to a tenth of the pitch. Printed
-        threads that are to fit want 0.05 to 0.1 on either side. Grooves stay in the middle, so that
-        the gap between a bolt and its nut is the sum of their clearances on both flanks.
+    clearance: the distance by which the surface lies inside of the basic profile, or outside of it
+        for an internal thread. It is measured across flanks, crests and roots, and is at most a
+        tenth of the pitch. Printed threads that are to fit need 0.05 to 0.1 for both bolt and nut.
+        The clearance does not move the thread along the axis: both flanks of a groove recede
+        equally. So the gap on each flank between a bolt and its nut is the sum of their clearances.
+    left_handed: whether the thread turns clockwise as it rises.
 
-    The profile is the basic one of ISO 68-1, for bolt and nut: flanks at 60 degrees to each other,
-    a crest of an eighth and a root of a quarter of the pitch P, and between their radii a depth of
-    5/8 H, H = sqrt(3)/2 P. It has no tolerances of ISO 965 and no rounded roots.
+    The profile is the basic one of ISO 68-1, for bolt and nut alike. With P the pitch and H =
+    sqrt(3)/2 P: the flanks are at 60 degrees to each other; the flats are P/8 wide at the major
+    diameter and P/4 at the minor diameter; the depth between the two radii is 5/8 H. It has no
+    tolerances of ISO 965 and no rounded roots.
 
     Raises:
         ValueError: an unknown thread, a length that leaves nothing between the bevels, or a
             clearance out of range.
     """
-    diameter, pitch = _sizes(name)
+    diameter, pitch = _diameter_and_pitch(name)
     length = as_positive(length, "the length of a thread")
     clearance = as_finite(clearance, "the clearance of a thread")
     internal = flag(internal, "internal")
@@ -329,9 +354,14 @@ def metric_thread(
     return thread & SolidOfRevolution([(0.0, 0.0), *ends, (0.0, length)])
 
 
-def _sizes(name: Any) -> tuple[float, float]:
-    """The diameter and the pitch of a thread, by its name."""
-    match = _NAME.fullmatch(name.strip()) if isinstance(name, str) else None
+def _diameter_and_pitch(name: Any) -> tuple[float, float]:
+    """The diameter and the pitch of a thread, in millimeters, from its name, such as "M8" or
+    "M8x1".
+
+    Raises:
+        ValueError: not the name of a thread, or a pitch that leaves no core.
+    """
+    match = _THREAD_NAME.fullmatch(name.strip()) if isinstance(name, str) else None
     if match is None:
         raise ValueError(f'a thread is named as "M8" or "M8x1", not {name!r:.40}')
     diameter = float(match[1])

@@ -33,9 +33,9 @@ class AffineMap(SpaceMap):
 
     matrix: (3, 3), row by row, not singular.
     translation_vector: (3,).
-    value_factor: the factor by which f is multiplied. For a similarity it is the factor by which
-        lengths grow, for other maps 1; for a composition of maps it is the product of their
-        factors.
+    value_factor: the factor by which the function of a solid is multiplied. For a similarity it is
+        the factor by which lengths grow; for other maps it is 1. For a composition of maps it is
+        the product of their factors.
     """
 
     matrix: tuple[tuple[float, ...], ...]
@@ -44,10 +44,11 @@ class AffineMap(SpaceMap):
 
     @classmethod
     def of_arrays(cls, matrix: npt.ArrayLike, offset: npt.ArrayLike = (0.0, 0.0, 0.0)) -> AffineMap:
-        """The map of these arrays.
+        """The map u -> matrix u + offset.
 
         Raises:
-            ValueError: arrays of other shapes, numbers that are not finite, or a singular matrix.
+            ValueError: arrays of other shapes than (3, 3) and (3,), numbers that are not finite, or
+                a singular matrix.
         """
         m, b = np.asarray(matrix, dtype=np.float64), np.asarray(offset, dtype=np.float64)
         if m.shape != (3, 3) or b.shape != (3,):
@@ -63,7 +64,7 @@ class AffineMap(SpaceMap):
                 "flatten the solid"
             )
         rows = tuple(tuple(float(number) for number in row) for row in m)
-        return cls(rows, tuple(float(number) for number in b), _similarity(m) or 1.0)
+        return cls(rows, tuple(float(number) for number in b), _length_factor(m) or 1.0)
 
     @classmethod
     def of_matrix(cls, matrix: npt.ArrayLike) -> AffineMap:
@@ -87,18 +88,19 @@ class AffineMap(SpaceMap):
 
     @classmethod
     def rotation(cls, degrees: float, axis: str | Sequence[float]) -> AffineMap:
-        """The rotation about an axis through the origin (Rodrigues' formula)."""
+        """The rotation about an axis through the origin, by Rodrigues' formula. For the parameters
+        see `Solid.rotated`."""
         if isinstance(axis, str):
             unit = np.eye(3)[axis_index(axis)]
         else:
             unit = np.asarray(axis, dtype=np.float64)
-            size = np.linalg.norm(unit) if unit.shape == (3,) else 0.0
-            if not (np.isfinite(size) and size > 0):
+            length = np.linalg.norm(unit) if unit.shape == (3,) else 0.0
+            if not (np.isfinite(length) and length > 0):
                 raise ValueError(
                     "axis must be a vector (3,) that is not zero, or one of x, y, z, not "
                     f'{axis!r}: write rotated(degrees, axis), such as rotated(30, "x")'
                 )
-            unit = unit / size
+            unit = unit / length
         angle = math.radians(float(degrees))
         k = np.cross(np.eye(3), unit)  # k v = unit x v
         turn = np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * (k @ k)
@@ -114,6 +116,8 @@ class AffineMap(SpaceMap):
         return cls.of_arrays(np.diag(sizes))
 
     def apply(self, solid: Solid) -> Solid:
+        """The image of a solid. If the solid is itself an image under an affine map, the two maps
+        are composed."""
         if isinstance(solid, TransformedSolid):
             m, b = np.array(self.matrix), np.array(self.translation_vector)
             inner = solid.map
@@ -132,11 +136,12 @@ class AffineMap(SpaceMap):
 
     @property
     def similarity(self) -> float | None:
-        """The factor by which all lengths grow; None if the map is not a similarity."""
-        return _similarity(np.array(self.matrix))
+        """The factor by which the map multiplies all lengths; None if it is not a similarity."""
+        return _length_factor(np.array(self.matrix))
 
     def volume(self, volume: Volume | None) -> Volume | None:
-        """A volume that contains the image of another volume; None for a volume without bounds."""
+        """A volume that contains the image of `volume` under the map; None for no volume or one
+        without bounds."""
         if volume is None:
             return None
         m, b = np.array(self.matrix), np.array(self.translation_vector)
@@ -155,8 +160,9 @@ class AffineMap(SpaceMap):
         return ConvexHull.from_points(image).padded(1e-12 * float(np.abs(image).max()))
 
 
-def _similarity(m: FloatArray) -> float | None:
-    """The factor by which a matrix multiplies all lengths; None if it is not a similarity."""
+def _length_factor(m: FloatArray) -> float | None:
+    """The factor by which the linear map with the matrix m (3, 3) multiplies all lengths; None if
+    it is not a similarity."""
     factor = abs(float(np.linalg.det(m))) ** (1 / 3)
     deviation = np.abs(m.T @ m - factor**2 * np.eye(3)).max()
     return factor if deviation <= 1e-14 * factor**2 else None
@@ -164,18 +170,20 @@ def _similarity(m: FloatArray) -> float | None:
 
 @dataclass(frozen=True, eq=False)
 class TransformedSolid(SolidOfField):
-    """The image of a solid under an affine map.
+    """The image of a solid under an affine map u -> M u + b. f is that of the solid at the
+    preimage, times the map's `value_factor`.
 
-    Proof. A ray o + t d is the image of the straight path M^-1 (o - b) + t M^-1 d, along which the
-    solid is sampled. Lengths on that path are |M^-1 d| times as large (`ScaledEnclosure`). The
-    rounding of coordinates there is a few units of the sum of the sizes of their terms, which
-    enters the error of the value. f is multiplied by the factor of the map.
+    Proof. The ray o + t d is the image of the straight path M^-1 (o - b) + t M^-1 d, along which
+    the solid is sampled. A length on the ray is |M^-1 d| times as large on that path
+    (`ScaledEnclosure`). The coordinates on the path are rounded by a few units in the last place of
+    the sum of the absolute values of their terms; this enters the error of the value.
     """
 
     field: Solid
     map: AffineMap
 
     def __post_init__(self) -> None:
+        """Set the attributes that follow from those of the inner solid and from the map."""
         self._copy_settings()
         domain = self.map.volume(self.field.domain)
         if self.field.domain is not None and domain is None:
@@ -196,7 +204,7 @@ class TransformedSolid(SolidOfField):
 
     @property
     def numbers(self) -> _InverseMap:
-        """The inverse map, as numbers of the backend once prepared."""
+        """The inverse map. Once the solid is prepared, its numbers are on the backend."""
         return cast("Any", self)._numbers
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
@@ -213,7 +221,7 @@ class TransformedSolid(SolidOfField):
 
     def evaluate(self, p: Vec3) -> Sample:
         local = type(p)(*self.numbers.local(p.x, p.y, p.z))
-        return self._image(self.field.evaluate(local), self._size(p, 0.0))
+        return self._image_sample(self.field.evaluate(local), self._term_bound(p, 0.0))
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         numbers = self.numbers
@@ -224,9 +232,9 @@ class TransformedSolid(SolidOfField):
         return x, y, z
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """The errors of a formula follow from its ranges. For another field they are its errors at
-        the local coordinates, without the effect of the rounding of these coordinates, which is not
-        known."""
+        """The errors of the gradient and of the Hessian. For a solid with a formula they follow
+        from the ranges of the formula. For another solid they are its own errors at the preimage of
+        p. These leave out the effect of the rounding of the preimage, which is not known."""
         del sample
         numbers = self.numbers
         local = type(p)(*numbers.local(p.x, p.y, p.z))
@@ -241,50 +249,51 @@ class TransformedSolid(SolidOfField):
         return first + sum(rate.radius for rate in jet.first_derivatives), hessian_error(jet, p.x)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
+        """The ray sample, from that of the inner solid on the path of the preimages, whose
+        direction is made a unit vector."""
         numbers, vector = self.numbers, cast("Any", type(path.origin))
         o, d = path.origin, path.direction
         direction = vector(*numbers.local_direction(d.x, d.y, d.z))
         speed = safe_norm(direction)
         inner_ray = Ray(vector(*numbers.local(o.x, o.y, o.z)), direction / speed, path.proofs)
-        ray_sample = self.field.sample_ray(inner_ray, t * speed, ahead * speed, back * speed)
-        sample = self._image(ray_sample.sample, self._size(o, t))
+        look = self.field.sample_ray(inner_ray, t * speed, ahead * speed, back * speed)
+        sample = self._image_sample(look.sample, self._term_bound(o, t))
 
         def stretched(enclosures: tuple[Any, ...]) -> tuple[Any, ...]:
+            """The enclosures along the ray from those along the path of its preimages."""
             return tuple(
                 ScaledEnclosure(enclosure, speed, numbers.factor) for enclosure in enclosures
             )
 
-        slope = ray_sample.slope * speed * numbers.factor
-        ahead_, back_ = stretched(ray_sample.forward), stretched(ray_sample.backward)
-        error = (
-            None
-            if ray_sample.slope_error is None
-            else ray_sample.slope_error * speed * numbers.factor
-        )
-        return RaySample(sample, ahead_, back_, slope, ray_sample.reach_growth, error)
+        slope = look.slope * speed * numbers.factor
+        forward, backward = stretched(look.forward), stretched(look.backward)
+        error = None if look.slope_error is None else look.slope_error * speed * numbers.factor
+        return RaySample(sample, forward, backward, slope, look.reach_growth, error)
 
-    def _size(self, p: Vec3, t: Real) -> Real:
-        """A bound of the terms in the sums that are the local coordinates of p + t d."""
+    def _term_bound(self, p: Vec3, t: Real) -> Real:
+        """A bound of the absolute values of the terms in the sums that are the coordinates of the
+        preimage of p + t d."""
         numbers = self.numbers
         return numbers.stretch * (max_norm(p) + numbers.offset_size + t) * math.sqrt(3)
 
-    def _image(self, sample: Sample, size: Real) -> Sample:
-        """The sample of the image from that of the inner solid.
+    def _image_sample(self, sample: Sample, term_bound: Real) -> Sample:
+        """The sample of the image from that of the inner solid at the preimage.
 
-        size: a bound of the terms of the local coordinates (`_size`).
+        term_bound: a bound of the terms of the preimage's coordinates (`_term_bound`).
         """
         numbers = self.numbers
         epsilon = 2 * float(dr.epsilon(type(sample.value)))
-        rounding = 8 * epsilon * size * safe_norm(sample.gradient)
+        rounding = 8 * epsilon * term_bound * safe_norm(sample.gradient)
         factor, stretch = numbers.factor, numbers.stretch
 
-        def image(promise: Promise) -> Promise:
+        def image_of_promise(promise: Promise) -> Promise:
+            """The promise of the image from a promise of the inner solid."""
             if self.map.similarity is None:
                 promise = promise.weakened_for_linear_maps(sample.value)
             return promise.scaled(factor).linearly_mapped(stretch)
 
         return sample.map_promises(
-            image,
+            image_of_promise,
             value=sample.value * factor,
             gradient=numbers.pull_back(sample.gradient) * factor,
             value_error=(sample.value_error + rounding) * factor,
@@ -299,11 +308,11 @@ class TransformedSolid(SolidOfField):
 class _InverseMap:
     """The inverse of an affine map u -> M u + b, as kernels use it.
 
-    rows: of M^-1.
+    rows: the rows of M^-1.
     translation_vector: b.
-    stretch: the largest singular value of M^-1.
+    stretch: the largest singular value of M^-1, rounded up.
     factor: the factor by which f is multiplied.
-    offset_size: the largest component of b.
+    offset_size: the largest absolute value of a component of b.
     """
 
     rows: tuple[tuple[Any, ...], ...]
@@ -314,6 +323,7 @@ class _InverseMap:
 
     @classmethod
     def of(cls, change: AffineMap) -> _InverseMap:
+        """The inverse of an affine map, in Python numbers."""
         inverse = change.inverse
         stretch = float(np.linalg.svd(inverse, compute_uv=False)[0]) * (1 + 1e-6)
         return cls(
@@ -325,7 +335,8 @@ class _InverseMap:
         )
 
     def prepare(self, backend: Backend) -> _InverseMap:
-        """The numbers as kernel parameters, except 0 and 1, which save most of the work."""
+        """The numbers as kernel parameters. Entries that are 0 or 1 stay Python numbers, so that
+        their terms or products are left out, which saves most of the work."""
         prepared = with_device_numbers(self, backend)
         rows = tuple(
             tuple(a if a in (0.0, 1.0) else b for a, b in zip(old, new, strict=True))
@@ -338,35 +349,36 @@ class _InverseMap:
         return replace(prepared, rows=rows[:3], translation_vector=rows[3])
 
     def local(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
-        """The preimage M^-1 (p - b) of p, for coordinates of any kind."""
+        """The preimage M^-1 (p - b) of the point p = (x, y, z). Coordinates may be of any kind."""
         a, b, c = (
-            coordinate if _is(shift, 0.0) else coordinate - shift
+            coordinate if _is_literal(shift, 0.0) else coordinate - shift
             for coordinate, shift in zip((x, y, z), self.translation_vector, strict=True)
         )
         return self.local_direction(a, b, c)
 
     def local_direction(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
         """The preimage M^-1 d of a direction."""
-        u, v, w = (_combined(row, (x, y, z)) for row in self.rows)
+        u, v, w = (_weighted_sum(row, (x, y, z)) for row in self.rows)
         return u, v, w
 
     def pull_back(self, g: Vec3) -> Vec3:
         """M^-T g: the gradient of f(M^-1 p), if g is the gradient of f."""
         columns = (tuple(row[i] for row in self.rows) for i in range(3))
-        return type(g)(*(_combined(column, (g.x, g.y, g.z)) for column in columns))
+        return type(g)(*(_weighted_sum(column, (g.x, g.y, g.z)) for column in columns))
 
 
-def _combined(weights: tuple[Any, ...], terms: tuple[Any, ...]) -> Any:
-    """The weighted sum, without the terms of weight 0."""
+def _weighted_sum(weights: tuple[Any, ...], terms: tuple[Any, ...]) -> Any:
+    """The sum of the terms times their weights. Terms whose weight is the Python number 0 are left
+    out; None if that leaves none."""
     total: Any = None
     for weight, term in zip(weights, terms, strict=True):
-        if _is(weight, 0.0):
+        if _is_literal(weight, 0.0):
             continue
-        product = term if _is(weight, 1.0) else term * weight
+        product = term if _is_literal(weight, 1.0) else term * weight
         total = product if total is None else total + product
     return total
 
 
-def _is(x: Any, number: float) -> bool:
-    """Whether x is a Python float that equals a number."""
+def _is_literal(x: Any, number: float) -> bool:
+    """Whether x is a Python float that equals `number`; False for a kernel parameter."""
     return isinstance(x, float) and x == number

@@ -41,12 +41,14 @@ if TYPE_CHECKING:
 
 __all__ = ["TubeNetwork"]
 
-_MAX_SEGMENTS = 1_000_000
-# Segments in a group, and the number of segments from which on they are grouped.
-_GROUP_SIZE, _MIN_GROUPED = 8, 64
-# The inner knots of the piecewise linear bound, as fractions of the length asked for.
-_KNOTS = (0.125, 0.25, 0.5)
-# That length for a ray without an end, in multiples of the size of the tube and of coordinates.
+_MOST_SEGMENTS = 1_000_000
+# The number of segments in a group; and the number of segments from which on they are grouped.
+_GROUP_SIZE, _MIN_SEGMENTS_FOR_GROUPS = 8, 64
+# Along a ray the distance is bounded at knots. The inner knots are these fractions of the requested
+# length.
+_KNOT_FRACTIONS = (0.125, 0.25, 0.5)
+# If the requested length is infinite, inner knots are fractions of this multiple of the sum of the
+# tube's size and the largest coordinate of the point.
 _ENDLESS_LENGTH = 8.0
 
 
@@ -54,13 +56,13 @@ _ENDLESS_LENGTH = 8.0
 class Tube(Solid):
     """A tube: the points within `radius` of a polyline.
 
-    points: (n, 3) the vertices of the polyline in order; repeat the first to close it.
-    starts: indices of vertices at which another polyline starts, not joined to the polyline before:
-        see `from_polylines`.
-    flattening_error: a bound of the distance of the polyline from the curve that it stands for, and
-        so of the distance between the surfaces: see `bezier`.
+    points: (n, 3) the vertices of the polyline in order. Repeat the first to close it.
+    starts: indices of vertices at which another polyline starts, which is not joined to the one
+        before: see `from_polylines`.
+    flattening_error: if the polyline stands for a curve, a bound of the distance between the two,
+        and so of the distance between the surfaces: see `bezier`.
 
-    f is the signed distance, whose Lipschitz constant is 1 (Hart 1996, equations 32 to 35, for
+    f is the signed distance, with the Lipschitz constant 1 (Hart 1996, equations 32 to 35, for
     cubic Bezier curves). Along a path a stronger bound is proved: see `TangentEnclosure`.
     """
 
@@ -72,26 +74,27 @@ class Tube(Solid):
     lipschitz = 1.0
 
     def __post_init__(self) -> None:
+        """Check the arguments, and leave out points that repeat the point before."""
         array = as_real_array(self.points, "the points of a tube")
         check_vectors(array, "the points of a tube")
         points = np.array(array, dtype=np.float64)
         check_finite(points, "point {} of a tube", ValueError)
         check_coordinate_size(points, ValueError)
-        pieces: list[FloatArray] = []
+        parts: list[FloatArray] = []
         if not isinstance(cast("Any", self.starts), tuple | list | np.ndarray):
             raise TypeError(f"starts must be indices of vertices, not {self.starts!r:.60}")
         starts = [as_integer_in_range(start, "each start", 0, len(points)) for start in self.starts]
         if not 0 <= as_real(self.flattening_error, "flattening_error") < math.inf:
             raise ValueError(f"flattening_error must be a length, not {self.flattening_error!r}")
-        for piece in np.split(points, starts):
-            if len(piece):
-                moves = np.any(piece[1:] != piece[:-1], axis=1)
-                piece = piece[np.concatenate([[True], moves])]
-            if len(piece) < 2:
+        for part in np.split(points, starts):
+            if len(part):
+                differs = np.any(part[1:] != part[:-1], axis=1)
+                part = part[np.concatenate([[True], differs])]
+            if len(part) < 2:
                 raise ValueError("a tube needs two points or more that differ: use Sphere for one")
-            pieces.append(piece)
-        points = np.concatenate(pieces)
-        ends = np.cumsum([len(piece) for piece in pieces])[:-1]
+            parts.append(part)
+        points = np.concatenate(parts)
+        ends = np.cumsum([len(part) for part in parts])[:-1]
         object.__setattr__(self, "starts", tuple(int(end) for end in ends))
         points.setflags(write=False)
         object.__setattr__(self, "points", points)
@@ -99,8 +102,10 @@ class Tube(Solid):
 
     @classmethod
     def from_polylines(cls, polylines: Iterable[npt.ArrayLike], radius: float) -> Tube:
-        """The points within `radius` of any of the polylines (n_i, 3), as a single tube with one
-        distance function.
+        """One tube around several polylines: the points within `radius` of any of them. It has a
+        single distance function.
+
+        polylines: arrays (n_i, 3).
 
         Raises:
             ValueError: no polylines, or an array that is not a polyline.
@@ -120,12 +125,13 @@ class Tube(Solid):
     def bezier(
         cls, controls: npt.ArrayLike, radius: float, *, tolerance: float | None = None
     ) -> Tube:
-        """The tube around a chain of cubic Bezier curves, each of which ends where the next starts.
+        """The tube around a chain of cubic Bezier curves, each of which starts where the one before
+        ends.
 
         controls: (3 n + 1, 3) control points of n curves; two curves meet at every third point.
-        tolerance: the largest distance between the surface and the exact surface, in units of
-            length; by default a thousandth of the radius. The number of segments grows like its
-            square root.
+        tolerance: the largest distance allowed between the surface and the exact surface, in units
+            of length; None for a thousandth of the radius. The number of segments grows like the
+            inverse of its square root.
 
         Proof: `harnack.geometry.beziers.flatten_bezier`.
 
@@ -156,17 +162,19 @@ class Tube(Solid):
         cls, radius: float, pitch: float, turns: float, wire: float, *,
         left_handed: bool = False, tolerance: float | None = None,
     ) -> Tube:  # fmt: skip
-        """A coil of round wire about the z axis, from (radius, 0, 0) to z = pitch turns; its ends
-        are round.
+        """A coil of round wire about the z axis. The middle of the wire is a helix from (radius, 0,
+        0) to z = pitch turns; the ends of the wire are round.
 
-        radius: of the helix that is the middle of the wire. pitch: the rise along the axis in each
-            turn.
-        wire: the radius of the wire. left_handed: whether the helix turns clockwise as it rises.
-        tolerance: the largest distance between the surface and the exact surface, in units of
-            length; by default a thousandth of the radius of the wire.
+        radius: of the helix.
+        pitch: how far the helix rises along the axis in each turn.
+        turns: the number of turns.
+        wire: the radius of the wire.
+        left_handed: whether the helix turns clockwise as it rises.
+        tolerance: the largest distance allowed between the surface and the exact surface, in units
+            of length; None for a thousandth of the wire's radius.
 
-        Proof. A chord between two angles h apart is within h^2/8 max |c''| of the helix c, which is
-        parametrized by the angle, and |c''| is the radius.
+        Proof. The helix c is parametrized by the angle, so that |c''| is the radius. A chord
+        between two angles that differ by h is within h^2/8 max |c''| of the helix.
 
         Raises:
             ValueError: numbers that are not positive, or more than a million segments.
@@ -176,7 +184,7 @@ class Tube(Solid):
         allowed = 1e-3 * wire if tolerance is None else as_positive(tolerance, "the tolerance")
         angle = 2 * math.pi * turns
         count = max(1.0, angle * math.sqrt(radius / (8.0 * allowed)))
-        if not count <= _MAX_SEGMENTS:
+        if not count <= _MOST_SEGMENTS:
             raise ValueError(f"{count:,.0f} segments: allow a larger tolerance")
         t = np.linspace(0.0, angle, math.ceil(count) + 1)
         y = np.sin(t) * (-radius if left_handed else radius)
@@ -201,14 +209,16 @@ class Tube(Solid):
 
     @cached_prepare
     def prepare(self, backend: Backend) -> Tube:
+        """The same tube with its segments as records of the backend. If there are many, they are
+        grouped, and each group has a ball around it."""
         prepared = copy.copy(self)
         is_segment = np.ones(len(self.points) - 1, dtype=np.bool_)
         is_segment[[vertex - 1 for vertex in self.starts]] = False
-        start, side = self.points[:-1][is_segment], np.diff(self.points, axis=0)[is_segment]
-        rows = np.column_stack([start, side, 1.0 / np.sum(side * side, axis=1)])
+        start, segment = self.points[:-1][is_segment], np.diff(self.points, axis=0)[is_segment]
+        rows = np.column_stack([start, segment, 1.0 / np.sum(segment * segment, axis=1)])
         groups = None
-        if len(rows) >= _MIN_GROUPED:
-            rows, balls = _grouped(rows)
+        if len(rows) >= _MIN_SEGMENTS_FOR_GROUPS:
+            rows, balls = _group_segments(rows)
             groups = RecordTable.upload(backend, balls)
         object.__setattr__(prepared, "_records", RecordTable.upload(backend, rows))
         object.__setattr__(prepared, "_groups", groups)
@@ -221,15 +231,18 @@ class Tube(Solid):
         return self._sample_with_bounds(p, None, ())[0]
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
+        """The ray sample, whose enclosure is a `TangentEnclosure`. It has no enclosure looking
+        back. If the caller asks for other kinds of enclosures, those of the Lipschitz constant are
+        used."""
         del back
         p = path.point(t)
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return path.enclose(self.evaluate(p))
         if not hasattr(self, "_records"):
             return self.prepare(backend_of(p)).sample_ray(path, t, ahead, ahead)
-        far = _ENDLESS_LENGTH * (max_norm(p) + self._parameter("_size"))
-        length = dr.select(dr.isfinite(ahead), ahead, far)
-        knots = (*(fraction * length for fraction in _KNOTS), ahead)
+        endless_length = _ENDLESS_LENGTH * (max_norm(p) + self._parameter("_size"))
+        length = dr.select(dr.isfinite(ahead), ahead, endless_length)
+        knots = (*(fraction * length for fraction in _KNOT_FRACTIONS), ahead)
         sample, distance, bounds = self._sample_with_bounds(p, path.direction, knots)
         slope = dr.dot(sample.gradient, path.direction)
         max_slope = fmin(slope + sample.gradient_error, 1.0)
@@ -240,32 +253,42 @@ class Tube(Solid):
     def _sample_with_bounds(
         self, p: Vec3, direction: Vec3 | None, knots: tuple[Real, ...]
     ) -> tuple[Sample, Real, tuple[Real, ...]]:
-        """The sample; the distance from the polyline; and at each knot of the ray, a lower bound of
-        the change of the distance."""
+        """The sample at p; the distance D of p from the polyline; and, for each knot, a lower bound
+        of the distance at p + knot direction less D.
+
+        direction: unit vectors; None if there are no knots.
+        knots: increasing lengths; the last may be infinite.
+        """
         if not hasattr(self, "_records"):
             return self.prepare(backend_of(p))._sample_with_bounds(p, direction, knots)
         real, vector = cast("Any", type(p.x)), cast("Any", type(p))
         epsilon = 2 * float(dr.epsilon(real))
         records: RecordTable = cast("Any", self)._records
 
-        def body(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            nearest, x, y, z, size, *bounds = state
-            from_start, side = p - vector(*row[:3]), vector(*row[3:6])
-            t = clamp(dr.dot(from_start, side) * row[6], 0, 1)
-            offset = dr.fma(side, -t, from_start)
-            distance = dr.norm(offset)
+        def add_segment(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+            """The state with the segment of record `row` added.
+
+            The state consists of the distance from the nearest segment, the three components of the
+            vector from its nearest point to p, the largest rounding error of such a vector, and the
+            smallest tangent at each knot.
+            """
+            nearest, x, y, z, max_rounding, *bounds = state
+            from_start, segment = p - vector(*row[:3]), vector(*row[3:6])
+            fraction = clamp(dr.dot(from_start, segment) * row[6], 0, 1)
+            away = dr.fma(segment, -fraction, from_start)
+            distance = dr.norm(away)
             # The error of the vector is a few roundings of its terms.
-            rounding = 8 * epsilon * (dr.norm(from_start) + dr.norm(side))
+            rounding = 8 * epsilon * (dr.norm(from_start) + dr.norm(segment))
             if direction is not None:
-                slope = dr.dot(offset, direction) / distance - rounding / distance * 2
+                slope = dr.dot(away, direction) / distance - rounding / distance * 2
                 bounds = min_with_tangent(
                     bounds, knots, distance - rounding, slope, 4 * epsilon * distance, epsilon
                 )
             is_nearer = distance < nearest
             return (
                 dr.select(is_nearer, distance, nearest),
-                *(dr.select(is_nearer, a, b) for a, b in zip(offset, (x, y, z), strict=True)),
-                fmax(rounding, size),
+                *(dr.select(is_nearer, a, b) for a, b in zip(away, (x, y, z), strict=True)),
+                fmax(rounding, max_rounding),
                 *bounds,
             )
 
@@ -273,12 +296,14 @@ class Tube(Solid):
         start = (zero + dr.inf, zero, zero, zero, zero, *(zero + dr.inf for _ in knots))
         groups: RecordTable | None = cast("Any", self)._groups
         if groups is None:
-            final = records.for_each(body, start, "tube")
+            final = records.for_each(add_segment, start, "tube")
         else:
-            final = _visit_by_groups(p, direction, knots, records, groups, body, start)
+            final = _add_segments_by_groups(
+                p, direction, knots, records, groups, add_segment, start
+            )
         distance, error = final[0], final[4]
-        offset = vector(*final[1:4])
-        gradient = dr.select(distance > 0, offset / distance, vector(0))
+        away = vector(*final[1:4])
+        gradient = dr.select(distance > 0, away / distance, vector(0))
         value = distance - self._parameter("_radius")
         error = error + 4 * epsilon * (distance + self._parameter("_radius"))
         gradient_error = dr.select(distance > 0, fmin(4 * error / distance, 2), 2)
@@ -286,75 +311,97 @@ class Tube(Solid):
         return sample, distance, tuple(bound - distance - error for bound in final[5:])
 
     def _parameter(self, name: str) -> Any:
+        """The attribute `name`, which is a number of the backend once the tube is prepared."""
         return getattr(self, name)
 
 
-def _grouped(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The records of segments in groups of `_GROUP_SIZE`, the last group padded with copies, and a
-    record of a ball (center, radius) around each group."""
-    padding = -len(rows) % _GROUP_SIZE
-    rows = np.concatenate([rows, np.repeat(rows[-1:], padding, axis=0)])
-    ends = np.concatenate([rows[:, :3], rows[:, :3] + rows[:, 3:6]], axis=1)
+def _group_segments(records: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The records of segments, filled up with copies of the last to a multiple of `_GROUP_SIZE`;
+    and for each group of that many consecutive segments the center and the radius of a ball that
+    contains them, as a record.
+
+    records: (n, 7), the start of each segment, the vector from its start to its end, and 1 /
+        length^2.
+    """
+    copy_count = -len(records) % _GROUP_SIZE
+    records = np.concatenate([records, np.repeat(records[-1:], copy_count, axis=0)])
+    ends = np.concatenate([records[:, :3], records[:, :3] + records[:, 3:6]], axis=1)
     points = ends.reshape(-1, 2 * _GROUP_SIZE, 3)
     centers = 0.5 * (points.min(axis=1) + points.max(axis=1))
     radii = np.linalg.norm(points - centers[:, None], axis=2).max(axis=1)
-    return rows, np.column_stack([centers, radii * (1 + 1e-5)])
+    return records, np.column_stack([centers, radii * (1 + 1e-5)])
 
 
-def _visit_by_groups(
+def _add_segments_by_groups(
     p: Vec3,
     direction: Vec3 | None,
     knots: tuple[Real, ...],
     records: RecordTable,
     groups: RecordTable,
-    body: Callable[[list[Real], tuple[Any, ...]], tuple[Any, ...]],
+    add_segment: Callable[[list[Real], tuple[Any, ...]], tuple[Any, ...]],
     start: tuple[Any, ...],
 ) -> tuple[Any, ...]:
-    """The state after `body` for all segments, where the ball of a far group replaces its segments.
+    """The state of `Tube._sample_with_bounds` with all segments added. For a group that is too far
+    away to hold the nearest segment, the distance from its ball takes the place of the distances
+    from its segments.
 
-    Proof. A segment in a ball of radius r about c is at least |p - c| - r and at most |p - c| + r
-    away. So the nearest segment is in no group whose ball begins farther away than another ball
-    ends. The distance from the ball is a lower bound of that from each of its segments. It is
-    convex along the ray as well, and lies above its own tangent.
+    p: the points.
+    direction, knots: as in `Tube._sample_with_bounds`.
+    records: of the segments.
+    groups: records (center, radius) of the groups' balls.
+    add_segment: returns the state with another segment added.
+    start: the state before any segment.
+
+    Proof. If a segment lies in a ball of radius r about c, its distance from p is at least |p - c|
+    - r and at most |p - c| + r. So the nearest segment is in no group whose smallest distance |p -
+    c| - r is more than the largest distance |p - c| + r of another group. The distance from the
+    ball is a lower bound of the distance from each of its segments. Along the ray it is convex as
+    well, and so lies above its own tangent.
     """
     real, vector = cast("Any", type(p.x)), cast("Any", type(p))
     epsilon = 2 * float(dr.epsilon(real))
 
-    def bound(ball: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+    def add_ball_end(ball: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+        """The smaller of the state and of the largest distance of a point of the ball from p."""
         return (fmin(dr.norm(p - vector(*ball[:3])) + ball[3], state[0]),)
 
-    (min_end,) = groups.for_each(bound, (real(dr.inf),), "tube groups")
-    limit = min_end * (1 + 16 * epsilon) + 16 * epsilon * dr.norm(p)
+    (min_end,) = groups.for_each(add_ball_end, (real(dr.inf),), "tube groups")
+    max_distance = min_end * (1 + 16 * epsilon) + 16 * epsilon * dr.norm(p)
 
-    def visit(i: Any, *state: Any) -> tuple[Any, ...]:
+    def visit_group(i: Any, *state: Any) -> tuple[Any, ...]:
+        """The state with the segments of group i added, or with the tangent of its ball if the
+        group is far."""
         ball = groups.read_record(i)
-        offset = p - vector(*ball[:3])
-        distance = dr.norm(offset)
-        is_near = distance - ball[3] <= limit
+        from_center = p - vector(*ball[:3])
+        distance = dr.norm(from_center)
+        is_near = distance - ball[3] <= max_distance
         updated = list(state)
         if direction is not None:
             rounding = 8 * epsilon * (dr.norm(p) + distance + ball[3])
-            slope = dr.dot(offset, direction) / distance - 2 * rounding / distance
+            slope = dr.dot(from_center, direction) / distance - 2 * rounding / distance
             start = dr.select(is_near, dr.inf, distance - ball[3] - rounding)
             updated[5:] = min_with_tangent(
                 updated[5:], knots, start, slope, 4 * epsilon * distance, epsilon
             )
 
-        def each(j: Any, *inner: Any) -> tuple[Any, ...]:
-            return j + 1, *body(records.read_record(i * _GROUP_SIZE + j), inner)
+        def visit_segment(j: Any, *segment_state: Any) -> tuple[Any, ...]:
+            """The state with segment j of the group added."""
+            return j + 1, *add_segment(records.read_record(i * _GROUP_SIZE + j), segment_state)
 
-        def has_more(j: Any, *_: Any) -> Any:
-            return j < last
+        def has_more_segments(j: Any, *_: Any) -> Any:
+            return j < segment_count
 
-        last = dr.select(is_near, type(i)(_GROUP_SIZE), type(i)(0))
-        visited = dr.while_loop((type(i)(0), *updated), has_more, each, label="tube")
+        segment_count = dr.select(is_near, type(i)(_GROUP_SIZE), type(i)(0))
+        visited = dr.while_loop(
+            (type(i)(0), *updated), has_more_segments, visit_segment, label="tube"
+        )
         return i + 1, *visited[1:]
 
     def has_groups(i: Any, *_: Any) -> Any:
         return i < groups.iteration_count
 
     index = groups.backend.UInt32(0)
-    return dr.while_loop((index, *start), has_groups, visit, label="tube by groups")[1:]
+    return dr.while_loop((index, *start), has_groups, visit_group, label="tube by groups")[1:]
 
 
 def min_with_tangent(
@@ -365,15 +412,17 @@ def min_with_tangent(
     rounding: Real,
     unit: float,
 ) -> list[Real]:
-    """At each knot, the smaller of the bound `lows` and of the value of a tangent. The last knot
-    may be infinite.
+    """At each knot, the smaller of the bound in `lows` and of the value of a tangent there.
 
+    lows: a bound for each knot.
+    knots: positions; the last may be infinite.
     start: the tangent's value at 0, with an error of up to `rounding`.
-    slope: of the tangent, at least -1; NaN, as on the segment itself, counts as -1.
+    slope: of the tangent, at least -1. NaN, which arises on the segment itself, counts as -1.
+    unit: the machine epsilon.
 
-    The slope is lowered by four roundings, for the rounding of the product with a knot. It is never
-    0, so that at infinity the tangent is infinite, with the slope's sign, and never 0 times
-    infinity.
+    The slope is lowered by four roundings, for the rounding of its product with a knot. It is never
+    0, since 0 times the infinite knot would be NaN: so the tangent at infinity is infinite, with
+    the sign of the slope.
     """
     slope = fmax(slope, -1) - 4 * unit
     slope = dr.select(slope == 0, -unit, slope)
@@ -383,24 +432,24 @@ def min_with_tangent(
 
 @dataclass(frozen=True)
 class TangentEnclosure(Enclosure):
-    """An enclosure of the distance F from a set of segments along a path.
+    """An enclosure of the distance F(s) from a set of segments along a path.
 
-    distance: from the nearest segment.
-    slope: an upper bound of the rate at which that distance grows.
+    distance: F(0), the distance from the nearest segment.
+    slope: an upper bound of the rate at which the distance from that segment grows at s = 0.
     knots: increasing lengths s.
-    lower_bounds: lower bounds of F at the knots, less its value at 0, by the tangents of the
-        distances from all segments.
+    lower_bounds: for each knot s, a lower bound of F(s) - F(0), which comes from the tangents of
+        the distances from all segments.
 
     Proof. The distance from a segment is a convex function of s, so it lies above its tangent at s
-    = 0 (Hart 1996, theorem 4). The smallest of all tangents is a concave function, which lies above
-    the chord between two of its points: so F lies above the piecewise linear function through 0 and
-    the lower bounds at the knots. The last knot may be infinite: if the bound there is -inf, F has
-    no bound beyond the knot before; if it is +inf, no tangent falls, and F never falls below the
-    bound at the knot before.
+    = 0 (Hart 1996, theorem 4). The smallest of all tangents is a concave function, and lies above
+    the chord between any two of its points. So F(s) - F(0) lies above the piecewise linear function
+    through 0 at s = 0 and the lower bounds at the knots. The last knot may be infinite. If the
+    bound there is -inf, F has no bound beyond the knot before; if it is +inf, no tangent falls, and
+    F never falls below the bound at the knot before.
 
-    From above, the distance from the polyline is at most that from the nearest point c, sqrt(D^2 +
-    2 D m s + s^2), with D the distance and m its slope; so F does not reach g before s^2 + 2 D m s
-    = g^2 + 2 D g. Where these squares overflow, F does not reach g before s = g, as it is a
+    From above, F(s) is at most the distance from the point that is nearest at s = 0. With D = F(0)
+    and m the slope, that is sqrt(D^2 + 2 D m s + s^2). So F does not rise by g before s^2 + 2 D m s
+    = g^2 + 2 D g. Where these squares overflow, F does not rise by g before s = g, as it is a
     distance.
     """
 
@@ -410,46 +459,50 @@ class TangentEnclosure(Enclosure):
     lower_bounds: tuple[Real, ...]
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """See `Enclosure`: the smaller of the length up to which F does not rise to the level
+        above, and the length up to which its lower bound does not fall to the level below."""
         half_slope = self.distance * self.slope
         product = gaps.above * (gaps.above + 2 * self.distance)
         root = dr.sqrt(fmax(dr.fma(half_slope, half_slope, product), 0))
-        up = dr.select(half_slope > 0, product / (half_slope + root), root - half_slope)
+        length_up = dr.select(half_slope > 0, product / (half_slope + root), root - half_slope)
         # Squares of large numbers overflow: a distance rises at most as fast as the length.
-        up = dr.select(dr.isfinite(product) & dr.isfinite(root), up, gaps.above)
-        total, start, bound = 0 * self.distance, 0 * self.distance, 0 * self.distance
+        length_up = dr.select(dr.isfinite(product) & dr.isfinite(root), length_up, gaps.above)
+        length_down, start, bound = 0 * self.distance, 0 * self.distance, 0 * self.distance
         is_free = gaps.below >= 0  # and not NaN
         for knot, next_bound in zip(self.knots, self.lower_bounds, strict=True):
             is_clear = next_bound >= -gaps.below
-            clear_length = fmax((gaps.below + bound) / (bound - next_bound) * (knot - start), 0)
-            length = dr.select(is_clear, knot, fmin(start + clear_length, knot))
-            total = dr.select(is_free, length, total)
+            part = fmax((gaps.below + bound) / (bound - next_bound) * (knot - start), 0)
+            length = dr.select(is_clear, knot, fmin(start + part, knot))
+            length_down = dr.select(is_free, length, length_down)
             is_free &= is_clear
             start, bound = knot, next_bound
-        is_valid = (total >= 0) & (up >= 0)
-        return dr.select(is_valid, fmin(total, up) * (1 - 1e-6), 0)
+        is_valid = (length_down >= 0) & (length_up >= 0)
+        return dr.select(is_valid, fmin(length_down, length_up) * (1 - 1e-6), 0)
 
 
-# Boxes are wider than the tubes by this fraction of their size.
+# The boxes of tubes are enlarged on each side by this fraction of their longest side.
 _BOX_MARGIN = 1e-5
-# The radius on which second derivatives are bounded, as a fraction of the distance to the segment.
-_REACH = 0.5
+# The radius of the ball on which second derivatives are bounded, as a fraction of the distance to
+# the segment.
+_TAYLOR_RADIUS = 0.5
 
 
 class TubeNetwork(PatchField["_TubeBuffers"]):
-    """The surfaces at distance `radius` from a set of segments: edges of meshes, wires, struts.
+    """The surfaces at distance `radius` from a set of segments, such as edges of meshes, wires or
+    struts.
 
     points: (n, 3).
     segments: (m, 2) indices of points, counted from 0.
-    radius: a number, or (m,).
+    radius: a number, or (m,), one for each segment.
 
     Each segment is a patch, a tube with rounded ends (`harnack.fields.capabilities`). A ray
     evaluates only the patches whose boxes it enters, so that thousands of segments cost little more
-    than a single segment, and `Hits.primitive_index` is the index of the segment. A level is added
-    to the radius of all tubes. For a single polyline, and for combinations with other solids, there
-    is `Tube`.
+    than one. `Hits.primitive_index` is the index of the segment. A level is added to the radius of
+    all tubes. For a single polyline, and for combinations with other solids, use `Tube`.
 
-    Raises ValueError for arrays of other shapes, numbers that are not finite, an index that is out
-    of range, a segment without a length, or a radius that is not positive.
+    Raises:
+        ValueError: arrays of other shapes, numbers that are not finite, an index out of range, a
+            segment without a length, or a radius that is not positive.
     """
 
     default_level: float = 0.0
@@ -465,17 +518,24 @@ class TubeNetwork(PatchField["_TubeBuffers"]):
         self.radius: FloatArray = _checked_radius(radius, len(self.segments))
 
     def boxes(self, levels: tuple[float, ...] | None = None) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corners (m, 3) of boxes around the tubes."""
+        """Lower and upper corners (m, 3) of boxes, each of which contains a tube.
+
+        levels: the largest is added to the radii; None for the levels of the field.
+        """
         level = max(self.levels if levels is None else levels)
         ends = self.points[self.segments]
-        reach = (self.radius + level)[:, None]
-        lower, upper = ends.min(axis=1) - reach, ends.max(axis=1) + reach
+        enlarged_radius = (self.radius + level)[:, None]
+        lower, upper = ends.min(axis=1) - enlarged_radius, ends.max(axis=1) + enlarged_radius
         slack = _BOX_MARGIN * (upper - lower).max(axis=1)[:, None]
         return lower - slack, upper + slack
 
     def evaluate(self, p: Vec3) -> NoReturn:
-        """Raises TypeError: each segment has a function of its own, and there is none for all
-        segments together."""
+        """Not defined, as each segment has a function of its own, and there is none for all
+        segments together.
+
+        Raises:
+            TypeError: always.
+        """
         del p
         raise TypeError(
             "tubes are no level set of one function, but of one for each segment: take "
@@ -486,9 +546,9 @@ class TubeNetwork(PatchField["_TubeBuffers"]):
         boxes = PatchBoxes.upload(backend, *self.boxes())
         center = np.array(boxes.center, dtype=np.float64).reshape(3)
         start, end = ((self.points[ends] - center) for ends in self.segments.T)
-        side = end - start
-        inverse = 1.0 / (side * side).sum(axis=1)
-        rows = np.column_stack([start, self.radius, side, inverse])
+        segment = end - start
+        inverse = 1.0 / (segment * segment).sum(axis=1)
+        rows = np.column_stack([start, self.radius, segment, inverse])
         return _TubeBuffers(boxes, RecordTable.upload(backend, rows))
 
     def patch(self, index: Any) -> Field:
@@ -509,47 +569,63 @@ class TubeNetwork(PatchField["_TubeBuffers"]):
 
 @dataclass(frozen=True)
 class _TubeBuffers:
-    """The tubes' boxes and records of segments on a backend. Segments are relative to the center of
-    the boxes."""
+    """The data of separate tubes on a backend.
+
+    boxes: a box for each tube.
+    segments: records of the start of a segment, the radius of its tube, the vector from start to
+        end, and 1 / length^2. Positions are relative to the center of the boxes.
+    """
 
     boxes: PatchBoxes
     segments: RecordTable
 
 
 class _Segment(Field):
-    """The distance from a segment less its radius; each lane may have another segment.
+    """The field of one tube: the distance D from its segment, less its radius r. Each lane may have
+    another segment.
 
-    The distance is convex, as the distance from a convex set, with the Lipschitz constant 1. Its
-    second derivative along a line is at most 1/D at the distance D (Hart 1996): this is the second
-    derivative, across the gradient, of the distance from a point or from a line, and the distance
-    from a segment is always one of these. So it is at most 1/(D - r) within r.
+    boxes: the boxes of all tubes, for their center.
+    row: the record of the segment, as in `_TubeBuffers`.
+
+    D is convex, as the distance from a convex set, and its Lipschitz constant is 1. Its second
+    derivative along any line is at most 1/D (Hart 1996): that of the distance from a point or from
+    a line, across the gradient, is 1/D, and the distance from a segment is everywhere one of these
+    two. So on a ball of radius s < D about the point it is at most 1/(D - s). Here s = D/2, so that
+    the bound is 1/s.
     """
 
     def __init__(self, boxes: PatchBoxes, row: list[Real]) -> None:
         self._boxes, self._row = boxes, row
 
     def evaluate(self, p: Vec3) -> Sample:
+        """The sample at p, with the Lipschitz constant 1 and a bound of second derivatives on a
+        ball."""
         backend, row = self._boxes.backend, self._row
         vector, epsilon = backend.Array3f, 2 * backend.machine_epsilon
         from_start = vector(p) - self._boxes.center - vector(*row[:3])
-        side = vector(*row[4:7])
-        t = clamp(dr.dot(from_start, side) * row[7], 0, 1)
-        away = dr.fma(side, vector(-t), from_start)
+        segment = vector(*row[4:7])
+        fraction = clamp(dr.dot(from_start, segment) * row[7], 0, 1)
+        away = dr.fma(segment, vector(-fraction), from_start)
         distance = dr.norm(away)
         # The error of the vector is a few roundings of its terms.
         vector_error = (
-            8 * epsilon * (dr.norm(from_start) + dr.norm(side) + dr.norm(vector(*row[:3])))
+            8 * epsilon * (dr.norm(from_start) + dr.norm(segment) + dr.norm(vector(*row[:3])))
         )
         error = vector_error + 4 * epsilon * (distance + row[3])
         gradient = dr.select(distance > 0, away / distance, vector(0))
-        doubt = dr.select(distance > 0, dr.minimum(4 * error / distance, 2), 2)
-        r = _REACH * fmax(distance - error, 0)
-        promises: tuple[Promise, ...] = (Lipschitz(backend.Float(1)), TaylorRemainder(1 / r, r))
-        return Sample(distance - row[3], gradient, promises, error, doubt)
+        gradient_error = dr.select(distance > 0, dr.minimum(4 * error / distance, 2), 2)
+        taylor_radius = _TAYLOR_RADIUS * fmax(distance - error, 0)
+        promises: tuple[Promise, ...] = (
+            Lipschitz(backend.Float(1)),
+            TaylorRemainder(1 / taylor_radius, taylor_radius),
+        )
+        return Sample(distance - row[3], gradient, promises, error, gradient_error)
 
 
 def _checked_segments(segments: Any, points: FloatArray) -> IntArray:
-    """The segments as indices (m, 2).
+    """The segments as an array (m, 2) of indices of points.
+
+    points: (n, 3).
 
     Raises:
         ValueError: a wrong shape or type, too many segments, an index out of range, or a segment
@@ -576,7 +652,7 @@ def _checked_segments(segments: Any, points: FloatArray) -> IntArray:
 
 
 def _checked_radius(radius: Any, count: int) -> FloatArray:
-    """The radii (count,) of the segments, from a number or an array.
+    """The radii (count,) of the segments, from one number or an array of that shape.
 
     Raises:
         ValueError: a wrong shape, or a radius that is not positive.
@@ -588,6 +664,6 @@ def _checked_radius(radius: Any, count: int) -> FloatArray:
         raise ValueError(
             f"the radius of tubes is a number or has shape ({count},), not {array.shape}"
         )
-    for radius_ in (array.min(), array.max()):
-        as_positive(float(radius_), "the radius of tubes")
+    for extreme in (array.min(), array.max()):
+        as_positive(float(extreme), "the radius of tubes")
     return np.array(array, dtype=np.float64)
