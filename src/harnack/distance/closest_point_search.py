@@ -189,7 +189,7 @@ def _search_smooth_part(
     result = search(
         smoothed,
         points,
-        InitialGuess(known.feet, estimate, on_boundary=False),
+        InitialGuess(known.closest, estimate, on_boundary=False),
         smooth_job,
         tolerance,
         progress,
@@ -199,7 +199,7 @@ def _search_smooth_part(
         _ROUNDING * backend.machine_epsilon * (np.abs(points).max(axis=1, initial=0.0) + jump_gap)
     )
     lower = np.maximum(np.minimum(result.lower_bounds, jump_gap - rounding), 0)
-    distance, closest = _length(points - known.feet), known.feet.copy()
+    distance, closest = _length(points - known.closest), known.closest.copy()
     rows = np.flatnonzero(
         _length(points - result.closest) < np.nan_to_num(distance, nan=np.inf) - rounding
     )
