@@ -84,53 +84,61 @@ class ClipCurveDescent:
         x = vector(x)
 
         def body(
-            y: Vec3, best: Vec3, nearest: Real, newton: Real, tangent: Vec3, ddy: Vec3, normal: Vec3,
+            y: Vec3, best: Vec3, nearest: Real, w: Real, tangent: Vec3, ddy: Vec3, normal: Vec3,
             face_normal: Vec3, face_offset: Real, corner: Any, factor: Real, tries: Any, k: Any,
             active: Mask,
         ) -> tuple[Any, ...]:  # fmt: skip
+            """Try the point y, and choose the next one.
+
+            best, nearest: the best point of the curve so far, and its distance from x; infinite if
+                there is none.
+            w, tangent, ddy, normal: Newton's step, the curve's derivatives and the face's normal at
+                `best`.
+            face_normal, face_offset: the plane of another face that ends steps; the normal is 0 if
+                there is none.
+            corner: 0, `_TURNING` or `_TURNED`.
+            factor: the fraction of Newton's step that is tried.
+            tries: the number of corrections towards the curve since the last step.
+            """
             trial = self._at(y)
             distance = safe_norm(x - y)
             reached = dr.isfinite(nearest)
             is_new_face = dr.dot(trial.normal, normal) < 1 - _SAME_FACE
-            face_gap = fmax(face_offset - dr.dot(face_normal, best), 0)
+            gap = fmax(face_offset - dr.dot(face_normal, best), 0)
             turns = (
                 (corner == _TURNING)
                 & is_new_face
-                & (distance < nearest + 8 * face_gap + 100 * trial.near)
+                & (distance < nearest + 8 * gap + 100 * trial.near)
             )
             accepted = trial.is_on & (~reached | (distance < nearest) | turns)
             # A step across another face makes that face end the next steps. A point that is off the
             # curve otherwise is corrected towards it, several times if necessary.
             is_free = ~(dr.squared_norm(face_normal) > 0)
-            crosses_face = reached & is_new_face & is_free & ~accepted & (corner != _TURNING)
-            corrects = ~trial.is_on & ~crosses_face & (tries < _MAX_CURVE_CORRECTIONS)
+            crosses = reached & is_new_face & is_free & ~accepted & (corner != _TURNING)
+            corrects = ~trial.is_on & ~crosses & (tries < _MAX_CURVE_CORRECTIONS)
             corrects &= dr.isfinite(dr.squared_norm(trial.correction))
             failed = ~accepted & ~corrects
             # A point on the curve that is nearer to x is accepted: the next Newton step.
-            slope = 1 - dr.dot(x - y, trial.second_derivative)
-            step = dr.dot(x - y, trial.tangent) / fmax(dr.abs(slope), _MIN_SECOND_DERIVATIVE)
-            newton = dr.select(accepted, clamp(step, -distance, distance), newton)
+            curvature_term = 1 - dr.dot(x - y, trial.second_derivative)
+            step = dr.dot(x - y, trial.tangent) / fmax(
+                dr.abs(curvature_term), _MIN_SECOND_DERIVATIVE
+            )
+            w = dr.select(accepted, clamp(step, -distance, distance), w)
             best, nearest = dr.select(accepted, y, best), dr.select(accepted, distance, nearest)
             tangent = dr.select(accepted, trial.tangent, tangent)
             ddy = dr.select(accepted, trial.second_derivative, ddy)
             changes_face = accepted & is_new_face
-            face_normal = dr.select(
-                crosses_face, trial.normal, dr.select(changes_face, 0, face_normal)
-            )
-            face_offset = dr.select(
-                crosses_face, dr.dot(trial.normal, y) + trial.depth, face_offset
-            )
+            face_normal = dr.select(crosses, trial.normal, dr.select(changes_face, 0, face_normal))
+            face_offset = dr.select(crosses, dr.dot(trial.normal, y) + trial.depth, face_offset)
             normal = dr.select(accepted, trial.normal, normal)
             factor = dr.select(accepted, fmin(4 * factor, 1), factor)
-            factor = dr.select(failed & ~crosses_face, 0.25 * factor, factor)
-            # The step s meets the face where slope_to_face |s| + s^2/2 face_normal.ddy = face_gap.
-            s, face_gap = factor * newton, fmax(face_offset - dr.dot(face_normal, best), 0)
-            slope_to_face = dr.sign(newton) * dr.dot(face_normal, tangent)
-            root = slope_to_face + dr.sqrt(
-                slope_to_face * slope_to_face + 2 * face_gap * dr.dot(face_normal, ddy)
-            )
-            limit = dr.select(root > 0, _STEP_TO_FACE * 2 * face_gap / root, dr.inf)
-            is_limited = ~(is_free & ~crosses_face) & (limit < dr.abs(s))
+            factor = dr.select(failed & ~crosses, 0.25 * factor, factor)
+            # The step s meets the face where rate |s| + s^2/2 face_normal.ddy = gap.
+            s, gap = factor * w, fmax(face_offset - dr.dot(face_normal, best), 0)
+            rate = dr.sign(w) * dr.dot(face_normal, tangent)
+            root = rate + dr.sqrt(rate * rate + 2 * gap * dr.dot(face_normal, ddy))
+            limit = dr.select(root > 0, _STEP_TO_FACE * 2 * gap / root, dr.inf)
+            is_limited = ~(is_free & ~crosses) & (limit < dr.abs(s))
             s = dr.select(is_limited, clamp(s, -limit, limit), s)
             target = dr.fma(vector(s), tangent, best) + vector(0.5 * s * s) * ddy
             min_step = dr.select(is_limited, 0, _MIN_RELATIVE_STEP * nearest)
@@ -139,7 +147,7 @@ class ClipCurveDescent:
             at_face = is_short & is_limited & ~corrects & (corner == 0)
             corner = dr.select(at_face, _TURNING, corner)
             target = dr.select(
-                at_face, dr.fma(vector(face_gap + 8 * trial.near), face_normal, best), target
+                at_face, dr.fma(vector(gap + 8 * trial.near), face_normal, best), target
             )
             active &= (
                 (corrects | accepted | reached) & (factor > _MIN_STEP_FACTOR) & (k + 1 < _ROUNDS)
@@ -150,7 +158,7 @@ class ClipCurveDescent:
                 dr.select(corrects, tries + 1, 0),
             )
             return (
-                y, best, nearest, newton, tangent, ddy, normal, face_normal, face_offset, corner, factor,
+                y, best, nearest, w, tangent, ddy, normal, face_normal, face_offset, corner, factor,
                 tries, k + 1, active,
             )  # fmt: skip
 

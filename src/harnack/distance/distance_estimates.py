@@ -110,13 +110,13 @@ def signed_distance(
     if method == "lower_bound":
         _check_domain(field, x)
     if field.has_jumps and method != "lower_bound":
-        to_sheet = find_closest(backend, traced, levels, x, teller(None)).distance
-        result = np.copysign(np.fmin(to_sheet, np.abs(result)), result)
+        jump_distance = find_closest(backend, traced, levels, x, teller(None)).distance
+        result = np.copysign(np.fmin(jump_distance, np.abs(result)), result)
     return _outwards(field) * result
 
 
 def _outwards(field: Field) -> float:
-    """The factor that makes a distance in the direction of larger values negative inside."""
+    """The sign by which a distance that grows with f becomes negative inside the solid."""
     return -1.0 if field.is_larger_inside else 1.0
 
 
@@ -205,6 +205,11 @@ def _find(
     *,
     is_proved: bool = False,
 ) -> ClosestPoints:
+    """`find_closest` for the points, with the clip of the surface made part of the field's domain.
+    Warns of points without a result.
+
+    name: of the public function, for messages.
+    """
     if surface.clip_volume is not None:
         if surface.field.has_jumps:
             raise NotImplementedError(
@@ -218,7 +223,7 @@ def _find(
         surface = replace(surface, field=field, clip=None, section=None)
     levels = surface.target_levels(backend)
     closest = find_closest(backend, surface, levels, points, teller(progress), is_proved=is_proved)
-    _warn(name, closest)
+    _warn_of_failures(name, closest)
     return closest
 
 
@@ -228,7 +233,9 @@ def _surface(
     options: TraceOptions | None,
     keywords: TraceKeywords,
 ) -> tuple[TracedSurface, Backend]:
-    """The surface whose distances are asked for, and the backend to compute them on.
+    """The surface to which distances are measured, and the backend to compute them on.
+
+    verb: the name of the public function, for messages.
 
     Raises:
         TypeError, ValueError: as `surface_and_options`; an option that distances do not have.
@@ -247,8 +254,8 @@ def _surface(
     )
 
 
-def _warn(name: str, result: ClosestPoints) -> None:
-    """Warn of points without an answer, and of answers that a promise of the field contradicts."""
+def _warn_of_failures(name: str, result: ClosestPoints) -> None:
+    """Warn of queries without a result, and of results that a promise of the field contradicts."""
     count = len(result.closest)
     unresolved = int(np.isnan(result.closest[:, 0]).sum())
     if unresolved:
@@ -270,6 +277,7 @@ def _warn(name: str, result: ClosestPoints) -> None:
 
 
 def _check_domain(field: Field, points: FloatArray) -> None:
+    """Raise a ValueError if a point is outside the field's domain."""
     if field.domain is None or not len(points):
         return
     outside = np.flatnonzero(~field.domain.contains_points(points))
@@ -281,26 +289,29 @@ def _check_domain(field: Field, points: FloatArray) -> None:
         )
 
 
-def _first(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
+def _first_order(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
+    """The first-order distance of p from the nearest level, with the sign of f - level."""
     del backend
     sample = field.evaluate(p)
     return first_order_distance(-levels.offset_to_nearest(sample.value), sample.gradient)
 
 
-def _second(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
+def _second_order(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
+    """The second-order distance of p from the nearest level, with the sign of f - level."""
     del backend
     sample, rows = field.evaluate(p), field.hessian(p)
     return second_order_distance(-levels.offset_to_nearest(sample.value), sample.gradient, rows)
 
 
-def _lower(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
+def _signed_lower_bound(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
+    """The proved lower bound of the distance of p from the levels, with the sign of f - level."""
     sample = field.evaluate(p)
     residual = -levels.offset_to_nearest(sample.value)
     return dr.copysign(level_distance_lower_bound(backend, field, levels, p, sample), residual)
 
 
 _COMPUTE: dict[str, Callable[[Backend, Field, Levels, Vec3], Real]] = {
-    "first_order": _first,
-    "second_order": _second,
-    "lower_bound": _lower,
+    "first_order": _first_order,
+    "second_order": _second_order,
+    "lower_bound": _signed_lower_bound,
 }
