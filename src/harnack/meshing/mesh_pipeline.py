@@ -77,13 +77,15 @@ __all__ = ["mesh"]
 
 _HONORED = (*SURFACE_OPTIONS, "tolerance")
 
-# Cells across the level set, unless a spacing is given; curves have their own length besides.
-_ACROSS = 24
-_MOST_ATTEMPTS = 4
-_ACROSS_BY_SIGNS, _ATTEMPTS_BY_SIGNS = 48, 2
-# Room around what has an extent, and around a curve whose surface has none, as a part of the size.
-_MARGIN = 0.01
-_ROOM = 0.05
+# The number of cells along the longest side of the level set's box, if no cell size is given, and
+# the number of cell sizes that are tried; then the same for meshes by signs.
+_CELLS_ACROSS = 24
+_MAX_ATTEMPTS = 4
+_SIGN_CELLS_ACROSS, _MAX_SIGN_ATTEMPTS = 48, 2
+# Margins of the meshing box, as fractions of its size: around the extent of a level set; and around
+# a curve whose surface has no extent.
+_EXTENT_MARGIN = 0.01
+_CURVE_MARGIN = 0.05
 
 
 @shows_keywords(*_HONORED)
@@ -183,56 +185,64 @@ def mesh(
         ValueError: options out of range, or that contradict each other; several levels.
     """
     target, choices = surface_and_options("mesh", surface, options, keywords, _HONORED)
-    accuracy = MeshTolerance.of(choices)
+    mesh_tolerance = MeshTolerance.of(choices)
     check_options(cell_size, thickness, seed, max_triangles)
     simplify, largest = flag(simplify, "simplify"), target.largest > 0
     report = teller(progress)
-    field, level, solid = _checked(target.field), *_level_and_solid(target, thickness)
+    field, level, solid = _meshable_field(target.field), *_level_and_solid(target, thickness)
     is_closed = bool(solid) or thickness is not None
     if simplify and not is_closed:
         raise ValueError('simplify is for closed meshes: give side="below" or thickness as well')
     volume = intersection_of([field.domain, target.clip, target.section])
-    asked = _MeshOptions(volume, accuracy, cell_size, seed, max_triangles, report)
+    settings = _MeshOptions(volume, mesh_tolerance, cell_size, seed, max_triangles, report)
     if uses_sign_meshing(field):
-        made = _mesh_from_signs(field, level, solid, thickness is not None, asked)
+        raw = _mesh_from_signs(field, level, solid, thickness is not None, settings)
     elif solid:
-        made = _mesh_solid(field, level, solid, asked)
+        raw = _mesh_solid(field, level, solid, settings)
     else:
-        made = _mesh_level_set(field, level, asked)
-    triangles, facts = made.surface, dict(made.facts)
+        raw = _mesh_level_set(field, level, settings)
+    triangles, facts = raw.surface, dict(raw.facts)
     if solid:
         facts["side"] = target.side or "below"
     else:
         triangles = largest_component(triangles) if largest else triangles
-        made.check_level(triangles)
-    tolerance = accuracy.at(made.size)
+        raw.check_level(triangles)
+    tolerance = mesh_tolerance.at(raw.size)
     if thickness is not None:
         report("thickening")
-        normals = vertex_normals(made.function, triangles)
-        triangles, more = thicken(triangles, normals, float(thickness), 0.5 * tolerance)
-        facts |= more
+        normals = vertex_normals(raw.function, triangles)
+        triangles, new_facts = thicken(triangles, normals, float(thickness), 0.5 * tolerance)
+        facts |= new_facts
     if largest and is_closed:
         triangles = largest_body(triangles)
 
-    def check(one: TriangleMesh) -> None:
+    def check(candidate: TriangleMesh) -> None:
+        """Raise a MeshingError unless the mesh is manifold and, for a solid, near the level."""
         if solid:
-            made.check_level(one)
-        check_manifold(one.faces)
+            raw.check_level(candidate)
+        check_manifold(candidate.faces)
 
-    if not made.is_checked:
+    if not raw.is_checked:
         report("checking")
         check(triangles)
         check_no_self_intersection(triangles.vertices, triangles.faces)
     if simplify:
         report("simplifying")
-        triangles, more = simplify_mesh(triangles, tolerance, check)
-        facts |= more
+        triangles, new_facts = simplify_mesh(triangles, tolerance, check)
+        facts |= new_facts
     return to_trimesh(triangles, facts, is_closed)
 
 
 @dataclass(frozen=True)
 class _MeshOptions:
-    """Arguments of `mesh`; volume: what the level set is cut by."""
+    """The arguments of `mesh`, validated.
+
+    volume: the intersection of clip, section and the field's domain, which cuts the level set; None
+        for none.
+    spacing: the size of the first cells, None for a default.
+    most_faces: the largest number of triangles.
+    report: is told what is being done.
+    """
 
     volume: Volume | None
     tolerance: MeshTolerance
@@ -244,11 +254,15 @@ class _MeshOptions:
 
 @dataclass(frozen=True)
 class _RawMesh:
-    """A surface, its size, what is known of it, and the function that it is a level set of.
+    """A mesh before it is thickened or simplified.
 
+    surface: the triangles.
+    size: the longest side of the box that was meshed.
+    facts: entries of the metadata.
+    function: the function of which the surface is a level set.
     check_level: raises a MeshingError unless a surface is within the tolerance of the level.
-    is_checked: whether that has been done, and the surface is known to be a manifold that does not
-        pass through itself.
+    is_checked: whether the surface is already known to be near the level, to be a manifold, and not
+        to intersect itself.
     """
 
     surface: TriangleMesh
@@ -264,88 +278,101 @@ def _mesh_from_signs(
     level: float | None,
     solid: tuple[float, float] | bool,
     is_thick: bool,
-    asked: _MeshOptions,
+    settings: _MeshOptions,
 ) -> _RawMesh:
-    """A level set by the signs of f, or the closed surface of a solid.
+    """Mesh a level set, or the closed surface of a solid, from the signs of f - level.
+
+    level: of the level set; None for the field's default.
+    solid: the values (low, high) between which the inside of a solid lies; True for the inside of a
+        `Solid`, False for a level set.
+    is_thick: whether the surface is to be thickened.
 
     Raises:
-        MeshingError: as `mesh_from_signs`; if it is empty, or not near the level at all.
+        MeshingError: as `mesh_from_signs`; the level set is empty, or the mesh is not near the
+            level at all.
     """
-    ends = _ends_by_signs(field, level, solid, is_thick)
+    ends = _sign_value_range(field, level, solid, is_thick)
     levels = tuple(end for end in ends if math.isfinite(end))
     if isinstance(field, WindingNumber) and field.is_of_sheets_alone(levels):
-        return _faces_alone(field, levels[0], solid, asked)
-    volume, box = asked.volume, _box(field, levels, asked.volume)
+        return _keep_faces(field, levels[0], solid, settings)
+    volume, box = settings.volume, _meshing_box(field, levels, settings.volume)
     size = float((box.upper - box.lower).max())
-    cells, attempts = _cells_by_signs(field, size, asked.spacing)
-    # Where nothing ends at the box, its cells should not lie along what is symmetrical.
-    room = np.zeros(3) if box.has_walls else size * np.array([0.0037, 0.0053, 0.0029])
-    filled = box.lower - room, box.upper + 0.5 * room
+    cell_size, attempts = _sign_cell_size(field, size, settings.spacing)
+    # If the surface does not end at the box, its cells are shifted off the symmetry planes.
+    margin = np.zeros(3) if box.has_walls else size * np.array([0.0037, 0.0053, 0.0029])
+    bounds = box.lower - margin, box.upper + 0.5 * margin
     facts: list[dict[str, Any]] = []
     losses: list[LostParts] = []
 
-    def function(one: float, side: float) -> SignFunction:
-        return SignFunction.of(field, one, filled, cells, side=side, most_faces=asked.most_faces)
+    def sign_function(value: float, side: float) -> SignFunction:
+        """The sign of side * (f - value), sampled in the cells."""
+        return SignFunction.of(
+            field, value, bounds, cell_size, side=side, most_faces=settings.most_faces
+        )
 
     is_apart = False
 
-    def signed(one: float, side: float, closed: bool) -> TriangleMesh:
+    def mesh_level(value: float, side: float, closed: bool) -> TriangleMesh:
+        """The mesh of the level `value`, from the sign of side * (f - value); closed: along the
+        faces of the box as well. Its facts and lost parts are added to the lists."""
         nonlocal is_apart
         try:
-            made, lost, more = mesh_from_signs(
-                function(one, side),
-                filled,
-                cells,
-                asked.tolerance.at(size),
+            made, lost, new_facts = mesh_from_signs(
+                sign_function(value, side),
+                bounds,
+                cell_size,
+                settings.tolerance.at(size),
                 attempts,
-                asked.report,
+                settings.report,
                 closed=closed,
-                volume=asked.volume,
+                volume=settings.volume,
             )
         except EmptySurfaceError as error:
             raise EmptySurfaceError(f"{error}{empty_surface_hint(field)}") from error
-        facts.append(more)
+        facts.append(new_facts)
         losses.append(lost)
         is_apart = made.is_intersection_free
         return made.surface
 
     if not solid:
-        made = signed(levels[0], 1.0, False)
+        made = mesh_level(levels[0], 1.0, False)
         if volume is not None and not (isinstance(volume, Box) and box.has_walls):
             made, is_apart = clip_to_volume(made, volume), False
     elif volume is None and ends[1] == math.inf:
-        made = signed(levels[0], -1.0, False)
+        made = mesh_level(levels[0], -1.0, False)
     else:
-        whole = box_manifold(box.lower, box.upper)
+        body = box_manifold(box.lower, box.upper)
         if math.isfinite(ends[0]):
-            whole = to_manifold(signed(ends[0], -1.0, True))
+            body = to_manifold(mesh_level(ends[0], -1.0, True))
         if math.isfinite(ends[1]):
-            whole = whole - to_manifold(signed(ends[1], -1.0, True))
+            body = body - to_manifold(mesh_level(ends[1], -1.0, True))
         if field.has_jumps and len(levels) == 2:
-            _check_has_thickness(field, whole, ends, asked.tolerance.at(size))
-        cut = volume or Box(tuple(box.lower.tolist()), tuple(box.upper.tolist()))
-        whole ^= volume_manifold(cut, box.lower, box.upper, 0.5 * asked.tolerance.at(size))
-        made, is_apart = from_manifold(whole), False
+            _check_has_thickness(field, body, ends, settings.tolerance.at(size))
+        cut_volume = volume or Box(tuple(box.lower.tolist()), tuple(box.upper.tolist()))
+        body ^= volume_manifold(cut_volume, box.lower, box.upper, 0.5 * settings.tolerance.at(size))
+        made, is_apart = from_manifold(body), False
     if not len(made.faces):
         raise MeshingError("the level set is empty: it lies outside of the clip")
     if is_apart:
         check_manifold(made.faces)
-    known = {"level": levels[0], **_merge_facts(facts)}
+    all_facts = {"level": levels[0], **_merge_facts(facts)}
     if isinstance(field, DipolePotential):
-        known["cloud"] = field.describe()
-    is_told = _check_sign_accuracy(field, known, asked.tolerance.at(size))
-    _warn_of_lost(field, losses, is_told)
-    return _RawMesh(made, size, known, function(levels[0], 1.0), _accept, is_apart)
+        all_facts["cloud"] = field.describe()
+    is_warned = _check_sign_accuracy(field, all_facts, settings.tolerance.at(size))
+    _warn_of_lost_parts(field, losses, is_warned)
+    return _RawMesh(made, size, all_facts, sign_function(levels[0], 1.0), _accept_any, is_apart)
 
 
-def _ends_by_signs(
+def _sign_value_range(
     field: Field,
     level: float | None,
     solid: tuple[float, float] | bool,
     is_thick: bool,
 ) -> tuple[float, float]:
-    """The values between which the inside is; of a level set that is not closed those from its
-    level on.
+    """The values (low, high) of f between which the inside of a solid lies. For a level set that is
+    not closed: its level, and infinity.
+
+    solid: as in `_mesh_from_signs`.
 
     Raises:
         TypeError: a surface that jumps is to be thickened.
@@ -363,28 +390,30 @@ def _ends_by_signs(
     return level, math.inf
 
 
-def _cells_by_signs(field: Field, size: float, spacing: float | None) -> tuple[float, int]:
-    """How large cells are, and how often smaller ones may be tried."""
+def _sign_cell_size(field: Field, size: float, spacing: float | None) -> tuple[float, int]:
+    """The size of cells for meshes by signs, and the number of sizes that may be tried. size: of
+    the box; spacing: the prescribed cell size, or None."""
     if spacing is not None:
         return float(spacing), 1
-    cells, attempts = size / _ACROSS_BY_SIGNS, _ATTEMPTS_BY_SIGNS
+    cell_size, attempts = size / _SIGN_CELLS_ACROSS, _MAX_SIGN_ATTEMPTS
     detailed = cell_size_for_smoothing(
-        field, cells, CELL_REFINEMENT_FACTOR, CELL_REFINEMENT_FACTOR**2
+        field, cell_size, CELL_REFINEMENT_FACTOR, CELL_REFINEMENT_FACTOR**2
     )
-    # At once what would be tried next.
-    return (detailed, attempts - 1) if detailed < cells else (cells, attempts)
+    # A field with more detail begins with the cells that would be tried next.
+    return (detailed, attempts - 1) if detailed < cell_size else (cell_size, attempts)
 
 
-def _faces_alone(
+def _keep_faces(
     field: WindingNumber,
     level: float,
     solid: tuple[float, float] | bool,
-    asked: _MeshOptions,
+    settings: _MeshOptions,
 ) -> _RawMesh:
-    """The triangles of a mesh that is its own surface, as they are, but for what the volume cuts.
+    """The raw mesh of a winding number whose level set consists of all triangles of its mesh: these
+    triangles, cut by the volume.
 
     Raises:
-        MeshingError: it is to be closed; nothing is left; it has too many triangles.
+        MeshingError: a solid is wanted; the surface is empty; it has too many triangles.
     """
     if solid:
         raise MeshingError(
@@ -394,26 +423,27 @@ def _faces_alone(
     vertices, faces = field.mesh.vertices, field.mesh.faces
     size = float(np.ptp(vertices[faces].reshape(-1, 3), axis=0).max())
     surface = TriangleMesh.without_unused_vertices(vertices, faces)
-    if asked.volume is not None:
-        surface = clip_to_volume(surface, asked.volume)
+    if settings.volume is not None:
+        surface = clip_to_volume(surface, settings.volume)
     if not len(surface.faces):
         raise MeshingError("the level set is empty: it lies outside of the clip")
-    if len(surface.faces) > asked.most_faces:
+    if len(surface.faces) > settings.most_faces:
         raise TriangleLimitError(
             f"{len(surface.faces):,} triangles of the mesh are its surface, and max_triangles is "
-            f"{asked.most_faces:,}: choose a larger `max_triangles`, or a smaller `clip`"
+            f"{settings.most_faces:,}: choose a larger `max_triangles`, or a smaller `clip`"
         )
-    known = {"level": level, "made_by": "faces", "spacing": math.nan, "evaluations": 0}
-    function = LevelFunction(field, level, most_faces=asked.most_faces)
-    return _RawMesh(surface, size, known, function, _accept, False)
+    facts = {"level": level, "made_by": "faces", "spacing": math.nan, "evaluations": 0}
+    function = LevelFunction(field, level, most_faces=settings.most_faces)
+    return _RawMesh(surface, size, facts, function, _accept_any, False)
 
 
 def _check_has_thickness(
-    field: Field, whole: Manifold, ends: tuple[float, float], tolerance: float
+    field: Field, body: Manifold, value_range: tuple[float, float], tolerance: float
 ) -> None:
-    """Raise if both levels are the same triangles, where the field jumps across them."""
-    if 2 * abs(whole.volume()) < tolerance * whole.surface_area():
-        low, high = (f"{one:g}" for one in ends)
+    """Raise a MeshingError if a body between two levels has no thickness, as the field jumps across
+    both levels at the same triangles."""
+    if 2 * abs(body.volume()) < tolerance * body.surface_area():
+        low, high = (f"{value:g}" for value in value_range)
         raise MeshingError(
             f"the part between the levels {low} and {high} of this {type(field).__name__} has no "
             f'thickness: it jumps across both at its triangles; for the inside give side="above"'
@@ -421,18 +451,19 @@ def _check_has_thickness(
 
 
 def _merge_facts(facts: list[dict[str, Any]]) -> dict[str, Any]:
-    """What is known of the surfaces at both ends of a solid."""
+    """The facts of the one or two surfaces of a solid, merged: sums of counts, maxima of
+    lengths."""
     sums = ("evaluations", "undecided", "flat", "far", "looked_at", "lost", "sought")
-    larger = {key: max(one[key] for one in facts) for key in ("spacing", "within")}
-    return {**facts[0], **larger, **{key: sum(one[key] for one in facts) for key in sums}}
+    maxima = {key: max(entry[key] for entry in facts) for key in ("spacing", "within")}
+    return {**facts[0], **maxima, **{key: sum(entry[key] for entry in facts) for key in sums}}
 
 
 def _check_sign_accuracy(field: Field, facts: dict[str, Any], tolerance: float) -> bool:
-    """Whether more than a few vertices and centers of triangles are beyond the tolerance, which is
-    warned of.
+    """Warn if more than the permitted fraction of vertices and triangle centers are farther from
+    the level than the tolerance. Returns whether that is so.
 
     Raises:
-        MeshingError: some of them are nowhere near the level.
+        MeshingError: some of them are farther from the level than several cells.
     """
     far, count, within = facts["far"], facts["looked_at"], facts["within"]
     kind = type(field).__name__
@@ -455,11 +486,14 @@ def _check_sign_accuracy(field: Field, facts: dict[str, Any], tolerance: float) 
     return far > MAX_OFF_LEVEL_FRACTION * count
 
 
-def _warn_of_lost(field: Field, losses: list[LostParts], is_told: bool) -> None:
-    """Warns where parts of the level set are missing from the mesh; if it is told already that the
-    mesh is coarse, only of more than that."""
+def _warn_of_lost_parts(field: Field, losses: list[LostParts], is_warned: bool) -> None:
+    """Warn if parts of the level set are missing from the mesh.
+
+    is_warned: whether a warning has already said that the mesh is coarse; then only thin parts are
+        worth another.
+    """
     for lost in losses:
-        if lost.matter and (lost.show_thin_parts or not is_told):
+        if lost.matter and (lost.show_thin_parts or not is_warned):
             warnings.warn(
                 f"the mesh is not quite the level of this {type(field).__name__}: {lost}; "
                 f"{lost.advice}",
@@ -467,15 +501,17 @@ def _warn_of_lost(field: Field, losses: list[LostParts], is_told: bool) -> None:
             )
 
 
-def _accept(surface: TriangleMesh) -> None:
-    """Accepts every surface: by signs distances were measured when it was made."""
+def _accept_any(surface: TriangleMesh) -> None:
+    """The `check_level` of meshes by signs: accepts every surface, as its distance from the level
+    was measured when it was made."""
 
 
 def _level_and_solid(
     surface: Surface, thickness: float | None
 ) -> tuple[float | None, tuple[float, float] | bool]:
-    """The level, and the values (low, high) on the closed solid in its place: True for the points
-    of a `Solid`, False for the level set.
+    """The level of a surface, and the range (low, high) of values inside the solid that is meshed
+    in its place: True for the points of a `Solid`, False for a level set. The level is None where
+    the range says all.
 
     Raises:
         ValueError: several levels; a solid that is to be thickened.
@@ -499,15 +535,21 @@ def _level_and_solid(
 
 
 def _check_level(
-    function: LevelFunction, made: TriangleMesh, tolerance: float, volume: Volume | None
+    function: LevelFunction, surface: TriangleMesh, tolerance: float, volume: Volume | None
 ) -> None:
-    """Raise unless a surface is within the tolerance of the level, and inside the volume."""
+    """Raise a MeshingError unless a surface is within the tolerance of the level, and inside the
+    volume."""
     if volume is not None:
-        check_inside(made.vertices, volume, tolerance)
-    check_near_level(function, made.vertices, made.faces, tolerance, volume)
+        check_inside(surface.vertices, volume, tolerance)
+    check_near_level(function, surface.vertices, surface.faces, tolerance, volume)
 
 
-def _checked(field: Field) -> Field:
+def _meshable_field(field: Field) -> Field:
+    """The field, if it can be meshed; a `SolidAngle` as a new one of its loops alone.
+
+    Raises:
+        TypeError: a field that is not one continuous function, has circles, or is periodic.
+    """
     check_is_field(field)
     if field.has_patches or (field.has_jumps and not uses_sign_meshing(field)):
         raise TypeError(
@@ -532,19 +574,25 @@ def _mesh_solid(
     field: Field,
     level: float | None,
     solid: tuple[float, float] | Literal[True],
-    asked: _MeshOptions,
+    settings: _MeshOptions,
 ) -> _RawMesh:
-    """The closed surface of a solid that is put together from smooth levels."""
-    region = LevelFunction(*solid_and_level(field, solid, level), most_faces=asked.most_faces)
+    """The closed surface of a solid that is made of smooth level sets.
+
+    solid: as in `_mesh_from_signs`.
+    """
+    region = LevelFunction(*solid_and_level(field, solid, level), most_faces=settings.most_faces)
     evaluations = [0]
 
-    def angle_mesher(error: float, cells: float) -> AngleMesher:
+    def angle_mesher(error: float, cell_size: float) -> AngleMesher:
+        """A function that meshes a level of an angle, for operands of the solid, with cells of that
+        size and within the distance `error`."""
+
         def mesh_angle(angle: SolidAngle, value: float) -> TriangleMesh:
-            angle = cast("SolidAngle", _checked(angle))
-            box = _box(angle, (value,), None)
-            function = LevelFunction(angle, value, most_faces=asked.most_faces)
+            angle = cast("SolidAngle", _meshable_field(angle))
+            box = _meshing_box(angle, (value,), None)
+            function = LevelFunction(angle, value, most_faces=settings.most_faces)
             made, facts = _mesh_spanning_curve(
-                function, box, error, cells, 1, asked.seed, asked.report
+                function, box, error, cell_size, 1, settings.seed, settings.report
             )
             evaluations[0] += facts["evaluations"]
             return made
@@ -552,7 +600,7 @@ def _mesh_solid(
         return mesh_angle
 
     def check_level(made: TriangleMesh, size: float) -> None:
-        _check_level(region, made, asked.tolerance.at(size), asked.volume)
+        _check_level(region, made, settings.tolerance.at(size), settings.volume)
 
     def check(made: TriangleMesh, size: float) -> None:
         check_manifold(made.faces, made.vertices)
@@ -561,13 +609,13 @@ def _mesh_solid(
     made = mesh_solid(
         cast("Solid", region.field),
         region.level,
-        asked.volume,
-        asked.tolerance,
-        asked.spacing,
+        settings.volume,
+        settings.tolerance,
+        settings.spacing,
         angle_mesher,
-        asked.most_faces,
+        settings.most_faces,
         check,
-        asked.report,
+        settings.report,
     )
     facts = {
         "level": region.level,
@@ -576,36 +624,41 @@ def _mesh_solid(
         "surfaces_with_options": made.levels,
     }
     return _RawMesh(
-        made.surface, made.size, facts, region, lambda one: check_level(one, made.size), True
+        made.surface,
+        made.size,
+        facts,
+        region,
+        lambda surface: check_level(surface, made.size),
+        True,
     )
 
 
-def _mesh_level_set(field: Field, level: float | None, asked: _MeshOptions) -> _RawMesh:
-    """A level set of a function that is smooth nearly everywhere, or of an angle."""
+def _mesh_level_set(field: Field, level: float | None, settings: _MeshOptions) -> _RawMesh:
+    """Mesh a level set of an angle, or of a function that is smooth nearly everywhere."""
     level = field.default_level if level is None else float(level)
-    function = LevelFunction(field, level, most_faces=asked.most_faces)
+    function = LevelFunction(field, level, most_faces=settings.most_faces)
     field.validate_levels((level,))
-    volume, report = asked.volume, asked.report
-    box = _box(field, (level,), volume)
+    volume, report = settings.volume, settings.report
+    box = _meshing_box(field, (level,), volume)
     size = float((box.upper - box.lower).max())
-    error = 0.5 * asked.tolerance.at(size)
-    cells = size / _ACROSS if asked.spacing is None else float(asked.spacing)
-    if asked.spacing is None and field.min_wavelength is not None:
-        cells = min(cells, field.min_wavelength / CELLS_PER_WAVE)
-    attempts = 1 if asked.spacing is not None else _MOST_ATTEMPTS
+    error = 0.5 * settings.tolerance.at(size)
+    cell_size = size / _CELLS_ACROSS if settings.spacing is None else float(settings.spacing)
+    if settings.spacing is None and field.min_wavelength is not None:
+        cell_size = min(cell_size, field.min_wavelength / CELLS_PER_WAVE)
+    attempts = 1 if settings.spacing is not None else _MAX_ATTEMPTS
     if isinstance(field, SolidAngle):
         made, facts = _mesh_spanning_curve(
-            function, box, error, cells, attempts, asked.seed, report
+            function, box, error, cell_size, attempts, settings.seed, report
         )
     else:
-        made, facts = _mesh_in_lattice(function, box, error, cells, attempts, report)
+        made, facts = _mesh_in_lattice(function, box, error, cell_size, attempts, report)
     if volume is not None and not (isinstance(volume, Box) and box.has_walls):
         made = clip_to_volume(made, volume)
         if not len(made.faces):
             raise MeshingError("the level set is empty: it lies outside of the clip")
 
-    def check_level(one: TriangleMesh) -> None:
-        _check_level(function, one, asked.tolerance.at(size), volume)
+    def check_level(surface: TriangleMesh) -> None:
+        _check_level(function, surface, settings.tolerance.at(size), volume)
 
     return _RawMesh(made, size, {"level": level, **facts}, function, check_level, False)
 
@@ -618,8 +671,12 @@ def _mesh_in_lattice(
     attempts: int,
     report: Callable[[str], None],
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The level set of a real-valued field in a box, in cells of a lattice."""
-    before: MeshingError | None = None
+    """Mesh the level set of a real-valued field in a box, in cells of a lattice of that spacing;
+    smaller cells are tried if a check fails. Returns the triangles and their facts.
+
+    attempts: the number of cell sizes that may be tried.
+    """
+    last_error: MeshingError | None = None
     while True:
         report(f"cells of {spacing:.3g}")
         try:
@@ -632,10 +689,10 @@ def _mesh_in_lattice(
         except MeshingError as wrong:
             attempts -= 1
             if not attempts or not is_retry_promising(
-                wrong, before, CELL_REFINEMENT_FACTOR**attempts
+                wrong, last_error, CELL_REFINEMENT_FACTOR**attempts
             ):
                 raise
-            before, spacing = wrong, CELL_REFINEMENT_FACTOR * spacing
+            last_error, spacing = wrong, CELL_REFINEMENT_FACTOR * spacing
             report(f"{wrong}; so smaller cells")
     facts = {
         "spacing": spacing,
@@ -656,37 +713,45 @@ def _mesh_spanning_curve(
     seed: int,
     report: Callable[[str], None],
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The level set of an angle, which ends at its curve."""
-    ends = box.lower, box.upper
-    made = mesh_spanning_curve(
-        function, spacing, attempts, ends, box.has_walls, seed, tolerance, report
+    """Mesh the level set of an angle, which ends at its curve. Returns the triangles and their
+    facts.
+
+    attempts: the number of cell sizes that may be tried.
+    """
+    bounds = box.lower, box.upper
+    mesh = mesh_spanning_curve(
+        function, spacing, attempts, bounds, box.has_walls, seed, tolerance, report
     )
     facts = {
-        "spacing": made.spacing,
+        "spacing": mesh.spacing,
         "evaluations": function.evaluations,
-        "proved": made.crossings.proved,
-        "integrated": made.crossings.integrated_count,
-        **made.isotopy.shares(),
-        "turned": made.turned,
+        "proved": mesh.crossings.proved,
+        "integrated": mesh.crossings.integrated_count,
+        **mesh.isotopy.shares(),
+        "turned": mesh.turned,
     }
-    return TriangleMesh.without_unused_vertices(made.vertices, made.faces), facts
+    return TriangleMesh.without_unused_vertices(mesh.vertices, mesh.faces), facts
 
 
 @dataclass(frozen=True)
 class _MeshingBox:
-    """The box to be filled, from `lower` to `upper`, (3,) each, and whether the surface may end at
-    its faces."""
+    """The box that is meshed.
+
+    lower, upper: its corners, (3,).
+    has_walls: whether the surface may end at the faces of the box.
+    """
 
     lower: FloatArray
     upper: FloatArray
     has_walls: bool
 
 
-def _box(field: Field, levels: tuple[float, ...], volume: Volume | None) -> _MeshingBox:
-    """The box to be filled: around the level sets, if it has an extent, and the volume.
+def _meshing_box(field: Field, levels: tuple[float, ...], volume: Volume | None) -> _MeshingBox:
+    """The box that is meshed: around the level sets, if these have an extent, and inside the
+    volume's bounds.
 
     Raises:
-        MeshingError: neither has bounds, or they have nothing in common.
+        MeshingError: neither has finite bounds, or they do not intersect.
     """
     extent, level = field.extent(levels), levels[0]
     if volume is None and extent is None and isinstance(field, SolidAngle):
@@ -700,16 +765,16 @@ def _box(field: Field, levels: tuple[float, ...], volume: Volume | None) -> _Mes
             "clip, such as a box (harnack.Box)"
         )
     if isinstance(field, SolidAngle):
-        return _around_curve(field, extent, volume)
+        return _curve_box(field, extent, volume)
     lower, upper = _bounds_of(extent if volume is None else volume)
     if volume is not None and extent is not None and extent != volume:
-        # A little room, so that what touches its extent does not end there.
+        # With a margin, so that a surface that touches its extent does not end at the box.
         low, high = _bounds_of(extent)
-        pad = _MARGIN * float((high - low).max())
+        pad = _EXTENT_MARGIN * float((high - low).max())
         if math.isfinite(pad):
             lower, upper = np.maximum(lower, low - pad), np.minimum(upper, high + pad)
     elif volume is None:
-        pad = _MARGIN * (upper - lower).max()
+        pad = _EXTENT_MARGIN * (upper - lower).max()
         lower, upper = lower - pad, upper + pad
     if not (np.isfinite(lower).all() and np.isfinite(upper).all()):
         raise MeshingError(
@@ -721,9 +786,10 @@ def _box(field: Field, levels: tuple[float, ...], volume: Volume | None) -> _Mes
     return _MeshingBox(lower, upper, volume is not None)
 
 
-def _around_curve(field: SolidAngle, extent: Volume | None, volume: Volume | None) -> _MeshingBox:
-    """Around the whole surface that a curve spans, which is cut later; or if that has no extent,
-    around the curve and the volume."""
+def _curve_box(field: SolidAngle, extent: Volume | None, volume: Volume | None) -> _MeshingBox:
+    """The box around the whole surface that a curve spans, which is cut by the volume later. If the
+    surface has no extent: the box around the curve and the volume.
+    """
     if extent is not None:
         return _MeshingBox(*_bounds_of(extent), False)
     assert volume is not None
@@ -732,11 +798,12 @@ def _around_curve(field: SolidAngle, extent: Volume | None, volume: Volume | Non
     lower, upper = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
     if not np.isfinite(upper - lower).all():
         raise MeshingError("the clip has no bounds: give a box or a ball")
-    pad = _ROOM * (upper - lower).max()
+    pad = _CURVE_MARGIN * (upper - lower).max()
     return _MeshingBox(lower - pad, upper + pad, True)
 
 
 def _bounds_of(volume: Volume | None) -> tuple[FloatArray, FloatArray]:
+    """The lower and upper corner of the volume, (3,) each."""
     assert volume is not None
-    lower, upper = (np.array(end, np.float64) for end in volume.bounds())
+    lower, upper = (np.array(corner, np.float64) for corner in volume.bounds())
     return lower, upper

@@ -66,16 +66,18 @@ if TYPE_CHECKING:
 
 __all__ = ["repair"]
 
-# How many sizes of cells are tried for patches on which w is 1/2, if all triangles have to stay;
-# and if they need not, where there are no more open edges than that.
-_ATTEMPTS, _FEW_ATTEMPTS, _FEW_EDGES = 6, 1, 1000
-# Cells across the mesh if all is made anew; larger ones by this factor, up to so many times, where
-# the surface is rough and has more triangles than that.
-_ACROSS_ANEW = 48
-_MOST_ANEW, _LARGER, _MOST_LARGER = 80_000, 1.4, 3
+# The number of cell sizes that are tried for harmonic hole fillings: if all triangles have to stay,
+# and else. In the latter case there may be no more open edges than the last number.
+_MAX_ATTEMPTS, _FEW_ATTEMPTS, _FEW_EDGES = 6, 1, 1000
+# The number of cells along the longest side of a mesh that is remeshed. If the surface is rough and
+# would have more than _MAX_REMESHED_FACES triangles, cells are made larger by the factor
+# _CELL_GROWTH, up to _MAX_CELL_GROWTHS times.
+_REMESH_CELLS_ACROSS = 48
+_MAX_REMESHED_FACES, _CELL_GROWTH, _MAX_CELL_GROWTHS = 80_000, 1.4, 3
 
-# Points lie in a plane if the least of their singular values is this part of the largest.
-_FLAT = 1e-9
+# Points lie in a plane if the smallest of their singular values is below this fraction of the
+# largest.
+_PLANE_TOLERANCE = 1e-9
 
 Keep = Literal["all", "valid", "none"]
 Patches = Literal["smooth", "harmonic"]
@@ -186,8 +188,8 @@ def repair(
     """
     largest = flag(largest, "largest")
     keywords = {} if tolerance is None else {"tolerance": tolerance}
-    accuracy = MeshTolerance.of(trace_options("repair", options, keywords, ("tolerance",)))
-    asked = _checked_settings(keep, filling, accuracy, cell_size, seed, teller(progress))
+    mesh_tolerance = MeshTolerance.of(trace_options("repair", options, keywords, ("tolerance",)))
+    settings = _repair_options(keep, filling, mesh_tolerance, cell_size, seed, teller(progress))
     _check_is_mesh(mesh)
     _check_encloses(mesh)
     intended = IntendedSolid.of(mesh, as_it_is=keep == "all")
@@ -202,23 +204,23 @@ def repair(
     reasons, results = list[str](), list[_Result]()
     for name in names:
         try:
-            surface, facts = stages[name](intended, asked)
+            surface, facts = stages[name](intended, settings)
         except (MeshError, MeshingError) as error:
             if name == names[-1] and not results:
                 raise
             reasons.append(str(error))
-            asked.report(f"{error}; so not all is kept")
+            settings.report(f"{error}; so not all is kept")
             continue
-        asked.report("comparing with what was given")
-        away = 2 * accuracy.at(intended.size) + facts.get("moved", 0.0)
-        results.append(_Result(surface, facts, intended.difference(surface, away)))
+        settings.report("comparing with what was given")
+        distance = 2 * mesh_tolerance.at(intended.size) + facts.get("moved", 0.0)
+        results.append(_Result(surface, facts, intended.difference(surface, distance)))
         if results[-1].difference is None:
             break
         reasons.append(f"the result of {facts['stage']} is another solid: {results[-1].difference}")
-        asked.report(f"{reasons[-1]}; so another way")
+        settings.report(f"{reasons[-1]}; so another way")
     best = min(results, key=lambda result: result.badness)
     moved = best.facts.get("moved", 0.0)
-    if moved > 2 * accuracy.at(intended.size):
+    if moved > 2 * mesh_tolerance.at(intended.size):
         warnings.warn(
             f"faces that were apart were joined, which moved corners by up to {moved:.3g}: the "
             "repaired mesh may be off by as much",
@@ -231,7 +233,8 @@ def repair(
 
 @dataclass(frozen=True)
 class _RepairOptions:
-    """The arguments of `repair`."""
+    """The arguments of `repair`, validated. patches: the argument `filling`; spacing: the argument
+    `cell_size`; report: is told what is being done."""
 
     keep: Keep | None
     patches: Patches
@@ -241,7 +244,7 @@ class _RepairOptions:
     report: Callable[[str], None]
 
 
-def _checked_settings(
+def _repair_options(
     keep: Keep | None,
     patches: Patches,
     tolerance: MeshTolerance,
@@ -249,6 +252,11 @@ def _checked_settings(
     seed: int,
     report: Callable[[str], None],
 ) -> _RepairOptions:
+    """Validate the arguments of `repair`.
+
+    Raises:
+        ValueError: an unknown `keep` or `filling`, or a number out of range.
+    """
     if keep is not None and not is_one_of(keep, ("all", "valid", "none")):
         raise ValueError(f'keep is None, "all", "valid" or "none", not {keep!r}')
     if not is_one_of(patches, ("smooth", "harmonic")):
@@ -259,7 +267,12 @@ def _checked_settings(
 
 @dataclass(frozen=True)
 class _Result:
-    """What a stage made, and how that differs from what was given."""
+    """The result of a stage.
+
+    surface: the repaired mesh.
+    facts: entries of its metadata.
+    difference: how it differs from the solid that the input bounds; None if it does not.
+    """
 
     surface: TriangleMesh
     facts: dict[str, Any]
@@ -267,15 +280,19 @@ class _Result:
 
     @property
     def badness(self) -> float:
-        """0 if it does not differ: see `Difference`."""
+        """How much the result differs from the input (`Difference.badness`); 0 if it does not."""
         return 0.0 if self.difference is None else self.difference.badness
 
-    def finished(self, more: dict[str, Any], largest: bool) -> trimesh.Trimesh:
-        """The mesh, with what is known of it and of its parts; a warning if it differs."""
+    def finished(self, new_facts: dict[str, Any], largest: bool) -> trimesh.Trimesh:
+        """The mesh with its metadata: the facts of the stage, `new_facts`, and facts of its
+        components. Warns if the result differs from the input.
+
+        largest: whether only the body of the largest volume is kept.
+        """
         from harnack.meshing.closed_mesh import ClosedMesh
 
         surface = self.surface
-        facts: dict[str, Any] = {**self.facts, **more, "differs": None}
+        facts: dict[str, Any] = {**self.facts, **new_facts, "differs": None}
         if self.difference is not None:
             facts["differs"] = dataclasses.asdict(self.difference)
             warnings.warn(
@@ -287,7 +304,7 @@ class _Result:
         if largest and len(parts) > 1:
             surface = largest_body(surface)
             dropped = len(parts) - len(component_facts(surface))
-            facts["kept"] = _count_of(surface, self.surface, facts["kept"])
+            facts["kept"] = _count_kept(surface, self.surface, facts["kept"])
         repaired = ClosedMesh(surface.vertices, surface.faces, process=False, validate=False)
         repaired.metadata["harnack"] = {
             **facts,
@@ -298,14 +315,16 @@ class _Result:
         return repaired
 
 
-def _count_of(surface: TriangleMesh, whole: TriangleMesh, first: int) -> int:
-    """How many of the first faces of a whole are in a surface that is a part of it."""
-    corners = [one.vertices[one.faces].reshape(-1, 9) for one in (surface, whole)]
-    there = {row.tobytes() for row in corners[0]}
-    return sum(row.tobytes() in there for row in corners[1][:first])
+def _count_kept(surface: TriangleMesh, original: TriangleMesh, count: int) -> int:
+    """How many of the first `count` faces of the mesh `original` are in `surface`, which is a part
+    of it."""
+    corners = [mesh.vertices[mesh.faces].reshape(-1, 9) for mesh in (surface, original)]
+    corner_bytes = {row.tobytes() for row in corners[0]}
+    return sum(row.tobytes() in corner_bytes for row in corners[1][:count])
 
 
 def _check_is_mesh(mesh: Any) -> None:
+    """Raise a TypeError for an object without `vertices` and `faces`."""
     if not hasattr(mesh, "vertices") or not hasattr(mesh, "faces"):
         raise TypeError(
             f"repair takes a mesh with vertices and faces, such as a trimesh.Trimesh, not "
@@ -314,18 +333,19 @@ def _check_is_mesh(mesh: Any) -> None:
 
 
 def _check_encloses(mesh: Any) -> None:
-    """Raise if all faces lie in a plane, or form a strip of one side only.
+    """Raise if a mesh cannot enclose a volume.
 
     Raises:
-        MeshError: so; or as `validate_mesh`.
+        MeshError: all faces lie in a plane; the mesh is one-sided, like a Moebius strip; or as
+            `validate_mesh`.
     """
     vertices, faces = validate_mesh(
         np.asarray(mesh.vertices), np.asarray(mesh.faces), allow_zero_area=True
     )
     x = vertices[np.unique(faces)]
     x = x - x.mean(axis=0)
-    largest, *_, least = np.linalg.svd(x / np.abs(x).max(), compute_uv=False)
-    if least <= _FLAT * largest:
+    largest, *_, smallest = np.linalg.svd(x / np.abs(x).max(), compute_uv=False)
+    if smallest <= _PLANE_TOLERANCE * largest:
         raise MeshError(
             "all faces of the mesh lie in a plane, or nearly so: they enclose nothing that could "
             "be closed; give it a thickness first, or mesh its boundary with `thickness`"
@@ -341,10 +361,10 @@ def _check_encloses(mesh: Any) -> None:
 
 
 def _unite_bodies(
-    intended: IntendedSolid, asked: _RepairOptions
+    intended: IntendedSolid, settings: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The boundary of the solid that a closed mesh bounds which passes through itself, or of parts
-    that touch.
+    """The stage "boolean_union": the boundary of the solid that is bounded by a closed mesh that
+    intersects itself, or by components that overlap or touch. Returns it with its facts.
 
     Raises:
         MeshError, MeshingError: as `repair`.
@@ -352,29 +372,30 @@ def _unite_bodies(
     vertices, faces = intended.vertices, intended.oriented
     if len(singular_edges(faces)[0]):
         raise MeshError("the mesh is not closed")
-    if _is_fine(vertices, faces):
+    if _is_sound(vertices, faces):
         raise MeshError("nothing of it passes through or lies in itself")
     facts = {"stage": "boolean_union", "kept": 0}
-    slivers = 0.5 * asked.tolerance.at(intended.size)
+    sliver_size = 0.5 * settings.tolerance.at(intended.size)
     if len(intended.parts) > 1 and sum(map(len, intended.parts)) == len(faces):
-        asked.report(f"uniting {len(intended.parts):,} parts")
+        settings.report(f"uniting {len(intended.parts):,} parts")
         try:
-            return united_parts(vertices, faces, intended.parts, slivers), facts
+            return united_parts(vertices, faces, intended.parts, sliver_size), facts
         except (MeshError, MeshingError) as error:
-            asked.report(f"{error}; so all at once")
-    asked.report("cutting faces along each other")
+            settings.report(f"{error}; so all at once")
+    settings.report("cutting faces along each other")
     try:
-        return mended_by_cuts(vertices, faces, slivers), facts
+        return mended_by_cuts(vertices, faces, sliver_size), facts
     except MeshingError as error:
-        asked.report(f"{error}; so by cells")
-    made = mesh_of(MeshSolid(vertices, faces), progress=asked.report)
-    return TriangleMesh(np.asarray(made.vertices), np.asarray(made.faces, np.int64)), facts
+        settings.report(f"{error}; so by cells")
+    remeshed = mesh_of(MeshSolid(vertices, faces), progress=settings.report)
+    return TriangleMesh(np.asarray(remeshed.vertices), np.asarray(remeshed.faces, np.int64)), facts
 
 
-def _is_fine(vertices: FloatArray, faces: IntArray) -> bool:
-    """Whether no triangles meet beyond what they share, and no part is in another's material."""
+def _is_sound(vertices: FloatArray, faces: IntArray) -> bool:
+    """Whether triangles meet only at shared vertices and edges, and no component is inside the
+    material of another."""
     try:
-        _check_sides(TriangleMesh.without_unused_vertices(vertices, faces))
+        _check_nesting(TriangleMesh.without_unused_vertices(vertices, faces))
     except MeshError:
         return False
     return not len(nonmanifold_vertices(faces)) and not len(intersecting_faces(vertices, faces))
@@ -383,42 +404,47 @@ def _is_fine(vertices: FloatArray, faces: IntArray) -> bool:
 # All made anew.
 
 
-def _remesh(intended: IntendedSolid, asked: _RepairOptions) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The surface on which the winding number is 1/2, closed whatever the mesh is."""
+def _remesh(
+    intended: IntendedSolid, settings: _RepairOptions
+) -> tuple[TriangleMesh, dict[str, Any]]:
+    """The stage "remeshed": the surface on which the winding number is 1/2, which is closed
+    whatever the mesh is. Returns it with its facts."""
     intended.check_encloses()
-    corners = without_zero_area_faces(intended.vertices, intended.oriented)
-    field = WindingNumber(*corners)
-    if asked.spacing is not None:
-        made = _by_signs(field, asked.spacing, asked)
+    vertices_faces = without_zero_area_faces(intended.vertices, intended.oriented)
+    field = WindingNumber(*vertices_faces)
+    if settings.spacing is not None:
+        remeshed = _mesh_from_signs(field, settings.spacing, settings)
     else:
-        spacing = float(np.ptp(corners[0], axis=0).max()) / _ACROSS_ANEW
+        spacing = float(np.ptp(vertices_faces[0], axis=0).max()) / _REMESH_CELLS_ACROSS
         try:
-            made = _of_bounded_size(field, spacing, asked)
+            remeshed = _remesh_bounded(field, spacing, settings)
         except MeshingError:
-            made = _by_signs(field, 0.6 * spacing, asked)
-    facts = made.metadata["harnack"] | {"stage": "remeshed", "kept": 0}
-    return TriangleMesh(np.asarray(made.vertices), np.asarray(made.faces, np.int64)), facts
+            remeshed = _mesh_from_signs(field, 0.6 * spacing, settings)
+    facts = remeshed.metadata["harnack"] | {"stage": "remeshed", "kept": 0}
+    return TriangleMesh(np.asarray(remeshed.vertices), np.asarray(remeshed.faces, np.int64)), facts
 
 
-def _of_bounded_size(
-    field: WindingNumber, spacing: float, asked: _RepairOptions
+def _remesh_bounded(
+    field: WindingNumber, spacing: float, settings: _RepairOptions
 ) -> trimesh.Trimesh:
-    """Of larger cells where there would be too many triangles, as of noisy meshes: the time of
-    checks grows with their number."""
-    for k in range(_MOST_LARGER):
+    """The level set w = 1/2, in larger cells if there would be too many triangles, as for noisy
+    meshes: the time of the checks grows with their number.
+    """
+    for k in range(_MAX_CELL_GROWTHS):
         try:
-            return _by_signs(field, spacing * _LARGER**k, asked, _MOST_ANEW)
+            return _mesh_from_signs(field, spacing * _CELL_GROWTH**k, settings, _MAX_REMESHED_FACES)
         except TriangleLimitError as error:
-            asked.report(f"{error}; so of larger cells")
-    return _by_signs(field, spacing * _LARGER**_MOST_LARGER, asked)
+            settings.report(f"{error}; so of larger cells")
+    return _mesh_from_signs(field, spacing * _CELL_GROWTH**_MAX_CELL_GROWTHS, settings)
 
 
-def _by_signs(
-    field: WindingNumber, spacing: float, asked: _RepairOptions, most: int = 2_000_000
+def _mesh_from_signs(
+    field: WindingNumber, spacing: float, settings: _RepairOptions, max_faces: int = 2_000_000
 ) -> trimesh.Trimesh:
+    """The level set w = 1/2 of a winding number, closed, in cells of size `spacing`."""
     return mesh_of(
-        field, level=0.5, side="above", tolerance=asked.tolerance.length, cell_size=spacing,
-        max_triangles=most, progress=asked.report,
+        field, level=0.5, side="above", tolerance=settings.tolerance.length, cell_size=spacing,
+        max_triangles=max_faces, progress=settings.report,
     )  # fmt: skip
 
 
@@ -426,62 +452,62 @@ def _by_signs(
 
 
 def _keep_valid(
-    intended: IntendedSolid, asked: _RepairOptions
+    intended: IntendedSolid, settings: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The triangles that are sound, with patches.
+    """The stage "cleaned": the valid triangles, with filled holes. Returns the mesh with its facts.
 
     Raises:
         MeshError, MeshingError: as `repair`.
     """
     vertices, faces = without_zero_area_faces(intended.vertices, intended.faces)
-    made = clean_and_fill(vertices, faces, asked.report)
-    flat = len(intended.faces) - len(faces)
-    left_out = {"flat": made.left_out["flat"] + flat}
-    return made.surface, {
+    cleaned = clean_and_fill(vertices, faces, settings.report)
+    flat_count = len(intended.faces) - len(faces)
+    left_out = {"flat": cleaned.left_out["flat"] + flat_count}
+    return cleaned.surface, {
         "stage": "cleaned",
-        "kept": len(made.kept),
-        "turned": _count_turned(intended, made),
-        "left_out": made.left_out | left_out,
-        "holes": made.holes,
-        "patches": len(made.surface.faces) - len(made.kept),
+        "kept": len(cleaned.kept),
+        "turned": _count_flipped(intended, cleaned),
+        "left_out": cleaned.left_out | left_out,
+        "holes": cleaned.holes,
+        "patches": len(cleaned.surface.faces) - len(cleaned.kept),
         "harmonic": 0,
     }
 
 
-def _count_turned(intended: IntendedSolid, sound: CleanedMesh) -> int:
-    """How many of the triangles that were kept run the other way than those that were given."""
-    turned_before = np.delete(
-        intended.is_turned, zero_area_faces(intended.vertices, intended.faces)
-    )
-    is_turned = np.zeros(len(turned_before), np.bool_)
-    is_turned[sound.turned] = True
-    return int((is_turned ^ turned_before)[sound.kept].sum())
+def _count_flipped(intended: IntendedSolid, cleaned: CleanedMesh) -> int:
+    """How many of the triangles that were kept have the opposite orientation of those of the
+    input."""
+    was_turned = np.delete(intended.is_turned, zero_area_faces(intended.vertices, intended.faces))
+    is_turned = np.zeros(len(was_turned), np.bool_)
+    is_turned[cleaned.turned] = True
+    return int((is_turned ^ was_turned)[cleaned.kept].sum())
 
 
 # Loose triangles joined.
 
 
 def _weld_loose(
-    intended: IntendedSolid, asked: _RepairOptions
+    intended: IntendedSolid, settings: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """Triangles with near corners joined, with patches; none is kept bit by bit.
+    """The stage "welded": nearby corners of loose triangles are merged and holes filled; no
+    triangle is kept bit by bit. Returns the mesh with its facts.
 
     Raises:
         MeshError, MeshingError: as `repair`.
     """
-    corners = without_zero_area_faces(intended.vertices, intended.faces)
-    vertices, faces, moved = weld_near_corners(*corners)
-    made = clean_and_fill(vertices, faces, asked.report)
-    count = len(made.kept)
-    return made.surface, {
+    vertices_faces = without_zero_area_faces(intended.vertices, intended.faces)
+    vertices, faces, moved = weld_near_corners(*vertices_faces)
+    cleaned = clean_and_fill(vertices, faces, settings.report)
+    kept_count = len(cleaned.kept)
+    return cleaned.surface, {
         "stage": "welded",
         "kept": 0,
-        "joined": count,
+        "joined": kept_count,
         "moved": moved,
-        "turned": len(made.turned),
-        "left_out": made.left_out | {"flat": len(intended.faces) - len(faces)},
-        "holes": made.holes,
-        "patches": len(made.surface.faces) - count,
+        "turned": len(cleaned.turned),
+        "left_out": cleaned.left_out | {"flat": len(intended.faces) - len(faces)},
+        "holes": cleaned.holes,
+        "patches": len(cleaned.surface.faces) - kept_count,
         "harmonic": 0,
     }
 
@@ -490,90 +516,111 @@ def _weld_loose(
 
 
 def _fill_only(
-    intended: IntendedSolid, asked: _RepairOptions
+    intended: IntendedSolid, settings: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The mesh with patches; all its triangles stay.
+    """The stage "filled": the mesh with all its triangles, and filled holes. Returns it with its
+    facts.
 
     Raises:
         MeshError, MeshingError: as `repair`.
     """
-    vertices, faces = _checked(intended)
+    vertices, faces = _checked_mesh(intended)
     if intended.is_turned.any():
         raise MeshError("a part of the mesh is inside out")
     edges = checked_boundary_edges(faces)
-    if asked.keep is None and len(crossing := intersecting_faces(vertices, faces)):
+    if settings.keep is None and len(crossing := intersecting_faces(vertices, faces)):
         raise MeshError(f"{len(crossing):,} triangles of the mesh pass through others")
     loops = hole_loops(vertices, faces, edges)
-    if asked.patches == "smooth":
+    if settings.patches == "smooth":
         try:
-            return _kept_with(vertices, faces, loops, asked)
+            return _fill_kept_mesh(vertices, faces, loops, settings)
         except MeshingError as error:
-            if asked.keep is None:
+            if settings.keep is None:
                 raise
-            asked.report(f"{error}; once more, with harmonic patches alone")
-    return _kept_with(vertices, faces, loops, dataclasses.replace(asked, patches="harmonic"))
+            settings.report(f"{error}; once more, with harmonic patches alone")
+    return _fill_kept_mesh(
+        vertices, faces, loops, dataclasses.replace(settings, patches="harmonic")
+    )
 
 
-def _checked(intended: IntendedSolid) -> tuple[FloatArray, IntArray]:
-    """Vertices and faces of a mesh all of which can be kept."""
+def _checked_mesh(intended: IntendedSolid) -> tuple[FloatArray, IntArray]:
+    """The vertices and faces of a mesh of which all triangles can be kept.
+
+    Raises:
+        MeshError: as `validate_mesh`; two vertices are at the same position.
+    """
     vertices, faces = validate_mesh(intended.vertices, intended.faces)
     used = np.unique(faces)
     welded = weld_vertices(vertices[used])
-    twice = np.flatnonzero(welded != np.arange(len(used)))
-    if len(twice):
+    copies = np.flatnonzero(welded != np.arange(len(used)))
+    if len(copies):
         raise MeshError(
-            f"vertices {used[welded[twice[0]]]} and {used[twice[0]]} are at the same place, and "
-            f"{len(twice):,} in all: join such vertices first, for instance by "
+            f"vertices {used[welded[copies[0]]]} and {used[copies[0]]} are at the same place, and "
+            f"{len(copies):,} in all: join such vertices first, for instance by "
             "mesh.merge_vertices() of trimesh, or faces are not known to be neighbors"
         )
     return vertices, faces
 
 
-def _kept_with(
-    vertices: FloatArray, faces: IntArray, loops: list[IntArray], asked: _RepairOptions
+def _fill_kept_mesh(
+    vertices: FloatArray, faces: IntArray, loops: list[IntArray], settings: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The mesh with patches over its holes: smooth ones if asked for, and harmonic ones.
+    """The mesh with fillings over its holes: smooth ones if `settings` asks for them, and harmonic
+    ones for the holes that remain. Returns it with its facts.
+
+    loops: the vertex indices of the boundary of each hole.
 
     Raises:
         MeshingError: as `repair`.
     """
-    x, together, left = vertices, faces, loops
-    if loops and asked.patches == "smooth":
-        asked.report(f"filling {len(loops):,} holes")
+    all_vertices, all_faces, unfilled = vertices, faces, loops
+    if loops and settings.patches == "smooth":
+        settings.report(f"filling {len(loops):,} holes")
         field = WindingNumber(vertices, faces)
-        made = fill_holes(vertices, faces, loops, lambda p: field.value(p, precision="double"))
-        x, together = np.concatenate([x, made.vertices]), np.concatenate([faces, made.faces])
-        left = made.unfilled_loops
-        asked.report(f"{len(left):,} holes are left" + f": {made.reason}" * bool(left))
-    rest = HarmonicFilling(vertices[:0], faces[:0], True, 0.0, 0)
-    if left:
-        edges = checked_boundary_edges(together)
-        if asked.keep is None and len(edges) > _FEW_EDGES:
-            raise MeshingError(f"{len(left):,} holes of {len(edges):,} edges have no smooth patch")
-        attempts = _ATTEMPTS if asked.keep == "all" else _FEW_ATTEMPTS
-        how = HoleFillingOptions(asked.tolerance, asked.spacing, asked.seed, attempts, asked.report)
-        rest = harmonic_patches(x, together, edges, how)
-        x, together = np.concatenate([x, rest.vertices]), np.concatenate([together, rest.faces])
-    surface = TriangleMesh.without_unused_vertices(x, together)
-    if loops or asked.keep is None:
-        _check_touching(together)
-    if asked.keep is None:
-        _check_sides(surface)
+        smooth = fill_holes(vertices, faces, loops, lambda p: field.value(p, precision="double"))
+        all_vertices, all_faces = (
+            np.concatenate([all_vertices, smooth.vertices]),
+            np.concatenate([faces, smooth.faces]),
+        )
+        unfilled = smooth.unfilled_loops
+        settings.report(f"{len(unfilled):,} holes are left" + f": {smooth.reason}" * bool(unfilled))
+    harmonic = HarmonicFilling(vertices[:0], faces[:0], True, 0.0, 0)
+    if unfilled:
+        edges = checked_boundary_edges(all_faces)
+        if settings.keep is None and len(edges) > _FEW_EDGES:
+            raise MeshingError(
+                f"{len(unfilled):,} holes of {len(edges):,} edges have no smooth patch"
+            )
+        attempts = _MAX_ATTEMPTS if settings.keep == "all" else _FEW_ATTEMPTS
+        filling_options = HoleFillingOptions(
+            settings.tolerance, settings.spacing, settings.seed, attempts, settings.report
+        )
+        harmonic = harmonic_patches(all_vertices, all_faces, edges, filling_options)
+        all_vertices, all_faces = (
+            np.concatenate([all_vertices, harmonic.vertices]),
+            np.concatenate([all_faces, harmonic.faces]),
+        )
+    surface = TriangleMesh.without_unused_vertices(all_vertices, all_faces)
+    if loops or settings.keep is None:
+        _check_vertex_neighborhoods(all_faces)
+    if settings.keep is None:
+        _check_nesting(surface)
     return surface, {
         "stage": "filled",
         "kept": len(faces),
         "holes": len(loops),
-        "patches": len(together) - len(faces),
-        "harmonic": len(rest.faces),
-        "missing": rest.triangle_fill_count,
-        "refined": rest.is_refined,
-        "spacing": rest.spacing,
-        "evaluations": rest.evaluations,
+        "patches": len(all_faces) - len(faces),
+        "harmonic": len(harmonic.faces),
+        "missing": harmonic.triangle_fill_count,
+        "refined": harmonic.is_refined,
+        "spacing": harmonic.spacing,
+        "evaluations": harmonic.evaluations,
     }
 
 
-def _check_sides(surface: TriangleMesh) -> None:
-    """Raise if a part is inside out, or inside the material of another one, also in part."""
+def _check_nesting(surface: TriangleMesh) -> None:
+    """Raise a MeshError if a component is inside out, or lies wholly or partly inside the material
+    of another one."""
     shells = Shells.of(surface)
     depths = shells.nesting_depths()
     if ((shells.volumes < 0) & (depths == 0)).any():
@@ -584,10 +631,10 @@ def _check_sides(surface: TriangleMesh) -> None:
         raise MeshError("the mesh passes through itself along edges that lie on faces")
 
 
-def _check_touching(faces: IntArray) -> None:
-    """Raise unless the faces around each vertex are joined by edges."""
-    if len(places := nonmanifold_vertices(faces)):
+def _check_vertex_neighborhoods(faces: IntArray) -> None:
+    """Raise a MeshingError unless the faces around each vertex are connected by edges."""
+    if len(pinched := nonmanifold_vertices(faces)):
         raise MeshingError(
-            f"faces touch in {len(places):,} vertices alone, such as vertex {places[0]}: such a "
+            f"faces touch in {len(pinched):,} vertices alone, such as vertex {pinched[0]}: such a "
             "mesh has no two sides there"
         )
