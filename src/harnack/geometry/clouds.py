@@ -389,7 +389,7 @@ def _fit_tangent_planes(x: FloatArray, tree: Any, neighbors: int) -> _TangentPla
     """
     normals, points = np.empty_like(x), np.empty_like(x)
     nearest = np.empty((len(x), min(neighbors, len(x) - 1)), dtype=np.int32)
-    is_collinear = np.zeros(len(x), dtype=bool)
+    on_line = np.zeros(len(x), dtype=bool)
 
     def fit_slice(rows: slice) -> None:
         index, distance = nearest_neighbors(tree, x[rows], neighbors)
@@ -402,13 +402,13 @@ def _fit_tangent_planes(x: FloatArray, tree: Any, neighbors: int) -> _TangentPla
         normals[rows] = axes[:, :, 0]
         height = np.einsum("mi,mi->m", center[:, 0], axes[:, :, 0]) * distance[:, -1]
         points[rows] = x[rows] + height[:, None] * axes[:, :, 0]
-        is_collinear[rows] = variances[:, 1] <= _COLLINEAR_RATIO * variances[:, 2]
+        on_line[rows] = variances[:, 1] <= _COLLINEAR_RATIO * variances[:, 2]
 
     parallel_over_slices(fit_slice, len(x))
-    if is_collinear.any():
-        first = int(np.flatnonzero(is_collinear)[0])
+    if on_line.any():
+        first = int(np.flatnonzero(on_line)[0])
         raise CloudError(
-            f"the {nearest.shape[1]} nearest neighbors of {is_collinear.sum():,} points lie on a line, "
+            f"the {nearest.shape[1]} nearest neighbors of {on_line.sum():,} points lie on a line, "
             f"first of {format_vector(x[first])}: they show no surface; ask for more neighbors, or "
             "give normals"
         )

@@ -183,7 +183,7 @@ def _distances(p: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
 
 def _orient_loops(loops: list[FloatArray]) -> Outline:
     """The outline of simple loops: each is oriented so that the region is on its left. The region
-    lies inside of a loop if an even number of other loops runs around that loop, else outside of it."""
+    lies inside of a loop if an even number of other loops runs around it, else outside of it."""
     start, end, _ = _edges_and_successors(loops)
     loop_index = np.repeat(np.arange(len(loops)), [len(points) for points in loops])
     oriented: list[FloatArray] = []
@@ -200,9 +200,11 @@ def _orient_loops(loops: list[FloatArray]) -> Outline:
 
 def _area(loop: FloatArray) -> float:
     """The signed area of a loop (n, 2), positive if it runs counter-clockwise."""
-    p = loop - loop[0]
-    q = np.roll(p, -1, axis=0)
-    return 0.5 * float((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum())
+    offsets = loop - loop[0]
+    next_offsets = np.roll(offsets, -1, axis=0)
+    return 0.5 * float(
+        (offsets[:, 0] * next_offsets[:, 1] - offsets[:, 1] * next_offsets[:, 0]).sum()
+    )
 
 
 def _resolve_crossings(loops: list[FloatArray], rule: FillingRule) -> Outline:

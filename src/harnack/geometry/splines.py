@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["smooth_curve"]
 
 Parameterization = Literal["centripetal", "chord"]
-# The parameter grows from point to point by this power of their distance.
+# From a point to the next, the parameter of the spline grows by this power of their distance.
 _POWERS = {"centripetal": 0.5, "chord": 1.0}
 
 
@@ -57,7 +57,7 @@ def smooth_curve(
         TypeError: samples_per_segment is not an integer.
         ValueError: samples_per_segment less than 1, or an unknown spacing.
     """
-    samples_per_segment = _count(samples_per_segment)
+    samples_per_segment = _as_sample_count(samples_per_segment)
     if spacing not in _POWERS:
         raise ValueError(f'spacing is "centripetal" or "chord", not {spacing!r}')
     loops = validate_loops(points, closed=closed)
@@ -70,7 +70,13 @@ def smooth_curve(
     return curves if _is_list(points) else curves[0]
 
 
-def _count(samples: Any) -> int:
+def _as_sample_count(samples: Any) -> int:
+    """The number of samples per segment as an int.
+
+    Raises:
+        TypeError: not an integer.
+        ValueError: less than 1.
+    """
     if isinstance(samples, bool) or not hasattr(samples, "__index__"):
         raise TypeError(f"samples_per_segment must be a whole number, not {samples!r}")
     count = operator.index(samples)
@@ -93,7 +99,8 @@ def _spline(x: FloatArray, samples: int, closed: bool, power: float) -> FloatArr
     """The vertices of the spline through the points of a loop, with `samples` from each point to
     the next.
 
-    power: the parameter grows from point to point like this power of the distance.
+    x: (n, 3) the points.
+    power: from a point to the next, the parameter grows by this power of their distance.
     """
     knots = np.concatenate([x, x[:1]]) if closed else x
     chords = np.diff(knots, axis=0)
