@@ -206,7 +206,7 @@ def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
 # Hulls.
 
 MAX_PLANES = 2048
-"""If there are more facets, nearly parallel ones are dropped, which makes the hull a little larger."""
+"""If there are more facets, nearly parallel ones are dropped; the hull is then a little larger."""
 
 FLATNESS = 1e-6
 """Points whose extent in a direction is below this fraction of their size get the hull of a flat or
@@ -266,7 +266,7 @@ class ConvexHull(Polytope):
     def _slacks(
         self, table: PlaneTable, o: Vec3, d: Vec3
     ) -> Callable[[Vec3, Real], RoundingSlacks]:
-        """As `Polytope._slacks`, with the same bounds for all planes: |n|.|o| <= |o|, as |n| = 1."""
+        """As `Polytope._slacks`, with one bound for all planes: |n|.|o| <= |o|, as |n| = 1."""
         rounding = clip_rounding(backend_of(o))
         offset_slack, slope_slack = (
             rounding * (dr.norm(o) + table.max_offset),
