@@ -320,8 +320,8 @@ def _read_geometry(path: Path, kind: str, read_as: ReadAs | None) -> LoadedGeome
 def _check_convertible(
     path: Path, read_as: ReadAs | None, choices: tuple[str, ...], noun: str
 ) -> None:
-    """Raise a FileFormatError unless `read_as` is None or one of `choices`. contents: the contents
-    of the file, for the message."""
+    """Raise a FileFormatError unless `read_as` is None or one of `choices`. noun: the contents of
+    the file, for the message."""
     needs = {
         "winding": "faces", "dipole": "points or faces", "loops": "polylines or faces",
         "polygons": "faces",
