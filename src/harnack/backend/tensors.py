@@ -89,6 +89,7 @@ def accepts_tensors(method: Method) -> Method:
 
     @functools.wraps(method)
     def wrapper(self: Any, points: Any, **settings: Any) -> Any:
+        """The method for tensors and for all other points."""
         if not is_tensor(points):
             return method(self, points, **settings)
         *shape, _ = points.shape or (0,)

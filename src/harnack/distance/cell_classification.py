@@ -467,6 +467,8 @@ class CellClassifier:
         zero = dr.opaque(real, 0.0)  # keeps constant components of a gradient in the loop
 
         def body(y: Vec3, last: Real, k: Any) -> tuple[Any, ...]:
+            """One Newton step from y. last: the length of the step before; k: the number of
+            steps."""
             sample = self._field.evaluate(y)
             gradient_norm = safe_norm(sample.gradient)
             off_level = self._levels.offset_to_nearest(sample.value)
@@ -499,6 +501,8 @@ class CellClassifier:
         real, vector, count = self._backend.Float, self._backend.Array3f, self._backend.UInt32
 
         def body(point: Vec3, best: Real, k: Any) -> tuple[Any, ...]:
+            """Trace ray k, and keep its hit if that is nearer to p; best: the squared distance of
+            `point`."""
             d = vector(*_DIAGONALS[0]) / 3**0.5
             for number, diagonal in enumerate(_DIAGONALS[1:], 1):
                 d = dr.select(k == number, vector(*diagonal) / 3**0.5, d)

@@ -369,6 +369,9 @@ class _CellSearch:
         tolerance = dr.opaque(backend.Float, self.tolerance)
 
         def compute(x: Vec3, guess_point: Vec3) -> tuple[Real | Vec3, ...]:
+            """For a query x: the best point and its exclusion radius, the lower bound, the surface
+            point where the descent began, the candidates for the next round, and 1 where Newton's
+            method did not converge."""
             real, missing = backend.Float, backend.Array3f(FAR_SENTINEL)
             limit = safe_norm(guess_point - x)
             limit = dr.select(dr.isfinite(limit), limit, FAR_SENTINEL)

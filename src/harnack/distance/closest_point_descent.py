@@ -101,6 +101,7 @@ class ClosestPointDescent:
 
     @classmethod
     def of(cls, backend: Backend, field: Field, levels: Levels) -> ClosestPointDescent:
+        """The descent; finds out whether the field has a Hessian."""
         return cls(backend, field, levels, has_hessian(backend, field))
 
     def newton(self, x: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Real, Mask, Mask]:
@@ -124,6 +125,7 @@ class ClosestPointDescent:
         def body(
             y: Vec3, first_step: Real, last: Real, is_lost: Mask, is_far: Mask, k: Any, active: Mask
         ) -> tuple[Any, ...]:
+            """One step from y. last: the length of the step before; k: the number of steps."""
             # The rounding error of f takes as long as f itself, and does not matter here.
             sample = dataclasses.replace(self.field.evaluate(y), value_error=0.0)
             residual, state = self._state_at(y, sample)
@@ -210,6 +212,13 @@ class ClosestPointDescent:
             y: Vec3, g: Vec3, uncertainty: Real, radius: Real,
             factor: Real, on_level: Mask, accepted: Mask, iteration: Any, active: Mask,
         ) -> tuple[Any, ...]:  # fmt: skip
+            """One step along the surface and back to the level, accepted if it leads nearer to x.
+
+            y, g, uncertainty, radius: the parts of the state (`_DescentState`).
+            factor: the fraction of Newton's step that is tried.
+            on_level, accepted: whether the start led to a level; whether y is a closest point.
+            iteration: the number of steps.
+            """
             current, is_first = _DescentState(y, g, uncertainty, radius), iteration == 0
             move, is_minimum = self._tangential_step(x, current, factor)
             is_minimum &= ~is_first
@@ -331,6 +340,15 @@ class ClosestPointDescent:
             residual: Real, y: Vec3, g: Vec3, uncertainty: Real, radius: Real,
             last: Real, factor: Real, on_level: Mask, iteration: Any, active: Mask,
         ) -> tuple[Any, ...]:  # fmt: skip
+            """One Newton step towards the level, accepted if f is nearer to it.
+
+            residual: f - level at y.
+            y, g, uncertainty, radius: the parts of the state (`_DescentState`).
+            last: the length of the step before.
+            factor: the fraction of Newton's step that is tried.
+            on_level: whether y is on the level.
+            iteration: the number of steps.
+            """
             current, gradient_norm, is_first = (
                 _DescentState(y, g, uncertainty, radius),
                 lengths.safe_norm(g),
@@ -426,6 +444,8 @@ class ClosestPointDescent:
         h = fmax(self.backend.machine_epsilon**0.5 * length, 1e-30)
 
         def body(along_u: Vec3, along_v: Vec3, k: Any) -> tuple[Any, ...]:
+            """Evaluate the gradient at node k of four: y + h u, y - h u, y + h v, y - h v; and add
+            it to the derivatives of the gradient along u and v."""
             direction, step = dr.select(k < 2, plane.u, plane.v), dr.select((k & 1) == 0, h, -h)
             gradient = self.field.evaluate(dr.fma(vector(step), direction, y)).gradient
             change = gradient * (0.5 / step)

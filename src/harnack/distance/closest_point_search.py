@@ -244,6 +244,7 @@ def _closest_on_mesh(
     prepared, nearest = surface.evaluator(backend), mesh.upload(backend)
 
     def compute(p: Vec3) -> tuple[Real | Vec3, ...]:
+        """The query, its nearest triangle point and the distance, and f - level."""
         residual = -levels.offset_to_nearest(prepared.evaluate(p).value)
         offset = nearest(p)
         return p, p + offset, safe_norm(offset), residual
@@ -362,6 +363,7 @@ class _QueryEvaluator:
         real, index = surface.backend.Float, surface.backend.UInt32
 
         def nearest(p: Vec3) -> tuple[Vec3, Any, Vec3]:
+            """The nearest point on a facet, the index of the facet, and its normal."""
             no_key, always = (real(-1), index(NO_FACET)), surface.backend.Bool(True)
             facet = surface.field.nearest_facet(p, no_key, real(dr.inf), always)
             return p + facet.offset, facet.facet, facet.normal
@@ -472,6 +474,8 @@ class _QueryEvaluator:
         """
 
         def arc_to_level(p: Vec3, b: Vec3, lengths: Vec3) -> tuple[Real]:
+            """The first-order distance of the level from the point at a distance from b towards
+            p."""
             way = p - b
             sample = self._field.evaluate(b + lengths.x / safe_norm(way) * way)
             return (
@@ -479,6 +483,8 @@ class _QueryEvaluator:
             )
 
         def near_edge(p: Vec3, b: Vec3, lengths: Vec3) -> tuple[Vec3]:
+            """The surface point to which Newton's method leads from that point; NaN if it is on the
+            side of b away from p."""
             way = p - b
             y = self._descent.newton_to_level(b + lengths.x / safe_norm(way) * way)
             towards = dr.dot(way, y - b) > -_MAX_OPPOSING_COSINE * safe_norm(way) * safe_norm(y - b)
@@ -589,6 +595,8 @@ class _QueryEvaluator:
         approximate = self._descent
 
         def truncation(y: Vec3) -> tuple[Vec3, Vec3]:
+            """The truncation errors of the value (as a vector of equal components) and of the
+            gradient at y."""
             full, sample = exact.field.evaluate(y), approximate.field.evaluate(y)
             vector = self.backend.Array3f
             return vector(full.value - sample.value), vector(full.gradient) - vector(
@@ -596,6 +604,8 @@ class _QueryEvaluator:
             )
 
         def newton(p: Vec3, y: Vec3, value: Vec3, gradient: Vec3) -> tuple[Vec3]:
+            """The closest point to p by Newton's method from y, for the approximate field plus the
+            linear function with this value and gradient at y; NaN if it does not converge."""
             field = _LinearlyShiftedField(approximate.field, y, value.x, gradient)
             descent = replace(approximate, field=field)
             end, _, is_lost, _ = descent.newton(p, y, self.backend.Float(dr.inf))

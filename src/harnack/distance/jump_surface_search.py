@@ -153,6 +153,7 @@ class JumpSurfaceSearch:
             facet = _nearest_jump_by_differences(backend, field, x)
 
             def single_facet(after: tuple[Real, Any], limit: Real, active: Mask) -> NearestFacet:
+                """The nearest facet, if none was given before; else no facet."""
                 del active
                 is_first = (after[0] < 0) & (facet.sort_key < limit)
                 sort_key = dr.select(is_first, facet.sort_key, dr.inf)
@@ -162,6 +163,7 @@ class JumpSurfaceSearch:
             return single_facet
 
         def listed_facet(after: tuple[Real, Any], limit: Real, active: Mask) -> NearestFacet:
+            """The next facet of the field's list."""
             nearest = field.nearest_facet(x, after, limit, active)
             if nearest is None:
                 raise RuntimeError("nearest_sheet tells sheets at some times and not at others")
@@ -183,6 +185,8 @@ def straddles_level(surface: SurfaceTracer, y: Vec3, radius: Real, active: Mask)
     zero = vector(0)
 
     def body(k: Any, lower: Real, upper: Real, active: Mask) -> tuple[Any, ...]:
+        """Extend the range [lower, upper] of values of f by two values on edge k of the
+        tetrahedron."""
         start, end = _probe(vector, k + 1, zero)
         o = dr.fma(vector(radius), start, y)
         edge_norm = dr.norm(end - start)

@@ -95,6 +95,7 @@ class LevelTriangles:
         del _frame
 
         def nearest(p: Vec3) -> Vec3:
+            """The vector from p to the nearest point of a triangle."""
             x: Any = (vector(p) - center) / size
             limit = initial_squared_distance(tree, x)
             start = real(-1), backend.UInt32(NO_TRIANGLE)

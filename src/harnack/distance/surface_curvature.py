@@ -104,6 +104,7 @@ def curvature(
         prepared = field.prepare(backend)
 
         def from_field(p: Vec3, acceptance: Real) -> tuple[Real | Vec3, ...]:
+            """The curvatures at p by the field's own derivatives."""
             refined = (
                 prepared.at_accuracy(acceptance) if prepared.has_variable_accuracy else prepared
             )
@@ -115,6 +116,7 @@ def curvature(
         return _refine_accuracy(backend, field, from_field, points, prepared.has_variable_accuracy)
 
     def from_tree(p: Vec3, acceptance: Real) -> tuple[Real | Vec3, ...]:
+        """The curvatures at p by the tree sum of a field that is evaluated in batches."""
         values = field.values_at(p, 2, acceptance)
         if values.gradient is None or values.hessian is None:
             raise RuntimeError(f"{type(field).__name__}: values_at(x, 2) gave no derivatives")
@@ -407,6 +409,7 @@ class _CurvatureLineTracer:
         max_steps = dr.opaque(integer, count)
 
         def body(state: _LineState) -> _LineState:
+            """Advance all lines by a step, and store their points."""
             x, direction, is_valid = self._advance(state)
             index = state.index + 1
             dr.scatter(points, x, index * (2 * n) + lane, state.active & is_valid)

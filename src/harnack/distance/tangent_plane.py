@@ -162,6 +162,7 @@ def in_batches(
 ) -> tuple[Any, ...]:
     """The results of `compute` for points of shape (n, 3), as float64 arrays (n,) or (n, 3).
 
+    compute: a function of Dr.Jit vectors that returns a tuple of numbers and vectors.
     others: further arguments of `compute`, of the same shape as the points; their values are not
         checked.
 

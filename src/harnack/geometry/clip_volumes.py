@@ -103,6 +103,7 @@ class PlaneTable:
             return state
 
         def body(k: Any, *values: Any) -> tuple[Any, ...]:
+            """Apply four planes, from row k on."""
             folded: Any = values
             for i in range(_PLANES_PER_ITERATION):
                 row: Any = dr.gather(self.backend.Array4f, self.buffer, k + i)
@@ -110,6 +111,7 @@ class PlaneTable:
             return (k + _PLANES_PER_ITERATION, *folded)
 
         def goes_on(*values: Any) -> Mask:
+            """The lanes in which further planes may change the state."""
             return self.backend.Bool(True) if may_change is None else may_change(*values)
 
         while_loop: Any = dr.while_loop  # its overloads do not know run-time array types
@@ -188,6 +190,7 @@ class Polytope(Volume):
         slacks = self._slacks(table, o, d)
 
         def step(state: tuple[Real, Real], n: Vec3, h: Real) -> tuple[Real, Real]:
+            """The interval [t0, t1] within a further half-space n.x <= h."""
             t0, t1 = state
             room_slack, speed_slack = slacks(n, h)
             room = h - dr.dot(n, o) + room_slack
@@ -231,6 +234,7 @@ class Polytope(Volume):
         backend = backend_of(p)
 
         def step(state: tuple[Real, Vec3], n: Vec3, h: Real) -> tuple[Real, Vec3]:
+            """Keep the larger of two signed distances, and its normal."""
             distance = dr.dot(n, p) - h
             is_larger = distance > state[0]
             return dr.select(is_larger, distance, state[0]), dr.select(is_larger, n, state[1])

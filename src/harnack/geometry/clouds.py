@@ -3,7 +3,7 @@ normals.
 
 A cloud is a sample of a surface: points (n, 3), unit normals (n, 3) to the positive (outer) side,
 and areas (n,) whose sum is about the area of the surface. Points at the same position are allowed:
-their dipoles add, which is right where two layers of a surface touch.
+their dipoles are added, as they should where two layers of a surface touch.
 """
 
 from __future__ import annotations
@@ -133,19 +133,20 @@ def estimate_areas(
     """The area (n,) that each point of a cloud stands for: the area of its Voronoi cell in the
     tangent plane.
 
-    After Barill et al. 2018, section 3.1, who project the nearest neighbors to the tangent plane
-    and take the area of the point's Voronoi cell among them. Here the point's cell in space is
-    intersected with the tangent plane instead. For points in a plane that is the same; but a point
+    Barill et al. 2018, section 3.1, project the nearest neighbors to the tangent plane and take the
+    area of the point's Voronoi cell among them. Here the point's Voronoi cell in space is
+    intersected with the tangent plane instead. For points in a plane this is the same; but a point
     on the other side of a thin wall does not shrink the cell, since its bisecting plane is parallel
-    to the tangent plane. Points at the same position share the cell.
+    to the tangent plane. Points at the same position share a cell.
 
-    Points beyond the farthest neighbor, at distance R, can cut the cell only beyond R/2; so the
-    cell is exact within the disc of that radius, and is cut off there. At the rim of an open
-    surface a cell may be unbounded: where all neighbors lie on one side (of a line through the
-    point), their mirror images bound the cell too, so that it extends as far outwards as inwards.
+    Let R be the distance of the farthest neighbor that is used. All other points can cut the cell
+    only at distances above R/2: so within the disc of radius R/2 the cell is exact, and it is cut
+    off there. At the boundary of an open surface a cell may be unbounded: if all neighbors lie on
+    one side of a line through the point, their mirror images bound the cell too, so that it extends
+    as far outwards as inwards.
 
-    Outliers: a cell is also cut off at three times the median of such radii of its neighbors, so
-    that a point far from the others stands for no more area than they do.
+    Outliers: a cell is also cut off at three times the median of these radii of its neighbors, so
+    that a point far from the others gets no more area than they have.
 
     neighbors: the number of neighbors; more cost time, fewer cut large cells of uneven samples.
 
@@ -268,23 +269,23 @@ _DIRECTIONS = np.array([d for d in itertools.product((-1.0, 0.0, 1.0), repeat=3)
 def estimate_normals(points: npt.ArrayLike, neighbors: int | None = None) -> FloatArray:
     """Estimate unit normals (n, 3), outward, of points (n, 3) that sample a surface.
 
-    After Hoppe et al. 1992. The line of a normal is the direction in which a point and its nearest
-    neighbors vary least. The signs are propagated from point to point along the spanning tree of
-    the graph of neighbors in which normals agree best. Normals are compared after mirroring, as Xie
-    et al. 2003 propose, which carries the sign around edges and thin walls; points are first moved
-    onto the planes of their neighbors, as noise would disturb the mirroring. A single sign then
-    remains for each connected component of the graph. It is chosen such that the component's
-    extreme points in 26 directions face outward, summed over the directions; for a closed surface
-    that is right, however unevenly sampled.
+    The method is that of Hoppe et al. 1992. A normal is, up to its sign, the direction in which a
+    point and its nearest neighbors vary least. The signs are propagated from point to point along
+    the spanning tree of the graph of neighbors in which normals agree best. Normals are compared
+    after mirroring, as Xie et al. 2003 propose; this propagates the sign correctly around edges and
+    thin walls. Points are first moved onto the planes of their neighbors, as noise would disturb
+    the mirroring. A single sign then remains for each connected component of the graph. It is
+    chosen such that the component's extreme points in 26 directions face outward, summed over the
+    directions; for a closed surface this is right, however unevenly it is sampled.
 
-    neighbors: the number of neighbors. None for 16; in noise, up to 64, so that the planes through
-        them are known to a few degrees; and where that is not enough, 64 among a random subset of
-        the points (with a seed), which is as sparse as the noise requires.
+    neighbors: the number of neighbors. None chooses: 16; for noisy points up to 64, so that the
+        planes through them are known to a few degrees; and if that is not enough, 64 neighbors
+        among a random subset of the points (with a fixed seed), as sparse as the noise requires.
 
-    So each component faces outward by itself: the inner wall of a hollow body does not face its
-    cavity, and the side that an open surface faces is a convention (a flat surface: the positive
-    side of the axis nearest to its normal). Where details are smaller than neighborhoods, normals
-    may have the wrong sign. Look at the result.
+    As each component faces outward by itself, the inner wall of a hollow body does not face its
+    cavity. The side that an open surface faces is a convention; for a flat surface it is the
+    positive side of the axis nearest to its normal. If details are smaller than neighborhoods,
+    normals may have the wrong sign: look at the result.
 
     Points at the same position get the same normal.
 
@@ -354,6 +355,7 @@ def _transfer_normals(
     normals = np.empty_like(x)
 
     def fit_slice(rows: slice) -> None:
+        """Compute the normals of a slice of the points."""
         _, index = tree.query(x[rows], k=min(neighbors, tree.n))
         offsets = tree.data[index] - tree.data[index].mean(axis=1, keepdims=True)
         _, axes = np.linalg.eigh(np.einsum("mki,mkj->mij", offsets, offsets))
@@ -392,6 +394,8 @@ def _fit_tangent_planes(x: FloatArray, tree: Any, neighbors: int) -> _TangentPla
     on_line = np.zeros(len(x), dtype=bool)
 
     def fit_slice(rows: slice) -> None:
+        """Fit the planes of a slice of the points. Offsets are relative to the point, in units of
+        the distance of the farthest neighbor."""
         index, distance = nearest_neighbors(tree, x[rows], neighbors)
         nearest[rows] = index
         offsets = (x[index] - x[rows, None]) / distance[:, -1, None, None]
@@ -445,6 +449,7 @@ def _spanning_forest(planes: _TangentPlanes) -> tuple[IntArray, IntArray]:
     weight = np.empty((n, k))
 
     def weigh_edges(rows: slice) -> None:
+        """Weights of the edges from a slice of the points: small where normals agree."""
         start = np.repeat(np.arange(rows.start, rows.stop, dtype=np.int64), k)
         agreement = np.abs(_agreement(planes, start, nearest[rows].ravel()))
         # SciPy takes a weight of 0 for a missing edge.

@@ -288,6 +288,7 @@ def _move_along_normals(
     moved = np.empty_like(start)
 
     def move_slice(rows: slice) -> None:
+        """Move the points of a slice."""
         n, index = own_normals[rows], neighbors[rows]
         neighbor_normals, offsets = normals[index], points[index] - start[rows, None]
         height = np.einsum("mi,mki->mk", n, offsets)
@@ -323,6 +324,7 @@ def _agreeing_weight(
     fraction = np.empty(len(start))
 
     def add_slice(rows: slice) -> None:
+        """Compute the fractions for a slice of the points."""
         n, index = own_normals[rows], neighbors[rows]
         offsets = points[index] - start[rows, None]
         height = np.einsum("mi,mki->mk", n, offsets)
@@ -351,6 +353,7 @@ def _refit_normals(
     refitted = np.empty_like(normals)
 
     def refit_slice(rows: slice) -> None:
+        """Fit the normals of a slice of the points."""
         index = neighbors[rows]
         offsets = points[index] - points[rows, None]
         cosine = np.einsum("mi,mki->mk", normals[rows], normals[index])

@@ -196,6 +196,8 @@ def _clip_bisectors(
         initial += [-half_chord, half_chord, half_chord > dr.inf]
 
     def clip_by_line(i: Any, *state: Any) -> tuple[Any, ...]:
+        """Clip the intervals of all own lines by line i; and note whether its neighbor is to the
+        left."""
         other, clipped = bisector(i, i < line_count), list[Any]()
         for t, (index, own_line) in enumerate(zip(indices, own_lines, strict=True)):
             lower, upper, has_left = state[3 * t : 3 * t + 3]

@@ -56,12 +56,12 @@ class Welded:
     def of(cls, vertices: FloatArray, faces: IntArray) -> Welded:
         """Weld vertices (n, 3) of faces (m, 3).
 
-        Corners are joined if they are nearer to each other than `rounding_of` and than a thousandth
-        of the edges there, if edges at them do not cancel, and if joining leaves fewer such edges.
-        No face loses its area, or two of its corners to the same position: where a face would, the
-        corners that it touches stay apart. So the number of faces is the same as before, except for
-        faces that cancel; and a wider gap stays, as two corners are joined only if they are as near
-        as two results of the same computation.
+        Two corners are joined if both are on edges that do not cancel, and if their distance is at
+        most `rounding_of` and at most a thousandth of the shortest edge there. The result is used
+        only if it has fewer edges that do not cancel. If a face would lose its area, or two of its
+        corners would become one, the corners of that face are not joined. So the number of faces is
+        the same as before, except for faces that cancel; and wider gaps stay, as two corners are
+        joined only if they are as near as two results of the same computation.
         """
         welded = cls._from_index(weld_vertices(vertices), vertices, faces, 0)
         if not len(welded.edges):

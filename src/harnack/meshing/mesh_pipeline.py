@@ -103,83 +103,90 @@ def mesh(
 ) -> trimesh.Trimesh:
     """Triangles of a level set, or the closed surface of a solid.
 
-    Tetrahedra around the level set, found by an octree whose empty cells are proved empty, are cut
-    by it; the surface of an angle ends exactly at its curve. Then edges are cut and vertices moved
-    onto the surface until middles of edges and centers of triangles are within the tolerance.
-    Solids are put together from the meshes of smooth levels by manifold3d, and so cut by the clip.
+    An octree finds the cells around the level set: all others are proved empty. The tetrahedra of
+    these cells are cut by the level set. Then edges are split and vertices moved onto the surface,
+    until midpoints of edges and centers of triangles are within the tolerance. The surface of an
+    angle ends exactly at its curve. A solid is made of the meshes of smooth level sets by
+    manifold3d, which also cuts it by the clip.
 
     Fields that are sums over meshes, points and blobs (`WindingNumber`, `DipolePotential`,
     `ScreenedWindingNumber`, `Morph`, `HRBF`, `Blobs`) are meshed by the signs of their values alone
-    (`meshing.sign_isosurface`), which gives a closed surface whatever the mesh or the cloud is.
-    Vertices lie where edges of the cells meet the level, so on the very triangles of a sound mesh;
-    parts that are thinner or nearer to each other than a cell may be missed or joined, which is
-    looked for at about three thousand points of the level (`meshing.lost_parts`) and warned of. Of
-    a mesh that is its own spanning surface (`WindingNumber`), such as a file of a `SolidAngle`'s,
-    the triangles are kept as they are, whatever tolerance, spacing and seed are.
+    (`meshing.sign_isosurface`). This gives a closed surface, whatever the mesh or the cloud is.
+    Vertices lie where edges of the cells meet the level, so exactly on the triangles of a valid
+    mesh. Parts of the surface that are thinner than a cell, or nearer to each other, may be missed
+    or joined: that is tested at about three thousand points of the level (`meshing.lost_parts`),
+    and a warning says so. If the mesh of a `WindingNumber` is its own spanning surface, as in the
+    file of a mesh of a `SolidAngle`, its triangles are kept as they are, whatever tolerance, cell
+    size and seed are.
 
-    surface: a field or a `Surface`; of a `SolidAngle` of polygons, or a real-valued field that is
-        continuous, or one of those named above; of one level, but for side="between". Surfaces end
-        where clip, section or the field's domain cut them, and solids (`side`) are closed there. A
-        clip is needed where the level set has no extent. The points of a `Solid` are those with
-        f <= level, unless side="surface" asks for the level set alone, which is open where it is
-        cut. `largest` keeps one connected component alone: of a surface the one with the largest
-        area, of a closed mesh the one with the largest volume, whose cavities stay.
-    cell_size: of cells before anything is refined, in the field's unit; None chooses a 24th of the
-        longest side (by signs a 48th), and of waves (`Field.min_wavelength`) a fifth of theirs at
-        the most. Sheets that are nearer to each other are told apart where that is noticed; else a
-        MeshingError says so.
-    thickness: makes a closed part so thick, in the field's unit, of a surface: half on each side.
-    simplify: leave out vertices that are not needed within the tolerance, of closed meshes: of the
-        mesh that is made without it, whose middles of edges are within half of the tolerance.
+    surface: a field or a `Surface`, of one level (two for side="between"). The field is a
+        `SolidAngle` of polygons, a continuous real-valued function, or one of those above. A
+        surface ends where clip, section or the field's domain cut it; a solid (`side`) is closed
+        there. A clip is needed if the level set has no extent. For a `Solid`, the solid
+        f <= level is meshed, unless side="surface" asks for the level set alone, which is open
+        where it is cut. `largest` keeps a single connected component: of a surface the one of
+        largest area; of a closed mesh the one of largest volume, with its cavities.
+    cell_size: the size of cells before refinement, in the field's unit. None is 1/24 of the longest
+        side of the level set's box (1/48 for meshes by signs), and at most a fifth of the
+        wavelength for waves (`Field.min_wavelength`). If the mesh joins parts of the surface that
+        are nearer to each other, smaller cells are tried, or a MeshingError says so.
+    thickness: makes a closed part of this thickness out of a surface, in the field's unit: half of
+        it on each side.
+    simplify: for closed meshes, whether to remove vertices that are not needed. All triangles stay
+        within the tolerance of the mesh that is made without this; its midpoints of edges are
+        within half of the tolerance of the surface.
     seed: of the small random moves that keep points in general position.
-    max_triangles: of one level set, before anything is simplified; what would take more is not
-        begun or given up, with a MeshingError. Cells are limited with them, to two millions.
-    progress: told what is being done.
-    options: a `TraceOptions`, of which meshes have the tolerance alone: the largest distance of
-        triangles from the surface, sampled and not proved; None for 1e-3 of the longest side of the
-        level set's box.
-    keywords: those of `Surface` beside a bare field, and `tolerance` in place of `options`.
+    max_triangles: the largest number of triangles of a level set, before simplification. If there
+        would be more, a MeshingError is raised. The number of cells is limited as well, to at most
+        two millions.
+    progress: a function that is called with a text about each stage.
+    options: a `TraceOptions`; meshes use its `tolerance` alone, the largest distance of triangles
+        from the surface, sampled and not proved. None is 1e-3 of the longest side of the level
+        set's box.
+    keywords: those of `Surface` for a bare field, and `tolerance` in place of `options`.
 
-    All that is returned has been checked: every edge has two faces, or one at the boundary, no two
-    triangles pass through each other, vertices and centers of triangles are within the tolerance of
-    the level by samples of the field, and inside the clip (of a thick part, the surface that it is
-    made of). Else a MeshingError is raised. By signs all is checked but the last: if more than one
-    in a hundred vertices and centers are beyond the tolerance, smaller cells are tried; if that is
-    not enough, a warning says how many there are and how far they are; and a MeshingError if some
-    are farther than a few cells. The same is done and said where parts of the level set are lost.
+    The result has been checked: every edge has two faces, or one at the boundary; no two triangles
+    intersect; and vertices and centers of triangles are within the tolerance of the level, by
+    samples of the field, and inside the clip. (For a thick part, the latter is checked for the
+    surface that it is made of.) If a check fails, a MeshingError is raised. Meshes by signs differ
+    in the check of distances: if more than one in a hundred vertices and centers are beyond the
+    tolerance, smaller cells are tried; if that is not enough, a warning says how many there are and
+    how far they are; and a MeshingError is raised if some are farther than a few cells. The same is
+    done if parts of the level set are missing.
 
     Returns:
-        A trimesh.Trimesh; if it is closed, `export` writes closed files, in single precision, or
-        raises a MeshingError. Vertices of a curve come first, in order, bit by bit, and its edges
-        are the boundary. Without a boundary, faces are turned outwards: the volume is positive;
-        else they are turned towards larger values. `metadata["harnack"]` has level, spacing,
-        evaluations, the Euler characteristic,
-        boundary: indices (k, 2) of edges of one face,
-        creases: how many edges have faces more than 30 degrees apart: a function with kinks, such
-            as |x| or max(f, g), has them where its level set does. That these are within the
-            tolerance is checked at middles of edges and triangles; nothing is proved there; and
-        proved, integrated: how many changes along edges of tetrahedra are proved to be differences
-            of wrapped values, and how many were integrated;
-        isotopy, isotopy_far: the shares of tetrahedra on which the first triangles are proved to
-            have the topology of the level set (`meshing.isotopy`), of all and of those farther than
-            1.5 times the spacing from the curve;
-        turned: triangles of an angle, smaller than the tolerance, that are turned over.
-        Of meshes by signs, made_by is "signs", and
-        far, looked_at, within: how many vertices and centers of triangles are beyond the tolerance,
-            of how many, and a distance within which all are, sampled up to a factor of 2;
-        lost, sought: how many points of the level are beyond the tolerance from the mesh, of how
-            many: on triangles of a mesh, at points of a cloud, on the way out of blobs;
-        undecided: at how many points of the lattice the error of f leaves its sign open;
-        flat: how many triangles were not fitted to creases, as they would pass through others;
-        Where the triangles of a mesh were kept, made_by is "faces", and there is none of
-        this.
-        cloud: of a `DipolePotential`, what it says of itself (`describe`), such as how many points
-            it has, what was estimated, and the smoothing and noise that were chosen and found.
+        A trimesh.Trimesh. If it is closed, its method `export` writes closed files, in single
+        precision, or raises a MeshingError. Vertices of a curve come first, in order and bit by
+        bit, and its edges are the boundary. A mesh without a boundary faces outwards: its volume is
+        positive; a mesh with a boundary faces towards larger values. `metadata["harnack"]` has
+        level, spacing, evaluations, the Euler characteristic,
+        boundary: indices (k, 2) of the edges with one face;
+        creases: the number of edges whose faces differ by more than 30 degrees. A function with
+            kinks, such as |x| or max(f, g), has them where its level set does. Their distance is
+            checked at midpoints of edges and centers of triangles; nothing is proved there;
+        proved, integrated: how many changes of an angle along edges of tetrahedra are proved to be
+            differences of wrapped values, and how many were integrated;
+        isotopy, isotopy_far: the fractions of tetrahedra on which the first triangles are proved to
+            have the topology of the level set (`meshing.isotopy`), among all, and among those
+            farther than 1.5 times the spacing from the curve;
+        turned: the number of triangles of an angle, smaller than the tolerance, that are reversed.
+        For meshes by signs, made_by is "signs", and there are
+        far, looked_at, within: the number of vertices and triangle centers beyond the tolerance,
+            the number of all, and a distance within which all are, sampled up to a factor of 2;
+        lost, sought: the number of points of the level that are beyond the tolerance from the mesh,
+            and the number tested: on triangles of a mesh, at points of a cloud, on rays out of
+            blobs;
+        undecided: the number of points of the lattice at which the error of f leaves its sign open;
+        flat: the number of triangles that were not fitted to creases, as they would have
+            intersected others.
+        If the triangles of a mesh were kept, made_by is "faces", and the others are missing.
+        cloud: for a `DipolePotential`, its `describe`, such as the number of points, the quantities
+            that were estimated, and the smoothing and noise that were chosen and found.
 
-        Solids and thick surfaces have more: see `docs/printing.md`.
+        For solids and thick surfaces there is more: see `docs/printing.md`.
 
     Raises:
-        MeshingError: a ValueError, if it could not be done; the message says why.
+        MeshingError: a ValueError: the mesh could not be made; the message says why.
         TypeError: a field that has patches; a clip that is no volume; an option of traces that
             meshes do not have; keywords beside an object that holds them.
         ValueError: options out of range, or that contradict each other; several levels.
@@ -588,6 +595,7 @@ def _mesh_solid(
         size and within the distance `error`."""
 
         def mesh_angle(angle: SolidAngle, value: float) -> TriangleMesh:
+            """Mesh the level `value` of an angle, and count its evaluations."""
             angle = cast("SolidAngle", _meshable_field(angle))
             box = _meshing_box(angle, (value,), None)
             function = LevelFunction(angle, value, most_faces=settings.most_faces)
@@ -600,6 +608,7 @@ def _mesh_solid(
         return mesh_angle
 
     def check_level(made: TriangleMesh, size: float) -> None:
+        """Raise a MeshingError unless a surface is near the level and in the volume."""
         _check_level(region, made, settings.tolerance.at(size), settings.volume)
 
     def check(made: TriangleMesh, size: float) -> None:

@@ -97,15 +97,15 @@ def repair(
 ) -> trimesh.Trimesh:
     """Return a closed mesh for a damaged one: with its holes filled, or remeshed.
 
-    First, vertices that differ by rounding only are merged, and components that are inside out as a
-    whole are reversed: each closed component that lies in no other, with all that lies in it. Then
-    five stages are tried in turn:
+    First, vertices that differ only by rounding are merged. Closed components that lie in no other
+    component and are inside out are reversed, together with all components in them. Then five
+    stages are tried in turn:
 
     - filled: all triangles stay, and holes are filled;
-    - boolean_union: a closed mesh that intersects itself, also along edges that lie on its faces,
-      or components that overlap or touch, are cut exactly along the intersections; interior faces
-      are removed, and those that wind around a point clockwise: cavities stay where the mesh winds
-      around no point;
+    - boolean_union: a closed mesh that intersects itself (also along edges that lie on its faces),
+      or components that overlap or touch, are cut exactly along the intersections. Faces in the
+      interior are removed, and faces of parts with a negative winding number; a cavity stays where
+      the winding number is 0;
     - cleaned: duplicate, degenerate and intersecting triangles are removed, those turned over
       against their neighbors are flipped, and holes are filled; around a hole that cannot be
       filled, triangles are removed ring by ring;
@@ -114,11 +114,12 @@ def repair(
     - remeshed: the surface on which the winding number w of the mesh is 1/2 is extracted from the
       signs of w - 1/2 in cells (`meshing.sign_isosurface`); it is closed whatever the mesh is.
 
-    Each result is compared with w at some thousand points, farther from both surfaces than two
-    tolerances: where w is above 0.86 the inside has to be, and where it is below 0.14 the outside;
-    and the volume has to be that of a closed mesh that winds around no point twice. One that
-    differs gives way to the next stage; if all do, the one that differs least is returned, with a
-    warning. That is sampled: what differs in less than a thousandth of the box may not be seen.
+    Each result is compared with w at some thousand points that are farther than two tolerances from
+    both surfaces: points with w > 0.86 have to be inside, and points with w < 0.14 outside; and if
+    the input is closed and winds around no point twice, the volumes have to agree. If a result
+    differs, the next stage is tried; if all results differ, the one that differs least is returned,
+    with a warning. As this is sampled, a difference in less than a thousandth of the box may not be
+    found.
 
     mesh: anything with `vertices` (n, 3) and `faces` (m, 3).
     keep: "all" does only the stage "filled", "valid" only "cleaned", and "none" only "remeshed",
@@ -129,13 +130,14 @@ def repair(
         boundary loops of a gap between two components, and have a dent where the surface was
         round. Only for harmonic fillings is it proved which surface they approximate.
     largest: keep only the body of the largest volume, with its cavities.
-    cell_size: of cells before anything is refined, in the mesh's unit; None chooses.
+    cell_size: the size of cells before refinement, in the mesh's unit; None for a default.
     seed: of the small random moves that keep points in general position.
-    progress: told what is being done.
-    options: a `TraceOptions`, of which repairs have the tolerance alone: the largest distance of
-        harmonic fillings and of remeshed triangles from the surface w = 1/2, a length, sampled and
-        not proved. None is 1e-3 of the longest side of the box of the mesh and, for fillings, of
-        the box around all holes. tolerance: the same, in place of `options`.
+    progress: a function that is called with a text about each stage.
+    options: a `TraceOptions`; repairs use its `tolerance` alone, the largest distance of harmonic
+        fillings and of remeshed triangles from the surface w = 1/2, a length, sampled and not
+        proved. None is 1e-3 of the longest side of the box of the mesh and, for fillings, of the
+        box around all holes.
+    tolerance: the same, in place of `options`.
 
     Returns:
         A closed trimesh.Trimesh: every edge has two faces, which agree. `metadata["harnack"]` has
@@ -178,12 +180,12 @@ def repair(
         signs, such as far and within; kept is 0.
 
     Raises:
-        MeshError: a ValueError, for a mesh that has no triangles, or numbers that are none; one
-            that is an open sheet, most of which has nothing inside, if it would be made anew; with
-            keep="all" also for edges of more than two faces, faces that disagree on their sides,
-            faces without an area and vertices at one place.
-        MeshingError: a ValueError, with keep="all" or "valid", if patches could not be made, or
-            meet the mesh or each other; else if the surface w = 1/2 is empty or takes too many
+        MeshError: a ValueError: the mesh has no triangles, or invalid numbers; it would be
+            remeshed, but is an open sheet, most of which encloses nothing; with keep="all"
+            also edges of more than two faces, neighbors with opposite orientations, faces of zero
+            area, and vertices at the same position.
+        MeshingError: a ValueError: with keep="all" or "valid", fillings could not be made, or they
+            intersect the mesh or each other; else, the surface w = 1/2 is empty or needs too many
             cells.
     """
     largest = flag(largest, "largest")

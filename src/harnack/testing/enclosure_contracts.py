@@ -273,6 +273,7 @@ def _bounded_laplacian(rng: np.random.Generator, rows: int, *, mirrored: bool) -
     sign = -1.0 if mirrored else 1.0
 
     def movement(t: FloatArray) -> FloatArray:
+        """f(t) - f(0)."""
         q = t / radius[:, None]
         wave_part = wave_density[:, None] / 5 * q * q * np.log(np.maximum(q, 1e-300))
         return sign * (u.movement(t) - balls.movement(q, constant_density) + wave_part)
@@ -301,6 +302,7 @@ def _zigzag_lines(rng: np.random.Generator, rows: int) -> RandomFunctions:
     slopes[is_straight] = (rng.choice([-1.0, 1.0], rows) * constant)[is_straight, None]
 
     def movement(t: FloatArray) -> FloatArray:
+        """f(t) - f(0)."""
         since_knot = np.maximum(t[:, :, None] - knots[:, None, :], 0)
         return slopes[:, :1] * t + (since_knot * np.diff(slopes, axis=1)[:, None, :]).sum(axis=2)
 
@@ -326,6 +328,7 @@ def _parabolas(rng: np.random.Generator, rows: int) -> RandomFunctions:
     slope = constant * radius * rng.choice([-1.0, 1.0], rows) * 10 ** rng.uniform(-4, 1, rows)
 
     def movement(t: FloatArray) -> FloatArray:
+        """f(t) - f(0)."""
         since_knot = np.maximum(t - knot[:, None], 0)
         change = (curvatures[:, 1] - curvatures[:, 0])[:, None]
         return (
