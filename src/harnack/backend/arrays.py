@@ -37,8 +37,8 @@ _ALIGNMENT = 64  # bytes: the widest vectors of any processor
 class Backend:
     """The Dr.Jit types of one backend and precision. All of them carry derivatives.
 
-    name: "llvm" (CPU), "cuda" (NVIDIA GPU) or "metal" (Apple GPU, single precision alone).
-    precision: "single" or "double": of Float and of the vectors' components.
+    name: "llvm" (CPU), "cuda" (NVIDIA GPU) or "metal" (Apple GPU, single precision only).
+    precision: "single" or "double", the precision of Float and of the vectors' components.
     """
 
     name: BackendName
@@ -171,10 +171,11 @@ def precision_of_input(*arrays: Any) -> Precision:
 
 
 def backend_of(array: Any) -> Backend:
-    """The backend and precision of a Dr.Jit array or vector of floats, with or without AD.
+    """The backend and precision of a Dr.Jit array or vector of floats, with or without automatic
+    differentiation.
 
     Raises:
-        TypeError: not a Dr.Jit array, of Dr.Jit's scalar mode, a tensor or the like, or not of
+        TypeError: not a Dr.Jit array; one of Dr.Jit's scalar mode, a tensor or the like; or not of
             32- or 64-bit floats.
         LLVMNotFoundError: it lives on an LLVM that Dr.Jit cannot work with.
     """
@@ -222,8 +223,8 @@ _PRECISIONS: dict[Any, Precision] = {
 def to_vector3(backend: Backend, vectors: Any, name: str = "vectors") -> Vec3:
     """Vectors as backend.Array3f, from an array-like of shape (n, 3) or a Dr.Jit 3-vector.
 
-    Values of an array-like must be finite. A Dr.Jit vector is passed on (its precision is changed
-    if necessary) and its values are not checked, which would end its recording.
+    Values of an array-like must be finite. A Dr.Jit vector is returned in the backend's precision.
+    Its values are not checked, as a check would evaluate it and end its recording.
 
     Raises:
         TypeError: not numbers; a Dr.Jit array that is no 3-vector or of another backend.

@@ -173,8 +173,9 @@ def loop_with_queue(
     ended stores its result and takes the next ray from a queue, so that no lane waits for the
     slowest ray of its packet.
 
-    body: may depend on the state of its own lane only, and must hold no array that differs between
-        lanes.
+    body: the next state from the state of a lane. It may depend on the state of that lane only, and
+        use no other array that differs between lanes.
+    result: the result from the final state.
     """
     dr.eval(*array_leaves(start))
     width = max(dr.width(leaf) for leaf in array_leaves(start))

@@ -81,8 +81,8 @@ class RecordTable:
         )
 
     def view(self, first: Any, trips: Any) -> RecordTable:
-        """A view of `trips` consecutive records that begins at record `first`; both may differ
-        between lanes. Only for tables with a single record per iteration.
+        """A view of the table that consists of `trips` consecutive records, from record `first` on.
+        Both numbers may differ between lanes. Only for tables with one record per iteration.
 
         Raises:
             ValueError: an iteration reads several records.

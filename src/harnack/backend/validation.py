@@ -138,9 +138,9 @@ def no_derivatives(function: Function) -> Function:
 
 
 def has_derivatives(value: Any) -> bool:
-    """Whether a value is, or contains, a Dr.Jit or PyTorch array with derivatives enabled.
-    Containers are searched, objects that functions refer to, and attributes of fields, of callables
-    and of dataclasses."""
+    """Whether a value is, or contains, a Dr.Jit or PyTorch array with derivatives enabled. The
+    search includes the entries of containers, the objects that functions refer to, and the
+    attributes of fields, of callables and of dataclasses."""
     visited: set[int] = set()
     pending: list[Any] = [value]
     for node in pending:  # the list grows in this loop

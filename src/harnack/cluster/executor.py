@@ -124,8 +124,9 @@ class Executor:
     chunks: int | None = None
 
     def split_range(self, count: int, most: int) -> list[tuple[int, int]]:
-        """Split range(count) into runs (start, stop) of at most `most` items. The runs are shorter
-        if `chunks`, or else the number of the client's threads, asks for more tasks."""
+        """Split range(count) into intervals (start, stop), each of at most `most` numbers. They are
+        shorter if that gives fewer tasks than `chunks` or, if `chunks` is None, than the threads of
+        the client need."""
         size = max(1, min(most, count))
         if self.chunks is not None:
             size = max(1, min(size, -(-count // self.chunks)))
@@ -176,9 +177,12 @@ class Executor:
 def open_executor(
     client: Any = None, checkpoint: Any = None, chunks: int | None = None
 ) -> Generator[Executor]:
-    """Context manager that yields an Executor. client: a Dask client, the address of a scheduler,
-    or None for this process. checkpoint: the path of a folder, or None. chunks: the number of tasks
-    of a job, or None.
+    """Context manager that yields an Executor.
+
+    client: a Dask client, the address of a scheduler, or None for this process.
+    checkpoint: the path of a folder in which results are kept, or None.
+    chunks: the number of tasks that a job is split into, or None for a number that suits the
+        workers.
 
     Raises:
         ModuleNotFoundError, TypeError, OSError, RuntimeError: as `connect_client` and

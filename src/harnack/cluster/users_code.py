@@ -55,9 +55,9 @@ class SentModule(ModuleType):
 
 @dataclass(frozen=True)
 class Namespace:
-    """The module in which functions look for names; it is opened as a `SentModule`.
+    """The module in which functions look up names. When it is unpickled, it becomes a `SentModule`.
 
-    known: the attributes that it has whatever names functions use.
+    known: the attributes that are sent in any case, whatever names the functions use.
     """
 
     known: Mapping[str, Any]

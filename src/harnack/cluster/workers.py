@@ -70,8 +70,7 @@ def connect_client(client: Any) -> Generator[Any]:
 @contextmanager
 def exclusive_compute() -> Generator[str]:
     """Context manager: within it no other task of this process computes, as Dr.Jit already uses all
-    threads of a worker. Yields the address of the Dask worker that this process is, "" if it is
-    none.
+    threads of a worker. It yields the address of this Dask worker, "" if this process is not one.
 
     Raises:
         RuntimeError: Dr.Jit has no backend that it can use here.

@@ -57,8 +57,9 @@ _MIN_RELATIVE_STEP = 1e-8
 
 @dataclass(frozen=True)
 class ClipCurveDescent:
-    """Descent to the closest point of the clip curve, on which f = level and h = 0, where h is the
-    distance from the domain's boundary; all are prepared for one backend."""
+    """Descent to the closest point of the clip curve. On this curve f = level and h = 0, where h is
+    the signed distance from the boundary of the field's domain. field and domain are prepared for
+    the backend."""
 
     backend: Backend
     field: Field

@@ -86,11 +86,11 @@ class ClosestPoints:
 
     points: (n, 3) the query points, rounded to the precision in use.
     closest: (n, 3) the closest points of the surface, NaN where none was found.
-    distance: (n,) to these, NaN likewise.
-    signed_value: (n,) f - level, of the level nearest in value.
+    distance: (n,) the distances of the queries from these, NaN likewise.
+    signed_value: (n,) f - level at the queries, for the level nearest in value.
     lower: (n,) proved lower bounds of the distance.
-    violates_promises: (n,) whether a point was found that is nearer than the field's promises
-        allow.
+    violates_promises: (n,) whether a surface point was found, and left out, that is nearer than the
+        field's promises allow.
     """
 
     points: FloatArray

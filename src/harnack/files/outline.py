@@ -205,10 +205,12 @@ def svg(
         default a thousandth of the picture's size.
 
     Raises:
-        FileFormatError (a ValueError): not an SVG file, or a file with contents that would be lost:
-            text (turn it into paths), images, copies of other elements (`use`), clips and masks,
-            style sheets that change fills, entities, a size or depth that no drawing has.
-        ModuleNotFoundError: without svgpathtools. OSError: it cannot be read.
+        FileFormatError (a ValueError): not an SVG file; a file with contents that are not
+            supported: text (turn it into paths), images, copies of other elements (`use`), clips
+            and masks, style sheets that change fills, entities; or a file that is too large or too
+            deeply nested.
+        ModuleNotFoundError: svgpathtools is not installed.
+        OSError: the file cannot be read.
     """
     scale = as_positive(scale, "the scale of an SVG file")
     if tolerance is not None:

@@ -170,8 +170,9 @@ class NetFaces(NamedTuple):
     """The faces of a mesh after duplicates were added up.
 
     faces: (k, 3), no two with the same three vertices.
-    multiplicity: (k,), positive.
-    source: (k,), ascending; `faces[i]` is original face `source[i]`, the first of its orientation.
+    multiplicity: (k,) how often each face counts, positive.
+    source: (k,) ascending indices of original faces: `faces[i]` is original face `source[i]`, the
+        first with these vertices and this orientation.
     """
 
     faces: IntArray
@@ -224,10 +225,12 @@ def net_faces(faces: IntArray) -> NetFaces:
 def singular_edges(faces: IntArray, multiplicity: npt.ArrayLike = 1) -> tuple[IntArray, IntArray]:
     """Directed edges (k, 2) that do not cancel between faces (m, 3), and their weights (k,) > 0.
 
-    faces: of a welded mesh. multiplicity: (m,) integers of any sign, or one for all.
+    faces: of a welded mesh.
+    multiplicity: (m,) how often each face counts, integers of any sign; or one integer for all.
 
-    Edges run the way they run in the faces, and are sorted by their lower, then higher index. The
-    module's docstring has the proof that the winding number is singular at these edges alone.
+    Edges have the direction that remains after cancellation, and are sorted by their lower, then
+    their higher index. The docstring of this module has the proof that the winding number is
+    singular at these edges alone.
     """
     if not len(faces):
         return np.zeros((0, 2), dtype=np.int64), np.zeros(0, dtype=np.int64)
@@ -266,9 +269,10 @@ def net_edges(
 def singular_loops(edges: IntArray, weights: IntArray) -> list[list[int]]:
     """The closed loops of vertex indices that singular edges form.
 
-    An edge of weight k occurs k times. A loop is listed without its first vertex at the end, and
-    ends where it first meets itself. The time is a Python step for each edge: for up to about a
-    million edges.
+    edges, weights: as `singular_edges` returns them. An edge of weight k occurs k times.
+
+    A loop does not repeat its first vertex at the end, and ends where it first meets itself. As
+    each edge takes a step of Python, this is meant for up to about a million edges.
 
     Raises:
         OpenChainError: the edges are not a result of `singular_edges`: a loop does not close.

@@ -315,8 +315,8 @@ def estimate_normals(points: npt.ArrayLike, neighbors: int | None = None) -> Flo
 
 
 def _choose_neighborhood(x: FloatArray) -> tuple[int, IntArray]:
-    """The number of neighbors with which tangent planes are fitted, and the indices (k,) of the
-    points among which the neighbors are sought."""
+    """Choose how tangent planes are fitted to the points x (n, 3), by their noise. Returns the
+    number of neighbors, and the indices (k,) of the points among which neighbors are searched."""
     rng = np.random.default_rng(0)
     probes = x[rng.choice(len(x), min(len(x), _PROBES), replace=False)]
     subset = np.arange(len(x))

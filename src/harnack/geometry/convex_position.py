@@ -44,16 +44,17 @@ def is_convex_position(loops: tuple[FloatArray, ...]) -> bool:
     every edge has a plane through it that no vertex exceeds by more than 1e-12. False means that
     there is no proof, as for more than 2048 vertices; it implies nothing about the curve.
 
-    Stability. Where no vertex exceeds the plane of an edge, that edge lies on the boundary of the
-    hull H, and nothing remains to be proved. Otherwise let each point move along the normal of its
-    edge until it leaves H: by at most delta = 1e-12. At a vertex the edges' normals n and n' may
-    send it to two positions; both lie in the wedge { a n + b n', a, b >= 0 } at the vertex, where
-    n.x <= delta and n'.x <= delta leave |x| <= 2 delta / (1 + n.n'), and n.n' >= -0.9 is required,
-    so a path of that size on the boundary joins them. It cannot meet another edge (1e-9 away);
-    crossings with its neighbor, near the common vertex, are cut off as loops of area below 1e-15.
-    So the theorems hold for a curve within w = 2e-11 of P, and the two solid angles differ by at
-    most 2 w / r for each edge at distance r: at r = 1e-4 that is less than the rounding of the
-    solid angle itself in single precision.
+    Stability. P is the curve, H its hull. If no vertex exceeds the plane of an edge, that edge lies
+    on the boundary of H, and nothing remains to be proved. Otherwise move each point of P along the
+    normal of its edge until it is on the boundary of H: by at most delta = 1e-12. A vertex has two
+    edges, with the normals n and n', and may move to two positions. Both lie in the wedge
+    { x = a n + b n', a, b >= 0 } at the vertex, in which n.x <= delta and n'.x <= delta imply
+    |x| <= 2 delta / (1 + n.n'). As n.n' >= -0.9 is required, a path of that size on the boundary
+    joins the two positions. The path cannot meet other edges, which are 1e-9 away; where it crosses
+    an edge at the same vertex, loops of area below 1e-15 are cut off. So the theorems hold for a
+    curve within w = 2e-11 of P. The solid angles of the two curves differ by at most 2 w / r for
+    each edge at distance r: at r = 1e-4 that is less than the rounding error of the solid angle
+    itself in single precision.
     """
     if len(loops) != 1 or not 3 <= len(loops[0]) <= MAX_EXAMINED_VERTICES:
         return False
@@ -128,11 +129,12 @@ def _supporting_planes(
 
 
 def _widest_gap_direction(a: FloatArray, b: FloatArray) -> FloatArray:
-    """(k,) the direction, as an angle, in the middle of the largest angular gap between the points
-    (a, b)[k, :] as seen from the origin.
+    """For each of k sets of n points in the plane, with coordinates a and b, (k, n) each: the
+    middle of the largest gap between their directions as seen from the origin. It is an angle:
+    (k,).
 
-    Points at the origin, where the edge itself is, have no direction: they take that of the
-    farthest point.
+    Points at the origin, where the edge itself is, have no direction; the direction of the farthest
+    point is used for them.
     """
     distance = np.hypot(a, b)
     angle = np.arctan2(b, a)
@@ -224,8 +226,9 @@ class ConvexHull(Polytope):
     """A convex polytope: the half-spaces normals[i].x <= offsets[i]. `ConvexHull.from_points`
     builds it.
 
-    normals: (m, 3), of unit length. offsets: (m,). lower, upper: (3,), the corners of a box around
-        it.
+    normals: (m, 3) unit outward normals.
+    offsets: (m,) the distances of the planes from the origin.
+    lower, upper: (3,) the corners of a box around the polytope.
     """
 
     normals: FloatArray

@@ -220,8 +220,9 @@ class CloudDenoiser:
         )
 
     def denoise_points_and_normals(self, normals: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The selected points, moved, and their normals, improved in turn with the points: (k, 3)
-        each. k <= m, as points whose normals hardly any neighbor has are left out.
+        """Move the selected points and improve their normals, in alternation. Returns points and
+        normals, (k, 3) each. k <= m, as a point is dropped if hardly any neighbor has a normal
+        similar to its own.
 
         normals: (m, 3), estimates for the selected points.
         """

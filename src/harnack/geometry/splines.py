@@ -48,8 +48,9 @@ def smooth_curve(
         1989). "chord": the distance, which makes rounder curves of evenly spaced points.
 
     Returns:
-        (n k, 3) vertices, of an open curve ((n - 1) k + 1, 3), with k = samples_per_segment; a list
-            of such arrays for a list. The result is not checked for self-intersections.
+        The vertices, with k = samples_per_segment: (n k, 3) for a closed curve, ((n - 1) k + 1, 3)
+            for an open one; for a list of curves, a list of such arrays. The result is not checked
+            for self-intersections.
 
     Raises:
         CurveError: fewer than 3 different points, two equal points in a row, NaN, wrong shapes, or

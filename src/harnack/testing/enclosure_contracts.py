@@ -45,8 +45,10 @@ __all__ = [
 
 @dataclass(frozen=True)
 class PromiseCase:
-    """A promise about a function with f(p) = 0, and levels. gap_below, gap_above: the differences
-    in value to the levels below and above."""
+    """A promise about a function f at a point p with f(p) = 0, together with levels.
+
+    gap_below, gap_above: the differences between f(p) and the levels below and above, positive.
+    """
 
     promise: Promise
     gap_below: Real
@@ -136,10 +138,12 @@ def check_enclosure(
     """Test a class of enclosures against random functions of every kind of promise that it applies
     to.
 
-    rng: a generator or a seed. rows: the number of functions of each kind.
+    rng: a generator or a seed.
+    rows: the number of functions of each kind.
 
-    Checked: free lengths are numbers in [0, reach]; no level is met within a free length; `is_free`
-    agrees with `free_length`; no level is met within any length that `is_free` accepts.
+    Checked: free lengths are numbers from 0 to the radius of the promise; no level is met within a
+    free length; `is_free` agrees with `free_length`; no level is met within any length that
+    `is_free` accepts.
 
     Raises:
         BrokenPromiseError: with the numbers of the first function that shows it.

@@ -114,9 +114,10 @@ def proved_free_lengths(
     """The free lengths (n,) that a field's enclosures prove from points (n, 3) along unit
     directions.
 
-    ahead: (n,) the reach that is requested of the enclosures.
+    ahead: (n,) the length of the ray for which enclosures are requested.
     gaps: (n, 2) the differences in value to the levels below and above.
-    forwards: False for the enclosures that look back from points on paths along `directions`.
+    forwards: whether the enclosures are those ahead of the points; False for those behind them, of
+        rays that came along `directions`.
     """
     backend = choose_backend(precision)
     ray = Ray(
@@ -262,8 +263,8 @@ def _check_numbers(field: Field, points: FloatArray, samples: FieldSamples) -> N
 
 
 def _check_rounding(field: Field, points: FloatArray) -> None:
-    """Check that in single precision the error of the value is at most `error`, eight units in its
-    last place, and the effect of rounding the point."""
+    """Check the error of the value in single precision: it is at most `Sample.value_error` plus
+    eight units in the last place plus the effect of rounding the point."""
     single = points.astype(np.float32).astype(np.float64)
     if field.domain is not None:
         single = single[field.domain.contains_points(single)]

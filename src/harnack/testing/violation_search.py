@@ -64,9 +64,12 @@ def require(
 
 
 def mutated_enclosure(kind: type[Enclosure], factor: float, *, covers: float | None = None) -> Any:
-    """A class of enclosures that is wrong on purpose, to test that the tests detect it: every free
-    length is multiplied by `factor`, and every length that `is_free` accepts by `covers` (None: by
-    the same factor)."""
+    """A class of enclosures that is wrong on purpose, to test that the checks detect it.
+
+    kind: the class from which it is derived.
+    factor: multiplies every free length.
+    covers: multiplies every length that `is_free` accepts; None for the same factor.
+    """
     covers_factor = factor if covers is None else covers
     base: Any = kind
 

@@ -58,8 +58,8 @@ class Operation:
 class Load:
     """result = an entry of an array.
 
-    source: "lane": the entry of the lane. "number": the only entry. "table": entry index * stride +
-        offset where `mask` holds, else 0.
+    source: which entry. "lane": that of the lane. "number": the only one. "table": number
+        index * stride + offset where `mask` holds, else the result is 0.
     parameter: the index of the array among the parameters of the kernel.
     """
 

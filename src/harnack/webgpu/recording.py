@@ -109,8 +109,9 @@ def _evaluate_and_get_ir(arrays: list[Any]) -> str:
 def _garbage_collection_paused() -> Generator[None]:
     """Context manager: within it, no thread collects garbage.
 
-    To print a kernel, Dr.Jit waits for Python's lock while it holds its own. A thread that collects
-    garbage holds Python's lock, and would wait for Dr.Jit's to free an array, for ever.
+    This avoids a deadlock. To print a kernel, Dr.Jit waits for Python's lock while it holds its
+    own. A thread that collects garbage holds Python's lock, and may wait for Dr.Jit's to free an
+    array.
     """
     was_enabled = gc.isenabled()
     gc.disable()
