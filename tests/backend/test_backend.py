@@ -293,9 +293,9 @@ def metal(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     monkeypatch.setitem(sys.modules, "drjit.metal.ad", module)
     monkeypatch.setattr(dr, "has_backend", lambda kind: kind != dr.JitBackend.CUDA)
     monkeypatch.delenv("HARNACK_BACKEND", raising=False)
-    arrays._backend.cache_clear()
+    arrays._make_backend.cache_clear()
     yield module
-    arrays._backend.cache_clear()
+    arrays._make_backend.cache_clear()
 
 
 def test_metal_is_taken_for_single_precision(metal: Any, monkeypatch: pytest.MonkeyPatch) -> None:

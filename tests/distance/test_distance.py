@@ -850,7 +850,7 @@ def test_results_are_float64_arrays_of_the_same_length(method: Any) -> None:
 def test_batches_make_no_difference(method: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     x = points_around(WAVY, 40)
     whole = signed_distance(WAVY, x, method=method)
-    monkeypatch.setattr(tangent_plane, "_AT_ONCE", 17)
+    monkeypatch.setattr(tangent_plane, "_BATCH_SIZE", 17)
     assert np.allclose(signed_distance(WAVY, x, method=method), whole, rtol=1e-12)
 
 

@@ -290,8 +290,8 @@ def test_rough_surfaces_are_made_of_larger_cells(monkeypatch: pytest.MonkeyPatch
     noisy = vertices + np.random.default_rng(0).normal(0, 0.1, vertices.shape)
     given = trimesh.Trimesh(noisy, faces, process=False)
     module = importlib.import_module("harnack.meshing.repair_stages")
-    monkeypatch.setattr(module, "_ACROSS_ANEW", 16)
-    monkeypatch.setattr(module, "_MOST_ANEW", 4_000)
+    monkeypatch.setattr(module, "_REMESH_CELLS_ACROSS", 16)
+    monkeypatch.setattr(module, "_MAX_REMESHED_FACES", 4_000)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # rough, and so not within the tolerance
         made = hk.repair(given, keep="none")

@@ -21,8 +21,8 @@ from harnack.name_suggestions import is_one_of
 
 # Dr.Jit creates its array types at run time, one family per backend and precision, so no static
 # type describes "a Float of any backend". These names stand for such types.
-Real: TypeAlias = Any  #: Dr.Jit floating-point array, one number a lane (a Python float may do)
-Vec3: TypeAlias = Any  #: Dr.Jit 3-vector, one a lane
+Real: TypeAlias = Any  #: Dr.Jit floating-point array, one number per lane (or a Python float)
+Vec3: TypeAlias = Any  #: Dr.Jit 3-vector, one per lane
 Index: TypeAlias = Any  #: Dr.Jit integer array
 Mask: TypeAlias = Any  #: Dr.Jit Boolean array
 
@@ -37,8 +37,8 @@ _ALIGNMENT = 64  # bytes: the widest vectors of any processor
 class Backend:
     """The Dr.Jit types of one backend and precision. All of them carry derivatives.
 
-    name: "llvm" (CPU), "cuda" (NVIDIA GPU) or "metal" (Apple GPU, single precision alone).
-    precision: "single" or "double": of Float and of the vectors' components.
+    name: "llvm" (CPU), "cuda" (NVIDIA GPU) or "metal" (Apple GPU, single precision only).
+    precision: "single" or "double", the precision of Float and of the vectors' components.
     """
 
     name: BackendName
@@ -67,13 +67,15 @@ class Backend:
 
 
 @functools.cache
-def _backend(name: BackendName, precision: Precision) -> Backend:
+def _make_backend(name: BackendName, precision: Precision) -> Backend:
+    """The backend with this name and precision; made once, after a check of LLVM or Metal."""
     if name == "llvm":
         ensure_llvm()
     module = importlib.import_module(f"drjit.{name}.ad")
     suffix = "64" if precision == "double" else ""
 
     def real(stem: str) -> Any:
+        """The floating-point type with this name, in the right precision."""
         return getattr(module, stem + suffix)
 
     backend = Backend(
@@ -152,13 +154,13 @@ def choose_backend(precision: Precision = "single") -> Backend:
             continue
         if dr.has_backend(kind):
             if name != "metal" or precision == "single":
-                return _backend(name, precision)
+                return _make_backend(name, precision)
         elif forced:
             raise RuntimeError(
                 f"{BACKEND_VARIABLE}={name}, but Dr.Jit finds no usable device for it: {advice}, "
                 f"or unset {BACKEND_VARIABLE}"
             )
-    return _backend("llvm", precision)
+    return _make_backend("llvm", precision)
 
 
 def precision_of_input(*arrays: Any) -> Precision:
@@ -175,21 +177,22 @@ def precision_of_input(*arrays: Any) -> Precision:
 
 
 def backend_of(array: Any) -> Backend:
-    """The backend and precision of a Dr.Jit array or vector of floats, with or without AD.
+    """The backend and precision of a Dr.Jit array or vector of floats, with or without automatic
+    differentiation.
 
     Raises:
-        TypeError: not a Dr.Jit array, of Dr.Jit's scalar mode, a tensor or the like, or not of
+        TypeError: not a Dr.Jit array; one of Dr.Jit's scalar mode, a tensor or the like; or not of
             32- or 64-bit floats.
         LLVMNotFoundError: it lives on an LLVM that Dr.Jit cannot work with.
     """
-    kind = _type_of(array)
+    kind = _untyped_class(array)
     full_name = f"{kind.__module__}.{kind.__name__}"
     if not dr.is_array_v(kind):
         raise TypeError(
             f"expected a Dr.Jit array, got {full_name}: convert NumPy arrays and lists with "
             "harnack.backend.to_vector3 or to_float"
         )
-    name = _NAMES.get(dr.backend_v(kind))
+    name = _BACKEND_NAMES.get(dr.backend_v(kind))
     if name is None:
         raise TypeError(
             f"{full_name} belongs to Dr.Jit's scalar mode: use the types of "
@@ -201,10 +204,11 @@ def backend_of(array: Any) -> Backend:
     precision = _PRECISIONS.get(dr.type_v(kind))
     if precision is None:
         raise TypeError(f"expected floats of 32 or 64 bits, got {full_name}")
-    return _backend(name, precision)
+    return _make_backend(name, precision)
 
 
-def _type_of(value: object) -> Any:
+def _untyped_class(value: object) -> Any:
+    """The class of a value, for calls whose static types do not know Dr.Jit's classes."""
     return type(value)
 
 
@@ -213,7 +217,7 @@ _DEVICES: dict[BackendName, tuple[Any, str]] = {
     "cuda": (dr.JitBackend.CUDA, "check that nvidia-smi lists one"),
     "metal": (dr.JitBackend.Metal, "it is for Macs with macOS 14 or later"),
 }
-_NAMES: dict[Any, BackendName] = {
+_BACKEND_NAMES: dict[Any, BackendName] = {
     dr.JitBackend.LLVM: "llvm", **{kind: name for name, (kind, _) in _DEVICES.items()}
 }  # fmt: skip
 _PRECISIONS: dict[Any, Precision] = {
@@ -225,14 +229,14 @@ _PRECISIONS: dict[Any, Precision] = {
 def to_vector3(backend: Backend, vectors: Any, name: str = "vectors") -> Vec3:
     """Vectors as backend.Array3f, from an array-like of shape (n, 3) or a Dr.Jit 3-vector.
 
-    Values of an array-like must be finite. A Dr.Jit vector is passed on (its precision is changed
-    if necessary) and its values are not checked, which would end its recording.
+    Values of an array-like must be finite. A Dr.Jit vector is returned in the backend's precision.
+    Its values are not checked, as a check would evaluate it and end its recording.
 
     Raises:
         TypeError: not numbers; a Dr.Jit array that is no 3-vector or of another backend.
         ValueError: wrong shape; NaN or infinite values. The message starts with `name`.
     """
-    if dr.is_array_v(_type_of(vectors)):
+    if dr.is_array_v(_untyped_class(vectors)):
         _check_same_backend(backend, vectors, name)
         if dr.depth_v(type(vectors)) != 2 or dr.size_v(type(vectors)) != 3:
             raise TypeError(f"{name} must be a 3-vector, got {type(vectors).__name__}")
@@ -273,7 +277,7 @@ def to_float(backend: Backend, values: Any, name: str = "values") -> Real:
         TypeError: not numbers; a Dr.Jit array that is no scalar array or of another backend.
         ValueError: wrong shape; NaN. The message starts with `name`.
     """
-    if dr.is_array_v(_type_of(values)):
+    if dr.is_array_v(_untyped_class(values)):
         _check_same_backend(backend, values, name)
         if dr.depth_v(type(values)) != 1:
             raise TypeError(f"{name} must be one number a lane, got {type(values).__name__}")
@@ -303,7 +307,7 @@ def gather_vectors(backend: Backend, vectors: Vec3, index: Index) -> Vec3:
 def as_kernel_parameters(array: Any) -> Any:
     """The same array with literals turned into kernel parameters (`dr.make_opaque`), so that
     another value uses the compiled kernel again. Derivatives are kept."""
-    kind = _type_of(array)
+    kind = _untyped_class(array)
     if dr.depth_v(kind) > 1:
         return kind(*map(as_kernel_parameters, array))
     if array.state != dr.VarState.Literal:
@@ -314,6 +318,7 @@ def as_kernel_parameters(array: Any) -> Any:
 
 
 def _check_same_backend(backend: Backend, array: Any, name: str) -> None:
+    """Raise a TypeError for an array that does not live on the backend."""
     try:
         array_backend = backend_of(array)
     except TypeError as error:
@@ -325,6 +330,8 @@ def _check_same_backend(backend: Backend, array: Any, name: str) -> None:
 
 
 def _check_rows(is_bad: Any, kind: str, name: str) -> None:
+    """Raise a ValueError that names the first row where `is_bad` (n,) holds. kind: what is wrong
+    with it."""
     indices = np.flatnonzero(is_bad)
     if indices.size:
         rest = f" and {indices.size - 1} more" if indices.size > 1 else ""
@@ -384,7 +391,7 @@ def to_numpy(array: Any) -> npt.NDArray[Any]:
     Raises:
         TypeError: not a Dr.Jit array, or one nested more deeply than a vector.
     """
-    kind = _type_of(array)
+    kind = _untyped_class(array)
     if not dr.is_array_v(kind) or dr.depth_v(kind) > 2:
         raise TypeError(f"expected a Dr.Jit array or vector, got {kind.__module__}.{kind.__name__}")
     array = dr.detach(array)

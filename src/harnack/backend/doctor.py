@@ -20,6 +20,7 @@ from harnack.backend.arrays import BACKEND_VARIABLE, Index, Mask, Real, choose_b
 from harnack.backend.llvm import PATH_VARIABLE, LLVMNotFoundError, find_libraries, loaded_library
 
 _PACKAGES = ("drjit", "mitsuba", "numpy", "scipy", "trimesh")
+# Time after which a kernel counts as hanging.
 _KERNEL_SECONDS = 120
 
 
@@ -40,37 +41,39 @@ class Finding:
 
 
 def diagnose() -> tuple[Finding, ...]:
-    """Examine this installation. Never raises; kernels are tried in processes of their own."""
+    """Examine this installation. It never raises: kernels are tried in separate processes."""
     findings = [
         Finding("harnack", __version__),
         Finding("Python", f"{platform.python_version()} at {sys.executable}"),
         Finding("system", f"{platform.platform()}, {os.cpu_count()} cores"),
-        *(_package(name) for name in _PACKAGES),
-        _device("CUDA", dr.JitBackend.CUDA),
-        _device("Metal", dr.JitBackend.Metal),
-        *_llvm(),
+        *(_package_finding(name) for name in _PACKAGES),
+        _device_finding("CUDA", dr.JitBackend.CUDA),
+        _device_finding("Metal", dr.JitBackend.Metal),
+        *_llvm_findings(),
     ]
-    backend = _backend()
+    backend = _backend_finding()
     findings.append(backend)
     if backend.ok:
-        findings += [_kernel("single"), _kernel("double")]
+        findings += [_kernel_finding("single"), _kernel_finding("double")]
     return tuple(findings)
 
 
-def _package(name: str) -> Finding:
+def _package_finding(name: str) -> Finding:
+    """The version of a package."""
     try:
         return Finding(name, importlib.metadata.version(name))
     except importlib.metadata.PackageNotFoundError:
         return Finding(name, "not installed", ok=False, advice=f"pip install {name}")
 
 
-def _device(name: str, kind: Any) -> Finding:
+def _device_finding(name: str, kind: Any) -> Finding:
+    """Whether Dr.Jit finds a device of this kind."""
     if dr.has_backend(kind):
         return Finding(name, "a usable device")
     return Finding(name, "no usable device (none is needed)")
 
 
-def _llvm() -> list[Finding]:
+def _llvm_findings() -> list[Finding]:
     """The LLVM that Dr.Jit loaded, then every LLVM on this machine, best first."""
     loaded = loaded_library()
     requested = os.environ.get(PATH_VARIABLE)
@@ -85,7 +88,8 @@ def _llvm() -> list[Finding]:
     return findings
 
 
-def _backend() -> Finding:
+def _backend_finding() -> Finding:
+    """The backend that is chosen, or the reason why there is none."""
     forced = os.environ.get(BACKEND_VARIABLE)
     source = f", forced by {BACKEND_VARIABLE}" if forced else ""
     try:
@@ -98,9 +102,9 @@ def _backend() -> Finding:
     return Finding("backend", f"{backend.name}{threads}, {backend.precision} precision{source}")
 
 
-def _kernel(precision: str) -> Finding:
-    """Run `try_kernel` in a separate process, since a wrong LLVM may end the process that uses
-    it."""
+def _kernel_finding(precision: str) -> Finding:
+    """Whether a small kernel runs. It runs in a separate process, since an unsuitable LLVM may end
+    the process that uses it."""
     subject = f"kernel, {precision} precision"
     code = f"import harnack.backend.doctor as d; d.try_kernel({precision!r})"
     try:

@@ -36,8 +36,9 @@ def clamp(x: Any, low: Any, high: Any) -> Any:
     return fmin(fmax(x, low), high)
 
 
-# Vectors shorter than the first and longer than the last of these powers of two are multiplied by
-# the power in between, which is exact: squares then neither vanish nor overflow.
+# Per precision two pairs (limit, factor) of exponents of 2: vectors shorter than the first limit,
+# or longer than the second, are multiplied by the factor beside it. That is exact, and squares then
+# neither underflow nor overflow.
 _SCALING_EXPONENTS_SINGLE, _SCALING_EXPONENTS_DOUBLE = (
     ((-50, 76), (60, -68)),
     ((-450, 572), (500, -524)),
@@ -74,6 +75,7 @@ def max_norm(v: Vec3) -> Real:
 
 
 def _norm_scaling_exponents(x: Real) -> tuple[tuple[int, int], tuple[int, int]]:
+    """The scaling exponents for the precision of x."""
     return (
         _SCALING_EXPONENTS_DOUBLE
         if dr.type_v(type(x)) == dr.VarType.Float64
@@ -84,7 +86,7 @@ def _norm_scaling_exponents(x: Real) -> tuple[tuple[int, int], tuple[int, int]]:
 # pi/2 in three parts, the first two so short that their products with integers below 2^11 are exact
 # (Cody and Waite 1980), and the minimax polynomials of Cephes (Moshier) on [-pi/4, pi/4].
 _HALF_PI = (1.5703125, 4.837512969970703125e-4, 7.54978995489188216e-8)
-# And in two, with fused products: the second is the remainder in double precision.
+# pi/2 in two parts, for fused products: the second is the rounding error of the first.
 _HALF_PI_DOUBLE = (1.5707963267948966, 6.123233995736766e-17)
 _SINE = (-1.9515295891e-4, 8.3321608736e-3, -1.6666654611e-1)
 _COSINE = (2.443315711809948e-5, -1.388731625493765e-3, 4.166664568298827e-2)
@@ -94,11 +96,12 @@ def sincos(x: Any) -> tuple[Any, Any]:
     """sin x and cos x, each within 2u (u the unit roundoff) for |x| <= `max_sincos_argument`;
     beyond it they are not numbers.
 
-    In single precision by arithmetic alone. Dr.Jit's own functions are one instruction on CUDA,
-    with an error of 2^-20.5 = 11u and of 600u for an angle of 300 (PTX ISA, sin.approx), and on
-    LLVM they lose accuracy from 8192 on: 16u at 10^5, everything at 10^6. In double precision they
-    are right within 1.6u up to about 10^9, so that angles are reduced here: x - k pi/2 is rounded
-    once, and once more for the remainder of pi/2 in double precision, as products are fused.
+    In single precision, they are computed here. Dr.Jit's own functions are one instruction on CUDA,
+    with an error of 2^-20.5 = 11u, and of 600u for an angle of 300 (PTX ISA, sin.approx); on LLVM
+    they lose accuracy above 8192: the error is 16u at 10^5, and no digit is right at 10^6. In
+    double precision, Dr.Jit's functions are accurate within 1.6u up to about 10^9, so only the
+    angles are reduced here: x - k pi/2 is rounded once, and once more for the second part of pi/2,
+    as products are fused.
     """
     is_double = dr.type_v(type(x)) == dr.VarType.Float64
     k = dr.round(x * 0.6366197723675814)
@@ -127,6 +130,7 @@ def max_sincos_argument(real: Any) -> float:
 
 
 def _polynomial(coefficients: tuple[float, ...], x: Any) -> Any:
+    """The polynomial with these coefficients, the highest power first, at x."""
     total = coefficients[0]
     for coefficient in coefficients[1:]:
         total = dr.fma(total, x, coefficient)

@@ -191,6 +191,7 @@ def loaded_library() -> LLVMLibrary | None:
 
 
 def _loaded_major() -> int | None:
+    """The major version of the LLVM that Dr.Jit has loaded; None if it has none."""
     import_drjit()
     import drjit as dr  # not at the top: importing it loads LLVM, and import_drjit says which
 
@@ -242,8 +243,8 @@ def _load_failure_message() -> str:
     if libraries and libraries[0].rejection_reason is None:
         return f"Dr.Jit did not load {libraries[0].path}. {repair_advice()}"
     listing = "; ".join(f"{library.path} ({library.rejection_reason})" for library in libraries)
-    listed = f" Found only {listing}." if libraries else ""
-    return f"The CPU backend needs LLVM {MINIMUM_MAJOR} or newer.{listed} {repair_advice()}"
+    found_text = f" Found only {listing}." if libraries else ""
+    return f"The CPU backend needs LLVM {MINIMUM_MAJOR} or newer.{found_text} {repair_advice()}"
 
 
 def repair_advice() -> str:

@@ -173,8 +173,9 @@ def loop_with_queue(
     ended stores its result and takes the next ray from a queue, so that no lane waits for the
     slowest ray of its packet.
 
-    body: may depend on the state of its own lane only, and must hold no array that differs between
-        lanes.
+    body: the next state from the state of a lane. It may depend on the state of that lane only, and
+        use no other array that differs between lanes.
+    result: the result from the final state.
     """
     dr.eval(*array_leaves(start))
     width = max(dr.width(leaf) for leaf in array_leaves(start))
@@ -189,14 +190,18 @@ def loop_with_queue(
 
 @dataclass(frozen=True)
 class _QueueLane:
-    """A lane that follows rays from the queue. queue_index: the index of the ray that it follows
-    now. state: the state of that ray."""
+    """A lane that follows rays from the queue.
+
+    queue_index: the position in the queue of the ray that it follows now.
+    state: the state of that ray.
+    """
 
     queue_index: Any
     state: Any
 
     @property
     def active(self) -> Mask:
+        """The lanes that follow a ray."""
         return self.state.active
 
 
@@ -204,34 +209,53 @@ def _run_queue(
     start: Any, body: Callable[[Any], Any], result: Callable[[Any], Any],
     rows: Any, total: int, results: list[Any], label: str,
 ) -> None:  # fmt: skip
-    """Run the loop of `loop_with_queue`. rows: indices in `start` of the `total` rays to be run.
-    results: arrays into which their results are written."""
+    """Run the loop of `loop_with_queue`.
+
+    rows: the indices in `start` of the rays in the queue.
+    total: the number of these rays.
+    results: arrays into which the results are written, in place.
+    """
     index = cast("Any", type(rows))
     count = dr.opaque(index, total)
     threads = dr.thread_count() if dr.backend_v(rows) == dr.JitBackend.LLVM else 0
     width = min(len(rows), _LANES_PER_THREAD * threads or _LANES_ON_GPU)
-    counter, first = _evaluate_unshared(lambda: [dr.full(index, width, 1), dr.arange(index, width)])
+    counter, first_indices = _evaluate_unshared(
+        lambda: [dr.full(index, width, 1), dr.arange(index, width)]
+    )
 
-    def fetch(slot: Any, mask: Mask) -> Any:
-        ids = dr.gather(index, rows, slot, mask)
+    def fetch_rays(queue_index: Any, mask: Mask) -> Any:
+        """The initial states of the rays at these positions of the queue, in lanes of the mask."""
+        ids = dr.gather(index, rows, queue_index, mask)
 
         def gather(leaf: Any) -> Any:
             return leaf if dr.width(leaf) == 1 else dr.gather(type(leaf), leaf, ids, mask)
 
         return rebuild_record(start, map(gather, array_leaves(start)))
 
-    def step(lane: _QueueLane) -> _QueueLane:
-        new = body(lane.state)
-        ended = lane.active & ~new.active
-        ids = dr.gather(index, rows, lane.queue_index, ended)
-        for target, value in zip(results, array_leaves(result(new)), strict=True):
-            dr.scatter(target, value, ids, ended)
-        slot = dr.select(ended, dr.scatter_inc(counter, index(0), ended), lane.queue_index)
-        fetches = ended & (slot < count)
-        pairs = zip(array_leaves(fetch(slot, fetches)), array_leaves(new), strict=True)
-        return _QueueLane(slot, rebuild_record(new, (dr.select(fetches, *pair) for pair in pairs)))
+    def step_lanes(lane: _QueueLane) -> _QueueLane:
+        """Step all rays. Where a ray ends, store its result and begin the next ray of the queue."""
+        new_state = body(lane.state)
+        is_ended = lane.active & ~new_state.active
+        ids = dr.gather(index, rows, lane.queue_index, is_ended)
+        for target, value in zip(results, array_leaves(result(new_state)), strict=True):
+            dr.scatter(target, value, ids, is_ended)
+        queue_index = dr.select(
+            is_ended, dr.scatter_inc(counter, index(0), is_ended), lane.queue_index
+        )
+        is_fetching = is_ended & (queue_index < count)
+        pairs = zip(
+            array_leaves(fetch_rays(queue_index, is_fetching)), array_leaves(new_state), strict=True
+        )
+        return _QueueLane(
+            queue_index,
+            rebuild_record(new_state, (dr.select(is_fetching, *pair) for pair in pairs)),
+        )
 
-    loop_while_active(_QueueLane(first, fetch(first, first < count)), step, label)
+    loop_while_active(
+        _QueueLane(first_indices, fetch_rays(first_indices, first_indices < count)),
+        step_lanes,
+        label,
+    )
     dr.eval(results)
 
 
@@ -242,17 +266,19 @@ def _begin_new_scope(array: Any) -> None:
     dr.detail.new_scope(dr.backend_v(array))
 
 
-def _evaluate_unshared(make: Callable[[], Any]) -> Any:
-    """Evaluate the arrays that `make` returns, in memory that they share with no other array.
+def _evaluate_unshared(compute: Callable[[], Any]) -> Any:
+    """Evaluate the arrays that `compute` returns, in memory that they share with no other array.
 
     Dr.Jit stores equal arrays once, and a kernel depends on which of its inputs are the same array:
     an accidental match, such as two arrays of the same length, would compile another kernel.
     """
     with dr.scoped_set_flag(dr.JitFlag.ValueNumbering, False):
-        arrays = make()
+        arrays = compute()
         dr.make_opaque(arrays)
     return arrays
 
 
 def _broadcast(leaf: Any, width: int, index: Any) -> Any:
+    """A copy of an array with `width` lanes: of each lane, or of the only one. index: the type of
+    lane indices."""
     return dr.gather(type(leaf), leaf, dr.arange(index, width) * (dr.width(leaf) > 1))

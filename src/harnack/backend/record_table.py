@@ -62,27 +62,27 @@ class RecordTable:
             ValueError: padding_row is needed and is None.
         """
         iterations = -(-len(table) // at_once)
-        missing = iterations * at_once - len(table)
-        if missing and padding_row is None:
+        missing_rows = iterations * at_once - len(table)
+        if missing_rows and padding_row is None:
             raise ValueError(
                 f"{len(table)} records make no whole trips of {at_once}: give `filling`"
             )
         if padding_row is not None:
-            table = np.concatenate([table, np.tile(padding_row, (missing, 1))])
+            table = np.concatenate([table, np.tile(padding_row, (missing_rows, 1))])
         rows, width = table.shape
         padded_width = -(-width // PACKET) * PACKET
-        mapped = upload_floats(backend, np.ascontiguousarray(table).ravel())
+        flat = upload_floats(backend, np.ascontiguousarray(table).ravel())
         lane = dr.arange(backend.UInt32, rows * padded_width)
         row, column = lane // padded_width, lane % padded_width
-        copy = dr.gather(backend.Float, mapped, row * width + column, column < width)
+        copy = dr.gather(backend.Float, flat, row * width + column, column < width)
         dr.eval(copy)
         return cls(
             backend, copy, padded_width // PACKET, at_once, dr.opaque(backend.UInt32, iterations)
         )
 
     def view(self, first: Any, trips: Any) -> RecordTable:
-        """A view of `trips` consecutive records that begins at record `first`; both may differ
-        between lanes. Only for tables with a single record per iteration.
+        """A view of the table that consists of `trips` consecutive records, from record `first` on.
+        Both numbers may differ between lanes. Only for tables with one record per iteration.
 
         Raises:
             ValueError: an iteration reads several records.
@@ -114,7 +114,8 @@ class RecordTable:
             self.iteration_count if active is True else dr.select(active, self.iteration_count, 0)
         )
 
-        def step(i: Any, *state: Any) -> LoopValues:
+        def read_and_apply(i: Any, *state: Any) -> LoopValues:
+            """Apply `body` to the records of iteration i."""
             for j in range(self.records_per_iteration):
                 state = body(self.read_record(i * self.records_per_iteration + j), state)
             return i + 1, *state
@@ -123,4 +124,4 @@ class RecordTable:
             return i < iterations
 
         start = (self.backend.UInt32(0), *state)
-        return dr.while_loop(start, is_active, step, label=label)[1:]
+        return dr.while_loop(start, is_active, read_and_apply, label=label)[1:]

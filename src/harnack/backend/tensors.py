@@ -1,15 +1,16 @@
-"""Conversions between tensors (n, 3) or (n,), in which arrays of other frameworks reach Dr.Jit, and
-vectors; functions for PyTorch and JAX.
+"""Conversions between Dr.Jit's tensors and vectors; functions for PyTorch and JAX.
 
-`drjit.wrap` gives a function tensors and takes back tensors, while this package computes with
-vectors, a lane for each row. All conversions pass derivatives on, in both directions.
-`wrap_for_jax` is the direction of `drjit.wrap` that Dr.Jit lacks. `wrap_for_torch` is a direction
-that Dr.Jit has, without its silent zeros: missing derivatives raise an error, and the backward pass
-may be repeated. Neither framework is imported before it is used.
+Arrays of other frameworks reach Dr.Jit as tensors (n, 3) or (n,): `drjit.wrap` passes tensors to a
+function and expects tensors from it. This package computes with vectors instead, one lane for each
+row. All conversions pass derivatives on, in both directions.
 
-Numbers that change from step to step of an optimization are data: literals with derivatives become
-kernel parameters, and curves whose vertices are Dr.Jit arrays do not choose proofs or hulls by
-their shape.
+`wrap_for_jax` makes functions for JAX, for which Dr.Jit has no `wrap`. `wrap_for_torch` replaces
+`drjit.wrap` for PyTorch, which returns zeros for missing derivatives: here they raise an error, and
+the backward pass may be repeated. Neither framework is imported before it is used.
+
+Numbers that change from step to step of an optimization do not compile new kernels: literals with
+derivatives become kernel parameters, and curves whose vertices are Dr.Jit arrays do not choose
+proofs or hulls by their shape.
 """
 
 from __future__ import annotations
@@ -88,6 +89,7 @@ def accepts_tensors(method: Method) -> Method:
 
     @functools.wraps(method)
     def wrapper(self: Any, points: Any, **settings: Any) -> Any:
+        """The method for tensors and for all other points."""
         if not is_tensor(points):
             return method(self, points, **settings)
         *shape, _ = points.shape or (0,)
@@ -119,19 +121,23 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
     """
     torch: Any = importlib.import_module("torch")
 
-    def run(arguments: list[Any], tensors: tuple[Any, ...]) -> tuple[list[Any], Any]:
-        """The inputs, and the result of `function`; arguments: its arguments, with None for
-        tensors."""
+    def run_function(arguments: list[Any], tensors: tuple[Any, ...]) -> tuple[list[Any], Any]:
+        """The inputs as Dr.Jit tensors with derivatives, and the result of `function`. arguments:
+        its arguments, with None in place of tensors."""
         inputs = [_differentiable_tensor(tensor.detach()) for tensor in tensors]
         remaining = iter(inputs)
-        filled = (next(remaining) if value is None else value for value in arguments)
-        return inputs, function(*filled)
+        all_arguments = (next(remaining) if value is None else value for value in arguments)
+        return inputs, function(*all_arguments)
 
     class Wrapped(torch.autograd.Function):
+        """The function, as PyTorch's automatic differentiation calls it."""
+
         @staticmethod
-        def forward(ctx: Any, arguments: list[Any], shape: list[Any], *tensors: Any) -> Any:
-            inputs, outputs = run(arguments, tensors)
-            shape.append(outputs)
+        def forward(ctx: Any, arguments: list[Any], container: list[Any], *tensors: Any) -> Any:
+            """The results as PyTorch tensors; the function's own result is appended to
+            `container`."""
+            inputs, outputs = run_function(arguments, tensors)
+            container.append(outputs)
             ctx.save_for_backward(*tensors)
             ctx.arguments, ctx.graph = arguments, (inputs, _results(outputs))
             results = tuple(dr.detach(_as_tensor(value)).torch() for value in ctx.graph[1])
@@ -142,9 +148,10 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
         @staticmethod
         @torch.autograd.function.once_differentiable
         def backward(ctx: Any, *cotangents: Any) -> Any:
+            """Gradients with respect to the tensors, from those with respect to the results."""
             graph, ctx.graph = ctx.graph, None
-            if graph is None:  # gone back through already
-                inputs, outputs = run(ctx.arguments, ctx.saved_tensors)
+            if graph is None:  # a repeated backward pass
+                inputs, outputs = run_function(ctx.arguments, ctx.saved_tensors)
                 graph = inputs, _results(outputs)
             inputs, outputs = graph
             gradients = iter(_gradients(inputs, outputs, list(cotangents)))
@@ -158,8 +165,8 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
     def wrapped(*args: Any) -> Any:
         tensors = [value for value in args if isinstance(value, torch.Tensor)]
         arguments = [None if isinstance(value, torch.Tensor) else value for value in args]
-        shape: list[Any] = []
-        return _like(shape, iter(Wrapped.apply(arguments, shape, *tensors)))
+        container: list[Any] = []
+        return _in_container(container, iter(Wrapped.apply(arguments, container, *tensors)))
 
     return wrapped
 
@@ -171,25 +178,29 @@ def _results(outputs: Any) -> list[Any]:
     return list(cast("list[Any]", outputs)) if isinstance(outputs, (tuple, list)) else [outputs]
 
 
-def _like(shape: list[Any], results: Any) -> Any:
-    """Results in the container that the function returned, the entry of `shape`."""
-    outputs = shape.pop()
+def _in_container(container: list[Any], results: Any) -> Any:
+    """The results in a container of the type of the function's result, which is the entry of
+    `container`."""
+    outputs = container.pop()
     if isinstance(outputs, dict):
         return dict(zip(cast("dict[Any, Any]", outputs), results, strict=True))
     return type(outputs)(results) if type(outputs) in (tuple, list) else next(results)
 
 
 def _gradients(inputs: list[Any], outputs: list[Any], cotangents: list[Any]) -> list[Any]:
-    """Gradients, as tensors, with respect to the inputs that are floats, from gradients with
-    respect to outputs (None for none).
+    """The gradients, as tensors, with respect to the inputs that are floats.
+
+    outputs: the results of the function for these inputs.
+    cotangents: the gradients with respect to the outputs, None for none.
 
     Raises:
-        NotImplementedError: an output that is asked for has no derivative at all.
+        NotImplementedError: a gradient is given for an output that depends on no input by a
+            derivative.
     """
     for output, cotangent in zip(outputs, cotangents, strict=True):
         if cotangent is None or not dr.is_float_v(output):
             continue
-        cotangent_tensor, tensor = _tensor(cotangent), _as_tensor(output)
+        cotangent_tensor, tensor = _import_tensor(cotangent), _as_tensor(output)
         if dr.grad_enabled(tensor):
             dr.accum_grad(tensor, cotangent_tensor)  # an output may occur twice, or be an input
             dr.enqueue(dr.ADMode.Backward, tensor)
@@ -238,10 +249,11 @@ def wrap_for_jax(
     Raises ImportError where JAX is not installed.
     """
     jax: Any = importlib.import_module("jax")
-    run = functools.partial(_run, jax, function)
+    run = functools.partial(_run_for_jax, jax, function)
     pull_back = functools.partial(_pull_back, jax, function)
 
     def call(*args: Any) -> Any:
+        """The result of the function, also inside of `jax.jit`."""
         if not _is_traced(jax, args):
             return run(*args)
         if result_like is None:
@@ -249,9 +261,11 @@ def wrap_for_jax(
         return _pure_callback(jax, run, jax.eval_shape(result_like, *args), *args)
 
     def forward(*args: Any) -> tuple[Any, Any]:
+        """The result, and the arguments, which `backward` needs."""
         return call(*args), args
 
     def backward(args: Any, cotangents: Any) -> Any:
+        """The gradients with respect to all arguments, from those with respect to the result."""
         leaves: list[Any] = jax.tree.leaves(args)
         if _is_traced(jax, (args, cotangents)):
             shapes = [
@@ -281,7 +295,7 @@ def wrap_for_jax(
     return wrapped
 
 
-def _run(jax: Any, function: Callable[..., Any], *args: Any) -> Any:
+def _run_for_jax(jax: Any, function: Callable[..., Any], *args: Any) -> Any:
     """The result of `function` as JAX arrays. Derivatives are always enabled: hits are polished to
     rounding where they are enabled, so that the result is the same with `jax.grad` and without."""
     outputs = function(*jax.tree.map(_differentiable_tensor, args))
@@ -305,31 +319,33 @@ def _is_traced(jax: Any, values: Any) -> bool:
 def _pure_callback(jax: Any, compute: Callable[..., Any], shapes: Any, *args: Any) -> Any:
     """The result of `compute`, called while a program that JAX has compiled runs."""
 
-    def on_host(*values: Any) -> Any:
-        # As NumPy arrays: a callback must not wait for work that is JAX's own to do.
+    def compute_on_host(*values: Any) -> Any:
+        # NumPy arrays, as a callback must not wait for work that JAX itself has to do.
         return jax.tree.map(np.asarray, compute(*jax.tree.map(np.asarray, values)))
 
-    return jax.pure_callback(on_host, shapes, *args, vmap_method="sequential")
+    return jax.pure_callback(compute_on_host, shapes, *args, vmap_method="sequential")
 
 
 def _is_float(jax: Any, array: Any) -> bool:
+    """Whether JAX computes with floats for this array or number."""
     return jax.numpy.issubdtype(jax.numpy.result_type(array), jax.numpy.floating)
 
 
-def _tensor(array: Any) -> Any:
+def _import_tensor(array: Any) -> Any:
     """A Dr.Jit tensor of the same shape and precision, on the device where the array is."""
     return dr.detail.import_tensor(array, True)
 
 
 def _differentiable_tensor(array: Any) -> Any:
-    """A Dr.Jit tensor as `_tensor` gives it, with derivatives enabled if it holds floats."""
-    tensor = _tensor(array)
+    """A Dr.Jit tensor as `_import_tensor` gives it, with derivatives enabled if it holds floats."""
+    tensor = _import_tensor(array)
     if dr.is_float_v(tensor):
         dr.enable_grad(tensor)
     return tensor
 
 
 def _as_tensor(value: Any) -> Any:
+    """A result of a function as a Dr.Jit tensor. Raises a TypeError for other values."""
     if not dr.is_array_v(cast("Any", type(value))):
         raise TypeError(
             "a function for JAX returns Dr.Jit arrays or tensors, in tuples, lists and "
@@ -339,4 +355,5 @@ def _as_tensor(value: Any) -> Any:
 
 
 def _as_jax(value: Any) -> Any:
+    """A result of a function as a JAX array, without derivatives."""
     return dr.detach(_as_tensor(value)).jax()

@@ -25,13 +25,13 @@ IntArray: TypeAlias = npt.NDArray[np.int64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 
 TRANSPOSE_ADVICE = "; transpose it"
-"""Advice of `check_vectors` where an array (3, n) surely holds n vectors."""
+"""Advice of `check_vectors` for an array (3, n) where n vectors (n, 3) are expected."""
 
 # Number of entries of a list, and of letters of a value, that `format_short` writes.
-_MAX_SHOWN, _MAX_TEXT_LENGTH = 4, 60
+_MAX_ENTRIES, _MAX_TEXT_LENGTH = 4, 60
 
 MAX_COORDINATE = 1e100
-"""Coordinates beyond this are refused: their squares would overflow soon."""
+"""Larger coordinates are refused: products of their squares would overflow."""
 
 
 def as_real_array(
@@ -46,8 +46,8 @@ def as_real_array(
     """The values as an array of integers or floats; it may be the same array, not a copy.
 
     type_error: the class raised for values that are no real numbers, if it is not `error`.
-    ragged, other: the text of messages, behind `name`, about rows of different lengths and about
-        values that are no real numbers.
+    ragged, other: the messages, after `name`, for rows of different lengths and for values that are
+        not real numbers.
     """
     check_no_derivatives(name, values)
     try:
@@ -138,14 +138,14 @@ def no_derivatives(function: Function) -> Function:
 
 
 def has_derivatives(value: Any) -> bool:
-    """Whether a value is, or contains, a Dr.Jit or PyTorch array with derivatives enabled.
-    Containers are searched, objects that functions refer to, and attributes of fields, of callables
-    and of dataclasses."""
+    """Whether a value is, or contains, a Dr.Jit or PyTorch array with derivatives enabled. The
+    search includes the entries of containers, the objects that functions refer to, and the
+    attributes of fields, of callables and of dataclasses."""
     visited: set[int] = set()
     pending: list[Any] = [value]
-    for node in pending:  # which grows
+    for node in pending:  # the list grows in this loop
         kind = cast("Any", type(node))
-        if kind is tuple:  # most of what fields hold
+        if kind is tuple:  # the most frequent type in fields
             pending += [entry for entry in node if type(entry) not in _PLAIN_TYPES]
         elif kind in _PLAIN_TYPES:
             continue
@@ -165,7 +165,7 @@ def is_plain_data(value: Any) -> bool:
     dictionaries and dataclasses of this package. Plain data can never carry derivatives; Dr.Jit
     arrays and functions can."""
     pending: list[Any] = [value]
-    for node in pending:  # which grows
+    for node in pending:  # the list grows in this loop
         kind = cast("Any", type(node))
         if kind in _PLAIN_TYPES:
             continue
@@ -203,7 +203,7 @@ _KNOWN_PACKAGES = frozenset(("harnack", "drjit", "numpy", "math"))
 
 
 def _contained_values(value: Any) -> list[Any]:
-    """The values that a value refers to, as far as they are searched."""
+    """The values that a value contains or refers to, as far as `has_derivatives` searches them."""
     if isinstance(value, _CONTAINER_TYPES):
         return [entry for entry in cast("Any", value) if type(entry) not in _PLAIN_TYPES]
     if isinstance(value, dict):
@@ -230,7 +230,7 @@ def format_short(value: Any) -> str:
         return f"<array {' x '.join(map(str, shape))}>"
     if isinstance(value, tuple | list):
         entries = cast("Sequence[Any]", value)
-        if len(entries) > _MAX_SHOWN:
+        if len(entries) > _MAX_ENTRIES:
             return f"<{len(entries)} entries>"
         comma = "," if len(entries) == 1 else ""
         return f"({', '.join(map(format_short, entries))}{comma})"

@@ -42,11 +42,11 @@ def accepts_dask_arrays(*names: str) -> Callable[[Function], Function]:
         )
 
         @functools.wraps(function)
-        def wrapper(*args: Any, **kwargs: Any) -> Any:
-            if not any(map(is_dask_array, (*args, *kwargs.values()))):
-                return function(*args, **kwargs)
-            arguments = signature.bind(*args, **kwargs).arguments
-            # Methods take the place of `self` by position, and the rest by name.
+        def wrapper(*positional: Any, **settings: Any) -> Any:
+            if not any(map(is_dask_array, (*positional, *settings.values()))):
+                return function(*positional, **settings)
+            arguments = signature.bind(*positional, **settings).arguments
+            # The first argument, `self` of a method, is passed by position, all others by name.
             first = arguments.pop(next(iter(signature.parameters)))
             named = {**arguments.pop(variadic, {}), **arguments}
             return _map_blocks(functools.partial(wrapper, first), names, named)
@@ -57,55 +57,70 @@ def accepts_dask_arrays(*names: str) -> Callable[[Function], Function]:
 
 
 def _map_blocks(call: Callable[..., Any], names: tuple[str, ...], arguments: dict[str, Any]) -> Any:
-    """The Dask arrays that result from `call` for arguments that contain Dask arrays."""
+    """Call a function block by block, without computing the blocks now.
+
+    call: the function, which takes all arguments by name.
+    names: the arguments that may be Dask arrays.
+    arguments: the arguments by name; at least one is a Dask array.
+
+    Returns a Dask array, or for a dataclass as the result one with Dask arrays as its attributes.
+
+    Raises:
+        TypeError: another argument is a Dask array, or a Dask array does not hold real numbers.
+    """
     purpose = "Dask arrays"
     delayed = import_optional("dask", purpose).delayed
     dask_array = import_optional("dask.array", purpose)
-    lazy = {name: array for name, array in arguments.items() if is_dask_array(array)}
-    for name in lazy.keys() - set(names):
+    dask_args = {name: array for name, array in arguments.items() if is_dask_array(array)}
+    for name in dask_args.keys() - set(names):
         raise TypeError(f"{name} cannot be a Dask array: call its method compute() first")
-    lazy = _align_blocks(
-        dask_array, lazy, {name: arguments[name] for name in names if name in arguments}
+    dask_args = _align_blocks(
+        dask_array, dask_args, {name: arguments[name] for name in names if name in arguments}
     )
-    constants = {name: array for name, array in arguments.items() if name not in lazy}
-    for name, array in lazy.items():
+    constants = {name: array for name, array in arguments.items() if name not in dask_args}
+    for name, array in dask_args.items():
         if array.dtype.kind not in "iuf":
             raise TypeError(f"{name} must hold real numbers, not {array.dtype}")
     call = functools.partial(call, **constants)
-    # The kind of the result, from a call with no points; wrong settings raise here as well.
+    # A call with no points gives the type of the result; wrong settings raise here as well.
     result = call(
-        **{name: np.zeros((0, *array.shape[1:]), array.dtype) for name, array in lazy.items()}
+        **{name: np.zeros((0, *array.shape[1:]), array.dtype) for name, array in dask_args.items()}
     )
-    empty = _arrays_of(result)
-    packed = SerializedObject.serialize(call, purpose)
+    empty_arrays = _arrays_of(result)
+    serialized = SerializedObject.serialize(call, purpose)
     token = content_hash(
-        (packed.content_hash, [(name, array.name) for name, array in lazy.items()]), purpose
+        (serialized.content_hash, [(name, array.name) for name, array in dask_args.items()]),
+        purpose,
     )
-    task = delayed(packed, name=f"harnack-{packed.content_hash}", traverse=False)
-    run_block = delayed(_run, pure=False)
-    block_lists = [array.to_delayed().reshape(-1).tolist() for array in lazy.values()]
-    lengths: tuple[int, ...] = next(iter(lazy.values())).chunks[0]
-    outputs: dict[str, list[Any]] = {name: [] for name in empty}
-    for k, blocks in enumerate(zip(*block_lists, strict=True)):
-        inputs = dict(zip(lazy, blocks, strict=True))
-        output = run_block(task, inputs, sum(lengths[:k]), dask_key_name=f"harnack-{token}-{k}")
-        for name, array in empty.items():
-            shape = (lengths[k], *array.shape[1:])
+    task = delayed(serialized, name=f"harnack-{serialized.content_hash}", traverse=False)
+    run_block = delayed(_run_block, pure=False)
+    block_lists = [array.to_delayed().reshape(-1).tolist() for array in dask_args.values()]
+    lengths: tuple[int, ...] = next(iter(dask_args.values())).chunks[0]
+    outputs: dict[str, list[Any]] = {name: [] for name in empty_arrays}
+    for block_index, blocks in enumerate(zip(*block_lists, strict=True)):
+        inputs = dict(zip(dask_args, blocks, strict=True))
+        output = run_block(
+            task, inputs, sum(lengths[:block_index]), dask_key_name=f"harnack-{token}-{block_index}"
+        )
+        for name, array in empty_arrays.items():
+            shape = (lengths[block_index], *array.shape[1:])
             outputs[name].append(dask_array.from_delayed(output[name], shape, array.dtype))
     results = {name: dask_array.concatenate(pieces) for name, pieces in outputs.items()}
     return type(result)(**results) if is_dataclass(result) else results[""]
 
 
 def _align_blocks(
-    dask_array: Any, lazy: dict[str, Any], arguments: Mapping[str, Any]
+    dask_array: Any, dask_args: dict[str, Any], others: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Dask arrays, and other arrays with an entry for each of their rows, cut into the same blocks
-    of rows.
+    """Dask arrays that all have the same blocks of rows.
+
+    dask_args: the Dask arrays by name; the blocks are those of the first.
+    others: arguments by name; arrays with as many rows become Dask arrays as well.
 
     Raises:
         ValueError: their lengths differ or are not known.
     """
-    first_name, reference = next(iter(lazy.items()))
+    first_name, reference = next(iter(dask_args.items()))
     if reference.ndim == 0:
         raise ValueError(f"{first_name} must have shape (n, 3) or (n,), not ()")
     if any(np.isnan(array) for array in reference.chunks[0]):
@@ -114,10 +129,10 @@ def _align_blocks(
             "compute_chunk_sizes() first"
         )
     count = reference.shape[0]
-    aligned = dict(lazy)
-    for name, array in arguments.items():
+    aligned = dict(dask_args)
+    for name, array in others.items():
         shape = np.shape(array)
-        if name not in lazy and shape not in ((), (3,)) and shape[0] == count:
+        if name not in dask_args and shape not in ((), (3,)) and shape[0] == count:
             aligned[name] = dask_array.from_array(np.asarray(array), chunks=-1)
     for name, array in aligned.items():
         if array.ndim not in (1, 2) or (array.ndim == 2 and array.shape[1] != 3):
@@ -129,10 +144,12 @@ def _align_blocks(
 
 
 def _arrays_of(result: Any) -> dict[str, np.ndarray[Any, Any]]:
+    """The arrays of a result by name: the attributes of a dataclass, or the array itself under the
+    name ""."""
     return dict(vars(result)) if is_dataclass(result) else {"": np.asarray(result)}
 
 
-def _run(packed: SerializedObject, blocks: dict[str, Any], start: int) -> dict[str, Any]:
+def _run_block(packed: SerializedObject, blocks: dict[str, Any], start: int) -> dict[str, Any]:
     """The results for one block of rows, which begins at row `start`."""
     with exclusive_compute():
         try:

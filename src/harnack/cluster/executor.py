@@ -45,12 +45,13 @@ TaskResult = dict[str, npt.NDArray[Any]]
 """The result of a task: arrays by name, and nothing else. They are sent and stored as they are."""
 TaskFunction = Callable[..., TaskResult]
 
-# Tasks that the cluster holds at a time for each of its threads. More of them hide the time that
-# messages take, but results wait in the memory of workers.
+# The number of tasks that the cluster holds at a time, for each of its threads. With more tasks no
+# thread waits for messages, but more results wait in the memory of workers.
 _PENDING_PER_THREAD = 3
-# Tasks that a job is split into for each thread, so that all threads end at about the same time.
+# The number of tasks per thread that a job is split into, so that all threads end at about the same
+# time.
 _TASKS_PER_THREAD = 6
-# Seconds between two queries for finished tasks; and without a worker, until a warning says so.
+# Seconds between two queries for finished tasks; and seconds without any worker before a warning.
 _POLL_SECONDS, _NO_WORKER_SECONDS = 0.005, 20.0
 
 
@@ -105,6 +106,7 @@ class CheckpointFolder:
             np.savez(partial, allow_pickle=False, **arrays)
 
     def _file(self, name: str) -> Path:
+        """The file of the result of the task with this name."""
         return self.path / f"{name}.npz"
 
 
@@ -121,10 +123,11 @@ class Executor:
     checkpoint: CheckpointFolder | None = None
     chunks: int | None = None
 
-    def split_range(self, count: int, max_size: int) -> list[tuple[int, int]]:
-        """Split range(count) into runs (start, stop) of at most `max_size` items. The runs are
-        shorter if `chunks`, or else the number of the client's threads, asks for more tasks."""
-        size = max(1, min(max_size, count))
+    def split_range(self, count: int, most: int) -> list[tuple[int, int]]:
+        """Split range(count) into intervals (start, stop), each of at most `most` numbers. They are
+        shorter if that gives fewer tasks than `chunks` or, if `chunks` is None, than the threads of
+        the client need."""
+        size = max(1, min(most, count))
         if self.chunks is not None:
             size = max(1, min(size, -(-count // self.chunks)))
         elif self.client is not None:
@@ -162,9 +165,11 @@ class Executor:
                     self.checkpoint.save(name, arrays)
 
     def _max_pending(self) -> int:
+        """The largest number of tasks that may be submitted or waiting to be yielded."""
         return 1 if self.client is None else _PENDING_PER_THREAD * self._threads()
 
     def _threads(self) -> int:
+        """The number of threads of all workers of the client, at least 1."""
         return max(1, sum(worker_threads(self.client).values()))
 
 
@@ -172,9 +177,12 @@ class Executor:
 def open_executor(
     client: Any = None, checkpoint: Any = None, chunks: int | None = None
 ) -> Generator[Executor]:
-    """Context manager that yields an Executor. client: a Dask client, the address of a scheduler,
-    or None for this process. checkpoint: the path of a folder, or None. chunks: the number of tasks
-    of a job, or None.
+    """Context manager that yields an Executor.
+
+    client: a Dask client, the address of a scheduler, or None for this process.
+    checkpoint: the path of a folder in which results are kept, or None.
+    chunks: the number of tasks that a job is split into, or None for a number that suits the
+        workers.
 
     Raises:
         ModuleNotFoundError, TypeError, OSError, RuntimeError: as `connect_client` and
@@ -224,7 +232,7 @@ class _DaskTasks:
         # As a task and not as data in a worker's memory, which would be lost with that worker.
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="Sending large graph")
-            self.packed = client.submit(_identity, packed, key=f"harnack-{packed.content_hash}")
+            self.packed = client.submit(_unchanged, packed, key=f"harnack-{packed.content_hash}")
 
     def submit(self, name: str, part: tuple[Any, ...]) -> None:
         """Send a task to the cluster."""
@@ -262,7 +270,7 @@ class _DaskTasks:
 
     def _wait(self) -> None:
         """Wait until a task is finished. Warns if there is no worker to run a task."""
-        idle_since, warned = None, False
+        idle_since, has_warned = None, False
         next_check = time.monotonic() + 1
         while not self.completed.has_ready():
             time.sleep(_POLL_SECONDS)
@@ -274,8 +282,8 @@ class _DaskTasks:
                 idle_since = None
                 continue
             idle_since = idle_since or now
-            if now - idle_since > _NO_WORKER_SECONDS and not warned:
-                warned = True
+            if now - idle_since > _NO_WORKER_SECONDS and not has_warned:
+                has_warned = True
                 warnings.warn("the cluster has no worker: this waits for one", stacklevel=2)
 
     def cancel(self) -> list[tuple[str, TaskResult]]:
@@ -300,23 +308,27 @@ def _ordered_results(
     runner: _LocalTasks | _DaskTasks,
     max_pending: Callable[[], int],
 ) -> Iterator[TaskResult]:
-    """The results of tasks in their order, while several tasks run at the same time.
+    """Yield the results of tasks in their order, while several tasks run at the same time. A task
+    that occurs several times is run once.
 
-    A task that occurs several times is run once. max_pending: gives the largest number of tasks
-    that may be submitted or waiting to be yielded.
+    names: of the tasks; equal names are the same task.
+    arguments: of each task.
+    folder: where results are looked up and saved; None for no folder.
+    runner: runs the tasks.
+    max_pending: gives the largest number of tasks that may be submitted or waiting to be yielded.
     """
     results: dict[str, TaskResult] = {}
     pending: set[str] = set()
-    uses, next_index = Counter(names), 0
+    remaining_uses, next_index = Counter(names), 0
 
     def submit(index: int) -> None:
         runner.submit(names[index], arguments[index])
         pending.add(names[index])
 
     for index, name in enumerate(names):
-        stored = None if folder is None or name in results else folder.load(name)
-        if stored is not None:
-            yield stored
+        stored_result = None if folder is None or name in results else folder.load(name)
+        if stored_result is not None:
+            yield stored_result
             continue
         if name not in results and name not in pending:
             submit(index)
@@ -332,16 +344,17 @@ def _ordered_results(
                 ):
                     submit(next_index)
                 next_index += 1
-            finished, arrays = runner.next_completed()
-            pending.remove(finished)
-            results[finished] = arrays
+            finished_name, arrays = runner.next_completed()
+            pending.remove(finished_name)
+            results[finished_name] = arrays
             if folder is not None:
-                folder.save(finished, arrays)
-        uses[name] -= 1
-        yield results[name] if uses[name] else results.pop(name)
+                folder.save(finished_name, arrays)
+        remaining_uses[name] -= 1
+        yield results[name] if remaining_uses[name] else results.pop(name)
 
 
-def _identity(packed: SerializedObject) -> SerializedObject:
+def _unchanged(packed: SerializedObject) -> SerializedObject:
+    """The argument itself: the task that holds a serialized job on the cluster."""
     return packed
 
 

@@ -4,12 +4,12 @@ Cached values are left out: they would be sent for nothing, and would make equal
 The cached values are those of `functools.cached_property` and of a `TransientCache`, and private
 fields of dataclasses that are not compared.
 
-Functions and classes of Python and of installed packages are sent by name. Those of users are sent
-by value, with the attributes of users' modules that they use (`users_code.py`). Their digest
-depends on what they do, and neither on their line numbers nor on the ids that cloudpickle
-generates, so that the same program, started again, finds its earlier results. These ids are not
-sent either: with them, an object that is opened in the same process would replace the methods of
-its classes.
+Functions and classes of Python and of installed packages are sent by name. Functions and classes of
+users are sent by value, with the attributes of users' modules that they use (`users_code.py`). The
+digest of such a function depends on what it does, but not on its line numbers, nor on the ids that
+cloudpickle generates for classes; so a program that is started again finds its earlier results. The
+ids are not sent either: with them, an object that is opened in the same process would replace the
+methods of its classes.
 """
 
 from __future__ import annotations
@@ -47,34 +47,34 @@ from harnack.cluster.users_code import (
 
 Key = TypeVar("Key")
 Value = TypeVar("Value")
-# Stands for an attribute that is left out.
+# Replaces the value of an attribute that is left out.
 _OMIT = object()
 # The newest protocol of the oldest Python that is supported.
 _PROTOCOL = 5
-# Bits of kernels and of pictures depend on these.
+# Packages on which the bits of kernels and pictures depend.
 _PACKAGES = ("drjit", "mitsuba", "numpy")
-# Names of files whose contents are code, which is sent itself.
-_CODE = (".py", ".pyc", ".ipynb")
-# Numbers that cloudpickle makes up for classes.
+# Suffixes of files that contain code; such code is sent by value, and not compared as a file.
+_CODE_SUFFIXES = (".py", ".pyc", ".ipynb")
+# The ids that cloudpickle generates for classes.
 _GENERATED_ID = re.compile(r"[0-9a-f]{32}")
 # cloudpickle's list of modules is one for all threads.
 _REGISTRY_LOCK = threading.RLock()
-_MISSING = (
-    "{purpose} needs Dask, which is not installed: pip install 'harnack[cluster]', on each machine "
-    "of the cluster in the same version"
+_MISSING_MESSAGE = (
+    "{what} needs Dask, which is not installed: pip install 'harnack[cluster]', on each machine of "
+    "the cluster in the same version"
 )
 
 
-def import_optional(name: str, purpose: str) -> Any:
+def import_optional(name: str, what: str) -> Any:
     """Import a module that the extra `cluster` installs.
 
     Raises:
-        ModuleNotFoundError: it is not installed. The message says that `purpose` needs it.
+        ModuleNotFoundError: it is not installed. The message says that `what` needs it.
     """
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(_MISSING.format(purpose=purpose)) from error
+        raise ModuleNotFoundError(_MISSING_MESSAGE.format(what=what)) from error
 
 
 @functools.cache
@@ -97,31 +97,31 @@ class SerializedObject:
     """A pickled object.
 
     content_hash: 32 hexadecimal digits, equal for equal contents and equal versions of this
-        library, of `package_versions` and of `packages`.
+        library, of `package_versions` and of `others`.
     data: the pickle.
     file_digests: (path, digest) of each file that the object names.
     package_versions: the versions where it was pickled; `deserialize` refuses others.
-    packages: (name, version) of other installed packages that it uses.
+    others: (name, version) of other installed packages that it uses.
     """
 
     content_hash: str
     data: bytes
     file_digests: tuple[tuple[str, str], ...] = ()
     package_versions: str = ""
-    packages: tuple[tuple[str, str], ...] = ()
+    others: tuple[tuple[str, str], ...] = ()
 
     @classmethod
-    def serialize(cls, value: Any, label: str) -> SerializedObject:
+    def serialize(cls, thing: Any, what: str) -> SerializedObject:
         """Pickle an object.
 
         Raises:
             ModuleNotFoundError: the extra `cluster` is not installed.
-            TypeError: the object cannot be pickled. The messages begin with `label`.
+            TypeError: the object cannot be pickled. The messages begin with `what`.
         """
-        name, pickler = _hash_and_files(value, label)
-        data = _written(_cacheless_pickler, value, label).file.getvalue()
-        files, packages = sorted(pickler.files.items()), sorted(pickler.packages.items())
-        return cls(name, data, tuple(files), package_versions(), tuple(packages))
+        name, pickler = _hash_and_files(thing, what)
+        data = _pickle(_cacheless_pickler, thing, what).file.getvalue()
+        files, others = sorted(pickler.files.items()), sorted(pickler.others.items())
+        return cls(name, data, tuple(files), package_versions(), tuple(others))
 
     def deserialize(self) -> Any:
         """The object. It is the same object as at the last call, as long as it is among the objects
@@ -139,10 +139,14 @@ class SerializedObject:
 
 @functools.lru_cache(maxsize=4)
 def _deserialize_cached(packed: SerializedObject) -> Any:
-    sent = [packed.package_versions, *(f"{name} {version}" for name, version in packed.packages)]
+    """`SerializedObject.deserialize`, which keeps the objects opened last."""
+    sent = [
+        packed.package_versions,
+        *(f"{name} {version}" for name, version in packed.others),
+    ]
     local = [
         package_versions(),
-        *(f"{name} {installed_version(name)}" for name, _ in packed.packages),
+        *(f"{name} {installed_version(name)}" for name, _ in packed.others),
     ]
     if sent != local:
         raise RuntimeError(
@@ -159,7 +163,7 @@ def _deserialize_cached(packed: SerializedObject) -> Any:
     return pickle.loads(packed.data)
 
 
-def content_hash(value: Any, label: str) -> str:
+def content_hash(thing: Any, what: str) -> str:
     """32 hexadecimal digits that depend on everything an object contains, on the contents of the
     files that it names, and on `package_versions`.
 
@@ -169,45 +173,51 @@ def content_hash(value: Any, label: str) -> str:
     Raises:
         ModuleNotFoundError, TypeError: as `SerializedObject.serialize`.
     """
-    return _hash_and_files(value, label)[0]
+    return _hash_and_files(thing, what)[0]
 
 
-def _hash_and_files(
-    value: Any, purpose: str, words: frozenset[str] = frozenset()
-) -> tuple[str, Any]:
-    """The content hash of an object, and the pickler that wrote it, which has noted files and
-    packages."""
+def _hash_and_files(value: Any, what: str, words: frozenset[str] = frozenset()) -> tuple[str, Any]:
+    """The content hash of an object, and the pickler that wrote it; this has noted the files and
+    packages that the object names.
+
+    words: names that occur in users' code, if some are known already.
+    """
     try:
-        pickler = _written(_hashing_pickler, value, purpose, words, fast=True)
-    except (RecursionError, TypeError, ValueError):  # an object that holds itself
-        pickler = _written(_hashing_pickler, value, purpose, words)
+        pickler = _pickle(_hashing_pickler, value, what, words, fast=True)
+    except (RecursionError, TypeError, ValueError):  # an object that contains itself
+        pickler = _pickle(_hashing_pickler, value, what, words)
     data = (
-        f"{package_versions()} {sorted(pickler.packages.items())}".encode()
-        + pickler.file.getvalue()
+        f"{package_versions()} {sorted(pickler.others.items())}".encode() + pickler.file.getvalue()
     )
     return hashlib.blake2b(data, digest_size=16).hexdigest(), pickler
 
 
-def _written(
-    make_class: Callable[[Any], Any], value: Any, purpose: str,
-    words: frozenset[str] = frozenset(), *, fast: bool = False,
+def _pickle(
+    make_class: Callable[[Any], Any], value: Any, what: str, words: frozenset[str] = frozenset(), *,
+    fast: bool = False,
 ) -> Any:  # fmt: skip
-    """A pickler of the class that `make_class` returns, after it has written an object into its
-    `file`.
+    """Write an object into the `file` of a new pickler, and return the pickler.
 
-    Which attributes of modules are needed is known only when all code was written. So the object is
-    written again until no name is missing; this ends, since the code has finitely many names.
+    make_class: gives the class of the pickler, from cloudpickle's Pickler.
+    words: names that occur in users' code, if some are known already.
+    fast: whether to write equal objects out wherever they occur.
+
+    Which attributes of modules are needed is known only after all code was written. So the object
+    is written again until no name is missing; this ends, since the code has finitely many names.
+
+    Raises:
+        TypeError: the object cannot be pickled.
     """
-    cloudpickle = import_optional("cloudpickle", purpose)
+    cloudpickle = import_optional("cloudpickle", what)
     while True:
-        pickler = make_class(cloudpickle.Pickler)(purpose, words)
+        pickler = make_class(cloudpickle.Pickler)(what, words)
         pickler.fast = fast
         try:
             pickler.dump(value)
         except (pickle.PicklingError, TypeError, AttributeError) as error:
             raise TypeError(
-                f"{purpose}: it cannot be sent to another process or written down ({error}); make "
-                "it of arrays, numbers and the classes of this library"
+                f"{what}: it cannot be sent to another process or written down ({error}); make it "
+                "of arrays, numbers and the classes of this library"
             ) from error
         words = frozenset(pickler.words)
         if all(len(attributes_named(*module)) == len(attributes_named(module[0], words))
@@ -216,8 +226,8 @@ def _written(
 
 
 def _by_value(definition: Any, reduce: Callable[[Any], Any]) -> Any:
-    """The result of cloudpickle's `reduce` for a function, class or type variable: its contents,
-    and not its name, if it is of a user's module."""
+    """The result of cloudpickle's `reduce` for a function, class or type variable. If it is defined
+    in a module of a user, the result describes its contents, and not its name."""
     module = sys.modules.get(str(getattr(definition, "__module__", None)))
     if module is None or not is_sent_itself(module):
         return reduce(definition)
@@ -247,12 +257,14 @@ def _file_digest(name: str) -> str | None:
 
 
 def _cached_property(function: Callable[..., Any], name: str) -> functools.cached_property[Any]:
+    """A cached property of a class that is rebuilt from its pickle."""
     cached = functools.cached_property(function)
     cached.__set_name__(object, name)
     return cached
 
 
 def _cached_function(function: Callable[..., Any], settings: dict[str, Any]) -> Any:
+    """A cached function that is rebuilt from its pickle, with an empty cache."""
     return functools.lru_cache(**settings)(function)
 
 
@@ -262,46 +274,53 @@ _CachedFunction = type(functools.cache(_cached_property))
 @functools.cache
 def _cacheless_pickler(base: Any) -> Callable[..., Any]:
     """Return a class derived from cloudpickle's Pickler that leaves out cached values (module
-    docstring) and sends functions of users.
+    docstring) and sends code of users by value.
 
-    Attributes of its objects: words, names that occur in users' code. modules: the users' modules
-    that were met, with the words known at that time. spaces: where the functions of a module look
-    up names.
+    Attributes of its objects:
+    words: names that occur in users' code.
+    modules: the users' modules that were met, with the words known at that time.
+    spaces: the namespaces in which functions look up names, by the id of the module's dictionary.
     """
 
     class Lean(base):
+        """The pickler class."""
+
         def __init__(self, context: str, words: frozenset[str]) -> None:
             self.file = io.BytesIO()
             super().__init__(self.file, protocol=_PROTOCOL)
-            self.context = context
+            self.what = context
             self.words = set(words)
             self.modules: list[tuple[ModuleType, frozenset[str]]] = []
             self.spaces: dict[int, Namespace] = {}
 
         def reducer_override(self, obj: Any) -> Any:
+            """The recipe by which an object is rebuilt (see `pickle.Pickler.reducer_override`),
+            without cached values."""
             if isinstance(obj, ModuleType):
                 return self.of_module(obj)
             if isinstance(obj, functools.cached_property):  # which holds a lock in Python 3.11
                 return _cached_property, (obj.func, obj.attrname)
             reduce = functools.partial(base.reducer_override, self)
             if isinstance(obj, TypeVar):
-                return _without_class_id(_by_value(obj, base.dispatch_table[TypeVar]))
+                return _without_generated_id(_by_value(obj, base.dispatch_table[TypeVar]))
             if isinstance(obj, type):
-                return _without_class_id(_by_value(obj, reduce))
+                return _without_generated_id(_by_value(obj, reduce))
             if isinstance(obj, FunctionType):
                 return self.of_function(obj, _by_value(obj, reduce))
             obj_type: type = obj.__class__
             transient = _transient_attributes(obj_type)
             if not transient:
-                return _not_by_name(obj)
+                return _refuse_user_names(obj)
             constructor, arguments, state, *rest = (*obj.__reduce_ex__(_PROTOCOL), None)[:6]
             if isinstance(state, dict):
-                attributes2 = cast("dict[str, Any]", state)
-                state = {key: transient.get(key, value) for key, value in attributes2.items()}
+                state_attributes = cast("dict[str, Any]", state)
+                state = {key: transient.get(key, value) for key, value in state_attributes.items()}
                 state = {key: value for key, value in state.items() if value is not _OMIT}
             return constructor, arguments, state, *rest[:3]
 
         def of_module(self, module: ModuleType) -> Any:
+            """The recipe of a module: its name or, for a user's module, its attributes that are
+            named by the words."""
             if not is_sent_itself(module):
                 return importlib.import_module, (module.__name__,)
             words = frozenset(self.words)
@@ -311,6 +330,8 @@ def _cacheless_pickler(base: Any) -> Callable[..., Any]:
             return itself, (self.space(vars(module)),), (attributes, left_out), None, None, fill
 
         def of_function(self, function: FunctionType, reduced: Any) -> Any:
+            """The recipe of a function, whose words are noted. reduced: the recipe by
+            cloudpickle."""
             if not isinstance(reduced, tuple):
                 return reduced
             refuse_imports_within(function)
@@ -319,14 +340,15 @@ def _cacheless_pickler(base: Any) -> Callable[..., Any]:
             return function_in, (self.space(function.__globals__), code, closure), *rest
 
         def space(self, names: dict[str, Any]) -> Namespace:
+            """The namespace of a module's dictionary; one for each dictionary."""
             return self.spaces.setdefault(id(names), Namespace.of(names))
 
     return Lean
 
 
-def _without_class_id(reduced: Any) -> Any:
-    """The recipe of a class without the id by which cloudpickle finds a class that it made before:
-    it would replace the methods of that class."""
+def _without_generated_id(reduced: Any) -> Any:
+    """The recipe of a class without its generated id. By this id cloudpickle finds a class that it
+    rebuilt before, whose methods it would replace."""
     if not isinstance(reduced, tuple):
         return reduced
     constructor, arguments, *rest = cast("tuple[Any, ...]", reduced)
@@ -337,9 +359,10 @@ def _without_class_id(reduced: Any) -> Any:
     )
 
 
-def _not_by_name(obj: Any) -> Any:
-    """`NotImplemented`, where an object does not stand for a name in a module of a user; else its
-    contents.
+def _refuse_user_names(obj: Any) -> Any:
+    """The recipe of an object that stands for a name in a module of a user, such as a cached
+    function: its contents in place of its name. `NotImplemented` for all other objects, which are
+    pickled as usual.
 
     Raises:
         TypeError: its contents cannot be determined.
@@ -359,20 +382,24 @@ def _not_by_name(obj: Any) -> Any:
 
 @functools.cache
 def _hashing_pickler(base: Any) -> Callable[..., Any]:
-    """Return a pickler class whose output is only hashed. It omits what changes from run to run
-    (line numbers, ids that cloudpickle generates, the order of sets), and adds a digest of each
-    file that a string or a path names.
+    """Return a pickler class whose output is only hashed. It leaves out whatever changes from run
+    to run (line numbers, generated ids, the order of sets), and adds a digest of each file that a
+    string or a path names.
 
-    Attributes of its objects: files, the digest of each file. others: the versions of the installed
-    packages that are used.
+    Attributes of its objects:
+    files: the digest of each file, by its path.
+    others: the versions of the installed packages that are used, by name.
+    begun: the functions, classes and modules that were begun, by id, with a number each.
     """
     base_pickler: Any = _cacheless_pickler(base)
 
     class Naming(base_pickler):
+        """The pickler class."""
+
         def __init__(self, context: str, words: frozenset[str]) -> None:
             super().__init__(context, words)
             self.files: dict[str, str] = {}
-            self.packages: dict[str, str] = {}
+            self.others: dict[str, str] = {}
             self.begun: dict[int, tuple[Any, int]] = {}
 
         def persistent_id(self, obj: Any) -> Any:
@@ -382,31 +409,35 @@ def _hashing_pickler(base: Any) -> Callable[..., Any]:
             if obj_type is set or obj_type is frozenset:  # whose order differs
                 members = cast("set[Any] | frozenset[Any]", obj)
                 words = frozenset(cast("set[str]", self.words))
-                hashed = [_hash_and_files(member, self.context, words) for member in members]
+                hashed = [_hash_and_files(member, self.what, words) for member in members]
                 for _, pickler in hashed:
                     self.words |= pickler.words
                     self.modules += pickler.modules
                     self.files |= pickler.files
-                    self.packages |= pickler.packages
+                    self.others |= pickler.others
                 return obj_type.__name__, sorted(name for name, _ in hashed)
             return self.of_file(obj) if isinstance(obj, str | os.PathLike) else None
 
         def of_file(self, obj: Any) -> str | None:
+            """The text "file" and the digest, for a name or path of an existing file that is not
+            code; None for others. The digest is noted."""
             path = os.fsdecode(cast("str | os.PathLike[str]", obj))
-            if path.endswith(_CODE) or (contents := _file_digest(path)) is None:
+            if path.endswith(_CODE_SUFFIXES) or (contents := _file_digest(path)) is None:
                 return None
             self.files[path] = contents
             return f"file {contents}"
 
         def reducer_override(self, obj: Any) -> Any:
-            if obj is tuple:  # in which all else is written
+            """The recipe of an object, of which only its content matters, as it is never
+            rebuilt."""
+            if obj is tuple:  # all other recipes are written as tuples
                 return NotImplemented
             if isinstance(obj, CodeType):
                 values = [getattr(obj, attribute, None) for attribute in _CODE_ATTRIBUTES]
                 return tuple, ([obj.co_consts, repr(values).encode()],)
             if isinstance(obj, functools.cached_property):
                 return tuple, ([obj.func],)
-            self.say_where_from(obj)
+            self.note_origin(obj)
             reduced = base_pickler.reducer_override(self, obj)
             is_code = isinstance(obj, type | FunctionType | ModuleType)
             if reduced is NotImplemented and type(obj) not in base.dispatch_table:
@@ -416,16 +447,17 @@ def _hashing_pickler(base: Any) -> Callable[..., Any]:
             if not isinstance(reduced, tuple) or len(cast("tuple[Any, ...]", reduced)) < 3:
                 return cast("Any", reduced)
             constructor, arguments, state, *rest = cast("tuple[Any, ...]", reduced)
-            if isinstance(obj, ModuleType):  # attributes that are left out have no effect
+            if isinstance(obj, ModuleType):  # names of attributes that were not sent have no effect
                 state, _ = state
-            state = _with_keys_apart(state)
+            state = _with_encoded_keys(state)
             if is_code:
                 self.begun[id(obj)] = (obj, len(self.begun))
-                return tuple, ([*map(_apart, arguments), state],)
+                return tuple, ([*map(_encoded, arguments), state],)
             return constructor, arguments, state, *rest
 
-        def say_where_from(self, obj: Any) -> None:
-            """Note the package or the compiled file that the code of an object is in."""
+        def note_origin(self, obj: Any) -> None:
+            """Note the version of the package, or the digest of the compiled file, that defines an
+            object."""
             name = obj.__name__ if isinstance(obj, ModuleType) else getattr(obj, "__module__", None)
             if not isinstance(name, str):
                 return
@@ -435,38 +467,41 @@ def _hashing_pickler(base: Any) -> Callable[..., Any]:
                 root not in (*_PACKAGES, "cloudpickle")
                 and (version := installed_version(root)) is not None
             ):
-                self.packages[root] = version
+                self.others[root] = version
             elif module is not None and (path := compiled_file(module)) is not None:
                 self.files[path] = str(_file_digest(path))
 
     return Naming
 
 
-# Attributes whose values are names as well, or contain names.
-_SAY_NAMES = ("__name__", "__qualname__", "__module__", "__annotations__")
-_HAVE_NAMES = ("__globals__", "__kwdefaults__")
+# Attributes whose values are names, and attributes that contain dictionaries of names.
+_NAME_ATTRIBUTES = ("__name__", "__qualname__", "__module__", "__annotations__")
+_NAMESPACE_ATTRIBUTES = ("__globals__", "__kwdefaults__")
 
 
-def _with_keys_apart(state: Any) -> Any:
-    """The contents of an object, with names of attributes that are no strings: there may be files
-    of the same names."""
+def _with_encoded_keys(state: Any) -> Any:
+    """The state of an object, with the names of attributes as bytes: as strings, they would be
+    taken for names of files."""
     if isinstance(state, tuple):
-        return tuple(map(_with_keys_apart, cast("tuple[Any, ...]", state)))
+        return tuple(map(_with_encoded_keys, cast("tuple[Any, ...]", state)))
     if not isinstance(state, dict):
         return state
     attributes = dict(cast("dict[Any, Any]", state))
-    attributes |= {key: _apart(attributes[key]) for key in _SAY_NAMES if key in attributes}
+    attributes |= {key: _encoded(attributes[key]) for key in _NAME_ATTRIBUTES if key in attributes}
     attributes |= {
-        key: _with_keys_apart(attributes[key]) for key in _HAVE_NAMES if key in attributes
+        key: _with_encoded_keys(attributes[key])
+        for key in _NAMESPACE_ATTRIBUTES
+        if key in attributes
     }
-    return [(_apart(key), value) for key, value in attributes.items()]
+    return [(_encoded(key), value) for key, value in attributes.items()]
 
 
-def _apart(names: Any) -> Any:
-    """Strings, and the strings in a dictionary, as bytes."""
+def _encoded(names: Any) -> Any:
+    """A string as bytes; a dictionary as a list of pairs, with its strings as bytes; other values
+    unchanged."""
     if isinstance(names, dict):
         mapping = cast("dict[Any, Any]", names)
-        return [(_apart(key), _apart(value)) for key, value in mapping.items()]
+        return [(_encoded(key), _encoded(value)) for key, value in mapping.items()]
     return names.encode() if isinstance(names, str) else names
 
 
@@ -477,12 +512,14 @@ _CODE_ATTRIBUTES = (
 
 
 def _is_generated_id(argument: Any) -> bool:
+    """Whether a value is an id that cloudpickle generated."""
     return isinstance(argument, str) and _GENERATED_ID.fullmatch(argument) is not None
 
 
 @functools.lru_cache(maxsize=1024)
 def _transient_attributes(kind: type) -> dict[str, Any]:
-    """The values that replace attributes in which objects of a class store computed values."""
+    """The attributes in which objects of a class store computed values, with the value that
+    replaces each in a pickle."""
     replacements: dict[str, Any] = {
         name: _OMIT
         for definition in kind.__mro__

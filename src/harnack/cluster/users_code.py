@@ -1,5 +1,5 @@
-"""Code of users: which code it is, which attributes of users' modules it uses, and modules as they
-are sent.
+"""Code of users: recognizing it, finding the attributes of users' modules that it uses, and sending
+such modules.
 
 Code of Python itself and of installed packages is sent by name. A user's module is sent by value,
 in its present state: a worker may lack it, or have imported it before it was changed, and a
@@ -27,14 +27,14 @@ from typing import Any, cast
 
 # Suffixes of modules that can be sent; other modules are compiled, and are files to be compared.
 _SOURCES = (*importlib.machinery.SOURCE_SUFFIXES, *importlib.machinery.BYTECODE_SUFFIXES)
-# Functions that see all attributes of a module at once.
-_FINDERS = frozenset(("vars", "dir", "__dict__", "getmembers"))
-# Functions that find modules whose names are not in an import statement.
+# Functions that read all attributes of a module at once.
+_ALL_ATTRIBUTES = frozenset(("vars", "dir", "__dict__", "getmembers"))
+# Functions that import modules without an import statement.
 _IMPORTERS = frozenset(("import_module", "__import__"))
-# Attributes that a function may use of its module without naming it.
-_MODULE_ATTRIBUTES = ("__package__", "__name__", "__path__", "__file__")
+# Attributes of its module that a function may use without naming them.
+_ALWAYS_SENT = ("__package__", "__name__", "__path__", "__file__")
 # Attributes that belong to the process that imported a module.
-_IMPORT_ATTRIBUTES = frozenset(("__builtins__", "__spec__", "__loader__", "__cached__"))
+_NEVER_SENT = frozenset(("__builtins__", "__spec__", "__loader__", "__cached__"))
 # The attribute of a sent module that lists the names of the attributes that were not sent.
 _LEFT_OUT = "__left_out__"
 
@@ -44,9 +44,8 @@ class SentModule(ModuleType):
     is imported here under its name is another one."""
 
     def __getattr__(self, name: str) -> Any:
-        if name in vars(self).get(
-            _LEFT_OUT, ()
-        ):  # no AttributeError, which `hasattr` would take for an answer
+        # Not an AttributeError, which `hasattr` would take for "no such attribute".
+        if name in vars(self).get(_LEFT_OUT, ()):
             raise RuntimeError(
                 f"{name} of your module {self.__name__} was not sent, since no code that was sent "
                 f"names it; write `{self.__name__}.{name}` where it is used"
@@ -56,26 +55,26 @@ class SentModule(ModuleType):
 
 @dataclass(frozen=True)
 class Namespace:
-    """The module in which functions look for names; it is opened as a `SentModule`.
+    """The module in which functions look up names. When it is unpickled, it becomes a `SentModule`.
 
-    attributes: the attributes that it has whichever names functions use.
+    known: the attributes that are sent in any case, whatever names the functions use.
     """
 
-    attributes: Mapping[str, Any]
+    known: Mapping[str, Any]
 
     @classmethod
     def of(cls, names: Mapping[str, Any]) -> Namespace:
         """The namespace of a module, from its attributes by name."""
-        return cls({key: names[key] for key in _MODULE_ATTRIBUTES if key in names})
+        return cls({key: names[key] for key in _ALWAYS_SENT if key in names})
 
     def __reduce__(self) -> Any:
-        return sent_module, (self.attributes,)
+        return sent_module, (self.known,)
 
 
-def sent_module(attributes: Mapping[str, Any]) -> SentModule:
-    """A module with only the attributes `attributes`."""
-    module = SentModule(str(attributes.get("__name__", "")))
-    vars(module).update(attributes)
+def sent_module(known: Mapping[str, Any]) -> SentModule:
+    """A module with only the attributes in `known`."""
+    module = SentModule(str(known.get("__name__", "")))
+    vars(module).update(known)
     return module
 
 
@@ -87,7 +86,7 @@ def itself(module: SentModule) -> SentModule:
 def fill(module: SentModule, contents: tuple[Mapping[str, Any], frozenset[str]]) -> None:
     """Give a module its attributes, and the names of the attributes that are left out."""
     attributes, left_out = contents
-    vars(module).update(attributes, **{_LEFT_OUT: left_out - _IMPORT_ATTRIBUTES})
+    vars(module).update(attributes, **{_LEFT_OUT: left_out - _NEVER_SENT})
 
 
 def function_in(module: SentModule, code: CodeType, closure: Any) -> FunctionType:
@@ -97,11 +96,11 @@ def function_in(module: SentModule, code: CodeType, closure: Any) -> FunctionTyp
 
 def attributes_named(module: ModuleType, words: frozenset[str] | set[str]) -> dict[str, Any]:
     """The attributes of a module that code with these words may use, in the order of names."""
-    uses_all = bool(words & _FINDERS)
+    uses_all = bool(words & _ALL_ATTRIBUTES)
     return {
         name: value
         for name, value in sorted(vars(module).items())
-        if (uses_all or name in words or name == "__getattr__") and name not in _IMPORT_ATTRIBUTES
+        if (uses_all or name in words or name == "__getattr__") and name not in _NEVER_SENT
     }
 
 
@@ -119,16 +118,17 @@ def words_of(function: FunctionType) -> set[str]:
     return {
         word
         for code in codes_within(function.__code__)
-        for word in (*code.co_names, *_texts(code.co_consts))
+        for word in (*code.co_names, *_strings_in(code.co_consts))
     }
 
 
-def _texts(constants: Iterable[Any]) -> Iterator[str]:
+def _strings_in(constants: Iterable[Any]) -> Iterator[str]:
+    """The strings among constants, and in their tuples and frozen sets."""
     for constant in constants:
         if isinstance(constant, str):
             yield constant
         elif isinstance(constant, tuple | frozenset):
-            yield from _texts(cast("Iterable[Any]", constant))
+            yield from _strings_in(cast("Iterable[Any]", constant))
 
 
 def refuse_imports_within(function: FunctionType) -> None:
@@ -140,13 +140,15 @@ def refuse_imports_within(function: FunctionType) -> None:
     """
     package = function.__globals__.get("__package__") or ""
     for code in codes_within(function.__code__):
-        names = [_imported(statement, package) for statement in _imports(code)]
+        names = [_imported_module(statement, package) for statement in _imports(code)]
         if _IMPORTERS.intersection(code.co_names):
             names += [
-                text for text in _texts(code.co_consts) if text.replace(".", "_").isidentifier()
+                text
+                for text in _strings_in(code.co_consts)
+                if text.replace(".", "_").isidentifier()
             ]
         for name in names:
-            if _is_users_root(name.partition(".")[0]):
+            if _is_user_root(name.partition(".")[0]):
                 raise TypeError(
                     f"{function.__qualname__} of the module {function.__module__} imports your "
                     f"module {name} when it is called, and which that is then cannot be told; "
@@ -155,7 +157,8 @@ def refuse_imports_within(function: FunctionType) -> None:
 
 
 def _imports(code: CodeType) -> Iterator[tuple[int, str]]:
-    """(level, name) of each import: the number of packages up, and the name relative to there."""
+    """The imports in a code object, as (level, name): the number of packages to go up (0 for an
+    absolute import), and the name relative to there."""
     instructions = [
         instruction
         for instruction in dis.get_instructions(code)
@@ -166,14 +169,17 @@ def _imports(code: CodeType) -> Iterator[tuple[int, str]]:
             yield int(instructions[k - 2].argval), str(step.argval)
 
 
-def _imported(statement: tuple[int, str], package: str) -> str:
+def _imported_module(statement: tuple[int, str], package: str) -> str:
+    """The full name of the module that an import statement (level, name) of a module in `package`
+    imports."""
     level, name = statement
-    with suppress(ImportError):  # which the function will meet itself
+    with suppress(ImportError):  # the function will raise this error itself
         return importlib.util.resolve_name("." * level + name, package)
     return name
 
 
-def _is_users_root(root: str) -> bool:
+def _is_user_root(root: str) -> bool:
+    """Whether a top-level module, imported or not, is a user's."""
     module = sys.modules.get(root)
     if module is not None:
         return is_users(module)
@@ -183,7 +189,7 @@ def _is_users_root(root: str) -> bool:
     if spec is None or spec.origin in ("built-in", "frozen"):
         return False
     location = spec.origin or next(iter(spec.submodule_search_locations or ()), None)
-    return location is not None and _is_users_path(root, location)
+    return location is not None and _is_user_location(root, location)
 
 
 def is_users(module: ModuleType) -> bool:
@@ -192,17 +198,17 @@ def is_users(module: ModuleType) -> bool:
     root = name.partition(".")[0]
     if name == "__main__" or sys.modules.get(name) is not module:
         return True
-    location = _module_path(module)
+    location = _location_of(module)
     if location is None and root != name and (top := sys.modules.get(root)) is not None:
         return is_users(top)
     if location is None:  # one that is built in has a specification
         return getattr(module, "__spec__", None) is None
-    return _is_users_path(root, location)
+    return _is_user_location(root, location)
 
 
 def is_sent_itself(module: ModuleType) -> bool:
     """Whether a module is a user's and not a compiled one."""
-    location = _module_path(module)
+    location = _location_of(module)
     return is_users(module) and (
         location is None or location.endswith(_SOURCES) or not Path(location).suffix
     )
@@ -210,19 +216,21 @@ def is_sent_itself(module: ModuleType) -> bool:
 
 def compiled_file(module: ModuleType) -> str | None:
     """The file of a compiled module of a user; None for another module."""
-    path = _module_path(module)
+    path = _location_of(module)
     return path if path is not None and is_users(module) and not is_sent_itself(module) else None
 
 
-def _module_path(module: ModuleType) -> str | None:
-    """The file or, of a package without one, the folder of a module."""
+def _location_of(module: ModuleType) -> str | None:
+    """The file of a module; the folder of a package without a file; None if there is neither."""
     attributes = vars(module)
     location = attributes.get("__file__") or next(iter(attributes.get("__path__", ())), None)
     return location if isinstance(location, str) else None
 
 
 @functools.cache
-def _is_users_path(root: str, location: str) -> bool:
+def _is_user_location(root: str, location: str) -> bool:
+    """Whether a file or folder of the top-level module `root` belongs neither to Python nor to an
+    installed package nor to this one."""
     if root == "harnack":
         return False
     path = Path(location).resolve()
@@ -239,7 +247,7 @@ def _is_users_path(root: str, location: str) -> bool:
 def installed_version(root: str) -> str | None:
     """The version of the installed package that has a module; None for a part of Python, a user's
     module, and one that is in no package."""
-    if root in sys.stdlib_module_names or root in ("__main__", "harnack") or _is_users_root(root):
+    if root in sys.stdlib_module_names or root in ("__main__", "harnack") or _is_user_root(root):
         return None
     with suppress(importlib.metadata.PackageNotFoundError, ValueError):
         return importlib.metadata.version(root)

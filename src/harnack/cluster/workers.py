@@ -17,7 +17,7 @@ import numpy as np
 from harnack.backend import choose_backend, to_numpy
 from harnack.cluster.serialization import import_optional, package_versions
 
-# The time to wait for a scheduler.
+# How long to wait for a scheduler to answer.
 _CONNECT_TIMEOUT = "10s"
 SCHEDULER_LOST = "the scheduler was lost, or somebody cancelled what this task waits for"
 _INSTALL = "install the same there as here, such as by pip install 'harnack[cluster]=={version}'"
@@ -43,10 +43,10 @@ def connect_client(client: Any) -> Generator[Any]:
         yield None
         return
     distributed = import_optional("distributed", "client")
-    opened = None
+    own_client = None
     if isinstance(client, str):
         try:
-            client = opened = distributed.Client(
+            client = own_client = distributed.Client(
                 client, timeout=_CONNECT_TIMEOUT, set_as_default=False
             )
         except (OSError, ValueError, TimeoutError) as error:
@@ -63,15 +63,14 @@ def connect_client(client: Any) -> Generator[Any]:
         _check_workers(client)
         yield client
     finally:
-        if opened is not None:
-            opened.close()
+        if own_client is not None:
+            own_client.close()
 
 
 @contextmanager
 def exclusive_compute() -> Generator[str]:
     """Context manager: within it no other task of this process computes, as Dr.Jit already uses all
-    threads of a worker. Yields the address of the Dask worker that this process is, "" if it is
-    none.
+    threads of a worker. It yields the address of this Dask worker, "" if this process is not one.
 
     Raises:
         RuntimeError: Dr.Jit has no backend that it can use here.
@@ -105,7 +104,13 @@ def worker_threads(client: Any) -> dict[str, int]:
 
 
 def _check_workers(client: Any) -> None:
-    # A function of Python's own library, which every worker has.
+    """Check that all workers of a client have the same versions of packages as this process, and
+    warn if they round differently.
+
+    Raises:
+        RuntimeError: a worker has other versions, or cannot compute.
+    """
+    # A function of the standard library, which every worker has.
     versions = client.run(importlib.metadata.version, "harnack", on_error="return")
     local_version = importlib.metadata.version("harnack")
     for address, version in versions.items():
@@ -139,8 +144,11 @@ def warn_rounding_differs(workers: Iterable[str]) -> None:
 
 
 def _worker_state(dask_worker: Any = None) -> tuple[str, str]:
-    """`package_versions` and `rounding_fingerprint` of a worker; LLVMNotFoundError if Dr.Jit has
-    nothing to work with."""
+    """Run on a worker: its `package_versions` and `rounding_fingerprint`.
+
+    Raises:
+        LLVMNotFoundError: Dr.Jit has no backend there.
+    """
     choose_backend()
     adopt_worker_threads(dask_worker.nanny is not None, dask_worker.state.nthreads)
     return package_versions(), rounding_fingerprint()
@@ -166,6 +174,7 @@ def rounding_fingerprint() -> str:
 
 @functools.cache
 def _rounding(_name: str) -> str:
+    """The digest of `rounding_fingerprint`; the name of the backend is the key of the cache."""
     x = dr.linspace(choose_backend().Float, 0.01, 40, 4096)
     s, c = dr.sincos(x)
     results = (dr.rcp(x), dr.rsqrt(x), s, c, dr.exp(-x), dr.log(x), dr.fma(s, c, x), dr.sqrt(x),

@@ -49,28 +49,30 @@ def to_zarr(
     if not is_dask_array(array):
         raise TypeError(f"to_zarr writes a Dask array, not a {type(array).__name__}")
     for lengths in array.chunks:
-        if any(one != lengths[0] for one in lengths[:-1]) or lengths[-1] > lengths[0]:
+        if any(length != lengths[0] for length in lengths[:-1]) or lengths[-1] > lengths[0]:
             raise ValueError(
                 f"the blocks have unequal lengths, {lengths[:9]}: call rechunk() first"
             )
     target = Path(path).resolve()
     file = _open_or_create(zarr, array, target)
-    missing = [
+    missing_chunks = [
         index
         for index in np.ndindex(*array.numblocks)
-        if all(one.stop > one.start for one in _chunk_slices(array, index))
-        and not _chunk(file, target, index).exists()
+        if all(extent.stop > extent.start for extent in _chunk_slices(array, index))
+        and not _chunk_path(file, target, index).exists()
     ]
     blocks = array.to_delayed()
-    write = dask.delayed(_write, pure=False)
-    tasks = [write(str(target), _chunk_slices(array, index), blocks[index]) for index in missing]
-    part = 1 / max(1, array.npartitions)
-    with progress_bar("writing", progress) as advance, connect_client(client) as one:
-        advance(1 - part * len(missing))
-        for _ in _compute_tasks(one, tasks):
-            advance(part)
-    for index in missing:
-        if not _chunk(file, target, index).exists():
+    write = dask.delayed(_write_block, pure=False)
+    tasks = [
+        write(str(target), _chunk_slices(array, index), blocks[index]) for index in missing_chunks
+    ]
+    fraction = 1 / max(1, array.npartitions)
+    with progress_bar("writing", progress) as advance, connect_client(client) as dask_client:
+        advance(1 - fraction * len(missing_chunks))
+        for _ in _compute_tasks(dask_client, tasks):
+            advance(fraction)
+    for index in missing_chunks:
+        if not _chunk_path(file, target, index).exists():
             raise OSError(
                 f"workers did not write to {target}: they see other files than this machine; name "
                 "a folder that all share"
@@ -79,7 +81,8 @@ def to_zarr(
 
 
 def _compute_tasks(client: Any, tasks: list[Any]) -> Iterator[None]:
-    """Compute tasks, all at once by a client, else one by one, and yield after each."""
+    """Compute tasks: all at once on a client's cluster; one by one without a client. Yields after
+    each task."""
     if client is None:
         for task in tasks:
             task.compute()
@@ -93,7 +96,7 @@ def _compute_tasks(client: Any, tasks: list[Any]) -> Iterator[None]:
             future.result()
             yield
     finally:
-        client.cancel([running for running in futures if running.status == "pending"])
+        client.cancel([pending for pending in futures if pending.status == "pending"])
 
 
 def _open_or_create(zarr: Any, array: Any, target: Path) -> Any:
@@ -119,19 +122,22 @@ def _open_or_create(zarr: Any, array: Any, target: Path) -> Any:
     return file
 
 
-def _chunk(file: Any, target: Path, index: tuple[int, ...]) -> Path:
-    """The file of a chunk, which is written under another name first, and then renamed."""
+def _chunk_path(file: Any, target: Path, index: tuple[int, ...]) -> Path:
+    """The path of the file of a chunk. A chunk is written under another name first, and then
+    renamed."""
     return target / file.metadata.encode_chunk_key(index)
 
 
 def _chunk_slices(array: Any, index: tuple[int, ...]) -> tuple[slice, ...]:
+    """The slices of an array that make up the chunk with this index."""
     starts = [sum(lengths[:k]) for lengths, k in zip(array.chunks, index, strict=True)]
     ends = [sum(lengths[: k + 1]) for lengths, k in zip(array.chunks, index, strict=True)]
     return tuple(slice(a, b) for a, b in zip(starts, ends, strict=True))
 
 
-def _write(path: str, slices: tuple[slice, ...], block: Any) -> None:
+def _write_block(path: str, slices: tuple[slice, ...], block: Any) -> None:
+    """Write a block into the Zarr array at `path`."""
     zarr = import_optional("zarr", "to_zarr")
-    # Chunks of zeros would be left out, and computed again.
+    # By default Zarr leaves out chunks of zeros, which would then be computed again.
     with zarr.config.set({"array.write_empty_chunks": True}):
         zarr.open_array(path, mode="r+")[slices] = block

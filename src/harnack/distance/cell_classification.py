@@ -33,24 +33,33 @@ if TYPE_CHECKING:
 
 __all__ = ["CellClassifier", "ClipCurveDescent", "taylor_remainder"]
 
+# Largest number of iterations along the clip curve, and of corrections back to it after one step.
 _ROUNDS, _MAX_CURVE_CORRECTIONS = 80, 8
-# In epsilons, of coordinates: the depth inside the domain at which points of the clip curve are
-# put, the error of that depth, and their distance from the level.
-_DOMAIN_INSET, _INSET_ERROR, _LEVEL_DISTANCE = 64.0, 48.0, 256.0
-# Fraction of the distance to another face at which steps end.
-_BEFORE = 0.999
-# States of a search at a corner of the domain: it turns into the other face, or has turned.
+# In machine epsilons of the coordinates: the depth inside the domain at which points of the clip
+# curve are placed, the tolerance of that depth, and the tolerance of their distance from the level.
+_DOMAIN_INSET, _DEPTH_TOLERANCE, _LEVEL_TOLERANCE = 64.0, 48.0, 256.0
+# Steps end at this fraction of the distance to another face of the domain.
+_STEP_TO_FACE = 0.999
+# States of a search at a corner of the domain, where two faces meet: the next step leads into the
+# other face; or a step has led there.
 _TURNING, _TURNED = 1, 2
-_MIN_STEP_FRACTION = 1e-9  # of a step: shorter steps are given up
-_MIN_SLOPE = 0.05  # of (x - y) . t along the curve: steps are at most 20 times that product
-_SAME_NORMAL = 1e-6  # cosines of angles between normals of one face differ from one by less
-_MIN_STEP = 1e-8  # of the distance: the relative error that remains is half its square
+# The search ends if the step has been reduced to this fraction.
+_MIN_STEP_FACTOR = 1e-9
+# Lower bound of the second derivative that the Newton step divides by: the step along the curve is
+# at most 20 |(x - y) . t|.
+_MIN_SECOND_DERIVATIVE = 0.05
+# Two normals belong to one face if the cosine of their angle differs from 1 by less than this.
+_SAME_FACE = 1e-6
+# The search ends at steps below this fraction of the distance: the relative error of the distance
+# that remains is half its square.
+_MIN_RELATIVE_STEP = 1e-8
 
 
 @dataclass(frozen=True)
 class ClipCurveDescent:
-    """Descent to the closest point of the clip curve, on which f = level and h = 0, where h is the
-    distance from the domain's boundary; all are prepared for one backend."""
+    """Descent to the closest point of the clip curve. On this curve f = level and h = 0, where h is
+    the signed distance from the boundary of the field's domain. field and domain are prepared for
+    the backend."""
 
     backend: Backend
     field: Field
@@ -59,78 +68,98 @@ class ClipCurveDescent:
 
     def closest(self, x: Vec3, start: Vec3) -> tuple[Vec3, Real]:
         """A point y of the curve at which the distance from x has a local minimum, found by descent
-        from `start`, and the curvature of the curve there; NaN where the curve is not reached.
+        from `start`; and the curvature of the curve there. NaN where the curve is not reached.
 
-        Let the curve have the tangent t and the second derivative y'', which follows from those of
-        f and h along t (differences of their gradients). Half the squared distance has the
-        derivative -(x - y).t along the curve and the second derivative 1 - (x - y).y'', which give
-        Newton's step w t + w^2/2 y''. After a step Newton's method for both equations leads back to
-        the curve. The step is accepted if the result is nearer to x, else a quarter of it is tried.
-        Where the step led to another face of the domain instead, that face ends steps from then on,
-        so that they lead to the corner where both faces meet; from there the search goes on, once,
-        along the curve in the other face.
+        Let t be the curve's unit tangent at y, and y'' its second derivative by arc length, which
+        follows from the second derivatives of f and h along t (differences of their gradients).
+        Half the squared distance has the derivative -(x - y).t along the curve and the second
+        derivative 1 - (x - y).y''. With Newton's step w, their negative quotient, the next point is
+        y + w t + w^2/2 y''; Newton's method for both equations then leads back to the curve. The
+        step is accepted if the result is nearer to x; else a quarter of it is tried.
+
+        If a step leads to another face of the domain, steps end at the plane of that face from then
+        on, so that they lead to the corner where the curve meets both faces. From there the search
+        goes on, once, along the curve in the other face.
         """
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
         x = vector(x)
 
         def body(
             y: Vec3, best: Vec3, nearest: Real, w: Real, tangent: Vec3, ddy: Vec3, normal: Vec3,
-            wall: Vec3, wall_height: Real, corner: Any, factor: Real, tries: Any, k: Any,
+            face_normal: Vec3, face_offset: Real, corner: Any, factor: Real, tries: Any, k: Any,
             active: Mask,
         ) -> tuple[Any, ...]:  # fmt: skip
+            """Try the point y, and choose the next one.
+
+            best, nearest: the best point of the curve so far, and its distance from x; infinite if
+                there is none.
+            w, tangent, ddy, normal: Newton's step, the curve's derivatives and the face's normal at
+                `best`.
+            face_normal, face_offset: the plane of another face that ends steps; the normal is 0 if
+                there is none.
+            corner: 0, `_TURNING` or `_TURNED`.
+            factor: the fraction of Newton's step that is tried.
+            tries: the number of corrections towards the curve since the last step.
+            """
             trial = self._at(y)
             distance = safe_norm(x - y)
             reached = dr.isfinite(nearest)
-            new_face = dr.dot(trial.normal, normal) < 1 - _SAME_NORMAL
-            gap = fmax(wall_height - dr.dot(wall, best), 0)
+            is_new_face = dr.dot(trial.normal, normal) < 1 - _SAME_FACE
+            gap = fmax(face_offset - dr.dot(face_normal, best), 0)
             turns = (
-                (corner == _TURNING) & new_face & (distance < nearest + 8 * gap + 100 * trial.near)
+                (corner == _TURNING)
+                & is_new_face
+                & (distance < nearest + 8 * gap + 100 * trial.near)
             )
             accepted = trial.is_on & (~reached | (distance < nearest) | turns)
-            # Beyond another face: that is a wall. Else off the curve: back to it, for several
-            # steps.
-            is_free = ~(dr.squared_norm(wall) > 0)
-            crosses = reached & new_face & is_free & ~accepted & (corner != _TURNING)
+            # A step across another face makes that face end the next steps. A point that is off the
+            # curve otherwise is corrected towards it, several times if necessary.
+            is_free = ~(dr.squared_norm(face_normal) > 0)
+            crosses = reached & is_new_face & is_free & ~accepted & (corner != _TURNING)
             corrects = ~trial.is_on & ~crosses & (tries < _MAX_CURVE_CORRECTIONS)
             corrects &= dr.isfinite(dr.squared_norm(trial.correction))
             failed = ~accepted & ~corrects
-            # On the curve, and nearer: the next step.
-            slope = 1 - dr.dot(x - y, trial.second_derivative)
-            step = dr.dot(x - y, trial.tangent) / fmax(dr.abs(slope), _MIN_SLOPE)
+            # A point on the curve that is nearer to x is accepted: the next Newton step.
+            curvature_term = 1 - dr.dot(x - y, trial.second_derivative)
+            step = dr.dot(x - y, trial.tangent) / fmax(
+                dr.abs(curvature_term), _MIN_SECOND_DERIVATIVE
+            )
             w = dr.select(accepted, clamp(step, -distance, distance), w)
             best, nearest = dr.select(accepted, y, best), dr.select(accepted, distance, nearest)
             tangent = dr.select(accepted, trial.tangent, tangent)
             ddy = dr.select(accepted, trial.second_derivative, ddy)
-            changes_face = accepted & new_face
-            wall = dr.select(crosses, trial.normal, dr.select(changes_face, 0, wall))
-            wall_height = dr.select(crosses, dr.dot(trial.normal, y) + trial.depth, wall_height)
+            changes_face = accepted & is_new_face
+            face_normal = dr.select(crosses, trial.normal, dr.select(changes_face, 0, face_normal))
+            face_offset = dr.select(crosses, dr.dot(trial.normal, y) + trial.depth, face_offset)
             normal = dr.select(accepted, trial.normal, normal)
             factor = dr.select(accepted, fmin(4 * factor, 1), factor)
             factor = dr.select(failed & ~crosses, 0.25 * factor, factor)
-            # The wall is met where rate |s| + s^2/2 wall.bend is the gap.
-            s, gap = factor * w, fmax(wall_height - dr.dot(wall, best), 0)
-            rate = dr.sign(w) * dr.dot(wall, tangent)
-            root = rate + dr.sqrt(rate * rate + 2 * gap * dr.dot(wall, ddy))
-            limit = dr.select(root > 0, _BEFORE * 2 * gap / root, dr.inf)
+            # The step s meets the face where rate |s| + s^2/2 face_normal.ddy = gap.
+            s, gap = factor * w, fmax(face_offset - dr.dot(face_normal, best), 0)
+            rate = dr.sign(w) * dr.dot(face_normal, tangent)
+            root = rate + dr.sqrt(rate * rate + 2 * gap * dr.dot(face_normal, ddy))
+            limit = dr.select(root > 0, _STEP_TO_FACE * 2 * gap / root, dr.inf)
             is_limited = ~(is_free & ~crosses) & (limit < dr.abs(s))
             s = dr.select(is_limited, clamp(s, -limit, limit), s)
             target = dr.fma(vector(s), tangent, best) + vector(0.5 * s * s) * ddy
-            min_step = dr.select(is_limited, 0, _MIN_STEP * nearest)
+            min_step = dr.select(is_limited, 0, _MIN_RELATIVE_STEP * nearest)
             is_short = dr.abs(s) <= fmax(min_step, trial.near)
             corner = dr.select((corner == _TURNING) & ~corrects, _TURNED, corner)
-            at_wall = is_short & is_limited & ~corrects & (corner == 0)
-            corner = dr.select(at_wall, _TURNING, corner)
-            target = dr.select(at_wall, dr.fma(vector(gap + 8 * trial.near), wall, best), target)
-            active &= (
-                (corrects | accepted | reached) & (factor > _MIN_STEP_FRACTION) & (k + 1 < _ROUNDS)
+            at_face = is_short & is_limited & ~corrects & (corner == 0)
+            corner = dr.select(at_face, _TURNING, corner)
+            target = dr.select(
+                at_face, dr.fma(vector(gap + 8 * trial.near), face_normal, best), target
             )
-            active &= corrects | at_wall | ~is_short
+            active &= (
+                (corrects | accepted | reached) & (factor > _MIN_STEP_FACTOR) & (k + 1 < _ROUNDS)
+            )
+            active &= corrects | at_face | ~is_short
             y, tries = (
                 dr.select(corrects, y + trial.correction, target),
                 dr.select(corrects, tries + 1, 0),
             )
             return (
-                y, best, nearest, w, tangent, ddy, normal, wall, wall_height, corner, factor,
+                y, best, nearest, w, tangent, ddy, normal, face_normal, face_offset, corner, factor,
                 tries, k + 1, active,
             )  # fmt: skip
 
@@ -146,17 +175,21 @@ class ClipCurveDescent:
         return final[1], safe_norm(final[5])
 
     def _at(self, y: Vec3) -> _ClipCurveState:
+        """The state at a point y near the clip curve: derivatives of the curve, and the step back
+        to it."""
         real, vector = self.backend.Float, self.backend.Array3f
         sample = self.field.evaluate(y)
-        gradient, size = vector(sample.gradient), max_norm(y)
-        slope, n = safe_norm(gradient), vector(self.domain.outward_normal(y))
-        u = gradient / slope
+        gradient, scale = vector(sample.gradient), max_norm(y)
+        gradient_norm, n = safe_norm(gradient), vector(self.domain.outward_normal(y))
+        u = gradient / gradient_norm
         depth = (
-            -self.domain.signed_distance(y) - _DOMAIN_INSET * self.backend.machine_epsilon * size
+            -self.domain.signed_distance(y) - _DOMAIN_INSET * self.backend.machine_epsilon * scale
         )
-        offset = self.levels.offset_to_nearest(sample.value) / slope
+        offset = self.levels.offset_to_nearest(sample.value) / gradient_norm
         radius = dr.fma(
-            _LEVEL_DISTANCE * self.backend.machine_epsilon, size, real(sample.value_error) / slope
+            _LEVEL_TOLERANCE * self.backend.machine_epsilon,
+            scale,
+            real(sample.value_error) / gradient_norm,
         )
         cosine = dr.dot(n, u)
         sine = 1 - cosine * cosine
@@ -167,17 +200,19 @@ class ClipCurveDescent:
             return (vector(first) * u + vector(second) * n) / sine
 
         t = dr.cross(u, n) * dr.rsqrt(sine)
-        h = self.backend.machine_epsilon**0.5 * fmax(size, real(1e-30))
-        ahead = dr.fma(vector(h), t, y)
-        du = dr.dot(vector(self.field.evaluate(ahead).gradient) - gradient, t) / (slope * h)
-        dn = dr.dot(vector(self.domain.outward_normal(ahead)) - n, t) / h
-        # Beside an edge of the domain the normal is another one ahead: no curvature.
-        dn = dr.select(dr.abs(dn) * h < 1e-3, dn, 0)
+        h = self.backend.machine_epsilon**0.5 * fmax(scale, real(1e-30))
+        next_point = dr.fma(vector(h), t, y)
+        u_change = dr.dot(vector(self.field.evaluate(next_point).gradient) - gradient, t) / (
+            gradient_norm * h
+        )
+        n_change = dr.dot(vector(self.domain.outward_normal(next_point)) - n, t) / h
+        # Across an edge of the domain the normal jumps: that change is not curvature.
+        n_change = dr.select(dr.abs(n_change) * h < 1e-3, n_change, 0)
         is_on = (dr.abs(offset) <= radius) & (
-            dr.abs(depth) <= _INSET_ERROR * self.backend.machine_epsilon * size
+            dr.abs(depth) <= _DEPTH_TOLERANCE * self.backend.machine_epsilon * scale
         )
         return _ClipCurveState(
-            is_on, radius, solution(offset, depth), t, solution(-du, -dn), n, depth
+            is_on, radius, solution(offset, depth), t, solution(-u_change, -n_change), n, depth
         )
 
 
@@ -186,8 +221,9 @@ class _ClipCurveState:
     """A point near the clip curve.
 
     is_on: whether the point is on the curve, to the tolerance `near`.
+    near: the length within which rounding leaves the level uncertain.
     correction: the step back to the curve, to first order.
-    tangent, second_derivative: unit tangent and second derivative of the curve.
+    tangent, second_derivative: unit tangent of the curve, and its second derivative by arc length.
     normal: the outward normal of the domain.
     depth: the distance of the point inside the domain, less a margin.
     """
@@ -203,21 +239,24 @@ class _ClipCurveState:
 
 # Cells.
 
-_STEPS = 6
-# More steps where Newton's steps shrink at a rate between these, as to a multiple root.
-_MULTIPLE_ROOT_STEPS, _SHRINK_RATES = 14, (0.4, 0.97)
+# The largest number of Newton steps; and if they shrink at a rate between the two below, as they do
+# towards a multiple root.
+_MAX_STEPS = 6
+_MAX_SLOW_STEPS, _SLOW_RATES = 14, (0.4, 0.97)
 # The radius of the ball around a cube of half size 1.
 _CUBE_CIRCUMRADIUS = 3**0.5 * (1 + 1e-9)
-# A surface point of a cell is on the level up to this fraction of the cell.
-_CLOSE = 1e-7
-# Rays through a cell of a field that jumps.
+# A point counts as on the level if the last Newton step was below this fraction of the radius of
+# the ball around the cell.
+_POINT_TOLERANCE = 1e-7
+# Directions of the rays through a cell, for fields that jump.
 _DIAGONALS = ((1.0, 1.0, 1.0), (1.0, 1.0, -1.0), (1.0, -1.0, 1.0), (-1.0, 1.0, 1.0))
 
 
 def taylor_remainder(sample: Sample, radius: Real, degree: int = 1) -> Real:
-    """A bound of the Taylor remainder: of |f(y) - T(y)| for |y - p| <= radius, where T is the
-    Taylor polynomial of f about p, of degree 1 or 2. Infinite where the field promises no bound. As
-    a function of the radius it falls at least as the power degree + 1."""
+    """A bound of the Taylor remainder |f(y) - T(y)| for |y - p| <= radius. p is the point of the
+    sample, and T the Taylor polynomial of f about p, of degree 1 or 2. Infinite where the field
+    promises no bound. When the radius decreases, the bound falls at least as fast as
+    radius^(degree + 1)."""
     bound: Real = dr.inf
     for promise in sample.all_promises:
         bound = fmin(bound, promise.taylor_remainder_bound(sample.value, radius, degree))
@@ -225,11 +264,17 @@ def taylor_remainder(sample: Sample, radius: Real, degree: int = 1) -> Real:
 
 
 def multiplicity(step: Real, last: Real) -> Real:
-    """The multiplicity m of the root to which Newton's steps lead, by the lengths of the last two
-    steps: at a root like that of u^m steps shrink by the factor 1 - 1/m, and a step m times as long
-    as Newton's leads to the root. It is 1 where steps shrink faster, or hardly."""
+    """The multiplicity m of the root towards which Newton's method converges, estimated from its
+    last two steps.
+
+    step, last: the current step, and the length of the one before.
+
+    At a root like that of u^m, each step is 1 - 1/m times the one before, and a step m times as
+    long as Newton's leads to the root. The result is 1 if the steps shrink faster than that, or
+    hardly at all.
+    """
     ratio = dr.abs(step) / last
-    is_slow = (ratio > _SHRINK_RATES[0]) & (ratio < _SHRINK_RATES[1])
+    is_slow = (ratio > _SLOW_RATES[0]) & (ratio < _SLOW_RATES[1])
     return dr.select(is_slow, 1 / (1 - ratio), 1)
 
 
@@ -245,19 +290,19 @@ class CellClassifier:
         self._levels = self._prepared.levels
         self._volume = _domain(self.surface)
         self._has_hessian = has_hessian(self._backend, self._field)
-        self._rim = None
+        self._clip_descent = None
         if self._volume is not None and not self.surface.field.has_jumps:
             volume = self._volume.prepare(self._backend)
-            self._rim = ClipCurveDescent(self._backend, self._field, self._levels, volume)
+            self._clip_descent = ClipCurveDescent(self._backend, self._field, self._levels, volume)
 
     @property
     def _field(self) -> Field:
         return self._prepared.field
 
     def nonempty_cells(self, center: FloatArray, half: FloatArray) -> SurfaceCells:
-        """The cubes that are not proved empty, with the slabs that the surface lies in.
+        """The cubes that are not proved empty, each with the slab that the surface in it lies in.
 
-        center: (n, 3) of cubes.
+        center: (n, 3) centers of the cubes.
         half: (n,) half the length of their edges.
         """
         is_inside = np.ones(len(center), np.bool_)
@@ -278,27 +323,30 @@ class CellClassifier:
         return cells.select(is_nonempty)
 
     def with_surface_points(self, cells: SurfaceCells) -> SurfaceCells:
-        """The cells, completed by points of the surface and of the clip curve."""
+        """The same cells, with a point of the surface and of the clip curve in each where one is
+        found, and the geometry of the surface there."""
         if not len(cells):
             return cells
         radius, start = _CUBE_CIRCUMRADIUS * cells.half, cells.center
         distance = np.full(len(cells), np.inf)
         if self._volume is not None:
-            distance, start = self._at(self._moved_into_domain, cells.center)
-        surface_point, normal, spread, curvature = self._at(
+            distance, start = self._at(self._pulled_inside, cells.center)
+        surface_point, normal, plane_radius, curvature = self._at(
             self._surface_point_and_plane, start, radius, cells.normal
         )
-        self._outside(surface_point)
+        self._remove_outside(surface_point)
         clip_point, clip_curvature = cells.clip_point.copy(), cells.clip_curvature.copy()
-        if self._rim is not None:
+        if self._clip_descent is not None:
             ids = np.flatnonzero(np.abs(distance) <= radius)
-            clip_point[ids], clip_curvature[ids] = self._at(self._on_rim, start[ids], radius[ids])
-            self._outside(clip_point)
+            clip_point[ids], clip_curvature[ids] = self._at(
+                self._clip_point, start[ids], radius[ids]
+            )
+            self._remove_outside(clip_point)
         return dataclasses.replace(
             cells,
             surface_point=surface_point,
             normal=normal,
-            plane_radius=spread,
+            plane_radius=plane_radius,
             curvature=curvature,
             clip_point=clip_point,
             clip_curvature=clip_curvature,
@@ -307,21 +355,26 @@ class CellClassifier:
     def _at(
         self, compute: Callable[..., tuple[Any, ...]], points: FloatArray, *values: FloatArray
     ) -> tuple[Any, ...]:
-        """values: vectors (n, 3), or numbers (n,), passed as vectors of equal components."""
+        """The results of `compute` at points (n, 3), as arrays. values: further arguments of
+        `compute`: vectors (n, 3), or numbers (n,), which are passed as vectors of three equal
+        components."""
         vectors = (np.tile(value[:, None], 3) if value.ndim == 1 else value for value in values)
         return in_batches(self._backend, compute, points, *vectors)
 
-    def _outside(self, feet: FloatArray) -> None:
-        """Replace points (n, 3) that lie outside the domain by `FAR_SENTINEL`."""
-        if self._volume is not None and len(feet):
-            feet[~self._volume.contains_points(np.where(feet < FAR_SENTINEL, feet, 0))] = (
-                FAR_SENTINEL
-            )
+    def _remove_outside(self, surface_points: FloatArray) -> None:
+        """Replace points (n, 3) that lie outside the domain by `FAR_SENTINEL`, in place."""
+        if self._volume is not None and len(surface_points):
+            surface_points[
+                ~self._volume.contains_points(
+                    np.where(surface_points < FAR_SENTINEL, surface_points, 0)
+                )
+            ] = FAR_SENTINEL
 
     def _distance_outside(self, p: Vec3) -> tuple[Real]:
+        """The signed distance of p from the domain, positive outside."""
         return (self._volume.signed_distance(p),)
 
-    def _moved_into_domain(self, p: Vec3) -> tuple[Real, Vec3]:
+    def _pulled_inside(self, p: Vec3) -> tuple[Real, Vec3]:
         """A lower bound of the signed distance of p from the domain; and p, or a point of the
         boundary near p if p is outside."""
         assert self._volume is not None
@@ -330,12 +383,21 @@ class CellClassifier:
         return distance, dr.select(distance > 0, p - self._backend.Array3f(distance) * normal, p)
 
     def _slab(self, p: Vec3, radii: Vec3) -> tuple[Real | Vec3, ...]:
-        """Whether the ball holds no level (1 or 0); the slab in which the level lies."""
+        """Bounds of the surface in the ball around p.
+
+        radii: the ball's radius, as a vector of three equal components.
+
+        Returns 1 where the ball is proved to hold no level, else 0; and the slab in which the
+        surface lies: unit normal, offset from p along it, and half its thickness. Where no slab is
+        proved the normal is 0 and the thickness `FAR_SENTINEL`.
+        """
         real, vector, radius = self._backend.Float, self._backend.Array3f, radii.x
         sample = self._field.evaluate(p)
-        free = real(0)
+        clearance = real(0)
         if sample.all_promises:
-            free = level_distance_lower_bound(self._backend, self._field, self._levels, p, sample)
+            clearance = level_distance_lower_bound(
+                self._backend, self._field, self._levels, p, sample
+            )
         value, norm = -self._levels.offset_to_nearest(sample.value), safe_norm(sample.gradient)
         error = taylor_remainder(sample, radius) + 8 * self._backend.machine_epsilon * dr.abs(
             sample.value
@@ -343,21 +405,28 @@ class CellClassifier:
         is_slab = (norm > 0) & dr.isfinite(error) & (error < FAR_SENTINEL * norm)
         if len(self._levels.values) > 1 or self.surface.field.has_jumps:
             is_slab &= False
-        elif self._levels.period is not None:  # no second level reaches into the ball
+        elif self._levels.period is not None:  # no other level lies in the ball
             is_slab &= dr.fma(norm, radius, error) < self._levels.period - dr.abs(value)
-        slope = dr.select(is_slab, norm, 1)
-        normal = dr.select(is_slab, sample.gradient / slope, vector(0, 0, 0))
-        offset = dr.select(is_slab, -value / slope, 0)
-        thickness = dr.select(is_slab, error / slope, FAR_SENTINEL)
-        is_empty = (free > radius) | (is_slab & (dr.abs(offset) > radius + thickness))
+        divisor = dr.select(is_slab, norm, 1)
+        normal = dr.select(is_slab, sample.gradient / divisor, vector(0, 0, 0))
+        offset = dr.select(is_slab, -value / divisor, 0)
+        thickness = dr.select(is_slab, error / divisor, FAR_SENTINEL)
+        is_empty = (clearance > radius) | (is_slab & (dr.abs(offset) > radius + thickness))
         return dr.select(is_empty, real(1), 0), normal, offset, thickness
 
     def _surface_point_and_plane(
         self, p: Vec3, radii: Vec3, normal: Vec3
     ) -> tuple[Vec3, Vec3, Real, Real]:
-        """A surface point near p; the normal of a plane that is nearly the surface there; the
-        radius about the point in which it is: that of the cell, up to the curve in which the
-        surface ends; and the curvature of the surface."""
+        """A surface point near p, and the shape of the surface there.
+
+        radii: the radius of the ball around the cell, as a vector of three equal components.
+        normal: the normal of the cell's slab, or 0.
+
+        Returns the surface point, `FAR_SENTINEL` if none is found; the normal of a plane that
+        approximates the surface; the radius about the point up to which the plane is used, which
+        ends at the curve in which the surface ends; and an upper bound of the curvature of the
+        surface there.
+        """
         radius, unknown = radii.x, self._backend.Float(FAR_SENTINEL)
         if self.surface.field.has_jumps:
             return self._nearest_ray_hit(p, radius), normal, self._backend.Float(0), unknown
@@ -367,60 +436,74 @@ class CellClassifier:
         gradient = self._field.evaluate(y).gradient
         n = gradient / safe_norm(gradient)
         is_plane = is_found & ~(dr.squared_norm(normal) > 0) & dr.isfinite(dr.squared_norm(n))
-        spread, boundary = radius + safe_norm(y - p), self._field.closest_boundary_point(y)
+        plane_radius, boundary = radius + safe_norm(y - p), self._field.closest_boundary_point(y)
         if boundary is not None:
-            spread = fmin(spread, safe_norm(boundary - y))
+            plane_radius = fmin(plane_radius, safe_norm(boundary - y))
         curvature = unknown
         if self._has_hessian:
             uu, vv, uv = TangentPlane.of(gradient).restrict_hessian(self._field.hessian(y))
             bound = dr.sqrt(dr.fma(uu, uu, dr.fma(vv, vv, 2 * uv * uv))) / safe_norm(gradient)
             curvature = dr.select(bound < FAR_SENTINEL, bound, unknown)
-        return point, dr.select(is_plane, n, normal), dr.select(is_found, spread, 0), curvature
+        return (
+            point,
+            dr.select(is_plane, n, normal),
+            dr.select(is_found, plane_radius, 0),
+            curvature,
+        )
 
-    def _on_rim(self, p: Vec3, radii: Vec3) -> tuple[Vec3, Real]:
-        """A point of the clip curve near p, and the curvature of the curve."""
-        assert self._rim is not None
-        y, curvature = self._rim.closest(p, p)
+    def _clip_point(self, p: Vec3, radii: Vec3) -> tuple[Vec3, Real]:
+        """A point of the clip curve near p, `FAR_SENTINEL` if none is found; and the curvature of
+        the curve there. radii: as in `_slab`."""
+        assert self._clip_descent is not None
+        y, curvature = self._clip_descent.closest(p, p)
         is_near = safe_norm(y - p) < 2 * radii.x
         return dr.select(is_near, y, self._backend.Array3f(FAR_SENTINEL)), dr.select(
             is_near, curvature, 0
         )
 
     def _newton_point(self, p: Vec3, radius: Real) -> Vec3:
-        """The point to which Newton's method leads from the center, if it is near."""
+        """The point of the level set to which Newton's method along the gradient leads from p;
+        `FAR_SENTINEL` if it does not converge within 2 `radius` of p."""
         real, vector, count = self._backend.Float, self._backend.Array3f, self._backend.UInt32
-        zero = dr.opaque(real, 0.0)  # no component of a gradient is a constant of the loop
+        zero = dr.opaque(real, 0.0)  # keeps constant components of a gradient in the loop
 
         def body(y: Vec3, last: Real, k: Any) -> tuple[Any, ...]:
+            """One Newton step from y. last: the length of the step before; k: the number of
+            steps."""
             sample = self._field.evaluate(y)
-            slope = safe_norm(sample.gradient)
+            gradient_norm = safe_norm(sample.gradient)
             off_level = self._levels.offset_to_nearest(sample.value)
-            newton_step = off_level / slope
-            factor = dr.select(k >= _STEPS - 1, multiplicity(newton_step, last), 1)
+            newton_step = off_level / gradient_norm
+            factor = dr.select(k >= _MAX_STEPS - 1, multiplicity(newton_step, last), 1)
             step = clamp(factor * newton_step, -radius, radius)
-            valid = dr.isfinite(step) & (dr.norm(y - p) < 4 * radius)
-            shrinks = (k < _STEPS - 1) | (dr.abs(newton_step) < _SHRINK_RATES[1] * last)
-            # On a surface along which the gradient is 0 the last step was the last one.
-            is_flat = (off_level == 0) & (slope == 0)
-            last = dr.select(valid, dr.abs(newton_step), dr.select(is_flat, 0, dr.inf))
-            y = dr.select(valid, dr.fma(vector(step / slope), sample.gradient + zero, y), y)
-            valid &= shrinks & (last > 1e-9 * radius)
-            return y, last, dr.select(valid, k + 1, _MULTIPLE_ROOT_STEPS)
+            is_valid = dr.isfinite(step) & (dr.norm(y - p) < 4 * radius)
+            shrinks = (k < _MAX_STEPS - 1) | (dr.abs(newton_step) < _SLOW_RATES[1] * last)
+            # At a point of the surface where the gradient is 0 the iteration has converged.
+            is_flat = (off_level == 0) & (gradient_norm == 0)
+            last = dr.select(is_valid, dr.abs(newton_step), dr.select(is_flat, 0, dr.inf))
+            y = dr.select(
+                is_valid, dr.fma(vector(step / gradient_norm), sample.gradient + zero, y), y
+            )
+            is_valid &= shrinks & (last > 1e-9 * radius)
+            return y, last, dr.select(is_valid, k + 1, _MAX_SLOW_STEPS)
 
         def is_active(y: Vec3, last: Real, k: Any) -> Mask:
             del y, last
-            return k < _MULTIPLE_ROOT_STEPS
+            return k < _MAX_SLOW_STEPS
 
         start = (vector(p), real(dr.inf), count(0))
         y, last, _ = dr.while_loop(start, is_active, body, label="feet of cells")
-        is_near = (last < _CLOSE * radius) & (dr.norm(y - p) < 2 * radius)
+        is_near = (last < _POINT_TOLERANCE * radius) & (dr.norm(y - p) < 2 * radius)
         return dr.select(is_near, y, vector(FAR_SENTINEL))
 
     def _nearest_ray_hit(self, p: Vec3, radius: Real) -> Vec3:
-        """The hit nearest to the center of rays through the cell, of a field that jumps."""
+        """For fields that jump: the point nearest to p among the first hits of four rays through
+        the ball around p, along the diagonals of the cell; `FAR_SENTINEL` without a hit."""
         real, vector, count = self._backend.Float, self._backend.Array3f, self._backend.UInt32
 
         def body(point: Vec3, best: Real, k: Any) -> tuple[Any, ...]:
+            """Trace ray k, and keep its hit if that is nearer to p; best: the squared distance of
+            `point`."""
             d = vector(*_DIAGONALS[0]) / 3**0.5
             for number, diagonal in enumerate(_DIAGONALS[1:], 1):
                 d = dr.select(k == number, vector(*diagonal) / 3**0.5, d)
@@ -442,4 +525,6 @@ class CellClassifier:
 
 
 def _domain(surface: TracedSurface) -> Any:
+    """The volume in which the surface lies: the field's domain, or that intersected with the clip
+    volume."""
     return surface.field.domain if surface.clip_volume is None else surface.volume

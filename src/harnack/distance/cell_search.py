@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 
 __all__ = ["DescentMethods", "InitialGuess", "SearchResult", "StoppingRule", "search"]
 
-# The number of cells before points are looked up in them: per point; at least; and for fields with
-# jump surfaces, which are searched in turn as well.
-_CELLS_PER_POINT, _PROOF_CELLS_PER_POINT, _MIN_CELLS, _MIN_JUMP_CELLS = 0.16, 0.25, 10_000, 1500
-# The largest number of cells, and the fraction of it where evaluations are as expensive as sums of
-# many terms.
+# The number of cells before queries are searched in them: per query, without and with proofs; the
+# minimum; and the minimum for fields with jump surfaces, whose facets are searched as well.
+_CELLS_PER_POINT, _CELLS_PER_PROOF, _MIN_CELLS, _MIN_JUMP_CELLS = 0.16, 0.25, 10_000, 1500
+# The largest number of cells: without proofs, with proofs, and for fields with jump surfaces. If an
+# evaluation is a sum of many terms, only this fraction of it.
 _MAX_CELLS, _MAX_PROOF_CELLS, _MAX_JUMP_CELLS, _EXPENSIVE_FIELD_FACTOR = (
     60_000,
     150_000,
@@ -35,19 +35,20 @@ _MAX_CELLS, _MAX_PROOF_CELLS, _MAX_JUMP_CELLS, _EXPENSIVE_FIELD_FACTOR = (
 )
 _MAX_SUBDIVISIONS = 40
 # The smallest number of cells in which the search for a point begins.
-_COARSE = 300
+_MIN_COARSE_CELLS = 300
 # Number of cells along an edge of the first cube.
-_ACROSS = 8
+_ROOT_CELLS = 8
 # Number of times that surface points of other parts of the surface are tried, from the same cells.
 _MAX_CANDIDATE_ROUNDS = 4
 # In tolerances: the distance from the boundary curve at which the surface is looked for.
 _BOUNDARY_OFFSET = 100.0
-# Beside the boundary the surface was looked for already: if the best point is on it, other surface
-# points are tried only if they are this many times farther from it.
-_APART_FROM_BOUNDARY = 2.0
-# Descents begin at points that seem nearer to the surface than this many times the best.
+# If the best point is on the boundary of the surface, the surface beside it was searched already:
+# another surface point is tried only at this many times the usual distance from the best point.
+_BOUNDARY_SEPARATION = 2.0
+# A descent begins at the query itself if its first-order distance is below this fraction of the
+# best distance.
 _MIN_GAIN = 0.9
-# Points that are searched for together, so that memory is bounded.
+# Number of queries that are searched together, which bounds the memory.
 _BATCH_SIZE = 1 << 18
 _MAX_BOX_GROWTHS = 6
 _CORNERS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
@@ -93,18 +94,18 @@ class DescentMethods(Protocol):
 class InitialGuess:
     """Initial guess for the cell search.
 
-    feet: (n, 3) points of the surface, or NaN.
+    closest: (n, 3) points of the surface, or NaN.
     estimate: (n,) first-order distance.
-    on_boundary: whether `feet` lie on the curve at which the surface ends.
+    on_boundary: whether the points `closest` lie on the curve at which the surface ends.
     """
 
-    feet: FloatArray
+    closest: FloatArray
     estimate: FloatArray
     on_boundary: bool = True
 
-    def select(self, rows: IntArray | slice) -> InitialGuess:
+    def some(self, rows: IntArray | slice) -> InitialGuess:
         """The initial guess for the queries `rows`."""
-        return replace(self, feet=self.feet[rows], estimate=self.estimate[rows])
+        return replace(self, closest=self.closest[rows], estimate=self.estimate[rows])
 
 
 @dataclass(frozen=True)
@@ -122,7 +123,8 @@ class StoppingRule:
 
 @dataclass(frozen=True)
 class _Cube:
-    """A cube that holds the surface, or the part of it that is searched."""
+    """A cube that contains the surface, or the part of it that is searched. half: half its edge
+    length."""
 
     center: FloatArray
     half: float
@@ -136,18 +138,18 @@ class _Cube:
 
 
 def search(
-    surface: TracedSurface, points: FloatArray, guess: InitialGuess, descents: DescentMethods,
+    surface: TracedSurface, points: FloatArray, known: InitialGuess, descents: DescentMethods,
     tolerance: StoppingRule, progress: Callable[[str], None],
 ) -> SearchResult:  # fmt: skip
     """The nearest points of a level set to `points` (n, 3)."""
-    box = _box(surface)
+    box = _bounding_box(surface)
     if box is not None:
         if (box[0] > box[1]).any():
             return SearchResult(np.full_like(points, np.nan), np.full(len(points), np.inf))
         return _search_in_batches(
-            surface, _Cube.around(*box), points, guess, descents, tolerance, progress
+            surface, _Cube.around(*box), points, known, descents, tolerance, progress
         )
-    feet, lower = guess.feet.copy(), np.zeros(len(points))
+    closest, lower = known.closest.copy(), np.zeros(len(points))
     rows = np.arange(len(points))
     half = 0.0
     for _ in range(_MAX_BOX_GROWTHS):
@@ -155,20 +157,22 @@ def search(
             break
         x = points[rows]
         root = _Cube.around(x.min(axis=0), x.max(axis=0))
-        distances = np.linalg.norm(x - feet[rows], axis=1)
+        distances = np.linalg.norm(x - closest[rows], axis=1)
         half = max(4 * half, 1.0 + 4 * root.half, 1.1 * float(np.nanmax(distances, initial=0.0)))
         root = _Cube(root.center, root.half + half)
-        start = replace(guess.select(rows), feet=feet[rows])
+        start = replace(known.some(rows), closest=closest[rows])
         result = _search_in_batches(surface, root, x, start, descents, tolerance, progress)
-        # Beyond the cube there may be more of the surface.
-        wall_distances = root.half - np.abs(x - root.center).max(axis=1)
-        feet[rows], lower[rows] = result.closest, np.minimum(result.lower_bounds, wall_distances)
+        # The surface may continue outside the cube: lower bounds end at its faces.
+        face_distance = root.half - np.abs(x - root.center).max(axis=1)
+        closest[rows], lower[rows] = result.closest, np.minimum(result.lower_bounds, face_distance)
         distance = np.linalg.norm(x - result.closest, axis=1)
         rows = rows[~(distance <= half)]
-    return SearchResult(feet, lower)
+    return SearchResult(closest, lower)
 
 
-def _box(surface: TracedSurface) -> tuple[FloatArray, FloatArray] | None:
+def _bounding_box(surface: TracedSurface) -> tuple[FloatArray, FloatArray] | None:
+    """The corners (lower, upper) of a box that contains the surface; None if no finite one is
+    known."""
     volume = surface.volume
     if volume is None:
         return None
@@ -185,14 +189,15 @@ def _search_in_batches(
     tolerance: StoppingRule,
     progress: Callable[[str], None],
 ) -> SearchResult:
-    """The nearest points in a cube, for a batch of the points at a time."""
-    proofs = CellClassifier(surface)
+    """The closest points of the surface in the cube `root` to `points` (n, 3), for a batch of the
+    queries at a time. guess: of all queries."""
+    classifier = CellClassifier(surface)
     max_cells = _max_cells(surface, len(points), tolerance.prove)
-    cells_per_point = _PROOF_CELLS_PER_POINT if tolerance.prove else _CELLS_PER_POINT
+    cells_per_point = _CELLS_PER_PROOF if tolerance.prove else _CELLS_PER_POINT
     min_cells = min(max(_MIN_CELLS, int(cells_per_point * len(points))), _MAX_CELLS, max_cells)
     if surface.field.has_jumps:
         min_cells = _MIN_JUMP_CELLS
-    coarse, cells = _split(proofs, root, min_cells, progress)
+    coarse, cells = _split(classifier, root, min_cells, progress)
     backend, trees = choose_backend("double"), None
     if len(cells):
         trees = CellTree.of(backend, coarse), CellTree.of(backend, cells)
@@ -201,11 +206,11 @@ def _search_in_batches(
         rows = slice(start, start + _BATCH_SIZE)
         limit = max_cells if tolerance.prove else 0
         cell_search = _CellSearch(
-            proofs,
+            classifier,
             cells,
             trees,
             points[rows],
-            guess.select(rows),
+            guess.some(rows),
             descents,
             tolerance.length,
             limit,
@@ -217,7 +222,7 @@ def _search_in_batches(
 
 
 def _max_cells(surface: TracedSurface, count: int, is_proved: bool) -> int:
-    """The largest number of cells."""
+    """The largest number of cells for a search of `count` queries."""
     if surface.field.has_jumps:
         return _MAX_JUMP_CELLS
     limit = min(max(_MAX_CELLS, count // 2), _MAX_PROOF_CELLS) if is_proved else _MAX_CELLS
@@ -225,50 +230,60 @@ def _max_cells(surface: TracedSurface, count: int, is_proved: bool) -> int:
 
 
 def _split(
-    proofs: CellClassifier, root: _Cube, min_cells: int, progress: Callable[[str], None]
+    classifier: CellClassifier, root: _Cube, min_cells: int, progress: Callable[[str], None]
 ) -> tuple[SurfaceCells, SurfaceCells]:
-    """Cells of the root, split until there are at least `min_cells`: in each iteration the larger
-    half. The size of a cell in which the surface is in one piece is a quarter of the thickness of
-    its slab, by which the surface may bend. Returned first are the few coarse cells that contain
-    these."""
-    half = root.half / _ACROSS
-    steps = (2 * np.indices((_ACROSS,) * 3).reshape(3, -1).T + 1 - _ACROSS) * half
-    cells = proofs.nonempty_cells(root.center + steps, np.full(len(steps), half))
+    """Divide the cube `root` into cells that may hold the surface.
+
+    Each iteration splits the larger half of the cells in eight, until there are at least
+    `min_cells`. A cell in which the surface is in one piece counts as smaller than it is: as a
+    quarter of the thickness of its slab, within which the surface may bend.
+
+    Returns few coarse cells, and the final cells, which lie in the coarse ones.
+    """
+    half = root.half / _ROOT_CELLS
+    steps = (2 * np.indices((_ROOT_CELLS,) * 3).reshape(3, -1).T + 1 - _ROOT_CELLS) * half
+    cells = classifier.nonempty_cells(root.center + steps, np.full(len(steps), half))
     coarse = cells
     for _ in range(_MAX_SUBDIVISIONS):
         if not 0 < len(cells) < min_cells:
             break
-        if len(coarse) < _COARSE:
+        if len(coarse) < _MIN_COARSE_CELLS:
             coarse = cells
         sizes = np.where(cells.is_single_piece, 0.25 * cells.thickness, cells.half)
         is_split = sizes >= np.median(sizes)
-        children = _subdivide(proofs, cells, is_split)
+        children = _subdivide(classifier, cells, is_split)
         cells = SurfaceCells.concatenate([cells.select(~is_split), children])
         progress(f"distances: {len(cells):,} cells")
-    return proofs.with_surface_points(coarse), proofs.with_surface_points(cells)
+    return classifier.with_surface_points(coarse), classifier.with_surface_points(cells)
 
 
-def _subdivide(proofs: CellClassifier, cells: SurfaceCells, is_split: BoolArray) -> SurfaceCells:
-    """The nonempty children of the cells of a mask (n,), each of which is cut in eight."""
+def _subdivide(
+    classifier: CellClassifier, cells: SurfaceCells, is_split: BoolArray
+) -> SurfaceCells:
+    """The nonempty children of the cells selected by the mask `is_split` (n,). Each cell has eight
+    children of half its size."""
     half = 0.5 * cells.half[is_split]
     center = cells.center[is_split, None] + half[:, None, None] * _CORNERS
-    return proofs.nonempty_cells(center.reshape(-1, 3), np.repeat(half, 8))
+    return classifier.nonempty_cells(center.reshape(-1, 3), np.repeat(half, 8))
 
 
 class _CellSearch:
     """Branch-and-bound search for the points closest to a batch of queries, over cells that cover
-    the surface; coarse cells are searched first.
+    the surface. Coarse cells are searched first.
 
-    trees: of the coarse cells and of `cells`; None if there are none.
-    feet: (n, 3) best points so far, or NaN.
-    free: (n,) no surface point within this radius of the best point is nearer.
+    classifier: proves cells empty, and finds surface points in the others.
+    trees: the tree of the coarse cells and that of `cells`; None if there are none.
+    guess: the initial guess of each query.
+    closest: (n, 3) best points so far, or NaN.
+    free: (n,) radius about the best point within which no surface point is nearer to the query.
     lower: (n,) proved lower bounds of the distances.
-    most: cells are subdivided while there are no more than these.
+    tolerance: an improvement of the distance by less than this is not pursued.
+    max_cells: cells are subdivided while there are no more than these; 0 for no subdivision.
     """
 
     def __init__(
         self,
-        proofs: CellClassifier,
+        classifier: CellClassifier,
         cells: SurfaceCells,
         trees: tuple[CellTree, CellTree] | None,
         points: FloatArray,
@@ -278,42 +293,51 @@ class _CellSearch:
         max_cells: int,
     ) -> None:
         self.trees = trees
-        self.proofs, self.cells, self.points, self.descents = proofs, cells, points, descents
+        self.classifier, self.cells, self.points, self.descents = (
+            classifier,
+            cells,
+            points,
+            descents,
+        )
         self.backend = choose_backend("double")
-        self.guess, self.feet, self.free = guess, guess.feet.copy(), np.zeros(len(points))
+        self.guess, self.closest, self.free = guess, guess.closest.copy(), np.zeros(len(points))
         self.lower, self.tolerance = np.zeros(len(points)), tolerance
         self.max_cells = max_cells
 
     def run(self, progress: Callable[[str], None]) -> SearchResult:
         """The closest points and the lower bounds of the distances."""
         if not len(self.points):
-            return SearchResult(self.feet, self.lower)
-        has_jumps = self.proofs.surface.field.has_jumps
+            return SearchResult(self.closest, self.lower)
+        has_jumps = self.classifier.surface.field.has_jumps
         if self.trees is not None:
             self._search_cells(*self.trees, has_jumps, progress)
         else:
             self.lower[:] = np.inf
         if not has_jumps:
-            # Where two parts of the surface meet or cross within a cell, descents may not have
-            # begun on both of them; and a promise that does not hold may have left out cells.
-            ids = np.flatnonzero(self._is_unproved() | np.isnan(self.feet[:, 0]))
+            # Two parts of the surface may meet or cross within a cell, and descents may not have
+            # begun on both of them. Also, cells may be missing if a promise does not hold.
+            ids = np.flatnonzero(self._is_unproved() | np.isnan(self.closest[:, 0]))
             ids = ids[self.guess.estimate[ids] < _MIN_GAIN * self._distance(ids)]
             self._descend(ids, self.points[ids])
-        return SearchResult(self.feet, self.lower)
+        return SearchResult(self.closest, self.lower)
 
     def _search_cells(
         self, coarse: CellTree, tree: CellTree, has_jumps: bool, progress: Callable[[str], None]
     ) -> None:
-        """Descend first from the surface point of the coarse cell where the surface seems nearest,
-        then from those of other parts that may be nearer. If cells remain that may hold a nearer
-        point, and there are not too many cells, those cells are split, and so on."""
+        """Search the cells of both trees, and subdivide cells if proofs are wanted.
+
+        For each query the first descent begins at the surface point of the coarse cell with the
+        smallest estimated distance; the next ones at surface points of other cells that may hold a
+        nearer point. Then all cells that may hold a point nearer than the best one are split and
+        searched again, until there are none or too many.
+        """
         marks = dr.zeros(self.backend.Bool, len(self.cells)) if self.max_cells else None
         if has_jumps or self._is_expensive:
             tried, ids = self._descend_from_best_start(tree), np.arange(len(self.points))
             if not has_jumps:
                 self._leave_boundary()
         else:
-            ids, tried = self._first_round(coarse, tree, marks)
+            ids, tried = self._search_in_kernel(coarse, tree, marks)
             ids = np.union1d(ids, self._leave_boundary())
         for _ in range(_MAX_SUBDIVISIONS):
             self._improve(tree, ids, [tried[ids]], marks)
@@ -324,98 +348,114 @@ class _CellSearch:
             count = int(is_split.sum())
             if not count or not len(ids) or len(self.cells) + 4 * count > self.max_cells:
                 break
-            octants = self.proofs.with_surface_points(_subdivide(self.proofs, self.cells, is_split))
-            self.cells = SurfaceCells.concatenate([self.cells.select(~is_split), octants])
+            children = self.classifier.with_surface_points(
+                _subdivide(self.classifier, self.cells, is_split)
+            )
+            self.cells = SurfaceCells.concatenate([self.cells.select(~is_split), children])
             progress(f"distances: {len(self.cells):,} cells for {len(ids):,} points")
-            tree, tried = CellTree.of(self.backend, self.cells), self.feet
+            tree, tried = CellTree.of(self.backend, self.cells), self.closest
             marks = dr.zeros(self.backend.Bool, len(self.cells))
 
-    def _first_round(
+    def _search_in_kernel(
         self, coarse: CellTree, tree: CellTree, marks: Any
     ) -> tuple[IntArray, FloatArray]:
-        """`_descend_from_best_start`, and a first `_improve`: in one kernel, where Newton's method
-        converges.
+        """The work of `_descend_from_best_start` and of one round of `_improve`, in one kernel.
+        Queries for which Newton's method does not converge in it are finished by `_descend`.
 
-        Returns the indices of the queries that have more to try, and the surface points that were
-        tried (n, 3).
+        Returns the indices (k,) of the queries for which another round is worthwhile, and the
+        surface points (n, 3) at which the first descents began.
         """
         backend = self.backend
         tolerance = dr.opaque(backend.Float, self.tolerance)
 
-        def compute(x: Vec3, guess: Vec3) -> tuple[Real | Vec3, ...]:
+        def compute(x: Vec3, guess_point: Vec3) -> tuple[Real | Vec3, ...]:
+            """For a query x: the best point and its exclusion radius, the lower bound, the surface
+            point where the descent began, the candidates for the next round, and 1 where Newton's
+            method did not converge."""
             real, missing = backend.Float, backend.Array3f(FAR_SENTINEL)
-            limit = safe_norm(guess - x)
+            limit = safe_norm(guess_point - x)
             limit = dr.select(dr.isfinite(limit), limit, FAR_SENTINEL)
             start = coarse.best_start(x, limit)
             y, free, unresolved = self.descents.newton_in_kernel(x, start, limit)
             has_start, gap = start.x < 0.5 * FAR_SENTINEL, safe_norm(y - x)
             unresolved &= has_start
             is_nearer = has_start & ~unresolved & (gap < limit)
-            point = dr.select(is_nearer, y, dr.select(limit < 0.5 * FAR_SENTINEL, guess, missing))
+            point = dr.select(
+                is_nearer, y, dr.select(limit < 0.5 * FAR_SENTINEL, guess_point, missing)
+            )
             distance = dr.select(is_nearer, gap, limit)
             best = BestCandidate(
                 point, dr.select(unresolved, 0, distance), dr.select(is_nearer, free, 0),
-                dr.select(is_nearer, 1, real(_APART_FROM_BOUNDARY)),
+                dr.select(is_nearer, 1, real(_BOUNDARY_SEPARATION)),
             )  # fmt: skip
-            lower, feet = tree.closer_candidates(x, best, (start,), tolerance, marks)
+            lower, candidates = tree.closer_candidates(x, best, (start,), tolerance, marks)
             point = dr.select(distance < 0.5 * FAR_SENTINEL, point, dr.nan)
             return (
                 point,
                 best.exclusion_radius,
                 lower,
                 start,
-                *feet,
+                *candidates,
                 dr.select(unresolved, real(1), 0),
             )
 
-        self.feet, self.free, lower, start, *feet, unresolved = in_batches(
-            backend, compute, self.points, self.guess.feet
+        self.closest, self.free, lower, start, *candidates, unresolved = in_batches(
+            backend, compute, self.points, self.guess.closest
         )
         self.lower = self._rounded(lower, self.points)
         ids = np.flatnonzero(unresolved)
         self._descend(ids, start[ids])
-        return np.union1d(ids, self._descend_from_candidates(np.arange(len(start)), feet)), start
+        return np.union1d(
+            ids, self._descend_from_candidates(np.arange(len(start)), candidates)
+        ), start
 
     @staticmethod
     def _rounded(lower: FloatArray, points: FloatArray) -> FloatArray:
-        """Lower bounds (n,), less a bound of their rounding errors."""
+        """The lower bounds (n,) of the distances of `points`, less a bound of their rounding
+        errors."""
         return lower * (1 - 1e-12) - 1e-15 * np.abs(points).max(axis=1)
 
     @property
     def _is_expensive(self) -> bool:
-        """Whether evaluations take longer than walks: then fine cells tell where to begin."""
-        return self.proofs.surface.field.has_variable_accuracy
+        """Whether an evaluation of the field takes longer than a walk through a tree. Then fine
+        cells are used from the first descent on."""
+        return self.classifier.surface.field.has_variable_accuracy
 
     def _is_unproved(self) -> BoolArray:
-        """Whether it is not proved that no point is nearer than the best."""
+        """(n,) whether a point may exist that is nearer than the best one by more than the
+        tolerance."""
         return self.lower < self._distance(slice(None)) - self.tolerance
 
     def _distance(self, rows: IntArray | slice) -> FloatArray:
-        """Distances of the best points so far; FAR where there is none."""
-        distances = np.linalg.norm(self.points[rows] - self.feet[rows], axis=1)
+        """Distances (k,) of the best points so far; `FAR_SENTINEL` where there is none."""
+        distances = np.linalg.norm(self.points[rows] - self.closest[rows], axis=1)
         return np.where(np.isnan(distances), FAR_SENTINEL, distances)
 
     def _is_boundary(self, rows: IntArray | slice) -> BoolArray:
-        """Whether the best point is the initial guess, on the boundary."""
-        return self.guess.on_boundary & (self.feet[rows] == self.guess.feet[rows]).all(axis=1)
+        """(k,) whether the best point is still the initial guess, and that lies on the boundary of
+        the surface."""
+        return self.guess.on_boundary & (self.closest[rows] == self.guess.closest[rows]).all(axis=1)
 
     def _descend_from_best_start(self, tree: CellTree) -> FloatArray:
-        """Descend from the surface points that seem nearest, which are returned (n, 3)."""
+        """For each query, descend from the surface point of the cell with the smallest estimated
+        distance. Returns these surface points (n, 3), `FAR_SENTINEL` for none."""
         limit = upload_floats(self.backend, self._distance(slice(None)))
         start = to_numpy(tree.best_start(upload_vectors(self.backend, self.points), limit))
-        ids = np.flatnonzero(start[:, 0] < 0.5 * FAR_SENTINEL)
-        self._descend(ids, start[ids])
+        rows = np.flatnonzero(start[:, 0] < 0.5 * FAR_SENTINEL)
+        self._descend(rows, start[rows])
         return start
 
     def _improve(
         self, tree: CellTree, rows: IntArray, tried: Sequence[FloatArray], marks: Any
     ) -> None:
-        """Improve the best points by descents from candidates in other cells, in rounds. A query
-        continues to the next round if the last one helped; it also continues, as long as it has
-        candidates, if the field has jump surfaces (their cells have no tangent planes) or is
-        expensive to evaluate. Expensive fields try one candidate per round.
+        """Improve the best points of the queries `rows` by descents from surface points of other
+        cells, in rounds.
 
-        tried: arrays (k, 3) of candidates to skip.
+        A query continues to the next round if the last one helped. As long as it has candidates it
+        also continues if the field has jump surfaces (their cells have no tangent planes) or is
+        expensive to evaluate. For expensive fields each round tries one candidate only.
+
+        tried: arrays (k, 3) of surface points that were tried already.
         marks: see `CellTree.closer_candidates`.
         """
         for _ in range(_MAX_CANDIDATE_ROUNDS):
@@ -426,13 +466,17 @@ class _CellSearch:
                 starts = starts[:1]
             improved_ids = self._descend_from_candidates(rows, starts)
             active = np.isin(rows, improved_ids)
-            if self._is_expensive or self.proofs.surface.field.has_jumps:
+            if self._is_expensive or self.classifier.surface.field.has_jumps:
                 active |= starts[0][:, 0] < 0.5 * FAR_SENTINEL
-            rows, tried = rows[active], [feet[active] for feet in (*tried[-1:], *starts)]
+            rows, tried = (
+                rows[active],
+                [candidates[active] for candidates in (*tried[-1:], *starts)],
+            )
 
     def _descend_from_candidates(self, rows: IntArray, starts: Sequence[FloatArray]) -> IntArray:
-        """Descend from surface points (k, 3), FAR for none; returns the rows where that led
-        nearer."""
+        """For each of the queries `rows` (k,), descend from its surface point in each of the arrays
+        `starts`, (k, 3), with `FAR_SENTINEL` for none. Returns those of `rows` whose distance this
+        reduced."""
         old_distance = self._distance(rows)
         start_index, selected = np.nonzero([start[:, 0] < 0.5 * FAR_SENTINEL for start in starts])
         self._descend(rows[selected], np.stack(starts)[start_index, selected])
@@ -441,35 +485,40 @@ class _CellSearch:
     def _closer_candidates(
         self, tree: CellTree, rows: IntArray, skipped: Sequence[FloatArray], marks: Any
     ) -> list[FloatArray]:
-        """`CellTree.closer_candidates` for some points; raises their lower bounds."""
-        backend, feet = self.backend, self.feet[rows]
+        """`CellTree.closer_candidates` for the queries `rows` (k,): arrays (k, 3) of surface
+        points. It also raises the lower bounds of these queries.
+
+        skipped: arrays (k, 3) of surface points near which no candidates are wanted.
+        """
+        backend, closest = self.backend, self.closest[rows]
         best = BestCandidate(
-            upload_vectors(backend, np.where(np.isnan(feet), FAR_SENTINEL, feet)),
+            upload_vectors(backend, np.where(np.isnan(closest), FAR_SENTINEL, closest)),
             upload_floats(backend, self._distance(rows)), upload_floats(backend, self.free[rows]),
-            upload_floats(backend, np.where(self._is_boundary(rows), _APART_FROM_BOUNDARY, 1.0)),
+            upload_floats(backend, np.where(self._is_boundary(rows), _BOUNDARY_SEPARATION, 1.0)),
         )  # fmt: skip
         x = upload_vectors(backend, self.points[rows])
-        tried_already = tuple(upload_vectors(backend, candidate) for candidate in skipped)
+        skipped_points = tuple(upload_vectors(backend, candidate) for candidate in skipped)
         tolerance = dr.opaque(backend.Float, self.tolerance)
-        lower, candidates = tree.closer_candidates(x, best, tried_already, tolerance, marks)
+        lower, candidates = tree.closer_candidates(x, best, skipped_points, tolerance, marks)
         dr.eval(lower, *candidates)
         proved = self._rounded(to_numpy(lower), self.points[rows])
         self.lower[rows] = np.maximum(proved, self.lower[rows])
         return [to_numpy(candidate) for candidate in candidates]
 
     def _leave_boundary(self) -> IntArray:
-        """Descend from the boundary of the surface, where the best point is on it; returns the
-        queries where that led nearer."""
+        """For each query whose best point is on the boundary of the surface, descend along the
+        surface from there. Returns the indices of the queries whose distance this reduced."""
         ids = np.flatnonzero(self._is_boundary(slice(None)))
         distance = self._distance(ids)
         ids, distance = ids[distance > 0], distance[distance > 0]
         offset = np.minimum(0.25 * distance, _BOUNDARY_OFFSET * self.tolerance)
         x = self.points[ids]
-        self._update_best(ids, *self.descents.descend_from_boundary(x, self.feet[ids], offset))
+        self._update_best(ids, *self.descents.descend_from_boundary(x, self.closest[ids], offset))
         return ids[self._distance(ids) < distance]
 
     def _descend(self, ids: IntArray, start: FloatArray) -> None:
-        """Descend from points (k, 3): points of the surface, or the query points themselves."""
+        """Descend for the queries `ids` (k,) from `start` (k, 3): surface points, or the queries
+        themselves. Surface points in `start` become best points at once if they are nearer."""
         if not len(ids):
             return
         x = self.points[ids]
@@ -477,10 +526,17 @@ class _CellSearch:
         self._update_best(ids, np.where(on_surface, start, np.nan), np.zeros(len(ids)))
         self._update_best(ids, *self.descents.descend(x, start, self._distance(ids)))
 
-    def _update_best(self, rows: IntArray, feet: FloatArray, free: FloatArray) -> None:
-        """Replace the best points by points of the surface (k, 3) or NaN, and their radii, where
-        these are nearer; rows may occur several times."""
-        distances = np.linalg.norm(self.points[rows] - feet, axis=1)
+    def _update_best(self, rows: IntArray, candidates: FloatArray, free: FloatArray) -> None:
+        """Replace the best points of the queries `rows` (k,), which may occur several times, by
+        those of `candidates` (k, 3) that are nearer.
+
+        candidates: points of the surface, or NaN.
+        free: (k,) radius about each candidate within which no surface point is nearer to the query.
+        """
+        distances = np.linalg.norm(self.points[rows] - candidates, axis=1)
         improved = np.flatnonzero(distances < self._distance(rows))
         improved = improved[np.argsort(-distances[improved])]  # the last one stays
-        self.feet[rows[improved]], self.free[rows[improved]] = feet[improved], free[improved]
+        self.closest[rows[improved]], self.free[rows[improved]] = (
+            candidates[improved],
+            free[improved],
+        )

@@ -1,5 +1,5 @@
-"""A tree over cells that may hold a surface, to find those near a point and bounds of their
-distance.
+"""A tree over cells that may hold a surface. It finds the cells near a point, and bounds of the
+distance of the surface in them.
 
 For each cell the surface in it is either unknown or proved to lie in a slab (two parallel planes).
 Some cells also have a known point of the surface.
@@ -30,16 +30,17 @@ __all__ = ["FAR_SENTINEL", "BestCandidate", "CellTree", "SurfaceCells"]
 
 FAR_SENTINEL = 1e150
 """Coordinates of missing surface points, and the thickness of slabs that bound nothing."""
-# Visits of nodes take a tenth of the time of visits of cells.
+# Cells per leaf: a visit of a node takes a tenth of the time of a visit of a cell.
 _LEAF_SIZE = 1
-# Number of surface points of other parts of the surface that a walk finds.
+# Number of candidates (surface points of other cells) that one traversal of the tree returns.
 _CANDIDATES_PER_WALK = 4
-# Surface points closer to each other than this many half cells lead to the same closest point:
-# where the surface in a cell is in one piece and does not end, and elsewhere.
+# Two surface points that are closer to each other than this many half edges of a cell are taken to
+# lead to the same closest point. The first number is for cells in which the surface is in one piece
+# and does not end, the second for all others.
 _SEPARATION, _SEPARATION_IN_PIECES = 4.0, 3.0
-# In half cells: the surface is in one piece in a slab that is thinner.
+# The surface in a cell is in one piece if its slab is thinner than this many half edges.
 _SINGLE_PIECE_THICKNESS = 0.5
-# In half cells: within this distance of its point the clip curve is nearly a line.
+# Within this distance of its known point, in half edges, the clip curve is taken for a line.
 _CLIP_CURVE_RADIUS = 4.0
 
 
@@ -47,16 +48,19 @@ _CLIP_CURVE_RADIUS = 4.0
 class SurfaceCells:
     """Cubes, with a slab and a point of the surface in each where these are known.
 
-    center: (n, 3). half: (n,) half the length of an edge.
+    FAR stands for `FAR_SENTINEL`: not known.
+
+    center: (n, 3) the centers.
+    half: (n,) half the length of an edge.
     surface_point: (n, 3) a point of the surface, no farther from the center than the cell is wide,
         or FAR.
-    normal: (n, 3), offset, thickness: (n,) the surface within the ball around the cell has |normal
-        . (y - center) - offset| <= thickness, which is FAR where nothing is known. The normal is
-        zero where no plane is known that is nearly the surface.
+    normal, offset, thickness: (n, 3), (n,), (n,) the slab: a surface point y in the ball around
+        the cell has |normal . (y - center) - offset| <= thickness. Where no slab is known the
+        thickness is FAR; where no plane approximates the surface the normal is zero.
     plane_radius: (n,) within this radius about its surface point the surface is nearly that plane.
-    curvature: (n,) an upper bound of its curvature there; FAR where none is known.
+    curvature: (n,) an upper bound of the surface's curvature there, or FAR.
     clip_point: (n, 3) a point of the clip curve, at which a domain cuts the surface, or FAR.
-    clip_curvature: (n,) of the clip curve there.
+    clip_curvature: (n,) the curvature of the clip curve there.
     """
 
     center: FloatArray
@@ -117,17 +121,18 @@ class BestCandidate:
 
 @dataclass(frozen=True)
 class CellTree:
-    """A tree of at least one cell, on a backend."""
+    """A tree of cells on a backend, for at least one cell."""
 
     tree: PackedTree
 
     @classmethod
     def of(cls, backend: Backend, cells: SurfaceCells) -> CellTree:
-        # Points of the clip curve are surface points of cells of their own.
-        cut_ids = np.flatnonzero(cells.clip_point[:, 0] < FAR_SENTINEL)
-        n, ids = len(cells), np.concatenate([np.arange(len(cells)), cut_ids])
+        """Build the tree of the cells. A cell with a point of the clip curve has a second record,
+        for that point."""
+        clip_ids = np.flatnonzero(cells.clip_point[:, 0] < FAR_SENTINEL)
+        count, ids = len(cells), np.concatenate([np.arange(len(cells)), clip_ids])
         is_plain = cells.is_single_piece & (cells.clip_point[:, 0] == FAR_SENTINEL)
-        separation = np.where(is_plain, _SEPARATION, _SEPARATION_IN_PIECES) * cells.half
+        separations = np.where(is_plain, _SEPARATION, _SEPARATION_IN_PIECES) * cells.half
         bulge = 0.15 * cells.curvature * np.square(cells.plane_radius)
         slack = np.where(cells.is_single_piece, np.minimum(cells.thickness, bulge), 0.0)
         records = np.column_stack(
@@ -138,17 +143,17 @@ class CellTree:
                 cells.thickness,
                 cells.normal,
                 cells.offset,
-                np.arange(n, dtype=np.float64),
+                np.arange(count, dtype=np.float64),
                 cells.plane_radius,
                 slack,
-                separation,
+                separations,
             ]
         )[ids]
-        radius = _CLIP_CURVE_RADIUS * cells.half[cut_ids]
-        bulge = radius * np.minimum(0.25, cells.clip_curvature[cut_ids] * radius)
-        records[n:, 4:7] = cells.clip_point[cut_ids]
-        records[n:, 12:] = np.column_stack([
-            np.full(len(cut_ids), -1), radius, bulge, _SEPARATION_IN_PIECES * cells.half[cut_ids],
+        radius = _CLIP_CURVE_RADIUS * cells.half[clip_ids]
+        bulge = radius * np.minimum(0.25, cells.clip_curvature[clip_ids] * radius)
+        records[count:, 4:7] = cells.clip_point[clip_ids]
+        records[count:, 12:] = np.column_stack([
+            np.full(len(clip_ids), -1), radius, bulge, _SEPARATION_IN_PIECES * cells.half[clip_ids],
         ])  # fmt: skip
         center, half = cells.center[ids], cells.half[ids, None]
         hierarchy = build_balanced_tree(center, leaf_size=_LEAF_SIZE)
@@ -165,11 +170,12 @@ class CellTree:
         vector = self.tree.backend.Array3f
 
         def visit_cell(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
+            """Keep the smallest estimate so far, and its surface point."""
             best, point = state
             cell = _CellRecord.of(vector, row)
             estimate = cell.estimate(x)
             is_best = active & (estimate < best)
-            return dr.select(is_best, estimate, best), dr.select(is_best, cell.foot, point)
+            return dr.select(is_best, estimate, best), dr.select(is_best, cell.surface_point, point)
 
         upper_bound = (1 + 1e-9) * dr.sqrt(squared_distance_in_nearby_leaf(self.tree, x, 4))
         start = fmin(upper_bound, limit), vector(FAR_SENTINEL)
@@ -191,6 +197,8 @@ class CellTree:
         vector, index = backend.Array3f, backend.UInt32
 
         def visit_cell(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
+            """Lower the bound of the distance by that of the cell, mark the cell, and add its point
+            to the list of candidates if it qualifies."""
             lower, *listed = state
             cell = _CellRecord.of(vector, row)
             is_relevant = active & ~cell.is_within(best.point, best.exclusion_radius)
@@ -210,9 +218,10 @@ class CellTree:
             return lower, *update_where_active(is_listed, insert, (*listed,), "listed cells")
 
         def with_candidate(cell: _CellRecord, estimate: Real, state: LoopValues) -> LoopValues:
-            # The list is sorted: a nearer candidate takes the place of a listed one, which moves on
-            # to the next place, unless both lead to the same closest point.
-            listed, point = [*state], cell.foot
+            """Insert a cell's point in the list, which is sorted by estimate. A nearer candidate
+            takes the place of a listed one; this one moves on to the next place, unless both lead
+            to the same closest point."""
+            listed, point = [*state], cell.surface_point
             for k in range(0, len(listed), 2):
                 old, y = listed[k], listed[k + 1]
                 is_nearer, is_apart = estimate < old, cell.is_separated(y, 1.0)
@@ -223,6 +232,8 @@ class CellTree:
             return tuple(listed)
 
         def may_contain(low: Vec3, high: Vec3) -> Mask:
+            """Whether a box extends outside the ball about the best point in which none is
+            nearer."""
             y = best.point
             corner = vector(*(fmax(high[k] - y[k], y[k] - low[k]) for k in range(3)))
             return dr.squared_norm(corner) >= best.exclusion_radius * best.exclusion_radius
@@ -239,19 +250,22 @@ class CellTree:
 
     def _walk(
         self, x: Vec3, visit_cell: Any, start: LoopValues, limit: Callable[[LoopValues], Real],
-        is_open: Callable[[Vec3, Vec3], Mask] = lambda low, high: low.x <= high.x,
+        may_contain: Callable[[Vec3, Vec3], Mask] = lambda low, high: low.x <= high.x,
     ) -> LoopValues:  # fmt: skip
-        """Traverse the tree.
+        """Traverse the tree from the root. Returns the final state.
 
-        limit: gives the squared distance, by the state, beyond which boxes are left out. Boxes that
-        are not `is_open` are left out too.
+        visit_cell: updates the state by the record of a cell.
+        limit: the squared distance from x, for a state, above which boxes are left out.
+        may_contain: whether a box, given by its lower and upper corner, is to be visited.
         """
         vector = self.tree.backend.Array3f
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
+            """Whether a node's box is to be visited, and the state after its cells, if it is a
+            leaf."""
             low, high = vector(*node.head[:3]), vector(*node.head[3:6])
             offset = dr.select(x < low, low - x, dr.select(x > high, x - high, 0))
-            is_near = (dr.squared_norm(offset) < limit(state)) & is_open(low, high)
+            is_near = (dr.squared_norm(offset) < limit(state)) & may_contain(low, high)
             return is_near, for_each_primitive(node, is_near & node.is_leaf, visit_cell, state)
 
         return traverse(self.tree, visit, start)
@@ -259,66 +273,72 @@ class CellTree:
 
 @dataclass(frozen=True)
 class _CellRecord:
-    """The record of a cell in the tree, or of a point of the clip curve in a cell (number < 0): the
-    columns of `SurfaceCells`, and
+    """The record of a cell in the tree, or of a point of the clip curve in a cell. The attributes
+    are the columns of `SurfaceCells`, and
 
-    estimate_slack: an upper bound of (estimate - distance) of the surface.
-    apart: surface points that are closer than this to `foot` lead to the same closest point.
+    number: the index of the cell; -1 for a point of the clip curve.
+    spread: the radius about `surface_point` within which the surface is taken for a plane, or the
+        clip curve for a line.
+    estimate_slack: an upper bound of (estimate - distance) for the surface in the cell.
+    separation: surface points that are closer than this to `surface_point` are taken to lead to the
+        same closest point.
     """
 
     center: Vec3
     half: Real
-    foot: Vec3
+    surface_point: Vec3
     thickness: Real
     normal: Vec3
     offset: Real
     number: Real
     spread: Real
     estimate_slack: Real
-    apart: Real
+    separation: Real
 
     @classmethod
     def of(cls, vector: Any, row: list[Real]) -> _CellRecord:
-        """From a row of numbers."""
+        """The record from its row of 16 numbers, in the order in which `CellTree.of` writes
+        them."""
         return cls(
             vector(*row[:3]), row[3], vector(*row[4:7]), row[7], vector(*row[8:11]), *row[11:16]
         )
 
     @property
     def is_cell(self) -> Mask:
-        """Whether it is a cell of its own."""
+        """Whether the record is that of a cell, not of a point of the clip curve."""
         return self.number >= 0
 
     def lower_bound(self, x: Vec3) -> Real:
-        """A lower bound of the distance from x to the surface in the cell: the larger of those by
-        the cell's box and by its slab."""
+        """A lower bound of the distance from x to the surface in the cell: the larger of the
+        distances from the cell's box and from its slab."""
         vector = cast("Any", type(x))
         offset = x - self.center
-        box = dr.norm(vector(*(fmax(dr.abs(offset[k]) - self.half, 0) for k in range(3))))
+        box_distance = dr.norm(vector(*(fmax(dr.abs(offset[k]) - self.half, 0) for k in range(3))))
         height = dr.dot(offset, self.normal)
-        across = dr.norm(dr.fma(vector(-height), self.normal, offset))
+        lateral = dr.norm(dr.fma(vector(-height), self.normal, offset))
         normal_gap = fmax(dr.abs(height - self.offset) - self.thickness, 0)
-        lateral_gap = fmax(across - 1.7321 * self.half, 0)
-        return fmax(box, dr.norm(vector(normal_gap, lateral_gap, 0)))
+        lateral_gap = fmax(lateral - 1.7321 * self.half, 0)
+        return fmax(box_distance, dr.norm(vector(normal_gap, lateral_gap, 0)))
 
     def estimate(self, x: Vec3) -> Real:
         """An estimate of the distance from x to the surface in the cell, not below the proved
-        bound; infinite without a surface point.
+        bound; infinite if no surface point is known.
 
-        Within the spread about its point the surface is taken for a plane, the clip curve for a
-        line: the path to its nearest point is at right angles to the path from there to the surface
-        point.
+        Within `spread` of its point the surface is taken for a plane, and the clip curve for a
+        line. The vector from x to the closest point of the plane or line is at right angles to the
+        vector from there to the surface point: so the distance follows by Pythagoras.
         """
-        offset = x - self.foot
+        offset = x - self.surface_point
         height = dr.select(self.is_cell, dr.dot(offset, self.normal), 0)
-        square = dr.squared_norm(offset) - height * height - self.spread * self.spread
-        near = dr.sqrt(dr.fma(height, height, fmax(square, 0)))
-        return dr.select(self.foot.x < 0.5 * FAR_SENTINEL, fmax(near, self.lower_bound(x)), dr.inf)
+        lateral_square = dr.squared_norm(offset) - height * height - self.spread * self.spread
+        distance = dr.sqrt(dr.fma(height, height, fmax(lateral_square, 0)))
+        return dr.select(
+            self.surface_point.x < 0.5 * FAR_SENTINEL, fmax(distance, self.lower_bound(x)), dr.inf
+        )
 
     def is_separated(self, y: Vec3, times: Real) -> Mask:
-        """Whether the surface point is separated from y (`_SEPARATION`), at `times` the distance
-        that is required."""
-        return dr.squared_norm(self.foot - y) >= dr.square(times * self.apart)
+        """Whether the surface point is at least `times` * `separation` away from y."""
+        return dr.squared_norm(self.surface_point - y) >= dr.square(times * self.separation)
 
     def is_within(self, y: Vec3, radius: Real) -> Mask:
         """Whether the whole cell is within a radius of y."""

@@ -27,30 +27,36 @@ if TYPE_CHECKING:
 
 __all__ = ["ClosestPointDescent"]
 
-_STEPS_DIRECT = 10
-_LAST_STEP = 1e-11  # of the distance: the last step is expected to be shorter
-_STEPS_TO_LEVEL = 60
-_STEPS_ALONG = 60
-# Newton's method to a simple root takes fewer steps than this.
-_PATIENT = 16
-_MIN_STEP_FRACTION = 1e-7  # of a step: shorter steps are given up
-_MIN_EIGENVALUE = (
-    0.05  # of B (`ClosestPointDescent.descend`): steps are no longer than 20 gradients
-)
+# Largest number of steps of `newton`.
+_MAX_NEWTON_STEPS = 10
+# `newton` stops if the next step is expected to be shorter than this fraction of the distance.
+_NEWTON_TOLERANCE = 1e-11
+# Largest number of steps of a descent to the level, and of one along the surface.
+_MAX_LEVEL_STEPS = 60
+_MAX_SURFACE_STEPS = 60
+# Newton's method to a simple root takes fewer steps than this; later steps are lengthened, as for a
+# multiple root.
+_SIMPLE_ROOT_STEPS = 16
+# A descent ends if its step has been reduced to this fraction.
+_MIN_STEP_FRACTION = 1e-7
+# Lower bound of the eigenvalues of B (`ClosestPointDescent.descend`) that steps are divided by:
+# steps are no longer than 20 gradients.
+_MIN_EIGENVALUE = 0.05
+# y is a saddle or a maximum of the distance if B has an eigenvalue below this.
 _INDEFINITE = -1e-3
 # A point counts as on the level if rounding moves the level by at most this fraction of its
 # coordinates or of the radius of the ball on which f is smooth.
 _MAX_RELATIVE_UNCERTAINTY = 1 / 16
-# No minimum is looked for where f is singular within this fraction of the distance, as the surface
-# ends there: its boundary is farther by a fraction of half the square.
+# A descent ends where f is singular within this fraction of the distance, as the surface ends
+# there. The boundary of the surface is then farther by half the square of this fraction at most.
 _MIN_SINGULARITY_FRACTION = 1e-5
 
 
 @dataclass(frozen=True)
 class _DescentState:
-    """A point y and the field there.
+    """A point y, and properties of the field f there.
 
-    gradient: of the field.
+    gradient: grad f(y).
     level_uncertainty: the length by which rounding may have moved the level.
     smooth_radius: the radius of the ball on which f is smooth.
     """
@@ -64,14 +70,18 @@ class _DescentState:
         """The attributes in the order of the constructor, as the state of a loop."""
         return self.y, self.gradient, self.level_uncertainty, self.smooth_radius
 
-    def flat_after(self, mask: Mask, before: _DescentState) -> _DescentState:
-        """The state, where f - level and its gradient are 0 on lanes of the mask: with the gradient
-        of the state before, and with the rounding of coordinates alone."""
+    def flat_after(self, is_flat: Mask, previous: _DescentState) -> _DescentState:
+        """This state, changed in the lanes `is_flat`, in which f - level and its gradient are 0: it
+        gets the gradient of the previous state, and the rounding of coordinates alone as its
+        uncertainty."""
         epsilon = float(dr.epsilon(type(self.level_uncertainty)))
         rounding = 4 * epsilon * lengths.max_norm(self.y)
-        gradient = dr.select(mask, before.gradient, self.gradient)
+        gradient = dr.select(is_flat, previous.gradient, self.gradient)
         return _DescentState(
-            self.y, gradient, dr.select(mask, rounding, self.level_uncertainty), self.smooth_radius
+            self.y,
+            gradient,
+            dr.select(is_flat, rounding, self.level_uncertainty),
+            self.smooth_radius,
         )
 
     def where(self, mask: Mask, other: _DescentState) -> tuple[Any, ...]:
@@ -91,6 +101,7 @@ class ClosestPointDescent:
 
     @classmethod
     def of(cls, backend: Backend, field: Field, levels: Levels) -> ClosestPointDescent:
+        """The descent; finds out whether the field has a Hessian."""
         return cls(backend, field, levels, has_hessian(backend, field))
 
     def newton(self, x: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Real, Mask, Mask]:
@@ -98,14 +109,15 @@ class ClosestPointDescent:
         f(y), in one kernel, from a point `start` near the surface.
 
         Returns y, to which `finish` adds the last step; the first-order distance of `start` from
-        the level; whether the last step was longer than half the radius in which f is smooth, so
-        that y is no result; and whether y will be farther from x than `limit`, where the iteration
-        stops.
+        the level; a mask of the lanes that failed, as the last step was longer than half the radius
+        in which f is smooth; and a mask of the lanes that stopped early, as their closest point is
+        farther from x than `limit`.
 
         Each step combines the step of `descend` along the surface, which follows its curvature,
-        with a Newton step to the level; both are from derivatives at the same point. Convergence is
+        with a Newton step to the level; both use derivatives at the same point. Convergence is
         quadratic: a step of length s after one of length s0 is followed by one of about s (s/s0)^2.
-        While steps at least halve, the limit is within twice the current step.
+        As long as each step is at most half the one before, the limit of the iteration is within
+        twice the current step.
         """
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
         x, mask = vector(x), self.backend.Bool
@@ -113,105 +125,128 @@ class ClosestPointDescent:
         def body(
             y: Vec3, first_step: Real, last: Real, is_lost: Mask, is_far: Mask, k: Any, active: Mask
         ) -> tuple[Any, ...]:
-            # The rounding error of f takes as long as f itself, and is of no matter here.
+            """One step from y. last: the length of the step before; k: the number of steps."""
+            # The rounding error of f takes as long as f itself, and does not matter here.
             sample = dataclasses.replace(self.field.evaluate(y), value_error=0.0)
-            residual, at_y = self._descent_state_at(y, sample)
-            move, _ = self._step_along(x, at_y, real(1))
-            step = -residual / lengths.safe_norm(at_y.gradient)
+            residual, state = self._state_at(y, sample)
+            move, _ = self._tangential_step(x, state, real(1))
+            step = -residual / lengths.safe_norm(state.gradient)
             first_step = dr.select(k == 0, dr.abs(step), first_step)
-            move = dr.fma(vector(step), at_y.gradient / lengths.safe_norm(at_y.gradient), move)
+            move = dr.fma(vector(step), state.gradient / lengths.safe_norm(state.gradient), move)
             length, distance = dr.norm(move), dr.norm(x - y)
-            max_length = 0.5 * at_y.smooth_radius
+            max_length = 0.5 * state.smooth_radius
             is_lost = dr.select(active, length > max_length, is_lost)
             shrinks = (k > 0) & (length < 0.5 * last)
             is_far = dr.select(active, shrinks & (distance - 2 * length > limit), is_far)
             ahead = length * dr.square(length / last)
             is_near = (
-                shrinks & ~is_lost & (ahead <= dr.fma(_LAST_STEP, distance, at_y.level_uncertainty))
+                shrinks
+                & ~is_lost
+                & (ahead <= dr.fma(_NEWTON_TOLERANCE, distance, state.level_uncertainty))
             )
             active &= ~is_far & dr.isfinite(length)
             y = dr.select(active, y + dr.select(is_lost, max_length / length, 1) * move, y)
-            active &= ~is_near & (k + 1 < _STEPS_DIRECT)
+            active &= ~is_near & (k + 1 < _MAX_NEWTON_STEPS)
             return y, first_step, length, is_lost, is_far, k + 1, active
 
-        def is_active(*state: Any) -> Mask:
-            return state[-1]
+        def is_active(*initial: Any) -> Mask:
+            return initial[-1]
 
         no_lane = mask(False)
-        state = vector(start), real(0), real(dr.inf), no_lane, mask(False), count(0), mask(True)
-        final = dr.while_loop(state, is_active, body, label="Newton's method")
+        initial = vector(start), real(0), real(dr.inf), no_lane, mask(False), count(0), mask(True)
+        final = dr.while_loop(initial, is_active, body, label="Newton's method")
         y, first_step, _, is_lost, is_far, _, _ = final
         return y, first_step, is_lost, is_far
 
     def finish(self, x: Vec3, y: Vec3) -> tuple[Vec3, Mask, Real]:
-        """The last step from y onto the level; whether it leads to a closest point to x, by the
-        criterion of `descend`; and a radius about it in which no point of the surface is nearer.
+        """The last step, from y onto the level.
 
-        Proof that the step, of length s along grad f, ends on the level: by Newton's formula f
-        differs from the level there by at most the remainder of Taylor's polynomial of first degree
-        within s. It turns normals by about s times the curvature, less than the tangential part may
-        be in any case.
+        Returns the end of the step; whether it is a closest point to x, by the criterion of
+        `descend`; and a radius about it in which no point of the surface is nearer to x.
+
+        Proof that the step, of length s along grad f, ends on the level: it is Newton's step, so f
+        differs from the level at its end by at most the remainder, within s, of the Taylor
+        polynomial of degree 1. Over the step the normal turns by about s times the curvature, which
+        is less than the tangential part that `descend` allows.
         """
         sample = self.field.evaluate(y)
-        residual, at_y = self._descent_state_at(y, sample)
+        residual, state = self._state_at(y, sample)
         rows = self.field.hessian(y) if self.has_hessian else None
-        _, is_minimum = self._step_along(x, at_y, self.backend.Float(1), rows)
-        slope = lengths.safe_norm(at_y.gradient)
-        step = -residual / slope
+        _, is_minimum = self._tangential_step(x, state, self.backend.Float(1), rows)
+        gradient_norm = lengths.safe_norm(state.gradient)
+        step = -residual / gradient_norm
         exact = dataclasses.replace(sample, value_error=0.0, gradient_error=0.0)
-        arrives = taylor_remainder(exact, dr.abs(step)) <= slope * at_y.level_uncertainty
-        end, is_short = self._step_to_level(x, residual, at_y)
+        arrives = taylor_remainder(exact, dr.abs(step)) <= gradient_norm * state.level_uncertainty
+        end, is_short = self._step_to_level(x, residual, state)
         arrives &= is_short
         is_found = is_minimum & (
-            self._is_on_level(residual, at_y) | (self._is_level_resolved(at_y) & arrives)
+            self._is_on_level(residual, state) | (self._is_level_resolved(state) & arrives)
         )
         radius = exclusion_radius(exact, rows, x, y)
         return end, is_found, dr.select(is_found, radius, 0)
 
     def descend(self, x: Vec3, start: Vec3) -> tuple[Vec3, Mask, Mask]:
-        """The closest point y to x that is found from `start`; whether it is a closest point (see
-        above); and whether it is a point of the level set at all.
+        """Descend from `start` to a closest point of x.
 
-        A step along the surface is Newton's for |x-y|^2/2: with r = x - y, tangential part t, and
-        the Hessian A in tangential coordinates, the surface near y is y + w - (w.Aw/(2|g|)) n + ..
-        and half the squared distance falls by t.w - w.Bw/2 with B = 1 + (r.n) A/|g|. Where an
-        eigenvalue of B is not positive its size is taken instead, so that the step still goes
-        down; where t vanishes as well, y is a saddle or a maximum of the distance (x is beyond a
-        center of curvature), left along that eigenvector. The step ends with Newton's method
-        back to the level, and counts if it came no farther from x, else a quarter is tried.
+        Returns the last point y; a mask of the lanes in which it is a closest point (a local
+        minimum of the distance); and a mask of the lanes in which it is a point of the level set.
+
+        Let g = grad f(y), n = g/|g|, r = x - y, and t the part of r tangential to the surface; A is
+        the Hessian of f, w a tangential vector. The surface near y is y + w - (w.Aw/(2|g|)) n + ..,
+        and half the squared distance decreases by t.w - w.Bw/2 with B = 1 + (r.n) A/|g|. The step w
+        along the surface is Newton's for this function. If an eigenvalue of B is not positive, its
+        absolute value is used, so that the step still decreases the distance. If t vanishes as
+        well, y is a saddle or a maximum of the distance (x is farther than a center of curvature),
+        and the step is along that eigenvector. After the step Newton's method leads back to the
+        level. The step is accepted if the result is no farther from x; else a quarter is tried.
 
         y is accepted if |t| <= 4 sqrt(epsilon) |r| plus a few rounding errors: then, by the same
-        formula, |r| exceeds the local minimum by a fraction 8 epsilon/(least eigenvalue of B).
+        formula, |r| exceeds the local minimum by a fraction of at most 8 epsilon/(smallest
+        eigenvalue of B).
         """
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
         mask = self.backend.Bool
         x = vector(x)
 
         def body(
-            y: Vec3, g: Vec3, noise: Real, radius: Real,
-            factor: Real, on_level: Mask, accepted: Mask, n: Any, active: Mask,
+            y: Vec3, g: Vec3, uncertainty: Real, radius: Real,
+            factor: Real, on_level: Mask, accepted: Mask, iteration: Any, active: Mask,
         ) -> tuple[Any, ...]:  # fmt: skip
-            at_y, first = _DescentState(y, g, noise, radius), n == 0
-            move, is_minimum = self._step_along(x, at_y, factor)
-            is_minimum &= ~first
-            going = active & ~is_minimum
-            trial, arrived = self._to_level(dr.select(first, y, y + move), going)
-            limit = dr.norm(x - y) * (1 + 8 * self.backend.machine_epsilon) + 4 * noise
-            better = going & arrived & (dr.norm(x - trial.y) <= limit)
-            new_factor = dr.select(better, fmin(4 * factor, 1), 0.25 * factor)
-            factor = dr.select(first, factor, new_factor)
+            """One step along the surface and back to the level, accepted if it leads nearer to x.
+
+            y, g, uncertainty, radius: the parts of the state (`_DescentState`).
+            factor: the fraction of Newton's step that is tried.
+            on_level, accepted: whether the start led to a level; whether y is a closest point.
+            iteration: the number of steps.
+            """
+            current, is_first = _DescentState(y, g, uncertainty, radius), iteration == 0
+            move, is_minimum = self._tangential_step(x, current, factor)
+            is_minimum &= ~is_first
+            goes_on = active & ~is_minimum
+            trial, is_arrived = self._to_level(dr.select(is_first, y, y + move), goes_on)
+            limit = dr.norm(x - y) * (1 + 8 * self.backend.machine_epsilon) + 4 * uncertainty
+            is_better = goes_on & is_arrived & (dr.norm(x - trial.y) <= limit)
+            new_factor = dr.select(is_better, fmin(4 * factor, 1), 0.25 * factor)
+            factor = dr.select(is_first, factor, new_factor)
             accepted |= active & is_minimum
-            on_level = dr.select(first, arrived, on_level)
-            # Where f ceases to be smooth the surface ends: no minimum inside it.
+            on_level = dr.select(is_first, is_arrived, on_level)
+            # The surface ends where f ceases to be smooth: the minimum is at its boundary then.
             is_inner = trial.smooth_radius > _MIN_SINGULARITY_FRACTION * dr.norm(x - trial.y)
-            is_inner &= (n <= _STEPS_ALONG) & (factor > _MIN_STEP_FRACTION)
-            active = going & dr.select(first, arrived, is_inner)
-            return *trial.where(better | first, at_y), factor, on_level, accepted, n + 1, active
+            is_inner &= (iteration <= _MAX_SURFACE_STEPS) & (factor > _MIN_STEP_FRACTION)
+            active = goes_on & dr.select(is_first, is_arrived, is_inner)
+            return (
+                *trial.where(is_better | is_first, current),
+                factor,
+                on_level,
+                accepted,
+                iteration + 1,
+                active,
+            )
 
         def is_active(*state: Any) -> Mask:
             return state[-1]
 
-        # Iteration 0 goes to the level: f is recorded once for both.
+        # Iteration 0 leads to the level: so the code of f occurs once in the kernel.
         state = (
             *_DescentState(vector(start), vector(0), real(0), real(0)).parts(),
             real(1), mask(False), mask(False), count(0), mask(True),
@@ -235,38 +270,41 @@ class ClosestPointDescent:
     def last_step(self, x: Vec3, y: Vec3) -> Vec3:
         """y moved onto the level, where y is closest to x except for a step as short as in
         `finish`; NaN elsewhere."""
-        residual, at_y = self._evaluate(y)
-        end, is_short = self._step_to_level(x, residual, at_y)
-        return dr.select(is_short & self._is_level_resolved(at_y), end, dr.nan)
+        residual, state = self._evaluate(y)
+        end, is_short = self._step_to_level(x, residual, state)
+        return dr.select(is_short & self._is_level_resolved(state), end, dr.nan)
 
-    def _step_to_level(self, x: Vec3, residual: Real, at_y: _DescentState) -> tuple[Vec3, Mask]:
-        """The end of Newton's step along the gradient, and whether the step is so short that the
-        point stays the closest to x, to rounding."""
-        slope = lengths.safe_norm(at_y.gradient)
-        step = -residual / slope
-        end = dr.fma(self.backend.Array3f(step / slope), at_y.gradient, at_y.y)
-        limit = self.backend.machine_epsilon**0.5 * dr.norm(x - at_y.y) + at_y.level_uncertainty
+    def _step_to_level(self, x: Vec3, residual: Real, state: _DescentState) -> tuple[Vec3, Mask]:
+        """Newton's step to the level, along the gradient. Returns its end, and whether the step is
+        so short that this is still the closest point to x, to rounding."""
+        gradient_norm = lengths.safe_norm(state.gradient)
+        step = -residual / gradient_norm
+        end = dr.fma(self.backend.Array3f(step / gradient_norm), state.gradient, state.y)
+        limit = self.backend.machine_epsilon**0.5 * dr.norm(x - state.y) + state.level_uncertainty
         return end, dr.abs(step) <= limit
 
     def _evaluate(self, y: Vec3) -> tuple[Real, _DescentState]:
-        """f - level at y, and the state at y."""
-        return self._descent_state_at(y, self.field.evaluate(y))
+        """f - level at y for the nearest level, and the state at y."""
+        return self._state_at(y, self.field.evaluate(y))
 
-    def _descent_state_at(self, y: Vec3, sample: Sample) -> tuple[Real, _DescentState]:
+    def _state_at(self, y: Vec3, sample: Sample) -> tuple[Real, _DescentState]:
+        """f - level for the nearest level, and the descent state, from the field's sample at y."""
         real = self.backend.Float
-        size = lengths.max_norm(y)
+        scale = lengths.max_norm(y)
         epsilon, gradient_norm = self.backend.machine_epsilon, lengths.safe_norm(sample.gradient)
         total_error = dr.fma(8 * epsilon, dr.abs(sample.value), sample.value_error)
-        noise = dr.fma(4 * epsilon, size, total_error / gradient_norm)
-        smooth = real(0)
+        uncertainty = dr.fma(4 * epsilon, scale, total_error / gradient_norm)
+        smooth_radius = real(0)
         for promise in sample.all_promises:
             if not promise.implies_smooth:
                 continue
             radius = real(promise.radius)
-            smooth = fmax(smooth, dr.select(dr.isfinite(radius), radius, 0))
-        smooth = dr.select(smooth > 0, smooth, dr.inf)
+            smooth_radius = fmax(smooth_radius, dr.select(dr.isfinite(radius), radius, 0))
+        smooth_radius = dr.select(smooth_radius > 0, smooth_radius, dr.inf)
         residual = real(-self.levels.offset_to_nearest(sample.value))
-        return residual, _DescentState(y, self.backend.Array3f(sample.gradient), noise, smooth)
+        return residual, _DescentState(
+            y, self.backend.Array3f(sample.gradient), uncertainty, smooth_radius
+        )
 
     @staticmethod
     def _is_on_level(residual: Real, state: _DescentState) -> Mask:
@@ -285,102 +323,129 @@ class ClosestPointDescent:
         )
 
     def _to_level(self, start: Vec3, active: Mask) -> tuple[_DescentState, Mask]:
-        """From `start` to the nearest level by Newton's method along the gradient.
+        """Newton's method along the gradient, from `start` to the nearest level.
 
         A step is no longer than the radius of the ball on which f is known to be smooth, and is
-        accepted if the result is nearer to a level. Returns the end, and whether it is on a level
-        to rounding.
+        accepted if the result is nearer to a level. Returns the state at the end, and whether that
+        is on a level to rounding.
 
-        Where f - level is a power u^m, as on a surface along which grad f is 0, steps shrink by the
-        factor 1 - 1/m only. Steps that shrink so slowly for long are made `multiplicity` times as
-        long. If such a step ends where f - level and its gradient are 0, the last direction of the
-        gradient is used.
+        If f - level is a power u^m of a smooth function u, grad f is 0 on the surface, and each
+        step is only 1 - 1/m times the one before. After `_SIMPLE_ROOT_STEPS` such steps, they are
+        made `multiplicity` times as long. If a step ends where f - level and its gradient are 0,
+        the last direction of the gradient is used.
         """
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
 
         def body(
-            residual: Real, y: Vec3, g: Vec3, noise: Real, radius: Real,
-            last: Real, factor: Real, on_level: Mask, n: Any, active: Mask,
+            residual: Real, y: Vec3, g: Vec3, uncertainty: Real, radius: Real,
+            last: Real, factor: Real, on_level: Mask, iteration: Any, active: Mask,
         ) -> tuple[Any, ...]:  # fmt: skip
-            at_y, gradient_norm, first = (
-                _DescentState(y, g, noise, radius),
+            """One Newton step towards the level, accepted if f is nearer to it.
+
+            residual: f - level at y.
+            y, g, uncertainty, radius: the parts of the state (`_DescentState`).
+            last: the length of the step before.
+            factor: the fraction of Newton's step that is tried.
+            on_level: whether y is on the level.
+            iteration: the number of steps.
+            """
+            current, gradient_norm, is_first = (
+                _DescentState(y, g, uncertainty, radius),
                 lengths.safe_norm(g),
-                n == 0,
+                iteration == 0,
             )
             step = -residual / gradient_norm
-            boost = dr.select(n > _PATIENT, multiplicity(step, last), 1)
+            boost = dr.select(iteration > _SIMPLE_ROOT_STEPS, multiplicity(step, last), 1)
             length = factor * clamp(boost * step, -radius, radius)
             point = dr.fma(vector(length / gradient_norm), g, y)
-            new_residual, trial = self._evaluate(dr.select(first, y, point))
-            is_flat = ~first & (new_residual == 0) & (lengths.safe_norm(trial.gradient) == 0)
-            trial = trial.flat_after(is_flat, at_y)
-            better = active & (first | (dr.abs(new_residual) < dr.abs(residual)))
-            boost = dr.select(better, fmin(2 * factor, 1), 0.25 * factor)
-            factor = dr.select(first, factor, boost)
-            on_level |= better & self._is_on_level(new_residual, trial)
-            active &= ~on_level & (n <= _STEPS_TO_LEVEL) & (factor > _MIN_STEP_FRACTION)
-            residual = dr.select(better, new_residual, residual)
-            last = dr.select(first, dr.inf, dr.abs(step))
-            return residual, *trial.where(better, at_y), last, factor, on_level, n + 1, active
+            new_residual, trial = self._evaluate(dr.select(is_first, y, point))
+            is_flat = ~is_first & (new_residual == 0) & (lengths.safe_norm(trial.gradient) == 0)
+            trial = trial.flat_after(is_flat, current)
+            is_better = active & (is_first | (dr.abs(new_residual) < dr.abs(residual)))
+            boost = dr.select(is_better, fmin(2 * factor, 1), 0.25 * factor)
+            factor = dr.select(is_first, factor, boost)
+            on_level |= is_better & self._is_on_level(new_residual, trial)
+            active &= ~on_level & (iteration <= _MAX_LEVEL_STEPS) & (factor > _MIN_STEP_FRACTION)
+            residual = dr.select(is_better, new_residual, residual)
+            last = dr.select(is_first, dr.inf, dr.abs(step))
+            return (
+                residual,
+                *trial.where(is_better, current),
+                last,
+                factor,
+                on_level,
+                iteration + 1,
+                active,
+            )
 
         def is_active(*state: Any) -> Mask:
             return state[-1]
 
         # Iteration 0 evaluates the start.
-        first = _DescentState(vector(start), vector(0), real(0), real(0))
+        is_first = _DescentState(vector(start), vector(0), real(0), real(0))
         on_level = self.backend.Bool(False)
         going = self.backend.Bool(active)
-        state = (real(dr.inf), *first.parts(), real(dr.inf), real(1), on_level, count(0), going)
+        state = (real(dr.inf), *is_first.parts(), real(dr.inf), real(1), on_level, count(0), going)
         _, *end, _, _, on_level, _, _ = dr.while_loop(state, is_active, body, label="to the level")
         return _DescentState(*end), on_level
 
-    def _step_along(
-        self, x: Vec3, at_y: _DescentState, factor: Real, rows: Rows | None = None
+    def _tangential_step(
+        self, x: Vec3, state: _DescentState, factor: Real, rows: Rows | None = None
     ) -> tuple[Vec3, Mask]:
-        """The step along the surface, and whether y already is a local minimum of the distance.
+        """The step along the surface from y (see `descend`), and whether y already is a local
+        minimum of the distance from x.
 
-        rows: the rows of the Hessian, if they are known.
+        state: the state at y.
+        factor: the fraction of the largest permitted step that is used.
+        rows: the rows of the Hessian at y, if they are known.
         """
-        plane = TangentPlane.of(at_y.gradient)
-        r = x - at_y.y
-        distance = dr.norm(r)
+        plane = TangentPlane.of(state.gradient)
+        to_x = x - state.y
+        distance = dr.norm(to_x)
         if rows is not None:
             uu, vv, uv = plane.restrict_hessian(rows)
         else:
-            uu, vv, uv = self._second_derivatives(at_y.y, plane, fmin(at_y.smooth_radius, distance))
-        lift = dr.dot(r, plane.n) / plane.gradient_norm
-        eigen = SymmetricEigen2.of(dr.fma(lift, uu, 1), dr.fma(lift, vv, 1), lift * uv)  # of B
-        tu, tv = dr.dot(r, plane.u), dr.dot(r, plane.v)
+            uu, vv, uv = self._second_derivatives(
+                state.y, plane, fmin(state.smooth_radius, distance)
+            )
+        height_ratio = dr.dot(to_x, plane.n) / plane.gradient_norm
+        eigen = SymmetricEigen2.of(
+            dr.fma(height_ratio, uu, 1), dr.fma(height_ratio, vv, 1), height_ratio * uv
+        )  # of B
+        tu, tv = dr.dot(to_x, plane.u), dr.dot(to_x, plane.v)
         tangential = dr.sqrt(dr.fma(tu, tu, tv * tv))
         is_normal = tangential <= dr.fma(
-            4 * self.backend.machine_epsilon**0.5, distance, 8 * at_y.level_uncertainty
+            4 * self.backend.machine_epsilon**0.5, distance, 8 * state.level_uncertainty
         )
         is_saddle = is_normal & (eigen.smallest < _INDEFINITE)
-        first, second = eigen.coordinates(tu, tv)
-        first = first / fmax(dr.abs(eigen.largest), _MIN_EIGENVALUE)
-        second = second / fmax(dr.abs(eigen.smallest), _MIN_EIGENVALUE)
-        second = dr.select(is_saddle, 0.5 * distance, second)
-        length = dr.sqrt(dr.fma(first, first, second * second))
-        limit = factor * dr.select(is_saddle, length, fmin(at_y.smooth_radius, distance))
+        along_largest, along_smallest = eigen.coordinates(tu, tv)
+        along_largest = along_largest / fmax(dr.abs(eigen.largest), _MIN_EIGENVALUE)
+        along_smallest = along_smallest / fmax(dr.abs(eigen.smallest), _MIN_EIGENVALUE)
+        along_smallest = dr.select(is_saddle, 0.5 * distance, along_smallest)
+        length = dr.sqrt(dr.fma(along_largest, along_largest, along_smallest * along_smallest))
+        limit = factor * dr.select(is_saddle, length, fmin(state.smooth_radius, distance))
         scale = dr.select(length > 0, fmin(limit / length, 1), 0)
-        a, b = eigen.combination(scale * first, scale * second)
+        a, b = eigen.combination(scale * along_largest, scale * along_smallest)
         vector = self.backend.Array3f
-        sag = a * dr.fma(a, uu, 2 * b * uv) + b * b * vv  # w.Aw
-        sag = clamp(0.5 * sag / plane.gradient_norm, -scale * length, scale * length)
-        along = dr.fma(vector(a), plane.u, vector(b) * plane.v)
-        return dr.fma(vector(-sag), plane.n, along), is_normal & ~is_saddle
+        drop = a * dr.fma(a, uu, 2 * b * uv) + b * b * vv  # w.Aw
+        drop = clamp(0.5 * drop / plane.gradient_norm, -scale * length, scale * length)
+        tangent_step = dr.fma(vector(a), plane.u, vector(b) * plane.v)
+        return dr.fma(vector(-drop), plane.n, tangent_step), is_normal & ~is_saddle
 
     def _second_derivatives(
         self, y: Vec3, plane: TangentPlane, length: Real
     ) -> tuple[Real, Real, Real]:
-        """u.Au, v.Av, u.Av; by differences of the gradient where the field has no Hessian, for
-        their errors only cost steps."""
+        """u.Au, v.Av and u.Av, for the Hessian A at y and the tangents u, v of the plane. If the
+        field has no Hessian, they are computed by central differences of the gradient over
+        sqrt(epsilon) times `length`: their errors only cost steps."""
         if self.has_hessian:
             return plane.restrict_hessian(self.field.hessian(y))
         vector, count = self.backend.Array3f, self.backend.UInt32
         h = fmax(self.backend.machine_epsilon**0.5 * length, 1e-30)
 
         def body(along_u: Vec3, along_v: Vec3, k: Any) -> tuple[Any, ...]:
+            """Evaluate the gradient at node k of four: y + h u, y - h u, y + h v, y - h v; and add
+            it to the derivatives of the gradient along u and v."""
             direction, step = dr.select(k < 2, plane.u, plane.v), dr.select((k & 1) == 0, h, -h)
             gradient = self.field.evaluate(dr.fma(vector(step), direction, y)).gradient
             change = gradient * (0.5 / step)
@@ -391,7 +456,8 @@ class ClosestPointDescent:
         def is_active(*state: Any) -> Mask:
             return state[-1] < 4
 
-        # The loop starts at NaN: a sum that stays 0, of a constant field, would not be a state.
+        # The loop starts at NaN, as a sum that stays 0 (of a constant field) would be no loop
+        # state.
         state = (vector(dr.nan), vector(dr.nan), count(0))
         along_u, along_v, _ = dr.while_loop(state, is_active, body, label="second derivatives")
         mixed = 0.5 * (dr.dot(plane.v, along_u) + dr.dot(plane.u, along_v))

@@ -5,16 +5,18 @@ Every search ends at a root of f, at the first hit of a ray or on a triangle. So
 points of the surface, and distances are upper bounds whatever path led there; a point that is
 nearer than the proved lower bound is refused.
 
-Cells that are proved empty are left out; descents begin at a known surface point of each of the
-other cells (`cell_search`): first, in one kernel, from a few coarse cells, then, where finer cells
-may hold a nearer point, from four of their points. The ball about a closest point that holds no
-nearer point (`exclusion_ball`) settles most queries, as boxes within it are left out. The remaining
-cells bound the distance from below, and are subdivided for proofs.
+Cells that are proved empty are left out. Descents begin at a known surface point of each of the
+other cells (`cell_search`): first, in one kernel, from a few coarse cells; then, for queries to
+which a finer cell may hold a nearer point, from the surface points of four finer cells. Around a
+closest point there is a ball that holds no nearer point (`exclusion_ball`). It settles most
+queries, as boxes within it are left out. The remaining cells bound the distance from below, and are
+subdivided for proofs.
 
-Closed meshes are triangles and a tree (`level_triangles`). For a mesh with holes the part of the
-surface off its triangles is a smooth surface of w modulo 1 (`JumpSurface.without_jumps`), whose
-closest points count where w itself has the level: rays that closed in on each point took 18 times
-as long, and a tenth of them ended too far away.
+For a closed mesh, a tree finds the nearest of the triangles of the level set (`level_triangles`).
+For a mesh with holes, the part of the surface off its triangles is part of a level set of the
+winding number w modulo 1, which is smooth (`JumpSurface.without_jumps`). A closest point of that
+level set counts if w itself has the level there. Compared with this, rays that closed in on each
+point took 18 times as long, and a tenth of them ended too far away.
 """
 
 from __future__ import annotations
@@ -50,27 +52,31 @@ if TYPE_CHECKING:
 
 __all__ = ["ClosestPoints", "find_closest"]
 
-# In epsilons, of coordinates: what rounding may do to a distance.
+# Allowance for the rounding of a distance, in machine epsilons of the coordinates.
 _ROUNDING = 64.0
-# Of the size of the surface: cells are split until none can hold a point so much nearer.
+# Fraction of the surface's size: cells are split until none can hold a point that is nearer than
+# the best one by more than this.
 _TOLERANCE = 1e-6
-# Cells along an axis that points are sorted by, as a power of two.
+# Bits per axis of the Morton codes by which points are sorted.
 _MORTON_BITS = 10
-# The surface may leave its boundary at this cosine away from a point and yet come nearer to it.
+# The surface is followed from its boundary in the direction of the query, or in one that points
+# away from the query with at most this cosine.
 _MAX_OPPOSING_COSINE = 0.2
-# About the boundary the surface may be as far along a circle, in radii.
+# On a small circle around the boundary the surface is searched up to this arc length, in radii of
+# the circle.
 _MAX_ARC_RADII = 2.5
-# Of feet of a field without jumps, which knows f but for a whole number: so near to a level f is.
+# The field without jumps knows f but for a whole number. A closest point of it belongs to the
+# surface if f differs from a level by less than this.
 _LEVEL_MATCH = 0.25
-# Where f is compared on both sides of a triangle: so far from the point towards the middle, in
-# parts of the way to it, and so far on either side, in sizes of the surface. By how much f has to
-# be on different sides of a level.
+# f is compared on both sides of a triangle. The point is first moved into the triangle, by this
+# fraction of the way to its center; then off the triangle, by this fraction of the surface's size;
+# and the two values must lie on different sides of a level by this margin.
 _WITHIN_FACE, _BESIDE_FACE, _LEVEL_MARGIN = 1e-7, 1e-12, 1e-3
-# How often what clusters leave out is computed for a foot.
+# Number of times that the truncation error of the treecode is computed for a closest point.
 _TRUNCATION_CORRECTIONS = 2
-# Samples of a smooth part for each point, about.
+# Approximate number of samples of the smooth part for each query point.
 _SAMPLES_PER_POINT = 10
-# Sheets that are examined for each point before cells are.
+# Number of facets of the jump surface that are examined for each query before cells are searched.
 _MAX_JUMPS_EXAMINED = 16
 
 
@@ -80,11 +86,11 @@ class ClosestPoints:
 
     points: (n, 3) the query points, rounded to the precision in use.
     closest: (n, 3) the closest points of the surface, NaN where none was found.
-    distance: (n,) to these, NaN likewise.
-    signed_value: (n,) f - level, of the level nearest in value.
+    distance: (n,) the distances of the queries from these, NaN likewise.
+    signed_value: (n,) f - level at the queries, for the level nearest in value.
     lower: (n,) proved lower bounds of the distance.
-    violates_promises: (n,) whether a point was found that is nearer than the field's promises
-        allow.
+    violates_promises: (n,) whether a surface point was found, and left out, that is nearer than the
+        field's promises allow.
     """
 
     points: FloatArray
@@ -99,57 +105,64 @@ def find_closest(
     backend: Backend, surface: TracedSurface, levels: Levels, points: Any,
     progress: Callable[[str], None], *, is_proved: bool = False,
 ) -> ClosestPoints:  # fmt: skip
-    """The closest point of a surface to each of the points (n, 3).
+    """The closest point of a surface to each query point.
 
+    points: (n, 3) the queries, in any order.
     is_proved: whether cells are subdivided to make `lower` as large as they can prove.
 
-    Points are sorted along a Morton curve, so that neighboring lanes traverse a tree together.
+    The result is in the order of `points`. The search itself sorts them along a Morton curve, so
+    that neighboring lanes traverse a tree together.
     """
     x = as_finite_vectors(points, "points")
     order = to_numpy(morton_order(backend, upload_vectors(backend, x), _MORTON_BITS))
-    result = _find_sorted(backend, surface, levels, x[order], progress, is_proved)
-    inverse = np.empty_like(order)
-    inverse[order] = np.arange(len(order), dtype=order.dtype)
-    return ClosestPoints(*(array[inverse] for array in vars(result).values()))
+    closest = _find_sorted(backend, surface, levels, x[order], progress, is_proved)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order), dtype=order.dtype)
+    return ClosestPoints(*(column[rank] for column in vars(closest).values()))
 
 
 def _find_sorted(
     backend: Backend, surface: TracedSurface, levels: Levels, points: FloatArray,
     progress: Callable[[str], None], is_proved: bool,
 ) -> ClosestPoints:  # fmt: skip
+    """`find_closest` for points (n, 3) that are sorted along a Morton curve."""
     mesh = LevelTriangles.of(surface)
     if mesh is not None and mesh.is_complete:
         return _closest_on_mesh(backend, surface, levels, mesh, points)
-    job = _QueryEvaluator(backend, surface, levels)
-    x, guess, above, lower, near = job.evaluate(points)
+    evaluator = _QueryEvaluator(backend, surface, levels)
+    x, guess, residual, lower, estimate = evaluator.evaluate(points)
     if mesh is not None:
         guess = _with_mesh_points(x, guess, mesh)
     if surface.field.has_jumps:
-        guess = job.with_jump_points(x, guess)
+        guess = evaluator.with_jump_points(x, guess)
     tolerance = StoppingRule(_TOLERANCE * _size(surface, x), is_proved)
-    field = surface.field.for_ray_count(_SAMPLES_PER_POINT * len(x))
-    smooth = field.without_jumps() if surface.clip_volume is None else None
+    batch_field = surface.field.for_ray_count(_SAMPLES_PER_POINT * len(x))
+    smooth = batch_field.without_jumps() if surface.clip_volume is None else None
     if smooth is None:
-        result = search(surface, x, InitialGuess(guess, near), job, tolerance, progress)
+        result = search(surface, x, InitialGuess(guess, estimate), evaluator, tolerance, progress)
     else:
-        result = _search_smooth_part(job, smooth, x, InitialGuess(guess, near), tolerance, progress)
-    result.closest = _with_singular_points(surface, x, job.remove_truncation(x, result.closest))
+        result = _search_smooth_part(
+            evaluator, smooth, x, InitialGuess(guess, estimate), tolerance, progress
+        )
+    result.closest = _with_singular_points(
+        surface, x, evaluator.remove_truncation(x, result.closest)
+    )
     distance = _length(x - result.closest)
-    # If a foot is nearer than the proof allows, then either it is off the surface by rounding, or a
-    # promise of the field does not hold.
-    is_short = distance < lower
+    # A closest point may be nearer than the proved lower bound: either rounding has moved it off
+    # the surface, or a promise of the field does not hold.
+    is_below_bound = distance < lower
     slack = np.zeros(len(x))
-    slack[is_short] = 4 * job.level_uncertainty(result.closest[is_short])
+    slack[is_below_bound] = 4 * evaluator.level_uncertainty(result.closest[is_below_bound])
     slack += _ROUNDING * backend.machine_epsilon * (np.abs(x).max(axis=1, initial=0.0) + lower)
-    refused = distance < lower - slack
-    feet = np.where(refused[:, None], np.nan, result.closest)
-    distance = np.where(refused, np.nan, distance)
+    is_refused = distance < lower - slack
+    closest = np.where(is_refused[:, None], np.nan, result.closest)
+    distance = np.where(is_refused, np.nan, distance)
     lower = np.fmin(np.maximum(lower, result.lower_bounds), distance)
-    return ClosestPoints(x, feet, distance, above, lower, refused)
+    return ClosestPoints(x, closest, distance, residual, lower, is_refused)
 
 
 def _search_smooth_part(
-    job: _QueryEvaluator,
+    evaluator: _QueryEvaluator,
     smooth: Field,
     points: FloatArray,
     known: InitialGuess,
@@ -160,99 +173,108 @@ def _search_smooth_part(
     already known on its jump surfaces.
 
     smooth: `JumpSurface.without_jumps` of the surface's field.
-    known: closest points on jump surfaces.
+    points: (n, 3) the query points.
+    known: points of the surface on its jump surfaces.
 
     Proof of the lower bounds: the surface lies in the union of the level sets of `smooth` and the
     jump surfaces, so it is no nearer than the nearer of the two. A point found on a level set of
-    `smooth` is accepted only if f has the level there. Queries are searched again, with rays, where
-    it does not, and where a jump surface is nearer than all accepted points: its nearest point need
-    not belong to the surface.
+    `smooth` is accepted only if f has the level there. A query is searched again, with rays, if f
+    does not have the level there, or if a jump surface is nearer than all accepted points: the
+    nearest point of the jump surface need not belong to the surface.
     """
-    backend, surface = job.backend, job.surface
-    smooth_surface = replace(surface, field=smooth).with_call_cache(begins=True)
-    evaluator = _QueryEvaluator(backend, smooth_surface, smooth_surface.target_levels(backend))
-    near = evaluator.evaluate(points)[-1]
+    backend, surface = evaluator.backend, evaluator.surface
+    smoothed = replace(surface, field=smooth).with_call_cache(begins=True)
+    smooth_job = _QueryEvaluator(backend, smoothed, smoothed.target_levels(backend))
+    estimate = smooth_job.evaluate(points)[-1]
     result = search(
-        smooth_surface,
+        smoothed,
         points,
-        InitialGuess(known.feet, near, on_boundary=False),
-        evaluator,
+        InitialGuess(known.closest, estimate, on_boundary=False),
+        smooth_job,
         tolerance,
         progress,
     )
-    to_jumps = job.distance_to_jumps(points)
+    jump_gap = evaluator.distance_to_jumps(points)
     rounding = (
-        _ROUNDING * backend.machine_epsilon * (np.abs(points).max(axis=1, initial=0.0) + to_jumps)
+        _ROUNDING * backend.machine_epsilon * (np.abs(points).max(axis=1, initial=0.0) + jump_gap)
     )
-    lower = np.maximum(np.minimum(result.lower_bounds, to_jumps - rounding), 0)
-    to_known, feet = _length(points - known.feet), known.feet.copy()
+    lower = np.maximum(np.minimum(result.lower_bounds, jump_gap - rounding), 0)
+    distance, closest = _length(points - known.closest), known.closest.copy()
     rows = np.flatnonzero(
-        _length(points - result.closest) < np.nan_to_num(to_known, nan=np.inf) - rounding
+        _length(points - result.closest) < np.nan_to_num(distance, nan=np.inf) - rounding
     )
-    moved = evaluator.remove_truncation(points[rows], result.closest[rows])
-    value = np.asarray(surface.field.value(moved, precision="double"))
-    is_level = np.abs(value[:, None] - surface.level_values).min(axis=1) < _LEVEL_MATCH
-    feet[rows[is_level]] = moved[is_level]
-    is_known = _length(points - feet) <= to_jumps + rounding + tolerance.length
-    is_known[rows[~is_level]] = False
-    unsure = np.flatnonzero(~is_known)
-    if len(unsure):
-        guess = InitialGuess(feet[unsure], known.estimate[unsure])
-        retried = search(surface, points[unsure], guess, job, tolerance, progress)
-        feet[unsure], lower[unsure] = (
-            retried.closest,
-            np.maximum(lower[unsure], retried.lower_bounds),
-        )
-    return SearchResult(feet, lower)
+    candidates = smooth_job.remove_truncation(points[rows], result.closest[rows])
+    values = np.asarray(surface.field.value(candidates, precision="double"))
+    is_level = np.abs(values[:, None] - surface.level_values).min(axis=1) < _LEVEL_MATCH
+    closest[rows[is_level]] = candidates[is_level]
+    is_settled = _length(points - closest) <= jump_gap + rounding + tolerance.length
+    is_settled[rows[~is_level]] = False
+    rest = np.flatnonzero(~is_settled)
+    if len(rest):
+        guess = InitialGuess(closest[rest], known.estimate[rest])
+        retry = search(surface, points[rest], guess, evaluator, tolerance, progress)
+        closest[rest], lower[rest] = retry.closest, np.maximum(lower[rest], retry.lower_bounds)
+    return SearchResult(closest, lower)
 
 
 def _with_singular_points(
-    surface: TracedSurface, points: FloatArray, feet: FloatArray
+    surface: TracedSurface, points: FloatArray, closest: FloatArray
 ) -> FloatArray:
-    """The feet (n, 3), or the nearest singular points where these are nearer: beside singular
-    points the surface may be a tiny loop that descents do not find."""
+    """The closest points `closest` (n, 3) of the queries `points`, each replaced by the nearest
+    singular point of the field inside the clip volume if that is nearer. Beside a singular point
+    the surface is a tiny loop, which descents miss."""
     singular = surface.field.singular_points
     if surface.clip_volume is not None and len(singular):
         singular = singular[surface.clip_volume.contains_points(singular)]
     if not len(singular) or not len(points):
-        return feet
-    import scipy.spatial  # here: half a second that few need
+        return closest
+    import scipy.spatial  # imported here: it takes half a second, and few calls need it
 
-    searching: Any = scipy.spatial
-    distance, index = searching.cKDTree(singular).query(points)
-    is_nearer = ~(_length(points - feet) <= distance)
-    return np.where(is_nearer[:, None], singular[index], feet)
+    spatial: Any = scipy.spatial
+    distance, rows = spatial.cKDTree(singular).query(points)
+    is_nearer = ~(_length(points - closest) <= distance)
+    return np.where(is_nearer[:, None], singular[rows], closest)
 
 
 def _closest_on_mesh(
     backend: Backend, surface: TracedSurface, levels: Levels, mesh: LevelTriangles, points: Any
 ) -> ClosestPoints:
+    """`find_closest` for a surface that consists of triangles only: the nearest point of the
+    triangles. The lower bound is the distance less an allowance for rounding."""
     prepared, nearest = surface.evaluator(backend), mesh.upload(backend)
 
     def compute(p: Vec3) -> tuple[Real | Vec3, ...]:
-        above = -levels.offset_to_nearest(prepared.evaluate(p).value)
+        """The query, its nearest triangle point and the distance, and f - level."""
+        residual = -levels.offset_to_nearest(prepared.evaluate(p).value)
         offset = nearest(p)
-        return p, p + offset, safe_norm(offset), above
+        return p, p + offset, safe_norm(offset), residual
 
-    x, feet, distance, above = in_batches(backend, compute, points)
+    x, closest, distance, residual = in_batches(backend, compute, points)
     slack = _ROUNDING * backend.machine_epsilon * (np.abs(x).max(axis=1, initial=0.0) + mesh.size)
     lower = np.maximum(distance - slack, 0)
-    return ClosestPoints(x, feet, distance, above, lower, np.zeros(len(x), np.bool_))
+    return ClosestPoints(x, closest, distance, residual, lower, np.zeros(len(x), np.bool_))
 
 
-def _with_mesh_points(points: FloatArray, start: FloatArray, mesh: LevelTriangles) -> FloatArray:
-    """The points `start` (n, 3), or the nearest points of triangles where these are nearer."""
+def _with_mesh_points(points: FloatArray, guess: FloatArray, mesh: LevelTriangles) -> FloatArray:
+    """The surface points `guess` (n, 3) of the queries `points`, each replaced by the nearest point
+    of the triangles if that is nearer. NaN in `guess` counts as infinitely far."""
     backend = choose_backend("double")
     nearest = mesh.upload(backend)
     (offset,) = in_batches(backend, lambda p: (nearest(p),), points)  # pyright: ignore
-    is_nearer = ~(_length(points - start) <= _length(offset))
-    return np.where(is_nearer[:, None], points + offset, start)
+    is_nearer = ~(_length(points - guess) <= _length(offset))
+    return np.where(is_nearer[:, None], points + offset, guess)
 
 
 @dataclass(frozen=True)
 class _QueryEvaluator:
     """Evaluates one surface's field on a backend and runs the closest-point descents, for arrays of
-    query points."""
+    query points.
+
+    The attributes with an underscore are made from these three: the field prepared for the backend;
+    the descent on it; the descent on the field without truncation errors (None if it has none); the
+    domain; the descent to the clip curve, at which the domain cuts the surface (None without a
+    domain); and, for fields with jumps, the surface prepared for rays, in double precision.
+    """
 
     backend: Backend
     surface: TracedSurface
@@ -260,303 +282,368 @@ class _QueryEvaluator:
 
     def __post_init__(self) -> None:
         backend, field = self.backend, self.surface.evaluator(self.backend)
-        set_ = object.__setattr__
-        set_(self, "_field", field)
+        assign = object.__setattr__
+        assign(self, "_field", field)
         exact = field.exact(backend)
-        set_(self, "_descent", ClosestPointDescent.of(backend, field, self.levels))
-        set_(
+        assign(self, "_descent", ClosestPointDescent.of(backend, field, self.levels))
+        assign(
             self,
-            "_exact",
+            "_exact_descent",
             ClosestPointDescent.of(backend, exact, self.levels)
             if field.has_variable_accuracy
             else None,
         )
         domain = field.domain and field.domain.prepare(backend)
-        set_(self, "_domain", domain)
-        set_(self, "_rim", domain and ClipCurveDescent(backend, field, self.levels, domain))
-        # Rays are compared by differences of angles, for which single precision is too short.
+        assign(self, "_domain", domain)
+        assign(self, "_clip", domain and ClipCurveDescent(backend, field, self.levels, domain))
+        # Rays are compared by differences of angles, for which single precision is too coarse.
         double = choose_backend("double")
-        set_(self, "_prepared", self.surface.prepare(double) if field.has_jumps else None)
+        assign(self, "_tracer", self.surface.prepare(double) if field.has_jumps else None)
 
     _field: Field = dataclasses.field(init=False)
     _descent: ClosestPointDescent = dataclasses.field(init=False)
-    _exact: ClosestPointDescent | None = dataclasses.field(init=False)
+    _exact_descent: ClosestPointDescent | None = dataclasses.field(init=False)
     _domain: Volume | None = dataclasses.field(init=False)
-    _rim: ClipCurveDescent | None = dataclasses.field(init=False)
-    _prepared: Any = dataclasses.field(init=False)
+    _clip: ClipCurveDescent | None = dataclasses.field(init=False)
+    _tracer: Any = dataclasses.field(init=False)
 
     def evaluate(self, points: Any) -> tuple[FloatArray, ...]:
-        """First estimates at query points. Returns the points as rounded to the precision in use,
-        points of the surface near them (NaN for none), f - level, proved lower bounds of the
-        distance, and the first-order distance."""
+        """First estimates at query points.
+
+        Returns the points (n, 3) as rounded to the precision in use; points (n, 3) of the surface
+        near them, NaN where none is known; f - level (n,); proved lower bounds (n,) of the
+        distance; and its first-order estimates (n,).
+        """
 
         def compute(p: Vec3) -> tuple[Real | Vec3, ...]:
             sample = self._field.evaluate(p)
-            above = -self.levels.offset_to_nearest(sample.value)
+            residual = -self.levels.offset_to_nearest(sample.value)
             boundary = self._field.closest_boundary_point(p)
-            start = self.backend.Array3f(dr.nan) if boundary is None else boundary
-            start = dr.select(above == 0, p, start)
+            surface_point = self.backend.Array3f(dr.nan) if boundary is None else boundary
+            surface_point = dr.select(residual == 0, p, surface_point)
             lower = self.backend.Float(0)
             if sample.all_promises:
                 lower = level_distance_lower_bound(
                     self.backend, self._field, self.levels, p, sample
                 )
-            return p, start, above, lower, dr.abs(first_order_distance(above, sample.gradient))
+            return (
+                p,
+                surface_point,
+                residual,
+                lower,
+                dr.abs(first_order_distance(residual, sample.gradient)),
+            )
 
-        x, start, above, lower, near = in_batches(self.backend, compute, points)
+        x, surface_point, residual, lower, estimate = in_batches(self.backend, compute, points)
         domain = self.surface.field.domain
         if domain is not None and len(x):
             lower[~domain.contains_points(x)] = 0
-        return x, self._inside_domain_or_nan(start), above, lower, near
+        return x, self._inside_domain_or_nan(surface_point), residual, lower, estimate
 
-    def with_jump_points(self, points: FloatArray, start: FloatArray) -> FloatArray:
-        """The points `start` (n, 3), or points of the surface on facets where these are nearer."""
-        distance, start = _length(points - start), start.copy()
+    def with_jump_points(self, points: FloatArray, guess: FloatArray) -> FloatArray:
+        """The surface points `guess` (n, 3) of the queries `points`, each replaced by a point of
+        the surface on its jump surface if that is nearer. NaN in `guess` counts as infinitely far.
+        """
+        distance, guess = _length(points - guess), guess.copy()
         rows = np.flatnonzero(~(distance <= self.distance_to_jumps(points) * (1 + 1e-12)))
-        start[rows] = self._nearest_face_points(points[rows])
-        rows = rows[np.isnan(start[rows, 0])]
+        guess[rows] = self._nearest_face_points(points[rows])
+        rows = rows[np.isnan(guess[rows, 0])]
         if len(rows):
-            start[rows] = self._closest_on_facets(points[rows], start[rows])
-        return start
+            guess[rows] = self._search_facets(points[rows], guess[rows])
+        return guess
 
     def _nearest_face_points(self, points: FloatArray) -> FloatArray:
-        """The nearest points (n, 3) of the triangles of a jump surface, where the level lies
-        between the values of f on both sides right beside them; NaN elsewhere."""
-        mesh, prepared = self.surface.field.jump_mesh(), self._prepared
-        feet = np.full_like(points, np.nan)
+        """The nearest points (n, 3) of the triangles across which the field jumps. A point is kept
+        only if a level lies between the values of f right beside it, on both sides of the triangle;
+        else it is NaN."""
+        mesh, surface = self.surface.field.jump_mesh(), self._tracer
+        closest = np.full_like(points, np.nan)
         if mesh is None or not len(points):
-            return feet
-        real, index = prepared.backend.Float, prepared.backend.UInt32
+            return closest
+        real, index = surface.backend.Float, surface.backend.UInt32
 
         def nearest(p: Vec3) -> tuple[Vec3, Any, Vec3]:
-            none, always = (real(-1), index(NO_FACET)), prepared.backend.Bool(True)
-            closest = prepared.field.nearest_facet(p, none, real(dr.inf), always)
-            return p + closest.offset, closest.facet, closest.normal
+            """The nearest point on a facet, the index of the facet, and its normal."""
+            no_key, always = (real(-1), index(NO_FACET)), surface.backend.Bool(True)
+            facet = surface.field.nearest_facet(p, no_key, real(dr.inf), always)
+            return p + facet.offset, facet.facet, facet.normal
 
-        y, facet, normal = in_batches(prepared.backend, nearest, points)
-        corners = mesh[0][mesh[1][facet.astype(np.int64)]]
+        y, facet_id, normal = in_batches(surface.backend, nearest, points)
+        corners = mesh[0][mesh[1][facet_id.astype(np.int64)]]
         y_within = y + _WITHIN_FACE * (corners.mean(axis=1) - y)
         offset = _BESIDE_FACE * _size(self.surface, points) * normal
         sides = [
             self.surface.field.value(y_within + k * offset, precision="double") for k in (1, -1)
         ]
         low, high = np.minimum(*sides) + _LEVEL_MARGIN, np.maximum(*sides) - _LEVEL_MARGIN
-        inside = np.any(
+        is_on = np.any(
             [(low < level) & (level < high) for level in self.surface.level_values], axis=0
         )
-        feet[inside] = y[inside]
-        return feet
+        closest[is_on] = y[is_on]
+        return closest
 
     def distance_to_jumps(self, points: FloatArray) -> FloatArray:
-        """The distances (n,) to facets, whether these belong to the surface or not."""
-        prepared = self._prepared
+        """Distances (n,) of points (n, 3) from the facets across which the field jumps, whether
+        these are part of the surface or not."""
+        surface = self._tracer
 
         def compute(p: Vec3) -> tuple[Real]:
-            return (prepared.field.distance_to_jumps(p),)
+            return (surface.field.distance_to_jumps(p),)
 
-        return in_batches(prepared.backend, compute, points)[0]
+        return in_batches(surface.backend, compute, points)[0]
 
-    def _closest_on_facets(self, points: FloatArray, start: FloatArray) -> FloatArray:
-        x = np.concatenate([points, np.nan_to_num(start)])
+    def _search_facets(self, points: FloatArray, guess: FloatArray) -> FloatArray:
+        """The closest points (n, 3) that `JumpSurfaceSearch` finds on facets, nearer than `guess`
+        (n, 3); `guess` where it finds none. It examines at most `_MAX_JUMPS_EXAMINED` facets for
+        each query."""
+        coordinates = np.concatenate([points, np.nan_to_num(guess)])
         search = JumpSurfaceSearch(
-            self._prepared, max(float(np.abs(x).max(initial=0)), 1e-30), _MAX_JUMPS_EXAMINED
+            self._tracer, max(float(np.abs(coordinates).max(initial=0)), 1e-30), _MAX_JUMPS_EXAMINED
         )
 
-        def compute(p: Vec3, foot: Vec3) -> tuple[Vec3]:
-            distance = safe_norm(foot - p)
+        def compute(p: Vec3, guess_point: Vec3) -> tuple[Vec3]:
+            distance = safe_norm(guess_point - p)
             return (search.closest(p, dr.select(dr.isnan(distance), dr.inf, distance))[0],)
 
-        (feet,) = in_batches(self._prepared.backend, compute, points, start)
-        return np.where(np.isnan(feet), start, feet)
+        (closest,) = in_batches(self._tracer.backend, compute, points, guess)
+        return np.where(np.isnan(closest), guess, closest)
 
-    def _inside_domain_or_nan(self, feet: FloatArray) -> FloatArray:
-        """The points (n, 3), NaN for those outside the field's domain: the surface is cut there."""
+    def _inside_domain_or_nan(self, points: FloatArray) -> FloatArray:
+        """The points (n, 3), with NaN for those outside the domain, which cuts the surface."""
         domain = self.surface.field.domain
-        if domain is None or not len(feet):
-            return feet
-        inside = domain.contains_points(np.nan_to_num(feet))
-        return np.where(inside[:, None], feet, np.nan)
+        if domain is None or not len(points):
+            return points
+        is_inside = domain.contains_points(np.nan_to_num(points))
+        return np.where(is_inside[:, None], points, np.nan)
 
     def descend(
         self, points: FloatArray, start: FloatArray, limit: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """`cell_search.DescentMethods`: by descent, or for fields with jumps by rays."""
+        """As `cell_search.DescentMethods` says: by Newton's method and descent, or by rays for
+        fields with jumps.
+
+        A row of `start` that equals its query stands for an unknown start: Newton's method leads
+        from the query to the level first. A closest point that lies outside the domain is replaced
+        by one on the clip curve.
+        """
         if self.surface.field.has_jumps:
 
             def by_rays(p: Vec3, start: Vec3) -> tuple[Vec3]:
-                return (compass_search(self._prepared, p, start),)
+                return (compass_search(self._tracer, p, start),)
 
-            return in_batches(self._prepared.backend, by_rays, points, start)[0], np.zeros(
+            return in_batches(self._tracer.backend, by_rays, points, start)[0], np.zeros(
                 len(points)
             )
-        is_far_off = (start == points).all(axis=1)
-        if is_far_off.any():
+        is_unknown = (start == points).all(axis=1)
+        if is_unknown.any():
 
             def to_level(p: Vec3) -> tuple[Vec3]:
                 y = self._descent.newton_to_level(p)
                 return (dr.select(dr.isnan(y.x), p, y),)
 
             start = start.copy()
-            (start[is_far_off],) = in_batches(self.backend, to_level, points[is_far_off])
+            (start[is_unknown],) = in_batches(self.backend, to_level, points[is_unknown])
         limits = np.tile(limit[:, None], 3)
-        feet, y, free, goes_on, is_far = in_batches(
-            self.backend, self._directly, points, start, limits
+        closest, y, free, is_unfinished, is_far = in_batches(
+            self.backend, self._newton_numbers, points, start, limits
         )
-        rows = np.flatnonzero(goes_on)
+        rows = np.flatnonzero(is_unfinished)
         if len(rows):
-            feet[rows], free[rows] = in_batches(self.backend, self._descend, points[rows], y[rows])
-        feet = self._inside_domain_or_nan(feet)
-        missing, rim = np.flatnonzero(np.isnan(feet[:, 0]) & (is_far == 0)), self._rim
-        if rim is not None and len(missing):  # out of the domain
+            closest[rows], free[rows] = in_batches(
+                self.backend, self._descend, points[rows], y[rows]
+            )
+        closest = self._inside_domain_or_nan(closest)
+        ids, clip = np.flatnonzero(np.isnan(closest[:, 0]) & (is_far == 0)), self._clip
+        if clip is not None and len(ids):  # out of the domain
 
-            def along_rim(p: Vec3, y: Vec3) -> tuple[Vec3]:
-                return (rim.closest(p, y)[0],)
+            def to_clip_curve(p: Vec3, y: Vec3) -> tuple[Vec3]:
+                return (clip.closest(p, y)[0],)
 
-            (on_rim,) = in_batches(self.backend, along_rim, points[missing], start[missing])
-            feet[missing], free[missing] = self._inside_domain_or_nan(on_rim), 0
-        return feet, free
+            (clipped,) = in_batches(self.backend, to_clip_curve, points[ids], start[ids])
+            closest[ids], free[ids] = self._inside_domain_or_nan(clipped), 0
+        return closest, free
 
     def descend_from_boundary(
         self, points: FloatArray, boundary: FloatArray, aside: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """`cell_search.DescentMethods`."""
+        """As `cell_search.DescentMethods` says.
 
-        def level_away(p: Vec3, b: Vec3, length_: Vec3) -> tuple[Real]:
-            ray = p - b
-            sample = self._field.evaluate(b + length_.x / safe_norm(ray) * ray)
+        At the distance `aside` from a boundary point b, in the direction of the query, f is
+        evaluated. If the level is near there to first order, Newton's method finds the surface, and
+        the descent begins at that point, unless it lies on the side of b away from the query.
+        """
+
+        def arc_to_level(p: Vec3, b: Vec3, lengths: Vec3) -> tuple[Real]:
+            """The first-order distance of the level from the point at a distance from b towards
+            p."""
+            way = p - b
+            sample = self._field.evaluate(b + lengths.x / safe_norm(way) * way)
             return (
                 first_order_distance(self.levels.offset_to_nearest(sample.value), sample.gradient),
             )
 
-        def to_level(p: Vec3, b: Vec3, length_: Vec3) -> tuple[Vec3]:
-            ray = p - b
-            y = self._descent.newton_to_level(b + length_.x / safe_norm(ray) * ray)
-            ahead = dr.dot(ray, y - b) > -_MAX_OPPOSING_COSINE * safe_norm(ray) * safe_norm(y - b)
-            return (dr.select(ahead, y, dr.nan),)
+        def near_edge(p: Vec3, b: Vec3, lengths: Vec3) -> tuple[Vec3]:
+            """The surface point to which Newton's method leads from that point; NaN if it is on the
+            side of b away from p."""
+            way = p - b
+            y = self._descent.newton_to_level(b + lengths.x / safe_norm(way) * way)
+            towards = dr.dot(way, y - b) > -_MAX_OPPOSING_COSINE * safe_norm(way) * safe_norm(y - b)
+            return (dr.select(towards, y, dr.nan),)
 
-        feet, free = np.full_like(points, np.nan), np.zeros(len(points))
-        lengths = np.tile(aside[:, None], 3)
+        closest, free = np.full_like(points, np.nan), np.zeros(len(points))
+        offsets = np.tile(aside[:, None], 3)
         if not len(points):
-            return feet, free
-        # Beside an edge f is the angle about it: to first order the level is as far as the arc.
-        (gap,) = in_batches(self.backend, level_away, points, boundary, lengths)
-        rows = np.flatnonzero(~(np.abs(gap) > _MAX_ARC_RADII * aside))
+            return closest, free
+        # Beside an edge of the surface f is the angle about the edge: so the first-order distance
+        # of the level is the length of an arc around the edge.
+        (arc_length,) = in_batches(self.backend, arc_to_level, points, boundary, offsets)
+        rows = np.flatnonzero(~(np.abs(arc_length) > _MAX_ARC_RADII * aside))
         start = points[rows]
         if len(rows):
             (start,) = in_batches(
-                self.backend, to_level, points[rows], boundary[rows], lengths[rows]
+                self.backend, near_edge, points[rows], boundary[rows], offsets[rows]
             )
         rows, start = rows[~np.isnan(start[:, 0])], start[~np.isnan(start[:, 0])]
         if len(rows):
-            feet[rows], free[rows] = in_batches(self.backend, self._descend, points[rows], start)
-        return self._inside_domain_or_nan(feet), free
+            closest[rows], free[rows] = in_batches(self.backend, self._descend, points[rows], start)
+        return self._inside_domain_or_nan(closest), free
 
     def newton_in_kernel(self, x: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Real, Mask]:
-        """`cell_search.DescentMethods`."""
+        """As `cell_search.DescentMethods` says. A closest point on the boundary of the domain or
+        outside it is left to `descend`."""
         p, vector = self.backend.Array3f(x), cast("Any", type(x))
-        foot, _, free, goes_on, _ = self._newton(p, self.backend.Array3f(start), limit)
+        closest, _, free, is_unfinished, _ = self._newton(p, self.backend.Array3f(start), limit)
         if self._domain is not None:
-            slack = _ROUNDING * self.backend.machine_epsilon * max_norm(foot)
-            goes_on |= ~(self._domain.signed_distance(foot) < -slack)
-        return vector(foot), type(x.x)(free), goes_on
+            slack = _ROUNDING * self.backend.machine_epsilon * max_norm(closest)
+            is_unfinished |= ~(self._domain.signed_distance(closest) < -slack)
+        return vector(closest), type(x.x)(free), is_unfinished
 
     def _newton(self, p: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Vec3, Real, Mask, Mask]:
-        """The results of Newton's method: feet, NaN if there is no foot; the points at which the
-        search goes on; radii about feet; whether the search goes on; and whether it ended farther
-        than `limit` away."""
-        y, first_step, is_lost, is_far = self._descent.newton(p, start, self.backend.Float(limit))
-        foot, is_found, free = self._descent.finish(p, y)
-        reach = (safe_norm(p - start) + 2 * first_step) * (1 + 64 * self.backend.machine_epsilon)
-        reach = dr.fma(64 * self.backend.machine_epsilon, max_norm(y), reach)
-        is_lost |= is_far
-        is_foot = is_found & ~is_lost & (safe_norm(p - foot) <= reach)
-        return dr.select(is_foot, foot, dr.nan), y, free, ~(is_found | is_lost), is_far
+        """Newton's method for the point closest to p, from `start`.
 
-    def _directly(self, p: Vec3, start: Vec3, limit: Vec3) -> tuple[Vec3, Vec3, Real, Real, Real]:
-        """`_newton` with numbers for masks."""
+        Returns the closest point, NaN if the method does not converge to one no farther than the
+        level near `start`; the last iterate, from which `_descend` goes on; the radius about the
+        closest point in which none is nearer; whether the search is to go on; and whether it ended
+        farther than `limit` from p.
+        """
+        y, first_step, is_lost, is_far = self._descent.newton(p, start, self.backend.Float(limit))
+        closest, is_converged, free = self._descent.finish(p, y)
+        bound = (safe_norm(p - start) + 2 * first_step) * (1 + 64 * self.backend.machine_epsilon)
+        bound = dr.fma(64 * self.backend.machine_epsilon, max_norm(y), bound)
+        is_lost |= is_far
+        is_closest = is_converged & ~is_lost & (safe_norm(p - closest) <= bound)
+        return dr.select(is_closest, closest, dr.nan), y, free, ~(is_converged | is_lost), is_far
+
+    def _newton_numbers(
+        self, p: Vec3, start: Vec3, limit: Vec3
+    ) -> tuple[Vec3, Vec3, Real, Real, Real]:
+        """`_newton` with 1 and 0 in place of its two masks. limit: a vector of three equal
+        components."""
         one, zero = self.backend.Float(1), self.backend.Float(0)
-        *results, goes_on, is_far = self._newton(p, start, limit.x)
-        return *results, dr.select(goes_on, one, zero), dr.select(is_far, one, zero)
+        *results, is_unfinished, is_far = self._newton(p, start, limit.x)
+        return *results, dr.select(is_unfinished, one, zero), dr.select(is_far, one, zero)
 
     def _descend(self, p: Vec3, start: Vec3) -> tuple[Vec3, Real]:
-        y, is_found, on_level = self._descent.descend(p, start)
-        return dr.select(on_level, y, dr.nan), dr.select(is_found, self._descent.finish(p, y)[2], 0)
+        """The closest point to p by descent from `start`, NaN if the descent does not end on the
+        level; and the radius about it in which none is nearer, 0 if the descent does not converge.
+        """
+        y, is_converged, on_level = self._descent.descend(p, start)
+        return dr.select(on_level, y, dr.nan), dr.select(
+            is_converged, self._descent.finish(p, y)[2], 0
+        )
 
-    def remove_truncation(self, points: FloatArray, feet: FloatArray) -> FloatArray:
-        """The feet (n, 3) moved onto the level of the field without truncation: by Newton's method
-        for the closest point, else straight to the level."""
-        rows = np.flatnonzero(np.isfinite(feet[:, 0]))
-        exact = self._exact
+    def remove_truncation(self, points: FloatArray, closest: FloatArray) -> FloatArray:
+        """Move closest points onto the level set of the field without the truncation error of its
+        treecode: by Newton's method for the closest point, or straight to the level where that
+        fails. A point that would leave the domain is not moved.
+
+        points, closest: (n, 3) the queries and their closest points, NaN for none.
+        """
+        rows = np.flatnonzero(np.isfinite(closest[:, 0]))
+        exact = self._exact_descent
         if exact is None or not len(rows):
-            return feet
+            return closest
 
         def to_level(start: Vec3) -> tuple[Vec3]:
             y = exact.newton_to_level(start)
             return (dr.select(dr.isfinite(dr.squared_norm(y)), y, start),)
 
-        feet = feet.copy()
-        corrected = self._corrected(exact, points[rows], feet[rows])
-        missing = np.flatnonzero(np.isnan(corrected[:, 0]))
-        if len(missing):
-            (corrected[missing],) = in_batches(self.backend, to_level, feet[rows[missing]])
-        inside = ~np.isnan(self._inside_domain_or_nan(corrected)[:, 0])
-        feet[rows[inside]] = corrected[inside]
-        return feet
+        closest = closest.copy()
+        corrected = self._corrected(exact, points[rows], closest[rows])
+        failed = np.flatnonzero(np.isnan(corrected[:, 0]))
+        if len(failed):
+            (corrected[failed],) = in_batches(self.backend, to_level, closest[rows[failed]])
+        is_inside = ~np.isnan(self._inside_domain_or_nan(corrected)[:, 0])
+        closest[rows[is_inside]] = corrected[is_inside]
+        return closest
 
     def _corrected(
-        self, exact: ClosestPointDescent, points: FloatArray, feet: FloatArray
+        self, exact: ClosestPointDescent, points: FloatArray, closest: FloatArray
     ) -> FloatArray:
-        """The feet (n, 3) on the level of the exact field, NaN where they are not found.
+        """The closest points (n, 3) on the level set of the exact field; NaN where they are not
+        found.
 
-        The truncation of clusters hardly changes on the way, and computing it costs as much as the
-        exact field. So it is computed at the foot, with its gradient, and Newton's method is that
-        of the field with clusters and this correction. This is done twice, as the foot moves by the
-        first correction. A short step to the level of the exact field remains.
+        exact: the descent on the field that sums all terms one by one.
+        closest: (n, 3) the closest points on the level set of the approximate field.
+
+        The truncation error of the treecode hardly changes along a descent, and costs as much as
+        the whole exact field. So it is computed at the closest point, with its gradient; Newton's
+        method then runs on the approximate field plus this linear correction. This is done twice,
+        as the first correction moves the closest point. A short step to the level of the exact
+        field remains.
         """
-        rough = self._descent
+        approximate = self._descent
 
-        def left_out(y: Vec3) -> tuple[Vec3, Vec3]:
-            full, partial = exact.field.evaluate(y), rough.field.evaluate(y)
+        def truncation(y: Vec3) -> tuple[Vec3, Vec3]:
+            """The truncation errors of the value (as a vector of equal components) and of the
+            gradient at y."""
+            full, sample = exact.field.evaluate(y), approximate.field.evaluate(y)
             vector = self.backend.Array3f
-            return vector(full.value - partial.value), vector(full.gradient) - vector(
-                partial.gradient
+            return vector(full.value - sample.value), vector(full.gradient) - vector(
+                sample.gradient
             )
 
-        def newton(p: Vec3, y: Vec3, value: Vec3, slope: Vec3) -> tuple[Vec3]:
-            field = _LinearlyShiftedField(rough.field, y, value.x, slope)
-            shifted = replace(rough, field=field)
-            end, _, is_lost, _ = shifted.newton(p, y, self.backend.Float(dr.inf))
-            foot, is_found, _ = shifted.finish(p, end)
-            return (dr.select(is_found & ~is_lost, foot, dr.nan),)
+        def newton(p: Vec3, y: Vec3, value: Vec3, gradient: Vec3) -> tuple[Vec3]:
+            """The closest point to p by Newton's method from y, for the approximate field plus the
+            linear function with this value and gradient at y; NaN if it does not converge."""
+            field = _LinearlyShiftedField(approximate.field, y, value.x, gradient)
+            descent = replace(approximate, field=field)
+            end, _, is_lost, _ = descent.newton(p, y, self.backend.Float(dr.inf))
+            nearest, is_found, _ = descent.finish(p, end)
+            return (dr.select(is_found & ~is_lost, nearest, dr.nan),)
 
         def on_level(p: Vec3, y: Vec3) -> tuple[Vec3]:
             return (exact.last_step(p, y),)
 
-        feet, rows = feet.copy(), np.arange(len(feet))
+        closest, rows = closest.copy(), np.arange(len(closest))
         for _ in range(_TRUNCATION_CORRECTIONS):
             if len(rows):
-                inputs = points[rows], feet[rows], *in_batches(self.backend, left_out, feet[rows])
-                (feet[rows],) = in_batches(self.backend, newton, *inputs)
-                rows = rows[~np.isnan(feet[rows, 0])]
+                given = (
+                    points[rows],
+                    closest[rows],
+                    *in_batches(self.backend, truncation, closest[rows]),
+                )
+                (closest[rows],) = in_batches(self.backend, newton, *given)
+                rows = rows[~np.isnan(closest[rows, 0])]
         if len(rows):
-            (feet[rows],) = in_batches(self.backend, on_level, points[rows], feet[rows])
-        return feet
+            (closest[rows],) = in_batches(self.backend, on_level, points[rows], closest[rows])
+        return closest
 
-    def level_uncertainty(self, feet: FloatArray) -> FloatArray:
-        """The distances by which rounding and approximation may have moved the level at feet
-        (n, 3)."""
-        if not len(feet):
+    def level_uncertainty(self, points: FloatArray) -> FloatArray:
+        """Bounds (n,) of how far rounding and approximation may have moved the level set at points
+        (n, 3) on it."""
+        if not len(points):
             return np.zeros(0)
 
         def compute(y: Vec3) -> tuple[Real]:
             return (self._descent.noise(y),)
 
-        return in_batches(self.backend, compute, feet)[0]
+        return in_batches(self.backend, compute, points)[0]
 
 
 class _LinearlyShiftedField(Field):
-    """A field plus a linear function of the vector from a point, both different in each lane; its
-    error is the rounding error alone."""
+    """The sum of a field and, in each lane, a linear function of the point: value + slope . (p -
+    at). Its error is the rounding error of the field, without the truncation error."""
 
     def __init__(self, field: Field, at: Vec3, value: Real, slope: Vec3) -> None:
         self._field, self._at, self._value, self._slope = field, at, value, slope
@@ -576,13 +663,14 @@ class _LinearlyShiftedField(Field):
 
 
 def _length(vectors: FloatArray) -> FloatArray:
-    """Lengths (n,) of vectors (n, 3), whose squares may overflow."""
+    """The lengths (n,) of vectors (n, 3), also where their squares overflow."""
     x, y, z = vectors.T
     return np.hypot(np.hypot(x, y), z)
 
 
 def _size(surface: TracedSurface, points: FloatArray) -> float:
-    """The size of the surface, or of the points where it is unknown."""
+    """The diagonal of the surface's volume; if that is unknown or infinite, the extent of the
+    points, at least 1."""
     if surface.volume is not None:
         lower, upper = surface.volume.bounds()
         if np.isfinite([lower, upper]).all():

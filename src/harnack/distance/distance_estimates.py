@@ -35,8 +35,8 @@ __all__ = ["DistanceBounds", "Method", "closest_points", "distance_bounds", "sig
 
 Method = Literal["first_order", "second_order", "closest_point", "lower_bound"]
 _HONORED = ("level", "clip", "section", "precision")
-# As close as rounding allows: the tracer raises it to that.
-_CLOSE = 1e-15
+# The tolerance of rays; the tracer raises it to the smallest that rounding allows.
+_RAY_TOLERANCE = 1e-15
 
 
 @accepts_dask_arrays("points")
@@ -53,31 +53,32 @@ def signed_distance(
 ) -> FloatArray:
     """Signed distances (n,) from points (n, 3) to a surface, negative inside.
 
-    The inside is where f < level; of winding numbers, clouds and blobs, which are larger inside
-    (`Field.is_larger_inside`), where f > level. (trimesh has the opposite sign.)
+    Points with f < level are inside. For winding numbers, clouds and blobs, which are larger inside
+    (`Field.is_larger_inside`), points with f > level are inside. (trimesh has the opposite sign.)
 
-    surface: a field or a `Surface`, but for `side` and `largest`, which distances do not have; of
-        several levels the sign is that of the one nearest in value. Of an angle-valued field every
-        level stands for all that differ from it by periods. Clip and section cut the surface for
-        "closest_point"; a "lower_bound" holds for the whole surface, and so for what is left of
-        it; the other methods refuse them.
+    surface: a field or a `Surface`; `side` and `largest` are not accepted. If there are several
+        levels, the sign belongs to the level nearest in value. For an angle-valued field, a level
+        includes all values that differ from it by periods. With "closest_point", clip and section
+        cut the surface. With "lower_bound", the bound holds for the whole surface, and so for the
+        part in clip and section. The other methods raise a TypeError for a clip or section.
     method:
         "first_order": (f - level)/|grad f|. Off by O(d^2) at distance d; infinite where grad f = 0.
-        "second_order": the same with the curvature of f along its gradient. Off by O(d^3); needs
-            the field's `hessian`.
-        "closest_point": to the nearest point of the surface that a search finds (`closest_points`
-            says how): an upper bound of the distance, exact to rounding if that is the nearest
-            point of all. `distance_bounds` says what is proved about it. For a closed triangle
-            mesh, and for the boundary of the solid of a closed mesh, it is exact to rounding. NaN,
-            with a RuntimeWarning that counts these points, where no surface is found: there is
-            none, or it was found only within a radius that the field promises to be free.
-        "lower_bound": never longer than the true distance, with proof: no level lies in the ball of
-            that radius about the point, not even outside the field's domain. Of first order too:
+        "second_order": the same with the second derivative of f along its gradient. Off by O(d^3);
+            needs the field's `hessian`.
+        "closest_point": the distance to the nearest surface point that a search finds
+            (`closest_points` says how). It is an upper bound of the true distance, and exact to
+            rounding if the search finds the closest point. `distance_bounds` gives proved bounds.
+            For a closed triangle mesh, and for the boundary of the solid of a closed mesh, it is
+            exact to rounding. NaN where no surface is found: there is none, or it was found only
+            within a radius that the field promises to be free. A RuntimeWarning counts these
+            points.
+        "lower_bound": a proved lower bound of the true distance: no level lies in the ball of that
+            radius about the point, not even outside the field's domain. It is of first order, too:
             the nearer the surface, the smaller the relative error.
         For a field that jumps across facets, "first_order" and "second_order" see the smooth part
         of the surface, and the nearest facet if that is nearer and the surface lies there.
-    progress: told what is being done.
-    options: a `TraceOptions`, of which distances have `precision` alone: None is double precision.
+    progress: a function that is called with a text about each stage.
+    options: a `TraceOptions`; distances use its `precision` alone. None is double precision.
         "lower_bound" allows for rounding in both precisions, and the search of "closest_point" is
         done in double precision in any case. Closest points have no tolerance: they are exact up to
         rounding.
@@ -97,7 +98,7 @@ def signed_distance(
     field = traced.field
     if method == "closest_point":
         closest = _find("signed_distance", traced, backend, points, progress)
-        return _outward_sign(field) * np.copysign(closest.distance, closest.signed_value)
+        return _outwards(field) * np.copysign(closest.distance, closest.signed_value)
     if traced.clip_volume is not None and method != "lower_bound":
         raise TypeError(f'method="{method}" does not see clip and section: use "closest_point"')
     levels, prepared = traced.target_levels(backend), traced.evaluator(backend)
@@ -110,13 +111,13 @@ def signed_distance(
     if method == "lower_bound":
         _check_domain(field, x)
     if field.has_jumps and method != "lower_bound":
-        to_sheet = find_closest(backend, traced, levels, x, teller(None)).distance
-        result = np.copysign(np.fmin(to_sheet, np.abs(result)), result)
-    return _outward_sign(field) * result
+        jump_distance = find_closest(backend, traced, levels, x, teller(None)).distance
+        result = np.copysign(np.fmin(jump_distance, np.abs(result)), result)
+    return _outwards(field) * result
 
 
-def _outward_sign(field: Field) -> float:
-    """The factor that makes a distance in the direction of larger values negative inside."""
+def _outwards(field: Field) -> float:
+    """The sign by which a distance that grows with f becomes negative inside the solid."""
     return -1.0 if field.is_larger_inside else 1.0
 
 
@@ -131,15 +132,15 @@ def closest_points(
     options: TraceOptions | None = None,
     **keywords: Unpack[TraceKeywords],
 ) -> FloatArray:
-    """The closest points (n, 3) of a level set to `points` (n, 3), as far as a search finds them.
+    """The closest points (n, 3) of a level set to `points` (n, 3), found by a search.
 
     For the winding number of a closed mesh, and for its solid, they are exact: the level set
-    consists of triangles, cut where others pass through them, and the nearest is taken. For other
-    fields the surface is enclosed in cells, and descents from the known surface points of cells
-    lead to local minima of the distance; `distance_bounds` also subdivides cells where a nearer
-    point may be. The curve at which the level sets of a field end counts as part of them, such as
-    the vertices and edges of a solid angle, and so does the clip curve at which the field's domain
-    cuts them. NaN, with a RuntimeWarning that counts these points, where no surface is found.
+    consists of triangles, which are cut where they intersect, and the nearest one is found. For
+    other fields the surface is enclosed in cells, and descents from known surface points in the
+    cells lead to local minima of the distance; `distance_bounds` also subdivides cells that may
+    hold a nearer point. The curves at which level sets end count as part of them: the edges and
+    vertices of a solid angle, and the clip curve, at which the field's domain cuts the surface. The
+    result is NaN where no surface is found; a RuntimeWarning counts these points.
 
     Raises:
         TypeError, ValueError: as `signed_distance`.
@@ -177,13 +178,13 @@ def distance_bounds(
 ) -> DistanceBounds:
     """Distances of points (n, 3) from a level set, with proved lower bounds.
 
-    `lower` is proved. Cells that hold no surface by the field's promises are left out; in each of
-    the other cells the surface lies in a slab, where the promises imply that; and around every
-    closest point there is a ball that holds no nearer point of the surface. `lower` is the
-    distance to the nearest slab or cell outside of that ball. Cells are subdivided where `lower`
-    is less than `upper` by more than 1e-6 of the size of the surface, up to about half as many
-    cells as there are points, but at least 60,000: so a few points are proved to that tolerance,
-    and of many points those for which the balls suffice.
+    `lower` is proved by the field's promises. By these, some cells hold no surface; in others the
+    surface lies in a slab; and around every closest point there is a ball that holds no nearer
+    point of the surface. `lower` is the distance to the nearest slab or nonempty cell outside of
+    that ball. If `lower` is less than `upper` by more than 1e-6 of the size of the surface, cells
+    are subdivided. The number of cells is limited to about half the number of points, but not to
+    less than 60,000. So a few points are proved to that tolerance; among many points, those for
+    which the balls suffice.
 
     `upper` is the distance to a point of the surface, found by several descents. Where `lower` is
     less than `upper`, the true distance may lie anywhere between the two.
@@ -205,6 +206,11 @@ def _find(
     *,
     is_proved: bool = False,
 ) -> ClosestPoints:
+    """`find_closest` for the points, with the clip of the surface made part of the field's domain.
+    Warns of points without a result.
+
+    name: of the public function, for messages.
+    """
     if surface.clip_volume is not None:
         if surface.field.has_jumps:
             raise NotImplementedError(
@@ -218,7 +224,7 @@ def _find(
         surface = replace(surface, field=field, clip=None, section=None)
     levels = surface.target_levels(backend)
     closest = find_closest(backend, surface, levels, points, teller(progress), is_proved=is_proved)
-    _warn(name, closest)
+    _warn_of_failures(name, closest)
     return closest
 
 
@@ -228,7 +234,9 @@ def _surface(
     options: TraceOptions | None,
     keywords: TraceKeywords,
 ) -> tuple[TracedSurface, Backend]:
-    """The surface whose distances are asked for, and the backend to compute them on.
+    """The surface to which distances are measured, and the backend to compute them on.
+
+    verb: the name of the public function, for messages.
 
     Raises:
         TypeError, ValueError: as `surface_and_options`; an option that distances do not have.
@@ -241,14 +249,14 @@ def _surface(
             f"{type(field).__name__} has jumps but does not say how far they are: define its "
             "method distance_to_jumps(p)"
         )
-    closely = TraceOptions(tolerance=_CLOSE, over_relaxation=1.0)
+    closely = TraceOptions(tolerance=_RAY_TOLERANCE, over_relaxation=1.0)
     return TracedSurface.of(target, closely).with_call_cache(), choose_backend(
         choices.precision or "double"
     )
 
 
-def _warn(name: str, result: ClosestPoints) -> None:
-    """Warn of points without an answer, and of answers that a promise of the field contradicts."""
+def _warn_of_failures(name: str, result: ClosestPoints) -> None:
+    """Warn of queries without a result, and of results that a promise of the field contradicts."""
     count = len(result.closest)
     unresolved = int(np.isnan(result.closest[:, 0]).sum())
     if unresolved:
@@ -270,37 +278,41 @@ def _warn(name: str, result: ClosestPoints) -> None:
 
 
 def _check_domain(field: Field, points: FloatArray) -> None:
+    """Raise a ValueError if a point is outside the field's domain."""
     if field.domain is None or not len(points):
         return
     outside = np.flatnonzero(~field.domain.contains_points(points))
     if outside.size:
-        rest = f" and {outside.size - 1} more" if outside.size > 1 else ""
+        more = f" and {outside.size - 1} more" if outside.size > 1 else ""
         raise ValueError(
-            f"points: entry {outside[0]}{rest} outside the domain of {type(field).__name__}, where "
+            f"points: entry {outside[0]}{more} outside the domain of {type(field).__name__}, where "
             "it promises nothing; leave such points out, or give the field a larger domain"
         )
 
 
-def _first(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
+def _first_order(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
+    """The first-order distance of p from the nearest level, with the sign of f - level."""
     del backend
     sample = field.evaluate(p)
     return first_order_distance(-levels.offset_to_nearest(sample.value), sample.gradient)
 
 
-def _second(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
+def _second_order(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
+    """The second-order distance of p from the nearest level, with the sign of f - level."""
     del backend
     sample, rows = field.evaluate(p), field.hessian(p)
     return second_order_distance(-levels.offset_to_nearest(sample.value), sample.gradient, rows)
 
 
-def _lower(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
+def _signed_lower_bound(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
+    """The proved lower bound of the distance of p from the levels, with the sign of f - level."""
     sample = field.evaluate(p)
     residual = -levels.offset_to_nearest(sample.value)
     return dr.copysign(level_distance_lower_bound(backend, field, levels, p, sample), residual)
 
 
 _COMPUTE: dict[str, Callable[[Backend, Field, Levels, Vec3], Real]] = {
-    "first_order": _first,
-    "second_order": _second,
-    "lower_bound": _lower,
+    "first_order": _first_order,
+    "second_order": _second_order,
+    "lower_bound": _signed_lower_bound,
 }

@@ -2,9 +2,8 @@
 and by rays.
 
 A *jump surface* consists of facets across which the field jumps, such as the triangles of a mesh. A
-point of it is part of the level set where f passes a level from one side to the other. A short ray
-through the point decides whether it does, in the same arithmetic in which rays meet the surface
-anywhere else.
+point of it belongs to the level set if a level lies between the values of f on both sides of it. A
+short ray through the point decides that, by the same arithmetic that traces rays elsewhere.
 """
 
 from __future__ import annotations
@@ -38,10 +37,11 @@ _CORNERS = (
     (-0.634, 0.533, -1.521),
 )
 _EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (0, 2), (1, 3))
-# In these lengths: the distance from y at which f is evaluated, where rounding of y hardly counts.
+# The distance from a hit y at which f is evaluated, in half lengths of the ray: there the rounding
+# of y hardly matters.
 _SIGN_TEST_SCALE = 64.0
-# Before a facet f is evaluated at this fraction of the distance to it.
-_BEFORE = 0.98
+# On a path that meets a facet, f is evaluated at this fraction of the distance to the facet.
+_FRACTION_TO_FACET = 0.98
 
 NextJump: TypeAlias = "Callable[[tuple[Any, Any], Any, Any], NearestFacet]"
 
@@ -52,31 +52,33 @@ class JumpSurfaceSearch:
 
     scale: an upper bound of the coordinates that the field computes with, for bounds of rounding
         errors.
-    max_facets: the largest number of facets that are examined for each point.
+    most: the largest number of facets that are examined for each point.
     """
 
     surface: SurfaceTracer
     scale: float
-    max_facets: int
+    most: int
 
     def closest(self, x: Vec3, limit: Real) -> tuple[Vec3, Vec3]:
-        """A point of the surface on a facet, nearer to x than `limit` (NaN where none is found),
-        and the vector from x to the nearest facet, part of the surface or not, if that is nearer
-        than `limit` (else infinite).
+        """A point of the surface on a facet, nearer to x than `limit`, NaN where none is found; and
+        the vector from x to the nearest facet, whether that is part of the surface or not, infinite
+        if it is not nearer than `limit`.
 
-        Facets are examined in the order of their distance, each at its nearest point y to x. A
-        short ray through y along the facet's normal hits the surface there, or the facet is not
-        part of it at y. Where y lies on the facet's edge that ray may miss it, and the six edges of
-        a small tetrahedron about y follow: a surface through y separates its corners, and a surface
-        that ends in a curve through y leaves it through two faces, so that either crosses an edge.
+        Facets are examined in the order of their distance, each at its point y nearest to x. If the
+        facet is part of the surface at y, a short ray through y along the facet's normal hits the
+        surface. If y lies on the facet's edge, that ray may miss the surface; then the six edges of
+        a small tetrahedron about y are tried as well. A surface through y separates its corners,
+        and a surface that ends in a curve through y leaves the tetrahedron through two of its
+        faces, so that either crosses one of these edges.
 
-        The first facet that is hit holds the closest point on facets, unless a nearer facet belongs
-        to the surface elsewhere than at y: the result is a point of the surface in any case.
+        The first facet that is hit contains the closest point on facets, unless a nearer facet
+        belongs to the surface at another point than y. The result is a point of the surface in any
+        case.
         """
         backend = self.surface.backend
         real, index, vector = backend.Float, backend.UInt32, backend.Array3f
         next_facet = self._next_jump(x)
-        max_count = dr.opaque(index, self.max_facets)
+        max_count = dr.opaque(index, self.most)
         length = (
             _PROBE_HALF_LENGTH * backend.machine_epsilon * fmax(real(self.scale), dr.max(dr.abs(x)))
         )
@@ -86,23 +88,29 @@ class JumpSurfaceSearch:
         )
 
         def body(*state: Any) -> tuple[Any, ...]:
+            """Try one probe of one facet, and choose the next.
+
+            The state: the facet's attributes, the index of the probe (0 for the normal, then the
+            edges), the surface point found, the vector to the nearest facet, the number of facets
+            examined, and whether to continue.
+            """
             last = NearestFacet(*state[:5])
-            probe, best, nearest, n, active = state[5:]
+            probe, best, nearest, count, active = state[5:]
             is_first = active & (probe == 0)
             candidate = next_facet((last.sort_key, last.facet), limit, is_first)
             facet = _select(is_first, candidate, last)
             active &= facet.facet != NO_FACET
-            nearest = dr.select(active & is_first & (n == 0), facet.offset, nearest)
+            nearest = dr.select(active & is_first & (count == 0), facet.offset, nearest)
             y = x + facet.offset
             start, end = _probe(vector, probe, facet.normal)
             is_hit, hit_facet, hit_point = self._probe_hits(y, length, start, end, active)
             hit_point = dr.select((hit_facet == facet.facet) & (probe == 0), y, hit_point)
             best = dr.select(is_hit, hit_point, best)
-            n = n + dr.select(is_first, index(1), 0)
+            count = count + dr.select(is_first, index(1), 0)
             last_probe = facet.is_inner | (probe == len(_EDGES))
-            active &= ~is_hit & ~(last_probe & (n >= max_count))
+            active &= ~is_hit & ~(last_probe & (count >= max_count))
             probe = dr.select(last_probe, index(0), probe + 1)
-            return *_parts(facet), probe, best, nearest, n, active
+            return *_parts(facet), probe, best, nearest, count, active
 
         def is_active(*state: Any) -> Mask:
             return state[-1]
@@ -115,23 +123,29 @@ class JumpSurfaceSearch:
         return best, nearest
 
     def _probe_hits(
-        self, y: Vec3, unit: Real, start: Vec3, end: Vec3, active: Mask
+        self, y: Vec3, scale: Real, start: Vec3, end: Vec3, active: Mask
     ) -> tuple[Mask, Any, Vec3]:
-        """Whether the segment between two points about y, in units of `unit`, meets the surface;
-        the facet that it meets, and the point where it does."""
+        """Trace the segment from y + scale * start to y + scale * end.
+
+        Returns whether it hits the surface, the facet that it hits, and the hit point.
+        """
         backend = self.surface.backend
         real, vector = backend.Float, backend.Array3f
-        o = dr.fma(vector(unit), start, y)
+        o = dr.fma(vector(scale), start, y)
         direction, length = (end - start) / dr.norm(end - start), dr.norm(end - start)
-        hit = self.surface.first_hit(o, direction, real(0), unit * length, active)
+        hit = self.surface.first_hit(o, direction, real(0), scale * length, active)
         is_hit = active & (hit.status == int(RayStatus.HIT))
         # To first order any level is near where the gradient has no bound, as at the facet's edge.
-        is_hit &= straddles_level(self.surface, y, _SIGN_TEST_SCALE * unit, is_hit)
+        is_hit &= straddles_level(self.surface, y, _SIGN_TEST_SCALE * scale, is_hit)
         return is_hit, hit.facet, dr.fma(vector(hit.t), direction, o)
 
     def _next_jump(self, x: Vec3) -> NextJump:
-        """A function that gives the facets of the field in the order of their distance; for a field
-        that does not list them, the nearest facet only."""
+        """A function that lists the facets of the field in the order of their distance from x; for
+        a field that does not list its facets, only the nearest one.
+
+        The function takes the sort key and index of the facet before, the largest distance, and the
+        active lanes.
+        """
         field, backend = self.surface.field, self.surface.backend
         real, index = backend.Float, backend.UInt32
         probe = field.nearest_facet(x, (real(-1), index(NO_FACET)), real(0), backend.Bool(False))
@@ -139,6 +153,7 @@ class JumpSurfaceSearch:
             facet = _nearest_jump_by_differences(backend, field, x)
 
             def single_facet(after: tuple[Real, Any], limit: Real, active: Mask) -> NearestFacet:
+                """The nearest facet, if none was given before; else no facet."""
                 del active
                 is_first = (after[0] < 0) & (facet.sort_key < limit)
                 sort_key = dr.select(is_first, facet.sort_key, dr.inf)
@@ -148,6 +163,7 @@ class JumpSurfaceSearch:
             return single_facet
 
         def listed_facet(after: tuple[Real, Any], limit: Real, active: Mask) -> NearestFacet:
+            """The next facet of the field's list."""
             nearest = field.nearest_facet(x, after, limit, active)
             if nearest is None:
                 raise RuntimeError("nearest_sheet tells sheets at some times and not at others")
@@ -169,14 +185,16 @@ def straddles_level(surface: SurfaceTracer, y: Vec3, radius: Real, active: Mask)
     zero = vector(0)
 
     def body(k: Any, lower: Real, upper: Real, active: Mask) -> tuple[Any, ...]:
+        """Extend the range [lower, upper] of values of f by two values on edge k of the
+        tetrahedron."""
         start, end = _probe(vector, k + 1, zero)
         o = dr.fma(vector(radius), start, y)
-        length = dr.norm(end - start)
-        direction, reach = (end - start) / length, radius * length
+        edge_norm = dr.norm(end - start)
+        direction, edge_length = (end - start) / edge_norm, radius * edge_norm
         start_crossing = JumpCrossing(real(0), index(NO_FACET), real(0), zero)
-        t = real(field.next_jump(o, direction, start_crossing, reach, active).t)
-        before_jump = dr.select(t < reach, t, 0.5 * reach)
-        for distance in (real(0), _BEFORE * before_jump):
+        t = real(field.next_jump(o, direction, start_crossing, edge_length, active).t)
+        before_jump = dr.select(t < edge_length, t, 0.5 * edge_length)
+        for distance in (real(0), _FRACTION_TO_FACET * before_jump):
             value = real(field.evaluate(dr.fma(vector(distance), direction, o)).value)
             lower, upper = fmin(lower, value), fmax(upper, value)
         return k + 1, lower, upper, active & (k + 1 < len(_EDGES))
@@ -190,16 +208,19 @@ def straddles_level(surface: SurfaceTracer, y: Vec3, radius: Real, active: Mask)
 
 
 def _parts(facet: NearestFacet) -> tuple[Any, ...]:
+    """The attributes of a facet in the order of the constructor, as the state of a loop."""
     return facet.sort_key, facet.facet, facet.offset, facet.normal, facet.is_inner
 
 
 def _select(mask: Mask, first: NearestFacet, second: NearestFacet) -> NearestFacet:
+    """The facet `first` in lanes of the mask, `second` elsewhere."""
     pairs = zip(_parts(first), _parts(second), strict=True)
     return NearestFacet(*(dr.select(mask, a, b) for a, b in pairs))
 
 
 def _probe(vector: Any, index: Any, normal: Vec3) -> tuple[Vec3, Vec3]:
-    """Both ends of a probe about the origin: along the normal, then the tetrahedron's edges."""
+    """Start and end of a probe about the origin. index: 0 for the probe along the normal, k + 1 for
+    edge k of the tetrahedron."""
     start, end = -normal, normal
     for k, (i, j) in enumerate(_EDGES):
         start = dr.select(index == k + 1, vector(*_CORNERS[i]), start)
@@ -208,12 +229,14 @@ def _probe(vector: Any, index: Any, normal: Vec3) -> tuple[Vec3, Vec3]:
 
 
 def _nearest_jump_by_differences(backend: Backend, field: Field, x: Vec3) -> NearestFacet:
-    """The nearest facet to x, from its distance d alone: in the direction in which d falls.
+    """The facet nearest to x, for a field that knows only the distance d of its facets: the facet
+    lies in the direction in which d falls.
 
-    Central differences over h = r d have an error of r^2, and of epsilon s/(r d) as rounding moves
-    d by epsilon s, where s is the size of coordinates: with r = (epsilon s/d)^(1/3) both are small
-    down to distances of a few rounding errors. At smaller distances any direction serves: y = x is
-    on the facet to rounding.
+    That direction is computed by central differences over h = r d. Their truncation error is about
+    r^2. Rounding moves d by epsilon s, where s is the size of the coordinates, which adds
+    epsilon s/(r d). With r = (epsilon s/d)^(1/3) both errors are small down to distances of a few
+    rounding errors. At smaller distances any direction serves, as x itself is on the facet to
+    rounding.
     """
     real, vector = backend.Float, backend.Array3f
     d = real(field.distance_to_jumps(x))
@@ -232,69 +255,74 @@ def _nearest_jump_by_differences(backend: Backend, field: Field, x: Vec3) -> Nea
     return NearestFacet(d, backend.UInt32(0), offset, direction, backend.Bool(False))
 
 
-# Nearer points by rays.
+# Compass search: nearer points by rays.
 
 _MAX_RAYS = 600
-# Rays of a turn, which all have to fail before the next turn is narrower: rays to the intersections
-# of planes, then rays near the best direction, about 137.5 degrees apart, so that any number of
-# them is spread evenly, and no turn repeats the one before.
-_PLANE_TRIALS, _TILTED, _GOLDEN = 4, 8, 2.399963229728653
-# Steps are tangents of angles.
+# A round consists of rays to the intersections of planes, then of rays tilted against the best
+# direction. If all of them fail, the next round tilts rays less. Tilted rays turn by the golden
+# angle (in radians) from each to the next, so that any number of them is spread evenly and no round
+# repeats the one before.
+_PLANE_RAYS, _TILTED_RAYS, _GOLDEN_ANGLE = 4, 8, 2.399963229728653
+# The first step, as the tangent of the angle to the best direction, and its factor after a round in
+# which all rays failed.
 _INITIAL_STEP, _STEP_REDUCTION = 1.0, 0.25
-# Rays that leave in directions all over the sphere before that.
+# Number of rays in directions all over the sphere, before the rounds.
 _SPHERE_RAYS = 128
 # Planes whose normals are closer than this, as the sine of an angle, count as the same.
-_MIN_NORMAL_SINE = 1e-3
-# In epsilons, of coordinates: the distance from a hit at which f is evaluated on both sides of the
-# level.
+_MIN_PLANE_SINE = 1e-3
+# The distance from a hit within which f is evaluated on both sides of the level, in machine
+# epsilons of the coordinates.
 _HIT_TEST_RADIUS = 1024.0
 
 
 @dataclass(frozen=True)
 class _HitPlane:
-    """Points x + r with r.normal = offset, |normal| = 1; normal = 0 where there is no plane."""
+    """The tangent plane of a hit, relative to the query x: the points x + r with r . normal =
+    offset, |normal| = 1. normal = 0 stands for no plane."""
 
     normal: Vec3
     offset: Real
 
     @classmethod
-    def where(cls, mask: Mask, plane: _HitPlane, other: _HitPlane) -> _HitPlane:
-        """The plane `plane` in lanes of the mask, `other` elsewhere."""
-        normal = dr.select(mask, plane.normal, other.normal)
-        return cls(normal, dr.select(mask, plane.offset, other.offset))
+    def where(cls, mask: Mask, first: _HitPlane, second: _HitPlane) -> _HitPlane:
+        """The plane `first` in lanes of the mask, `second` elsewhere."""
+        normal = dr.select(mask, first.normal, second.normal)
+        return cls(normal, dr.select(mask, first.offset, second.offset))
 
     def is_apart(self, other: _HitPlane) -> Mask:
         """Whether both are planes, and not nearly parallel."""
         return (
-            dr.squared_norm(dr.cross(self.normal, other.normal))
-            > _MIN_NORMAL_SINE * _MIN_NORMAL_SINE
+            dr.squared_norm(dr.cross(self.normal, other.normal)) > _MIN_PLANE_SINE * _MIN_PLANE_SINE
         )
 
     def nearest_on_line(self, other: _HitPlane) -> Vec3:
-        """The shortest vector to the intersection of both planes; not finite if they are
-        parallel."""
+        """The shortest vector from x to the line in which both planes intersect; not finite if they
+        are parallel."""
         vector = cast("Any", type(self.normal))
         cosine = dr.dot(self.normal, other.normal)
-        own_part = vector(self.offset - cosine * other.offset) * self.normal
-        return (own_part + vector(other.offset - cosine * self.offset) * other.normal) / (
+        along_normal = vector(self.offset - cosine * other.offset) * self.normal
+        return (along_normal + vector(other.offset - cosine * self.offset) * other.normal) / (
             1 - cosine * cosine
         )
 
     def intersection_point(self, second: _HitPlane, third: _HitPlane) -> Vec3:
-        """The vector to the intersection of all three; not finite if they are parallel to a
-        line."""
+        """The vector from x to the point in which three planes intersect; not finite if the three
+        normals are linearly dependent."""
         vector = cast("Any", type(self.normal))
         a, b, c = self.normal, second.normal, third.normal
         normals = (dr.cross(b, c), dr.cross(c, a), dr.cross(a, b))
         offsets = (self.offset, second.offset, third.offset)
-        total = sum((vector(o) * n for o, n in zip(offsets, normals, strict=True)), vector(0))
-        return total / dr.dot(a, normals[0])
+        weighted_sum = sum(
+            (vector(offset) * normal for offset, normal in zip(offsets, normals, strict=True)),
+            vector(0),
+        )
+        return weighted_sum / dr.dot(a, normals[0])
 
 
 @dataclass(frozen=True)
 class _HitPlanes:
-    """Three planes that touch the surface: at the best point, then at the last two hits whose
-    planes are parallel neither to it nor to each other."""
+    """Three planes tangent to the surface. The first belongs to the best point. The others belong
+    to the last two hits whose planes are parallel neither to the first nor to each other."""
 
     first: _HitPlane
     second: _HitPlane
@@ -302,20 +330,24 @@ class _HitPlanes:
 
     @classmethod
     def of(cls, parts: tuple[Any, ...]) -> _HitPlanes:
-        """The planes, from their normals and offsets as `parts` gives them."""
+        """The planes, from a tuple of normals and offsets as `parts` returns it."""
         return cls(*(_HitPlane(parts[k], parts[k + 1]) for k in (0, 2, 4)))
 
     def parts(self) -> tuple[Any, ...]:
-        """Normals and offsets in turn, as the state of a loop."""
+        """The three normals and offsets, alternating, as the state of a loop."""
         return tuple(
             number
             for plane in (self.first, self.second, self.third)
             for number in (plane.normal, plane.offset)
         )
 
-    def updated(self, plane: _HitPlane, is_hit: Mask, best: Mask) -> _HitPlanes:
-        """The planes with `plane` added on lanes of `is_hit`; as the plane of the best point on
-        lanes of `best`."""
+    def updated(self, plane: _HitPlane, is_hit: Mask, is_best: Mask) -> _HitPlanes:
+        """The planes after another hit.
+
+        plane: the hit's tangent plane.
+        is_hit: the lanes that have this plane.
+        is_best: the lanes in which it belongs to the new best point and becomes the first plane.
+        """
         first, second, third = self.first, self.second, self.third
         select = _HitPlane.where
         is_apart = first.is_apart(plane)
@@ -324,28 +356,30 @@ class _HitPlanes:
             select(is_apart, first, second),
             select(is_apart & second.is_apart(plane), second, third),
         )
-        is_new = is_hit & ~best & is_apart
+        is_new = is_hit & ~is_best & is_apart
         otherwise = _HitPlanes(
             first,
             select(is_new, plane, second),
             select(is_new & second.is_apart(plane), second, third),
         )
         return _HitPlanes(
-            select(best, if_best.first, otherwise.first),
-            select(best, if_best.second, otherwise.second),
-            select(best, if_best.third, otherwise.third),
+            select(is_best, if_best.first, otherwise.first),
+            select(is_best, if_best.second, otherwise.second),
+            select(is_best, if_best.third, otherwise.third),
         )
 
-    def meeting(self, number: Any) -> Vec3:
-        """The shortest vector to the intersection of planes: of all three (0), of the first and the
-        second (1), of the first and the third (2), or to the first alone (3); not finite where
-        there is no intersection."""
+    def shortest_to_intersection(self, number: Any) -> Vec3:
+        """The shortest vector from x to an intersection of planes: of all three (number 0), of the
+        first and the second (1), of the first and the third (2); or to the first plane alone (3).
+        Not finite where there is no intersection."""
         first, second, third = self.first, self.second, self.third
         vector = cast("Any", type(first.normal))
-        pairs = dr.select(number == 1, first.nearest_on_line(second), first.nearest_on_line(third))
-        alone = vector(first.offset) * first.normal
-        ends = dr.select(number == 0, first.intersection_point(second, third), alone)
-        return dr.select((number == 1) | (number == 2), pairs, ends)
+        to_line = dr.select(
+            number == 1, first.nearest_on_line(second), first.nearest_on_line(third)
+        )
+        to_first = vector(first.offset) * first.normal
+        to_point = dr.select(number == 0, first.intersection_point(second, third), to_first)
+        return dr.select((number == 1) | (number == 2), to_line, to_point)
 
 
 def compass_search(surface: SurfaceTracer, x: Vec3, foot: Vec3) -> Vec3:
@@ -363,43 +397,56 @@ def compass_search(surface: SurfaceTracer, x: Vec3, foot: Vec3) -> Vec3:
     """
     backend = surface.backend
     real, vector, count = backend.Float, backend.Array3f, backend.UInt32
-    r = vector(foot) - x
-    t = dr.norm(r)
+    offset = vector(foot) - x
+    t = dr.norm(offset)
     active = dr.isfinite(t) & (t > 0)
-    d = dr.select(active, r / t, vector(0, 0, 1))
+    d = dr.select(active, offset / t, vector(0, 0, 1))
 
     def body(
-        d: Vec3, t: Real, foot: Vec3, step: Real, angle: Real, failed: Any, n: Any, active: Mask,
+        d: Vec3, t: Real, foot: Vec3, step: Real, angle: Real, failed: Any, ray: Any, active: Mask,
         *values: Any,
     ) -> tuple[Any, ...]:  # fmt: skip
-        planes, is_global = _HitPlanes.of(values), n < _SPHERE_RAYS
-        to_planes = ~is_global & (failed < _PLANE_TRIALS)
+        """Trace one ray, and choose the next direction.
+
+        d, t, foot: direction, distance and position of the best point.
+        step: tangent of the angle by which rays are tilted against d.
+        angle: the direction of that tilt about d.
+        failed: the number of rays of this round, all of which failed.
+        ray: the number of the ray.
+        values: the planes of hits, `_HitPlanes.parts`.
+        """
+        planes, is_global = _HitPlanes.of(values), ray < _SPHERE_RAYS
+        to_planes = ~is_global & (failed < _PLANE_RAYS)
         direction = dr.select(
-            to_planes, dr.normalize(planes.meeting(failed)), _tilt_direction(d, step, angle)
+            to_planes,
+            dr.normalize(planes.shortest_to_intersection(failed)),
+            _tilt_direction(d, step, angle),
         )
-        direction = dr.select(is_global, _spiral_direction(vector, real(n)), direction)
+        direction = dr.select(is_global, _spiral_direction(vector, real(ray)), direction)
         is_valid = active & dr.isfinite(dr.squared_norm(direction))
-        # Beyond t as well, for planes.
-        end = dr.select(is_global, t, t * (1 + fmin(step, 0.5)))
-        hit = surface.first_hit(x, dr.select(is_valid, direction, d), real(0), end, is_valid)
+        # Rays of a round go farther than t, as a farther hit gives a plane, too.
+        max_t = dr.select(is_global, t, t * (1 + fmin(step, 0.5)))
+        hit = surface.first_hit(x, dr.select(is_valid, direction, d), real(0), max_t, is_valid)
         is_hit = is_valid & (hit.status == int(RayStatus.HIT))
-        nearer = is_hit & (hit.t < t * (1 - 8 * backend.machine_epsilon))
+        is_nearer = is_hit & (hit.t < t * (1 - 8 * backend.machine_epsilon))
         point = dr.fma(vector(hit.t), direction, x)
-        nearer &= is_on_surface(surface, point, hit, nearer)
+        is_nearer &= is_on_surface(surface, point, hit, is_nearer)
         normal = dr.normalize(hit.gradient)
         has_plane = is_hit & dr.isfinite(dr.squared_norm(normal))
         plane = _HitPlane(normal, dr.dot(normal, direction) * hit.t)
-        planes = planes.updated(plane, has_plane, has_plane & nearer)
-        d, t = dr.select(nearer, direction, d), dr.select(nearer, hit.t, t)
-        foot = dr.select(nearer, point, foot)
-        failed = dr.select(nearer | is_global, count(0), failed + 1)
-        is_spent = failed == _PLANE_TRIALS + _TILTED
+        planes = planes.updated(plane, has_plane, has_plane & is_nearer)
+        d, t = dr.select(is_nearer, direction, d), dr.select(is_nearer, hit.t, t)
+        foot = dr.select(is_nearer, point, foot)
+        failed = dr.select(is_nearer | is_global, count(0), failed + 1)
+        is_spent = failed == _PLANE_RAYS + _TILTED_RAYS
         new_step = dr.select(is_spent, _STEP_REDUCTION * step, step)
-        step = dr.select(nearer & ~is_global & ~to_planes, fmin(2 * step, _INITIAL_STEP), new_step)
-        angle = dr.select(nearer | to_planes | is_global, angle, angle + _GOLDEN)
+        step = dr.select(
+            is_nearer & ~is_global & ~to_planes, fmin(2 * step, _INITIAL_STEP), new_step
+        )
+        angle = dr.select(is_nearer | to_planes | is_global, angle, angle + _GOLDEN_ANGLE)
         failed = dr.select(is_spent, count(0), failed)
-        active &= (step > backend.machine_epsilon**0.5) & (n + 1 < _MAX_RAYS)
-        return d, t, foot, step, angle, failed, n + 1, active, *planes.parts()
+        active &= (step > backend.machine_epsilon**0.5) & (ray + 1 < _MAX_RAYS)
+        return d, t, foot, step, angle, failed, ray + 1, active, *planes.parts()
 
     def is_active(*state: Any) -> Mask:
         return state[7]
@@ -412,15 +459,19 @@ def compass_search(surface: SurfaceTracer, x: Vec3, foot: Vec3) -> Vec3:
 
 
 def is_on_surface(surface: SurfaceTracer, y: Vec3, hit: MarchResult, active: Mask) -> Mask:
-    """Whether f takes the level about hits y. Beside the edge of a jump surface the gradient is
-    unbounded, so that to first order rays are within the tolerance of any level, and a ray that
-    begins there may hit the facet at once, whatever f is."""
+    """Whether f has values on both sides of a level about the hit y, so that y is on the surface.
+
+    A hit alone does not prove that beside the edge of a jump surface: the gradient is unbounded
+    there, so that a ray is within the tolerance of any level to first order, and a ray that begins
+    there may hit the facet at once, whatever value f has.
+    """
     radius = _HIT_TEST_RADIUS * surface.backend.machine_epsilon * fmax(max_norm(y), hit.t)
     return straddles_level(surface, y, radius, active)
 
 
 def _tilt_direction(d: Vec3, step: Real, angle: Real) -> Vec3:
-    """The direction at a distance of `step` from d, seen along d at that angle."""
+    """The unit direction of d + step w, where w is the unit vector normal to d at the angle `angle`
+    about d. step is so the tangent of the tilt."""
     vector = cast("Any", type(d))
     u, v = orthonormal_basis(d)
     sine, cosine = dr.sincos(angle)
@@ -428,8 +479,8 @@ def _tilt_direction(d: Vec3, step: Real, angle: Real) -> Vec3:
 
 
 def _spiral_direction(vector: Any, n: Real) -> Vec3:
-    """Evenly spread directions, one for each n < `_SPHERE_RAYS`."""
+    """Direction number n of `_SPHERE_RAYS` directions that are spread evenly over the sphere."""
     z = 1 - (2 * n + 1) / _SPHERE_RAYS
     radius = dr.sqrt(1 - z * z)
-    sine, cosine = dr.sincos(_GOLDEN * n)
+    sine, cosine = dr.sincos(_GOLDEN_ANGLE * n)
     return vector(radius * cosine, radius * sine, z)

@@ -1,8 +1,9 @@
-"""The level sets of a closed mesh's winding number as triangles, of which a tree finds the nearest.
+"""The level sets of a closed mesh's winding number as triangles, with a tree that finds the nearest
+one.
 
 Off its triangles the winding number of a closed mesh is an integer, so its level sets consist of
-triangles. A triangle belongs to a level entirely, unless others pass through it: then it is cut
-along these first.
+triangles. A triangle belongs to a level as a whole, unless other triangles pass through it: then it
+is cut along them first.
 """
 
 from __future__ import annotations
@@ -32,8 +33,9 @@ if TYPE_CHECKING:
 __all__ = ["LevelTriangles"]
 
 _LEAF_SIZE = 8
-# Of the mesh's size: the distance from a triangle at which f is evaluated on either side.
-_BESIDE = 1e-9
+# The distance from a triangle at which f is evaluated on either side, as a fraction of the mesh
+# size.
+_SIDE_DISTANCE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -52,10 +54,10 @@ class LevelTriangles:
 
     @classmethod
     def of(cls, surface: TracedSurface) -> LevelTriangles | None:
-        """The triangles of a surface: the level set of the winding number of a mesh without a clip,
-        or the boundary of a `MeshSolid`; None for other surfaces. For a mesh that is not closed,
-        the triangles that are proved to belong to the surface as a whole; or all, if the surface
-        consists of triangles only."""
+        """The triangles of a surface: of the boundary of a `MeshSolid`, or of a level set of the
+        winding number of a mesh, without clip and domain; None for other surfaces. For a mesh that
+        is not closed, only triangles that are proved to belong to the surface as a whole; but all
+        triangles, if the surface consists of triangles only."""
         if isinstance(surface.field, MeshSolid) and surface.clip_volume is None:
             if surface.field.domain is not None or any(surface.level_values):
                 return None
@@ -93,6 +95,7 @@ class LevelTriangles:
         del _frame
 
         def nearest(p: Vec3) -> Vec3:
+            """The vector from p to the nearest point of a triangle."""
             x: Any = (vector(p) - center) / size
             limit = initial_squared_distance(tree, x)
             start = real(-1), backend.UInt32(NO_TRIANGLE)
@@ -104,33 +107,40 @@ class LevelTriangles:
 def _tree(
     backend: Backend, vertices: FloatArray, faces: Any, *, slabs: bool = False
 ) -> TriangleTree:
+    """The tree of triangles vertices[faces]. slabs: whether its nodes store slabs as well as
+    boxes."""
     tree = build_balanced_tree(vertices[faces].mean(axis=1), leaf_size=_LEAF_SIZE)
     return TriangleTree.of(backend, tree, triangle_records(vertices, faces), slabs=slabs)
 
 
 def _proved_on_level(surface: TracedSurface, corners: FloatArray, size: float) -> BoolArray:
-    """(k,) whether all of a triangle, through which no other one passes, belongs to a level.
+    """A mask (k,) of the triangles that are proved to belong to a level as a whole.
 
-    Proof. With its jumps, which are whole numbers, removed, f is smooth about the triangle's
-    center, and takes no level mod 1 within the radius that `level_distance_lower_bound` proves. If
-    a ball of that radius contains the triangle, f on either side of it stays on the same side of
-    the level as just beside the center.
+    corners: (k, 3, 3) of triangles through which no other triangle passes.
+    size: of the mesh.
+
+    Proof. The jumps of f are whole numbers. Without them, f is smooth about the triangle's center,
+    and has no level modulo 1 within the radius that `level_distance_lower_bound` proves. If the
+    ball of that radius about the center contains the triangle, then f, on either side of the whole
+    triangle, is on the same side of the level as right beside the center.
     """
     backend, field = choose_backend("double"), surface.field
     prepared = surface.evaluator(backend)
-    smooth = EvaluateOnly(prepared.evaluate)
+    smooth_field = EvaluateOnly(prepared.evaluate)
     levels = Levels(tuple(dr.opaque(backend.Float, level) for level in surface.level_values), 1.0)
 
     def clearance(p: Vec3) -> tuple[Any]:
-        return (level_distance_lower_bound(backend, smooth, levels, p, prepared.evaluate(p)),)
+        return (level_distance_lower_bound(backend, smooth_field, levels, p, prepared.evaluate(p)),)
 
     center = corners.mean(axis=1)
     (clearances,) = in_batches(backend, clearance, center)
     radius = np.linalg.norm(corners - center[:, None], axis=2).max(axis=1)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normal, axis=1, keepdims=True)
-    offset = _BESIDE * size * normal / np.maximum(length, 1e-300)
-    sides = [field.value(center + sign * offset, precision="double") for sign in (1, -1)]
-    lower, upper = np.minimum(*sides), np.maximum(*sides)
-    between = np.any([(lower < level) & (level < upper) for level in surface.level_values], axis=0)
-    return between & (clearances > radius + 2 * _BESIDE * size) & (length[:, 0] > 0)
+    offset = _SIDE_DISTANCE * size * normal / np.maximum(length, 1e-300)
+    side_values = [field.value(center + sign * offset, precision="double") for sign in (1, -1)]
+    lower, upper = np.minimum(*side_values), np.maximum(*side_values)
+    is_between = np.any(
+        [(lower < level) & (level < upper) for level in surface.level_values], axis=0
+    )
+    return is_between & (clearances > radius + 2 * _SIDE_DISTANCE * size) & (length[:, 0] > 0)

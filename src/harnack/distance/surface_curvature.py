@@ -31,14 +31,14 @@ if TYPE_CHECKING:
 __all__ = ["CurvatureSamples", "Family", "curvature", "curvature_lines"]
 
 _HONORED_BY_LINES = ("level", "clip", "section", "precision")
-# The error of a mean curvature that is good enough: this share of it, or of one over the size of
-# the surface where that is more.
+# A mean curvature is accurate enough if its error is at most this fraction of it, or this fraction
+# of 1/(size of the surface), whichever is larger.
 _ACCURACY = 1e-3
 # Acceptance factors of the multipole expansions, tried in turn until the error is small enough: a
 # cluster is expanded only if it is this many times farther away than usual; with infinity every
 # term is summed directly.
 _ACCEPTANCE_FACTORS = (1.0, 2.0, 4.0, 8.0, 16.0, math.inf)
-# The rounding errors of the arithmetic in this module, in epsilons of gradient and Hessian.
+# Rounding error of the formulas here, in machine epsilons of the gradient and the Hessian.
 _ROUNDING = 16.0
 
 
@@ -77,7 +77,7 @@ def curvature(
 
     surface: a field, or a `Surface` whose levels, clip and section say where it is drawn: the
         curvature at a point is that of the level set through it, whatever its level.
-    options: a `TraceOptions`, of which curvatures have `precision` alone; None is double precision.
+    options: a `TraceOptions`; curvatures use its `precision` alone. None is double precision.
     keywords: `precision`, in place of `options`.
 
     The derivative of n = grad f/|grad f| along a tangent u of the level set has the tangential
@@ -88,10 +88,11 @@ def curvature(
         mean = tr S/2 = (tr A - n.An)/(2 |grad f|) = (div n)/2,
         gaussian = det S = n.adj(A)n/|grad f|^2.
 
-    Of a sum over a tree, and of a solid made of one, both derivatives have an error that the field
-    states. Where it leaves the mean curvature uncertain by more than a thousandth of itself, or of
-    one over the size of the surface, clusters are taken as a whole only from farther away, up to
-    the sum of all terms one by one. What remains is in `mean_error` and `gaussian_error`.
+    A field that is summed over a tree, or a solid made of one, states the errors of its gradient
+    and Hessian. If they make the mean curvature uncertain by more than a thousandth of itself, and
+    by more than a thousandth of 1/(size of the surface), then clusters are expanded as a whole only
+    from farther away; at the last, all terms are summed one by one. `mean_error` and
+    `gaussian_error` bound the error that remains.
 
     Raises:
         NotImplementedError: the field has no second derivatives.
@@ -102,17 +103,21 @@ def curvature(
     if not isinstance(field, BatchedField):
         prepared = field.prepare(backend)
 
-        def directly(p: Vec3, closer: Real) -> tuple[Real | Vec3, ...]:
-            closely = prepared.at_accuracy(closer) if prepared.has_variable_accuracy else prepared
-            sample = closely.evaluate(p)
-            errors = closely.derivative_errors(p, sample)
-            rows = closely.hessian(p)
+        def from_field(p: Vec3, acceptance: Real) -> tuple[Real | Vec3, ...]:
+            """The curvatures at p by the field's own derivatives."""
+            refined = (
+                prepared.at_accuracy(acceptance) if prepared.has_variable_accuracy else prepared
+            )
+            sample = refined.evaluate(p)
+            errors = refined.derivative_errors(p, sample)
+            rows = refined.hessian(p)
             return _Derivatives(backend, sample.gradient, rows, *errors).curvatures()
 
-        return _refine_accuracy(backend, field, directly, points, prepared.has_variable_accuracy)
+        return _refine_accuracy(backend, field, from_field, points, prepared.has_variable_accuracy)
 
-    def by_tree(p: Vec3, closer: Real) -> tuple[Real | Vec3, ...]:
-        values = field.values_at(p, 2, closer)
+    def from_tree(p: Vec3, acceptance: Real) -> tuple[Real | Vec3, ...]:
+        """The curvatures at p by the tree sum of a field that is evaluated in batches."""
+        values = field.values_at(p, 2, acceptance)
         if values.gradient is None or values.hessian is None:
             raise RuntimeError(f"{type(field).__name__}: values_at(x, 2) gave no derivatives")
         rows = values.hessian.rows(backend.Array3f)
@@ -121,45 +126,51 @@ def curvature(
         )
         return derivatives.curvatures()
 
-    return _refine_accuracy(backend, field, by_tree, points, True)
+    return _refine_accuracy(backend, field, from_tree, points, True)
 
 
 def _refine_accuracy(
     backend: Backend,
     field: Field,
-    computed: Callable[[Vec3, Real], tuple[Real | Vec3, ...]],
+    evaluate: Callable[[Vec3, Real], tuple[Real | Vec3, ...]],
     points: Any,
-    has_detail: bool,
+    can_refine: bool,
 ) -> CurvatureSamples:
-    """The curvatures; `computed` with higher accuracy where the error is too large, if the field
-    `has_detail`."""
+    """The curvatures at points (n, 3), evaluated again with larger acceptance factors where their
+    error is too large.
 
-    def at(closer: float) -> Callable[[Vec3], tuple[Real | Vec3, ...]]:
+    evaluate: gives the values of `_Derivatives.curvatures` at points, for an acceptance factor (see
+        `_ACCEPTANCE_FACTORS`).
+    can_refine: whether the field's accuracy depends on that factor.
+    """
+
+    def with_acceptance(acceptance: float) -> Callable[[Vec3], tuple[Real | Vec3, ...]]:
         def compute(p: Vec3) -> tuple[Real | Vec3, ...]:
-            return computed(p, dr.opaque(backend.Float, closer))
+            return evaluate(p, dr.opaque(backend.Float, acceptance))
 
         return compute
 
-    *results, is_truncated = in_batches(backend, at(_ACCEPTANCE_FACTORS[0]), points)
-    if not has_detail:
-        return CurvatureSamples(*results)
+    *columns, is_truncated = in_batches(backend, with_acceptance(_ACCEPTANCE_FACTORS[0]), points)
+    if not can_refine:
+        return CurvatureSamples(*columns)
     x = np.asarray(points, np.float64)
-    flat = _ACCURACY / _size(field, x)
-    for closer in _ACCEPTANCE_FACTORS[1:]:
-        mean, error = results[0], results[3]
+    flat_error = _ACCURACY / _size(field, x)
+    for acceptance in _ACCEPTANCE_FACTORS[1:]:
+        mean, error = columns[0], columns[3]
         with np.errstate(invalid="ignore"):
-            is_accurate = error <= np.maximum(_ACCURACY * np.abs(mean), flat)
+            is_accurate = error <= np.maximum(_ACCURACY * np.abs(mean), flat_error)
         rows = np.flatnonzero(~is_accurate & (is_truncated > 0))
         if not rows.size:
             break
-        *refined, is_truncated[rows] = in_batches(backend, at(closer), x[rows])
-        for values, replacement in zip(results, refined, strict=True):
-            values[rows] = replacement
-    return CurvatureSamples(*results)
+        *refined, is_truncated[rows] = in_batches(backend, with_acceptance(acceptance), x[rows])
+        for column, values in zip(columns, refined, strict=True):
+            column[rows] = values
+    return CurvatureSamples(*columns)
 
 
 def _size(field: Field, points: FloatArray) -> float:
-    """The size of the surface: of the box that holds it, else the extent of the points."""
+    """The size of the surface: the diagonal of the box that holds it; if there is no finite one,
+    the largest coordinate of the points."""
     volume = field.extent((field.default_level,))
     if volume is not None:
         lower, upper = volume.bounds()
@@ -170,8 +181,13 @@ def _size(field: Field, points: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class _Derivatives:
-    """Gradient and rows of the Hessian, and bounds of their errors: of the length of one and the
-    spectral norm of the other."""
+    """First and second derivatives of f at points, with bounds of their errors.
+
+    gradient: grad f.
+    rows: the three rows of the Hessian.
+    gradient_error: bound of the length of the gradient's error.
+    hessian_error: bound of the spectral norm of the Hessian's error.
+    """
 
     backend: Backend
     gradient: Vec3
@@ -180,21 +196,24 @@ class _Derivatives:
     hessian_error: Real
 
     def curvatures(self) -> tuple[Real | Vec3, ...]:
-        """Mean, Gaussian curvature and normal, the two errors, and 0 where the field states that
-        its derivatives are exact, else 1.
+        """Mean and Gaussian curvature, normal, bounds of the errors of both curvatures, and a
+        number: 0 where the field states that its derivatives are exact, else 1.
 
-        Bounds. Let g, A be the derivatives at hand, G = |g|, T = tr M and D = det M of the matrix
-        M = (u, v)^T A (u, v), so that mean H = T/(2G) and Gaussian K = D/G^2. Let g', A' be the
-        true ones, |g' - g| <= c < G and |A' - A| <= h in the spectral norm; T', D', .. theirs. Then
-        G' >= G - c, and n' is at an angle t <= pi/2 to n with sin t <= c/G =: s. Let S be at least
-        the range of A's eigenvalues: sqrt(2) |A - (tr A/3) 1|_F, as (a-b)^2 <= 2 (a^2 + b^2).
+        Bounds. Let g, A be the computed gradient and Hessian, G = |g|, n = g/G, (u, v) an
+        orthonormal basis of the plane at right angles to n, and M = (u, v)^T A (u, v) with T = tr M
+        and D = det M, so that the mean curvature is H = T/(2G) and the Gaussian K = D/G^2. A prime
+        marks the same quantities of the true derivatives g', A'; |g' - g| <= c < G, and
+        |A' - A| <= h in the spectral norm. Then G' >= G - c, and n' is at an angle t <= pi/2 to n
+        with sin t <= c/G =: s. Let S = sqrt(2) |A - (tr A/3) 1|_F in the Frobenius norm; S is at
+        least the range of A's eigenvalues, as (a-b)^2 <= 2 (a^2 + b^2).
 
         - T = tr A - n.An. nn^T - n'n'^T has the eigenvalues sin t, -sin t and 0, the first two with
           unit eigenvectors p, q: |n.An - n'.An'| = sin t |p.Ap - q.Aq| <= s S. The projection
           1 - n'n'^T has two eigenvalues 1: |tr((1 - n'n'^T)(A - A'))| <= 2 h. So |T - T'| <= s S +
           2 h, and as |1/G' - 1/G| <= c/(G (G - c)), |H - H'| <= ((s S + 2 h)/2 + |H| c)/(G - c).
-        - Let the rotation R by the angle t take n to n'. M' is that of R^T A' R in the same frame
-          (its determinant does not depend on the frame). With m the middle of A's range,
+        - Let the rotation R by the angle t take n to n'. M' is the matrix of R^T A' R in the basis
+          (u, v), as its determinant does not depend on the basis. With m the middle of the range of
+          A's eigenvalues,
           |A - R^T A R| = |(R - 1)(A - m) - (A - m)(R - 1)| <= 2 |R - 1| S/2, |R - 1| = 2 sin(t/2) =
           sin t sqrt(2/(1 + cos t)) <= s sqrt(2/(1 + sqrt(1 - s^2))) =: r. So E = M' - M is at most
           e := r S + h, and det(M + E) = det M + tr(adj(M) E) + det E differs from det M by at most
@@ -202,48 +221,54 @@ class _Derivatives:
           With 1/G'^2 - 1/G^2 <= c (2G - c)/(G^2 (G - c)^2):
           |K - K'| <= (e (|a| + |b|) + e^2 + |K| c (2G - c))/(G - c)^2.
 
-        The arithmetic here is that of derivatives changed by a few epsilons of themselves, which
-        are added to c and h.
+        The rounding of this arithmetic is the same as a change of g and A by a few epsilons of
+        themselves, which are added to c and h.
         """
         real = self.backend.Float
         x, y, z = self.rows
         plane = TangentPlane.of(self.gradient)
         uu, vv, uv = plane.restrict_hessian(self.rows)
-        share = 1 / plane.gradient_norm
-        mean = 0.5 * (uu + vv) * share
-        gaussian = (uu * share) * (vv * share) - (uv * share) * (uv * share)
+        inverse_norm = 1 / plane.gradient_norm
+        mean = 0.5 * (uu + vv) * inverse_norm
+        gaussian = (uu * inverse_norm) * (vv * inverse_norm) - (uv * inverse_norm) * (
+            uv * inverse_norm
+        )
 
         rounding = _ROUNDING * self.backend.machine_epsilon
-        third = (x.x + y.y + z.z) / 3
-        off = dr.square(x.y) + dr.square(x.z) + dr.square(y.z)
-        diagonal = dr.square(x.x - third) + dr.square(y.y - third) + dr.square(z.z - third)
-        deviator = dr.sqrt(diagonal + 2 * off)
-        size = deviator + math.sqrt(3) * dr.abs(third)
-        wide = math.sqrt(2) * deviator + rounding * size
+        mean_diagonal = (x.x + y.y + z.z) / 3
+        off_diagonal = dr.square(x.y) + dr.square(x.z) + dr.square(y.z)
+        diagonal = (
+            dr.square(x.x - mean_diagonal)
+            + dr.square(y.y - mean_diagonal)
+            + dr.square(z.z - mean_diagonal)
+        )
+        deviator = dr.sqrt(diagonal + 2 * off_diagonal)
+        hessian_norm = deviator + math.sqrt(3) * dr.abs(mean_diagonal)
+        eigen_range = math.sqrt(2) * deviator + rounding * hessian_norm
         c = dr.fma(rounding, plane.gradient_norm, real(self.gradient_error))
-        h = dr.fma(rounding, size, real(self.hessian_error))
-        left = plane.gradient_norm - c
-        known = (left > 0) & dr.isfinite(mean) & dr.isfinite(gaussian)
-        s = fmin(c * share, real(1))
-        mean_error = (0.5 * s * wide + h + dr.abs(mean) * c) / left
-        e = dr.fma(s * dr.sqrt(2 / (1 + dr.sqrt(1 - s * s))), wide, h)
-        both = fmax(dr.abs(uu + vv), dr.sqrt(dr.square(uu - vv) + 4 * uv * uv))
-        moved = e * (both + e) + dr.abs(gaussian) * c * (2 * plane.gradient_norm - c)
-        gaussian_error = moved / (left * left)
+        h = dr.fma(rounding, hessian_norm, real(self.hessian_error))
+        min_norm = plane.gradient_norm - c
+        is_known = (min_norm > 0) & dr.isfinite(mean) & dr.isfinite(gaussian)
+        s = fmin(c * inverse_norm, real(1))
+        mean_error = (0.5 * s * eigen_range + h + dr.abs(mean) * c) / min_norm
+        e = dr.fma(s * dr.sqrt(2 / (1 + dr.sqrt(1 - s * s))), eigen_range, h)
+        eigenvalue_sum = fmax(dr.abs(uu + vv), dr.sqrt(dr.square(uu - vv) + 4 * uv * uv))
+        numerator = e * (eigenvalue_sum + e) + dr.abs(gaussian) * c * (2 * plane.gradient_norm - c)
+        gaussian_error = numerator / (min_norm * min_norm)
         is_exact = (real(self.gradient_error) <= 0) & (real(self.hessian_error) <= 0)
         return (
-            dr.select(known, mean, dr.nan),
-            dr.select(known, gaussian, dr.nan),
-            dr.select(known, plane.n, dr.nan),
-            _or_infinite(known, mean_error),
-            _or_infinite(known, gaussian_error),
+            dr.select(is_known, mean, dr.nan),
+            dr.select(is_known, gaussian, dr.nan),
+            dr.select(is_known, plane.n, dr.nan),
+            _or_infinite(is_known, mean_error),
+            _or_infinite(is_known, gaussian_error),
             dr.select(is_exact, real(0), 1),
         )
 
 
-def _or_infinite(known: Any, error: Real) -> Real:
-    """Errors, rounded up; infinite where nothing is known."""
-    return dr.select(known & dr.isfinite(error), error * (1 + 1e-5), dr.inf)
+def _or_infinite(is_known: Any, error: Real) -> Real:
+    """The error bound rounded up; infinity where it is not known or not finite."""
+    return dr.select(is_known & dr.isfinite(error), error * (1 + 1e-5), dr.inf)
 
 
 # Lines of curvature.
@@ -252,14 +277,15 @@ Family = Literal["maximum", "minimum"]
 
 # Newton steps that bring a seed to the surface.
 _SEED_NEWTON_STEPS = 8
-# A line ends where the two principal curvatures differ by less than this part of their size: what
-# direction is principal is not known there, and about an umbilic all are.
+# A line ends where the two principal curvatures differ by less than this fraction of the larger
+# absolute value: the principal directions are not known there, and at an umbilic all directions are
+# principal.
 _UMBILIC = 1e-3
-# It ends where it turns in one step by more than this angle (its cosine), and where a step is
-# longer than this part of the least radius of curvature: what follows would be no line of the
-# surface but the step's.
+# A line also ends where it turns in one step by more than the angle with this cosine, and where the
+# step is longer than this fraction of the smallest radius of curvature: its continuation would
+# depend on the step and not on the surface.
 _MIN_STEP_COSINE, _MAX_STEP_PER_RADIUS = math.cos(math.radians(40)), 0.5
-_MAX_STEPS = 100_000
+_MOST_STEPS = 100_000
 
 
 @shows_keywords(*_HONORED_BY_LINES)
@@ -283,20 +309,21 @@ def curvature_lines(
     surface: a field, or a `Surface` of one level; lines end where its clip and section do, and a
         seed outside of these gives an empty line, (0, 3).
     seeds: points near the surface, from which Newton's method leads to it.
-    step: length of the steps, as a length of arc. length: how far to follow a line to either side.
-    family: whether to follow the direction of the larger principal curvature or of the smaller; the
-        sign of curvatures is that of `curvature`.
+    step: the arc length of a step.
+    length: the arc length to which a line is followed, on either side of its seed.
+    family: whether to follow the direction of the larger principal curvature or of the smaller one;
+        the sign of curvatures is that of `curvature`.
     options, keywords: as in `curvature`; beside a bare field also `level`, `clip` and `section`.
 
-    With n = grad f/|grad f| and the Hessian A, the principal directions are the eigenvectors of A
-    restricted to the tangent plane (`curvature` says why). They are lines without an arrow: each
-    stage of a step (Runge and Kutta's of order four) takes the sign that agrees with the direction
-    before it. One step of Newton's method along grad f brings the end of each step back to the
-    surface, from which it is O(step^5) away.
+    The principal directions are the eigenvectors of the Hessian restricted to the tangent plane
+    (`curvature` says why). An eigenvector has no sign: so each stage of a step (of the Runge-Kutta
+    method of order four) takes the sign that agrees with the direction before it. The end of each
+    step is O(step^5) away from the surface; one step of Newton's method along grad f brings it
+    back.
 
     A line ends where the directions are not defined, as at umbilics, where both curvatures are the
     same; where the surface turns too fast for the step, as beside the curve of a solid angle; and
-    after `length`. A seed whose first point is no point of a surface gives an empty line.
+    after `length`. A seed that Newton's method does not bring to the surface gives an empty line.
 
     Raises:
         NotImplementedError: the field has no second derivatives.
@@ -311,33 +338,41 @@ def curvature_lines(
     if len(levels) > 1:
         raise ValueError(f"lines of curvature are of one level, not of {len(levels)}")
     if not is_one_of(family, get_args(Family)):
-        known = ", ".join(f'"{name}"' for name in get_args(Family))
+        names = ", ".join(f'"{name}"' for name in get_args(Family))
         hint = did_you_mean(family, get_args(Family))
-        raise ValueError(f"unknown family {family!r}; choose one of {known}{hint}")
+        raise ValueError(f"unknown family {family!r}; choose one of {names}{hint}")
     step, length = as_positive(step, "step"), as_positive(length, "length")
     count = math.ceil(length / step)
-    if count > _MAX_STEPS:
-        raise ValueError(f"length/step asks for {count:,} steps: at most {_MAX_STEPS:,}")
+    if count > _MOST_STEPS:
+        raise ValueError(f"length/step asks for {count:,} steps: at most {_MOST_STEPS:,}")
     start = as_finite_vectors(seeds, "seeds")
     if not len(start):
         return []
     # Data, so that another level, step or family compiles no other kernel.
-    wants_largest = 1.0 if family == "maximum" else 0.0
-    at, h, largest = (
-        dr.opaque(backend.Float, number) for number in (levels[0], step, wants_largest)
+    largest = 1.0 if family == "maximum" else 0.0
+    level, opaque_step, largest_factor = (
+        dr.opaque(backend.Float, name) for name in (levels[0], step, largest)
     )
-    guide = _CurvatureLineTracer(backend, field.prepare(backend), at, h, largest)
+    tracer = _CurvatureLineTracer(
+        backend, field.prepare(backend), level, opaque_step, largest_factor
+    )
     with dr.suspend_grad():
-        both = guide.follow(start, count)
+        halves = tracer.follow(start, count)
     return [
-        _join_halves(ahead, back, step, target.clip_volume)
-        for ahead, back in zip(*both, strict=True)
+        _join_halves(ahead, behind, step, target.clip_volume)
+        for ahead, behind in zip(*halves, strict=True)
     ]
 
 
 @dataclass(frozen=True)
 class _LineState:
-    """The points that lines have reached, their directions there, and which lines go on."""
+    """The state of the lines, one in each lane.
+
+    x: the current point.
+    direction: the unit tangent with which the line came to it.
+    index: the number of steps so far.
+    active: whether the line continues.
+    """
 
     x: Vec3
     direction: Vec3
@@ -347,7 +382,8 @@ class _LineState:
 
 @dataclass(frozen=True)
 class _CurvatureLineTracer:
-    """Follows the lines of one family: largest is 1 for the larger curvature, 0 for the smaller."""
+    """Follows the lines of one family. largest: 1 for the family of the larger principal curvature,
+    0 for the smaller."""
 
     backend: Backend
     field: Field
@@ -356,7 +392,11 @@ class _CurvatureLineTracer:
     largest: Real
 
     def follow(self, seeds: FloatArray, count: int) -> tuple[list[FloatArray], list[FloatArray]]:
-        """The points of each line to both sides of its seed, each from the seed on."""
+        """Trace each line from its seed in both directions, by at most `count` steps each.
+
+        Returns two lists of n polylines (k, 3), one for each direction; all begin at the seeds,
+        moved onto the surface.
+        """
         integer, vector, n = self.backend.UInt32, self.backend.Array3f, len(seeds)
         x = upload_vectors(self.backend, np.concatenate([seeds, seeds]))
         x = self._on_surface(x, _SEED_NEWTON_STEPS)
@@ -366,22 +406,24 @@ class _CurvatureLineTracer:
         points = vector(*(dr.full(self.backend.Float, dr.nan, 2 * n * (count + 1)) for _ in "xyz"))
         dr.scatter(points, x, lane, is_known)
         dr.eval(points, x, direction, is_known)
-        last = dr.opaque(integer, count)
+        max_steps = dr.opaque(integer, count)
 
         def body(state: _LineState) -> _LineState:
-            x, direction, goes_on = self._advance(state)
+            """Advance all lines by a step, and store their points."""
+            x, direction, is_valid = self._advance(state)
             index = state.index + 1
-            dr.scatter(points, x, index * (2 * n) + lane, state.active & goes_on)
-            return _LineState(x, direction, index, state.active & goes_on & (index < last))
+            dr.scatter(points, x, index * (2 * n) + lane, state.active & is_valid)
+            return _LineState(x, direction, index, state.active & is_valid & (index < max_steps))
 
         index = dr.zeros(integer, 2 * n)
         loop_while_active(_LineState(x, direction, index, is_known & True), body, "curvature lines")
-        array = to_numpy(points).reshape(count + 1, 2 * n, 3).astype(np.float64)
-        lines = [line[np.isfinite(line).all(axis=1)] for line in array.swapaxes(0, 1)]
+        point_array = to_numpy(points).reshape(count + 1, 2 * n, 3).astype(np.float64)
+        lines = [line[np.isfinite(line).all(axis=1)] for line in point_array.swapaxes(0, 1)]
         return lines[:n], lines[n:]
 
     def _advance(self, state: _LineState) -> tuple[Vec3, Vec3, Mask]:
-        """The next point, the direction there, and whether it is a point of the line."""
+        """One Runge-Kutta step. Returns the next point, the principal direction there, and whether
+        that point continues the line."""
         x, h = state.x, self.step
         first = state.direction
         second, _ = self._direction(x + 0.5 * h * first, first)
@@ -393,7 +435,9 @@ class _CurvatureLineTracer:
         return end, last, is_known & (dr.dot(first, last) > _MIN_STEP_COSINE)
 
     def _direction(self, x: Vec3, previous: Vec3 | None) -> tuple[Vec3, Mask]:
-        """The principal direction that agrees with the previous one, and whether it is defined."""
+        """The principal direction at x, with the sign that agrees with `previous` (either sign if
+        that is None); and whether it is well defined and the step short enough for the curvature.
+        """
         plane = TangentPlane.of(self.field.evaluate(x).gradient)
         eigen = SymmetricEigen2.of(*plane.restrict_hessian(self.field.hessian(x)))
         u, v = eigen.combination(self.largest, 1 - self.largest)
@@ -409,7 +453,7 @@ class _CurvatureLineTracer:
         )
 
     def _on_surface(self, x: Vec3, steps: int) -> Vec3:
-        """The point to which Newton's method along the gradient leads in `steps` steps."""
+        """x after `steps` steps of Newton's method along the gradient, towards the level."""
 
         def step(x: Vec3) -> Vec3:
             sample = self.field.evaluate(x)
@@ -422,47 +466,55 @@ class _CurvatureLineTracer:
 
 
 def _iterate(step: Callable[[Vec3], Vec3], x: Vec3, times: int, backend: Backend) -> Vec3:
-    """The step repeated `times` times, recorded once."""
+    """The result of `step` applied `times` times to x; the kernel contains it once."""
     if times == 1:
         return step(x)
 
     def body(k: Any, x: Vec3) -> tuple[Any, Vec3]:
         return k + 1, step(x)
 
-    def more(k: Any, x: Vec3) -> Mask:
+    def is_active(k: Any, x: Vec3) -> Mask:
         del x
         return k < times
 
     start = (backend.UInt32(0), backend.Array3f(x))
-    return dr.while_loop(start, more, body, label="to the surface")[1]
+    return dr.while_loop(start, is_active, body, label="to the surface")[1]
 
 
 def _join_halves(
-    ahead: FloatArray, back: FloatArray, step: float, clip: Volume | None
+    ahead: FloatArray, behind: FloatArray, step: float, clip: Volume | None
 ) -> FloatArray:
-    """One line of its two halves, each cut where it first leaves the volume; of one that comes
-    back to its seed, one turn, which ends in the seed."""
+    """One polyline (k, 3) from the two halves of a line, which begin at its seed.
+
+    Each half is first cut where it leaves the clip volume. If `ahead` returns to the seed, the line
+    is closed: it is `ahead` up to there, and ends with the seed again.
+    """
     if clip is not None:
-        ahead, back = (_inside(half, clip) for half in (ahead, back))
+        ahead, behind = (_until_exit(half, clip) for half in (ahead, behind))
     if len(ahead) > 3:
-        # Passed within half a step, by a step that leads from one side of the seed to the other.
+        # The line returns in a step that passes the seed at a distance below a quarter of `step`.
         moves, to_seed = np.diff(ahead, axis=0), ahead[0] - ahead[:-1]
-        share = (moves * to_seed).sum(axis=1) / np.maximum((moves * moves).sum(axis=1), 1e-300)
-        passing = np.linalg.norm(to_seed - share[:, None] * moves, axis=1) < 0.25 * step
-        agrees = moves @ moves[0] > 0
-        closed = np.flatnonzero(
-            passing & (share > 0) & (share <= 1) & agrees & _after_second_step(len(moves))
+        fraction = (moves * to_seed).sum(axis=1) / np.maximum((moves * moves).sum(axis=1), 1e-300)
+        is_near_seed = np.linalg.norm(to_seed - fraction[:, None] * moves, axis=1) < 0.25 * step
+        is_same_way = moves @ moves[0] > 0
+        closing = np.flatnonzero(
+            is_near_seed
+            & (fraction > 0)
+            & (fraction <= 1)
+            & is_same_way
+            & _after_second_step(len(moves))
         )
-        if closed.size:
-            return np.concatenate([ahead[: closed[0] + 1], ahead[:1]])
-    return np.concatenate([back[:0:-1], ahead])
+        if closing.size:
+            return np.concatenate([ahead[: closing[0] + 1], ahead[:1]])
+    return np.concatenate([behind[:0:-1], ahead])
 
 
 def _after_second_step(count: int) -> BoolArray:
-    """Not one of the first two steps, which pass near the seed."""
+    """A mask (count,) of the steps of a line, False for the first two, which pass near the seed."""
     return np.arange(count) > 1
 
 
-def _inside(line: FloatArray, clip: Volume) -> FloatArray:
+def _until_exit(line: FloatArray, clip: Volume) -> FloatArray:
+    """The points (k, 3) of a line before the first that is outside the clip volume."""
     outside = np.flatnonzero(~clip.contains_points(line)) if len(line) else np.zeros(0, int)
     return line[: outside[0]] if outside.size else line

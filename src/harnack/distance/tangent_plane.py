@@ -32,8 +32,12 @@ __all__ = [
 
 @dataclass(frozen=True)
 class TangentPlane:
-    """The tangent plane where grad f is not zero: the length of grad f, the unit normal n along it,
-    and two unit tangents u, v."""
+    """The tangent plane of a level set at a point where grad f is not zero.
+
+    gradient_norm: |grad f|.
+    n: the unit normal along grad f.
+    u, v: two unit tangents, at right angles to each other.
+    """
 
     gradient_norm: Real
     n: Vec3
@@ -56,7 +60,8 @@ class TangentPlane:
 
 @dataclass(frozen=True)
 class SymmetricEigen2:
-    """The eigenvalues of a symmetric 2x2 matrix and the angle of the larger one's eigenvector."""
+    """The two eigenvalues of a symmetric 2x2 matrix; (cosine, sine) is the unit eigenvector of the
+    larger one."""
 
     largest: Real
     smallest: Real
@@ -65,25 +70,26 @@ class SymmetricEigen2:
 
     @classmethod
     def of(cls, uu: Real, vv: Real, uv: Real) -> SymmetricEigen2:
-        """The eigenvalues and the angle of the matrix ((uu, uv), (uv, vv))."""
+        """The eigenvalues and eigenvector of the matrix ((uu, uv), (uv, vv))."""
         middle, half = 0.5 * (uu + vv), 0.5 * (uu - vv)
         spread = dr.sqrt(dr.fma(half, half, uv * uv))
         s, c = dr.sincos(0.5 * dr.atan2(uv, half))
         return cls(middle + spread, middle - spread, c, s)
 
     def coordinates(self, u: Real, v: Real) -> tuple[Real, Real]:
-        """Coordinates of the vector (u, v) along the two eigenvectors, that of the larger
-        eigenvalue first."""
+        """Coordinates of the vector (u, v) in the basis of eigenvectors; the eigenvector of the
+        larger eigenvalue comes first."""
         return (
             dr.fma(self.cosine, u, self.sine * v),
             dr.fma(self.cosine, v, -self.sine * u),
         )
 
-    def combination(self, u: Real, v: Real) -> tuple[Real, Real]:
-        """The vector (u, v) with these coordinates."""
+    def combination(self, most: Real, least: Real) -> tuple[Real, Real]:
+        """The vector (u, v) with these coordinates in the basis of eigenvectors; `most`
+        belongs to the larger eigenvalue."""
         return (
-            dr.fma(self.cosine, u, -self.sine * v),
-            dr.fma(self.sine, u, self.cosine * v),
+            dr.fma(self.cosine, most, -self.sine * least),
+            dr.fma(self.sine, most, self.cosine * least),
         )
 
 
@@ -142,22 +148,23 @@ def second_order_distance(above: Real, gradient: Vec3, rows: tuple[Vec3, Vec3, V
     return dr.select(dr.isfinite(first) & (first != 0), quotient, first)
 
 
-# Computations at points, for searches, in batches: NumPy on both ends, in double precision.
+# Evaluation at points in batches. Arguments and results are NumPy arrays of float64.
 
-# Bounds memory, and the time until an interrupt is noticed.
-_AT_ONCE = 1 << 18
+# Number of points per batch. It bounds the memory, and the time until an interrupt is noticed.
+_BATCH_SIZE = 1 << 18
 
 
 def in_batches(
     backend: Backend,
     compute: Callable[..., tuple[Real | Vec3, ...]],
     points: Any,
-    *vectors: FloatArray,
+    *others: FloatArray,
 ) -> tuple[Any, ...]:
     """The results of `compute` for points of shape (n, 3), as float64 arrays (n,) or (n, 3).
 
-    vectors: further vectors of the same shape, passed to `compute` with the points, one for each
-        lane; their values are not checked.
+    compute: a function of Dr.Jit vectors that returns a tuple of numbers and vectors.
+    others: further arguments of `compute`, of the same shape as the points; their values are not
+        checked.
 
     Raises:
         TypeError, ValueError: points that are not an (n, 3) array of finite numbers of at most
@@ -165,12 +172,13 @@ def in_batches(
     """
     _check_size(points)
     with np.errstate(over="ignore"):
-        rounded = (values.astype(backend.dtype, copy=False) for values in vectors)
-        results = field_points.map_batches(backend, compute, points, *rounded, at_once=_AT_ONCE)
+        rounded = (values.astype(backend.dtype, copy=False) for values in others)
+        results = field_points.map_batches(backend, compute, points, *rounded, at_once=_BATCH_SIZE)
     return tuple(values.astype(np.float64, copy=False) for values in results)
 
 
 def _check_size(points: Any) -> None:
+    """Raise a ValueError if a finite coordinate of the points is larger than `MAX_COORDINATE`."""
     coordinates = None if dr.is_array_v(type(points)) else as_real_array(points, "points")
     if coordinates is None or not coordinates.size:
         return

@@ -20,7 +20,8 @@ from harnack.backend import FloatArray, IntArray
 __all__ = ["check_writable", "write_atomically"]
 
 MAX_BYTES = 1 << 28
-# The most elements of files that are read one by one, at up to some microseconds each.
+# The largest number of elements in files whose elements are read one by one, some microseconds
+# each.
 MAX_ELEMENTS = 10_000_000
 
 
@@ -37,7 +38,7 @@ class FileLocation:
     position: str = ""
 
     def __str__(self) -> str:
-        # A name may hold line ends and other characters that a terminal would obey.
+        # A name may contain line ends and control characters, which a terminal would execute.
         name = "".join(c if c.isprintable() else repr(c)[1:-1] for c in str(self.path))
         return f"{name}, {self.position}" if self.position else name
 
@@ -86,16 +87,21 @@ class PolygonList:
             yield self.corners[begin:end], self.locations[k]
 
 
-_NONE = np.zeros(0, dtype=np.int64)
-NO_POLYGONS = PolygonList(_NONE, _NONE, FileLocations(Path(), "", ()))
+_NO_INDICES = np.zeros(0, dtype=np.int64)
+NO_POLYGONS = PolygonList(_NO_INDICES, _NO_INDICES, FileLocations(Path(), "", ()))
 
 
 @dataclass(frozen=True, eq=False)
 class FileGeometry:
     """The geometry in a file.
 
-    vertices: (n, 3), finite. normals: (n, 3) or none. faces: closed, last vertex joined to first.
-    polylines: as listed, closed only if the last index is the first. All indices lie in [0, n).
+    path: of the file.
+    vertices: (n, 3), finite.
+    normals: (n, 3) normals of the vertices, or None.
+    faces: closed polygons; the last corner is joined to the first.
+    polylines: closed only if the last index equals the first.
+
+    All indices lie in [0, n).
     """
 
     path: Path
@@ -183,7 +189,7 @@ def have_mixed_sizes(polygons: PolygonList) -> bool:
     return bool(len(sizes)) and bool((sizes != max(3, int(sizes[0]))).any())
 
 
-# Writing files so that none is ever left half done.
+# Writing files so that no partial file remains.
 
 
 @contextlib.contextmanager
@@ -207,7 +213,7 @@ def write_atomically(path: str | os.PathLike[str]) -> Generator[Path, None, None
         os.replace(partial, target)
     except OSError as error:
         if error.errno is None or error.filename not in (None, str(partial)):
-            raise  # about something else than this file
+            raise  # an error about another file
         raise _write_error(path, error) from error
     finally:
         try:
@@ -230,11 +236,13 @@ def check_writable(path: str | os.PathLike[str]) -> None:
 
 def _writable_target(path: str | os.PathLike[str]) -> Path:
     """The file that `path` names, links followed."""
-    cannot = f"cannot write {_name(path)}"
+    cannot = f"cannot write {_printable_path(path)}"
     try:
         target = Path(os.path.realpath(path))
         if not target.parent.is_dir():
-            raise FileNotFoundError(f"{cannot}: create the folder {_name(target.parent)} first")
+            raise FileNotFoundError(
+                f"{cannot}: create the folder {_printable_path(target.parent)} first"
+            )
         if target.is_dir():
             raise IsADirectoryError(f"{cannot}: it is a directory, name a file in it")
         if target.exists() and not target.is_file():
@@ -249,20 +257,21 @@ def _writable_target(path: str | os.PathLike[str]) -> Path:
 
 
 def _remove(partial: Path) -> None:
+    """Remove the file if it exists."""
     if os.path.lexists(partial):
         partial.unlink()
 
 
 def _partial_name(target: Path) -> Path:
-    # As long as the target's name if that is long, so that it is allowed where the target's is.
-    """A random name for a partial file beside the target."""
+    """A random name for a partial file beside the target. It is not longer than the target's name
+    if that is long, so that the file system accepts it as well."""
     token = f".{secrets.token_hex(4)}.partial"
     stem = os.fsencode(target.stem)
     prefix = os.fsdecode(stem[: max(0, len(stem) - len(token) - 1)])
     return target.with_name(f".{prefix}{token}{target.suffix}")
 
 
-_ADVICE = {
+_WRITE_ADVICE = {
     errno.ENOSPC: "the disk is full; free some space, or write to another disk",
     errno.EDQUOT: "your share of the disk is used up; free some space, or write to another disk",
     errno.EACCES: "you may not write in its folder; name another one",
@@ -273,14 +282,15 @@ _ADVICE = {
 }
 
 
-def _name(path: str | os.PathLike[str]) -> str:
+def _printable_path(path: str | os.PathLike[str]) -> str:
+    """The path for messages, with unprintable characters escaped."""
     return str(FileLocation(Path(path)))
 
 
 def _write_error(path: str | os.PathLike[str], error: OSError) -> OSError:
     """The error that says which file could not be written, why, and what to do."""
     number = error.errno
-    why = _ADVICE.get(number or 0) or f"{error.strerror or error}; name a file elsewhere"
-    explained = type(error)(f"cannot write {_name(path)}: {why}")
-    explained.errno = number
-    return explained
+    reason = _WRITE_ADVICE.get(number or 0) or f"{error.strerror or error}; name a file elsewhere"
+    write_error = type(error)(f"cannot write {_printable_path(path)}: {reason}")
+    write_error.errno = number
+    return write_error

@@ -99,6 +99,8 @@ def closed_curves_of(contents: FileGeometry, *, boundary: bool = False) -> list[
 
 
 def _validated(loop: FloatArray, place: FileLocation) -> FloatArray:
+    """The loop, validated as a closed curve; raises a FileFormatError with its place if it is
+    none."""
     try:
         return validate_loops(loop)[0]
     except CurveError as error:
@@ -106,6 +108,12 @@ def _validated(loop: FloatArray, place: FileLocation) -> FloatArray:
 
 
 def _all_loops(contents: FileGeometry) -> list[LocatedLoop]:
+    """The closed curves of a file, and their places: its faces and its joined polylines; the
+    vertices of a .ply file without either are a single loop.
+
+    Raises:
+        FileFormatError: there are none, or polylines are open.
+    """
     x = contents.vertices
     loops = [(x[corners], place) for corners, place in contents.faces]
     if len(contents.polylines):
@@ -118,12 +126,18 @@ def _all_loops(contents: FileGeometry) -> list[LocatedLoop]:
 
 
 def _joined_polylines(contents: FileGeometry) -> list[LocatedLoop]:
-    x, same = contents.vertices, weld_vertices(contents.vertices)
+    """The closed curves that the polylines of a file form, and their places: closed polylines as
+    they are, the edges of all others joined.
+
+    Raises:
+        FileFormatError: an edge of length zero, or edges that do not form closed curves.
+    """
+    x, welded = contents.vertices, weld_vertices(contents.vertices)
     loops: list[LocatedLoop] = []
     open_edges: list[Edge] = []
     places: dict[int, FileLocation] = {}
     for corners, place in contents.polylines:
-        ids: list[int] = same[corners].tolist()
+        ids: list[int] = welded[corners].tolist()
         if ids[0] == ids[-1] and len(ids) > 3:
             loops.append((x[ids[:-1]], place))
             continue
@@ -140,6 +154,7 @@ def _joined_polylines(contents: FileGeometry) -> list[LocatedLoop]:
 
 
 def _open_message(error: OpenChainError, position: FloatArray) -> str:
+    """The message about edges that do not form closed curves at a vertex at `position`."""
     point = position.tolist()
     if error.count == 1:
         return (
@@ -153,12 +168,17 @@ def _open_message(error: OpenChainError, position: FloatArray) -> str:
 
 
 def _boundary_loops(contents: FileGeometry) -> list[LocatedLoop]:
+    """The loops of the boundary of a file's faces, and their place.
+
+    Raises:
+        FileFormatError: there are no faces, or their surface is closed.
+    """
     place = FileLocation(contents.path)
     if not len(contents.faces):
         raise place.error("it has no faces to take the boundary of")
-    same = weld_vertices(contents.vertices)
+    welded = weld_vertices(contents.vertices)
     remaining = boundary_edges(
-        same[corners].tolist() for corners, _ in contents.faces if len(corners)
+        welded[corners].tolist() for corners, _ in contents.faces if len(corners)
     )
     if not remaining:
         raise place.error("its faces form a closed surface, which has no boundary")
@@ -265,12 +285,13 @@ def read_geometry(path: str | os.PathLike[str], read_as: ReadAs | None = None) -
         raise FileFormatError(
             f"{path}: surfaces are read from {', '.join(GEOMETRY_SUFFIXES)} files"
         )
-    # Wild numbers overflow on the way to the check that refuses them.
+    # Very large numbers may overflow before the check that refuses them.
     with np.errstate(over="ignore", invalid="ignore"):
-        return _read(path, kind, read_as)
+        return _read_geometry(path, kind, read_as)
 
 
-def _read(path: Path, kind: str, read_as: ReadAs | None) -> LoadedGeometry:
+def _read_geometry(path: Path, kind: str, read_as: ReadAs | None) -> LoadedGeometry:
+    """`read_geometry` for a valid extension `kind` and a valid `read_as`."""
     if kind == ".blobs":
         _check_convertible(path, read_as, (), "blobs")
         return read_metaballs(path, read_bytes(path))
@@ -279,17 +300,17 @@ def _read(path: Path, kind: str, read_as: ReadAs | None) -> LoadedGeometry:
         return parse_molecule(path, read_bytes(path))
     if kind == ".loops":
         _check_convertible(path, read_as, ("loops",), "curves")
-        return _to_curves(read_loops(path), "curves, since the file lists nothing else")
+        return _as_curves(read_loops(path), "curves, since the file lists nothing else")
     contents = _READERS[kind](path, read_bytes(path))
     try:
         if (contents.faces.sizes >= 3).any():
             return _interpret_faces(contents, read_as)
         if len(contents.polylines):
             _check_convertible(path, read_as, ("loops",), "polylines")
-            return _to_curves(closed_curves_of(contents), "polylines without faces: curves")
+            return _as_curves(closed_curves_of(contents), "polylines without faces: curves")
         if read_as == "loops" and kind == ".ply":
             why = "points joined in their order, as asked: a curve"
-            return _to_curves(closed_curves_of(contents), why)
+            return _as_curves(closed_curves_of(contents), why)
         _check_convertible(path, read_as, ("dipole",), "points")
         return _cloud(contents)
     except (MeshError, CloudError) as error:
@@ -297,31 +318,34 @@ def _read(path: Path, kind: str, read_as: ReadAs | None) -> LoadedGeometry:
 
 
 def _check_convertible(
-    path: Path, read_as: ReadAs | None, possible: tuple[str, ...], held: str
+    path: Path, read_as: ReadAs | None, choices: tuple[str, ...], noun: str
 ) -> None:
-    """Raise an error unless the contents of the file can be read as `read_as`."""
+    """Raise a FileFormatError unless `read_as` is None or one of `choices`. noun: the contents of
+    the file, for the message."""
     needs = {
         "winding": "faces", "dipole": "points or faces", "loops": "polylines or faces",
         "polygons": "faces",
     }  # fmt: skip
-    if read_as is not None and read_as not in possible:
+    if read_as is not None and read_as not in choices:
         raise FileLocation(path).error(
-            f'it holds {held} only: it cannot be taken as "{read_as}", which needs {needs[read_as]}'
+            f'it holds {noun} only: it cannot be taken as "{read_as}", which needs {needs[read_as]}'
         )
 
 
 def _interpret_faces(
     contents: FileGeometry, read_as: ReadAs | None
 ) -> LoadedMesh | LoadedCloud | LoadedCurves | LoadedPolygons:
+    """The faces of a file as a mesh, cloud, curves or polygons, as `read_as` says; None decides
+    between mesh and curves."""
     if read_as == "polygons":
         return _polygons(contents)
     can_be_loops = contents.path.suffix.lower() in _LOOP_FILES
     if read_as == "loops" and len(contents.polylines) and can_be_loops:
-        return _to_curves(
+        return _as_curves(
             closed_curves_of(contents), "polylines and faces, taken as curves as asked"
         )
     if read_as in (None, "loops") and can_be_loops and _looks_like_curves(contents):
-        return _to_curves(
+        return _as_curves(
             closed_curves_of(contents), "polygons of which no two share an edge: curves"
         )
     mesh = _mesh(contents)
@@ -350,13 +374,13 @@ def _looks_like_curves(contents: FileGeometry) -> bool:
     faces = contents.faces
     if faces.sizes.max() <= 4:
         return False
-    same = weld_vertices(contents.vertices)
-    begin = same[faces.corners]
+    welded = weld_vertices(contents.vertices)
+    begin = welded[faces.corners]
     ends = np.cumsum(faces.sizes)
-    after = np.arange(1, len(begin) + 1, dtype=np.int64)
-    after[ends[faces.sizes > 0] - 1] = (ends - faces.sizes)[faces.sizes > 0]
-    end = begin[after]
-    keys = np.minimum(begin, end) * len(same) + np.maximum(begin, end)
+    following = np.arange(1, len(begin) + 1, dtype=np.int64)
+    following[ends[faces.sizes > 0] - 1] = (ends - faces.sizes)[faces.sizes > 0]
+    end = begin[following]
+    keys = np.minimum(begin, end) * len(welded) + np.maximum(begin, end)
     keys = keys[np.repeat(faces.sizes, faces.sizes) >= 3]
     return len(np.unique(keys)) == len(keys)
 
@@ -439,8 +463,9 @@ def _cloud(contents: FileGeometry) -> LoadedCloud:
     return LoadedCloud(points, normals, None, f"{count} with normals, no faces: a point cloud")
 
 
-def _to_curves(loops: list[FloatArray], why: str) -> LoadedCurves:
+def _as_curves(loops: list[FloatArray], reason: str) -> LoadedCurves:
+    """The loops with their summary. reason: why they are read as curves."""
     noun = "loop" if len(loops) == 1 else "loops"
     return LoadedCurves(
-        tuple(loops), f"{len(loops):,} {noun} of {sum(map(len, loops)):,} vertices: {why}"
+        tuple(loops), f"{len(loops):,} {noun} of {sum(map(len, loops)):,} vertices: {reason}"
     )

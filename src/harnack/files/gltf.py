@@ -35,9 +35,9 @@ _UNSUPPORTED_EXTENSIONS = (
     "EXT_mesh_gpu_instancing", "KHR_mesh_quantization", "KHR_node_visibility",
     "EXT_meshopt_compression", "KHR_meshopt_compression",
 )  # fmt: skip
-# The modes in which triangles may be listed: one by one, or in strips.
+# Codes of the modes in which a primitive lists triangles: one by one, in strips, in fans.
 _TRIANGLES, _FAN = (4, 5), 6
-# Extensions under which vertices and indices are stored as always.
+# Extensions that do not change how vertices and indices are stored.
 _IGNORED_EXTENSIONS = ("KHR_materials", "KHR_texture", "KHR_lights", "EXT_texture", "KHR_xmp")
 
 
@@ -68,12 +68,17 @@ def read_gltf(path: Path, data: bytes) -> FileGeometry:
             return _contents(place, scene)
     except FileFormatError:
         raise
-    except Exception as error:  # whatever trimesh stumbles over
+    except Exception as error:  # trimesh raises any error for malformed files
         reason = str(error).strip().splitlines()[:1] or [type(error).__name__]
         raise place.error(f"it is no sound glTF file ({reason[0][:120]})") from None
 
 
 def _header(place: FileLocation, data: bytes) -> dict[str, Any]:
+    """The JSON header of a .gltf file, or of a .glb file.
+
+    Raises:
+        FileFormatError: another format or version, a truncated file, or no JSON object.
+    """
     text = data
     if place.path.suffix.lower() == ".glb":
         if len(data) < 20 or data[:4] != b"glTF":
@@ -115,15 +120,16 @@ def _buffer_files(path: Path, header: dict[str, Any]) -> dict[str, bytes]:
 
 
 def _check_header(place: FileLocation, header: dict[str, Any], size: int) -> None:
-    """Compare the sizes that the header asks for with the data in the file. A malformed header may
-    raise any error."""
+    """Refuse headers that need unsupported extensions or features, or that ask for more data than
+    the file has. size: of the file and its buffers, in bytes. A malformed header may raise any
+    error."""
     for name in header.get("extensionsRequired", []):
         if not str(name).startswith(_IGNORED_EXTENSIONS):
             raise place.error(f"it needs the extension {name}, which is not read: save it without")
     for name in header.get("extensionsUsed", []):
         if name in _UNSUPPORTED_EXTENSIONS:
             raise place.error(f"it uses the extension {name}, which is not read: save it without")
-    _check_no_animation(place, header)
+    _check_supported(place, header)
     views, accessors = header.get("bufferViews", []), header.get("accessors", [])
     total = 0
     for view in views:
@@ -131,8 +137,8 @@ def _check_header(place: FileLocation, header: dict[str, Any], size: int) -> Non
             raise place.error("a buffer view lies outside the file: it is truncated")
         total += view["byteLength"]
     for accessor in accessors:
-        item = _COMPONENT_BYTES[accessor["componentType"]] * _COMPONENTS[accessor["type"]]
-        total += _count(accessor, "count") * item
+        element_bytes = _COMPONENT_BYTES[accessor["componentType"]] * _COMPONENTS[accessor["type"]]
+        total += _count(accessor, "count") * element_bytes
         _count(accessor, "byteOffset", 0)
     if total > 8 * max(size, 1 << 16):
         raise place.error(
@@ -141,9 +147,9 @@ def _check_header(place: FileLocation, header: dict[str, Any], size: int) -> Non
     _check_nodes(place, header, _corner_counts(place, header, accessors))
 
 
-def _check_no_animation(place: FileLocation, header: dict[str, Any]) -> None:
-    """Refuse scenes with features that are not read: vertices moved by anything but nodes, fans of
-    triangles, and points or lines beside triangles."""
+def _check_supported(place: FileLocation, header: dict[str, Any]) -> None:
+    """Refuse scenes with features that are not supported: vertices that are moved by anything but
+    nodes, fans of triangles, and points or lines beside triangles."""
     nodes: list[Any] = header.get("nodes", [])
     meshes: list[Any] = header.get("meshes", [])
     if any("skin" in node for node in nodes):
@@ -162,51 +168,56 @@ def _check_no_animation(place: FileLocation, header: dict[str, Any]) -> None:
 
 
 def _corner_counts(place: FileLocation, header: dict[str, Any], accessors: list[Any]) -> list[int]:
-    """The number of corners that each mesh draws."""
-    drawn: list[int] = []
+    """The number of corners that each mesh of the header lists."""
+    corner_counts: list[int] = []
     for mesh in header.get("meshes", []):
         total = 0
         for primitive in mesh["primitives"]:
-            used = [primitive["attributes"]["POSITION"]]
-            used += [primitive["indices"]] if "indices" in primitive else []
-            for index in used:
-                accessor = accessors[index]
+            accessor_ids = [primitive["attributes"]["POSITION"]]
+            accessor_ids += [primitive["indices"]] if "indices" in primitive else []
+            for accessor_id in accessor_ids:
+                accessor = accessors[accessor_id]
                 if "bufferView" not in accessor or "sparse" in accessor:
                     raise place.error("compressed or sparse vertices are not read: save it plainly")
-            total += accessors[used[-1]]["count"]
-        drawn.append(total)
-    return drawn
+            total += accessors[accessor_ids[-1]]["count"]
+        corner_counts.append(total)
+    return corner_counts
 
 
-def _check_nodes(place: FileLocation, header: dict[str, Any], drawn: list[int]) -> None:
-    """Refuse nodes that do not form trees of moderate depth, or that together draw too many
-    corners. drawn: the number of corners of each mesh."""
+def _check_nodes(place: FileLocation, header: dict[str, Any], corner_counts: list[int]) -> None:
+    """Refuse nodes that do not form trees of moderate depth, or whose meshes have too many corners
+    in all. corner_counts: the number of corners of each mesh."""
     nodes: list[Any] = header.get("nodes", [])
     children = {k: node.get("children", []) for k, node in enumerate(nodes)}
     descendants = [child for child_list in children.values() for child in child_list]
     roots = [root for scene in header.get("scenes", []) for root in set(scene.get("nodes", []))]
     if len(descendants) != len(set(descendants)) or set(descendants) & set(roots):
         raise place.error("a node of its scene hangs below two others")
-    level, depth = set(roots), 0
-    while level:
-        level, depth = {child for node in level for child in children[node]}, depth + 1
+    generation, depth = set(roots), 0
+    while generation:
+        generation, depth = {child for node in generation for child in children[node]}, depth + 1
         if depth > _MAX_NODE_DEPTH:
             raise place.error(f"its scene is nested more than {_MAX_NODE_DEPTH} nodes deep")
-    drawn_meshes: list[int] = [node["mesh"] for node in nodes if "mesh" in node]
-    total = sum(drawn[mesh] for mesh in drawn_meshes)
+    mesh_ids: list[int] = [node["mesh"] for node in nodes if "mesh" in node]
+    total = sum(corner_counts[mesh] for mesh in mesh_ids)
     if total > MAX_BYTES:
         raise place.error(f"its scene draws {total:,} corners: at most {MAX_BYTES:,} are read")
 
 
-def _count(item: dict[str, Any], key: str, default: int | None = None) -> int:
-    value = item.get(key, default)
+def _count(entry: dict[str, Any], key: str, default: int | None = None) -> int:
+    """A nonnegative integer in the header: entry[key]. Raises a ValueError if it is none."""
+    value = entry.get(key, default)
     if not isinstance(value, int) or isinstance(value, bool) or value < 0:
         raise ValueError(f"{key} is {value!r}")
     return value
 
 
 def _contents(place: FileLocation, scene: Any) -> FileGeometry:
-    """The scene's triangles in one frame, or its points if there are none."""
+    """The triangles of the scene in world coordinates; if there are none, its points.
+
+    Raises:
+        FileFormatError: an index out of range; neither triangles nor points.
+    """
     vertices: list[FloatArray] = []
     faces: list[IntArray] = []
     points: list[FloatArray] = []
@@ -214,22 +225,22 @@ def _contents(place: FileLocation, scene: Any) -> FileGeometry:
     for node in scene.graph.nodes_geometry:
         world_from_node, name = scene.graph[node]
         geometry = scene.geometry[name]
-        placed = _placed(place, np.asarray(geometry.vertices), np.asarray(world_from_node))
+        positions = _transformed(place, np.asarray(geometry.vertices), np.asarray(world_from_node))
         if not hasattr(geometry, "faces"):
             # Lines have entities; the other geometries are points.
-            points += [] if hasattr(geometry, "entities") else [placed]
+            points += [] if hasattr(geometry, "entities") else [positions]
             continue
         corners = np.asarray(geometry.faces, dtype=np.int64)
-        if corners.size and (corners.min() < 0 or corners.max() >= len(placed)):
+        if corners.size and (corners.min() < 0 or corners.max() >= len(positions)):
             raise place.error(
                 f"vertex {corners.max()} of mesh {name[:40]!r} is out of range: it has "
-                f"{len(placed):,} vertices"
+                f"{len(positions):,} vertices"
             )
         if np.linalg.det(world_from_node[:3, :3]) < 0.0:  # a mirror image, inside out
             corners = corners[:, ::-1]
-        vertices.append(placed)
+        vertices.append(positions)
         faces.append(corners + count)
-        count += len(placed)
+        count += len(positions)
     if sum(map(len, faces)):
         triangles = triangles_as_polygons(place.path, np.concatenate(faces))
         return FileGeometry(place.path, np.concatenate(vertices), None, triangles)
@@ -238,7 +249,11 @@ def _contents(place: FileLocation, scene: Any) -> FileGeometry:
     raise place.error("its scene has neither triangles nor points")
 
 
-def _placed(place: FileLocation, vertices: FloatArray, world_from_node: FloatArray) -> FloatArray:
+def _transformed(
+    place: FileLocation, vertices: FloatArray, world_from_node: FloatArray
+) -> FloatArray:
+    """The vertices (n, 3) under the transform `world_from_node` (4, 4). Raises a FileFormatError
+    for coordinates that are not finite."""
     x = vertices.astype(np.float64) @ world_from_node[:3, :3].T + world_from_node[:3, 3]
     if not math.isfinite(float(np.abs(x).max(initial=0.0))):
         raise place.error("coordinates must be finite")

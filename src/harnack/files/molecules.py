@@ -90,7 +90,7 @@ def parse_molecule(path: Path, data: bytes) -> Atoms:
     left_out = {
         "alternatives": sizes[0] - len(atoms),
         "of unknown elements": len(atoms) - len(known_atoms),
-        "behind the line END": 0 if is_cif else _atom_lines(text) - sum(sizes),
+        "behind the line END": 0 if is_cif else _count_atom_lines(text) - sum(sizes),
     }
     return Atoms(positions, radii, elements, _summarize(elements, left_out, len(structure)))
 
@@ -111,36 +111,40 @@ def _text(data: bytes, *, is_cif: bool) -> str:
 
 
 def _drop_alternate_locations(model: Any) -> list[Any]:
-    """The atoms of a model; of atoms that are marked as alternatives by different letters, only the
-    first of each name in the first residue of each position. A line TER ends a chain: after it the
-    same name and number are another position."""
+    """The atoms of a model without alternatives. Among atoms that are marked as alternatives by
+    different letters, only the first of each name is kept, in the first residue at each position. A
+    line TER ends a chain: the same residue number after it is another position.
+    """
     residues: dict[tuple[int, str], tuple[str, str]] = {}
-    marks: dict[tuple[int, str, str, str], str] = {}
+    first_altlocs: dict[tuple[int, str, str, str], str] = {}
     atoms: list[Any] = []
     for chain, residue in ((k, entry) for k, part in enumerate(model) for entry in part):
         for atom in residue:
             if atom.has_altloc():
-                place = (chain, str(residue.seqid))
-                name, letter = residues.setdefault(place, (residue.name, atom.altloc))
+                position = (chain, str(residue.seqid))
+                name, letter = residues.setdefault(position, (residue.name, atom.altloc))
                 is_other = name != residue.name and letter != atom.altloc
-                mark = marks.setdefault((*place, residue.name, atom.name), atom.altloc)
-                if is_other or mark != atom.altloc:
+                first_altloc = first_altlocs.setdefault(
+                    (*position, residue.name, atom.name), atom.altloc
+                )
+                if is_other or first_altloc != atom.altloc:
                     continue
             atoms.append(atom)
     return atoms
 
 
-def _atom_lines(text: str) -> int:
+def _count_atom_lines(text: str) -> int:
+    """The number of lines of a .pdb file that are atoms."""
     return sum(line[:4].upper() in _ATOM_LINES for line in text.split("\n"))
 
 
 def _check_coordinates(path: Path, text: str) -> None:
-    """Check that columns 31 to 54 of all atoms are three numbers: gemmi would take a word for 0,
-    and digits before a letter for the number. Like gemmi, this recognizes atoms by the first four
-    letters of a line, upper or lower case: serial numbers above 99,999 may follow directly.
+    """Check that columns 31 to 54 of all atoms are three numbers. gemmi would read a word as 0, and
+    of digits before a letter the digits alone. As in gemmi, a line is an atom by its first four
+    letters, in upper or lower case, since serial numbers above 99,999 may follow directly.
 
     Raises:
-        FileFormatError: naming the first line where they are not.
+        FileFormatError: the message names the first line where they are not.
     """
     for number, line in enumerate(text.split("\n"), start=1):
         if line[:4].upper() not in _ATOM_LINES:
@@ -149,30 +153,30 @@ def _check_coordinates(path: Path, text: str) -> None:
                     "ATOM and HETATM begin in column 1"
                 )
             continue
-        points = {line[k : k + 8].find(".") for k in (30, 38, 46)}
-        if len(points) > 1 and not any(c.isspace() for c in line[30:54]):
+        dot_columns = {line[k : k + 8].find(".") for k in (30, 38, 46)}
+        if len(dot_columns) > 1 and not any(c.isspace() for c in line[30:54]):
             raise FileLocation(path, f"line {number}").error(
                 f"coordinates run out of their columns 31 to 54: {line[30:54]!r}"
             )
         try:
-            finite = all(math.isfinite(float(line[k : k + 8])) for k in (30, 38, 46))
+            is_finite = all(math.isfinite(float(line[k : k + 8])) for k in (30, 38, 46))
         except ValueError:
-            finite = False
-        if not finite or "_" in line[30:54]:  # Python reads 1_0 as 10
+            is_finite = False
+        if not is_finite or "_" in line[30:54]:  # Python reads 1_0 as 10
             raise FileLocation(path, f"line {number}").error(
                 f"columns 31 to 54 must be the three coordinates of an atom, not {line[30:54]!r}"
             )
 
 
-def _summarize(elements: tuple[str, ...], left_out: dict[str, int], models: int) -> str:
-    """The summary of what was read: the number of atoms, the commonest elements, and the atoms left
-    out, by reason."""
+def _summarize(elements: tuple[str, ...], left_out: dict[str, int], model_count: int) -> str:
+    """The summary of a molecule: the number of atoms, the commonest elements, and how many atoms
+    were left out, by reason."""
     common = Counter(elements).most_common(_MAX_LISTED_ELEMENTS)
     names = ", ".join(f"{count:,} {name}" for name, count in common)
     summary = (
         f"{len(elements):,} atoms ({names}{', ...' if len(set(elements)) > len(common) else ''})"
     )
-    if models > 1:
-        summary += f", the first of {models} models"
-    parts = [f"{number:,} {reason}" for reason, number in left_out.items() if number]
-    return f"{summary}; {', '.join(parts)} left out" if parts else summary
+    if model_count > 1:
+        summary += f", the first of {model_count} models"
+    reasons = [f"{number:,} {reason}" for reason, number in left_out.items() if number]
+    return f"{summary}; {', '.join(reasons)} left out" if reasons else summary

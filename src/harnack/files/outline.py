@@ -28,11 +28,11 @@ from harnack.geometry.outline_loops import FillingRule, Outline, make_outline
 
 __all__ = ["regular_polygon", "svg", "text"]
 
-# Of the size of letters, or of a picture.
+# The default tolerance, as a fraction of the size of letters, or of a picture.
 _RELATIVE_TOLERANCE = 1e-3
 _LINE_HEIGHT = 1.2
-_MOST_LETTERS = 10_000
-_MOST_SIDES = 100_000
+_MAX_LETTERS = 10_000
+_MAX_SIDES = 100_000
 
 
 def regular_polygon(sides: int, radius: float) -> Outline:
@@ -42,14 +42,15 @@ def regular_polygon(sides: int, radius: float) -> Outline:
     Raises:
         ValueError: fewer sides, or a radius that is not positive.
     """
-    count = as_integer_in_range(sides, "the number of sides of a polygon", 3, _MOST_SIDES)
+    count = as_integer_in_range(sides, "the number of sides of a polygon", 3, _MAX_SIDES)
     angle = 2 * math.pi * np.arange(count) / count
     corners = np.column_stack([np.cos(angle), np.sin(angle)])
     return make_outline(as_positive(radius, "the radius of a polygon") * corners)
 
 
 def _import_optional(module: str) -> Any:
-    """A module of matplotlib, which sets text, or of svgpathtools, which reads paths."""
+    """Import a module of an optional package: matplotlib, for text, or svgpathtools, for SVG paths.
+    Raises a ModuleNotFoundError that says how to install it."""
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError:
@@ -87,39 +88,46 @@ def text(
         ModuleNotFoundError: without matplotlib.
     """
     size = as_positive(size, "the size of text")
-    allowed = (
+    max_error = (
         _RELATIVE_TOLERANCE * size if tolerance is None else as_positive(tolerance, "the tolerance")
     )
-    if not isinstance(words, str) or len(words) > _MOST_LETTERS:  # pyright: ignore
-        raise ValueError(f"words must be a text of at most {_MOST_LETTERS:,} letters")
+    if not isinstance(words, str) or len(words) > _MAX_LETTERS:  # pyright: ignore
+        raise ValueError(f"words must be a text of at most {_MAX_LETTERS:,} letters")
     if align not in ("left", "center", "right"):
         raise ValueError(f'align must be "left", "center" or "right", not {align!r}')
     loops: list[FloatArray] = []
     for number, line in enumerate(words.expandtabs(4).splitlines()):
-        line_loops = _line(line, font, size, allowed)
+        line_loops = _text_line_loops(line, font, size, max_error)
         if line_loops:
             x = np.concatenate(line_loops)[:, 0]
             left, right = float(x.min()), float(x.max())
-            along = {"left": 0.0, "center": 0.5 * (left + right), "right": right}[align]
-            shift = np.array([-along, -number * _LINE_HEIGHT * size])
+            anchor = {"left": 0.0, "center": 0.5 * (left + right), "right": right}[align]
+            shift = np.array([-anchor, -number * _LINE_HEIGHT * size])
             loops += [loop + shift for loop in line_loops]
     if not loops:
         raise ValueError(f"there is nothing to see in the text {words!r:.60}")
     return make_outline(loops, "nonzero")
 
 
-def _line(line: str, font: Any, size: float, allowed: float) -> list[FloatArray]:
-    """The loops of a line of text."""
+def _text_line_loops(line: str, font: Any, size: float, max_error: float) -> list[FloatArray]:
+    """The loops (n, 2) of a line of text.
+
+    font: as in `text`.
+    max_error: the largest distance between a polygon and the curve of a letter.
+
+    Raises:
+        ValueError: an unknown font, or a letter that it lacks.
+    """
     manager = _import_optional("matplotlib.font_manager")
     if font is not None and Path(font).suffix.lower() in (".ttf", ".otf", ".ttc"):
         if not Path(font).is_file():
             raise ValueError(f"there is no font file {os.fspath(font)}")
-        about = manager.FontProperties(fname=os.fspath(font))
+        properties = manager.FontProperties(fname=os.fspath(font))
     else:
-        about = manager.FontProperties(family="DejaVu Sans" if font is None else str(font))
+        properties = manager.FontProperties(family="DejaVu Sans" if font is None else str(font))
     try:
         face = _import_optional("matplotlib.ft2font").FT2Font(
-            manager.findfont(about, fallback_to_default=False)
+            manager.findfont(properties, fallback_to_default=False)
         )
     except ValueError:
         raise ValueError(
@@ -132,53 +140,54 @@ def _line(line: str, font: Any, size: float, allowed: float) -> list[FloatArray]
             raise ValueError(
                 f"the font {face.family_name} has no letter {letter!r}: choose another by font="
             )
-    maker = _import_optional("matplotlib.textpath").TextToPath()
-    points, codes = maker.get_text_path(about, line, ismath=False)
-    scale = size / maker.FONT_SCALE
-    rows = np.asarray(points, dtype=np.float64).reshape(-1, 2) * scale
-    return _path_to_loops(rows, [int(code) for code in codes], allowed)
+    text_to_path = _import_optional("matplotlib.textpath").TextToPath()
+    points, codes = text_to_path.get_text_path(properties, line, ismath=False)
+    scale = size / text_to_path.FONT_SCALE
+    positions = np.asarray(points, dtype=np.float64).reshape(-1, 2) * scale
+    return _path_to_loops(positions, [int(code) for code in codes], max_error)
 
 
-# Codes of matplotlib's paths, and how many points belong to each.
-_MOVE, _CLOSE = 1, 79
-_POINTS = {2: 1, 3: 2, 4: 3}
+# Codes of matplotlib's paths; and the number of points of each code that draws a line or a curve.
+_MOVE_CODE, _CLOSE_CODE = 1, 79
+_POINTS_OF_CODE = {2: 1, 3: 2, 4: 3}
 
 
-def _path_to_loops(points: FloatArray, codes: list[int], allowed: float) -> list[FloatArray]:
-    """The closed loops of a path of matplotlib, its curves flattened within `allowed`."""
+def _path_to_loops(points: FloatArray, codes: list[int], max_error: float) -> list[FloatArray]:
+    """The closed loops (n, 2) of a path of matplotlib. Its curves are flattened within the distance
+    `max_error`."""
     loops: list[list[FloatArray]] = []
     k = 0
     while k < len(codes):
         code = codes[k]
-        if code == _MOVE:
+        if code == _MOVE_CODE:
             loops.append([points[k : k + 1]])
-        if code in (_MOVE, _CLOSE):
+        if code in (_MOVE_CODE, _CLOSE_CODE):
             k += 1
             continue
-        count = _POINTS[code]
+        count = _POINTS_OF_CODE[code]
         controls = np.concatenate([loops[-1][-1][-1:], points[k : k + count]])
-        loops[-1].append(flatten_bezier(controls, allowed)[0] if count > 1 else controls[1:])
+        loops[-1].append(flatten_bezier(controls, max_error)[0] if count > 1 else controls[1:])
         k += count
     return _drop_degenerate_loops([np.concatenate(pieces) for pieces in loops])
 
 
 def _drop_degenerate_loops(loops: list[FloatArray]) -> list[FloatArray]:
-    """The loops with at least three different points; other loops enclose nothing."""
+    """The loops with at least three different points; all others enclose nothing."""
     return [loop for loop in loops if len(np.unique(loop, axis=0)) > 2]
 
 
 # SVG.
 
 _MAX_SVG_BYTES, _MAX_SVG_ELEMENTS, _MAX_SVG_DEPTH = 32 * 2**20, 200_000, 200
-# Elements that are not visible, with all elements in them; and elements that are visible in ways
-# that are not read.
+# Elements that are not drawn, nor are the elements in them; and elements that are drawn but not
+# supported here.
 _HIDDEN = (
     "defs", "symbol", "clipPath", "mask", "marker", "pattern", "linearGradient", "radialGradient",
     "filter", "metadata", "title", "desc", "script", "namedview", "style",
 )  # fmt: skip
 _UNSUPPORTED_TAGS = ("use", "text", "image", "foreignObject", "switch")
 _SHAPES = ("path", "rect", "circle", "ellipse", "polygon", "polyline")
-# Rules of a style sheet that would change fills.
+# Words of a style sheet that may change what is filled.
 _FILL_CHANGING_RULES = re.compile(r"none|evenodd|transform|hidden|@import|clip|mask", re.IGNORECASE)
 
 
@@ -196,10 +205,12 @@ def svg(
         default a thousandth of the picture's size.
 
     Raises:
-        FileFormatError (a ValueError): not an SVG file, or a file with contents that would be lost:
-            text (turn it into paths), images, copies of other elements (`use`), clips and masks,
-            style sheets that change fills, entities, a size or depth that no drawing has.
-        ModuleNotFoundError: without svgpathtools. OSError: it cannot be read.
+        FileFormatError (a ValueError): not an SVG file; a file with contents that are not
+            supported: text (turn it into paths), images, copies of other elements (`use`), clips
+            and masks, style sheets that change fills, entities; or a file that is too large or too
+            deeply nested.
+        ModuleNotFoundError: svgpathtools is not installed.
+        OSError: the file cannot be read.
     """
     scale = as_positive(scale, "the scale of an SVG file")
     if tolerance is not None:
@@ -216,13 +227,19 @@ def svg(
 
 
 def _parse_svg(data: bytes) -> Element:
-    """The root element. The declaration of entities is refused: a few entities can stand for
-    billions of letters."""
+    """The root element of an SVG file. Declarations of entities are refused: a few entities can
+    stand for billions of letters.
+
+    Raises:
+        ValueError: too many elements, too deep nesting, an entity, or another root than <svg>.
+    """
     builder = TreeBuilder()
     parser = expat.ParserCreate()
     count = depth = 0
 
-    def start(name: str, attributes: dict[str, str]) -> None:
+    def start_element(name: str, attributes: dict[str, str]) -> None:
+        """Add an element, without the prefix of its name. Raises a ValueError if there are too
+        many."""
         nonlocal count, depth
         count, depth = count + 1, depth + 1
         if count > _MAX_SVG_ELEMENTS or depth > _MAX_SVG_DEPTH:
@@ -231,17 +248,18 @@ def _parse_svg(data: bytes) -> Element:
             )
         builder.start(name.rpartition(":")[2], attributes)
 
-    def end(name: str) -> None:
+    def end_element(name: str) -> None:
+        """End the current element."""
         nonlocal depth
         depth -= 1
         builder.end(name.rpartition(":")[2])
 
-    def entity(*about: Any) -> None:
-        raise ValueError(f"it declares the entity {about[0]!r}, and entities are not read")
+    def refuse_entity(*declaration: Any) -> None:
+        raise ValueError(f"it declares the entity {declaration[0]!r}, and entities are not read")
 
-    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.StartElementHandler, parser.EndElementHandler = start_element, end_element
     parser.CharacterDataHandler = builder.data
-    parser.EntityDeclHandler = entity
+    parser.EntityDeclHandler = refuse_entity
     parser.Parse(data, True)
     root = builder.close()
     if root.tag != "svg":
@@ -252,7 +270,15 @@ def _parse_svg(data: bytes) -> Element:
 def _filled_shapes(
     element: Element, transform: FloatArray, inherited: dict[str, str]
 ) -> Iterator[tuple[str, FloatArray, FillingRule]]:
-    """The path data, transform (3, 3) and fill rule of each filled shape of an element."""
+    """The filled shapes of an element and the elements in it: the path data, transform (3, 3) and
+    fill rule of each.
+
+    transform: of the element's parent.
+    inherited: the style properties that the parent passes on.
+
+    Raises:
+        ValueError: contents that are not supported.
+    """
     tag = element.tag
     if tag == "style" and _FILL_CHANGING_RULES.search("".join(element.itertext())):
         raise ValueError("its style sheet may change what is filled: save it with plain attributes")
@@ -311,37 +337,49 @@ _LENGTHS = {"x", "y", "cx", "cy", "width", "height", "r", "rx", "ry"}
 
 
 def _path_data(element: Element) -> str:
-    """The path data of a shape."""
-    makers = _import_optional("svgpathtools.svg_to_paths")
-    values, kind = {k: v.removesuffix("px") for k, v in element.attrib.items()}, element.tag
-    if kind == "path":
-        return values.get("d", "")
-    for name in _LENGTHS & values.keys():
-        if re.search(r"[%a-df-z]", values[name], re.IGNORECASE):
+    """The path data (SVG's attribute d) of a shape.
+
+    Raises:
+        ValueError: a length with a unit, or a size that is negative or not finite.
+    """
+    converters = _import_optional("svgpathtools.svg_to_paths")
+    attrib, tag = {k: v.removesuffix("px") for k, v in element.attrib.items()}, element.tag
+    if tag == "path":
+        return attrib.get("d", "")
+    for name in _LENGTHS & attrib.keys():
+        if re.search(r"[%a-df-z]", attrib[name], re.IGNORECASE):
             raise ValueError(
-                f'{name}="{values[name]:.20}" of a <{kind}> has a unit: save the file with plain '
+                f'{name}="{attrib[name]:.20}" of a <{tag}> has a unit: save the file with plain '
                 "numbers"
             )
-    sizes = {name: float(values[name]) for name in ("width", "height", "r", "rx", "ry")
-             if name in values and kind != "polygon"}  # fmt: skip
+    sizes = {name: float(attrib[name]) for name in ("width", "height", "r", "rx", "ry")
+             if name in attrib and tag != "polygon"}  # fmt: skip
     if any(not 0 <= size < math.inf for size in sizes.values()):
-        raise ValueError(f"a <{kind}> in it has a size that is negative or not finite")
-    if kind == "rect":
-        # Corners are rounded by half of a side at the most.
-        for name, other, side in (("rx", "ry", "width"), ("ry", "rx", "height")):
-            if name in sizes or other in sizes:
-                radius = sizes.get(name, sizes.get(other, 0.0))
-                values = {**values, name: str(min(radius, 0.5 * sizes.get(side, 0.0)))}
-        return makers.rect2pathd(values)
-    if kind in ("circle", "ellipse"):
-        return makers.ellipse2pathd(values)
-    return makers.polygon2pathd(values, kind == "polygon")
+        raise ValueError(f"a <{tag}> in it has a size that is negative or not finite")
+    if tag == "rect":
+        # The radius of rounded corners is at most half of a side.
+        for name, counterpart, side in (("rx", "ry", "width"), ("ry", "rx", "height")):
+            if name in sizes or counterpart in sizes:
+                radius = sizes.get(name, sizes.get(counterpart, 0.0))
+                attrib = {**attrib, name: str(min(radius, 0.5 * sizes.get(side, 0.0)))}
+        return converters.rect2pathd(attrib)
+    if tag in ("circle", "ellipse"):
+        return converters.ellipse2pathd(attrib)
+    return converters.polygon2pathd(attrib, tag == "polygon")
 
 
 def _outline_of(
     shapes: list[tuple[str, FloatArray, FillingRule]], scale: float, tolerance: float | None
 ) -> Outline:
-    """The outline of the union of filled shapes, y upwards."""
+    """The outline of the union of filled shapes, y upwards.
+
+    shapes: as `_filled_shapes` gives them.
+    scale: the length of the file's unit.
+    tolerance: in the file's unit; None for the default.
+
+    Raises:
+        ValueError: nothing is filled.
+    """
     paths: list[tuple[list[Any], FloatArray, FillingRule]] = [
         (_segments(data), matrix, rule) for data, matrix, rule in shapes
     ]
@@ -389,34 +427,36 @@ def _segments(data: str) -> list[Any]:
 
 
 def _loops(segments: list[Any], matrix: FloatArray, tolerance: float) -> list[FloatArray]:
-    """The closed loops of consecutive segments, under a transform."""
+    """The closed loops (n, 2) of segments, under a transform (3, 3). A loop consists of segments
+    each of which begins where the one before ends. Curves are flattened within `tolerance`."""
     loops: list[list[FloatArray]] = []
-    last: complex | None = None
-    for piece in segments:
-        if last is None or piece.start != last:
-            loops.append([_transform_points(matrix, [piece.start])])
-        last = piece.end
-        kind = type(piece).__name__
+    end_point: complex | None = None
+    for segment in segments:
+        if end_point is None or segment.start != end_point:
+            loops.append([_transform_points(matrix, [segment.start])])
+        end_point = segment.end
+        kind = type(segment).__name__
         if kind == "Arc":
-            loops[-1].append(_arc(piece, matrix, tolerance))
+            loops[-1].append(_arc(segment, matrix, tolerance))
             continue
-        controls = _transform_points(matrix, [*piece.bpoints()])
+        controls = _transform_points(matrix, [*segment.bpoints()])
         if not np.isfinite(controls).all():
             raise ValueError("a number in it is not finite")
         loops[-1].append(
             flatten_bezier(controls, tolerance)[0] if len(controls) > 2 else controls[1:]
         )
-    return _drop_degenerate_loops([np.concatenate(piece) for piece in loops])
+    return _drop_degenerate_loops([np.concatenate(segment) for segment in loops])
 
 
 def _arc(arc: Any, matrix: FloatArray, tolerance: float) -> FloatArray:
-    """The points of an elliptic arc without its first point. n chords are within r (angle/n)^2/8 of
-    the arc, with r its larger radius."""
+    """The points (n, 2) of a polyline within `tolerance` of an elliptic arc, without the arc's
+    first point, under a transform. n chords of an arc of angle a are within r (a/n)^2/8 of it,
+    where r is its larger radius."""
     angle = math.radians(abs(float(arc.delta)))
-    largest = max(abs(arc.radius.real), abs(arc.radius.imag))
-    largest *= float(np.linalg.norm(matrix[:2, :2], 2))
-    count = max(2.0, angle * math.sqrt(largest / (8 * tolerance)))
-    if not count <= _MOST_SIDES:
+    max_radius = max(abs(arc.radius.real), abs(arc.radius.imag))
+    max_radius *= float(np.linalg.norm(matrix[:2, :2], 2))
+    count = max(2.0, angle * math.sqrt(max_radius / (8 * tolerance)))
+    if not count <= _MAX_SIDES:
         raise ValueError("an arc in it has too many segments: allow a larger tolerance")
     t = np.linspace(0.0, 1.0, math.ceil(count) + 1)[1:]
     points = [arc.point(float(parameter)) for parameter in t[:-1]]
@@ -424,9 +464,10 @@ def _arc(arc: Any, matrix: FloatArray, tolerance: float) -> FloatArray:
 
 
 def _transform_points(matrix: FloatArray, points: list[complex]) -> FloatArray:
-    """The points (n, 2) of complex numbers under a transform."""
+    """Points given as complex numbers x + i y, under a transform (3, 3): (n, 2)."""
     return np.array([_xy(point) for point in points]) @ matrix[:2, :2].T + matrix[:2, 2]
 
 
 def _xy(z: complex) -> FloatArray:
+    """The vector (x, y) of x + i y."""
     return np.array([z.real, z.imag])

@@ -103,9 +103,9 @@ class BinaryValues:
         """The numbers at byte positions. Positions outside of the file give arbitrary numbers:
         `_columns` and its callers detect them by the ends of the rows."""
         kind = np.dtype(self.byte_order + code)
-        last = self.size - kind.itemsize  # the header alone is longer than a number
-        every = np.ndarray((last + 1,), kind, self.data, strides=(1,))
-        return every[np.clip(where, 0, last)].astype(kind.newbyteorder("="))
+        last_position = self.size - kind.itemsize  # the header alone is longer than a number
+        all_numbers = np.ndarray((last_position + 1,), kind, self.data, strides=(1,))
+        return all_numbers[np.clip(where, 0, last_position)].astype(kind.newbyteorder("="))
 
     def width(self, code: str) -> int:
         """The number of bytes that a number takes."""
@@ -122,12 +122,15 @@ class TextValues:
         self.size = len(numbers)
 
     def read(self, where: IntArray, code: str) -> npt.NDArray[Any]:
+        """The numbers at these positions; as integers if `code` is an integer type and all of them
+        are whole. Positions outside give arbitrary numbers."""
         values = self._numbers[np.clip(where, 0, self.size)]
         if code in "fd" or (values != np.rint(values)).any():
             return values
         return np.clip(values, -(2.0**53), 2.0**53).astype(np.int64)
 
     def width(self, code: str) -> int:
+        """The number of words that a number takes."""
         return 1
 
 
@@ -135,6 +138,8 @@ Values: TypeAlias = BinaryValues | TextValues
 
 
 def _any_number(word: bytes, place: FileLocation) -> float:
+    """The number that a word is, also NaN or infinite. Raises a FileFormatError for another
+    word."""
     try:
         return float(word)
     except ValueError as error:
@@ -174,7 +179,7 @@ class ElementTable:
         """A column of single numbers."""
         column = self._column(name)
         if column.list_lengths is not None:
-            raise self._is_other_kind()
+            raise self._wrong_kind_error()
         return self.values.read(column.positions + column.offset, column.code)
 
     def list_column(self, name: str) -> tuple[npt.NDArray[Any], IntArray]:
@@ -182,17 +187,19 @@ class ElementTable:
         each list."""
         column = self._column(name)
         if column.list_lengths is None:
-            raise self._is_other_kind()
+            raise self._wrong_kind_error()
         where = np.repeat(column.positions + column.offset, column.list_lengths)
         where += ranks_in_lists(column.list_lengths) * self.values.width(column.code)
         return self.values.read(where, column.code), column.list_lengths
 
     def _column(self, name: str) -> PropertyColumn:
+        """The column with this name. Raises a FileFormatError if there is none."""
         if name not in self.columns:
             raise self.places[0].error(f"this element needs a property {name!r}")
         return self.columns[name]
 
-    def _is_other_kind(self) -> FileFormatError:
+    def _wrong_kind_error(self) -> FileFormatError:
+        """The error for a list in place of a single number, or the reverse."""
         return self.places[0].error("a list where one number is expected, or the reverse")
 
 
@@ -219,7 +226,7 @@ def read_ply(path: Path, data: bytes) -> FileGeometry:
         name = "vertex_index" if "vertex_index" in table.columns else "vertex_indices"
         faces = _polygons(table, *table.list_column(name), len(vertices))
     table = tables.get("edge")
-    # Edges of faces may have names of their own: they are not needed.
+    # Beside faces, edges with other property names are not needed.
     if table and (table.has_scalars("vertex1", "vertex2") or not tables.get("face")):
         ends = np.stack([table.scalar_column("vertex1"), table.scalar_column("vertex2")], axis=1)
         edges = _polygons(table, ends.ravel(), np.full(len(ends), 2), len(vertices))
@@ -267,28 +274,34 @@ def _polygons(
 def _columns(
     section: PlyElement, values: Values, begins: IntArray, places: FileLocations
 ) -> tuple[dict[str, PropertyColumn], IntArray]:
-    """The columns of rows that begin at these positions, and where each row ends."""
+    """The columns of an element whose rows begin at the positions `begins` (n,), by name; and the
+    position (n,) at which each row ends."""
     columns: dict[str, PropertyColumn] = {}
-    at, added = begins, 0
-    for p in section.properties:
-        if p.length_code is None:
-            columns[p.name] = PropertyColumn(p.code, at, added, None)
-            added += values.width(p.code)
+    positions, offset = begins, 0
+    for prop in section.properties:
+        if prop.length_code is None:
+            columns[prop.name] = PropertyColumn(prop.code, positions, offset, None)
+            offset += values.width(prop.code)
             continue
-        lengths = values.read(at + added, p.length_code)
+        lengths = values.read(positions + offset, prop.length_code)
         if lengths.dtype.kind == "f":
             k = int(np.argmax(lengths != np.rint(lengths)))
             raise places[k].error(f"the length of a list is no integer, but {lengths[k]}")
-        # Impossible lists end beyond the end of the file.
+        # Lists of invalid length get one that ends after the end of the file.
         sizes = np.where(lengths < 0, values.size + 1, lengths).astype(np.int64)
         sizes = np.minimum(sizes, values.size + 1)
-        added += values.width(p.length_code)
-        columns[p.name] = PropertyColumn(p.code, at, added, sizes)
-        at, added = at + added + values.width(p.code) * sizes, 0
-    return columns, at + added
+        offset += values.width(prop.length_code)
+        columns[prop.name] = PropertyColumn(prop.code, positions, offset, sizes)
+        positions, offset = positions + offset + values.width(prop.code) * sizes, 0
+    return columns, positions + offset
 
 
 def _text_tables(path: Path, data: bytes, header: PlyHeader) -> dict[str, ElementTable]:
+    """The tables of the elements of a text file, by name.
+
+    Raises:
+        FileFormatError: fewer or more rows than the header declares, or a row of wrong length.
+    """
     lines = split_content_lines(path, data[header.size :], comment=None, first=header.lines + 1)
     tables: dict[str, ElementTable] = {}
     for section in header.elements:
@@ -311,7 +324,11 @@ def _text_tables(path: Path, data: bytes, header: PlyHeader) -> dict[str, Elemen
 
 
 def _binary_tables(path: Path, data: bytes, header: PlyHeader) -> dict[str, ElementTable]:
-    """The tables of the elements of a binary file, by name."""
+    """The tables of the elements of a binary file, by name.
+
+    Raises:
+        FileFormatError: fewer or more data than the header declares.
+    """
     values = BinaryValues(data, header.byte_order)
     tables: dict[str, ElementTable] = {}
     begin = header.size
@@ -343,30 +360,32 @@ def _binary_tables(path: Path, data: bytes, header: PlyHeader) -> dict[str, Elem
 
 
 def _row_ends(section: PlyElement, values: BinaryValues, begin: int) -> Iterator[int]:
-    """The end of each row. Raises struct.error if that is behind the end of the file."""
-    skipped = 0
+    """The position at which each row of an element ends, row by row. begin: the start of the first
+    row. Raises struct.error if a row ends after the end of the file."""
+    fixed_bytes = 0
     lists: list[tuple[int, struct.Struct, int]] = []
-    for p in section.properties:
-        if p.length_code is None:
-            skipped += values.width(p.code)
+    for prop in section.properties:
+        if prop.length_code is None:
+            fixed_bytes += values.width(prop.code)
         else:
-            length = struct.Struct(values.byte_order + p.length_code)
-            lists.append((skipped, length, values.width(p.code)))
-            skipped = 0
-    at = begin
+            length = struct.Struct(values.byte_order + prop.length_code)
+            lists.append((fixed_bytes, length, values.width(prop.code)))
+            fixed_bytes = 0
+    position = begin
     for _ in range(section.count):
-        for before, length, width in lists:
-            (count,) = length.unpack_from(values.data, at + before)
+        for fixed_before, length, width in lists:
+            (count,) = length.unpack_from(values.data, position + fixed_before)
             if count < 0:
                 raise struct.error
-            at += before + length.size + count * width
-        at += skipped
-        if at > values.size:
+            position += fixed_before + length.size + count * width
+        position += fixed_bytes
+        if position > values.size:
             raise struct.error
-        yield at
+        yield position
 
 
 def _too_short(path: Path, section: PlyElement) -> FileFormatError:
+    """The error for a file that ends before all rows of an element."""
     return FileLocation(path).error(
         f"the file ends before the {section.count:,} rows of element {section.name!r} that its "
         "header declares"
@@ -397,10 +416,10 @@ def _header(path: Path, data: bytes) -> PlyHeader:
             byte_order = _BYTE_ORDERS[words[1]]
         elif words[0] == b"element" and len(words) == 3 and words[2].isdigit():
             name = words[1].decode("ascii", "backslashreplace")
-            sections.append(PlyElement(name, _count(words[2], place), ()))
+            sections.append(PlyElement(name, _parse_count(words[2], place), ()))
         elif words[0] == b"property" and sections:
             last = sections[-1]
-            columns = (*last.properties, _property(words, last, place))
+            columns = (*last.properties, _parse_property(words, last, place))
             sections[-1] = PlyElement(last.name, last.count, columns)
         else:
             raise place.error(f"{excerpt(line)} is no statement of a .ply header")
@@ -412,13 +431,20 @@ def _header(path: Path, data: bytes) -> PlyHeader:
     return PlyHeader(byte_order, tuple(sections), size, len(data[:size].splitlines()))
 
 
-def _count(word: bytes, place: FileLocation) -> int:
+def _parse_count(word: bytes, place: FileLocation) -> int:
+    """The number of rows of an element, from the digits of a header."""
     if len(word) > 18:
         raise place.error(f"{excerpt(word)} is too large a count")
     return int(word)
 
 
-def _property(words: list[bytes], section: PlyElement, place: FileLocation) -> Property:
+def _parse_property(words: list[bytes], section: PlyElement, place: FileLocation) -> Property:
+    """The property that a line of the header declares for the element `section`.
+
+    Raises:
+        FileFormatError: a malformed line, a name that occurs twice, or a list whose length is no
+            integer.
+    """
     types = words[2:4] if words[1:2] == [b"list"] else words[1:2]
     if len(words) != (5 if len(types) == 2 else 3) or any(t not in _CODES for t in types):
         raise place.error("a property is 'property TYPE NAME' or 'property list TYPE TYPE NAME'")

@@ -114,8 +114,10 @@ def read_metaballs(path: Path, data: bytes) -> Metaballs:
     """The blobs of a .blobs file: text that a person can write, with a blob on each line. `#`
     begins a comment.
 
-        # x y z radius [weight [group]] 0.0  0.0  0.0  1.0 1.2  0.0  0.0  0.8 0.6  0.5  0.0  0.4  -1
-        # carves
+        # x y z radius [weight [group]]
+        0.0  0.0  0.0  1.0
+        1.2  0.0  0.0  0.8
+        0.6  0.5  0.0  0.4  -1   # carves
 
     The radius is that of the ball that the blob is by itself. The default weight is 1. Blobs of the
     same group flow together, and groups meet in creases; without groups all blobs flow together.
@@ -164,7 +166,7 @@ def read_metaballs(path: Path, data: bytes) -> Metaballs:
 
 # Wavefront .obj.
 
-# Statements by which there is more of the surface: free forms, old faces, other files.
+# Statements that define further surface: free forms, old faces, other files.
 _UNSUPPORTED_OBJ_STATEMENTS = (b"curv", b"curv2", b"surf", b"bzp", b"bsp", b"fo", b"call")
 
 
@@ -221,13 +223,19 @@ def read_obj(path: Path, data: bytes) -> FileGeometry:
 def _parse_obj_points(
     path: Path, vertices: FloatArray, normals: FloatArray | None, rows: dict[bytes, TextLines]
 ) -> FileGeometry:
-    """The vertices that points name, with normals if all points name a normal."""
+    """The vertices that statements `p` name, with normals if all of these name one.
+
+    rows: the lines of each statement, by keyword.
+
+    Raises:
+        FileFormatError: an index out of range, or normals for only some of the points.
+    """
     points = _parse_obj_polygons(rows[b"p"], "'p' needs a vertex", 1, rows[b"v"])
     words = [word.split(b"/") for line in rows[b"p"].text for word in line.split()]
-    named = [word[2] for word in words if len(word) == 3 and word[2]]
-    if normals is None or not named:
+    normal_words = [word[2] for word in words if len(word) == 3 and word[2]]
+    if normals is None or not normal_words:
         return FileGeometry(path, vertices[points.corners])
-    normal_indices = [parse_vertex_index(word, rows[b"p"].locations[0]) for word in named]
+    normal_indices = [parse_vertex_index(word, rows[b"p"].locations[0]) for word in normal_words]
     if len(normal_indices) != len(words) or not all(1 <= k <= len(normals) for k in normal_indices):
         raise (
             rows[b"p"]
@@ -238,7 +246,7 @@ def _parse_obj_points(
 
 
 def _join_continued_lines(lines: TextLines) -> TextLines:
-    """A backslash at the end of a line continues it on the next."""
+    """The lines, where a line that ends with a backslash is joined with the next one."""
     pieces: list[list[bytes]] = []
     numbers: list[int] = []
     continued = 0  # the number of the line that continues the last
@@ -258,8 +266,14 @@ def _join_continued_lines(lines: TextLines) -> TextLines:
 def _parse_obj_polygons(
     lines: TextLines, too_few: str, min_corners: int, vertices: TextLines
 ) -> PolygonList:
-    """The faces or polylines of statements, with vertices counted from 0. too_few: the error of a
-    statement with fewer corners than `min_corners`."""
+    """The faces or polylines of statements, with vertices counted from 0.
+
+    too_few: the error of a statement with fewer corners than `min_corners`.
+    vertices: the lines of all vertices.
+
+    Raises:
+        FileFormatError: too few corners, or an index out of range.
+    """
     # Texture and normal indices stand behind slashes.
     text = [re.sub(rb"(?<=\S)/\S*", b"", line) if b"/" in line else line for line in lines.text]
     corners, sizes = read_integers(TextLines(text, lines.locations))
@@ -271,12 +285,14 @@ def _parse_obj_polygons(
             "vertices are counted from 1, there is no vertex 0"
         )
     # Negative indices are counted back from the statement.
-    before = np.repeat(np.searchsorted(vertices.locations.numbers, lines.locations.numbers), sizes)
-    if (bad := np.flatnonzero(corners < -before)).size:
-        raise statements.location_of_corner(bad[0]).error(
-            f"vertex {corners[bad[0]]} is out of range: {before[bad[0]]} vertices precede it"
+    preceding = np.repeat(
+        np.searchsorted(vertices.locations.numbers, lines.locations.numbers), sizes
+    )
+    if (low := np.flatnonzero(corners < -preceding)).size:
+        raise statements.location_of_corner(low[0]).error(
+            f"vertex {corners[low[0]]} is out of range: {preceding[low[0]]} vertices precede it"
         )
-    corners = np.where(corners > 0, corners - 1, corners + before)
+    corners = np.where(corners > 0, corners - 1, corners + preceding)
     polygons = PolygonList(corners, sizes, lines.locations)
     check_indices(polygons, len(vertices), first=1)
     return polygons
@@ -307,7 +323,7 @@ def read_off(path: Path, data: bytes) -> FileGeometry:
         raise FileLocation(path).error("it holds no vertices")
     vertices = read_table(lines[:count], 3)
     rows = lines[count : count + faces_count]
-    # Colors may follow the corners: they need be no integers, and not even numbers.
+    # Colors may follow the corners; these need not be integers, and not even numbers.
     numbers, counts = read_floats(rows, convert=_number_or_nan)
     begins = np.cumsum(counts) - counts
     sizes = _integers(rows, numbers[begins], np.arange(len(rows)), np.zeros_like(begins))
@@ -323,23 +339,36 @@ def read_off(path: Path, data: bytes) -> FileGeometry:
 
 
 def _number_or_nan(word: bytes, _: FileLocation) -> float:
+    """The number that a word is, NaN for other words."""
     try:
         return float(word)
     except ValueError:
         return math.nan
 
 
-def _integers(rows: TextLines, numbers: FloatArray, owners: IntArray, within: IntArray) -> IntArray:
-    """Numbers as integers. owners, within: which word of which row each is."""
+def _integers(
+    rows: TextLines, numbers: FloatArray, row_of: IntArray, word_of: IntArray
+) -> IntArray:
+    """Numbers (k,) as integers. row_of, word_of: (k,) the row and the word in that row from which
+    each was read, for messages.
+
+    Raises:
+        FileFormatError: a number is no integer.
+    """
     wrong = np.flatnonzero(~((numbers == np.rint(numbers)) & (np.abs(numbers) < 2.0**53)))
     if wrong.size:
-        k = int(owners[wrong[0]])
-        parse_vertex_index(rows.text[k].split()[int(within[wrong[0]])], rows.locations[k])
+        k = int(row_of[wrong[0]])
+        parse_vertex_index(rows.text[k].split()[int(word_of[wrong[0]])], rows.locations[k])
     return numbers.astype(np.int64)
 
 
 def _parse_off_header(path: Path, lines: TextLines) -> tuple[int, int, TextLines]:
-    """Numbers of vertices and faces, and the lines that follow."""
+    """The numbers of vertices and of faces that the header of an .off file declares, and the lines
+    after the header.
+
+    Raises:
+        FileFormatError: it is malformed, or not supported.
+    """
     match = (
         re.match(rb"(ST)?(C)?(N)?(4)?(n)?OFF(?!\S)\s*(.*)", lines.text[0]) if len(lines) else None
     )
@@ -352,21 +381,21 @@ def _parse_off_header(path: Path, lines: TextLines) -> tuple[int, int, TextLines
         raise FileLocation(path).error(
             "binary .off files are not read: save it as text, or as .ply"
         )
-    at = 0 if rest else 1
-    if at == len(lines):
+    line_index = 0 if rest else 1
+    if line_index == len(lines):
         raise FileLocation(path).error("the file ends before the numbers of vertices and faces")
     words = (rest or lines.text[1]).split()
     if len(words) < 2:
-        raise lines.locations[at].error("numbers of vertices and faces are expected here")
-    counts = [parse_vertex_index(word, lines.locations[at]) for word in words[:2]]
+        raise lines.locations[line_index].error("numbers of vertices and faces are expected here")
+    counts = [parse_vertex_index(word, lines.locations[line_index]) for word in words[:2]]
     if min(counts) < 0:
-        raise lines.locations[at].error("numbers of vertices and faces cannot be negative")
-    return counts[0], counts[1], lines[at + 1 :]
+        raise lines.locations[line_index].error("numbers of vertices and faces cannot be negative")
+    return counts[0], counts[1], lines[line_index + 1 :]
 
 
 # .stl, binary and ascii.
 
-_HEADER = 84
+_STL_HEADER_BYTES = 84
 # The byte order mark of UTF-8, before the text of some programs.
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
@@ -390,38 +419,50 @@ def read_stl(path: Path, data: bytes) -> FileGeometry:
 
 
 def _is_binary(data: bytes) -> bool:
-    """Many binary files begin with "solid" as well, so their length decides first."""
-    if len(data) >= _HEADER and len(data) == _HEADER + _stl_facet_count(data) * _FACET.itemsize:
+    """Whether an .stl file is binary. Many binary files begin with "solid" as well, so the length
+    decides first."""
+    if (
+        len(data) >= _STL_HEADER_BYTES
+        and len(data) == _STL_HEADER_BYTES + _stl_facet_count(data) * _FACET.itemsize
+    ):
         return True
     return data.removeprefix(_BYTE_ORDER_MARK).lstrip()[:5].lower() != b"solid" or b"\0" in data
 
 
 def _stl_facet_count(data: bytes) -> int:
-    return int.from_bytes(data[_HEADER - 4 : _HEADER], "little")
+    """The number of triangles in the header of a binary .stl file."""
+    return int.from_bytes(data[_STL_HEADER_BYTES - 4 : _STL_HEADER_BYTES], "little")
 
 
 def _parse_binary_stl(path: Path, data: bytes) -> FloatArray:
-    if len(data) < _HEADER:
+    """The corners (3 m, 3) of the m triangles of a binary .stl file. Raises a FileFormatError if
+    its length is not that of its triangles."""
+    if len(data) < _STL_HEADER_BYTES:
         raise FileLocation(path).error(
             f"{len(data)} bytes are too few for an .stl file: it begins with 'solid' or with a "
-            f"header of {_HEADER} bytes"
+            f"header of {_STL_HEADER_BYTES} bytes"
         )
-    count, held = _stl_facet_count(data), (len(data) - _HEADER) // _FACET.itemsize
-    if count > held:
+    count, room = _stl_facet_count(data), (len(data) - _STL_HEADER_BYTES) // _FACET.itemsize
+    if count > room:
         raise FileLocation(path).error(
-            f"its header promises {count:,} triangles, but there is room for {held:,}: the file is "
+            f"its header promises {count:,} triangles, but there is room for {room:,}: the file is "
             "truncated, or no .stl file"
         )
-    if held > count:
+    if room > count:
         raise FileLocation(path).error(
-            f"its header promises {count:,} triangles, but {held - count:,} more follow: the count "
+            f"its header promises {count:,} triangles, but {room - count:,} more follow: the count "
             "is wrong, or several files were joined"
         )
-    facets = np.frombuffer(data, _FACET, count, _HEADER)
+    facets = np.frombuffer(data, _FACET, count, _STL_HEADER_BYTES)
     return facets["corners"].reshape(-1, 3).astype(np.float64)
 
 
 def _parse_text_stl(path: Path, data: bytes) -> FloatArray:
+    """The corners (3 m, 3) of the m triangles of a text .stl file.
+
+    Raises:
+        FileFormatError: an unknown statement, a truncated file, or a facet without three vertices.
+    """
     lines = split_content_lines(path, data)
     words = [line.split(None, 1)[0].lower() for line in lines.text]
     for k, word in enumerate(words):
@@ -431,15 +472,20 @@ def _parse_text_stl(path: Path, data: bytes) -> FloatArray:
         raise lines.locations[len(words) - 1].error(
             "the file ends before 'endsolid': it is truncated"
         )
-    at = [k for k, word in enumerate(words) if word == b"vertex"]
+    vertex_lines = [k for k, word in enumerate(words) if word == b"vertex"]
     facets = words.count(b"facet")
     begins = [k for k, word in enumerate(words) if word == b"facet"]
-    of_facets = np.histogram(at, [*begins, len(words)])[0] if begins else np.zeros(0, int)
-    if len(at) != 3 * facets or (of_facets != 3).any():
+    vertices_per_facet = (
+        np.histogram(vertex_lines, [*begins, len(words)])[0] if begins else np.zeros(0, int)
+    )
+    if len(vertex_lines) != 3 * facets or (vertices_per_facet != 3).any():
         raise FileLocation(path).error(
-            f"{len(at):,} vertices in {facets:,} facets: each needs three"
+            f"{len(vertex_lines):,} vertices in {facets:,} facets: each needs three"
         )
-    rows = [lines.text[k][len("vertex") :] for k in at]
+    rows = [lines.text[k][len("vertex") :] for k in vertex_lines]
     return read_table(
-        TextLines(rows, FileLocations(path, "line", [lines.locations.numbers[k] for k in at])), 3
+        TextLines(
+            rows, FileLocations(path, "line", [lines.locations.numbers[k] for k in vertex_lines])
+        ),
+        3,
     )

@@ -114,6 +114,7 @@ def parse_vertex_index(word: bytes, place: FileLocation) -> int:
 
 
 def _is_integral(word: bytes) -> bool:
+    """Whether a word is a number that is an integer, such as 3.000e+00."""
     try:
         return b"_" not in word and float(word).is_integer()
     except ValueError:
@@ -164,7 +165,7 @@ def read_floats(
     """
     table = _parse_with_numpy(lines)
     if table is not None and np.isfinite(table).all():
-        return table.ravel(), _equal(table)
+        return table.ravel(), _row_lengths(table)
     return _parse_words(lines, float, convert)
 
 
@@ -176,14 +177,14 @@ def read_integers(lines: TextLines) -> tuple[IntArray, IntArray]:
     """
     table = _parse_with_numpy(lines)
     if table is not None and (np.abs(table) < 2.0**53).all() and (table == np.rint(table)).all():
-        return table.astype(np.int64).ravel(), _equal(table)
+        return table.astype(np.int64).ravel(), _row_lengths(table)
     return _parse_words(lines, int, parse_vertex_index)
 
 
 def _parse_with_numpy(lines: TextLines, columns: Sequence[int] | None = None) -> FloatArray | None:
-    """A table of numbers by NumPy, or None where it does not succeed.
+    """A table (n, k) of the numbers of all lines, parsed by NumPy; None if that fails.
 
-    columns: the columns to read. None: all columns, if each line has the same number of them.
+    columns: the columns to read. None: all columns, if all lines have the same number of them.
     """
     if not len(lines) or b"_" in b"\n".join(lines.text):
         return None
@@ -195,21 +196,25 @@ def _parse_with_numpy(lines: TextLines, columns: Sequence[int] | None = None) ->
             )
     except (ValueError, UserWarning):
         return None
-    return table if len(table) == len(lines) else None  # it passes over blank lines
+    return table if len(table) == len(lines) else None  # NumPy skips blank lines
 
 
-def _equal(table: FloatArray) -> IntArray:
-    """The number of numbers of each row of a table."""
+def _row_lengths(table: FloatArray) -> IntArray:
+    """(n,) the number of numbers in each row of a table (n, k): k for all."""
     return np.full(len(table), table.shape[1], dtype=np.int64)
 
 
 def _parse_words(
     lines: TextLines, kind: type[_Number], convert: Callable[[bytes, FileLocation], _Number]
 ) -> tuple[npt.NDArray[Any], IntArray]:
-    """The numbers of all lines, and the count of numbers of each line, for lines of different
-    lengths or with words that are not numbers."""
+    """The numbers of all lines, one line after the other, and the number of numbers (n,) of each
+    line. For lines of different lengths, or with words that are not plain numbers.
 
-    def converted() -> Iterator[_Number]:
+    kind: float or int, which converts most words.
+    convert: converts each word if `kind` fails for one; it is slower, and raises for invalid words.
+    """
+
+    def slow_numbers() -> Iterator[_Number]:
         for k, line in enumerate(lines.text):
             place = lines.locations[k]
             for word in line.split():
@@ -223,4 +228,4 @@ def _parse_words(
             return numbers, counts
     except (ValueError, OverflowError):
         pass
-    return np.fromiter(converted(), np.dtype(kind)), counts
+    return np.fromiter(slow_numbers(), np.dtype(kind)), counts

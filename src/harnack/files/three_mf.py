@@ -25,9 +25,10 @@ from harnack.files.file_geometry import (
 __all__ = ["REQUIRED_PACKAGES", "read_3mf"]
 
 REQUIRED_PACKAGES = ("lxml", "networkx")
-"""What trimesh needs for 3MF."""
+"""Packages that trimesh needs to read 3MF."""
 
-# Millimeters in the units of the format, in the singular that it has and trimesh's plural.
+# The length of each unit of the format in millimeters. The names are in the singular, as in the
+# format; trimesh has the plural.
 _UNITS = {
     "micron": 1e-3, "millimeter": 1.0, "centimeter": 10.0, "inch": 25.4, "foot": 304.8,
     "meter": 1000.0,
@@ -62,24 +63,29 @@ def read_3mf(path: Path, data: bytes) -> FileGeometry:
             return _contents(place, scene)
     except FileFormatError:
         raise
-    except Exception as error:  # whatever trimesh stumbles over
+    except Exception as error:  # trimesh raises any error for malformed files
         reason = str(error).strip().splitlines()[:1] or [type(error).__name__]
         raise place.error(f"it is no sound 3MF file ({reason[0][:120]})") from None
 
 
 def _contents(place: FileLocation, scene: Any) -> FileGeometry:
-    """The triangles of a scene's nodes."""
+    """The triangles of a scene's nodes in one coordinate system, in millimeters.
+
+    Raises:
+        FileFormatError: an unknown unit, an index out of range, numbers that are not finite, or no
+            triangles.
+    """
     unit = str(scene.units or "millimeter").lower().removesuffix("s")
     if unit not in _UNITS:
         raise place.error(f"its unit, {unit[:40]!r}, is none of {', '.join(_UNITS)}")
     vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
     for node in scene.graph.nodes_geometry:
         matrix, name = scene.graph[node]
-        part = scene.geometry[name]
-        corners = np.asarray(part.faces, np.int64)
+        geometry = scene.geometry[name]
+        corners = np.asarray(geometry.faces, np.int64)
         polygons = triangles_as_polygons(place.path, corners)
-        check_indices(polygons, len(part.vertices))
-        x = np.asarray(part.vertices, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+        check_indices(polygons, len(geometry.vertices))
+        x = np.asarray(geometry.vertices, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
         if np.linalg.det(matrix[:3, :3]) < 0:  # a mirror image
             corners = corners[:, ::-1]
         vertices.append(_UNITS[unit] * x)

@@ -14,25 +14,28 @@ _MAX_SEGMENTS = 1_000_000
 
 
 def flatten_bezier(controls: FloatArray, tolerance: float) -> tuple[FloatArray, float]:
-    """Flatten a Bezier curve. Returns the points (k, d) of a polyline that starts at the curve's
-    first point, which is not among them, and a bound of the distance between curve and polyline.
+    """Flatten a Bezier curve to a polyline within `tolerance` of it.
 
-    controls: (3, d) or (4, d), of a quadratic or a cubic curve.
+    controls: (3, d) or (4, d), the control points of a quadratic or a cubic curve.
 
-    Proof. A chord between two parameters h apart is within h^2/8 max |B''| of the curve, at equal
-    parameters, and |B''| <= n (n - 1) max |second difference of the control points|.
+    Returns the vertices (k, d) of the polyline without the first, which is the curve's first point;
+    and a bound of the distance between the curve and the polyline.
+
+    Proof. Let B be the curve, of degree n. A chord between two parameters at a distance h is within
+    h^2/8 max |B''| of the curve, at equal parameters, and |B''| is at most n (n - 1) times the
+    largest second difference of the control points.
 
     Raises:
         ValueError: more than a million segments.
     """
     degree = len(controls) - 1
-    second = (
+    second_bound = (
         degree * (degree - 1) * float(np.linalg.norm(np.diff(controls, 2, axis=0), axis=1).max())
     )
-    count = max(1.0, math.sqrt(second / (8.0 * tolerance)))
+    count = max(1.0, math.sqrt(second_bound / (8.0 * tolerance)))
     if not count <= _MAX_SEGMENTS:
         raise ValueError(f"{count:,.0f} segments for one curve: allow a larger tolerance")
     count = math.ceil(count)
     t = np.linspace(0.0, 1.0, count + 1)[1:, None]
     weights = [math.comb(degree, k) * (1 - t) ** (degree - k) * t**k for k in range(degree + 1)]
-    return np.hstack(weights) @ controls, second / (8.0 * count**2)
+    return np.hstack(weights) @ controls, second_bound / (8.0 * count**2)

@@ -1,7 +1,8 @@
-"""Edges by integer index: closed loops of edges, and the edges at which faces of a mesh do not
-cancel.
+"""Edges by integer index: closed loops of edges, and the edges of a mesh that do not cancel between
+its faces.
 
-At the latter the winding number is singular. Let T be the triangles of a mesh, m_T integers, and
+At the edges that do not cancel the winding number is singular. Let T be the triangles of a mesh,
+m_T integers, and
 Omega_T(x) the signed solid angle of T seen from x. Then
 
     w = 1/(4 pi) sum_T m_T Omega_T
@@ -105,24 +106,28 @@ def join_edges(edges: Sequence[Edge]) -> list[list[int]]:
     loops: list[list[int]] = []
     for a, _ in edges:
         while leaving[a]:
-            loops += _trace_loops(a, leaving)
+            loops += _loops_through(a, leaving)
     return loops
 
 
-def _trace_loops(start: int, leaving: dict[int, list[int]]) -> list[list[int]]:
-    """Loops met on the way from `start` back to it, using up the edges."""
+def _loops_through(start: int, leaving: dict[int, list[int]]) -> list[list[int]]:
+    """Follow edges from `start` until they return to it. Returns the loops that this path forms;
+    their edges are removed from `leaving`.
+
+    leaving: for each vertex the ends of the edges that begin there.
+    """
     loops: list[list[int]] = []
     path = [start]
     position = {start: 0}
     while True:
         vertex = leaving[path[-1]].pop()
         if vertex in position:
-            begin = position[vertex]
-            loops.append(path[begin:])
-            for passed in path[begin + 1 :]:
-                del position[passed]
-            del path[begin + 1 :]
-            if begin == 0:
+            loop_begin = position[vertex]
+            loops.append(path[loop_begin:])
+            for vertex_in_loop in path[loop_begin + 1 :]:
+                del position[vertex_in_loop]
+            del path[loop_begin + 1 :]
+            if loop_begin == 0:
                 return loops
         else:
             position[vertex] = len(path)
@@ -130,27 +135,31 @@ def _trace_loops(start: int, leaving: dict[int, list[int]]) -> list[list[int]]:
 
 
 def _orient_consistently(edges: Sequence[Edge]) -> list[Edge]:
-    """The edges, reversed where need be so that each loop runs in the direction of its first
-    edge."""
+    """The edges, reversed where necessary, so that each loop runs in the direction of its first
+    edge.
+
+    Raises:
+        OpenChainError: more or fewer than two edges meet at a vertex.
+    """
     touching: defaultdict[int, list[int]] = defaultdict(list)
     for k, (a, b) in enumerate(edges):
         touching[a].append(k)
         touching[b].append(k)
-    for vertex, met in touching.items():
-        if len(met) != 2:
-            raise OpenChainError(vertex, len(met))
+    for vertex, edge_ids in touching.items():
+        if len(edge_ids) != 2:
+            raise OpenChainError(vertex, len(edge_ids))
     used = [False] * len(edges)
-    turned: list[Edge] = []
+    oriented: list[Edge] = []
     for k in range(len(edges)):
         start, vertex = edges[k]
         edge = k
         while not used[edge]:
             used[edge] = True
-            turned.append((start, vertex))
+            oriented.append((start, vertex))
             first, second = touching[vertex]
             edge = second if first == edge else first
             start, vertex = vertex, sum(edges[edge]) - vertex
-    return turned
+    return oriented
 
 
 # 2^64 over the golden ratio, made odd: the multiplier of Fibonacci hashing (Knuth, TAOCP 6.4).
@@ -161,8 +170,9 @@ class NetFaces(NamedTuple):
     """The faces of a mesh after duplicates were added up.
 
     faces: (k, 3), no two with the same three vertices.
-    multiplicity: (k,), positive.
-    source: (k,), ascending; `faces[i]` is original face `source[i]`, the first of its orientation.
+    multiplicity: (k,) how often each face counts, positive.
+    source: (k,) ascending indices of original faces: `faces[i]` is original face `source[i]`, the
+        first with these vertices and this orientation.
     """
 
     faces: IntArray
@@ -179,7 +189,7 @@ def weld_vertices(vertices: FloatArray) -> IntArray:
     order, starts = _group_equal_rows(bits)
     first = np.minimum.reduceat(order, starts) if len(order) else order
     welded = np.empty(len(bits), dtype=np.int64)
-    welded[order] = np.repeat(first, _lengths(starts, len(order)))
+    welded[order] = np.repeat(first, _group_lengths(starts, len(order)))
     return welded
 
 
@@ -203,7 +213,7 @@ def net_faces(faces: IntArray) -> NetFaces:
         return NetFaces(empty.reshape(0, 3), empty, empty)
     order, starts = _group_equal_rows(corners.view(np.uint64))
     net = np.add.reduceat(sign[order], starts)
-    group_sign = np.repeat(np.sign(net), _lengths(starts, len(order)))
+    group_sign = np.repeat(np.sign(net), _group_lengths(starts, len(order)))
     agreeing = np.where(sign[order] == group_sign, proper[order], np.iinfo(np.int64).max)
     source = np.minimum.reduceat(agreeing, starts)[net != 0]
     net = net[net != 0]
@@ -215,10 +225,12 @@ def net_faces(faces: IntArray) -> NetFaces:
 def singular_edges(faces: IntArray, multiplicity: npt.ArrayLike = 1) -> tuple[IntArray, IntArray]:
     """Directed edges (k, 2) that do not cancel between faces (m, 3), and their weights (k,) > 0.
 
-    faces: of a welded mesh. multiplicity: (m,) integers of any sign, or one for all.
+    faces: of a welded mesh.
+    multiplicity: (m,) how often each face counts, integers of any sign; or one integer for all.
 
-    Edges run the way they run in the faces, and are sorted by their lower, then higher index. The
-    module's docstring has the proof that the winding number is singular at these edges alone.
+    Edges have the direction that remains after cancellation, and are sorted by their lower, then
+    their higher index. The docstring of this module has the proof that the winding number is
+    singular at these edges alone.
     """
     if not len(faces):
         return np.zeros((0, 2), dtype=np.int64), np.zeros(0, dtype=np.int64)
@@ -257,9 +269,10 @@ def net_edges(
 def singular_loops(edges: IntArray, weights: IntArray) -> list[list[int]]:
     """The closed loops of vertex indices that singular edges form.
 
-    An edge of weight k occurs k times. A loop is listed without its first vertex at the end, and
-    ends where it first meets itself. The time is a Python step for each edge: for up to about a
-    million edges.
+    edges, weights: as `singular_edges` returns them. An edge of weight k occurs k times.
+
+    A loop does not repeat its first vertex at the end, and ends where it first meets itself. As
+    each edge takes a step of Python, this is meant for up to about a million edges.
 
     Raises:
         OpenChainError: the edges are not a result of `singular_edges`: a loop does not close.
@@ -269,10 +282,12 @@ def singular_loops(edges: IntArray, weights: IntArray) -> list[list[int]]:
 
 
 def _group_equal_rows(rows: npt.NDArray[np.uint64]) -> tuple[IntArray, IntArray]:
-    """An order (n,) that puts equal rows next to each other, and where each group starts in it.
+    """Group the rows of an array (n, k) by equality. Returns an order (n,) that puts equal rows
+    next to each other, and the index in it at which each group starts.
 
-    Rows are ordered by a 64-bit hash, and neighbors then compared in full. Should different rows
-    ever have the same hash, they are sorted by their columns instead, which is three times slower.
+    Rows are ordered by a 64-bit hash, and neighbors are then compared in full. Should different
+    rows ever have the same hash, the rows are sorted by their columns instead, which is three times
+    slower.
     """
     hashed = np.zeros(len(rows), dtype=np.uint64)
     for column in rows.T:
@@ -291,8 +306,10 @@ def _group_equal_rows(rows: npt.NDArray[np.uint64]) -> tuple[IntArray, IntArray]
 
 
 def _differ_from_previous(rows: npt.NDArray[np.uint64]) -> npt.NDArray[np.bool_]:
+    """(n - 1,) whether each row but the first differs from the row before."""
     return (rows[1:] != rows[:-1]).any(axis=1)
 
 
-def _lengths(starts: IntArray, count: int) -> IntArray:
+def _group_lengths(starts: IntArray, count: int) -> IntArray:
+    """The lengths of the groups of `count` entries that begin at `starts`."""
     return np.diff(np.append(starts, count))

@@ -38,10 +38,10 @@ from harnack.geometry.volume import (
 __all__ = ["Ball", "Box", "HalfSpace", "VolumeIntersection"]
 
 MAX_UNROLLED = 32
-"""Up to this many planes the loop is unrolled into the kernel."""
+"""Up to this number of planes, the loop over planes is unrolled in the kernel."""
 
 _PLANES_PER_ITERATION = 4
-_NO_CONSTRAINT = (0.0, 0.0, 0.0, 1e30)
+_UNBOUNDED_PLANE = (0.0, 0.0, 0.0, 1e30)
 
 FoldState = TypeVar("FoldState", bound=tuple[Any, ...])
 Prepared = TypeVar("Prepared", bound="Polytope")
@@ -77,10 +77,10 @@ class PlaneTable:
         """The planes (m, 4) in a buffer. If there are more than eight, planes without effect fill
         it up to a multiple of eight, so that volumes with about as many planes share a kernel."""
         count = len(rows) if len(rows) <= 8 else -(-len(rows) // 8) * 8
-        filled = np.concatenate([rows, np.tile(_NO_CONSTRAINT, (count - len(rows), 1))])
-        length = dr.opaque(backend.UInt32, count)
-        reach = dr.opaque(backend.Float, _max_offset(rows))
-        return cls(backend, filled, upload_floats(backend, filled.ravel()), length, reach)
+        padded = np.concatenate([rows, np.tile(_UNBOUNDED_PLANE, (count - len(rows), 1))])
+        plane_count = dr.opaque(backend.UInt32, count)
+        max_offset = dr.opaque(backend.Float, _max_offset(rows))
+        return cls(backend, padded, upload_floats(backend, padded.ravel()), plane_count, max_offset)
 
     def fold(
         self,
@@ -91,36 +91,40 @@ class PlaneTable:
         """Apply state = step(state, n, h) to one plane n . x <= h after the other, and return the
         last state.
 
-        may_change: may_change(*state) is false where no further plane can change the result; a loop
-            over planes stops there. Unrolled planes are all applied.
+        step: gives the next state, from the state, the normal n and the offset h of a plane.
+        may_change: may_change(*state) is false in lanes in which no further plane can change the
+            result; a loop over planes stops there. Unrolled planes are all applied.
         """
         index = self.backend.UInt32
         if self.buffer is None or len(self.rows) <= MAX_UNROLLED:
             for k in range(len(self.rows)):
-                x, y, z, h = (self._number(k, i) for i in range(4))
+                x, y, z, h = (self._entry(k, i) for i in range(4))
                 state = step(state, self.backend.Array3f(x, y, z), h)
             return state
 
-        def body(k: Any, *inner: Any) -> tuple[Any, ...]:
-            after: Any = inner
+        def body(k: Any, *values: Any) -> tuple[Any, ...]:
+            """Apply four planes, from row k on."""
+            folded: Any = values
             for i in range(_PLANES_PER_ITERATION):
                 row: Any = dr.gather(self.backend.Array4f, self.buffer, k + i)
-                after = step(after, self.backend.Array3f(row.x, row.y, row.z), row.w)
-            return (k + _PLANES_PER_ITERATION, *after)
+                folded = step(folded, self.backend.Array3f(row.x, row.y, row.z), row.w)
+            return (k + _PLANES_PER_ITERATION, *folded)
 
-        def wanted(*inner: Any) -> Mask:
-            return self.backend.Bool(True) if may_change is None else may_change(*inner)
+        def goes_on(*values: Any) -> Mask:
+            """The lanes in which further planes may change the state."""
+            return self.backend.Bool(True) if may_change is None else may_change(*values)
 
-        loop: Any = dr.while_loop  # its overloads do not know run-time array types
-        result: Any = loop(
+        while_loop: Any = dr.while_loop  # its overloads do not know run-time array types
+        result: Any = while_loop(
             state=(index(0), *state),
-            cond=lambda k, *inner: (k < self.plane_count) & wanted(*inner),  # pyright: ignore
+            cond=lambda k, *values: (k < self.plane_count) & goes_on(*values),  # pyright: ignore
             body=body,
             label="planes",
         )
         return result[1:]
 
-    def _number(self, k: int, i: int) -> Real:
+    def _entry(self, k: int, i: int) -> Real:
+        """Entry i of row k: a literal, or read from the buffer."""
         if self.buffer is None:
             return self.backend.Float(float(self.rows[k, i]))
         return dr.gather(self.backend.Float, self.buffer, self.backend.UInt32(4 * k + i))
@@ -130,6 +134,7 @@ RoundingSlacks: TypeAlias = tuple[Real, Real]
 
 
 def _max_offset(rows: FloatArray) -> float:
+    """The largest |h| of the rows (n, h)."""
     return float(np.abs(rows[:, 3]).max(initial=0.0))
 
 
@@ -154,10 +159,12 @@ class Polytope(Volume):
         return replace(self, _device_planes=PlaneTable.upload(backend, self.planes()))
 
     def _plane_table(self, backend: Backend) -> PlaneTable:
+        """The prepared table, or a new one: of literals, if there are few planes or while a loop is
+        recorded, when nothing can be uploaded."""
         if self._device_planes is not None and self._device_planes.backend == backend:
             return self._device_planes
         rows = self.planes()
-        is_recording = dr.flag(dr.JitFlag.SymbolicScope)  # nothing can be uploaded then
+        is_recording = dr.flag(dr.JitFlag.SymbolicScope)
         if len(rows) <= MAX_UNROLLED or is_recording:
             return PlaneTable.literal(backend, rows)
         return PlaneTable.upload(backend, rows)
@@ -165,7 +172,8 @@ class Polytope(Volume):
     def _slacks(
         self, table: PlaneTable, o: Vec3, d: Vec3
     ) -> Callable[[Vec3, Real], RoundingSlacks]:
-        """(n, h) -> bounds of the errors of h - n.o and n.d."""
+        """A function of (n, h) that gives bounds of the rounding errors of h - n.o and of n.d, for
+        rays o + t d."""
         del table
         eps = clip_rounding(backend_of(o))
         abs_o, abs_d = dr.abs(o), dr.abs(d)
@@ -182,22 +190,26 @@ class Polytope(Volume):
         slacks = self._slacks(table, o, d)
 
         def step(state: tuple[Real, Real], n: Vec3, h: Real) -> tuple[Real, Real]:
+            """The interval [t0, t1] within a further half-space n.x <= h."""
             t0, t1 = state
             room_slack, speed_slack = slacks(n, h)
             room = h - dr.dot(n, o) + room_slack
             speed = dr.dot(n, d) - speed_slack
             t = room / speed
-            leaving = speed > 0
-            t1 = dr.select(leaving, fmin(t, t1), t1)
-            t0 = dr.select(leaving | (room >= 0), t0, fmax(dr.abs(t), t0))
+            is_leaving = speed > 0
+            t1 = dr.select(is_leaving, fmin(t, t1), t1)
+            t0 = dr.select(is_leaving | (room >= 0), t0, fmax(dr.abs(t), t0))
             return t0, t1
 
         lanes = dr.zeros(backend.Float, dr.width(o, d, t_min, t_max))
 
-        def holds(t0: Real, t1: Real) -> Mask:  # what is empty stays empty
+        def is_nonempty(t0: Real, t1: Real) -> Mask:
+            """Whether further planes can change the interval: an empty one stays empty."""
             return t0 < t1
 
-        return normalize_empty_interval(*table.fold((lanes + t_min, lanes + t_max), step, holds))
+        return normalize_empty_interval(
+            *table.fold((lanes + t_min, lanes + t_max), step, is_nonempty)
+        )
 
     def contains(self, p: Vec3) -> Mask:
         backend = backend_of(p)
@@ -208,8 +220,8 @@ class Polytope(Volume):
             slack = eps * (dr.dot(dr.abs(n), abs_p) + dr.abs(h))
             return (state[0] & (dr.dot(n, p) - h <= slack),)
 
-        everywhere = dr.full(backend.Bool, True, dr.width(p))
-        return self._plane_table(backend).fold((everywhere,), step)[0]
+        all_lanes = dr.full(backend.Bool, True, dr.width(p))
+        return self._plane_table(backend).fold((all_lanes,), step)[0]
 
     def signed_distance(self, p: Vec3) -> Real:
         return self._nearest_plane(p)[0]
@@ -218,12 +230,14 @@ class Polytope(Volume):
         return self._nearest_plane(p)[1]
 
     def _nearest_plane(self, p: Vec3) -> tuple[Real, Vec3]:
+        """The largest signed distance of p from a plane, and that plane's normal."""
         backend = backend_of(p)
 
         def step(state: tuple[Real, Vec3], n: Vec3, h: Real) -> tuple[Real, Vec3]:
+            """Keep the larger of two signed distances, and its normal."""
             distance = dr.dot(n, p) - h
-            nearer = distance > state[0]
-            return dr.select(nearer, distance, state[0]), dr.select(nearer, n, state[1])
+            is_larger = distance > state[0]
+            return dr.select(is_larger, distance, state[0]), dr.select(is_larger, n, state[1])
 
         width = dr.width(p)
         start = (
@@ -235,12 +249,12 @@ class Polytope(Volume):
     def contains_points(self, points: npt.ArrayLike) -> BoolArray:
         x = as_points(points)
         rows = self.planes()
-        inside = np.ones(len(x), dtype=np.bool_)
+        is_inside = np.ones(len(x), dtype=np.bool_)
         for row in rows:
             n, h = row[:3], float(row[3])
             slack = 8.0 * sys.float_info.epsilon * (np.abs(x) @ np.abs(n) + abs(h))
-            inside &= x @ n - h <= slack
-        return inside
+            is_inside &= x @ n - h <= slack
+        return is_inside
 
 
 @dataclass(frozen=True)
@@ -264,6 +278,8 @@ class Ball(Volume):
         object.__setattr__(self, "radius", radius)
 
     def _center_and_radius(self, backend: Backend) -> tuple[Vec3, Real]:
+        """Center and radius on the backend: kernel parameters if the ball was prepared, else
+        literals."""
         if self._device_numbers is not None and backend_of(self._device_numbers[0]) == backend:
             return self._device_numbers
         return backend.Array3f(*self.center), backend.Float(self.radius)
@@ -273,24 +289,28 @@ class Ball(Volume):
         return replace(self, _device_numbers=(center, dr.opaque(backend.Float, self.radius)))
 
     def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
-        """The discriminant r^2 - |perp|^2 is taken from perp, the vector from the center to the
-        nearest point of the line: (o.d)^2 - |d|^2 (|o|^2 - r^2) cancels for far origins.
+        """The interval of `Volume.clip`, by the discriminant r^2 - |perp|^2, where r is the radius,
+        c the center, and perp the vector from c to the nearest point of the line. The usual formula
+        (o.d)^2 - |d|^2 (|o|^2 - r^2) cancels for far origins o.
 
         With u the unit roundoff, perp and the parameter of the nearest point are off by a few
-        u |o - c|, c and r by u |c| and u r: so much is added to r and to both ends."""
+        u |o - c|, the center by u |c| and the radius by u r. The sum of these bounds is added to r
+        and to both ends of the interval."""
         backend = backend_of(o)
-        c, r = self._center_and_radius(backend)
-        from_center = o - c
+        center, radius = self._center_and_radius(backend)
+        from_center = o - center
         speed = dr.norm(d)
-        along = -dr.dot(from_center, d) / (speed * speed)
-        clearance = dr.norm(dr.fma(d, along, from_center))
-        slack = clip_rounding(backend) * (dr.norm(from_center) + dr.norm(c) + r)
-        reach = r + slack
-        half = dr.sqrt(fmax((reach - clearance) * (reach + clearance), 0.0))
-        half = (half + slack) / speed
-        t0 = fmax(along - half, t_min)
-        t1 = fmin(along + half, t_max)
-        return normalize_empty_interval(t0, dr.select(clearance <= reach, t1, -dr.inf))
+        t_nearest = -dr.dot(from_center, d) / (speed * speed)
+        line_distance = dr.norm(dr.fma(d, t_nearest, from_center))
+        slack = clip_rounding(backend) * (dr.norm(from_center) + dr.norm(center) + radius)
+        radius_bound = radius + slack
+        half_length = dr.sqrt(
+            fmax((radius_bound - line_distance) * (radius_bound + line_distance), 0.0)
+        )
+        half_length = (half_length + slack) / speed
+        t0 = fmax(t_nearest - half_length, t_min)
+        t1 = fmin(t_nearest + half_length, t_max)
+        return normalize_empty_interval(t0, dr.select(line_distance <= radius_bound, t1, -dr.inf))
 
     def contains(self, p: Vec3) -> Mask:
         backend = backend_of(p)
@@ -384,7 +404,9 @@ class HalfSpace(Polytope):
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         lower, upper = np.full(3, -np.inf), np.full(3, np.inf)
         for k, n in enumerate(self.normal):
-            if n and not any(np.delete(self.normal, k)):  # only an axis bounds it
+            if n and not any(
+                np.delete(self.normal, k)
+            ):  # only a plane normal to an axis bounds the box
                 (upper if n > 0 else lower)[k] = n * self.offset
         return lower, upper
 
@@ -418,10 +440,10 @@ class VolumeIntersection(Volume):
         return t0, t1
 
     def contains(self, p: Vec3) -> Mask:
-        inside = self.volumes[0].contains(p)
+        is_inside = self.volumes[0].contains(p)
         for volume in self.volumes[1:]:
-            inside &= volume.contains(p)
-        return inside
+            is_inside &= volume.contains(p)
+        return is_inside
 
     def signed_distance(self, p: Vec3) -> Real:
         distance = self.volumes[0].signed_distance(p)
@@ -432,10 +454,10 @@ class VolumeIntersection(Volume):
     def outward_normal(self, p: Vec3) -> Vec3:
         distance, normal = self.volumes[0].signed_distance(p), self.volumes[0].outward_normal(p)
         for volume in self.volumes[1:]:
-            other = volume.signed_distance(p)
-            nearer = other > distance
-            distance = dr.select(nearer, other, distance)
-            normal = dr.select(nearer, volume.outward_normal(p), normal)
+            other_distance = volume.signed_distance(p)
+            is_larger = other_distance > distance
+            distance = dr.select(is_larger, other_distance, distance)
+            normal = dr.select(is_larger, volume.outward_normal(p), normal)
         return normal
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:

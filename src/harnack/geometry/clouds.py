@@ -3,7 +3,7 @@ normals.
 
 A cloud is a sample of a surface: points (n, 3), unit normals (n, 3) to the positive (outer) side,
 and areas (n,) whose sum is about the area of the surface. Points at the same position are allowed:
-their dipoles add, which is right where two layers of a surface touch.
+their dipoles are added, as they should where two layers of a surface touch.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ __all__ = ["CloudError", "estimate_areas", "estimate_normals", "validate_cloud"]
 MAX_POINTS = 100_000_000
 # Points per step: the temporary arrays of one step then stay in the cache of one core.
 _CHUNK = 4096
-# The radius of a cell over the median radius of its neighbors' cells, at most.
+# The largest ratio of a cell's radius to the median radius of its neighbors' cells.
 _MAX_RADIUS_RATIO = 3.0
-# Points whose cells are computed at once.
+# Number of points whose cells are computed at once.
 _POINTS_PER_BATCH = 1 << 18
-_REMOVE = "its components must be finite; remove the point"
+_NONFINITE_ADVICE = "its components must be finite; remove the point"
 
 
 class CloudError(ValueError):
@@ -92,7 +92,7 @@ def as_cloud_points(points: Any) -> FloatArray:
     if x.size == 0:
         raise CloudError("there are no points: give an array (n, 3)")
     check_vectors(x, "the points", CloudError, transposed=TRANSPOSE_ADVICE)
-    check_finite(x, "point {}", CloudError, _REMOVE)
+    check_finite(x, "point {}", CloudError, _NONFINITE_ADVICE)
     check_coordinate_size(x, CloudError)
     return x
 
@@ -114,16 +114,16 @@ def as_unit_normals(normals: Any, count: int) -> FloatArray:
         raise CloudError(
             f"there are {count:,} points but {len(n):,} normals: every point needs one normal"
         )
-    check_finite(n, "normal {}", CloudError, _REMOVE)
-    longest = np.abs(n).max(axis=1, keepdims=True)
-    bad = np.flatnonzero(longest == 0.0)
+    check_finite(n, "normal {}", CloudError, _NONFINITE_ADVICE)
+    largest = np.abs(n).max(axis=1, keepdims=True)
+    bad = np.flatnonzero(largest == 0.0)
     if bad.size:
         raise CloudError(
             f"normal {bad[0]} is zero{others_suffix(bad.size)}: remove these points, or estimate "
             "all "
             "normals with harnack.geometry.estimate_normals(points)"
         )
-    n = n / longest  # first, so that squares neither overflow nor vanish
+    n = n / largest  # first, so that squares neither overflow nor vanish
     return n / np.linalg.norm(n, axis=1, keepdims=True)
 
 
@@ -133,19 +133,20 @@ def estimate_areas(
     """The area (n,) that each point of a cloud stands for: the area of its Voronoi cell in the
     tangent plane.
 
-    After Barill et al. 2018, section 3.1, who project the nearest neighbors to the tangent plane
-    and take the area of the point's Voronoi cell among them. Here the point's cell in space is
-    intersected with the tangent plane instead. For points in a plane that is the same; but a point
+    Barill et al. 2018, section 3.1, project the nearest neighbors to the tangent plane and take the
+    area of the point's Voronoi cell among them. Here the point's Voronoi cell in space is
+    intersected with the tangent plane instead. For points in a plane this is the same; but a point
     on the other side of a thin wall does not shrink the cell, since its bisecting plane is parallel
-    to the tangent plane. Points at the same position share the cell.
+    to the tangent plane. Points at the same position share a cell.
 
-    Points beyond the farthest neighbor, at distance R, can cut the cell only beyond R/2; so the
-    cell is exact within the disc of that radius, and is cut off there. At the rim of an open
-    surface a cell may be unbounded: where all neighbors lie on one side (of a line through the
-    point), their mirror images bound the cell too, so that it extends as far outwards as inwards.
+    Let R be the distance of the farthest neighbor that is used. All other points can cut the cell
+    only at distances above R/2: so within the disc of radius R/2 the cell is exact, and it is cut
+    off there. At the boundary of an open surface a cell may be unbounded: if all neighbors lie on
+    one side of a line through the point, their mirror images bound the cell too, so that it extends
+    as far outwards as inwards.
 
-    Outliers: a cell is also cut off at three times the median of such radii of its neighbors, so
-    that a point far from the others stands for no more area than they do.
+    Outliers: a cell is also cut off at three times the median of these radii of its neighbors, so
+    that a point far from the others gets no more area than they have.
 
     neighbors: the number of neighbors; more cost time, fewer cut large cells of uneven samples.
 
@@ -157,33 +158,35 @@ def estimate_areas(
     check_neighbors(neighbors)
     welded = weld_vertices(x)
     positions, position_of = np.unique(welded, return_inverse=True)
-    sharing = np.bincount(position_of)[position_of]
+    sharing_count = np.bincount(position_of)[position_of]
     tree = build_point_tree(x[positions])
     rank = np.empty(len(positions), np.int64)
     rank[tree.indices] = np.arange(len(positions))
-    order = np.argsort(
-        rank[position_of]
-    )  # neighbors one after the other, which saves half of the time
+    # In the order of the tree neighbors follow each other, which halves the time.
+    order = np.argsort(rank[position_of])
     nearest = np.empty((len(x), min(neighbors, tree.n - 1)), np.uint32)
     radii = np.empty(len(positions))
 
-    def find(part: slice) -> None:
-        batch = order[part]
+    def find_neighbors(rows: slice) -> None:
+        """Find the neighbors of some of the points, and half the distance of the farthest."""
+        batch = order[rows]
         nearest[batch], distance = nearest_neighbors(tree, x[batch], neighbors)
         radii[position_of[batch]] = 0.5 * distance[:, -1]
 
-    parallel_over_slices(find, len(x))
+    parallel_over_slices(find_neighbors, len(x))
     areas = np.empty(len(x))
     cells = TangentVoronoi.of(tree.data)
     for start in range(0, len(x), _POINTS_PER_BATCH):
         batch = order[start : start + _POINTS_PER_BATCH]
         max_radius = _MAX_RADIUS_RATIO * np.median(radii[nearest[batch]], axis=1)
-        reach = np.minimum(radii[position_of[batch]], max_radius)
-        areas[batch] = cells.areas(x[batch], n[batch], nearest[batch], reach)
-    return areas / sharing
+        cell_radii = np.minimum(radii[position_of[batch]], max_radius)
+        areas[batch] = cells.areas(x[batch], n[batch], nearest[batch], cell_radii)
+    return areas / sharing_count
 
 
 def _as_numbers(values: Any, name: str) -> FloatArray:
+    """A new float64 array of the values. Raises CloudError if they are not real numbers, or too
+    many."""
     ragged = "are ragged: every row needs as many numbers"
     array = as_real_array(values, name, CloudError, ragged=ragged, other="must be real numbers")
     if array.size > 3 * MAX_POINTS:
@@ -209,7 +212,7 @@ def build_point_tree(points: FloatArray) -> Any:
     """
     if len(points) < 2:
         raise CloudError("all points are at one position: a surface needs points beside each other")
-    import scipy.spatial  # here: half a second that few need
+    import scipy.spatial  # imported here: it takes half a second, and few programs need it
 
     spatial: Any = scipy.spatial
     return spatial.cKDTree(points)
@@ -232,9 +235,9 @@ def nearest_neighbors(tree: Any, points: FloatArray, count: int) -> tuple[IntArr
 
 def parallel_over_slices(work: Callable[[slice], None], count: int) -> None:
     """Call `work` for slices that make up range(count), on all cores."""
-    parts = [slice(k, min(k + _CHUNK, count)) for k in range(0, count, _CHUNK)]
+    slices = [slice(k, min(k + _CHUNK, count)) for k in range(0, count, _CHUNK)]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for _ in pool.map(work, parts):
+        for _ in pool.map(work, slices):
             pass
 
 
@@ -266,23 +269,23 @@ _DIRECTIONS = np.array([d for d in itertools.product((-1.0, 0.0, 1.0), repeat=3)
 def estimate_normals(points: npt.ArrayLike, neighbors: int | None = None) -> FloatArray:
     """Estimate unit normals (n, 3), outward, of points (n, 3) that sample a surface.
 
-    After Hoppe et al. 1992. The line of a normal is the direction in which a point and its nearest
-    neighbors vary least. The signs are propagated from point to point along the spanning tree of
-    the graph of neighbors in which normals agree best. Normals are compared after mirroring, as Xie
-    et al. 2003 propose, which carries the sign around edges and thin walls; points are first moved
-    onto the planes of their neighbors, as noise would disturb the mirroring. A single sign then
-    remains for each connected component of the graph. It is chosen such that the component's
-    extreme points in 26 directions face outward, summed over the directions; for a closed surface
-    that is right, however unevenly sampled.
+    The method is that of Hoppe et al. 1992. A normal is, up to its sign, the direction in which a
+    point and its nearest neighbors vary least. The signs are propagated from point to point along
+    the spanning tree of the graph of neighbors in which normals agree best. Normals are compared
+    after mirroring, as Xie et al. 2003 propose; this propagates the sign correctly around edges and
+    thin walls. Points are first moved onto the planes of their neighbors, as noise would disturb
+    the mirroring. A single sign then remains for each connected component of the graph. It is
+    chosen such that the component's extreme points in 26 directions face outward, summed over the
+    directions; for a closed surface this is right, however unevenly it is sampled.
 
-    neighbors: the number of neighbors. None for 16; in noise, up to 64, so that the planes through
-        them are known to a few degrees; and where that is not enough, 64 among a random subset of
-        the points (with a seed), which is as sparse as the noise requires.
+    neighbors: the number of neighbors. None chooses: 16; for noisy points up to 64, so that the
+        planes through them are known to a few degrees; and if that is not enough, 64 neighbors
+        among a random subset of the points (with a fixed seed), as sparse as the noise requires.
 
-    So each component faces outward by itself: the inner wall of a hollow body does not face its
-    cavity, and the side that an open surface faces is a convention (a flat surface: the positive
-    side of the axis nearest to its normal). Where details are smaller than neighborhoods, normals
-    may have the wrong sign. Look at the result.
+    As each component faces outward by itself, the inner wall of a hollow body does not face its
+    cavity. The side that an open surface faces is a convention; for a flat surface it is the
+    positive side of the axis nearest to its normal. If details are smaller than neighborhoods,
+    normals may have the wrong sign: look at the result.
 
     Points at the same position get the same normal.
 
@@ -312,8 +315,8 @@ def estimate_normals(points: npt.ArrayLike, neighbors: int | None = None) -> Flo
 
 
 def _choose_neighborhood(x: FloatArray) -> tuple[int, IntArray]:
-    """The number of neighbors with which tangent planes are fitted, and the indices (k,) of the
-    points among which the neighbors are sought."""
+    """Choose how tangent planes are fitted to the points x (n, 3), by their noise. Returns the
+    number of neighbors, and the indices (k,) of the points among which neighbors are searched."""
     rng = np.random.default_rng(0)
     probes = x[rng.choice(len(x), min(len(x), _PROBES), replace=False)]
     subset = np.arange(len(x))
@@ -322,11 +325,13 @@ def _choose_neighborhood(x: FloatArray) -> tuple[int, IntArray]:
     while True:
         tree = build_point_tree(x[subset])
         for count in counts:
-            index, _ = nearest_neighbors(tree, probes, count)
-            spread = tree.data[index]
-            spread = spread - spread.mean(axis=1, keepdims=True)
-            widths = np.linalg.eigvalsh(np.einsum("mki,mkj->mij", spread, spread))
-            flatness = np.median(np.sqrt(np.abs(widths[:, 0]) / np.maximum(widths[:, 1], 1e-300)))
+            neighbors_of, _ = nearest_neighbors(tree, probes, count)
+            offsets = tree.data[neighbors_of]
+            offsets = offsets - offsets.mean(axis=1, keepdims=True)
+            variances = np.linalg.eigvalsh(np.einsum("mki,mkj->mij", offsets, offsets))
+            flatness = np.median(
+                np.sqrt(np.abs(variances[:, 0]) / np.maximum(variances[:, 1], 1e-300))
+            )
             if flatness < _FLATNESS_GAIN * min_flatness:
                 min_flatness, choice = float(flatness), (count, subset)
             if min_flatness < _MAX_FLATNESS:
@@ -342,26 +347,34 @@ def _choose_neighborhood(x: FloatArray) -> tuple[int, IntArray]:
 def _transfer_normals(
     x: FloatArray, tree: Any, known_normals: FloatArray, neighbors: int
 ) -> FloatArray:
-    """Normals of points (n, 3) from the nearest points that have a normal, with the signs of these
-    normals. known_normals: of the points of the tree."""
+    """Normals (n, 3) of the points x (n, 3): normals of the planes that fit the nearest points of
+    the tree, with the signs of the normals of these points.
+
+    known_normals: (k, 3) of the points of the tree.
+    """
     normals = np.empty_like(x)
 
-    def fit(part: slice) -> None:
-        _, index = tree.query(x[part], k=min(neighbors, tree.n))
-        spread = tree.data[index] - tree.data[index].mean(axis=1, keepdims=True)
-        _, axes = np.linalg.eigh(np.einsum("mki,mkj->mij", spread, spread))
-        line = axes[:, :, 0]
-        projections = np.einsum("mki,mi->mk", known_normals[index[:, :_VOTING_NEIGHBORS]], line)
-        normals[part] = line * np.where(projections.sum(axis=1) < 0, -1.0, 1.0)[:, None]
+    def fit_slice(rows: slice) -> None:
+        """Compute the normals of a slice of the points."""
+        _, index = tree.query(x[rows], k=min(neighbors, tree.n))
+        offsets = tree.data[index] - tree.data[index].mean(axis=1, keepdims=True)
+        _, axes = np.linalg.eigh(np.einsum("mki,mkj->mij", offsets, offsets))
+        axis = axes[:, :, 0]
+        projections = np.einsum("mki,mi->mk", known_normals[index[:, :_VOTING_NEIGHBORS]], axis)
+        normals[rows] = axis * np.where(projections.sum(axis=1) < 0, -1.0, 1.0)[:, None]
 
-    parallel_over_slices(fit, len(x))
+    parallel_over_slices(fit_slice, len(x))
     return normals
 
 
 @dataclass(frozen=True)
 class _TangentPlanes:
-    """Points (n, 3), moved onto the planes of their neighbors; normals (n, 3) of any sign, and the
-    indices of the neighbors (n, k)."""
+    """Tangent planes of a cloud.
+
+    points: (n, 3) the points, moved onto the planes that fit their neighbors.
+    normals: (n, 3) unit normals of these planes, of either sign.
+    neighbors: (n, k) the indices of the neighbors.
+    """
 
     points: FloatArray
     normals: FloatArray
@@ -369,25 +382,33 @@ class _TangentPlanes:
 
 
 def _fit_tangent_planes(x: FloatArray, tree: Any, neighbors: int) -> _TangentPlanes:
-    """tree: of these points."""
+    """Fit a plane to each point of a cloud and its nearest neighbors.
+
+    tree: the tree of the points x.
+
+    Raises:
+        CloudError: the neighbors of a point lie on a line.
+    """
     normals, points = np.empty_like(x), np.empty_like(x)
     nearest = np.empty((len(x), min(neighbors, len(x) - 1)), dtype=np.int32)
     on_line = np.zeros(len(x), dtype=bool)
 
-    def fit(part: slice) -> None:
-        index, distance = nearest_neighbors(tree, x[part], neighbors)
-        nearest[part] = index
-        offsets = (x[index] - x[part, None]) / distance[:, -1, None, None]
+    def fit_slice(rows: slice) -> None:
+        """Fit the planes of a slice of the points. Offsets are relative to the point, in units of
+        the distance of the farthest neighbor."""
+        index, distance = nearest_neighbors(tree, x[rows], neighbors)
+        nearest[rows] = index
+        offsets = (x[index] - x[rows, None]) / distance[:, -1, None, None]
         offsets = np.concatenate([offsets, np.zeros_like(offsets[:, :1])], axis=1)
-        middle = offsets.mean(axis=1, keepdims=True)
-        offsets -= middle
+        center = offsets.mean(axis=1, keepdims=True)
+        offsets -= center
         variances, axes = np.linalg.eigh(np.einsum("mki,mkj->mij", offsets, offsets))
-        normals[part] = axes[:, :, 0]
-        height = np.einsum("mi,mi->m", middle[:, 0], axes[:, :, 0]) * distance[:, -1]
-        points[part] = x[part] + height[:, None] * axes[:, :, 0]
-        on_line[part] = variances[:, 1] <= _COLLINEAR_RATIO * variances[:, 2]
+        normals[rows] = axes[:, :, 0]
+        height = np.einsum("mi,mi->m", center[:, 0], axes[:, :, 0]) * distance[:, -1]
+        points[rows] = x[rows] + height[:, None] * axes[:, :, 0]
+        on_line[rows] = variances[:, 1] <= _COLLINEAR_RATIO * variances[:, 2]
 
-    parallel_over_slices(fit, len(x))
+    parallel_over_slices(fit_slice, len(x))
     if on_line.any():
         first = int(np.flatnonzero(on_line)[0])
         raise CloudError(
@@ -399,56 +420,62 @@ def _fit_tangent_planes(x: FloatArray, tree: Any, neighbors: int) -> _TangentPla
 
 
 def _agreement(planes: _TangentPlanes, i: Indices, j: Indices) -> FloatArray:
-    """The product of each normal i with normal j mirrored in the plane that bisects i and j: (m,).
+    """How well the normals of points i and j agree, (m,): the inner product of normal i with normal
+    j mirrored in the plane that bisects the two points.
 
-    On a circle, across an edge between two planes and across a thin wall it is 1 if both face
-    outward (Xie et al. 2003).
+    On a circle, across an edge between two planes and across a thin wall it is 1 if both normals
+    face outward (Xie et al. 2003).
     """
     x, normals = planes.points, planes.normals
     edge = x[j] - x[i]
     length = np.linalg.norm(edge, axis=1, keepdims=True)
     edge /= np.where(length > 0.0, length, 1.0)
     a, b = normals[i], normals[j]
-    along = np.einsum("ij,ij->i", edge, a) * np.einsum("ij,ij->i", edge, b)
-    return np.einsum("ij,ij->i", a, b) - 2.0 * along
+    product_along_edge = np.einsum("ij,ij->i", edge, a) * np.einsum("ij,ij->i", edge, b)
+    return np.einsum("ij,ij->i", a, b) - 2.0 * product_along_edge
 
 
 def _spanning_forest(planes: _TangentPlanes) -> tuple[IntArray, IntArray]:
-    """The component (n,) of each point, counted from 0, and its parent (n,); a root is its own
-    parent."""
-    import scipy.sparse  # here: half a second that few need
+    """The spanning forest of the graph of neighbors in which normals agree best.
+
+    Returns the connected component (n,) of each point, counted from 0, and its parent (n,) in the
+    forest; a root is its own parent.
+    """
+    import scipy.sparse  # imported here: it takes half a second, and few programs need it
 
     sparse: Any = scipy.sparse
     nearest = planes.neighbors
     n, k = nearest.shape
     weight = np.empty((n, k))
 
-    def weigh(part: slice) -> None:
-        start = np.repeat(np.arange(part.start, part.stop, dtype=np.int64), k)
-        agreement = np.abs(_agreement(planes, start, nearest[part].ravel()))
-        # An edge of weight 0 would be no edge.
-        weight[part] = np.maximum(1.0 - agreement, 0.0).reshape(-1, k) + 1e-9
+    def weigh_edges(rows: slice) -> None:
+        """Weights of the edges from a slice of the points: small where normals agree."""
+        start = np.repeat(np.arange(rows.start, rows.stop, dtype=np.int64), k)
+        agreement = np.abs(_agreement(planes, start, nearest[rows].ravel()))
+        # SciPy takes a weight of 0 for a missing edge.
+        weight[rows] = np.maximum(1.0 - agreement, 0.0).reshape(-1, k) + 1e-9
 
-    parallel_over_slices(weigh, n)
-    first = np.arange(0, n * k + 1, k, dtype=np.int64)
-    graph = sparse.csr_array((weight.ravel(), nearest.ravel(), first), shape=(n, n))
+    parallel_over_slices(weigh_edges, n)
+    row_starts = np.arange(0, n * k + 1, k, dtype=np.int64)
+    graph = sparse.csr_array((weight.ravel(), nearest.ravel(), row_starts), shape=(n, n))
     forest = sparse.csgraph.minimum_spanning_tree(graph).tocoo()
-    _, piece = sparse.csgraph.connected_components(forest, directed=False)
-    # One more point joins the pieces, so that one search from it visits all.
-    _, roots = np.unique(piece, return_index=True)
+    _, component = sparse.csgraph.connected_components(forest, directed=False)
+    # An additional node is joined to all roots, so that one search from it visits all points.
+    _, roots = np.unique(component, return_index=True)
     start = np.concatenate([forest.row, np.full(len(roots), n)])
     end = np.concatenate([forest.col, roots])
-    joined = sparse.csr_array((np.ones(len(start)), (start, end)), shape=(n + 1, n + 1))
-    _, before = sparse.csgraph.breadth_first_order(joined, n, directed=False)
-    parent = np.asarray(before[:n], dtype=np.int64)
+    joined_graph = sparse.csr_array((np.ones(len(start)), (start, end)), shape=(n + 1, n + 1))
+    _, predecessors = sparse.csgraph.breadth_first_order(joined_graph, n, directed=False)
+    parent = np.asarray(predecessors[:n], dtype=np.int64)
     parent[roots] = roots
-    return np.asarray(piece, dtype=np.int64), parent
+    return np.asarray(component, dtype=np.int64), parent
 
 
 def _propagate_signs(planes: _TangentPlanes, parent: IntArray) -> FloatArray:
-    """The sign (n,) of each normal with which it agrees with its root, along the way to it.
+    """The sign (n,) that makes each normal agree with the normal of its root, along the path
+    through its ancestors.
 
-    Pointer doubling: after step i, `parent` is the ancestor 2^i levels up, or the root.
+    Pointer doubling: after step i, `parent` is the ancestor 2^i generations up, or the root.
     """
     agreement = _agreement(planes, np.arange(len(parent)), parent)
     sign = np.where(agreement < 0.0, -1.0, 1.0)
@@ -460,18 +487,22 @@ def _propagate_signs(planes: _TangentPlanes, parent: IntArray) -> FloatArray:
         parent = ancestor
 
 
-def _outward_signs(x: FloatArray, normals: FloatArray, piece: IntArray) -> FloatArray:
-    """The sign (p,) of each piece with which its extreme points face outward."""
-    by_piece = np.argsort(piece, kind="stable")
-    x, normals, piece = x[by_piece], normals[by_piece], piece[by_piece]
-    starts = np.flatnonzero(np.append(True, piece[1:] != piece[:-1]))
+def _outward_signs(x: FloatArray, normals: FloatArray, component: IntArray) -> FloatArray:
+    """The sign (p,) for each connected component of the cloud that makes the normals of its extreme
+    points face outward.
+
+    component: (n,) of each point.
+    """
+    order = np.argsort(component, kind="stable")
+    x, normals, component = x[order], normals[order], component[order]
+    starts = np.flatnonzero(np.append(True, component[1:] != component[:-1]))
     outwardness = np.zeros(len(starts))
     for direction in _DIRECTIONS / np.linalg.norm(_DIRECTIONS, axis=1, keepdims=True):
         height = x @ direction
-        highest = np.flatnonzero(height == np.maximum.reduceat(height, starts)[piece])
-        _, first = np.unique(piece[highest], return_index=True)
+        highest = np.flatnonzero(height == np.maximum.reduceat(height, starts)[component])
+        _, first = np.unique(component[highest], return_index=True)
         outwardness += normals[highest[first]] @ direction
     total = np.add.reduceat(normals, starts)
-    main = np.take_along_axis(total, np.abs(total).argmax(axis=1)[:, None], axis=1)[:, 0]
-    decisive = np.where(np.abs(outwardness) > 1e-6, outwardness, main)
+    main_component = np.take_along_axis(total, np.abs(total).argmax(axis=1)[:, None], axis=1)[:, 0]
+    decisive = np.where(np.abs(outwardness) > 1e-6, outwardness, main_component)
     return np.where(decisive < 0.0, -1.0, 1.0)

@@ -25,7 +25,7 @@ from harnack.geometry.clip_volumes import PlaneTable, Polytope, RoundingSlacks
 from harnack.geometry.volume import as_padding, as_points, clip_rounding
 
 MAX_EXAMINED_VERTICES = 2048
-"""Longer curves are not examined: the tests take quadratic time."""
+"""Curves with more vertices are not examined, as the tests take quadratic time."""
 
 # All relative to the curve's size.
 PLANE_TOLERANCE = 1e-12  # a vertex may lie this far off a supporting plane
@@ -44,16 +44,17 @@ def is_convex_position(loops: tuple[FloatArray, ...]) -> bool:
     every edge has a plane through it that no vertex exceeds by more than 1e-12. False means that
     there is no proof, as for more than 2048 vertices; it implies nothing about the curve.
 
-    Stability. Where no vertex exceeds the plane of an edge, that edge lies on the boundary of the
-    hull H, and nothing remains to be proved. Otherwise let each point move along the normal of its
-    edge until it leaves H: by at most delta = 1e-12. At a vertex the edges' normals n and n' may
-    send it to two positions; both lie in the wedge { a n + b n', a, b >= 0 } at the vertex, where
-    n.x <= delta and n'.x <= delta leave |x| <= 2 delta / (1 + n.n'), and n.n' >= -0.9 is required,
-    so a path of that size on the boundary joins them. It cannot meet another edge (1e-9 away);
-    crossings with its neighbor, near the common vertex, are cut off as loops of area below 1e-15.
-    So the theorems hold for a curve within w = 2e-11 of P, and the two solid angles differ by at
-    most 2 w / r for each edge at distance r: at r = 1e-4 that is less than the rounding of the
-    solid angle itself in single precision.
+    Stability. P is the curve, H its hull. If no vertex exceeds the plane of an edge, that edge lies
+    on the boundary of H, and nothing remains to be proved. Otherwise move each point of P along the
+    normal of its edge until it is on the boundary of H: by at most delta = 1e-12. A vertex has two
+    edges, with the normals n and n', and may move to two positions. Both lie in the wedge
+    { x = a n + b n', a, b >= 0 } at the vertex, in which n.x <= delta and n'.x <= delta imply
+    |x| <= 2 delta / (1 + n.n'). As n.n' >= -0.9 is required, a path of that size on the boundary
+    joins the two positions. The path cannot meet other edges, which are 1e-9 away; where it crosses
+    an edge at the same vertex, loops of area below 1e-15 are cut off. So the theorems hold for a
+    curve within w = 2e-11 of P. The solid angles of the two curves differ by at most 2 w / r for
+    each edge at distance r: at r = 1e-4 that is less than the rounding error of the solid angle
+    itself in single precision.
     """
     if len(loops) != 1 or not 3 <= len(loops[0]) <= MAX_EXAMINED_VERTICES:
         return False
@@ -69,65 +70,71 @@ def is_convex_position(loops: tuple[FloatArray, ...]) -> bool:
 
 
 def _edge_lengths(x: FloatArray) -> FloatArray:
+    """(n,) the lengths of the edges of a closed polygon x (n, 3)."""
     return np.linalg.norm(np.roll(x, -1, axis=0) - x, axis=1)
 
 
 def _is_flat(x: FloatArray) -> bool:
+    """Whether the vertices x (n, 3) lie within PLANE_TOLERANCE of a common plane."""
     axes: FloatArray = np.linalg.svd(x - x.mean(axis=0), full_matrices=False)[2]
     return bool(np.ptp(x @ axes[2]) <= PLANE_TOLERANCE)
 
 
 def _lies_on_hull(x: FloatArray) -> bool:
-    """Whether every edge has a supporting plane, and neighbors' planes are not opposite."""
+    """Whether every edge of the polygon x (n, 3) has a supporting plane, and the planes of
+    neighboring edges do not face opposite ways."""
     count = len(x)
     normals = np.empty((count, 3))
     is_strict = np.empty(count, dtype=np.bool_)
     rows = max(1, 200_000 // count)
     for begin in range(0, count, rows):
-        part = np.arange(begin, min(begin + rows, count))
-        normals[part], excess, is_strict[part] = _supporting_planes(x, part)
+        indices = np.arange(begin, min(begin + rows, count))
+        normals[indices], excess, is_strict[indices] = _supporting_planes(x, indices)
         if not excess.max() <= PLANE_TOLERANCE:
             return False
-    following = np.roll(normals, -1, axis=0)
+    next_normals = np.roll(normals, -1, axis=0)
     is_exact = is_strict & np.roll(is_strict, -1)
-    return bool((is_exact | ((normals * following).sum(axis=1) >= -0.9)).all())
+    return bool((is_exact | ((normals * next_normals).sum(axis=1) >= -0.9)).all())
 
 
 def _supporting_planes(
-    x: FloatArray, part: np.ndarray[tuple[int], np.dtype[np.intp]]
+    x: FloatArray, indices: np.ndarray[tuple[int], np.dtype[np.intp]]
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """For the edges from vertices `part`: a plane that contains the edge and supports all of x.
+    """For each edge of the polygon x (n, 3) that begins at a vertex of `indices` (k,): a plane that
+    contains the edge and has all vertices on one side.
 
-    Projected along the edge, the vertices have to leave an angle of at least pi free; the normal
-    (k, 3) points to the middle of the largest free angle. Also returned are the distance by which
-    the vertices exceed the plane (k,), and whether all but the edge's ends stay below it beyond
-    rounding.
+    Seen along the edge, the vertices have to leave an angle of at least pi free; the normal points
+    to the middle of the largest free angle.
+
+    Returns the unit normals (k, 3); the distance (k,) by which the vertices exceed the plane; and
+    whether (k,) all vertices but the edge's ends are below the plane by more than rounding.
     """
     count = len(x)
-    start = x[part]
-    edge = x[(part + 1) % count] - start
+    start = x[indices]
+    edge = x[(indices + 1) % count] - start
     edge /= np.linalg.norm(edge, axis=1, keepdims=True)
     across, up = orthonormal_basis_rows(edge)
     offset = x[None, :, :] - start[:, None, :]
     a: FloatArray = np.einsum("kni,ki->kn", offset, across)
     b: FloatArray = np.einsum("kni,ki->kn", offset, up)
     angle = _widest_gap_direction(a, b)
-    c, s = np.cos(angle), np.sin(angle)
-    height = c[:, None] * a + s[:, None] * b
+    cosine, sine = np.cos(angle), np.sin(angle)
+    height = cosine[:, None] * a + sine[:, None] * b
     excess = height.max(axis=1)
-    rows = np.arange(len(part))
-    height[rows, part] = -np.inf
-    height[rows, (part + 1) % count] = -np.inf
-    normals = c[:, None] * across + s[:, None] * up
+    rows = np.arange(len(indices))
+    height[rows, indices] = -np.inf
+    height[rows, (indices + 1) % count] = -np.inf
+    normals = cosine[:, None] * across + sine[:, None] * up
     return normals, excess, height.max(axis=1) < -ROUNDING
 
 
 def _widest_gap_direction(a: FloatArray, b: FloatArray) -> FloatArray:
-    """(k,) the direction, as an angle, in the middle of the largest angular gap between the points
-    (a, b)[k, :] as seen from the origin.
+    """For each of k sets of n points in the plane, with coordinates a and b, (k, n) each: the
+    middle of the largest gap between their directions as seen from the origin. It is an angle:
+    (k,).
 
-    Points at the origin, where the edge itself is, have no direction: they take that of the
-    farthest point.
+    Points at the origin, where the edge itself is, have no direction; the direction of the farthest
+    point is used for them.
     """
     distance = np.hypot(a, b)
     angle = np.arctan2(b, a)
@@ -166,11 +173,12 @@ def is_simple(x: FloatArray) -> bool:
 def segment_distance_lower_bound(
     p1: FloatArray, q1: FloatArray, p2: FloatArray, q2: FloatArray
 ) -> FloatArray:
-    """Lower bound of the distance of segments p1 q1 and p2 q2, (k, 3) each: (k,), not above it.
+    """Lower bounds (k,) of the distances between the segments p1 q1 and p2 q2, (k, 3) each.
 
-    The nearest points are found by alternating projection (after Ericson, 'Real-Time Collision
-    Detection', 5.1.9). However well that went, the width of the slab between the segments across
-    the line that joins them is a lower bound, and the distance itself if it went well.
+    The closest points are found by alternating projection (after Ericson, 'Real-Time Collision
+    Detection', 5.1.9). Whether or not that has converged, the width of the slab between the
+    segments, at right angles to the line that joins the two points, is a lower bound of the
+    distance; if it has converged, it is the distance.
     """
     d1, d2, r = q1 - p1, q2 - p2, p1 - p2
     a, e, b = _dot(d1, d1), _dot(d2, d2), _dot(d1, d2)
@@ -179,7 +187,7 @@ def segment_distance_lower_bound(
     safe = np.where(determinant > 0.0, determinant, 1.0)
     s = np.where(determinant > 0.0, np.clip((b * f - c * e) / safe, 0.0, 1.0), 0.0)
     t = np.zeros_like(s)
-    # Of a segment of length zero every share is the same point.
+    # Along a segment of length zero, every parameter gives the same point.
     a, e = np.where(a > 0.0, a, 1.0), np.where(e > 0.0, e, 1.0)
     for _ in range(3):
         t = np.clip((b * s + f) / e, 0.0, 1.0)
@@ -193,22 +201,24 @@ def segment_distance_lower_bound(
 
 
 def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    """(n,) the inner products of the rows of a and b."""
     return (a * b).sum(axis=1)
 
 
 # Hulls.
 
 MAX_PLANES = 2048
-"""Nearly parallel facets beyond this number are dropped; what is left is a little larger."""
+"""If there are more facets, nearly parallel ones are dropped; the hull is then a little larger."""
 
 FLATNESS = 1e-6
-"""Points thinner than this part of their size get the hull of a flat or straight set."""
+"""Points whose extent in a direction is below this fraction of their size get the hull of a flat or
+straight set."""
 
 _LEADING_PLANES = 24
-"""Planes that rays are clipped to first."""
+"""Number of planes, far from each other, that rays are clipped to first."""
 
 THIN_PADDING = 1e-6
-"""Half-thickness, as a part of the size, given to the hull of a flat or straight set."""
+"""Half the thickness of the hull of a flat or straight set, as a fraction of its size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,8 +226,9 @@ class ConvexHull(Polytope):
     """A convex polytope: the half-spaces normals[i].x <= offsets[i]. `ConvexHull.from_points`
     builds it.
 
-    normals: (m, 3), of unit length. offsets: (m,). lower, upper: (3,), the corners of a box around
-        it.
+    normals: (m, 3) unit outward normals.
+    offsets: (m,) the distances of the planes from the origin.
+    lower, upper: (3,) the corners of a box around the polytope.
     """
 
     normals: FloatArray
@@ -258,10 +269,13 @@ class ConvexHull(Polytope):
     def _slacks(
         self, table: PlaneTable, o: Vec3, d: Vec3
     ) -> Callable[[Vec3, Real], RoundingSlacks]:
-        """As |n| = 1, |n|.|o| <= |o| serves all planes; in a bounded volume that is enough."""
-        eps = clip_rounding(backend_of(o))
-        room, speed = eps * (dr.norm(o) + table.max_offset), eps * dr.norm(d)
-        return lambda _n, _h: (room, speed)
+        """As `Polytope._slacks`, with one bound for all planes: |n|.|o| <= |o|, as |n| = 1."""
+        rounding = clip_rounding(backend_of(o))
+        offset_slack, slope_slack = (
+            rounding * (dr.norm(o) + table.max_offset),
+            rounding * dr.norm(d),
+        )
+        return lambda _n, _h: (offset_slack, slope_slack)
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         return np.array(self.lower), np.array(self.upper)
@@ -272,7 +286,8 @@ class ConvexHull(Polytope):
 
 
 def _support(x: FloatArray, normals: FloatArray) -> FloatArray:
-    """Largest n.x of each normal, in slices that keep the memory small."""
+    """For each normal n (m, 3), the largest n.x among the points x (n, 3): (m,). Computed in
+    slices, to save memory."""
     columns = np.transpose(normals)
     highest = np.full(len(normals), -np.inf)
     for start in range(0, len(x), 4096):
@@ -281,15 +296,16 @@ def _support(x: FloatArray, normals: FloatArray) -> FloatArray:
 
 
 def _hull_normals(x: FloatArray) -> tuple[FloatArray, bool]:
-    """Unit outward normals that bound the hull of x (centered, of size 1), and if x is thin."""
+    """Unit outward normals (m, 3) of half-spaces that bound the hull of x (n, 3), and whether x is
+    flat or straight. x is centered and of size 1."""
     axes: FloatArray = np.linalg.svd(x - x.mean(axis=0), full_matrices=len(x) < 3)[2]
-    along: FloatArray = np.einsum("ij,kj->ik", x, axes)
-    thickness: FloatArray = np.ptp(along, axis=0)
+    coordinates: FloatArray = np.einsum("ij,kj->ik", x, axes)
+    thickness: FloatArray = np.ptp(coordinates, axis=0)
     both_sides = np.concatenate([axes, -axes])
     if thickness[1] <= FLATNESS:
         return both_sides, True
     if thickness[2] <= FLATNESS:
-        outline = _facet_normals(along[:, :2])
+        outline = _facet_normals(coordinates[:, :2])
         if outline is None:
             return both_sides, True
         return np.concatenate([outline @ axes[:2], axes[2:], -axes[2:]]), True
@@ -301,7 +317,7 @@ def _hull_normals(x: FloatArray) -> tuple[FloatArray, bool]:
 
 def _facet_normals(x: FloatArray) -> FloatArray | None:
     """Facet normals by Qhull, which merges coplanar facets; None where it finds x degenerate."""
-    import scipy.spatial  # here: half a second that few need
+    import scipy.spatial  # imported here: it takes half a second, and few programs need it
 
     qhull: Any = scipy.spatial
     try:
@@ -312,8 +328,8 @@ def _facet_normals(x: FloatArray) -> FloatArray | None:
 
 
 def _order_by_spread(normals: FloatArray) -> FloatArray:
-    """The same normals in another order, the first ones far from each other: most rays that miss
-    the hull are recognized by a few planes."""
+    """The same normals in another order, in which the first ones are far from each other: so few
+    planes suffice to recognize most rays that miss the hull."""
     order, min_distances = [0], np.full(len(normals), np.inf)
     for _ in range(min(len(normals), _LEADING_PLANES) - 1):
         min_distances = np.minimum(min_distances, 1.0 - normals @ normals[order[-1]])
@@ -323,8 +339,9 @@ def _order_by_spread(normals: FloatArray) -> FloatArray:
 
 
 def _distinct_normals(normals: FloatArray) -> FloatArray:
-    """A normal of each group of nearly equal normals, at most MAX_PLANES groups; with the six axes
-    if the groups are coarser than 9 digits."""
+    """One normal of each group of nearly equal normals, at most MAX_PLANES of them. Normals are
+    grouped by rounding to 9 digits or, if that leaves too many, to fewer; then the six axis
+    directions are added."""
     digits = 9
     while True:
         _, first = np.unique(np.round(normals, digits), axis=0, return_index=True)

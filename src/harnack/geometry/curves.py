@@ -49,7 +49,7 @@ __all__ = [
     "validate_loops",
 ]
 
-_SMALLEST = 1 / MAX_COORDINATE
+_MIN_RADIUS = 1 / MAX_COORDINATE
 
 
 @dataclass(frozen=True)
@@ -71,9 +71,9 @@ class Circle:
 
     def __post_init__(self) -> None:
         radius = _numbers(self.radius, "radius", ())
-        if not _SMALLEST <= radius <= MAX_COORDINATE:
+        if not _MIN_RADIUS <= radius <= MAX_COORDINATE:
             raise ValueError(
-                f"radius of a circle must lie between {_SMALLEST:g} and {MAX_COORDINATE:g}, not "
+                f"radius of a circle must lie between {_MIN_RADIUS:g} and {MAX_COORDINATE:g}, not "
                 f"{float(radius):g}"
             )
         center, normal = (
@@ -85,7 +85,7 @@ class Circle:
         largest = float(np.abs(normal).max())
         if largest == 0.0:
             raise ValueError("normal of a circle is zero: give the direction of its axis")
-        if abs(float(normal @ normal) - 1) > 1e-15:  # else it is one already, to rounding
+        if abs(float(normal @ normal) - 1) > 1e-15:  # else it has unit length, to rounding
             normal = normal / largest
             normal = normal / np.linalg.norm(normal)
         object.__setattr__(self, "radius", float(radius))
@@ -105,8 +105,8 @@ class Circle:
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """Lower and upper corner of the box around it, (3,) each."""
-        reach = self.radius * np.sqrt(np.maximum(1 - np.square(self.normal), 0))
-        return np.array(self.center) - reach, np.array(self.center) + reach
+        half_size = self.radius * np.sqrt(np.maximum(1 - np.square(self.normal), 0))
+        return np.array(self.center) - half_size, np.array(self.center) + half_size
 
     def polygon(self, sides: int, *, circumscribed: bool = False) -> FloatArray:
         """(sides, 3) corners of the regular polygon inscribed in the circle, or circumscribed about
@@ -115,14 +115,20 @@ class Circle:
             raise ValueError(f"a polygon needs at least three sides, not {sides}")
         radius = self.radius / math.cos(math.pi / sides) if circumscribed else self.radius
         axis = np.array(self.normal)
-        first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
-        first /= np.linalg.norm(first)
+        first_axis = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+        first_axis /= np.linalg.norm(first_axis)
         angle = 2 * math.pi * np.arange(sides)[:, None] / sides
-        across = np.cos(angle) * first + np.sin(angle) * np.cross(axis, first)
-        return np.array(self.center) + radius * across
+        offsets = np.cos(angle) * first_axis + np.sin(angle) * np.cross(axis, first_axis)
+        return np.array(self.center) + radius * offsets
 
 
 def _numbers(values: Any, name: str, shape: tuple[int, ...]) -> FloatArray:
+    """The values of a circle's attribute as a float64 array of this shape.
+
+    Raises:
+        ValueError: another shape, or a number that is not finite.
+        TypeError: not numbers.
+    """
     array = as_real_array(values, f"{name} of a circle", type_error=TypeError).astype(np.float64)
     if array.shape != shape:
         expected = "three numbers" if shape else "a number"
@@ -197,14 +203,14 @@ def validate_loops(loops: LoopsLike, *, closed: bool = True) -> Loops:
     parts = _as_list(loops)
     if not parts:
         raise CurveShapeError("there are no loops: give an array (n, 3) or a list of them")
-    several = len(parts) > 1
+    is_list = len(parts) > 1
     kind = "loop" if closed else "curve"
-    names = [f"{kind} {k}" if several else f"the {kind}" for k, _ in parts]
+    names = [f"{kind} {k}" if is_list else f"the {kind}" for k, _ in parts]
     pairs = zip(parts, names, strict=True)
     checked = [_validate_loop(part, name, closed) for (_, part), name in pairs]
     total = sum(len(loop) for loop in checked)
     if total > MAX_VERTICES:
-        raise TooManyVerticesError(_too_many_vertices("the curve", total))
+        raise TooManyVerticesError(_too_many("the curve", total))
     return tuple(checked)
 
 
@@ -228,18 +234,18 @@ def validate_curves(curves: Any) -> tuple[Loops, tuple[Circle, ...]]:
     ]
     total = sum(len(loop) for loop in loops)
     if total > MAX_VERTICES:
-        raise TooManyVerticesError(_too_many_vertices("the curve", total))
+        raise TooManyVerticesError(_too_many("the curve", total))
     return tuple(loops), circles
 
 
 def _as_parts(curves: Any) -> list[Any]:
-    """The entries of a list or tuple; none of anything else."""
+    """The entries of a list or tuple; an empty list for any other object."""
     return list(curves) if isinstance(curves, list | tuple) else []  # pyright: ignore[reportUnknownArgumentType, reportUnknownVariableType]
 
 
 def _as_list(loops: Any) -> list[tuple[int, Any]]:
-    """The numbered loops of an argument. A list is a list of loops if its entries are lists of
-    points."""
+    """The loops in the argument of `validate_loops`, each with its number. A list is a list of
+    loops if its entries are lists of points; else it is a single loop."""
     try:
         array = np.asarray(loops)
     except ValueError:  # loops of different lengths, or points of different lengths
@@ -256,6 +262,7 @@ def _as_list(loops: Any) -> list[tuple[int, Any]]:
 
 
 def _is_point(part: Any) -> bool:
+    """Whether an entry is a list of numbers, such as a vertex."""
     try:
         return np.ndim(part) == 1
     except ValueError:
@@ -263,10 +270,14 @@ def _is_point(part: Any) -> bool:
 
 
 def _numbered(loops: Any) -> list[tuple[int, Any]]:
+    """The loops with their numbers, counted from 0."""
     return [(k, loop) for k, loop in enumerate(loops)]
 
 
 def _validate_loop(loop: Any, name: str, closed: bool = True) -> FloatArray:
+    """The vertices (n, 3) of a validated loop; a last vertex that repeats the first is dropped.
+    name: for messages. Raises: as `validate_loops`.
+    """
     vertices = _as_vertices(loop, name)
     check_finite(vertices, f"vertex {{}} of {name}", NonFiniteVertexError)
     if closed and len(vertices) > 1 and (vertices[0] == vertices[-1]).all():
@@ -282,17 +293,19 @@ def _validate_loop(loop: Any, name: str, closed: bool = True) -> FloatArray:
 
 
 def _as_vertices(loop: Any, name: str) -> FloatArray:
+    """A new float64 array (n, 3) of the vertices of a loop. Raises CurveShapeError or
+    TooManyVerticesError."""
     ragged = "is ragged: every vertex needs three coordinates"
     array = as_real_array(loop, name, CurveShapeError, ragged=ragged)
     planar = "; append a column of zeros to a planar curve"
     check_vectors(array, name, CurveShapeError, planar=planar, transposed=TRANSPOSE_ADVICE)
     if len(array) > MAX_VERTICES:
-        raise TooManyVerticesError(_too_many_vertices(name, len(array)))
+        raise TooManyVerticesError(_too_many(name, len(array)))
     return np.array(array, dtype=np.float64, order="C")
 
 
 def _count_distinct(vertices: FloatArray) -> int:
-    """Number of different vertices, counted up to 3."""
+    """The number of different vertices, at most 3."""
     remaining = vertices
     for count in range(3):
         if len(remaining) == 0:
@@ -302,20 +315,21 @@ def _count_distinct(vertices: FloatArray) -> int:
 
 
 def _check_edges(vertices: FloatArray, name: str, closed: bool) -> None:
-    """No edge of length zero, and no length that overflows or underflows."""
+    """Raise RepeatedVertexError for an edge of length zero, and CurveScaleError for lengths that
+    overflow or underflow."""
     ends = np.roll(vertices, -1, axis=0)
-    apart = ends - vertices
+    edges = ends - vertices
     if not closed:
-        apart = apart[:-1]
-    same = np.flatnonzero((apart == 0).all(axis=1))
-    if same.size:
-        first, second = int(same[0]), (int(same[0]) + 1) % len(vertices)
+        edges = edges[:-1]
+    zero_edges = np.flatnonzero((edges == 0).all(axis=1))
+    if zero_edges.size:
+        first, second = int(zero_edges[0]), (int(zero_edges[0]) + 1) % len(vertices)
         raise RepeatedVertexError(
             f"vertices {first} and {second} of {name} are both {format_vector(vertices[first])}"
-            f"{others_suffix(same.size)}: remove one of them"
+            f"{others_suffix(zero_edges.size)}: remove one of them"
         )
     size = float(np.abs(vertices).max())
-    shortest = float(np.abs(apart).max(axis=1).min())
+    shortest = float(np.abs(edges).max(axis=1).min())
     if size > 1e100 or shortest < 1e-100:
         raise CurveScaleError(
             f"{name} has coordinates up to {size:g} and an edge as short as {shortest:g}: "
@@ -323,7 +337,8 @@ def _check_edges(vertices: FloatArray, name: str, closed: bool) -> None:
         )
 
 
-def _too_many_vertices(name: str, count: int) -> str:
+def _too_many(name: str, count: int) -> str:
+    """The message for a curve with too many vertices."""
     return f"{name} has {count:,} vertices: at most {MAX_VERTICES:,} are accepted; resample it"
 
 

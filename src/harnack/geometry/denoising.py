@@ -9,11 +9,11 @@ A neighbor j, at p_j with the normal n_j, predicts that the surface near x is
 
     t_j = (n + n_j)/2 . (p_j - x)
 
-farther along the normal n of x. On a sphere, and to second order on every surface, t_j is 0 at a
-point of the surface, however far the neighbor is: the plane of j lies as far outside of the surface
-as j itself is inside of the plane of x. So the mean of t_j does not shrink curved surfaces, as the
-mean of the positions would. Neighbors are weighted by distance and by the angle between n and n_j,
-so that neighbors around an edge or on the other side of a wall do not count.
+away from x, along the normal n of x. If x is on the surface, t_j is 0 on a sphere, and to second
+order on every surface, however far the neighbor is: at x, the tangent plane of j is as far outside
+of the surface as p_j is inside of the tangent plane of x. So the mean of t_j does not shrink curved
+surfaces, as the mean of the positions would. Neighbors are weighted by distance and by the angle
+between n and n_j, so that neighbors around an edge or on the other side of a wall do not count.
 
 The noise is removed from the points, not from the field. A kernel wide enough for the noise rounds
 all edges and shrinks curved parts. Points moved along their normals, by planes of their own and of
@@ -42,8 +42,8 @@ from harnack.geometry.clouds import (
 
 __all__ = ["CloudDenoiser", "NoiseEstimate", "estimate_noise", "outlier_indices"]
 
-# A point is an outlier if its fourth neighbor is _OUTLIER_RATIO times as far from it as the fourth
-# neighbors of its neighbors are from these (median).
+# A point is an outlier if the distance of its fourth neighbor is more than _OUTLIER_RATIO times the
+# median of the same distance of its neighbors.
 _OUTLIER_RATIO, _OUTLIER_NEIGHBORS = 6.0, 4
 # Noise is measured at _PROBES points, among the first of _COUNTS neighbors that reach _MIN_REACH
 # standard deviations far; neighbors whose normals turn by more than 60 degrees do not count.
@@ -55,17 +55,19 @@ _NEIGHBORS_PER_NOISE, _MIN_NEIGHBORS, _MAX_NEIGHBORS = 62.0, 16, 256
 # _MAX_NOISE_PER_SPACING * spacing / noise of the points (at least _MIN_KEPT_FRACTION) is selected
 # and moved. All points still count as neighbors.
 _MAX_NOISE_PER_SPACING, _MIN_KEPT_FRACTION = 1.2, 0.1
-# Weights of neighbors fall to exp(-3) at the last of them, and to 1/e where normals differ by this
-# chord, given and estimated.
-_DISTANCE_DECAY, _NORMAL_CHORD, _CHORD_OF_ESTIMATES = 3.0, 0.8, 0.4
+# The weight of a neighbor falls to exp(-3) at the farthest one, and to 1/e if its normal n_j has
+# this difference |n - n_j|: for given normals, and for estimated ones.
+_DISTANCE_DECAY, _NORMAL_SCALE, _ESTIMATED_NORMAL_SCALE = 3.0, 0.8, 0.4
 # Normals are estimated again from moved points _NORMAL_ITERATIONS times, each from
 # _PLANE_NEIGHBORS points. Where only a fraction of the points is moved, these are first moved by
 # _INITIAL_NEIGHBORS of each other.
 _NORMAL_ITERATIONS, _PLANE_NEIGHBORS, _INITIAL_NEIGHBORS = 2, 32, 32
-# Half of the sum of weights is less than this where neighbors face the other way.
+# A point is not moved if its neighbors face the other way: then the derivative of the mean of t_j
+# along n is below this.
 _MIN_SLOPE = 0.25
-# A point is dropped if less than this fraction of its neighbors, by weight, has a normal like its
-# estimated one: such points lie in the middle of thin parts. At edges and corners more have it.
+# A point is dropped if less than this fraction of its neighbors, by weight, has a normal similar to
+# its estimated one: such points lie in the middle of thin parts. At edges and corners the fraction
+# is larger.
 _MIN_AGREEING_WEIGHT = 0.1
 
 
@@ -98,15 +100,15 @@ def outlier_indices(points: FloatArray, tree: Any) -> IntArray:
     median. tree: of these points."""
     count = min(_OUTLIER_NEIGHBORS, len(points) - 1)
     nearest = np.empty((len(points), count), np.int64)
-    reach = np.empty(len(points))
+    distances = np.empty(len(points))
 
-    def find(part: slice) -> None:
-        distance, index = tree.query(points[part], k=count + 1)
-        nearest[part], reach[part] = index[:, 1:], distance[:, -1]
+    def find_neighbors(rows: slice) -> None:
+        distance, index = tree.query(points[rows], k=count + 1)
+        nearest[rows], distances[rows] = index[:, 1:], distance[:, -1]
 
-    parallel_over_slices(find, len(points))
-    usual = np.maximum(np.median(reach[nearest], axis=1), np.median(reach))
-    return np.flatnonzero(reach > _OUTLIER_RATIO * usual)
+    parallel_over_slices(find_neighbors, len(points))
+    expected = np.maximum(np.median(distances[nearest], axis=1), np.median(distances))
+    return np.flatnonzero(distances > _OUTLIER_RATIO * expected)
 
 
 def estimate_noise(points: FloatArray, normals: FloatArray | None, tree: Any) -> NoiseEstimate:
@@ -133,38 +135,44 @@ def estimate_noise(points: FloatArray, normals: FloatArray | None, tree: Any) ->
         else:
             deviations = _deviations_by_normals(offsets, normals[probes], normals[index])
             deviation = float(np.median(deviations))
-        reach = float(np.median(distance[:, -1]))
-        noise = NoiseEstimate(deviation, reach * math.sqrt(math.pi / index.shape[1]))
-        if reach >= _MIN_REACH * deviation or index.shape[1] < count:
+        radius = float(np.median(distance[:, -1]))
+        noise = NoiseEstimate(deviation, radius * math.sqrt(math.pi / index.shape[1]))
+        if radius >= _MIN_REACH * deviation or index.shape[1] < count:
             break
     return noise
 
 
 def _deviations_from_planes(offsets: FloatArray) -> FloatArray:
-    """Standard deviations (m,) of neighbors, at these offsets (m, k, 3), from their planes."""
-    spread = offsets - offsets.mean(axis=1, keepdims=True)
-    variances = np.linalg.eigvalsh(np.matmul(spread.transpose(0, 2, 1), spread))
-    freedoms = max(offsets.shape[1] - 3, 1)
-    return np.sqrt(np.maximum(variances[:, 0], 0.0) / freedoms)
+    """For each of m points, the standard deviation (m,) of its neighbors from the plane that fits
+    them best. offsets: (m, k, 3) of the neighbors."""
+    centered = offsets - offsets.mean(axis=1, keepdims=True)
+    variances = np.linalg.eigvalsh(np.matmul(centered.transpose(0, 2, 1), centered))
+    degrees_of_freedom = max(offsets.shape[1] - 3, 1)
+    return np.sqrt(np.maximum(variances[:, 0], 0.0) / degrees_of_freedom)
 
 
 def _min_variance_axes(offsets: FloatArray, weights: FloatArray | None) -> FloatArray:
-    """(m, 3) the directions in which offsets (m, k, 3), weighted (m, k), vary least."""
+    """(m, 3) unit vectors along which the offsets (m, k, 3) vary least. weights: (m, k) of the
+    offsets; None for equal weights."""
     weighted = offsets if weights is None else offsets * weights[:, :, None]
     _, axes = np.linalg.eigh(np.matmul(weighted.transpose(0, 2, 1), offsets))
     return axes[:, :, 0]
 
 
 def _deviations_by_normals(
-    offsets: FloatArray, normals: FloatArray, theirs: FloatArray
+    offsets: FloatArray, normals: FloatArray, neighbor_normals: FloatArray
 ) -> FloatArray:
-    """Standard deviations (m,) of t_j among the neighbors whose normals are like the points'
-    normals."""
-    is_like = np.einsum("mi,mki->mk", normals, theirs) > _MIN_NORMAL_COSINE
-    heights = np.einsum("mki,mki->mk", 0.5 * (normals[:, None] + theirs), offsets)
-    count = np.maximum(is_like.sum(axis=1), 2)
-    mean = (heights * is_like).sum(axis=1) / count
-    return np.sqrt(((heights - mean[:, None]) ** 2 * is_like).sum(axis=1) / (count - 1))
+    """For each of m points, the standard deviation (m,) of t_j (module docstring) among the
+    neighbors with a similar normal.
+
+    offsets: (m, k, 3) of the neighbors.
+    normals: (m, 3) of the points. neighbor_normals: (m, k, 3).
+    """
+    is_similar = np.einsum("mi,mki->mk", normals, neighbor_normals) > _MIN_NORMAL_COSINE
+    heights = np.einsum("mki,mki->mk", 0.5 * (normals[:, None] + neighbor_normals), offsets)
+    count = np.maximum(is_similar.sum(axis=1), 2)
+    mean = (heights * is_similar).sum(axis=1) / count
+    return np.sqrt(((heights - mean[:, None]) ** 2 * is_similar).sum(axis=1) / (count - 1))
 
 
 class CloudDenoiser:
@@ -179,9 +187,9 @@ class CloudDenoiser:
         self.points, self.noise = points, noise
         self.tree = build_point_tree(points) if tree is None else tree
         self.selected = np.arange(len(points))
-        if (part := noise.kept_fraction()) < 1:
+        if (fraction := noise.kept_fraction()) < 1:
             subset = np.random.default_rng(0).choice(
-                len(points), max(4, round(part * len(points))), replace=False
+                len(points), max(4, round(fraction * len(points))), replace=False
             )
             # In the order of the tree, so that neighbors of neighbors are looked up together.
             rank = np.empty(len(points), np.int64)
@@ -204,18 +212,21 @@ class CloudDenoiser:
                 _neighbors(build_point_tree(points), points, _INITIAL_NEIGHBORS),
                 points,
                 own_normals,
-                _NORMAL_CHORD,
+                _NORMAL_SCALE,
             )
-        near = _neighbors(self.tree, points, self.noise.neighbor_count)
-        return _move_along_normals(points, own_normals, near, self.points, normals, _NORMAL_CHORD)
+        neighbors = _neighbors(self.tree, points, self.noise.neighbor_count)
+        return _move_along_normals(
+            points, own_normals, neighbors, self.points, normals, _NORMAL_SCALE
+        )
 
     def denoise_points_and_normals(self, normals: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The selected points, moved, and their normals, improved in turn with the points: (k, 3)
-        each. k <= m, as points whose normals hardly any neighbor has are left out.
+        """Move the selected points and improve their normals, in alternation. Returns points and
+        normals, (k, 3) each. k <= m, as a point is dropped if hardly any neighbor has a normal
+        similar to its own.
 
         normals: (m, 3), estimates for the selected points.
         """
-        start, chord = self.points[self.selected], _CHORD_OF_ESTIMATES
+        start, normal_scale = self.points[self.selected], _ESTIMATED_NORMAL_SCALE
         if len(start) == len(self.points):
             nearest = self.selected
             adjacent = _neighbors(self.tree, start, _PLANE_NEIGHBORS)
@@ -223,15 +234,21 @@ class CloudDenoiser:
             tree = build_point_tree(start)
             nearest = _neighbors(tree, self.points, 1)[:, 0]
             adjacent = _neighbors(tree, start, _INITIAL_NEIGHBORS)
-            start = _move_along_normals(start, normals, adjacent, start, normals, chord)
-        near = _neighbors(self.tree, start, self.noise.neighbor_count)
-        moved = _move_along_normals(start, normals, near, self.points, normals[nearest], chord)
+            start = _move_along_normals(start, normals, adjacent, start, normals, normal_scale)
+        neighbors = _neighbors(self.tree, start, self.noise.neighbor_count)
+        moved = _move_along_normals(
+            start, normals, neighbors, self.points, normals[nearest], normal_scale
+        )
         for _ in range(_NORMAL_ITERATIONS):
-            normals = _refit_normals(moved, normals, adjacent, chord)
-            moved = _move_along_normals(start, normals, near, self.points, normals[nearest], chord)
-        is_self = near == self.selected[:, None]
+            normals = _refit_normals(moved, normals, adjacent, normal_scale)
+            moved = _move_along_normals(
+                start, normals, neighbors, self.points, normals[nearest], normal_scale
+            )
+        is_self = neighbors == self.selected[:, None]
         is_kept = (
-            _agreeing_weight(start, normals, near, is_self, self.points, normals[nearest], chord)
+            _agreeing_weight(
+                start, normals, neighbors, is_self, self.points, normals[nearest], normal_scale
+            )
             >= _MIN_AGREEING_WEIGHT
         )
         return moved[is_kept], normals[is_kept]
@@ -243,122 +260,138 @@ def _neighbors(tree: Any, points: FloatArray, count: int) -> Indices:
     count = min(count, tree.n)
     index = np.empty((len(points), count), np.int32)
 
-    def find(part: slice) -> None:
-        index[part] = tree.query(points[part], k=count)[1].reshape(-1, count)
+    def find_slice(rows: slice) -> None:
+        index[rows] = tree.query(points[rows], k=count)[1].reshape(-1, count)
 
-    parallel_over_slices(find, len(points))
+    parallel_over_slices(find_slice, len(points))
     return index
 
 
 def _move_along_normals(
     start: FloatArray,
     own_normals: FloatArray,
-    near: Indices,
+    neighbors: Indices,
     points: FloatArray,
     normals: FloatArray,
-    chord: float,
+    normal_scale: float,
 ) -> FloatArray:
-    """Points (m, 3), moved along their normals `own_normals` (m, 3) to where the mean of t_j is 0.
+    """The points `start` (m, 3), each moved along its normal to where the weighted mean of t_j
+    (module docstring) is 0.
 
-    near: (m, k) the indices of their neighbors among points (n, 3) with normals (n, 3). Weights
-        depend on the distance along the plane of the point only: with the distance in space,
-        neighbors on the point's side of the surface would hold it there.
+    own_normals: (m, 3) of the points `start`.
+    neighbors: (m, k) the indices of their neighbors among `points` (n, 3), which have `normals` (n,
+        3).
+    normal_scale: the difference |n - n_j| at which the weight of a neighbor is 1/e.
+
+    Weights depend on the distance along the tangent plane only. With the distance in space, the
+    neighbors on the same side of the surface as the point would hold it there.
     """
     moved = np.empty_like(start)
 
-    def move(part: slice) -> None:
-        n, index = own_normals[part], near[part]
-        theirs, offsets = normals[index], points[index] - start[part, None]
+    def move_slice(rows: slice) -> None:
+        """Move the points of a slice."""
+        n, index = own_normals[rows], neighbors[rows]
+        neighbor_normals, offsets = normals[index], points[index] - start[rows, None]
         height = np.einsum("mi,mki->mk", n, offsets)
-        cosine = np.einsum("mi,mki->mk", n, theirs)
-        weight = _weights(_squared_tangential(offsets, height), cosine, chord)
+        cosine = np.einsum("mi,mki->mk", n, neighbor_normals)
+        weight = _weights(_squared_tangential(offsets, height), cosine, normal_scale)
         # The mean of n_j . (p_j - x) and n . (p_j - x); both are linear where x moves along n.
-        heights = 0.5 * (np.einsum("mki,mki->mk", theirs, offsets) + height)
+        heights = 0.5 * (np.einsum("mki,mki->mk", neighbor_normals, offsets) + height)
         slope = 0.5 * (weight * (cosine + 1)).sum(axis=1)
         # A point whose normal no neighbor supports stays.
         mean = np.where(slope > _MIN_SLOPE, (weight * heights).sum(axis=1), 0.0)
-        moved[part] = start[part] + (mean / np.maximum(slope, _MIN_SLOPE))[:, None] * n
+        moved[rows] = start[rows] + (mean / np.maximum(slope, _MIN_SLOPE))[:, None] * n
 
-    parallel_over_slices(move, len(start))
+    parallel_over_slices(move_slice, len(start))
     return moved
 
 
 def _agreeing_weight(
     start: FloatArray,
     own_normals: FloatArray,
-    near: Indices,
+    neighbors: Indices,
     is_own: BoolArray,
     points: FloatArray,
     normals: FloatArray,
-    chord: float,
+    normal_scale: float,
 ) -> FloatArray:
-    """(m,) the fraction, by weight, of the neighbors of points that have a normal like the point's.
+    """(m,) the fraction, by weight, of each point's neighbors that have a normal similar to its
+    own.
 
-    is_own: (m, k) whether a neighbor is the point itself, which does not count. The other
-        arguments: as for `_move_along_normals`.
+    is_own: (m, k) whether a neighbor is the point itself, which does not count.
+
+    The other arguments are those of `_move_along_normals`.
     """
     fraction = np.empty(len(start))
 
-    def add(part: slice) -> None:
-        n, index = own_normals[part], near[part]
-        offsets = points[index] - start[part, None]
+    def add_slice(rows: slice) -> None:
+        """Compute the fractions for a slice of the points."""
+        n, index = own_normals[rows], neighbors[rows]
+        offsets = points[index] - start[rows, None]
         height = np.einsum("mi,mki->mk", n, offsets)
         weight = (
-            np.exp(
-                -_DISTANCE_DECAY * _relative_to_row_maximum(_squared_tangential(offsets, height))
-            )
-            * ~is_own[part]
+            np.exp(-_DISTANCE_DECAY * _relative(_squared_tangential(offsets, height)))
+            * ~is_own[rows]
         )
         cosine = np.einsum("mi,mki->mk", n, normals[index])
-        fraction[part] = (weight * _normal_weight(cosine, chord)).sum(axis=1) / weight.sum(axis=1)
+        fraction[rows] = (weight * _normal_weight(cosine, normal_scale)).sum(axis=1) / weight.sum(
+            axis=1
+        )
 
-    parallel_over_slices(add, len(start))
+    parallel_over_slices(add_slice, len(start))
     return fraction
 
 
 def _refit_normals(
-    points: FloatArray, normals: FloatArray, near: Indices, chord: float
+    points: FloatArray, normals: FloatArray, neighbors: Indices, normal_scale: float
 ) -> FloatArray:
-    """Normals (m, 3) of points (m, 3), from the planes of their neighbors (m, k) that have similar
-    normals."""
-    turned = np.empty_like(normals)
+    """New normals (m, 3) of points (m, 3): normals of the planes that fit those neighbors best that
+    have similar normals. The signs are those of `normals`.
 
-    def turn(part: slice) -> None:
-        index = near[part]
-        offsets = points[index] - points[part, None]
-        cosine = np.einsum("mi,mki->mk", normals[part], normals[index])
-        weight = _weights(_squares(offsets), cosine, chord)
+    neighbors: (m, k) indices of the neighbors.
+    normal_scale: the difference of two normals at which the weight of a neighbor is 1/e.
+    """
+    refitted = np.empty_like(normals)
+
+    def refit_slice(rows: slice) -> None:
+        """Fit the normals of a slice of the points."""
+        index = neighbors[rows]
+        offsets = points[index] - points[rows, None]
+        cosine = np.einsum("mi,mki->mk", normals[rows], normals[index])
+        weight = _weights(_squares(offsets), cosine, normal_scale)
         offsets -= np.einsum("mk,mki->mi", weight, offsets)[:, None]
-        line = _min_variance_axes(offsets, weight)
-        is_reversed = np.einsum("mi,mi->m", line, normals[part]) < 0
-        turned[part] = np.where(is_reversed[:, None], -line, line)
+        axis = _min_variance_axes(offsets, weight)
+        is_reversed = np.einsum("mi,mi->m", axis, normals[rows]) < 0
+        refitted[rows] = np.where(is_reversed[:, None], -axis, axis)
 
-    parallel_over_slices(turn, len(points))
-    return turned
+    parallel_over_slices(refit_slice, len(points))
+    return refitted
 
 
 def _squares(offsets: FloatArray) -> FloatArray:
+    """(m, k) squared lengths of offsets (m, k, 3)."""
     return np.einsum("mki,mki->mk", offsets, offsets)
 
 
 def _squared_tangential(offsets: FloatArray, height: FloatArray) -> FloatArray:
-    """(m, k) squared lengths of offsets (m, k, 3) along planes, from their heights (m, k)."""
+    """(m, k) squared lengths of the parts of offsets (m, k, 3) along the tangent planes; height:
+    (m, k) the parts normal to them."""
     return np.maximum(_squares(offsets) - height * height, 0.0)
 
 
-def _relative_to_row_maximum(square: FloatArray) -> FloatArray:
-    """(m, k) squared distances as parts of the largest in each row."""
+def _relative(square: FloatArray) -> FloatArray:
+    """(m, k) squared distances, divided by the largest in each row."""
     return square / np.maximum(square.max(axis=1, keepdims=True), 1e-300)
 
 
-def _normal_weight(cosine: FloatArray, chord: float) -> FloatArray:
-    return np.exp(-(2 - 2 * cosine) / chord**2)
+def _normal_weight(cosine: FloatArray, normal_scale: float) -> FloatArray:
+    """(m, k) weights by the cosine between normals: 1 for equal normals, 1/e for a difference of
+    `normal_scale`."""
+    return np.exp(-(2 - 2 * cosine) / normal_scale**2)
 
 
-def _weights(square: FloatArray, cosine: FloatArray, chord: float) -> FloatArray:
-    """(m, k) weights of neighbors, whose sum is 1, by squared distances and by cosines between
-    normals."""
-    weight = np.exp(-_DISTANCE_DECAY * _relative_to_row_maximum(square)) * _normal_weight(
-        cosine, chord
-    )
+def _weights(square: FloatArray, cosine: FloatArray, normal_scale: float) -> FloatArray:
+    """(m, k) weights of neighbors, with sum 1 in each row, from their squared distances and the
+    cosines between normals."""
+    weight = np.exp(-_DISTANCE_DECAY * _relative(square)) * _normal_weight(cosine, normal_scale)
     return weight / weight.sum(axis=1, keepdims=True)

@@ -22,15 +22,16 @@ def _check_whole(name: str, number: Any) -> None:
         raise TypeError(f"{name} must be a whole number, not {number!r}")
 
 
-def _angles(n: int, least: int) -> FloatArray:
-    """n angles that divide the full turn.
+def _angles(n: int, minimum: int) -> FloatArray:
+    """n angles that divide the full turn, in radians.
 
     Raises:
-        ValueError: fewer than `least`. TypeError: n is not an integer.
+        ValueError: n is less than `minimum`.
+        TypeError: n is not an integer.
     """
     _check_whole("the number of vertices of a curve", n)
-    if n < least:
-        raise ValueError(f"this curve needs at least {least} vertices, not {n}")
+    if n < minimum:
+        raise ValueError(f"this curve needs at least {minimum} vertices, not {n}")
     return 2.0 * np.pi * np.arange(n) / n
 
 
@@ -93,15 +94,15 @@ def coil(
     """
     if turns < 1:
         raise ValueError(f"a coil needs at least one turn, not {turns}")
-    corners = {"outside": 1.5 * radius, "axis": 0.0}
-    if return_path not in corners:
+    return_x = {"outside": 1.5 * radius, "axis": 0.0}
+    if return_path not in return_x:
         raise ValueError(f'the route of a coil is "outside" or "axis", not {return_path!r}')
     if n < 3 * turns + 3:
         raise ValueError(f"a coil of {turns} turns needs at least {3 * turns + 3} vertices")
     s = np.linspace(0.0, 1.0, n - 2)
     t = 2.0 * np.pi * turns * s
     helix = np.column_stack([radius * np.cos(t), radius * np.sin(t), height * (s - 0.5)])
-    x = corners[return_path]
+    x = return_x[return_path]
     return np.concatenate([helix, [[x, 0.0, 0.5 * height], [x, 0.0, -0.5 * height]]])
 
 
@@ -168,7 +169,7 @@ def spiky_polygon(
     Even vertices are spikes, odd ones lie near the inner radius.
     """
     t = _angles(n, 3) + rng.uniform(-0.3, 0.3, size=n) * (2.0 * np.pi / n)
-    reach = rng.uniform(0.6, 1.0, size=n)
-    reach[1::2] = rng.uniform(inner, 1.5 * inner, size=len(reach[1::2]))
+    radii = rng.uniform(0.6, 1.0, size=n)
+    radii[1::2] = rng.uniform(inner, 1.5 * inner, size=len(radii[1::2]))
     z = rng.uniform(-height, height, size=n)
-    return np.column_stack([reach * np.cos(t), reach * np.sin(t), z])
+    return np.column_stack([radii * np.cos(t), radii * np.sin(t), z])

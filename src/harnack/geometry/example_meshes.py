@@ -111,6 +111,7 @@ def _random_faces(faces: IntArray, fraction: float, seed: int) -> IntArray:
 
 
 def _icosahedron() -> MeshArrays:
+    """The icosahedron in the unit sphere."""
     golden = 0.5 * (1.0 + np.sqrt(5.0))
     corners = [(0.0, y, z) for y in (-1.0, 1.0) for z in (-golden, golden)]
     vertices = np.concatenate([np.roll(corners, shift, axis=1) for shift in range(3)])
@@ -130,13 +131,13 @@ def _icosahedron() -> MeshArrays:
 
 
 def _subdivided(vertices: FloatArray, faces: IntArray) -> MeshArrays:
-    """Each face cut in four at the middles of its edges, which become new vertices."""
+    """Each face divided in four at the midpoints of its edges, which become new vertices."""
     ends = np.roll(faces, -1, axis=1)
     n = len(vertices)
     keys = np.minimum(faces, ends) * n + np.maximum(faces, ends)
-    edges, middle = np.unique(keys.ravel(), return_inverse=True)
-    middles = 0.5 * (vertices[edges // n] + vertices[edges % n])
+    edges, midpoint_index = np.unique(keys.ravel(), return_inverse=True)
+    midpoints = 0.5 * (vertices[edges // n] + vertices[edges % n])
     a, b, c = faces.T
-    ab, bc, ca = (n + middle.reshape(-1, 3)).T
-    cut = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3)
-    return np.concatenate([vertices, middles]), cut
+    ab, bc, ca = (n + midpoint_index.reshape(-1, 3)).T
+    children = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3)
+    return np.concatenate([vertices, midpoints]), children

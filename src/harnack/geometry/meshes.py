@@ -111,14 +111,14 @@ def without_zero_area_faces(
 
 
 def solid_angles(corners: FloatArray, point: FloatArray) -> FloatArray:
-    """(m,) solid angles of triangles (m, 3, 3) as seen from a point (3,) (Van Oosterom and Strackee
-    1983), between -2 pi and 2 pi: positive as seen from the negative side of a triangle. Added up
-    over a mesh and divided by 4 pi they are its winding number."""
+    """The solid angles (m,) of triangles (m, 3, 3) as seen from a point (3,), between -2 pi and 2
+    pi (Van Oosterom and Strackee 1983). They are positive if the point is on the negative side of
+    the triangle. Their sum over a mesh, divided by 4 pi, is the winding number of the mesh."""
     a, b, c = (corners[:, k] - point for k in range(3))
-    x, y, z = (np.sqrt(np.einsum("ij,ij->i", side, side)) for side in (a, b, c))
+    x, y, z = (np.sqrt(np.einsum("ij,ij->i", offset, offset)) for offset in (a, b, c))
     ab, bc, ca = (np.einsum("ij,ij->i", p, q) for p, q in ((a, b), (b, c), (c, a)))
-    below = x * y * z + ab * z + bc * x + ca * y
-    return 2 * np.arctan2(np.einsum("ij,ij->i", a, np.cross(b, c)), below)
+    denominator = x * y * z + ab * z + bc * x + ca * y
+    return 2 * np.arctan2(np.einsum("ij,ij->i", a, np.cross(b, c)), denominator)
 
 
 def _checked_arrays(vertices: Any, faces: Any) -> tuple[FloatArray, IntArray]:
@@ -129,6 +129,7 @@ def _checked_arrays(vertices: Any, faces: Any) -> tuple[FloatArray, IntArray]:
 
 
 def _as_vertices(vertices: Any) -> FloatArray:
+    """A new float64 array (n, 3) of finite vertices. Raises MeshError."""
     array = _as_array(vertices, "the vertices", "every vertex needs three coordinates")
     if array.size == 0:
         raise MeshError("there are no vertices: give an array (n, 3)")
@@ -145,6 +146,7 @@ def _as_vertices(vertices: Any) -> FloatArray:
 
 
 def _as_faces(faces: Any, count: int) -> IntArray:
+    """A new int64 array (m, 3) of indices of `count` vertices. Raises MeshError."""
     array = _as_array(faces, "the faces", "every face needs three indices; triangulate polygons")
     if array.size == 0:
         raise MeshError("there are no faces: give an array (m, 3) of vertex indices")
@@ -165,6 +167,7 @@ def _as_faces(faces: Any, count: int) -> IntArray:
 
 
 def _check_range(faces: npt.NDArray[Any], count: int) -> None:
+    """Raise a MeshError for a face with an index outside of [0, count)."""
     if int(faces.min()) >= 0 and int(faces.max()) < count:
         return
     outside = (faces < 0) | (faces >= count)
@@ -182,6 +185,8 @@ def _check_range(faces: npt.NDArray[Any], count: int) -> None:
 
 
 def _as_array(values: Any, name: str, ragged: str) -> npt.NDArray[Any]:
+    """The values as a NumPy array of numbers. ragged: the end of the message for rows of different
+    lengths. Raises MeshError."""
     try:
         array = np.asarray(values)
     except (ValueError, OverflowError):
@@ -208,7 +213,8 @@ def _measure_faces(x: FloatArray, faces: IntArray) -> tuple[BoolArray, FloatArra
 
 
 def _check_size(longest: FloatArray) -> None:
-    """No face so small that the squares of its edges vanish. Zero-area faces were seen before."""
+    """Raise a MeshError for a face so small that squares of its edges underflow. longest: (m,) the
+    longest edge of each face, 0 for some faces of zero area, which are not reported here."""
     small = np.flatnonzero((longest > 0.0) & (longest < 1e-100))
     if small.size:
         raise MeshError(

@@ -22,10 +22,11 @@ Outline = tuple[FloatArray, ...]
 FillingRule = Literal["even-odd", "nonzero"]
 
 MAX_EDGES = 200_000
-# Segments closer than this part of the outline's size count as touching.
+# Segments that are closer than this fraction of the outline's size count as touching.
 _TOUCH_TOLERANCE = 1e-12
-# Pairs of segments that are compared at once, and in all; with more, crossings are resolved unseen.
-_CHUNK, _MAX_PAIRS = 2_000_000, 100_000_000
+# Number of pairs of segments that are compared at once; and the largest number in all: if there are
+# more pairs, crossings are resolved without looking for them first.
+_PAIRS_PER_BATCH, _MAX_PAIRS = 2_000_000, 100_000_000
 # Coordinates are scaled to about this size for Clipper2, which rounds them to 1e-8.
 _CLIPPER_SIZE = 2.0**17
 
@@ -47,21 +48,21 @@ def make_outline(loops: Any, rule: FillingRule = "even-odd") -> Outline:
         ValueError: a loop is malformed or too large; there is no area inside.
         TypeError: not numbers.
     """
-    checked = _checked_loops(loops)
-    points = np.concatenate(checked)
+    valid_loops = _validated_loops(loops)
+    points = np.concatenate(valid_loops)
     size = float(np.ptp(points, axis=0).max())
     if not size > 0:
         raise ValueError("an outline encloses no area: all of its points are one")
     tolerance = _TOUCH_TOLERANCE * (size + float(np.abs(points).max()))
-    if rule == "even-odd" and not _self_intersects(checked, tolerance):
-        return _orient_loops(checked)
-    outline = _resolve_crossings(checked, rule)
+    if rule == "even-odd" and not _self_intersects(valid_loops, tolerance):
+        return _orient_loops(valid_loops)
+    outline = _resolve_crossings(valid_loops, rule)
     if not outline:
         raise ValueError("an outline encloses no area")
     return outline
 
 
-def _checked_loops(loops: Any) -> list[FloatArray]:
+def _validated_loops(loops: Any) -> list[FloatArray]:
     """The loops as arrays (n, 2), without repeated points.
 
     Raises:
@@ -71,7 +72,7 @@ def _checked_loops(loops: Any) -> list[FloatArray]:
     entries: list[Any] = [loops] if _is_one_loop(loops) else list(loops)
     if not entries:
         raise ValueError("an outline needs a loop of points at least, and there is none")
-    checked: list[FloatArray] = []
+    valid_loops: list[FloatArray] = []
     total = 0
     for k, loop in enumerate(entries):
         name = f"loop {k} of an outline"
@@ -87,12 +88,16 @@ def _checked_loops(loops: Any) -> list[FloatArray]:
         points = points[np.any(points != np.roll(points, 1, axis=0), axis=1)]
         if len(points) < 3:
             raise ValueError(f"{name} needs three points or more that differ, not {len(points)}")
-        checked.append(points)
-    return checked
+        valid_loops.append(points)
+    return valid_loops
 
 
 def _is_one_loop(loops: Any) -> bool:
-    """Whether this is a single loop (n, 2), and no list of loops."""
+    """Whether the argument of `make_outline` is a single loop (n, 2), not a list of loops.
+
+    Raises:
+        TypeError: it is neither.
+    """
     if isinstance(loops, np.ndarray):
         return cast("FloatArray", loops).ndim == 2
     try:
@@ -118,8 +123,8 @@ def _edges_and_successors(loops: list[FloatArray]) -> tuple[FloatArray, FloatArr
 
 
 def _self_intersects(loops: list[FloatArray], tolerance: float) -> bool:
-    """Whether two edges that are not neighbors touch or cross, or a neighbor runs back on an
-    edge."""
+    """Whether two edges that are not neighbors come within `tolerance` of each other, or an edge
+    folds back on its neighbor. True also if there are too many pairs to compare."""
     start, end, successor = _edges_and_successors(loops)
     next_edge = end[successor] - start[successor]
     edge = end - start
@@ -136,7 +141,7 @@ def _self_intersects(loops: list[FloatArray], tolerance: float) -> bool:
         return True
     begin = 0
     while begin < len(order):
-        stop = begin + max(1, int(counts[begin:].cumsum().searchsorted(_CHUNK)))
+        stop = begin + max(1, int(counts[begin:].cumsum().searchsorted(_PAIRS_PER_BATCH)))
         batch = counts[begin:stop]
         rows = np.arange(begin, stop).repeat(batch)
         offset = np.arange(len(rows)) - (batch.cumsum() - batch).repeat(batch)
@@ -153,36 +158,40 @@ def _self_intersects(loops: list[FloatArray], tolerance: float) -> bool:
 def _segments_touch(
     a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, tolerance: float
 ) -> BoolArray:
-    """Whether segments from a to b and from c to d, (k, 2) each, cross or touch."""
+    """(k,) whether the segments from a to b and from c to d, (k, 2) each, cross or come within
+    `tolerance` of each other."""
 
-    def side(p: FloatArray, q: FloatArray, r: FloatArray) -> FloatArray:
+    def orientation(p: FloatArray, q: FloatArray, r: FloatArray) -> FloatArray:
+        """Twice the signed area of the triangles p q r: positive if r is to the left of p -> q."""
         return (q[:, 0] - p[:, 0]) * (r[:, 1] - p[:, 1]) - (q[:, 1] - p[:, 1]) * (r[:, 0] - p[:, 0])
 
-    crossing = (side(a, b, c) * side(a, b, d) < 0) & (side(c, d, a) * side(c, d, b) < 0)
-    nearest = np.minimum.reduce([
+    is_crossing = (orientation(a, b, c) * orientation(a, b, d) < 0) & (
+        orientation(c, d, a) * orientation(c, d, b) < 0
+    )
+    distance = np.minimum.reduce([
         _distances(a, c, d), _distances(b, c, d), _distances(c, a, b), _distances(d, a, b)
     ])  # fmt: skip
-    return crossing | (nearest <= tolerance)
+    return is_crossing | (distance <= tolerance)
 
 
 def _distances(p: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
-    """The distance of each point from its segment."""
+    """The distances (k,) of points p from the segments from a to b, (k, 2) each."""
     edge = b - a
     t = ((p - a) * edge).sum(axis=1) / (edge * edge).sum(axis=1)
     return np.linalg.norm(p - a - np.clip(t, 0, 1)[:, None] * edge, axis=1)
 
 
 def _orient_loops(loops: list[FloatArray]) -> Outline:
-    """Simple loops, oriented so that the region is on the left of each. The region lies inside of a
-    loop if an even number of other loops runs around it, else outside."""
+    """The outline of simple loops: each is oriented so that the region is on its left. The region
+    lies inside of a loop if an even number of other loops runs around it, else outside of it."""
     start, end, _ = _edges_and_successors(loops)
     loop_index = np.repeat(np.arange(len(loops)), [len(points) for points in loops])
     oriented: list[FloatArray] = []
     for k, loop in enumerate(loops):
         x, y = loop[0]
-        spans = (start[:, 1] > y) != (end[:, 1] > y)
-        spans &= loop_index != k
-        a, b = start[spans], end[spans]
+        spans_y = (start[:, 1] > y) != (end[:, 1] > y)
+        spans_y &= loop_index != k
+        a, b = start[spans_y], end[spans_y]
         crossing = a[:, 0] + (y - a[:, 1]) / (b[:, 1] - a[:, 1]) * (b[:, 0] - a[:, 0])
         is_hole = np.count_nonzero(crossing > x) % 2 == 1
         oriented.append(loop[::-1].copy() if (_area(loop) > 0) == is_hole else loop)
@@ -190,9 +199,12 @@ def _orient_loops(loops: list[FloatArray]) -> Outline:
 
 
 def _area(loop: FloatArray) -> float:
-    p = loop - loop[0]
-    q = np.roll(p, -1, axis=0)
-    return 0.5 * float((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum())
+    """The signed area of a loop (n, 2), positive if it runs counter-clockwise."""
+    offsets = loop - loop[0]
+    next_offsets = np.roll(offsets, -1, axis=0)
+    return 0.5 * float(
+        (offsets[:, 0] * next_offsets[:, 1] - offsets[:, 1] * next_offsets[:, 0]).sum()
+    )
 
 
 def _resolve_crossings(loops: list[FloatArray], rule: FillingRule) -> Outline:

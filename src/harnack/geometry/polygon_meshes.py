@@ -34,11 +34,11 @@ __all__ = ["PolygonFaces", "cluster_into_polygons", "validate_polygons"]
 
 # A face whose corners are closer to a line than this fraction of its size counts as collinear.
 _COLLINEAR_TOLERANCE = 1e-9
-# A turn between two edges counts from this fraction of their lengths on.
-_TURN = 1e-6
-# Turns of a convex polygon add up to one revolution, to this many radians.
-_REVOLUTION = 1e-6
-# The largest number of faces with non-convex projections that are examined further, 0.5 ms each.
+# The turn between two edges counts if its sine is at least this.
+_MIN_TURN_SINE = 1e-6
+# The turns of a convex polygon add up to 2 pi, within this tolerance in radians.
+_REVOLUTION_TOLERANCE = 1e-6
+# Faces with a non-convex projection are examined further, 0.5 ms each, up to this number.
 _MAX_EXAMINED_FACES = 20_000
 
 
@@ -75,9 +75,9 @@ class PolygonFaces:
     @property
     def next_corner(self) -> IntArray:
         """(k,) the index in `corners` of the next corner of the same loop."""
-        after = np.arange(1, len(self.corners) + 1, dtype=np.int64)
-        after[self.loop_starts + self.loop_sizes - 1] = self.loop_starts
-        return after
+        following = np.arange(1, len(self.corners) + 1, dtype=np.int64)
+        following[self.loop_starts + self.loop_sizes - 1] = self.loop_starts
+        return following
 
     @property
     def edges(self) -> IntArray:
@@ -87,11 +87,11 @@ class PolygonFaces:
 
     def loops(self, face: int) -> list[FloatArray]:
         """The closed curves of a face, (n, 3) each."""
-        chosen = np.flatnonzero(self.face_of_loop == face)
-        pieces = (
-            slice(self.loop_starts[k], self.loop_starts[k] + self.loop_sizes[k]) for k in chosen
+        loop_ids = np.flatnonzero(self.face_of_loop == face)
+        slices = (
+            slice(self.loop_starts[k], self.loop_starts[k] + self.loop_sizes[k]) for k in loop_ids
         )
-        return [self.vertices[self.corners[piece]] for piece in pieces]
+        return [self.vertices[self.corners[corners]] for corners in slices]
 
     def face_boxes(self) -> tuple[FloatArray, FloatArray]:
         """Lower and upper corners (m, 3) of the boxes around the vertices of each face."""
@@ -126,20 +126,20 @@ class PolygonFaces:
         x = self.vertices[self.corners]
         face, first = self.face_of_corner, self.first_corners
         center = np.add.reduceat(x, first) / np.diff(np.append(first, len(x)))[:, None]
-        a = x - center[face]
-        normal = np.add.reduceat(np.cross(a, a[self.next_corner]), first)
+        offsets = x - center[face]
+        normal = np.add.reduceat(np.cross(offsets, offsets[self.next_corner]), first)
         length = np.linalg.norm(normal, axis=1)
         normal /= np.where(length > 0, length, 1)[:, None]
         edge = x[self.next_corner] - x
         min_sine = np.linalg.norm(edge, axis=1)
-        min_sine *= _TURN * min_sine[self.next_corner]
+        min_sine *= _MIN_TURN_SINE * min_sine[self.next_corner]
         edge -= (edge * normal[face]).sum(axis=1)[:, None] * normal[face]
         next_edge = edge[self.next_corner]
         sine = (np.cross(edge, next_edge) * normal[face]).sum(axis=1)
         cosine = (edge * next_edge).sum(axis=1)
         turns_left = np.logical_and.reduceat(sine > min_sine, first)
         total_turn = np.add.reduceat(np.arctan2(sine, cosine), first)
-        is_once = np.abs(total_turn - 2 * np.pi) < _REVOLUTION
+        is_once = np.abs(total_turn - 2 * np.pi) < _REVOLUTION_TOLERANCE
         is_single = np.bincount(self.face_of_loop, minlength=self.face_count) == 1
         return turns_left & is_once & is_single & (length > 0)
 
@@ -183,6 +183,7 @@ def validate_polygons(vertices: Any, faces: Any) -> PolygonFaces:
 
 
 def _checked_vertices(vertices: Any) -> FloatArray:
+    """A new float64 array (n, 3) of finite vertices. Raises MeshError."""
     array = as_real_array(vertices, "the vertices", MeshError, ragged="must all have 3 coordinates")
     if array.size == 0:
         raise MeshError("there are no vertices: give an array (n, 3)")
@@ -197,7 +198,8 @@ def _checked_vertices(vertices: Any) -> FloatArray:
 
 
 def _flatten_faces(faces: Any) -> tuple[IntArray, IntArray, IntArray]:
-    """The corners of all loops, and the size and the face of each loop."""
+    """The corners (k,) of all loops, one loop after the other; and the number of corners (l,) and
+    the face (l,) of each loop. Raises MeshError."""
     if not _is_list(faces):
         raise MeshError(f"the faces must be a list of lists of vertex indices, not {faces!r}")
     if len(faces) == 0:
@@ -207,9 +209,9 @@ def _flatten_faces(faces: Any) -> tuple[IntArray, IntArray, IntArray]:
     loops: list[Any] = []
     owners: list[int] = []
     for k, face in enumerate(faces):
-        several = _loops_of(face, k)
-        loops += several
-        owners += [k] * len(several)
+        face_loops = _loops_of(face, k)
+        loops += face_loops
+        owners += [k] * len(face_loops)
     sizes = np.array([len(loop) for loop in loops], dtype=np.int64)
     if (short := np.flatnonzero(sizes < 3)).size:
         raise MeshError(
@@ -221,7 +223,7 @@ def _flatten_faces(faces: Any) -> tuple[IntArray, IntArray, IntArray]:
 
 
 def _loops_of(face: Any, k: int) -> list[Any]:
-    """The loops of a face, integer arrays (n,)."""
+    """The loops of face number k, as integer arrays (n,). Raises MeshError."""
     if not _is_list(face):
         raise MeshError(
             f"face {k} is {face!r}: it must be a list of vertex indices, or a list of such loops"
@@ -247,6 +249,7 @@ def _loops_of(face: Any, k: int) -> list[Any]:
 
 
 def _is_list(value: Any) -> bool:
+    """Whether a value is a list or an array of at least one dimension."""
     is_array = isinstance(value, np.ndarray) and value.ndim > 0
     return is_array or (isinstance(value, Sequence) and not isinstance(value, str))
 
@@ -280,7 +283,7 @@ def _check_edges(mesh: PolygonFaces) -> None:
 
 
 def _first_repeated_key(keys: IntArray) -> int | None:
-    """The index of the first key that came before."""
+    """The index of the first key that occurs earlier in the array; None if all keys differ."""
     _, first = np.unique(keys, return_index=True)
     if len(first) == len(keys):
         return None
@@ -288,27 +291,29 @@ def _first_repeated_key(keys: IntArray) -> int | None:
 
 
 def _check_not_collinear(mesh: PolygonFaces) -> None:
-    """Raise MeshError for a face whose corners are collinear: all within 1e-9 of its size from the
-    line that joins the corner farthest from the center of its box to the corner farthest from that
-    corner."""
+    """Raise a MeshError for a face whose corners are collinear.
+
+    Let a be the corner that is farthest from the center of the face's box, and b the corner that is
+    farthest from a. The corners are collinear if all are within 1e-9 of the face's size from the
+    line through a and b.
+    """
     x, face = mesh.vertices[mesh.corners], mesh.face_of_corner
     lower, upper = mesh.face_boxes()
-    a = x - (0.5 * (lower + upper))[face]
-    a /= np.abs(upper - lower).max(axis=1)[face][:, None]
-    # The corner of each face that is farthest from the center, and the offsets of the others from
-    # it.
-    square = (a * a).sum(axis=1)
-    order = np.lexsort((square, face))
+    relative = x - (0.5 * (lower + upper))[face]
+    relative /= np.abs(upper - lower).max(axis=1)[face][:, None]
+    # The pole of each face is its corner farthest from the center; offsets are relative to it.
+    squared_radius = (relative * relative).sum(axis=1)
+    order = np.lexsort((squared_radius, face))
     last = np.append(np.flatnonzero(np.diff(face[order])), len(order) - 1)
-    pole = a[order[last]]
-    offset = a - pole[face]
+    pole = relative[order[last]]
+    offset = relative - pole[face]
     # From the pole to the corner that is farthest from it.
     square_distance = (offset * offset).sum(axis=1)
     order = np.lexsort((square_distance, face))
-    line = offset[order[last]]
-    line /= np.linalg.norm(line, axis=1, keepdims=True)
+    direction = offset[order[last]]
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     distance = np.linalg.norm(
-        offset - (offset * line[face]).sum(axis=1)[:, None] * line[face], axis=1
+        offset - (offset * direction[face]).sum(axis=1)[:, None] * direction[face], axis=1
     )
     widest = np.maximum.reduceat(distance, mesh.first_corners)
     if (flat := np.flatnonzero(widest < _COLLINEAR_TOLERANCE)).size:
@@ -348,38 +353,44 @@ def cluster_into_polygons(
     """
     if not 2 <= count <= len(faces):
         raise ValueError(f"a mesh of {len(faces):,} faces has 2 to as many patches, not {count}")
-    patch = _clusters(vertices, faces, count, iterations, seed)
-    order = np.argsort(patch, kind="stable")
-    parts = np.split(faces[order], np.flatnonzero(np.diff(patch[order])) + 1)
+    cluster_of = _clusters(vertices, faces, count, iterations, seed)
+    order = np.argsort(cluster_of, kind="stable")
+    parts = np.split(faces[order], np.flatnonzero(np.diff(cluster_of[order])) + 1)
     loops = [join_edges(boundary_edges(part.tolist())) for part in parts]
     loops = [cluster for cluster in loops if cluster]
     used = np.unique([corner for cluster in loops for loop in cluster for corner in loop])
-    number = np.full(len(vertices), -1)
-    number[used] = np.arange(len(used))
-    numbered = [[[int(number[corner]) for corner in loop] for loop in cluster] for cluster in loops]
+    new_index = np.full(len(vertices), -1)
+    new_index[used] = np.arange(len(used))
+    polygons = [
+        [[int(new_index[corner]) for corner in loop] for loop in cluster] for cluster in loops
+    ]
     points = vertices[used]
     if smoothing:
         ends = np.array(
-            [(a, b) for cluster in numbered for loop in cluster for a, b in _edges(loop)]
+            [(a, b) for cluster in polygons for loop in cluster for a, b in _loop_edges(loop)]
         )
         points = _smoothed(points, np.unique(np.sort(ends, axis=1), axis=0), smoothing)
-    return points, numbered
+    return points, polygons
 
 
-def _edges(loop: list[int]) -> list[tuple[int, int]]:
+def _loop_edges(loop: list[int]) -> list[tuple[int, int]]:
+    """The edges of a loop of vertex indices, as pairs."""
     return list(zip(loop, [*loop[1:], loop[0]], strict=True))
 
 
 def _smoothed(points: FloatArray, edges: IntArray, times: int) -> FloatArray:
-    """The points, where points of exactly two edges (e, 2) are smoothed along the polygon, `times`
-    times."""
-    both = np.concatenate([edges, edges[:, ::-1]])
-    inner = np.bincount(both[:, 0], minlength=len(points)) == 2
-    both = both[np.argsort(both[:, 0], kind="stable")]
-    neighbors = both[inner[both[:, 0]], 1].reshape(-1, 2)
+    """The points (n, 3), where each point of exactly two edges is moved to the middle between its
+    position and the mean of its two neighbors, `times` times.
+
+    edges: (e, 2), each edge once.
+    """
+    directed = np.concatenate([edges, edges[:, ::-1]])
+    is_inner = np.bincount(directed[:, 0], minlength=len(points)) == 2
+    directed = directed[np.argsort(directed[:, 0], kind="stable")]
+    neighbors = directed[is_inner[directed[:, 0]], 1].reshape(-1, 2)
     for _ in range(times):
         moved = points.copy()
-        moved[inner] = 0.5 * (points[inner] + points[neighbors].mean(axis=1))
+        moved[is_inner] = 0.5 * (points[is_inner] + points[neighbors].mean(axis=1))
         points = moved
     return points
 
@@ -387,23 +398,24 @@ def _smoothed(points: FloatArray, edges: IntArray, times: int) -> FloatArray:
 def _clusters(
     vertices: FloatArray, faces: IntArray, count: int, iterations: int, seed: int
 ) -> IntArray:
-    """The patch of each triangle (m,)."""
-    import scipy.spatial  # here: half a second that few need
+    """The cluster (m,) of each triangle, by Lloyd's algorithm in six dimensions
+    (`cluster_into_polygons`)."""
+    import scipy.spatial  # imported here: it takes half a second, and few programs need it
 
     spatial: Any = scipy.spatial
     corners = vertices[faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(normal, axis=1)
     points = np.hstack([corners.mean(axis=1), _NORMAL_WEIGHT * normal / area[:, None]])
-    chance = area / area.sum()
+    probability = area / area.sum()
     rng = np.random.default_rng(seed)
-    centers = points[rng.choice(len(points), count, p=chance, replace=False)]
-    patch = np.zeros(len(faces), dtype=np.int64)
+    centers = points[rng.choice(len(points), count, p=probability, replace=False)]
+    cluster_of = np.zeros(len(faces), dtype=np.int64)
     for _ in range(iterations):
-        patch = spatial.KDTree(centers).query(points)[1]
-        weight = np.bincount(patch, area, count)
+        cluster_of = spatial.KDTree(centers).query(points)[1]
+        weight = np.bincount(cluster_of, area, count)
         for axis in range(points.shape[1]):
-            moment = np.bincount(patch, area * points[:, axis], count)
+            moment = np.bincount(cluster_of, area * points[:, axis], count)
             centers[:, axis] = np.where(weight > 0, moment / np.maximum(weight, 1e-300), np.inf)
         centers = centers[weight > 0]
         count = len(centers)

@@ -1,7 +1,7 @@
-"""Closed polygons: removal of edges that are run both ways, and cutting into triangles.
+"""Closed polygons: removal of opposite edges, and triangulation.
 
-Edges that are run both ways are removed by integer index, before a curve is uploaded: in floating
-point, two opposite contributions would leave their rounding errors.
+Pairs of opposite edges are removed by integer index, before a curve is uploaded: in floating point,
+two opposite contributions would leave their rounding errors.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def cancel_opposite_edges(loops: Loops) -> Loops:
     away both vanish, modulo 4 pi.
     """
     points = np.concatenate(loops)
-    begin, end = _welded(loops, points)
+    begin, end = _welded_edges(loops, points)
     edges, weights = net_edges(begin, end)
     if int(weights.sum()) == len(points):
         return loops
@@ -58,12 +58,13 @@ def remaining_edges(loops: Loops) -> tuple[FloatArray, FloatArray]:
     if not loops:
         return np.zeros((0, 3)), np.zeros((0, 3))
     points = np.concatenate(loops)
-    edges, _ = net_edges(*_welded(loops, points))
+    edges, _ = net_edges(*_welded_edges(loops, points))
     return points[edges[:, 0]], points[edges[:, 1]]
 
 
-def _welded(loops: Loops, points: FloatArray) -> tuple[IntArray, IntArray]:
-    """Begin and end of all edges as indices of points, equal for points at the same position."""
+def _welded_edges(loops: Loops, points: FloatArray) -> tuple[IntArray, IntArray]:
+    """The begin and the end (m,) of all edges of the loops, as indices of `points`, which are the
+    vertices of all loops. Points at the same position have the same index."""
     index = weld_vertices(points)
     parts = np.split(index, np.cumsum([len(loop) for loop in loops])[:-1])
     return index, np.concatenate([np.roll(part, -1) for part in parts])
@@ -71,15 +72,16 @@ def _welded(loops: Loops, points: FloatArray) -> tuple[IntArray, IntArray]:
 
 # Triangles of polygons.
 
-# The square of the number of corners plus a constant, summed over the polygons of which ears are
-# cut: about ten seconds of work at worst.
+# The largest work for ear clipping, which takes about ten seconds: the sum, over the polygons that
+# need it, of the squared number of corners plus _WORK_PER_POLYGON.
 _MAX_EAR_WORK = 1_000_000_000
-_WORK_A_POLYGON = 1000
+_WORK_PER_POLYGON = 1000
 # Twice the area of a triangle, in a polygon of size about 1, up to which it counts as flat.
-_FLAT = 1e-12
-# The curvature of an edge with corners in its middle: depth over the square of its length.
-_INWARD = 1e-6
-_CHUNK = 2_000_000
+_FLAT_AREA = 1e-12
+# Straight edges with corners in their middle are bent inwards: a corner at the distances a and b
+# from the ends moves by this times a b.
+_INWARD_CURVATURE = 1e-6
+_CORNERS_PER_GROUP = 2_000_000
 
 
 def triangulate(vertices: FloatArray, corners: IntArray, sizes: IntArray) -> IntArray:
@@ -106,28 +108,28 @@ def triangulate(vertices: FloatArray, corners: IntArray, sizes: IntArray) -> Int
     triangles = [np.zeros((0, 3), dtype=np.int64)]
     owners = [np.zeros(0, dtype=np.int64)]
     work = 0
-    for part in _group_by_size(sizes):
-        k = int(sizes[part[0]])
-        polygons = corners[begins[part][:, None] + np.arange(k)]
-        is_concave = np.zeros(len(part), dtype=bool)
+    for group in _group_by_size(sizes):
+        k = int(sizes[group[0]])
+        polygons = corners[begins[group][:, None] + np.arange(k)]
+        is_concave = np.zeros(len(group), dtype=bool)
         if k > 3:
             is_concave = _fan_is_invalid(vertices, polygons)
             # The fan around the second corner is the fan around the first corner of the rotated
             # polygon.
             polygons[is_concave] = np.roll(polygons[is_concave], -1, axis=1)
-            # A quadrilateral can be cut in no other way.
+            # A quadrilateral has no other triangulation.
             is_concave[is_concave] = k > 4 and _fan_is_invalid(vertices, polygons[is_concave])
-        work += int(is_concave.sum()) * (k * k + _WORK_A_POLYGON)
+        work += int(is_concave.sum()) * (k * k + _WORK_PER_POLYGON)
         if work > _MAX_EAR_WORK:
             raise MeshError(
                 f"{is_concave.sum():,} polygons with dents and {k:,} corners each take too long to "
                 "triangulate: let the program that made the file triangulate them"
             )
         triangles.append(_fans(polygons[~is_concave]))
-        owners.append(np.repeat(part[~is_concave], k - 2))
+        owners.append(np.repeat(group[~is_concave], k - 2))
         projections = _projections(vertices, polygons[is_concave])
         for owner, polygon, projection in zip(
-            part[is_concave], polygons[is_concave], projections, strict=True
+            group[is_concave], polygons[is_concave], projections, strict=True
         ):
             triangles.append(_clip_ears(polygon, projection))
             owners.append(np.full(len(triangles[-1]), owner))
@@ -135,20 +137,20 @@ def triangulate(vertices: FloatArray, corners: IntArray, sizes: IntArray) -> Int
 
 
 def _group_by_size(sizes: IntArray) -> list[IntArray]:
-    """The indices of polygons with the same number of corners, three or more, in groups of limited
-    size."""
+    """Groups of indices of polygons that have the same number of corners, at least three. The size
+    of the groups is limited."""
     order = np.argsort(sizes, kind="stable")
     order = order[sizes[order] >= 3]
     distinct, first = np.unique(sizes[order], return_index=True)
-    parts: list[IntArray] = []
+    groups: list[IntArray] = []
     for size, begin, end in zip(distinct, first, [*first[1:], len(order)], strict=True):
-        step = max(1, _CHUNK // int(size))
-        parts += [order[k : min(k + step, end)] for k in range(begin, end, step)]
-    return parts
+        step = max(1, _CORNERS_PER_GROUP // int(size))
+        groups += [order[k : min(k + step, end)] for k in range(begin, end, step)]
+    return groups
 
 
 def _fans(polygons: IntArray) -> IntArray:
-    """Triangles (m (k - 2), 3) of polygons (m, k) around their first corners."""
+    """The triangles (m (k - 2), 3) of polygons (m, k): the fan of each around its first corner."""
     first = np.broadcast_to(polygons[:, :1], polygons[:, 2:].shape)
     return np.stack([first, polygons[:, 1:-1], polygons[:, 2:]], axis=2).reshape(-1, 3)
 
@@ -158,38 +160,39 @@ def _fan_is_invalid(vertices: FloatArray, polygons: IntArray) -> BoolArray:
 
     Polygons of zero area count as convex.
     """
-    p = vertices[polygons]
-    spokes = p[:, 1:] - p[:, :1]
-    areas = np.cross(spokes[:, :-1], spokes[:, 1:])
+    points = vertices[polygons]
+    diagonals = points[:, 1:] - points[:, :1]
+    areas = np.cross(diagonals[:, :-1], diagonals[:, 1:])
     normal = areas.sum(axis=1)
     square = np.einsum("mj,mj->m", normal, normal)
-    is_turned = np.einsum("mkj,mj->mk", areas, normal) <= _FLAT * square[:, None]
+    is_turned = np.einsum("mkj,mj->mk", areas, normal) <= _FLAT_AREA * square[:, None]
     return is_turned.any(axis=1) & (square > 0.0)
 
 
 def _projections(vertices: FloatArray, polygons: IntArray) -> FloatArray:
-    """Plane coordinates (m, k, 2) of polygons, counter-clockwise, along their mean normals."""
-    p = vertices[polygons]
-    p = p - p[:, :1]
-    normal = np.cross(p[:, :-1], p[:, 1:]).sum(axis=1)
+    """Plane coordinates (m, k, 2) of polygons (m, k), projected along their mean normals; the
+    polygons run counter-clockwise."""
+    offsets = vertices[polygons]
+    offsets = offsets - offsets[:, :1]
+    normal = np.cross(offsets[:, :-1], offsets[:, 1:]).sum(axis=1)
     # The axis most across the normal gives a first tangent, the cross product the second.
     first = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
     second = np.cross(normal, first)
-    size = np.abs(p).max(axis=(1, 2), keepdims=True)[..., 0]
+    size = np.abs(offsets).max(axis=(1, 2), keepdims=True)[..., 0]
     axes = [axis / np.maximum(np.linalg.norm(axis, axis=1, keepdims=True) * size, 1e-300)
             for axis in (first, second)]  # fmt: skip
-    return np.stack([np.einsum("mkj,mj->mk", p, axis) for axis in axes], axis=2)
+    return np.stack([np.einsum("mkj,mj->mk", offsets, axis) for axis in axes], axis=2)
 
 
 def _clip_ears(polygon: IntArray, projection: FloatArray) -> IntArray:
-    """Triangles of a polygon (k,) whose projection (k, 2) is not convex."""
-    import mapbox_earcut  # here, since most files do without
+    """The triangles of a polygon (k,) whose projection (k, 2) is not convex."""
+    import mapbox_earcut  # imported here, since most files do not need it
 
     ears = np.zeros((0, 3), dtype=np.int64)
     if np.isfinite(projection).all():
         ends = np.array([len(polygon)], dtype=np.uint32)
-        cut = mapbox_earcut.triangulate_float64(_perturb_straight_corners(projection), ends)
-        ears = polygon[cut.reshape(-1, 3)]
+        indices = mapbox_earcut.triangulate_float64(_perturb_straight_corners(projection), ends)
+        ears = polygon[indices.reshape(-1, 3)]
     if len(ears) == len(polygon) - 2:
         return ears
     # The polygon crosses or touches itself, and corners were dropped: fans fill what remains.
@@ -207,15 +210,17 @@ def _perturb_straight_corners(projection: FloatArray) -> FloatArray:
         np.roll(projection, -1, axis=0) - projection,
     )
     turn = arriving[:, 0] * leaving[:, 1] - arriving[:, 1] * leaving[:, 0]
-    is_straight = (np.abs(turn) <= _FLAT) & ((arriving * leaving).sum(axis=1) > 0.0)
+    is_straight = (np.abs(turn) <= _FLAT_AREA) & ((arriving * leaving).sum(axis=1) > 0.0)
     ends = np.flatnonzero(~is_straight)
     if len(ends) in (0, len(projection)):
         return projection
     k = np.arange(len(projection))
-    begin = projection[ends[np.searchsorted(ends, k, side="right") - 1]]
-    end = projection[ends[np.searchsorted(ends, k) % len(ends)]]
-    edge = end - begin
+    edge_begin = projection[ends[np.searchsorted(ends, k, side="right") - 1]]
+    edge_end = projection[ends[np.searchsorted(ends, k) % len(ends)]]
+    edge = edge_end - edge_begin
     length = np.maximum(np.linalg.norm(edge, axis=1), 1e-300)
-    depth = np.linalg.norm(projection - begin, axis=1) * np.linalg.norm(end - projection, axis=1)
+    depth = np.linalg.norm(projection - edge_begin, axis=1) * np.linalg.norm(
+        edge_end - projection, axis=1
+    )
     inward = np.stack([-edge[:, 1], edge[:, 0]], axis=1) / length[:, None]
-    return projection + _INWARD * depth[:, None] * inward
+    return projection + _INWARD_CURVATURE * depth[:, None] * inward

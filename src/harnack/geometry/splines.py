@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["smooth_curve"]
 
 Parameterization = Literal["centripetal", "chord"]
-# The parameter grows from point to point by this power of their distance.
+# From a point to the next, the parameter of the spline grows by this power of their distance.
 _POWERS = {"centripetal": 0.5, "chord": 1.0}
 
 
@@ -48,8 +48,9 @@ def smooth_curve(
         1989). "chord": the distance, which makes rounder curves of evenly spaced points.
 
     Returns:
-        (n k, 3) vertices, of an open curve ((n - 1) k + 1, 3), with k = samples_per_segment; a list
-            of such arrays for a list. The result is not checked for self-intersections.
+        The vertices, with k = samples_per_segment: (n k, 3) for a closed curve, ((n - 1) k + 1, 3)
+            for an open one; for a list of curves, a list of such arrays. The result is not checked
+            for self-intersections.
 
     Raises:
         CurveError: fewer than 3 different points, two equal points in a row, NaN, wrong shapes, or
@@ -57,7 +58,7 @@ def smooth_curve(
         TypeError: samples_per_segment is not an integer.
         ValueError: samples_per_segment less than 1, or an unknown spacing.
     """
-    samples_per_segment = _count(samples_per_segment)
+    samples_per_segment = _as_sample_count(samples_per_segment)
     if spacing not in _POWERS:
         raise ValueError(f'spacing is "centripetal" or "chord", not {spacing!r}')
     loops = validate_loops(points, closed=closed)
@@ -70,7 +71,13 @@ def smooth_curve(
     return curves if _is_list(points) else curves[0]
 
 
-def _count(samples: Any) -> int:
+def _as_sample_count(samples: Any) -> int:
+    """The number of samples per segment as an int.
+
+    Raises:
+        TypeError: not an integer.
+        ValueError: less than 1.
+    """
     if isinstance(samples, bool) or not hasattr(samples, "__index__"):
         raise TypeError(f"samples_per_segment must be a whole number, not {samples!r}")
     count = operator.index(samples)
@@ -93,7 +100,8 @@ def _spline(x: FloatArray, samples: int, closed: bool, power: float) -> FloatArr
     """The vertices of the spline through the points of a loop, with `samples` from each point to
     the next.
 
-    power: the parameter grows from point to point like this power of the distance.
+    x: (n, 3) the points.
+    power: from a point to the next, the parameter grows by this power of their distance.
     """
     knots = np.concatenate([x, x[:1]]) if closed else x
     chords = np.diff(knots, axis=0)

@@ -30,18 +30,18 @@ Point: TypeAlias = tuple[float, float, float]
 class Volume(abc.ABC):
     """A closed convex set of R^3, not empty.
 
-    Only points that are certainly outside are cut away: in any precision, `clip` and `contains`
-    lose no point of the volume. They may admit points that lie outside by a few roundings of the
-    coordinates involved (about 1e-6 of the distance to the ray's origin in single precision).
+    In any precision, `clip` and `contains` lose no point of the volume: they exclude a point only
+    if it is certainly outside. They may admit points that lie outside by a few rounding errors of
+    the coordinates (about 1e-6 of the distance to the ray's origin in single precision).
 
     Methods that take Dr.Jit arrays can be called while a loop is being recorded.
 
     `a & b` is the intersection of two volumes, which is convex as well.
     """
 
-    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
-        """Refuses numbers with derivatives, which would be dropped."""
-        check_no_derivatives(cls.__name__, args, kwargs)
+    def __new__(cls, *given: Any, **named: Any) -> Self:
+        """Make a volume. Raises for numbers with derivatives, which would be lost."""
+        check_no_derivatives(cls.__name__, given, named)
         return super().__new__(cls)
 
     def __and__(self, other: object) -> Volume:
@@ -49,7 +49,7 @@ class Volume(abc.ABC):
 
         if not isinstance(other, Volume):
             return NotImplemented
-        return VolumeIntersection((*_parts(self), *_parts(other)))
+        return VolumeIntersection((*_operands(self), *_operands(other)))
 
     @abc.abstractmethod
     def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
@@ -92,10 +92,10 @@ class Volume(abc.ABC):
         return self
 
 
-def _parts(volume: Volume) -> tuple[Volume, ...]:
-    """The operands of an intersection; a volume of another kind itself."""
-    parts: tuple[Volume, ...] | None = getattr(volume, "volumes", None)
-    return (volume,) if parts is None else parts
+def _operands(volume: Volume) -> tuple[Volume, ...]:
+    """The volumes of an intersection; for a volume of another kind, that volume alone."""
+    volumes: tuple[Volume, ...] | None = getattr(volume, "volumes", None)
+    return (volume,) if volumes is None else volumes
 
 
 def clip_rounding(backend: Backend) -> float:
@@ -109,8 +109,8 @@ def clip_rounding(backend: Backend) -> float:
 
 def normalize_empty_interval(t0: Real, t1: Real) -> tuple[Real, Real]:
     """The interval [t0, t1], or (inf, -inf) where it is empty or a single point."""
-    full = t0 < t1
-    return dr.select(full, t0, dr.inf), dr.select(full, t1, -dr.inf)
+    is_nonempty = t0 < t1
+    return dr.select(is_nonempty, t0, dr.inf), dr.select(is_nonempty, t1, -dr.inf)
 
 
 def as_point(value: Iterable[float], name: str, *, finite: bool = True) -> Point:
@@ -132,12 +132,12 @@ def as_point(value: Iterable[float], name: str, *, finite: bool = True) -> Point
     return numbers
 
 
-def check_volume(value: object, name: str) -> None:
+def check_volume(given: object, name: str) -> None:
     """Raise TypeError for a value that is neither a volume nor None."""
-    if value is not None and not isinstance(value, Volume):
+    if given is not None and not isinstance(given, Volume):
         raise TypeError(
             f"{name} must be a volume: a harnack.Ball, harnack.Box or harnack.HalfSpace, or an "
-            f"intersection of these, not {value!r}"
+            f"intersection of these, not {given!r}"
         )
 
 

@@ -20,9 +20,10 @@ if TYPE_CHECKING:
 
 __all__ = ["TangentVoronoi"]
 
-# Lines that are cut at once by each of the others.
+# Number of lines that are intersected with all other lines in one iteration.
 _LINES_PER_ITERATION = 4
-# Sines below which lines are parallel, and distances below which these are equal.
+# Lines count as parallel if the sine of their angle is below this, and as equal if they are
+# parallel and their distance is below this.
 _PARALLEL = 1e-12
 
 
@@ -44,8 +45,10 @@ class _BisectorLine:
 
 @dataclass(frozen=True)
 class TangentVoronoi:
-    """Computes Voronoi areas of points in their tangent planes. positions: of all possible
-    neighbors, on a backend; each coordinate (n,)."""
+    """Computes Voronoi areas of points in their tangent planes.
+
+    positions: the positions of all n possible neighbors, as three coordinates of width n.
+    """
 
     backend: Backend
     positions: tuple[Real, ...]
@@ -60,33 +63,42 @@ class TangentVoronoi:
     def areas(
         self, points: FloatArray, normals: FloatArray, nearest: npt.NDArray[Any], radii: FloatArray
     ) -> FloatArray:
-        """(m,) the areas of the cells of points (m, 3). The cell of a point is { y : |y| <= R, y
-        nearer to the point than to each neighbor }, in the plane through the point normal to its
-        normal.
+        """The areas (m,) of the Voronoi cells of points (m, 3) in their tangent planes. The cell of
+        a point x is the set of the points y of the tangent plane with |y - x| <= R that are nearer
+        to x than to each neighbor.
 
+        normals: (m, 3) unit normals of the tangent planes.
         nearest: (m, k) the indices of the neighbors among the positions.
         radii: (m,) R of each point.
 
-        Where all neighbors lie on one side of a line through the point, their mirror images count
-        too.
+        If all neighbors lie on one side of a line through the point, their mirror images at the
+        point count as neighbors, too.
         """
-        areas, rim = self._cell_areas(points, normals, nearest, radii, mirrored=False)
-        if rim.any():
-            rim_points = points[rim], normals[rim], nearest[rim], radii[rim]
-            areas[rim], _ = self._cell_areas(*rim_points, mirrored=True)
+        areas, one_sided = self._cell_areas(points, normals, nearest, radii, mirrored=False)
+        if one_sided.any():
+            one_sided_points = (
+                points[one_sided],
+                normals[one_sided],
+                nearest[one_sided],
+                radii[one_sided],
+            )
+            areas[one_sided], _ = self._cell_areas(*one_sided_points, mirrored=True)
         return areas * radii * radii
 
     def _cell_areas(
         self, points: FloatArray, normals: FloatArray, nearest: npt.NDArray[Any],
         radii: FloatArray, *, mirrored: bool,
     ) -> tuple[FloatArray, BoolArray]:  # fmt: skip
-        """The areas (m,) of cells in units of the radii squared, and whether all neighbors lie on
-        one side.
+        """The areas (m,) of cells in units of the squared radii, and a mask (m,) of the points all
+        of whose neighbors lie on one side.
 
-        On line j, at distance h_j from the center, the other lines and the circle leave an interval
-        of the position s along it. The region is star shaped, so its area is the sum of the
-        triangles between these intervals and the center, and of circular sectors in the directions
-        that remain. All neighbors lie on one side if one of them has no other neighbor to its left.
+        mirrored: whether the mirror images of the neighbors count as well.
+
+        Each neighbor has a bisector line, at distance h_j from the center of the cell. The other
+        lines and the circle leave an interval of line j: an edge of the cell. The cell is star
+        shaped, so its area is the sum of the triangles between these edges and the center, and of
+        circular sectors in the remaining directions. All neighbors lie on one side if one of them
+        has no other neighbor to its left.
         """
         backend, index = self.backend, self.backend.UInt32
         u, v = (upload_vectors(backend, axis) for axis in orthonormal_basis_rows(normals))
@@ -94,62 +106,69 @@ class TangentVoronoi:
         count = nearest.shape[1]
         table = upload_integers(backend, np.ascontiguousarray(nearest.T).ravel())
         lane, width = dr.arange(index, len(points)), dr.opaque(index, len(points))
-        lines = dr.opaque(index, count * (2 if mirrored else 1))
-        rows = dr.opaque(index, count)
+        line_count = dr.opaque(index, count * (2 if mirrored else 1))
+        neighbor_count = dr.opaque(index, count)
 
-        def line(i: Any, active: Mask) -> _BisectorLine:
-            row = dr.select(i < rows, i, i - rows)
-            bisector = dr.gather(index, table, row * width + lane, active)
-            location = [dr.gather(backend.Float, part, bisector, active) for part in self.positions]
-            offset = (backend.Array3f(*location) - center) * scale
-            sign = dr.select(i < rows, backend.Float(1), backend.Float(-1))
+        def bisector(i: Any, active: Mask) -> _BisectorLine:
+            """The bisector line of neighbor i; beyond `neighbor_count`, of the mirror image of a
+            neighbor."""
+            row = dr.select(i < neighbor_count, i, i - neighbor_count)
+            neighbor_id = dr.gather(index, table, row * width + lane, active)
+            position = [
+                dr.gather(backend.Float, coordinate, neighbor_id, active)
+                for coordinate in self.positions
+            ]
+            offset = (backend.Array3f(*position) - center) * scale
+            sign = dr.select(i < neighbor_count, backend.Float(1), backend.Float(-1))
             # The plane that bisects the offset d meets the tangent plane in q . y = |d|^2/2.
             q = sign * dr.dot(offset, u), sign * dr.dot(offset, v)
-            return _crossing(backend, q, 0.5 * dr.squared_norm(offset))
+            return _line_in_disc(backend, q, 0.5 * dr.squared_norm(offset))
 
-        def step(j: Any, *state: Any) -> tuple[Any, ...]:
+        def add_lines(j: Any, *state: Any) -> tuple[Any, ...]:
+            """Add the triangles at the lines j, j + 1, ... to the area and their angles to the sum
+            of angles; and note whether one of them has no neighbor to its left."""
             numbers = [j + t for t in range(_LINES_PER_ITERATION)]
-            bisectors = [line(number, number < lines) for number in numbers]
-            area, angle, is_rim = state
-            for number, bisector, interval in zip(
+            own_lines = [bisector(number, number < line_count) for number in numbers]
+            area, angle, is_one_sided = state
+            for number, own_line, interval in zip(
                 numbers,
-                bisectors,
-                _clip_bisectors(backend, numbers, bisectors, line, lines),
+                own_lines,
+                _clip_bisectors(backend, numbers, own_lines, bisector, line_count),
                 strict=True,
             ):
                 lower, upper, has_left = interval
-                is_cut, location = lower < upper, number < lines
+                is_cut, is_line = lower < upper, number < line_count
                 lower, upper = dr.select(is_cut, lower, 0), dr.select(is_cut, upper, 0)
-                area = area + dr.select(location, 0.5 * bisector.h * (upper - lower), 0)
-                turn = dr.atan2(upper, bisector.h) - dr.atan2(lower, bisector.h)
-                angle = angle + dr.select(location, turn, 0)
-                is_rim = is_rim | (
-                    location
+                area = area + dr.select(is_line, 0.5 * own_line.h * (upper - lower), 0)
+                turn = dr.atan2(upper, own_line.h) - dr.atan2(lower, own_line.h)
+                angle = angle + dr.select(is_line, turn, 0)
+                is_one_sided = is_one_sided | (
+                    is_line
                     & ~has_left
-                    & ((bisector.neighbor[0] != 0) | (bisector.neighbor[1] != 0))
+                    & ((own_line.neighbor[0] != 0) | (own_line.neighbor[1] != 0))
                 )
-            return j + _LINES_PER_ITERATION, area, angle, is_rim
+            return j + _LINES_PER_ITERATION, area, angle, is_one_sided
 
         zero = backend.Float(0) + 0 * scale
-        start = index(0) + 0 * lane, zero, zero, zero > 1
-        condition = _while_below(lines)
-        _, area, angle, is_rim = dr.while_loop(start, condition, step, label="lines")
+        initial = index(0) + 0 * lane, zero, zero, zero > 1
+        condition = _below(line_count)
+        _, area, angle, is_one_sided = dr.while_loop(initial, condition, add_lines, label="lines")
         total = area + 0.5 * fmax(2 * math.pi - angle, 0)
-        dr.eval(total, is_rim)
-        return to_numpy(total), to_numpy(is_rim)
+        dr.eval(total, is_one_sided)
+        return to_numpy(total), to_numpy(is_one_sided)
 
 
-def _while_below(count: Any) -> Callable[..., Mask]:
-    """Whether a loop's first number is below the count."""
+def _below(count: Any) -> Callable[..., Mask]:
+    """A loop condition: whether the first number of the state is below `count`."""
 
-    def more(i: Any, *_: Any) -> Mask:
+    def is_active(i: Any, *_: Any) -> Mask:
         return i < count
 
-    return more
+    return is_active
 
 
-def _crossing(backend: Backend, q: tuple[Real, Real], b: Real) -> _BisectorLine:
-    """The line q . y = b in the unit disc."""
+def _line_in_disc(backend: Backend, q: tuple[Real, Real], b: Real) -> _BisectorLine:
+    """The line q . y = b as a `_BisectorLine`, relative to the unit disc."""
     length = dr.sqrt(dr.square(q[0]) + dr.square(q[1]))
     crosses = length > b
     inverse = dr.select(crosses, dr.rcp(length), 0)
@@ -157,39 +176,51 @@ def _crossing(backend: Backend, q: tuple[Real, Real], b: Real) -> _BisectorLine:
 
 
 def _clip_bisectors(
-    backend: Backend, numbers: list[Any], own_lines: list[_BisectorLine], line: Any, lines: Any
+    backend: Backend,
+    indices: list[Any],
+    own_lines: list[_BisectorLine],
+    bisector: Any,
+    line_count: Any,
 ) -> list[tuple[Real, Real, Mask]]:
-    """For each of these bisector lines, the interval of it that all other lines leave, and whether
-    a neighbor is to the left of its neighbor."""
-    start: list[Any] = []
-    for bisector in own_lines:
-        half_chord = dr.sqrt(fmax(1 - dr.square(bisector.h), 0))
-        start += [-half_chord, half_chord, half_chord > dr.inf]
+    """For each of `own_lines`, the interval (lower, upper) of positions along it that all other
+    lines leave, empty if lower >= upper; and whether another neighbor lies to the left of its
+    neighbor.
 
-    def cut(i: Any, *state: Any) -> tuple[Any, ...]:
-        other, new = line(i, i < lines), list[Any]()
-        for t, (number, bisector) in enumerate(zip(numbers, own_lines, strict=True)):
+    indices: the indices of `own_lines`.
+    bisector: gives the line of an index, in lanes of a mask.
+    line_count: the number of all lines.
+    """
+    initial: list[Any] = []
+    for own_line in own_lines:
+        half_chord = dr.sqrt(fmax(1 - dr.square(own_line.h), 0))
+        initial += [-half_chord, half_chord, half_chord > dr.inf]
+
+    def clip_by_line(i: Any, *state: Any) -> tuple[Any, ...]:
+        """Clip the intervals of all own lines by line i; and note whether its neighbor is to the
+        left."""
+        other, clipped = bisector(i, i < line_count), list[Any]()
+        for t, (index, own_line) in enumerate(zip(indices, own_lines, strict=True)):
             lower, upper, has_left = state[3 * t : 3 * t + 3]
-            # The rate at which this line nears the other line, along this line.
-            slope = other.y * bisector.x - other.x * bisector.y
-            distance = other.h - bisector.h * (other.x * bisector.x + other.y * bisector.y)
+            # The rate at which a point that moves along the own line nears the other line.
+            slope = other.y * own_line.x - other.x * own_line.y
+            distance = other.h - own_line.h * (other.x * own_line.x + other.y * own_line.y)
             is_parallel = dr.abs(slope) < _PARALLEL
             bound = distance / dr.select(is_parallel, 1, slope)
             lower = dr.select(slope < -_PARALLEL, fmax(lower, bound), lower)
             upper = dr.select(slope > _PARALLEL, fmin(upper, bound), upper)
-            # Of equal lines only the first counts.
-            is_hidden = is_parallel & (distance < dr.select(number > i, _PARALLEL, -_PARALLEL))
+            # If lines are equal, only the first counts.
+            is_hidden = is_parallel & (distance < dr.select(index > i, _PARALLEL, -_PARALLEL))
             upper = dr.select(is_hidden, -dr.inf, upper)
             has_left = has_left | (
-                bisector.neighbor[0] * other.neighbor[1] - bisector.neighbor[1] * other.neighbor[0]
+                own_line.neighbor[0] * other.neighbor[1] - own_line.neighbor[1] * other.neighbor[0]
                 > 0
             )
-            new += [lower, upper, has_left]
-        return i + 1, *new
+            clipped += [lower, upper, has_left]
+        return i + 1, *clipped
 
-    zero = backend.UInt32(0) + 0 * numbers[0]
+    zero = backend.UInt32(0) + 0 * indices[0]
     final: tuple[Any, ...] = dr.while_loop(
-        (zero, *start), _while_below(lines), cut, label="other lines"
+        (zero, *initial), _below(line_count), clip_by_line, label="other lines"
     )
     final = final[1:]
     return [(final[k], final[k + 1], final[k + 2]) for k in range(0, len(final), 3)]

@@ -1,9 +1,9 @@
 """Welding of meshes: vertices at the same position, up to rounding, are joined.
 
 Programs compute a corner once for each face around it, and may get 0 for one face and 2.7e-16 for
-another. As edges are compared by index, such faces would not be neighbors. So corners at open edges
-are joined if rounding explains their distance; all others stay as they are, and so does a closed
-mesh.
+another. As edges are compared by index, such faces would not be neighbors. So corners at boundary
+edges are joined if rounding explains their distance. All other vertices stay as they are, and so
+does a closed mesh.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from harnack.geometry.meshes import zero_area_faces
 __all__ = ["Welded", "connected_groups", "pairs_within", "rounding_of"]
 
 # The distance, in units in the last place of the largest coordinate, that rounding explains.
-_UNITS = 4
+_MAX_ULPS = 4
 # Rounding explains no distance that is more than this fraction of the shortest edge there.
 _MAX_EDGE_FRACTION = 1e-3
 
@@ -31,7 +31,7 @@ def rounding_of(vertices: FloatArray) -> float:
     single precision."""
     single = vertices.astype(np.float32)
     precision = np.float32 if (single == vertices).all() else np.float64
-    return _UNITS * float(np.finfo(precision).eps) * float(np.abs(vertices).max(initial=0.0))
+    return _MAX_ULPS * float(np.finfo(precision).eps) * float(np.abs(vertices).max(initial=0.0))
 
 
 @dataclass(frozen=True)
@@ -56,60 +56,67 @@ class Welded:
     def of(cls, vertices: FloatArray, faces: IntArray) -> Welded:
         """Weld vertices (n, 3) of faces (m, 3).
 
-        Corners are joined if they are nearer to each other than `rounding_of` and than a thousandth
-        of the edges there, if edges at them do not cancel, and if joining leaves fewer such edges.
-        No face loses its area, or two of its corners to the same position: where a face would, the
-        corners that it touches stay apart. So the number of faces is the same as before, except for
-        faces that cancel; and a wider gap stays, as two corners are joined only if they are as near
-        as two results of the same computation.
+        Two corners are joined if both are on edges that do not cancel, and if their distance is at
+        most `rounding_of` and at most a thousandth of the shortest edge there. The result is used
+        only if it has fewer edges that do not cancel. If a face would lose its area, or two of its
+        corners would become one, the corners of that face are not joined. So the number of faces is
+        the same as before, except for faces that cancel; and wider gaps stay, as two corners are
+        joined only if they are as near as two results of the same computation.
         """
-        welded = cls._by(weld_vertices(vertices), vertices, faces, 0)
+        welded = cls._from_index(weld_vertices(vertices), vertices, faces, 0)
         if not len(welded.edges):
             return welded
         joined = _joined_by_rounding(vertices, welded.net.faces, np.unique(welded.edges))
         count = int((joined != np.arange(len(vertices))).sum())
         if not count:
             return welded
-        closer = cls._by(joined[welded.index], vertices, faces, count)
+        closer = cls._from_index(joined[welded.index], vertices, faces, count)
         return closer if closer.weights.sum() < welded.weights.sum() else welded
 
     @classmethod
-    def _by(cls, index: IntArray, vertices: FloatArray, faces: IntArray, rounded: int) -> Welded:
+    def _from_index(
+        cls, index: IntArray, vertices: FloatArray, faces: IntArray, rounded: int
+    ) -> Welded:
+        """The mesh with vertex k replaced by vertex index[k]. rounded: see `Welded`."""
         net = net_faces(index[faces])
         return cls(index, net, *singular_edges(net.faces, net.multiplicity), rounded)
 
 
-def _joined_by_rounding(x: FloatArray, faces: IntArray, places: IntArray) -> IntArray:
-    """(n,) the vertex that stands for each vertex. Only vertices in `places`, all at different
-    positions, are joined."""
-    stands = np.arange(len(x))
-    pairs = places[pairs_within(x[places], rounding_of(x[faces]))]
-    distance = np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1)
-    corner = x[faces]
-    shortest = np.full(len(x), np.inf)
-    edges = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).min(axis=1)
+def _joined_by_rounding(positions: FloatArray, faces: IntArray, candidates: IntArray) -> IntArray:
+    """The representative (n,) of each vertex: itself, or the vertex that it is joined to.
+
+    positions: (n, 3) of the vertices.
+    faces: (m, 3).
+    candidates: (k,) the vertices that may be joined, all at different positions.
+    """
+    representative = np.arange(len(positions))
+    pairs = candidates[pairs_within(positions[candidates], rounding_of(positions[faces]))]
+    distance = np.linalg.norm(positions[pairs[:, 0]] - positions[pairs[:, 1]], axis=1)
+    corners = positions[faces]
+    min_edge = np.full(len(positions), np.inf)
+    face_min_edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(axis=1)
     for k in range(3):
-        np.minimum.at(shortest, faces[:, k], edges)
-    pairs = pairs[distance <= _MAX_EDGE_FRACTION * shortest[pairs].min(axis=1)]
+        np.minimum.at(min_edge, faces[:, k], face_min_edge)
+    pairs = pairs[distance <= _MAX_EDGE_FRACTION * min_edge[pairs].min(axis=1)]
     while len(pairs):
-        group = connected_groups(pairs, len(x))
-        stands = np.unique(group, return_index=True)[1][group]
-        joined = stands[faces]
-        changed = np.flatnonzero((joined != faces).any(axis=1))
-        vanished = (joined == np.roll(joined, 1, axis=1)).any(axis=1)
-        flat = changed[zero_area_faces(x, joined[changed])]
-        vanished[np.setdiff1d(flat, zero_area_faces(x, faces))] = True
-        if not vanished.any():
+        group = connected_groups(pairs, len(positions))
+        representative = np.unique(group, return_index=True)[1][group]
+        joined = representative[faces]
+        changed_faces = np.flatnonzero((joined != faces).any(axis=1))
+        is_degenerate = (joined == np.roll(joined, 1, axis=1)).any(axis=1)
+        new_flat = changed_faces[zero_area_faces(positions, joined[changed_faces])]
+        is_degenerate[np.setdiff1d(new_flat, zero_area_faces(positions, faces))] = True
+        if not is_degenerate.any():
             break
-        stays = np.unique(joined[vanished])
-        pairs = pairs[~np.isin(stands[pairs[:, 0]], stays)]
-        stands = np.arange(len(x))
-    return stands
+        kept_apart = np.unique(joined[is_degenerate])
+        pairs = pairs[~np.isin(representative[pairs[:, 0]], kept_apart)]
+        representative = np.arange(len(positions))
+    return representative
 
 
 def pairs_within(points: FloatArray, distance: float) -> IntArray:
     """(k, 2) indices of the pairs of points (n, 3) that are at most a distance apart."""
-    import scipy.spatial  # here: half a second that few need
+    import scipy.spatial  # imported here: it takes half a second, and few programs need it
 
     spatial = cast("Any", scipy.spatial)
     pairs = spatial.cKDTree(points).query_pairs(distance, output_type="ndarray")
@@ -117,9 +124,9 @@ def pairs_within(points: FloatArray, distance: float) -> IntArray:
 
 
 def connected_groups(pairs: IntArray, count: int) -> IntArray:
-    """(count,) the number of the group of each index, where pairs (k, 2) join indices to groups.
-    Groups are numbered in the order of their first indices."""
-    import scipy.sparse  # here: half a second that few need
+    """(count,) the number of the connected component of each index. pairs (k, 2) are the edges of
+    the graph. Components are numbered in the order of their first indices."""
+    import scipy.sparse  # imported here: it takes half a second, and few programs need it
     import scipy.sparse.csgraph as csgraph_module
 
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)

@@ -17,21 +17,24 @@ if TYPE_CHECKING:
 
 __all__ = ["check_branch_points"]
 
-# Number of points about each branch point, and the smallest of their distances, in radii.
-_PLACES, _NEAREST = 4000, 1e-6
+# Number of test points around each branch point, and their smallest distance from it, in radii.
+_POINT_COUNT, _MIN_RADIUS_FRACTION = 4000, 1e-6
 # An upper bound of the rounding errors of branches and of their power.
-_SLACK = 1e-6
+_ROUNDING = 1e-6
 
 
 def check_branch_points(field: RiemannSurface, size: float, rng: np.random.Generator) -> None:
-    """Check that |g - value| <= constant |z - at|^power within the radius of each branch point, for
-    the part of g that is drawn, up to its period. Enclosures near a branch point are derived from
-    that, and few rays come so near by chance.
+    """Check the bounds that a Riemann surface states for its branch points.
+
+    For each branch point `at` they are |g(z) - value| <= constant |z - at|^power within its radius,
+    where g is the drawn part (real or imaginary) of any branch, up to its period. Enclosures near a
+    branch point are derived from this, and few rays come so near by chance.
 
     size: of the domain; it limits an infinite radius.
 
     Raises:
-        BrokenPromiseError: naming the branch point, and the point where the bound does not hold.
+        BrokenPromiseError: the message names the branch point, and a point where the bound does not
+            hold.
     """
     for point in field.branches.branch_points:
         if point.power is not None:
@@ -41,30 +44,34 @@ def check_branch_points(field: RiemannSurface, size: float, rng: np.random.Gener
 def _check_branch_point(
     field: RiemannSurface, point: BranchPoint, radius: float, rng: np.random.Generator
 ) -> None:
+    """Check the bound of one branch point at random points within `radius` of it
+    (`check_branch_points`)."""
     backend = choose_backend("double")
     assert point.power is not None
-    # As many near the point as near the circle, where the power's part of g is smallest.
+    # Half of the points are near the branch point, half are spread evenly over the disc.
     radii = radius * np.where(
-        rng.random(_PLACES) < 0.5,
-        _NEAREST ** rng.random(_PLACES),
-        np.sqrt(rng.random(_PLACES)) * (1 - 1e-9),
+        rng.random(_POINT_COUNT) < 0.5,
+        _MIN_RADIUS_FRACTION ** rng.random(_POINT_COUNT),
+        np.sqrt(rng.random(_POINT_COUNT)) * (1 - 1e-9),
     )
-    angle = rng.uniform(-math.pi, math.pi, _PLACES)
+    angle = rng.uniform(-math.pi, math.pi, _POINT_COUNT)
     x, y = point.location.real + radii * np.cos(angle), point.location.imag + radii * np.sin(angle)
-    radii = np.hypot(x - point.location.real, y - point.location.imag)  # of the rounded points
+    radii = np.hypot(
+        x - point.location.real, y - point.location.imag
+    )  # recomputed from the rounded points
     branches: Any = field.branches.prepare(backend)
     imaginary = field.part == "imag"
     period: float | None = branches.period(imaginary)
     value = point.value.imag if imaginary else point.value.real
     bound = point.constant * radii**point.power
-    errors = np.zeros(_PLACES)
+    errors = np.zeros(_POINT_COUNT)
     for branch in branches.evaluate(complex_type(backend)(backend.Float(x), backend.Float(y))):
         component = branch.value.imag if imaginary else branch.value.real
         error: FloatArray = to_numpy(component) - value
         if period is not None:
             error = error - period * np.round(error / period)
         errors = np.fmax(errors, np.abs(error))
-    rounding = _SLACK * (bound + 1e-6 * abs(value)) + 2.0**-48 * (
+    rounding = _ROUNDING * (bound + 1e-6 * abs(value)) + 2.0**-48 * (
         abs(value) + np.abs(point.location)
     )
     require(
@@ -72,6 +79,6 @@ def _check_branch_point(
         f"BranchPoint({point.location}): a branch is farther from the value {point.value} than "
         f"{point.constant:g} |z - at|^{point.power:g}: the constant must be at least "
         f"{(errors / radii**point.power).max():.6g}",
-        np.column_stack([x, y, np.full(_PLACES, field.height * value)]),
+        np.column_stack([x, y, np.full(_POINT_COUNT, field.height * value)]),
         errors - bound,
     )

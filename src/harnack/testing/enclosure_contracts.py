@@ -1,10 +1,9 @@
-"""`check_enclosure`: tests of enclosures on functions that keep a promise, with levels that they
-reach.
+"""`check_enclosure`: tests of enclosures on random functions that keep a promise and reach a level.
 
-An enclosure is right if no function that the promise allows meets a level within its free length.
-The functions drawn here include the extremal ones of the proofs in `harnack.enclosures`, so that an
-enclosure whose lengths are a thousandth too long is detected. A `PromiseCase` is a promise with
-levels, on which every enclosure can be tried.
+An enclosure is right if no function that the promise allows meets a level within the free length.
+The random functions include those for which the inequalities in the proofs of `harnack.enclosures`
+are equalities; so an enclosure whose lengths are a thousandth too long is detected. A `PromiseCase`
+is a promise together with levels, for which every enclosure can be tested.
 """
 
 from __future__ import annotations
@@ -46,8 +45,10 @@ __all__ = [
 
 @dataclass(frozen=True)
 class PromiseCase:
-    """A promise about a function with f(p) = 0, and levels. gap_below, gap_above: the differences
-    in value to the levels below and above."""
+    """A promise about a function f at a point p with f(p) = 0, together with levels.
+
+    gap_below, gap_above: the differences between f(p) and the levels below and above, positive.
+    """
 
     promise: Promise
     gap_below: Real
@@ -61,10 +62,10 @@ class PromiseCase:
     def enclosure(self, kind: type[Enclosure], slopes: SlopeRange) -> Enclosure | None:
         """The enclosure of a class for this promise; None if the class does not apply."""
         promise: Any = self.promise
-        # Without the allowance of `of` for rounding, so that steps can be compared exactly.
+        # Without the allowance for rounding, so that steps can be compared exactly.
         if isinstance(promise, HarmonicBall) and issubclass(kind, HarmonicBallEnclosure):
             ends = -promise.lower, promise.upper
-            below, above = (None if _is_open(end) else end for end in ends)
+            below, above = (None if _is_infinite(end) else end for end in ends)
             if not kind.applies_to(promise.dimension, below is not None, above is not None):
                 return None
             return kind(promise.radius, below, above, promise.dimension, slopes)
@@ -80,7 +81,7 @@ class PromiseCase:
         values = {
             name: -1.0 if name in lower_names else 1.0
             for name, *_ in self.promise.units
-            if not _is_open(getattr(self.promise, name))
+            if not _is_infinite(getattr(self.promise, name))
         }
         case = PromiseCase(dataclasses.replace(self.promise, **values), 1.0, 1.0)
         return case.enclosure(kind, SlopeRange(0.0, 0.0)) is not None
@@ -98,24 +99,26 @@ class PromiseCase:
         return enclosure.is_free(LevelGaps(self.gap_below, self.gap_above), length)
 
 
-def _is_open(end: Any) -> bool:
-    """Whether this end is infinite, that is, no limit."""
+def _is_infinite(end: Any) -> bool:
+    """Whether an end of a range is infinite."""
     return isinstance(end, float) and math.isinf(end)
 
 
 # Functions that keep a promise.
 
+# Number of points at which a function is sampled within a length.
 _SAMPLES = 48
 
 
 @dataclass(frozen=True)
 class RandomFunctions:
-    """Functions along rays, (rows,), and a case at t = 0 whose promise they keep.
+    """Random functions f of t along rays, one per row, that keep a promise made at t = 0.
 
-    movement: f(t) - f(0) for t (rows, m) with 0 <= t < reach, the radius of the promise.
-    slope: f'(0).
-
-    The gaps of the case are such that levels are met.
+    name: of the kind of functions, for messages.
+    case: the promise, and levels such that most of the functions meet one.
+    slope: (rows,) f'(0).
+    reach: (rows,) the radius of the promise.
+    movement: gives f(t) - f(0) for t (rows, m) with 0 <= t < reach.
     """
 
     name: str
@@ -135,10 +138,12 @@ def check_enclosure(
     """Test a class of enclosures against random functions of every kind of promise that it applies
     to.
 
-    rng: a generator or a seed. rows: the number of functions of each kind.
+    rng: a generator or a seed.
+    rows: the number of functions of each kind.
 
-    Checked: free lengths are numbers in [0, reach]; no level is met within a free length; `is_free`
-    agrees with `free_length`; no level is met within any length that `is_free` accepts.
+    Checked: free lengths are numbers from 0 to the radius of the promise; no level is met within a
+    free length; `is_free` agrees with `free_length`; no level is met within any length that
+    `is_free` accepts.
 
     Raises:
         BrokenPromiseError: with the numbers of the first function that shows it.
@@ -159,21 +164,24 @@ def check_enclosure(
 
 
 def random_functions(rng: np.random.Generator, rows: int) -> Iterator[RandomFunctions]:
-    """A set of functions of each kind: harmonic in 2, 3, 4 dimensions, of bounded Laplacian,
-    Lipschitz, of bounded curvature."""
+    """A set of functions of each kind: harmonic in 2, 3 and 4 dimensions, of bounded Laplacian,
+    Lipschitz, and of bounded second derivative."""
     with np.errstate(all="ignore"):
         for dimension in (2, 3, 4):
-            yield _positive(rng, rows, dimension, mirrored=False)
-            yield _positive(rng, rows, dimension, mirrored=True)
-            yield _bounded(rng, rows, dimension)
-        yield _sourced(rng, rows, mirrored=False)
-        yield _sourced(rng, rows, mirrored=True)
-        yield _lipschitz(rng, rows)
-        yield _curved(rng, rows)
+            yield _positive_harmonic(rng, rows, dimension, mirrored=False)
+            yield _positive_harmonic(rng, rows, dimension, mirrored=True)
+            yield _bounded_harmonic(rng, rows, dimension)
+        yield _bounded_laplacian(rng, rows, mirrored=False)
+        yield _bounded_laplacian(rng, rows, mirrored=True)
+        yield _zigzag_lines(rng, rows)
+        yield _parabolas(rng, rows)
 
 
-def _positive(rng: np.random.Generator, rows: int, n: int, *, mirrored: bool) -> RandomFunctions:
-    """f - lower (mirrored: upper - f) is the Poisson integral of one, two or three rings."""
+def _positive_harmonic(
+    rng: np.random.Generator, rows: int, n: int, *, mirrored: bool
+) -> RandomFunctions:
+    """Harmonic functions f in n dimensions for which f - lower (mirrored: upper - f) is positive:
+    the Poisson integral of one, two or three rings of mass."""
     radius, mass = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
     latitudes = rng.uniform(-1, 1, (rows, 3))
     near_poles = rng.choice([-1.0, 1.0], (rows, 3)) * (1 - 10 ** rng.uniform(-8, 0, (rows, 3)))
@@ -181,14 +189,14 @@ def _positive(rng: np.random.Generator, rows: int, n: int, *, mirrored: bool) ->
     weights = rng.dirichlet([0.7] * 3, rows)
     kind = rng.integers(0, 3, rows)
     weights[kind == 0] = (1, 0, 0)  # equality in Jensen's inequality
-    at_poles = kind == 1  # equality in the chord's
-    latitudes[at_poles, :2] = (1, -1)
-    weights[at_poles, 2] = 0
+    is_at_poles = kind == 1  # equality in the bound by the chord
+    latitudes[is_at_poles, :2] = (1, -1)
+    weights[is_at_poles, 2] = 0
     weights /= weights.sum(axis=1, keepdims=True)
     u = AxialFunctions("points", latitudes, weights * mass[:, None], radius, n)
     sign = -1.0 if mirrored else 1.0
     ends = (-math.inf, mass) if mirrored else (-mass, math.inf)
-    return _with_gaps(
+    return _with_random_levels(
         rng,
         f"positive harmonic, n = {n}, {'upper' if mirrored else 'lower'} end known",
         mass,
@@ -199,13 +207,14 @@ def _positive(rng: np.random.Generator, rows: int, n: int, *, mirrored: bool) ->
     )
 
 
-def _bounded(rng: np.random.Generator, rows: int, n: int) -> RandomFunctions:
-    """Boundary values in [lower, upper]: steps at random heights, among them two caps."""
+def _bounded_harmonic(rng: np.random.Generator, rows: int, n: int) -> RandomFunctions:
+    """Harmonic functions in n dimensions with values in [lower, upper]: their boundary values are
+    steps at random heights, among them those of two caps."""
     radius, span = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
     heights = np.sort(rng.uniform(0, 2, (rows, 3)), axis=1)
     is_thin = rng.random(rows) < 0.2
     heights[is_thin] *= 10 ** rng.uniform(-4, 0, is_thin.sum())[:, None]
-    values = rng.uniform(0, 1, (rows, 4))  # from the cap ahead to what lies behind the third
+    values = rng.uniform(0, 1, (rows, 4))  # of the four zones, from the pole ahead
     kind = rng.integers(0, 3, rows)
     values[kind == 0] = (1, 0, 0, 1)  # equality in the upper cap bound
     values[kind == 1] = (0, 1, 1, 0)  # and in the lower one
@@ -213,7 +222,7 @@ def _bounded(rng: np.random.Generator, rows: int, n: int) -> RandomFunctions:
     u = AxialFunctions("caps", heights, weights * span[:, None], radius, n)
     mean = values[:, 3] + (weights * cap_mass(heights, n)).sum(axis=1)
     gap_below, gap_above = span * mean, span * (1 - mean)
-    return _with_gaps(
+    return _with_random_levels(
         rng,
         f"bounded harmonic, n = {n}",
         np.minimum(gap_below, gap_above),
@@ -224,17 +233,20 @@ def _bounded(rng: np.random.Generator, rows: int, n: int) -> RandomFunctions:
     )
 
 
-def _sourced(rng: np.random.Generator, rows: int, *, mirrored: bool) -> RandomFunctions:
-    """Poisson integrals of rings of mass with sources: the Laplacian jumps and varies.
+def _bounded_laplacian(rng: np.random.Generator, rows: int, *, mirrored: bool) -> RandomFunctions:
+    """Functions of bounded Laplacian: Poisson integrals of rings of mass, plus potentials of
+    sources.
 
-    It is that of an even density, two balls of even density and a multiple of the Legendre
-    polynomial P_2 of the latitude, whose f, q^2 ln(q) P_2/5, has the logarithm of the bound. With
-    one density everywhere, not negative, and mass at the poles alone, the bound is attained.
+    The sources are a constant density in the unit ball, two balls of constant density, and a
+    multiple of the Legendre polynomial P_2 of the latitude. The latter has the potential
+    q^2 ln(q) P_2/5, and so the logarithm that occurs in the bound. The bound is attained if there
+    is only a constant density that is not negative, and mass only at the poles.
     """
     radius, mass = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
     latitudes, weights = rng.uniform(-1, 1, (rows, 3)), rng.dirichlet([0.7] * 3, rows)
-    # As h - c >= mass (1-q^2)/8, f stays above c if its Laplacian stays below 0.75 of the mass: a
-    # potential is at most (1-q^2)/6 times the largest density.
+    # The Poisson integral of the mass is at least mass (1-q^2)/8, and a potential is at most
+    # (1-q^2)/6 times the largest density: so f stays above its lower end if the densities stay
+    # below 0.75 of the mass.
     centers = rng.uniform(-0.9, 0.9, (rows, 2))
     sizes = (1 - np.abs(centers)) * rng.uniform(0.1, 1, (rows, 2))
     density = rng.uniform(-0.18, 0.18, (rows, 4)) * 10 ** rng.uniform(-3, 0, (rows, 1))
@@ -248,24 +260,33 @@ def _sourced(rng: np.random.Generator, rows: int, *, mirrored: bool) -> RandomFu
     balls = GreenPotentials(
         np.column_stack([np.zeros(rows), centers]), np.column_stack([np.ones(rows), sizes])
     )
-    even, wave = density[:, :3], density[:, 3]
+    constant_density, wave_density = density[:, :3], density[:, 3]
     u = AxialFunctions("points", latitudes, weights * mass[:, None], radius, 3)
-    potential, slope = balls.at_center(even)
-    wave_sources = np.stack([-0.5 * wave, wave])  # P_2 is between -1/2 and 1
-    min_density = density[:, 0] + np.minimum(even[:, 1:], 0).sum(axis=1) + wave_sources.min(axis=0)
-    max_density = density[:, 0] + np.maximum(even[:, 1:], 0).sum(axis=1) + wave_sources.max(axis=0)
+    potential, slope = balls.at_center(constant_density)
+    wave_sources = np.stack([-0.5 * wave_density, wave_density])  # P_2 is between -1/2 and 1
+    min_density = (
+        density[:, 0]
+        + np.minimum(constant_density[:, 1:], 0).sum(axis=1)
+        + wave_sources.min(axis=0)
+    )
+    max_density = (
+        density[:, 0]
+        + np.maximum(constant_density[:, 1:], 0).sum(axis=1)
+        + wave_sources.max(axis=0)
+    )
     sign = -1.0 if mirrored else 1.0
 
     def movement(t: FloatArray) -> FloatArray:
+        """f(t) - f(0)."""
         q = t / radius[:, None]
-        wave_part = wave[:, None] / 5 * q * q * np.log(np.maximum(q, 1e-300))
-        return sign * (u.movement(t) - balls.movement(q, even) + wave_part)
+        wave_part = wave_density[:, None] / 5 * q * q * np.log(np.maximum(q, 1e-300))
+        return sign * (u.movement(t) - balls.movement(q, constant_density) + wave_part)
 
-    # The ball is taken a little smaller, on which even point masses are bounded.
+    # On a slightly smaller ball, the Poisson integrals of point masses are bounded as well.
     near_end, far_end = mass - potential, 1e18 * mass
     below, above = (far_end, near_end) if mirrored else (near_end, far_end)
     lower, upper = np.sort(sign * np.stack([min_density, max_density]) / radius**2, axis=0)
-    return _with_gaps(
+    return _with_random_levels(
         rng,
         f"bounded Laplacian, {'upper' if mirrored else 'lower'} end near",
         near_end,
@@ -276,8 +297,8 @@ def _sourced(rng: np.random.Generator, rows: int, *, mirrored: bool) -> RandomFu
     )
 
 
-def _lipschitz(rng: np.random.Generator, rows: int) -> RandomFunctions:
-    """Straight and zigzag lines of slope at most the constant."""
+def _zigzag_lines(rng: np.random.Generator, rows: int) -> RandomFunctions:
+    """Lipschitz functions: straight and zigzag lines whose slopes are at most the constant."""
     radius, constant = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
     knots = np.sort(rng.uniform(0, 1, (rows, 2)), axis=1) * radius[:, None]
     slopes = rng.uniform(-1, 1, (rows, 3)) * constant[:, None]
@@ -285,10 +306,11 @@ def _lipschitz(rng: np.random.Generator, rows: int) -> RandomFunctions:
     slopes[is_straight] = (rng.choice([-1.0, 1.0], rows) * constant)[is_straight, None]
 
     def movement(t: FloatArray) -> FloatArray:
-        late = np.maximum(t[:, :, None] - knots[:, None, :], 0)
-        return slopes[:, :1] * t + (late * np.diff(slopes, axis=1)[:, None, :]).sum(axis=2)
+        """f(t) - f(0)."""
+        since_knot = np.maximum(t[:, :, None] - knots[:, None, :], 0)
+        return slopes[:, :1] * t + (since_knot * np.diff(slopes, axis=1)[:, None, :]).sum(axis=2)
 
-    return _with_gaps(
+    return _with_random_levels(
         rng,
         "Lipschitz",
         constant * radius,
@@ -299,21 +321,27 @@ def _lipschitz(rng: np.random.Generator, rows: int) -> RandomFunctions:
     )
 
 
-def _curved(rng: np.random.Generator, rows: int) -> RandomFunctions:
-    """Parabolas whose second derivative, at most the constant in absolute value, jumps once."""
+def _parabolas(rng: np.random.Generator, rows: int) -> RandomFunctions:
+    """Functions of bounded second derivative: parabolas whose second derivative jumps once, and is
+    at most the constant in absolute value."""
     radius, constant = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
     curvatures = rng.uniform(-1, 1, (rows, 2)) * constant[:, None]
-    extremal = rng.random(rows) < 0.5
-    curvatures[extremal] = (rng.choice([-1.0, 1.0], rows) * constant)[extremal, None]
+    is_extremal = rng.random(rows) < 0.5
+    curvatures[is_extremal] = (rng.choice([-1.0, 1.0], rows) * constant)[is_extremal, None]
     knot = rng.uniform(0, 1, rows) * radius
     slope = constant * radius * rng.choice([-1.0, 1.0], rows) * 10 ** rng.uniform(-4, 1, rows)
 
     def movement(t: FloatArray) -> FloatArray:
-        late = np.maximum(t - knot[:, None], 0)
+        """f(t) - f(0)."""
+        since_knot = np.maximum(t - knot[:, None], 0)
         change = (curvatures[:, 1] - curvatures[:, 0])[:, None]
-        return slope[:, None] * t + 0.5 * curvatures[:, :1] * t * t + 0.5 * change * late * late
+        return (
+            slope[:, None] * t
+            + 0.5 * curvatures[:, :1] * t * t
+            + 0.5 * change * since_knot * since_knot
+        )
 
-    return _with_gaps(
+    return _with_random_levels(
         rng,
         "bounded curvature",
         constant * radius**2,
@@ -324,7 +352,7 @@ def _curved(rng: np.random.Generator, rows: int) -> RandomFunctions:
     )
 
 
-def _with_gaps(
+def _with_random_levels(
     rng: np.random.Generator,
     name: str,
     scale: FloatArray,
@@ -333,7 +361,11 @@ def _with_gaps(
     movement: Callable[[FloatArray], FloatArray],
     promise: Promise,
 ) -> RandomFunctions:
-    """Levels that the function reaches at a random point, and other levels at random."""
+    """The functions with random levels: most of them with a level that the function reaches at a
+    random point, and other levels at random distances.
+
+    scale: (rows,) a typical size of f - f(0).
+    """
     rows = len(scale)
     below, above = scale * _log_uniform(rng, rows, -9, 2), scale * _log_uniform(rng, rows, -9, 2)
     fraction = np.where(rng.random(rows) < 0.5, rng.random(rows), _log_uniform(rng, rows, -8, 0))
@@ -348,11 +380,12 @@ def _with_gaps(
 
 
 def _log_uniform(rng: np.random.Generator, rows: int, lower: float, upper: float) -> FloatArray:
+    """(rows,) random numbers whose decimal logarithms are uniform in [lower, upper]."""
     return 10 ** rng.uniform(lower, upper, rows)
 
 
 def _upload(trial: RandomFunctions, precision: Precision) -> tuple[PromiseCase, Any]:
-    """The cases and slopes as Dr.Jit arrays."""
+    """The case and the slopes of a trial as Dr.Jit arrays."""
     real = choose_backend(precision).Float
     case = trial.case.map_numbers(lambda n: real(n) if isinstance(n, np.ndarray) else n)
     return case, real(trial.slope)
@@ -366,6 +399,13 @@ def _check_trial(
     rng: np.random.Generator,
     precision: Precision,
 ) -> None:
+    """Check a class of enclosures on the random functions of a trial.
+
+    case, slope: of the trial, as Dr.Jit arrays.
+
+    Raises:
+        BrokenPromiseError: a free length is wrong for one of the functions.
+    """
     rows = len(trial.slope)
     real = cast("Any", type(slope))
     step = to_numpy(case.step(kind, slope)).astype(np.float64)
@@ -374,7 +414,7 @@ def _check_trial(
     is_valid = (step >= 0) & (step <= trial.reach * (1 + 1e-6))
     message = "the step {length} is no length up to {reach}, where the promise ends"
     _require(trial, is_valid, kind, message, step)
-    # In single precision both are rounded, each on its safe side.
+    # In single precision both are rounded, each to the safe side.
     fractions = [1 - 1e-5 if precision == "double" else 0.98, *rng.uniform(0.01, 0.98, 2)]
     for fraction in fractions:
         length = step * fraction
@@ -397,34 +437,44 @@ def _meets_level(trial: RandomFunctions, length: FloatArray, precision: Precisio
     t = (1 - tolerance) * length[:, None] * fractions
     with np.errstate(all="ignore"):
         movement = trial.movement(t)
-        # An upper bound of the movement of a function by rounding of its inputs.
+        # An upper bound of how much rounding of its inputs changes a function.
         q = np.minimum(t / trial.reach[:, None], 1 - 1e-12)
         growth = kernel_difference(q, 1.0, 4) + 1
     rounding = 0.0
     if precision == "single":
-        rounding = 2e-6 * _size(trial)[:, None] * growth
-    c = trial.case
-    over = movement > c.gap_above[:, None] * (1 + tolerance) + rounding
-    under = -movement > c.gap_below[:, None] * (1 + tolerance) + rounding
-    return (over | under).any(axis=1)
+        rounding = 2e-6 * _value_scale(trial)[:, None] * growth
+    case = trial.case
+    is_above = movement > case.gap_above[:, None] * (1 + tolerance) + rounding
+    is_below = -movement > case.gap_below[:, None] * (1 + tolerance) + rounding
+    return (is_above | is_below).any(axis=1)
 
 
-def _size(trial: RandomFunctions) -> FloatArray:
+def _value_scale(trial: RandomFunctions) -> FloatArray:
+    """(rows,) the size of the numbers whose rounding changes the functions."""
     promise, size = trial.case.promise, np.abs(trial.slope) * trial.reach
-    for low, high in promise.interval_pairs[:1]:  # the nearer one: the other may be as good as open
+    for low, high in promise.interval_pairs[
+        :1
+    ]:  # the nearer end, as the other may be practically infinite
         size = size + np.minimum(np.abs(getattr(promise, low)), np.abs(getattr(promise, high)))
     return size
 
 
 def _require(
-    trial: RandomFunctions, holds: Any, kind: type[Enclosure], promise: str, length: FloatArray
+    trial: RandomFunctions,
+    holds: Any,
+    kind: type[Enclosure],
+    message_format: str,
+    length: FloatArray,
 ) -> None:
+    """Raise a BrokenPromiseError for the first function for which `holds` (rows,) is false.
+    message_format: the message, with {length} and {reach} in place of numbers.
+    """
     failures = np.flatnonzero(~holds)
     if not failures.size:
         return
     row = failures[0]
     numbers = trial.case.map_numbers(lambda n: float(n[row]) if np.ndim(n) else n)
-    message = promise.format(reach=float(trial.reach[row]), length=float(length[row]))
+    message = message_format.format(reach=float(trial.reach[row]), length=float(length[row]))
     raise BrokenPromiseError(
         f"{kind.__name__} does not keep its promise ({trial.name}): {message}. Wrong in "
         f"{failures.size} of {len(holds)} trials; the first: {numbers}, "

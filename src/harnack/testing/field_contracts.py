@@ -73,11 +73,13 @@ def check_ray_samples(
     directions = random_directions(generator, n)
     size = float(np.ptp(points, axis=0).max()) or 1.0
     reach = size * 2.0 ** generator.uniform(-10, 1, n)
-    coarse = lift_along_rays(field, points, directions, reach[:, None] * np.linspace(0, 1, 9))
-    scale = np.abs(coarse.moved).max(axis=1) + 1e-6
+    coarse_lift = lift_along_rays(field, points, directions, reach[:, None] * np.linspace(0, 1, 9))
+    scale = np.abs(coarse_lift.moved).max(axis=1) + 1e-6
     for forwards in (True, False):
         gaps = scale[:, None] * 10.0 ** generator.uniform(-3, 0.5, (n, 2))
-        no_level = generator.integers(0, 3, n)  # a level below, above, or on both sides
+        no_level = generator.integers(
+            0, 3, n
+        )  # 0: no level below; 1: none above; 2: levels on both sides
         gaps[no_level < 2, no_level[no_level < 2]] = np.inf
         steps = proved_free_lengths(
             field, points, directions if forwards else -directions, reach, gaps,
@@ -91,11 +93,11 @@ def check_ray_samples(
         allowed = path.error + path.error[:, :1] + 8 * position + 1e-12 * scale[:, None]
         excess = np.maximum(path.moved - gaps[:, 1:], -path.moved - gaps[:, :1]) - allowed
         worst = excess.max(axis=1)
-        places = (
+        worst_points = (
             points + np.take_along_axis(lengths, excess.argmax(axis=1)[:, None], 1) * directions
         )
         side = "ahead" if forwards else "back"
-        require(worst <= 0, f"an enclosure looking {side} is left", points, worst, places)
+        require(worst <= 0, f"an enclosure looking {side} is left", points, worst, worst_points)
 
 
 def proved_free_lengths(
@@ -112,9 +114,10 @@ def proved_free_lengths(
     """The free lengths (n,) that a field's enclosures prove from points (n, 3) along unit
     directions.
 
-    ahead: (n,) the reach that is requested of the enclosures.
+    ahead: (n,) the length of the ray for which enclosures are requested.
     gaps: (n, 2) the differences in value to the levels below and above.
-    forwards: False for the enclosures that look back from points on paths along `directions`.
+    forwards: whether the enclosures are those ahead of the points; False for those behind them, of
+        rays that came along `directions`.
     """
     backend = choose_backend(precision)
     ray = Ray(
@@ -209,11 +212,18 @@ def check_field(
 
 
 def _overrides_sample_ray(field: Field) -> bool:
-    """Whether the field has enclosures along a path besides those that follow from its promises."""
+    """Whether the field gives its own enclosures along rays, which do not follow from its
+    promises."""
     return type(field).sample_ray is not Field.sample_ray and not field.has_jumps
 
 
 def _check_numbers(field: Field, points: FloatArray, samples: FieldSamples) -> None:
+    """Check that values, gradients and the numbers of the promises are valid, and that a step is
+    possible at most points.
+
+    Raises:
+        BrokenPromiseError: they are not.
+    """
     if field.period is not None and not 0 < field.period < np.inf:
         raise BrokenPromiseError(f"period must be None or a positive number, not {field.period!r}")
     require(np.isfinite(samples.value), "the value is not a finite number", points)
@@ -253,8 +263,8 @@ def _check_numbers(field: Field, points: FloatArray, samples: FieldSamples) -> N
 
 
 def _check_rounding(field: Field, points: FloatArray) -> None:
-    """Check that in single precision the error of the value is at most `error`, eight units in its
-    last place, and the effect of rounding the point."""
+    """Check the error of the value in single precision: it is at most `Sample.value_error` plus
+    eight units in the last place plus the effect of rounding the point."""
     single = points.astype(np.float32).astype(np.float64)
     if field.domain is not None:
         single = single[field.domain.contains_points(single)]
@@ -270,12 +280,14 @@ def _check_rounding(field: Field, points: FloatArray) -> None:
     allowed = rounded.error + exact.error + 8 * roundoff * (np.abs(exact.value) + length * size)
     allowed += 8 * 2.0**-126  # numbers below the smallest normal one are lost
     radii = [promise.radius for promise in exact.promises] or [np.full(len(single), np.inf)]
-    singular = np.min(radii, axis=0) < 1e-4 * np.ptp(points)
-    is_right = (np.abs(error) <= allowed) | singular
+    is_singular = np.min(radii, axis=0) < 1e-4 * np.ptp(points)
+    is_right = (np.abs(error) <= allowed) | is_singular
     require(is_right, "Sample.error: in single precision the value is off by more", single, error)
 
 
 def _check_differentiable_value(field: Field, points: FloatArray, samples: FieldSamples) -> None:
+    """Check that `differentiable_value` is the value, and that its derivative in reverse mode is
+    the gradient."""
     backend = choose_backend("double")
     prepared = field.prepare(backend)
     x = to_vector3(backend, points, "points")
@@ -286,7 +298,10 @@ def _check_differentiable_value(field: Field, points: FloatArray, samples: Field
     error = np.abs(to_numpy(value) - samples.value)
     if field.period is not None:
         error = np.abs(error - field.period * np.round(error / field.period))
-    value_error, gradient_error = 0.0, 0.0  # what values at points leave out, which samples may not
+    value_error, gradient_error = (
+        0.0,
+        0.0,
+    )  # truncation errors of values at points, which samples may lack
     if isinstance(field, BatchedField):
         value_error = field.error_bound(points, precision="double")
         gradient_error = field.gradient_error_bound(points, precision="double")
@@ -307,10 +322,11 @@ def _check_promise(
     rng: np.random.Generator,
     directions: int,
 ) -> None:
-    """Test a promise along random directions from each point, to the border of the promise or
-    across the extent of the points.
+    """Test a promise along random directions from each point, up to its radius, which counts as at
+    most twice the extent of the points.
 
-    Promises of all space, such as harmonic balls, are tested outside of the field's domain as well.
+    Promises that also hold outside of the field's domain, such as harmonic balls, are tested there
+    as well.
     """
     name = type(promise).__name__
     radius = np.minimum(promise.radius, 2 * float(np.ptp(points, axis=0).max()) + 1e-300)
@@ -347,7 +363,8 @@ def _check_promise(
 
 
 def _distance_to_exit(field: Field, points: FloatArray, d: FloatArray) -> FloatArray:
-    """Lengths (n,) within the domain, which is convex, of rays from points in it."""
+    """The lengths (n,) for which rays from points (n, 3) in directions d stay in the domain, which
+    is convex; infinite without a domain."""
     if field.domain is None:
         return np.full(len(points), np.inf)
     backend = choose_backend("double")
@@ -360,8 +377,13 @@ def _distance_to_exit(field: Field, points: FloatArray, d: FloatArray) -> FloatA
 def _harnack_excess(
     ball: HarmonicBall, value: FloatArray, movement: FloatArray, fraction: FloatArray
 ) -> FloatArray:
-    """The excess of f over [lower, upper], or of its movement over the one that Harnack's
-    inequality allows a positive harmonic function: if positive, f is not harmonic on the ball."""
+    """How far (n, m) the movement of f along a ray exceeds the bounds of Harnack's inequality and
+    of the ball's range; if it is positive, f is not harmonic on the ball.
+
+    value: (n,) f at the center.
+    movement: (n, m) f minus its value at the center.
+    fraction: (m,) the distances from the center, as fractions of the radius.
+    """
     n = ball.dimension
     growth = (1 + fraction) / (1 - fraction) ** (n - 1) - 1
     decay = 1 - (1 - fraction) / (1 + fraction) ** (n - 1)
@@ -369,7 +391,7 @@ def _harnack_excess(
     with np.errstate(invalid="ignore"):  # 0 * inf, where nothing is known
         rise = np.fmin(np.fmin(gap_below * growth, gap_above), gap_above * decay)
         fall = np.fmin(np.fmin(gap_above * growth, gap_below), gap_below * decay)
-    # A radius cut short only makes the comparison weaker for q <= 1.
+    # If the radius was reduced, the comparison is only weaker.
     return np.maximum(movement - rise * (1 + 1e-9), -movement - fall * (1 + 1e-9))
 
 
@@ -379,10 +401,10 @@ def _check_extent(field: Field, level: float, rng: np.random.Generator, count: i
     if volume is None:
         return
     lower, upper = volume.bounds()
-    middle, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
+    center, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
     if not np.isfinite(half).all():
         return
-    start = middle + rng.uniform(-2.5, 2.5, (count, 3)) * half
+    start = center + rng.uniform(-2.5, 2.5, (count, 3)) * half
     if field.domain is not None:
         start = np.concatenate([start, random_points(field, rng, count)])
         start = start[field.domain.contains_points(start)]
@@ -391,7 +413,7 @@ def _check_extent(field: Field, level: float, rng: np.random.Generator, count: i
     t = np.linspace(0, 1, 160) * length[:, None]
     lift = lift_along_rays(field, start, d, t)
     offsets = sample_field(field, start).value[:, None] + lift.moved + lift.jumped - level
-    # To first order, farther from the level than a thousandth of the extent: f does not graze it.
+    # To first order farther from the level than a thousandth of the extent, so f does not touch it.
     is_clear = (
         _distance_to_level(field, offsets)
         > 1e-3 * float(half.max()) * lift.gradient_norm + lift.error
@@ -419,9 +441,11 @@ def _check_extent(field: Field, level: float, rng: np.random.Generator, count: i
 
 
 def _level_interval(field: Field, offset: FloatArray) -> FloatArray:
+    """A number for the interval between levels in which f lies. offset: f - level."""
     return np.sign(offset) if field.period is None else np.floor(offset / field.period)
 
 
 def _distance_to_level(field: Field, offset: FloatArray) -> FloatArray:
+    """The difference |f - level| to the nearest level. offset: f - level, for one of the levels."""
     nearest = 0.0 if field.period is None else field.period * np.round(offset / field.period)
     return np.abs(offset - nearest)

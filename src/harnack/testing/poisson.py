@@ -1,9 +1,10 @@
 """Poisson integrals along an axis, in double precision on the host.
 
-A positive harmonic function on the unit ball of R^n is a Poisson integral of a positive measure
-on the sphere. Along an axis only the latitude s of its mass counts, s = 1 ahead and s = -1
-behind. Everything is written as a movement, the value at q minus that at the center, free of
-cancellation at small q, and shares no formula with `harnack.enclosures`.
+A positive harmonic function on the unit ball of R^n is the Poisson integral of a positive measure
+on the sphere. Its values on an axis depend only on the latitudes s of the mass: the cosines of the
+angles to the axis, s = 1 ahead and s = -1 behind. All results are differences to the value at the
+center (movements), as a function of the position q on the axis, -1 < q < 1. The formulas have no
+cancellation at small q, and none of them is used in `harnack.enclosures`.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ _TERMS = 30
 
 
 def kernel_difference(q: npt.ArrayLike, s: npt.ArrayLike, dimension: int) -> FloatArray:
-    """P(q, s) - 1 with P = (1-q^2)/(1+q^2-2qs)^(n/2), for 0 <= q < 1 and -1 <= s <= 1."""
+    """P(q, s) - 1 for 0 <= q < 1 and -1 <= s <= 1, where P = (1-q^2)/(1+q^2-2qs)^(n/2) is the
+    Poisson kernel of the unit ball of dimension n."""
     q, s = np.asarray(q, np.float64), np.asarray(s, np.float64)
     squared_distance = (1 - q) ** 2 + 2 * q * (1 - s)  # accurate where q and s are near 1
     log = np.where(q < 0.5, np.log1p(np.maximum(q * (q - 2 * s), -0.99)), np.log(squared_distance))
@@ -55,21 +57,25 @@ def cap_movement(q: npt.ArrayLike, height: npt.ArrayLike, dimension: int) -> Flo
     A cap behind is a cap ahead with -q.
     """
     q, b = np.broadcast_arrays(np.asarray(q, np.float64), np.asarray(height, np.float64))
-    small = np.abs(q) < _SERIES_BELOW
-    series = _cap_series(np.where(small, q, 0.0), b, dimension)
-    closed = _cap_closed(np.where(small, 0.5, q), b, dimension) - cap_mass(b, dimension)
-    return np.where(small, series, closed)
+    is_small = np.abs(q) < _SERIES_BELOW
+    series = _cap_series(np.where(is_small, q, 0.0), b, dimension)
+    closed_form = _cap_closed_form(np.where(is_small, 0.5, q), b, dimension) - cap_mass(
+        b, dimension
+    )
+    return np.where(is_small, series, closed_form)
 
 
 def _cap_angle(height: FloatArray) -> FloatArray:
+    """The angle from the center of a cap to its border, as seen from the center of the sphere."""
     return 2 * np.arcsin(np.sqrt(np.clip(0.5 * height, 0, 1)))
 
 
 def _cap_series(q: FloatArray, b: FloatArray, dimension: int) -> FloatArray:
-    """Sum of c_l q^l, l >= 1: the expansion of P in Gegenbauer polynomials, integrated.
+    """The movement of the cap of height b at small q, as the sum of c_l q^l over l >= 1.
 
-    n = 3: the integral of P_l over [s, 1] is (1-s^2) P_l'(s)/(l(l+1)), and P_{l+1}' =
-    P_{l-1}' + (2l+1) P_l.
+    It is the expansion of the Poisson kernel in Gegenbauer polynomials, integrated over the cap.
+    For n = 3 these are the Legendre polynomials P_l: the integral of P_l over [s, 1] is
+    (1-s^2) P_l'(s)/(l(l+1)), and P_{l+1}' = P_{l-1}' + (2l+1) P_l.
     """
     total, power = np.zeros_like(q), np.ones_like(q)
     angle, s = _cap_angle(b), 1 - b
@@ -91,7 +97,9 @@ def _cap_series(q: FloatArray, b: FloatArray, dimension: int) -> FloatArray:
     return total
 
 
-def _cap_closed(q: FloatArray, b: FloatArray, dimension: int) -> FloatArray:
+def _cap_closed_form(q: FloatArray, b: FloatArray, dimension: int) -> FloatArray:
+    """The Poisson integral at q of the indicator of a cap of height b, in closed form; it loses
+    digits at small q."""
     if dimension == 3:  # the integral of (1-q^2)/2 (1+q^2-2qs)^(-3/2) over [1-b, 1]
         s = np.sqrt((1 - q) ** 2 + 2 * q * b)
         return b * (1 + q) / (s * (s + 1 - q))
@@ -99,20 +107,22 @@ def _cap_closed(q: FloatArray, b: FloatArray, dimension: int) -> FloatArray:
     if dimension == 2:
         return 2 / math.pi * np.arctan2((1 + q) * np.sin(angle / 2), (1 - q) * np.cos(angle / 2))
     # n = 4: the sums over j of q^j sin(j angle) and of q^j sin(j angle)/j.
-    along, across = q * np.cos(angle), q * np.sin(angle)
-    plain_sum = across / ((1 - along) ** 2 + across**2)
-    over_j = np.arctan2(across, 1 - along)
-    return (angle + plain_sum + over_j - (plain_sum - over_j) / (q * q)) / math.pi
+    real_part, imaginary_part = q * np.cos(angle), q * np.sin(angle)
+    sine_sum = imaginary_part / ((1 - real_part) ** 2 + imaginary_part**2)
+    sine_sum_over_j = np.arctan2(imaginary_part, 1 - real_part)
+    return (angle + sine_sum + sine_sum_over_j - (sine_sum - sine_sum_over_j) / (q * q)) / math.pi
 
 
 @dataclass(frozen=True)
 class AxialFunctions:
-    """Harmonic functions u on balls of R^n along an axis, a function for each row.
+    """Harmonic functions u on balls of R^n, on an axis through the center; one function per row.
 
-    measure: "points" for rings of point masses at latitudes `latitudes_or_heights`, "caps" for
-        boundary values that are sums of indicators of caps of heights `latitudes_or_heights`.
-    latitudes_or_heights, weights: (rows, k). For "points" the weights are masses, >= 0.
+    measure: "points" if u is the Poisson integral of rings of mass; "caps" if the boundary values
+        of u are a sum of indicators of caps.
+    latitudes_or_heights: (rows, k) the latitudes of the rings, or the heights of the caps.
+    weights: (rows, k) of the rings (>= 0) or of the caps.
     radius: (rows,) of the balls.
+    dimension: n.
     """
 
     measure: str
@@ -143,11 +153,15 @@ class AxialFunctions:
 
 @dataclass(frozen=True)
 class GreenPotentials:
-    """Potentials, 0 on the unit sphere of space, of balls of constant density on its axis.
+    """Potentials of balls of constant density, on an axis through the centers of the balls and of
+    the unit ball of R^3. The potentials vanish on the unit sphere.
 
-    centers, sizes: (rows, k), |center| + size <= 1. With density s the potential is w with
-    Laplacian -s in the ball and 0 outside: Newton's minus that of the image, which is harmonic in
-    the unit ball and so that of a point mass at the center.
+    centers, sizes: (rows, k) the positions of the balls on the axis, and their radii;
+        |center| + size <= 1.
+
+    For a ball of density s, the potential w has the Laplacian -s in the ball, and 0 outside of it.
+    It is Newton's potential of the ball minus that of its image. The image is outside of the unit
+    ball, where the ball's potential is that of a point mass at its center.
     """
 
     centers: FloatArray
@@ -174,7 +188,7 @@ class GreenPotentials:
 
 
 def _newton(q: FloatArray, y: FloatArray, size: FloatArray) -> FloatArray:
-    """Newton's potential of a ball of density 1 at q, minus that at 0."""
+    """Newton's potential at q, minus that at 0, of a ball of density 1 with its center at y."""
     distance0, distance = np.abs(y), np.abs(q - y)
     values: list[FloatArray] = []
     with np.errstate(divide="ignore", invalid="ignore"):

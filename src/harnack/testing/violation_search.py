@@ -40,37 +40,42 @@ class BrokenPromiseError(AssertionError):
 
 
 def require(
-    holds: Any,
+    good: Any,
     message: str,
     points: FloatArray,
     amount: FloatArray | None = None,
-    shown_at: FloatArray | None = None,
+    there: FloatArray | None = None,
 ) -> None:
-    """Raise BrokenPromiseError for the worst of the points (n, 3) at which `holds` (n,) is false.
+    """Raise BrokenPromiseError for the worst of the points (n, 3) at which `good` (n,) is false.
 
     amount: (n,) the size of the violation.
-    shown_at: (n, 3) the points at which the violation shows, if not the points themselves.
+    there: (n, 3) the points where it shows, if not at the points themselves.
     """
-    is_broken: BoolArray = ~np.asarray(holds, dtype=np.bool_)
+    is_broken: BoolArray = ~np.asarray(good, dtype=np.bool_)
     ids = np.flatnonzero(is_broken)
     if not ids.size:
         return
     worst = ids[0] if amount is None else ids[np.abs(amount[ids]).argmax()]
     size = "" if amount is None else f" (by {amount[worst]:.3g})"
-    at = "" if shown_at is None else f", at {shown_at[worst].tolist()}"
+    at = "" if there is None else f", at {there[worst].tolist()}"
     raise BrokenPromiseError(
         f"{message}{size}: point {points[worst].tolist()}{at}; {ids.size} of {len(points)} points"
     )
 
 
 def mutated_enclosure(kind: type[Enclosure], factor: float, *, covers: float | None = None) -> Any:
-    """A class of enclosures that is wrong on purpose, to test that the tests detect it: every free
-    length is multiplied by `factor`, and every length that `is_free` accepts by `covers` (None: by
-    the same factor)."""
+    """A class of enclosures that is wrong on purpose, to test that the checks detect it.
+
+    kind: the class from which it is derived.
+    factor: multiplies every free length.
+    covers: multiplies every length that `is_free` accepts; None for the same factor.
+    """
     covers_factor = factor if covers is None else covers
     base: Any = kind
 
     class Scaled(base):
+        """The class with all lengths scaled."""
+
         original = kind
 
         def free_length(self, gaps: LevelGaps) -> Real:
@@ -127,18 +132,18 @@ def sample_field(
     n = len(points)
     sample = _sample(field, points, precision, closely)
     numbers = [list(vars(promise).values()) for promise in sample.all_promises]
-    # At once, or each would be computed by a kernel of its own.
+    # In one kernel for all of them.
     dr.eval(sample.value, sample.gradient, sample.value_error, sample.gradient_error, numbers)
 
     promises = tuple(
-        promise.map_numbers(lambda number, _, __: _spread(number, n))
+        promise.map_numbers(lambda number, _, __: _to_lanes(number, n))
         for promise in sample.all_promises
     )
     return FieldSamples(
-        _spread(sample.value, n),
+        _to_lanes(sample.value, n),
         np.broadcast_to(to_numpy(sample.gradient), (n, 3)).astype(np.float64),
-        _spread(sample.value_error, n),
-        _spread(sample.gradient_error, n),
+        _to_lanes(sample.value_error, n),
+        _to_lanes(sample.gradient_error, n),
         promises,
     )
 
@@ -178,7 +183,7 @@ def lift_along_rays(
     if field.period is not None:
         expected = 0.5 * (slope[:, 1:] + slope[:, :-1]) * np.diff(lengths, axis=1)
         expected = np.where(np.isfinite(expected), expected, 0)
-        # A gradient may grow without limit at a curve; there the lift still moves little.
+        # Near a singular curve the gradient is unbounded, while the lift changes little.
         expected = np.clip(expected, -0.5 * field.period, 0.5 * field.period)
         changes -= field.period * np.round((changes - expected) / field.period)
     total = np.concatenate([np.zeros((n, 1)), np.cumsum(changes, axis=1)], axis=1)
@@ -203,7 +208,7 @@ def accumulated_jumps(
     crossing = JumpCrossing(first, backend.UInt32(NO_FACET), backend.Float(0), d)
     while True:
         crossing = prepared.next_jump(o, d, crossing, last, backend.Bool(True))
-        t, jump = (_spread(values, len(start)) for values in (crossing.t, crossing.jump))
+        t, jump = (_to_lanes(values, len(start)) for values in (crossing.t, crossing.jump))
         is_ahead = np.isfinite(t)
         if not is_ahead.any():
             return total
@@ -234,67 +239,76 @@ def random_directions(rng: np.random.Generator, n: int) -> FloatArray:
 
 
 def _sample(field: Field, points: FloatArray, precision: Precision, closely: bool) -> Sample:
+    """The field's Dr.Jit sample at points (n, 3). closely: without truncation error."""
     backend = choose_backend(precision)
     prepared = field.prepare(backend)
     evaluator = prepared.exact(backend) if closely else prepared
     return evaluator.evaluate(to_vector3(backend, points, "points"))
 
 
-def _spread(value: object, n: int) -> FloatArray:
+def _to_lanes(value: object, n: int) -> FloatArray:
+    """A Dr.Jit array or a number as a float64 array (n,)."""
     array = to_numpy(value) if dr.is_array_v(value) else np.asarray(value)
     return np.broadcast_to(array, (n,)).astype(np.float64)
 
 
 # The search for the worst points.
 
-# The number of pairs that climb: the largest, and as a fraction of the points; the number of moves
-# that each pair tries in an iteration, and of iterations. Where f is known along a path only, which
-# costs an evaluation a sample, fewer.
-_MOST_PAIRS, _PAIRS_OF_POINTS = 48, 0.25
+# The number of pairs of points that are improved: at most, and as a fraction of the points.
+_MAX_PAIRS, _PAIRS_OF_POINTS = 48, 0.25
+# The number of moves that each pair tries in an iteration, and of iterations. All these numbers are
+# divided by the last one if the movement of f is known along paths only, as each sample of a path
+# costs an evaluation.
 _MOVES, _ROUNDS, _PATH_COST_DIVISOR = 8, 36, 2
-# Fraction of the radius within which points stay, away from the border of the ball.
-_BORDER = 1 - 1e-6
+# Points stay within this fraction of the radius, off the border of the ball.
+_MAX_RADIUS_FRACTION = 1 - 1e-6
 # Lengths of moves, in radii: the first, the smallest, and the factors after success and failure.
 _FIRST_STEP, _MIN_STEP, _STEP_GROWTH, _STEP_SHRINKAGE = 0.25, 1e-9, 1.6, 0.6
-# Of the coordinates: smaller radii are left out, for rounding moves points in such balls.
-_SMALLEST = 1e-6
-# Number of samples on the path to a point, where f is known along it only: in the search, and at
-# last.
+# Balls whose radius is below this fraction of the coordinates are left out, as rounding moves
+# points in them.
+_MIN_RELATIVE_RADIUS = 1e-6
+# Number of samples on a path between two points, if the movement of f is known along paths only: in
+# the search, and for the final test.
 _PATH_SAMPLES, _FINAL_PATH_SAMPLES = 24, 600
-# The allowance of a ratio above 1 for rounding, and the rounding error of the values.
-_ALLOWED, _ROUNDING = 1e-6, 1e-9
-# Of the radius: the spacing of differences of gradients.
-_SPACING = 1e-3
+# How far a ratio may exceed 1 by rounding; and the relative rounding error of values.
+_RATIO_TOLERANCE, _ROUNDING = 1e-6, 1e-9
+# The spacing of differences of gradients, as a fraction of the distance to the border.
+_DIFFERENCE_SPACING = 1e-3
 
 
 @dataclass(frozen=True)
 class _Candidates:
-    """Pairs of points p (n, 3) and y = p + reach * w, |w| < 1, with their violation ratios (n,): a
-    promise is violated where the ratio is above 1."""
+    """Pairs of points, at which a promise is tested.
+
+    p: (n, 3) the points where the promise is made.
+    w: (n, 3) the vectors from p to the points y = p + reach * w where it is tested, |w| < 1.
+    reach: (n,) the radius of the promise at p.
+    violation_ratio: (n,) above 1 if the promise is violated.
+    """
 
     p: FloatArray
     w: FloatArray
     reach: FloatArray
     violation_ratio: FloatArray
 
-    def best_of(self, candidates: _Candidates) -> tuple[_Candidates, BoolArray]:
-        """For each of these n pairs, the best of itself and its m of the n * m `candidates`; and
-        (n,) whether the best is a candidate."""
+    def best_of(self, alternatives: _Candidates) -> tuple[_Candidates, BoolArray]:
+        """The best of these n pairs and their alternatives, m for each pair, n * m in all. Returns
+        n pairs, and a mask (n,) of those that are alternatives."""
         n = len(self.p)
-        m = len(candidates.p) // n
-        best = np.arange(n) * m + candidates.violation_ratio.reshape(n, m).argmax(axis=1)
-        is_better = candidates.violation_ratio[best] > self.violation_ratio
+        m = len(alternatives.p) // n
+        best = np.arange(n) * m + alternatives.violation_ratio.reshape(n, m).argmax(axis=1)
+        is_better = alternatives.violation_ratio[best] > self.violation_ratio
         mask = is_better[:, None]
         return _Candidates(
-            np.where(mask, candidates.p[best], self.p),
-            np.where(mask, candidates.w[best], self.w),
-            np.where(is_better, candidates.reach[best], self.reach),
-            np.where(is_better, candidates.violation_ratio[best], self.violation_ratio),
+            np.where(mask, alternatives.p[best], self.p),
+            np.where(mask, alternatives.w[best], self.w),
+            np.where(is_better, alternatives.reach[best], self.reach),
+            np.where(is_better, alternatives.violation_ratio[best], self.violation_ratio),
         ), is_better
 
 
 def search_violations(
-    field: Field, points: FloatArray, samples: FieldSamples, number: int, rng: np.random.Generator
+    field: Field, points: FloatArray, look: FieldSamples, number: int, rng: np.random.Generator
 ) -> None:
     """Search for points that violate a promise, the one with index `number` in
     `Sample.all_promises`.
@@ -306,7 +320,7 @@ def search_violations(
     random, and a move is kept if it raises the violation ratio. The step length grows after success
     and shrinks after failure.
 
-    points: (n, 3), and `samples` the samples of the field there. The search starts from the points
+    points: (n, 3), and `look` the samples of the field there. The search starts from the points
         with the smallest radius and from random points, with y towards the border of the ball:
         along the gradient, against it, and in random directions.
 
@@ -315,16 +329,16 @@ def search_violations(
     """
     search = _ViolationSearch(field, number, 2 * float(np.ptp(points, axis=0).max()) + 1e-300)
     divisor = _PATH_COST_DIVISOR if search.needs_path else 1
-    count = min(max(int(_PAIRS_OF_POINTS * len(points)), 6), _MOST_PAIRS) // divisor
+    count = min(max(int(_PAIRS_OF_POINTS * len(points)), 6), _MAX_PAIRS) // divisor
     moves_each = _MOVES // divisor
-    order = np.argsort(np.broadcast_to(samples.promises[number].radius, len(points)), kind="stable")
+    order = np.argsort(np.broadcast_to(look.promises[number].radius, len(points)), kind="stable")
     rows = np.concatenate([order[: count // 3], rng.choice(len(points), count)])[:count]
-    steepest = samples.gradient[rows]
+    steepest = look.gradient[rows]
     length = np.linalg.norm(steepest, axis=1, keepdims=True)
     steepest = np.where(length > 0, steepest / np.maximum(length, 1e-300), [1.0, 0.0, 0.0])
     start_kind = np.arange(count)[:, None] % 3
-    along = np.where(start_kind == 1, -1, 1) * steepest
-    directions = np.where(start_kind == 2, random_directions(rng, count), along)
+    axial = np.where(start_kind == 1, -1, 1) * steepest
+    directions = np.where(start_kind == 2, random_directions(rng, count), axial)
     best = search.pairs(points[rows], directions * rng.uniform(0.3, 1, (count, 1)))
     steps = np.full(count, _FIRST_STEP)
     for _ in range(_ROUNDS // divisor):
@@ -335,33 +349,33 @@ def search_violations(
         kind = np.arange(len(p))[:, None] % 4
         moves_point = kind >= 2
         change = rng.normal(size=p.shape) * step * 10 ** rng.uniform(-1, 0, (len(p), 1))
-        shift = np.where(moves_point, rng.normal(size=p.shape) * step, 0)
-        new_w = w - np.where(kind == 3, shift, 0) + np.where(kind == 3, 0, change)
+        point_shift = np.where(moves_point, rng.normal(size=p.shape) * step, 0)
+        new_w = w - np.where(kind == 3, point_shift, 0) + np.where(kind == 3, 0, change)
         # A promise of slopes or second derivatives is broken most between neighbors: an offset that
         # is turned and made shorter or longer, by a fraction of its length.
         length = np.linalg.norm(w, axis=1, keepdims=True)
         rotated = (w + length * change) * 10 ** rng.uniform(-1, 0.5, (len(p), 1))
         new_w = np.where(np.arange(len(p))[:, None] % 8 == 1, rotated, new_w)
         new_w = np.where(np.arange(len(p))[:, None] % 8 == 2, w + length * change, new_w)
-        best, is_better = best.best_of(search.pairs(p + reach * shift, new_w))
+        best, is_better = best.best_of(search.pairs(p + reach * point_shift, new_w))
         steps = np.where(is_better, np.minimum(_STEP_GROWTH * steps, 1), _STEP_SHRINKAGE * steps)
         steps = np.where(steps < _MIN_STEP, _FIRST_STEP, steps)
-    is_violated = best.violation_ratio > 1 + _ALLOWED
+    is_violated = best.violation_ratio > 1 + _RATIO_TOLERANCE
     if is_violated.any():
         best = search.pairs(best.p[is_violated], best.w[is_violated], samples=_FINAL_PATH_SAMPLES)
         y = best.p + best.reach[:, None] * best.w
-        holds = ~(best.violation_ratio > 1 + _ALLOWED)
-        name = type(samples.promises[number]).__name__
+        holds = ~(best.violation_ratio > 1 + _RATIO_TOLERANCE)
+        name = type(look.promises[number]).__name__
         message = f"{name}: f leaves what is promised here, by this factor"
         require(holds, message, best.p, best.violation_ratio, y)
 
 
 @dataclass(frozen=True)
 class _ViolationSearch:
-    """The search for pairs that violate a promise.
+    """The search for pairs of points that violate a promise.
 
-    promise_index: of the promise in `Sample.all_promises`.
-    longest: the length that stands for an infinite radius.
+    promise_index: the index of the promise in `Sample.all_promises`.
+    longest: the length that takes the place of an infinite radius.
     """
 
     field: Field
@@ -370,31 +384,32 @@ class _ViolationSearch:
 
     @property
     def needs_path(self) -> bool:
-        """Whether the movement of f between two points must be added up along a path, without its
-        jumps."""
+        """Whether the change of f between two points has to be added up along a path, without jumps
+        and periods."""
         return self.field.period is not None or self.field.has_jumps
 
     def pairs(self, p: FloatArray, w: FloatArray, samples: int = _PATH_SAMPLES) -> _Candidates:
-        """The pairs of points p (n, 3) and vectors w (n, 3), fractions of the radius, which are
-        shortened to stay in the ball."""
+        """The pairs of points p (n, 3) and vectors w (n, 3), with their ratios. Vectors of length 1
+        or more are shortened, to stay in the ball; samples: on each path."""
         length = np.linalg.norm(w, axis=1, keepdims=True)
-        w = w * np.minimum(1, _BORDER / np.maximum(length, 1e-300))
+        w = w * np.minimum(1, _MAX_RADIUS_FRACTION / np.maximum(length, 1e-300))
         ratios, radii = np.full(len(p), -np.inf), np.full(len(p), 1.0)
-        rows = np.flatnonzero(self._within(p))
+        rows = np.flatnonzero(self._is_in_domain(p))
         if len(rows):
-            samples2 = sample_field(self.field, p[rows])
-            promise = samples2.promises[self.promise_index]
+            at_p = sample_field(self.field, p[rows])
+            promise = at_p.promises[self.promise_index]
             radii[rows] = np.minimum(promise.radius, self.longest)
             y = p + radii[:, None] * w
-            is_usable = radii[rows] > _SMALLEST * np.abs(p[rows]).max(axis=1)
+            is_usable = radii[rows] > _MIN_RELATIVE_RADIUS * np.abs(p[rows]).max(axis=1)
             if not promise.holds_outside_domain:
-                is_usable &= self._within(y[rows])
-            rows, samples2 = rows[is_usable], samples2.subset(is_usable)
+                is_usable &= self._is_in_domain(y[rows])
+            rows, at_p = rows[is_usable], at_p.subset(is_usable)
             if len(rows):
-                ratios[rows] = self._ratio(samples2, p[rows], w[rows], radii[rows], samples)
+                ratios[rows] = self._ratio(at_p, p[rows], w[rows], radii[rows], samples)
         return _Candidates(p, w, radii, np.where(np.isnan(ratios), -np.inf, ratios))
 
-    def _within(self, p: FloatArray) -> BoolArray:
+    def _is_in_domain(self, p: FloatArray) -> BoolArray:
+        """(n,) whether points are finite and in the field's domain."""
         is_inside = np.asarray(np.isfinite(p).all(axis=1))
         if self.field.domain is not None:
             is_inside &= self.field.domain.contains_points(np.nan_to_num(p))
@@ -403,6 +418,13 @@ class _ViolationSearch:
     def _ratio(
         self, at_p: FieldSamples, p: FloatArray, w: FloatArray, reach: FloatArray, samples: int
     ) -> FloatArray:
+        """The violation ratio (n,) of pairs: the movement of f from p to y, less its error,
+        relative to the bounds of the promise.
+
+        at_p: the samples at p.
+        reach: (n,) the radius of the promise.
+        samples: the number of samples on a path from p to y.
+        """
         promise, y = at_p.promises[self.promise_index], p + reach[:, None] * w
         at_y = sample_field(self.field, y)
         moved = at_y.value - at_p.value
@@ -424,12 +446,13 @@ class _ViolationSearch:
                 gap = np.minimum(max_fall + moved, max_rise - moved)
                 ratio = np.fmax(ratio, _slope_ratio(promise, at_y, margin, gap))
             if isinstance(promise, BoundedLaplacian):
-                spacing = _SPACING * margin
+                spacing = _DIFFERENCE_SPACING * margin
                 ratio = np.fmax(ratio, self._laplacian_ratio(promise, y, at_y, spacing))
             return ratio
 
     def _lift(self, p: FloatArray, y: FloatArray, samples: int) -> FloatArray:
-        """The movement (n,) of the continuous lift from p to y."""
+        """The change (n,) of the continuous lift of f from points p to points y, sampled on the
+        segments between them."""
         offset = y - p
         length = np.linalg.norm(offset, axis=1)
         d = offset / np.maximum(length, 1e-300)[:, None]
@@ -440,19 +463,19 @@ class _ViolationSearch:
     def _laplacian_ratio(
         self, bound: BoundedLaplacian, y: FloatArray, at_y: FieldSamples, h: FloatArray
     ) -> FloatArray:
-        """1 plus the amount by which the Laplacian at y (n, 3) leaves its bounds, relative to their
-        size."""
+        """1 plus the amount by which the Laplacian at y (n, 3) is outside of its bounds, relative
+        to their size. It is computed by differences of the gradient, with the spacings h and 2h."""
         fine, wide = np.zeros(len(y)), np.zeros(len(y))
         rounding = 4 * at_y.gradient_error / h
         for axis in range(3):
-            for node, weight, wider in ((1, 1.0, 0.0), (2, 0.0, 0.5)):
-                shift = (node * h)[:, None] * np.eye(3)[axis]
+            for node, weight, wide_weight in ((1, 1.0, 0.0), (2, 0.0, 0.5)):
+                offset = (node * h)[:, None] * np.eye(3)[axis]
                 rate = (
-                    sample_field(self.field, y + shift).gradient
-                    - sample_field(self.field, y - shift).gradient
+                    sample_field(self.field, y + offset).gradient
+                    - sample_field(self.field, y - offset).gradient
                 )
                 fine += weight * rate[:, axis] / (2 * h)
-                wide += wider * rate[:, axis] / (2 * h)
+                wide += wide_weight * rate[:, axis] / (2 * h)
         slope = np.linalg.norm(at_y.gradient, axis=1)
         rounding += 1e-11 * slope * (1 + np.abs(y).max(axis=1) / h) / h + np.abs(fine - wide)
         excess = np.maximum(bound.laplacian_lower - fine, fine - bound.laplacian_upper) - rounding
@@ -463,12 +486,16 @@ class _ViolationSearch:
 def _slope_ratio(
     promise: HarmonicBall, at_y: FieldSamples, margin: FloatArray, gap: FloatArray
 ) -> FloatArray:
-    """The ratio of |grad f|, at points of a ball, to the largest gradient of a harmonic function
-    whose value there is `gap` away from the nearer end of its range.
+    """The ratio (k,) of |grad f(y)| to the largest value that it can have if f is harmonic on the
+    ball and within its range there.
 
-    Proof. At y, `free` from the border, f - lower is positive and harmonic on B(y, free), so that
-    by Harnack's inequality |grad f(y)| <= n (f(y) - lower)/free; likewise upper - f. Where a
-    singularity lies in the ball, the left side grows faster than the right one beside it.
+    at_y: the samples at points y of the balls.
+    margin: (k,) the distances of the points from the border of their ball.
+    gap: (k,) the differences between f(y) and the nearer end of its range.
+
+    Proof. f - lower is positive and harmonic on the ball of radius `margin` about y. So by
+    Harnack's inequality |grad f(y)| <= n (f(y) - lower)/margin; likewise for upper - f. If there is
+    a singularity in the ball, the left side grows faster than the right one beside it.
     """
     slope = np.maximum(np.linalg.norm(at_y.gradient, axis=1) - at_y.gradient_error, 0)
     return np.where(gap > 0, slope * margin / (promise.dimension * gap), -np.inf)

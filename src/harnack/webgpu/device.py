@@ -34,7 +34,8 @@ __all__ = [
 ]
 
 Words = npt.NDArray[np.uint32]
-# Seconds that a dispatch should take: a system kills a program that keeps its display waiting.
+# Seconds that a dispatch should take: the system may kill a program that blocks the display. The
+# number of lanes of a dispatch is doubled below the first, and halved above the second.
 _MIN_DISPATCH_SECONDS, _MAX_DISPATCH_SECONDS = 0.1, 0.4
 _INITIAL_BATCH, _MAX_BATCH = 1 << 15, 1 << 21
 # The largest number of workgroups along an axis, on every device.
@@ -44,12 +45,13 @@ _SHADER_CACHE_SIZE = 64
 
 
 class NoDeviceError(RuntimeError):
-    """There is no device behind WebGPU, or no package to reach it."""
+    """WebGPU finds no device, or the package `wgpu` is missing."""
 
 
 @dataclass(frozen=True)
 class Device:
-    """A WebGPU device, and the name by which it identifies itself."""
+    """A WebGPU device. handle: the device object of the package `wgpu`; name: by which the device
+    identifies itself."""
 
     handle: Any
     name: str
@@ -121,6 +123,11 @@ class CompiledShader:
         return dict(zip(self.shader.results, results, strict=True))
 
     def _dispatch(self, data: Words, lanes: Words) -> Words:
+        """Run the shader on all lanes at once. Returns the bits of its results, (results, count).
+
+        data: the buffer of numbers and tables (`pack_shader_data`).
+        lanes: (arrays, count) the bits of each array of lanes.
+        """
         import wgpu
 
         handle, usage = self.device.handle, wgpu.BufferUsage
@@ -157,14 +164,15 @@ def pack_shader_data(shader: Shader, data: Mapping[str, Any]) -> Words:
     to 0."""
     tables = [as_words(data[label]) for label in shader.tables]
     numbers = [as_words(data[label])[:1] for label in shader.numbers]
-    table_start = 2 + len(tables) + len(numbers)
-    starts = table_start + np.cumsum([0, *map(len, tables)])[:-1].astype(np.uint32)
+    first_start = 2 + len(tables) + len(numbers)
+    table_starts = first_start + np.cumsum([0, *map(len, tables)])[:-1].astype(np.uint32)
     header = np.zeros(2, np.uint32)
-    return np.concatenate([header, starts, *numbers, *tables]).astype(np.uint32)
+    return np.concatenate([header, table_starts, *numbers, *tables]).astype(np.uint32)
 
 
 def as_words(array: Any) -> Words:
-    """The 32 bits of each entry."""
+    """The entries of a number or array as 32-bit words (n,): the bits of 32-bit numbers, other
+    numbers converted to integers."""
     values: npt.NDArray[Any] = np.atleast_1d(
         to_numpy(array) if dr.is_array_v(type(array)) else array
     )
@@ -231,6 +239,7 @@ def evaluate_on_device(
 
 
 def _gather_lanes(array: Any, rows: npt.NDArray[np.int64]) -> Any:
+    """The entries `rows` (k,) of a Dr.Jit array, evaluated."""
     index = upload_integers(backend_of(array), rows.astype(np.uint32))
     gathered = dr.gather(type(array), array, index)
     dr.make_opaque(gathered)
@@ -238,7 +247,8 @@ def _gather_lanes(array: Any, rows: npt.NDArray[np.int64]) -> Any:
 
 
 def _columns_to_arrays(columns: Arrays) -> Arrays:
-    """Columns "result name" and "result name k" as arrays (n,) and (n, 3) by name."""
+    """The arrays of results by name, (n,) or (n, 3), from columns with the labels "result name" or
+    "result name k"."""
     groups: dict[str, list[npt.NDArray[Any]]] = {}
     for label, column in columns.items():
         groups.setdefault(label.split()[1], []).append(column)

@@ -58,8 +58,8 @@ class Operation:
 class Load:
     """result = an entry of an array.
 
-    source: "lane": the entry of the lane. "number": the only entry. "table": entry index * stride +
-        offset where `mask` holds, else 0.
+    source: which entry. "lane": that of the lane. "number": the only one. "table": number
+        index * stride + offset where `mask` holds, else the result is 0.
     parameter: the index of the array among the parameters of the kernel.
     """
 
@@ -155,7 +155,7 @@ class _Address:
 
 _VECTOR = r"<\d+ x (\w+)>"
 _NAME = r"%[\w.]+"
-# A result, a constant of a packet, or a number.
+# The pattern of an operand: the name of a result, a constant of a packet, or a number.
 _OPERAND = r"(%[\w.]+|<[^>]*>|[^,<>]+)"
 # Flags of instructions that only say how LLVM may compile them.
 _FLAGS = re.compile(r"\b(?:fast|nnan|ninf|nsz|arcp|contract|afn|reassoc|nuw|nsw|exact)\b ?")
@@ -191,23 +191,28 @@ _CALLS = {
 
 
 def _ignore(*groups: str) -> None:
+    """The action for instructions without an effect on the lanes."""
     del groups
 
 
 class _LLVMParser:
-    """Reads a kernel line by line."""
+    """Parses a kernel line by line.
+
+    statements: the statements so far.
+    labels: index of a kernel parameter -> label of its array.
+    """
 
     def __init__(self) -> None:
         self.statements: list[Statement] = []
         self.labels: dict[int, str] = {}
-        self._tables: dict[str, int] = {}  # the parameter that a result was read from
+        self._tables: dict[str, int] = {}  # result -> parameter of the table it was read from
         self._current_block = self.statements
         self._loops: list[Loop] = []
-        self._aliases: dict[str, Operand] = {}  # names for other values
+        self._aliases: dict[str, Operand] = {}  # result -> the value that it is another name of
         self._addresses: dict[str, _Address] = {}
-        self._records: dict[str, _Address] = {}  # of results that consist of several numbers
+        self._records: dict[str, _Address] = {}  # result of several numbers -> their address
         self._label: str | None = None
-        self._labeled = ""  # the variable that has this label
+        self._labeled = ""  # the variable that the label belongs to
         self._block = ""
         self._patterns = {
             word: [(re.compile(pattern), action) for pattern, action in rules]
@@ -215,7 +220,12 @@ class _LLVMParser:
         }
 
     def parse_line(self, line: str) -> None:
-        """Read the next line."""
+        """Parse the next line: a comment (which is a label), the name of a block, or an
+        instruction.
+
+        Raises:
+            UntranslatableError: the instruction is unknown.
+        """
         text = line.partition(", !")[0].strip()
         if text.startswith(";"):
             self._label, self._labeled = text[1:].strip(), ""
@@ -237,8 +247,8 @@ class _LLVMParser:
             )
 
     def _enter_block(self, block: str) -> None:
-        """Enter a block of the kernel: of a loop, the part before it, its test, its body, or its
-        end."""
+        """Begin a block of the kernel. A loop has four blocks: the part before it, its test, its
+        body and the part after it."""
         self._block = block
         if re.fullmatch(r"l_\d+_cond", block):
             loop = Loop()
@@ -256,6 +266,7 @@ class _LLVMParser:
             self._current_block = outer.body if outer else self.statements
 
     def _value(self, text: str, kind: Kind) -> Operand:
+        """The operand that a text stands for: the name of a result, or a constant of this kind."""
         text = text.strip()
         if text.startswith("%"):
             return self._aliases.get(text, text)
@@ -275,21 +286,25 @@ class _LLVMParser:
         return Constant(kind, int(text) & 0xFFFFFFFF)
 
     def _emit(self, result: str, kind: Kind, name: str, *operands: Operand) -> None:
+        """Add an operation to the current block."""
         self._current_block.append(Operation(result, kind, name, operands))
 
     def _label_parameter(self, parameter: int) -> None:
+        """Give the current label, if there is one, to a parameter that has none."""
         if self._label is not None:
             self.labels.setdefault(parameter, self._label)
 
     def _grammar(self) -> dict[str, list[tuple[str, Callable[..., None]]]]:
-        """By the first word of an instruction: patterns of lines, and the action for each."""
+        """The grammar: for each first word of an instruction, the patterns of such instructions,
+        each with its action. An action takes the result, if there is one, and the groups of the
+        pattern."""
         entry = rf"ptr ({_NAME}), <\d+ x i32> (\S+)"
         binary: list[tuple[str, Callable[..., None]]]
         binary = [(rf"(\w+) {_VECTOR} {_OPERAND}, {_OPERAND}", self._arithmetic)]
         convert: list[tuple[str, Callable[..., None]]]
         convert = [(rf"(\w+) {_VECTOR} {_OPERAND} to {_VECTOR}", self._convert)]
         return {
-            # Of packets and branches; results under another name.
+            # Control of packets and branches, and other names of values.
             "br": [
                 (rf"br i1 ({_NAME}), label %l_\d+_body, label %l_\d+_done", self._test),
                 (r"br .*", _ignore),
@@ -359,65 +374,82 @@ class _LLVMParser:
             ],
         }  # fmt: skip
 
-    # The actions; arguments are the groups of the pattern.
+    # The actions of the grammar.
 
     def _test(self, condition: str) -> None:
+        """The condition of the current loop."""
         self._loops[-1].condition = self._value(condition, "bool")
 
     def _phi(self, result: str, element: str, before: str, after: str) -> None:
+        """A variable of the current loop, with its value before the first iteration and after
+        each."""
         kind = self._kind(element)
         variable = LoopVariable(result, kind, self._value(before, kind), after)
         self._loops[-1].variables.append(variable)
 
     def _alias(self, result: str, element: str, value: str) -> None:
+        """Another name for a value."""
         if element != "ptr":
             self._aliases[result] = self._value(value, self._kind(element))
 
     def _lane(self, result: str, name: str) -> None:
+        """The index of the lane, or the number of lanes."""
         self._aliases[result] = "lane" if name == "index" else "count"
 
     def _parameter(self, result: str, number: str) -> None:
+        """The address of the array of a kernel parameter."""
         self._addresses[result] = _Address(int(number))
         self._label_parameter(int(number))
 
     def _pointer(self, result: str, pointer: str) -> None:
+        """Another name for an address."""
         self._addresses[result] = self._addresses[pointer]
 
     def _load_number(self, result: str, element: str, pointer: str) -> None:
+        """Load the only entry of an array."""
         source = self._addresses[pointer]
         self._current_block.append(Load(result, self._kind(element), "number", source.parameter))
 
     def _load_lane(self, result: str, element: str, pointer: str) -> None:
+        """Load the lane's entry of an array."""
         source = self._addresses[pointer]
         self._current_block.append(Load(result, self._kind(element), "lane", source.parameter))
 
     def _store(self, element: str, value: str, pointer: str) -> None:
+        """Store a value in the lane's entry of an array."""
         kind = self._kind(element)
         self._current_block.append(
             Store(self._addresses[pointer].parameter, kind, self._value(value, kind))
         )
 
     def _record(self, result: str, stride: str, pointer: str, index: str) -> None:
+        """The address of a record of `stride` numbers in a table."""
         source = self._addresses[pointer]
         self._addresses[result] = _Address(source.parameter, self._value(index, "u32"), int(stride))
 
     def _set_address_mask(self, result: str, mask: str, pointer: str) -> None:
+        """The same address, read only where the mask holds."""
         source = self._addresses[pointer]
         self._addresses[result] = _Address(
             source.parameter, source.index, source.stride, self._value(mask, "bool")
         )
 
     def _entry(self, result: str, pointer: str, index: str) -> None:
+        """The address of an entry of a table."""
         self._record(result, "1", pointer, index)
 
     def _gather_record(self, result: str, pointer: str) -> None:
+        """Note the address from which a record is read; `_extract` reads its numbers."""
         self._records[result] = self._addresses[pointer]
 
     def _extract(self, result: str, element: str, record: str, entry: str) -> None:
+        """Load number `entry` of a record."""
         source = self._records[record]
         self._read_table(result, element, source, int(entry), source.mask)
 
     def _gather(self, result: str, element: str, pointer: str, mask: str) -> None:
+        """Load an entry of a table where the mask holds, else 0. The label of the result becomes
+        that of the table."""
         source = self._addresses[pointer]
         self._read_table(result, element, source, 0, self._value(mask, "bool"))
         self._label_parameter(source.parameter)
@@ -425,6 +457,7 @@ class _LLVMParser:
     def _read_table(
         self, result: str, element: str, source: _Address, entry: int, mask: Operand | None
     ) -> None:
+        """Add the load of number `entry` of the record at an address."""
         kind = self._kind(element)
         load = Load(
             result, kind, "table", source.parameter, source.index, source.stride, entry, mask
@@ -433,23 +466,28 @@ class _LLVMParser:
         self._tables[result] = source.parameter
 
     def _arithmetic(self, result: str, name: str, element: str, a: str, b: str) -> None:
+        """An operation on two operands of the same kind as the result."""
         kind = self._kind(element)
         self._emit(result, kind, name, self._value(a, kind), self._value(b, kind))
 
     def _unary(self, result: str, name: str, element: str, a: str) -> None:
+        """An operation on a single operand."""
         kind = self._kind(element)
         self._emit(result, kind, name, self._value(a, kind))
 
     def _compare(self, result: str, name: str, element: str, a: str, b: str) -> None:
+        """A comparison of two operands."""
         kind = self._kind(element)
         self._emit(result, "bool", name, self._value(a, kind), self._value(b, kind))
 
     def _select(self, result: str, mask: str, element: str, a: str, b: str) -> None:
+        """a where the mask holds, else b."""
         kind = self._kind(element)
         values = self._value(mask, "bool"), self._value(a, kind), self._value(b, kind)
         self._emit(result, kind, "select", *values)
 
     def _convert(self, result: str, name: str, source_type: str, a: str, target_type: str) -> None:
+        """A conversion between types. A bitcast to the same kind is another name of its value."""
         kind, source = self._kind(target_type), self._kind(source_type)
         value = self._value(a, source)
         if name == "bitcast" and isinstance(value, str):  # of a value that was read from a table
@@ -461,9 +499,11 @@ class _LLVMParser:
         self._emit(result, kind, f"{name} {source}", value)
 
     def _class(self, result: str, name: str, element: str, value: str, mask: str) -> None:
+        """A test of the class of a float: NaN, infinite and so on, as the bits of `mask` say."""
         self._emit(result, "bool", f"{name} {mask}", self._value(value, self._kind(element)))
 
     def _call(self, result: str, element: str, function: str, arguments: str) -> None:
+        """A call of a function of LLVM that is one operation here."""
         kind = self._kind(element)
         operands = re.findall(r"<\d+ x \w+> (<[^>]*>|[^,\s]+)", arguments)
         stem = re.sub(r"\.(?:v\d+\w*|ps|f32|i32|ss)\b.*", "", function)
@@ -478,6 +518,7 @@ class _LLVMParser:
 
     @staticmethod
     def _kind(element: str) -> Kind:
+        """The kind of a number of this LLVM type."""
         if element not in _KINDS:
             raise UntranslatableError(
                 f"a kernel of this field computes with numbers of type {element}: other GPUs have "

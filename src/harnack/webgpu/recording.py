@@ -71,25 +71,31 @@ def record_kernel(
             dr.set_label(array, label)
         text = _evaluate_and_get_ir(list(computed.values()))
     constants = {label: value for label, value in results.items() if label not in computed}
-    return RecordedKernel(_shader(text), labels.labeled_arrays, computed, constants)
+    return RecordedKernel(_cached_shader(text), labels.labeled_arrays, computed, constants)
 
 
 @functools.lru_cache(maxsize=64)
-def _shader(text: str) -> Shader:
+def _cached_shader(text: str) -> Shader:
+    """The shader of a kernel, given as text."""
     return to_shader(parse(text))
 
 
 def _is_constant(array: Any) -> bool:
+    """Whether an array is a literal: a constant that is not stored."""
     return array.state == dr.VarState.Literal
 
 
 def _evaluate_and_get_ir(arrays: list[Any]) -> str:
-    """Evaluate arrays, and return the text of the kernel."""
+    """Evaluate arrays, and return the text of the kernel that did it.
+
+    Raises:
+        RuntimeError: that took more than one kernel, or none.
+    """
     with (
         _garbage_collection_paused(),
         dr.scoped_set_flag(dr.JitFlag.KernelHistory, True),
         dr.scoped_set_flag(dr.JitFlag.PrintIR, True),
-        contextlib.redirect_stdout(io.StringIO()),  # the flag also has it printed
+        contextlib.redirect_stdout(io.StringIO()),  # the flag also prints the kernel
     ):
         dr.kernel_history_clear()
         dr.eval(arrays)
@@ -103,8 +109,9 @@ def _evaluate_and_get_ir(arrays: list[Any]) -> str:
 def _garbage_collection_paused() -> Generator[None]:
     """Context manager: within it, no thread collects garbage.
 
-    To print a kernel, Dr.Jit waits for Python's lock while it holds its own. A thread that collects
-    garbage holds Python's lock, and would wait for Dr.Jit's to free an array, for ever.
+    This avoids a deadlock. To print a kernel, Dr.Jit waits for Python's lock while it holds its
+    own. A thread that collects garbage holds Python's lock, and may wait for Dr.Jit's to free an
+    array.
     """
     was_enabled = gc.isenabled()
     gc.disable()
@@ -116,10 +123,12 @@ def _garbage_collection_paused() -> Generator[None]:
 
 
 class _ArrayLabels:
-    """Labels arrays in the order in which they are met.
+    """Labels arrays, with numbers in the order of the calls.
 
     Labels are part of the text of a kernel. Data of the same structure get the same labels, so that
     the kernel is neither translated nor compiled again.
+
+    labeled_arrays: the arrays by label.
     """
 
     def __init__(self) -> None:
@@ -141,9 +150,10 @@ class _ArrayLabels:
         original = module.gather
 
         def gather(dtype: Any, source: Any, index: Any, *args: Any, **kwargs: Any) -> Any:
+            """`drjit.gather`, which also labels its result."""
             gathered = original(dtype, source, index, *args, **kwargs)
             if dr.is_array_v(type(source)) and dr.depth_v(type(source)) == 1:
-                self._name_parts(gathered, source)
+                self._label_gathered(gathered, source)
             return gathered
 
         module.gather = gather
@@ -152,20 +162,22 @@ class _ArrayLabels:
         finally:
             module.gather = original
 
-    def _name_parts(self, gathered: Any, source: Any) -> None:
+    def _label_gathered(self, gathered: Any, source: Any) -> None:
+        """Label the components of a gathered value: each by the label of the table `source` or, if
+        it is evaluated already, by a label of its own."""
         for _, leaf in labeled_leaves("", gathered):
             if leaf.state == dr.VarState.Evaluated:  # gathered at known indices
                 self.label_array(leaf)
             elif source.state == dr.VarState.Evaluated:
-                dr.set_label(leaf, self._table(source))
+                dr.set_label(leaf, self._table_label(source))
 
-    def _table(self, source: Any) -> str:
+    def _table_label(self, source: Any) -> str:
+        """The label of an evaluated array that lanes gather from."""
         if source.index not in self._tables:
             label = f"table {len(self._tables)}"
             self._tables[source.index] = label
-            self.labeled_arrays[label] = type(source)(
-                source
-            )  # kept, so that no other has its index
+            # A reference keeps the array alive, so that no other array gets its index.
+            self.labeled_arrays[label] = type(source)(source)
         return self._tables[source.index]
 
 
@@ -186,7 +198,8 @@ def labeled_leaves(name: str, value: Any) -> list[tuple[str, Any]]:
 
 
 def _find_arrays(data: Any) -> Iterator[Any]:
-    """The flat arrays that an object holds, each once, in a fixed order."""
+    """The flat arrays in an object and in all objects that it refers to, each once, in a fixed
+    order."""
     visited: set[int] = set()
     pending: list[Any] = [data]
     while pending:

@@ -54,15 +54,15 @@ _INFIX = {
     "fadd": "+", "fsub": "-", "fmul": "*", "fdiv": "/", "add": "+", "sub": "-", "mul": "*",
     "udiv": "/", "urem": "%",
 }  # fmt: skip
-# Operators of bits, and of truth values: "&&" would be a branch.
-_BITS = {"and": ("&", "&"), "or": ("|", "|"), "xor": ("^", "!=")}
+# Operators on bits, and on truth values; "&&" and "||" would be branches.
+_BIT_OPERATORS = {"and": ("&", "&"), "or": ("|", "|"), "xor": ("^", "!=")}
 _FUNCTIONS = {
     "sqrt": "sqrt", "abs": "abs", "floor": "floor", "ceil": "ceil", "trunc": "trunc",
     "round": "round", "rsqrt": "inverseSqrt", "fma": "fma", "fmuladd": "fma",
     "minnum": "min_number", "maxnum": "max_number", "minimum": "min_or_nan",
     "maximum": "max_or_nan", "umin": "min", "umax": "max", "popcount": "countOneBits",
 }  # fmt: skip
-_ORDER = {"eq": "==", "ne": "!=", "gt": ">", "ge": ">=", "lt": "<", "le": "<="}
+_COMPARISONS = {"eq": "==", "ne": "!=", "gt": ">", "ge": ">=", "lt": "<", "le": "<="}
 _NEGATED_COMPARISONS = {"gt": "le", "ge": "lt", "lt": "ge", "le": "gt"}
 
 
@@ -93,6 +93,8 @@ def to_shader(kernel: ComputeKernel) -> Shader:
 
 
 class _WGSLWriter:
+    """Writes a kernel as a shader, statement by statement."""
+
     def __init__(self, kernel: ComputeKernel) -> None:
         self._kernel = kernel
         slots: dict[str, list[int]] = {"number": [], "table": [], "lane": []}
@@ -108,6 +110,7 @@ class _WGSLWriter:
         self._depth = 1
 
     def shader(self) -> Shader:
+        """The shader of the kernel."""
         for statement in self._kernel.statements:
             self._write(statement)
         names = {
@@ -135,47 +138,55 @@ class _WGSLWriter:
         return Shader(code, names["number"], names["table"], names["lane"], results)
 
     def _label(self, parameter: int) -> str:
+        """The label of a kernel parameter. Raises UntranslatableError if it has none."""
         label = self._kernel.labels.get(parameter)
         if label is None:
             raise UntranslatableError(f"parameter {parameter} of a kernel has no name")
         return label
 
     def _emit(self, line: str) -> None:
+        """Add a line of code, indented."""
         self._lines.append("  " * self._depth + line)
 
     def _write(self, statement: Statement) -> None:
+        """Write a statement."""
         if isinstance(statement, Loop):
             self._loop(statement)
         elif isinstance(statement, Store):
             slot = self._stores.index(statement)
-            value = self._text(statement.value)
+            value = self._operand_text(statement.value)
             bits = value if statement.kind == "u32" else f"bitcast<u32>({value})"
             self._emit(f"results[{slot}u * count + lane] = {bits};")
         elif isinstance(statement, Load):
-            self._emit(f"let {_name(statement.result)} = {self._load(statement)};")
+            self._emit(f"let {_variable(statement.result)} = {self._load(statement)};")
         else:
-            self._emit(f"let {_name(statement.result)} = {self._operation(statement)};")
+            self._emit(f"let {_variable(statement.result)} = {self._operation(statement)};")
 
     def _loop(self, loop: Loop) -> None:
+        """Write a loop."""
         for node in loop.variables:
-            self._emit(f"var {_name(node.name)}: {node.kind} = {self._text(node.before)};")
+            self._emit(
+                f"var {_variable(node.name)}: {node.kind} = {self._operand_text(node.before)};"
+            )
         self._emit("loop {")
         self._depth += 1
         for node in loop.test:
             self._write(node)
-        self._emit(f"if (!{self._text(loop.condition)}) {{ break; }}")
+        self._emit(f"if (!{self._operand_text(loop.condition)}) {{ break; }}")
         for node in loop.body:
             self._write(node)
         changed = [node for node in loop.variables if node.after != node.name]
-        # All at the same time: the new value of a variable may be the old value of another.
+        # All new values are computed first: one may be the old value of another variable.
         for node in changed:
-            self._emit(f"let next_{_name(node.name)} = {self._text(node.after)};")
+            self._emit(f"let next_{_variable(node.name)} = {self._operand_text(node.after)};")
         for node in changed:
-            self._emit(f"{_name(node.name)} = next_{_name(node.name)};")
+            self._emit(f"{_variable(node.name)} = next_{_variable(node.name)};")
         self._depth -= 1
         self._emit("}")
 
     def _load(self, load: Load) -> str:
+        """The expression that reads an entry of an array (`Shader` says how the buffers are laid
+        out)."""
         slot = self._buffer_slots[load.source].index(load.parameter)
         if load.source == "lane":
             bits = f"lanes[{slot}u * count + lane]"
@@ -183,21 +194,22 @@ class _WGSLWriter:
             bits = f"data[{2 + len(self._buffer_slots['table']) + slot}]"
         else:
             assert load.index is not None
-            index = self._text(load.index)
+            index = self._operand_text(load.index)
             if load.stride > 1:
                 index = f"{index} * {load.stride}u + {load.offset}u"
             bits = f"data[data[{2 + slot}] + {index}]"
             if load.mask is not None and not (isinstance(load.mask, Constant) and load.mask.bits):
-                bits = f"select(0u, {bits}, {self._text(load.mask)})"
+                bits = f"select(0u, {bits}, {self._operand_text(load.mask)})"
         return bits if load.kind == "u32" else f"bitcast<f32>({bits})"
 
     def _operation(self, operation: Operation) -> str:
-        a = [self._text(value) for value in operation.operands]
+        """The expression of an operation."""
+        a = [self._operand_text(value) for value in operation.operands]
         name, _, variant = operation.name.partition(" ")
         if name in _INFIX:
             return f"{a[0]} {_INFIX[name]} {a[1]}"
-        if name in _BITS:
-            return f"{a[0]} {_BITS[name][operation.kind == 'bool']} {a[1]}"
+        if name in _BIT_OPERATORS:
+            return f"{a[0]} {_BIT_OPERATORS[name][operation.kind == 'bool']} {a[1]}"
         if name in _FUNCTIONS:
             return f"{_FUNCTIONS[name]}({', '.join(a)})"
         match name:
@@ -210,14 +222,14 @@ class _WGSLWriter:
             case "lshr":
                 return f"{a[0]} >> ({a[1]} & 31u)"
             case "ashr":
-                return f"bitcast<u32>({_signed(a[0])} >> ({a[1]} & 31u))"
+                return f"bitcast<u32>({_as_signed(a[0])} >> ({a[1]} & 31u))"
             case "sdiv" | "srem":
                 operator = "/" if name == "sdiv" else "%"
-                return f"bitcast<u32>({_signed(a[0])} {operator} {_signed(a[1])})"
+                return f"bitcast<u32>({_as_signed(a[0])} {operator} {_as_signed(a[1])})"
             case "smin" | "smax":
-                return f"bitcast<u32>({name[1:]}({_signed(a[0])}, {_signed(a[1])}))"
+                return f"bitcast<u32>({name[1:]}({_as_signed(a[0])}, {_as_signed(a[1])}))"
             case "iabs":
-                return f"bitcast<u32>(abs({_signed(a[0])}))"
+                return f"bitcast<u32>(abs({_as_signed(a[0])}))"
             case "copysign":
                 return (
                     f"bitcast<f32>((bitcast<u32>({a[0]}) & 0x7fffffffu) | "
@@ -231,15 +243,16 @@ class _WGSLWriter:
                 return _float_comparison(variant, a[0], a[1])
             case "icmp":
                 if variant in ("eq", "ne"):
-                    return f"{a[0]} {_ORDER[variant]} {a[1]}"
-                x, y = (_signed(v) for v in a) if variant[0] == "s" else a
-                return f"{x} {_ORDER[variant[1:]]} {y}"
+                    return f"{a[0]} {_COMPARISONS[variant]} {a[1]}"
+                x, y = (_as_signed(v) for v in a) if variant[0] == "s" else a
+                return f"{x} {_COMPARISONS[variant[1:]]} {y}"
             case _:
                 return _conversion(operation, name, variant, a[0])
 
-    def _text(self, value: Operand) -> str:
+    def _operand_text(self, value: Operand) -> str:
+        """The expression of an operand: a variable, or a constant with exactly these bits."""
         if isinstance(value, str):
-            return _name(value)
+            return _variable(value)
         if value.kind == "bool":
             return "true" if value.bits else "false"
         if value.kind == "u32":
@@ -253,16 +266,19 @@ class _WGSLWriter:
         return f"{number!r}f" if number >= 0 and value.bits >> 31 == 0 else f"({number!r}f)"
 
 
-def _name(result: str) -> str:
+def _variable(result: str) -> str:
+    """The WGSL variable of a result."""
     return result.replace("%", "v_").replace(".", "_")
 
 
-def _signed(text: str) -> str:
+def _as_signed(text: str) -> str:
+    """The expression as a signed integer with the same bits."""
     return f"bitcast<i32>({text})"
 
 
 def _float_comparison(predicate: str, x: str, y: str) -> str:
-    """A comparison of numbers; predicates "o.." are false for NaN, "u.." true."""
+    """The expression of a comparison of floats. Predicates that begin with "o" (ordered) are false
+    if an operand is NaN; those with "u" (unordered) are true."""
     if predicate in ("ord", "uno"):
         any_nan = f"is_nan({x}) | is_nan({y})"
         return any_nan if predicate == "uno" else f"!({any_nan})"
@@ -276,12 +292,13 @@ def _float_comparison(predicate: str, x: str, y: str) -> str:
     if predicate == "une":
         return f"({x} != {y}) | is_nan({x}) | is_nan({y})"
     if family == "o":
-        return f"{x} {_ORDER[order]} {y}"
-    return f"!({x} {_ORDER[_NEGATED_COMPARISONS[order]]} {y})"
+        return f"{x} {_COMPARISONS[order]} {y}"
+    return f"!({x} {_COMPARISONS[_NEGATED_COMPARISONS[order]]} {y})"
 
 
 def _float_class_test(classes: int, x: str) -> str:
-    """Whether a number is of one of the classes of AVX-512's `fpclass`."""
+    """The expression of a test whether a float is in one of the classes, a bit mask as in AVX-512's
+    `fpclass`."""
     bits = f"bitcast<u32>({x})"
     tests = {
         0x81: f"is_nan({x})",
@@ -297,11 +314,16 @@ def _float_class_test(classes: int, x: str) -> str:
 
 
 def _conversion(op: Operation, name: str, source: str, x: str) -> str:
+    """The expression of the conversion of x from the kind `source` to the kind of the operation.
+
+    Raises:
+        UntranslatableError: the conversion is unknown.
+    """
     match name, source, op.kind:
         case "bitcast", _, kind:
             return x if source == kind else f"bitcast<{kind}>({x})"
         case "sitofp", "u32", _:
-            return f"f32({_signed(x)})"
+            return f"f32({_as_signed(x)})"
         case "uitofp", "u32" | "bool", _:
             return f"f32({x})"
         case "fptosi", _, _:
