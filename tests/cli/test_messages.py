@@ -51,8 +51,8 @@ def draw(**settings: Any) -> Any:
         ({"level": [1.0, "a"]}, r"level must be a number, .* not 'a'"),
         ({"solid": (0, 1)}, r"no option 'solid'; did you mean \"side\"\?$"),
         ({"tolerance": "x"}, r"tolerance must be a length or HitTolerance, not 'x'"),
-        ({"material": 5}, r"a material is a name, .* not 5; there are two-tone"),
-        ({"material": [0.5]}, r"a material is a name, a color, .* not 0.5; there are two"),
+        ({"material": 5}, r"material must be a name, .* not 5; there are two-tone"),
+        ({"material": [0.5]}, r"material must be a name, a color, .* not 0.5; there are two"),
         ({"colour": "red"}, r"no option 'colour'; did you mean \"material\"\?$"),
         (
             {"filename": "a.png"},

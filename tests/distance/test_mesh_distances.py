@@ -202,7 +202,7 @@ def test_boxes_in_contact(count: int) -> None:
     surface: 2.031 was said of the first point, and of 22 pairs 8 were wrong, by up to 1.28."""
     low, high = np.array([[0.0, 0, 0], [5, 0, 10]]), np.array([[10.0, 10, 10], [15, 10, 20]])
     field = hk.WindingNumber(*mesh_of_boxes([(a, b, 1) for a, b in zip(low, high, strict=True)]))
-    assert hk.signed_distance(field, [[7.5, 5.0, 9.0]])[0] == pytest.approx(2.5, abs=1e-12)
+    assert hk.signed_distance(field, [[7.5, 5.0, 9.0]])[0] == pytest.approx(-2.5, abs=1e-12)
     rng, refused = np.random.default_rng(0), list[int]()
     for k in range(count):
         boxes = boxes_in_contact(rng)
@@ -214,16 +214,14 @@ def test_boxes_in_contact(count: int) -> None:
         computed = hk.signed_distance(field, x @ turn + shift)
         inside = [((x > low) & (x < high)).all(axis=1) for low, high, _ in boxes]
         np.testing.assert_allclose(np.abs(computed), distance_to_boxes(boxes, x), atol=1e-9)
-        np.testing.assert_array_equal(computed > 0, np.any(inside, axis=0))
+        np.testing.assert_array_equal(computed < 0, np.any(inside, axis=0))
         # Of the solid, whose function is that: a search over cells found feet up to 0.1 too far.
         try:
             solid = hk.solid((vertices @ turn + shift, faces))
         except MeshError:  # rounding left a gap between parts that were turned
             refused.append(k)
             continue
-        np.testing.assert_allclose(
-            hk.signed_distance(solid, x @ turn + shift), -computed, atol=1e-9
-        )
+        np.testing.assert_allclose(hk.signed_distance(solid, x @ turn + shift), computed, atol=1e-9)
     assert len(refused) <= count // 25
 
 

@@ -39,7 +39,10 @@ def test_solids_turn_anticlockwise(axis: Any, degrees: float, start: Any, end: A
     [
         (hk.solids.DoubleCone(), (0, 0, 3), (0, 0, -1), 3.0),
         (hk.solids.DoubleCone().rotated(90, "x").translated((0, 3, 0)), (0, 0, 0), (0, 1, 0), 3.0),
-        (hk.solids.DoubleCone().twisted(math.degrees(2.0)) - hk.Torus(1.0, 0.2), (0, 0, 3), (0, 0, -1), 3.0),
+        (
+            hk.solids.DoubleCone().twisted(math.degrees(2.0)) - hk.Torus(1.0, 0.2),
+            (0, 0, 3), (0, 0, -1), 3.0,
+        ),
         (hk.Torus(0.5, 0.75), (0, 0, 3), (0, 0, -1), 3 - np.sqrt(0.75**2 - 0.5**2)),
         (hk.solids.Superellipsoid((1.0, 1.0)), (-3, 0, 0), (1, 0, 0), 2.0),
         (hk.solids.Supertorus((1.0, 3.0), 0.75, 0.25), (-3, 0, 0), (1, 0, 0), 2.0),

@@ -104,7 +104,9 @@ CASES: dict[str, tuple[Callable[[], hk.solids.Solid], Values]] = {
         lambda p: sphere(((p - [0.2, 0.1, -0.3]) @ TURN) / [1, 0.5, 1.5]),
     ),
     "twisted": (
-        lambda: (hk.Sphere(1.0) - hk.Torus(0.8, 0.3).translated((0.3, 0, 0))).twisted(math.degrees(2.0)),
+        lambda: (
+            (hk.Sphere(1.0) - hk.Torus(0.8, 0.3).translated((0.3, 0, 0))).twisted(math.degrees(2.0))
+        ),
         lambda p: np.maximum(
             sphere(untwisted(p, 2.0)), -torus(untwisted(p, 2.0) - [0.3, 0, 0], 0.8, 0.3)
         ),
@@ -123,7 +125,9 @@ CASES: dict[str, tuple[Callable[[], hk.solids.Solid], Values]] = {
         lambda p: 0.7 * np.maximum(0.1 - gyroid(shrunk(p)), sphere(shrunk(p))),
     ),
     "twisted gyroid": (
-        lambda: (hk.solid(hk.Gyroid(1.0), below=0.2) & hk.Torus(0.8, 0.4)).twisted(math.degrees(1.0)),
+        lambda: (
+            (hk.solid(hk.Gyroid(1.0), below=0.2) & hk.Torus(0.8, 0.4)).twisted(math.degrees(1.0))
+        ),
         lambda p: np.maximum(gyroid(untwisted(p, 1.0)) - 0.2, torus(untwisted(p, 1.0), 0.8, 0.4)),
     ),
     "blend": (
@@ -306,7 +310,7 @@ def test_a_union_reaches_as_far_as_its_parts() -> None:
         (lambda: hk.Sphere(1.0) | 3, TypeError, "only solids, such as"),
         (lambda: hk.Gyroid(1.0) | hk.Sphere(1.0), TypeError, "Gyroid is a field and no solid"),
         (lambda: hk.Sphere(1.0) - hk.Gyroid(1.0), TypeError, r"make one of it by harnack.solid\("),
-        (lambda: hk.Gyroid(1.0).twisted(math.degrees(1.0)), AttributeError, "make a solid of the field first"),
+        (lambda: hk.Gyroid(1.0).twisted(60.0), AttributeError, "make a solid of the field first"),
         (lambda: hk.expression(lambda x, y, z: x ^ 2), TypeError, r"powers as x\*\*2"),
         (lambda: hk.union(), ValueError, "at least one solid"),
         (lambda: hk.union(hk.Gyroid(1.0)), TypeError, "is a field and no solid"),

@@ -60,7 +60,7 @@ def test_both_ends_of_a_solid_are_told_of() -> None:
     ball = hk.DipolePotential(*sphere_points(1000))
     solids = [
         hk.Surface(ball, 5.0, side="above"),
-        hk.Surface(ball, 8.0, side="below"),
+        hk.Surface(ball, 8.0, side="above"),
         hk.Surface(ball, (5.0, 8.0), side="between"),
     ]
     low, high, both = (
