@@ -170,6 +170,17 @@ def test_what_is_the_same_for_all_pictures_is_no_function(name: str, tmp_path: P
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_function_of_coordinates_is_no_function_of_s(tmp_path: Path) -> None:
+    """It is what colors a surface, in films as in pictures."""
+    path = tmp_path / "a.gif"
+    film = hk.animate(
+        hk.Sphere(1.0), path, frames=2, size=(32, 24), show="value", progress=False,
+        color_by=lambda x, y, z: x + y * z,
+    )  # fmt: skip
+    assert film.path == path
+    assert path.stat().st_size > 0
+
+
 def test_classes_of_enclosures_are_no_functions(tmp_path: Path) -> None:
     """A film refused them as functions of s."""
     bounds = {"enclosures": hk.proofs.LipschitzEnclosure, "show": "normal", "frames": 1}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
+import inspect
 import math
 import os
 from collections.abc import Callable, Generator
@@ -187,7 +188,16 @@ def _value_at(value: Any, s: float) -> Any:
 
 
 def _is_function_of_s(value: Any) -> bool:
-    return callable(value) and not isinstance(value, type)
+    """Whether an option is a function of one number. A function of three coordinates, by which a
+    surface is colored, is no function of s."""
+    if not callable(value) or isinstance(value, type):
+        return False
+    try:
+        parameters = inspect.signature(value).parameters.values()
+    except ValueError:  # a function of C
+        return True
+    required = [p for p in parameters if p.default is p.empty and p.kind is not p.VAR_KEYWORD]
+    return len(required) <= 1
 
 
 def _cameras(
