@@ -45,11 +45,11 @@ class GroupedList:
     """
 
     records: RecordTable
-    of: Any
+    group_of_record: Any
     entries: Any
     begin: Any
     end: Any
-    count: Any
+    group_count: Any
 
     def record(self, i: Any) -> Any:
         """The index in the table of the record at position i of the list."""
@@ -60,7 +60,7 @@ class GroupedList:
     def group(self, i: Any) -> Any:
         """The number of the group of the blob at position i of the list."""
         kind = self.records.backend.UInt32
-        return dr.gather(kind, self.of, self.record(i), i < self.end)
+        return dr.gather(kind, self.group_of_record, self.record(i), i < self.end)
 
     def each_group(self, body: Any, state: State, label: str) -> tuple[Any, State]:
         """Call body(for_each, state) for each group that has blobs in the list. It returns the next
@@ -139,7 +139,9 @@ def group_maximum_at(kernel: BlobKernel, backend: Backend, p: Vec3, blobs: Group
     start = (real(-dr.inf), *(real(0) for _ in range(5)))
     groups, final = blobs.each_group(add_group, start, "groups")
     value, x, y, z, error, gradient_error = final
-    is_zero = (groups < blobs.count) & ~(value > 0)  # the largest sum is 0, that of a far group
+    is_zero = (groups < blobs.group_count) & ~(
+        value > 0
+    )  # the largest sum is 0, that of a far group
     gradient = dr.select(is_zero, backend.Array3f(0), backend.Array3f(x, y, z))
     return SumValue(dr.select(is_zero, 0, value), gradient, error, gradient_error)
 
@@ -236,7 +238,7 @@ class GroupMaximumEnclosure(Enclosure):
         start = (real(0) + self.length, real(0))
         groups, (up, down) = self.blobs.each_group(add_group, start, "steps of groups")
         # The sums of far groups stay 0. If the level is below 0, the maximum never falls to it.
-        zero_is_above_level = (groups < self.blobs.count) & (gaps.below > self.value)
+        zero_is_above_level = (groups < self.blobs.group_count) & (gaps.below > self.value)
         down = dr.select(zero_is_above_level, self.length, down)
         down = dr.select(gaps.below == dr.inf, self.length, down)
         return fmin(dr.select(gaps.above == dr.inf, self.length, up), down)

@@ -105,28 +105,30 @@ class BlobKernel(abc.ABC):
         """The second derivative of k by q."""
 
     @abc.abstractmethod
-    def chord(self, height: Real, inside: Real) -> ChordProfile:
+    def chord(self, height_squared: Real, half_chord_squared: Real) -> ChordProfile:
         """The extreme values of the kernel's derivatives along lines.
 
-        height: h^2, at most 1.
-        inside: S^2 = 1 - h^2, at least 0.
+        height_squared: h^2, at most 1.
+        half_chord_squared: S^2 = 1 - h^2, at least 0.
         """
 
     @abc.abstractmethod
-    def derivatives(self, height: Real, inside: Real, x: Real) -> tuple[Real, Real]:
+    def derivatives(
+        self, height_squared: Real, half_chord_squared: Real, x: Real
+    ) -> tuple[Real, Real]:
         """The first two derivatives along the lines of `chord`, at the position x, |x| <= S.
 
-        height, inside: h^2 and S^2.
+        height_squared, half_chord_squared: h^2 and S^2.
         """
 
-    def lipschitz_fraction(self, inside: Real, nearest: Real) -> Real:
+    def lipschitz_fraction(self, half_chord_squared: Real, nearest: Real) -> Real:
         """A factor, at most 1, by which the constants `steepness` may be multiplied for a part of a
         line.
 
-        inside: S^2 of the line.
+        half_chord_squared: S^2 of the line.
         nearest: a lower bound of x^2 on the part.
         """
-        del inside, nearest
+        del half_chord_squared, nearest
         return 1.0
 
     @abc.abstractmethod
@@ -187,8 +189,8 @@ class CompactKernel(BlobKernel):
     def second_derivative(self, q: Real) -> Real:
         return 6 * fmax(1 - q, 0)
 
-    def chord(self, height: Real, inside: Real) -> ChordProfile:
-        half, squared = dr.sqrt(inside), inside * inside
+    def chord(self, height_squared: Real, half_chord_squared: Real) -> ChordProfile:
+        half, squared = dr.sqrt(half_chord_squared), half_chord_squared * half_chord_squared
         zero_x = math.sqrt(0.2) * half
         return ChordProfile(
             half,
@@ -199,9 +201,11 @@ class CompactKernel(BlobKernel):
             -6 * squared,
         )
 
-    def derivatives(self, height: Real, inside: Real, x: Real) -> tuple[Real, Real]:
+    def derivatives(
+        self, height_squared: Real, half_chord_squared: Real, x: Real
+    ) -> tuple[Real, Real]:
         square = x * x
-        w = inside - square
+        w = half_chord_squared - square
         return -6 * x * (w * w), 6 * w * dr.fma(4, square, -w)
 
     def derivative_ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
@@ -254,25 +258,27 @@ class SexticKernel(BlobKernel):
     def second_derivative(self, q: Real) -> Real:
         return dr.select(q < 1, dr.fma(8 / 3, 1 - q, 10 / 9), 0)
 
-    def chord(self, height: Real, inside: Real) -> ChordProfile:
-        total = dr.fma(1.2, inside, 0.5)
-        product = inside * dr.fma(0.2, inside, 1 / 6)
+    def chord(self, height_squared: Real, half_chord_squared: Real) -> ChordProfile:
+        total = dr.fma(1.2, half_chord_squared, 0.5)
+        product = half_chord_squared * dr.fma(0.2, half_chord_squared, 1 / 6)
         zero_x = dr.sqrt(2 * product / (total + dr.sqrt(fmax(total * total - 4 * product, 0))))
-        peak_x = dr.sqrt(fmin(dr.fma(0.6, inside, 0.25), inside))
-        first, _ = self.derivatives(height, inside, zero_x)
-        _, max_second = self.derivatives(height, inside, peak_x)
+        peak_x = dr.sqrt(fmin(dr.fma(0.6, half_chord_squared, 0.25), half_chord_squared))
+        first, _ = self.derivatives(height_squared, half_chord_squared, zero_x)
+        _, max_second = self.derivatives(height_squared, half_chord_squared, peak_x)
         return ChordProfile(
-            dr.sqrt(inside),
+            dr.sqrt(half_chord_squared),
             zero_x,
             -first,
             peak_x,
             max_second,
-            -inside * dr.fma(8 / 3, inside, 20 / 9),
+            -half_chord_squared * dr.fma(8 / 3, half_chord_squared, 20 / 9),
         )
 
-    def derivatives(self, height: Real, inside: Real, x: Real) -> tuple[Real, Real]:
+    def derivatives(
+        self, height_squared: Real, half_chord_squared: Real, x: Real
+    ) -> tuple[Real, Real]:
         square = x * x
-        w = inside - square
+        w = half_chord_squared - square
         part = w * dr.fma(8 / 3, w, 20 / 9)
         return -x * part, dr.fma(square, dr.fma(32 / 3, w, 40 / 9), -part)
 
@@ -334,16 +340,22 @@ class CubicKernel(BlobKernel):
     def second_derivative(self, q: Real) -> Real:
         return dr.select(q < 1, 1.5 / dr.sqrt(fmax(q, float(dr.smallest(type(q))))), 0)
 
-    def chord(self, height: Real, inside: Real) -> ChordProfile:
-        half = dr.sqrt(inside)
-        zero_x = dr.sqrt(fmax(1 + dr.sqrt(dr.fma(8, height, 1)) - 4 * height, 0) * 0.125)
+    def chord(self, height_squared: Real, half_chord_squared: Real) -> ChordProfile:
+        half = dr.sqrt(half_chord_squared)
+        zero_x = dr.sqrt(
+            fmax(1 + dr.sqrt(dr.fma(8, height_squared, 1)) - 4 * height_squared, 0) * 0.125
+        )
         zero_x = fmin(zero_x, half)
-        first, _ = self.derivatives(height, inside, zero_x)
-        return ChordProfile(half, zero_x, -first, half, 6 * inside, 6 * dr.sqrt(height) - 6)
+        first, _ = self.derivatives(height_squared, half_chord_squared, zero_x)
+        return ChordProfile(
+            half, zero_x, -first, half, 6 * half_chord_squared, 6 * dr.sqrt(height_squared) - 6
+        )
 
-    def derivatives(self, height: Real, inside: Real, x: Real) -> tuple[Real, Real]:
+    def derivatives(
+        self, height_squared: Real, half_chord_squared: Real, x: Real
+    ) -> tuple[Real, Real]:
         square = x * x
-        r = dr.sqrt(fmax(height + square, float(dr.smallest(type(x)))))
+        r = dr.sqrt(fmax(height_squared + square, float(dr.smallest(type(x)))))
         return -6 * x * (1 - r), 6 * (square / r - (1 - r))
 
     def derivative_ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
@@ -440,9 +452,9 @@ class GaussianKernel(BlobKernel):
     def second_derivative(self, q: Real) -> Real:
         return dr.select(q < 1, self._rate * self._rate * dr.exp(self._rate * (1 - q)), 0)
 
-    def chord(self, height: Real, inside: Real) -> ChordProfile:
+    def chord(self, height_squared: Real, half_chord_squared: Real) -> ChordProfile:
         b = self._rate
-        z = b * inside
+        z = b * half_chord_squared
         exp_z = dr.exp(z)
         u = 1 / exp_z
         polynomial: Any = _ZERO_OF_SECOND[-1]
@@ -457,7 +469,7 @@ class GaussianKernel(BlobKernel):
             * (2 * dr.select(is_at_end, z, exp_z * math.exp(-1.5)) + dr.select(is_at_end, 0, 1))
         )
         return ChordProfile(
-            dr.sqrt(inside),
+            dr.sqrt(half_chord_squared),
             zero_x,
             2 * b * zero_x * (dr.exp(z - y) - 1),
             dr.sqrt(fmin(1.5, z) / b),
@@ -465,13 +477,15 @@ class GaussianKernel(BlobKernel):
             -2 * b * (exp_z - 1),
         )
 
-    def derivatives(self, height: Real, inside: Real, x: Real) -> tuple[Real, Real]:
+    def derivatives(
+        self, height_squared: Real, half_chord_squared: Real, x: Real
+    ) -> tuple[Real, Real]:
         b = self._rate
         y = b * (x * x)
-        e = dr.exp(b * inside - y)
+        e = dr.exp(b * half_chord_squared - y)
         return -2 * b * x * (e - 1), 2 * b * dr.fma(e, dr.fma(2, y, -1), 1)
 
-    def lipschitz_fraction(self, inside: Real, nearest: Real) -> Real:
+    def lipschitz_fraction(self, half_chord_squared: Real, nearest: Real) -> Real:
         """See `BlobKernel`. Proof. All constants are multiples of the largest e^z with z = b (S^2 -
         x^2), which is at most e^(b (S^2 - 1)) times the value for S = 1 and x = 0. The factor e^(-b
         x^2) is bounded by e^y >= (1 + y/32)^32 with y = b x^2."""
@@ -479,7 +493,11 @@ class GaussianKernel(BlobKernel):
         power = dr.fma(b / 32, nearest, 1)
         for _ in range(5):
             power = power * power
-        largest = 1.01 if isinstance(inside, float) else 1.01 * dr.exp(b * (inside - 1))
+        largest = (
+            1.01
+            if isinstance(half_chord_squared, float)
+            else 1.01 * dr.exp(b * (half_chord_squared - 1))
+        )
         return fmin(largest / power, 1)
 
     def derivative_ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:

@@ -418,7 +418,7 @@ def _octree(
             root.subset(backend, np.zeros(len(centers), np.int64)),
             to_vector3(backend, centers),
         )
-        counts = roots.primitives_of(packed, c, near, none_stay, None, far=False, most=limit)
+        counts = roots.primitives_of(packed, c, near, none_stay, None, far=False, count_limit=limit)
         count = to_numpy(counts).astype(np.int64)
         is_leaf = np.broadcast_to(count <= most_near, len(centers)) | is_last
         levels.append(_CellLevel(centers, radius, is_leaf, count))

@@ -385,26 +385,26 @@ class PendingSources:
         return cls(nodes, LaneLists.concatenate(backend, [part.primitives for part in parts]))
 
     def split_far(
-        self, tree: PackedTree, c: Vec3, radius: Real, factor: float, smallest: Real
+        self, tree: PackedTree, c: Vec3, radius: Real, factor: float, max_node_radius: Real
     ) -> tuple[DipoleExpansions, PendingSources]:
         """Split the sources into those that are far from the balls, and the rest.
 
         c: the centers of the balls.
         factor: k of this module: dipoles are far if they are farther than `factor` radii from the
             center.
-        smallest: inner nodes that are not far stay nodes if their radius is at most this. Larger
+        max_node_radius: inner nodes that are not far stay nodes if their radius is at most this. Larger
             nodes are replaced by their children, and leaves by their primitives, which are far or
             near.
 
         Returns the sums over the far sources, and the remaining sources. Each primitive is in
         exactly one far node, or is itself far, or is among the remaining sources.
         """
-        backend, inner = tree.backend, factor * radius
+        backend, far_radius = tree.backend, factor * radius
         far, pending = (
             build_lists(
                 backend,
-                lambda put, far=far: _count_nodes(
-                    tree, self.nodes, c, inner, smallest, put, far=far
+                lambda store, far=far: _count_nodes(
+                    tree, self.nodes, c, far_radius, max_node_radius, store, far=far
                 ),
             )
             for far in (True, False)
@@ -412,7 +412,9 @@ class PendingSources:
         far_primitives, near_primitives = (
             build_lists(
                 backend,
-                lambda put, far=far: self.primitives_of(tree, c, inner, smallest, put, far=far),
+                lambda store, far=far: self.primitives_of(
+                    tree, c, far_radius, max_node_radius, store, far=far
+                ),
             )
             for far in (True, False)
         )
@@ -424,35 +426,35 @@ class PendingSources:
         self,
         tree: PackedTree,
         c: Vec3,
-        inner: Real,
-        smallest: Real,
-        put: WriteEntry | None,
+        far_radius: Real,
+        max_node_radius: Real,
+        store: WriteEntry | None,
         *,
         far: bool,
-        most: Any = None,
+        count_limit: Any = None,
     ) -> Any:
         """Count the far primitives, or with far=False the near primitives, and write them to lists.
         This is a walk for `build_lists`. The primitives are those of the list of primitives, and
         those of leaves that are not far.
 
-        inner: k rho: a dipole is far if its distance from c is more than this. For a triangle
+        far_radius: k rho: a dipole is far if its distance from c is more than this. For a triangle
             `TRIANGLE_RATIO` times its radius is added.
-        smallest: nodes up to this radius stay nodes, so that their primitives are not visited.
-        put: writes an entry; None to count only.
-        most: once a count exceeds this, the remaining primitives need not be counted.
+        max_node_radius: nodes up to this radius stay nodes, so that their primitives are not visited.
+        store: writes an entry; None to count only.
+        count_limit: once a count exceeds this, the remaining primitives need not be counted.
 
         Returns the number of primitives on each lane.
 
         A leaf that is far has no near primitives: a triangle's box lies in the ball of its node, of
         radius R. So `TRIANGLE_RATIO` times the triangle's radius is at most 1.5 * 2 R = 3 R, while
-        its centroid is farther from c than inner + 4 R - R.
+        its centroid is farther from c than far_radius + 4 R - R.
         """
-        index, vector = tree.backend.UInt32, tree.backend.Array3f
+        uint_t, vector = tree.backend.UInt32, tree.backend.Array3f
         are_points = tree.primitives.packets_per_record == 1
 
         def is_chosen(row: list[Real], active: Mask) -> Mask:
             """Whether the primitive of a record is to be counted."""
-            far_distance = inner if are_points else inner + row[7]
+            far_distance = far_radius if are_points else far_radius + row[7]
             is_far = dr.squared_norm(c - vector(*row[:3])) > dr.square(far_distance)
             return (is_far if far else ~is_far) & (row[6] > 0) & active
 
@@ -460,12 +462,12 @@ class PendingSources:
             """Count the primitives of a leaf. state: the number so far. Returns whether the walk
             enters the node, and the new number."""
             square = dr.squared_norm(c - vector(*node.head[:3]))
-            enters = square <= dr.square(inner + node.head[3])
+            enters = square <= dr.square(far_radius + node.head[3])
             if are_points and not far:  # only nodes whose ball comes near have near points
-                enters &= square <= dr.square(inner + node.head[4] * (1 + 1e-9) + 1e-12)
-            enters &= node.is_leaf | (node.head[4] > smallest)
-            if most is not None:
-                enters &= state[0] <= most
+                enters &= square <= dr.square(far_radius + node.head[4] * (1 + 1e-9) + 1e-12)
+            enters &= node.is_leaf | (node.head[4] > max_node_radius)
+            if count_limit is not None:
+                enters &= state[0] <= count_limit
 
             def runs(slot: Any, *_: Any) -> Mask:
                 """Whether the leaf has further slots."""
@@ -474,20 +476,22 @@ class PendingSources:
             def step(slot: Any, count: Any) -> tuple[Any, ...]:
                 """Count the primitive in a slot of the leaf."""
                 chosen = is_chosen(tree.primitive(node.leaf, slot, enters), enters)
-                if put is not None:
-                    put(count, node.leaf * tree.leaf_size + slot, chosen)
-                return slot + 1, count + dr.select(chosen, index(1), index(0))
+                if store is not None:
+                    store(count, node.leaf * tree.leaf_size + slot, chosen)
+                return slot + 1, count + dr.select(chosen, uint_t(1), uint_t(0))
 
-            return enters, (dr.while_loop((index(0), state[0]), runs, step, label="primitives")[1],)
+            return enters, (
+                dr.while_loop((uint_t(0), state[0]), runs, step, label="primitives")[1],
+            )
 
         def listed(i: Any, active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
             """Count primitive i of the list of primitives."""
             chosen = is_chosen(tree.primitives.read_record(i, active), active)
-            if put is not None:
-                put(state[0], i, chosen)
-            return (state[0] + dr.select(chosen, index(1), index(0)),)
+            if store is not None:
+                store(state[0], i, chosen)
+            return (state[0] + dr.select(chosen, uint_t(1), uint_t(0)),)
 
-        counts = traverse_subtrees(tree, self.nodes, visit, (index(0),))
+        counts = traverse_subtrees(tree, self.nodes, visit, (uint_t(0),))
         return for_each_entry(tree.backend, self.primitives, listed, counts)[0]
 
 
@@ -495,34 +499,34 @@ def _count_nodes(
     tree: PackedTree,
     lists: LaneLists,
     c: Vec3,
-    inner: Real,
-    smallest: Real,
-    put: WriteEntry | None,
+    far_radius: Real,
+    max_node_radius: Real,
+    store: WriteEntry | None,
     *,
     far: bool,
 ) -> Any:
     """Count the far nodes, or with far=False the pending nodes, in the subtrees of the listed
     nodes, and write them to lists. This is a walk for `build_lists`.
 
-    Pending nodes are inner nodes that are not far and have a radius of at most `smallest`. Other
+    Pending nodes are inner nodes that are not far and have a radius of at most `max_node_radius`. Other
     nodes that are not far are replaced by their children. Leaves that are not far are in neither
     list.
 
-    c, inner: centers of the balls, and k rho of this module.
-    put: writes an entry; None to count only.
+    c, far_radius: centers of the balls, and k rho of this module.
+    store: writes an entry; None to count only.
 
     Returns the number of nodes on each lane.
     """
-    index, vector = tree.backend.UInt32, tree.backend.Array3f
+    uint_t, vector = tree.backend.UInt32, tree.backend.Array3f
 
     def visit(node: VisitedNode, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
         """Count a node. state: the number so far. Returns whether the walk enters the node, and the
         new number."""
-        is_far = dr.squared_norm(c - vector(*node.head[:3])) > dr.square(inner + node.head[3])
-        is_pending = ~is_far & ~node.is_leaf & (node.head[4] <= smallest)
+        is_far = dr.squared_norm(c - vector(*node.head[:3])) > dr.square(far_radius + node.head[3])
+        is_pending = ~is_far & ~node.is_leaf & (node.head[4] <= max_node_radius)
         chosen = is_far if far else is_pending
-        if put is not None:
-            put(state[0], node.index, chosen)
-        return ~(is_far | is_pending), (state[0] + dr.select(chosen, index(1), index(0)),)
+        if store is not None:
+            store(state[0], node.index, chosen)
+        return ~(is_far | is_pending), (state[0] + dr.select(chosen, uint_t(1), uint_t(0)),)
 
-    return traverse_subtrees(tree, lists, visit, (index(0),))[0]
+    return traverse_subtrees(tree, lists, visit, (uint_t(0),))[0]

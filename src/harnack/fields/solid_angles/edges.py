@@ -145,10 +145,10 @@ class LoopEdges:
         return self.records.for_each(of_record, state, label, active)
 
 
-def vertex_rounding(epsilon: float, x: Vec3, squares: Real) -> Real:
+def vertex_rounding(epsilon: float, x: Vec3, inverse_squares: Real) -> Real:
     """A bound of the rounding of the angle near the curve, to be added to `LoopEdges.rounding`.
-    squares: `EdgeSums.squares`."""
-    return epsilon * dr.fma(2.25, dr.norm(x), 2.9 + 2.25) * squares
+    inverse_squares: `EdgeSums.inverse_squares`."""
+    return epsilon * dr.fma(2.25, dr.norm(x), 2.9 + 2.25) * inverse_squares
 
 
 def _edges_per_record(loops: tuple[FloatArray, ...]) -> int:
@@ -265,8 +265,8 @@ class Edge:
             * ratio
             * (dr.fma(difference * difference, inverse, 1) + total * ratio)
         )
-        cubes = inverse * dr.fma(inverse_a, inverse_a, dr.fma(inverse_b, inverse_b, inverse))
-        e_factor = dr.dot(e, a + self.b) / total * cubes * self.inverse_square_length
+        cube_ratio = inverse * dr.fma(inverse_a, inverse_a, dr.fma(inverse_b, inverse_b, inverse))
+        e_factor = dr.dot(e, a + self.b) / total * cube_ratio * self.inverse_square_length
         return c, h_factor * h + e_factor * e
 
     def _denominator(self, square: Real) -> Real:
@@ -301,16 +301,16 @@ class EdgeSums:
 
     angle, gradient: Omega in (-2pi, 2pi], and its gradient.
     distance: the distance to the nearest edge.
-    squares, cubes, fourths: integrals of |dp|/D^k along the edges, with D the distance from x to p:
+    inverse_squares, inverse_cubes, inverse_fourths: integrals of |dp|/D^k along the edges, with D the distance from x to p:
         an upper bound for k = 2, the integral for k = 3, and an upper bound for k = 4.
     """
 
     angle: Real
     gradient: Vec3
     distance: Real
-    squares: Real
-    cubes: Real
-    fourths: Real
+    inverse_squares: Real
+    inverse_cubes: Real
+    inverse_fourths: Real
 
 
 def sum_over_edges(edges: LoopEdges, x: Vec3, active: Mask = True) -> EdgeSums:
@@ -346,7 +346,7 @@ def sum_over_edges(edges: LoopEdges, x: Vec3, active: Mask = True) -> EdgeSums:
         """Add the edges of a record to the state: the product of spinors (zr, zi), half the
         gradient g, the least squared distance d2, and a quarter or half of the three
         integrals."""
-        zr, zi, g, d2, squares, cubes, fourths = state
+        zr, zi, g, d2, inverse_squares, inverse_cubes, inverse_fourths = state
         p = edges.vertex(row, 0)
         a = p - x
         la, sa, ca = spinor(a)
@@ -366,16 +366,23 @@ def sum_over_edges(edges: LoopEdges, x: Vec3, active: Mask = True) -> EdgeSums:
             d2 = fmin(square, d2)
             term = weight * dr.rsqrt(inverse)
             inverse_d = dr.rsqrt(square)
-            cubes, fourths = cubes + term, dr.fma(term, inverse_d, fourths)
-            squares = dr.fma(term, square * inverse_d, squares)
+            inverse_cubes, inverse_fourths = (
+                inverse_cubes + term,
+                dr.fma(term, inverse_d, inverse_fourths),
+            )
+            inverse_squares = dr.fma(term, square * inverse_d, inverse_squares)
             p, a, la, sa, ca = q, b, lb, sb, cb
-        return zr, zi, g, d2, squares, cubes, fourths
+        return zr, zi, g, d2, inverse_squares, inverse_cubes, inverse_fourths
 
     start = (real(1), real(0), type(x)(0), real(dr.inf), real(0), real(0), real(0))
-    zr, zi, g, d2, squares, cubes, fourths = edges.records.for_each(add, start, "edges", active)
+    zr, zi, g, d2, inverse_squares, inverse_cubes, inverse_fourths = edges.records.for_each(
+        add, start, "edges", active
+    )
     angle = 2 * dr.atan2(zi, zr)
     # The weights are half of those in the gradient.
-    return EdgeSums(angle, 2 * g, dr.sqrt(d2), 4 * squares, 2 * cubes, 2 * fourths)
+    return EdgeSums(
+        angle, 2 * g, dr.sqrt(d2), 4 * inverse_squares, 2 * inverse_cubes, 2 * inverse_fourths
+    )
 
 
 def hessian_over_edges(edges: LoopEdges, x: Vec3) -> tuple[Vec3, Vec3, Vec3]:

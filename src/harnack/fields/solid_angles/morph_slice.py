@@ -339,11 +339,11 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         self._pieces = tuple(
             quadrature_points(*pair) for pair in zip(corners, longest, strict=True)
         )
-        self._dipoles = tuple(self._clustered(pair) for pair in self._pieces)
+        self._dipoles = tuple(self._dipole_tree(pair) for pair in self._pieces)
         self._extents: TransientCache[tuple[float, ...], Volume] = TransientCache()
         self._occupied: TransientCache[tuple[float, ...], OccupancyGrid] = TransientCache()
 
-    def _clustered(self, pieces: QuadraturePoints) -> ClusteredDipoles:
+    def _dipole_tree(self, pieces: QuadraturePoints) -> ClusteredDipoles:
         """The dipoles of the quadrature points, in unit coordinates, scaled so that f is the sum
         over both meshes."""
         scale = 1 / (8 * math.pi * self._size**2)

@@ -153,8 +153,8 @@ class FaceSolidAngle(Field):
         backend, x, rounding = face.backend, face.to_unit(p), face.rounding
         sums = sum_over_edges(face.edges, x)
         distance = sums.distance * (1 - SUM_MARGIN) - rounding
-        promises = remainder_promises(sums.cubes, sums.fourths, distance)
-        lift = lift_ball(sums.angle, sums.gradient, sums.squares, promises)
+        promises = remainder_promises(sums.inverse_cubes, sums.inverse_fourths, distance)
+        lift = lift_ball(sums.angle, sums.gradient, sums.inverse_squares, promises)
         is_convex = face.trips < 0
         ball = HarmonicBall(
             dr.select(is_convex, distance, lift.radius),
@@ -165,7 +165,7 @@ class FaceSolidAngle(Field):
         on_curve = sums.distance <= 2 * rounding
         steep_gradient = backend.Array3f(0, 0, 4 * PERIOD / rounding)
         gradient = dr.select(on_curve, steep_gradient, sums.gradient)
-        error = vertex_rounding(backend.machine_epsilon, x, sums.squares)
+        error = vertex_rounding(backend.machine_epsilon, x, sums.inverse_squares)
         error = dr.select(on_curve, 0, error) + face.value_rounding
         error = dr.select(on_curve, 8 * PERIOD, error)
         ray_promises: tuple[Lipschitz, ...] = ()

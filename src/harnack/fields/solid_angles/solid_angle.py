@@ -157,7 +157,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         if not self._all_cancel:
             self._region = planar_region(self._net_loops, self._net_circles)
         self.lift_bound_option: LiftBoundName = lift_bound
-        self.lift_bound = self._choose(lift_bound)
+        self.lift_bound = self._resolve_lift_bound(lift_bound)
         points = self._points_around()
         self._center = 0.5 * (points.min(axis=0) + points.max(axis=0))
         self._size = float(np.linalg.norm(points - self._center, axis=1).max())
@@ -198,7 +198,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
             [*loops, *(circle.polygon(64, circumscribed=True) for circle in circles)]
         )
 
-    def _choose(self, option: LiftBoundName) -> Literal["edges", "planar", "range"]:
+    def _resolve_lift_bound(self, option: LiftBoundName) -> Literal["edges", "planar", "range"]:
         """The kind of bound that the option `lift_bound` stands for. Raises ValueError if the
         hypothesis of the option fails."""
         if option == "auto":
@@ -332,10 +332,12 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         epsilon = data.backend.machine_epsilon
         rounding = data.rounding
         distance = sums.distance * (1 - SUM_MARGIN) - rounding
-        promises = remainder_promises(sums.cubes, sums.fourths, distance)
-        value_rounding = errors.rounding + vertex_rounding(epsilon, x, sums.squares)
+        promises = remainder_promises(sums.inverse_cubes, sums.inverse_fourths, distance)
+        value_rounding = errors.rounding + vertex_rounding(epsilon, x, sums.inverse_squares)
         if self.lift_bound == "edges":
-            ball = lift_ball(sums.angle, sums.gradient, sums.squares, promises, errors.slope)
+            ball = lift_ball(
+                sums.angle, sums.gradient, sums.inverse_squares, promises, errors.slope
+            )
         elif self.lift_bound == "planar":
             ball = self._planar_ball(data, x, sums, distance, errors.value)
         else:
@@ -354,9 +356,11 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
             # Measured: 15 units in the last place of a circle's angle and 60 of its gradient (near
             # it, 10 elsewhere). Its position is rounded by a few units too.
             point_error = epsilon * (4 + 4 * dr.max(dr.abs(x)))
-            value = 16 * epsilon * len(self._net_circles) + point_error * circles.squares
+            value = 16 * epsilon * len(self._net_circles) + point_error * circles.inverse_squares
             error = error + dr.select(on_curve, 0, value)
-            slope = 32 * epsilon * circles.squares + 1.5 * point_error * circles.cubes
+            slope = (
+                32 * epsilon * circles.inverse_squares + 1.5 * point_error * circles.inverse_cubes
+            )
             gradient_error = gradient_error + slope
         gradient_error = dr.select(on_curve, 0, gradient_error)
         error = dr.select(on_curve, 8 * _PERIOD, error)  # the steep gradient times 2 rounding
@@ -437,8 +441,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         distance = sums.distance - 4 * unit
         is_off_curve = (distance > 0) & (sums.distance > 2 * data.rounding)  # see `evaluate`
         growth = dr.select(is_off_curve, dr.square(dr.square(sums.distance / distance)), dr.inf)
-        slope = SLOPE_ROUNDINGS / 3 * unit * sums.cubes * growth / data.size
-        second = 0.25 * SECOND_ROUNDINGS * unit * sums.cubes / sums.distance * growth
+        slope = SLOPE_ROUNDINGS / 3 * unit * sums.inverse_cubes * growth / data.size
+        second = 0.25 * SECOND_ROUNDINGS * unit * sums.inverse_cubes / sums.distance * growth
         return slope, second / (data.size * data.size)
 
     def gradient_change_bound(self, p: Vec3, radius: Real) -> Real:
@@ -450,7 +454,10 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         x, unit_radius = data.to_unit(p), radius / data.size + data.rounding
         sums = data.sums(x)
         distance = sums.distance * (1 - SUM_MARGIN) - data.rounding
-        return gradient_change_bound(sums.cubes, sums.fourths, distance, unit_radius) / data.size
+        return (
+            gradient_change_bound(sums.inverse_cubes, sums.inverse_fourths, distance, unit_radius)
+            / data.size
+        )
 
     def closest_boundary_point(self, p: Vec3) -> Vec3 | None:
         """The closest point of the curve, without edges that cancel each other (`remaining_edges`);
@@ -688,15 +695,15 @@ class CurveSums:
     angle: Real
     gradient: Vec3
     distance: Real
-    squares: Real
-    cubes: Real
-    fourths: Real
+    inverse_squares: Real
+    inverse_cubes: Real
+    inverse_fourths: Real
     circles: CircleSums | None = None
 
     @classmethod
     def of(cls, sums: EdgeSums | CircleSums) -> CurveSums:
         """The sums over edges only, or over circles only."""
-        integrals = sums.squares, sums.cubes, sums.fourths
+        integrals = sums.inverse_squares, sums.inverse_cubes, sums.inverse_fourths
         return cls(sums.angle, sums.gradient, sums.distance, *integrals)
 
     def plus(self, other: CurveSums) -> CurveSums:
@@ -705,9 +712,9 @@ class CurveSums:
             self.angle + other.angle,
             self.gradient + other.gradient,
             fmin(self.distance, other.distance),
-            self.squares + other.squares,
-            self.cubes + other.cubes,
-            self.fourths + other.fourths,
+            self.inverse_squares + other.inverse_squares,
+            self.inverse_cubes + other.inverse_cubes,
+            self.inverse_fourths + other.inverse_fourths,
             other.circles if self.circles is None else self.circles,
         )
 

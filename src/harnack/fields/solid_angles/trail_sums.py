@@ -30,7 +30,7 @@ from harnack.fields.solid_angles.edge_lift import (
     FACTOR_ROUNDINGS,
     STEEP_ROUNDINGS,
     LiftedProduct,
-    ends_factor,
+    edge_factor_of_views,
     view_vertex,
 )
 from harnack.fields.solid_angles.edges import Edge, inverse_squares
@@ -521,7 +521,7 @@ class LiftedTrails:
                 p, q = self._vertex(row, k), self._vertex(row, k + 1)
                 inverse, length = self._edge(row, k)
                 b = view_vertex(q, frame, x)
-                re, im = ends_factor(a, b, length)
+                re, im = edge_factor_of_views(a, b, length)
                 is_edge = length != 0
                 product = product.times(dr.select(is_edge, re, 1), dr.select(is_edge, im, 0))
                 edge = Edge(a.offset, b.offset, q - p, inverse)

@@ -201,7 +201,7 @@ def _hessian(
     xyy, xzz, xxy, yzz, xxz, yyz, xyz = c[8:15]
     v = dr.fma(3, g1, dr.fma(5, g2, 7 * g3)) * u2
     w = dr.fma(15, p1, dr.fma(35, p2, 63 * p3)) * u4
-    cubes = (
+    p3_entries = (
         -2 * dr.fma(xyy + xzz, x, -dr.fma(xxy, y, xxz * z)),
         -2 * dr.fma(xxy + yzz, y, -dr.fma(xyy, x, yyz * z)),
         -2 * dr.fma(xxz + yyz, z, -dr.fma(xzz, x, yzz * y)),
@@ -209,7 +209,7 @@ def _hessian(
         dr.fma(2, dr.fma(xxz, x, xzz * z), xyz * y),
         dr.fma(2, dr.fma(yyz, y, yzz * z), xyz * x),
     )
-    squares = (2 * c[3], 2 * c[4], 2 * czz, 2 * c[5], 2 * c[6], 2 * c[7])
+    p2_entries = (2 * c[3], 2 * c[4], 2 * czz, 2 * c[5], 2 * c[6], 2 * c[7])
     pairs = ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))
     crossed = (
         (v.x * x, v.x * x), (v.y * y, v.y * y), (v.z * z, v.z * z),
@@ -218,7 +218,7 @@ def _hessian(
     parts = [
         (square * u2 + cube * u4 - left - right + w * a * b - (s if k < 3 else 0)) * u3
         for k, (square, cube, (left, right), (a, b)) in enumerate(
-            zip(squares, cubes, crossed, pairs, strict=True)
+            zip(p2_entries, p3_entries, crossed, pairs, strict=True)
         )
     ]
     return SymmetricMatrix(*parts)
