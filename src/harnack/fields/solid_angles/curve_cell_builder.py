@@ -262,8 +262,8 @@ class _FarBounds:
 
     @classmethod
     def of(cls, edges: LoopEdges, centers: FloatArray, radius: float) -> _FarBounds:
-        """The bounds for cells with these centers (n, 3) and balls of this radius. Edges farther than
-        about `_NEAR_RADII` radii from a center count as far."""
+        """The bounds for cells with these centers (n, 3) and balls of this radius. Edges farther
+        than about `_NEAR_RADII` radii from a center count as far."""
         backend, c = edges.backend, to_vector3(edges.backend, centers)
         ball_radius = dr.opaque(backend.Float, radius)
         far_from = dr.opaque(backend.Float, _NEAR_RADII * radius * (1 - _SUM_MARGIN))

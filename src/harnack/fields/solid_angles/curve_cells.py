@@ -93,9 +93,9 @@ class CurveCells:
     records: one record per cell. In this order it holds: center (3,) and one over the radius;
         bounds of the truncation errors of value and gradient, and of the rounding of the value; a
         lower bound of the distance of the far edges from the center; the factor that multiplies
-        `EdgeSums.inverse_squares` of the near edges; an upper bound of the integral of |dp|/D^3 over the
-        far edges, D the distance from the center, and the gradient (3,) of this integral; index of
-        the first record of near edges, and the number of these records; and after these
+        `EdgeSums.inverse_squares` of the near edges; an upper bound of the integral of |dp|/D^3
+        over the far edges, D the distance from the center, and the gradient (3,) of this integral;
+        index of the first record of near edges, and the number of these records; and after these
         `HEADER_SIZE` numbers the coefficients of the expansion.
     near: records of two vertices each. For each vertex a record holds its position (3,) and a
         number for the edge that leads to it: one over the squared length of this edge, negative
@@ -282,7 +282,8 @@ class CurveCells:
 
     def _sum_near(self, x: Vec3, first: Any, count: Any) -> EdgeSums:
         """Sums over the edges of near loops at x, as of `sum_over_edges`. Edges that close runs do
-        not count in the distance, in `inverse_cubes` and in `inverse_fourths`, which are about the curve.
+        not count in the distance, in `inverse_cubes` and in `inverse_fourths`, which are about the
+        curve.
 
         first, count: index of the first record of near edges, and the number of these records.
         """

@@ -176,8 +176,8 @@ def remainder_promises(
 def gradient_change_bound(
     inverse_cubes: Real, inverse_fourths: Real, distance: Real, radius: Real
 ) -> Real:
-    """A bound of |grad f(y) - grad f(x)| for |y - x| <= `radius`, with f the solid angle of a curve.
-    It is infinite unless `radius` is less than `distance`.
+    """A bound of |grad f(y) - grad f(x)| for |y - x| <= `radius`, with f the solid angle of a
+    curve. It is infinite unless `radius` is less than `distance`.
 
     inverse_cubes, inverse_fourths: I3 and I4, the integrals of |dp|/|D|^3 and |dp|/|D|^4 over the
         curve, with D the vector from x to the point p of the curve.
@@ -213,7 +213,8 @@ def lift_ball(
     of the promises `bends`. The promises themselves prove longer steps than this range.
 
     value, gradient: the solid angle and its gradient at x.
-    inverse_squares: the integral of |dp|/|D|^2, to which the rounding of the gradient is proportional.
+    inverse_squares: the integral of |dp|/|D|^2, to which the rounding of the gradient is
+        proportional.
     bends: the bounds of second derivatives on balls around x, from `remainder_promises`.
     slope_error: a bound of the errors of the gradient other than its rounding.
     """

@@ -392,9 +392,9 @@ class PendingSources:
         c: the centers of the balls.
         factor: k of this module: dipoles are far if they are farther than `factor` radii from the
             center.
-        max_node_radius: inner nodes that are not far stay nodes if their radius is at most this. Larger
-            nodes are replaced by their children, and leaves by their primitives, which are far or
-            near.
+        max_node_radius: inner nodes that are not far stay nodes if their radius is at most this.
+            Larger nodes are replaced by their children, and leaves by their primitives, which are
+            far or near.
 
         Returns the sums over the far sources, and the remaining sources. Each primitive is in
         exactly one far node, or is itself far, or is among the remaining sources.
@@ -439,7 +439,8 @@ class PendingSources:
 
         far_radius: k rho: a dipole is far if its distance from c is more than this. For a triangle
             `TRIANGLE_RATIO` times its radius is added.
-        max_node_radius: nodes up to this radius stay nodes, so that their primitives are not visited.
+        max_node_radius: nodes up to this radius stay nodes, so that their primitives are not
+            visited.
         store: writes an entry; None to count only.
         count_limit: once a count exceeds this, the remaining primitives need not be counted.
 
@@ -508,9 +509,9 @@ def _count_nodes(
     """Count the far nodes, or with far=False the pending nodes, in the subtrees of the listed
     nodes, and write them to lists. This is a walk for `build_lists`.
 
-    Pending nodes are inner nodes that are not far and have a radius of at most `max_node_radius`. Other
-    nodes that are not far are replaced by their children. Leaves that are not far are in neither
-    list.
+    Pending nodes are inner nodes that are not far and have a radius of at most `max_node_radius`.
+    Other nodes that are not far are replaced by their children. Leaves that are not far are in
+    neither list.
 
     c, far_radius: centers of the balls, and k rho of this module.
     store: writes an entry; None to count only.

@@ -163,9 +163,9 @@ class LiftedEdge:
         This changes the angle by at most that length times Biot and Savart's field, which is at
         most 2e'. The rounding of the number s of an end (see the module) acts as if the end had
         moved by another half unit. Both edges at an end use the same bits of s, so that this
-        moves a single point of the boundary. The sums in the factor, and the product, add `FACTOR_ROUNDINGS` unit
-        roundoffs, and `STEEP_ROUNDINGS` L e' if the edge subtends more than a right angle. The
-        rounding is less than 4 pi in any case.
+        moves a single point of the boundary. The sums in the factor, and the product, add
+        `FACTOR_ROUNDINGS` unit roundoffs, and `STEEP_ROUNDINGS` L e' if the edge subtends more than
+        a right angle. The rounding is less than 4 pi in any case.
 
         Remainder. Let rho be the distance from x to a point p of the edge. At the distance t from x
         the solid angle differs from its linear Taylor polynomial by at most 3/4 t^2 times the
@@ -334,8 +334,8 @@ def edge_factor(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Real, Real]:
     """Real and imaginary part of the factor F_e of the edge from a to b, whose argument is half the
     solid angle of the edge's triangle (see the module).
 
-    a, b: the ends relative to a point x, as (u, v, z), with two coordinates across the direction d and the coordinate
-        along it.
+    a, b: the ends relative to a point x, as (u, v, z), with two coordinates across the direction d
+        and the coordinate along it.
     la, lb: |a| and |b|.
 
     s_a is computed as |a'|^2/(|a| + a.d) where a.d > 0, so that nothing cancels.

@@ -301,8 +301,9 @@ class EdgeSums:
 
     angle, gradient: Omega in (-2pi, 2pi], and its gradient.
     distance: the distance to the nearest edge.
-    inverse_squares, inverse_cubes, inverse_fourths: integrals of |dp|/D^k along the edges, with D the distance from x to p:
-        an upper bound for k = 2, the integral for k = 3, and an upper bound for k = 4.
+    inverse_squares, inverse_cubes, inverse_fourths: integrals of |dp|/D^k along the edges, with D
+        the distance from x to p: an upper bound for k = 2, the integral for k = 3, and an upper
+        bound for k = 4.
     """
 
     angle: Real

@@ -33,9 +33,9 @@ if TYPE_CHECKING:
 
 
 def coefficient_keys(degree: int) -> list[tuple[int, int, int]]:
-    """The keys (j, k, part) of the (degree + 1)^2 coefficients of a local expansion, in the order in
-    which they are stored. A key stands for the real part (part = 0) or the imaginary part
-    (part = 1) of L_jk, with j <= degree and 0 <= k <= j; L_j0 is real."""
+    """The keys (j, k, part) of the (degree + 1)^2 coefficients of a local expansion, in the order
+    in which they are stored. A key stands for the real part (part = 0) or the imaginary part (part
+    = 1) of L_jk, with j <= degree and 0 <= k <= j; L_j0 is real."""
     return [
         (j, k, part)
         for j in range(degree + 1)
@@ -173,8 +173,8 @@ def evaluate_expansion(coefficients: Sequence[Any], y: Sequence[Any], degree: in
 
 
 class _AbsoluteValues:
-    """Arrays of nonnegative numbers. Their sums and differences are sums of absolute values, so that
-    an expression gives the sum of the absolute values of its terms."""
+    """Arrays of nonnegative numbers. Their sums and differences are sums of absolute values, so
+    that an expression gives the sum of the absolute values of its terms."""
 
     def __init__(self, number: Any) -> None:
         """number: a number or an array, not negative."""

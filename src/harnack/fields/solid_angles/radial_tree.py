@@ -1,5 +1,5 @@
-"""Sums over dipoles of a radial potential K(r): direct sums, or sums by a tree in which a cluster of
-far dipoles counts as a single source.
+"""Sums over dipoles of a radial potential K(r): direct sums, or sums by a tree in which a cluster
+of far dipoles counts as a single source.
 
 Expansion. A cluster consists of dipoles m_i at c + d_i with |d_i| <= R. At the point x = c - z, at
 the distance r = D of z, Taylor's formula in d_i gives
@@ -200,8 +200,8 @@ def cluster_source(
 
 @dataclass(frozen=True)
 class ClusteredDipoles:
-    """A tree over dipoles, with the moments of its nodes. These are the data of a sum by a tree that
-    do not depend on the kernel.
+    """A tree over dipoles, with the moments of its nodes. These are the data of a sum by a tree
+    that do not depend on the kernel.
 
     rows: (n, 8) the records of the dipoles, from `dipole_records`.
     tree: the hierarchy of the dipoles.
