@@ -1,4 +1,5 @@
-"""Local expansions of far dipoles and triangles in balls, and bounds of their truncation errors.
+"""Local expansions (harmonic polynomials) of the field of far dipoles and triangles in balls, and
+bounds of their truncation errors.
 
 - `source_tree`: a tree of primitives, dipoles or triangles, in double precision, with all data that
   expansions need; `triangle_sources`: triangles as records.
@@ -69,14 +70,16 @@ _ROUNDED_UP = 1 + 1e-9
 
 
 def source_tree(tree: BalancedTree, levels: list[NodeMoments], rows: FloatArray) -> PackedTree:
-    """Pack the tree of primitives, in double precision, with the data that expansions need.
+    """The tree of primitives on a backend in double precision, with the records that expansions
+    need.
 
     A node's record holds: center, `_NODE_RATIO` times the radius, radius, area; then its moments up
-    to degree 4, (E, G) of `multipole.truncation_bounds`, and the sup norms of the moments.
+    to degree 4; the bounds E and G of the terms beyond degree 4 in value and gradient
+    (`multipole.truncation_bounds`); and for each degree a bound of its term (`multipole.sup_norm`).
 
-    levels: the moments of the tree's nodes.
-    rows: the records of the primitives in slots, dipoles (`treecode.dipole_records`) or
-        `triangle_sources`.
+    levels: the moments of the tree's nodes, one entry for each level of the tree.
+    rows: the records of the primitives, in the slots of the tree's leaves: dipoles from
+        `treecode.dipole_records`, or triangles from `triangle_sources`.
     """
     numbers: list[FloatArray] = []
     for level in levels:
@@ -119,7 +122,7 @@ def triangle_sources(corners: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class DipoleExpansions:
-    """Sums over far primitives, for n balls.
+    """Sums over the far primitives of n balls: a polynomial for each ball, and error bounds.
 
     coefficients: (n, COEFFICIENTS) of the local expansion (`local_expansion.coefficient_keys`).
     error, slope: (n,) bounds of the truncation errors of value and gradient, anywhere in the ball.
@@ -155,7 +158,7 @@ class DipoleExpansions:
         )
 
     def subset(self, which: IntArray) -> DipoleExpansions:
-        """The sums of the balls with these indices. An index may occur several times."""
+        """The sums of the balls with the indices `which`. An index may occur several times."""
         return DipoleExpansions(*(values[which] for values in vars(self).values()))
 
     @classmethod
@@ -166,16 +169,17 @@ class DipoleExpansions:
 
     def to_octants(self, shifts: FloatArray, radius: float) -> DipoleExpansions:
         """The same sums about the centers of the eight octants of each cell. The octants of a cell
-        follow each other.
+        follow each other in the result.
 
-        shifts: `local_expansion.local_to_local_matrices`.
+        shifts: (8, COEFFICIENTS, COEFFICIENTS) matrices from
+            `local_expansion.local_to_local_matrices`.
         radius: the radius of the cells' balls.
 
         Proof. The ball of an octant lies in that of the cell, so that bounds of errors hold there
         as well. But the truncation error of the polynomial is not small about an octant's center,
         so `tail` is added to `error`. An octant's center is at most half a radius from the cell's
-        center, so that distances shrink by at most that, and 1/D^4 grows by at most (1 - radius/(2
-        least))^-4 for D >= least.
+        center, so that distances shrink by at most that, and 1/D^4 grows at most by the factor (1 -
+        radius/(2 d))^-4 for D >= d, with d = `min_distance`.
         """
         shifted = np.einsum("oab,kb->koa", shifts, self.coefficients)
         ratio = 0.5 * radius / self.min_distance  # 0 where there is nothing
@@ -189,11 +193,14 @@ class DipoleExpansions:
     def over_nodes(
         cls, tree: PackedTree, lists: LaneLists, c: Vec3, radius: Real
     ) -> DipoleExpansions:
-        """Sums over far nodes, for balls of this radius around c. lists: for each ball, a list of
-        nodes of the tree."""
+        """Sums over all primitives of far nodes, from the moments of the nodes, for n balls of this
+        radius around the centers c (3, n).
+
+        lists: for each ball, the list of the indices of its far nodes in the tree.
+        """
 
         def term(i: Any, active: Mask) -> list[Any]:
-            """The numbers of `DipoleExpansions` for node i."""
+            """What node i adds to the attributes of `DipoleExpansions`, as a list of numbers."""
             head, payload = tree.node_heads.read_record(i, active), tree.payload(i, active)
             numbers = dict(zip(_MOMENTS, payload, strict=False))
             error, slope_error, *norms = payload[len(_MOMENTS) :]
@@ -207,11 +214,14 @@ class DipoleExpansions:
     def over_primitives(
         cls, tree: PackedTree, lists: LaneLists, c: Vec3, radius: Real
     ) -> DipoleExpansions:
-        """Sums over far primitives, for balls of this radius around c. lists: for each ball, a list
-        of primitives of the tree."""
+        """Sums over single far primitives, for n balls of this radius around the centers c (3, n).
+
+        lists: for each ball, the list of its far primitives, as rows of the tree's primitives.
+        """
 
         def term(i: Any, active: Mask) -> list[Any]:
-            """The numbers of `DipoleExpansions` for primitive i, a dipole or a triangle."""
+            """What primitive i, a dipole or a triangle, adds to the attributes of
+            `DipoleExpansions`, as a list of numbers."""
             row = tree.primitives.read_record(i, active)
             first = {(1, 0): (row[5], 0.0), (1, 1): (0.5 * row[3], 0.5 * row[4])}
             r = c - tree.backend.Array3f(*row[:3])
@@ -232,10 +242,11 @@ class DipoleExpansions:
     def _accumulated(
         cls, backend: Backend, lists: LaneLists, term: Callable[[Any, Mask], list[Any]]
     ) -> DipoleExpansions:
-        """The sums of `term` over the entries of each list.
+        """Add up `term` over the entries of each list.
 
-        term: from an entry of a list and a mask, returns the numbers of `DipoleExpansions`. The
-            last of these is a minimum, all others are sums.
+        term: a function. From an entry of a list and a mask of active lanes it returns what the
+            entry adds to the attributes of `DipoleExpansions`. The last number, for `min_distance`,
+            is used in a minimum; all other numbers are added up.
         """
         zero = backend.Float(0)
 
@@ -275,7 +286,8 @@ def _pairs(numbers: dict[Any, Any]) -> dict[tuple[int, int], tuple[Any, Any]]:
 
 @dataclass(frozen=True)
 class _ClusterExpansion:
-    """The local expansion of multipole terms in a ball.
+    """The local expansion, in a ball, of the field of one source that is given by its multipole
+    moments.
 
     coefficients: the coefficients of the polynomial, times powers of the ball's radius.
     tail, tail_slope: bounds of the truncation errors of value and gradient on the ball's sphere.
@@ -294,9 +306,10 @@ class _ClusterExpansion:
         """The expansion of multipole terms in the ball of this radius.
 
         r: the vector from the multipole's center to the ball's center.
-        moments: moments as pairs, by degree and order.
-        norms: norms[l-1] bounds the term of degree l = 1, 2, ...: at distance r this term is at
-            most norms[l-1]/r^(l+1).
+        moments: a dictionary of the moments, as pairs of real and imaginary part, by (degree,
+            order).
+        norms: norms[l-1] bounds the term of degree l = 1, 2, ...: at a distance d from the
+            multipole's center this term is at most norms[l-1]/d^(l+1).
 
         The bounds are those of `tail_factors`, whose c grows with l. They bound all terms of degree
         j > p. So at q times the radius, q <= 1, the truncation error is q^(p+1) times as much as on
@@ -335,11 +348,12 @@ class _ClusterExpansion:
     def of_cluster(
         self, left_out: Real, slope_left_out: Real, size: Real, area: Real, radius: Real
     ) -> list[Any]:
-        """The numbers of `DipoleExpansions` for a cluster of dipoles whose moments up to degree 4
-        were used.
+        """What a cluster of dipoles, expanded from its moments up to degree 4, adds to the
+        attributes of `DipoleExpansions`, as a list of numbers.
 
-        left_out, slope_left_out: (E, G) of `multipole.truncation_bounds`, for points that are no
-            nearer to the cluster than the ball is.
+        left_out, slope_left_out: the numbers E and G of `multipole.truncation_bounds`, which bound
+            the terms of higher degree in value and gradient, for points that are no nearer to the
+            cluster than the ball is.
         size: the cluster's radius.
         area: the area of its dipoles.
         radius: the radius of the ball.
@@ -358,7 +372,7 @@ class _ClusterExpansion:
 
 @dataclass(frozen=True)
 class PendingSources:
-    """Sources that balls have not yet taken into account.
+    """The sources that n balls have not yet added to their expansions.
 
     nodes: for each ball a list of nodes, each of which stands for all its primitives.
     primitives: for each ball a list of primitives, as rows of the tree's primitives.
@@ -387,14 +401,16 @@ class PendingSources:
     def split_far(
         self, tree: PackedTree, c: Vec3, radius: Real, factor: float, max_node_radius: Real
     ) -> tuple[DipoleExpansions, PendingSources]:
-        """Split the sources into those that are far from the balls, and the rest.
+        """Split the sources of each ball into those that are far from it, which are added up, and
+        the remaining ones.
 
-        c: the centers of the balls.
-        factor: k of this module: dipoles are far if they are farther than `factor` radii from the
+        c: (3, n) the centers of the balls.
+        radius: the radius of the balls.
+        factor: k of this module: a dipole is far if it is farther than `factor` radii from the
             center.
-        max_node_radius: inner nodes that are not far stay nodes if their radius is at most this.
-            Larger nodes are replaced by their children, and leaves by their primitives, which are
-            far or near.
+        max_node_radius: a node that is not far, and no leaf, stays a node if its radius is at most
+            this. A larger node is replaced by its children, and a leaf by its primitives, each of
+            which is far or near by itself.
 
         Returns the sums over the far sources, and the remaining sources. Each primitive is in
         exactly one far node, or is itself far, or is among the remaining sources.
@@ -433,9 +449,12 @@ class PendingSources:
         far: bool,
         count_limit: Any = None,
     ) -> Any:
-        """Count the far primitives, or with far=False the near primitives, and write them to lists.
-        This is a walk for `build_lists`. The primitives are those of the list of primitives, and
-        those of leaves that are not far.
+        """Count the far primitives of each ball, or with far=False its near primitives, and write
+        them to lists. `build_lists` calls this function twice, to count and to write. The
+        primitives are those in the list `primitives`, and those of the leaves below the listed
+        nodes that are not far.
+
+        c: (3, n) the centers of the balls.
 
         far_radius: k rho: a dipole is far if its distance from c is more than this. For a triangle
             `TRIANGLE_RATIO` times its radius is added.
@@ -460,8 +479,12 @@ class PendingSources:
             return (is_far if far else ~is_far) & (row[6] > 0) & active
 
         def visit(node: VisitedNode, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
-            """Count the primitives of a leaf. state: the number so far. Returns whether the walk
-            enters the node, and the new number."""
+            """Count, and store, the chosen primitives of a leaf that is not far.
+
+            state: the number of primitives so far.
+
+            Returns whether the walk enters the node, and the new number.
+            """
             square = dr.squared_norm(c - vector(*node.head[:3]))
             enters = square <= dr.square(far_radius + node.head[3])
             if are_points and not far:  # only nodes whose ball comes near have near points
@@ -486,7 +509,8 @@ class PendingSources:
             )
 
         def listed(i: Any, active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Count primitive i of the list of primitives."""
+            """Count, and store, primitive i of the list if it is chosen. state: the number of
+            primitives so far. Returns the new number."""
             chosen = is_chosen(tree.primitives.read_record(i, active), active)
             if store is not None:
                 store(state[0], i, chosen)
@@ -506,23 +530,31 @@ def _count_nodes(
     *,
     far: bool,
 ) -> Any:
-    """Count the far nodes, or with far=False the pending nodes, in the subtrees of the listed
-    nodes, and write them to lists. This is a walk for `build_lists`.
+    """Count the far nodes of each ball, or with far=False its pending nodes, and write them to
+    lists. `build_lists` calls this function twice, to count and to write. The nodes are those in
+    the subtrees of the nodes in `lists`.
 
     Pending nodes are inner nodes that are not far and have a radius of at most `max_node_radius`.
     Other nodes that are not far are replaced by their children. Leaves that are not far are in
     neither list.
 
-    c, far_radius: centers of the balls, and k rho of this module.
-    store: writes an entry; None to count only.
+    c: (3, n) the centers of the balls.
+    far_radius: k rho, with rho the balls' radius and k > 1: a node of radius R is far if its center
+        is farther from c than far_radius + `_NODE_RATIO` R.
+    store: a function that writes an entry to a list; None to count only.
 
     Returns the number of nodes on each lane.
     """
     uint_t, vector = tree.backend.UInt32, tree.backend.Array3f
 
     def visit(node: VisitedNode, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
-        """Count a node. state: the number so far. Returns whether the walk enters the node, and the
-        new number."""
+        """Count a node, and store its index, if it is of the kind that is sought. In `node.head`,
+        entry 3 is `_NODE_RATIO` times the radius of the node and entry 4 is the radius.
+
+        state: the number of nodes so far.
+
+        Returns whether the walk enters the node, and the new number.
+        """
         is_far = dr.squared_norm(c - vector(*node.head[:3])) > dr.square(far_radius + node.head[3])
         is_pending = ~is_far & ~node.is_leaf & (node.head[4] <= max_node_radius)
         chosen = is_far if far else is_pending
