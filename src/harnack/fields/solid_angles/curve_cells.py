@@ -116,8 +116,9 @@ class CurveCells:
         return to_numpy(self.backend.Array3f(*row[:3])).astype(np.float64)
 
     def sums(self, x: Vec3, active: Mask) -> tuple[CurveCellSums, Mask]:
-        """The sums over all edges at x, and the mask of the lanes on which they hold. These are the
-        active lanes whose point lies in the cube.
+        """The sums over all edges at points x, from the near edges and the expansion of the cell
+        that contains x; and the mask of the lanes on which they hold. These are the active lanes
+        whose point lies in the cube of the cells.
 
         Proof of the bound of I3, the integral of |dp|/D^3 over far edges, at the point c + u. It
         follows from I3 and its gradient at the center c. For a point p of an edge, let D = |p - c|,
@@ -179,9 +180,9 @@ class CurveCells:
         """The change of the solid angle from the cell's center to x, followed continuously along
         the line between them; and the mask of the lanes on which this change is certain.
 
-        found: the sums at x.
+        found: the result of `sums` at x.
         frame: the frame of the rays from the center to x.
-        unit: the rounding of a coordinate.
+        unit: a bound of the rounding of a coordinate.
 
         Proof. The far edges contribute the polynomial, everywhere in the ball. The near loops are
         closed, so that the lifted sum of their edges (`edge_lift`) is their solid angle; it has no
@@ -199,8 +200,15 @@ class CurveCells:
             return i < count
 
         def body(i: Any, p: Vec3, is_certain: Mask, *products: Real) -> tuple[Any, ...]:
-            """Multiply both products, at x and at the center, by the factors of the edges of record
-            i. p: the vertex before the record. Returns the state of the loop."""
+            """Multiply the two products of the state, one at x and one at the cell's center, by the
+            factors of the edges of record i.
+
+            p: the vertex before the record.
+            is_certain: the mask of the lanes on which no rounding has mattered so far.
+            products: the parts of both products.
+
+            Returns the state of the loop.
+            """
             row = self.near.read_record(found.near_first + i, i < count)
             at_x, at_center = LiftedProduct(*products[:3]), LiftedProduct(*products[3:])
             a, a_center = view_vertex(p, frame, x), view_vertex(p, frame, center)
@@ -230,7 +238,7 @@ class CurveCells:
         """For each length T, a bound of the size of the derivative of the solid angle along a line,
         at all points of the line within T of x in both directions.
 
-        found: the sums at x.
+        found: the result of `sums` at x.
         line: the line through x = line.x, with the unit direction v = line.v.
         lengths: the lengths T.
 
@@ -252,8 +260,13 @@ class CurveCells:
             return i < count
 
         def body(i: Any, p: Vec3, field: Vec3, *rates: Real) -> tuple[Any, ...]:
-            """Add the edges of record i: those of the curve to `rates`, and closing edges to
-            `field`. p: the vertex before the record. Returns the state of the loop."""
+            """Add the edges of record i. An edge of the curve adds to `rates`, the bounds for all
+            lengths. An edge that closes a run adds its Biot and Savart field to `field`.
+
+            p: the vertex before the record.
+
+            Returns the state of the loop.
+            """
             row = self.near.read_record(found.near_first + i, i < count)
             for k in range(VERTICES_PER_RECORD):
                 q, inverse = vector(*row[4 * k : 4 * k + 3]), row[4 * k + 3]
@@ -281,9 +294,9 @@ class CurveCells:
         )
 
     def _sum_near(self, x: Vec3, first: Any, count: Any) -> EdgeSums:
-        """Sums over the edges of near loops at x, as of `sum_over_edges`. Edges that close runs do
-        not count in the distance, in `inverse_cubes` and in `inverse_fourths`, which are about the
-        curve.
+        """The sums of `edges.sum_over_edges`, over the near loops of a cell only, at points x.
+        Edges that close runs do not count in the distance, in `inverse_cubes` and in
+        `inverse_fourths`, which are about the curve.
 
         first, count: index of the first record of near edges, and the number of these records.
         """
@@ -353,9 +366,15 @@ class CurveCells:
 def _with_edge(
     product: LiftedProduct, a: VertexView, b: VertexView, is_edge: Mask, slack: Real
 ) -> tuple[LiftedProduct, Mask]:
-    """The product times the factor of the edge from a to b, on lanes on which `is_edge` is true;
-    and the mask of the lanes on which that factor is farther than `slack` from the negative axis,
-    or is left out."""
+    """Multiply a product by the complex factor of the edge from a to b, on lanes on which `is_edge`
+    is true.
+
+    slack: a bound of the rounding of the factor's real and imaginary part.
+
+    Returns the new product, and the mask of the lanes on which rounding cannot change the sign of
+    the factor's argument: the factor is farther than `slack` from the negative axis, or is left
+    out.
+    """
     re, im = edge_factor_of_views(a, b, type(slack)(1))
     is_sure = ~is_edge | (dr.abs(im) > slack) | (re > slack)
     return product.times(dr.select(is_edge, re, 1), dr.select(is_edge, im, 0)), is_sure

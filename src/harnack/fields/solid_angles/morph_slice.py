@@ -365,8 +365,9 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
 
         pieces: the quadrature points, in the user's coordinates.
 
-        Positions are relative to the field's center and divided by its size. Moments contain the
-        factor 1/(2 pi^2) of f, so that f is the sum of the dipoles' potentials over both meshes.
+        Positions are relative to the field's center and divided by its size. Moments are
+        scaled so that, with the scaled kernel of `SlicedKernel`, they contain the factor 1/(2 pi^2)
+        of f: f is the plain sum of the dipoles' potentials over both meshes.
         """
         scale = 1 / (8 * math.pi * self._size**2)
         points = (pieces.points - self._center) / self._size
