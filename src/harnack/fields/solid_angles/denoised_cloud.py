@@ -46,7 +46,8 @@ _MIN_POINTS = 32
 
 @dataclass(frozen=True)
 class DenoisedCloud:
-    """The points that were kept, and how to smooth their sum.
+    """The result of denoising a cloud: the points that were kept, and the length over which the sum
+    of their dipoles is to be smoothed.
 
     points, normals: (m, 3) of the points that were kept, moved onto the surface.
     smoothing: the length over which their sum is to be smoothed; 0 if there is hardly any noise.

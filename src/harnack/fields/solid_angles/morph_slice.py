@@ -379,7 +379,11 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         return tuple(len(dipoles.rows) for dipoles in self._dipoles)
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
-        """Values and derivatives at points x: see `BatchedField.values_at`."""
+        """Values and derivatives at points x (3, n), with error bounds (`BatchedField.values_at`).
+
+        derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
+        closer: the accuracy scale.
+        """
         buffers = self._batch_data(backend_of(x))
         x = buffers.to_unit(x)
         sums = buffers.sums(x, closer, derivatives).sums

@@ -112,7 +112,8 @@ class FaceLoops:
 
 @dataclass(frozen=True)
 class FaceData(UnitFrame):
-    """The head of a face, with its edges. The face may differ from lane to lane.
+    """The data of a face of a polygon mesh: its unit coordinates, its edges, and bounds of
+    rounding. The face may differ from lane to lane.
 
     edges: the records of its edges.
     trips: the number of these records, negative if the face is in convex position.
@@ -147,8 +148,10 @@ class FaceSolidAngle(Field):
         return path.enclose(self._sample(path.point(t), path.direction))
 
     def _sample(self, p: Vec3, direction: Vec3 | None) -> Sample:
-        """The sample at points p. direction: a unit vector (3,), along which the sample gets
-        further promises; None for none."""
+        """The sample at points p: value, gradient, errors and promises (proved bounds of f near p).
+
+        direction: (3,) a unit vector, along which the sample gets further promises; None for none.
+        """
         face = self.face
         backend, x, rounding = face.backend, face.to_unit(p), face.rounding
         sums = sum_over_edges(face.edges, x)
@@ -173,7 +176,8 @@ class FaceSolidAngle(Field):
             line = RayLine(x, backend.Array3f(direction), rounding)
 
             def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
-                """Bounds of the derivative along the line for these lengths (`line_rates`)."""
+                """For each length, a bound of the derivative along the line at points within that
+                length of x (`line_rates`)."""
                 return line_rates(face.edges, line, lengths, active)
 
             ray_promises = lipschitz_along(line, sums.gradient, sums.distance, rates)
@@ -230,6 +234,7 @@ def _carve_boxes(
     the boxes around the cells of the old boxes that are not proved empty.
 
     lower, upper: (m, 3) corners of the old boxes of all faces.
+    levels: the levels of the surfaces.
 
     Only cells at the faces of a box can make it smaller, so only these are split further.
     """
@@ -270,19 +275,23 @@ class _FaceCells:
     depth: IntArray
 
     def sizes(self, sides: FloatArray) -> FloatArray:
-        """Sizes (k, 3) of the cells, if the boxes of the faces have the sizes `sides` (m, 3)."""
+        """The sizes (k, 3) of the cells. sides: (m, 3) the sizes of the boxes of all faces."""
         return sides[self.face] * (0.5**self.depth)[:, None]
 
     def boxes(self, sides: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corners of the boxes around the cells of each face. sides: as for
-        `sizes`."""
+        """For each face that has cells, the lower and upper corner of the box around its cells, as
+        two arrays with three columns. sides: (m, 3) the sizes of the original boxes of all
+        faces."""
         first = np.flatnonzero(np.diff(self.face, prepend=-1))
         low = np.minimum.reduceat(self.corner, first)
         return low, np.maximum.reduceat(self.corner + self.sizes(sides), first)
 
     def touch(self, low: FloatArray, high: FloatArray, sides: FloatArray) -> BoolArray:
         """A mask (k,) of the cells that lie at a side of a box, up to a quarter of the cell's size.
-        low, high: (k, 3) corners of the box for each cell."""
+
+        low, high: (k, 3) for each cell the corners of the box.
+        sides: (m, 3) the sizes of the original boxes of all faces.
+        """
         size = self.sizes(sides)
         at_low = self.corner < low + 0.25 * size
         at_high: BoolArray = self.corner > high - 1.25 * size
@@ -293,7 +302,8 @@ class _FaceCells:
         return _FaceCells(self.face[chosen], self.corner[chosen], self.depth[chosen])
 
     def split(self, sides: FloatArray) -> _FaceCells:
-        """The eight octants of each cell. sides: as for `sizes`."""
+        """The eight octants of each cell. sides: (m, 3) the sizes of the original boxes of all
+        faces."""
         depth = np.repeat(self.depth + 1, 8)
         face = np.repeat(self.face, 8)
         half = sides[face] * (0.5**depth)[:, None]
@@ -312,7 +322,8 @@ def _are_empty(
     curves: FaceLoops, face: IntArray, centers: FloatArray, half: FloatArray,
     levels: tuple[float, ...],
 ) -> BoolArray:  # fmt: skip
-    """A mask (k,) of the balls in which no level set of a face is proved to lie.
+    """A mask (k,) of the balls that are proved to contain no level set of their face's solid angle
+    f.
 
     curves: the boundary curves of all faces.
     face: (k,) the face for each ball.

@@ -160,10 +160,13 @@ def add_edge_rates(
     lengths: the lengths.
     rates: the constants so far, one for each length.
 
-    Returns the new constants. m = a x v and n = e x v are a and e projected along the line and
-    rotated by a right angle. Distances in the plane perpendicular to the line are computed from
-    them, and so is c = v . m x n. So c is small if m and n are, whatever the lengths of a and e:
-    its error is at most 8 epsilon |m| |e| plus slack |n|.
+    Returns the new constants.
+
+    Let the edge run from x + a to x + a + e, and let v be the direction of the line. m = a x v and
+    n = e x v are a and e projected along the line and rotated by a right angle. Distances in the
+    plane perpendicular to the line are computed from them, and so is c = v . m x n. So c is small
+    if m and n are, whatever the lengths of a and e: its error is at most 8 epsilon |m| |e| plus
+    slack |n|.
     """
     a, e, inverse, slack = edge.a, edge.e, edge.inverse_square_length, line.slack
     epsilon = float(dr.epsilon(type(inverse)))
@@ -279,8 +282,8 @@ class _AngleProduct:
         return _AngleProduct(x, y, self.half + (changes & (bits.sign(factor[1]) | 1)))
 
     def times_product(self, bits: _FloatFormat, other: _AngleProduct) -> _AngleProduct:
-        """The product of this product and another one; the sums of arguments are added. other: its
-        own sum of arguments may be several turns."""
+        """The product of this product and another product. The sums of arguments of both, which may
+        be several turns, are added."""
         z = self.times(bits, (other.x, other.y))
         return _AngleProduct(z.x, z.y, z.half + ((other.half + 1) & -2))
 

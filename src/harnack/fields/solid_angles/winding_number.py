@@ -76,15 +76,15 @@ class ModuloOneEvaluable(Protocol):
     """The methods of `WindingNumber` that proofs about its level sets use."""
 
     def prepare(self, backend: Backend) -> ModuloOneEvaluable:
-        """See `Field.prepare`."""
+        """A copy with its data on a backend, for tracing."""
         ...
 
     def evaluate_modulo_one(self, p: Vec3, detail: Real = 0.0) -> Sample:
-        """See `WindingNumber.evaluate_modulo_one`."""
+        """A sample of w minus an unknown integer, at points p. detail: the accuracy scale."""
         ...
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """See `Field.extent`."""
+        """A volume that contains the level sets of w; None if there is no bounded one."""
         ...
 
 
@@ -439,7 +439,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return max(_MIN_RAYS, _PAYS_PER_EDGE * edges) if pays else math.inf
 
     def occupied_cells(self, levels: tuple[float, ...]) -> OccupancyGrid | None:
-        """The cells of `winding_cells`; None if there are few edges, if the surface is the mesh
+        """A grid over the extent, in which a cell is empty if w modulo 1 is proved to take none of
+        the levels in it (`winding_cells`). None if there are few edges, if the surface is the mesh
         itself, or for the method "tree" without FMM cells."""
         is_small = len(self.mesh.singular_edges) < _MIN_CELL_EDGES
         if (
@@ -465,8 +466,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return WindingModuloOne(self)
 
     def evaluate_modulo_one(self, p: Vec3, detail: Real = 0.0) -> Sample:
-        """A sample of w minus an unknown integer, which may differ from point to point. detail: the
-        accuracy scale; by default the sample is the coarsest one."""
+        """A sample of w minus an unknown integer at points p. The integer may differ from point to
+        point. detail: the accuracy scale; by default the sample is the coarsest one."""
         data, frame = self._upward_rays(p)
         detail = data.backend.Float(detail)
         if data.cells is None:
@@ -478,8 +479,9 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return outside.select(inside, space_scaled(in_cells, data.size))
 
     def value_if_cheap(self, p: Vec3, rounding: Real, active: Mask) -> Real:
-        """w at p where it follows from the cell that contains p, else NaN. rounding: the rounding
-        of a coordinate of p."""
+        """The winding number w at points p, with its integer, on active lanes on which it follows
+        from the FMM cell that contains p; NaN on other lanes. rounding: a bound of the rounding of
+        a coordinate of p."""
         data = self._data_for(p)
         if data.cells is None:
             return data.backend.Float(dr.nan)
@@ -496,8 +498,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
     def next_jump(
         self, o: Vec3, d: Vec3, after: JumpCrossing, t_max: Real, active: Mask
     ) -> JumpCrossing:
-        """The next crossing of a triangle on each ray, after the crossing `after` and up to
-        t_max."""
+        """The next crossing of a triangle on each ray o + t d, after the crossing `after` and up to
+        t = t_max, with the jump of w there."""
         data = self._data_for(o)
         frame = RayFrame.along(data.backend, data.to_unit(o), d)
         behind = (after.t / data.size, after.facet)
@@ -506,7 +508,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return JumpCrossing(t * data.size, facet, -sign, -normal)
 
     def initial_offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
-        """The sum of the signs of all crossings beyond t_min, for the exact method; otherwise 0."""
+        """For the exact method, the sum of the signs of all crossings of triangles beyond t_min on
+        each ray o + t d. It is 0 for the tree, which needs no such sum."""
         data = self._data_for(o)
         if self.only_sheets:
             return data.backend.Float(0)
@@ -533,7 +536,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
     def continuation(
         self, o: Vec3, d: Vec3, behind: JumpCrossing, ahead: JumpCrossing, offset: Real
     ) -> Field:
-        """w on a ray between the crossings `behind` and `ahead`, as a field without jumps."""
+        """The winding number w on each ray o + t d between the crossings `behind` and `ahead`, as a
+        field without jumps. offset: the sum of the signs of all crossings ahead of `behind`."""
         if self.only_sheets:
             return _BesideSheets(self._data_for(o).backend, self._level_of_sheets, behind, ahead)
         data = self._data_for(o)
@@ -549,7 +553,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
     def nearest_facet(
         self, p: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
     ) -> NearestFacet:
-        """The nearest triangle after the one given by `after`, within the distance `limit`."""
+        """The triangle that follows the one given by `after` in the order of distance from p,
+        within the distance `limit`."""
         data = self._data_for(p)
         facet = next_closest_triangle(
             data.rays, data.to_unit(p), after, dr.square(limit / data.size), active
@@ -614,7 +619,7 @@ class _WindingData(UnitFrame):
 def _sample_at_start(
     data: _WindingData, frame: RayFrame, turns: Real, detail: Real, active: Mask = True
 ) -> Sample:
-    """The sample at the start of rays, where active.
+    """The sample of w at the starts of rays, on active lanes, without promises along the rays.
 
     frame: the frame of the rays.
     turns: the sum of the signs of all crossings ahead.
@@ -627,7 +632,8 @@ def _sample_at_start(
 
 
 class _WindingOnInterval(Field):
-    """A winding number on a ray interval between two crossings of triangles.
+    """The winding number w on a ray interval between two crossings of triangles, continued smoothly
+    to both ends.
 
     on: the data of the winding number.
     frame: the frame of the rays.
@@ -660,8 +666,8 @@ class _WindingOnInterval(Field):
         return _WindingOnInterval(self._on, self._frame, self._behind, self._offset, detail)
 
     def evaluate(self, p: Vec3) -> Sample:
-        """A sample of w, from the cells where they are used. There it is w up to an integer, and
-        marked as such."""
+        """A sample of w at points p of the interval. On lanes on which it comes from the cells, it
+        is w up to an unknown integer, and marked as such (`branch_unknown`)."""
         data, frame = self._on, self._frame
         x, detail = data.to_unit(p), self._detail
         if data.cells is None:
@@ -676,10 +682,12 @@ class _WindingOnInterval(Field):
 
 
 class _BesideSheets(Field):
-    """The field on a ray interval beside a mesh that is the surface as a whole (`own_sheet`).
+    """The field on a ray interval between two crossings of a mesh that lies on its own level set
+    (`own_sheet`), so that its triangles are the whole surface.
 
-    It is constant, and half a unit from the level, on the side from which the jump at the triangle
-    ahead passes the level. If no triangle is ahead, the jump at the triangle behind decides.
+    The field is constant: the level plus 1/2 or minus 1/2. The sign is such that the jump at the
+    triangle ahead passes the level. If no triangle is ahead, the jump at the triangle behind
+    decides.
 
     level: the level of the surface.
     behind, ahead: the crossings at the ends of the interval.
@@ -693,5 +701,5 @@ class _BesideSheets(Field):
         self._value = dr.select(jump > 0, real(level + 0.5), level - 0.5)
 
     def evaluate(self, p: Vec3) -> Sample:
-        """The sample of the constant."""
+        """The sample of the constant, which holds at any points p."""
         return Sample(self._value, 0 * p, (Lipschitz(0.0),), 0.0)
