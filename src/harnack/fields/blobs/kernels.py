@@ -37,15 +37,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ChordProfile:
-    """The extreme values of a kernel's derivatives along a line, and where they are taken. See the
-    module for S, c1 and c2.
+    """The extreme values of the first two derivatives of a kernel along a line, and the positions
+    on the line at which the derivatives take them. Positions are measured from the point of the
+    line nearest to the kernel's center, in units of the support's radius.
 
-    half_length: S, half the length of the chord; 0 if the line misses the support.
-    steepest_position: c1.
-    steepest: the first derivative at -c1, which is its largest value.
-    max_curvature_position: c2.
-    max_second: the second derivative at c2, its maximum.
-    min_second: the second derivative at 0, its minimum.
+    half_length: S: the line is inside the support for positions from -S to S. S is 0 if the line
+        misses the support.
+    steepest_position: c1 >= 0. The first derivative has its maximum at -c1 and its minimum at c1.
+    steepest: the maximum of the first derivative; the minimum is minus this number.
+    max_curvature_position: c2 >= 0. The second derivative has its maximum at -c2 and at c2.
+    max_second: the maximum of the second derivative.
+    min_second: the minimum of the second derivative, at the position 0.
     """
 
     half_length: Real
@@ -58,14 +60,15 @@ class ChordProfile:
 
 @dataclass(frozen=True)
 class KernelLipschitz:
-    """Lipschitz constants of k and of its first two derivatives along lines. They say how fast
-    these change with the distance of the line from the center and with the position on the line, in
-    units of the support, and bound the effect of rounding.
+    """Lipschitz constants of a kernel and of its first two derivatives along lines, by which the
+    effect of rounding is bounded. They say how much these numbers change at most if the line or
+    the position on it is displaced, for each unit of the displacement. Lengths are in units of the
+    support's radius.
 
-    value: of k.
-    slope: of the first derivative along a line; also a bound of |grad k|.
-    bend: of the second derivative along a line. The jump of the second derivative at S is not
-        included.
+    value: the constant of the kernel k.
+    slope: the constant of the first derivative along a line; also a bound of |grad k|.
+    bend: the constant of the second derivative along a line. The jump of the second derivative at
+        the end of the support is not included.
     """
 
     value: float
@@ -89,51 +92,61 @@ class BlobKernel(abc.ABC):
     @property
     @abc.abstractmethod
     def steepness(self) -> KernelLipschitz:
-        """The Lipschitz constants of the kernel: see `KernelLipschitz`."""
+        """The Lipschitz constants of the kernel and of its first two derivatives along lines."""
 
     @abc.abstractmethod
     def height(self, q: FloatArray) -> FloatArray:
-        """k(q) in NumPy, in double precision."""
+        """The kernel's values k(q) in NumPy, in double precision. q: squared distances from the
+        center, in units of the support."""
 
     @abc.abstractmethod
     def profile(self, q: Real) -> tuple[Real, Real, Real]:
-        """k(q); dk/dq; and a number m. The error of k is at most 16 roundings of m plus 16
-        roundings of dk/dq."""
+        """Three numbers at the squared distance q from the center, in units of the support: the
+        value k(q); the derivative dk/dq; and a number m that bounds the rounding of k. The error of
+        k is at most 16 unit roundoffs times m plus 16 unit roundoffs times |dk/dq|."""
 
     @abc.abstractmethod
     def second_derivative(self, q: Real) -> Real:
-        """The second derivative of k by q."""
+        """The second derivative of the kernel k(q) by the squared distance q."""
 
     @abc.abstractmethod
     def chord(self, height_squared: Real, half_chord_squared: Real) -> ChordProfile:
-        """The extreme values of the kernel's derivatives along lines.
+        """The extreme values of the kernel's first two derivatives along lines, one for each lane.
+        Lengths are in units of the support's radius.
 
-        height_squared: h^2, at most 1.
-        half_chord_squared: S^2 = 1 - h^2, at least 0.
+        height_squared: h^2 <= 1, with h the distance of the line from the kernel's center.
+        half_chord_squared: S^2 = 1 - h^2 >= 0, with S half the length of the line's part inside the
+            support.
         """
 
     @abc.abstractmethod
     def derivatives(
         self, height_squared: Real, half_chord_squared: Real, x: Real
     ) -> tuple[Real, Real]:
-        """The first two derivatives along the lines of `chord`, at the position x, |x| <= S.
+        """The first and the second derivative of the kernel along lines, at the position x. Lengths
+        are in units of the support's radius.
 
-        height_squared, half_chord_squared: h^2 and S^2.
+        height_squared: h^2 <= 1, with h the distance of the line from the kernel's center.
+        half_chord_squared: S^2 = 1 - h^2 >= 0, with S half the length of the line's part inside the
+            support.
+        x: the position on the line, from the point nearest to the center; |x| <= S.
         """
 
     def lipschitz_fraction(self, half_chord_squared: Real, nearest: Real) -> Real:
-        """A factor, at most 1, by which the constants `steepness` may be multiplied for a part of a
-        line.
+        """A factor, at most 1, by which the Lipschitz constants `steepness` may be multiplied for a
+        part of a line. Lengths are in units of the support's radius.
 
-        half_chord_squared: S^2 of the line.
-        nearest: a lower bound of x^2 on the part.
+        half_chord_squared: S^2, with S half the length of the line's part inside the support.
+        nearest: a lower bound of x^2 on the part, with x the position on the line from the point
+            nearest to the kernel's center.
         """
         del half_chord_squared, nearest
         return 1.0
 
     @abc.abstractmethod
     def derivative_ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
-        """Ranges of k, dk/dq and d2k/dq2 on an interval of q >= 0."""
+        """Three intervals that contain the kernel k(q), its derivative dk/dq and its second
+        derivative on an interval of squared distances q >= 0."""
 
     def prepare(self, backend: Backend) -> BlobKernel:
         """The same kernel with its numbers as kernel parameters of the backend."""
@@ -424,7 +437,8 @@ class GaussianKernel(BlobKernel):
 
     @property
     def _rate(self) -> Any:
-        """b: as a kernel parameter if the kernel is prepared, else as a number."""
+        """The number b of the class: a kernel parameter of the backend if the kernel is prepared,
+        else a Python number."""
         return self.sharpness * self.support**2 if self.rate is None else self.rate
 
     @property
@@ -486,7 +500,10 @@ class GaussianKernel(BlobKernel):
         return -2 * b * x * (e - 1), 2 * b * dr.fma(e, dr.fma(2, y, -1), 1)
 
     def lipschitz_fraction(self, half_chord_squared: Real, nearest: Real) -> Real:
-        """See `BlobKernel`. Proof. All constants are multiples of the largest e^z with z = b (S^2 -
+        """A factor, at most 1, by which the Lipschitz constants `steepness` may be multiplied for a
+        part of a line. The arguments are those of `BlobKernel.lipschitz_fraction`.
+
+        Proof. All constants are multiples of the largest e^z with z = b (S^2 -
         x^2), which is at most e^(b (S^2 - 1)) times the value for S = 1 and x = 0. The factor e^(-b
         x^2) is bounded by e^y >= (1 + y/32)^32 with y = b x^2."""
         b = self._rate
@@ -554,7 +571,7 @@ def _check_support(support: float) -> None:
 
 
 def _one_minus(q: Interval) -> Interval:
-    """The range of max(1 - q, 0) for q in an interval."""
+    """The interval of the values of max(1 - q, 0) for q in an interval."""
     w = Interval(1.0, 1.0) - q
     return Interval(fmax(w.lower, 0), fmax(w.upper, 0))
 
@@ -569,7 +586,8 @@ def _widened_range(lower: Real, upper: Real, relative_error: float) -> Interval:
 
 
 def _range_with_support_end(second: Interval, q: Interval) -> Interval:
-    """The range of a second derivative d2k/dq2 that is positive for q < 1 and 0 beyond.
+    """The interval of the values of a kernel's second derivative by q, if this derivative is
+    positive for q < 1 and 0 for larger q.
 
     second: its range for q < 1.
     q: the range of q. If it contains 1, the result contains 0.
