@@ -155,6 +155,7 @@ class Blobs(Formula):
         return Box((self.centers - reach).min(axis=0), (self.centers + reach).max(axis=0))
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
+        """Raise ValueError for level 0, which blobs take in all of the space outside of them."""
         for level in levels:
             if level == 0.0:
                 raise ValueError(
@@ -267,6 +268,7 @@ class Blobs(Formula):
         return self._on
 
     def describe(self) -> dict[str, Any]:
+        """Facts about the field for users, as a dictionary of names and values."""
         facts: dict[str, Any] = {"blobs": len(self), "kernel": self.kernel.name}
         lists = self.cell_lists
         if lists is not None:
@@ -378,8 +380,8 @@ def _blob_records(backend: Backend, blobs: Blobs) -> FloatArray:
 
 @dataclass(frozen=True)
 class DelayedEnclosure(Enclosure):
-    """An enclosure (a proof which levels are not taken) of a function F(s) along a path, if F is 0
-    for 0 <= s <= run.
+    """An enclosure (proved bounds of the change along a path) of a function F(s) that is 0 for
+    0 <= s <= run.
 
     run: the length at the start of the path on which F is 0.
     then: the enclosure of F from s = run on.
@@ -389,6 +391,8 @@ class DelayedEnclosure(Enclosure):
     then: Enclosure
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """A length of the path that is proved to contain no level. gaps: the differences of F at
+        the start from the next levels below and above."""
         return self.run + self.then.free_length(gaps)
 
 
@@ -503,5 +507,6 @@ class Molecule(Blobs):
         )
 
     def describe(self) -> dict[str, Any]:
+        """Facts about the field for users, as a dictionary of names and values."""
         facts = super().describe()
         return {"atoms": facts.pop("blobs"), **facts}

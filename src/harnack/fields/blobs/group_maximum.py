@@ -148,7 +148,7 @@ def group_maximum_at(kernel: BlobKernel, backend: Backend, p: Vec3, blobs: Group
     value, x, y, z, error, gradient_error = final
     is_zero = (groups < blobs.group_count) & ~(
         value > 0
-    )  # the largest sum is 0, that of a far group
+    )  # then the largest sum is the sum of a far group, which is 0
     gradient = dr.select(is_zero, backend.Array3f(0), backend.Array3f(x, y, z))
     return SumValue(dr.select(is_zero, 0, value), gradient, error, gradient_error)
 

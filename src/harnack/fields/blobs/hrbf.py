@@ -336,6 +336,7 @@ class HRBF(Formula):
         return SumOnRay(start, tuple(pieces))
 
     def describe(self) -> dict[str, Any]:
+        """Facts about the field for users, as a dictionary of names and values."""
         return {"points": len(self.points)}
 
 
@@ -384,7 +385,8 @@ def _offset_of_point(p: Vec3, row: list[Real]) -> tuple[Vec3, Vec3, Real, Real]:
 
 
 def _solve_coefficients(points: FloatArray, normals: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The numbers a (n,) and the vectors b (n, 3) of the function: see `HRBF`.
+    """The numbers a_i (n,) and the vectors b_i (n, 3) of the function f = sum over i of a_i r_i^3 +
+    b_i . grad r_i^3, with r_i the distance from the point p_i (`HRBF`).
 
     They solve a linear system with four equations for each point: f = 0 and grad f = normal.
 

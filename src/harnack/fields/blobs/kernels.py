@@ -203,6 +203,9 @@ class CompactKernel(BlobKernel):
         return 6 * fmax(1 - q, 0)
 
     def chord(self, height_squared: Real, half_chord_squared: Real) -> ChordProfile:
+        """The extreme values of the kernel's first two derivatives along lines, by the formulas of
+        the class. The arguments are the squares h^2 and S^2 of the distance of a line from the
+        center and of half its chord, in units of the support's radius."""
         half, squared = dr.sqrt(half_chord_squared), half_chord_squared * half_chord_squared
         zero_x = math.sqrt(0.2) * half
         return ChordProfile(
@@ -222,6 +225,9 @@ class CompactKernel(BlobKernel):
         return -6 * x * (w * w), 6 * w * dr.fma(4, square, -w)
 
     def derivative_ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
+        """Intervals that contain the kernel k(q), dk/dq and d2k/dq2 for q in an interval. For q < 1
+        each of the three is monotone in q, so that the ends are values at the ends of q, widened
+        for rounding."""
         w = _one_minus(q)
         epsilon = machine_epsilon(w.lower)
         return (
@@ -272,6 +278,9 @@ class SexticKernel(BlobKernel):
         return dr.select(q < 1, dr.fma(8 / 3, 1 - q, 10 / 9), 0)
 
     def chord(self, height_squared: Real, half_chord_squared: Real) -> ChordProfile:
+        """The extreme values of the kernel's first two derivatives along lines, by the formulas of
+        the class. The arguments are the squares h^2 and S^2 of the distance of a line from the
+        center and of half its chord, in units of the support's radius."""
         total = dr.fma(1.2, half_chord_squared, 0.5)
         product = half_chord_squared * dr.fma(0.2, half_chord_squared, 1 / 6)
         zero_x = dr.sqrt(2 * product / (total + dr.sqrt(fmax(total * total - 4 * product, 0))))
@@ -296,6 +305,9 @@ class SexticKernel(BlobKernel):
         return -x * part, dr.fma(square, dr.fma(32 / 3, w, 40 / 9), -part)
 
     def derivative_ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
+        """Intervals that contain the kernel k(q), dk/dq and d2k/dq2 for q in an interval. For q < 1
+        each of the three is monotone in q, so that the ends are values at the ends of q, widened
+        for rounding."""
         w = _one_minus(q)
         epsilon = machine_epsilon(w.lower)
 
@@ -354,6 +366,9 @@ class CubicKernel(BlobKernel):
         return dr.select(q < 1, 1.5 / dr.sqrt(fmax(q, float(dr.smallest(type(q))))), 0)
 
     def chord(self, height_squared: Real, half_chord_squared: Real) -> ChordProfile:
+        """The extreme values of the kernel's first two derivatives along lines, by the formulas of
+        the class. The arguments are the squares h^2 and S^2 of the distance of a line from the
+        center and of half its chord, in units of the support's radius."""
         half = dr.sqrt(half_chord_squared)
         zero_x = dr.sqrt(
             fmax(1 + dr.sqrt(dr.fma(8, height_squared, 1)) - 4 * height_squared, 0) * 0.125
@@ -372,6 +387,9 @@ class CubicKernel(BlobKernel):
         return -6 * x * (1 - r), 6 * (square / r - (1 - r))
 
     def derivative_ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
+        """Intervals that contain the kernel k(q), dk/dq and d2k/dq2 for q in an interval. For q < 1
+        each of the three is monotone in q, so that the ends are values at the ends of q, widened
+        for rounding."""
         low, high = dr.sqrt(fmin(fmax(q.lower, 0), 1)), dr.sqrt(fmin(q.upper, 1))
         epsilon = machine_epsilon(low)
 
@@ -467,6 +485,9 @@ class GaussianKernel(BlobKernel):
         return dr.select(q < 1, self._rate * self._rate * dr.exp(self._rate * (1 - q)), 0)
 
     def chord(self, height_squared: Real, half_chord_squared: Real) -> ChordProfile:
+        """The extreme values of the kernel's first two derivatives along lines, by the formulas of
+        the class. The arguments are the squares h^2 and S^2 of the distance of a line from the
+        center and of half its chord, in units of the support's radius."""
         b = self._rate
         z = b * half_chord_squared
         exp_z = dr.exp(z)
@@ -518,6 +539,9 @@ class GaussianKernel(BlobKernel):
         return fmin(largest / power, 1)
 
     def derivative_ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
+        """Intervals that contain the kernel k(q), dk/dq and d2k/dq2 for q in an interval. For q < 1
+        each of the three is monotone in q, so that the ends are values at the ends of q, widened
+        for rounding."""
         w = _one_minus(q)
         b, epsilon = self._rate, machine_epsilon(w.lower)
         # The error of the product with b is half an epsilon, that of the exponential eight.

@@ -234,7 +234,8 @@ class CircleSet:
         x = vector(x)
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """The running sums `state`, with those of the circle in a record added."""
+            """Add the circle in the record `row` to the state: angle, gradient, nearest distance,
+            the three integrals, and the lower bound of the lifted angle."""
             angle, gradient, distance, inverse_squares, inverse_cubes, inverse_fourths, lower = (
                 state
             )
@@ -276,7 +277,8 @@ class CircleSet:
         x = vector(x)
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """The entries `state` of the Hessian, with those of the circle in a record added."""
+            """Add the Hessian of the circle in the record `row` to the entries `state` of the
+            total."""
             relative = self._relative(row, x)
             a, n, outward = relative.a, relative.normal, relative.outward
             f_zz, f_rz_over_r, f_tt = relative.circle.second_derivatives()
@@ -332,7 +334,7 @@ class CircleSet:
         real, vector = self._types
 
         def add(row: list[Real], rates: tuple[Any, ...]) -> tuple[Any, ...]:
-            """The bounds `rates`, with those of the circle in a record added."""
+            """Add the circle in the record `row` to the bounds `rates`, one for each length."""
             relative = self._relative(row, line.x)
             slack, axial = line.slack, fmin(dr.abs(dr.dot(relative.normal, line.v)), 1)
             across = dr.sqrt(fmax(1 - axial * axial, 0))

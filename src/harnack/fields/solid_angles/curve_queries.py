@@ -117,7 +117,9 @@ def continuous_change(edges: LoopEdges, p: Vec3, q: Vec3) -> Real:
     real = edges.backend.Float
 
     def add(a: Vec3, b: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """The change `state`, with that of the edge from a to b added."""
+        """Add the edge from a to b to the change of the solid angle, which is the state of the
+        loop.
+        inverse: not used here."""
         del inverse
         ap, bp, bq, aq = a - p, b - p, b - q, a - q
         return (state[0] - _angle(ap, bp, bq) - _angle(ap, bq, aq),)

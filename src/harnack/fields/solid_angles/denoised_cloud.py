@@ -118,7 +118,10 @@ class DenoisedCloud:
 def _estimated_normals(cloud: CloudDenoiser, gradients: Gradients) -> FloatArray:
     """Estimate normals (m, 3) of the selected points of a cloud, at their original positions. Where
     the smoothed sum rises along a normal, the normal is replaced by the direction in which the sum
-    falls. gradients: as for `DenoisedCloud.of`.
+    falls.
+
+    gradients: a function that returns gradients of the smoothed sum, from points, normals, areas
+        and the smoothing length.
     """
     x = cloud.points[cloud.selected]
     normals = estimate_normals(x)

@@ -561,6 +561,7 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         return on.sample(p, detail)
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
+        """Raise ValueError for a level whose surface would be unbounded."""
         for level in levels:
             if abs(level) < 1e-6:
                 raise ValueError(
@@ -588,6 +589,7 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         return self._smoothing
 
     def describe(self) -> dict[str, Any]:
+        """Facts about the field for users, as a dictionary of names and values."""
         origins = ("estimated" if is_estimated else "given" for is_estimated in self.is_estimated)
         sources = dict(zip(("normals", "areas"), origins, strict=True))
         tree = None if self._device is None else self._device.tree

@@ -186,7 +186,7 @@ class DipoleCells:
 
     def sums_with_tree(
         self, tree: Treecode, x: Vec3, detail: Real, add: tuple[AddPrimitive, AddPrimitive],
-        own: tuple[Any, ...], where: Mask = True,
+        own: tuple[Any, ...], active_lanes: Mask = True,
     ) -> tuple[SourceSums, tuple[Any, ...]]:  # fmt: skip
         """The sums over all primitives at points x, with gradients, and the caller's own state. On
         lanes on which `detail` is at most 1 and x is in the cube they come from the cells. On the
@@ -196,10 +196,10 @@ class DipoleCells:
         add: two functions that add a near primitive (`treecode.AddPrimitive`): the first to the
             sums of a cell, the second to the sums of the tree.
         own: a further state of the caller, which `add` updates.
-        where: the mask of the active lanes.
+        active_lanes: the mask of the active lanes.
         """
         in_cell, in_tree = add
-        lanes, tree_detail = self.backend.Bool(where), fmax(detail, self.backend.Float(1))
+        lanes, tree_detail = self.backend.Bool(active_lanes), fmax(detail, self.backend.Float(1))
         sums, state, is_valid = self.sums(x, lanes & (detail <= 1), in_cell, own)
         tree_sums, tree_state = tree.sums(x, tree_detail, in_tree, own, lanes & ~is_valid)
         pairs = zip(state, tree_state, strict=True)

@@ -251,7 +251,8 @@ class DipoleExpansions:
         zero = backend.Float(0)
 
         def add(i: Any, active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Add the numbers of entry i to the state, where active."""
+            """Add what `term` returns for entry i to the state, on active lanes. The last number of
+            the state is a minimum, all other numbers are sums."""
             *sums, minimum = state
             *added, nearest = term(i, active)
             pairs = zip(sums, added, strict=True)

@@ -410,7 +410,7 @@ def hessian_over_edges(edges: LoopEdges, x: Vec3) -> tuple[Vec3, Vec3, Vec3]:
     x = edges.backend.Array3f(x)
 
     def add(p: Vec3, q: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """The entries `state` of the Hessian, with those of an edge added."""
+        """Add the edge from p to q to the entries `state` of the Hessian. inverse: 1/|q - p|^2."""
         return (
             SymmetricMatrix(*state)
             .add_outer_product(*Edge.between(p, q, inverse, x).hessian_factors())

@@ -113,6 +113,7 @@ class Morph(BatchedField):
         return np.zeros(len(np.asarray(points)))
 
     def describe(self) -> dict[str, Any]:
+        """Facts about the field for users, as a dictionary of names and values."""
         heights = {"w": self.w, "gap": self.gap}
         if isinstance(self._slice, WindingNumber):
             return {**heights, "shows": "mesh " + "ab"[self.w > 0], **self._slice.describe()}

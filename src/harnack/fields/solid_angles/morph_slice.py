@@ -125,14 +125,20 @@ class SlicedKernel(RadialKernel):
         return KernelValues(inverse, thetas)
 
     def bounds(self, distance: Real, last: int) -> list[Real]:
+        """The numbers Q_2 to Q_last of the class: m! Q_m/D^(m+1) bounds m-th derivatives along
+        lines at distances D. They are the same for all distances."""
         del distance
         return [GRADIENT_BOUND, *(1.0 for _ in range(3, last + 1))]
 
     def growth(self, r: Real) -> Real:
+        """A factor that bounds how much larger the numbers Q_m of `bounds` are at a distance that
+        is shorter by r."""
         del r
         return 1.0
 
     def accepting_distance(self, radius: FloatArray, accuracy: float) -> FloatArray:
+        """For clusters of dipoles with these radii (k,), the distances (k,) beyond which their
+        moments are used. accuracy: the larger it is, the larger are the distances."""
         return accuracy * radius + 1e-5
 
 
@@ -444,6 +450,7 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         return on.sample(p, detail)
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
+        """Raise ValueError for a level whose surface would be unbounded."""
         for level in levels:
             if abs(level) < _SMALLEST_LEVEL:
                 raise ValueError("level 0 of a morph reaches to infinity; the surface is at 0.5")

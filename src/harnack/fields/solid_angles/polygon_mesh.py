@@ -130,8 +130,9 @@ class FaceData(UnitFrame):
 class FaceSolidAngle(Field):
     """The solid angle of a face, which may differ from lane to lane.
 
-    Its promises are those of `SolidAngle`, which has their proofs. The ball is that of
-    `lift_bound="convex"` if the face is in convex position, else that of "edges".
+    Its promises, proved bounds near a point, are those of `SolidAngle`, which has the proofs. They
+    include a ball and a range of the lifted solid angle on it. The range is that of
+    `lift_bound="convex"` if the face is in convex position, and that of "edges" otherwise.
     """
 
     period: ClassVar[float | None] = PERIOD
@@ -477,6 +478,7 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
                 )
 
     def describe(self) -> dict[str, Any]:
+        """Facts about the field for users, as a dictionary of names and values."""
         return {
             "faces": self.faces.face_count,
             "vertices": len(self.vertices),

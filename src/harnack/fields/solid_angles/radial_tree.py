@@ -145,12 +145,13 @@ class RadialTreecode(RadialSum):
         derivatives = sums.sums.derivatives
 
         def near(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """The state with the dipole of a record added; it is in a leaf that is not far."""
+            """Add the dipole in the record `row`, which is in a leaf that is not far, to the state
+            of the sums."""
             del active
             return self._with_dipole(row, x, derivatives, state)
 
         def far(node: ClusterView, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """The state with a cluster added, where it is far."""
+            """Add a cluster to the state of the sums, on lanes on which it is far."""
             length = dr.sqrt(node.square)
             cluster = cluster_source(
                 node.head, node.payload, -node.r, length, self.kernel, derivatives

@@ -119,9 +119,13 @@ class YukawaKernel(RadialKernel):
         return factors
 
     def growth(self, r: Real) -> Real:
+        """A factor that bounds how much larger the numbers Q_m of `bounds` are at a distance that
+        is shorter by r."""
         return dr.exp(self.kappa * r)
 
     def accepting_distance(self, radius: FloatArray, accuracy: float) -> FloatArray:
+        """For clusters of dipoles with these radii (k,), the distances (k,) beyond which their
+        moments are used. accuracy: the larger it is, the larger are the distances."""
         return accepting_distance(radius, self._number, accuracy)
 
 
@@ -324,7 +328,10 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         """The field of dipoles at the centroids of the triangles of a mesh.
 
         subdivide: how many times each triangle is cut into 4 triangles first.
-        length, method, accuracy: as for `ScreenedWindingNumber`.
+        length: the screening length l, in the mesh's unit.
+        method: "sum" (all dipoles), "tree" (clusters of far dipoles), or "auto".
+        accuracy: for the tree, the larger it is, the farther away clusters must be to count as one
+            source (see `ScreenedWindingNumber`).
 
         This is quadrature by the midpoint rule, not the integral over the triangles. Let R be the
         distance from the centroid to the farthest corner of a triangle of area a and edges of
@@ -467,6 +474,7 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         return tight_extent(self, levels, lower, upper, _MAX_CELLS)
 
     def describe(self) -> dict[str, Any]:
+        """Facts about the field for users, as a dictionary of names and values."""
         return {
             "points": len(self.points),
             "length": self.length,

@@ -84,10 +84,14 @@ class SmoothedKernel(RadialKernel):
         return [dr.fma(0.25 * (m + 1) * (m + 2), q, 1) for m in range(2, last + 1)]
 
     def growth(self, r: Real) -> Real:
+        """A factor that bounds how much larger the numbers Q_m of `bounds` are at a distance that
+        is shorter by r."""
         del r
         return 1.0
 
     def accepting_distance(self, radius: FloatArray, accuracy: float) -> FloatArray:
+        """For clusters of dipoles with these radii (k,), the distances (k,) beyond which their
+        moments are used. accuracy: the larger it is, the larger are the distances."""
         return accuracy * radius + 1e-5
 
 

@@ -510,6 +510,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return angle + sums.angle + dr.dot(sums.gradient / data.size, p - q)
 
     def continuous_change(self, p: FloatArray, q: FloatArray) -> FloatArray | None:
+        """The change (n,) of the solid angle, followed continuously along the segments from points
+        p (n, 3) to q (n, 3). None if there are circles."""
         if self._net_circles:
             return None
         backend = choose_backend("double")
@@ -595,6 +597,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return math.inf if never_pays else max(_MIN_RAYS, _MIN_WORK / edges)
 
     def describe(self) -> dict[str, Any]:
+        """Facts about the field for users, as a dictionary of names and values."""
         return {
             "loops": len(self.loops) + len(self.circles),
             **({"circles": len(self.circles)} if self.circles else {}),

@@ -500,7 +500,12 @@ class LiftedTrails:
 
     @classmethod
     def upload(cls, backend: Backend, vertices: FloatArray, trails: list[IntArray]) -> LiftedTrails:
-        """Upload closed trails over vertices (n, 3), as from `closed_trails`."""
+        """Upload closed trails of edges to a backend.
+
+        vertices: (n, 3).
+        trails: arrays of indices of vertices; each ends with the vertex with which it begins
+            (`closed_trails`).
+        """
         run = min(
             _RECORD_SIZES,
             key=lambda run: sum(-(-(len(t) - 1) // run) for t in trails) * (run + 0.5),

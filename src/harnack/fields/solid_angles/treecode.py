@@ -367,7 +367,8 @@ class Treecode:
         unit = coordinate_rounding(x)
 
         def add_cluster(node: ClusterView, state: ExtraState) -> ExtraState:
-            """The state with a node added where it is far."""
+            """Add a node to the state on lanes on which it is far. The state consists of the state
+            of the sums and the caller's own state."""
             c, inverse = node.payload, node.inverse
             error = c[15] * self._decay(inverse)
             slope = error * inverse
@@ -383,7 +384,7 @@ class Treecode:
             return sums.to_state(), state[1]
 
         def add_primitive(row: list[Real], active: Mask, state: ExtraState) -> ExtraState:
-            """The state with a primitive of a near leaf added, where active."""
+            """Add the primitive of a near leaf to the state, on active lanes."""
             sums, own = add(row, active, SourceSums.from_state(state[0]), state[1])
             return sums.to_state(), own
 

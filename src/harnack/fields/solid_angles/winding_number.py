@@ -309,7 +309,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
 
     @property
     def mesh(self) -> WindingMesh:
-        """The triangles. They cannot be set: see `with_vertices`."""
+        """The triangles of the mesh, prepared for sums. They cannot be set, because all other data
+        are computed from them once; `with_vertices` makes a field with moved vertices."""
         return self._mesh
 
     @property
@@ -324,7 +325,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return prepared
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
-        """Values and derivatives at points x: see `BatchedField.values_at`. With a tree, second
+        """Values and derivatives at points x (3, n), with error bounds. With a tree, second
         derivatives come from the boundary, unless the user chose the accuracy."""
         data = self._batch_data(backend_of(x))
         winding, x = data.winding, data.to_unit(x)
@@ -425,7 +426,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
 
     @property
     def has_unknown_branch(self) -> bool:
-        """Whether samples along rays may know w only up to an integer, as those of cells of edges
+        """Whether samples along rays may know w only up to an integer. Samples from cells of edges
         do."""
         return self._device is not None and self._device.cells is not None
 
@@ -585,6 +586,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return self._extents[levels]
 
     def describe(self) -> dict[str, Any]:
+        """Facts about the field for users, as a dictionary of names and values."""
         mesh = self.mesh
         return {
             "triangles": len(mesh.triangles),
@@ -637,7 +639,7 @@ class _WindingOnInterval(Field):
 
     on: the data of the winding number.
     frame: the frame of the rays.
-    behind: the crossing at the start of the interval, in unit lengths.
+    behind: the crossing at the start of the interval, with its position in unit coordinates.
     offset: the sum of the signs of all crossings ahead of the start; only the exact method uses it.
     detail: the accuracy scale.
     """

@@ -196,7 +196,7 @@ class TreeWinding:
         unit: Real,
         is_ahead: IsAhead,
         derivatives: int,
-        where: Mask = True,
+        active_lanes: Mask = True,
     ) -> SourceSums:
         """Sums whose value is 4 pi w: far clusters, the crossings of near triangles that are ahead
         of x on rays of the frame, and the open edges of near triangles (`NearEdge.is_open`).
@@ -206,7 +206,7 @@ class TreeWinding:
         unit: the rounding of a coordinate.
         is_ahead: a function; is_ahead(row, t) tells whether a crossing at t with the triangle of
             the record `row` is ahead.
-        where: the mask of the active lanes.
+        active_lanes: the mask of the active lanes.
         """
         start = LiftedProduct.identity(self.backend.Float).parts()
 
@@ -217,8 +217,8 @@ class TreeWinding:
             def add(
                 row: list[Real], active: Mask, sums: SourceSums, state: tuple[Any, ...]
             ) -> tuple[SourceSums, tuple[Any, ...]]:
-                """Add the triangle of a record to the sums, where active. state: the product of the
-                factors of edges, as `LiftedProduct.parts`."""
+                """Add the triangle in the record `row` to the sums, on active lanes. state: the
+                parts of the product of the factors of edges (`LiftedProduct`)."""
                 t, sign = signed_crossing(row, frame)
                 # A crossing is a full turn of the product, which counts them without rounding.
                 re, im, turns = state
@@ -230,12 +230,12 @@ class TreeWinding:
 
             return add
 
-        sums, product = self._near_sums(x, detail, adder, start, where, derivatives)
+        sums, product = self._near_sums(x, detail, adder, start, active_lanes, derivatives)
         return LiftedSums(sums, LiftedProduct(*product)).total()
 
     def _near_sums(
         self, x: Vec3, detail: Real, adder: Callable[[Real], AddPrimitive], state: tuple[Any, ...],
-        where: Mask, derivatives: int = 1,
+        active_lanes: Mask, derivatives: int = 1,
     ) -> tuple[SourceSums, tuple[Any, ...]]:  # fmt: skip
         """The sums at points x over far clusters, to which near triangles are added; and the
         caller's own state. They come from the FMM cells if there are cells, no second derivatives
@@ -244,14 +244,14 @@ class TreeWinding:
         adder: a function that makes the function that adds a near triangle. Its argument is the
             number of radii beyond which nodes are far (`reach` of `NearEdge.is_open`).
         state: a further state of the caller, which that function updates.
-        where: the mask of the active lanes.
+        active_lanes: the mask of the active lanes.
         """
         if self.cells is None or derivatives == 2:
             add = adder(self.clusters.acceptance_ratio(detail))
-            return self.clusters.sums(x, detail, add, state, where, derivatives=derivatives)
+            return self.clusters.sums(x, detail, add, state, active_lanes, derivatives=derivatives)
         acceptance = self.clusters.acceptance_ratio(fmax(detail, self.backend.Float(1)))
         adders = adder(self.backend.Float(TRIANGLE_RATIO)), adder(acceptance)
-        return self.cells.sums_with_tree(self.clusters, x, detail, adders, state, where)
+        return self.cells.sums_with_tree(self.clusters, x, detail, adders, state, active_lanes)
 
     def crossings_ahead(self, frame: RayFrame, t: Real, active: Mask) -> Real:
         """Always 0. The crossings ahead on a ray need not be counted separately, because every sum
@@ -300,14 +300,14 @@ class TreeWinding:
         )
         return sums.sample(_PER_SPHERE, unit, self.rounding, along=promises)
 
-    def _rates(self, line: RayLine, where: Mask) -> Rates:
+    def _rates(self, line: RayLine, active_lanes: Mask) -> Rates:
         """Make a function that computes, for each of several lengths T, a bound of the derivative
         of 4 pi w along a line, at points within T of x = line.x (as `trail_sums.line_rates` does
-        for curves). where: the mask of the lanes that may be active."""
+        for curves). active_lanes: the mask of the lanes that may be active."""
 
         def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
             """Bounds of the derivative along the line, one for each length."""
-            active = active & where
+            active = active & active_lanes
 
             def adder(reach: Real) -> AddPrimitive:
                 """Make a function that adds the open edges of a near triangle to the bounds. reach:
@@ -316,8 +316,8 @@ class TreeWinding:
                 def add(
                     row: list[Real], active: Mask, sums: SourceSums, old: tuple[Any, ...]
                 ) -> tuple[SourceSums, tuple[Any, ...]]:
-                    """Add the open edges of a record's triangle to the bounds `old`, where
-                    active."""
+                    """Add the open edges of the triangle in the record `row` to the bounds `old`,
+                    on active lanes. The sums stay as they are."""
                     for near in edges_of(row, line.x, VerticalRayFrame(line.x)):
                         is_open = active & near.is_open(reach)
                         new = add_edge_rates(line, near.edge.edge, lengths, old)
