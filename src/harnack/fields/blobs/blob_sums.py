@@ -74,7 +74,7 @@ class SumOnRay:
 
     @property
     def piece_count(self) -> int:
-        """The number of pieces."""
+        """The number of pieces of the path."""
         return len(self.parts)
 
     def derivative_ranges(self, knots: Sequence[Real]) -> tuple[PathPiece, ...]:
@@ -361,7 +361,7 @@ def for_each_record(records: RecordTable, *, active: Mask = True) -> ForEach:
     state) that applies `body` to one record after another."""
 
     def for_each(body: EachBlob, state: State) -> State:
-        """The state after all records."""
+        """Apply `body` to all records, one after another. Returns the last state."""
         return records.for_each(body, state, "blobs", active)
 
     return for_each
@@ -374,7 +374,7 @@ def for_each_listed(records: RecordTable, entries: Any, begin: Any, end: Any) ->
     kind = records.backend.UInt32
 
     def for_each(body: EachBlob, state: State) -> State:
-        """The state after the records of the list."""
+        """Apply `body` to the records of the list, one after another. Returns the last state."""
 
         def step(i: Any, *state: Any) -> State:
             return i + 1, *body(records.read_record(dr.gather(kind, entries, i)), state)
@@ -402,7 +402,8 @@ def sum_jets(term: Term, like: Jet, zero: Real, for_each: ForEach) -> Jet:
     """
 
     def add_term(row: list[Real], state: State) -> State:
-        """The bounds of the sum with the jet of record `row` added."""
+        """Add the jet of the blob in the record `row` to the sum, whose interval ends are the
+        state."""
         total = jet_from_bounds(like, iter(state)) + term(row)
         return tuple(jet_bounds(total, zero))
 

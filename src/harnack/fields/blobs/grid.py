@@ -134,7 +134,7 @@ class BlobGrid(EmptySpaceGrid):
 
     @classmethod
     def upload(cls, backend: Backend, lists: CellLists) -> BlobGrid:
-        """The lists on a backend."""
+        """Upload the lists of all cells to a backend."""
         return cls(
             *cls.upload_layout(backend, lists),
             _MARGIN,

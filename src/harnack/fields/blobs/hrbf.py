@@ -170,7 +170,7 @@ class HRBF(Formula):
         backend, records = self._prepared_for(backend_of(next(numbers)))
 
         def term(row: list[Real]) -> Jet:
-            """The jet of the term of the point with record `row`."""
+            """The jet of the term a r^3 + b . grad r^3 of the point with the record `row`."""
             u, v, w = ((entry - row[k]) - row[3 + k] for k, entry in enumerate((x, y, z)))
             r = (u**2 + v**2 + w**2).apply(sqrt)
             return r**3 * row[6] + r * (u * row[7] + v * row[8] + w * row[9])

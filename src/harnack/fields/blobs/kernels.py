@@ -155,7 +155,8 @@ class BlobKernel(abc.ABC):
 
     @property
     def amplitude(self) -> float:
-        """1 / k at the radius of a blob, that is at q = 1/support^2."""
+        """The amplitude of a blob of weight 1: one over the value of k at the radius of a blob,
+        that is at q = 1/support^2."""
         return 1.0 / float(self.height(np.array([self.support**-2.0]))[0])
 
     def function(self) -> ElementaryFunction:
@@ -312,11 +313,11 @@ class SexticKernel(BlobKernel):
         epsilon = machine_epsilon(w.lower)
 
         def value_at(w: Real) -> Real:
-            """k for w = 1 - q."""
+            """The kernel k(q) as a function of w = 1 - q."""
             return w * w * (4 / 9 * w + 5 / 9)
 
         def slope_at(w: Real) -> Real:
-            """dk/dq for w = 1 - q."""
+            """The derivative dk/dq as a function of w = 1 - q."""
             return -w * (4 / 3 * w + 10 / 9)
 
         second = _widened_range(8 / 3 * w.lower + 10 / 9, 8 / 3 * w.upper + 10 / 9, 4 * epsilon)
@@ -394,7 +395,7 @@ class CubicKernel(BlobKernel):
         epsilon = machine_epsilon(low)
 
         def value_at(r: Real) -> Real:
-            """k at the distance r = sqrt(q)."""
+            """The kernel at the distance r = sqrt(q) from the center."""
             return (1 - r) * (1 - r) * (1 + 2 * r)
 
         # Absolute errors: of r half an epsilon, of 1 - r at most as much.

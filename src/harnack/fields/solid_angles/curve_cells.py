@@ -196,7 +196,7 @@ class CurveCells:
         count, center = dr.select(active, found.count, 0), found.center
 
         def runs(i: Any, *_: Any) -> Mask:
-            """Whether the lane has further records of near edges."""
+            """The mask of the lanes that have further records of near edges."""
             return i < count
 
         def body(i: Any, p: Vec3, is_certain: Mask, *products: Real) -> tuple[Any, ...]:
@@ -256,7 +256,7 @@ class CurveCells:
         count = dr.select(active, found.count, 0)
 
         def runs(i: Any, *_: Any) -> Mask:
-            """Whether the lane has further records of near edges."""
+            """The mask of the lanes that have further records of near edges."""
             return i < count
 
         def body(i: Any, p: Vec3, field: Vec3, *rates: Real) -> tuple[Any, ...]:
@@ -303,7 +303,7 @@ class CurveCells:
         real, index, vector = self.backend.Float, self.backend.UInt32, self.backend.Array3f
 
         def runs(i: Any, *_: Any) -> Mask:
-            """Whether the lane has further records of near edges."""
+            """The mask of the lanes that have further records of near edges."""
             return i < count
 
         def body(i: Any, *state: Any) -> tuple[Any, ...]:

@@ -164,7 +164,7 @@ class DipoleCells:
         first, count = index(low) + index(high) * _INDEX_BASE, dr.select(active, index(count), 0)
 
         def runs(i: Any, *_: Any) -> Mask:
-            """Whether the lane has further near primitives."""
+            """The mask of the lanes that have further near primitives."""
             return i < count
 
         def step(i: Any, sums: Any, own: Any) -> tuple[Any, ...]:
@@ -349,7 +349,7 @@ class _ParentExpansions:
     radius: float
 
     def of(self, cells: IntArray) -> DipoleExpansions:
-        """The inherited sums of the cells with these indices."""
+        """The sums that the cells with these indices inherit from their parents."""
         if not self.radius:  # the first level has no parents
             return self.sums
         parents, parent_index = np.unique(cells // 8, return_inverse=True)

@@ -144,12 +144,12 @@ class DipoleExpansions:
 
     @classmethod
     def zero(cls, n: int) -> DipoleExpansions:
-        """Sums over no primitives."""
+        """The sums of n balls over no primitives: zeros, and an infinite distance."""
         zero = np.zeros(n)
         return cls(np.zeros((n, COEFFICIENTS)), *(5 * [zero]), min_distance=np.full(n, np.inf))
 
     def plus(self, other: DipoleExpansions) -> DipoleExpansions:
-        """The sums over the primitives of both operands."""
+        """For each ball, the sum over the primitives of this object and those of `other`."""
         bounds = "error", "slope", "tail", "tail_slope", "s4"
         sums = (_ROUNDED_UP * (getattr(self, name) + getattr(other, name)) for name in bounds)
         min_distance = np.minimum(self.min_distance, other.min_distance)
@@ -163,7 +163,7 @@ class DipoleExpansions:
 
     @classmethod
     def concatenate(cls, parts: list[DipoleExpansions]) -> DipoleExpansions:
-        """The sums of all balls, in the order of `parts`."""
+        """The sums of the balls of all parts, in the order of `parts`."""
         columns = zip(*(vars(part).values() for part in parts), strict=True)
         return cls(*(np.concatenate(column) for column in columns))
 
@@ -270,7 +270,7 @@ class DipoleExpansions:
 
 
 def _fourth(number: Any) -> Any:
-    """The fourth power."""
+    """The fourth power of a number."""
     square = number * number
     return square * square
 
@@ -384,7 +384,8 @@ class PendingSources:
 
     @classmethod
     def of_root(cls, backend: Backend) -> PendingSources:
-        """The root of a tree, and so all its primitives, for one ball."""
+        """The sources of a single ball that has added none: the root of a tree, which stands for
+        all its primitives."""
         return cls(LaneLists.of_root(backend), LaneLists.empty(backend))
 
     def subset(self, backend: Backend, lanes: IntArray) -> PendingSources:
@@ -395,7 +396,7 @@ class PendingSources:
 
     @classmethod
     def concatenate(cls, backend: Backend, parts: list[PendingSources]) -> PendingSources:
-        """The sources of all balls, in the order of `parts`."""
+        """The sources of the balls of all parts, in the order of `parts`."""
         nodes = LaneLists.concatenate(backend, [part.nodes for part in parts])
         return cls(nodes, LaneLists.concatenate(backend, [part.primitives for part in parts]))
 
@@ -474,7 +475,8 @@ class PendingSources:
         are_points = tree.primitives.packets_per_record == 1
 
         def is_chosen(row: list[Real], active: Mask) -> Mask:
-            """Whether the primitive of a record is to be counted."""
+            """The mask of the lanes on which the primitive in the record `row` is to be counted: it
+            is far, or with far=False near, and its slot is not empty."""
             far_distance = far_radius if are_points else far_radius + row[7]
             is_far = dr.squared_norm(c - vector(*row[:3])) > dr.square(far_distance)
             return (is_far if far else ~is_far) & (row[6] > 0) & active
@@ -495,11 +497,11 @@ class PendingSources:
                 enters &= state[0] <= count_limit
 
             def runs(slot: Any, *_: Any) -> Mask:
-                """Whether the leaf has further slots."""
+                """The mask of the lanes that enter the leaf and have further slots in it."""
                 return enters & node.is_leaf & (slot < tree.leaf_size)
 
             def step(slot: Any, count: Any) -> tuple[Any, ...]:
-                """Count the primitive in a slot of the leaf."""
+                """Count, and store, the primitive in a slot of the leaf if it is chosen."""
                 chosen = is_chosen(tree.primitive(node.leaf, slot, enters), enters)
                 if store is not None:
                     store(count, node.leaf * tree.leaf_size + slot, chosen)

@@ -68,11 +68,11 @@ class EdgeExpansions:
 
     @classmethod
     def zero(cls, n: int) -> EdgeExpansions:
-        """Sums over no edges."""
+        """The sums of n balls over no edges: zeros."""
         return cls(np.zeros((n, COEFFICIENTS)), np.zeros(n), np.zeros(n))
 
     def plus(self, other: EdgeExpansions) -> EdgeExpansions:
-        """The sums over the edges of both operands."""
+        """For each ball, the sum over the edges of this object and those of `other`."""
         error, slope = self.error + other.error, self.slope + other.slope
         total = self.coefficients + other.coefficients
         return EdgeExpansions(total, error * _ROUNDED_UP, slope * _ROUNDED_UP)
@@ -148,7 +148,7 @@ def _over_pieces(
     index, real, vector = backend.UInt32, backend.Float, backend.Array3f
 
     def runs(j: Any, *_: Any) -> Mask:
-        """Whether the lane has further edges."""
+        """The mask of the lanes that have further edges."""
         return j < count
 
     def body(j: Any, t: Real, zr: Real, zi: Real, *sums: Real) -> tuple[Any, ...]:

@@ -216,7 +216,7 @@ class LiftedSums:
         return cls(SourceSums.from_state(parts[0]), LiftedProduct(*parts[1]))
 
     def parts(self) -> tuple[Any, ...]:
-        """The parts of the sums and of the product, for the state of a loop."""
+        """The numbers of the sums and of the product as nested tuples, for the state of a loop."""
         return self.sums.to_state(), self.product.parts()
 
     def add_edge(self, edge: LiftedEdge, unit: Real, active: Mask) -> LiftedSums:
@@ -244,7 +244,7 @@ class LiftedSums:
         return self.product.angle()
 
     def total(self) -> SourceSums:
-        """The sums with the angles of the edges added to the value."""
+        """The sums, with the solid angles of the edges added to the value."""
         return self.sums.add_term(SourceTerm(self.angle), True)
 
 
@@ -259,7 +259,7 @@ def lifted_sums(edges: LiftedEdges, x: Vec3, derivatives: int) -> LiftedSums:
     vector = backend.Array3f
 
     def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """The sums `state`, with the edge of a record added."""
+        """Add the edge in the record `row` to the state of the sums."""
         p, q = vector(*row[:3]), vector(*row[4:7])
         edge = LiftedEdge.between(p, q, row[3], row[7], VerticalRayFrame(x), x)
         return LiftedSums.of(state).add_edge(edge, unit, row[3] != 0).parts()
@@ -276,7 +276,7 @@ def edge_rates(edges: LiftedEdges, x: Vec3, derivatives: int) -> SourceSums:
     vector = backend.Array3f
 
     def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """The sums `state`, with the edge of a record added."""
+        """Add the edge in the record `row` to the state of the sums."""
         p, q, active = vector(*row[:3]), vector(*row[4:7]), row[3] != 0
         edge = LiftedEdge.between(p, q, row[3], row[7], VerticalRayFrame(x), x)
         sums = SourceSums.from_state(state).add_term(edge.terms(derivatives, active), True)

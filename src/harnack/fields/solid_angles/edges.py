@@ -144,7 +144,7 @@ class LoopEdges:
         """
 
         def of_record(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Apply `body` to the edges of a record."""
+            """Apply `body` to the edges in the record `row`, one after another."""
             for k in range(self.edges_per_record):
                 p, q = self.vertex(row, k), self.vertex(row, k + 1)
                 state = body(p, q, row[4 * k + 3], state)

@@ -193,7 +193,7 @@ class _AbsoluteValues:
         )
 
     def __neg__(self) -> _AbsoluteValues:
-        """The number itself, as its sign does not count."""
+        """This object itself, because signs do not count."""
         return self
 
     __radd__ = __sub__ = __rsub__ = __add__

@@ -150,7 +150,7 @@ def moment_polynomial(n: int, degree: int) -> tuple[float, ...]:
     t, weight = 0.5 * (t + 1), 0.5 * weight
 
     def moment(x: FloatArray) -> FloatArray:
-        """i_n at x = 2c - 1, an array in [-1, 1]."""
+        """The values of i_n at x = 2c - 1. x: an array of numbers in [-1, 1]."""
         phi = np.arccos(0.5 * (x + 1))[:, None]
         ratio = np.sin(phi * t) / np.sin(phi)
         return phi[:, 0] / np.sin(phi[:, 0]) * (ratio ** (2 * n - 2) @ weight)
@@ -414,7 +414,7 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         """
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Real]:
-            """The bound at points x, in the unit of the meshes."""
+            """The bound of the displacement at points x, as a length in the unit of the meshes."""
             data = self._batch_data(backend)
             x = data.to_unit(x)
             error, gradient = backend.Float(0), backend.Array3f(0)
@@ -486,7 +486,11 @@ class _SliceBuffers(UnitFrame):
     clouds: tuple[RadialTreecode, ...]
 
     def sums(self, x: Vec3, closer: Real, derivatives: int) -> RadialSums:
-        """The sums over the points of both meshes. closer: the accuracy scale."""
+        """The sums over the quadrature points of both meshes, at points x in unit coordinates.
+
+        closer: the accuracy scale.
+        derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
+        """
         sums = RadialSums.zero(self.backend, derivatives)
         for cloud in self.clouds:
             sums = cloud.accumulate(sums, x, closer)

@@ -268,14 +268,15 @@ def _leaf_moments(
     end = first + dr.gather(index, upload_integers(backend, filled.sum(axis=1)), leaf)
 
     def visit(body: Callable[..., tuple[Any, ...]], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """The state after `body` was applied to all primitives of each leaf."""
+        """Apply `body` to the primitives of each leaf, one after another. Each lane is a leaf.
+        Returns the last state."""
 
         def step(slot: Any, *state: Any) -> tuple[Any, ...]:
             """Apply `body` to the primitive in a slot."""
             return slot + 1, *body(primitive(dr.gather(index, slots, slot)), *state)
 
         def more(slot: Any, *_: Any) -> Any:
-            """Whether the leaf has further slots."""
+            """The mask of the leaves that have further slots."""
             return slot < end
 
         return dr.while_loop((first, *state), more, step, label="slots")[1:]

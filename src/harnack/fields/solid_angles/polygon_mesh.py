@@ -459,7 +459,7 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
         )
 
     def _upload(self, backend: Backend) -> _MeshBuffers:
-        """The faces' boxes and boundary curves on a backend."""
+        """The boxes of all faces and their boundary curves, on a backend."""
         boxes = PatchBoxes.upload(backend, *self.boxes())
         return _MeshBuffers(boxes, FaceLoops.upload(backend, self.faces))
 
@@ -489,7 +489,7 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
 
 @dataclass(frozen=True)
 class _MeshBuffers:
-    """The faces' boxes and boundary curves on a backend."""
+    """The boxes of all faces and their boundary curves, on a backend."""
 
     boxes: PatchBoxes
     curves: FaceLoops

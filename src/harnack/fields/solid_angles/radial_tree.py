@@ -109,19 +109,20 @@ class RadialSum(abc.ABC):
 
 
 class DirectSum(RadialSum):
-    """The direct sum over all dipoles, without truncation."""
+    """The sum over dipoles, one by one. It has no truncation error."""
 
     def __init__(self, backend: Backend, rows: FloatArray, kernel: RadialKernel) -> None:
         super().__init__(backend, rows, kernel)
         self._records = RecordTable.upload(backend, rows, empty_record(rows[0]), _DIPOLES_PER_TRIP)
 
     def accumulate(self, sums: RadialSums, x: Vec3, closer: Real) -> RadialSums:
-        """The sums with the terms of all dipoles added; `closer` has no effect."""
+        """Add the terms of all dipoles at points x to `sums`. Returns the new sums; `closer` has no
+        effect."""
         del closer
         derivatives = sums.sums.derivatives
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """The state with the dipole of a record added."""
+            """Add the dipole in the record `row` to the state of the sums."""
             return self._with_dipole(row, x, derivatives, state)
 
         return RadialSums.of(self._records.for_each(add, sums.parts(), "radial dipoles"))
@@ -140,7 +141,9 @@ class RadialTreecode(RadialSum):
         self._tree = dipoles.packed(backend, kernel, accuracy)
 
     def accumulate(self, sums: RadialSums, x: Vec3, closer: Real) -> RadialSums:
-        """The sums with the terms of near dipoles and far clusters added."""
+        """Add the terms of near dipoles and far clusters at points x to `sums`. Returns the new
+        sums.
+        closer: a cluster is far beyond this many times its accepting distance."""
         closer = fmax(self.backend.Float(closer), self.backend.Float(1))
         derivatives = sums.sums.derivatives
 

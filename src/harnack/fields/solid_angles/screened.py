@@ -485,7 +485,8 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
 
 @dataclass(frozen=True)
 class _ScreenedBuffers(UnitFrame):
-    """The kernel and the dipoles on a backend."""
+    """The data of a screened winding number on a backend: the kernel, and the sum over the
+    dipoles."""
 
     kernel: YukawaKernel
     dipoles: RadialSum

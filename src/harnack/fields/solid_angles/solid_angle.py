@@ -184,7 +184,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
 
     @property
     def boundary_curves(self) -> tuple[FloatArray, ...]:
-        """The curves as polygons, without edges that cancel each other."""
+        """The curves as polygons (n, 3), without edges that cancel each other. Circles become
+        polygons with many sides."""
         return (*self._net_loops, *(circle.polygon(_CIRCLE_SIDES) for circle in self._net_circles))
 
     def _points_around(self) -> FloatArray:
@@ -287,7 +288,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
 
     @functools.cached_property
     def _without_cells(self) -> SolidAngle:
-        """The same field without cells."""
+        """This field if it has no cells; otherwise the same field without cells."""
         if not self.has_variable_accuracy:
             return self
         return SolidAngle([*self.loops, *self.circles], lift_bound=self.lift_bound_option)
@@ -728,12 +729,12 @@ class CurveSums:
 
     @classmethod
     def of(cls, sums: EdgeSums | CircleSums) -> CurveSums:
-        """The sums over edges only, or over circles only."""
+        """The sums of a set of curves, from the sums over its edges or over its circles."""
         integrals = sums.inverse_squares, sums.inverse_cubes, sums.inverse_fourths
         return cls(sums.angle, sums.gradient, sums.distance, *integrals)
 
     def plus(self, other: CurveSums) -> CurveSums:
-        """The sums over the curves of both operands."""
+        """The sums over the curves of this object and those of `other`."""
         return CurveSums(
             self.angle + other.angle,
             self.gradient + other.gradient,

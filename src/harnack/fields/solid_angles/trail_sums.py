@@ -142,7 +142,7 @@ def line_rates(
     """
 
     def add(p: Vec3, q: Vec3, inverse: Real, rates: tuple[Real, ...]) -> tuple[Real, ...]:
-        """The constants `rates`, with the term of the edge from p to q added."""
+        """Add the term of the edge from p to q to the constants `rates`, one for each length."""
         return add_edge_rates(line, Edge.between(p, q, inverse, line.x), lengths, rates)
 
     start = tuple(edges.backend.Float(0) for _ in lengths)
@@ -585,11 +585,12 @@ class LiftedTrails:
         )
 
     def _vertex(self, row: list[Real], k: int) -> Vec3:
-        """Vertex k of a record."""
+        """The position (3,) of vertex k of the record `row`."""
         return self.records.backend.Array3f(*row[3 * k : 3 * k + 3])
 
     def _edge(self, row: list[Real], k: int) -> tuple[Real, Real]:
-        """1/length^2 and the signed length of edge k of a record."""
+        """One over the squared length of edge k of the record `row`, and its signed length:
+        negative if the edge runs from a higher to a lower vertex index, 0 if there is no edge."""
         first = 3 * (self.edges_per_record + 1)
         return row[first + k], row[first + self.edges_per_record + k]
 

@@ -73,7 +73,8 @@ _CELLS_ACROSS = 192
 
 
 class ModuloOneEvaluable(Protocol):
-    """The methods of `WindingNumber` that proofs about its level sets use."""
+    """An object that evaluates a winding number modulo 1, as `WindingNumber` does: the methods that
+    proofs about its level sets use."""
 
     def prepare(self, backend: Backend) -> ModuloOneEvaluable:
         """A copy with its data on a backend, for tracing."""
@@ -357,7 +358,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return self._stated(data, x, values)
 
     def _boundary_rates(self, data: _WindingData, winding: TreeWinding) -> BoundaryRates:
-        """The derivatives from the boundary, computed once for a backend."""
+        """The object that evaluates derivatives at points from the boundary only; made once for a
+        backend."""
         if data.backend not in self._rates:
             self._rates[data.backend] = BoundaryRates.of(
                 data.backend, self.mesh, self.order, winding
@@ -376,7 +378,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         )
 
     def _upload(self, backend: Backend, *, traced: bool) -> _WindingData:
-        """The data on a backend, for tracing or for values at points."""
+        """Upload the data to a backend. traced: whether they are for tracing, and not for values at
+        points."""
         accuracy = self.accuracy or (_TRACING_ACCURACY if traced else _VALUES_ACCURACY)
         mesh = self.mesh
         rays = TriangleTree.of(backend, mesh.ray_tree, mesh.ray_records)
@@ -612,7 +615,7 @@ class _WindingData(UnitFrame):
 
     @property
     def built(self) -> BuiltCells | None:
-        """The cells, of edges or of triangles; None for none."""
+        """The FMM cells, which are cells of edges or of triangles; None if there are none."""
         if self.cells is None and isinstance(self.winding, TreeWinding):
             return self.winding.cells
         return self.cells
@@ -652,7 +655,7 @@ class _WindingOnInterval(Field):
         offset: Real,
         detail: Real = 1.0,
     ) -> None:
-        """The arguments are those of the class."""
+        """For the arguments see the class."""
         self.has_variable_accuracy = on.winding.has_detail or on.cells is not None
         self.coarsest_accuracy = on.winding.coarsest_detail
         self._on, self._frame, self._detail = on, frame, on.backend.Float(detail)

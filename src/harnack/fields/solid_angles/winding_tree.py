@@ -157,7 +157,7 @@ class TreeWinding:
 
     @property
     def has_detail(self) -> bool:
-        """Whether coarse samples cost less. It is true."""
+        """Whether samples at small accuracy scales cost less. It is true for a tree."""
         return True
 
     @property
@@ -181,7 +181,7 @@ class TreeWinding:
         )
 
         def is_ahead(row: list[Real], t: Real) -> Mask:
-            """Whether a crossing at t is ahead of x."""
+            """The mask of the lanes on which a crossing at the ray parameter t is ahead of x."""
             del row
             return t > 0
 
@@ -306,7 +306,8 @@ class TreeWinding:
         for curves). active_lanes: the mask of the lanes that may be active."""
 
         def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
-            """Bounds of the derivative along the line, one for each length."""
+            """For each length, a bound of the derivative along the line within that length of x;
+            infinite on lanes that are not active."""
             active = active & active_lanes
 
             def adder(reach: Real) -> AddPrimitive:
