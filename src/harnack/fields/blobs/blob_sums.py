@@ -1,7 +1,7 @@
-"""Sums of blobs. They are evaluated at a point, along a path with ranges of both derivatives on its
-pieces, and as jets.
+"""Sums of blobs: values at a point; ranges of the first two derivatives along a path, for each of
+its pieces; and jets (ranges of value and derivatives in several variables).
 
-Each is one loop over the blobs. Positions are relative to each blob and in units of its own
+Each sum is one loop over the blobs. Positions are relative to each blob and in units of its own
 support, so that the same bounds hold for blobs of every size. Jets allow blobs to be deformed and
 blended.
 
@@ -62,7 +62,8 @@ PIECES, PIECES_IN_CELL = 4, 3
 
 @dataclass(frozen=True)
 class SumOnRay:
-    """A sum of blobs along a path p + s d, as a `PathRestriction`.
+    """A sum of blobs along a path p + s d. It has the methods of `PathRestriction`, from which
+    enclosures (proofs about the sum along the path) are made.
 
     start: the sum at p.
     parts: ranges of the first two derivatives, for each piece of the path.
@@ -73,7 +74,7 @@ class SumOnRay:
 
     @property
     def piece_count(self) -> int:
-        """The number of pieces."""
+        """The number of pieces of the path."""
         return len(self.parts)
 
     def derivative_ranges(self, knots: Sequence[Real]) -> tuple[PathPiece, ...]:
@@ -84,8 +85,11 @@ class SumOnRay:
 
 
 class KnotRecorder:
-    """A stand-in for a `PathRestriction`. It records the knots (positions on the path) at which a
-    proof asks for ranges, so that these can be computed afterwards.
+    """A stand-in for a function restricted to a path (`PathRestriction`). A proof asks it for
+    ranges of derivatives on the pieces between knots, which are positions on the path. It records
+    these knots, so that the ranges can be computed afterwards.
+
+    piece_count: the number of pieces.
 
     knots: the recorded knots; None until a proof has asked.
     """
@@ -102,14 +106,14 @@ class KnotRecorder:
 
 
 def value_at(kernel: BlobKernel, backend: Backend, p: Vec3, for_each: ForEach) -> SumValue:
-    """The sum at points p.
+    """The sum of blobs at points p (3, n): value, gradient, and bounds of their rounding errors.
 
     for_each: the loop over the blobs that may be nonzero at p.
     """
     real = backend.Float
 
     def add_blob(row: list[Real], state: State) -> State:
-        """The state of `_add_value` with the blob of record `row` added."""
+        """The state of the sum (`_add_value`), with the blob of the record `row` added."""
         inverse, amplitude = row[6], row[7]
         offset = _vector_to_center(p, row) * inverse
         return _add_value(kernel, offset, inverse, amplitude, state)
@@ -128,9 +132,10 @@ def sum_along(
     *,
     signed: bool = True,
 ) -> SumOnRay:
-    """The sum along p + s d, with ranges of its first two derivatives on the pieces between knots.
+    """The sum of blobs along the paths p + s d, with ranges of its first two derivatives by s on
+    the pieces between knots.
 
-    d: unit vectors.
+    p, d: (3, n) starts of the paths, and their unit directions.
     knots: increasing values of s, the first of them 0. There is one piece less than knots.
     for_each: the loop over the blobs that may be nonzero on the path.
     signed: whether amplitudes may be negative.
@@ -282,7 +287,8 @@ def _add_value(
 
 
 def _finished_value(kernel: BlobKernel, backend: Backend, state: State) -> SumValue:
-    """The sum, with bounds of its rounding errors, from the last state of `_add_value`."""
+    """The value and gradient of a sum of blobs with bounds of their rounding errors, from the last
+    state of `_add_value`."""
     value, x, y, z, slope_sum, rounding_sum, gradient_size, term_count = state
     roundoff = 0.5 * backend.machine_epsilon
     error = roundoff * dr.fma(16 + term_count, rounding_sum, 8 * slope_sum)
@@ -298,9 +304,10 @@ def _vector_to_center(p: Vec3, row: list[Real]) -> Vec3:
 def _first_derivative_range(
     chord: ChordProfile, a: Real, b: Real, at_a: Real, at_b: Real
 ) -> tuple[Real, Real]:
-    """The lower and the upper end of the range of the first derivative for positions from a to b on
-    a chord.
+    """The smallest and the largest value of the first derivative of a kernel along a line, for
+    positions from a to b on the line.
 
+    chord: the extreme values of the derivatives on the line.
     at_a, at_b: the first derivative at a and at b.
     """
     has_minimum = (a <= chord.steepest_position) & (b >= chord.steepest_position)
@@ -312,9 +319,10 @@ def _first_derivative_range(
 def _second_derivative_range(
     chord: ChordProfile, a: Real, b: Real, at_a: Real, at_b: Real
 ) -> tuple[Real, Real]:
-    """The lower and the upper end of the range of the second derivative for positions from a to b
-    on a chord.
+    """The smallest and the largest value of the second derivative of a kernel along a line, for
+    positions from a to b on the line.
 
+    chord: the extreme values of the derivatives on the line.
     at_a, at_b: the second derivative at a and at b.
     """
     has_minimum = (a <= 0) & (b >= 0)
@@ -349,22 +357,24 @@ def _with_jumps(
 
 
 def for_each_record(records: RecordTable, *, active: Mask = True) -> ForEach:
-    """A loop over all records of a table, on the active lanes."""
+    """Make the loop over all records of a table, on the active lanes. It is a function (body,
+    state) that applies `body` to one record after another."""
 
     def for_each(body: EachBlob, state: State) -> State:
-        """The state after all records."""
+        """Apply `body` to all records, one after another. Returns the last state."""
         return records.for_each(body, state, "blobs", active)
 
     return for_each
 
 
 def for_each_listed(records: RecordTable, entries: Any, begin: Any, end: Any) -> ForEach:
-    """A loop over the records whose indices are entries[begin:end]. Each lane may have its own
-    begin and end."""
+    """Make the loop over the records whose indices are entries[begin:end]. It is a function (body,
+    state) that applies `body` to one record after another. Each lane may have its own begin and
+    end."""
     kind = records.backend.UInt32
 
     def for_each(body: EachBlob, state: State) -> State:
-        """The state after the records of the list."""
+        """Apply `body` to the records of the list, one after another. Returns the last state."""
 
         def step(i: Any, *state: Any) -> State:
             return i + 1, *body(records.read_record(dr.gather(kind, entries, i)), state)
@@ -382,16 +392,18 @@ Term: TypeAlias = "Callable[[list[Real]], Jet]"
 
 
 def sum_jets(term: Term, like: Jet, zero: Real, for_each: ForEach) -> Jet:
-    """The sum of the jets term(row) over all records, in a loop whose state is the bounds of all
-    intervals of the sum.
+    """The sum of the jets of all blobs. A jet consists of intervals of value and derivatives. The
+    loop over the blobs has the ends of all intervals of the sum as its state.
 
+    term: a function that returns the jet of a blob from its record.
     like: any jet of the same variables and piece.
     zero: the number 0 on each lane.
     for_each: the loop over the records.
     """
 
     def add_term(row: list[Real], state: State) -> State:
-        """The bounds of the sum with the jet of record `row` added."""
+        """Add the jet of the blob in the record `row` to the sum, whose interval ends are the
+        state."""
         total = jet_from_bounds(like, iter(state)) + term(row)
         return tuple(jet_bounds(total, zero))
 
@@ -400,7 +412,8 @@ def sum_jets(term: Term, like: Jet, zero: Real, for_each: ForEach) -> Jet:
 
 
 def blob_term(kernel: BlobKernel, coordinates: Coordinates) -> Term:
-    """A function that takes the record of a blob and returns the jet of that blob.
+    """Make a function that returns the jet of a blob from its record. A jet consists of intervals
+    of value and derivatives.
 
     coordinates: the jets of x, y and z at which the blob is evaluated.
     """

@@ -137,8 +137,9 @@ class Blobs(Formula):
         return prepared
 
     def largest_gradient(self) -> float:
-        """A bound of |grad f| everywhere. It is the largest sum, over any cell, of the gradient
-        bounds of the blobs in the cell's list; without a grid, the sum over all blobs."""
+        """A bound of |grad f| everywhere. With a grid, the bounds of the gradients of the blobs in
+        a cell's list are added up, and the largest of these sums is returned. Without a grid it is
+        the sum over all blobs."""
         gradients = np.abs(self.weights) * (self.kernel.amplitude * self.kernel.steepness.slope)
         gradients /= self._supports
         lists = self.cell_lists
@@ -154,6 +155,7 @@ class Blobs(Formula):
         return Box((self.centers - reach).min(axis=0), (self.centers + reach).max(axis=0))
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
+        """Raise ValueError for level 0, which blobs take in all of the space outside of them."""
         for level in levels:
             if level == 0.0:
                 raise ValueError(
@@ -166,12 +168,15 @@ class Blobs(Formula):
         return self._sample(data.value_at(self.kernel, p))
 
     def _sample(self, sums: SumValue) -> Sample:
-        """The sample at points, from the sum there, with the Lipschitz constant as its promise."""
+        """The sample at points, from the sum there. Its promise (proved bound of f near a point) is
+        the Lipschitz constant of the field."""
         promises = () if self.lipschitz is None else (Lipschitz(0 * sums.value + self.lipschitz),)
         return Sample(sums.value, sums.gradient, promises, sums.error, sums.gradient_error)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The ray sample, by one loop over the blobs nearby. It has no enclosure looking back.
+        """The sample at the position t of a ray, with enclosures: proofs of lengths ahead on which
+        f takes no level. It needs one loop over the blobs nearby. There is no enclosure looking
+        back.
 
         In a grid, enclosures end where the path leaves the enlarged cell of the point. If the cell
         is empty, f is 0 until the path comes to the first cell that is not empty. The enclosures
@@ -230,8 +235,8 @@ class Blobs(Formula):
         return RaySample(self._sample(start), enclosures, (), slope, float(count))
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        """f at jets of the coordinates, or at Dr.Jit numbers. For jets it is a sum over all
-        blobs."""
+        """The function f at jets of the coordinates (intervals of values and derivatives), or at
+        Dr.Jit numbers. For jets it is a sum over all blobs, without the grid."""
         if not is_jet(x, type(self).__name__):
             return self.differentiable_value(backend_of(x).Array3f(x, y, z))
         data = self._prepared_for(backend_of(_backend_number(x, y, z)))
@@ -242,8 +247,8 @@ class Blobs(Formula):
         return group_maximum_jet(term, x, zero, data.grouped(None))
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """The rows of the Hessian of f. Where f is a largest sum of groups, it is the Hessian of
-        that sum."""
+        """The three rows of the Hessian of f at points p. If blobs have groups, it is the Hessian
+        of the group's sum that is largest at p."""
         data = self._prepared(p)
         if data.groups is not None:
             return super().hessian(p)
@@ -263,6 +268,7 @@ class Blobs(Formula):
         return self._on
 
     def describe(self) -> dict[str, Any]:
+        """Facts about the field for users, as a dictionary of names and values."""
         facts: dict[str, Any] = {"blobs": len(self), "kernel": self.kernel.name}
         lists = self.cell_lists
         if lists is not None:
@@ -308,8 +314,8 @@ class _BlobDeviceData:
         )
 
     def near(self, p: Vec3) -> ForEach:
-        """A loop over the blobs whose supports may contain p: those in the list of its cell or,
-        without a grid, all blobs."""
+        """Make a loop over the blobs whose supports may contain p: the blobs in the list of the
+        grid cell that contains p or, without a grid, all blobs."""
         if self.grid is None:
             return for_each_record(self.records)
         return for_each_listed(self.records, self.grid.entries, *self.grid.list_at(p))
@@ -374,8 +380,10 @@ def _blob_records(backend: Backend, blobs: Blobs) -> FloatArray:
 
 @dataclass(frozen=True)
 class DelayedEnclosure(Enclosure):
-    """An enclosure of a function F(s) along a path, with F = 0 for 0 <= s <= run.
+    """An enclosure (proved bounds of the change along a path) of a function F(s) that is 0 for
+    0 <= s <= run.
 
+    run: the length at the start of the path on which F is 0.
     then: the enclosure of F from s = run on.
     """
 
@@ -383,11 +391,14 @@ class DelayedEnclosure(Enclosure):
     then: Enclosure
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """A length of the path that is proved to contain no level. gaps: the differences of F at
+        the start from the next levels below and above."""
         return self.run + self.then.free_length(gaps)
 
 
 def _zero_where(mask: Any, sums: SumValue) -> SumValue:
-    """The sum at points, with value, gradient and errors replaced by 0 where the mask holds."""
+    """The same sum at points, with value, gradient and errors replaced by 0 on lanes on which the
+    mask is true."""
     zero = 0 * sums.value
     return SumValue(
         dr.select(mask, zero, sums.value),
@@ -496,5 +507,6 @@ class Molecule(Blobs):
         )
 
     def describe(self) -> dict[str, Any]:
+        """Facts about the field for users, as a dictionary of names and values."""
         facts = super().describe()
         return {"atoms": facts.pop("blobs"), **facts}

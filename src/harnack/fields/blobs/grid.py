@@ -84,7 +84,8 @@ def _cell_ball_pairs(
     size: float,
     shape: tuple[int, int, int],
 ) -> tuple[IntArray, IntArray]:
-    """All pairs of a cell and a ball, for which the ball meets the cell enlarged by the margin.
+    """All pairs of a cell of a grid and a ball for which the ball meets the cell, enlarged by
+    `_MARGIN` of its size on all sides.
 
     centers, radii: (n, 3) and (n,), of the balls.
     origin: the lowest corner of the grid.
@@ -122,9 +123,10 @@ def _cell_ball_pairs(
 
 @dataclass(frozen=True)
 class BlobGrid(EmptySpaceGrid):
-    """The cell lists of blobs on a backend.
+    """The lists of the blobs near each cell of a grid, on a backend.
 
-    starts, entries: as in `CellLists`, as Dr.Jit integers.
+    starts: (cells + 1,) Dr.Jit integers: the list of cell k is entries[starts[k]:starts[k + 1]].
+    entries: the lists, one after another, as Dr.Jit integers: indices of blobs.
     """
 
     starts: Any
@@ -132,7 +134,7 @@ class BlobGrid(EmptySpaceGrid):
 
     @classmethod
     def upload(cls, backend: Backend, lists: CellLists) -> BlobGrid:
-        """The lists on a backend."""
+        """Upload the lists of all cells to a backend."""
         return cls(
             *cls.upload_layout(backend, lists),
             _MARGIN,

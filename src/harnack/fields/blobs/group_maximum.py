@@ -37,19 +37,22 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class GroupedList:
-    """A list of blobs, sorted by groups: the records with the indices entries[begin:end], or the
-    records begin to end of the table itself if `entries` is None.
+    """A list of blobs, sorted by groups, for each lane.
 
-    of: for each record of the table, the number of its group.
-    count: the number of all groups, also of those without a blob in the list.
+    records: the table of the records of all blobs.
+    group_of_record: for each record of the table, the index of its group.
+    entries: an array of indices of records; None if the list is a range of the table itself.
+    begin, end: the list has the records with the indices entries[begin:end], or if `entries` is
+        None, the records from begin to end - 1.
+    group_count: how many groups exist, including groups without a blob in this list.
     """
 
     records: RecordTable
-    of: Any
+    group_of_record: Any
     entries: Any
     begin: Any
     end: Any
-    count: Any
+    group_count: Any
 
     def record(self, i: Any) -> Any:
         """The index in the table of the record at position i of the list."""
@@ -58,18 +61,19 @@ class GroupedList:
         return dr.gather(self.records.backend.UInt32, self.entries, i)
 
     def group(self, i: Any) -> Any:
-        """The number of the group of the blob at position i of the list."""
+        """The index of the group of the blob at position i of the list."""
         kind = self.records.backend.UInt32
-        return dr.gather(kind, self.of, self.record(i), i < self.end)
+        return dr.gather(kind, self.group_of_record, self.record(i), i < self.end)
 
     def each_group(self, body: Any, state: State, label: str) -> tuple[Any, State]:
-        """Call body(for_each, state) for each group that has blobs in the list. It returns the next
-        state.
+        """Apply `body` to each group that has blobs in the list, one group after another.
 
-        for_each: the loop over the group's blobs. The body must run it.
+        body: a function (for_each, state) that returns the next state. Its argument `for_each` is
+            the loop over the group's blobs, which the body must run.
+        state: the first state.
         label: the name of the recorded loop.
 
-        Returns the number of these groups, and the last state.
+        Returns the number of groups that have blobs in the list, and the last state.
         """
         kind = self.records.backend.UInt32
 
@@ -99,7 +103,7 @@ class _OneGroup:
         self.end: Any = None
 
     def __call__(self, body: EachBlob, state: State) -> State:
-        """The state after `body` for all blobs of the group."""
+        """Apply `body` to all blobs of the group, one after another. Returns the last state."""
         blobs = self._blobs
         group = blobs.group(self._begin)
 
@@ -117,13 +121,16 @@ class _OneGroup:
 
 
 def group_maximum_at(kernel: BlobKernel, backend: Backend, p: Vec3, blobs: GroupedList) -> SumValue:
-    """The largest of the groups' sums at points p, with its gradient. The error bounds are the
-    largest of all groups."""
+    """The largest of the groups' sums at points p (3, n), with its gradient. The error bounds are
+    the largest ones of all groups.
+
+    blobs: the list of the blobs that may be nonzero at p.
+    """
     real = backend.Float
 
     def add_group(for_each: ForEach, state: State) -> State:
-        """The largest sum so far, its gradient and the largest errors so far, with another group's
-        sum included."""
+        """The state with another group included. It consists of the largest sum, the three
+        components of its gradient, and the largest error bounds of value and gradient."""
         value, x, y, z, error, gradient_error = state
         sums = value_at(kernel, backend, p, for_each)
         is_larger = sums.value > value
@@ -139,15 +146,18 @@ def group_maximum_at(kernel: BlobKernel, backend: Backend, p: Vec3, blobs: Group
     start = (real(-dr.inf), *(real(0) for _ in range(5)))
     groups, final = blobs.each_group(add_group, start, "groups")
     value, x, y, z, error, gradient_error = final
-    is_zero = (groups < blobs.count) & ~(value > 0)  # the largest sum is 0, that of a far group
+    is_zero = (groups < blobs.group_count) & ~(
+        value > 0
+    )  # then the largest sum is the sum of a far group, which is 0
     gradient = dr.select(is_zero, backend.Array3f(0), backend.Array3f(x, y, z))
     return SumValue(dr.select(is_zero, 0, value), gradient, error, gradient_error)
 
 
 def group_maximum_jet(term: Term, like: Jet, zero: Real, blobs: GroupedList) -> Jet:
-    """The jet of the largest of the groups' sums.
+    """The jet (ranges of value and derivatives on a piece of a path) of the largest of the groups'
+    sums.
 
-    term: returns the jet of a blob from its record.
+    term: a function that returns the jet of a blob from its record.
     like: any jet of the same variables and piece.
     zero: the number 0 on each lane.
     blobs: the list of all blobs.
@@ -175,12 +185,16 @@ def group_maximum_jet(term: Term, like: Jet, zero: Real, blobs: GroupedList) -> 
 
 @dataclass(frozen=True)
 class GroupMaximumEnclosure(Enclosure):
-    """An enclosure of the largest of the groups' sums, along the first `length` of the path from p.
+    """An enclosure of the largest of the groups' sums of blobs along a path: it proves lengths of
+    the path on which this maximum takes no level.
 
+    kernel: the kernel of the blobs.
     blobs: the blobs that may be nonzero there.
-    path: gives the direction, and the proofs to use.
+    path: the ray; it gives the direction of the path, and the proofs to use.
+    p: the points at which the path starts.
     value: the largest sum at p.
-    knots: the ends of the pieces on which derivatives are bounded.
+    knots: the ends of the pieces of the path on which derivatives are bounded, as distances from p.
+    length: the distance from p up to which the list of blobs is complete.
     signed: whether amplitudes may be negative.
 
     Along a path the largest sum reaches a level above it as soon as one of the sums does, and falls
@@ -200,8 +214,11 @@ class GroupMaximumEnclosure(Enclosure):
     signed: bool
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """The smaller of two lengths: the shortest free length upwards of any group, and the
-        longest free length downwards of any group (see `GroupMaximumEnclosure`).
+        """A length of the path from p that is proved to contain no level. It is the smaller of two
+        lengths: the shortest one of any group before its sum rises to the level above, and the
+        longest one of any group before its sum falls to the level below.
+
+        gaps: the differences of the largest sum at p from the next levels below and above.
 
         Proof. Take a group whose sum is lower than the largest by g. For this group the level above
         is farther by g, and the level below is nearer by g. The error of g is that of both sums.
@@ -212,8 +229,9 @@ class GroupMaximumEnclosure(Enclosure):
         real = backend.Float
 
         def add_group(for_each: ForEach, state: State) -> State:
-            """The shortest length upwards and the longest downwards, with another group's
-            included."""
+            """The state with another group included. It consists of the shortest length before a
+            sum rises to the level above, and the longest length before a sum falls to the level
+            below."""
             up, down = state
             sums = sum_along(
                 self.kernel, backend, self.p, self.path.direction, self.knots, for_each,
@@ -236,7 +254,7 @@ class GroupMaximumEnclosure(Enclosure):
         start = (real(0) + self.length, real(0))
         groups, (up, down) = self.blobs.each_group(add_group, start, "steps of groups")
         # The sums of far groups stay 0. If the level is below 0, the maximum never falls to it.
-        zero_is_above_level = (groups < self.blobs.count) & (gaps.below > self.value)
+        zero_is_above_level = (groups < self.blobs.group_count) & (gaps.below > self.value)
         down = dr.select(zero_is_above_level, self.length, down)
         down = dr.select(gaps.below == dr.inf, self.length, down)
         return fmin(dr.select(gaps.above == dr.inf, self.length, up), down)

@@ -97,8 +97,9 @@ class HRBF(Formula):
     def _largest_gradient(self) -> float | None:
         """A bound of |grad f| in the domain; None for a domain without bounds.
 
-        It adds up bounds of the terms: |grad (a r^3 + b . grad r^3)| <= 3 |a| r^2 + 6 |b| r, with r
-        the largest distance of the domain from the point.
+        It is the sum over the points p_i of bounds of the gradients of their terms,
+        |grad (a r^3 + b . grad r^3)| <= 3 |a| r^2 + 6 |b| r, with r the distance from the point p_i
+        to the farthest corner of the domain's box.
         """
         if self.domain is None or not np.isfinite(corners := np.array(self.domain.bounds())).all():
             return None
@@ -138,12 +139,14 @@ class HRBF(Formula):
         return self._sample(self._along(p, d, (0.0,)).start)
 
     def _sample(self, sums: SumValue) -> Sample:
-        """The sample at points, from the sum there, with the Lipschitz constant as its promise."""
+        """The sample at points, from the sum there. Its promise (proved bound of f near a point) is
+        the Lipschitz constant of the field in its domain."""
         promises = () if self.lipschitz is None else (Lipschitz(0 * sums.value + self.lipschitz),)
         return Sample(sums.value, sums.gradient, promises, sums.error, sums.gradient_error)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The ray sample, by one loop over the points. It has no enclosure looking back."""
+        """The sample at the position t of a ray, with enclosures: proofs of lengths ahead on which
+        f takes no level. It needs one loop over the points. There is no enclosure looking back."""
         del back
         p, d = path.point(t), path.direction
         recorder = KnotRecorder()
@@ -158,7 +161,8 @@ class HRBF(Formula):
         return RaySample(self._sample(sums.start), enclosures, (), slope, PIECES)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        """f at jets of the coordinates, or at Dr.Jit numbers."""
+        """The function f at jets of the coordinates (intervals of values and derivatives), or at
+        Dr.Jit numbers."""
         if not is_jet(x, type(self).__name__):
             return self.differentiable_value(backend_of(x).Array3f(x, y, z))
         numbers = (end for jet in (x, y, z) for entry in (jet.value, *jet.first_derivatives)
@@ -166,7 +170,7 @@ class HRBF(Formula):
         backend, records = self._prepared_for(backend_of(next(numbers)))
 
         def term(row: list[Real]) -> Jet:
-            """The jet of the term of the point with record `row`."""
+            """The jet of the term a r^3 + b . grad r^3 of the point with the record `row`."""
             u, v, w = ((entry - row[k]) - row[3 + k] for k, entry in enumerate((x, y, z)))
             r = (u**2 + v**2 + w**2).apply(sqrt)
             return r**3 * row[6] + r * (u * row[7] + v * row[8] + w * row[9])
@@ -174,7 +178,7 @@ class HRBF(Formula):
         return sum_jets(term, x, backend.Float(0), for_each_record(records))
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """The rows of the Hessian of f at p: a sum over the points."""
+        """The three rows of the Hessian of f at p, by a sum over the points."""
         backend, records = self._prepared_for(backend_of(p))
         pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
@@ -203,9 +207,10 @@ class HRBF(Formula):
         return vector(xx, xy, xz), vector(xy, yy, yz), vector(xz, yz, zz)
 
     def _along(self, p: Vec3, d: Vec3, knots: Sequence[Real]) -> SumOnRay:
-        """The sum along p + s d, with ranges of its first two derivatives on the pieces between
-        knots.
+        """The function f along the paths p + s d, with ranges of its first two derivatives by s on
+        the pieces between knots.
 
+        p, d: (3, n) starts of the paths, and their unit directions.
         knots: increasing values of s, the first of them 0. If there is only that one, derivatives
             along the line are left out.
 
@@ -331,14 +336,16 @@ class HRBF(Formula):
         return SumOnRay(start, tuple(pieces))
 
     def describe(self) -> dict[str, Any]:
+        """Facts about the field for users, as a dictionary of names and values."""
         return {"points": len(self.points)}
 
 
 @dataclass(frozen=True)
 class _TermFunctions:
-    """The functions of x whose ranges bound the derivatives of a term, at one position x of the
-    line. For h, r and u see `HRBF._along`. `bowl` and `bell` are named by the shapes of their
-    graphs."""
+    """The values, at a position x on a line, of the functions of x whose ranges bound the
+    derivatives of a point's term along the line. Here x is measured from the point of the line
+    nearest to the point p_i of the term, h is the distance of the line from p_i, r^2 = h^2 + x^2
+    and u = x/r. `bowl` and `bell` are named by the shapes of their graphs."""
 
     lift: Real  # r x
     sine: Real  # u
@@ -348,7 +355,8 @@ class _TermFunctions:
 
 
 def _term_functions(h_squared: Real, x: Real, tiny: float) -> _TermFunctions:
-    """The functions of a term at the position x of a line that passes the point at the distance h.
+    """The functions `_TermFunctions` at the position x of a line that passes the point of a term at
+    the distance h.
 
     h_squared: h^2.
     tiny: the smallest positive number, below which no distance is divided by.
@@ -368,8 +376,8 @@ def _term_functions(h_squared: Real, x: Real, tiny: float) -> _TermFunctions:
 
 
 def _offset_of_point(p: Vec3, row: list[Real]) -> tuple[Vec3, Vec3, Real, Real]:
-    """The vector v from a point to p; the vector 3 b of the point's record; the length of v; and
-    the inverse of that length."""
+    """Four results for the point p_i of the record `row`: the vector v from p_i to p; the vector 3
+    b of the record; the length of v; and one over that length."""
     v = type(p)(*((p[k] - row[k]) - row[3 + k] for k in range(3)))
     b = type(p)(row[7], row[8], row[9])
     r = dr.norm(v)
@@ -377,7 +385,8 @@ def _offset_of_point(p: Vec3, row: list[Real]) -> tuple[Vec3, Vec3, Real, Real]:
 
 
 def _solve_coefficients(points: FloatArray, normals: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The numbers a (n,) and the vectors b (n, 3) of the function: see `HRBF`.
+    """The numbers a_i (n,) and the vectors b_i (n, 3) of the function f = sum over i of a_i r_i^3 +
+    b_i . grad r_i^3, with r_i the distance from the point p_i (`HRBF`).
 
     They solve a linear system with four equations for each point: f = 0 and grad f = normal.
 

@@ -37,15 +37,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ChordProfile:
-    """The extreme values of a kernel's derivatives along a line, and where they are taken. See the
-    module for S, c1 and c2.
+    """The extreme values of the first two derivatives of a kernel along a line, and the positions
+    on the line at which the derivatives take them. Positions are measured from the point of the
+    line nearest to the kernel's center, in units of the support's radius.
 
-    half_length: S, half the length of the chord; 0 if the line misses the support.
-    steepest_position: c1.
-    steepest: the first derivative at -c1, which is its largest value.
-    max_curvature_position: c2.
-    max_second: the second derivative at c2, its maximum.
-    min_second: the second derivative at 0, its minimum.
+    half_length: S: the line is inside the support for positions from -S to S. S is 0 if the line
+        misses the support.
+    steepest_position: c1 >= 0. The first derivative has its maximum at -c1 and its minimum at c1.
+    steepest: the maximum of the first derivative; the minimum is minus this number.
+    max_curvature_position: c2 >= 0. The second derivative has its maximum at -c2 and at c2.
+    max_second: the maximum of the second derivative.
+    min_second: the minimum of the second derivative, at the position 0.
     """
 
     half_length: Real
@@ -58,14 +60,15 @@ class ChordProfile:
 
 @dataclass(frozen=True)
 class KernelLipschitz:
-    """Lipschitz constants of k and of its first two derivatives along lines. They say how fast
-    these change with the distance of the line from the center and with the position on the line, in
-    units of the support, and bound the effect of rounding.
+    """Lipschitz constants of a kernel and of its first two derivatives along lines, by which the
+    effect of rounding is bounded. They say how much these numbers change at most if the line or
+    the position on it is displaced, for each unit of the displacement. Lengths are in units of the
+    support's radius.
 
-    value: of k.
-    slope: of the first derivative along a line; also a bound of |grad k|.
-    bend: of the second derivative along a line. The jump of the second derivative at S is not
-        included.
+    value: the constant of the kernel k.
+    slope: the constant of the first derivative along a line; also a bound of |grad k|.
+    bend: the constant of the second derivative along a line. The jump of the second derivative at
+        the end of the support is not included.
     """
 
     value: float
@@ -89,49 +92,61 @@ class BlobKernel(abc.ABC):
     @property
     @abc.abstractmethod
     def steepness(self) -> KernelLipschitz:
-        """The Lipschitz constants of the kernel: see `KernelLipschitz`."""
+        """The Lipschitz constants of the kernel and of its first two derivatives along lines."""
 
     @abc.abstractmethod
     def height(self, q: FloatArray) -> FloatArray:
-        """k(q) in NumPy, in double precision."""
+        """The kernel's values k(q) in NumPy, in double precision. q: squared distances from the
+        center, in units of the support."""
 
     @abc.abstractmethod
     def profile(self, q: Real) -> tuple[Real, Real, Real]:
-        """k(q); dk/dq; and a number m. The error of k is at most 16 roundings of m plus 16
-        roundings of dk/dq."""
+        """Three numbers at the squared distance q from the center, in units of the support: the
+        value k(q); the derivative dk/dq; and a number m that bounds the rounding of k. The error of
+        k is at most 16 unit roundoffs times m plus 16 unit roundoffs times |dk/dq|."""
 
     @abc.abstractmethod
     def second_derivative(self, q: Real) -> Real:
-        """The second derivative of k by q."""
+        """The second derivative of the kernel k(q) by the squared distance q."""
 
     @abc.abstractmethod
-    def chord(self, height: Real, inside: Real) -> ChordProfile:
-        """The extreme values of the kernel's derivatives along lines.
+    def chord(self, height_squared: Real, half_chord_squared: Real) -> ChordProfile:
+        """The extreme values of the kernel's first two derivatives along lines, one for each lane.
+        Lengths are in units of the support's radius.
 
-        height: h^2, at most 1.
-        inside: S^2 = 1 - h^2, at least 0.
+        height_squared: h^2 <= 1, with h the distance of the line from the kernel's center.
+        half_chord_squared: S^2 = 1 - h^2 >= 0, with S half the length of the line's part inside the
+            support.
         """
 
     @abc.abstractmethod
-    def derivatives(self, height: Real, inside: Real, x: Real) -> tuple[Real, Real]:
-        """The first two derivatives along the lines of `chord`, at the position x, |x| <= S.
+    def derivatives(
+        self, height_squared: Real, half_chord_squared: Real, x: Real
+    ) -> tuple[Real, Real]:
+        """The first and the second derivative of the kernel along lines, at the position x. Lengths
+        are in units of the support's radius.
 
-        height, inside: h^2 and S^2.
+        height_squared: h^2 <= 1, with h the distance of the line from the kernel's center.
+        half_chord_squared: S^2 = 1 - h^2 >= 0, with S half the length of the line's part inside the
+            support.
+        x: the position on the line, from the point nearest to the center; |x| <= S.
         """
 
-    def lipschitz_fraction(self, inside: Real, nearest: Real) -> Real:
-        """A factor, at most 1, by which the constants `steepness` may be multiplied for a part of a
-        line.
+    def lipschitz_fraction(self, half_chord_squared: Real, nearest: Real) -> Real:
+        """A factor, at most 1, by which the Lipschitz constants `steepness` may be multiplied for a
+        part of a line. Lengths are in units of the support's radius.
 
-        inside: S^2 of the line.
-        nearest: a lower bound of x^2 on the part.
+        half_chord_squared: S^2, with S half the length of the line's part inside the support.
+        nearest: a lower bound of x^2 on the part, with x the position on the line from the point
+            nearest to the kernel's center.
         """
-        del inside, nearest
+        del half_chord_squared, nearest
         return 1.0
 
     @abc.abstractmethod
     def derivative_ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
-        """Ranges of k, dk/dq and d2k/dq2 on an interval of q >= 0."""
+        """Three intervals that contain the kernel k(q), its derivative dk/dq and its second
+        derivative on an interval of squared distances q >= 0."""
 
     def prepare(self, backend: Backend) -> BlobKernel:
         """The same kernel with its numbers as kernel parameters of the backend."""
@@ -140,7 +155,8 @@ class BlobKernel(abc.ABC):
 
     @property
     def amplitude(self) -> float:
-        """1 / k at the radius of a blob, that is at q = 1/support^2."""
+        """The amplitude of a blob of weight 1: one over the value of k at the radius of a blob,
+        that is at q = 1/support^2."""
         return 1.0 / float(self.height(np.array([self.support**-2.0]))[0])
 
     def function(self) -> ElementaryFunction:
@@ -187,8 +203,11 @@ class CompactKernel(BlobKernel):
     def second_derivative(self, q: Real) -> Real:
         return 6 * fmax(1 - q, 0)
 
-    def chord(self, height: Real, inside: Real) -> ChordProfile:
-        half, squared = dr.sqrt(inside), inside * inside
+    def chord(self, height_squared: Real, half_chord_squared: Real) -> ChordProfile:
+        """The extreme values of the kernel's first two derivatives along lines, by the formulas of
+        the class. The arguments are the squares h^2 and S^2 of the distance of a line from the
+        center and of half its chord, in units of the support's radius."""
+        half, squared = dr.sqrt(half_chord_squared), half_chord_squared * half_chord_squared
         zero_x = math.sqrt(0.2) * half
         return ChordProfile(
             half,
@@ -199,12 +218,17 @@ class CompactKernel(BlobKernel):
             -6 * squared,
         )
 
-    def derivatives(self, height: Real, inside: Real, x: Real) -> tuple[Real, Real]:
+    def derivatives(
+        self, height_squared: Real, half_chord_squared: Real, x: Real
+    ) -> tuple[Real, Real]:
         square = x * x
-        w = inside - square
+        w = half_chord_squared - square
         return -6 * x * (w * w), 6 * w * dr.fma(4, square, -w)
 
     def derivative_ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
+        """Intervals that contain the kernel k(q), dk/dq and d2k/dq2 for q in an interval. For q < 1
+        each of the three is monotone in q, so that the ends are values at the ends of q, widened
+        for rounding."""
         w = _one_minus(q)
         epsilon = machine_epsilon(w.lower)
         return (
@@ -254,38 +278,46 @@ class SexticKernel(BlobKernel):
     def second_derivative(self, q: Real) -> Real:
         return dr.select(q < 1, dr.fma(8 / 3, 1 - q, 10 / 9), 0)
 
-    def chord(self, height: Real, inside: Real) -> ChordProfile:
-        total = dr.fma(1.2, inside, 0.5)
-        product = inside * dr.fma(0.2, inside, 1 / 6)
+    def chord(self, height_squared: Real, half_chord_squared: Real) -> ChordProfile:
+        """The extreme values of the kernel's first two derivatives along lines, by the formulas of
+        the class. The arguments are the squares h^2 and S^2 of the distance of a line from the
+        center and of half its chord, in units of the support's radius."""
+        total = dr.fma(1.2, half_chord_squared, 0.5)
+        product = half_chord_squared * dr.fma(0.2, half_chord_squared, 1 / 6)
         zero_x = dr.sqrt(2 * product / (total + dr.sqrt(fmax(total * total - 4 * product, 0))))
-        peak_x = dr.sqrt(fmin(dr.fma(0.6, inside, 0.25), inside))
-        first, _ = self.derivatives(height, inside, zero_x)
-        _, max_second = self.derivatives(height, inside, peak_x)
+        peak_x = dr.sqrt(fmin(dr.fma(0.6, half_chord_squared, 0.25), half_chord_squared))
+        first, _ = self.derivatives(height_squared, half_chord_squared, zero_x)
+        _, max_second = self.derivatives(height_squared, half_chord_squared, peak_x)
         return ChordProfile(
-            dr.sqrt(inside),
+            dr.sqrt(half_chord_squared),
             zero_x,
             -first,
             peak_x,
             max_second,
-            -inside * dr.fma(8 / 3, inside, 20 / 9),
+            -half_chord_squared * dr.fma(8 / 3, half_chord_squared, 20 / 9),
         )
 
-    def derivatives(self, height: Real, inside: Real, x: Real) -> tuple[Real, Real]:
+    def derivatives(
+        self, height_squared: Real, half_chord_squared: Real, x: Real
+    ) -> tuple[Real, Real]:
         square = x * x
-        w = inside - square
+        w = half_chord_squared - square
         part = w * dr.fma(8 / 3, w, 20 / 9)
         return -x * part, dr.fma(square, dr.fma(32 / 3, w, 40 / 9), -part)
 
     def derivative_ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
+        """Intervals that contain the kernel k(q), dk/dq and d2k/dq2 for q in an interval. For q < 1
+        each of the three is monotone in q, so that the ends are values at the ends of q, widened
+        for rounding."""
         w = _one_minus(q)
         epsilon = machine_epsilon(w.lower)
 
         def value_at(w: Real) -> Real:
-            """k for w = 1 - q."""
+            """The kernel k(q) as a function of w = 1 - q."""
             return w * w * (4 / 9 * w + 5 / 9)
 
         def slope_at(w: Real) -> Real:
-            """dk/dq for w = 1 - q."""
+            """The derivative dk/dq as a function of w = 1 - q."""
             return -w * (4 / 3 * w + 10 / 9)
 
         second = _widened_range(8 / 3 * w.lower + 10 / 9, 8 / 3 * w.upper + 10 / 9, 4 * epsilon)
@@ -334,24 +366,36 @@ class CubicKernel(BlobKernel):
     def second_derivative(self, q: Real) -> Real:
         return dr.select(q < 1, 1.5 / dr.sqrt(fmax(q, float(dr.smallest(type(q))))), 0)
 
-    def chord(self, height: Real, inside: Real) -> ChordProfile:
-        half = dr.sqrt(inside)
-        zero_x = dr.sqrt(fmax(1 + dr.sqrt(dr.fma(8, height, 1)) - 4 * height, 0) * 0.125)
+    def chord(self, height_squared: Real, half_chord_squared: Real) -> ChordProfile:
+        """The extreme values of the kernel's first two derivatives along lines, by the formulas of
+        the class. The arguments are the squares h^2 and S^2 of the distance of a line from the
+        center and of half its chord, in units of the support's radius."""
+        half = dr.sqrt(half_chord_squared)
+        zero_x = dr.sqrt(
+            fmax(1 + dr.sqrt(dr.fma(8, height_squared, 1)) - 4 * height_squared, 0) * 0.125
+        )
         zero_x = fmin(zero_x, half)
-        first, _ = self.derivatives(height, inside, zero_x)
-        return ChordProfile(half, zero_x, -first, half, 6 * inside, 6 * dr.sqrt(height) - 6)
+        first, _ = self.derivatives(height_squared, half_chord_squared, zero_x)
+        return ChordProfile(
+            half, zero_x, -first, half, 6 * half_chord_squared, 6 * dr.sqrt(height_squared) - 6
+        )
 
-    def derivatives(self, height: Real, inside: Real, x: Real) -> tuple[Real, Real]:
+    def derivatives(
+        self, height_squared: Real, half_chord_squared: Real, x: Real
+    ) -> tuple[Real, Real]:
         square = x * x
-        r = dr.sqrt(fmax(height + square, float(dr.smallest(type(x)))))
+        r = dr.sqrt(fmax(height_squared + square, float(dr.smallest(type(x)))))
         return -6 * x * (1 - r), 6 * (square / r - (1 - r))
 
     def derivative_ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
+        """Intervals that contain the kernel k(q), dk/dq and d2k/dq2 for q in an interval. For q < 1
+        each of the three is monotone in q, so that the ends are values at the ends of q, widened
+        for rounding."""
         low, high = dr.sqrt(fmin(fmax(q.lower, 0), 1)), dr.sqrt(fmin(q.upper, 1))
         epsilon = machine_epsilon(low)
 
         def value_at(r: Real) -> Real:
-            """k at the distance r = sqrt(q)."""
+            """The kernel at the distance r = sqrt(q) from the center."""
             return (1 - r) * (1 - r) * (1 + 2 * r)
 
         # Absolute errors: of r half an epsilon, of 1 - r at most as much.
@@ -412,7 +456,8 @@ class GaussianKernel(BlobKernel):
 
     @property
     def _rate(self) -> Any:
-        """b: as a kernel parameter if the kernel is prepared, else as a number."""
+        """The number b of the class: a kernel parameter of the backend if the kernel is prepared,
+        else a Python number."""
         return self.sharpness * self.support**2 if self.rate is None else self.rate
 
     @property
@@ -440,9 +485,12 @@ class GaussianKernel(BlobKernel):
     def second_derivative(self, q: Real) -> Real:
         return dr.select(q < 1, self._rate * self._rate * dr.exp(self._rate * (1 - q)), 0)
 
-    def chord(self, height: Real, inside: Real) -> ChordProfile:
+    def chord(self, height_squared: Real, half_chord_squared: Real) -> ChordProfile:
+        """The extreme values of the kernel's first two derivatives along lines, by the formulas of
+        the class. The arguments are the squares h^2 and S^2 of the distance of a line from the
+        center and of half its chord, in units of the support's radius."""
         b = self._rate
-        z = b * inside
+        z = b * half_chord_squared
         exp_z = dr.exp(z)
         u = 1 / exp_z
         polynomial: Any = _ZERO_OF_SECOND[-1]
@@ -457,7 +505,7 @@ class GaussianKernel(BlobKernel):
             * (2 * dr.select(is_at_end, z, exp_z * math.exp(-1.5)) + dr.select(is_at_end, 0, 1))
         )
         return ChordProfile(
-            dr.sqrt(inside),
+            dr.sqrt(half_chord_squared),
             zero_x,
             2 * b * zero_x * (dr.exp(z - y) - 1),
             dr.sqrt(fmin(1.5, z) / b),
@@ -465,24 +513,36 @@ class GaussianKernel(BlobKernel):
             -2 * b * (exp_z - 1),
         )
 
-    def derivatives(self, height: Real, inside: Real, x: Real) -> tuple[Real, Real]:
+    def derivatives(
+        self, height_squared: Real, half_chord_squared: Real, x: Real
+    ) -> tuple[Real, Real]:
         b = self._rate
         y = b * (x * x)
-        e = dr.exp(b * inside - y)
+        e = dr.exp(b * half_chord_squared - y)
         return -2 * b * x * (e - 1), 2 * b * dr.fma(e, dr.fma(2, y, -1), 1)
 
-    def lipschitz_fraction(self, inside: Real, nearest: Real) -> Real:
-        """See `BlobKernel`. Proof. All constants are multiples of the largest e^z with z = b (S^2 -
+    def lipschitz_fraction(self, half_chord_squared: Real, nearest: Real) -> Real:
+        """A factor, at most 1, by which the Lipschitz constants `steepness` may be multiplied for a
+        part of a line. The arguments are those of `BlobKernel.lipschitz_fraction`.
+
+        Proof. All constants are multiples of the largest e^z with z = b (S^2 -
         x^2), which is at most e^(b (S^2 - 1)) times the value for S = 1 and x = 0. The factor e^(-b
         x^2) is bounded by e^y >= (1 + y/32)^32 with y = b x^2."""
         b = self._rate
         power = dr.fma(b / 32, nearest, 1)
         for _ in range(5):
             power = power * power
-        largest = 1.01 if isinstance(inside, float) else 1.01 * dr.exp(b * (inside - 1))
+        largest = (
+            1.01
+            if isinstance(half_chord_squared, float)
+            else 1.01 * dr.exp(b * (half_chord_squared - 1))
+        )
         return fmin(largest / power, 1)
 
     def derivative_ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
+        """Intervals that contain the kernel k(q), dk/dq and d2k/dq2 for q in an interval. For q < 1
+        each of the three is monotone in q, so that the ends are values at the ends of q, widened
+        for rounding."""
         w = _one_minus(q)
         b, epsilon = self._rate, machine_epsilon(w.lower)
         # The error of the product with b is half an epsilon, that of the exponential eight.
@@ -536,7 +596,7 @@ def _check_support(support: float) -> None:
 
 
 def _one_minus(q: Interval) -> Interval:
-    """The range of max(1 - q, 0) for q in an interval."""
+    """The interval of the values of max(1 - q, 0) for q in an interval."""
     w = Interval(1.0, 1.0) - q
     return Interval(fmax(w.lower, 0), fmax(w.upper, 0))
 
@@ -551,7 +611,8 @@ def _widened_range(lower: Real, upper: Real, relative_error: float) -> Interval:
 
 
 def _range_with_support_end(second: Interval, q: Interval) -> Interval:
-    """The range of a second derivative d2k/dq2 that is positive for q < 1 and 0 beyond.
+    """The interval of the values of a kernel's second derivative by q, if this derivative is
+    positive for q < 1 and 0 for larger q.
 
     second: its range for q < 1.
     q: the range of q. If it contains 1, the result contains 0.

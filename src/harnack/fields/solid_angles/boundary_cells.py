@@ -1,19 +1,21 @@
-"""Winding numbers modulo 1 from FMM cells.
+"""Winding numbers modulo 1 from FMM cells (octree cells, each with a list of near edges and a
+polynomial for all far edges).
 
-Modulo 1, the winding number w of a mesh is 1/(4 pi) times the solid angle of its singular edges.
-These are the edges at which triangles do not cancel; they form closed curves. Cells (`curve_cells`)
-evaluate this solid angle at nearly the same cost for any number of edges, and without following a
-ray.
+The winding number w of a mesh is, modulo 1, 1/(4 pi) times the solid angle of its singular edges:
+the edges at which the triangles do not cancel. These edges form closed curves. The cells
+(`curve_cells`) evaluate that solid angle at nearly the same cost for any number of edges.
 
-`tracer.branch_tracker.BranchTracker` determines the integer along rays: proved steps stay between
-two periodic levels, and a jump adds an integer to w. If a ray comes from outside the extent of the
-field, w is about 0 where it begins. If a ray begins inside, it gets w from the center of its cell,
-where w was computed once (`BoundaryCells.value_where_known`). Along the line from that center to
-the ray's start, the solid angle of the near loops is followed continuously, the polynomial is
-continuous, and crossings of triangles are counted. Rays take samples that know their branch only if
-rounding leaves the result of these steps uncertain, and to pass a periodic level that is no true
-level. These cells replaced a tree of chains of edges along rays, which had to open all chains that
-a ray passes through.
+The integer that is missing is tracked along each ray by `tracer.branch_tracker.BranchTracker`. A
+step of the ray that is proved free of the level modulo 1 changes w by less than 1, and a crossing
+of a triangle changes w by a known integer. So w at the end of a step follows from w at its start. A
+ray that begins outside of the field's extent begins with w near 0. A ray that begins inside takes w
+from the center of its cell, where w was computed when the cells were built
+(`BoundaryCells.value_where_known`): the change of the solid angle is followed continuously from
+there to the ray's start, and the triangles that are crossed are counted.
+
+The sum over all edges, which gives w with its integer, is needed in two cases only: if rounding
+leaves the integer uncertain, and if a ray has to pass a point at which w modulo 1 has the level but
+w has not.
 """
 
 from __future__ import annotations
@@ -82,8 +84,9 @@ class BoundaryCells:
         cls, rays: TriangleTree, mesh: WindingMesh, low: FloatArray, high: FloatArray,
         most_bytes: int, value: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
     ) -> BoundaryCells | None:  # fmt: skip
-        """Build the cells of a cube that contains the mesh and the box from low (3,) to high (3,).
-        Returns None if the cells would take more than `most_bytes` bytes.
+        """Build the cells of the singular edges of a mesh, in a cube that contains the mesh and the
+        box from low (3,) to high (3,). Returns None if they would take more than `most_bytes`
+        bytes.
 
         rays: the tree of the mesh's triangles.
         low, high: corners of the box, in the unit of the mesh's own coordinates.
@@ -127,10 +130,10 @@ class BoundaryCells:
         return self.cells.size + self.count * np.dtype(self.cells.backend.dtype).itemsize
 
     def value_where_known(self, x: Vec3, unit: Real, active: Mask) -> Real:
-        """The winding number w at x, on active lanes. It is NaN on other lanes, and wherever w does
-        not follow from the cell.
+        """The winding number w at points x, with its integer, on active lanes. It is NaN on other
+        lanes, and wherever w does not follow from w at the center of the cell that contains x.
 
-        unit: the rounding of a coordinate of x, and of the ray on which x lies.
+        unit: a bound of the rounding of a coordinate of x, and of the ray on which x lies.
 
         Proof. On the line from the cell's center c to x, w changes for two reasons: by 1/(4 pi)
         times the change of the solid angle of the boundary, and by -1 where the line crosses a
@@ -170,23 +173,27 @@ class BoundaryCells:
     def sample(
         self, x: Vec3, direction: Vec3 | None, unit: Real, active: Mask
     ) -> tuple[Sample, Mask]:
-        """A sample of w modulo 1 at x, and the mask of the lanes on which the sample is valid.
-        These are the active lanes whose x lies in a cell and is not at an edge.
+        """A sample of w modulo 1 at points x (value, gradient, errors, promises), and the mask of
+        the lanes on which it is valid: the active lanes whose x lies in a cell, not at an edge.
 
-        The promises are those of `SolidAngle`. They hold for the smooth continuation of w, without
-        its jumps.
+        The promises, proved bounds near x, are computed as those of `SolidAngle`. They hold for the
+        smooth continuation of w through the triangles, without its jumps.
 
         direction: (3,) a unit vector, along which `ray_promises` hold; None for no such promises.
-        unit: the rounding of a coordinate.
+        unit: a bound of the rounding of a coordinate.
         """
         backend = self.cells.backend
         cell_sums, inside = self.cells.sums(x, active)
         sums, rounding = cell_sums.sums, _POINT_ROUNDINGS * unit
         promises = remainder_promises(
-            sums.cubes, sums.fourths, sums.distance * (1 - SUM_MARGIN) - rounding
+            sums.inverse_cubes, sums.inverse_fourths, sums.distance * (1 - SUM_MARGIN) - rounding
         )
-        ball = lift_ball(sums.angle, sums.gradient, sums.squares, promises, cell_sums.slope_error)
-        rounded = cell_sums.rounding + vertex_rounding(backend.machine_epsilon, x, sums.squares)
+        ball = lift_ball(
+            sums.angle, sums.gradient, sums.inverse_squares, promises, cell_sums.slope_error
+        )
+        rounded = cell_sums.rounding + vertex_rounding(
+            backend.machine_epsilon, x, sums.inverse_squares
+        )
         ray_promises: tuple[Lipschitz, ...] = ()
         if direction is not None:
             line = RayLine(x, direction, rounding)
@@ -202,7 +209,8 @@ class BoundaryCells:
             _PER_SPHERE * sums.gradient,
             tuple(promise.scaled(_PER_SPHERE) for promise in promises),
             _PER_SPHERE * (cell_sums.error + rounded),
-            _PER_SPHERE * dr.fma(SLOPE_ROUNDINGS / 3 * unit, sums.cubes, cell_sums.slope_error),
+            _PER_SPHERE
+            * dr.fma(SLOPE_ROUNDINGS / 3 * unit, sums.inverse_cubes, cell_sums.slope_error),
             truncation_error=_PER_SPHERE * cell_sums.error,
             alternative_promises=(ball.scaled(_PER_SPHERE),),
             ray_promises=tuple(promise.scaled(_PER_SPHERE) for promise in ray_promises),

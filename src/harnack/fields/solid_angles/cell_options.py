@@ -1,8 +1,9 @@
 """The argument `cells` of fields that may have FMM cells, and the decision whether cells pay.
 
-Fields with cells (`dipole_cells`, `curve_cells`) take an argument `cells`. None builds cells if
-they pay, True builds cells in any case, and False builds none. A number builds cells in any case
-and limits their memory to this number of megabytes.
+FMM cells are cells of an octree, each with a list of near sources and a polynomial for all far
+sources. Fields with cells (`dipole_cells`, `curve_cells`) take an argument `cells`. None builds
+cells if they pay, True builds cells in any case, and False builds none. A number builds cells in
+any case and limits their memory to this number of megabytes.
 
 `trace`, `render`, and views that Python draws tell a field the number of rays
 (`Field.for_ray_count`). The field builds cells if that pays: to build the cells of a cloud takes as
@@ -40,7 +41,11 @@ Built = TypeVar("Built")
 
 
 class BuiltCells(Protocol):
-    """Cells that were built. count: their number. size: the number of their bytes."""
+    """The FMM cells of a field, once they have been built.
+
+    count: the number of cells.
+    size: the number of bytes that they take.
+    """
 
     @property
     def count(self) -> int: ...
@@ -126,9 +131,11 @@ class FieldWithCells(Field):
     def describe_cells(self, built: BuiltCells | None) -> dict[str, str]:
         """The entry "cells" of `describe`, or an empty dictionary if the field has no cells.
 
-        In a prepared field the entry states the number and the memory of the cells `built`, which
-        is None if they would take too much memory. In a field that is not prepared it states how
-        much memory they may take, or the smallest number of rays for which there are cells.
+        built: in a prepared field the cells; None if they would have taken too much memory.
+
+        In a prepared field the entry states the number and the memory of the cells. In a field that
+        is not prepared it states how much memory they may take. If the field decides by the number
+        of rays, the entry is the smallest number of rays for which it builds cells.
         """
         if self.cells is None and self.cells_pay_from() < math.inf:
             return {"cells": f"from {math.ceil(self.cells_pay_from()):,} rays on"}

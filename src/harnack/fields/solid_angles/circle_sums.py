@@ -138,15 +138,16 @@ class UnitCircle:
 
     @property
     def across(self) -> Real:
-        """z J. The component of the gradient perpendicular to the axis is (x, y) times this."""
+        """z J, with the integral J of the class. The component of the gradient perpendicular to the
+        axis is (x, y) times this number."""
         return (self.z * self.share) * (self.share * self.radial)
 
     def second_derivatives(self) -> tuple[Real, Real, Real]:
-        """The numbers Omega_zz, Omega_rz/r and z J. With the axial direction z, the radial
-        direction r and the tangential direction t of the circle, these are the entries zz and rz
-        (over r) and tt of the Hessian.
+        """Three numbers from which the Hessian of the solid angle follows: its entry zz, its entry
+        rz divided by r, and its entry tt, which is z J with the integral J of the class.
 
-        The entry rr is minus the sum of the first and the last; rt and zt are 0.
+        z is the direction of the circle's axis, r the radial and t the tangential direction. The
+        entry rr is minus the sum of the entries zz and tt; the entries rt and zt are 0.
         """
         r, z = self.r, self.z
         a_sum = dr.fma(r, r, dr.fma(z, z, 1))  # A
@@ -161,22 +162,23 @@ class UnitCircle:
 
 @dataclass(frozen=True)
 class CircleSums:
-    """Sums over circles at a point x.
+    """Quantities of a set of circles at a point x, summed over the circles.
 
-    angle, gradient: the solid angle and its gradient. The angle of each circle is in (-2 pi, 2 pi).
+    angle, gradient: the sum of the circles' solid angles, each in (-2 pi, 2 pi), and its gradient.
     distance: the distance to the nearest circle.
-    squares, cubes, fourths: integrals of |dp|/D^k along the circles, with D the distance from x to
-        the point p. For k = 2 and k = 3 these are the integrals, for k = 4 an upper bound.
-    lower, upper: bounds of the lifted angle on the ball around x of radius `distance` (see
-        `planar`).
+    inverse_squares, inverse_cubes: the integrals of |dp|/D^2 and |dp|/D^3 along the circles, with D
+        the distance from x to the point p of a circle.
+    inverse_fourths: an upper bound of the integral of |dp|/D^4.
+    lower, upper: bounds of the lifted angle on the ball around x of radius `distance`. The lifted
+        angle is the angle continued from x without its jumps of 4 pi (`planar` has the proof).
     """
 
     angle: Real
     gradient: Vec3
     distance: Real
-    squares: Real
-    cubes: Real
-    fourths: Real
+    inverse_squares: Real
+    inverse_cubes: Real
+    inverse_fourths: Real
     lower: Real
     upper: Real
 
@@ -226,13 +228,17 @@ class CircleSet:
         return cls(RecordTable.upload(backend, np.array(rows)))
 
     def sums(self, x: Vec3) -> CircleSums:
-        """All sums at points x (3, n), in one loop over the circles."""
+        """The sums over all circles at points x (3, n), in unit coordinates, in one loop over the
+        circles."""
         real, vector = self._types
         x = vector(x)
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """The running sums `state`, with those of the circle in a record added."""
-            angle, gradient, distance, squares, cubes, fourths, lower = state
+            """Add the circle in the record `row` to the state: angle, gradient, nearest distance,
+            the three integrals, and the lower bound of the lifted angle."""
+            angle, gradient, distance, inverse_squares, inverse_cubes, inverse_fourths, lower = (
+                state
+            )
             relative = self._relative(row, x)
             circle, a = relative.circle, relative.a
             # In units of the circle's radius, so that all numbers are of order one.
@@ -249,26 +255,30 @@ class CircleSet:
                 angle + circle.angle,
                 gradient,
                 fmin(relative.distance, distance),
-                squares + 2 * math.pi / (nearest * farthest * a),
-                cubes + cube,
-                fourths + cube / (nearest * a),
+                inverse_squares + 2 * math.pi / (nearest * farthest * a),
+                inverse_cubes + cube,
+                inverse_fourths + cube / (nearest * a),
                 lower + lower_end,
             )
 
         start = (real(0), vector(0), real(dr.inf), real(0), real(0), real(0), real(0))
-        angle, gradient, distance, squares, cubes, fourths, lower = self.records.for_each(
-            add, start, "circles"
+        angle, gradient, distance, inverse_squares, inverse_cubes, inverse_fourths, lower = (
+            self.records.for_each(add, start, "circles")
         )
         upper = lower + 4 * math.pi * real(self.records.iteration_count)
-        return CircleSums(angle, gradient, distance, squares, cubes, fourths, lower, upper)
+        return CircleSums(
+            angle, gradient, distance, inverse_squares, inverse_cubes, inverse_fourths, lower, upper
+        )
 
     def hessian(self, x: Vec3) -> SymmetricMatrix:
-        """The Hessian of the sum of solid angles at points x."""
+        """The Hessian of the sum of the circles' solid angles at points x (3, n), in unit
+        coordinates."""
         real, vector = self._types
         x = vector(x)
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """The entries `state` of the Hessian, with those of the circle in a record added."""
+            """Add the Hessian of the circle in the record `row` to the entries `state` of the
+            total."""
             relative = self._relative(row, x)
             a, n, outward = relative.a, relative.normal, relative.outward
             f_zz, f_rz_over_r, f_tt = relative.circle.second_derivatives()
@@ -324,7 +334,7 @@ class CircleSet:
         real, vector = self._types
 
         def add(row: list[Real], rates: tuple[Any, ...]) -> tuple[Any, ...]:
-            """The bounds `rates`, with those of the circle in a record added."""
+            """Add the circle in the record `row` to the bounds `rates`, one for each length."""
             relative = self._relative(row, line.x)
             slack, axial = line.slack, fmin(dr.abs(dr.dot(relative.normal, line.v)), 1)
             across = dr.sqrt(fmax(1 - axial * axial, 0))
@@ -358,7 +368,8 @@ class CircleSet:
         return tuple(dr.select(active, rate, dr.inf) for rate in rates)
 
     def closest(self, x: Vec3) -> tuple[Vec3, Real]:
-        """The point of the circles that is closest to x, and the square of its distance from x."""
+        """The point (3, n) on the circles that is closest to each point x (3, n), and the square of
+        its distance from x. Both are in unit coordinates."""
         real, vector = self._types
         x = vector(x)
 
@@ -385,7 +396,7 @@ class CircleSet:
         return self.records.backend.Float, self.records.backend.Array3f
 
     def _relative(self, row: list[Real], x: Vec3) -> _RelativeCircle:
-        """The circle in a record, relative to x."""
+        """The circle in a record (center, radius, normal), relative to points x."""
         vector = self.records.backend.Array3f
         center, a, normal = vector(*row[:3]), row[3], vector(*row[4:7])
         displacement = x - center

@@ -1,8 +1,10 @@
 """Builds FMM cells of curves (`curve_cells`), one octree depth at a time.
 
-A cell inherits the local expansion and the near list of its parent. Edges of that list that are far
-from the cell are added to the expansion. So the work for a cell is proportional to the near list of
-its parent, and not to the whole curve. All edges are visited only for bounds of the far edges.
+In a cell, the solid angle of a curve is a sum over a list of near edges, plus a local expansion: a
+polynomial for all far edges. A cell inherits the expansion and the near list of its parent. The
+edges of that list that are far from the cell are added to the expansion. So the work for a cell is
+proportional to the near list of its parent, and not to the whole curve. All edges are visited only
+for bounds of the far edges.
 
 - `build_curve_cells`: builds the cells of a cube, with a limit of their bytes.
 """
@@ -101,8 +103,9 @@ def build_curve_cells(
 
 @dataclass
 class _CurveCellBuilder:
-    """Cells under construction.
+    """The cells of a cube under construction: the octree of the cells, and their records.
 
+    backend: the backend of the finished cells.
     vertices, edges: the curve, for runs of edges and for sums over all edges.
     middle, half: center (3,) of the cube, and half of its side.
     most_near, max_tail_ratio: a cell is split if it has more near edges than `most_near`, or if its
@@ -142,7 +145,9 @@ class _CurveCellBuilder:
         for depth in range(MAX_DEPTH + 1):
             half_side = self.half / 2**depth
             radius = math.sqrt(3) * half_side * BALL_MARGIN
-            is_leaf, runs, far = self._level(centers, radius, runs, far, is_last=depth == MAX_DEPTH)
+            is_leaf, runs, far = self._build_depth(
+                centers, radius, runs, far, is_last=depth == MAX_DEPTH
+            )
             split = np.flatnonzero(~is_leaf)
             self.nodes.append(encode_nodes(is_leaf, self.leaves - int(is_leaf.sum()), split_count))
             split_count += len(split)
@@ -154,7 +159,7 @@ class _CurveCellBuilder:
             centers = (centers[split][:, None] + 0.5 * half_side * OCTANT_DIRECTIONS).reshape(-1, 3)
         return True
 
-    def _level(
+    def _build_depth(
         self,
         centers: FloatArray,
         radius: float,
@@ -163,12 +168,13 @@ class _CurveCellBuilder:
         *,
         is_last: bool,
     ) -> tuple[BoolArray, EdgeRuns, EdgeExpansions]:
-        """Build the n cells of one depth of the octree. Records of the cells that are not split are
-        appended to `tables` and `near`.
+        """Build the n cells of one depth of the octree, and decide which of them are split. Records
+        of the cells that are not split are appended to `tables` and `near`.
 
         centers: (n, 3) of the cells.
         radius: the radius of their balls.
-        runs, far: the near runs and the expansions that the cells inherit from their parents.
+        runs: the runs of consecutive edges that the cells inherit from their parents' near lists.
+        far: the expansions of far edges that the cells inherit from their parents.
         is_last: whether no cell may be split any more.
 
         Returns the mask (n,) of the cells that are not split, and the near runs and the expansions
@@ -225,7 +231,7 @@ class _CurveCellBuilder:
         )
 
     def cells(self) -> CurveCells:
-        """The cells that were built, uploaded to the backend."""
+        """The finished cells, uploaded to the backend."""
         backend = self.backend
         lookup = OctreeLookup.from_levels(
             backend, self.middle - self.half, 2 * self.half, self.nodes
@@ -238,34 +244,40 @@ class _CurveCellBuilder:
 
 @dataclass(frozen=True)
 class _FarBounds:
-    """Sums over the far edges of n cells. D is the distance of an edge's point from the cell's
-    center.
+    """Bounds of the far edges of n cells, for the ball of each cell. D is the distance of a point
+    of an edge from the cell's center.
 
     least: (n,) a lower bound of the distance of the far edges from the center.
-    cubes: (n,) an upper bound of the integral of |dp|/D^3.
+    inverse_cubes: (n,) an upper bound of the integral of |dp|/D^3.
     slope: (n, 3) the gradient of this integral as a function of the center.
     tail: (n,) an estimate of the truncation error of the expansion's value.
     total: (n,) an upper bound of the integral of |dp|/D^2, over all edges.
     """
 
     least: FloatArray
-    cubes: FloatArray
+    inverse_cubes: FloatArray
     slope: FloatArray
     tail: FloatArray
     total: FloatArray
 
     @classmethod
     def of(cls, edges: LoopEdges, centers: FloatArray, radius: float) -> _FarBounds:
-        """The sums for cells with these centers (n, 3) and balls of this radius. Some near edges
-        may count as well."""
+        """The bounds for cells with these centers (n, 3) and balls of this radius. Edges farther
+        than about `_NEAR_RADII` radii from a center count as far."""
         backend, c = edges.backend, to_vector3(edges.backend, centers)
         ball_radius = dr.opaque(backend.Float, radius)
         far_from = dr.opaque(backend.Float, _NEAR_RADII * radius * (1 - _SUM_MARGIN))
 
         def add(p: Vec3, q: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Add the edge from p to q to the sums `state`, at the centers c: the least squared
-            distance, and the others in the order of the attributes. inverse: 1/|q - p|^2."""
-            least_square, cubes, slope, tail, total = state
+            """Add the edge from p to q to the sums `state` of the cells with the centers c.
+
+            The state holds the smallest squared distance of a far edge; then, summed over the far
+            edges, the integral of |dp|/D^3, the gradient of this integral, and an estimate of the
+            truncation error; then, summed over all edges, the integral of |dp|/D^2.
+
+            inverse: 1/|q - p|^2.
+            """
+            least_square, inverse_cubes, slope, tail, total = state
             edge = Edge.between(p, q, inverse, c)
             square, length = edge.squared_distance, dr.rsqrt(inverse)
             weight, inverse_distance = edge.biot_savart()[0] * length, dr.rsqrt(square)
@@ -276,7 +288,7 @@ class _FarBounds:
             new_slope = dr.fma(type(slope)(length), edge.hessian_factors()[1], slope)
             return (
                 dr.select(is_far, fmin(least_square, square), least_square),
-                cubes + dr.select(is_far, weight, 0),
+                inverse_cubes + dr.select(is_far, weight, 0),
                 dr.select(is_far, new_slope, slope),
                 tail + dr.select(is_far, truncation, 0),
                 dr.fma(2 * weight, square * inverse_distance, total),
@@ -287,13 +299,17 @@ class _FarBounds:
         sums = edges.for_each(add, start, "around cells")
         dr.eval(*sums)
         columns = (to_numpy(column).astype(np.float64) for column in sums)
-        least_square, cubes, slope, tail, total = columns
+        least_square, inverse_cubes, slope, tail, total = columns
         return cls(
-            np.sqrt(least_square) * (1 - _SUM_MARGIN), cubes * (1 + _SUM_MARGIN), slope, tail, total
+            np.sqrt(least_square) * (1 - _SUM_MARGIN),
+            inverse_cubes * (1 + _SUM_MARGIN),
+            slope,
+            tail,
+            total,
         )
 
     def subset(self, which: BoolArray) -> _FarBounds:
-        """The sums of the cells that a mask selects."""
+        """The bounds of the cells that a mask (n,) selects."""
         return _FarBounds(*(values[which] for values in vars(self).values()))
 
 
@@ -317,13 +333,14 @@ def _distances(
 def near_records(
     vertices: VertexTable, runs: EdgeRuns, is_leaf: BoolArray
 ) -> tuple[FloatArray, IntArray, IntArray]:
-    """Records of near edges (`CurveCells.near`) of the cells that are not split.
+    """Records of the near edges of the cells that are not split, as `CurveCells.near` describes
+    them.
 
-    runs: the near runs of all cells, closed by apexes.
-    is_leaf: the mask of the cells that are not split.
+    runs: the near runs of all n cells, closed by apexes.
+    is_leaf: (n,) the mask of the cells that are not split.
 
-    Returns the table of records, and for each cell that is not split the index of its first record
-    and the number of its records.
+    Returns the table of records; and two arrays with an entry for each cell that is not split: the
+    index of its first record, and the number of its records.
     """
     run_ids = np.flatnonzero(is_leaf[runs.cell])
     first, count, is_open = runs.first[run_ids], runs.count[run_ids], ~runs.is_whole[run_ids]
@@ -380,11 +397,12 @@ def _cell_records(
     backend: Backend, centers: FloatArray, radius: float, far: EdgeExpansions, bounds: _FarBounds,
     factor: FloatArray, first: IntArray, count: IntArray,
 ) -> FloatArray:  # fmt: skip
-    """Records (n, k) of cells, as described for `CurveCells.records`.
+    """The records (n, k) of n cells that are not split, with the columns that `CurveCells.records`
+    describes.
 
     centers, radius: centers (n, 3) of the cells, and the radius of their balls.
     far, bounds: expansions and bounds of their far edges.
-    factor: (n,) the result of `_rounding_factor`.
+    factor: (n,) factors for the rounding of the near loops, from `_rounding_factor`.
     first, count: (n,) index of the first record of near edges, and the number of these records.
 
     The rounding of the value has three parts. The first is that of the polynomial without its
@@ -401,5 +419,12 @@ def _cell_records(
     value = rounding[:, 0] + backend.machine_epsilon * (48 + 7.25 * VERTICES_PER_RECORD * count)
     slope = far.slope + rounding[:, 1:].sum(axis=1) / radius
     inverse, least = np.full(len(first), 1 / radius), np.minimum(bounds.least, 1e3)
-    columns = [far.error * margin, slope * margin, value * margin, least, factor, bounds.cubes]
+    columns = [
+        far.error * margin,
+        slope * margin,
+        value * margin,
+        least,
+        factor,
+        bounds.inverse_cubes,
+    ]
     return np.column_stack([centers, inverse, *columns, bounds.slope, first, count, coefficients])

@@ -30,7 +30,7 @@ import numpy as np
 from harnack.backend import to_numpy
 from harnack.backend.elementary import fmin
 from harnack.fields.solid_angles.edge_expansion import COEFFICIENTS, DEGREE
-from harnack.fields.solid_angles.edge_lift import LiftedProduct, ends_factor, view_vertex
+from harnack.fields.solid_angles.edge_lift import LiftedProduct, edge_factor_of_views, view_vertex
 from harnack.fields.solid_angles.edges import Edge, EdgeSums, inner_product, spinor
 from harnack.fields.solid_angles.local_expansion import evaluate_expansion
 from harnack.fields.solid_angles.trail_sums import add_edge_rates
@@ -93,9 +93,9 @@ class CurveCells:
     records: one record per cell. In this order it holds: center (3,) and one over the radius;
         bounds of the truncation errors of value and gradient, and of the rounding of the value; a
         lower bound of the distance of the far edges from the center; the factor that multiplies
-        `EdgeSums.squares` of the near edges; an upper bound of the integral of |dp|/D^3 over the
-        far edges, D the distance from the center, and the gradient (3,) of this integral; index of
-        the first record of near edges, and the number of these records; and after these
+        `EdgeSums.inverse_squares` of the near edges; an upper bound of the integral of |dp|/D^3
+        over the far edges, D the distance from the center, and the gradient (3,) of this integral;
+        index of the first record of near edges, and the number of these records; and after these
         `HEADER_SIZE` numbers the coefficients of the expansion.
     near: records of two vertices each. For each vertex a record holds its position (3,) and a
         number for the edge that leads to it: one over the squared length of this edge, negative
@@ -116,8 +116,9 @@ class CurveCells:
         return to_numpy(self.backend.Array3f(*row[:3])).astype(np.float64)
 
     def sums(self, x: Vec3, active: Mask) -> tuple[CurveCellSums, Mask]:
-        """The sums over all edges at x, and the mask of the lanes on which they hold. These are the
-        active lanes whose point lies in the cube.
+        """The sums over all edges at points x, from the near edges and the expansion of the cell
+        that contains x; and the mask of the lanes on which they hold. These are the active lanes
+        whose point lies in the cube of the cells.
 
         Proof of the bound of I3, the integral of |dp|/D^3 over far edges, at the point c + u. It
         follows from I3 and its gradient at the center c. For a point p of an edge, let D = |p - c|,
@@ -134,7 +135,7 @@ class CurveCells:
         cell, inside = self.lookup.find_leaf(x)
         active = active & inside
         row = self.records.read_record(cell, active)
-        inverse, error, slope_error, rounding, far_least, factor, cubes = row[3:10]
+        inverse, error, slope_error, rounding, far_least, factor, inverse_cubes = row[3:10]
         center = vector(*row[:3])
         u = x - center
         constant, *rest = row[HEADER_SIZE : HEADER_SIZE + COEFFICIENTS]
@@ -149,14 +150,14 @@ class CurveCells:
         q, far_free = distance / far_least, far_least - distance
         least_over_free = far_least / far_free
         psi = dr.fma(q, dr.fma(3, q, -8), 6) * least_over_free * least_over_free * least_over_free
-        far_i3 = dr.fma(cubes, dr.fma(dr.square(q), psi, 1), dr.dot(u, vector(*row[10:13])))
+        far_i3 = dr.fma(inverse_cubes, dr.fma(dr.square(q), psi, 1), dr.dot(u, vector(*row[10:13])))
         sums = EdgeSums(
             near.angle + (constant + value),
             near.gradient + slope,
             fmin(near.distance, far_free),
-            near.squares * factor,
-            near.cubes + far_i3,
-            near.fourths + far_i3 / far_free,
+            near.inverse_squares * factor,
+            near.inverse_cubes + far_i3,
+            near.inverse_fourths + far_i3 / far_free,
         )
         details = (
             error,
@@ -179,9 +180,9 @@ class CurveCells:
         """The change of the solid angle from the cell's center to x, followed continuously along
         the line between them; and the mask of the lanes on which this change is certain.
 
-        found: the sums at x.
+        found: the result of `sums` at x.
         frame: the frame of the rays from the center to x.
-        unit: the rounding of a coordinate.
+        unit: a bound of the rounding of a coordinate.
 
         Proof. The far edges contribute the polynomial, everywhere in the ball. The near loops are
         closed, so that the lifted sum of their edges (`edge_lift`) is their solid angle; it has no
@@ -195,12 +196,19 @@ class CurveCells:
         count, center = dr.select(active, found.count, 0), found.center
 
         def runs(i: Any, *_: Any) -> Mask:
-            """Whether the lane has further records of near edges."""
+            """The mask of the lanes that have further records of near edges."""
             return i < count
 
         def body(i: Any, p: Vec3, is_certain: Mask, *products: Real) -> tuple[Any, ...]:
-            """Multiply both products, at x and at the center, by the factors of the edges of record
-            i. p: the vertex before the record. Returns the state of the loop."""
+            """Multiply the two products of the state, one at x and one at the cell's center, by the
+            factors of the edges of record i.
+
+            p: the vertex before the record.
+            is_certain: the mask of the lanes on which no rounding has mattered so far.
+            products: the parts of both products.
+
+            Returns the state of the loop.
+            """
             row = self.near.read_record(found.near_first + i, i < count)
             at_x, at_center = LiftedProduct(*products[:3]), LiftedProduct(*products[3:])
             a, a_center = view_vertex(p, frame, x), view_vertex(p, frame, center)
@@ -230,7 +238,7 @@ class CurveCells:
         """For each length T, a bound of the size of the derivative of the solid angle along a line,
         at all points of the line within T of x in both directions.
 
-        found: the sums at x.
+        found: the result of `sums` at x.
         line: the line through x = line.x, with the unit direction v = line.v.
         lengths: the lengths T.
 
@@ -248,12 +256,17 @@ class CurveCells:
         count = dr.select(active, found.count, 0)
 
         def runs(i: Any, *_: Any) -> Mask:
-            """Whether the lane has further records of near edges."""
+            """The mask of the lanes that have further records of near edges."""
             return i < count
 
         def body(i: Any, p: Vec3, field: Vec3, *rates: Real) -> tuple[Any, ...]:
-            """Add the edges of record i: those of the curve to `rates`, and closing edges to
-            `field`. p: the vertex before the record. Returns the state of the loop."""
+            """Add the edges of record i. An edge of the curve adds to `rates`, the bounds for all
+            lengths. An edge that closes a run adds its Biot and Savart field to `field`.
+
+            p: the vertex before the record.
+
+            Returns the state of the loop.
+            """
             row = self.near.read_record(found.near_first + i, i < count)
             for k in range(VERTICES_PER_RECORD):
                 q, inverse = vector(*row[4 * k : 4 * k + 3]), row[4 * k + 3]
@@ -270,7 +283,7 @@ class CurveCells:
         start = (*start, *(self.backend.Float(0) for _ in lengths))
         _, _, field, *rates = dr.while_loop(start, runs, body, label="near edges along")
         slope = dr.abs(dr.dot(field, line.v)) + found.slope_error
-        slope = slope + SUM_MARGIN * found.sums.squares
+        slope = slope + SUM_MARGIN * found.sums.inverse_squares
         half_k = (1 + SUM_MARGIN) * 1.5 * found.far_i3  # K/2
         valid_length = _LINE_FRACTION * found.far_distance
         return tuple(
@@ -281,15 +294,16 @@ class CurveCells:
         )
 
     def _sum_near(self, x: Vec3, first: Any, count: Any) -> EdgeSums:
-        """Sums over the edges of near loops at x, as of `sum_over_edges`. Edges that close runs do
-        not count in the distance, in `cubes` and in `fourths`, which are about the curve.
+        """The sums of `edges.sum_over_edges`, over the near loops of a cell only, at points x.
+        Edges that close runs do not count in the distance, in `inverse_cubes` and in
+        `inverse_fourths`, which are about the curve.
 
         first, count: index of the first record of near edges, and the number of these records.
         """
         real, index, vector = self.backend.Float, self.backend.UInt32, self.backend.Array3f
 
         def runs(i: Any, *_: Any) -> Mask:
-            """Whether the lane has further records of near edges."""
+            """The mask of the lanes that have further records of near edges."""
             return i < count
 
         def body(i: Any, *state: Any) -> tuple[Any, ...]:
@@ -297,7 +311,9 @@ class CurveCells:
             zi), half the gradient g, the least squared distance d2 and the three integrals, and of
             the last vertex: its position p, and a = p - x with |a|, s and spinor.
             """
-            zr, zi, g, d2, squares, cubes, fourths, p, a, la, sa, *ca = state
+            zr, zi, g, d2, inverse_squares, inverse_cubes, inverse_fourths, p, a, la, sa, *ca = (
+                state
+            )
             row = self.near.read_record(first + i, i < count)
             for k in range(VERTICES_PER_RECORD):
                 q, inverse = vector(*row[4 * k : 4 * k + 3]), row[4 * k + 3]
@@ -313,30 +329,52 @@ class CurveCells:
                 inverse_square = dr.select(is_edge, dr.abs(inverse), 1)
                 square = squared_distance_to_segment(a, e, inverse_square)
                 term, inverse_d = weight * dr.rsqrt(inverse_square), dr.rsqrt(square)
-                squares = squares + dr.select(is_edge, term * square * inverse_d, 0)
+                inverse_squares = inverse_squares + dr.select(is_edge, term * square * inverse_d, 0)
                 d2 = dr.select(on_curve, fmin(square, d2), d2)
-                cubes = cubes + dr.select(on_curve, term, 0)
-                fourths = fourths + dr.select(on_curve, term * inverse_d, 0)
+                inverse_cubes = inverse_cubes + dr.select(on_curve, term, 0)
+                inverse_fourths = inverse_fourths + dr.select(on_curve, term * inverse_d, 0)
                 p, a, la, sa, ca = q, b, lb, sb, cb
             scale = dr.rcp(dr.abs(zr) + dr.abs(zi))
             zr, zi = zr * scale, zi * scale
-            return i + 1, zr, zi, g, d2, squares, cubes, fourths, p, a, la, sa, *ca
+            return (
+                i + 1,
+                zr,
+                zi,
+                g,
+                d2,
+                inverse_squares,
+                inverse_cubes,
+                inverse_fourths,
+                p,
+                a,
+                la,
+                sa,
+                *ca,
+            )
 
         unit, zero = real(1), real(0)
         start = (unit, zero, vector(0), real(dr.inf), zero, zero, zero, vector(0), vector(1), unit,
                  unit, unit, zero, zero, zero)  # fmt: skip
         sums = dr.while_loop((index(0), *start), runs, body, label="near edges")[1:8]
-        zr, zi, g, d2, squares, cubes, fourths = sums
+        zr, zi, g, d2, inverse_squares, inverse_cubes, inverse_fourths = sums
         angle = 2 * dr.atan2(zi, zr)
-        return EdgeSums(angle, 2 * g, dr.sqrt(d2), 4 * squares, 2 * cubes, 2 * fourths)
+        return EdgeSums(
+            angle, 2 * g, dr.sqrt(d2), 4 * inverse_squares, 2 * inverse_cubes, 2 * inverse_fourths
+        )
 
 
 def _with_edge(
     product: LiftedProduct, a: VertexView, b: VertexView, is_edge: Mask, slack: Real
 ) -> tuple[LiftedProduct, Mask]:
-    """The product times the factor of the edge from a to b, on lanes on which `is_edge` is true;
-    and the mask of the lanes on which that factor is farther than `slack` from the negative axis,
-    or is left out."""
-    re, im = ends_factor(a, b, type(slack)(1))
+    """Multiply a product by the complex factor of the edge from a to b, on lanes on which `is_edge`
+    is true.
+
+    slack: a bound of the rounding of the factor's real and imaginary part.
+
+    Returns the new product, and the mask of the lanes on which rounding cannot change the sign of
+    the factor's argument: the factor is farther than `slack` from the negative axis, or is left
+    out.
+    """
+    re, im = edge_factor_of_views(a, b, type(slack)(1))
     is_sure = ~is_edge | (dr.abs(im) > slack) | (re > slack)
     return product.times(dr.select(is_edge, re, 1), dr.select(is_edge, im, 0)), is_sure

@@ -3,12 +3,13 @@
 - `differentiable_angle`: the solid angle as an expression that Dr.Jit differentiates.
 - `closest_on_segments`: the closest point of the curve, at which the level sets end.
 - `continuous_change`: the change of the solid angle along a straight segment.
-- `remainder_promises`, `gradient_change_bound`, `lift_ball`: promises of the solid angle near a
-  point.
+- `remainder_promises`, `gradient_change_bound`, `lift_ball`: promises (proved bounds) of the solid
+  angle near a point.
 
-Curves promise a bound of second derivatives. It comes from the integral of |dp|/|p - x|^3, which is
-also the weight in Biot and Savart's law. Caps and the published step rule need ranges on balls
-instead; with these, polygons and knots take 1.4 to 2 times as many evaluations.
+By default a curve promises a bound of second derivatives. It comes from the integral of
+|dp|/|p - x|^3, which is also the weight in Biot and Savart's law. Other step rules need the range
+of the solid angle on a ball instead; with these, polygons and knots take 1.4 to 2 times as many
+evaluations.
 """
 
 from __future__ import annotations
@@ -60,7 +61,8 @@ def differentiable_angle(backend: Backend, loops: tuple[Any, ...], x: Vec3) -> R
 
 
 def _loop_angle(backend: Backend, vertices: Vec3, x: Vec3) -> Real:
-    """`differentiable_angle` of one loop with these vertices."""
+    """The solid angle (n,), in steradians and modulo 4 pi, of one closed loop at points x (3, n),
+    as an expression that Dr.Jit can differentiate. vertices: (3, m) of the loop."""
     point_count, edge_count = dr.width(x), dr.width(vertices)
     lane = dr.arange(backend.UInt32, point_count * edge_count)
     point, edge = lane // edge_count, lane % edge_count
@@ -75,13 +77,14 @@ def _loop_angle(backend: Backend, vertices: Vec3, x: Vec3) -> Real:
 
 def segment_records(backend: Backend, start: FloatArray, end: FloatArray) -> RecordTable:
     """Records of the k >= 1 segments from start (k, 3) to end (k, 3). The coordinates should be of
-    order one. A segment whose ends are equal in the backend's precision becomes a point."""
+    order one. Ends that are equal in the backend's precision make a record of a point."""
     start, end = (q.astype(backend.dtype).astype(np.float64) for q in (start, end))
     return RecordTable.upload(backend, single_edges(start, end))
 
 
 def closest_on_segments(segments: RecordTable, x: Vec3) -> Vec3:
-    """The point of the segments that is closest to x."""
+    """The point (3, n) on any of the segments that is closest to each point x (3, n). segments:
+    the result of `segment_records`."""
     vector = segments.backend.Array3f
     x = vector(x)
 
@@ -101,8 +104,8 @@ def closest_on_segments(segments: RecordTable, x: Vec3) -> Vec3:
 
 
 def continuous_change(edges: LoopEdges, p: Vec3, q: Vec3) -> Real:
-    """The change of the solid angle, followed continuously along the segment from p to q. p and q
-    must differ.
+    """The change (n,) of the curve's solid angle, followed continuously along the segments from
+    points p to points q. p and q must differ.
 
     The change is the integral of Biot and Savart's field along the segment. For an edge from a to b
     of the curve, it is minus the solid angle at the origin of the parallelogram (a - p) + s (b - a)
@@ -114,7 +117,9 @@ def continuous_change(edges: LoopEdges, p: Vec3, q: Vec3) -> Real:
     real = edges.backend.Float
 
     def add(a: Vec3, b: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """The change `state`, with that of the edge from a to b added."""
+        """Add the edge from a to b to the change of the solid angle, which is the state of the
+        loop.
+        inverse: not used here."""
         del inverse
         ap, bp, bq, aq = a - p, b - p, b - q, a - q
         return (state[0] - _angle(ap, bp, bq) - _angle(ap, bq, aq),)
@@ -135,11 +140,14 @@ def _angle(a: Vec3, b: Vec3, c: Vec3) -> Real:
 _RADIUS_FRACTIONS = (0.3, 0.6, 0.85)
 
 
-def remainder_promises(cubes: Real, fourths: Real, distance: Real) -> tuple[TaylorRemainder, ...]:
-    """Bounds of the remainder of the solid angle after its linear term, on balls around x.
+def remainder_promises(
+    inverse_cubes: Real, inverse_fourths: Real, distance: Real
+) -> tuple[TaylorRemainder, ...]:
+    """Promises for a curve's solid angle at points x: bounds of what it differs, on balls around x,
+    from its linear Taylor polynomial at x.
 
-    cubes, fourths: I3 and I4, the integrals of |dp|/|D|^3 and |dp|/|D|^4 over the curve, with D = p
-        - x.
+    inverse_cubes, inverse_fourths: I3 and I4, the integrals of |dp|/|D|^3 and |dp|/|D|^4 over the
+        curve, with D = p - x.
     distance: the distance d from x to the curve, or a lower bound of it.
 
     Returns one promise for each radius q d, for a few fixed fractions q.
@@ -160,20 +168,27 @@ def remainder_promises(cubes: Real, fourths: Real, distance: Real) -> tuple[Tayl
     """
     scale = 1.5 * (1 + SUM_MARGIN)
     return tuple(
-        TaylorRemainder(scale * dr.fma(q / (1 - q) * distance, fourths, cubes), q * distance)
+        TaylorRemainder(
+            scale * dr.fma(q / (1 - q) * distance, inverse_fourths, inverse_cubes), q * distance
+        )
         for q in _RADIUS_FRACTIONS
     )
 
 
-def gradient_change_bound(cubes: Real, fourths: Real, distance: Real, radius: Real) -> Real:
-    """A bound of the change of the gradient within the distance `radius` of x. It is infinite
-    unless `radius` is less than `distance`.
+def gradient_change_bound(
+    inverse_cubes: Real, inverse_fourths: Real, distance: Real, radius: Real
+) -> Real:
+    """A bound of |grad f(y) - grad f(x)| for |y - x| <= `radius`, with f the solid angle of a
+    curve. It is infinite unless `radius` is less than `distance`.
 
-    cubes, fourths, distance: I3, I4 and d, as for `remainder_promises`.
+    inverse_cubes, inverse_fourths: I3 and I4, the integrals of |dp|/|D|^3 and |dp|/|D|^4 over the
+        curve, with D the vector from x to the point p of the curve.
+    distance: d, the distance from x to the curve, or a lower bound of it.
 
-    Proof. The second derivative in every direction is at most 3/2 times the integral of |dp|/|D|^3
-    (`remainder_promises`). So is the norm of the Hessian, and from x to x + t v the gradient
-    changes by at most
+    Proof. At x, the second derivative of the solid angle along every line is at most 3/2 times the
+    integral of |dp|/|D|^3 (`remainder_promises`), and so is the norm of the Hessian. At a point at
+    the distance s from x, |D| is less by at most s. So for a unit vector v, and with t = `radius`,
+    the gradient changes from x to x + t v by at most
 
         3/2 integral of |dp| integral over [0, t] of ds/(|D|-s)^3
             = 3/4 t integral of |dp|/|D|^3 (2 - u)/(1 - u)^2,    u = t/|D|.
@@ -184,27 +199,29 @@ def gradient_change_bound(cubes: Real, fourths: Real, distance: Real, radius: Re
     """
     q = radius / distance
     growth = (3 - 2 * q) / dr.square(1 - q)
-    change = radius * (1.5 * cubes + 0.75 * radius * growth * fourths)
+    change = radius * (1.5 * inverse_cubes + 0.75 * radius * growth * inverse_fourths)
     return dr.select(radius < distance, (1 + SUM_MARGIN) * change, dr.inf)
 
 
 def lift_ball(
     value: Real,
     gradient: Vec3,
-    squares: Real,
+    inverse_squares: Real,
     bends: tuple[TaylorRemainder, ...],
     slope_error: Real = 0.0,
 ) -> HarmonicBall:
-    """A ball around x on which the lifted solid angle is proved to lie in a range. It is the ball
-    of one of the promises `bends`, which themselves prove longer steps.
+    """A ball around x, and a range in which the solid angle is proved to lie on it. The solid angle
+    is lifted, that is, continued from x without its jumps of 4 pi. The ball is that of the second
+    of the promises `bends`. The promises themselves prove longer steps than this range.
 
     value, gradient: the solid angle and its gradient at x.
-    squares: the integral of |dp|/|D|^2, to which the rounding of the gradient is proportional.
-    bends: the promises of `remainder_promises`.
-    slope_error: a bound of the other errors of the gradient.
+    inverse_squares: the integral of |dp|/|D|^2, to which the rounding of the gradient is
+        proportional.
+    bends: the bounds of second derivatives on balls around x, from `remainder_promises`.
+    slope_error: a bound of the errors of the gradient other than its rounding.
     """
     promise = bends[1]
-    gradient_bound = dr.norm(gradient) + SUM_MARGIN * squares + slope_error
+    gradient_bound = dr.norm(gradient) + SUM_MARGIN * inverse_squares + slope_error
     max_change = (
         (1 + SUM_MARGIN)
         * promise.radius

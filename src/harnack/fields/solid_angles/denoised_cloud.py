@@ -46,7 +46,8 @@ _MIN_POINTS = 32
 
 @dataclass(frozen=True)
 class DenoisedCloud:
-    """The points that were kept, and how to smooth their sum.
+    """The result of denoising a cloud: the points that were kept, and the length over which the sum
+    of their dipoles is to be smoothed.
 
     points, normals: (m, 3) of the points that were kept, moved onto the surface.
     smoothing: the length over which their sum is to be smoothed; 0 if there is hardly any noise.
@@ -117,7 +118,10 @@ class DenoisedCloud:
 def _estimated_normals(cloud: CloudDenoiser, gradients: Gradients) -> FloatArray:
     """Estimate normals (m, 3) of the selected points of a cloud, at their original positions. Where
     the smoothed sum rises along a normal, the normal is replaced by the direction in which the sum
-    falls. gradients: as for `DenoisedCloud.of`.
+    falls.
+
+    gradients: a function that returns gradients of the smoothed sum, from points, normals, areas
+        and the smoothing length.
     """
     x = cloud.points[cloud.selected]
     normals = estimate_normals(x)

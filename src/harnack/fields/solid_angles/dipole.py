@@ -119,8 +119,9 @@ class DipoleTree:
         return self.clusters.coarsest_accuracy if self.cells is None else 1.0
 
     def values(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:
-        """Value and derivatives up to order `derivatives` at x. closer: the accuracy scale, at
-        least 1."""
+        """Value and derivatives of the sum at points x, up to order `derivatives`, with error
+        bounds.
+        closer: the accuracy scale, at least 1."""
         unit, detail = (
             coordinate_rounding(x),
             fmax(self.backend.Float(closer), self.backend.Float(1)),
@@ -129,8 +130,13 @@ class DipoleTree:
         return self.clusters.values(sums, 1.0, unit, self.rounding)
 
     def _sums(self, x: Vec3, detail: Real, unit: Real, derivatives: int) -> tuple[SourceSums, Vec3]:
-        """The sums over all dipoles, by the tree; and the moment (3,) of the nearest dipole among
-        those that are summed one by one. unit: the rounding of a coordinate of x."""
+        """The sums over all dipoles at points x, by the tree; and the moment (3, n) of the nearest
+        of the dipoles that are summed one by one.
+
+        detail: the accuracy scale.
+        unit: a bound of the rounding of a coordinate of x.
+        derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
+        """
         add, vector = _dipole_adder(x, unit, derivatives), self.backend.Array3f
         sums, state = self.clusters.sums(x, detail, add, (vector(0),), derivatives=derivatives)
         return sums, state[0]
@@ -138,8 +144,9 @@ class DipoleTree:
     def _near_sums(
         self, x: Vec3, detail: Real, unit: Real, derivatives: int = 1
     ) -> tuple[SourceSums, Vec3]:
-        """As `_sums`, but by the cells if there are cells and no second derivatives are
-        requested."""
+        """The sums over all dipoles at points x, and the moment (3, n) of the nearest of the
+        dipoles that are summed one by one. They come from the cells if there are cells and no
+        second derivatives are requested, else from the tree. The arguments are those of `_sums`."""
         if self.cells is None or derivatives == 2:
             return self._sums(x, detail, unit, derivatives)
         add, start = _dipole_adder(x, unit, 1), (self.backend.Array3f(0),)
@@ -147,7 +154,8 @@ class DipoleTree:
         return sums, state[0]
 
     def sample(self, x: Vec3, detail: Real) -> Sample:
-        """Value, gradient and promises at x, as `SourceSums.sample`. detail: the accuracy scale.
+        """The sample at points x: value, gradient, errors and promises (proved bounds of f near x).
+        detail: the accuracy scale.
 
         If there are cells, accuracy scales up to 1 get the accuracy of the cells' expansions, and
         larger scales are computed by the tree.
@@ -165,15 +173,22 @@ class DipoleTree:
 
 
 def _dipole_adder(x: Vec3, unit: Real, derivatives: int) -> AddPrimitive:
-    """Returns a function `add` that adds a dipole to the sums at x. unit: the rounding of a
-    coordinate of x."""
+    """Make a function `add` that adds a dipole to sums at points x (`treecode.AddPrimitive`).
+
+    unit: a bound of the rounding of a coordinate of x.
+    derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
+    """
     vector = cast("Any", type(x))
 
     def add(
         row: list[Real], active: Mask, sums: SourceSums, state: tuple[Any, ...]
     ) -> tuple[SourceSums, tuple[Any, ...]]:
-        """Add the dipole of a record to the sums, where active. state: the moment of the nearest
-        dipole so far, which is updated."""
+        """Add the dipole of the record `row` to the sums on active lanes.
+
+        state: the moment of the nearest dipole so far.
+
+        Returns the new sums and the new state.
+        """
         inverse, terms = _dipole_term(row, x, derivatives)
         distance, has_area = dr.rcp(inverse), active & (row[6] > 0)
         # `upper` is an upper bound of 1/(distance - 2 unit), as 2 unit bounds the rounding of
@@ -200,8 +215,8 @@ def _dipole_adder(x: Vec3, unit: Real, derivatives: int) -> AddPrimitive:
 
 
 def _dipole_term(row: list[Real], x: Vec3, derivatives: int) -> tuple[Real, SourceTerm]:
-    """One over the distance from x to the dipole of a record; and its value with gradient (paper,
-    Eq. 12 and 15) and Hessian, up to order `derivatives`.
+    """Two results for the dipole of the record `row`: one over its distance from x; and its value
+    at x with gradient (paper, Eq. 12 and 15) and Hessian, up to order `derivatives`.
 
     With the dipole's moment m, z = y - x and u = 1/|z|: f = m.z u^3, grad f = 3 (m.z) u^5 z - m
     u^3, and Hess f = 15 (m.z) u^7 z z^T - 3 u^5 (m z^T + z m^T + (m.z) I).
@@ -345,8 +360,14 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
     def _fitted(
         self, points: Any, normals: Any, areas: Any, smoothing: str
     ) -> tuple[FloatArray, FloatArray, float]:
-        """Denoise the cloud for `smoothing="auto"`. Returns points, normals and smoothing length,
-        and sets `fit_report` to the report about the noise."""
+        """Denoise the cloud for `smoothing="auto"`. Returns the kept points (m, 3) moved onto the
+        surface, their normals (m, 3), and the smoothing length. Sets `fit_report` to the report
+        about the noise.
+
+        Raises:
+            ValueError: `smoothing` is another string than "auto".
+            CloudError: areas are given; or the cloud is not valid.
+        """
         if smoothing != "auto":
             raise ValueError(f'smoothing must be a length or "auto", not {smoothing!r}')
         if areas is not None:
@@ -439,7 +460,11 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         return field
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
-        """Values and derivatives at points x: see `BatchedField.values_at`."""
+        """Values and derivatives at points x (3, n), with error bounds (`BatchedField.values_at`).
+
+        derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
+        closer: the accuracy scale.
+        """
         data = self._batch_data(backend_of(x))
         x = data.to_unit(x)
         weight = float(self.areas.sum()) / self._size**2
@@ -458,12 +483,17 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
 
     @functools.cached_property
     def _hierarchy(self) -> BalancedTree:
-        """The hierarchy of the tree, without positions. It was computed from these points or, if
-        they were moved, from their earlier positions."""
+        """The hierarchy of the tree over the points: which points are in which node. If the points
+        were moved (`with_points`), the hierarchy is that of their earlier positions, which stays
+        valid; otherwise it is computed from the points."""
         return self._given_hierarchy or dipole_hierarchy((self.points - self._center) / self._size)
 
     def _upload(self, backend: Backend, *, traced: bool) -> _DipoleData:
-        """The data on a backend, for tracing or for values at points."""
+        """Upload the sum over the dipoles to a backend.
+
+        traced: whether the sum is for tracing, and not for values at points. By default a sum for
+            tracing is more accurate.
+        """
         accuracy = self.accuracy or (_TRACING_ACCURACY if traced else _VALUES_ACCURACY)
         unit = (self.points - self._center) / self._size
         # Areas scale with the square of lengths; the potential is invariant under scaling.
@@ -479,13 +509,18 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         return _DipoleData(*frame_parameters(backend, self._center, self._size), tree)
 
     def _cell_builder(self, backend: Backend, half: float) -> BuildCells:
-        """Returns a function that builds the cells of the cube [-half, half]^3, once for a
-        backend."""
+        """Make a function that builds the FMM cells of the cube [-half, half]^3 on a backend
+        (`BuildCells`). The cells are built by its first call, and kept for later calls."""
 
         def build(
             levels: list[NodeMoments], rows: FloatArray, dipoles: RecordTable
         ) -> DipoleCells | None:
-            """Build the cells, or take those that were built before (`BuildCells`)."""
+            """Return the cells that were built before, or build them.
+
+            levels: the moments of all levels of the tree.
+            rows: the dipoles as records.
+            dipoles: the same records on the backend.
+            """
             return self.build_cached(
                 backend,
                 lambda: build_cells(
@@ -497,9 +532,11 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         return build
 
     def _half_side(self, unit: FloatArray) -> float:
-        """Half the side of the cube that the cells fill. This cube contains the `extent` of the
-        default level, because rays begin at the faces of the extent. unit: (n, 3) the points in
-        unit coordinates."""
+        """Half the side, in unit coordinates, of the cube that the cells fill. This cube contains
+        the `extent` of the default level, because rays begin at the faces of the extent.
+
+        unit: (n, 3) the points in unit coordinates.
+        """
         margin = math.sqrt(float(self.areas.sum()) / self.default_level) / self._size
         return 1.001 * (float(np.abs(unit).max()) + margin)
 
@@ -524,6 +561,7 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         return on.sample(p, detail)
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
+        """Raise ValueError for a level whose surface would be unbounded."""
         for level in levels:
             if abs(level) < 1e-6:
                 raise ValueError(
@@ -551,6 +589,7 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         return self._smoothing
 
     def describe(self) -> dict[str, Any]:
+        """Facts about the field for users, as a dictionary of names and values."""
         origins = ("estimated" if is_estimated else "given" for is_estimated in self.is_estimated)
         sources = dict(zip(("normals", "areas"), origins, strict=True))
         tree = None if self._device is None else self._device.tree

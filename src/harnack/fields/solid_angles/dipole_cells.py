@@ -115,10 +115,11 @@ class DipoleCells:
     def sums(
         self, x: Vec3, active: Mask, add: AddPrimitive, own: tuple[Any, ...]
     ) -> tuple[SourceSums, tuple[Any, ...], Mask]:
-        """Sum over all primitives at x, with gradients.
+        """The sums over all primitives at points x, with gradients: from the near list and the
+        local expansion of the cell that contains x.
 
-        add: as for `Treecode.sums`; it adds a near primitive.
-        own: the caller's own state, which `add` updates.
+        add: a function that adds a near primitive to the sums (`treecode.AddPrimitive`).
+        own: a further state of the caller, which `add` updates.
 
         Returns the sums, the caller's own state, and the mask of the lanes on which the sums hold.
         These are the active lanes whose point lies in the cube.
@@ -163,11 +164,12 @@ class DipoleCells:
         first, count = index(low) + index(high) * _INDEX_BASE, dr.select(active, index(count), 0)
 
         def runs(i: Any, *_: Any) -> Mask:
-            """Whether the lane has further near primitives."""
+            """The mask of the lanes that have further near primitives."""
             return i < count
 
         def step(i: Any, sums: Any, own: Any) -> tuple[Any, ...]:
-            """Add near primitive i to the state of the sums and to the caller's own state."""
+            """Add primitive i of the near list to the state of the sums and to the caller's own
+            state."""
             in_list = i < count
             primitive = self.primitives.read_record(
                 dr.gather(index, self.near, first + i, in_list), in_list
@@ -184,20 +186,20 @@ class DipoleCells:
 
     def sums_with_tree(
         self, tree: Treecode, x: Vec3, detail: Real, add: tuple[AddPrimitive, AddPrimitive],
-        own: tuple[Any, ...], where: Mask = True,
+        own: tuple[Any, ...], active_lanes: Mask = True,
     ) -> tuple[SourceSums, tuple[Any, ...]]:  # fmt: skip
-        """The sums at x, with gradients, and the caller's own state. Where `detail` is at most 1
-        and x is in the cube they come from the cells, elsewhere from a tree over the same
-        primitives.
+        """The sums over all primitives at points x, with gradients, and the caller's own state. On
+        lanes on which `detail` is at most 1 and x is in the cube they come from the cells. On the
+        other lanes they come from a tree over the same primitives.
 
         detail: the accuracy scale.
-        add: two functions; the first adds a near primitive to the sums of a cell, the second to the
-            sums of the tree.
-        own: the caller's own state.
-        where: the mask of the active lanes.
+        add: two functions that add a near primitive (`treecode.AddPrimitive`): the first to the
+            sums of a cell, the second to the sums of the tree.
+        own: a further state of the caller, which `add` updates.
+        active_lanes: the mask of the active lanes.
         """
         in_cell, in_tree = add
-        lanes, tree_detail = self.backend.Bool(where), fmax(detail, self.backend.Float(1))
+        lanes, tree_detail = self.backend.Bool(active_lanes), fmax(detail, self.backend.Float(1))
         sums, state, is_valid = self.sums(x, lanes & (detail <= 1), in_cell, own)
         tree_sums, tree_state = tree.sums(x, tree_detail, in_tree, own, lanes & ~is_valid)
         pairs = zip(state, tree_state, strict=True)
@@ -209,8 +211,12 @@ def _truncation_at(
     q: Real, error: Real, slope: Real, tail: Real, tail_slope: Real
 ) -> tuple[Real, Real]:
     """Bounds of the truncation errors of value and gradient at a point whose distance from the
-    cell's center is q times the radius of its ball. The other arguments are those of
-    `DipoleExpansions`."""
+    cell's center is q times the radius of the cell's ball.
+
+    error, slope: bounds of the parts of both errors that are the same in the whole ball.
+    tail, tail_slope: bounds of the other parts on the sphere; they fall towards the center, as in
+        `DipoleExpansions`.
+    """
     power = 1.0 + 0 * q
     for _ in range(DEGREE):
         power = power * q
@@ -220,7 +226,7 @@ def _truncation_at(
 
 @dataclass(frozen=True)
 class _CellLevel:
-    """The cells of one size, at one depth of the octree.
+    """The cells of one size: all cells at one depth of the octree.
 
     centers: (n, 3) centers of the cells.
     radius: the radius of their balls.
@@ -324,8 +330,8 @@ def build_cells(
 
 
 def _chunks(cells: IntArray) -> list[IntArray]:
-    """The cells in batches. A batch is so small that lists of the sources far from its cells take
-    little memory."""
+    """Divide an array of indices of cells into batches. A batch is so small that lists of the
+    sources far from its cells take little memory."""
     return [cells[start : start + _CHUNK_SIZE] for start in range(0, len(cells), _CHUNK_SIZE)]
 
 
@@ -334,7 +340,7 @@ class _ParentExpansions:
     """The sums that cells of one size inherit from their parents.
 
     sums: the sums of the parents. Cells 8 i to 8 i + 7 are the octants of parent i.
-    shifts: `local_expansion.local_to_local_matrices`.
+    shifts: (8, COEFFICIENTS, COEFFICIENTS) matrices from `local_expansion.local_to_local_matrices`.
     radius: the radius of the parents' balls; 0 for the root of the octree, which has no parent.
     """
 
@@ -343,7 +349,7 @@ class _ParentExpansions:
     radius: float
 
     def of(self, cells: IntArray) -> DipoleExpansions:
-        """The inherited sums of the cells with these indices."""
+        """The sums that the cells with these indices inherit from their parents."""
         if not self.radius:  # the first level has no parents
             return self.sums
         parents, parent_index = np.unique(cells // 8, return_inverse=True)
@@ -355,7 +361,8 @@ def _cell_records(
     backend: Backend, centers: FloatArray, radius: float, sums: DipoleExpansions, first: IntArray,
     lengths: IntArray,
 ) -> FloatArray:  # fmt: skip
-    """Records (n, k) of cells, as described for `DipoleCells.records`.
+    """The records (n, k) of n cells that are not split, with the columns that `DipoleCells.records`
+    describes.
 
     centers, radius: centers (n, 3) of the cells, and the radius of their balls.
     sums: the sums over their far primitives.
@@ -377,61 +384,70 @@ def _cell_records(
 
 
 def _octree_within_memory(
-    packed: PackedTree, half: float, backend: Backend, limits: tuple[int, int], most_bytes: int
+    packed: PackedTree, half_side: float, backend: Backend, limits: tuple[int, int], most_bytes: int
 ) -> list[_CellLevel] | None:
-    """The octree of the cells, with the smallest limit of near primitives per cell for which it
-    fits in memory; None if there is none.
+    """The cells of the cube [-half_side, half_side]^3, one entry for each depth of the octree.
+    Cells are split if they have more near primitives than a limit. The limit is the smallest one
+    for which the cells take at most `most_bytes` bytes. Returns None if no limit is large enough.
 
     packed: the tree of the primitives.
-    half: half the side of the cube.
-    near: the first limit to try, and the largest limit. Beyond the largest limit, lists of near
-        primitives take nearly as much memory, whatever the size of the cells.
+    limits: the first limit to try, and the largest limit. In between the limit is doubled. Beyond
+        the largest limit, lists of near primitives take nearly as much memory, whatever the size
+        of the cells.
     """
 
     def is_too_large(levels: list[_CellLevel]) -> bool:
-        """Whether the cells take too many bytes."""
+        """Whether the cells of these depths take more than `most_bytes` bytes."""
         return _bytes(backend, levels) > most_bytes
 
-    limit, most_near = limits
-    while (octree := _octree(packed, half, limit, is_too_large)) is None and limit < most_near:
-        limit = min(2 * limit, most_near)
+    limit, max_near = limits
+    while (octree := _octree(packed, half_side, limit, is_too_large)) is None and limit < max_near:
+        limit = min(2 * limit, max_near)
     return octree
 
 
 def _octree(
-    packed: PackedTree, half: float, most_near: int, too_large: Callable[[list[_CellLevel]], bool]
+    packed: PackedTree,
+    half_side: float,
+    max_near: int,
+    is_too_large: Callable[[list[_CellLevel]], bool],
 ) -> list[_CellLevel] | None:
-    """The cells of the cube [-half, half]^3, one entry for each depth of the octree. Cells with
-    more than `most_near` near primitives are split. Returns None as soon as `too_large` says so for
-    the cells so far."""
+    """The cells of the cube [-half_side, half_side]^3, one entry for each depth of the octree.
+
+    packed: the tree of the primitives.
+    max_near: a cell is split if more primitives than this are near to it, that is, within `_NEAR`
+        radii of its ball from its center.
+    is_too_large: a function that says whether the cells built so far take too much memory. If they
+        do, the result is None.
+    """
     backend = packed.backend
     root = PendingSources.of_root(backend)
     levels: list[_CellLevel] = []
     centers = np.zeros((1, 3))
     while len(centers):
-        side = half / 2 ** len(levels)
+        side = half_side / 2 ** len(levels)
         radius = math.sqrt(3) * side * BALL_MARGIN
         is_last = len(levels) == MAX_DEPTH
-        limit = dr.opaque(backend.UInt32, _UNLIMITED if is_last else most_near)
+        limit = dr.opaque(backend.UInt32, _UNLIMITED if is_last else max_near)
         near, none_stay = (dr.opaque(backend.Float, _NEAR * radius), dr.opaque(backend.Float, -1.0))
         roots, c = (
             root.subset(backend, np.zeros(len(centers), np.int64)),
             to_vector3(backend, centers),
         )
-        counts = roots.primitives_of(packed, c, near, none_stay, None, far=False, most=limit)
+        counts = roots.primitives_of(packed, c, near, none_stay, None, far=False, count_limit=limit)
         count = to_numpy(counts).astype(np.int64)
-        is_leaf = np.broadcast_to(count <= most_near, len(centers)) | is_last
+        is_leaf = np.broadcast_to(count <= max_near, len(centers)) | is_last
         levels.append(_CellLevel(centers, radius, is_leaf, count))
-        if too_large(levels):
+        if is_too_large(levels):
             return None
         centers = (centers[~is_leaf][:, None] + 0.5 * side * OCTANT_DIRECTIONS).reshape(-1, 3)
     return levels
 
 
 def _bytes(backend: Backend, levels: list[_CellLevel]) -> int:
-    """The number of bytes of cells: of records, lists of near primitives, and nodes. Each cell at
-    the last depth that is still to be split counts as eight records, which is the least that it
-    can become."""
+    """The number of bytes that cells take: their records, their lists of near primitives, and the
+    octree's nodes. levels: the cells of each depth of the octree. A cell at the last of these
+    depths that is still to be split counts as eight cells, as it becomes at least eight."""
     leaves, near = 8 * int((~levels[-1].is_leaf).sum()), 0
     for level in levels:
         leaves += int(level.is_leaf.sum())

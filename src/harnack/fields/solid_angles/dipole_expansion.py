@@ -1,4 +1,5 @@
-"""Local expansions of far dipoles and triangles in balls, and bounds of their truncation errors.
+"""Local expansions (harmonic polynomials) of the field of far dipoles and triangles in balls, and
+bounds of their truncation errors.
 
 - `source_tree`: a tree of primitives, dipoles or triangles, in double precision, with all data that
   expansions need; `triangle_sources`: triangles as records.
@@ -69,14 +70,16 @@ _ROUNDED_UP = 1 + 1e-9
 
 
 def source_tree(tree: BalancedTree, levels: list[NodeMoments], rows: FloatArray) -> PackedTree:
-    """Pack the tree of primitives, in double precision, with the data that expansions need.
+    """The tree of primitives on a backend in double precision, with the records that expansions
+    need.
 
     A node's record holds: center, `_NODE_RATIO` times the radius, radius, area; then its moments up
-    to degree 4, (E, G) of `multipole.truncation_bounds`, and the sup norms of the moments.
+    to degree 4; the bounds E and G of the terms beyond degree 4 in value and gradient
+    (`multipole.truncation_bounds`); and for each degree a bound of its term (`multipole.sup_norm`).
 
-    levels: the moments of the tree's nodes.
-    rows: the records of the primitives in slots, dipoles (`treecode.dipole_records`) or
-        `triangle_sources`.
+    levels: the moments of the tree's nodes, one entry for each level of the tree.
+    rows: the records of the primitives, in the slots of the tree's leaves: dipoles from
+        `treecode.dipole_records`, or triangles from `triangle_sources`.
     """
     numbers: list[FloatArray] = []
     for level in levels:
@@ -119,7 +122,7 @@ def triangle_sources(corners: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class DipoleExpansions:
-    """Sums over far primitives, for n balls.
+    """Sums over the far primitives of n balls: a polynomial for each ball, and error bounds.
 
     coefficients: (n, COEFFICIENTS) of the local expansion (`local_expansion.coefficient_keys`).
     error, slope: (n,) bounds of the truncation errors of value and gradient, anywhere in the ball.
@@ -141,12 +144,12 @@ class DipoleExpansions:
 
     @classmethod
     def zero(cls, n: int) -> DipoleExpansions:
-        """Sums over no primitives."""
+        """The sums of n balls over no primitives: zeros, and an infinite distance."""
         zero = np.zeros(n)
         return cls(np.zeros((n, COEFFICIENTS)), *(5 * [zero]), min_distance=np.full(n, np.inf))
 
     def plus(self, other: DipoleExpansions) -> DipoleExpansions:
-        """The sums over the primitives of both operands."""
+        """For each ball, the sum over the primitives of this object and those of `other`."""
         bounds = "error", "slope", "tail", "tail_slope", "s4"
         sums = (_ROUNDED_UP * (getattr(self, name) + getattr(other, name)) for name in bounds)
         min_distance = np.minimum(self.min_distance, other.min_distance)
@@ -155,27 +158,28 @@ class DipoleExpansions:
         )
 
     def subset(self, which: IntArray) -> DipoleExpansions:
-        """The sums of the balls with these indices. An index may occur several times."""
+        """The sums of the balls with the indices `which`. An index may occur several times."""
         return DipoleExpansions(*(values[which] for values in vars(self).values()))
 
     @classmethod
     def concatenate(cls, parts: list[DipoleExpansions]) -> DipoleExpansions:
-        """The sums of all balls, in the order of `parts`."""
+        """The sums of the balls of all parts, in the order of `parts`."""
         columns = zip(*(vars(part).values() for part in parts), strict=True)
         return cls(*(np.concatenate(column) for column in columns))
 
     def to_octants(self, shifts: FloatArray, radius: float) -> DipoleExpansions:
         """The same sums about the centers of the eight octants of each cell. The octants of a cell
-        follow each other.
+        follow each other in the result.
 
-        shifts: `local_expansion.local_to_local_matrices`.
+        shifts: (8, COEFFICIENTS, COEFFICIENTS) matrices from
+            `local_expansion.local_to_local_matrices`.
         radius: the radius of the cells' balls.
 
         Proof. The ball of an octant lies in that of the cell, so that bounds of errors hold there
         as well. But the truncation error of the polynomial is not small about an octant's center,
         so `tail` is added to `error`. An octant's center is at most half a radius from the cell's
-        center, so that distances shrink by at most that, and 1/D^4 grows by at most (1 - radius/(2
-        least))^-4 for D >= least.
+        center, so that distances shrink by at most that, and 1/D^4 grows at most by the factor (1 -
+        radius/(2 d))^-4 for D >= d, with d = `min_distance`.
         """
         shifted = np.einsum("oab,kb->koa", shifts, self.coefficients)
         ratio = 0.5 * radius / self.min_distance  # 0 where there is nothing
@@ -189,11 +193,14 @@ class DipoleExpansions:
     def over_nodes(
         cls, tree: PackedTree, lists: LaneLists, c: Vec3, radius: Real
     ) -> DipoleExpansions:
-        """Sums over far nodes, for balls of this radius around c. lists: for each ball, a list of
-        nodes of the tree."""
+        """Sums over all primitives of far nodes, from the moments of the nodes, for n balls of this
+        radius around the centers c (3, n).
+
+        lists: for each ball, the list of the indices of its far nodes in the tree.
+        """
 
         def term(i: Any, active: Mask) -> list[Any]:
-            """The numbers of `DipoleExpansions` for node i."""
+            """What node i adds to the attributes of `DipoleExpansions`, as a list of numbers."""
             head, payload = tree.node_heads.read_record(i, active), tree.payload(i, active)
             numbers = dict(zip(_MOMENTS, payload, strict=False))
             error, slope_error, *norms = payload[len(_MOMENTS) :]
@@ -207,11 +214,14 @@ class DipoleExpansions:
     def over_primitives(
         cls, tree: PackedTree, lists: LaneLists, c: Vec3, radius: Real
     ) -> DipoleExpansions:
-        """Sums over far primitives, for balls of this radius around c. lists: for each ball, a list
-        of primitives of the tree."""
+        """Sums over single far primitives, for n balls of this radius around the centers c (3, n).
+
+        lists: for each ball, the list of its far primitives, as rows of the tree's primitives.
+        """
 
         def term(i: Any, active: Mask) -> list[Any]:
-            """The numbers of `DipoleExpansions` for primitive i, a dipole or a triangle."""
+            """What primitive i, a dipole or a triangle, adds to the attributes of
+            `DipoleExpansions`, as a list of numbers."""
             row = tree.primitives.read_record(i, active)
             first = {(1, 0): (row[5], 0.0), (1, 1): (0.5 * row[3], 0.5 * row[4])}
             r = c - tree.backend.Array3f(*row[:3])
@@ -232,15 +242,17 @@ class DipoleExpansions:
     def _accumulated(
         cls, backend: Backend, lists: LaneLists, term: Callable[[Any, Mask], list[Any]]
     ) -> DipoleExpansions:
-        """The sums of `term` over the entries of each list.
+        """Add up `term` over the entries of each list.
 
-        term: from an entry of a list and a mask, returns the numbers of `DipoleExpansions`. The
-            last of these is a minimum, all others are sums.
+        term: a function. From an entry of a list and a mask of active lanes it returns what the
+            entry adds to the attributes of `DipoleExpansions`. The last number, for `min_distance`,
+            is used in a minimum; all other numbers are added up.
         """
         zero = backend.Float(0)
 
         def add(i: Any, active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Add the numbers of entry i to the state, where active."""
+            """Add what `term` returns for entry i to the state, on active lanes. The last number of
+            the state is a minimum, all other numbers are sums."""
             *sums, minimum = state
             *added, nearest = term(i, active)
             pairs = zip(sums, added, strict=True)
@@ -258,7 +270,7 @@ class DipoleExpansions:
 
 
 def _fourth(number: Any) -> Any:
-    """The fourth power."""
+    """The fourth power of a number."""
     square = number * number
     return square * square
 
@@ -275,7 +287,8 @@ def _pairs(numbers: dict[Any, Any]) -> dict[tuple[int, int], tuple[Any, Any]]:
 
 @dataclass(frozen=True)
 class _ClusterExpansion:
-    """The local expansion of multipole terms in a ball.
+    """The local expansion, in a ball, of the field of one source that is given by its multipole
+    moments.
 
     coefficients: the coefficients of the polynomial, times powers of the ball's radius.
     tail, tail_slope: bounds of the truncation errors of value and gradient on the ball's sphere.
@@ -294,9 +307,10 @@ class _ClusterExpansion:
         """The expansion of multipole terms in the ball of this radius.
 
         r: the vector from the multipole's center to the ball's center.
-        moments: moments as pairs, by degree and order.
-        norms: norms[l-1] bounds the term of degree l = 1, 2, ...: at distance r this term is at
-            most norms[l-1]/r^(l+1).
+        moments: a dictionary of the moments, as pairs of real and imaginary part, by (degree,
+            order).
+        norms: norms[l-1] bounds the term of degree l = 1, 2, ...: at a distance d from the
+            multipole's center this term is at most norms[l-1]/d^(l+1).
 
         The bounds are those of `tail_factors`, whose c grows with l. They bound all terms of degree
         j > p. So at q times the radius, q <= 1, the truncation error is q^(p+1) times as much as on
@@ -335,11 +349,12 @@ class _ClusterExpansion:
     def of_cluster(
         self, left_out: Real, slope_left_out: Real, size: Real, area: Real, radius: Real
     ) -> list[Any]:
-        """The numbers of `DipoleExpansions` for a cluster of dipoles whose moments up to degree 4
-        were used.
+        """What a cluster of dipoles, expanded from its moments up to degree 4, adds to the
+        attributes of `DipoleExpansions`, as a list of numbers.
 
-        left_out, slope_left_out: (E, G) of `multipole.truncation_bounds`, for points that are no
-            nearer to the cluster than the ball is.
+        left_out, slope_left_out: the numbers E and G of `multipole.truncation_bounds`, which bound
+            the terms of higher degree in value and gradient, for points that are no nearer to the
+            cluster than the ball is.
         size: the cluster's radius.
         area: the area of its dipoles.
         radius: the radius of the ball.
@@ -358,7 +373,7 @@ class _ClusterExpansion:
 
 @dataclass(frozen=True)
 class PendingSources:
-    """Sources that balls have not yet taken into account.
+    """The sources that n balls have not yet added to their expansions.
 
     nodes: for each ball a list of nodes, each of which stands for all its primitives.
     primitives: for each ball a list of primitives, as rows of the tree's primitives.
@@ -369,7 +384,8 @@ class PendingSources:
 
     @classmethod
     def of_root(cls, backend: Backend) -> PendingSources:
-        """The root of a tree, and so all its primitives, for one ball."""
+        """The sources of a single ball that has added none: the root of a tree, which stands for
+        all its primitives."""
         return cls(LaneLists.of_root(backend), LaneLists.empty(backend))
 
     def subset(self, backend: Backend, lanes: IntArray) -> PendingSources:
@@ -380,31 +396,33 @@ class PendingSources:
 
     @classmethod
     def concatenate(cls, backend: Backend, parts: list[PendingSources]) -> PendingSources:
-        """The sources of all balls, in the order of `parts`."""
+        """The sources of the balls of all parts, in the order of `parts`."""
         nodes = LaneLists.concatenate(backend, [part.nodes for part in parts])
         return cls(nodes, LaneLists.concatenate(backend, [part.primitives for part in parts]))
 
     def split_far(
-        self, tree: PackedTree, c: Vec3, radius: Real, factor: float, smallest: Real
+        self, tree: PackedTree, c: Vec3, radius: Real, factor: float, max_node_radius: Real
     ) -> tuple[DipoleExpansions, PendingSources]:
-        """Split the sources into those that are far from the balls, and the rest.
+        """Split the sources of each ball into those that are far from it, which are added up, and
+        the remaining ones.
 
-        c: the centers of the balls.
-        factor: k of this module: dipoles are far if they are farther than `factor` radii from the
+        c: (3, n) the centers of the balls.
+        radius: the radius of the balls.
+        factor: k of this module: a dipole is far if it is farther than `factor` radii from the
             center.
-        smallest: inner nodes that are not far stay nodes if their radius is at most this. Larger
-            nodes are replaced by their children, and leaves by their primitives, which are far or
-            near.
+        max_node_radius: a node that is not far, and no leaf, stays a node if its radius is at most
+            this. A larger node is replaced by its children, and a leaf by its primitives, each of
+            which is far or near by itself.
 
         Returns the sums over the far sources, and the remaining sources. Each primitive is in
         exactly one far node, or is itself far, or is among the remaining sources.
         """
-        backend, inner = tree.backend, factor * radius
+        backend, far_radius = tree.backend, factor * radius
         far, pending = (
             build_lists(
                 backend,
-                lambda put, far=far: _count_nodes(
-                    tree, self.nodes, c, inner, smallest, put, far=far
+                lambda store, far=far: _count_nodes(
+                    tree, self.nodes, c, far_radius, max_node_radius, store, far=far
                 ),
             )
             for far in (True, False)
@@ -412,7 +430,9 @@ class PendingSources:
         far_primitives, near_primitives = (
             build_lists(
                 backend,
-                lambda put, far=far: self.primitives_of(tree, c, inner, smallest, put, far=far),
+                lambda store, far=far: self.primitives_of(
+                    tree, c, far_radius, max_node_radius, store, far=far
+                ),
             )
             for far in (True, False)
         )
@@ -424,70 +444,82 @@ class PendingSources:
         self,
         tree: PackedTree,
         c: Vec3,
-        inner: Real,
-        smallest: Real,
-        put: WriteEntry | None,
+        far_radius: Real,
+        max_node_radius: Real,
+        store: WriteEntry | None,
         *,
         far: bool,
-        most: Any = None,
+        count_limit: Any = None,
     ) -> Any:
-        """Count the far primitives, or with far=False the near primitives, and write them to lists.
-        This is a walk for `build_lists`. The primitives are those of the list of primitives, and
-        those of leaves that are not far.
+        """Count the far primitives of each ball, or with far=False its near primitives, and write
+        them to lists. `build_lists` calls this function twice, to count and to write. The
+        primitives are those in the list `primitives`, and those of the leaves below the listed
+        nodes that are not far.
 
-        inner: k rho: a dipole is far if its distance from c is more than this. For a triangle
+        c: (3, n) the centers of the balls.
+
+        far_radius: k rho: a dipole is far if its distance from c is more than this. For a triangle
             `TRIANGLE_RATIO` times its radius is added.
-        smallest: nodes up to this radius stay nodes, so that their primitives are not visited.
-        put: writes an entry; None to count only.
-        most: once a count exceeds this, the remaining primitives need not be counted.
+        max_node_radius: nodes up to this radius stay nodes, so that their primitives are not
+            visited.
+        store: writes an entry; None to count only.
+        count_limit: once a count exceeds this, the remaining primitives need not be counted.
 
         Returns the number of primitives on each lane.
 
         A leaf that is far has no near primitives: a triangle's box lies in the ball of its node, of
         radius R. So `TRIANGLE_RATIO` times the triangle's radius is at most 1.5 * 2 R = 3 R, while
-        its centroid is farther from c than inner + 4 R - R.
+        its centroid is farther from c than far_radius + 4 R - R.
         """
-        index, vector = tree.backend.UInt32, tree.backend.Array3f
+        uint_t, vector = tree.backend.UInt32, tree.backend.Array3f
         are_points = tree.primitives.packets_per_record == 1
 
         def is_chosen(row: list[Real], active: Mask) -> Mask:
-            """Whether the primitive of a record is to be counted."""
-            far_distance = inner if are_points else inner + row[7]
+            """The mask of the lanes on which the primitive in the record `row` is to be counted: it
+            is far, or with far=False near, and its slot is not empty."""
+            far_distance = far_radius if are_points else far_radius + row[7]
             is_far = dr.squared_norm(c - vector(*row[:3])) > dr.square(far_distance)
             return (is_far if far else ~is_far) & (row[6] > 0) & active
 
         def visit(node: VisitedNode, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
-            """Count the primitives of a leaf. state: the number so far. Returns whether the walk
-            enters the node, and the new number."""
+            """Count, and store, the chosen primitives of a leaf that is not far.
+
+            state: the number of primitives so far.
+
+            Returns whether the walk enters the node, and the new number.
+            """
             square = dr.squared_norm(c - vector(*node.head[:3]))
-            enters = square <= dr.square(inner + node.head[3])
+            enters = square <= dr.square(far_radius + node.head[3])
             if are_points and not far:  # only nodes whose ball comes near have near points
-                enters &= square <= dr.square(inner + node.head[4] * (1 + 1e-9) + 1e-12)
-            enters &= node.is_leaf | (node.head[4] > smallest)
-            if most is not None:
-                enters &= state[0] <= most
+                enters &= square <= dr.square(far_radius + node.head[4] * (1 + 1e-9) + 1e-12)
+            enters &= node.is_leaf | (node.head[4] > max_node_radius)
+            if count_limit is not None:
+                enters &= state[0] <= count_limit
 
             def runs(slot: Any, *_: Any) -> Mask:
-                """Whether the leaf has further slots."""
+                """The mask of the lanes that enter the leaf and have further slots in it."""
                 return enters & node.is_leaf & (slot < tree.leaf_size)
 
             def step(slot: Any, count: Any) -> tuple[Any, ...]:
-                """Count the primitive in a slot of the leaf."""
+                """Count, and store, the primitive in a slot of the leaf if it is chosen."""
                 chosen = is_chosen(tree.primitive(node.leaf, slot, enters), enters)
-                if put is not None:
-                    put(count, node.leaf * tree.leaf_size + slot, chosen)
-                return slot + 1, count + dr.select(chosen, index(1), index(0))
+                if store is not None:
+                    store(count, node.leaf * tree.leaf_size + slot, chosen)
+                return slot + 1, count + dr.select(chosen, uint_t(1), uint_t(0))
 
-            return enters, (dr.while_loop((index(0), state[0]), runs, step, label="primitives")[1],)
+            return enters, (
+                dr.while_loop((uint_t(0), state[0]), runs, step, label="primitives")[1],
+            )
 
         def listed(i: Any, active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Count primitive i of the list of primitives."""
+            """Count, and store, primitive i of the list if it is chosen. state: the number of
+            primitives so far. Returns the new number."""
             chosen = is_chosen(tree.primitives.read_record(i, active), active)
-            if put is not None:
-                put(state[0], i, chosen)
-            return (state[0] + dr.select(chosen, index(1), index(0)),)
+            if store is not None:
+                store(state[0], i, chosen)
+            return (state[0] + dr.select(chosen, uint_t(1), uint_t(0)),)
 
-        counts = traverse_subtrees(tree, self.nodes, visit, (index(0),))
+        counts = traverse_subtrees(tree, self.nodes, visit, (uint_t(0),))
         return for_each_entry(tree.backend, self.primitives, listed, counts)[0]
 
 
@@ -495,34 +527,42 @@ def _count_nodes(
     tree: PackedTree,
     lists: LaneLists,
     c: Vec3,
-    inner: Real,
-    smallest: Real,
-    put: WriteEntry | None,
+    far_radius: Real,
+    max_node_radius: Real,
+    store: WriteEntry | None,
     *,
     far: bool,
 ) -> Any:
-    """Count the far nodes, or with far=False the pending nodes, in the subtrees of the listed
-    nodes, and write them to lists. This is a walk for `build_lists`.
+    """Count the far nodes of each ball, or with far=False its pending nodes, and write them to
+    lists. `build_lists` calls this function twice, to count and to write. The nodes are those in
+    the subtrees of the nodes in `lists`.
 
-    Pending nodes are inner nodes that are not far and have a radius of at most `smallest`. Other
-    nodes that are not far are replaced by their children. Leaves that are not far are in neither
-    list.
+    Pending nodes are inner nodes that are not far and have a radius of at most `max_node_radius`.
+    Other nodes that are not far are replaced by their children. Leaves that are not far are in
+    neither list.
 
-    c, inner: centers of the balls, and k rho of this module.
-    put: writes an entry; None to count only.
+    c: (3, n) the centers of the balls.
+    far_radius: k rho, with rho the balls' radius and k > 1: a node of radius R is far if its center
+        is farther from c than far_radius + `_NODE_RATIO` R.
+    store: a function that writes an entry to a list; None to count only.
 
     Returns the number of nodes on each lane.
     """
-    index, vector = tree.backend.UInt32, tree.backend.Array3f
+    uint_t, vector = tree.backend.UInt32, tree.backend.Array3f
 
     def visit(node: VisitedNode, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
-        """Count a node. state: the number so far. Returns whether the walk enters the node, and the
-        new number."""
-        is_far = dr.squared_norm(c - vector(*node.head[:3])) > dr.square(inner + node.head[3])
-        is_pending = ~is_far & ~node.is_leaf & (node.head[4] <= smallest)
-        chosen = is_far if far else is_pending
-        if put is not None:
-            put(state[0], node.index, chosen)
-        return ~(is_far | is_pending), (state[0] + dr.select(chosen, index(1), index(0)),)
+        """Count a node, and store its index, if it is of the kind that is sought. In `node.head`,
+        entry 3 is `_NODE_RATIO` times the radius of the node and entry 4 is the radius.
 
-    return traverse_subtrees(tree, lists, visit, (index(0),))[0]
+        state: the number of nodes so far.
+
+        Returns whether the walk enters the node, and the new number.
+        """
+        is_far = dr.squared_norm(c - vector(*node.head[:3])) > dr.square(far_radius + node.head[3])
+        is_pending = ~is_far & ~node.is_leaf & (node.head[4] <= max_node_radius)
+        chosen = is_far if far else is_pending
+        if store is not None:
+            store(state[0], node.index, chosen)
+        return ~(is_far | is_pending), (state[0] + dr.select(chosen, uint_t(1), uint_t(0)),)
+
+    return traverse_subtrees(tree, lists, visit, (uint_t(0),))[0]

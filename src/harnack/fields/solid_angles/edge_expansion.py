@@ -54,7 +54,8 @@ _ROUNDED_UP = 1 + 1e-9
 
 @dataclass(frozen=True)
 class EdgeExpansions:
-    """Sums over cycles of edges, for n balls.
+    """The solid angle of cycles of far edges in n balls: for each ball a polynomial, and error
+    bounds.
 
     coefficients: (n, COEFFICIENTS) of the polynomial (`local_expansion.coefficient_keys`). Its
         value at the center is known modulo 4 pi.
@@ -67,11 +68,11 @@ class EdgeExpansions:
 
     @classmethod
     def zero(cls, n: int) -> EdgeExpansions:
-        """Sums over no edges."""
+        """The sums of n balls over no edges: zeros."""
         return cls(np.zeros((n, COEFFICIENTS)), np.zeros(n), np.zeros(n))
 
     def plus(self, other: EdgeExpansions) -> EdgeExpansions:
-        """The sums over the edges of both operands."""
+        """For each ball, the sum over the edges of this object and those of `other`."""
         error, slope = self.error + other.error, self.slope + other.slope
         total = self.coefficients + other.coefficients
         return EdgeExpansions(total, error * _ROUNDED_UP, slope * _ROUNDED_UP)
@@ -85,7 +86,8 @@ class EdgeExpansions:
         balls of the octants lie in the balls of the cells, so the bounds of errors hold there.
 
         is_split: the mask of the cells that are split.
-        shifts: `local_expansion.local_to_local_matrices`.
+        shifts: (8, COEFFICIENTS, COEFFICIENTS) matrices from
+            `local_expansion.local_to_local_matrices`.
         radius: the radius of the cells' balls.
 
         Rounding: in double precision, sums of 49 products lose less than 2^-46 of the sum of
@@ -102,9 +104,11 @@ class EdgeExpansions:
     def of(
         cls, points: RecordTable, edges: CellEdges, c: Vec3, radius: Real, n: int
     ) -> EdgeExpansions:
-        """The sums over the edges of each of n cells, for balls of this radius around c (n lanes).
+        """The sums over the edges of each of n cells, for balls of this radius around the centers c
+        (3, n).
 
-        points: rows (x, y, z), to which the edges refer.
+        points: records (x, y, z, ...) of the points to which the edges refer.
+        edges: the edges, sorted by cell.
 
         Rounding of the angle at the center, as in `LoopEdges.rounding`: each edge is off by less
         than 2^-46, and by the effect of moving its ends by 2^-50 of coordinates below 2^3. The
@@ -130,9 +134,9 @@ class EdgeExpansions:
 def _over_pieces(
     points: RecordTable, start: Any, end: Any, first: Any, count: Any, c: Vec3, radius: Real
 ) -> tuple[Any, ...]:
-    """Sum over the edges of each lane, cut into short pieces.
+    """Sums over the far edges of each lane's ball. Edges are cut into short pieces.
 
-    points: rows (x, y, z).
+    points: records (x, y, z, ...) of the ends of edges.
     start, end: for each edge, the rows of its end points.
     first, count: the first edge of each lane, and the number of its edges.
     c, radius: the centers and the radius of the balls.
@@ -144,7 +148,7 @@ def _over_pieces(
     index, real, vector = backend.UInt32, backend.Float, backend.Array3f
 
     def runs(j: Any, *_: Any) -> Mask:
-        """Whether the lane has further edges."""
+        """The mask of the lanes that have further edges."""
         return j < count
 
     def body(j: Any, t: Real, zr: Real, zi: Real, *sums: Real) -> tuple[Any, ...]:
@@ -173,7 +177,7 @@ def _over_pieces(
 
 @dataclass(frozen=True)
 class _EdgePiece:
-    """A piece of an edge.
+    """A piece of a far edge, short enough for Gauss's rule.
 
     middle: the midpoint of the piece, relative to the center of the ball.
     e: the vector from its start to its end.
@@ -198,8 +202,8 @@ class _EdgePiece:
         return cls(dr.fma(vector(0.5 * (t + stop)), e, a), (stop - t) * e, stop)
 
     def sums(self, radius: Real) -> list[Real]:
-        """Bounds of the truncation errors of value and gradient, and all coefficients after the
-        first, for a ball of this radius.
+        """What the piece adds to the polynomial in a ball of this radius: a list of bounds of the
+        truncation errors of value and gradient, followed by all coefficients after the first.
 
         Rounding: each product of a coefficient with a harmonic of the ball passes through fewer
         than 2^9 roundings of 2^-53 each. The sum of the absolute values of these products is below

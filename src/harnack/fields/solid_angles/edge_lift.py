@@ -1,4 +1,5 @@
-"""The lifted solid angle of boundary edges: a real number that has no jumps along a ray.
+"""The lifted solid angle of boundary edges. It is a real number, not only known modulo 4 pi, and it
+has no jumps along a ray.
 
 The antipodal method (Martens, Trettner and Bessmeltsev 2026) adds up triangles from every edge to
 an apex at infinity, opposite to a direction d. Let an edge e run from a to b, relative to x. Its
@@ -60,7 +61,8 @@ FACTOR_ROUNDINGS, STEEP_ROUNDINGS = 16.5, 7.5
 
 @dataclass(frozen=True)
 class LiftedEdges:
-    """Directed edges on a backend, one record for each: see `edge_records`."""
+    """Directed edges on a backend. Each has a record of both ends, its direction and its length
+    (`edge_records`)."""
 
     records: RecordTable
 
@@ -90,8 +92,8 @@ class LiftedEdge:
     """An edge relative to a point x, and to rays of a single direction.
 
     edge: the edge relative to x.
-    ends: its end points, in the order of their indices.
-    frame: the frame of the rays.
+    ends: its end points in absolute coordinates, in the order of their indices.
+    frame: the frame of the rays, which gives coordinates across the rays and along them.
     direction: 1 if the boundary runs from the first end to the second, -1 if it runs back. All
         terms of the edge are multiplied by it.
     """
@@ -111,12 +113,16 @@ class LiftedEdge:
         frame: RayFrame | VerticalRayFrame,
         x: Vec3,
     ) -> LiftedEdge:
-        """The edge from p to q relative to x, which lies on a ray of the frame. inverse:
-        1/|q-p|^2."""
+        """The edge from p to q relative to a point x that lies on a ray of the frame.
+
+        direction: 1 if the boundary runs from p to q, -1 if it runs back.
+        inverse: 1/|q-p|^2.
+        """
         return cls(Edge.between(p, q, inverse, x), (p, q), frame, direction)
 
     def factor(self) -> tuple[Real, Real]:
-        """Real and imaginary part of F_e."""
+        """Real and imaginary part of the factor F_e, whose argument is half the solid angle of the
+        edge's triangle (see the module)."""
         vector, frame, edge = cast("Any", type(self.edge.a)), self.frame, self.edge
         pairs = zip(self.ends, (edge.a, edge.b), strict=True)
         a, b = (vector(*frame.transverse(p), frame.component(a)) for p, a in pairs)
@@ -124,8 +130,9 @@ class LiftedEdge:
         return re, self.direction * im
 
     def terms(self, derivatives: int, active: Mask) -> SourceTerm:
-        """The edge's terms of the gradient and the Hessian of the sum of angles, up to order
-        `derivatives`. They are 0 where the edge is not active. There is no term of the value."""
+        """What the edge adds to the gradient (for `derivatives` >= 1) and to the Hessian (for
+        `derivatives` = 2) of the sum of solid angles. It adds 0 on lanes that are not active. The
+        value is None, because angles are added up by a product of factors."""
         if derivatives == 0:
             return SourceTerm(None)
         weight, c = self.edge.biot_savart()
@@ -139,47 +146,57 @@ class LiftedEdge:
         )
 
     def bounds(self, unit: Real) -> tuple[Real, Real, Real]:
-        """Bounds of the edge's rounding, and of its effect on higher derivatives.
+        """Bounds for this edge: of rounding, and of its share in Taylor's remainder.
 
-        unit: the rounding of a coordinate, `coordinate_rounding`, which is twice that of correct
-            rounding.
+        unit: a bound of the rounding of a coordinate (`coordinate_rounding`). Coordinates that are
+            correctly rounded are off by half of it.
 
-        Returns a bound of the rounding of Omega_e and of its factor in the product, and the edge's
-        terms of s4 and s5 of `SourceSums`.
+        Returns three numbers. The first bounds the rounding error of Omega_e, the solid angle of
+        the edge's triangle, together with the rounding error of multiplying by its factor F_e. The
+        other two are the terms that the edge adds to `s4` and `s5` of `SourceSums`.
 
-        Rounding. The ends of the edge, x and their differences are off by half a unit together. The
-        angle is off by that times Biot and Savart's field, which is at most twice the first number
-        e' of `edge_variation`. Roundings of s act like moving the ends by another half unit, and
-        the same bits of an end serve both of its edges. The rest is the rounding of the factor's
-        own sums and of the product: `FACTOR_ROUNDINGS`, and `STEEP_ROUNDINGS` L e' if the edge, of
-        length L, subtends more than a right angle. The rounding is less than 4 pi in any case.
+        Symbols. L = 2a is the edge's length, d its distance from the point x (reduced by its
+        rounding), e' = a/(d sqrt(d^2 + a^2)) the local `half_field`, and e = e'/d the local
+        `half_integral`.
 
-        Variation. Let rho be the distance of a point of the edge. Taylor's remainder after the
-        linear term is at most 3/4 t^2 times the integral of |dp|/(rho^3 (1-t/rho))
-        (`curve_queries.remainder_promises`). With a = L/2 and distance d an edge has int
-        rho^-3 <= 2a/(d^2 sqrt(d^2+a^2)) =: 2e and int rho^-4 <= 2e/d. On [0, b],
-        1/(1-q) <= 1 + q/(1-b) <= 1 + q rise/4 (`SourceSums.sample`). So the terms s4 += e/2 and
-        s5 += 3e/(8d) bound the edge's part of the remainder. d is reduced by its rounding.
+        Rounding. The ends of the edge, x, and their differences together are off by half a unit.
+        This changes the angle by at most that length times Biot and Savart's field, which is at
+        most 2e'. The rounding of the number s of an end (see the module) acts as if the end had
+        moved by another half unit. Both edges at an end use the same bits of s, so that this
+        moves a single point of the boundary. The sums in the factor, and the product, add
+        `FACTOR_ROUNDINGS` unit roundoffs, and `STEEP_ROUNDINGS` L e' if the edge subtends more than
+        a right angle. The rounding is less than 4 pi in any case.
+
+        Remainder. Let rho be the distance from x to a point p of the edge. At the distance t from x
+        the solid angle differs from its linear Taylor polynomial by at most 3/4 t^2 times the
+        integral of |dp|/(rho^3 (1 - t/rho)) (`curve_queries.remainder_promises`). Over the edge the
+        integral of |dp|/rho^3 is at most 2e, and that of |dp|/rho^4 at most 2e/d. `SourceSums`
+        bounds 1/(1 - q), for q = t/rho up to its largest value b, by 1 + q/(1 - b), and adds up the
+        two parts with the weights s4 and s5. So the terms e/2 and 3e/(8d) bound the edge's share.
         """
         distance = fmax(dr.sqrt(self.edge.squared_distance) - 2 * unit, 0)
-        first, e = edge_variation(distance * distance, self.edge.inverse_square_length)
-        factor_rounding = FACTOR_ROUNDINGS * float(dr.epsilon(first))
+        half_field, half_integral = edge_variation(
+            distance * distance, self.edge.inverse_square_length
+        )
+        factor_rounding = FACTOR_ROUNDINGS * float(dr.epsilon(half_field))
         steep_rounding = (
-            STEEP_ROUNDINGS * float(dr.epsilon(first)) * dr.rsqrt(self.edge.inverse_square_length)
+            STEEP_ROUNDINGS
+            * float(dr.epsilon(half_field))
+            * dr.rsqrt(self.edge.inverse_square_length)
         )
         rounding = fmin(
-            dr.fma(dr.fma(2.0, unit, steep_rounding), first, factor_rounding), 4 * dr.pi
+            dr.fma(dr.fma(2.0, unit, steep_rounding), half_field, factor_rounding), 4 * dr.pi
         )
-        return rounding, 0.5 * e, 0.375 * dr.rcp(distance) * e
+        return rounding, 0.5 * half_integral, 0.375 * dr.rcp(distance) * half_integral
 
 
 @dataclass(frozen=True)
 class LiftedSums:
-    """Sums over terms and edges. The angles of the edges are kept as a product of factors, and are
-    not yet part of the value.
+    """Sums over edges and other sources. The angles of the edges are kept as a product of complex
+    factors, and are not yet part of the value.
 
-    sums: all other sums.
-    product: the product of the factors F_e.
+    sums: the value without the angles of edges, the derivatives, and all bounds.
+    product: the product of the factors F_e of the edges, whose argument is half the sum of angles.
     """
 
     sums: SourceSums
@@ -187,22 +204,24 @@ class LiftedSums:
 
     @classmethod
     def zero(cls, backend: Backend, derivatives: int) -> LiftedSums:
-        """Sums without terms. derivatives: as for `SourceSums.zero`."""
+        """Sums over nothing. derivatives: 0 for the value only, 1 with the gradient, 2 with the
+        Hessian."""
         return cls(
             SourceSums.zero(backend, dr.inf, derivatives), LiftedProduct.identity(backend.Float)
         )
 
     @classmethod
     def of(cls, parts: tuple[Any, ...]) -> LiftedSums:
-        """The sums with these `parts`, as the method `parts` returns them."""
+        """The sums from a state of a loop, as the method `parts` returns it."""
         return cls(SourceSums.from_state(parts[0]), LiftedProduct(*parts[1]))
 
     def parts(self) -> tuple[Any, ...]:
-        """The parts of the sums and of the product, for the state of a loop."""
+        """The numbers of the sums and of the product as nested tuples, for the state of a loop."""
         return self.sums.to_state(), self.product.parts()
 
     def add_edge(self, edge: LiftedEdge, unit: Real, active: Mask) -> LiftedSums:
-        """The sums with an edge added, where active. unit: as for `LiftedEdge.bounds`."""
+        """The sums with an edge added on active lanes. unit: a bound of the rounding of a
+        coordinate."""
         (re, im), terms = edge.factor(), edge.terms(self.sums.derivatives, active)
         sums = self.sums.add_term(terms, True)
         rounding, s4, s5 = edge.bounds(unit)
@@ -221,16 +240,17 @@ class LiftedSums:
 
     @property
     def angle(self) -> Real:
-        """The sum of Omega_e over the edges."""
+        """The sum of the solid angles Omega_e of the edges' triangles."""
         return self.product.angle()
 
     def total(self) -> SourceSums:
-        """The sums with the angles of the edges added to the value."""
+        """The sums, with the solid angles of the edges added to the value."""
         return self.sums.add_term(SourceTerm(self.angle), True)
 
 
 def lifted_sums(edges: LiftedEdges, x: Vec3, derivatives: int) -> LiftedSums:
-    """Sum over all edges at points x in one loop, for the direction d = z.
+    """Sums over all edges at points x (3, n), in one loop: the solid angles of the edges' triangles
+    with their apex at infinity opposite to the direction d = z, derivatives, and bounds.
 
     derivatives: 0 for the angle only, 1 with the gradient, 2 with the Hessian. Results that are not
         used are not computed.
@@ -239,7 +259,7 @@ def lifted_sums(edges: LiftedEdges, x: Vec3, derivatives: int) -> LiftedSums:
     vector = backend.Array3f
 
     def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """The sums `state`, with the edge of a record added."""
+        """Add the edge in the record `row` to the state of the sums."""
         p, q = vector(*row[:3]), vector(*row[4:7])
         edge = LiftedEdge.between(p, q, row[3], row[7], VerticalRayFrame(x), x)
         return LiftedSums.of(state).add_edge(edge, unit, row[3] != 0).parts()
@@ -249,13 +269,14 @@ def lifted_sums(edges: LiftedEdges, x: Vec3, derivatives: int) -> LiftedSums:
 
 
 def edge_rates(edges: LiftedEdges, x: Vec3, derivatives: int) -> SourceSums:
-    """The sums of `lifted_sums` without the value: the gradient and, for derivatives = 2, the
-    Hessian of the solid angle of closed edges, by Biot and Savart's law."""
+    """The gradient and, for derivatives = 2, the Hessian of the solid angle of closed edges at
+    points x (3, n), by Biot and Savart's law. The sums have no value, but the terms `s4` and `s5`,
+    by which their errors are bounded."""
     backend, unit = edges.records.backend, coordinate_rounding(x)
     vector = backend.Array3f
 
     def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """The sums `state`, with the edge of a record added."""
+        """Add the edge in the record `row` to the state of the sums."""
         p, q, active = vector(*row[:3]), vector(*row[4:7]), row[3] != 0
         edge = LiftedEdge.between(p, q, row[3], row[7], VerticalRayFrame(x), x)
         sums = SourceSums.from_state(state).add_term(edge.terms(derivatives, active), True)
@@ -269,12 +290,12 @@ def edge_rates(edges: LiftedEdges, x: Vec3, derivatives: int) -> SourceSums:
 
 @dataclass(frozen=True)
 class VertexView:
-    """A vertex relative to a point x and to rays.
+    """A vertex as seen from a point x on a ray.
 
     offset: the vector from x to the vertex.
     length: the length of the offset.
-    u, v: the vertex's coordinates across the rays.
-    s: the length minus the component of the offset along the rays.
+    u, v: the vertex's two coordinates relative to the ray, across its direction.
+    s: the length minus the component of the offset along the ray.
     """
 
     offset: Vec3
@@ -285,7 +306,7 @@ class VertexView:
 
 
 def view_vertex(p: Vec3, frame: RayFrame, x: Vec3) -> VertexView:
-    """The vertex p, relative to x and to the rays of a frame."""
+    """The vertex p as seen from the point x on a ray of the frame."""
     offset = p - x
     length = dr.norm(offset)
     u, v = frame.transverse(p)
@@ -293,12 +314,13 @@ def view_vertex(p: Vec3, frame: RayFrame, x: Vec3) -> VertexView:
     return VertexView(offset, length, u, v, _length_less_axial(a, length))
 
 
-def ends_factor(a: VertexView, b: VertexView, direction: Real) -> tuple[Real, Real]:
-    """Real and imaginary part of the factor F_e of the edge from a to b.
+def edge_factor_of_views(a: VertexView, b: VertexView, direction: Real) -> tuple[Real, Real]:
+    """Real and imaginary part of the factor F_e = (s_a s_b + a'.b') - i (a' x b') of the edge from
+    a to b, whose argument is half the solid angle of the edge's triangle (see the module).
 
-    direction: positive if a has the lower index, else negative. `edge_function` must get the ends
-        in the order of their indices, so that both triangles at an edge, and its record, decide by
-        the same bits.
+    direction: positive if a has the lower vertex index, else negative. The cross product a' x b' is
+        computed from the ends in the order of their indices. So all computations of the same edge
+        get the same bits, and agree on which side of the ray the edge passes.
     """
     rises = direction > 0
     low, high = (dr.select(rises, a.u, b.u), dr.select(rises, a.v, b.v)), (
@@ -309,10 +331,11 @@ def ends_factor(a: VertexView, b: VertexView, direction: Real) -> tuple[Real, Re
 
 
 def edge_factor(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Real, Real]:
-    """Real and imaginary part of the factor F_e of the edge from a to b.
+    """Real and imaginary part of the factor F_e of the edge from a to b, whose argument is half the
+    solid angle of the edge's triangle (see the module).
 
-    a, b: the ends as (u, v, z), with two coordinates across the direction d and the coordinate
-        along it.
+    a, b: the ends relative to a point x, as (u, v, z), with two coordinates across the direction d
+        and the coordinate along it.
     la, lb: |a| and |b|.
 
     s_a is computed as |a'|^2/(|a| + a.d) where a.d > 0, so that nothing cancels.
@@ -321,14 +344,14 @@ def edge_factor(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Real, Real]:
 
 
 def _factor(a: tuple[Real, Real], b: tuple[Real, Real], sa: Real, sb: Real) -> tuple[Real, Real]:
-    """Real and imaginary part of F_e.
+    """Real and imaginary part of the factor F_e = (sa sb + a.b) - i (a x b) of an edge.
 
-    a, b: the coordinates of both ends across the direction.
-    sa, sb: the numbers s of both ends.
+    a, b: the coordinates (u, v) of both ends relative to the ray, across its direction d.
+    sa, sb: for both ends, the distance from x minus the component along d.
 
-    If the ray passes exactly through an edge or a vertex, it is treated as by
-    `tree.triangle_tree.signed_crossing`: as if its v were smaller than zero by an infinitesimal
-    amount, and its u by a much smaller infinitesimal amount.
+    A ray that passes exactly through an edge or a vertex is treated as if its v were smaller by an
+    infinitesimal amount, and its u by a much smaller infinitesimal amount.
+    `tree.triangle_tree.signed_crossing` uses the same rule for crossings.
     """
     real, (au, av), (bu, bv) = cast("Any", type(sa)), a, b
     on_ray = (au == 0) & (av == 0), (bu == 0) & (bv == 0)
@@ -352,8 +375,12 @@ def _length_less_axial(a: Vec3, length: Real) -> Real:
 
 @dataclass(frozen=True)
 class LiftedProduct:
-    """A product re + i im of factors, scaled to a length of about 1. turns: the number of full
-    turns by which the sum of the factors' arguments differs from the argument of re + i im."""
+    """A product of complex factors, scaled to a length of about 1, with the sum of their arguments.
+
+    re, im: real and imaginary part of the product.
+    turns: the number of full turns by which the sum of the factors' arguments is larger than the
+        argument of re + i im.
+    """
 
     re: Real
     im: Real
@@ -394,5 +421,5 @@ class LiftedProduct:
         )
 
     def angle(self) -> Real:
-        """The solid angle: twice the sum of arguments."""
+        """Twice the sum of the factors' arguments: the sum of the edges' solid angles."""
         return 2 * dr.fma(2 * dr.pi, self.turns, dr.atan2(self.im, self.re))

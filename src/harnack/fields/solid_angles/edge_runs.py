@@ -31,7 +31,8 @@ _APEX_RATIO = 2.5
 
 @dataclass(frozen=True)
 class VertexTable:
-    """Vertices of closed loops, in a table in which every run of edges is consecutive.
+    """The vertices of closed loops, in a table in which every run of consecutive edges has
+    consecutive rows.
 
     points: (m, 3) the vertices of each loop, twice in a row, and its first vertex a third time. So
         a run that continues across the end of a loop is consecutive.
@@ -66,7 +67,8 @@ class CellEdges:
 
 @dataclass(frozen=True)
 class EdgeRuns:
-    """Runs of the edges of loops, sorted by cell.
+    """Runs of consecutive edges of closed loops, each near to a cell, sorted by cell. Together with
+    its apex, a run is a closed loop.
 
     cell: (m,) the cell that each run belongs to.
     first, count: (m,) the row of its first vertex in the table, and the number of its edges.
@@ -82,14 +84,17 @@ class EdgeRuns:
 
     @classmethod
     def of_loops(cls, table: VertexTable) -> EdgeRuns:
-        """All loops, whole, as the runs of one cell."""
+        """The runs of a single cell to which all edges are near: each loop as a whole is a run."""
         n = len(table.sizes)
         is_whole = np.ones(n, np.bool_)
         return cls(np.zeros(n, np.int64), table.first, table.sizes, is_whole, np.zeros((n, 3)))
 
     def to_octants(self, is_split: BoolArray) -> EdgeRuns:
-        """The runs of the cells that are split, repeated for each of their eight octants. is_split:
-        the mask of these cells."""
+        """The runs of the cells that are split, repeated for each of a cell's eight octants. Octant
+        j of the i-th split cell gets the index 8 i + j.
+
+        is_split: (n,) the mask of the cells that are split.
+        """
         is_chosen = is_split[self.cell]
         split_index = np.cumsum(is_split) - 1
         parent, count = split_index[self.cell[is_chosen]], int(is_chosen.sum())
@@ -100,13 +105,14 @@ class EdgeRuns:
         return self._some(rows, cell[order])
 
     def _some(self, rows: IntArray, cell: IntArray) -> EdgeRuns:
-        """The runs at these rows, assigned to the cells `cell`."""
+        """The runs with the indices `rows`, each assigned to the cell in `cell`."""
         return EdgeRuns(
             cell, self.first[rows], self.count[rows], self.is_whole[rows], self.apex[rows]
         )
 
     def edges(self) -> tuple[IntArray, IntArray]:
-        """For each edge of all runs, the index of its run, and the row of its first vertex."""
+        """The edges of all runs, one run after another: for each edge the index (k,) of its run,
+        and the row (k,) of its first vertex in the table."""
         run = np.repeat(np.arange(len(self.count)), self.count)
         start = np.cumsum(self.count) - self.count
         return run, np.arange(len(run)) - start[run] + self.first[run]
@@ -164,8 +170,9 @@ class EdgeRuns:
     def with_apexes(
         self, table: VertexTable, centers: FloatArray, radius: FloatArray, number: np.dtype[Any]
     ) -> EdgeRuns:
-        """The same runs with apexes.
+        """The same runs, with an apex chosen for each.
 
+        table: the vertices of the loops.
         centers: (n, 3) of the cells.
         radius: (n,) the distance from the centers beyond which edges are far.
         number: the type of numbers to which apexes are rounded.
@@ -191,9 +198,13 @@ class EdgeRuns:
         return EdgeRuns(self.cell, self.first, self.count, self.is_whole, apex)
 
     def closing_edges(self, apexes: int) -> tuple[CellEdges, CellEdges]:
-        """The closing edges of all runs that are no whole loops: first those from the ends of runs
-        to their apexes, then those from the apexes to the beginnings of the runs. apexes: the
-        row of the first apex in the table of points."""
+        """The closing edges of all runs that are no whole loops, as two groups: the edges from the
+        ends of the runs to their apexes, and the edges from the apexes to the beginnings of the
+        runs.
+
+        apexes: the row of the first run's apex in the table of points. The apexes of the other runs
+            follow.
+        """
         run_ids = np.flatnonzero(~self.is_whole)
         first, last = self.first[run_ids], self.first[run_ids] + self.count[run_ids]
         cell = self.cell[run_ids]
@@ -214,9 +225,10 @@ def subtract_runs(
     vertices: int,
 ) -> CellEdges:
     """The edges that remain when the closed runs `after` are subtracted from the closed runs
-    `before`, sorted by cell.
+    `before`, sorted by cell. They are the edges of `before` that are not in `after`, the closing
+    edges of `before`, and the reversed closing edges of `after`.
 
-    edges: the edges of the runs `before`, as `EdgeRuns.edges` gives them.
+    edges: the edges of the runs `before`, as `EdgeRuns.edges` returns them.
     kept: (k,) for each of these edges, whether it is in a run of `after`.
     vertices: the number of vertices in the table.
 
@@ -236,7 +248,7 @@ def subtract_runs(
 
 
 def _merged(groups: list[CellEdges]) -> CellEdges:
-    """The edges of all groups, sorted by cell; each group must be sorted by cell."""
+    """The edges of all groups as one group, sorted by cell. Each group must be sorted by cell."""
     cell_count = 1 + max((int(group.cell[-1]) for group in groups if len(group.cell)), default=0)
     counts = [np.bincount(group.cell, minlength=cell_count) for group in groups]
     total = np.sum(counts, axis=0)

@@ -40,7 +40,8 @@ _MAX_INVERSE_SQUARE = 1e30
 
 
 def inverse_squares(edges: FloatArray) -> FloatArray:
-    """1/length^2 (k,) of edge vectors (k, 3), limited to the largest number that records hold.
+    """One over the squared length (k,) of edge vectors (k, 3), but at most 1e30, the largest number
+    that records hold.
 
     For edges shorter than 1e-15 the result is too small. That harms neither distances nor bounds:
     the nearest point of the line is off by less than the edge's length, far below the rounding of
@@ -77,8 +78,11 @@ class LoopEdges:
     def upload(
         cls, backend: Backend, loops: tuple[FloatArray, ...], run: int | None = None
     ) -> LoopEdges:
-        """The edges of closed loops, each of shape (n, 3). run: the number of edges of a record;
-        None to choose it by the loops."""
+        """Upload the edges of closed loops.
+
+        loops: the vertices of each loop, an array (n, 3).
+        run: the number of edges of a record; None to choose it by the loops.
+        """
         run, dtype = run or _edges_per_record(loops), backend.dtype
         rounded = (loop.astype(dtype).astype(np.float64) for loop in loops)
         table = np.concatenate([_loop_records(loop, run) for loop in rounded])
@@ -89,8 +93,8 @@ class LoopEdges:
         return self.records.backend
 
     def rounding(self, records: Any) -> Any:
-        """A bound of the rounding of the solid angle, for loops of this many records, without
-        `vertex_rounding`, which is to be added.
+        """A bound of the rounding of the solid angle of loops that have this many records. The
+        result of `vertex_rounding` has to be added to it.
 
         Proof, with u = epsilon/2. Omega = 2 arg of a product of n factors, including the factors of
         padding. Errors of arguments add up, as each step is compared with the exact product of its
@@ -121,8 +125,8 @@ class LoopEdges:
         return self.backend.machine_epsilon * (16 + 7.25 * self.edges_per_record * records)
 
     def records_of(self, first: Any, trips: Any) -> LoopEdges:
-        """The edges of `trips` records, beginning with record `first`. Both may differ from lane to
-        lane."""
+        """The edges of `trips` consecutive records only, of which `first` is the index of the first
+        one. Both numbers may differ from lane to lane."""
         return replace(self, records=self.records.view(first, trips))
 
     def vertex(self, row: list[Real], k: int) -> Vec3:
@@ -132,11 +136,15 @@ class LoopEdges:
     def for_each(
         self, body: EachEdge, state: tuple[Any, ...], label: str, active: Mask = True
     ) -> tuple[Any, ...]:
-        """The state after `body` has been applied to all edges, one after the other. label, active:
-        as for `RecordTable.for_each`."""
+        """Apply `body` to all edges, one after another, in a recorded loop. Returns the last state.
+
+        state: the first state.
+        label: the name of the recorded loop.
+        active: the mask of the lanes on which the loop runs.
+        """
 
         def of_record(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Apply `body` to the edges of a record."""
+            """Apply `body` to the edges in the record `row`, one after another."""
             for k in range(self.edges_per_record):
                 p, q = self.vertex(row, k), self.vertex(row, k + 1)
                 state = body(p, q, row[4 * k + 3], state)
@@ -145,15 +153,20 @@ class LoopEdges:
         return self.records.for_each(of_record, state, label, active)
 
 
-def vertex_rounding(epsilon: float, x: Vec3, squares: Real) -> Real:
-    """A bound of the rounding of the angle near the curve, to be added to `LoopEdges.rounding`.
-    squares: `EdgeSums.squares`."""
-    return epsilon * dr.fma(2.25, dr.norm(x), 2.9 + 2.25) * squares
+def vertex_rounding(epsilon: float, x: Vec3, inverse_squares: Real) -> Real:
+    """A bound of the rounding of the solid angle at x that grows near the curve. It has to be added
+    to the bound `LoopEdges.rounding`.
+
+    epsilon: the machine epsilon of the backend.
+    inverse_squares: an upper bound of the integral of |dp|/D^2 along the curve, with D the distance
+        from x to the point p (`EdgeSums.inverse_squares`).
+    """
+    return epsilon * dr.fma(2.25, dr.norm(x), 2.9 + 2.25) * inverse_squares
 
 
 def _edges_per_record(loops: tuple[FloatArray, ...]) -> int:
-    """Eight edges per record, or four if padding to multiples of eight would add more than a fifth
-    to the number of edges."""
+    """The number of edges of a record for these loops: eight, or four if padding to multiples of
+    eight would add more than a fifth to the number of edges."""
     edges = sum(len(loop) for loop in loops)
     padded = sum(-(-len(loop) // 8) * 8 for loop in loops)
     return 8 if padded <= 1.2 * edges else 4
@@ -224,7 +237,7 @@ class Edge:
 
     @functools.cached_property
     def lengths(self) -> tuple[Real, Real]:
-        """|a| and |b|."""
+        """The distances |a| and |b| from x to both ends of the edge."""
         return dr.norm(self.a), dr.norm(self.b)
 
     @functools.cached_property
@@ -240,7 +253,8 @@ class Edge:
         return dr.select(square > 0, (la + lb) / (la * lb * self._denominator(square)), 0), c
 
     def biot_savart_of_lengths(self, la: Real, lb: Real) -> tuple[Real, Vec3]:
-        """w and c as from `biot_savart`, with one division. la, lb: |a| and |b|."""
+        """The number w and the vector c of Biot and Savart's field w c of the edge, computed with a
+        single division from the distances la = |a| and lb = |b| of its ends."""
         c, product, dot = dr.cross(self.a, self.e), la * lb, dr.dot(self.a, self.b)
         square, is_obtuse = dr.squared_norm(c), dot < 0
         numerator = (la + lb) * dr.select(is_obtuse, product - dot, 1)
@@ -248,7 +262,8 @@ class Edge:
         return dr.select(square > 0, numerator / denominator, 0), c
 
     def hessian_factors(self) -> tuple[Vec3, Vec3]:
-        """c and grad w. The edge's term of the Hessian is (c grad w^T + grad w c^T)/2.
+        """The vectors c = a x e and grad w, with w of the class. The edge's term of the Hessian is
+        (c grad w^T + grad w c^T)/2.
 
         Lengths should be of order one, to stay far from overflow: at the distance d, the terms fall
         like d^-5 far away and grow like d^-3 near the edge.
@@ -265,18 +280,20 @@ class Edge:
             * ratio
             * (dr.fma(difference * difference, inverse, 1) + total * ratio)
         )
-        cubes = inverse * dr.fma(inverse_a, inverse_a, dr.fma(inverse_b, inverse_b, inverse))
-        e_factor = dr.dot(e, a + self.b) / total * cubes * self.inverse_square_length
+        cube_ratio = inverse * dr.fma(inverse_a, inverse_a, dr.fma(inverse_b, inverse_b, inverse))
+        e_factor = dr.dot(e, a + self.b) / total * cube_ratio * self.inverse_square_length
         return c, h_factor * h + e_factor * e
 
     def _denominator(self, square: Real) -> Real:
-        """D, in the form that does not cancel. square: |c|^2."""
+        """The number D = |a||b| + a.b, in the form that does not cancel near the edge. square:
+        |c|^2 with c = a x e."""
         (la, lb), dot = self.lengths, dr.dot(self.a, self.b)
         return dr.select(dot < 0, square / (la * lb - dot), la * lb + dot)
 
 
 def edge_variation(square: Real, inverse: Real) -> tuple[Real, Real]:
-    """h/(d sqrt(d^2+h^2)), and that divided by d, for an edge of half length h at distance d.
+    """Two numbers for an edge of half length h at the distance d: h/(d sqrt(d^2+h^2)), and that
+    divided by d.
 
     square: d^2.
     inverse: 1/(2h)^2.
@@ -297,24 +314,26 @@ _RENORMALIZE_EVERY = 2
 
 @dataclass(frozen=True)
 class EdgeSums:
-    """Sums over all edges at a point x.
+    """Quantities of curves at a point x, summed over their edges.
 
-    angle, gradient: Omega in (-2pi, 2pi], and its gradient.
+    angle, gradient: the solid angle in (-2 pi, 2 pi], and its gradient.
     distance: the distance to the nearest edge.
-    squares, cubes, fourths: integrals of |dp|/D^k along the edges, with D the distance from x to p:
-        an upper bound for k = 2, the integral for k = 3, and an upper bound for k = 4.
+    inverse_squares, inverse_cubes, inverse_fourths: integrals of |dp|/D^k along the edges, with D
+        the distance from x to p: an upper bound for k = 2, the integral for k = 3, and an upper
+        bound for k = 4.
     """
 
     angle: Real
     gradient: Vec3
     distance: Real
-    squares: Real
-    cubes: Real
-    fourths: Real
+    inverse_squares: Real
+    inverse_cubes: Real
+    inverse_fourths: Real
 
 
 def sum_over_edges(edges: LoopEdges, x: Vec3, active: Mask = True) -> EdgeSums:
-    """Sum over all edges at x in one loop, on lanes that are active.
+    """The sums over all edges at points x, in one loop, on lanes that are active: solid angle,
+    gradient, distance and integrals.
 
     Nearly all of the time of tracing a curve is spent in this loop, so it is written for
     throughput: records of eight edges, vertices fetched in aligned packets of eight floats, one
@@ -346,7 +365,7 @@ def sum_over_edges(edges: LoopEdges, x: Vec3, active: Mask = True) -> EdgeSums:
         """Add the edges of a record to the state: the product of spinors (zr, zi), half the
         gradient g, the least squared distance d2, and a quarter or half of the three
         integrals."""
-        zr, zi, g, d2, squares, cubes, fourths = state
+        zr, zi, g, d2, inverse_squares, inverse_cubes, inverse_fourths = state
         p = edges.vertex(row, 0)
         a = p - x
         la, sa, ca = spinor(a)
@@ -366,24 +385,32 @@ def sum_over_edges(edges: LoopEdges, x: Vec3, active: Mask = True) -> EdgeSums:
             d2 = fmin(square, d2)
             term = weight * dr.rsqrt(inverse)
             inverse_d = dr.rsqrt(square)
-            cubes, fourths = cubes + term, dr.fma(term, inverse_d, fourths)
-            squares = dr.fma(term, square * inverse_d, squares)
+            inverse_cubes, inverse_fourths = (
+                inverse_cubes + term,
+                dr.fma(term, inverse_d, inverse_fourths),
+            )
+            inverse_squares = dr.fma(term, square * inverse_d, inverse_squares)
             p, a, la, sa, ca = q, b, lb, sb, cb
-        return zr, zi, g, d2, squares, cubes, fourths
+        return zr, zi, g, d2, inverse_squares, inverse_cubes, inverse_fourths
 
     start = (real(1), real(0), type(x)(0), real(dr.inf), real(0), real(0), real(0))
-    zr, zi, g, d2, squares, cubes, fourths = edges.records.for_each(add, start, "edges", active)
+    zr, zi, g, d2, inverse_squares, inverse_cubes, inverse_fourths = edges.records.for_each(
+        add, start, "edges", active
+    )
     angle = 2 * dr.atan2(zi, zr)
     # The weights are half of those in the gradient.
-    return EdgeSums(angle, 2 * g, dr.sqrt(d2), 4 * squares, 2 * cubes, 2 * fourths)
+    return EdgeSums(
+        angle, 2 * g, dr.sqrt(d2), 4 * inverse_squares, 2 * inverse_cubes, 2 * inverse_fourths
+    )
 
 
 def hessian_over_edges(edges: LoopEdges, x: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-    """Rows of the Hessian of the solid angle at x, in one loop over the edges."""
+    """The three rows of the Hessian of the curves' solid angle at points x, in one loop over the
+    edges."""
     x = edges.backend.Array3f(x)
 
     def add(p: Vec3, q: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """The entries `state` of the Hessian, with those of an edge added."""
+        """Add the edge from p to q to the entries `state` of the Hessian. inverse: 1/|q - p|^2."""
         return (
             SymmetricMatrix(*state)
             .add_outer_product(*Edge.between(p, q, inverse, x).hessian_factors())
@@ -402,8 +429,8 @@ def inner_product(a: Spinor, b: Spinor) -> tuple[Real, Real]:
 
 
 def spinor(a: Vec3) -> tuple[Real, Real, Spinor]:
-    """a|, |a| + |a_z|, and the spinor of the direction of a, as four reals. The spinor is not
-    normalized."""
+    """Three results for a vector a: its length |a|; s = |a| + |a_z|; and the spinor of its
+    direction, as four real numbers. The spinor is not normalized: its length is sqrt(2 s |a|)."""
     length = dr.sqrt(dr.fma(a.z, a.z, dr.fma(a.x, a.x, a.y * a.y)))
     s = length + dr.abs(a.z)
     is_up = a.z >= 0

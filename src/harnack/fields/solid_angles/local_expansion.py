@@ -33,8 +33,9 @@ if TYPE_CHECKING:
 
 
 def coefficient_keys(degree: int) -> list[tuple[int, int, int]]:
-    """The keys (j, k, part) of the (degree + 1)^2 coefficients, in order. part: 0 for the real
-    part, 1 for the imaginary part."""
+    """The keys (j, k, part) of the (degree + 1)^2 coefficients of a local expansion, in the order
+    in which they are stored. A key stands for the real part (part = 0) or the imaginary part (part
+    = 1) of L_jk, with j <= degree and 0 <= k <= j; L_j0 is real."""
     return [
         (j, k, part)
         for j in range(degree + 1)
@@ -44,10 +45,13 @@ def coefficient_keys(degree: int) -> list[tuple[int, int, int]]:
 
 
 def irregular_harmonics(x: Any, y: Any, z: Any, inverse: Any, degree: int) -> Pairs:
-    """I_lm at (x, y, z) for l <= degree and 0 <= m <= l, as pairs of real and imaginary part.
-    inverse: one over the length of (x, y, z).
+    """The irregular solid harmonics I_lm at the vector (x, y, z), for l <= degree and 0 <= m <= l,
+    as pairs of real and imaginary part.
 
-    By definition I_lm = (l+m)! (l-m)! R_lm / r^(2l+1), and R_lm(v / r^2) = R_lm(v) / r^(2l).
+    inverse: 1/r, with r the length of (x, y, z).
+
+    With the regular solid harmonics R_lm of `multipole`, I_lm = (l+m)! (l-m)! R_lm / r^(2l+1) by
+    definition, and R_lm(v / r^2) = R_lm(v) / r^(2l).
     """
     square = inverse * inverse
     harmonics: Pairs = {}
@@ -58,8 +62,9 @@ def irregular_harmonics(x: Any, y: Any, z: Any, inverse: Any, degree: int) -> Pa
 
 
 def _signed(values: Pairs, l: int, m: int) -> tuple[Any, Any]:
-    """The entry (l, m) for m of either sign. For m < 0 it is (-1)^m times the conjugate of the
-    entry (l, -m)."""
+    """The real and imaginary part of the entry (l, m) of harmonics or moments, for m of either
+    sign. `values` has the entries for m >= 0. For m < 0 the entry is (-1)^m times the conjugate of
+    the entry (l, -m)."""
     re, im = values[l, abs(m)]
     if m >= 0:
         return re, im
@@ -67,10 +72,10 @@ def _signed(values: Pairs, l: int, m: int) -> tuple[Any, Any]:
 
 
 def multipole_to_local(moments: Pairs, seen: Pairs, degree: int) -> list[Any]:
-    """L_jk about c, up to `degree` and in the order of `coefficient_keys`, of dipoles with these
-    moments.
+    """The coefficients L_jk of the local expansion about a point c, up to `degree` and in the order
+    of `coefficient_keys`, of the field f of dipoles with given multipole moments.
 
-    moments: M_lm about a point y; moments of other degrees count as 0.
+    moments: the moments M_lm of the dipoles about a point y; moments of other degrees count as 0.
     seen: I_lm (`irregular_harmonics`) at c - y, up to the degree `degree` plus the largest degree
         of the moments.
 
@@ -98,7 +103,7 @@ def multipole_to_local(moments: Pairs, seen: Pairs, degree: int) -> list[Any]:
 
 def local_to_local_matrices(degree: int, offset: float) -> FloatArray:
     """Matrices T (8, n, n) that shift a local expansion from the center of a cube to the centers of
-    its eight octants. Octants have the order of the cube's corners, z fastest.
+    its eight octants. Octants are in the order of the cube's corners: z changes fastest, x slowest.
 
     If L are the n coefficients about the cube's center, T @ L are those about an octant's center.
     They are in units of the octant's radius, which is half that of the cube.
@@ -132,7 +137,12 @@ def local_to_local_matrices(degree: int, offset: float) -> FloatArray:
 
 
 def evaluate_expansion(coefficients: Sequence[Any], y: Sequence[Any], degree: int) -> list[Any]:
-    """The value and the three first derivatives of the polynomial at y, in units of the radius.
+    """The value and the three first derivatives of a local expansion at the point y, as a list of
+    four numbers.
+
+    coefficients: L_jk, in the order of `coefficient_keys`.
+    y: the three coordinates of the point relative to the center, in units of the ball's radius.
+        The derivatives are by these coordinates.
 
     With A_jk = w_k conj L_jk, w_0 = 1 and w_k = 2 otherwise, f = Re sum A_jk R_jk over k >= 0.
     R_j,-1 = -conj R_j1. So by the derivatives of R_jk (`multipole`), each derivative of f is Re sum
@@ -163,8 +173,8 @@ def evaluate_expansion(coefficients: Sequence[Any], y: Sequence[Any], degree: in
 
 
 class _AbsoluteValues:
-    """Numbers for which every sum or difference is the sum of absolute values, so that an
-    expression gives the sum of the absolute values of its terms."""
+    """Arrays of nonnegative numbers. Their sums and differences are sums of absolute values, so
+    that an expression gives the sum of the absolute values of its terms."""
 
     def __init__(self, number: Any) -> None:
         """number: a number or an array, not negative."""
@@ -183,7 +193,7 @@ class _AbsoluteValues:
         )
 
     def __neg__(self) -> _AbsoluteValues:
-        """The number itself, as its sign does not count."""
+        """This object itself, because signs do not count."""
         return self
 
     __radd__ = __sub__ = __rsub__ = __add__
@@ -191,9 +201,14 @@ class _AbsoluteValues:
 
 
 def rounding_tables(degree: int, largest: float) -> FloatArray:
-    """Numbers (n, 4) that bound the rounding of `evaluate_expansion` for coordinates up to
-    `largest`. Multiply |L_jk| (n,) by each column, sum up, and multiply by the backend's epsilon:
-    this gives bounds for the value and the three derivatives.
+    """Factors (n, 4) that bound the rounding of `evaluate_expansion`, for the n coefficients of an
+    expansion and for the value and the three derivatives.
+
+    largest: the largest absolute value of a coordinate, in units of the ball's radius.
+
+    The rounding error of the value is at most epsilon, the backend's machine epsilon, times the sum
+    of the products of |L_jk| and the first column. The other columns give bounds for the three
+    derivatives in the same way.
 
     Proof. Value and derivatives are sums of products of coefficients, coordinates and constants.
     Each product passes through at most n = 9 degree + 2 (degree + 1)^2 roundings: 6 per degree in

@@ -1,4 +1,4 @@
-"""Shape interpolation: slices of a solid angle in four dimensions."""
+"""Interpolation of two shapes, by slices of a solid angle in four dimensions."""
 
 from __future__ import annotations
 
@@ -101,19 +101,19 @@ class Morph(BatchedField):
     def quadrature_displacement(
         self, points: Any, *, precision: Precision | None = None
     ) -> FloatArray:
-        """A bound (n,), to first order, of how far quadrature displaces the surface.
+        """A bound (n,), to first order, of the distance between this surface and the surface that
+        exact integration over the triangles would give, at points (n, 3) of this surface.
 
-        The surface is compared with the one that exact integration over the triangles would give,
-        at points (n, 3) of the surface. The bound is the bound of the error of the quadrature,
-        divided by the length of the gradient. For meshes of regular triangles the true displacement
-        is far smaller. It is a length in the unit of the meshes, and 0 if w is 0 or `gap`, where
-        there is no quadrature.
+        It is a length in the unit of the meshes: the bound of the quadrature's error, divided by
+        the length of the gradient. For meshes of regular triangles the true distance is far
+        smaller. The result is 0 if w is 0 or `gap`, because then no quadrature is used.
         """
         if isinstance(self._slice, MorphSlice):
             return self._slice.quadrature_displacement(points, precision)
         return np.zeros(len(np.asarray(points)))
 
     def describe(self) -> dict[str, Any]:
+        """Facts about the field for users, as a dictionary of names and values."""
         heights = {"w": self.w, "gap": self.gap}
         if isinstance(self._slice, WindingNumber):
             return {**heights, "shows": "mesh " + "ab"[self.w > 0], **self._slice.describe()}
@@ -169,7 +169,14 @@ class Morph(BatchedField):
 
 
 def _checked(mesh: Any, name: str) -> tuple[FloatArray, IntArray]:
-    """The validated mesh (vertices, faces). Raises MeshError with the name of the argument."""
+    """The mesh as checked arrays of vertices (n, 3) and faces (m, 3).
+
+    mesh: the argument that the user gave for a mesh.
+    name: the name of that argument, for messages.
+
+    Raises:
+        MeshError: the argument is no pair, or its mesh is not valid.
+    """
     try:
         vertices, faces = mesh
     except (TypeError, ValueError):

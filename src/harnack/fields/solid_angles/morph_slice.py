@@ -1,5 +1,5 @@
-"""A slice of the sum of two solid angles in four dimensions, at a height strictly between 0 and the
-gap.
+"""The field of a `Morph`, an interpolation of two shapes, at a height strictly between its two
+ends. It is a slice of the sum of two solid angles in four dimensions.
 
 - `MorphSlice`: the field.
 - `SlicedKernel`: its kernel, with the proof of its bounds.
@@ -109,8 +109,11 @@ class SlicedKernel(RadialKernel):
         self._degree = _DEGREES[np.dtype(backend.dtype).itemsize]
 
     def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
-        """psi_0 to psi_last, from the last i_n, which is a polynomial, and the recurrence for the
-        others."""
+        """The functions psi_0 to psi_last of the class, at the distance D in four dimensions. The
+        last of the integrals i_n comes from a polynomial, and the other ones from the recurrence.
+
+        inverse: 1/D.
+        """
         del distance
         c = self.height * inverse
         s2 = dr.fma(-c, c, 1)
@@ -122,26 +125,32 @@ class SlicedKernel(RadialKernel):
         return KernelValues(inverse, thetas)
 
     def bounds(self, distance: Real, last: int) -> list[Real]:
+        """The numbers Q_2 to Q_last of the class: m! Q_m/D^(m+1) bounds m-th derivatives along
+        lines at distances D. They are the same for all distances."""
         del distance
         return [GRADIENT_BOUND, *(1.0 for _ in range(3, last + 1))]
 
     def growth(self, r: Real) -> Real:
+        """A factor that bounds how much larger the numbers Q_m of `bounds` are at a distance that
+        is shorter by r."""
         del r
         return 1.0
 
     def accepting_distance(self, radius: FloatArray, accuracy: float) -> FloatArray:
+        """For clusters of dipoles with these radii (k,), the distances (k,) beyond which their
+        moments are used. accuracy: the larger it is, the larger are the distances."""
         return accuracy * radius + 1e-5
 
 
 @functools.cache
 def moment_polynomial(n: int, degree: int) -> tuple[float, ...]:
-    """i_n of `SlicedKernel` as a polynomial of this degree in 2c - 1, for c in [0, 1]. Returns its
-    coefficients in ascending order."""
+    """The coefficients, in ascending order, of a polynomial in 2c - 1 of this degree that
+    approximates the integral i_n(c) of `SlicedKernel` for c in [0, 1]."""
     t, weight = legendre.leggauss(48)
     t, weight = 0.5 * (t + 1), 0.5 * weight
 
     def moment(x: FloatArray) -> FloatArray:
-        """i_n at x = 2c - 1, an array in [-1, 1]."""
+        """The values of i_n at x = 2c - 1. x: an array of numbers in [-1, 1]."""
         phi = np.arccos(0.5 * (x + 1))[:, None]
         ratio = np.sin(phi * t) / np.sin(phi)
         return phi[:, 0] / np.sin(phi[:, 0]) * (ratio ** (2 * n - 2) @ weight)
@@ -160,7 +169,7 @@ def _horner(x: Real, coefficients: tuple[float, ...]) -> Real:
 
 
 def _psi_factor(k: int) -> float:
-    """The factor (2/pi) 2^k k! of psi_k (`SlicedKernel`)."""
+    """The factor (2/pi) 2^k k! in the formula for psi_k of `SlicedKernel`."""
     return 2 / math.pi * 2.0**k * math.factorial(k)
 
 
@@ -171,11 +180,11 @@ _CELL_FRACTION = 0.54
 
 @dataclass(frozen=True)
 class QuadraturePoints:
-    """Points that stand for pieces of triangles, or for several small triangles. Each point and its
-    triangles form a group.
+    """Oriented points for the quadrature of integrals over triangles. A point stands for a piece of
+    a triangle, or for several small triangles: the group of the point.
 
-    points: (n, 3) centroids.
-    moments: (n, 3) sums of area times normal.
+    points: (n, 3) the centroids of the groups.
+    moments: (n, 3) for each group, the sum of area times normal.
     farthest: the largest distance, in all groups, between a point of a triangle and the quadrature
         point that stands for it.
     second_moment_ratio: the largest ratio, over all groups, of the integral of |d|^2 over the
@@ -198,9 +207,12 @@ def piece_counts(corners: FloatArray, longest: float) -> IntArray:
 
 
 def quadrature_points(corners: FloatArray, longest: float) -> QuadraturePoints:
-    """Points for triangles (m, 3, 3): centroids of similar pieces with edges of at most `longest`.
-    For triangles much smaller than that, there is a single point for all triangles in a cell of
-    space that face the same way."""
+    """Quadrature points for triangles (m, 3, 3).
+
+    longest: the length that edges of pieces may have. A larger triangle is cut into similar pieces,
+        each with a point at its centroid. Of much smaller triangles, all that lie in the same cell
+        of space and face the same way have a single point.
+    """
     is_small = _longest_edges(corners) <= _CELL_FRACTION * longest
     parts = [
         sample(rows, longest)
@@ -239,8 +251,9 @@ def _mean_squares(corners: FloatArray) -> FloatArray:
 
 
 def _subdivide(corners: FloatArray, longest: float) -> QuadraturePoints:
-    """Points for triangles (m, 3, 3), each cut into count^2 similar pieces, where count is its
-    number from `piece_counts`. The first moments of the pieces about their centroids vanish."""
+    """Quadrature points for triangles (m, 3, 3) with edges longer than `longest`: the centroids of
+    pieces. A triangle is cut into count^2 similar pieces, where count is its number from
+    `piece_counts`. The first moments of the pieces about their centroids vanish."""
     counts = piece_counts(corners, longest)
     points: list[FloatArray] = []
     moments: list[FloatArray] = []
@@ -263,7 +276,8 @@ def _subdivide(corners: FloatArray, longest: float) -> QuadraturePoints:
 
 
 def _merge_small(corners: FloatArray, longest: float) -> QuadraturePoints:
-    """Points for small triangles (m, 3, 3). There is a single point for all triangles whose
+    """Quadrature points for small triangles (m, 3, 3). `longest` is the length that edges of pieces
+    may have; cells are a fraction of it wide. There is a single point for all triangles whose
     centroids are in the same cell of space, and whose normals have the same largest component with
     the same sign. So the length of their total moment is at least 1/sqrt(3) of their area."""
     moments, centroids = _areas(corners), corners.mean(axis=1)
@@ -306,15 +320,23 @@ _CELLS_ACROSS = 128
 
 
 class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
-    """The field f(x) = (U_a(x, w) + U_b(x, gap - w))/(2 pi^2) with 0 < w < gap: see `Morph`.
+    """The field f(x) = (U_a(x, w) + U_b(x, gap - w))/(2 pi^2) with 0 < w < gap.
 
-    corners: two arrays (m, 3, 3) of triangles.
-    w, gap, spacing, accuracy: as for `Morph`.
+    U_a(x, w) is the solid angle that the flat solid inside mesh a subtends in four dimensions, seen
+    from the point x at the height w above it (see `Morph`). It is computed as a sum over oriented
+    points that stand for the triangles.
 
-    Promises. Let d be the smallest distance, in four dimensions, of a quadrature point from x. The
-    promises are `TaylorRemainder` within 0.45 d, and a `HarmonicBall` of dimension 4 and radius
-    0.35 d, which proves shorter steps. `SlicedKernel` has the proof that second derivatives are no
-    larger than those of dipoles at the distances in four dimensions.
+    corners: the triangles of both meshes, as two arrays (m, 3, 3).
+    w, gap: the height of the slice above mesh a, and the height of mesh b above mesh a.
+    spacing: the largest length of the edges of pieces of triangles, in units of the height of the
+        slice above (or below) their mesh.
+    accuracy: the moments of a cluster of points are used beyond this many times its radius.
+
+    Promises (proved bounds of f near a point). Let d be the smallest distance, in four dimensions,
+    of a quadrature point from x. The promises are `TaylorRemainder` within 0.45 d, and a
+    `HarmonicBall` of dimension 4 and radius 0.35 d, which proves shorter steps. `SlicedKernel` has
+    the proof that second derivatives are no larger than those of dipoles at the distances in four
+    dimensions.
     """
 
     default_level = 0.5
@@ -339,24 +361,35 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         self._pieces = tuple(
             quadrature_points(*pair) for pair in zip(corners, longest, strict=True)
         )
-        self._dipoles = tuple(self._clustered(pair) for pair in self._pieces)
+        self._dipoles = tuple(self._dipole_tree(pair) for pair in self._pieces)
         self._extents: TransientCache[tuple[float, ...], Volume] = TransientCache()
         self._occupied: TransientCache[tuple[float, ...], OccupancyGrid] = TransientCache()
 
-    def _clustered(self, pieces: QuadraturePoints) -> ClusteredDipoles:
-        """The dipoles of the quadrature points, in unit coordinates, scaled so that f is the sum
-        over both meshes."""
+    def _dipole_tree(self, pieces: QuadraturePoints) -> ClusteredDipoles:
+        """The tree over the dipoles of the quadrature points of one of the two meshes, one dipole
+        for each point.
+
+        pieces: the quadrature points, in the user's coordinates.
+
+        Positions are relative to the field's center and divided by its size. Moments are
+        scaled so that, with the scaled kernel of `SlicedKernel`, they contain the factor 1/(2 pi^2)
+        of f: f is the plain sum of the dipoles' potentials over both meshes.
+        """
         scale = 1 / (8 * math.pi * self._size**2)
         points = (pieces.points - self._center) / self._size
         return ClusteredDipoles.of(dipole_records(points, scale * pieces.moments))
 
     @property
     def point_counts(self) -> tuple[int, ...]:
-        """The number of points of the quadrature of each mesh."""
+        """The numbers of quadrature points of both meshes."""
         return tuple(len(dipoles.rows) for dipoles in self._dipoles)
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
-        """Values and derivatives at points x: see `BatchedField.values_at`."""
+        """Values and derivatives at points x (3, n), with error bounds (`BatchedField.values_at`).
+
+        derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
+        closer: the accuracy scale.
+        """
         buffers = self._batch_data(backend_of(x))
         x = buffers.to_unit(x)
         sums = buffers.sums(x, closer, derivatives).sums
@@ -368,7 +401,9 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
     def quadrature_displacement(
         self, points: Any, precision: Precision | None = None
     ) -> FloatArray:
-        """As `Morph.quadrature_displacement`.
+        """A bound (n,), to first order, of the distance between the surface of this field and the
+        surface that exact integration over the triangles would give, at points (n, 3) of the
+        surface. It is the bound of the quadrature's error, divided by the length of the gradient.
 
         Let a quadrature point at distance D stand for a part of the mesh with moment m, made of
         triangles with moments m_i at offsets d_i from it. Its error is at most 2 |T|_*/D^3 plus the
@@ -379,7 +414,7 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         """
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Real]:
-            """The bound at points x, in the unit of the meshes."""
+            """The bound of the displacement at points x, as a length in the unit of the meshes."""
             data = self._batch_data(backend)
             x = data.to_unit(x)
             error, gradient = backend.Float(0), backend.Array3f(0)
@@ -415,6 +450,7 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         return on.sample(p, detail)
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
+        """Raise ValueError for a level whose surface would be unbounded."""
         for level in levels:
             if abs(level) < _SMALLEST_LEVEL:
                 raise ValueError("level 0 of a morph reaches to infinity; the surface is at 0.5")
@@ -450,7 +486,11 @@ class _SliceBuffers(UnitFrame):
     clouds: tuple[RadialTreecode, ...]
 
     def sums(self, x: Vec3, closer: Real, derivatives: int) -> RadialSums:
-        """The sums over the points of both meshes. closer: the accuracy scale."""
+        """The sums over the quadrature points of both meshes, at points x in unit coordinates.
+
+        closer: the accuracy scale.
+        derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
+        """
         sums = RadialSums.zero(self.backend, derivatives)
         for cloud in self.clouds:
             sums = cloud.accumulate(sums, x, closer)

@@ -55,8 +55,8 @@ MOMENT_KEYS = tuple((l, m) for l in range(1, MAX_DEGREE + 1) for m in range(l + 
 
 
 def regular_harmonics(x: Any, y: Any, z: Any, order: int) -> Pairs:
-    """R_lm at (x, y, z) for l <= order and 0 <= m <= l, as pairs of real and imaginary part. The
-    imaginary part is the number 0 if m = 0."""
+    """The regular solid harmonics R_lm at (x, y, z), for l <= order and 0 <= m <= l, as pairs of
+    real and imaginary part. The imaginary part is the number 0 if m = 0."""
     r2 = x * x + y * y + z * z
     harmonics: Pairs = {(0, 0): (0 * x + 1, 0.0)}
     for m in range(order + 1):
@@ -77,9 +77,10 @@ def regular_harmonics(x: Any, y: Any, z: Any, order: int) -> Pairs:
 
 
 def dipole_moments(harmonics: Pairs, nx: Any, ny: Any, nz: Any) -> Pairs:
-    """M_lm of a dipole at d, from the harmonics R_lm(d) for l < MAX_DEGREE. For a dipole that is
-    spread out over points, `harmonics` holds the means of R_lm.
+    """The moments M_lm of a dipole at d, for l <= MAX_DEGREE.
 
+    harmonics: R_lm(d) for l < MAX_DEGREE. For a dipole that is spread out over points, these are
+        the means of R_lm over the points.
     nx, ny, nz: the dipole's normal, whose length is its area.
     """
     r, x, y = _with_negative_orders(harmonics), 0.5 * nx, 0.5 * ny
@@ -97,7 +98,7 @@ def dipole_moments(harmonics: Pairs, nx: Any, ny: Any, nz: Any) -> Pairs:
 
 
 def multipole_to_multipole(moments: Pairs, x: Any, y: Any, z: Any) -> Pairs:
-    """Moments about c, from the moments of the same dipoles about c + (x, y, z)."""
+    """The moments M_lm of dipoles about a point c, from their moments about c + (x, y, z)."""
     r, old = (
         _with_negative_orders(regular_harmonics(x, y, z, MAX_DEGREE - 1)),
         _with_negative_orders(moments),
@@ -116,7 +117,7 @@ def multipole_to_multipole(moments: Pairs, x: Any, y: Any, z: Any) -> Pairs:
 
 
 def _with_negative_orders(values: Pairs) -> Pairs:
-    """R_lm or M_lm, together with the entries for m < 0."""
+    """Harmonics R_lm or moments M_lm, given for m >= 0, together with the entries for m < 0."""
     negative = {
         (l, -m): (re, -im) if m % 2 == 0 else (-re, im) for (l, m), (re, im) in values.items() if m
     }
@@ -159,7 +160,8 @@ class NodeMoments:
 def dipole_tree_moments(
     tree: BalancedTree, points: FloatArray, normals: FloatArray, low: FloatArray, high: FloatArray
 ) -> list[NodeMoments]:
-    """Moments of the nodes of all levels, from the leaves to the root.
+    """The moments of the nodes of a tree over primitives, each of which consists of dipoles. The
+    list has an entry for each level of the tree, from the leaves to the root.
 
     points, normals: (n, s, 3) the s dipoles of each of n primitives. The length of a normal is its
         area.
@@ -180,8 +182,12 @@ def dipole_tree_moments(
 
 
 def triangle_tree_moments(tree: BalancedTree, corners: FloatArray) -> list[NodeMoments]:
-    """Moments of the nodes of all levels, from the leaves to the root, for triangles (n, 3, 3).
-    They are exact up to rounding."""
+    """The moments of the nodes of a tree over triangles, each of which counts as a sheet of dipoles
+    along its normal. They are exact up to rounding. The list has an entry for each level of the
+    tree, from the leaves to the root.
+
+    corners: (n, 3, 3) of the triangles.
+    """
     backend = choose_backend("double")
     buffer = upload_floats(backend, corners.ravel())
     rule = tuple(zip(*(part.tolist() for part in triangle_rule()), strict=True))
@@ -210,7 +216,7 @@ class _Dipole:
 
 @dataclass(frozen=True)
 class _DipolePrimitive:
-    """The dipoles of a primitive, and the corners of a box that contains it."""
+    """The dipoles of a primitive, and the lower and upper corner of a box that contains it."""
 
     dipoles: Sequence[_Dipole]
     low: Vec3
@@ -225,8 +231,11 @@ def _row(backend: Backend, buffer: Real, i: Any) -> Vec3:
 def _all_levels(
     backend: Backend, tree: BalancedTree, primitive: Callable[[Any], _DipolePrimitive]
 ) -> list[NodeMoments]:
-    """Moments of the nodes of all levels, from the leaves to the root. primitive: a function that
-    returns the dipoles of a primitive from its index."""
+    """The moments of the nodes of a tree. The list has an entry for each level of the tree, from
+    the leaves to the root.
+
+    primitive: a function that returns the dipoles of a primitive from its index.
+    """
     level, parts, low, high = _leaf_moments(backend, tree, primitive)
     levels = [level]
     for arity in tree.arities:
@@ -240,12 +249,13 @@ def _all_levels(
 def _leaf_moments(
     backend: Backend, tree: BalancedTree, primitive: Callable[[Any], _DipolePrimitive]
 ) -> tuple[NodeMoments, list[Real], FloatArray, FloatArray]:
-    """The moments of the leaves.
+    """The moments of the leaves of a tree.
 
     primitive: a function that returns the dipoles of a primitive from its index.
 
-    Returns the moments; their numbers on the backend, in the order of `_MOMENT_PARTS`; and the
-    lower and upper corners (n, 3) of boxes around the leaves.
+    Returns the moments as NumPy arrays; the real and imaginary parts of M_lm as a list of numbers
+    of the backend, in the order of `_MOMENT_PARTS`; and the lower and upper corners (n, 3) of boxes
+    around the leaves.
 
     Each lane is a leaf, which visits its primitives twice: for the center, and for the moments
     about it.
@@ -258,14 +268,15 @@ def _leaf_moments(
     end = first + dr.gather(index, upload_integers(backend, filled.sum(axis=1)), leaf)
 
     def visit(body: Callable[..., tuple[Any, ...]], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """The state after `body` was applied to all primitives of each leaf."""
+        """Apply `body` to the primitives of each leaf, one after another. Each lane is a leaf.
+        Returns the last state."""
 
         def step(slot: Any, *state: Any) -> tuple[Any, ...]:
             """Apply `body` to the primitive in a slot."""
             return slot + 1, *body(primitive(dr.gather(index, slots, slot)), *state)
 
         def more(slot: Any, *_: Any) -> Any:
-            """Whether the leaf has further slots."""
+            """The mask of the leaves that have further slots."""
             return slot < end
 
         return dr.while_loop((first, *state), more, step, label="slots")[1:]
@@ -352,14 +363,16 @@ def _moments_of(parts: Sequence[Real]) -> Moments:
 def _parent_moments(
     backend: Backend, children: NodeMoments, parts: list[Real], low: FloatArray, high: FloatArray
 ) -> tuple[NodeMoments, list[Real]]:
-    """The moments of the next higher level of the tree.
+    """The moments of n parents in the tree, from the moments of their children, which are the nodes
+    of the tree's next level towards the leaves.
 
-    children: the moments of the level below.
-    parts: the children's moments on the backend, in the order of `_MOMENT_PARTS`.
+    children: the moments of the children, sorted by parents.
+    parts: the real and imaginary parts of the children's M_lm as a list of numbers of the backend,
+        in the order of `_MOMENT_PARTS`.
     low, high: (n, 3) corners of boxes around the parents.
 
-    Returns the parents' moments, and their numbers on the backend, which the next call takes as
-    `parts`.
+    Returns the parents' moments as NumPy arrays; and the real and imaginary parts of their M_lm as
+    a list of numbers of the backend, which the call for the grandparents takes as `parts`.
     """
     count, arity = len(low), len(children.area) // len(low)
     area = children.area.reshape(-1, arity).sum(axis=1)
@@ -388,8 +401,11 @@ def _parent_moments(
 
 
 def _shifted_powers(level: NodeMoments, s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The second, third and fourth moments of nodes about center - s, that is, with d + s in place
-    of d. s: (k, 3). About its own center a node's first moment is 0."""
+    """The second, third and fourth moments of k nodes (the attributes of `NodeMoments`) about the
+    points center - s instead of their centers. Offsets d of dipoles become d + s.
+
+    s: (k, 3). The first moment of a node about its own center is 0.
+    """
     a, square = level.area[:, None], (s * s).sum(axis=1)
     trace, m2_s = (
         np.einsum("kii->k", level.second_moment),
@@ -407,8 +423,12 @@ def _bounding_radius(center: FloatArray, low: FloatArray, high: FloatArray) -> F
 
 
 def cartesian_coefficients(moments: Moments, order: int = 2) -> FloatArray:
-    """Coefficients (k, 15) of the terms of degree l <= order + 1, as `treecode.multipole_terms`
-    reads them. Those of higher degree are 0.
+    """Coefficients (k, 15) of the multipole terms of k nodes in Cartesian coordinates, for the
+    degrees l <= order + 1, as `treecode.multipole_terms` reads them. Coefficients of higher degree
+    are 0.
+
+    moments: the complex moments M_lm, (k,) each.
+    order: 0, 1 or 2.
 
     The term of degree l is P_l(r)/r^(2l+1) with a harmonic polynomial P_l. P_1 = D.r with the
     coefficients D. P_2 has the coefficients of xx, yy, 2xy, 2xz, 2yz; that of zz follows, as the
@@ -460,8 +480,8 @@ _ROUND_UP = 1 + 2.0**-20
 
 
 def sup_norm(moments: Moments, l: int) -> FloatArray:
-    """A bound (k,) of r^(l+1) times the absolute value of the term of degree l, over all
-    directions.
+    """A bound (k,), for k nodes, of r^(l+1) times the absolute value of the multipole term of
+    degree l, over all directions. r is the distance from a node's center.
 
     For unit x, y the addition theorem gives sum_m |I_lm(x)|^2 / ((l+m)!(l-m)!) = P_l(1) = 1, so by
     Cauchy and Schwarz |sum_m conj(M_lm) I_lm|^2 <= sum_m (l+m)! (l-m)! |M_lm|^2.
@@ -476,8 +496,10 @@ def sup_norm(moments: Moments, l: int) -> FloatArray:
 def truncation_bounds(
     level: NodeMoments, nearest: FloatArray, order: int = 2
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Bounds (E, G, H), each (n,), of the terms that are left out if the terms of degree up to
-    order + 1 are used.
+    """Bounds (E, G, H), each (n,), of the multipole terms of n nodes that are left out if only the
+    terms of degree up to order + 1 are used.
+
+    level: the moments of the n nodes of a level of the tree.
 
     nearest: (n,) the bounds hold at distances r >= nearest from the centers of the nodes.
 
@@ -515,7 +537,8 @@ def truncation_bounds(
 
 
 def remainder_constants(level: NodeMoments, rough: float) -> tuple[FloatArray, FloatArray]:
-    """Numbers A and K, each (k,), that bound the remainder of a node's field after its linear part.
+    """Numbers A and K, each (k,), for k nodes of a tree. They bound the difference between the
+    field of a node's dipoles and its linear Taylor polynomial at a point.
 
     They hold at points whose distance r from the node's center is at least r0, which is `rough`
     times the node's radius R. Over a step of length t = q r with

@@ -1,12 +1,13 @@
-"""Open meshes that lie on the level set of their own winding number, such as a file that `mesh`
-wrote of a `SolidAngle`.
+"""The test whether an open mesh lies on the level set of its own winding number. An example is a
+mesh of the surface of a `SolidAngle`, as the function `mesh` writes it.
 
-Off its triangles the winding number w of a mesh is, modulo 1, the solid angle of its boundary over
-4 pi. The level set of this solid angle spans the boundary. If the triangles themselves lie on this
-level set, w is nearly the level right beside all of them. Then it depends on rounding, or on the
-distance of a flat triangle from a curved surface, on which side of the level w is, and so whether w
-passes the level at the jump. The points with the level form a checkerboard. But up to the
-coarseness of the triangles the level set is the mesh itself.
+Away from its triangles, the winding number w of an open mesh is, modulo 1, the solid angle of its
+boundary divided by 4 pi. The level set of this solid angle is a surface that spans the boundary. If
+the triangles lie on this surface, w tends to the level itself on one side of every triangle, and to
+the level plus or minus 1 on the other side. Whether w takes the level near a triangle then depends
+on rounding, or on the distance of the flat triangle from the curved surface: a picture of the hits
+would be a checkerboard. Up to the size of the triangles, the level set is the mesh itself. If
+`lies_on_own_level` finds such a mesh, `WindingNumber` takes the triangles as the level set.
 """
 
 from __future__ import annotations
@@ -50,8 +51,8 @@ _APEX: FloatArray = np.array([0.3017, 0.5043, 0.8091]) / math.sqrt(
 
 
 def lies_on_own_level(mesh: WindingMesh, level: float) -> bool:
-    """Whether the triangles of an open mesh lie on the surface that spans its boundary and on which
-    w modulo 1 has this level, and are the points at which w jumps from the level by one.
+    """Whether the triangles of an open mesh lie on a level set of the mesh's own winding number w:
+    on the surface that spans the boundary of the mesh and on which w modulo 1 has this level.
 
     This is a numerical test and no proof. It tests three things. 99 % of the vertices that are not
     on the boundary are on that surface within the rounding of files, to first order; if there are
@@ -102,9 +103,10 @@ def _spaced_rows(rows: FloatArray, max_count: int) -> FloatArray:
 def _level_gaps(
     edges: FloatArray, points: FloatArray, level: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Compare w modulo 1 with a level, at points (n, 3).
+    """Compare w modulo 1 with a level, at points (n, 3). w is the solid angle of closed curves,
+    divided by 4 pi.
 
-    edges: (k, 2, 3) the directed edges of closed curves.
+    edges: (k, 2, 3) both ends of the directed edges of the curves.
 
     Returns the absolute difference (n,) of w modulo 1 from the level, and the distance (n,) of the
     points, to first order, from the surface with this level that spans the edges. w and its
@@ -132,9 +134,13 @@ def _level_gaps(
 
 
 def _mean_winding(corners: FloatArray, point: FloatArray) -> float:
-    """The mean of the winding numbers on both sides of a mesh (m, 3, 3) at a point of it. It is the
-    winding number of all triangles except those that contain the point, which fill half of all
-    directions."""
+    """The mean of the winding numbers on both sides of a mesh, at a point (3,) of the mesh.
+
+    corners: (m, 3, 3) of the triangles.
+
+    The mean is the winding number of the triangles that do not contain the point. From the point, a
+    triangle that contains it has the solid angle 2 pi, with one sign from each side.
+    """
     angles = solid_angles(corners, point)
     is_off = np.abs(angles) < 2 * (math.pi - _ON_SURFACE)
     return float(angles[is_off].sum()) / (4 * math.pi)

@@ -52,8 +52,12 @@ _MAX_VERTICES = 2048  # the tests take quadratic time
 
 @dataclass(frozen=True)
 class PlanarRegion:
-    """The plane n.x = offset of a region that curves bound. normal: n (3,), oriented such that the
-    solid angle is negative above the plane."""
+    """The plane of a region that curves bound.
+
+    normal: (3,) the unit normal n of the plane. The curves' solid angle is negative on the side to
+        which n points.
+    offset: the plane is the set of points x with n.x = offset.
+    """
 
     normal: FloatArray
     offset: float
@@ -61,9 +65,10 @@ class PlanarRegion:
     def lift_range(
         self, angle: Real, height: Real, distance: Real, slack: Real, error: Real = 0.0
     ) -> HarmonicBall:
-        """A ball around a point and a range of the lift on it: see this module.
+        """A ball around each point, and a range of the lifted solid angle on it. The lift is the
+        solid angle f continued from the point without its jumps of 4 pi. The module has the proof.
 
-        angle: f modulo 4 pi, at the point.
+        angle: f at the point, known modulo 4 pi.
         height: the height of the point above the plane, along its normal. It is off by at most
             `slack`.
         distance: the distance of the point from the curves, or a lower bound of it.
@@ -95,7 +100,7 @@ class PlanarRegion:
 
 @dataclass(frozen=True)
 class _PlanarLoop:
-    """A simple loop in a plane.
+    """A simple loop in a plane: a polygon or a circle, in coordinates of the plane.
 
     points: (k, 2) the vertices of a polygon, or the center (1, 2) of a circle.
     radius: the radius of a circle, 0 for a polygon.
@@ -122,8 +127,8 @@ class _PlanarLoop:
 
 
 def planar_region(loops: Loops, circles: Sequence[Circle]) -> PlanarRegion | None:
-    """The region that the curves bound in their plane; None if they do not bound one, or if that
-    cannot be tested.
+    """The plane of the region that the curves bound. None if the curves do not bound a region of a
+    plane, or if they have too many vertices to be tested.
 
     The result is None in these cases: the loops do not lie in one plane up to 1e-12 of their size;
     they cross, or come nearer to each other than 1e-6 of their size; they have winding numbers
@@ -166,7 +171,8 @@ def planar_region(loops: Loops, circles: Sequence[Circle]) -> PlanarRegion | Non
 def _plane_of(
     loops: Loops, circles: Sequence[Circle]
 ) -> tuple[FloatArray, FloatArray, float, FloatArray] | None:
-    """A plane that contains all curves; None if there is none.
+    """A plane that contains all loops and circles, up to `_MAX_PLANE_DISTANCE`; None if there is
+    none.
 
     Returns its unit normal, a point of it as the origin, the size of the curves, and two
     perpendicular unit vectors (2, 3) in it, right-handed together with the normal.

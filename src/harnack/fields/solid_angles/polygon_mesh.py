@@ -112,7 +112,8 @@ class FaceLoops:
 
 @dataclass(frozen=True)
 class FaceData(UnitFrame):
-    """The head of a face, with its edges. The face may differ from lane to lane.
+    """The data of a face of a polygon mesh: its unit coordinates, its edges, and bounds of
+    rounding. The face may differ from lane to lane.
 
     edges: the records of its edges.
     trips: the number of these records, negative if the face is in convex position.
@@ -129,8 +130,9 @@ class FaceData(UnitFrame):
 class FaceSolidAngle(Field):
     """The solid angle of a face, which may differ from lane to lane.
 
-    Its promises are those of `SolidAngle`, which has their proofs. The ball is that of
-    `lift_bound="convex"` if the face is in convex position, else that of "edges".
+    Its promises, proved bounds near a point, are those of `SolidAngle`, which has the proofs. They
+    include a ball and a range of the lifted solid angle on it. The range is that of
+    `lift_bound="convex"` if the face is in convex position, and that of "edges" otherwise.
     """
 
     period: ClassVar[float | None] = PERIOD
@@ -147,14 +149,16 @@ class FaceSolidAngle(Field):
         return path.enclose(self._sample(path.point(t), path.direction))
 
     def _sample(self, p: Vec3, direction: Vec3 | None) -> Sample:
-        """The sample at points p. direction: a unit vector (3,), along which the sample gets
-        further promises; None for none."""
+        """The sample at points p: value, gradient, errors and promises (proved bounds of f near p).
+
+        direction: (3,) a unit vector, along which the sample gets further promises; None for none.
+        """
         face = self.face
         backend, x, rounding = face.backend, face.to_unit(p), face.rounding
         sums = sum_over_edges(face.edges, x)
         distance = sums.distance * (1 - SUM_MARGIN) - rounding
-        promises = remainder_promises(sums.cubes, sums.fourths, distance)
-        lift = lift_ball(sums.angle, sums.gradient, sums.squares, promises)
+        promises = remainder_promises(sums.inverse_cubes, sums.inverse_fourths, distance)
+        lift = lift_ball(sums.angle, sums.gradient, sums.inverse_squares, promises)
         is_convex = face.trips < 0
         ball = HarmonicBall(
             dr.select(is_convex, distance, lift.radius),
@@ -165,7 +169,7 @@ class FaceSolidAngle(Field):
         on_curve = sums.distance <= 2 * rounding
         steep_gradient = backend.Array3f(0, 0, 4 * PERIOD / rounding)
         gradient = dr.select(on_curve, steep_gradient, sums.gradient)
-        error = vertex_rounding(backend.machine_epsilon, x, sums.squares)
+        error = vertex_rounding(backend.machine_epsilon, x, sums.inverse_squares)
         error = dr.select(on_curve, 0, error) + face.value_rounding
         error = dr.select(on_curve, 8 * PERIOD, error)
         ray_promises: tuple[Lipschitz, ...] = ()
@@ -173,7 +177,8 @@ class FaceSolidAngle(Field):
             line = RayLine(x, backend.Array3f(direction), rounding)
 
             def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
-                """Bounds of the derivative along the line for these lengths (`line_rates`)."""
+                """For each length, a bound of the derivative along the line at points within that
+                length of x (`line_rates`)."""
                 return line_rates(face.edges, line, lengths, active)
 
             ray_promises = lipschitz_along(line, sums.gradient, sums.distance, rates)
@@ -230,6 +235,7 @@ def _carve_boxes(
     the boxes around the cells of the old boxes that are not proved empty.
 
     lower, upper: (m, 3) corners of the old boxes of all faces.
+    levels: the levels of the surfaces.
 
     Only cells at the faces of a box can make it smaller, so only these are split further.
     """
@@ -270,19 +276,23 @@ class _FaceCells:
     depth: IntArray
 
     def sizes(self, sides: FloatArray) -> FloatArray:
-        """Sizes (k, 3) of the cells, if the boxes of the faces have the sizes `sides` (m, 3)."""
+        """The sizes (k, 3) of the cells. sides: (m, 3) the sizes of the boxes of all faces."""
         return sides[self.face] * (0.5**self.depth)[:, None]
 
     def boxes(self, sides: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corners of the boxes around the cells of each face. sides: as for
-        `sizes`."""
+        """For each face that has cells, the lower and upper corner of the box around its cells, as
+        two arrays with three columns. sides: (m, 3) the sizes of the original boxes of all
+        faces."""
         first = np.flatnonzero(np.diff(self.face, prepend=-1))
         low = np.minimum.reduceat(self.corner, first)
         return low, np.maximum.reduceat(self.corner + self.sizes(sides), first)
 
     def touch(self, low: FloatArray, high: FloatArray, sides: FloatArray) -> BoolArray:
         """A mask (k,) of the cells that lie at a side of a box, up to a quarter of the cell's size.
-        low, high: (k, 3) corners of the box for each cell."""
+
+        low, high: (k, 3) for each cell the corners of the box.
+        sides: (m, 3) the sizes of the original boxes of all faces.
+        """
         size = self.sizes(sides)
         at_low = self.corner < low + 0.25 * size
         at_high: BoolArray = self.corner > high - 1.25 * size
@@ -293,7 +303,8 @@ class _FaceCells:
         return _FaceCells(self.face[chosen], self.corner[chosen], self.depth[chosen])
 
     def split(self, sides: FloatArray) -> _FaceCells:
-        """The eight octants of each cell. sides: as for `sizes`."""
+        """The eight octants of each cell. sides: (m, 3) the sizes of the original boxes of all
+        faces."""
         depth = np.repeat(self.depth + 1, 8)
         face = np.repeat(self.face, 8)
         half = sides[face] * (0.5**depth)[:, None]
@@ -312,7 +323,8 @@ def _are_empty(
     curves: FaceLoops, face: IntArray, centers: FloatArray, half: FloatArray,
     levels: tuple[float, ...],
 ) -> BoolArray:  # fmt: skip
-    """A mask (k,) of the balls in which no level set of a face is proved to lie.
+    """A mask (k,) of the balls that are proved to contain no level set of their face's solid angle
+    f.
 
     curves: the boundary curves of all faces.
     face: (k,) the face for each ball.
@@ -447,7 +459,7 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
         )
 
     def _upload(self, backend: Backend) -> _MeshBuffers:
-        """The faces' boxes and boundary curves on a backend."""
+        """The boxes of all faces and their boundary curves, on a backend."""
         boxes = PatchBoxes.upload(backend, *self.boxes())
         return _MeshBuffers(boxes, FaceLoops.upload(backend, self.faces))
 
@@ -466,6 +478,7 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
                 )
 
     def describe(self) -> dict[str, Any]:
+        """Facts about the field for users, as a dictionary of names and values."""
         return {
             "faces": self.faces.face_count,
             "vertices": len(self.vertices),
@@ -476,7 +489,7 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
 
 @dataclass(frozen=True)
 class _MeshBuffers:
-    """The faces' boxes and boundary curves on a backend."""
+    """The boxes of all faces and their boundary curves, on a backend."""
 
     boxes: PatchBoxes
     curves: FaceLoops

@@ -45,8 +45,11 @@ BALL_FRACTION = 0.35
 
 @dataclass(frozen=True)
 class KernelValues:
-    """A kernel at a distance D. psi_k is scale * thetas[k]/D^(2k), for k from 0 to the requested
-    order."""
+    """The functions psi_0, psi_1, ... of a kernel (see the module) at a distance D.
+
+    scale: a common factor.
+    thetas: one number for each k: psi_k is scale * thetas[k]/D^(2k).
+    """
 
     scale: Real
     thetas: Sequence[Real]
@@ -63,28 +66,35 @@ class RadialKernel(abc.ABC):
 
     @abc.abstractmethod
     def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
-        """The numbers psi_0 to psi_last at a distance D. inverse: 1/D."""
+        """The numbers psi_0 to psi_last at the distance D = `distance`, where psi_0 = K and
+        psi_(k+1) = -psi_k'/r. inverse: 1/D."""
 
     @abc.abstractmethod
     def bounds(self, distance: Real, last: int) -> list[Real]:
-        """The bounds Q_2 to Q_last, and at least Q_3, which hold at all distances that are at least
-        `distance`. last: at most 6."""
+        """The numbers Q_2, Q_3, ..., Q_last, but at least Q_2 and Q_3. The m-th derivatives of the
+        kernel along lines are at most m! Q_m/D^(m+1) at all distances D >= `distance`.
+
+        last: at most 6.
+        """
 
     @abc.abstractmethod
     def growth(self, r: Real) -> Real:
-        """The factor by which Q_m may be larger if the distance is shorter by r."""
+        """A factor that bounds how much larger the numbers Q_m of `bounds` are at a distance that
+        is shorter by r."""
 
     @abc.abstractmethod
     def accepting_distance(self, radius: FloatArray, accuracy: float) -> FloatArray:
-        """For clusters of these radii (k,), the distances D beyond which their moments are used."""
+        """For clusters of dipoles with these radii (k,), the distances (k,) beyond which their
+        moments are used. accuracy: the larger it is, the larger are the distances."""
 
 
 @dataclass(frozen=True)
 class PolynomialTerm:
-    """A term P(z) psi_k, without psi_k. k = 1, 2, 3 is its position in a list.
+    """The polynomial P of a term P(z) psi_k of a source, at the vector z from a point to the
+    source. The number k = 1, 2, 3 is the position of the term in the source's list of terms.
 
-    value, gradient, hessian: P, its gradient and its Hessian (xx, yy, zz, xy, xz, yz), all times
-        D^(-2k). The Hessian is None if it is 0.
+    value, gradient, hessian: P, its gradient and its Hessian (xx, yy, zz, xy, xz, yz) by z, all
+        times D^(-2k), with D the distance of the source. The Hessian is None if it is 0.
     """
 
     value: Real
@@ -108,13 +118,14 @@ class RadialSums:
 
     @classmethod
     def zero(cls, backend: Backend, derivatives: int) -> RadialSums:
-        """The sums over no dipoles; derivatives: as for `SourceSums.zero`."""
+        """The sums over no dipoles. derivatives: 0 for the value only, 1 with the gradient, 2 with
+        the Hessian."""
         zero = backend.Float(0)
         return cls(SourceSums.zero(backend, dr.inf, derivatives), zero, zero)
 
     @classmethod
     def of(cls, parts: tuple[Any, ...]) -> RadialSums:
-        """The sums with these `parts`, as the method `parts` returns them."""
+        """The sums from a state of a loop, as the method `parts` returns it."""
         return cls(SourceSums.from_state(parts[0]), *parts[1:])
 
     def parts(self) -> tuple[Any, ...]:
@@ -122,7 +133,7 @@ class RadialSums:
         return self.sums.to_state(), self.q2_d3, self.q2_d4
 
     def plus(self, source: SourceAtPoint, rounding: Real, active: Mask) -> RadialSums:
-        """The sums with a further dipole or cluster, where active.
+        """The sums with a further dipole or cluster added on active lanes.
 
         rounding: a bound of the rounding of its term, as a fraction of w Q_2/d^2, which is at least
             the term's absolute value. The rounding of positions adds 6 epsilon w Q_2/d^3;
@@ -171,7 +182,8 @@ class RadialSums:
     def curvatures(
         self, growth: Callable[[Real], Real], most: Real, size: Real
     ) -> tuple[TaylorRemainder, ...]:
-        """The bounds of `remainder` as promises, for several radii.
+        """Promises for several radii: on a ball around x, a bound of the difference between f and
+        its linear Taylor polynomial at x, from `remainder`.
 
         growth: the function `RadialKernel.growth`.
         most: a lower bound of the distance to the nearest dipole.
@@ -187,8 +199,9 @@ class RadialSums:
         """A bound of |f(y) - f(x)| on the ball B(x, r). r must be at most `BALL_FRACTION` times the
         distance to the nearest dipole. growth: the result of `RadialKernel.growth` for r.
 
-        It is the integral of |K^(2)| = 2 Q_2/(d_i-s)^3 over s from 0 to r, where 1/(1-q)^2 - 1 = 2q
-        + ... is bounded by its chord: 1/(1-q)^2 - 1 - 2q over q^2 grows with q.
+        It is the sum over the dipoles of w_i times the integral of |K^(2)| = 2 Q_2/(d_i-s)^3 over s
+        from 0 to r. With q = r/d_i the integral contains 1/(1-q)^2 - 1 = 2q + c q^2. Its factor c
+        grows with q, and so is at most its value at q = `BALL_FRACTION`.
         """
         chord = (1 / (1 - BALL_FRACTION) ** 2 - 1 - 2 * BALL_FRACTION) / BALL_FRACTION**2
         change = dr.fma(chord * r, self.q2_d4, 2 * self.q2_d3)
@@ -197,7 +210,8 @@ class RadialSums:
 
 @dataclass(frozen=True)
 class KernelBounds:
-    """Bounds Q_2 and Q_3 that hold at a distance and beyond, and powers of that distance.
+    """A distance, its powers, and numbers that bound a kernel's derivatives there and beyond: the
+    m-th derivatives along lines are at most m! Q_m/D^(m+1) at distances D.
 
     distance, inverse, cube: the distance, one over it, and one over its cube.
     second, third: Q_2 and Q_3.
@@ -223,11 +237,12 @@ def _type_of(vector: object) -> Any:
 def combine_terms(
     parts: Sequence[PolynomialTerm], z: Vec3, inverse: Real, radial: KernelValues, derivatives: int
 ) -> SourceTerm:
-    """The sum of the terms of a source at z.
+    """The potential of a source, and its derivatives: the sum of the terms P_k(z) psi_k.
 
-    parts: the terms for k = 1, 2, ...
-    inverse: 1/D.
-    radial: psi_0 to psi_(len(parts) + derivatives).
+    parts: the polynomials P_k for k = 1, 2, ...
+    z: the vector from the point to the source.
+    inverse: 1/D, with D the distance from the point to the source.
+    radial: the numbers psi_0 to psi_(len(parts) + derivatives) at the distance D.
     derivatives: 0 for the value, 1 with the gradient, 2 with the Hessian.
 
     Powers of 1/D are spread over the factors, so that no factor overflows.
@@ -268,7 +283,8 @@ def combine_terms(
 
 @dataclass(frozen=True)
 class SourceAtPoint:
-    """The terms of a dipole or a cluster at x, with bounds of its derivatives near x.
+    """What a dipole or a cluster of dipoles adds to a sum at a point x, and bounds of its
+    derivatives near x.
 
     terms: value, gradient and Hessian.
     weight: the sum of the weights of all its dipoles.
@@ -287,8 +303,12 @@ class SourceAtPoint:
 def dipole_source(
     row: Sequence[Real], x: Vec3, kernel: RadialKernel, derivatives: int
 ) -> SourceAtPoint:
-    """A dipole at x. row: its record of eight numbers, position, moment, weight = |moment|, and
-    0."""
+    """The value and the derivatives of a dipole at points x, with bounds.
+
+    row: the dipole's record of eight numbers: position, moment, weight = |moment|, and 0.
+    kernel: the radial potential.
+    derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
+    """
     vector = _type_of(x)
     z, m = vector(row[0], row[1], row[2]) - x, vector(row[3], row[4], row[5])
     squared = dr.squared_norm(z) + kernel.height_square
@@ -305,10 +325,11 @@ def dipole_source(
 
 
 def cluster_parts(c: Sequence[Real], z: Vec3, inverse: Real) -> list[PolynomialTerm]:
-    """The terms P_k of a cluster with the center x + z.
+    """The polynomials P_k of the terms P_k(z) psi_k of a cluster of dipoles, for k = 1, 2, 3. z is
+    the vector from the point to the cluster's center.
 
-    c: its coefficients (`radial_tree.coefficients`).
-    inverse: 1/D.
+    c: the 23 coefficients of the cluster (`radial_tree.coefficients`).
+    inverse: 1/D, with D the distance of the center.
 
     P_1 = c0.z + c3; P_2 = z.(A z + b); P_3 = C[z, z, z] with symmetric A, C, where c0 is `c[0:3]`,
     c3 is `c[3]`, and A, b and C are the following coefficients.

@@ -1,5 +1,5 @@
-"""Sums of dipoles of a radial potential: direct sums, or sums by a tree with clusters of far
-dipoles.
+"""Sums over dipoles of a radial potential K(r): direct sums, or sums by a tree in which a cluster
+of far dipoles counts as a single source.
 
 Expansion. A cluster consists of dipoles m_i at c + d_i with |d_i| <= R. At the point x = c - z, at
 the distance r = D of z, Taylor's formula in d_i gives
@@ -71,10 +71,11 @@ _DIPOLES_PER_TRIP = 4
 
 
 class RadialSum(abc.ABC):
-    """Dipoles on a backend, and sums over them.
+    """Dipoles of a radial potential on a backend, and sums over them.
 
     kernel: the radial potential.
-    rounding: a bound of the rounding of a dipole's term, as `RadialSums.plus` takes it.
+    rounding: a bound of the rounding of a dipole's term, as a fraction of the bound of the term's
+        absolute value.
     """
 
     def __init__(self, backend: Backend, rows: FloatArray, kernel: RadialKernel) -> None:
@@ -83,40 +84,45 @@ class RadialSum(abc.ABC):
         self.rounding = dr.opaque(backend.Float, 12 * backend.machine_epsilon)
 
     def sums(self, x: Vec3, closer: Real, derivatives: int) -> RadialSums:
-        """Value, derivatives and bounds at x.
+        """Value, derivatives and error bounds of the sum over all dipoles, at points x (3, n).
 
-        closer: the moments of clusters are used beyond `closer` times their `accepting_distance`.
-        derivatives: as for `SourceSums.zero`.
+        closer: the moments of a cluster are used beyond `closer` times its accepting distance
+            (`RadialKernel.accepting_distance`).
+        derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
         """
         return self.accumulate(RadialSums.zero(self.backend, derivatives), x, closer)
 
     @abc.abstractmethod
     def accumulate(self, sums: RadialSums, x: Vec3, closer: Real) -> RadialSums:
-        """The sums over other dipoles, with the terms of these dipoles at x added. closer: as for
-        `sums`."""
+        """Add the terms of these dipoles at points x to `sums`, which may hold sums over other
+        dipoles. Returns the new sums.
+
+        closer: the moments of a cluster are used beyond `closer` times its accepting distance.
+        """
 
     def _with_dipole(
         self, row: list[Real], x: Vec3, derivatives: int, state: tuple[Any, ...]
     ) -> tuple[Any, ...]:
-        """The state of the sums, with the dipole of a record added."""
+        """The state of `RadialSums` in a loop, with the dipole of the record `row` at x added."""
         dipole = dipole_source(row, x, self.kernel, derivatives)
         return RadialSums.of(state).plus(dipole, self.rounding, True).parts()
 
 
 class DirectSum(RadialSum):
-    """The direct sum over all dipoles, without truncation."""
+    """The sum over dipoles, one by one. It has no truncation error."""
 
     def __init__(self, backend: Backend, rows: FloatArray, kernel: RadialKernel) -> None:
         super().__init__(backend, rows, kernel)
         self._records = RecordTable.upload(backend, rows, empty_record(rows[0]), _DIPOLES_PER_TRIP)
 
     def accumulate(self, sums: RadialSums, x: Vec3, closer: Real) -> RadialSums:
-        """The sums with the terms of all dipoles added; `closer` has no effect."""
+        """Add the terms of all dipoles at points x to `sums`. Returns the new sums; `closer` has no
+        effect."""
         del closer
         derivatives = sums.sums.derivatives
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """The state with the dipole of a record added."""
+            """Add the dipole in the record `row` to the state of the sums."""
             return self._with_dipole(row, x, derivatives, state)
 
         return RadialSums.of(self._records.for_each(add, sums.parts(), "radial dipoles"))
@@ -129,22 +135,26 @@ class RadialTreecode(RadialSum):
     def __init__(
         self, backend: Backend, dipoles: ClusteredDipoles, kernel: RadialKernel, accuracy: float
     ) -> None:
-        """accuracy: as for `RadialKernel.accepting_distance`."""
+        """accuracy: the larger it is, the farther away a cluster must be for its moments to be used
+        (`RadialKernel.accepting_distance`)."""
         super().__init__(backend, dipoles.rows, kernel)
         self._tree = dipoles.packed(backend, kernel, accuracy)
 
     def accumulate(self, sums: RadialSums, x: Vec3, closer: Real) -> RadialSums:
-        """The sums with the terms of near dipoles and far clusters added."""
+        """Add the terms of near dipoles and far clusters at points x to `sums`. Returns the new
+        sums.
+        closer: a cluster is far beyond this many times its accepting distance."""
         closer = fmax(self.backend.Float(closer), self.backend.Float(1))
         derivatives = sums.sums.derivatives
 
         def near(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """The state with the dipole of a record added; it is in a leaf that is not far."""
+            """Add the dipole in the record `row`, which is in a leaf that is not far, to the state
+            of the sums."""
             del active
             return self._with_dipole(row, x, derivatives, state)
 
         def far(node: ClusterView, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """The state with a cluster added, where it is far."""
+            """Add a cluster to the state of the sums, on lanes on which it is far."""
             length = dr.sqrt(node.square)
             cluster = cluster_source(
                 node.head, node.payload, -node.r, length, self.kernel, derivatives
@@ -162,11 +172,16 @@ def cluster_source(
     head: Sequence[Real], c: Sequence[Real], z: Vec3, length: Real, kernel: RadialKernel,
     derivatives: int,
 ) -> SourceAtPoint:  # fmt: skip
-    """A cluster at a point, with its truncation errors.
+    """The value and the derivatives of a cluster of dipoles at a point, with bounds of their
+    truncation errors. The formulas are those of the module.
 
-    head, c: the numbers of `node_records`: the six numbers of the head, and the others.
+    head: the first six numbers of the cluster's record: center, accepting distance, radius, weight.
+    c: the other numbers of its record: 23 coefficients, and the third moment (`node_records`).
     z: the vector from the point to the cluster's center.
-    length: D, the distance of the center.
+    length: D, the distance from the point to the center, in four dimensions if the kernel has a
+        height.
+    kernel: the radial potential.
+    derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
     """
     radius, weight = head[4], head[5]
     inverse = dr.rcp(length)
@@ -189,8 +204,8 @@ def cluster_source(
 
 @dataclass(frozen=True)
 class ClusteredDipoles:
-    """A tree over dipoles with its moments. These are all data of the sum that do not depend on the
-    kernel.
+    """A tree over dipoles, with the moments of its nodes. These are the data of a sum by a tree
+    that do not depend on the kernel.
 
     rows: (n, 8) the records of the dipoles, from `dipole_records`.
     tree: the hierarchy of the dipoles.
@@ -208,8 +223,9 @@ class ClusteredDipoles:
         return cls(rows, tree, taylor_tree_moments(tree, rows))
 
     def packed(self, backend: Backend, kernel: RadialKernel, accuracy: float) -> PackedTree:
-        """The tree on a backend. kernel, accuracy: they decide beyond which distance the moments of
-        a cluster are used (`RadialKernel.accepting_distance`)."""
+        """The tree with the records of its nodes and dipoles, on a backend. `kernel` and `accuracy`
+        decide beyond which distance the moments of a cluster are used
+        (`RadialKernel.accepting_distance`)."""
         numbers = [
             node_records(level, kernel.accepting_distance(level.radius, accuracy))
             for level in self.levels
@@ -225,7 +241,9 @@ class TaylorMoments:
     radius, weight: (k,) the largest |d|, and the sum of the weights w = |m|, with d the offset of a
         dipole m from the center.
     third: (k,) the sum of w |d|^3.
-    t1, t2, t3: T1 (k, 3), T2 (k, 3, 3), T3 (k, 3, 3, 3), symmetric, as defined in this module.
+    t1: (k, 3) the sum T1 of the dipoles m.
+    t2, t3: (k, 3, 3) and (k, 3, 3, 3) the symmetric parts T2 and T3 of the sums of the tensors m d
+        and m d d.
     """
 
     center: FloatArray
@@ -238,7 +256,10 @@ class TaylorMoments:
 
 
 def taylor_tree_moments(tree: BalancedTree, rows: FloatArray) -> list[TaylorMoments]:
-    """Moments of all levels, from the leaves to the root. rows: the records of the dipoles.
+    """The moments of the nodes of a tree over dipoles. The list has an entry for each level of the
+    tree, from the leaves to the root.
+
+    rows: (n, 8) the records of the dipoles.
 
     T1, T2, T3 are moved from a child's center to its parent's, by replacing d with d + s: T2 gains
     sym(T1 s), and T3 gains sym(2 T2 s + T1 s s). All other numbers are computed from the dipoles
@@ -271,28 +292,36 @@ def taylor_tree_moments(tree: BalancedTree, rows: FloatArray) -> list[TaylorMome
 def _moved_to_parents(
     children: TaylorMoments, center: FloatArray, arity: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """T1, T2, T3 of the parents of groups of `arity` children, about the parents' centers (k,
-    3)."""
+    """The moments T1 (k, 3), T2 (k, 3, 3), T3 (k, 3, 3, 3) of k parents, each of which has `arity`
+    consecutive children, about the parents' centers (k, 3).
+
+    Let s be the offset of a child's center from that of its parent. The parent's moments are the
+    sums over its children of T1, sym(T2 + T1 s) and sym(T3 + 2 T2 s + T1 s s), where sym is the
+    symmetric part.
+    """
     s = children.center - np.repeat(center, arity, axis=0)
     t1, t2, t3 = children.t1, children.t2, children.t3
-    first = np.einsum("ki,kj->kij", t1, s)
-    second = t3 + np.einsum("kij,kl->kijl", 2 * t2 + first, s)
-    sums = [a.reshape(-1, arity, *a.shape[1:]).sum(axis=1) for a in (t1, t2 + first, second)]
+    t1_s = np.einsum("ki,kj->kij", t1, s)
+    moved_t3 = t3 + np.einsum("kij,kl->kijl", 2 * t2 + t1_s, s)
+    sums = [a.reshape(-1, arity, *a.shape[1:]).sum(axis=1) for a in (t1, t2 + t1_s, moved_t3)]
     return _symmetric(*sums)
 
 
 def _symmetric(
     t1: FloatArray, t2: FloatArray, t3: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The symmetric parts of the tensors (k, 3), (k, 3, 3) and (k, 3, 3, 3)."""
+    """The symmetric parts of k tensors each of first, second and third order: (k, 3), (k, 3, 3) and
+    (k, 3, 3, 3). The second order is symmetrized over two indices; for the third, the mean is over
+    all six orders of the indices."""
     orders = itertools.permutations((1, 2, 3))
     total = sum((t3.transpose(0, *order) for order in orders), start=np.zeros_like(t3))
     return t1, 0.5 * (t2 + t2.transpose(0, 2, 1)), total / 6
 
 
 def coefficients(level: TaylorMoments) -> FloatArray:
-    """The numbers (k, 23) of nodes as `cluster_parts` reads them: T1; tr T2; -T2; -3/2 tr T3;
-    T3/2."""
+    """The coefficients (k, 23) of the k nodes of a level, in the order in which `cluster_parts`
+    reads them: T1; tr T2; -T2; -3/2 tr T3; T3/2. Of symmetric tensors, each different entry occurs
+    once."""
     t2, t3 = -level.t2, 0.5 * level.t3
     i, j = np.array([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]).T
     a, b, c = np.array(
@@ -305,8 +334,11 @@ def coefficients(level: TaylorMoments) -> FloatArray:
 
 
 def node_records(level: TaylorMoments, accept: FloatArray) -> FloatArray:
-    """Records (k, 30) of nodes: center, accepting distance, radius, weight; then coefficients and
-    third moment. accept: (k,) the accepting distances."""
+    """Records (k, 30) of the k nodes of a level: center, accepting distance, radius, weight; then
+    the 23 numbers of `coefficients`, and the third moment.
+
+    accept: (k,) for each node, the distance beyond which its moments are used.
+    """
     # The ball must contain all dipoles in spite of the rounding of center and radius.
     head = np.stack([accept, level.radius * (1 + 1e-5) + 1e-6, level.weight], axis=1)
     return np.concatenate([level.center, head, coefficients(level), level.third[:, None]], axis=1)

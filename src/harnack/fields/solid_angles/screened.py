@@ -98,12 +98,15 @@ class YukawaKernel(RadialKernel):
         self.kappa = dr.opaque(backend.Float, kappa)
 
     def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
-        """psi_0 to psi_last at a distance, by the polynomials theta_k."""
+        """The functions psi_0 to psi_last of the class at a distance, by the polynomials theta_k.
+        inverse: 1/distance."""
         t = fmin(self.kappa * distance, MAX_LENGTHS)
         return KernelValues(dr.exp(-t) * inverse, thetas(t, last))
 
     def bounds(self, distance: Real, last: int) -> list[Real]:
-        """Q_2 to Q_last for t = kappa times the distance, by their sums of powers of t."""
+        """The numbers Q_2(t) to Q_last(t) of the class for t = kappa times the distance, which
+        bound derivatives of the kernel at this distance and beyond. They are sums of powers of
+        t."""
         t = fmin(self.kappa * distance, MAX_LENGTHS)
         decay = dr.exp(-t)
         sum2 = dr.fma(t, dr.fma(t, 0.5, 1), 1)
@@ -116,14 +119,19 @@ class YukawaKernel(RadialKernel):
         return factors
 
     def growth(self, r: Real) -> Real:
+        """A factor that bounds how much larger the numbers Q_m of `bounds` are at a distance that
+        is shorter by r."""
         return dr.exp(self.kappa * r)
 
     def accepting_distance(self, radius: FloatArray, accuracy: float) -> FloatArray:
+        """For clusters of dipoles with these radii (k,), the distances (k,) beyond which their
+        moments are used. accuracy: the larger it is, the larger are the distances."""
         return accepting_distance(radius, self._number, accuracy)
 
 
 def thetas(t: Real, last: int) -> list[Real]:
-    """The numbers theta_0(t), ..., theta_last(t) of `YukawaKernel`."""
+    """The values theta_0(t), ..., theta_last(t) of the reverse Bessel polynomials of
+    `YukawaKernel`."""
     square = t * t
     values: list[Real] = [1.0, 1 + t]
     for k in range(2, last + 1):
@@ -134,8 +142,8 @@ def thetas(t: Real, last: int) -> list[Real]:
 def screened_promises(
     radial: RadialSums, f: Real, gradient: Vec3, kernel: YukawaKernel, size: Real, epsilon: float
 ) -> tuple[tuple[TaylorRemainder, ...], HarmonicBall]:
-    """The promises of `ScreenedWindingNumber`: several of second derivatives; and a ball, which
-    proves shorter steps.
+    """The promises of `ScreenedWindingNumber`, proved bounds of f near a point x: several bounds of
+    second derivatives on balls around x; and a ball with a range of f, which proves shorter steps.
 
     radial: the sums at the point.
     f, gradient: value and gradient at the point, in units of `size`.
@@ -164,8 +172,9 @@ def screened_promises(
 
 
 def accepting_distance(radius: FloatArray, kappa: float, accuracy: float) -> FloatArray:
-    """For clusters of these radii R (k,), the distance r beyond which their moments are used: the
-    smallest r with accuracy R Q_4(kappa (r-R))^(1/5) <= r.
+    """The distances (k,) beyond which the moments of clusters with the radii R (k,) are used: the
+    smallest r with accuracy R Q_4(kappa (r-R))^(1/5) <= r. Here Q_4 is that of `YukawaKernel`, and
+    kappa is one over the screening length.
 
     For each unit of area, clusters of radius R on a surface cost 1/R^2 and have an error of R^3/r^5
     Q_4. The sum of errors is smallest at a fixed cost if R is proportional to r Q_4^(-1/5). r is
@@ -319,7 +328,10 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         """The field of dipoles at the centroids of the triangles of a mesh.
 
         subdivide: how many times each triangle is cut into 4 triangles first.
-        length, method, accuracy: as for `ScreenedWindingNumber`.
+        length: the screening length l, in the mesh's unit.
+        method: "sum" (all dipoles), "tree" (clusters of far dipoles), or "auto".
+        accuracy: for the tree, the larger it is, the farther away clusters must be to count as one
+            source (see `ScreenedWindingNumber`).
 
         This is quadrature by the midpoint rule, not the integral over the triangles. Let R be the
         distance from the centroid to the farthest corner of a triangle of area a and edges of
@@ -349,7 +361,11 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         )
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
-        """Values and derivatives at points x: see `BatchedField.values_at`."""
+        """Values and derivatives at points x (3, n), with error bounds (`BatchedField.values_at`).
+
+        derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
+        closer: the accuracy scale.
+        """
         data = self._batch_data(backend_of(x))
         x = data.to_unit(x)
         sums, epsilon = data.dipoles.sums(x, closer, derivatives).sums, data.backend.machine_epsilon
@@ -367,7 +383,8 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
     def _cutoff_errors(
         self, data: _ScreenedBuffers, sums: SourceSums, unit: Real
     ) -> tuple[Real, Real, Real]:
-        """The additional errors of value, gradient and second derivatives that screening causes.
+        """Bounds of the additional errors of value, gradient and second derivatives that screening
+        causes.
 
         sums: the sums at the points.
         unit: the rounding of a coordinate.
@@ -441,7 +458,7 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         return self._extents[levels]
 
     def _extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """`extent`, computed anew."""
+        """The volume that `extent` returns, without the cache."""
         min_level = min(abs(level) for level in levels)
         if min_level < _SMALLEST_LEVEL:
             return None
@@ -457,6 +474,7 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         return tight_extent(self, levels, lower, upper, _MAX_CELLS)
 
     def describe(self) -> dict[str, Any]:
+        """Facts about the field for users, as a dictionary of names and values."""
         return {
             "points": len(self.points),
             "length": self.length,
@@ -467,7 +485,8 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
 
 @dataclass(frozen=True)
 class _ScreenedBuffers(UnitFrame):
-    """The kernel and the dipoles on a backend."""
+    """The data of a screened winding number on a backend: the kernel, and the sum over the
+    dipoles."""
 
     kernel: YukawaKernel
     dipoles: RadialSum

@@ -62,7 +62,11 @@ class SmoothedKernel(RadialKernel):
         self.height_square = dr.opaque(backend.Float, height * height)
 
     def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
-        """psi_0 to psi_last, by the closed form above: `factor` is (2k-1)!!, `half` is q/2."""
+        """The functions psi_0 to psi_last of the class at the distance D, by their closed form. In
+        the code, `factor` is (2k-1)!! and `half` is q/2.
+
+        inverse: 1/D.
+        """
         del distance
         half = 0.5 * self.height_square * inverse * inverse
         thetas: list[Real] = []
@@ -73,16 +77,21 @@ class SmoothedKernel(RadialKernel):
         return KernelValues(inverse, thetas)
 
     def bounds(self, distance: Real, last: int) -> list[Real]:
-        """Q_2 to Q_last, for all distances of at least `_BOUND_FRACTION` times `distance`."""
+        """The numbers Q_2 to Q_last of the class, which bound derivatives of the kernel. They hold
+        at all distances of at least `_BOUND_FRACTION` times `distance`."""
         ratio = dr.sqrt(self.height_square) / (_BOUND_FRACTION * fmax(distance, 1e-30))
         q = fmin(ratio * ratio, 1)
         return [dr.fma(0.25 * (m + 1) * (m + 2), q, 1) for m in range(2, last + 1)]
 
     def growth(self, r: Real) -> Real:
+        """A factor that bounds how much larger the numbers Q_m of `bounds` are at a distance that
+        is shorter by r."""
         del r
         return 1.0
 
     def accepting_distance(self, radius: FloatArray, accuracy: float) -> FloatArray:
+        """For clusters of dipoles with these radii (k,), the distances (k,) beyond which their
+        moments are used. accuracy: the larger it is, the larger are the distances."""
         return accuracy * radius + 1e-5
 
 
@@ -118,14 +127,15 @@ class SmoothedSum:
         return 1.0
 
     def values(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:
-        """Value and derivatives up to order `derivatives` at x. closer: the accuracy scale, at
-        least 1."""
+        """Value and derivatives of the sum up to order `derivatives` at points x (3, n), with error
+        bounds. closer: the accuracy scale, at least 1."""
         sums = self.dipoles.sums(x, closer, derivatives).sums
         rounding = 8 * self.dipoles.backend.machine_epsilon * dr.abs(sums.value)
         return sums.values(1.0, coordinate_rounding(x), rounding)
 
     def sample(self, x: Vec3, detail: Real) -> Sample:
-        """Value, gradient and promises at x. detail: the accuracy scale."""
+        """The sample at points x: value, gradient, errors and promises (proved bounds near x).
+        detail: the accuracy scale."""
         radial = self.dipoles.sums(x, detail, 1)
         sums = radial.sums
         slope_error = dr.fma(

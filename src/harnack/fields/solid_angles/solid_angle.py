@@ -157,7 +157,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         if not self._all_cancel:
             self._region = planar_region(self._net_loops, self._net_circles)
         self.lift_bound_option: LiftBoundName = lift_bound
-        self.lift_bound = self._choose(lift_bound)
+        self.lift_bound = self._resolve_lift_bound(lift_bound)
         points = self._points_around()
         self._center = 0.5 * (points.min(axis=0) + points.max(axis=0))
         self._size = float(np.linalg.norm(points - self._center, axis=1).max())
@@ -184,7 +184,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
 
     @property
     def boundary_curves(self) -> tuple[FloatArray, ...]:
-        """The curves as polygons, without edges that cancel each other."""
+        """The curves as polygons (n, 3), without edges that cancel each other. Circles become
+        polygons with many sides."""
         return (*self._net_loops, *(circle.polygon(_CIRCLE_SIDES) for circle in self._net_circles))
 
     def _points_around(self) -> FloatArray:
@@ -198,9 +199,15 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
             [*loops, *(circle.polygon(64, circumscribed=True) for circle in circles)]
         )
 
-    def _choose(self, option: LiftBoundName) -> Literal["edges", "planar", "range"]:
-        """The kind of bound that the option `lift_bound` stands for. Raises ValueError if the
-        hypothesis of the option fails."""
+    def _resolve_lift_bound(self, option: LiftBoundName) -> Literal["edges", "planar", "range"]:
+        """The kind of bound by which the range of the lifted solid angle on a ball is computed,
+        from the option `lift_bound`. "auto" becomes the best bound whose assumption about the curve
+        is known to hold; "convex" and "paper" become "range".
+
+        Raises:
+            ValueError: the option is unknown; or it is "convex" or "planar", and the curve does not
+                satisfy the assumption of that bound.
+        """
         if option == "auto":
             if self._differentiable_loops:
                 return "edges"
@@ -281,14 +288,14 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
 
     @functools.cached_property
     def _without_cells(self) -> SolidAngle:
-        """The same field without cells."""
+        """This field if it has no cells; otherwise the same field without cells."""
         if not self.has_variable_accuracy:
             return self
         return SolidAngle([*self.loops, *self.circles], lift_bound=self.lift_bound_option)
 
     def _data_for(self, p: Vec3) -> _CurveData:
-        """The data on the device. If `prepare` was not called, data without cells for the backend
-        of p."""
+        """The data of the curves on the device. If `prepare` was not called, they are uploaded now,
+        without cells, to the backend of p."""
         if self._device is None:
             return self._upload(backend_of(p), traced=False)
         return self._device
@@ -296,8 +303,9 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
     def _evaluate_points(
         self, points: Any, precision: Precision | None, choose: Callable[[Sample], Any]
     ) -> npt.NDArray[Any]:
-        """As `Field._evaluate_points`, by a field without cells, because values at points are those
-        of all edges."""
+        """Evaluate the field at points (n, 3), and return what `choose` takes from the samples. A
+        field with cells uses the same field without cells, because values at points are sums over
+        all edges."""
         if self.has_variable_accuracy:
             return self._without_cells._evaluate_points(points, precision, choose)
         return super()._evaluate_points(points, precision, choose)
@@ -322,8 +330,10 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return path.enclose(self._sample(path.point(t), direction))
 
     def _sample(self, p: Vec3, direction: Vec3 | None) -> Sample:
-        """The sample at points p. direction: a unit vector (3,), along which the sample gets
-        further promises; None for none."""
+        """The sample at points p: value, gradient, errors and promises (proved bounds of f near p).
+
+        direction: (3,) a unit vector, along which the sample gets further promises; None for none.
+        """
         data = self._data_for(p)
         if self._all_cancel:
             return self._zero_sample(data, p)
@@ -332,10 +342,12 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         epsilon = data.backend.machine_epsilon
         rounding = data.rounding
         distance = sums.distance * (1 - SUM_MARGIN) - rounding
-        promises = remainder_promises(sums.cubes, sums.fourths, distance)
-        value_rounding = errors.rounding + vertex_rounding(epsilon, x, sums.squares)
+        promises = remainder_promises(sums.inverse_cubes, sums.inverse_fourths, distance)
+        value_rounding = errors.rounding + vertex_rounding(epsilon, x, sums.inverse_squares)
         if self.lift_bound == "edges":
-            ball = lift_ball(sums.angle, sums.gradient, sums.squares, promises, errors.slope)
+            ball = lift_ball(
+                sums.angle, sums.gradient, sums.inverse_squares, promises, errors.slope
+            )
         elif self.lift_bound == "planar":
             ball = self._planar_ball(data, x, sums, distance, errors.value)
         else:
@@ -354,9 +366,11 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
             # Measured: 15 units in the last place of a circle's angle and 60 of its gradient (near
             # it, 10 elsewhere). Its position is rounded by a few units too.
             point_error = epsilon * (4 + 4 * dr.max(dr.abs(x)))
-            value = 16 * epsilon * len(self._net_circles) + point_error * circles.squares
+            value = 16 * epsilon * len(self._net_circles) + point_error * circles.inverse_squares
             error = error + dr.select(on_curve, 0, value)
-            slope = 32 * epsilon * circles.squares + 1.5 * point_error * circles.cubes
+            slope = (
+                32 * epsilon * circles.inverse_squares + 1.5 * point_error * circles.inverse_cubes
+            )
             gradient_error = gradient_error + slope
         gradient_error = dr.select(on_curve, 0, gradient_error)
         error = dr.select(on_curve, 8 * _PERIOD, error)  # the steep gradient times 2 rounding
@@ -379,8 +393,11 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
     def _planar_ball(
         self, data: _CurveData, x: Vec3, sums: CurveSums, distance: Real, error: Real
     ) -> HarmonicBall:
-        """The ball for `lift_bound="planar"`: that of the region of a plane, or of circles.
+        """A ball around each point, and a range of the lifted solid angle on it, for
+        `lift_bound="planar"`. They come from the region of a plane that the curves bound, or from
+        the circles if there are only circles.
 
+        data: the curves on a backend.
         x: the points in unit coordinates.
         sums: the sums at x.
         distance: a lower bound of the distance to the curve.
@@ -394,9 +411,10 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return self._region.lift_range(sums.angle, data.height(x), distance, slack, error)
 
     def _zero_sample(self, data: _CurveData, p: Vec3) -> Sample:
-        """The sample of f = 0, for curves whose edges all cancel each other. It holds on any ball.
-        Its range has a positive width, because bounds divide by the width; it contains no level
-        (`validate_levels`)."""
+        """The sample of the constant 0 at points p, for curves whose edges all cancel each other.
+        Its promise is a range on a large ball. The range has a positive width, because formulas
+        divide by the width. It contains no level, because levels that are multiples of 4 pi are
+        refused (`validate_levels`)."""
         x = data.to_unit(p)
         radius = 1e6 * (1 + dr.norm(x)) * data.size
         zero = dr.zeros(data.backend.Float, dr.width(p))
@@ -404,8 +422,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return Sample(zero, data.backend.Array3f(zero), (ball,))
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """Rows of the Hessian at p. Its trace is 0 up to rounding. The Hessian grows without limit
-        at the curve."""
+        """The three rows of the Hessian of the solid angle at points p. Its trace is 0 up to
+        rounding. It grows without limit towards the curve."""
         data = self._data_for(p)
         if self._all_cancel:
             zero = dr.zeros(data.backend.Array3f, dr.width(p))
@@ -424,8 +442,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return first, second, third
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """Bounds of the errors of the gradient and of second derivatives at p, by the rounding of
-        positions. They are computed as for sums over boundary edges
+        """Bounds of the errors of the gradient and of the second derivatives at points p. The
+        errors come from the rounding of positions. The bounds are those of sums over boundary edges
         (`source_sums.SLOPE_ROUNDINGS`), with distances reduced by their rounding. They are infinite
         at the curve."""
         del sample
@@ -437,20 +455,23 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         distance = sums.distance - 4 * unit
         is_off_curve = (distance > 0) & (sums.distance > 2 * data.rounding)  # see `evaluate`
         growth = dr.select(is_off_curve, dr.square(dr.square(sums.distance / distance)), dr.inf)
-        slope = SLOPE_ROUNDINGS / 3 * unit * sums.cubes * growth / data.size
-        second = 0.25 * SECOND_ROUNDINGS * unit * sums.cubes / sums.distance * growth
+        slope = SLOPE_ROUNDINGS / 3 * unit * sums.inverse_cubes * growth / data.size
+        second = 0.25 * SECOND_ROUNDINGS * unit * sums.inverse_cubes / sums.distance * growth
         return slope, second / (data.size * data.size)
 
     def gradient_change_bound(self, p: Vec3, radius: Real) -> Real:
-        """The bound of `curve_queries.gradient_change_bound`, with the rounding of positions
-        included."""
+        """A bound of the change of the gradient within the distance `radius` of points p. The bound
+        is that of `curve_queries.gradient_change_bound`, and includes the rounding of positions."""
         data = self._data_for(p)
         if self._all_cancel:
             return 0 * p.x
         x, unit_radius = data.to_unit(p), radius / data.size + data.rounding
         sums = data.sums(x)
         distance = sums.distance * (1 - SUM_MARGIN) - data.rounding
-        return gradient_change_bound(sums.cubes, sums.fourths, distance, unit_radius) / data.size
+        return (
+            gradient_change_bound(sums.inverse_cubes, sums.inverse_fourths, distance, unit_radius)
+            / data.size
+        )
 
     def closest_boundary_point(self, p: Vec3) -> Vec3 | None:
         """The closest point of the curve, without edges that cancel each other (`remaining_edges`);
@@ -490,6 +511,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return angle + sums.angle + dr.dot(sums.gradient / data.size, p - q)
 
     def continuous_change(self, p: FloatArray, q: FloatArray) -> FloatArray | None:
+        """The change (n,) of the solid angle, followed continuously along the segments from points
+        p (n, 3) to q (n, 3). None if there are circles."""
         if self._net_circles:
             return None
         backend = choose_backend("double")
@@ -516,7 +539,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
                 )
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """A volume that contains the level sets.
+        """A volume that contains the level sets; None for a level that is a multiple of 4 pi.
 
         The 2 pi level of a curve in convex position lies in its convex hull (paper, Theorem B.1).
         For any curves of total length L, let x be at the distance rho from all of them. Seen from
@@ -533,7 +556,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return self._extents[levels]
 
     def _extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """`extent`, computed anew."""
+        """The volume that `extent` returns, without the cache."""
         points = self._points_around()
         gaps = [abs(math.remainder(float(level), _PERIOD)) for level in levels]
         nearest = min(gaps)
@@ -575,6 +598,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return math.inf if never_pays else max(_MIN_RAYS, _MIN_WORK / edges)
 
     def describe(self) -> dict[str, Any]:
+        """Facts about the field for users, as a dictionary of names and values."""
         return {
             "loops": len(self.loops) + len(self.circles),
             **({"circles": len(self.circles)} if self.circles else {}),
@@ -609,8 +633,9 @@ class _CurveData(UnitFrame):
     cells: CurveCells | None = None
 
     def at_detail(self, x: Vec3, detail: Real) -> tuple[CurveSums, CellErrors]:
-        """All sums at x, and their errors. They come from the cells where there are cells, x is in
-        one of them, and the accuracy scale `detail` is at most 1; elsewhere from all edges."""
+        """The sums over edges and circles at points x, in unit coordinates, and their errors. They
+        come from the cells on lanes on which x is in a cell and the accuracy scale `detail` is at
+        most 1. On all other lanes, and if there are no cells, they come from all edges."""
         if self.cells is None or self.edges is None:
             return self.sums(x), CellErrors(0.0, 0.0, self.value_rounding)
         cell_sums, in_cells = self.cells.sums(x, detail <= 1)
@@ -632,10 +657,12 @@ class _CurveData(UnitFrame):
     def edge_rates(
         self, left_out: CellErrors, line: RayLine, lengths: tuple[Real, ...], active: Mask
     ) -> tuple[Real, ...]:
-        """`line_rates` of the edges. On lanes whose sums come from the cells, these come from the
-        cells, too.
+        """For each length T, a bound of the derivative of the edges' solid angle along a line, at
+        all points of the line within T of x = line.x (see `trail_sums.line_rates`). On lanes whose
+        sums come from the cells, the bounds come from the cells, too.
 
-        left_out: the errors of the sums at the line's x, as `at_detail` gave them.
+        left_out: the errors of the sums at x, as `at_detail` returned them.
+        lengths: the lengths T.
         """
         assert self.edges is not None
         if self.cells is None or left_out.cell is None:
@@ -648,12 +675,13 @@ class _CurveData(UnitFrame):
         )
 
     def height(self, x: Vec3) -> Real:
-        """The height of x above the plane, in unit coordinates."""
+        """The signed height of points x above the plane of the `PlanarRegion`, in unit coordinates.
+        There must be a region."""
         assert self.plane is not None
         return dr.dot(self.backend.Array3f(*self.plane[:3]), x) - self.plane[3]
 
     def sums(self, x: Vec3) -> CurveSums:
-        """Sum over all edges and circles at x, in unit coordinates."""
+        """The sums over all edges and circles at points x, in unit coordinates."""
         parts: list[CurveSums] = []
         if self.edges is not None:
             parts.append(CurveSums.of(sum_over_edges(self.edges, x)))
@@ -665,12 +693,12 @@ class _CurveData(UnitFrame):
 
 @dataclass(frozen=True)
 class CellErrors:
-    """Errors of sums from cells, or from all edges.
+    """The errors of sums that come from cells on some lanes, and from all edges on other lanes.
 
     value, slope: bounds of the truncation errors of value and gradient.
     rounding: a bound of the rounding of the value.
-    cell, in_cells: the sums in cells, and the mask of the lanes on which they were used; None
-        without cells.
+    cell: the sums that the cells gave; None without cells.
+    in_cells: the mask of the lanes on which the sums of the cells were used; False without cells.
     """
 
     value: Real
@@ -682,39 +710,46 @@ class CellErrors:
 
 @dataclass(frozen=True)
 class CurveSums:
-    """Sums over edges and circles, with the attributes of `EdgeSums`. circles: the sums over
-    circles only, None if there are no circles."""
+    """Quantities of edges and circles at a point x, summed over both.
+
+    angle, gradient: the solid angle, modulo 4 pi, and its gradient.
+    distance: the distance from x to the nearest edge or circle, or a lower bound of it.
+    inverse_squares, inverse_cubes, inverse_fourths: the integrals of |dp|/D^k along the curves for
+        k = 2, 3 and 4, with D the distance from x to the point p; or upper bounds of them.
+    circles: the sums over circles only; None if there are no circles.
+    """
 
     angle: Real
     gradient: Vec3
     distance: Real
-    squares: Real
-    cubes: Real
-    fourths: Real
+    inverse_squares: Real
+    inverse_cubes: Real
+    inverse_fourths: Real
     circles: CircleSums | None = None
 
     @classmethod
     def of(cls, sums: EdgeSums | CircleSums) -> CurveSums:
-        """The sums over edges only, or over circles only."""
-        integrals = sums.squares, sums.cubes, sums.fourths
+        """The sums of a set of curves, from the sums over its edges or over its circles."""
+        integrals = sums.inverse_squares, sums.inverse_cubes, sums.inverse_fourths
         return cls(sums.angle, sums.gradient, sums.distance, *integrals)
 
     def plus(self, other: CurveSums) -> CurveSums:
-        """The sums over the curves of both operands."""
+        """The sums over the curves of this object and those of `other`."""
         return CurveSums(
             self.angle + other.angle,
             self.gradient + other.gradient,
             fmin(self.distance, other.distance),
-            self.squares + other.squares,
-            self.cubes + other.cubes,
-            self.fourths + other.fourths,
+            self.inverse_squares + other.inverse_squares,
+            self.inverse_cubes + other.inverse_cubes,
+            self.inverse_fourths + other.inverse_fourths,
             other.circles if self.circles is None else self.circles,
         )
 
 
 def _convex_ball(angle: Real, distance: Real, error: Real) -> HarmonicBall:
-    """The ball for curves in convex position. The lift stays in (-6 pi, 6 pi) if its value at the
-    center is the principal value, in (-2 pi, 2 pi).
+    """A ball, and a range of the lifted solid angle on it, for a curve in convex position, that is,
+    on the boundary of its convex hull. If the value at the center is the principal value, in
+    (-2 pi, 2 pi), the lift stays in (-6 pi, 6 pi).
 
     angle: the value at the center. It may differ from the principal value by a multiple of 4 pi.
     distance: the radius of the ball.
@@ -731,15 +766,20 @@ def _convex_ball(angle: Real, distance: Real, error: Real) -> HarmonicBall:
 def _ray_promises(
     data: _CurveData, x: Vec3, sums: CurveSums, errors: CellErrors, direction: Vec3 | None
 ) -> tuple[Lipschitz, ...]:
-    """Promises along a direction at points x, in unit coordinates; none if the direction is None.
-    sums, errors: the sums at x, and their errors."""
+    """Promises of the change of f along a line: Lipschitz constants on lengths of the line through
+    each point x in a direction. Lengths are in unit coordinates.
+
+    data: the curves on a backend.
+    sums, errors: the sums at x, and their errors.
+    direction: (3,) a unit vector; None for no promises.
+    """
     if direction is None:
         return ()
     line = RayLine(x, data.backend.Array3f(direction), data.rounding)
 
     def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
-        """Bounds of the derivative along the line for these lengths, of edges and circles
-        together."""
+        """For each length, a bound of the derivative along the line at points within that length of
+        x, for edges and circles together."""
         summands: list[tuple[Real, ...]] = []
         if data.edges is not None:
             summands.append(data.edge_rates(errors, line, lengths, active))
@@ -758,11 +798,11 @@ def _read_only(loop: FloatArray) -> FloatArray:
 
 
 def _movable_loops(loops: Any) -> tuple[Any, tuple[Any, ...]]:
-    """Separate the argument `loops` into two forms.
+    """Convert the argument `loops` of `SolidAngle` into two forms.
 
-    Returns the curves as `validate_curves` takes them, with NumPy arrays instead of Dr.Jit arrays.
-    If there are Dr.Jit arrays among the loops, also returns a tuple of all loops, with tensors
-    converted to 3-vectors; otherwise an empty tuple.
+    Returns the curves as `validate_curves` takes them, with NumPy arrays in place of Dr.Jit arrays;
+    and a tuple for derivatives by vertices. If any loop is a Dr.Jit array, this tuple has all loops
+    of vertices, with tensors converted to 3-vectors. If none is, it is empty.
     """
     is_list = isinstance(loops, list | tuple)
     parts: list[Any] = [*loops] if is_list else [loops]

@@ -1,4 +1,5 @@
-"""Sums over the edges of closed curves, for rays that run along edges and for many points.
+"""Sums over the edges of closed curves, for rays that run along edges and for many points. A trail
+is a sequence of edges that ends at the vertex where it begins.
 
 - `line_rates`: bounds of the change of a solid angle along a line, also along an edge.
 - `TrailValues`: boundary parts of winding numbers at many points; values only, fast.
@@ -30,7 +31,7 @@ from harnack.fields.solid_angles.edge_lift import (
     FACTOR_ROUNDINGS,
     STEEP_ROUNDINGS,
     LiftedProduct,
-    ends_factor,
+    edge_factor_of_views,
     view_vertex,
 )
 from harnack.fields.solid_angles.edges import Edge, inverse_squares
@@ -59,8 +60,12 @@ Rates: TypeAlias = "Callable[[tuple[Real, ...], Mask], tuple[Real, ...]]"
 
 @dataclass(frozen=True)
 class RayLine:
-    """Lines x + s v, with lengths of order one and unit vectors v. rounding: a bound of the
-    rounding of their points."""
+    """Lines x + s v, one for each lane, in coordinates in which lengths are of order one.
+
+    x: a point of each line.
+    v: the unit direction of each line.
+    rounding: a bound of the rounding of points of the lines.
+    """
 
     x: Vec3
     v: Vec3
@@ -76,12 +81,15 @@ class RayLine:
 def lipschitz_along(
     line: RayLine, gradient: Vec3, distance: Real, rates: Rates
 ) -> tuple[Lipschitz, ...]:
-    """Lipschitz constants of f along lines, for several lengths from half the distance to the curve
-    towards its size. They are finite only on lanes on which they may be worth their cost.
+    """Promises for the solid angle f of a curve along lines: for several lengths T, a Lipschitz
+    constant of f on the points of a line within T of its point x. The lengths begin with half the
+    distance to the curve and grow towards the size of the curve. The constants are finite only on
+    lanes on which they may be worth their cost.
 
     line: the lines.
-    gradient, distance: the gradient of f at line.x, and the distance to the curve.
-    rates: computes the constants for lengths, on lanes that are active.
+    gradient: the gradient of f at x = line.x.
+    distance: the distance from x to the curve.
+    rates: a function that computes the constants, from the lengths and a mask of active lanes.
 
     Along a straight edge the longest length is of use, near the ends of an edge the other lengths.
     Along a flat part of the surface, bounded by a plane curve, the shortest length is of use.
@@ -134,7 +142,7 @@ def line_rates(
     """
 
     def add(p: Vec3, q: Vec3, inverse: Real, rates: tuple[Real, ...]) -> tuple[Real, ...]:
-        """The constants `rates`, with the term of the edge from p to q added."""
+        """Add the term of the edge from p to q to the constants `rates`, one for each length."""
         return add_edge_rates(line, Edge.between(p, q, inverse, line.x), lengths, rates)
 
     start = tuple(edges.backend.Float(0) for _ in lengths)
@@ -145,13 +153,20 @@ def line_rates(
 def add_edge_rates(
     line: RayLine, edge: Edge, lengths: tuple[Real, ...], rates: tuple[Real, ...]
 ) -> tuple[Real, ...]:
-    """The constants `rates` of `line_rates`, with the term of an edge added. edge: relative to the
-    line's x.
+    """Add the term of an edge to the constants K of `line_rates`, which bound the change of the
+    solid angle along a line within each of several lengths of the line's point x.
 
-    m = a x v and n = e x v are a and e projected along the line and rotated by a right angle.
-    Distances in the plane perpendicular to the line are computed from them, and so is
-    c = v . m x n. So c is small if m and n are, whatever the lengths of a and e: its error is at
-    most 8 epsilon |m| |e| plus slack |n|.
+    edge: the edge, relative to x.
+    lengths: the lengths.
+    rates: the constants so far, one for each length.
+
+    Returns the new constants.
+
+    Let the edge run from x + a to x + a + e, and let v be the direction of the line. m = a x v and
+    n = e x v are a and e projected along the line and rotated by a right angle. Distances in the
+    plane perpendicular to the line are computed from them, and so is c = v . m x n. So c is small
+    if m and n are, whatever the lengths of a and e: its error is at most 8 epsilon |m| |e| plus
+    slack |n|.
     """
     a, e, inverse, slack = edge.a, edge.e, edge.inverse_square_length, line.slack
     epsilon = float(dr.epsilon(type(inverse)))
@@ -221,19 +236,20 @@ class _FloatFormat:
         return cls(dr.int_array_t(backend.Float), mantissa, bias)
 
     def sign(self, x: Real) -> Any:
-        """-1 where the sign bit of x is set, also for -0, else 0; an integer."""
+        """An integer for each number x: -1 if the sign bit of x is set, as it is for -0, else 0."""
         bits = dr.reinterpret_array(self.integer, x)
         return bits >> (self.mantissa + self.bias.bit_length() + 1)
 
     def reciprocal_power_of_two(self, x: Real) -> Real:
-        """A power of two; multiplied by it, x > 0 lies between one and two."""
+        """The power of two by which x > 0 has to be multiplied to lie between one and two."""
         exponent = dr.reinterpret_array(self.integer, x) & ((2 * self.bias + 1) << self.mantissa)
         return dr.reinterpret_array(type(x), (2 * self.bias << self.mantissa) - exponent)
 
 
 @dataclass(frozen=True)
 class _AngleProduct:
-    """A product z = x + iy of complex factors, of any length, with the sum of their arguments.
+    """A product z = x + iy of complex factors, with the sum of their arguments. The length |z| is
+    arbitrary, as only arguments matter.
 
     x, y: real and imaginary part.
     half: the number of half turns. The sum theta of the factors' principal arguments lies in [half
@@ -266,19 +282,20 @@ class _AngleProduct:
         return _AngleProduct(x, y, self.half + (changes & (bits.sign(factor[1]) | 1)))
 
     def times_product(self, bits: _FloatFormat, other: _AngleProduct) -> _AngleProduct:
-        """The product with another product. The half turns of both are added."""
+        """The product of this product and another product. The sums of arguments of both, which may
+        be several turns, are added."""
         z = self.times(bits, (other.x, other.y))
         return _AngleProduct(z.x, z.y, z.half + ((other.half + 1) & -2))
 
     def scaled(self, bits: _FloatFormat) -> tuple[_AngleProduct, Real]:
-        """The same product with a length of about one, and its length before. Scaling by a power of
-        two is exact."""
+        """The same product, multiplied by a power of two so that |x| + |y| lies between one and
+        two; and the value of |x| + |y| before. This scaling is exact."""
         length = dr.abs(self.x) + dr.abs(self.y)
         scale = bits.reciprocal_power_of_two(length)
         return _AngleProduct(self.x * scale, self.y * scale, self.half), length
 
     def turns(self) -> Real:
-        """theta/(2 pi), as a number of turns."""
+        """The sum of the factors' arguments as a number of turns, that is, divided by 2 pi."""
         real = cast("Any", type(self.x))
         # atan2 ignores the sign of a zero.
         y = dr.copysign(fmax(dr.abs(self.y), real(1e-30)), self.y)
@@ -317,8 +334,8 @@ class TrailValues:
         return cls(RecordTable.upload(backend, np.concatenate(rows)))
 
     def turns(self, x: Vec3, ray_sign: Real) -> tuple[Real, Mask]:
-        """1/(4 pi) times the sum of Omega_e at points x, and a mask of the points that must be
-        computed again.
+        """The sum of the solid angles Omega_e of the edges' triangles (`edge_lift`) at points x,
+        divided by 4 pi; and a mask (n,) of the points at which it must be computed again.
 
         ray_sign: 1 for the direction d = z; -1 if x and the edges are to be mirrored in a plane
             z = const.
@@ -349,8 +366,12 @@ class TrailValues:
         return all_turns, (all_margins <= 0) | is_far
 
     def _over_records(self, points: list[Point]) -> tuple[list[_AngleProduct], list[Real]]:
-        """For each point the product of all factors, and a number that is at most 0 if rounding
-        could have changed a sign or if the product nearly underflowed."""
+        """Loop over all records of edges. points: the points of a lane.
+
+        Returns two lists with an entry for each point: the product of the factors of all edges; and
+        a number that is at most 0 if rounding could have changed a sign, or if the product nearly
+        underflowed.
+        """
         backend = self.records.backend
         real, bits = backend.Float, _FloatFormat.of(backend)
         slack = real(-_SIGN_ROUNDINGS * 0.5 * backend.machine_epsilon)
@@ -372,9 +393,10 @@ class TrailValues:
 def _multiplied_by_record(
     bits: _FloatFormat, row: list[Real], slacks: list[Real], x: Point, state: tuple[Any, ...]
 ) -> tuple[Any, ...]:
-    """The state of a point, with the four edges of a record added.
+    """Multiply the product of a point by the factors of the four edges of a record. Returns the new
+    state of the point.
 
-    row: the record.
+    row: the record: five vertices, and the number of edges that are no padding.
     slacks: for each edge, minus the relative error of the products in a factor's imaginary part, or
         1 if it is padding.
     x: the point, with the direction of its ray.
@@ -405,8 +427,8 @@ def _multiplied_by_record(
 
 
 def _relative_vertex(bits: _FloatFormat, vertex: list[Real], point: Point) -> Seen:
-    """A vertex a = (u, v, z) relative to a point: (u t, v t, s t) with t = |a| + |z| and
-    s = |a| - ray_sign z.
+    """The vector a = (u, v, z) from a point to a vertex, in the form (u t, v t, s t) with
+    t = |a| + |z| and s = |a| - ray_sign z, where ray_sign is the direction of the point's ray.
 
     s t is (|a| + |z|)^2 or u^2 + v^2, so that no difference cancels.
     """
@@ -420,10 +442,10 @@ def _relative_vertex(bits: _FloatFormat, vertex: list[Real], point: Point) -> Se
 
 
 def _factor(a: Seen, b: Seen, slack: Real) -> tuple[Complex, Real]:
-    """The conjugate of F_e times a positive number; and a number that is at most 0 if the sign of
-    its imaginary part is uncertain.
+    """Two results for an edge: the conjugate of its factor F_e (`edge_lift`), times a positive
+    number; and a number that is at most 0 if the sign of the imaginary part is uncertain.
 
-    a, b: the ends of the edge.
+    a, b: the ends of the edge, from `_relative_vertex`.
     slack: minus the relative error of the products in the imaginary part, or 1 for an edge that is
         padding.
     """
@@ -434,8 +456,8 @@ def _factor(a: Seen, b: Seen, slack: Real) -> tuple[Complex, Real]:
 
 
 def closed_trails(edges: IntArray) -> list[IntArray]:
-    """Directed edges (k, 2) as closed trails. A trail is an array of vertices that ends with the
-    vertex with which it begins. Each edge is in one trail, once.
+    """Divide directed edges (k, 2) into closed trails. A trail is an array of vertex indices that
+    ends with the vertex with which it begins. Each edge is in exactly one trail, once.
 
     Raises:
         ValueError: an edge leads to a vertex that no further edge leaves.
@@ -478,7 +500,12 @@ class LiftedTrails:
 
     @classmethod
     def upload(cls, backend: Backend, vertices: FloatArray, trails: list[IntArray]) -> LiftedTrails:
-        """Upload closed trails over vertices (n, 3), as from `closed_trails`."""
+        """Upload closed trails of edges to a backend.
+
+        vertices: (n, 3).
+        trails: arrays of indices of vertices; each ends with the vertex with which it begins
+            (`closed_trails`).
+        """
         run = min(
             _RECORD_SIZES,
             key=lambda run: sum(-(-(len(t) - 1) // run) for t in trails) * (run + 0.5),
@@ -488,7 +515,9 @@ class LiftedTrails:
         return cls(RecordTable.upload(backend, np.concatenate(rows)), run)
 
     def sum(self, frame: RayFrame, x: Vec3, active: Mask = True) -> SourceSums:
-        """The sum of Omega_e at points x of rays, where active, and the sums that promises need.
+        """The sum of the solid angles Omega_e of the edges' triangles (`edge_lift`) at points x of
+        rays, on active lanes; with the gradient, and the sums by which errors and promises (proved
+        bounds near x) are computed.
 
         frame: the frame of the rays.
 
@@ -521,7 +550,7 @@ class LiftedTrails:
                 p, q = self._vertex(row, k), self._vertex(row, k + 1)
                 inverse, length = self._edge(row, k)
                 b = view_vertex(q, frame, x)
-                re, im = ends_factor(a, b, length)
+                re, im = edge_factor_of_views(a, b, length)
                 is_edge = length != 0
                 product = product.times(dr.select(is_edge, re, 1), dr.select(is_edge, im, 0))
                 edge = Edge(a.offset, b.offset, q - p, inverse)
@@ -556,17 +585,19 @@ class LiftedTrails:
         )
 
     def _vertex(self, row: list[Real], k: int) -> Vec3:
-        """Vertex k of a record."""
+        """The position (3,) of vertex k of the record `row`."""
         return self.records.backend.Array3f(*row[3 * k : 3 * k + 3])
 
     def _edge(self, row: list[Real], k: int) -> tuple[Real, Real]:
-        """1/length^2 and the signed length of edge k of a record."""
+        """One over the squared length of edge k of the record `row`, and its signed length:
+        negative if the edge runs from a higher to a lower vertex index, 0 if there is no edge."""
         first = 3 * (self.edges_per_record + 1)
         return row[first + k], row[first + self.edges_per_record + k]
 
 
 def _trail_records(vertices: FloatArray, trail: IntArray, run: int) -> FloatArray:
-    """Records of a trail, with `run` edges each. Edges of length 0 pad the last record."""
+    """The records of a closed trail of vertices (n, 3), with `run` edges in each record, as
+    `LiftedTrails` describes them. Edges of length 0 pad the last record."""
     count = len(trail) - 1
     record_count = -(-count // run)
     index = np.minimum(run * np.arange(record_count)[:, None] + np.arange(run + 1), count)

@@ -50,11 +50,11 @@ State: TypeAlias = "tuple[Any, ...]"
 
 @dataclass(frozen=True)
 class ClusterView:
-    """A node of the tree relative to points x.
+    """A node of a tree of dipoles, as seen from points x.
 
     head: the numbers of the node that every visit reads.
-    payload: its other numbers, which are read where it is far.
-    r: the vector from its center to x.
+    payload: its other numbers, which are read only on lanes on which the node is far.
+    r: the vector from the node's center to x.
     square: |r|^2, plus the square of the height (`traverse_clusters`).
     inverse: 1/sqrt(square), or 0 where the node is not far.
     far: the mask of the lanes on which the node is far enough for its moments to be used.
@@ -75,20 +75,25 @@ def traverse_clusters(
     tree: PackedTree, x: Vec3, closer: Real, add_cluster: EachCluster,
     add_primitive: PrimitiveBody, state: State, active: Mask = True, height_square: Real = 0.0,
 ) -> State:  # fmt: skip
-    """The state after a traversal of a tree. Records of its nodes begin with the node's center and
-    its accepting distance, beyond which its moments may be used.
+    """Traverse a tree from points x: nodes that are far from x are added as a single source, and
+    the primitives of near leaves are added one by one. Returns the last state.
 
+    tree: a packed tree. A node's record begins with its center and its accepting distance, beyond
+        which its moments may be used.
     closer: the moments of nodes are used beyond this many times the accepting distance.
-    add_cluster: returns the state with a node added where it is far.
-    add_primitive: as for `tree.for_each_primitive`, for the primitives of leaves that are not far.
+    add_cluster: a function (node, state) that returns the state with a node added on the lanes on
+        which it is far.
+    add_primitive: a function (record, mask of active lanes, state) that returns the state with the
+        primitive of a near leaf added.
+    state: the first state.
     height_square: added to the squares of all distances. In four dimensions it is the square of the
         distance of the point from the space of the tree.
     """
     vector = tree.backend.Array3f
 
     def visit(node: VisitedNode, state: State) -> tuple[Mask, State]:
-        """Add a node where it is far, and the primitives of a leaf where it is not. Returns the
-        mask of the lanes on which the walk enters the node, and the state."""
+        """Add the node on lanes on which it is far; on other lanes, add its primitives if it is a
+        leaf. Returns the mask of the lanes on which the walk enters the node, and the new state."""
         r = x - vector(*node.head[:3])
         square = dr.squared_norm(r) + height_square
         is_far = square > dr.square(node.head[3] * closer)
@@ -105,7 +110,8 @@ _LEAF_SIZE, _ARITY = 8, 4
 
 
 def dipole_hierarchy(points: FloatArray) -> BalancedTree:
-    """Build the tree over points (n, 3)."""
+    """Build the balanced tree over points (n, 3): which points are in which node. It holds no
+    positions and no moments."""
     return build_balanced_tree(points, leaf_size=_LEAF_SIZE, arity=_ARITY)
 
 
@@ -127,8 +133,11 @@ def empty_record(row: FloatArray) -> FloatArray:
 
 
 def records_in_slots(tree: BalancedTree, rows: FloatArray) -> FloatArray:
-    """Records (leaves, leaf_size, 8) in the slots of the tree. Empty slots hold a record with
-    moment 0 at the position of the leaf's first record."""
+    """The records of dipoles in the slots of the leaves of a tree: (leaves, leaf_size, 8). Empty
+    slots hold a record with moment 0 at the position of the leaf's first dipole.
+
+    rows: (n, 8) the records of all dipoles.
+    """
     slots = tree.values_in_slots(rows)
     empty = tree.leaf_slots == NO_PRIMITIVE
     slots[empty] = np.broadcast_to(empty_record(slots[:, :1]), slots.shape)[empty]
@@ -136,7 +145,8 @@ def records_in_slots(tree: BalancedTree, rows: FloatArray) -> FloatArray:
 
 
 def multipole_terms(c: Sequence[Real], r: Vec3, inverse: Real, derivatives: int) -> SourceTerm:
-    """The sum f of P_l(r)/|r|^(2l+1) over l = 1, 2, 3, and its derivatives.
+    """The potential f of a far node: the sum of P_l(r)/|r|^(2l+1) over l = 1, 2, 3, with harmonic
+    polynomials P_l of degree l; and its derivatives.
 
     c: the coefficients of the polynomials P_l, in the order of `multipole.cartesian_coefficients`.
     r: the vector from the node's center to the point.
@@ -187,8 +197,10 @@ def multipole_terms(c: Sequence[Real], r: Vec3, inverse: Real, derivatives: int)
 def _hessian(
     c: Sequence[Real], r: Vec3, g: tuple[Vec3, ...], p: tuple[Real, ...], u: tuple[Real, Real]
 ) -> SymmetricMatrix:
-    """The Hessian of `multipole_terms`, with its arguments c and r.
+    """The Hessian of the sum f of P_l(r)/|r|^(2l+1) over l = 1, 2, 3 (`multipole_terms`).
 
+    c: the coefficients of the polynomials P_l.
+    r: the vector from the node's center to the point.
     g, p: the gradients G_l and the values P_l, times u^(2l-2), which makes them as large as those
         of l = 1.
     u: u^2 and u^3, with u = 1/|r|.
@@ -201,7 +213,7 @@ def _hessian(
     xyy, xzz, xxy, yzz, xxz, yyz, xyz = c[8:15]
     v = dr.fma(3, g1, dr.fma(5, g2, 7 * g3)) * u2
     w = dr.fma(15, p1, dr.fma(35, p2, 63 * p3)) * u4
-    cubes = (
+    p3_entries = (
         -2 * dr.fma(xyy + xzz, x, -dr.fma(xxy, y, xxz * z)),
         -2 * dr.fma(xxy + yzz, y, -dr.fma(xyy, x, yyz * z)),
         -2 * dr.fma(xxz + yyz, z, -dr.fma(xzz, x, yzz * y)),
@@ -209,7 +221,7 @@ def _hessian(
         dr.fma(2, dr.fma(xxz, x, xzz * z), xyz * y),
         dr.fma(2, dr.fma(yyz, y, yzz * z), xyz * x),
     )
-    squares = (2 * c[3], 2 * c[4], 2 * czz, 2 * c[5], 2 * c[6], 2 * c[7])
+    p2_entries = (2 * c[3], 2 * c[4], 2 * czz, 2 * c[5], 2 * c[6], 2 * c[7])
     pairs = ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))
     crossed = (
         (v.x * x, v.x * x), (v.y * y, v.y * y), (v.z * z, v.z * z),
@@ -218,7 +230,7 @@ def _hessian(
     parts = [
         (square * u2 + cube * u4 - left - right + w * a * b - (s if k < 3 else 0)) * u3
         for k, (square, cube, (left, right), (a, b)) in enumerate(
-            zip(squares, cubes, crossed, pairs, strict=True)
+            zip(p2_entries, p3_entries, crossed, pairs, strict=True)
         )
     ]
     return SymmetricMatrix(*parts)
@@ -243,11 +255,14 @@ AddPrimitive: TypeAlias = (
 
 
 def node_records(level: NodeMoments, order: int, rough: float, error: FloatArray) -> FloatArray:
-    """Records of nodes as `Treecode` reads them.
+    """The records of the k nodes of one level of a tree, as `Treecode` reads them.
 
     A record holds center, accepting distance (`rough` times the radius), remainder constants A and
     K (`remainder_constants`), 15 coefficients of moments up to the order, and the error bound E.
 
+    level: the moments of the nodes.
+    order: 0, 1 or 2, the order of the multipole moments that are used.
+    rough: the accepting distance of a node, in radii of the node.
     error: (k,) E, the bound of the truncation error of the value.
     """
     head = [rough * level.radius, *remainder_constants(level, rough)]
@@ -257,7 +272,8 @@ def node_records(level: NodeMoments, order: int, rough: float, error: FloatArray
 
 @dataclass(frozen=True)
 class Treecode:
-    """Sums over sources by a tree on a backend. A far node counts as a single source.
+    """Sums over sources by a tree on a backend. A node that is far from a point counts as a single
+    source, given by its multipole moments.
 
     tree: the nodes, with the records of `node_records`.
     accuracy: at accuracy scale 1, nodes are far beyond this many times their radius.
@@ -336,11 +352,12 @@ class Treecode:
         self, x: Vec3, detail: Real, add: AddPrimitive, own: ExtraState = (), active: Mask = True,
         derivatives: int = 1,
     ) -> tuple[SourceSums, ExtraState]:  # fmt: skip
-        """Sum over all sources at points x. Returns the sums and the caller's own state.
+        """The sums over all sources at points x, and the caller's own state.
 
-        detail: the accuracy scale of `Field.at_accuracy`; infinity gives the direct sum.
-        add: adds a primitive of a near leaf (`AddPrimitive`).
-        own: the caller's own state, which `add` updates.
+        detail: the accuracy scale of `Field.at_accuracy`. The larger it is, the farther away nodes
+            must be to count as one source; infinity gives the direct sum.
+        add: a function that adds a primitive of a near leaf (`AddPrimitive`).
+        own: a further state of the caller, which `add` updates.
         derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
         """
         free_fraction, closer = (
@@ -350,7 +367,8 @@ class Treecode:
         unit = coordinate_rounding(x)
 
         def add_cluster(node: ClusterView, state: ExtraState) -> ExtraState:
-            """The state with a node added where it is far."""
+            """Add a node to the state on lanes on which it is far. The state consists of the state
+            of the sums and the caller's own state."""
             c, inverse = node.payload, node.inverse
             error = c[15] * self._decay(inverse)
             slope = error * inverse
@@ -366,7 +384,7 @@ class Treecode:
             return sums.to_state(), state[1]
 
         def add_primitive(row: list[Real], active: Mask, state: ExtraState) -> ExtraState:
-            """The state with a primitive of a near leaf added, where active."""
+            """Add the primitive of a near leaf to the state, on active lanes."""
             sums, own = add(row, active, SourceSums.from_state(state[0]), state[1])
             return sums.to_state(), own
 
@@ -389,12 +407,18 @@ class Treecode:
         return sums, state[1]
 
     def values(self, sums: SourceSums, share: float, unit: Real, rounding: Real) -> PointValues:
-        """`SourceSums.values` of sums over the tree, with the same arguments."""
+        """Value and derivatives with error bounds, from sums over the tree.
+
+        sums: the result of the method `sums`.
+        share: the factor by which all results are multiplied.
+        unit: a bound of the rounding of a coordinate.
+        rounding: a bound of the rounding of the final operations on the value.
+        """
         return sums.values(share, unit, rounding, _FAR_GRADIENT_ROUNDINGS)
 
     def _decay(self, inverse: Real) -> Real:
-        """r^-(order + 3), for inverse = 1/r. The first term beyond the order is proportional to
-        it."""
+        """The number r^-(order + 3) at the distance r from a node, for inverse = 1/r. The first
+        multipole term beyond the order is proportional to it."""
         decay = inverse * inverse * inverse
         for _ in range(self.order):
             decay = decay * inverse
@@ -402,7 +426,7 @@ class Treecode:
 
 
 def _median_ratio(larger: FloatArray, smaller: FloatArray) -> float:
-    """The median of the ratio larger/smaller, or 1 if the median is less. Entries with smaller = 0
-    do not count."""
+    """The median of the ratios of the entries of two arrays, larger/smaller; but at least 1.
+    Entries with smaller = 0 do not count."""
     nonzero = smaller > 0
     return max(1.0, float(np.median(larger[nonzero] / smaller[nonzero]))) if nonzero.any() else 1.0

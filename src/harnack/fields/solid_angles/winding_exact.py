@@ -72,8 +72,8 @@ class ExactWinding:
     def of(
         cls, backend: Backend, mesh: WindingMesh, rays: TriangleTree, traced: bool
     ) -> ExactWinding:
-        """Upload the data of a mesh. traced: whether `sample_interval` is to be called, which needs
-        more data."""
+        """Upload the data of a mesh. traced: whether `sample_interval` will be called, which needs
+        further data."""
         if not len(mesh.singular_edges):
             return cls(backend, rays, None, None, None, None, final_rounding(backend))
         vertices, edges = mesh.unit_vertices, mesh.singular_edges
@@ -99,8 +99,8 @@ class ExactWinding:
     """`Field.coarsest_accuracy` of the boundary's cells: any number below 1 (`boundary_cells`)."""
 
     def fast_values(self, x: Vec3) -> Real:
-        """w at points, as from `values`, for a third of the work. It cannot be called while a loop
-        is being recorded.
+        """The winding number w (n,) at points x (3, n). It takes a third of the time of `values`,
+        and cannot be called while Dr.Jit records a loop.
 
         Crossings are decided by `tree.triangle_tree.signed_crossing`. Where `TrailValues` is
         uncertain about an edge, the sum over edges is computed again by `lifted_sums`, which
@@ -124,7 +124,8 @@ class ExactWinding:
         return value
 
     def values(self, x: Vec3, derivatives: int) -> PointValues:
-        """w and its derivatives up to order `derivatives` at points x."""
+        """The winding number w and its derivatives up to order `derivatives` at points x (3, n),
+        with error bounds."""
         real = self.backend.Float
         turns = self.rays.signed_crossings_vertical(x, real(1))
         if self.edges is None:
@@ -135,16 +136,18 @@ class ExactWinding:
         return sums.values(_PER_SPHERE, unit, self.rounding)
 
     def crossings_ahead(self, frame: RayFrame, t: Real, active: Mask) -> Real:
-        """The sum of the signs of all crossings beyond the parameter t of rays. It is the part of w
-        that `sample_interval` takes as `turns`."""
+        """The sum (n,) of the signs of all crossings of triangles by rays of the frame, beyond the
+        parameter t. It is the part of w that `sample_interval` takes as `turns`."""
         return self.rays.signed_crossings_ahead(frame, t, active)
 
     def sample_interval(
         self, frame: RayFrame, x: Vec3, behind: JumpCrossing, turns: Real, detail: Real,
         active: Mask = True,
     ) -> Sample:  # fmt: skip
-        """w at x, continued along a ray interval without jumps, where active, with the promises of
-        `SourceSums.sample`.
+        """The sample of w at points x of a ray interval between two crossings of triangles, on
+        active
+        lanes: value, gradient, errors, and promises (proved bounds near x, see
+        `SourceSums.sample`). w is continued smoothly along the interval.
 
         frame: the frame of the rays on which the points x lie.
         turns: the sum of the signs of all crossings ahead of the interval's start.
@@ -163,7 +166,8 @@ class ExactWinding:
         line, loops = RayLine(x, frame.d, 8 * unit), self.loops
 
         def rates(lengths: tuple[Real, ...], lanes: Mask) -> tuple[Real, ...]:
-            """Bounds of the derivative along the line for these lengths (`line_rates`)."""
+            """For each length, a bound of the derivative along the line at points within that
+            length of x (`line_rates`)."""
             return line_rates(loops, line, lengths, lanes & active)
 
         promises = lipschitz_along(line, sums.gradient, sums.singularity_distance, rates)

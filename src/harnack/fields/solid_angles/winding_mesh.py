@@ -161,7 +161,8 @@ class WindingMesh:
 
     @functools.cached_property
     def records(self) -> FloatArray:
-        """Records (k, 14) of the triangles, with the indices of their faces."""
+        """Records (k, 14) of the triangles (`tree.triangle_tree`). Each copy of a face has a record
+        of its own, with the index of the face."""
         if len(self.faces) == len(self.triangles):
             return self.ray_records
         return np.repeat(
@@ -193,7 +194,8 @@ class WindingMesh:
 
     @functools.cached_property
     def box(self) -> tuple[Any, Any]:
-        """The lowest and the highest coordinates (3,) of the triangles."""
+        """The lower and the upper corner (3,) of the box around the triangles, in the user's
+        coordinates."""
         return _box(self.vertices, self.faces)
 
     @functools.cached_property
@@ -218,7 +220,9 @@ def _box(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, FloatArray]
 
 
 def _center_and_size(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, float]:
-    """The attributes `center` and `size` of `WindingMesh`."""
+    """The center (3,) and the size of the unit coordinates of a mesh: the center of the box around
+    its faces, rounded to single precision; and the smallest power of two that is at least half of
+    the box's longest side."""
     low, high = _box(vertices, faces)
     size = 2.0 ** np.ceil(np.log2(0.5 * float((high - low).max())))
     return round_to_single(0.5 * (low + high)), float(size)

@@ -73,18 +73,19 @@ _CELLS_ACROSS = 192
 
 
 class ModuloOneEvaluable(Protocol):
-    """The methods of `WindingNumber` that proofs about its level sets use."""
+    """An object that evaluates a winding number modulo 1, as `WindingNumber` does: the methods that
+    proofs about its level sets use."""
 
     def prepare(self, backend: Backend) -> ModuloOneEvaluable:
-        """See `Field.prepare`."""
+        """A copy with its data on a backend, for tracing."""
         ...
 
     def evaluate_modulo_one(self, p: Vec3, detail: Real = 0.0) -> Sample:
-        """See `WindingNumber.evaluate_modulo_one`."""
+        """A sample of w minus an unknown integer, at points p. detail: the accuracy scale."""
         ...
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """See `Field.extent`."""
+        """A volume that contains the level sets of w; None if there is no bounded one."""
         ...
 
 
@@ -309,7 +310,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
 
     @property
     def mesh(self) -> WindingMesh:
-        """The triangles. They cannot be set: see `with_vertices`."""
+        """The triangles of the mesh, prepared for sums. They cannot be set, because all other data
+        are computed from them once; `with_vertices` makes a field with moved vertices."""
         return self._mesh
 
     @property
@@ -324,7 +326,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return prepared
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
-        """Values and derivatives at points x: see `BatchedField.values_at`. With a tree, second
+        """Values and derivatives at points x (3, n), with error bounds. With a tree, second
         derivatives come from the boundary, unless the user chose the accuracy."""
         data = self._batch_data(backend_of(x))
         winding, x = data.winding, data.to_unit(x)
@@ -356,7 +358,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return self._stated(data, x, values)
 
     def _boundary_rates(self, data: _WindingData, winding: TreeWinding) -> BoundaryRates:
-        """The derivatives from the boundary, computed once for a backend."""
+        """The object that evaluates derivatives at points from the boundary only; made once for a
+        backend."""
         if data.backend not in self._rates:
             self._rates[data.backend] = BoundaryRates.of(
                 data.backend, self.mesh, self.order, winding
@@ -375,7 +378,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         )
 
     def _upload(self, backend: Backend, *, traced: bool) -> _WindingData:
-        """The data on a backend, for tracing or for values at points."""
+        """Upload the data to a backend. traced: whether they are for tracing, and not for values at
+        points."""
         accuracy = self.accuracy or (_TRACING_ACCURACY if traced else _VALUES_ACCURACY)
         mesh = self.mesh
         rays = TriangleTree.of(backend, mesh.ray_tree, mesh.ray_records)
@@ -425,7 +429,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
 
     @property
     def has_unknown_branch(self) -> bool:
-        """Whether samples along rays may know w only up to an integer, as those of cells of edges
+        """Whether samples along rays may know w only up to an integer. Samples from cells of edges
         do."""
         return self._device is not None and self._device.cells is not None
 
@@ -439,7 +443,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return max(_MIN_RAYS, _PAYS_PER_EDGE * edges) if pays else math.inf
 
     def occupied_cells(self, levels: tuple[float, ...]) -> OccupancyGrid | None:
-        """The cells of `winding_cells`; None if there are few edges, if the surface is the mesh
+        """A grid over the extent, in which a cell is empty if w modulo 1 is proved to take none of
+        the levels in it (`winding_cells`). None if there are few edges, if the surface is the mesh
         itself, or for the method "tree" without FMM cells."""
         is_small = len(self.mesh.singular_edges) < _MIN_CELL_EDGES
         if (
@@ -465,8 +470,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return WindingModuloOne(self)
 
     def evaluate_modulo_one(self, p: Vec3, detail: Real = 0.0) -> Sample:
-        """A sample of w minus an unknown integer, which may differ from point to point. detail: the
-        accuracy scale; by default the sample is the coarsest one."""
+        """A sample of w minus an unknown integer at points p. The integer may differ from point to
+        point. detail: the accuracy scale; by default the sample is the coarsest one."""
         data, frame = self._upward_rays(p)
         detail = data.backend.Float(detail)
         if data.cells is None:
@@ -478,8 +483,9 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return outside.select(inside, space_scaled(in_cells, data.size))
 
     def value_if_cheap(self, p: Vec3, rounding: Real, active: Mask) -> Real:
-        """w at p where it follows from the cell that contains p, else NaN. rounding: the rounding
-        of a coordinate of p."""
+        """The winding number w at points p, with its integer, on active lanes on which it follows
+        from the FMM cell that contains p; NaN on other lanes. rounding: a bound of the rounding of
+        a coordinate of p."""
         data = self._data_for(p)
         if data.cells is None:
             return data.backend.Float(dr.nan)
@@ -496,8 +502,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
     def next_jump(
         self, o: Vec3, d: Vec3, after: JumpCrossing, t_max: Real, active: Mask
     ) -> JumpCrossing:
-        """The next crossing of a triangle on each ray, after the crossing `after` and up to
-        t_max."""
+        """The next crossing of a triangle on each ray o + t d, after the crossing `after` and up to
+        t = t_max, with the jump of w there."""
         data = self._data_for(o)
         frame = RayFrame.along(data.backend, data.to_unit(o), d)
         behind = (after.t / data.size, after.facet)
@@ -506,7 +512,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return JumpCrossing(t * data.size, facet, -sign, -normal)
 
     def initial_offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
-        """The sum of the signs of all crossings beyond t_min, for the exact method; otherwise 0."""
+        """For the exact method, the sum of the signs of all crossings of triangles beyond t_min on
+        each ray o + t d. It is 0 for the tree, which needs no such sum."""
         data = self._data_for(o)
         if self.only_sheets:
             return data.backend.Float(0)
@@ -533,7 +540,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
     def continuation(
         self, o: Vec3, d: Vec3, behind: JumpCrossing, ahead: JumpCrossing, offset: Real
     ) -> Field:
-        """w on a ray between the crossings `behind` and `ahead`, as a field without jumps."""
+        """The winding number w on each ray o + t d between the crossings `behind` and `ahead`, as a
+        field without jumps. offset: the sum of the signs of all crossings ahead of `behind`."""
         if self.only_sheets:
             return _BesideSheets(self._data_for(o).backend, self._level_of_sheets, behind, ahead)
         data = self._data_for(o)
@@ -549,7 +557,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
     def nearest_facet(
         self, p: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
     ) -> NearestFacet:
-        """The nearest triangle after the one given by `after`, within the distance `limit`."""
+        """The triangle that follows the one given by `after` in the order of distance from p,
+        within the distance `limit`."""
         data = self._data_for(p)
         facet = next_closest_triangle(
             data.rays, data.to_unit(p), after, dr.square(limit / data.size), active
@@ -580,6 +589,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return self._extents[levels]
 
     def describe(self) -> dict[str, Any]:
+        """Facts about the field for users, as a dictionary of names and values."""
         mesh = self.mesh
         return {
             "triangles": len(mesh.triangles),
@@ -605,7 +615,7 @@ class _WindingData(UnitFrame):
 
     @property
     def built(self) -> BuiltCells | None:
-        """The cells, of edges or of triangles; None for none."""
+        """The FMM cells, which are cells of edges or of triangles; None if there are none."""
         if self.cells is None and isinstance(self.winding, TreeWinding):
             return self.winding.cells
         return self.cells
@@ -614,7 +624,7 @@ class _WindingData(UnitFrame):
 def _sample_at_start(
     data: _WindingData, frame: RayFrame, turns: Real, detail: Real, active: Mask = True
 ) -> Sample:
-    """The sample at the start of rays, where active.
+    """The sample of w at the starts of rays, on active lanes, without promises along the rays.
 
     frame: the frame of the rays.
     turns: the sum of the signs of all crossings ahead.
@@ -627,11 +637,12 @@ def _sample_at_start(
 
 
 class _WindingOnInterval(Field):
-    """A winding number on a ray interval between two crossings of triangles.
+    """The winding number w on a ray interval between two crossings of triangles, continued smoothly
+    to both ends.
 
     on: the data of the winding number.
     frame: the frame of the rays.
-    behind: the crossing at the start of the interval, in unit lengths.
+    behind: the crossing at the start of the interval, with its position in unit coordinates.
     offset: the sum of the signs of all crossings ahead of the start; only the exact method uses it.
     detail: the accuracy scale.
     """
@@ -644,7 +655,7 @@ class _WindingOnInterval(Field):
         offset: Real,
         detail: Real = 1.0,
     ) -> None:
-        """The arguments are those of the class."""
+        """For the arguments see the class."""
         self.has_variable_accuracy = on.winding.has_detail or on.cells is not None
         self.coarsest_accuracy = on.winding.coarsest_detail
         self._on, self._frame, self._detail = on, frame, on.backend.Float(detail)
@@ -660,8 +671,8 @@ class _WindingOnInterval(Field):
         return _WindingOnInterval(self._on, self._frame, self._behind, self._offset, detail)
 
     def evaluate(self, p: Vec3) -> Sample:
-        """A sample of w, from the cells where they are used. There it is w up to an integer, and
-        marked as such."""
+        """A sample of w at points p of the interval. On lanes on which it comes from the cells, it
+        is w up to an unknown integer, and marked as such (`branch_unknown`)."""
         data, frame = self._on, self._frame
         x, detail = data.to_unit(p), self._detail
         if data.cells is None:
@@ -676,10 +687,12 @@ class _WindingOnInterval(Field):
 
 
 class _BesideSheets(Field):
-    """The field on a ray interval beside a mesh that is the surface as a whole (`own_sheet`).
+    """The field on a ray interval between two crossings of a mesh that lies on its own level set
+    (`own_sheet`), so that its triangles are the whole surface.
 
-    It is constant, and half a unit from the level, on the side from which the jump at the triangle
-    ahead passes the level. If no triangle is ahead, the jump at the triangle behind decides.
+    The field is constant: the level plus 1/2 or minus 1/2. The sign is such that the jump at the
+    triangle ahead passes the level. If no triangle is ahead, the jump at the triangle behind
+    decides.
 
     level: the level of the surface.
     behind, ahead: the crossings at the ends of the interval.
@@ -693,5 +706,5 @@ class _BesideSheets(Field):
         self._value = dr.select(jump > 0, real(level + 0.5), level - 0.5)
 
     def evaluate(self, p: Vec3) -> Sample:
-        """The sample of the constant."""
+        """The sample of the constant, which holds at any points p."""
         return Sample(self._value, 0 * p, (Lipschitz(0.0),), 0.0)

@@ -75,8 +75,8 @@ class BoundaryRates:
         return cls(TreeWinding.of(backend, caps, _CAPS_ACCURACY, order))
 
     def at(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:
-        """The derivatives up to order `derivatives` at points x. The value in the result has no
-        meaning. closer: the accuracy scale."""
+        """The derivatives of w up to order `derivatives` at points x (3, n), with error bounds. The
+        value in the result has no meaning. closer: the accuracy scale."""
         if isinstance(self.summed, TreeWinding):
             return self.summed.values(x, derivatives, closer)
         real = cast("Any", type(x.x))
@@ -88,7 +88,8 @@ class BoundaryRates:
         return sums.values(1 / (4 * math.pi), coordinate_rounding(x), real(0))
 
     def sharp(self, x: Vec3) -> PointValues:
-        """The gradient at points x, as from `at`, with an error of about 1 % of its length
+        """The gradient of w at points x (3, n), with an error of about 1 % of its length in most
+        places. If it comes from a tree, the accuracy is increased until that is so
         (`sharpened`)."""
         if isinstance(self.summed, TreeWinding):
             return sharpened(lambda points, accuracy: self.at(points, 1, accuracy), x)
@@ -96,7 +97,8 @@ class BoundaryRates:
 
 
 def with_rates(value: PointValues, rates: PointValues) -> PointValues:
-    """The value from `value`, and the derivatives from `rates`."""
+    """The value of the first argument with the derivatives of the second, each with its error
+    bounds."""
     return dataclasses.replace(rates, value=value.value, error=value.error)
 
 

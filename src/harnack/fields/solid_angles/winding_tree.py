@@ -76,14 +76,15 @@ class NearEdge:
     is_singular: Mask
 
     def is_open(self, reach: Real) -> Mask:
-        """Whether the edge may be part of the boundary of the triangles near x.
+        """Whether the edge may be part of the boundary of the set of near triangles, those that are
+        not in a far node of the tree. It is an edge at which the near triangles do not cancel.
 
         reach: nodes are far beyond `reach` times their radius.
 
-        The edge is no part of it if it is not singular, and nearer than (reach - 1)/2 times its
-        length L. Proof: a far node that has a triangle at this edge has a radius R >= L/2 and is
-        farther than reach R, and so the edge is farther than (reach - 1) R. Hence all triangles at
-        a nearer edge are near, and cancel there.
+        The edge is not part of that boundary if it is not singular, and is nearer to x than
+        (reach - 1)/2 times its length L. Proof: a far node that has a triangle at this edge has a
+        radius R >= L/2 and is farther than reach R, and so the edge is farther than (reach - 1) R.
+        Hence all triangles at a nearer edge are near, and cancel there.
 
         In a cell the same holds for a triangle that is far from the cell, with `TRIANGLE_RATIO` for
         `reach`, because x is nearer to the cell's center than the k > 1 radii of
@@ -95,8 +96,8 @@ class NearEdge:
 
 
 def edges_of(row: list[Real], x: Vec3, frame: RayFrame | VerticalRayFrame) -> Iterator[NearEdge]:
-    """The three edges of the triangle of a record, relative to x and to rays of the frame. In an
-    empty slot they have length 0."""
+    """Yield the three edges of the triangle in the record `row`, relative to x and to rays of the
+    frame. The record of an empty slot gives edges of length 0."""
     ends = corners_of(row, cast("Any", type(x)))
     for k, (i, j, sign) in enumerate(_EDGES):
         inverse = dr.select(row[NUMBER_COLUMN] >= 0, row[INVERSE_SQUARES_COLUMN + k], 0)
@@ -156,7 +157,7 @@ class TreeWinding:
 
     @property
     def has_detail(self) -> bool:
-        """Whether coarse samples cost less. It is true."""
+        """Whether samples at small accuracy scales cost less. It is true for a tree."""
         return True
 
     @property
@@ -169,8 +170,8 @@ class TreeWinding:
         return self.clusters.coarsest_accuracy if self.cells is None else 1.0
 
     def values(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:
-        """w and its derivatives up to order `derivatives` at points x. closer: the accuracy scale,
-        at least 1.
+        """The winding number w and its derivatives up to order `derivatives` at points x (3, n),
+        with error bounds. closer: the accuracy scale, at least 1.
 
         Near triangles add their crossings with the rays from x along z, and their open edges.
         """
@@ -180,7 +181,7 @@ class TreeWinding:
         )
 
         def is_ahead(row: list[Real], t: Real) -> Mask:
-            """Whether a crossing at t is ahead of x."""
+            """The mask of the lanes on which a crossing at the ray parameter t is ahead of x."""
             del row
             return t > 0
 
@@ -195,7 +196,7 @@ class TreeWinding:
         unit: Real,
         is_ahead: IsAhead,
         derivatives: int,
-        where: Mask = True,
+        active_lanes: Mask = True,
     ) -> SourceSums:
         """Sums whose value is 4 pi w: far clusters, the crossings of near triangles that are ahead
         of x on rays of the frame, and the open edges of near triangles (`NearEdge.is_open`).
@@ -205,18 +206,19 @@ class TreeWinding:
         unit: the rounding of a coordinate.
         is_ahead: a function; is_ahead(row, t) tells whether a crossing at t with the triangle of
             the record `row` is ahead.
-        where: the mask of the active lanes.
+        active_lanes: the mask of the active lanes.
         """
         start = LiftedProduct.identity(self.backend.Float).parts()
 
         def adder(reach: Real) -> AddPrimitive:
-            """Returns a function that adds a near triangle. reach: as for `NearEdge.is_open`."""
+            """Make a function that adds a near triangle to sums. reach: nodes are far beyond this
+            many times their radius."""
 
             def add(
                 row: list[Real], active: Mask, sums: SourceSums, state: tuple[Any, ...]
             ) -> tuple[SourceSums, tuple[Any, ...]]:
-                """Add the triangle of a record to the sums, where active. state: the product of the
-                factors of edges, as `LiftedProduct.parts`."""
+                """Add the triangle in the record `row` to the sums, on active lanes. state: the
+                parts of the product of the factors of edges (`LiftedProduct`)."""
                 t, sign = signed_crossing(row, frame)
                 # A crossing is a full turn of the product, which counts them without rounding.
                 re, im, turns = state
@@ -228,30 +230,32 @@ class TreeWinding:
 
             return add
 
-        sums, product = self._near_sums(x, detail, adder, start, where, derivatives)
+        sums, product = self._near_sums(x, detail, adder, start, active_lanes, derivatives)
         return LiftedSums(sums, LiftedProduct(*product)).total()
 
     def _near_sums(
         self, x: Vec3, detail: Real, adder: Callable[[Real], AddPrimitive], state: tuple[Any, ...],
-        where: Mask, derivatives: int = 1,
+        active_lanes: Mask, derivatives: int = 1,
     ) -> tuple[SourceSums, tuple[Any, ...]]:  # fmt: skip
-        """The sums and the caller's own state. They come from the cells if there are cells and no
-        second derivatives are requested, at accuracy scales up to 1; otherwise from the tree.
+        """The sums at points x over far clusters, to which near triangles are added; and the
+        caller's own state. They come from the FMM cells if there are cells, no second derivatives
+        are requested, and the accuracy scale `detail` is at most 1; otherwise from the tree.
 
-        adder: returns a function that adds a near triangle, from `reach` of `NearEdge.is_open`.
-        own: the caller's own state.
-        where: the mask of the active lanes.
+        adder: a function that makes the function that adds a near triangle. Its argument is the
+            number of radii beyond which nodes are far (`reach` of `NearEdge.is_open`).
+        state: a further state of the caller, which that function updates.
+        active_lanes: the mask of the active lanes.
         """
         if self.cells is None or derivatives == 2:
             add = adder(self.clusters.acceptance_ratio(detail))
-            return self.clusters.sums(x, detail, add, state, where, derivatives=derivatives)
+            return self.clusters.sums(x, detail, add, state, active_lanes, derivatives=derivatives)
         acceptance = self.clusters.acceptance_ratio(fmax(detail, self.backend.Float(1)))
         adders = adder(self.backend.Float(TRIANGLE_RATIO)), adder(acceptance)
-        return self.cells.sums_with_tree(self.clusters, x, detail, adders, state, where)
+        return self.cells.sums_with_tree(self.clusters, x, detail, adders, state, active_lanes)
 
     def crossings_ahead(self, frame: RayFrame, t: Real, active: Mask) -> Real:
-        """Always 0. Crossings along rays need not be counted before, as every sum gives all of
-        w."""
+        """Always 0. The crossings ahead on a ray need not be counted separately, because every sum
+        over the tree contains them and gives w with its integer."""
         del frame, t, active
         return self.backend.Float(0)
 
@@ -259,7 +263,9 @@ class TreeWinding:
         self, frame: RayFrame, x: Vec3, behind: JumpCrossing, turns: Real, detail: Real,
         active: Mask = True,
     ) -> Sample:  # fmt: skip
-        """w at points x of a ray interval, where active, with promises.
+        """The sample of w at points x of a ray interval between two crossings of triangles, on
+        active
+        lanes: value, gradient, errors and promises (proved bounds near x).
 
         frame: the frame of the rays.
         behind: the crossing at which the interval starts.
@@ -294,23 +300,25 @@ class TreeWinding:
         )
         return sums.sample(_PER_SPHERE, unit, self.rounding, along=promises)
 
-    def _rates(self, line: RayLine, where: Mask) -> Rates:
-        """Returns a function that computes bounds of the derivative of 4 pi w along a line, as
-        `trail_sums.line_rates`. where: the mask of the active lanes."""
+    def _rates(self, line: RayLine, active_lanes: Mask) -> Rates:
+        """Make a function that computes, for each of several lengths T, a bound of the derivative
+        of 4 pi w along a line, at points within T of x = line.x (as `trail_sums.line_rates` does
+        for curves). active_lanes: the mask of the lanes that may be active."""
 
         def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
-            """Bounds of the derivative along the line, one for each length."""
-            active = active & where
+            """For each length, a bound of the derivative along the line within that length of x;
+            infinite on lanes that are not active."""
+            active = active & active_lanes
 
             def adder(reach: Real) -> AddPrimitive:
-                """Returns a function that adds the open edges of a near triangle. reach: as for
-                `NearEdge.is_open`."""
+                """Make a function that adds the open edges of a near triangle to the bounds. reach:
+                nodes are far beyond this many times their radius."""
 
                 def add(
                     row: list[Real], active: Mask, sums: SourceSums, old: tuple[Any, ...]
                 ) -> tuple[SourceSums, tuple[Any, ...]]:
-                    """Add the open edges of a record's triangle to the bounds `old`, where
-                    active."""
+                    """Add the open edges of the triangle in the record `row` to the bounds `old`,
+                    on active lanes. The sums stay as they are."""
                     for near in edges_of(row, line.x, VerticalRayFrame(line.x)):
                         is_open = active & near.is_open(reach)
                         new = add_edge_rates(line, near.edge.edge, lengths, old)
