@@ -325,13 +325,15 @@ def lipschitz_of_norms(p: float, q: float) -> float:
     at most c^2 u^(2q-2) + v^(2q-2). For q >= 2 both powers are at most u^q and v^q, whose sum is 1;
     so the square is at most c^2, as c >= 1. For q < 2, Hoelder's inequality with the exponents
     q/(2q-2) and q/(2-q) gives (c^m + 1)^(2/m) with m = 2q/(2-q). All these bounds are attained.
-    (Hart's constant, 1996, equation 31, is right only for p = q < 2, or p >= 2 and q >= 2.)
+    The root is computed as c (1 + c^-m)^(1/m), as c^m overflows if q is just below 2. The result
+    has an error of a few roundings, for which callers have to increase it. (Hart's constant, 1996,
+    equation 31, is right only for p = q < 2, or p >= 2 and q >= 2.)
     """
     c = 2.0 ** max(0.0, 1.0 / p - 0.5)
     if q >= 2.0:
         return c
     m = 2.0 * q / (2.0 - q)
-    return (c**m + 1.0) ** (1.0 / m)
+    return c * (1.0 + c**-m) ** (1.0 / m)
 
 
 def _checked_powers(powers: Any, name: str) -> tuple[float, float]:
