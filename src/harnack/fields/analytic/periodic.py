@@ -135,7 +135,8 @@ class ExtensionBounds:
         )
 
     def ball(self, f: Real, slope: Real) -> HarmonicBall:
-        """The promise at a point p: a ball of R^4 with bounds of the harmonic extension on it.
+        """The promise at a point p: a `HarmonicBall` of R^4 about p, with bounds on it of the
+        harmonic extension F of f to four dimensions.
 
         f: the value at p.
         slope: |grad f(p)|.
@@ -150,7 +151,8 @@ class ExtensionBounds:
         return HarmonicBall(real(r), lower, upper, dimension=4)
 
     def _max_descent(self, f: Real, rise: Real) -> Real:
-        """A bound of -F on the ball about p; with -f instead of f, a bound of F.
+        """A bound of -F on the ball about p, where F is the harmonic extension of f to four
+        dimensions. With -f instead of f, it is a bound of F.
 
         f: the value at p, without the constant term.
         rise: the number D, for which |f(y) - f(p)| <= D |y-p|/R.

@@ -187,9 +187,8 @@ def _integer(value: Any) -> int:
 def _user_branches(
     function: Any, singular_points: Any, second_bound: Any, period: Any
 ) -> UserBranches:
-    """The branches of a user's function, after a test evaluation of all that the user gave.
-
-    The parameters are those of `RiemannSurface`.
+    """The `Branches` of a user's function, after a test evaluation of all functions that the user
+    gave. The parameters are those of `make_branches`.
 
     Raises:
         TypeError, ValueError: a parameter is missing or invalid, or a function returns something
@@ -342,7 +341,8 @@ class LevelCurves(Field):
         return field
 
     def evaluate(self, p: Vec3) -> Sample:
-        """The sample at p, with two promises for each of two disks: see `LevelCurves`."""
+        """The sample at p. It has two promises for each of two disks about p: a harmonic ball, and
+        a bound of second derivatives."""
         rounding, z, branch = self._at(p)
         slope_x, slope_y = derivatives(branch.first, self.part)
         vector = cast("Any", type(p))

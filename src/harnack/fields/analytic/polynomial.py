@@ -102,10 +102,11 @@ class HarmonicPromises:
 
     @classmethod
     def of(cls, weights: Weights, known: BallRange, *, is_divided: bool) -> HarmonicPromises:
-        """The promises of the sum of solid harmonics with these weights, (l, m) -> coefficient.
+        """The promises of the sum of solid harmonics with these weights.
 
-        known: the ranges of its parts of each degree.
-        is_divided: whether points are divided by a size other than 1 before, which adds rounding.
+        weights: (l, m) -> coefficient.
+        known: proved ranges of the parts of each degree.
+        is_divided: whether points are divided by a size other than 1 first, which adds rounding.
         """
         inner, outer = _best_radius(known, 0.0), _best_radius(known, 1.0)
         order, axial, axis_share = order_on_axis(weights), None, 0.0
@@ -144,7 +145,11 @@ class HarmonicPromises:
         return HarmonicBall(radius, lower - margin, upper + margin)
 
     def curvatures(self, rho: Real, r: Real) -> list[TaylorRemainder]:
-        """Bounds of the Hessian on balls of different radii, the smallest ball first."""
+        """Bounds of the Hessian on balls of different radii about a point, as promises, the
+        smallest ball first.
+
+        rho, r: the distances of the point from the z axis and from the origin.
+        """
         radii = [dr.inf]  # where the Hessian is constant
         if self.degree > 2:
             scale = r / (self.degree - 2)
@@ -164,8 +169,8 @@ class HarmonicPromises:
         return dr.fma(constant, 1 + _ROUNDING + _SLOPE_SHARE, self._underflow(r))
 
     def lipschitz(self, rho: Real, r: Real) -> Lipschitz | None:
-        """A Lipschitz constant on a ball that has a smallest radius; None if the harmonic ball has
-        one, too."""
+        """A Lipschitz constant on a ball that has a smallest radius, as a promise; None if the
+        harmonic ball has a smallest radius, too."""
         if self.lowest_degree < 3:
             return None
         radius = fmax(r * (_WIDE / (self.degree - 2)), _FLOOR)
@@ -191,10 +196,10 @@ class HarmonicPromises:
         E R is a few u times the range; `enclosures.free_radius.condition_rounding` covers 16 u.
         """
         unit = float(dr.epsilon(type(r)))  # u, half the distance from 1 to the next number
-        error = dr.fma(self.rounding.value(rho, r), unit, self._underflow(r))
+        error = dr.fma(self.rounding.value_error(rho, r), unit, self._underflow(r))
         if self.degree < 2:
             return error
-        slope = unit * self.rounding.gradient(rho, r)
+        slope = unit * self.rounding.gradient_error(rho, r)
         return dr.fma(slope * (0.5 / _SLOPE_SHARE), slope / curvature.constant, error)
 
     def _radius(self, rho: Real, r: Real) -> Real:
@@ -233,7 +238,8 @@ def _best_radius(known: BallRange, distance: float) -> float:
 
 
 class _SolidHarmonics(Field):
-    """A sum of solid harmonics of p/size, for |p| <= size; see `HarmonicPromises`."""
+    """A sum of solid harmonics of p/size, for |p| <= size, as a field whose promises are
+    `HarmonicPromises`."""
 
     is_cheap = True
     over_relaxation = 1.6
@@ -280,8 +286,8 @@ class _SolidHarmonics(Field):
         return Sample(value, slope, promises, error, alternative_promises=tuple(alternatives))
 
     def _local(self, p: Vec3) -> Vec3:
-        """The point in the coordinates of the solid harmonics: axes rotated, divided by the
-        size."""
+        """The point p in the coordinates of the solid harmonics: with its axes rotated, and divided
+        by the size."""
         return type(p)(*_rotate_axes((p.x, p.y, p.z), self._axis + 1)) / self._size
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
