@@ -91,6 +91,12 @@ class BoundedLaplacianEnclosure(Enclosure):
     def from_promise(
         cls, promise: Promise, value: Real, error: Real, slopes: SlopeRange
     ) -> Self | None:
+        """The enclosure from a `BoundedLaplacian`; None for another kind of promise, and if the
+        promise bounds f on one side only.
+
+        value, error: f at the center of the ball, and a bound of its error.
+        slopes: the range of the derivative of f along the path there.
+        """
         if not isinstance(promise, BoundedLaplacian):
             return None
         radius, max_fall, max_rise = allowed_movement(promise, value, error)

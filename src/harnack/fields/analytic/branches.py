@@ -84,6 +84,7 @@ class BranchPoint:
     value: complex = 0.0
 
     def __post_init__(self) -> None:
+        """Check the numbers."""
         check_no_derivatives("a BranchPoint", vars(self))
         object.__setattr__(self, "location", _finite(self.location, "the place of a branch point"))
         object.__setattr__(self, "value", _finite(self.value, "the value at a branch point"))
@@ -292,8 +293,8 @@ class Branches(abc.ABC):
         return z
 
     def clearance(self, z: Complex) -> Real:
-        """The distance from z to the nearest singular point. If there are no singular points it is
-        2, a number that serves as the radius of disks on which promises are made."""
+        """The distance from z to the nearest singular point; 2 if there are no singular points, as
+        it limits the size of the disks on which promises are made."""
         nearest = 0 * z.real + (dr.inf if self.branch_points else _CLEARANCE_WITHOUT_POINTS)
         for point in self.points_on(z):
             nearest = fmin(abs(z - point.at), nearest)

@@ -95,6 +95,7 @@ class FourierSeries(Field):
     from coefficients."""
 
     def __init__(self, coefficients: Any, box: Box | tuple[Any, Any]) -> None:
+        """Check the arguments, and compute the bounds of the series."""
         a = as_real_array(coefficients, "coefficients").astype(np.float64)
         if a.ndim != 3 or 0 in a.shape:
             raise ValueError(f"coefficients must have shape (K_x, K_y, K_z), not {a.shape}")

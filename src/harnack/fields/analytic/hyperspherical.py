@@ -153,6 +153,7 @@ class HypersphericalHarmonic(Field):
     is_global = True
 
     def __init__(self, l: int, j: int, m: int, *, domain: Volume | None = None) -> None:  # noqa: E741
+        """Check l, j and m, and set up the function with this single term."""
         l, j, m = integer(l, "the degree l"), integer(j, "j"), integer(m, "the order m")  # noqa: E741
         check_volume(domain, "domain")
         if not 0 <= l <= LARGEST_DEGREE:

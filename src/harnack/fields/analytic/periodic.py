@@ -215,6 +215,7 @@ class EigenfunctionSum(Field):
     is_cheap = True
 
     def __init__(self, terms: Iterable[Term], *, domain: Volume | None = None) -> None:
+        """Check the terms, and compute their bounds and the default domain."""
         self.terms = checked_terms(terms)
         self.waves = self._bounds()
         longest = 2 * math.pi / min(self.waves.wavenumbers)

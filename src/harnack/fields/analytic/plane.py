@@ -314,6 +314,7 @@ class LevelCurves(Field):
         level: float = 0.0,
         domain: Volume | None = None,
     ) -> None:
+        """Check the arguments, and make the branches of the function."""
         if part not in ("imag", "real"):
             raise ValueError(f'part must be "real" or "imag", not {part!r}')
         self.part = part
@@ -421,6 +422,7 @@ class HeightField(Formula):
     domain: Volume | None = field(default_factory=_unit_box)
 
     def __post_init__(self) -> None:
+        """Check the function and the domain."""
         if not callable(self.function):
             raise TypeError(f"function must be callable with x, y, not {self.function!r}")
         check_volume(self.domain, "domain")

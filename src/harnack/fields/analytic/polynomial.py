@@ -325,6 +325,7 @@ class SphericalHarmonic(_SolidHarmonics):
     """
 
     def __init__(self, l: int, m: int, *, radius: float = 1.0) -> None:  # noqa: E741
+        """Check the arguments, and set up the sum with this single term."""
         l, m = degree_and_order((l, m))  # noqa: E741
         if not 0 <= l <= LARGEST_DEGREE:
             raise ValueError(f"the degree l must be 0 to {LARGEST_DEGREE}, not {l}")
@@ -357,6 +358,7 @@ class HarmonicPolynomial(_SolidHarmonics):
     def __init__(
         self, coefficients: Mapping[tuple[int, int, int], float], *, domain: Volume | None = None
     ) -> None:
+        """Check the arguments, and convert the monomials to solid harmonics."""
         self.coefficients = _checked(coefficients)
         domain = Ball() if domain is None else domain
         size = _enclosing_radius(domain)

@@ -164,6 +164,7 @@ class RiemannSurface(Field):
         height: float = 1.0,
         domain: Volume | None = None,
     ) -> None:
+        """Check the arguments, and make the branches of the function."""
         if part not in ("imag", "real"):
             raise ValueError(f'part must be "imag" or "real", not {part!r}')
         if as_finite(height, "height") == 0:

@@ -90,9 +90,11 @@ class Sphere(FormulaSolid):
 
 
 def _box_of_radii(radii: tuple[float, float, float], level: float) -> Volume:
-    """A box that contains all points where m (g - 1) <= level, with m the smallest radius. Here g
-    is a norm. The surface g = 1 meets the axes at the radii, and lies in the box of half sides
-    `radii`."""
+    """A box that contains all points where f = m (g - 1) <= level, with m the smallest radius. g is
+    a norm: the set g <= 1 lies in the box whose half sides are the radii.
+
+    radii: the half sides (3,) of that box.
+    """
     a, b, c = radii
     size = 1.0 + level / min(radii)
     return box_around((size * a, size * b, size * c))
@@ -279,10 +281,10 @@ class Cuboid(FormulaSolid):
     """The box |x| <= a/2, |y| <= b/2, |z| <= c/2.
 
     sides: (a, b, c).
-    radius: with which the edges are rounded.
+    radius: the radius with which the edges are rounded; 0 for sharp edges.
 
-    f is the signed distance: that of the box smaller by the radius on each side
-    (`orthogonal_intersection`), less the radius.
+    f is the signed distance. It is the signed distance from the box that is smaller by the radius
+    on each side (`orthogonal_intersection`), minus the radius.
     """
 
     is_convex = True
@@ -293,6 +295,7 @@ class Cuboid(FormulaSolid):
     lipschitz = 1.0
 
     def __post_init__(self) -> None:
+        """Check the arguments."""
         sides = as_triple(self.sides, "the sides of a box", all_positive=True)
         set_frozen(self, "sides", sides)
         radius = as_finite(self.radius, "the radius of the edges of a box")
@@ -407,7 +410,8 @@ class Supertorus(_Powered):
     """The points with | (|(x, y)|_p - major, z) |_q <= minor, where |.|_p is the p-norm.
 
     powers: (p, q), each at least 1.
-    major, minor: as for `Torus`.
+    major: the radius of the central curve, in the p-norm.
+    minor: the radius of the tube around it, in the q-norm.
 
     The Lipschitz constant is that of the norms (`lipschitz_of_norms`), as subtracting `major`
     changes no gradient.

@@ -254,10 +254,10 @@ class Tube(Solid):
         self, p: Vec3, direction: Vec3 | None, knots: tuple[Real, ...]
     ) -> tuple[Sample, Real, tuple[Real, ...]]:
         """The sample at p; the distance D of p from the polyline; and, for each knot, a lower bound
-        of the distance at p + knot direction less D.
+        of the distance at p + knot direction minus D.
 
-        direction: unit vectors; None if there are no knots.
-        knots: increasing lengths; the last may be infinite.
+        direction: the unit vectors of lines from p; None if there are no knots.
+        knots: increasing lengths along these lines; the last may be infinite.
         """
         if not hasattr(self, "_records"):
             return self.prepare(backend_of(p))._sample_with_bounds(p, direction, knots)
@@ -266,11 +266,11 @@ class Tube(Solid):
         records: RecordTable = cast("Any", self)._records
 
         def add_segment(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """The state with the segment of record `row` added.
+            """The state of the loop over segments after the segment of the record `row` was added.
 
             The state consists of the distance from the nearest segment, the three components of the
-            vector from its nearest point to p, the largest rounding error of such a vector, and the
-            smallest tangent at each knot.
+            vector from its nearest point to p, the largest rounding error of such a vector, and for
+            each knot the smallest value there of the tangents of the distances from the segments.
             """
             nearest, x, y, z, max_rounding, *bounds = state
             from_start, segment = p - vector(*row[:3]), vector(*row[3:6])
@@ -316,9 +316,9 @@ class Tube(Solid):
 
 
 def _group_segments(records: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The records of segments, filled up with copies of the last to a multiple of `_GROUP_SIZE`;
-    and for each group of that many consecutive segments the center and the radius of a ball that
-    contains them, as a record.
+    """The records of segments in groups of `_GROUP_SIZE` consecutive segments; and for each group a
+    record of the center and the radius of a ball that contains its segments. The last group is
+    filled up with copies of the last segment.
 
     records: (n, 7), the start of each segment, the vector from its start to its end, and 1 /
         length^2.
@@ -362,7 +362,8 @@ def _add_segments_by_groups(
     epsilon = 2 * float(dr.epsilon(real))
 
     def add_ball_end(ball: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """The smaller of the state and of the largest distance of a point of the ball from p."""
+        """The smaller of two distances: the state, and the largest distance from p of a point of
+        the ball."""
         return (fmin(dr.norm(p - vector(*ball[:3])) + ball[3], state[0]),)
 
     (min_end,) = groups.for_each(add_ball_end, (real(dr.inf),), "tube groups")
@@ -459,8 +460,9 @@ class TangentEnclosure(Enclosure):
     lower_bounds: tuple[Real, ...]
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """See `Enclosure`: the smaller of the length up to which F does not rise to the level
-        above, and the length up to which its lower bound does not fall to the level below."""
+        """The length of the path on which F is proved to meet neither level: the smaller of the
+        length up to which F does not rise to the level above, and the length up to which its lower
+        bound does not fall to the level below."""
         half_slope = self.distance * self.slope
         product = gaps.above * (gaps.above + 2 * self.distance)
         root = dr.sqrt(fmax(dr.fma(half_slope, half_slope, product), 0))
