@@ -180,7 +180,8 @@ def _jet_norm(xs: list[Jet], p: float) -> Jet:
 def _wronskian_term(
     xs: list[Jet], values: list[Interval], over: Interval, i: int, j: int
 ) -> Interval:
-    """The range of sum_(k<l) w_kl,i w_kl,j / N^3, the first part of N'' for p = 2: see `norm`.
+    """The range of sum_(k<l) w_kl,i w_kl,j / N^3: for p = 2 this is the part of a second derivative
+    of the norm N of functions x_k that their first derivatives contribute (`norm` has the proof).
 
     w_kl,i is the function w_kl = x_k x_l' - x_l x_k' with derivatives by the variable i.
 

@@ -195,11 +195,11 @@ class BoundedLaplacianEnclosure(Enclosure):
 
 @dataclass(frozen=True)
 class _GreenCondition:
-    """The condition w (A-1) + s B + l kappa + m q^2/6 <= d: see `BoundedLaplacianEnclosure`.
+    """The condition w (A-1) + s B + l kappa + m q^2/6 <= d on a fraction q of the radius, for f not
+    to reach a level at the gap d. The symbols are those of `BoundedLaplacianEnclosure`, with R = 1.
 
-    d is the gap in value. Let S = (1-q)^2 (1 + left side), which has no pole, and
-    g = sqrt(1 + d) - 1. The condition is sqrt(S) <= (1 + g) (1-q), that is, q k(q) <= g with
-    k = g + 1 + (sqrt(S) - 1)/q.
+    Let S = (1-q)^2 (1 + left side), which has no pole, and g = sqrt(1 + d) - 1. The condition is
+    sqrt(S) <= (1 + g) (1-q), that is, q k(q) <= g with k = g + 1 + (sqrt(S) - 1)/q.
 
     gap: g.
     weight: w.

@@ -431,7 +431,8 @@ def _two_caps(gap: Real, max_rise: Real, p: Real, rest: Real, mu: Real) -> _CapC
 
 @dataclass(frozen=True)
 class _CapCondition:
-    """The condition (1-g) S(q) <= 1-q^2 with S = s1 s2 (s1+s2)/2: see `SphericalCapEnclosure`.
+    """The condition (1-g) S(q) <= 1-q^2 with S = s1 s2 (s1+s2)/2, on a fraction q of the radius,
+    for f not to reach the level above. The symbols are those of `SphericalCapEnclosure`.
 
     That is q k(q) <= g with k = (1-g) (S - 1 + q^2)/q + g q.
 

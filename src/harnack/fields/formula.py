@@ -393,12 +393,13 @@ def as_jet(value: Any, like: Jet, name: str) -> Jet:
 class FormulaOnRay:
     """A formula along the path p + s d, as an `EvaluableRestriction`.
 
-    field: has the formula.
+    field: the field with the formula.
     p, direction: (3,) p and d.
     before: the distance before p at which the first piece begins. If it is not 0.0, the pieces
         cover all paths that lead through p up to rounding.
-    piece_count: see `PathRestriction`. The ranges of a formula cost as much as its value: one piece
-        takes the least time; four pieces take two thirds of the samples, but twice the time.
+    piece_count: the number of pieces into which the path is cut. The ranges of a formula cost as
+        much as its value: one piece takes the least time; four pieces take two thirds of the
+        samples, but twice the time.
     """
 
     field: Formula

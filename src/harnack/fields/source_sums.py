@@ -344,16 +344,17 @@ class SourceSums:
         self, v: Vec3, unit: Real, lengths: tuple[Real, ...], rates: tuple[Real, ...], active: Mask
     ) -> tuple[Real, ...]:
         """Rates K with |f(x + s v) - f(x)| <= K |s| for lengths |s| up to each of `lengths`: the
-        rates for some edges (see `trail_sums.line_rates`), plus those for the sources of these
-        sums. They are infinite on lanes that are not active.
+        given rates for some edges, plus those for the sources of these sums. They are infinite on
+        lanes that are not active.
 
         v: (3,) directions of the lines.
         unit: the rounding of a coordinate of their points.
-        rates: for the edges, one for each length.
+        lengths: the lengths, one for each rate.
+        rates: the rates of the edges, one for each length (`trail_sums.line_rates`).
 
         Proof. By these sources f changes by at most |s| |g . v| + s^2 (3 s4 + rise R s5) for |s| <=
-        R (see `sample`, also for the symbols). |g . v| is raised by the truncation and rounding
-        errors of the gradient g. For lengths above R the rate is infinite.
+        R, with the symbols and the proof of `sample`. |g . v| is raised by the truncation and
+        rounding errors of the gradient g. For lengths above R the rate is infinite.
         """
         slope = dr.abs(dr.dot(self.gradient, v)) + self.gradient_truncation
         slope = dr.fma(SLOPE_ROUNDINGS * unit, self.s4, slope)

@@ -101,8 +101,9 @@ class BranchPoint:
 class PreparedBranchPoint:
     """A `BranchPoint` whose numbers are kernel parameters of a backend.
 
-    at: the location of the point.
-    power, constant, radius, value: as for `BranchPoint`.
+    at: the point of the plane.
+    power, constant, radius, value: the bound |g - value| <= constant |z - at|^power of all branches
+        g at points z within the radius; the power is None if no such bound is known.
     """
 
     at: Complex
@@ -580,11 +581,11 @@ class ArcSine(Branches):
 
 @dataclass(frozen=True)
 class UserBranches(Branches):
-    """The branches of a user's function; see `RiemannSurface` for what the user gives.
+    """The branches of a user's function of a complex variable.
 
-    function: returns all branches at z, each as (g, g') or (g, g', g").
+    function: a function of z that returns all branches at z, each as (g, g') or (g, g', g").
     singular: the points where a branch is not analytic.
-    second_bound: second_bound(z, r) bounds |g"| on the disk of radius r about z.
+    second_bound: a function: second_bound(z, r) bounds |g"| on the disk of radius r about z.
     branch_count: the number of branches.
     shift: the period of the drawn part, or None.
 

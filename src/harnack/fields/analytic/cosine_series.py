@@ -398,7 +398,8 @@ class _CellCurvatures:
 
     count: the number of cells along each side of the box.
     sides: the lengths of a cell's sides.
-    bounds: the bounds of the cells, as in `CellBounds`.
+    bounds: for each cell a bound that holds on the cell and all its neighbors; the index along x
+        runs fastest.
     """
 
     backend: Backend

@@ -110,7 +110,12 @@ class Lobes(Field):
         return field
 
     def _initialize(self, weights: Any, scale: Any, sign: LobeSign) -> None:
-        """Check the parameters, which are those of `combined`, and compute the range of Y."""
+        """Check the parameters, and compute the range of Y.
+
+        weights: {(l, m): c}, for the sum Y of c Y_lm.
+        scale: the length of a lobe in which Y reaches 1.
+        sign: "both", "positive" or "negative".
+        """
         self.weights = _checked(weights)
         scale = as_positive(scale, "the scale of lobes")
         if not is_one_of(sign, _SIGNS):

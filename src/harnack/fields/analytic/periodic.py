@@ -249,8 +249,8 @@ class EigenfunctionSum(Field):
         return self.waves.largest_curvature
 
     def evaluate(self, p: Vec3) -> Sample:
-        """The sample at p: see `EigenfunctionSum` for its promises and for the bound of its
-        rounding."""
+        """The sample at p. Its promises are a bound of second derivatives, a local Lipschitz
+        constant, and bounds on a harmonic ball of R^4; `EigenfunctionSum` has the proofs."""
         value, components = evaluate_terms(self.terms, p)
         gradient = type(p)(*components)
         epsilon = float(dr.epsilon(type(value)))
@@ -389,7 +389,8 @@ class Gyroid(_CubicSurface):
 class SchwarzP(_CubicSurface):
     """cos X + cos Y + cos Z with (X, Y, Z) = 2 pi p/cell: Schwarz's primitive surface.
 
-    cell, domain: as for `Gyroid`.
+    cell: the edge length of the cubic cell of periodicity, 2 pi by default.
+    domain: the volume in which f is drawn, by default the ball of radius `cell` about the origin.
 
     |f| <= 3, and |grad f| <= sqrt 3 (2 pi/cell) since the derivatives by X, Y and Z are sines. Both
     bounds are attained.

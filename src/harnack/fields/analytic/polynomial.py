@@ -268,7 +268,8 @@ class _SolidHarmonics(Field):
         return max(degree for degree, _ in self._weights)
 
     def evaluate(self, p: Vec3) -> Sample:
-        """The sample at p, computed at p/size and scaled back: see `HarmonicPromises`."""
+        """The sample at p. It is computed at p/size and scaled back to p; its promises are those of
+        `HarmonicPromises`."""
         s, size = self._local(p), self._size
         value, gradient = evaluate(self._weights, s.x, s.y, s.z)
         rho, r = dr.norm(type(s)(s.x, s.y, 0)), dr.norm(s)

@@ -66,8 +66,8 @@ class _BranchValue:
         return dr.fma(self.x, direction.x, dr.fma(self.y, direction.y, direction.z))
 
     def coincides_with(self, other: _BranchValue) -> Mask:
-        """Whether phi and its gradient equal those of the other branch, as they do for a branch and
-        itself.
+        """Whether phi and its gradient equal phi and the gradient of the branch `other`. For a
+        branch and itself they do.
 
         On a line of symmetry two branches agree in phi and in its derivative by x but not by y;
         they do not coincide, and f has a crease there.
@@ -389,11 +389,11 @@ class RiemannSurface(Field):
     def _nearest_branch(
         self, z: Complex, h: Real, graphs: list[_BranchValue], error: Real, rounding: Real
     ) -> _PointBranches:
-        """Find the nearest branch at a point, and the sign of f.
+        """The branches at a point, with the nearest branch and the sign of f.
 
         z, h: the projection of the point to the plane, and its height.
-        graphs: all branches at the point.
-        error, rounding: kept in the result, see `_PointBranches`.
+        graphs: phi and its gradient for each branch at the point.
+        error, rounding: bounds of the errors of phi and of z, which are stored in the result.
         """
         nearest, sign = graphs[0], type(graphs[0].phi)(1)
         if not self._is_single:

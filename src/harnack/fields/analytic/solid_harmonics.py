@@ -140,7 +140,8 @@ def evaluate(weights: Weights, x: Any, y: Any, z: Any) -> tuple[Any, tuple[Any, 
 def hessian(weights: Weights, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any, Any, Any, Any]:
     """The second derivatives xx, yy, zz, xy, xz, yz of the sum of c_lm r^l Y_lm at points.
 
-    weights, x, y, z: as for `evaluate`.
+    weights: the coefficients (l, m) -> c_lm.
+    x, y, z: the coordinates, numbers or arrays.
 
     The rules of `evaluate` are applied twice to Q B, where B is C_m or S_m. With Q' =
     Q_(l-1)^(m+1), Q" = Q_(l-2)^(m+2) and the derivatives B_x, B_xx, ... of B, for which B_yy =

@@ -357,9 +357,10 @@ class BallRange:
         return cls(constant, tuple(ends))
 
     def with_spheres(self, weights: Weights, largest: float) -> BallRange:
-        """The same bounds with ranges of f on six spheres up to the radius `largest`.
+        """The same bounds of f, with ranges of f on six spheres up to the radius `largest`.
 
-        weights: those of f. A polynomial with a single f_l besides f_0 is returned unchanged.
+        weights: (l, m) -> coefficient, those of f. A polynomial with a single f_l besides f_0 is
+            returned unchanged.
         """
         if len(self.ends) < 2:
             return self

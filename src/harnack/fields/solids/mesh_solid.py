@@ -577,18 +577,20 @@ def _boundary_pieces(
     """The triangles between winding numbers below and above 1/2, and their area.
 
     unit: (n, 3) the vertices in unit coordinates.
-    faces, weights: as in `ClosedSurface`.
-    place: returns the text for a place near a triangle, for messages.
+    faces: (m, 3), indices of vertices.
+    weights: (m,) how many times each face is counted.
+    place: a function that returns the text for a place near a triangle, for messages.
 
     Faces are cut into pieces where they meet other faces. The result is the corners (k, 3, 3) of
     the pieces that bound the solid, or None if these are all faces, uncut. Pieces run
-    counter-clockwise as seen from outside. In the area, pieces that coincide count once. Where
-    several faces coincide, and more of them are turned one way than the other, each of these is a
+    counter-clockwise as seen from outside. In the area, pieces that coincide count once. If several
+    faces coincide, and more of them are turned one way than the opposite way, each of these is a
     piece of the boundary.
 
     Triangles thinner than `_THIN_HEIGHT` have no reliable normal, and so no reliable winding
-    numbers beside them. If the boundary is all faces, it includes them. Else their computed winding
-    numbers decide; a wrong decision moves the surface by no more than their height.
+    numbers beside them. If the boundary is all faces, it includes such triangles. Else their
+    computed winding numbers decide; a wrong decision moves the surface by no more than their
+    height.
 
     Raises:
         MeshError: the mesh is inside out, or faces lie on each other.

@@ -326,7 +326,9 @@ class _OutlineQuery:
 
 
 def _chain_records(start: FloatArray, end: FloatArray, loop_index: IntArray) -> FloatArray:
-    """The records of chains of consecutive edges, as in `OutlineEdges`.
+    """The records of chains of consecutive edges: for each its box as (lowest x, lowest y, highest
+    x, highest y), y of its first and of its last vertex, the index of its first edge, and the
+    number of its edges.
 
     start, end: (n, 2) the ends of the edges.
     loop_index: (n,) an index that changes where the next edge belongs to another chain.

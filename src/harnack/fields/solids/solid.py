@@ -98,7 +98,7 @@ def _with_source(prepare: Callable[[Any, Backend], Field]) -> Callable[[Any, Bac
 
     @functools.wraps(prepare)
     def remembering(self: Any, backend: Backend) -> Field:
-        """See `Field.prepare`."""
+        """The prepared solid, with the original in its attribute `_source`."""
         prepared = prepare(self, backend)
         if prepared is not self:
             object.__setattr__(prepared, "_source", vars(self).get("_source", self))

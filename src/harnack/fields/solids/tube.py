@@ -341,15 +341,17 @@ def _add_segments_by_groups(
     add_segment: Callable[[list[Real], tuple[Any, ...]], tuple[Any, ...]],
     start: tuple[Any, ...],
 ) -> tuple[Any, ...]:
-    """The state of `Tube._sample_with_bounds` with all segments added. For a group that is too far
-    away to hold the nearest segment, the distance from its ball takes the place of the distances
-    from its segments.
+    """The state of the loop over segments of `Tube._sample_with_bounds`, with all segments added.
+    If a group is too far away to hold the nearest segment, the distance from its ball takes the
+    place of the distances from its segments.
 
     p: the points.
-    direction, knots: as in `Tube._sample_with_bounds`.
-    records: of the segments.
+    direction: the unit vectors of lines from p; None if there are no knots.
+    knots: increasing lengths along these lines.
+    records: the records of the segments.
     groups: records (center, radius) of the groups' balls.
-    add_segment: returns the state with another segment added.
+    add_segment: a function that takes a record and a state, and returns the state with that segment
+        added.
     start: the state before any segment.
 
     Proof. If a segment lies in a ball of radius r about c, its distance from p is at least |p - c|
@@ -583,17 +585,18 @@ class _TubeBuffers:
 
 
 class _Segment(Field):
-    """The field of one tube: the distance D from its segment, less its radius r. Each lane may have
-    another segment.
+    """The field of one tube: the distance D from its segment, less its radius r. The segment may
+    differ from lane to lane.
 
     boxes: the boxes of all tubes, for their center.
-    row: the record of the segment, as in `_TubeBuffers`.
+    row: the record of the segment: its start, the radius of its tube, the vector from start to end,
+        and 1 / length^2.
 
     D is convex, as the distance from a convex set, and its Lipschitz constant is 1. Its second
-    derivative along any line is at most 1/D (Hart 1996): that of the distance from a point or from
-    a line, across the gradient, is 1/D, and the distance from a segment is everywhere one of these
-    two. So on a ball of radius s < D about the point it is at most 1/(D - s). Here s = D/2, so that
-    the bound is 1/s.
+    derivative along any line is at most 1/D (Hart 1996). For the distance from a point or from a
+    line it is 1/D across the gradient, and the distance from a segment is everywhere one of these
+    two distances. So on a ball of radius s < D about the point it is at most 1/(D - s). Here s =
+    D/2, so that the bound is 1/s.
     """
 
     def __init__(self, boxes: PatchBoxes, row: list[Real]) -> None:
