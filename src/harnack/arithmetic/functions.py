@@ -353,7 +353,8 @@ def integer_power(x: Interval, n: int) -> Interval:
         low, high = x.lower, x.upper
     a = _power_by_squaring(low, n)
     b = a if low is high else _power_by_squaring(high, n)
-    # The error of every product is at most half a unit.
+    # The relative errors of the products add up to at most n - 1 roundings of half a machine
+    # epsilon each; a product that underflows has a small absolute error instead.
     result = Interval(a, b).widened(n * machine_epsilon(x.lower), n * _smallest_normal(x))
     return Interval(fmax(result.lower, 0), result.upper) if n % 2 == 0 else result
 
