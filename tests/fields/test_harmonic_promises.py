@@ -62,8 +62,8 @@ def rounding_used(weights: Weights, n: int, seed: int) -> tuple[float, float]:
         for one in (np.hypot(p[:, 0], p[:, 1]), np.linalg.norm(p, axis=1))
     )
     lost = 2.0**-126 * rounding.underflow
-    of_value = UNIT * on_host(rounding.value(rho, r), n) + lost
-    of_gradient = UNIT * on_host(rounding.gradient(rho, r), n) + 100 * lost
+    of_value = UNIT * on_host(rounding.value_error(rho, r), n) + lost
+    of_gradient = UNIT * on_host(rounding.gradient_error(rho, r), n) + 100 * lost
     off = np.stack([on_host(a, n) - b for a, b in zip(g, exact_g, strict=True)], axis=1)
     used = np.abs(on_host(f, n) - exact_f) / of_value
     return float(used.max()), float((np.linalg.norm(off, axis=1) / of_gradient).max())

@@ -82,6 +82,15 @@ def test_equation_31_the_constant_of_pq_norms(p: float, q: float) -> None:
     assert 0.99 * lipschitz_of_norms(p, q) < values.max() <= lipschitz_of_norms(p, q)
 
 
+def test_equation_31_powers_just_below_2() -> None:
+    """At (1, 1, 0)/sqrt(2) the norm is sqrt(2); for q < 2 points near it are hardly steeper."""
+    for q in (1.9995, math.nextafter(2.0, 0.0)):
+        assert lipschitz_of_norms(1.0, q) == pytest.approx(2**0.5, rel=1e-15)
+    assert lipschitz_of_norms(1.0, 1.0) == pytest.approx(3**0.5, rel=1e-15)
+    assert lipschitz_of_norms(4.0, 1.25) == pytest.approx(2**0.3, rel=1e-15)
+    assert hk.solids.Superellipsoid((1.0, 1.9995)).lipschitz >= 2**0.5
+
+
 def test_equation_34_the_normal_is_no_unit_vector() -> None:
     u, v = np.array([1.0, 0.0, 0.0]), np.array([1.0, 1.0, 0.0])
     printed = np.cross(u / np.linalg.norm(u), v / np.linalg.norm(v))

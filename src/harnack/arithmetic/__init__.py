@@ -1,6 +1,7 @@
 """Arithmetic of functions along a path: numbers that carry proved ranges.
 
-Intervals, jets, parabolas and affine forms; formulas are written once and evaluated in any of them.
+There are intervals, jets, parabolas and affine forms. A formula is written once and evaluated in
+any of them.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 A function of 0 <= s <= h is written as c + l e + r, with e = 2s/h - 1 between -1 and 1, and |r| <=
 error. Sums are exact. Products and functions put the terms that are not linear in s into the error.
-Unlike `ParabolaBounds` such a number is not exact at s = 0, so the march tries shorter lengths
-where it proves nothing.
+Unlike `ParabolaBounds`, such a number is not exact at s = 0. If it proves nothing on a length, the
+march tries shorter lengths.
 
 Source: Vu, Sam-Haroud and Faltings 2009; Fryazinov, Pasko and Comninos 2010.
 """
@@ -47,7 +47,10 @@ class AffineForm(FormulaNumber):
     def along_ray(
         cls, p: Vec3, direction: Vec3, length: Real
     ) -> tuple[AffineForm, AffineForm, AffineForm]:
-        """The three coordinates of p + s d for 0 <= s <= length."""
+        """The three coordinates of p + s d as functions of s, for 0 <= s <= length.
+
+        direction: d.
+        """
 
         def coordinate(x: Real, rate: Real) -> AffineForm:
             """The function x + s rate."""
@@ -98,14 +101,15 @@ class AffineForm(FormulaNumber):
         return AffineForm(c * d + half, c * m + d * l, error + _rounding_bound(size))
 
     def apply(self, function: ElementaryFunction) -> AffineForm:
-        """The composition phi(f), by the best of three lines for phi: its chord, its mean slope, a
-        constant.
+        """The composition phi(f) of an elementary function phi with this function f. phi is
+        replaced by a line plus an error: its chord, a line of its mean slope, or a constant,
+        whichever has the smallest error.
 
-        Proof. Let f have the range [x, y] of width w, and let m be the middle of the range. Chord:
-        phi(t) is above its chord by -phi''(z) (t - x)(y - t)/2 for some z. This is at most max(0,
-        -min phi'' w^2/8) and at least min(0, -max phi'' w^2/8). Mean slope: if phi' is in [D-, D+],
-        phi(t) is within (D+ - D-)/2 |t - m| of phi(m) + (D+ + D-)/2 (t - m). Constant: phi stays
-        within its range.
+        Proof. Let f have the range [x, y] of width w, and let m be the middle of the range. For the
+        chord, phi(t) is above it by -phi''(z) (t - x)(y - t)/2 for some z. This is at most max(0,
+        -min phi'' w^2/8) and at least min(0, -max phi'' w^2/8). For the mean slope, if phi' is in
+        [D-, D+], phi(t) is within (D+ - D-)/2 |t - m| of phi(m) + (D+ + D-)/2 (t - m). For the
+        constant, phi stays within its range.
         """
         x = self.range
         value, slopes, curvature = function.ranges(x)
@@ -142,8 +146,8 @@ class AffineForm(FormulaNumber):
         )
 
     def pointwise_maximum(self, other: Any) -> AffineForm:
-        """The maximum max(f, g) = g + max(f - g, 0) of two functions; f or g itself where it is
-        proved to be the larger one."""
+        """The maximum of this function f and another function g, as g + max(f - g, 0). On lanes on
+        which f or g is proved to be the larger one everywhere, it is that function itself."""
         difference = self.sum(-other)
         x = difference.range
         self_larger, other_larger = x.lower >= 0, x.upper <= 0
@@ -200,8 +204,8 @@ def _entries(x: AffineForm) -> tuple[Real, Real, Real]:
 def _smaller_error(
     first: tuple[Real, Real, Real], second: tuple[Real, Real, Real]
 ) -> tuple[Real, Real, Real]:
-    """Of two tuples (center, slope, error) the one with the smaller error; if one is not finite,
-    the other."""
+    """The one of two tuples (center, slope, error) that has the smaller error. If one tuple is not
+    finite, it is the other tuple."""
     first_finite = dr.isfinite(first[0]) & dr.isfinite(first[1]) & dr.isfinite(first[2])
     second_finite = dr.isfinite(second[0]) & dr.isfinite(second[1]) & dr.isfinite(second[2])
     use_first = first_finite & ((first[2] <= second[2]) | ~second_finite)
@@ -210,7 +214,9 @@ def _smaller_error(
 
 
 def _rounding_bound(size: Real) -> Real:
-    """A bound of the rounding and underflow in a sum; size: the sum of the absolute values of its
-    terms."""
+    """A bound of the rounding and underflow in a sum.
+
+    size: the sum of the absolute values of its terms.
+    """
     smallest = float(dr.smallest(cast("Any", type(size))))
     return dr.fma(size, _ROUNDINGS * machine_epsilon(size), _ROUNDINGS * smallest)

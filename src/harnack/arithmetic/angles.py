@@ -46,19 +46,22 @@ def atan2(y: Any, x: Any) -> Any:
 
 
 def meets_branch_cut(y: Interval, x: Interval) -> Mask:
-    """Whether the box of all points (x, y) may meet the cut {y = 0, x <= 0}; also true if an end is
-    NaN.
+    """A mask of the lanes on which the box of all points (x, y) may meet the cut {y = 0, x <= 0} of
+    the polar angle. It is also set if an end is NaN.
 
-    The ends of the intervals are numbers of the backend.
+    y, x: intervals whose ends are numbers of the backend.
     """
     return ~((x.lower > 0) | (y.lower > 0) | (y.upper < 0))
 
 
 def angle_range(y: Interval, x: Interval) -> tuple[Interval, Mask]:
-    """The range of the angle on the box of all points (x, y), and whether the box meets the cut.
+    """The range of the polar angle on the box of all points (x, y); and a mask, whether the box
+    meets the cut {y = 0, x <= 0} of the angle.
 
-    The ends of the intervals are numbers of the backend. A box that is a single point of the cut
-    other than the origin has the angle pi, though it meets the cut.
+    y, x: intervals whose ends are numbers of the backend.
+
+    A box that is a single point of the cut other than the origin has the angle pi, though it meets
+    the cut.
 
     Proof. Along an edge of the box the angle is monotone, because its derivative there has one
     sign: it is (y'x - x'y)/(x^2 + y^2). It has no extremum inside. So the ends of the range are at

@@ -42,9 +42,10 @@ class ElementaryFunction:
         f(s) = f(0) + s f'(r) does not hold across such a point.
     on_drjit: evaluates the function for Dr.Jit numbers.
     on_numpy: evaluates the function for NumPy arrays and Python numbers.
-    domain: the smallest and the largest number at which it has a value.
-    is_steep: whether its slope is unbounded near a point: a pole, or a vertical tangent.
-    has_pole: whether there is a point at which it is not continuous.
+    domain: the smallest and the largest number at which the function has a value.
+    is_steep: whether the function's slope is unbounded near a point: at a pole or a vertical
+        tangent.
+    has_pole: whether there is a point at which the function is not continuous.
     """
 
     name: str
@@ -90,8 +91,11 @@ def _twice(x: Interval) -> Interval:
 
 
 def _unbounded_where_undefined(defined: Mask, ranges: DerivativeRanges) -> DerivativeRanges:
-    """The ranges; where `defined` is False, those of the derivatives are replaced by all
-    numbers."""
+    """The three ranges of a function and of its derivatives; on lanes where `defined` is False, the
+    ranges of the derivatives are replaced by all numbers.
+
+    ranges: of the function, of its derivative and of its second derivative.
+    """
     value, *derivatives = ranges
     slope, second = (
         Interval(
@@ -111,7 +115,7 @@ def _exp(x: Interval) -> DerivativeRanges:
 
 
 def _exponential_range(f: Callable[[Any], Any], x: Interval) -> Interval:
-    """The range on x of an increasing function f that is computed by exp.
+    """The range, on the interval x, of an increasing function f that is computed by exp.
 
     exp is computed as 2^y with a rounded exponent y: on CUDA the error is larger by |x| units in
     the last place. A result that overflows is known to be large: the end is then a large number, so
@@ -138,7 +142,8 @@ def _log(x: Interval) -> DerivativeRanges:
 
 
 def _sqrt(x: Interval) -> DerivativeRanges:
-    """The ranges of the square root and of its derivatives."""
+    """The ranges of the square root and of its derivatives on the numbers >= 0 of the interval
+    x."""
     low = fmax(x.lower, 0)
     high = low if x.lower is x.upper else x.upper
     root = _increasing_range(dr.sqrt, Interval(low, high))
@@ -192,10 +197,11 @@ def _sine_and_cosine(x: Interval) -> tuple[Interval, Interval]:
 
     Proof. Both are monotone between the points at which they are 1 or -1, which are multiples of
     pi/2. So the range is given by the values at the ends and by such points inside the interval.
-    The test for a point inside widens the interval by the rounding of the test; a point that is
-    counted although it is outside is within that rounding of an end. Beyond `max_sincos_argument`
-    sines are not known. There the range is [-1, 1] on intervals. At a single point it is all
-    numbers: the value at a point is taken half way between the ends, and 0 would look like a value.
+    The test for a point inside is made on an interval that is wider by the rounding of the test; a
+    point that is counted although it is outside is within that rounding of an end. Beyond
+    `max_sincos_argument` sines are not known. There the range is [-1, 1] on intervals. At a single
+    point it is all numbers: the value at a point is taken half way between the ends, and 0 would
+    look like a value.
     """
     epsilon, max_argument = machine_epsilon(x.lower), max_sincos_argument(type(x.lower))
     s0, c0 = sincos(x.lower)
@@ -220,8 +226,11 @@ def _sine_and_cosine(x: Interval) -> tuple[Interval, Interval]:
         return dr.floor(high - phase) > dr.floor(low - phase)
 
     def range_between(a: Real, b: Real, top: float, bottom: float) -> Interval:
-        """The range, from the values a and b at the ends; it is 1 at `top` and -1 at `bottom`
-        turns."""
+        """The range of a sine or cosine on the interval.
+
+        a, b: its values at the ends of the interval.
+        top, bottom: the phases, as fractions of a full turn, at which it is 1 and -1.
+        """
         plain = Interval(fmin(a, b), fmax(a, b)).widened(4 * epsilon, 4 * epsilon)
         lowest = dr.select(passes(bottom), -1, plain.lower)
         return _clip_to_unit(Interval(lowest, dr.select(passes(top), 1, plain.upper)), is_unknown)
@@ -238,7 +247,8 @@ def _clip_to_unit(x: Interval, wide: Mask) -> Interval:
 
 
 def _tan(x: Interval) -> DerivativeRanges:
-    """The ranges of tan and of its derivatives."""
+    """The ranges of tan and of its derivatives on the interval x; all numbers if a pole may lie in
+    it."""
     s, c = _sine_and_cosine(x)
     t = s * c.reciprocal()
     # Monotone where the cosine has no zero: the ends are the range.
@@ -320,8 +330,8 @@ def _cosh_range(x: Interval) -> Interval:
 
 
 def _abs(x: Interval) -> DerivativeRanges:
-    """The ranges of |x| and of its derivatives. The second derivative at 0 is a Dirac impulse,
-    upwards."""
+    """The ranges of |x| and of its derivatives. The second derivative has no upper bound at 0,
+    where the slope jumps from -1 to 1."""
     positive, negative = x.lower > 0, x.upper < 0
     slope = Interval(typed_select(positive, 1, -1, x.lower), typed_select(negative, -1, 1, x.lower))
     kink = typed_select(positive | negative, 0, dr.inf, x.lower)
@@ -329,7 +339,8 @@ def _abs(x: Interval) -> DerivativeRanges:
 
 
 def integer_power(x: Interval, n: int) -> Interval:
-    """The range of y^n for y in the interval x; n >= 0."""
+    """The range of y^n for y in the interval x, n >= 0. If both ends of x are the same object, only
+    one power is computed."""
     if n == 0:
         return ONE
     if n == 1:
@@ -342,7 +353,8 @@ def integer_power(x: Interval, n: int) -> Interval:
         low, high = x.lower, x.upper
     a = _power_by_squaring(low, n)
     b = a if low is high else _power_by_squaring(high, n)
-    # The error of every product is at most half a unit.
+    # The relative errors of the products add up to at most n - 1 roundings of half a machine
+    # epsilon each; a product that underflows has a small absolute error instead.
     result = Interval(a, b).widened(n * machine_epsilon(x.lower), n * _smallest_normal(x))
     return Interval(fmax(result.lower, 0), result.upper) if n % 2 == 0 else result
 
@@ -359,13 +371,15 @@ def _power_by_squaring(x: Real, n: int) -> Real:
 
 
 def power(n: float) -> ElementaryFunction:
-    """The function x -> x^n. For an n that is no integer it is defined for x >= 0 only."""
+    """The function x -> x^n, as an `ElementaryFunction`. For an n that is no integer it is defined
+    for x >= 0 only."""
     if float(n).is_integer():
         k = int(n)
         if k < 0:
 
             def inverse(x: Interval) -> DerivativeRanges:
-                """The ranges for a negative integer k."""
+                """The ranges of x^n and of its derivatives on the interval x, for a negative
+                integer n."""
                 inv = x.reciprocal()
                 slope = Interval.enclosing(k, type(x.lower)) * integer_power(inv, 1 - k)
                 second = Interval.enclosing(k * (k - 1), type(x.lower)) * integer_power(inv, 2 - k)
@@ -380,7 +394,7 @@ def power(n: float) -> ElementaryFunction:
             )
 
         def ranges(x: Interval) -> DerivativeRanges:
-            """The ranges for an integer k >= 0."""
+            """The ranges of x^n and of its derivatives on the interval x, for an integer n >= 0."""
             like = cast("Any", type(x.lower))
             slope, second = Interval.enclosing(k, like), Interval.enclosing(k * (k - 1), like)
             return (
@@ -395,7 +409,8 @@ def power(n: float) -> ElementaryFunction:
         return ElementaryFunction(f"power {k}", ranges, of_numbers, _numpy_power(k))
 
     def real(x: Interval) -> DerivativeRanges:
-        """The ranges for an n that is no integer."""
+        """The ranges of x^n and of its derivatives on the interval x, for an n that is no
+        integer."""
         like = cast("Any", type(x.lower))
         slope = Interval.enclosing(n, like) * _real_power(x, n - 1)
         second = Interval.enclosing(n * (n - 1), like) * _real_power(x, n - 2)
@@ -421,7 +436,7 @@ def _numpy_power(n: float) -> Callable[[Any], Any]:
 
 
 def _real_power(x: Interval, n: float) -> Interval:
-    """The range of y^n for the numbers y >= 0 of x and any n.
+    """The range of y^n for the numbers y >= 0 of the interval x and any n.
 
     The power is computed as exp2(n log2 y), with an error of n log2(y) units in the last place and
     a few more. A y below the smallest normal number may stand for any number from 0 to that.
@@ -470,18 +485,19 @@ absolute = ElementaryFunction("abs", _abs, dr.abs, np.abs)
 
 @dataclass(frozen=True)
 class ClippedPower(ElementaryFunction):
-    """The function x -> max(x, 0)^n, n >= 1, a kernel of blobs with compact support.
+    """The function x -> max(x, 0)^n for an integer n >= 1, a kernel of blobs with compact support.
 
     It is convex and n - 1 times continuously differentiable. Written as maximum(x, 0)**n, no bound
-    of its second derivative would be known, since that of the maximum has none. An arithmetic may
-    use that the function is 0 for x <= 0.
+    of its second derivative would be known, since the maximum has none at 0. An arithmetic may use
+    that the function is 0 for x <= 0.
     """
 
     exponent: int = 1
 
 
 def clipped_power(n: int) -> ClippedPower:
-    """The function x -> max(x, 0)^n for an integer n >= 1: see `ClippedPower`.
+    """The function x -> max(x, 0)^n for an integer n >= 1, as a `ClippedPower`, which has a bounded
+    second derivative for n >= 2.
 
     Raises:
         ValueError: n is less than 1 or no integer.

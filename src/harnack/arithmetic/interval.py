@@ -1,11 +1,10 @@
 """Intervals: ranges of real numbers, rounded outwards.
 
-The result of every operation contains the exact result for all numbers of its operands, in the
-rounded arithmetic of the backend too. So the ranges of a function and of its derivatives are proved
-(Moore 1966).
+The result of every operation contains the exact result for all numbers of its operands, in spite of
+the backend's rounding. So the ranges of a function and of its derivatives are proved (Moore 1966).
 
-Ranges are rounded outwards because a single rounding in float32 that violates an enclosure may
-cause a missed hit. By measurement, a path is best divided into four pieces for blobs, which then
+A single rounding in float32 that violates an enclosure may cause a missed hit; therefore ranges are
+rounded outwards. By measurement, a path is best divided into four pieces for blobs, which then
 share the search for nearby blobs, and not divided for formulas (`PathRestriction.piece_count`).
 """
 
@@ -85,7 +84,7 @@ class Interval:
 
     @property
     def radius(self) -> Real:
-        """The largest distance of a number of the interval from `midpoint`."""
+        """An upper bound of the distance from `midpoint` to the numbers of the interval."""
         if self.lower is self.upper:
             return 0.0
         return _round_up(0.5 * self.upper - 0.5 * self.lower)
@@ -142,6 +141,8 @@ class Interval:
         return self + -other
 
     def __mul__(self, other: Interval) -> Interval:
+        """The interval of all products with numbers of the other interval. An interval of Python
+        floats is multiplied as a constant, with fewer operations."""
         if self.is_zero or other.is_zero:
             return ZERO
         if self.is_literal:
@@ -168,8 +169,8 @@ class Interval:
         return Interval(_round_down(_pad_underflow(low, -1)), _round_up(_pad_underflow(high, 1)))
 
     def _times(self, constant: Interval) -> Interval:
-        """The product with an interval of Python floats, which may have been computed while
-        recording."""
+        """The product with an interval of Python floats, whose signs are known while a kernel is
+        recorded."""
         a, b = cast("tuple[float, float]", (constant.lower, constant.upper))
         if a == b == 1.0:
             return self
@@ -239,7 +240,7 @@ ONE = Interval(1.0, 1.0)
 
 
 def machine_epsilon(x: Real) -> float:
-    """The distance from 1 to the next number of x's precision."""
+    """The distance from 1 to the next number, in the precision of x."""
     return float(dr.epsilon(type(x))) * 2 if dr.is_array_v(cast("Any", type(x))) else 2.0**-52
 
 
@@ -281,16 +282,16 @@ def _outward_single(low: float, high: float) -> tuple[float, float]:
 
 
 def _minimum(a: Real, b: Real) -> Real:
-    """The smaller number, a Python float if both are; the other number where one is NaN in an
-    array."""
+    """The smaller number, a Python float if both are Python floats. If one is NaN on a lane of an
+    array, it is the other number."""
     if isinstance(a, float) and isinstance(b, float):
         return min(a, b)
     return fmin(a, b)
 
 
 def _maximum(a: Real, b: Real) -> Real:
-    """The larger number, a Python float if both are; the other number where one is NaN in an
-    array."""
+    """The larger number, a Python float if both are Python floats. If one is NaN on a lane of an
+    array, it is the other number."""
     if isinstance(a, float) and isinstance(b, float):
         return max(a, b)
     return fmax(a, b)
@@ -304,12 +305,12 @@ def _maximum_or_nan(a: Real, b: Real) -> Real:
 
 
 def _minimum_ignoring_nan(a: Real, b: Real) -> Real:
-    """The smaller number; if one is NaN, the other."""
+    """The smaller number; if one is NaN, the other number."""
     return dr.select((a <= b) | dr.isnan(b), a, b)
 
 
 def _maximum_ignoring_nan(a: Real, b: Real) -> Real:
-    """The larger number; if one is NaN, the other."""
+    """The larger number; if one is NaN, the other number."""
     return dr.select((a >= b) | dr.isnan(b), a, b)
 
 
@@ -319,7 +320,8 @@ def _absolute(x: Real) -> Real:
 
 
 def _none_is_nan(numbers: tuple[Real, ...]) -> Mask | None:
-    """Whether none of the numbers is NaN, nor two of them opposite infinities."""
+    """Whether the sum of the numbers is a number: none of them is NaN, and no two of them are
+    opposite infinities."""
     total = numbers[0]
     for number in numbers[1:]:
         total = total + number

@@ -1,9 +1,9 @@
 """A function and its derivatives as a single number: `Jet` holds proved ranges, `Dual` plain
 numbers.
 
-A formula that is evaluated with jets as its coordinates returns the jet of its value. So the same
-formula serves for values, gradients and Hessians at a point, with proved bounds of rounding, and
-for the ranges from which steps are proved.
+A formula that is evaluated with jets as its coordinates returns the jet of its value. With jets at
+a point it gives value, gradient and Hessian with proved bounds of rounding; with jets on a piece of
+a path it gives the ranges from which steps are proved.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ class Jet(FormulaNumber):
 
     @classmethod
     def at_point(cls, p: Vec3, *, order: int = 1) -> tuple[Jet, Jet, Jet]:
-        """The three coordinates as functions of themselves, at points p, for gradients and
-        Hessians.
+        """The three coordinates x, y and z as functions of (x, y, z), at points p: jets for
+        gradients and Hessians.
 
         order: the highest order of derivatives, 1 or 2.
         """
@@ -72,8 +72,8 @@ class Jet(FormulaNumber):
 
     @classmethod
     def over_ball(cls, p: Vec3, radius: Real) -> tuple[Jet, Jet, Jet]:
-        """The three coordinates as functions of themselves, on boxes around the balls B(p,
-        radius)."""
+        """The three coordinates x, y and z as functions of (x, y, z), on boxes around the balls
+        B(p, radius)."""
         x, y, z = cls.at_point(p)
         ends = Interval(-radius, radius)
         x, y, z = (dataclasses.replace(jet, value=jet.value + ends) for jet in (x, y, z))
@@ -189,8 +189,8 @@ class Jet(FormulaNumber):
         return dataclasses.replace(jet, roots=roots) if roots else jet
 
     def _scaled_roots(self, factor: Interval) -> tuple[Jet, ...]:
-        """The roots of the product of this function with a constant; none if it is not known to be
-        positive.
+        """The roots (functions whose squares add up to a function, see `Jet`) of the product of
+        this function with a constant; none if the constant is not known to be positive.
 
         factor: the range of the constant.
         """
@@ -203,6 +203,11 @@ class Jet(FormulaNumber):
         return tuple(number * number._constant(scale) for number in self.roots)
 
     def __truediv__(self, other: Any) -> Any:
+        """The quotient of this function and another one: this function times the reciprocal.
+
+        Raises:
+            ZeroDivisionError: the divisor is the Python number 0.
+        """
         if isinstance(other, Jet):
             return self * other.apply(reciprocal)
         b = self._coerce_or_none(other)
@@ -343,7 +348,7 @@ class Jet(FormulaNumber):
         )
 
     def select(self, condition: Mask, other: Jet) -> Jet:
-        """This jet on lanes where the condition holds, the other on all others."""
+        """This jet on lanes where the condition holds, the jet `other` on all other lanes."""
         kind = self.backend_number()
 
         def chosen(u: Interval, v: Interval) -> Interval:
@@ -435,9 +440,11 @@ def wronskian_range(x: Jet, y: Jet, u: Interval, v: Interval, i: int) -> Interva
 def range_times_length(slope: Interval, width: Real) -> Interval:
     """The range of s t for 0 <= s <= width and t in the interval `slope`: it contains 0.
 
+    width: a length >= 0, a number of the backend.
+
     If the product at the lower end overflows to +infinity, or at the upper end to -infinity,
-    rounding outwards makes that end NaN. The right end is 0 in this case, since s t = 0 at s = 0,
-    and fmin and fmax return it.
+    rounding outwards makes that end NaN. The end is 0 in this case, since s t = 0 at s = 0, and
+    fmin and fmax return 0 rather than NaN.
     """
     if slope.is_zero:
         return ZERO
@@ -459,9 +466,9 @@ _Partials = tuple[Any, Any, Any]
 class Dual(FormulaNumber):
     """A function at a point: its value and its three partial derivatives, as plain numbers.
 
-    There are no ranges, so nothing is proved. At a tie, such as in max(x, 0) at x = 0, ranges of
-    derivatives contain all slopes nearby. A dual number has the slope on one side, since each
-    comparison is decided by the values.
+    There are no ranges, so nothing is proved. At a tie, such as in max(x, 0) at x = 0, the ranges
+    of a `Jet` contain all slopes nearby. A dual number has the slope of one of the two sides there,
+    since each comparison is decided by the values.
     """
 
     value: Real
@@ -469,7 +476,7 @@ class Dual(FormulaNumber):
 
     @classmethod
     def at_point(cls, p: Vec3) -> tuple[Dual, Dual, Dual]:
-        """The three coordinates as functions of themselves, at points p."""
+        """The three coordinates x, y and z as functions of (x, y, z), at points p."""
         return cls(p.x, (1.0, 0.0, 0.0)), cls(p.y, (0.0, 1.0, 0.0)), cls(p.z, (0.0, 0.0, 1.0))
 
     def constant(self, x: float | Real) -> Dual:
@@ -523,7 +530,7 @@ class Dual(FormulaNumber):
         )
 
     def pointwise_maximum(self, other: Dual) -> Dual:
-        """The larger of two functions; at a tie, the other one."""
+        """The larger of this function and another function; at a tie, the other function."""
         is_own = self.value > other.value
 
         def rule(a: Any, b: Any) -> Any:

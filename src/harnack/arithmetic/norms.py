@@ -110,7 +110,8 @@ def norm(*values: Any, p: float = 2.0) -> Any:
 
 
 def _plain_norm(values: tuple[Any, ...], p: float) -> Any:
-    """The p-norm of arrays and Python numbers, in a form whose derivative at 0 is finite."""
+    """The p-norm of arrays and Python numbers, in a form whose derivative is finite if all numbers
+    are 0."""
     if not any(dr.is_array_v(cast("Any", type(value))) for value in values):
         sizes = np.array(np.broadcast_arrays(*(np.abs(value) for value in values)))
         largest = sizes.max(axis=0)
@@ -134,10 +135,10 @@ def _plain_power(x: Any, p: float) -> Any:
 
 
 def _jet_norm(xs: list[Jet], p: float) -> Jet:
-    """The p-norm of jets, for 1 < p < infinity; `norm` has the proof of its ranges.
+    """The p-norm N of the jets x_i, for 1 < p < infinity; `norm` has the proof of its ranges.
 
-    Symbols: over is the range of 1/N, ratios are those of x_i/N, and pulls those of sign(x_i)
-    u_i^(p-1).
+    In the code `over` is the range of 1/N, `ratios` are the ranges of x_i/N, and `pulls` those of
+    sign(x_i) |x_i/N|^(p-1).
     """
     like = next((f.value.lower for f in xs if not f.value.is_literal), None)
     like = xs[0].backend_number() if like is None else like
@@ -179,7 +180,8 @@ def _jet_norm(xs: list[Jet], p: float) -> Jet:
 def _wronskian_term(
     xs: list[Jet], values: list[Interval], over: Interval, i: int, j: int
 ) -> Interval:
-    """The range of sum_(k<l) w_kl,i w_kl,j / N^3, the first part of N'' for p = 2: see `norm`.
+    """The range of sum_(k<l) w_kl,i w_kl,j / N^3: for p = 2 this is the part of a second derivative
+    of the norm N of functions x_k that their first derivatives contribute (`norm` has the proof).
 
     w_kl,i is the function w_kl = x_k x_l' - x_l x_k' with derivatives by the variable i.
 
@@ -205,7 +207,10 @@ def _norm_range(values: list[Interval], p: float) -> Interval:
 
 
 def _norm_of_magnitudes(sizes: list[Any], p: float) -> Interval:
-    """The range of the p-norm of the numbers `sizes`, which are >= 0, with its rounding."""
+    """The range of the p-norm of numbers >= 0, with its rounding.
+
+    sizes: the numbers.
+    """
     if p == 2.0:
         return sqrt.ranges(_total([Interval.point(size).square() for size in sizes]))[0]
     largest = functools.reduce(lambda a, b: dr.select((a > b) | dr.isnan(a), a, b), sizes)
@@ -221,7 +226,7 @@ def _norm_of_magnitudes(sizes: list[Any], p: float) -> Interval:
 
 
 def _signed_power(x: Interval, q: float) -> Interval:
-    """The range of sign(y) |y|^q for y in x, q > 0; this function increases."""
+    """The range of sign(y) |y|^q for y in the interval x, q > 0. The function increases with y."""
 
     def at(v: Any) -> Interval:
         """The range at a single number v, with its rounding."""
@@ -250,7 +255,8 @@ def _clip_magnitude(x: Interval, limit: Interval) -> Interval:
 
 
 def _product(a: Interval, b: Interval) -> Interval:
-    """The range of a product; that of a square if both are the same interval object."""
+    """The range of the product of two numbers, each in its interval. If both intervals are the same
+    object, it is the range of the square of one number."""
     return a.square() if a is b else a * b
 
 
@@ -260,7 +266,7 @@ def _total(parts: list[Interval]) -> Interval:
 
 
 def as_backend_interval(x: Interval, like: Any) -> Interval:
-    """The interval with ends of the type of `like`, if its ends are Python numbers."""
+    """The interval x; if its ends are Python numbers, they are converted to the type of `like`."""
     if not x.is_literal:
         return x
     kind = cast("Any", type(like))
@@ -304,8 +310,8 @@ def blend_union(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
 
 
 def blend_intersection(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
-    """The same for the intersection of {a <= 0} and {b <= 0}, whose outer edge is rounded: see
-    `blend_union`."""
+    """The function of the intersection of {a <= 0} and {b <= 0} with a rounded outer edge: the
+    blended union of the complements, negated. The parameters are those of `blend_union`."""
     return -blend_union(-a, -b, radius, power)
 
 

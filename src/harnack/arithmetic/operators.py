@@ -1,4 +1,4 @@
-"""The operators of the numbers of all arithmetics, with which each arithmetic evaluates formulas.
+"""The operators that the numbers of all arithmetics share, so that each of them evaluates formulas.
 
 `tally_of` estimates, before a kernel is recorded, how large the kernel of a formula will be. It
 also tells whether the formula may jump, have a vertical tangent, or turn within the rounding of
@@ -91,11 +91,12 @@ class FormulaNumber(abc.ABC):
 
     @abc.abstractmethod
     def polar_angle(self, x: Any) -> Self:
-        """The angle of the point (x, y), where y is this number: see
-        `harnack.arithmetic.angles`."""
+        """The polar angle in (-pi, pi] of the point (x, y), where y is this number and x a number
+        of the same arithmetic."""
 
     def norm_of_powers(self, p: float) -> Self:
-        """The p-norm of some numbers, where this number is the sum of their p-th powers."""
+        """The p-norm (|x|^p + |y|^p + ...)^(1/p) of some numbers, where this number is the sum
+        |x|^p + |y|^p + ... that is already computed."""
         return self.apply(sqrt if p == 2.0 else power(1 / p))
 
     def _coerce_or_none(self, other: Any) -> Self | None:
@@ -154,6 +155,8 @@ class FormulaNumber(abc.ABC):
         return self.apply(reciprocal) * other
 
     def __pow__(self, exponent: Any) -> Self:
+        """This number to a power: by products for a constant integer, by the function `power` for
+        another constant, and as exp(exponent log(this)) for a number of the same arithmetic."""
         if isinstance(exponent, type(self)):
             return (self.apply(log) * exponent).apply(exp)
         n = exponent_of(exponent)
@@ -202,11 +205,13 @@ class FormulaNumber(abc.ABC):
         return -((-self).pointwise_maximum(-self.coerce(other)))
 
     def atan2(self, x: Any) -> Self:
-        """The angle of the point (x, y), where y is this number and x a number of any kind."""
+        """The polar angle in (-pi, pi] of the point (x, y), where y is this number and x a number
+        of any kind."""
         return self.polar_angle(self.coerce(x))
 
     def _atan2_of(self, y: Any) -> Self:
-        """The angle of the point (x, y), where x is this number and y a number of any kind."""
+        """The polar angle in (-pi, pi] of the point (x, y), where x is this number and y a number
+        of any kind. NumPy's arctan2(y, x) calls it if only x is a number of this arithmetic."""
         return self.coerce(y).polar_angle(self)
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **settings: Any) -> Any:
@@ -282,11 +287,11 @@ class Tally:
 
     operations: about how many operations of Dr.Jit their ranges take.
     may_jump: whether a function was used that is not continuous everywhere.
-    is_steep: whether the slope may have no bound in a bounded box, as it may with roots, powers
-        below 1, quotients or logarithms.
+    is_steep: whether the slope may have no bound in a bounded box, as with roots, powers below 1,
+        quotients or logarithms.
     steepest: the largest slope, for coordinates up to 1, of any number that was bent. A number is
         bent by a maximum, an absolute value, or a function that is no power.
-    finest: the smallest nonzero constant, at most 1. A bent number may turn within this.
+    finest: the smallest nonzero constant, at most 1. A bent number may turn within this distance.
     farthest: the largest constant that was added.
     """
 
@@ -404,10 +409,12 @@ class OperationCounter(FormulaNumber):
     def _bent(
         self, operations: int, other: OperationCounter, size: float, rate: float
     ) -> OperationCounter:
-        """The result of an operation on this and another number that may be flat on both sides of a
-        place.
+        """The result of an operation that may bend this and another number, that is, be flat on
+        both sides of a place and steep between. The slopes of both numbers are recorded in the
+        tally.
 
-        Records the slopes of both numbers. Parameters as for `_after`.
+        operations, size, rate: the number of Dr.Jit operations, and the size and the slope of the
+            result, as for `_after`.
         """
         if not (self.is_constant and other.is_constant):
             self.tally.steepest = max(self.tally.steepest, self.rate, other.rate)
@@ -439,11 +446,13 @@ def _power(x: float, n: float) -> float:
 
 
 def tally_of(formula: Callable[[Any, Any, Any], Any]) -> Tally:
-    """The tally of a formula of three coordinates.
+    """The tally of a formula: how many operations it has, and whether it may jump or be steep.
 
-    A formula that does not accept numbers of this kind gets a tally without operations that may
-    jump. Such a formula accepts only ranges of derivatives, as those of the library's shapes do,
-    which are bounded.
+    formula: a function of three coordinates.
+
+    A formula that does not accept numbers of this kind gets a tally with no operations and with
+    `may_jump` set. Such a formula accepts only ranges of derivatives, as the formulas of the
+    library's shapes do, and these are bounded.
     """
     tally = Tally()
     x, y, z = (

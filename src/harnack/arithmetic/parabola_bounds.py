@@ -65,8 +65,11 @@ class ParabolaBounds(FormulaNumber):
     def along_ray(
         cls, p: Vec3, direction: Vec3, length: Real, *, degree: int = 2
     ) -> tuple[ParabolaBounds, ParabolaBounds, ParabolaBounds]:
-        """The three coordinates of p + s d for 0 <= s <= length; degree: the `bound_degree`, 1 or
-        2."""
+        """The three coordinates of p + s d as functions of s, for 0 <= s <= length.
+
+        direction: d.
+        degree: the `bound_degree`, 1 for lines or 2 for parabolas.
+        """
 
         def coordinate(x: Real, slope: Real) -> ParabolaBounds:
             """The function x + s slope."""
@@ -94,10 +97,11 @@ class ParabolaBounds(FormulaNumber):
     def _new(
         self, value: Interval, lower: Quadratic, upper: Quadratic, polynomial: int | None = None
     ) -> ParabolaBounds:
-        """A function on the same piece with this value and these bounds, made lines if
-        `bound_degree` is 1.
+        """A function on the same piece of the path, with this value and these bounds. If
+        `bound_degree` is 1, the bounds are replaced by lines that bound them, unless the function
+        is a polynomial.
 
-        polynomial: its degree if it is a polynomial, whose bounds stay parabolas; else None.
+        polynomial: the degree of the function if it is a polynomial; else None.
         """
         new = ParabolaBounds(value, lower, upper, self.piece_length, self.bound_degree, polynomial)
         if polynomial is None and self.bound_degree == 1:
@@ -179,8 +183,8 @@ class ParabolaBounds(FormulaNumber):
     def _product_of_lines(self, other: ParabolaBounds) -> tuple[Quadratic, Quadratic]:
         """Bounds of the product of two polynomials of degree 1: exact up to rounding.
 
-        Symbols: v and w are the midpoints of the two values at s = 0, a and c those of the two
-        slopes; rv, rw, ra and rc are their radii.
+        In the code v and w are the midpoints of the two values at s = 0, a and c those of the two
+        slopes; rv, rw, ra and rc are the radii of these ranges.
         """
         a, ra = _midpoint_and_half_width(self.lower[0], self.upper[0])
         c, rc = _midpoint_and_half_width(other.lower[0], other.upper[0])
@@ -193,10 +197,10 @@ class ParabolaBounds(FormulaNumber):
         return (linear - error_1, quadratic - error_2), (linear + error_1, quadratic + error_2)
 
     def _straight_product(self, other: ParabolaBounds) -> tuple[Quadratic, Quadratic]:
-        """Bounds of a product f g by lines: see `product`.
+        """Bounds of the product f g of this and another function by lines; `product` has the proof.
 
-        Symbols: v and w are the midpoints of f(0) and g(0), rv and rw their radii. a and c are the
-        slopes of a bound of f and of one of g.
+        In the code v and w are the midpoints of f(0) and g(0), rv and rw their radii. a and c are
+        the slopes of a bound of f and of one of g.
         """
         h = self.piece_length
         v, rv, w, rw = *_midpoint_and_radius(self.value), *_midpoint_and_radius(other.value)
@@ -212,9 +216,10 @@ class ParabolaBounds(FormulaNumber):
         return (_minimum_or_inf(*lows), 0.0), (_maximum_or_inf(*highs), 0.0)
 
     def _curved_product(self, other: ParabolaBounds) -> tuple[Quadratic, Quadratic]:
-        """Bounds of a product f g by parabolas: see `product`.
+        """Bounds of the product f g of this and another function by parabolas; `product` has the
+        proof.
 
-        Symbols: v and w are the midpoints of f(0) and g(0), rv and rw their radii. (a, b) is a
+        In the code v and w are the midpoints of f(0) and g(0), rv and rw their radii. (a, b) is a
         bound of f and (c, d) one of g, with the radii ra, rb, rc, rd of their coefficients.
         """
         h = self.piece_length
@@ -329,7 +334,8 @@ class ParabolaBounds(FormulaNumber):
         )
 
     def _taylor_bounds(self, slope: Interval, curvature: Interval) -> tuple[Quadratic, Quadratic]:
-        """The bounds of phi(f) by Taylor's formula: see `apply`.
+        """The bounds of phi(f) by Taylor's formula, for an elementary function phi and this
+        function f; `apply` has the proof.
 
         slope: the range of phi' at f(0).
         curvature: the range of phi'' on the range of f.
@@ -467,10 +473,11 @@ class ParabolaBounds(FormulaNumber):
     def _extend_parabolas(
         self, start: Real, length: Real, is_cut: Any, tail: Real
     ) -> tuple[Quadratic, Quadratic]:
-        """Extend bounds from an interval to all of [0, length]: parabolas.
+        """Extend parabolas that bound a function on an interval to parabolas that bound it on [0,
+        length].
 
-        This function is known on an interval that begins at `start`. The bounds are for a function
-        that equals it there and is constant before and after.
+        This function is known on an interval that begins at `start`. The extended function equals
+        it there and is constant before and after the interval.
 
         is_cut: whether the interval is not all of [0, length].
         tail: a bound of the derivative outside of the interval, which rounding may cause.
@@ -489,15 +496,20 @@ class ParabolaBounds(FormulaNumber):
     def _extend_lines(
         self, start: Real, end: Real, length: Real, value: Interval, is_cut: Any, tail: Real
     ) -> tuple[Quadratic, Quadratic]:
-        """Extend bounds from an interval to all of [0, length]: lines; see `_extend_parabolas`.
+        """Extend lines that bound a function on an interval to lines that bound it on [0, length].
+
+        This function is known on an interval. The extended function equals it there, and is
+        constant before and after the interval.
 
         start, end: the ends of the interval.
         value: the range of the extended function at s = 0.
+        is_cut: whether the interval is not all of [0, length].
+        tail: a bound of the derivative outside of the interval, which rounding may cause.
 
-        Proof. Before `start` the extended function is 0, as at s = 0. So a line from 0 at s = 0 to
-        the bound at `end` lies above it. Behind `end` the function is 0, that is, its change is
-        -value. A line of slope at least -value/s is above -value at s; slope -value/length is
-        enough for all s >= end.
+        Proof. Let the change be the function minus its value at s = 0. Before `start` it is 0. So a
+        line from 0 at s = 0 to the bound at `end` lies above it. Behind `end` the function is 0,
+        that is, the change is -value. A line of slope at least -value/s is above -value at s; slope
+        -value/length is enough for all s >= end.
         """
         (low, _), (high, _) = self.bounds
         fraction = (end - start) / end * (1 + 8 * machine_epsilon(length))
@@ -606,7 +618,8 @@ def _common_lower_bound(parabolas: list[Quadratic], length: Real) -> Quadratic:
 
 
 def _tighter_bound(first: Quadratic, second: Quadratic, length: Real, sign: int) -> Quadratic:
-    """The tighter of two bounds on one side, compared at one point; if one bound is NaN, the other.
+    """The tighter of two bounds on one side, compared at one point of the length; if one bound is
+    NaN, the other bound.
 
     sign: 1 for upper bounds, -1 for lower bounds.
     """
@@ -616,7 +629,10 @@ def _tighter_bound(first: Quadratic, second: Quadratic, length: Real, sign: int)
 
 
 def _maximum_on_piece(q: Quadratic, length: Real) -> Real:
-    """An upper bound of a s + b s^2 on [0, length], where q = (a, b); infinite if it is NaN."""
+    """An upper bound of a s + b s^2 on [0, length]; infinite if it is NaN.
+
+    q: (a, b).
+    """
     a, b = q
     if _is_zero(a) and _is_zero(b):
         return 0 * length
@@ -656,7 +672,8 @@ def _select(mask: Any, first: Quadratic, second: Quadratic) -> Quadratic:
 
 
 def _midpoint_and_half_width(low: Real, high: Real) -> tuple[Real, Real]:
-    """The middle of two numbers, and an upper bound of the distance of both from it."""
+    """The middle of the interval from `low` to `high`, and an upper bound of the distance of its
+    ends from the middle."""
     if low is high or (_is_zero(low) and _is_zero(high)):
         return low, 0.0
     middle = 0.5 * low + 0.5 * high
@@ -678,7 +695,7 @@ def _radius(x: Interval) -> Real:
 
 
 def _on_backend(x: Interval, like: Real) -> Interval:
-    """The interval with ends of the type of `like`, if its ends are Python numbers."""
+    """The interval x; if its ends are Python numbers, they are converted to the type of `like`."""
     if not x.is_literal:
         return x
     kind = cast("Any", type(like))
@@ -700,8 +717,10 @@ def _shift_by_rounding(x: Real, sign: int, size: Real) -> Real:
 
 
 def _rounding_bound(size: Real) -> Real:
-    """A bound of the rounding and underflow in a sum; size: the sum of the absolute values of its
-    terms."""
+    """A bound of the rounding and underflow in a sum.
+
+    size: the sum of the absolute values of its terms.
+    """
     if isinstance(size, float):
         assert size == 0.0
         return 0.0

@@ -109,10 +109,11 @@ class Values(FormulaNumber):
         return replace(self, jumps=self.jumps | _is_lost(self.value))
 
     def pointwise_maximum(self, other: Values) -> Values:
-        """The larger of two functions at each point.
+        """The larger of this and another function at each point.
 
-        Where only one of them has a value, the result may count as that value or as having none. So
-        the range then contains both ranges, and may jump.
+        At a point where only one of the two functions has a value, the result may count as that
+        value or as having none. So if there may be such points, the range contains the ranges of
+        both functions, and the result may jump.
         """
         x, y = self.value, other.value
         gaps = self.gaps | other.gaps
@@ -132,8 +133,8 @@ class Values(FormulaNumber):
         return Values(value, angle.nowhere, jumps, angle.gaps)
 
     def _with(self, value: Interval, other: Values) -> Values:
-        """A function with this range, computed from this and another function: it has no value
-        where one of the two has none, and may jump where one of the two may."""
+        """A function with the range `value`, computed from this and another function. It has no
+        value at points where one of the two has none, and may jump where one of the two may."""
         return Values(
             value,
             self.nowhere | other.nowhere,
@@ -143,10 +144,12 @@ class Values(FormulaNumber):
 
 
 def _is_lost(x: Interval, large: float = _LARGE_EXPONENT) -> Mask:
-    """Whether a range has an infinite end or NaN, and is not known to be large.
+    """A mask of the lanes on which a range has an infinite end or NaN, and is not known to be
+    large.
 
     large: the exponent e. The range is known to be large if all of it is beyond (largest number)^e,
-        on the positive or on the negative side. With 0.0, no range with such an end is.
+        on the positive or on the negative side. With e = 0.0, no range with an infinite end or NaN
+        is known to be large.
     """
     lost = ~(dr.isfinite(x.lower) & dr.isfinite(x.upper))
     if large == 0.0:

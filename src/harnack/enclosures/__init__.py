@@ -1,7 +1,8 @@
-"""Enclosures: proofs of bounds of the movement of f along a path, for fields of any kind.
+"""Enclosures: proofs of how far a field's function f can move along a path from its value at the
+start.
 
-This package exports the parts that all proofs share. The proofs themselves are names of `harnack`,
-which `harnack/__init__.pyi` lists.
+This package exports what all proofs share. The proofs themselves, the classes of enclosures, are
+names of `harnack`; `harnack/__init__.pyi` lists them.
 """
 
 from __future__ import annotations

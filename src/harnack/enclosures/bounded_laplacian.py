@@ -91,6 +91,12 @@ class BoundedLaplacianEnclosure(Enclosure):
     def from_promise(
         cls, promise: Promise, value: Real, error: Real, slopes: SlopeRange
     ) -> Self | None:
+        """The enclosure from a `BoundedLaplacian`; None for another kind of promise, and if the
+        promise bounds f on one side only.
+
+        value, error: f at the center of the ball, and a bound of its error.
+        slopes: the range of the derivative of f along the path there.
+        """
         if not isinstance(promise, BoundedLaplacian):
             return None
         radius, max_fall, max_rise = allowed_movement(promise, value, error)
@@ -109,9 +115,9 @@ class BoundedLaplacianEnclosure(Enclosure):
     ) -> Self:
         """The enclosure from bounds on a ball.
 
-        ranges: how far the function may fall, and how far it may rise, from its value at the
-            center.
-        laplacian: a lower and an upper bound of its Laplacian.
+        ranges: two differences in value: how far the function may fall from its value at the
+            center, and how far it may rise.
+        laplacian: a lower and an upper bound of its Laplacian on the ball.
         slopes: the range of its derivative along the path at the center.
         """
         half = 0.5 * radius * radius
@@ -138,15 +144,19 @@ class BoundedLaplacianEnclosure(Enclosure):
         return (length <= 0) | (is_inside & is_free_fraction(above, q) & is_free_fraction(below, q))
 
     def _is_known(self, gaps: LevelGaps) -> Mask:
-        """Whether the bounds and the gaps are numbers, and neither too large nor too small to
-        divide by."""
+        """A mask of the lanes on which the bounds and the gaps (differences of value to the next
+        levels) are numbers, and neither too large nor too small to divide by."""
         is_valid = (gaps.below >= 0) & (gaps.above >= 0) & dr.isfinite(self.laplacian_mean)
         for x in (self.max_fall + self.max_rise, self.laplacian_spread):
             is_valid = is_valid & ((x == 0) | (dr.isfinite(1 / x) & dr.isfinite(4 * x)))
         return is_valid
 
     def _conditions(self, gaps: LevelGaps) -> tuple[_GreenCondition, _GreenCondition]:
-        """The condition for f not to reach the level above, and that for the level below."""
+        """Two conditions on a length of the path: for f not to reach the level above on it, and for
+        f not to reach the level below.
+
+        gaps: the differences of value to these levels.
+        """
         fall, rise, slopes = self.max_fall, self.max_rise, self.slopes
         return (
             self._growth(gaps.above, fall, rise, self.laplacian_mean, slopes.upper),
@@ -154,15 +164,16 @@ class BoundedLaplacianEnclosure(Enclosure):
         )
 
     def _growth(self, gap: Real, u: Real, rise: Real, mean: Real, slope: Real) -> _GreenCondition:
-        """The condition for f not to rise to the level above; for -f, not to fall to the level
-        below.
+        """The condition for f not to rise to the level above. With the numbers of -f in place of
+        those of f, it is the condition for f not to fall to the level below.
 
-        All its numbers are divided by w + l R^2, with w as in the proof.
+        All numbers of the condition are divided by w + l R^2, with R, l and w as in the proof of
+        the class.
 
         gap: the difference in value to the level.
-        u: f(p) - c.
-        rise: the largest rise of f.
-        mean: m R^2.
+        u: f(p) - c, how far f may fall on the ball.
+        rise: how far f may rise on the ball.
+        mean: m R^2, the mean of the two bounds of the Laplacian times R^2/2.
         slope: the largest derivative along the path.
         """
         w = fmax(dr.fma(mean, 1 / 6, u), 0)
@@ -184,11 +195,11 @@ class BoundedLaplacianEnclosure(Enclosure):
 
 @dataclass(frozen=True)
 class _GreenCondition:
-    """The condition w (A-1) + s B + l kappa + m q^2/6 <= d: see `BoundedLaplacianEnclosure`.
+    """The condition w (A-1) + s B + l kappa + m q^2/6 <= d on a fraction q of the radius, for f not
+    to reach a level at the gap d. The symbols are those of `BoundedLaplacianEnclosure`, with R = 1.
 
-    d is the gap in value. Let S = (1-q)^2 (1 + left side), which has no pole, and
-    g = sqrt(1 + d) - 1. The condition is sqrt(S) <= (1 + g) (1-q), that is, q k(q) <= g with
-    k = g + 1 + (sqrt(S) - 1)/q.
+    Let S = (1-q)^2 (1 + left side), which has no pole, and g = sqrt(1 + d) - 1. The condition is
+    sqrt(S) <= (1 + g) (1-q), that is, q k(q) <= g with k = g + 1 + (sqrt(S) - 1)/q.
 
     gap: g.
     weight: w.

@@ -44,7 +44,7 @@ class PathPiece:
 class PathRestriction(Protocol):
     """A function f restricted to a path, with computable ranges of its derivatives.
 
-    piece_count: the number of pieces into which to cut the path; the fastest number, by experiment.
+    piece_count: the number of pieces into which the path is best cut, found by experiment.
     """
 
     @property
@@ -64,10 +64,11 @@ class EvaluableRestriction(Protocol):
     """A function given by a formula along a path, which can be evaluated in any arithmetic."""
 
     def evaluate_with(self, coordinates: Callable[[Vec3, Vec3], tuple[Any, Any, Any]]) -> Any:
-        """Evaluate the formula at x, y, z = coordinates(p, d).
+        """The value of the formula at (x, y, z) = coordinates(p, d).
 
-        coordinates: a function of a point p and the direction d of the path. The type of the three
-            numbers that it returns chooses the arithmetic.
+        coordinates: a function of the start p and the direction d of the path. It returns the three
+            coordinates along the path as numbers of some arithmetic, such as jets or intervals; the
+            result is a number of that arithmetic.
         """
         ...
 
@@ -126,7 +127,7 @@ class SlopeRange:
         return cls(slope - error, slope + error)
 
     def negated(self) -> SlopeRange:
-        """The range of the derivative along the opposite direction."""
+        """The range of the derivative along the opposite direction: the negated ends, exchanged."""
         return SlopeRange(-self.upper, -self.lower)
 
 
@@ -136,20 +137,21 @@ class Enclosure(abc.ABC):
     F(s) = f(path(t+s)) - f(path(t)) is the movement of f relative to its value at a sample. In this
     form two large numbers are never subtracted; in float32 rays would stall otherwise.
 
-    Its input are the differences in value to the next levels (`LevelGaps`). From them an enclosure
-    proves a length free of levels (`free_length`), or decides whether a given length is free
-    (`is_free`). The latter takes one evaluation of the proof and no solver; the tracer uses it for
-    the way back from a sample.
+    Its input are the gaps: the differences in value to the next level below and above
+    (`LevelGaps`). From them an enclosure proves a length free of levels (`free_length`), or decides
+    whether a given length is free (`is_free`). `is_free` takes one evaluation of the proof and no
+    solver; the tracer uses it for the way back from a sample.
 
     Each end of the interval must be an increasing function of the slope at the sample, or constant,
-    and every proof says why it is. Then the interval for the upper end of a `SlopeRange` bounds F
-    from above, and that for the lower end bounds F from below, whatever the slope in between is. In
-    particular slopes in [-|grad f|, |grad f|] bound F in every direction.
+    and every proof says why it is. Then the upper end of a `SlopeRange` gives a bound of F from
+    above, and its lower end a bound from below, for every slope in between. In particular slopes in
+    [-|grad f|, |grad f|] bound F in every direction.
     """
 
     @property
     def reach_growth(self) -> float:
-        """The reach to ask for at the next sample, as a multiple of the length proved at this one.
+        """Up to which length the next sample should be bounded, as a multiple of the length proved
+        at this sample.
 
         The best values were found by experiment.
         """
@@ -159,8 +161,8 @@ class Enclosure(abc.ABC):
     def from_promise(
         cls, promise: Promise, value: Real, error: Real, slopes: SlopeRange
     ) -> Self | None:
-        """The enclosure that this class proves from a promise; None if it does not use promises of
-        that kind.
+        """The enclosure that this class proves from a promise (a proved bound of f near the
+        sample); None if it does not use promises of that kind.
 
         value: f at the sample.
         error: a bound of the error of this value.
@@ -173,13 +175,12 @@ class Enclosure(abc.ABC):
     def from_restriction(
         cls, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> Self | None:
-        """The enclosure that this class proves from ranges of the derivatives of f along the path.
-
+        """The enclosure that this class proves from ranges of the derivatives of f along the path;
         None if this class does not use such ranges.
 
         function: f along the path.
         slopes: the range of its derivative at the start of the path.
-        length: the reach that is asked for.
+        length: the length of the path on which the enclosure is wanted.
         """
         del function, slopes, length
         return None

@@ -1,4 +1,4 @@
-"""Enclosures of functions that are made of several functions, or of one by a map.
+"""Enclosures of functions that are made of several functions, or of one function by a map.
 
 - `MaximumEnclosure`, with `NegatedEnclosure` and `ScaledEnclosure`: unions, intersections and
   differences of solids, and solids that were moved and scaled.
@@ -38,20 +38,24 @@ class MaximumOperand:
 
 @dataclass(frozen=True)
 class MaximumEnclosure(Enclosure):
-    """The movement of max f_i, from enclosures of the movements of all f_i.
+    """An enclosure of max f_i along a path, from enclosures of all f_i (the operands).
 
     Proof. Let the deficit of f_i be the difference between the maximum and f_i at the start. The
     maximum rises by a gap g only where some f_i rises by g plus its deficit. As long as no f_i
     does, each by its own proof, the maximum does not rise so far. The maximum falls by g only where
-    all f_i are that low. As long as one of them is proved not to have fallen so far, the maximum
-    has not. The operands may have proofs of different kinds.
+    all f_i are that low. As long as one f_i is proved not to have fallen so far, the maximum has
+    not. The operands may have proofs of different kinds.
     """
 
     operands: tuple[MaximumOperand, ...]
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """The shorter of two lengths: that on which no operand rises to the level above, and the
-        longest one on which an operand is proved not to fall to the level below."""
+        """The shorter of two lengths: the length on which no operand rises to the level above, and
+        the longest length on which some operand is proved not to fall to the level below.
+
+        gaps: the differences between the maximum and these levels. If both are infinite, the result
+            is the length on which the enclosures of all operands are valid.
+        """
         infty = type(gaps.above)(dr.inf)
         rise_length, fall_length = infty, type(gaps.above)(0)
         for operand in self.operands:
@@ -63,7 +67,7 @@ class MaximumEnclosure(Enclosure):
         rise_length = dr.select(gaps.above == dr.inf, infty, rise_length)
         fall_length = dr.select(gaps.below == dr.inf, infty, fall_length)
         free = fmin(rise_length, fall_length)
-        return dr.select(free == dr.inf, self._common_length(infty), free)
+        return dr.select(free == dr.inf, self._shared_valid_length(infty), free)
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
         free_above, free_below = gaps.above == gaps.above, gaps.below == dr.inf
@@ -73,9 +77,9 @@ class MaximumEnclosure(Enclosure):
             free_below |= (fall.below > 0) & any_is_free(operand.enclosures, fall, length)
         return (free_above | (gaps.above == dr.inf)) & free_below
 
-    def _common_length(self, infty: Real) -> Real:
-        """The length on which the enclosures of all operands hold; it is the free length if there
-        is no level.
+    def _shared_valid_length(self, infty: Real) -> Real:
+        """The length, from the start of the path, on which the enclosures of all operands are
+        valid: the smallest of the lengths that they prove if there is no level.
 
         infty: infinity, as a number of the backend.
         """
@@ -89,7 +93,9 @@ class MaximumEnclosure(Enclosure):
         """The gap by which an operand must rise for the maximum to meet the level above, and the
         gap by which it must fall for the maximum to meet the level below.
 
-        Each is a `LevelGaps` with one finite side at most.
+        gaps: the differences between the maximum and these levels.
+
+        Each of the two results is a `LevelGaps` in which only that one gap may be finite.
         """
         infty = type(gaps.above)(dr.inf)
         return (
@@ -100,7 +106,7 @@ class MaximumEnclosure(Enclosure):
 
 @dataclass(frozen=True)
 class NegatedEnclosure(Enclosure):
-    """The movement of -f: that of f, with the levels above and below exchanged.
+    """The enclosure of -f: that of f, with the levels above and below exchanged.
 
     inner: the enclosure of f.
     """
@@ -116,15 +122,17 @@ class NegatedEnclosure(Enclosure):
 
 @dataclass(frozen=True)
 class ScaledEnclosure(Enclosure):
-    """The movement of value_factor * f(map(path)), where the map stretches the path by `speed`.
+    """An enclosure of h = value_factor * f(map(.)) along a path, from an enclosure of f along the
+    mapped path. The map multiplies all lengths on the path by `speed`.
 
     inner: the enclosure of f along the mapped path.
-    speed: the length of the mapped path per length of the path, > 0.
-    value_factor: > 0.
+    speed, value_factor: two factors > 0.
 
-    Proof. A length s of the path is a length speed * s of the mapped path, and a gap g of
-    value_factor * f is a gap g/value_factor of f. speed and value_factor are known to within a few
-    roundings, by which steps are shortened.
+    Proof. A length s of the path becomes the length speed * s of the mapped path. h differs from a
+    level by g if and only if f differs by g/value_factor from the level divided by value_factor. So
+    a length that `inner` proves free for the gaps divided by value_factor is, divided by speed,
+    free here. Both factors have errors of a few roundings; the gaps and the length are shortened by
+    more than that (`STEP_SAFETY`).
     """
 
     inner: Enclosure
@@ -138,7 +146,8 @@ class ScaledEnclosure(Enclosure):
         return self.inner.is_free(self._gaps(gaps), length * self.speed / STEP_SAFETY)
 
     def _gaps(self, gaps: LevelGaps) -> LevelGaps:
-        """The gaps of f, from those of value_factor * f."""
+        """The gaps of f (differences of value to the next levels), from those of value_factor *
+        f."""
         factor = STEP_SAFETY / self.value_factor
         below, above = _scaled(gaps.below, factor), _scaled(gaps.above, factor)
         return LevelGaps(below, above, gaps.is_one_sided)
@@ -164,11 +173,12 @@ class BranchSample:
 
 @dataclass(frozen=True)
 class NearestBranchEnclosure(Enclosure):
-    """The movement of f = s min_j |phi_j|, where s is the sign of the product of all phi_j.
+    """An enclosure of f = s min_j |phi_j| along a path, where s is the sign of the product of all
+    phi_j.
 
     Such an f is continuous and single-valued wherever the set of all phi_j is, however the branches
-    are numbered, because s changes only where the minimum is 0. f is zero where one of the phi_j
-    is.
+    are numbered, because s changes only where the minimum is 0. f is zero if and only if one of the
+    phi_j is.
 
     branches: a sample of each phi_j.
     nearest: the sample of the phi_j with the smallest |phi_j|.
@@ -181,16 +191,16 @@ class NearestBranchEnclosure(Enclosure):
     Proof. Let g_j be phi_j or -phi_j, whichever has the sign of f at the start. A g_j falls at most
     along the parabola given by its slope and the bound of its second derivative.
 
-    Towards zero: let f > 0 at the start, and take a level f - d below it (for f < 0 the proof is
-    that of -f). As long as no g_j has fallen by |phi_j| - f + d, that is, to the value f - d, f
-    stays above the level. For if all g_j are positive, no sign has changed and f is the smallest
-    g_j. Otherwise the level is below 0, and where f is negative an odd number of the g_j is
-    negative, so at least one is, and f is at least -|g_j| and thus above the level.
+    First for a level towards zero. Let f > 0 at the start, and take a level f - d below it (for f <
+    0 the proof is that of -f). As long as no g_j has fallen by |phi_j| - f + d, that is, to the
+    value f - d, f stays above the level. For if all g_j are positive, no sign has changed and f is
+    the smallest g_j. Otherwise the level is below 0. If f is negative then, an odd number of the
+    g_j is negative, so at least one is, and f is at least -|g_j| and thus above the level.
 
-    Away from zero: f stays below a level f + a as long as |g_i| does, where phi_i is the nearest
-    branch at the start. This holds as long as g_i has neither risen by a nor fallen by 2 f + a. So
-    a step is proved free of all branches, not of the nearest one alone, and another branch may
-    become the nearest on the way.
+    Then for a level away from zero. f stays below a level f + a as long as |g_i| does, where phi_i
+    is the nearest branch at the start. This holds as long as g_i has neither risen by a nor fallen
+    by 2 f + a. So a step is proved free of all branches, not of the nearest one alone, and another
+    branch may become the nearest on the way.
     """
 
     branches: tuple[BranchSample, ...]
@@ -201,7 +211,11 @@ class NearestBranchEnclosure(Enclosure):
     reach: Real
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """The shortest of the lengths that the two parts of the proof give, over all branches."""
+        """The shortest of the lengths that the two parts of the class's proof give, over all
+        branches.
+
+        gaps: the differences between f and the next level below and above.
+        """
         towards = dr.select(self.is_positive, gaps.below, gaps.above)
         away = dr.select(self.is_positive, gaps.above, gaps.below)
         length = first_reach(away, self.nearest.slopes.upper, self.second_derivative_bound)
@@ -268,8 +282,8 @@ class BranchPointEnclosure(Enclosure):
     is_positive: Mask
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """The longest length of the proof over the values of q that are tried; 0 if there is a
-        level away from zero."""
+        """The longest of the lengths that the class's proof gives for the values of q that are
+        tried; 0 if there is a level farther from zero than f."""
         towards = dr.select(self.is_positive, gaps.below, gaps.above)
         away = dr.select(self.is_positive, gaps.above, gaps.below)
         w = self.distance_to_limit - fmax(self.distance - towards, 0)

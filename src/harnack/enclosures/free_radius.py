@@ -36,8 +36,8 @@ _ROUNDINGS = 16.0
 class FreeRadiusCondition(Protocol):
     """A condition q k(q) <= gap which proves that all of [0, q] is free of levels.
 
-    q is a length as a fraction of the ball's radius. q k(q) exceeds the gap on all of [0, 1] from
-    some place on, or nowhere: it crosses the gap at most once, upwards.
+    q is a length as a fraction of the ball's radius. The product q k(q) crosses the gap at most
+    once on [0, 1], upwards.
     """
 
     @property
@@ -53,13 +53,16 @@ class FreeRadiusCondition(Protocol):
 
 
 def condition_rounding(real: Any) -> float:
-    """The number that is added to k to cover rounding; real: the type of numbers of the
-    precision."""
+    """The number that is added to k to cover its rounding.
+
+    real: the type of numbers, which tells the precision.
+    """
     return _ROUNDINGS * float(dr.epsilon(real))
 
 
 def is_free_fraction(condition: FreeRadiusCondition, q: Real) -> Mask:
-    """Whether all of [0, q] is proved free, for fractions q of the radius, 0 <= q <= 1."""
+    """A mask of the lanes on which all of [0, q] is proved free of levels, for fractions q of the
+    ball's radius, 0 <= q <= 1."""
     rounding = condition_rounding(type(q))
     return q * (condition(q) + rounding) <= condition.gap * CONDITION_SAFETY
 
@@ -125,9 +128,8 @@ class HarmonicBallEnclosure(Enclosure):
     """Base of enclosures of a function f that is harmonic and bounded on a ball B(p, radius) of
     R^dimension.
 
-    max_fall, max_rise: bounds f(p) - lower and upper - f(p) of how far f falls and rises on the
-        ball. They are kept in this form so that two large numbers are never subtracted. None for a
-        side that is not bounded.
+    max_fall, max_rise: how far f may fall below, and rise above, its value f(p) on the ball; None
+        for a side on which it is not bounded. In this form two large numbers are never subtracted.
     slopes: the range of the derivative of f along the path at p.
     """
 
@@ -141,6 +143,12 @@ class HarmonicBallEnclosure(Enclosure):
     def from_promise(
         cls, promise: Promise, value: Real, error: Real, slopes: SlopeRange
     ) -> Self | None:
+        """The enclosure from a `HarmonicBall`; None for another kind of promise, and for a ball on
+        which f is not bounded on the sides that this class needs.
+
+        value, error: f at the center of the ball, and a bound of its error.
+        slopes: the range of the derivative of f along the path there.
+        """
         if not isinstance(promise, HarmonicBall):
             return None
         radius, max_fall, max_rise = allowed_movement(promise, value, error)
@@ -149,7 +157,8 @@ class HarmonicBallEnclosure(Enclosure):
         return cls(radius, max_fall, max_rise, promise.dimension, slopes)
 
     def is_valid(self, gaps: LevelGaps) -> Mask:
-        """Whether the bounds and the gaps are numbers, and the bounds large enough to divide by."""
+        """A mask of the lanes on which the bounds and the gaps are numbers, and the bounds large
+        enough to divide by."""
         valid = (gaps.below >= 0) & (gaps.above >= 0)
         for movement in (self.max_fall, self.max_rise):
             if movement is not None:
@@ -158,7 +167,7 @@ class HarmonicBallEnclosure(Enclosure):
 
     @classmethod
     def applies_to(cls, dimension: int, is_bounded_below: bool, is_bounded_above: bool) -> bool:
-        """Whether this class has a proof for balls of this dimension if f is bounded on these
+        """Whether this class has a proof for balls of this dimension, if f is bounded on these
         sides."""
         del dimension
         return is_bounded_below or is_bounded_above
@@ -167,22 +176,27 @@ class HarmonicBallEnclosure(Enclosure):
 def allowed_movement(
     promise: HarmonicBall | BoundedLaplacian, value: Real, error: Real
 ) -> tuple[Real, Real | None, Real | None]:
-    """The radius of a promise, and how far f may fall and rise from its value on the ball.
+    """The radius of the ball on which a promise bounds f, how far f may fall on the ball below its
+    value at the center, and how far it may rise above it.
 
     value: f at the center.
     error: a bound of the error of this value.
 
-    A fall or rise that is not bounded is None. The ends of the promise are moved outwards by the
-    error and by eight units in the last place of f. Otherwise a promise whose two ends are equal up
-    to rounding would prove f constant. The radius is 0, which proves nothing, if it is not a
-    positive number or if any number is NaN.
+    A fall or rise that is not bounded is None. Both bounds are increased by the error and by eight
+    units in the last place of f. Otherwise a promise whose two ends are equal up to rounding would
+    prove f constant. The radius is 0, which proves nothing, if it is not a positive number or if
+    any number is NaN.
     """
     epsilon = 2 * float(dr.epsilon(type(value)))  # Dr.Jit's is half the distance to the next number
     total_error = dr.fma(8 * epsilon, dr.abs(value), error)
     is_valid = promise.radius > 0
 
     def movement(end: Real, sign: float) -> Real | None:
-        """The distance from the value to the upper end (sign 1) or to the lower end (-1)."""
+        """How far f may move to one end of the promised range; None if that end is infinite. It
+        clears the mask `is_valid` where the distance is NaN.
+
+        end: the upper end, with sign 1, or the lower end, with sign -1.
+        """
         nonlocal is_valid
         if isinstance(end, float) and math.isinf(end):
             return None

@@ -55,7 +55,8 @@ class HarnackEnclosure(HarmonicBallEnclosure):
         return dr.select(self.is_valid(gaps), self.radius * self._fraction(gaps), 0)
 
     def _fraction(self, gaps: LevelGaps) -> Real:
-        """The free length divided by the radius; the better one if f is bounded on both sides."""
+        """The free length divided by the radius. If f is bounded on both sides, it is the larger of
+        the two fractions that the bounds prove."""
         lower = upper = None
         if self.max_fall is not None:
             lower = _fraction_from_one_side(self.max_fall, gaps.above, gaps.below, self.dimension)
@@ -73,8 +74,8 @@ def _fraction_from_one_side(u: Real, gap_away: Real, gap_toward: Real, dimension
     function.
 
     u: its value at the center.
-    gap_away, gap_toward: the differences from u to the next level above, and to the next level
-        below.
+    gap_away, gap_toward: the differences from u to the next level above, which is away from 0, and
+        to the next level below, toward 0.
     """
     growing, falling = _FRACTION_FORMULAS[dimension]
     # u = 0 forces u to vanish identically: no level is ever reached.
@@ -85,23 +86,36 @@ def _fraction_from_one_side(u: Real, gap_away: Real, gap_toward: Real, dimension
 
 
 def _fraction_2d(u: Real, v: Real, gap: Real) -> Real:
-    """The q at which u may first reach a level v, above or below, in the plane; gap = |v - u|."""
+    """The fraction q of the radius at which u may first reach a level v, above or below, in the
+    plane.
+
+    u, v: the positive function at the center, and the level.
+    gap: |v - u|.
+    """
     return gap / (u + v)
 
 
 def _fraction_3d(u: Real, v: Real, gap: Real) -> Real:
     # Two square roots, as the product u (u + 8v) may underflow or overflow.
-    """The q at which u may first reach a level v, above or below, in space; gap = |v - u|."""
+    """The fraction q of the radius at which u may first reach a level v, above or below, in space.
+
+    u, v: the positive function at the center, and the level.
+    gap: |v - u|.
+    """
     return 2 * gap / (u + 2 * v + dr.sqrt(u) * dr.sqrt(u + 8 * v))
 
 
 def _fraction_4d_up(u: Real, v: Real, gap: Real) -> Real:
-    """The q at which u may first reach a level v > u in R^4, or slightly less; gap = v - u.
+    """The fraction q of the radius at which u may first reach a level v > u in R^4, or slightly
+    less.
 
-    It solves (1+q)/(1-q)^3 = w with w = v/u by Newton's method from the safe side, in one of two
-    forms. For w < 2 it comes from the left, with h(q) = gap - q (u + v (3 - 3q + q^2)), which
-    decreases and is convex. This form cancels for large w. There y = 1-q is the root of the convex
-    w y^3 + y - 2, approached from the right.
+    u, v: the positive function at the center, and the level.
+    gap: v - u.
+
+    q solves (1+q)/(1-q)^3 = w with w = v/u. Newton's method approaches it from the safe side, in
+    one of two forms. For w < 2 it comes from the left, with h(q) = gap - q (u + v (3 - 3q + q^2)),
+    which decreases and is convex. This form cancels for large w. For these, y = 1-q is the root of
+    the convex function w y^3 + y - 2, and is approached from the right.
     """
     q = gap / (u + 3 * v)
     for _ in range(4):
@@ -115,11 +129,15 @@ def _fraction_4d_up(u: Real, v: Real, gap: Real) -> Real:
 
 
 def _fraction_4d_down(u: Real, v: Real, gap: Real) -> Real:
-    """The q at which u may first reach a level v < u in R^4, or slightly less; gap = u - v.
+    """The fraction q of the radius at which u may first reach a level v < u in R^4, or slightly
+    less.
 
-    It solves (1-q)/(1+q)^3 = v/u with h(q) = gap - q (u + v (3 + 3q + q^2)), which decreases and is
-    concave. So Newton's method ends on the right of the root. The chord from (0, gap) to this point
-    meets 0 on the left of the root, which is the safe side.
+    u, v: the positive function at the center, and the level.
+    gap: u - v.
+
+    q solves (1-q)/(1+q)^3 = v/u, and is the root of h(q) = gap - q (u + v (3 + 3q + q^2)), which
+    decreases and is concave. So Newton's method ends on the right of the root. The chord from (0,
+    gap) to this point meets 0 on the left of the root, which is the safe side.
     """
     q = fmin(gap / (u + 3 * v), 1)
     for _ in range(4):
@@ -172,8 +190,8 @@ class HarnackSlopeEnclosure(HarmonicBallEnclosure):
     """Rounds of `largest_free_fraction`."""
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """The shorter of the lengths proved for the two levels; for each level, the longest of
-        those that its conditions prove."""
+        """The shorter of the lengths proved for the level above and for the level below. For each
+        level this is the longest length that one of its conditions proves."""
         q = type(gaps.above)(1)
         for alternatives in self._conditions(gaps):
             best = type(q)(0)
@@ -183,7 +201,8 @@ class HarnackSlopeEnclosure(HarmonicBallEnclosure):
         return dr.select(self.is_valid(gaps), q * self.radius, 0)
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
-        """Whether, for each of the two levels, at least one condition proves the length free."""
+        """A mask of the lanes on which, for each of the two levels, at least one condition proves
+        the length free."""
         q = length / self.radius
         is_covered = q <= 1
         q = clamp(q, 0, 1)
@@ -198,9 +217,10 @@ class HarnackSlopeEnclosure(HarmonicBallEnclosure):
     def _conditions(
         self, gaps: LevelGaps
     ) -> tuple[list[FreeRadiusCondition], list[FreeRadiusCondition]]:
-        """The conditions for f not to reach the level above, and those for the level below.
+        """The conditions for f not to reach the level above, and the conditions for f not to reach
+        the level below, as two lists.
 
-        For each level it is enough that one of the conditions holds.
+        For each level it is enough that one of its conditions holds.
         """
         up: list[FreeRadiusCondition] = []
         down: list[FreeRadiusCondition] = []
@@ -228,12 +248,13 @@ class HarnackSlopeEnclosure(HarmonicBallEnclosure):
 
 @dataclass(frozen=True)
 class _ChordCondition:
-    """The condition that the chord's bound stays below the level away from the bounded side.
+    """The condition that the upper bound of a positive harmonic u, by the chord of Poisson's
+    kernel, stays below the level above.
 
-    It is (1+m)/2 P(q,1) + (1-m)/2 P(q,-1) <= w with w = 1 + (gap of u)/u. The left side times
-    (1-q)^K, K = n-1, is B = (1-q)^K + q A/(1+q)^K with a polynomial A. So the condition is
-    B^(1/K) <= w^(1/K) (1-q), which has no pole. This is q k(q) <= g with g = w^(1/K) - 1 and
-    k = g + 1 + (B^(1/K) - 1)/q.
+    With the symbols of `HarnackSlopeEnclosure` it is (1+m)/2 P(q,1) + (1-m)/2 P(q,-1) <= w with w =
+    1 + (gap of u)/u. The left side times (1-q)^K, K = n-1, is B = (1-q)^K + q A/(1+q)^K with a
+    polynomial A. So the condition is B^(1/K) <= w^(1/K) (1-q), which has no pole. This is q k(q) <=
+    g with g = w^(1/K) - 1 and k = g + 1 + (B^(1/K) - 1)/q.
 
     gap: g.
     mean: m, the mean of s.
@@ -279,11 +300,12 @@ class _ChordCondition:
 
 @dataclass(frozen=True)
 class _JensenCondition:
-    """The condition that Jensen's bound stays above the level towards the bounded side.
+    """The condition that the lower bound of a positive harmonic u, by Jensen's inequality, stays
+    above the level below.
 
-    It is P(q, m) >= 1 - g with g = (gap of u)/u. With D = 1+q^2-2qm this is
-    (1-g) D^(n/2) <= 1-q^2, that is, q k(q) <= g with k = (1-g) (D^(n/2) - 1 + q^2)/q + g q.
-    q k(q) is convex.
+    With the symbols of `HarnackSlopeEnclosure` it is P(q, m) >= 1 - g with g = (gap of u)/u. With D
+    = 1+q^2-2qm this is (1-g) D^(n/2) <= 1-q^2, that is, q k(q) <= g with k = (1-g) (D^(n/2) - 1 +
+    q^2)/q + g q. The product q k(q) is convex.
 
     gap: g.
     mean: m, the mean of s.
@@ -371,7 +393,11 @@ class SphericalCapEnclosure(HarmonicBallEnclosure):
         return (length <= 0) | (is_inside & is_free_fraction(up, q) & is_free_fraction(down, q))
 
     def _conditions(self, gaps: LevelGaps) -> tuple[_CapCondition, _CapCondition]:
-        """The condition for f not to reach the level above, and that for the level below."""
+        """Two conditions on a length of the path: for f not to reach the level above on it, and for
+        f not to reach the level below.
+
+        gaps: the differences of value to these levels.
+        """
         fall, rise = self.max_fall, self.max_rise
         assert fall is not None
         assert rise is not None
@@ -387,7 +413,8 @@ class SphericalCapEnclosure(HarmonicBallEnclosure):
 
 def _two_caps(gap: Real, max_rise: Real, p: Real, rest: Real, mu: Real) -> _CapCondition:
     # Without a range f is constant: no level is ever reached.
-    """The condition for f not to reach the level above.
+    """The condition for f not to reach the level above, with the symbols of
+    `SphericalCapEnclosure`.
 
     gap: the difference in value to that level.
     max_rise: C - f at the center.
@@ -404,7 +431,8 @@ def _two_caps(gap: Real, max_rise: Real, p: Real, rest: Real, mu: Real) -> _CapC
 
 @dataclass(frozen=True)
 class _CapCondition:
-    """The condition (1-g) S(q) <= 1-q^2 with S = s1 s2 (s1+s2)/2: see `SphericalCapEnclosure`.
+    """The condition (1-g) S(q) <= 1-q^2 with S = s1 s2 (s1+s2)/2, on a fraction q of the radius,
+    for f not to reach the level above. The symbols are those of `SphericalCapEnclosure`.
 
     That is q k(q) <= g with k = (1-g) (S - 1 + q^2)/q + g q.
 

@@ -1,9 +1,9 @@
 """Enclosures of the literature for fields that are formulas, for comparison with
 `PiecewiseTaylorEnclosure`.
 
-Parabolas come from the bottom-up arithmetic of `harnack.arithmetic.ParabolaBounds`, bands from
-affine forms and from intervals. All of them prove steps. Benchmarks measure how many steps a ray
-takes.
+Enclosures by parabolas come from the bottom-up arithmetic of `harnack.arithmetic.ParabolaBounds`;
+enclosures by bands, between two lines, come from affine forms and from intervals. All of them prove
+steps. Benchmarks measure how many steps a ray takes with each.
 """
 
 from __future__ import annotations
@@ -55,7 +55,8 @@ class BottomUpQuadraticEnclosure(ParabolaEnclosure):
         return cls(SlopeRange(a, c), 2 * b, 2 * d, length)
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """The whole length if it is proved free; otherwise that of `ParabolaEnclosure`.
+        """The whole length of the path's piece if it is proved free of both levels; otherwise the
+        length that `ParabolaEnclosure` proves.
 
         The whole length is not shortened for rounding: else a ray that misses would need one more
         sample.
@@ -80,10 +81,10 @@ class BottomUpLinearEnclosure(BottomUpQuadraticEnclosure):
 
 @dataclass(frozen=True)
 class LongestOfEnclosure(Enclosure):
-    """The longest of the steps that several enclosures of the same function prove.
+    """Several enclosures of the same function; the longest of the steps that they prove is taken.
 
-    Source: Aydinlilar and Zanni 2023, section 4 ("mixed"). Bounds of derivatives are used if they
-    are tight, bottom-up arithmetic if they are not.
+    Source: Aydinlilar and Zanni 2023, section 4 ("mixed"). There, bounds of derivatives are used if
+    they are tight, and bottom-up arithmetic if they are not.
     """
 
     enclosures: tuple[Enclosure, ...]
@@ -114,8 +115,9 @@ class BandEnclosure(Enclosure):
 
         offsets.lower + slopes.lower s <= F(s) <= offsets.upper + slopes.upper s.
 
-    Proof of the step: F cannot reach a level before the line on that side does. A band is not exact
-    at s = 0. If its offset exceeds the gap it proves nothing, and the march tries a third of the
+    Proof of the step: F cannot reach the level above before the upper line does, nor the level
+    below before the lower line does. At s = 0 the lines differ, although F(0) = 0. If a line's
+    offset exceeds the gap to its level, nothing is proved, and the march tries a third of the
     length.
     """
 
@@ -129,8 +131,8 @@ class BandEnclosure(Enclosure):
         return fmax(fmin(up, down), 0)
 
     def _length_below(self, gap: Real, offset: Real, slope: Real) -> Real:
-        """The length on which the upper line, offset + slope s, stays below the gap; 0 if nothing
-        is proved."""
+        """The length on which the line offset + slope s stays below the gap; 0 if nothing is
+        proved."""
         no_level = gap == dr.inf
         remaining = gap - offset
         reach = dr.select(slope > 0, remaining / slope * STEP_SAFETY, self.reach)
@@ -163,8 +165,8 @@ class AffineEnclosure(BandEnclosure):
 
 
 class IntervalEnclosure(BandEnclosure):
-    """The range of interval arithmetic on the whole length: either all of it is proved free, or
-    nothing is.
+    """The range of interval arithmetic on the whole length: either the whole length is proved free
+    of levels, or nothing is.
 
     Source: Mitchell 1990.
     """
@@ -189,7 +191,7 @@ def _parabolas(function: EvaluableRestriction, length: Real, degree: int) -> Par
 
 
 def _value(function: EvaluableRestriction) -> Interval:
-    """The range of f at the start of the path."""
+    """The range of f at the start of the path, from the formula evaluated with intervals."""
 
     def at_start(p: Vec3, direction: Vec3) -> tuple[Jet, Jet, Jet]:
         """The coordinates of the start of the path."""

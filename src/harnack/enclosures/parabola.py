@@ -118,6 +118,8 @@ def first_reach(gap: Real, slope: Real, curvature: Real) -> Real:
     """The first s > 0 at which slope s + curvature s^2/2 reaches the gap; infinite if there is
     none.
 
+    gap: the difference in value to a level, >= 0; infinite if there is no level on this side.
+
     It is computed in a form whose squares neither overflow nor underflow: near a zero of high
     order, slope, curvature and gap are all far below the square root of the smallest number.
     """
@@ -135,7 +137,7 @@ def first_reach(gap: Real, slope: Real, curvature: Real) -> Real:
 
 
 def _stays_below(gap: Real, slope: Real, curvature: Real, length: Real) -> Mask:
-    """Whether slope s + curvature s^2/2 <= gap for 0 <= s <= length.
+    """A mask of the lanes on which slope s + curvature s^2/2 <= gap for 0 <= s <= length.
 
     The largest value is at an end of the length or, if the parabola rises and then falls, at its
     vertex.
@@ -147,16 +149,19 @@ def _stays_below(gap: Real, slope: Real, curvature: Real, length: Real) -> Mask:
 
 
 def _max_turning_slope(gap: Real, curvature: Real) -> Real:
-    """sqrt(2 |curvature| gap). If curvature < 0, a parabola with a smaller slope falls again before
-    it reaches the gap."""
+    """sqrt(2 |curvature| gap): the slope at the start of a parabola slope s - |curvature| s^2/2
+    whose largest value is the gap. With a smaller slope it turns back before it reaches the gap."""
     return dr.sqrt(dr.abs(curvature)) * (_ROOT_OF_TWO * dr.sqrt(gap))
 
 
 def _rounded_down_where(turns: Mask, gap: Real) -> Real:
-    """The gap, smaller by eight roundings on lanes where `turns` is set.
+    """The gap, smaller by eight roundings on the lanes of the mask `turns`, and unchanged on all
+    others.
 
-    These are lanes where a parabola bends away from the level. If its vertex is close to the level,
-    rounding would decide whether a^2 + 2 c g is negative.
+    turns: the lanes on which the parabola slope s + curvature s^2/2 bends away from the level, so
+        that it may turn back before it. If its vertex is close to the level, rounding would decide
+        whether the discriminant slope^2 + 2 curvature gap is negative, that is, whether the
+        parabola reaches the level.
     """
     return dr.select(turns, gap * (1 - 8 * float(dr.epsilon(type(gap)))), gap)
 
@@ -167,8 +172,8 @@ class ConvexityEnclosure(Enclosure):
 
     Proof. A convex function lies above its tangents. So f does not fall to a level at a gap g below
     before s = g/|slope|, and never if it rises at the start. Nothing is proved about levels above.
-    f itself must be convex. A convex solid, with f a bound of its distance, is not enough (Hart
-    1996, equation 21: 1 - e^-d is not convex). The lower end increases with the slope.
+    f itself must be convex. That a solid is convex, with f a bound of the distance from it, is not
+    enough (Hart 1996, equation 21: 1 - e^-d is not convex). The lower end increases with the slope.
     """
 
     slopes: SlopeRange
@@ -223,23 +228,26 @@ class SphereArcEnclosure(Enclosure):
     squared_radius: Real
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """The length that the angle of the proof becomes on the line; infinite if no level is met.
+        """The length of the line that is proved free of both levels; infinite if no level is ever
+        met.
 
-        Symbols: total is S = c^2 + t^2, rate is dt/da, half is psi/2.
+        The symbols are those of the proof of the class: `square_sum` is S = c^2 + t^2,
+        `length_per_angle` is dt/da = S/(2c) at the start, and `half_angle` is half the smallest
+        angle psi at which f may reach a level. The result is the length s that belongs to psi.
         """
         c = dr.sqrt(self.squared_radius)
-        total = dr.fma(self.offset, self.offset, self.squared_radius)
-        rate = 0.5 * total / c
-        up = first_reach(gaps.above, self.slopes.upper * rate, self.curvature)
-        down = first_reach(gaps.below, -self.slopes.lower * rate, self.curvature)
-        half = 0.5 * _ARC_SAFETY * fmin(up, down)
-        is_valid = (up >= 0) & (down >= 0) & (self.curvature >= 0)  # and not NaN
-        is_valid &= dr.isfinite(total)  # its square does not overflow
-        is_full_turn = half >= _PI_BELOW  # once around the circle
-        sin, cos = sincos(dr.select(is_full_turn, 0, half))
+        square_sum = dr.fma(self.offset, self.offset, self.squared_radius)
+        length_per_angle = 0.5 * square_sum / c
+        angle_above = first_reach(gaps.above, self.slopes.upper * length_per_angle, self.curvature)
+        angle_below = first_reach(gaps.below, -self.slopes.lower * length_per_angle, self.curvature)
+        half_angle = 0.5 * _ARC_SAFETY * fmin(angle_above, angle_below)
+        is_valid = (angle_above >= 0) & (angle_below >= 0) & (self.curvature >= 0)  # and not NaN
+        is_valid &= dr.isfinite(square_sum)  # its square does not overflow
+        is_full_turn = half_angle >= _PI_BELOW  # once around the circle
+        sin, cos = sincos(dr.select(is_full_turn, 0, half_angle))
         divisor = dr.fma(c, cos, -self.offset * sin)
         length = dr.select(
-            (divisor > 0) & ~is_full_turn, total * sin / divisor * _ARC_SAFETY, dr.inf
+            (divisor > 0) & ~is_full_turn, square_sum * sin / divisor * _ARC_SAFETY, dr.inf
         )
         return dr.select(is_valid, fmax(length, 0), 0)
 

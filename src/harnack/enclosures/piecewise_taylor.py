@@ -1,4 +1,4 @@
-"""Enclosures from ranges of the first two derivatives on pieces of the path."""
+"""Enclosures of f along a path from ranges of its first two derivatives on pieces of the path."""
 
 from __future__ import annotations
 
@@ -64,6 +64,8 @@ class PiecewiseTaylorEnclosure(Enclosure):
         return max(2.0, float(len(self.pieces)))
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """The shorter of the lengths on which F does not reach the level above and the level
+        below."""
         if gaps.is_one_sided:
             rises = gaps.below == dr.inf
             reach, is_free = self._free_on_pieces(fmin(gaps.above, gaps.below), rises)
@@ -89,18 +91,18 @@ class PiecewiseTaylorEnclosure(Enclosure):
         return falls | (first.slope_range.lower * reach >= gaps.above)
 
     def _free_on_pieces(self, gap: Real, rises: Mask | bool) -> tuple[Real, Mask]:
-        """The length on which F does not reach a level on one side, and whether it is that of all
-        pieces.
+        """The length on which F does not reach the level above, or the level below.
 
-        gap: the difference in value to the level.
-        rises: whether the level is above. Otherwise -F is bounded in place of F.
+        gap: the difference in value to that level.
+        rises: True for the level above. Otherwise -F is bounded in place of F.
 
         Returns the first s at which the bound of F reaches the gap, or the length of all pieces if
         there is no such s; and a mask of the lanes on which there is none.
         """
 
         def one_sided(upper: Real, lower: Real) -> Real:
-            """The upper end for F, minus the lower end for -F."""
+            """The largest value for F (`upper`) or, if the level is below, the largest value for -F
+            (-`lower`)."""
             return dr.select(rises, upper, -lower)
 
         slope = one_sided(self.slopes.upper, self.slopes.lower)

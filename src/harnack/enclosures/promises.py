@@ -1,12 +1,13 @@
-"""Promises: what a field guarantees near a point, in every direction.
+"""Promises: proved bounds of a field's function f near a point, in every direction.
 
 A promise is stated in the field's own units and must be *true*: every step that the tracer takes
-relies on it. Enclosures are derived from promises, once the slope along a direction is known.
+relies on it. Enclosures (bounds of f along a path) are derived from promises, once the slope along
+the path is known.
 
-This module alone derives promises of other functions from a promise of f. If f is scaled, shifted,
-negated or stretched in space, the new promise follows from the units of the old promise's numbers.
-A new kind of promise defines these units, the bounds of f that it implies (`movement_bounds`), and
-further consequences.
+Only this module derives, from a promise about f, promises about other functions. If f is scaled,
+shifted, negated or stretched in space, the new promise follows from the units of the old promise's
+numbers. A new kind of promise defines these units, the bounds of f that it implies
+(`movement_bounds`), and further consequences.
 """
 
 from __future__ import annotations
@@ -88,7 +89,10 @@ class Promise(abc.ABC):
         return dr.inf
 
     def implied_lipschitz(self, value: Real) -> Lipschitz | None:
-        """A Lipschitz promise that follows from this one; None if none does. value: f(p)."""
+        """A Lipschitz promise that follows from this promise; None if none does.
+
+        value: f(p).
+        """
         del value
         return None
 
@@ -104,12 +108,12 @@ class Promise(abc.ABC):
         del value
 
     def weakened_for_linear_maps(self, value: Real) -> Promise:
-        """A weaker promise, of a kind that is preserved by every linear map A of space.
+        """A weaker promise, of a kind that every linear map A of space preserves.
 
-        If f makes a promise of such a kind, f(A x) makes it with other numbers (`linearly_mapped`).
-        Harmonic functions and bounds of the Laplacian are preserved by similarities only. So
-        HarmonicBall returns a TaylorRemainder, and BoundedLaplacian a Lipschitz promise. Other
-        kinds return themselves.
+        If f makes a promise of such a kind, then x -> f(A x) makes a promise of the same kind with
+        other numbers (`linearly_mapped`). Harmonic functions and bounds of the Laplacian are
+        preserved by similarities only. So HarmonicBall returns a TaylorRemainder, and
+        BoundedLaplacian a Lipschitz promise. All other kinds return themselves.
 
         value: f(p).
         """
@@ -173,8 +177,8 @@ class Promise(abc.ABC):
         return dataclasses.replace(self, **numbers)
 
     def select(self, mask: Mask, other: Self) -> Self:
-        """The other promise, which is of the same kind, on lanes where the mask is set; this one
-        elsewhere."""
+        """The promise `other`, which is of the same kind, on the lanes of the mask; this promise on
+        all other lanes."""
         numbers: dict[str, Any] = {}
         for name, *_ in self.units:
             new, old = getattr(other, name), getattr(self, name)
@@ -190,12 +194,13 @@ def _power(number: Real, exponent: int) -> Real:
 
 @dataclass(frozen=True)
 class HarmonicBall(Promise):
-    """f extends to a harmonic function on the ball B(p, radius) of R^dimension that stays in range.
+    """f extends to a harmonic function on the ball B(p, radius) of R^dimension, with bounded
+    values.
 
-    If f has a period, this is about its continuous branch that agrees with `Sample.value` at p.
+    If f has a period, the promise is about the continuous function that equals `Sample.value` at p
+    and f elsewhere up to multiples of the period.
 
-    lower, upper: bounds of the harmonic function on the open ball. Either may be infinite, not
-        both.
+    lower, upper: bounds of the harmonic function on the open ball. One of them may be infinite.
     dimension: 2 for a function of the plane, extended constantly along z; 3 for a function of
         space; 4 if f is a slice of a function of R^4.
     """
@@ -213,16 +218,20 @@ class HarmonicBall(Promise):
         return self.lower - value, self.upper - value
 
     def taylor_remainder_bound(self, value: Real, length: Real, degree: int = 1) -> Real:
-        """A bound of the error of Taylor's formula: see `Promise`.
+        """A bound of |f(y) - T(y)| for |y - p| <= length, where T is the Taylor polynomial of f
+        about p.
+
+        value: f(p).
+        degree: the degree of T, 1 or 2.
 
         Proof for a harmonic f >= c on a ball of radius R in n dimensions. f - c is the integral of
         Poisson's kernel P(q, s), q = length/R, with a measure of mass f(p) - c. P is the sum over l
-        of the zonal harmonics, which are all largest at s = 1. Those of degree 0 and 1 are the
-        value and the gradient. The rest of P is at most P - 1 - n q at s = 1, in absolute value,
-        where P = (1 + q)/(1 - q)^(n - 1). So the error is at most this number times f(p) - c. The
-        same holds for C - f with f <= C, and the smaller of the two bounds is returned. For degree
-        2, the harmonic of degree 2 is left out, too: at s = 1 it is 2, 5 and 9 times q^2 for n = 2,
-        3 and 4.
+        of the zonal harmonics, which are all largest at s = 1. Those of degree 0 and 1 give the
+        value and the gradient. The sum of all others is at most P - 1 - n q at s = 1, in absolute
+        value, where P = (1 + q)/(1 - q)^(n - 1). So the error is at most this number times f(p) -
+        c. The same holds for C - f with f <= C, and the smaller of the two bounds is returned. For
+        degree 2, the harmonic of degree 2 is left out, too: at s = 1 it is 2, 5 and 9 times q^2 for
+        n = 2, 3 and 4.
         """
         mass = fmin(value - self.lower, self.upper - value)
         q = length / self.radius
@@ -271,11 +280,12 @@ class HarmonicBall(Promise):
         )
 
     def implied_second_derivative_bound(self, value: Real) -> tuple[Real, Real] | None:
-        """A bound of |f_vv| on half the ball; None if f is not bounded on both sides.
+        """A bound of |f_vv| for all unit vectors v on half the ball, and the radius R/2 of that
+        half; None if f is not bounded on both sides.
 
-        As for `weakened_for_linear_maps`, at the centers of balls of radius R/2. In R^4, where f_vv
-        is R^-2 times the mean of 6 (4 s^2 - 1) f, the mean of the positive part of this kernel is 9
-        sqrt(3)/(2 pi) = 2.48, which is half the mean of its absolute value.
+        Proof: that of `weakened_for_linear_maps`, at the centers of balls of radius R/2. In R^4,
+        where f_vv is R^-2 times the mean of 6 (4 s^2 - 1) f, the mean of the positive part of this
+        kernel is 9 sqrt(3)/(2 pi) = 2.48, which is half the mean of its absolute value.
         """
         if _is_infinite(self.lower) or _is_infinite(self.upper):
             return None
@@ -284,7 +294,8 @@ class HarmonicBall(Promise):
         return 1.0001 * constant * self._span(value) / (half * half), half
 
     def _span(self, value: Real) -> Real:
-        """upper - lower, as the sum of the distances of both from the value f(p)."""
+        """upper - lower, the length of the range of f on the ball, computed as (upper - value) +
+        (value - lower). With value = f(p) between the two, both terms are at least 0."""
         return (self.upper - value) + (value - self.lower)
 
 
@@ -389,8 +400,8 @@ class TaylorRemainder(Promise):
         return slopes.lower * length - curved, slopes.upper * length + curved
 
     def implied_second_derivative_bound(self, value: Real) -> tuple[Real, Real] | None:
-        """The constant, if the promise has no radius: then it holds at every point. Otherwise
-        None."""
+        """The constant, which bounds |f_vv| for all unit vectors v, and the infinite radius, if the
+        promise has no radius: then it holds at every point. Otherwise None."""
         del value
         return (self.constant, self.radius) if _is_infinite(self.radius) else None
 

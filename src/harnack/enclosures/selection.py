@@ -70,12 +70,13 @@ _NAMES_USING_RANGES = [
 
 @dataclass(frozen=True)
 class EnclosureKinds:
-    """Ordered classes of enclosures. For each promise the first class that can use it is chosen.
+    """Classes of enclosures in an order. For each promise the first class that can use it is
+    chosen.
 
-    kinds: the classes from the sharpest to the weakest. A later class would only prove less from
-        the same promise.
-    uses_alternative_promises: whether to use promises that the field declares weaker than its
-        others (`Sample.alternative_promises`).
+    kinds: the classes, the sharpest first. A later class would only prove less from the same
+        promise.
+    uses_alternative_promises: whether to use also the promises that the field declares weaker than
+        its other promises (`Sample.alternative_promises`).
     """
 
     kinds: tuple[type[Enclosure], ...]
@@ -87,10 +88,10 @@ class EnclosureKinds:
         """The enclosure of a function from ranges of its derivatives along the path, as a tuple of
         one.
 
-        It is that of the first class that uses ranges; the tuple is empty if no class does.
+        It is made by the first class that uses such ranges; the tuple is empty if no class does.
 
         slopes: the range of the derivative at the start of the path.
-        length: the reach that is asked for.
+        length: the length of the path on which the enclosure is wanted.
         """
         for kind in self.kinds:
             enclosure = kind.from_restriction(function, slopes, length)
@@ -109,11 +110,13 @@ class EnclosureKinds:
     ) -> tuple[Enclosure, ...]:
         """The enclosures of f along a direction, one for each promise that a class can use.
 
-        promises, alternative_promises, value, error, ray_promises: as in `Sample`.
+        promises, alternative_promises, ray_promises: proved bounds of f near the point, as in
+            `Sample`.
+        value, error: f at the point, and a bound of its error.
         slopes: the range of the derivative of f along the direction.
 
         Raises:
-            ValueError: no class of enclosures applies to a promise.
+            ValueError: no class of enclosures can use any of the promises.
         """
         promises = promises + alternative_promises if self.uses_alternative_promises else promises
         enclosures = [
@@ -138,8 +141,11 @@ class EnclosureKinds:
     def _nothing_applies_message(
         self, promises: tuple[Promise, ...], value: Real, error: Real, slopes: SlopeRange
     ) -> str:
-        """The message for promises that no class can use, with the names of enclosures that
-        could."""
+        """The text of the error that none of these classes of enclosures can use the field's
+        promises. It names the choices of the option `enclosures` that can use them.
+
+        promises, value, error, slopes: as for `from_promises`.
+        """
         requested = ", ".join(kind.__name__ for kind in self.kinds)
         if not promises:
             kinds = ", ".join(kind.__name__ for kind in Promise.__subclasses__())

@@ -38,10 +38,11 @@ def evaluate_points(
     kernel: Callable[[Backend, Vec3], tuple[Any, ...]],
     precision: Precision | None,
 ) -> tuple[npt.NDArray[Any], ...]:
-    """The arrays that `kernel` returns for points (n, 3), in the order of the points; for a single
-    point (3,), without the first axis.
+    """The results of `kernel` at points (n, 3), as NumPy arrays in the order of the points; for a
+    single point (3,), without the first axis.
 
-    kernel: takes a backend and a Dr.Jit 3-vector of points, and returns Dr.Jit arrays.
+    kernel: a function that takes a backend and a Dr.Jit 3-vector of points, and returns a tuple of
+        Dr.Jit arrays.
     precision: "single" or "double"; None for double if the points are an array of float64, else
         single.
 
@@ -54,7 +55,8 @@ def evaluate_points(
     backend = choose_backend(precision or precision_of_input(points))
 
     def visit(x: Vec3) -> tuple[Any, ...]:
-        """The results of `kernel` at points x, which it gets in the order of a Morton curve."""
+        """The results of `kernel` at the Dr.Jit points x, in the order of x; the kernel is given
+        the points in the order of a Morton curve."""
         order = morton_order(backend, x)
         results = kernel(backend, dr.gather(backend.Array3f, x, order))
         return tuple(_restore_order(array, order, dr.width(x)) for array in results)
@@ -73,7 +75,8 @@ def accepts_numpy_points(hessian: Callable[[Any, Vec3], Any]) -> Callable[..., A
     @accepts_dask_arrays("p")
     @functools.wraps(hessian)
     def general(self: Any, p: Any, *, precision: Precision | None = None) -> Any:
-        """See `Field.hessian`."""
+        """The second derivatives at p (`Field.hessian`): for a Dr.Jit 3-vector the rows of the
+        matrix, for NumPy points NumPy matrices."""
         if dr.is_array_v(type(p)):
             check_no_derivatives(f"the Hessian of {type(self).__name__}", p, self.parameters())
             return hessian(self, p)
@@ -94,8 +97,12 @@ def map_batches(
     *others: npt.NDArray[Any],
     at_once: int = _BATCH_SIZE,
 ) -> tuple[npt.NDArray[Any], ...]:
-    """The results of `compute` for points (n, 3), as arrays (n,) or (n, 3) in its precision.
+    """The results of `compute` for points (n, 3), as NumPy arrays (n,) or (n, 3), computed batch by
+    batch.
 
+    backend: tells the precision of the arrays.
+    compute: a function that takes the Dr.Jit points of a batch and its rows of `others`, and
+        returns a tuple of Dr.Jit arrays and vectors.
     points: an array-like, or a Dr.Jit 3-vector.
     others: further arguments of `compute`, vectors (n, 3) of any values, one row for each point.
     at_once: the number of points of a batch.
@@ -127,7 +134,7 @@ def map_batches(
 
 
 def _slice_vectors(backend: Backend, vectors: Any, start: int, lanes: int) -> Vec3:
-    """Vectors number `start` to `start + lanes`, the last excluded, as a Dr.Jit vector.
+    """The `lanes` vectors that begin with the vector number `start`, as a Dr.Jit vector.
 
     vectors: a Dr.Jit vector, or an array (n, 3).
     """
@@ -137,15 +144,16 @@ def _slice_vectors(backend: Backend, vectors: Any, start: int, lanes: int) -> Ve
 
 
 def _repeat_single_row(values: npt.NDArray[Any], n: int) -> npt.NDArray[Any]:
-    """The values as an array of n rows: a single row, of a result that is the same for all points,
-    is repeated."""
+    """The values as an array of n rows. A single row is repeated: it is a result that is the same
+    for all points."""
     return values if len(values) == n else np.repeat(values, n, axis=0)
 
 
 def _restore_order(values: Any, order: Any, n: int) -> Any:
-    """Values of points in the original order of the points.
+    """Values of points, put back into the original order of the points.
 
-    values: in visiting order, as a Dr.Jit array, or vectors and matrices of such arrays.
+    values: a Dr.Jit array, or a vector or matrix of such arrays, in the order in which the points
+        were visited.
     order: the original index of each visited point.
     n: the number of points.
     """
@@ -158,8 +166,8 @@ def _restore_order(values: Any, order: Any, n: int) -> Any:
 
 
 def morton_order(backend: Backend, x: Vec3, bits: int = _BITS_PER_AXIS) -> Any:
-    """The order in which to visit points x cell by cell, with the cells along a Morton curve: their
-    indices, as Dr.Jit UInt32.
+    """The order in which points x are visited cell by cell, with the cells along a Morton curve, as
+    the indices of the points (a Dr.Jit UInt32).
 
     bits: there are 2^bits cells along an axis, and bits is at most 10.
     """

@@ -37,8 +37,8 @@ _MOMENT_ROUNDING = 32 * 2.0**-53
 
 @dataclass(frozen=True)
 class SymmetricMatrix:
-    """A sum of symmetric matrices, one in each lane, for the state of a loop. xx, xy, ... are the
-    entries of the sum so far."""
+    """A symmetric 3 x 3 matrix in each lane, for the state of a loop that adds up such matrices.
+    xx, xy, ... are its entries."""
 
     xx: Real
     yy: Real
@@ -68,13 +68,14 @@ class SymmetricMatrix:
         )
 
     def components(self) -> tuple[Real, ...]:
-        """The entries in the order of the constructor, for the state of a loop."""
+        """The entries xx, xy, ... in the order of the constructor, as a tuple for the state of a
+        loop."""
         return self.xx, self.yy, self.zz, self.xy, self.xz, self.yz
 
     def rows(self, vector: Any) -> tuple[Vec3, Vec3, Vec3]:
-        """The three rows.
+        """The three rows of the matrix.
 
-        vector: the type of a row.
+        vector: the type of a row, a Dr.Jit 3-vector.
         """
         return (
             vector(self.xx, self.xy, self.xz),
@@ -103,11 +104,12 @@ class PointValues:
     hessian_error: Real = 0.0
 
     def with_far_field_errors(self, x: Vec3, terms: int, weight: float) -> PointValues:
-        """The same values, with error bounds that hold at points far away too.
+        """The same values, with error bounds that also hold at points far away from the field's
+        data.
 
         x: the points, in coordinates in which the field's data have a size of about 1.
         terms: the number of terms that were summed.
-        weight: of all dipoles together.
+        weight: the weight of all dipoles together.
 
         Two errors matter only far away. First, a term of a derivative is the product of a factor
         that falls like |x|^-5 and one that grows like |x|^2, and the first may underflow. Second,
@@ -151,8 +153,8 @@ class BatchedField(Field):
         """Values and derivatives at points x, a Dr.Jit 3-vector of any backend and precision.
 
         derivatives: 0 for values only, 1 for gradients too, 2 for Hessians too.
-        closer: a factor, at least 1. Clusters of far terms are approximated only beyond this
-            multiple of the usual distance; with infinity nothing is approximated.
+        closer: a factor, at least 1, by which a cluster of far terms must be farther away than
+            usual to be approximated; with infinity nothing is approximated.
 
         It is not called while a loop is being recorded, unless `derivatives` is 2.
         """
@@ -205,8 +207,8 @@ class BatchedField(Field):
         self, points: Any, *, precision: Precision | None = None
     ) -> tuple[FloatArray, FloatArray]:
         """Values (n,) and gradients (n, 3) at points (n, 3), by a single pass over a tree. The
-        errors of the gradients may be large, so that they are for estimates, and for points at
-        which f is steep."""
+        errors of the gradients may be large. So they serve for estimates, and at points at which f
+        is steep."""
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
             """The values and gradients at the Dr.Jit points x."""
@@ -236,7 +238,9 @@ class BatchedField(Field):
     def gradient_error_bound(
         self, points: Any, *, precision: Precision | None = None
     ) -> FloatArray:
-        """Bounds (n,) of the error of `gradient`, as a length, at points (n, 3): see `error_bound`.
+        """Bounds (n,) of the error of `gradient`, as a length, at points (n, 3). They include the
+        proved truncation error and the rounding error, but not the rounding of the points
+        themselves.
 
         For a sum over a tree the bound is about a hundred times the error itself, because the
         accuracy of the sum is chosen by estimates (`sharpened`).
@@ -245,8 +249,9 @@ class BatchedField(Field):
 
     @accepts_dask_arrays("points")
     def hessian_error_bound(self, points: Any, *, precision: Precision | None = None) -> FloatArray:
-        """Bounds (n,) of the error of `hessian`, in the spectral norm, at points (n, 3): see
-        `error_bound`."""
+        """Bounds (n,) of the error of `hessian`, in the spectral norm, at points (n, 3). They
+        include the proved truncation error and the rounding error, but not the rounding of the
+        points themselves."""
         return self._choose_at_points(points, precision, 2, lambda at: (at.hessian_error,))[0]
 
     def _choose_at_points(
@@ -256,11 +261,13 @@ class BatchedField(Field):
         derivatives: int,
         choose: Callable[[PointValues], tuple[Any, ...]],
     ) -> tuple[FloatArray, ...]:
-        """The arrays that `choose` takes from the `PointValues` at points, in the order of the
+        """Results of the field at points (n, 3) or (3,), as NumPy arrays in the order of the
         points.
 
-        precision: as for `value`.
+        precision: "single", "double", or None for that of the points.
         derivatives: the order up to which derivatives are computed, 0 to 2.
+        choose: a function that takes the `PointValues` of a batch and returns the wanted Dr.Jit
+            arrays.
         """
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
@@ -273,11 +280,12 @@ class BatchedField(Field):
 
 
 class SumAtDetail(EvaluateOnly):
-    """A sum over sources at one accuracy scale (`VariableAccuracy.at_accuracy`), with second
-    derivatives.
+    """A sum over sources at one accuracy scale (the parameter of `VariableAccuracy.at_accuracy`),
+    with second derivatives.
 
-    evaluate: returns the sample at a point.
-    values: returns the `PointValues` there, with the Hessian, at that accuracy scale.
+    evaluate: a function that returns the sample at a point.
+    values: a function that returns the `PointValues` at a point, with the Hessian, at the same
+        accuracy scale.
     """
 
     def __init__(
@@ -304,16 +312,17 @@ _ACCEPTED_ERROR = 0.01
 
 
 def sharpened(at: Callable[[Vec3, Real], PointValues], x: Vec3) -> PointValues:
-    """Values and gradients at points x by a sum over a tree. The error of a gradient is about 1 %
-    of its length.
+    """Values and gradients at points x by a sum over a tree, summed so accurately that the error of
+    a gradient is about 1 % of its length.
 
-    at: takes points and a factor, and returns values and gradients there. Clusters are taken as one
-        source only beyond this multiple of the usual distance.
+    at: a function that takes points and a factor, and returns values and gradients there. A cluster
+        counts as one source only beyond this multiple of the usual distance. The values are those
+        for the factor 1; for the gradients the factor is raised where needed.
 
     Far terms may nearly cancel, as the triangles of a mesh with small holes do. Then the gradient
     is far smaller than the truncation errors of its clusters. Proved bounds of these errors add up
     absolute values, and would demand that all terms are summed nearly everywhere. So the observed
-    change of the gradient, from one distance to the next, decides whether to refine it. The error
+    change of the gradient, from one factor to the next, decides whether to refine it. The error
     bounds that are returned stay proved.
     """
     real = cast("Any", type(x.x))
@@ -343,10 +352,10 @@ def sharpened(at: Callable[[Vec3, Real], PointValues], x: Vec3) -> PointValues:
 
 
 def _required_hessian(values: PointValues) -> SymmetricMatrix:
-    """The Hessian of values that include it.
+    """The Hessian of `PointValues` that were computed with second derivatives.
 
     Raises:
-        RuntimeError: they do not.
+        RuntimeError: they were computed without second derivatives.
     """
     if values.hessian is None:
         raise RuntimeError("values_at(x, 2) gave no Hessian")
@@ -358,8 +367,8 @@ Value = TypeVar("Value")
 
 
 class FieldCache(Generic[Value]):
-    """A cache that keeps one value per field: the value for the last key. It is dropped with the
-    field.
+    """A cache that keeps one value per field: the value for the last key. The value is dropped when
+    the field is deleted.
 
     A value must not refer to its field, or neither of them would ever be deleted.
     """
@@ -369,8 +378,8 @@ class FieldCache(Generic[Value]):
         self._kept: dict[int, tuple[Any, dict[str, Any], Value]] = {}
 
     def get(self, field: Field, key: Any, make: Callable[[], Value]) -> Value:
-        """The cached value of a field, if it belongs to this key and no attribute of the field was
-        set since it was computed. Otherwise make(), which is then cached."""
+        """The cached value of a field, if it was computed for this key and no attribute of the
+        field was set since then. Otherwise the result of make(), which is then cached."""
         if id(field) in self._kept:
             kept_key, attributes, value = self._kept[id(field)]
             now = vars(field)

@@ -135,22 +135,22 @@ class JumpSurface:
     """Whether this field takes its levels at its facets only: see `is_of_sheets_alone`."""
 
     def without_jumps(self) -> Field | None:
-        """A field without jumps for distances; None if none is known. Its level sets contain all
-        points of this field's level sets that lie on no facet."""
+        """A field without jumps, whose level sets contain all points of this field's level sets
+        that lie on no facet; None if none is known. Distances use it."""
         return None
 
     def evaluate_modulo_one(self, p: Vec3) -> Sample:
         """A sample at p whose value is f minus an integer. The integer is not known and may differ
-        from point to point, which takes less work than `evaluate`. It is used only for fields with
-        `has_unknown_branch`. The default is `evaluate`."""
+        from point to point, so that the sample may take less work than `evaluate`. It is used only
+        for fields with `has_unknown_branch`. The default is `evaluate`."""
         return cast("Field", self).evaluate(p)
 
     def value_if_cheap(self, p: Vec3, rounding: Real, active: Mask) -> Real:
-        """f at p on active lanes, if it takes less work there than `evaluate`. NaN on all other
+        """f at p on active lanes, if it takes less work there than `evaluate`; NaN on all other
         lanes, and where p may lie on a facet. It is used only for fields with `has_unknown_branch`.
         The default is NaN everywhere.
 
-        rounding: of the coordinates of p, and of the ray on which p lies.
+        rounding: a bound of the rounding of the coordinates of p, and of the ray on which p lies.
         """
         del rounding, active
         return 0 * p.x + math.nan
@@ -256,7 +256,8 @@ class PatchUnion:
     def next_patch(
         self, o: Vec3, d: Vec3, after: PatchEntry, start: Real, end: Real, active: Mask
     ) -> PatchEntry:
-        """The first entry of a ray into a box after the entry `after`, for start <= t <= end.
+        """The first entry of a ray into a box after the entry `after`, with start <= t <= end. Each
+        box is proved to contain one patch.
 
         A ray that begins in a box enters it at `start`. Entries are ordered by (enter, patch).
         Repeated calls, the first of them with an entry before `start`, must give every box that the

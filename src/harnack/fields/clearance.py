@@ -47,8 +47,8 @@ _PROOFS = choose_enclosures("curvature")
 def clearance_function(
     field: Field, levels: tuple[float, ...], precision: Precision = "double"
 ) -> Clearance:
-    """A function that takes points (n, 3) and returns their clearances (n,):
-    `level_distance_lower_bound` of the nearest of the levels."""
+    """A function that takes points (n, 3) and returns their clearances (n,): proved lower bounds of
+    the distance to the nearest of the levels' surfaces (`level_distance_lower_bound`)."""
     backend = choose_backend(precision)
     prepared = field.prepare(backend)
     # Kernel parameters, so that other levels compile nothing.
@@ -77,10 +77,12 @@ def tight_extent(
     """A convex polytope of few planes that contains every point of the level sets inside a box.
 
     The box is cut into cells. A cell is left out if the ball around it is within the clearance of
-    its center. The polytope contains the remaining cells.
+    its center (the proved lower bound of the distance to the level sets). The polytope contains the
+    remaining cells.
 
     lower, upper: (3,) corners of the box.
-    max_cells, finest: as for `nonempty_cells`.
+    max_cells: the largest number of cells tested in a round.
+    finest: the largest number of rounds; each halves the edges of cells.
     points: (n, 3) that the polytope must contain in any case. A polytope is put around them first,
         and no cells inside of it are tested.
     """
@@ -99,9 +101,13 @@ def tight_extent(
 
 
 def _clearance_outside(polytope: ConvexHull, clearance: Clearance) -> Clearance:
-    """A clearance for points outside of a polytope: it proves nothing about level sets inside. For
-    a point inside, it is the distance to the nearest face; for a point outside, that of
-    `clearance`."""
+    """A function that takes points (n, 3) and returns lengths (n,) within which there is no level
+    set outside of a polytope. For a point inside the polytope it is the distance to the nearest
+    face; for a point outside, the result of `clearance`.
+
+    clearance: a function that takes points and returns lower bounds of their distances to the level
+        sets.
+    """
 
     def clearance_outside(points: FloatArray) -> FloatArray:
         """The clearances (n,) of points (n, 3)."""
@@ -117,7 +123,8 @@ def _clearance_outside(polytope: ConvexHull, clearance: Clearance) -> Clearance:
 def occupied_cells(
     field: Field, levels: tuple[float, ...], extent: Volume, cells_across: int
 ) -> OccupancyGrid:
-    """A grid over an extent, with the cells marked that may hold a level.
+    """A grid of cells over an extent. The cells that may contain a point of the level sets are
+    marked; all others are proved to contain none.
 
     cells_across: the approximate number of cells along the longest side.
     """
@@ -129,23 +136,24 @@ def occupied_cells(
 def level_distance_lower_bound(
     backend: Backend, field: Field, levels: Levels, p: Vec3, sample: Sample
 ) -> Real:
-    """A proved lower bound of the distance from the points p to the nearest level.
+    """A proved lower bound of the distance from the points p to the nearest level set.
 
     field: prepared for the backend.
-    sample: of the field at p.
+    sample: the sample of the field at p.
 
-    Proof. Let v be a unit direction and s the slope of f at p along v. An enclosure holds f(p + t
-    v) within an interval [L(t, s), U(t, s)], and its free length ends where this interval first
-    meets a level. Neither L nor U falls as s grows, which every enclosure has to prove
-    (`Enclosure`).
+    Proof. Let v be a unit direction and s the slope of f at p along v. An enclosure (a proof of
+    bounds of f along a path) holds f(p + t v) within an interval [L(t, s), U(t, s)]. The length
+    that it proves free ends where this interval first meets a level. Neither L nor U falls as s
+    grows, which every enclosure has to prove (`Enclosure`).
 
     All slopes at p lie in [-G, G], where G is |grad f(p)| plus its error. So an enclosure with that
     interval of slopes holds in every direction. The distances to the level above and to the level
-    below are proved separately, each by the promise that proves the larger distance.
+    below are proved separately, each by the promise (a proved bound of f near p) that proves the
+    larger distance.
 
-    As in the tracer, the level gaps are reduced by the rounding of value and position, and the
-    result is reduced by the rounding of p itself. If f jumps, the bound is for f continued smoothly
-    through all facets, which equals f up to the nearest facet.
+    As in the tracer, the differences of f to the levels are reduced by the rounding of value and
+    position, and the result is reduced by the rounding of p itself. If f jumps, the bound is for f
+    continued smoothly through all facets, which equals f up to the nearest facet.
     """
     steepest = safe_norm(sample.gradient) + sample.gradient_error
     size = max_norm(p)
@@ -208,14 +216,14 @@ class DeviceField(Field, Generic[Uploaded]):
         return prepared
 
     def _data_for(self, p: Vec3) -> Uploaded:
-        """The data for tracing. If `prepare` was not called, they are uploaded to the backend of
-        p."""
+        """The data for tracing, on the backend for which the field is prepared; if it is not
+        prepared, they are uploaded to the backend of p."""
         if self._device is None:
             return self._upload(backend_of(p), traced=True)
         return self._device
 
     def _require_data(self) -> Uploaded:
-        """The data for tracing.
+        """The data for tracing, on the backend for which the field is prepared.
 
         Raises:
             RuntimeError: `prepare` was not called.
@@ -232,8 +240,8 @@ class DeviceField(Field, Generic[Uploaded]):
 
 
 class VariableAccuracyField(DeviceField[Uploaded], BatchedField):
-    """A field that is a sum over sources on a backend, at any accuracy scale (`Field.at_accuracy`).
-    Subclasses define `_sample`."""
+    """A field that is a sum over sources on a backend, and can be sampled at any accuracy
+    (`Field.at_accuracy`). Subclasses define `_sample`."""
 
     has_variable_accuracy = True
 
@@ -244,8 +252,9 @@ class VariableAccuracyField(DeviceField[Uploaded], BatchedField):
     def _sample(self, on: Uploaded, p: Vec3, detail: Real) -> Sample:
         """The sample of f at p.
 
-        on: the data.
-        detail: the accuracy scale (`Field.at_accuracy`).
+        on: the field's data on a backend.
+        detail: the accuracy scale: 0 for the coarsest samples, 1 for those of `evaluate`, more for
+            more accurate ones.
         """
 
     def evaluate(self, p: Vec3) -> Sample:
@@ -260,7 +269,8 @@ class VariableAccuracyField(DeviceField[Uploaded], BatchedField):
         )
 
     def _batch_data(self, backend: Backend) -> Uploaded:
-        """The data for values at points. They are those for tracing if the two do not differ."""
+        """The data for values at points. If the data for tracing do not differ from them, those are
+        taken."""
         device = self._device
         if self.has_separate_batch_data or device is None or device.backend is not backend:
             return super()._batch_data(backend)
@@ -284,6 +294,6 @@ def frame_parameters(
 
 
 def coordinate_rounding(x: Vec3) -> Real:
-    """The rounding of a coordinate of x, a point in unit coordinates, or of a vertex of size about
-    1."""
+    """A bound of the rounding of the coordinates of x, a point in unit coordinates, and of vertices
+    of size about 1."""
     return float(dr.epsilon(x)) * (1 + dr.max(dr.abs(x)))

@@ -56,9 +56,9 @@ _MAX_LENGTH, _MAX_DEPTH = 4000, 200
 class TextFormula:
     """A formula f(x, y, z) as a text. It is called like any function of three coordinates.
 
-    text: has + - * / ^ (or **), brackets, numbers, x, y, z, pi, e, parameters and the functions
-        `_FUNCTIONS`. An equation "left = right" means left - right.
-    tree: the text, parsed to a syntax tree. It is never run as Python, so that texts from untrusted
+    text: it is made of + - * / ^ (or **), brackets, numbers, x, y, z, pi, e, parameters and the
+        functions `_FUNCTIONS`. An equation "left = right" means left - right.
+    tree: the syntax tree of the text. It is never run as Python, so that texts from untrusted
         sources do no harm.
     parameters: numbers by their names in the text.
     """
@@ -246,7 +246,11 @@ def _value(node: ast.expr, names: Mapping[str, Any]) -> Any:
 
 
 def _evaluate_node(node: ast.expr, names: Mapping[str, Any]) -> Any:
-    """The value of a node, as in `_value`, which may be a constant that is not finite."""
+    """The value of a node of a syntax tree that `_check_tree` accepted. A constant part may be
+    infinite or NaN.
+
+    names: the values of coordinates, constants and parameters.
+    """
     match node:
         case ast.BinOp(left, ast.Pow(), right):
             base, exponent = _value(left, names), _value(right, names)
@@ -290,9 +294,10 @@ class Expression(Formula):
     functions of `harnack.math`.
 
     function: takes three coordinates. It is called while a kernel is being recorded, and numbers in
-        it are literals of that kernel.
+        it become literals of that kernel.
     domain: the volume in which f is drawn; None for all of space.
-    default_level, is_convex: as in `Field` and `Formula`.
+    default_level: the level that is drawn by default.
+    is_convex: whether f is a convex function.
     """
 
     function: Callable[[Any, Any, Any], Any]

@@ -119,9 +119,9 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         return super().__new__(cls)
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Wrap methods of the subclass. The result of `evaluate` is checked; `hessian` also takes
-        NumPy arrays; and public class methods refuse arguments with derivatives, as the constructor
-        does."""
+        """Wrap methods of the subclass. The wrapped `evaluate` checks its result; the wrapped
+        `hessian` also takes NumPy arrays; and public class methods refuse arguments with
+        derivatives, as the constructor does."""
         super().__init_subclass__(**kwargs)
         if "__repr__" not in vars(cls):  # a dataclass would write out all numbers
             cls.__repr__ = Field.__repr__
@@ -208,7 +208,8 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         return self
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """A volume that is proved to contain every point of the level sets; None if none is known.
+        """A volume that is proved to contain every point of the level sets; None if no such volume
+        is known.
 
         It may be smaller than `domain`. With an extent, a ray without an end can be a proved miss.
         """
@@ -216,17 +217,18 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         return self.domain
 
     def occupied_cells(self, levels: tuple[float, ...]) -> OccupancyGrid | None:
-        """A grid of cells, or None if none is known. Cells that are not marked as occupied are
+        """A grid of cells; None if no such grid is known. Cells that are not marked as occupied are
         proved to contain no point of the level sets.
 
         Searches for first hits skip these cells, which pays for fields that are expensive to
-        evaluate. For a field with jumps, no continuation of f takes a level in these cells either.
+        evaluate. If the field has jumps, f continued across its facets takes no level in these
+        cells either.
         """
         del levels
         return None
 
     def for_ray_count(self, count: int) -> Field:
-        """The field to use for this many rays. It may spend more on preparation if that pays. Equal
+        """The field to use for this many rays: for many rays a larger preparation may pay. Equal
         counts must return the same object, so that nothing is prepared twice. The default is the
         field itself."""
         del count
@@ -339,9 +341,11 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
     def _evaluate_points(
         self, points: Any, precision: Precision | None, choose: Callable[[Sample], Any]
     ) -> npt.NDArray[Any]:
-        """What `choose` takes from the samples at points, as an array in the order of the points.
+        """Results of samples at points (n, 3) or (3,), as a NumPy array in the order of the points.
 
-        precision: as for `value`.
+        precision: "single", "double", or None for that of the points.
+        choose: a function that takes the sample of a batch of points and returns the wanted number
+            or vector.
         """
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
@@ -366,25 +370,28 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         )
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """Bounds of the errors of the gradient, as a length, and of `hessian`, in the spectral
-        norm, at the point p of a sample. The default is the sample's `gradient_error`, and infinity
-        for the Hessian, whose error is not known."""
+        """Two bounds at the point p of a sample: of the error of the gradient, as a length, and of
+        the error of `hessian`, in the spectral norm. The default is the sample's `gradient_error`,
+        and infinity for the Hessian, whose error is not known."""
         del p
         return sample.gradient_error, math.inf
 
     def describe(self) -> dict[str, Any]:
-        """Names and values of the choices that the field made by itself, for users."""
+        """The choices that the field made by itself, such as a method or an accuracy, as a
+        dictionary from names to values, for users."""
         return {}
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """A sample at parameter t of a ray, with enclosures of f ahead and behind.
+        """A sample at parameter t of a ray, with enclosures (proofs of bounds of f along the ray)
+        ahead and behind.
 
         path: the ray.
         ahead, back: the lengths up to which enclosures are of use. An enclosure that is sharper on
             a shorter length need not hold on all of it.
 
-        The default evaluates the field at that point and applies its promises to the slope along
-        the ray. A field that knows more about f along a ray than in all directions overrides this.
+        The default evaluates the field at that point and applies its promises (proved bounds of f
+        near the point) to the slope along the ray. A field that knows more about f along a ray than
+        in all directions overrides this.
         """
         del ahead, back
         return path.enclose(self.evaluate(path.point(t)))

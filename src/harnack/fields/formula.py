@@ -1,5 +1,5 @@
-"""Fields that are defined by a formula of the coordinates. Everything else follows from the
-formula.
+"""Fields that are defined by a formula of the coordinates. Value, gradient and proofs follow from
+the formula.
 
 A formula is evaluated in two ways. For jets of the coordinates at a point it returns value and
 gradient, with bounds of their rounding. For jets along a piece of a path it returns ranges of its
@@ -65,9 +65,9 @@ _WITHOUT_ALTERNATIVES: ContextVar[bool] = ContextVar("without_alternatives", def
 
 @contextmanager
 def without_alternatives() -> Generator[None]:
-    """Within this context, samples of formulas carry no alternative promises. These take several
-    times as long to record as value and gradient. The context is for callers that use value and
-    gradient only."""
+    """A context within which samples of formulas carry no alternative promises (further bounds of f
+    that are rarely used). To record these takes several times as long as value and gradient. The
+    context is for callers that use value and gradient only."""
     token = _WITHOUT_ALTERNATIVES.set(True)
     try:
         yield
@@ -105,24 +105,23 @@ class Formula(Field):
     @property
     def tally(self) -> Tally:
         """The summary of the formula's operations: their number, and whether f may jump or is
-        steep. For a prepared formula, it was made before it was prepared, while its numbers were
-        known."""
+        steep. A prepared formula returns the summary made before it was prepared, when its numbers
+        were still known."""
         return tally_of(self.formula) if self._prepared_tally is None else self._prepared_tally
 
     @property
     def is_steep(self) -> bool:
-        """Whether the formula uses an operation that may have a vertical tangent or a pole; or
-        whether f is so steep that it acts like a pole within the rounding of coordinates
-        (`is_abrupt`)."""
+        """Whether the formula uses an operation that may have a vertical tangent or a pole, or f is
+        so steep that it acts like a pole within the rounding of coordinates (`is_abrupt`)."""
         return self.tally.is_steep or self.is_abrupt
 
     @property
     def is_abrupt(self) -> bool:
         """Whether f may change within the rounding of coordinates by far more than its slopes
-        allow.
+        allow, as a steep step between two flat parts does.
 
-        If a Lipschitz constant is stated, as for the library's shapes, whose values are about
-        distances, small numbers in a formula are lengths, and only large numbers make it abrupt.
+        A stated Lipschitz constant means that the values are about distances, as for the library's
+        shapes. Then small numbers in a formula are lengths, and only large numbers make it abrupt.
         """
         return self.tally.turns_within(1.0 if self.lipschitz is not None else self.tally.finest)
 
@@ -133,11 +132,12 @@ class Formula(Field):
         return dataclasses.replace(sample, alternative_promises=self._local_lipschitz(p, sample))
 
     def _with_one_sided_gradient(self, p: Vec3, sample: Sample) -> Sample:
-        """The sample at p, with a one-sided gradient if p lies on a tie of the formula.
+        """The sample at p; on lanes on which p lies on a tie of the formula, with the gradient of
+        one side of the tie.
 
         A tie is a point at which two branches of a formula are equal, such as x = 0 for max(x, 0).
-        There the jet gives a range of gradients. The range contains all gradients nearby. It
-        contains others, too, if terms of several ties are added, as on the faces of
+        There the jet gives a range of gradients. The range contains all gradients nearby, and
+        further ones if terms of several ties are added, as on the faces of
         `orthogonal_intersection`. The middle of the range is the gradient at no point, but its
         direction mostly leads across the tie. So f is evaluated once more (by `Dual`) at a point a
         few roundings away, in about this direction, and the gradient there is used.
@@ -177,7 +177,7 @@ class Formula(Field):
         return self._sample_of(self._jet(Jet.at_point(p), p.x), p)
 
     def _sample_of(self, jet: Jet, p: Vec3) -> Sample:
-        """The sample at p from the jet of f at p."""
+        """The sample at p, with value, gradient and their errors from the jet of f at p."""
         zero = 0 * p.x
         gradient = type(p)(*(zero + derivative.midpoint for derivative in jet.first_derivatives))
         gradient_error = zero
@@ -188,11 +188,11 @@ class Formula(Field):
         return Sample(value, gradient, promises, error, gradient_error)
 
     def _local_lipschitz(self, p: Vec3, sample: Sample) -> tuple[Lipschitz, ...]:
-        """Lipschitz constants on balls around p, as promises. Each is a bound of |grad f| on the
-        box around the ball.
+        """Lipschitz constants of f on balls around p, as promises. Each constant is a bound of
+        |grad f| on the box around the ball.
 
-        sample: of f at p. The radii are the multiples `_RADII` of Newton's estimate |f|/|grad f| of
-            the distance to the level 0.
+        sample: the sample of f at p. The radii are the multiples `_RADII` of |f|/|grad f|, Newton's
+            estimate of the distance to the level 0.
         """
         newton_length = dr.abs(sample.value) / safe_norm(sample.gradient)
         promises: list[Lipschitz] = []
@@ -270,12 +270,14 @@ class Formula(Field):
         return RaySample(sample, enclosures, (), slope, growth, slope_error, min_norm)
 
     def _slope(self, p: Vec3, direction: Vec3, *, is_rounded: bool = False) -> tuple[Real, Real]:
-        """The derivative of f at p along a direction, and a bound of its error. In a crease, where
-        the gradient is a range, it is a number for directions along the crease.
+        """The derivative of f at p along a direction, and a bound of its error. On a crease the
+        gradient is a range; for directions along the crease the derivative is a single number all
+        the same.
 
         is_rounded: whether the error covers all points that round to p.
 
-        The pieces of the path start from the same jet, so that this takes no more work.
+        The jet that it computes is the one from which the pieces of the path start, so that the
+        kernel does no more work.
         """
         zero = 0 * p.x
 
@@ -309,6 +311,7 @@ class Formula(Field):
     def _jet(self, coordinates: tuple[Jet, Jet, Jet], like: Real) -> Jet:
         """The jet of f at jets of the coordinates.
 
+        coordinates: the three jets.
         like: a number of the backend.
         """
         return as_jet(self.formula(*coordinates), coordinates[0], type(self).__name__)
@@ -390,12 +393,13 @@ def as_jet(value: Any, like: Jet, name: str) -> Jet:
 class FormulaOnRay:
     """A formula along the path p + s d, as an `EvaluableRestriction`.
 
-    field: has the formula.
+    field: the field with the formula.
     p, direction: (3,) p and d.
     before: the distance before p at which the first piece begins. If it is not 0.0, the pieces
         cover all paths that lead through p up to rounding.
-    piece_count: see `PathRestriction`. The ranges of a formula cost as much as its value: one piece
-        takes the least time; four pieces take two thirds of the samples, but twice the time.
+    piece_count: the number of pieces into which the path is cut. The ranges of a formula cost as
+        much as its value: one piece takes the least time; four pieces take two thirds of the
+        samples, but twice the time.
     """
 
     field: Formula
@@ -417,17 +421,22 @@ class FormulaOnRay:
         return dr.isfinite(0 * length + slopes.lower) & dr.isfinite(0 * length + slopes.upper)
 
     def derivative_ranges(self, knots: Sequence[Real]) -> tuple[PathPiece, ...]:
-        """See `harnack.enclosures.PathRestriction`."""
+        """Ranges of the derivatives of F(s) = f(p + s d), as `PathPiece`s, one between each knot
+        and the next.
+
+        knots: increasing lengths s, the first of them 0.
+        """
         return tuple(self._piece(start, end) for start, end in itertools.pairwise(knots))
 
     def evaluate_with(self, coordinates: Callable[[Vec3, Vec3], tuple[Any, Any, Any]]) -> Any:
-        """See `harnack.enclosures.EvaluableRestriction`."""
+        """The value of the formula at (x, y, z) = coordinates(p, d), in the arithmetic of these
+        three numbers."""
         x, y, z = coordinates(self.p, self.direction)
         value = self.field.formula(x, y, z)
         return x.constant(float(value)) if isinstance(value, int | float) else value
 
     def _piece(self, start: Real, end: Real) -> PathPiece:
-        """The ranges of the first two derivatives for start <= s <= end."""
+        """The ranges of the first two derivatives of f(p + s d) by s, for start <= s <= end."""
         jet = self._jet(start, end)
         (slopes,), (curvatures,) = jet.first_derivatives, jet.second_derivatives
         zero = 0 * self.p.x
@@ -439,7 +448,7 @@ class FormulaOnRay:
         )
 
     def _jet(self, start: Real, end: Real) -> Jet:
-        """The jet of the formula for start <= s <= end."""
+        """The jet of f(p + s d) as a function of s, for start <= s <= end."""
         is_exact = isinstance(self.before, float) and self.before == 0.0
         if not is_exact and isinstance(start, float):  # the first piece starts at 0.0
             start = -self.before

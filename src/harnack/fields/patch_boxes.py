@@ -1,5 +1,5 @@
-"""Fields whose surfaces are unions of patches in boxes, and these boxes on a backend (see
-`harnack.fields.capabilities`)."""
+"""Fields whose surfaces are unions of patches (level sets of functions of their own, each inside a
+box), and these boxes on a backend."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class PatchBoxes(UnitFrame):
     """A tree of boxes, one for each patch, in unit coordinates (`UnitFrame`), in which all boxes
     together have a size of about 1.
 
-    tree: of the boxes.
+    tree: the tree of the boxes.
     """
 
     tree: BoxTree
@@ -56,7 +56,8 @@ class PatchBoxes(UnitFrame):
     def next(
         self, o: Vec3, d: Vec3, after: PatchEntry, start: Real, end: Real, active: Mask
     ) -> PatchEntry:
-        """See `Field.next_patch`."""
+        """The first entry of a ray into a box after the entry `after`, with start <= t <= end, as a
+        `PatchEntry`; see `PatchUnion.next_patch`."""
         behind = after.enter / self.size, after.patch
         enter, leave, box = self.tree.next_box(
             self.to_unit(o), d, behind, start / self.size, end / self.size, active
@@ -89,10 +90,10 @@ class PatchField(Field, Generic[_Buffers]):
 
     @abc.abstractmethod
     def boxes(self, levels: tuple[float, ...] | None = None) -> tuple[FloatArray, FloatArray]:
-        """The lowest and the highest corners (m, 3) of boxes. Each box is proved to contain its
-        patch.
+        """The lowest and the highest corners of boxes, two arrays (m, 3). Each box is proved to
+        contain its patch.
 
-        levels: of the patches; None for the attribute `levels`.
+        levels: the levels whose patches are meant; None for the attribute `levels`.
         """
 
     @abc.abstractmethod
@@ -100,7 +101,8 @@ class PatchField(Field, Generic[_Buffers]):
         """The boxes and the data of the patches on a backend."""
 
     def with_levels(self, levels: tuple[float, ...]) -> Self:
-        """See `PatchUnion.with_levels`. The fields for other levels are kept."""
+        """This field with boxes that contain the patches of these levels, not yet prepared. It is
+        made once for equal levels."""
         if levels == self.levels:
             return self
         if levels not in self._for_levels:
@@ -118,7 +120,7 @@ class PatchField(Field, Generic[_Buffers]):
         return prepared
 
     def _require_data(self) -> _Buffers:
-        """The data on the backend.
+        """The boxes and the data of the patches, on the backend for which the field is prepared.
 
         Raises:
             RuntimeError: `prepare` was not called.

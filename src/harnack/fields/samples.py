@@ -1,10 +1,11 @@
 """The records that fields return: `Sample`, at a point, and `RaySample`, at a point of a ray with
 enclosures of f ahead and behind.
 
-Rounding is part of the proof. The enclosure ahead of a point and the enclosure behind the next
-point may be exact to first order. Then they meet right at a surface, and with rounded arithmetic
-one ray in ten slipped through at tight tolerances. So every level gap is reduced by the rounding
-error of f, and a tolerance below that error is raised to it.
+Rounding is part of the proof. The enclosure (a bound of f along the ray) ahead of a point and the
+enclosure behind the next point may be exact to first order. Then they meet right at a surface, and
+with rounded arithmetic one ray in ten slipped through at tight tolerances. So the difference of f
+to every level is reduced by the rounding error of f, and a tolerance below that error is raised to
+it.
 """
 
 from __future__ import annotations
@@ -70,8 +71,11 @@ class Sample:
         return self.promises + self.alternative_promises
 
     def map_promises(self, change: Callable[[Promise], Promise], **numbers: Any) -> Sample:
-        """This sample with each promise replaced by change(promise), the alternative ones included,
-        and with the named attributes replaced by `numbers`. `ray_promises` stay as they are."""
+        """This sample with each promise replaced by change(promise), the alternative promises
+        included. `ray_promises` stay as they are.
+
+        numbers: new values of further attributes, by their names.
+        """
         promises, alternatives = (
             tuple(map(change, group)) for group in (self.promises, self.alternative_promises)
         )
@@ -84,8 +88,8 @@ class Sample:
         return self.map_promises(lambda promise: promise.shifted(offset), value=self.value + offset)
 
     def select(self, mask: Mask, other: Sample) -> Sample:
-        """The sample `other` on the lanes of the mask, this sample on all others. The two must have
-        promises of the same kinds in the same order. The result has no shading normal."""
+        """The sample `other` on the lanes of the mask, this sample on all other lanes. Both samples
+        must have promises of the same kinds in the same order. The result has no shading normal."""
         names = "value", "gradient", "value_error", "gradient_error", "truncation_error"
         numbers = {k: dr.select(mask, getattr(other, k), getattr(self, k)) for k in names}
         groups: dict[str, Any] = {}
@@ -114,7 +118,7 @@ def validate_samples(
 
     @functools.wraps(evaluate)
     def checked(self: Any, p: Vec3) -> Sample:
-        """See `Field.evaluate`."""
+        """The sample at p that `evaluate` returns, after all checks."""
         sample: Any = evaluate(self, p)
         name = f"{type(self).__name__}.evaluate"
         if not isinstance(sample, Sample):
@@ -227,10 +231,11 @@ class RaySample:
 
 @dataclass(frozen=True)
 class Ray:
-    """Rays o + t d with |d| = 1, and the kinds of enclosures by which steps on them are proved.
+    """Rays o + t d with |d| = 1, and the classes of enclosures (proofs of bounds of f along a ray)
+    by which steps on them are proved.
 
     origin, direction: (3,) o and d, one ray per lane.
-    proofs: the kinds of enclosures to use.
+    proofs: the classes of enclosures to use.
     """
 
     origin: Vec3
@@ -242,10 +247,11 @@ class Ray:
         return dr.fma(type(self.origin)(t), self.direction, self.origin)
 
     def enclose(self, sample: Sample) -> RaySample:
-        """The sample, with the enclosures along the ray that its promises prove.
+        """The sample with enclosures: intervals, as functions of the length s along the ray, that
+        provably contain the change of f from the sample's point, ahead and behind.
 
-        The slope of f along the ray is known up to the error of the gradient. It enters the proofs
-        as an interval: see `Enclosure`.
+        They follow from the sample's promises (proved bounds of f near the point) and the slope of
+        f along the ray. The gradient has an error, so the slope enters the proofs as an interval.
         """
         slope = dr.dot(sample.gradient, self.direction)
         slopes = SlopeRange.around(slope, sample.gradient_error)

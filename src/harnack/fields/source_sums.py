@@ -1,8 +1,8 @@
-"""Sums over sources at a point, and bounds of f near it. Sources are edges, dipoles and far nodes
-of trees.
+"""Sums over sources (edges, dipoles and far nodes of trees) at a point, and bounds of f near the
+point.
 
 All fields that are such sums accumulate the same record, `SourceSums`. It gives values with error
-bounds, or a sample with promises.
+bounds, or a sample with promises (proved bounds of f near the point).
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ SLOPE_ROUNDINGS, SECOND_ROUNDINGS = 16.0, 320.0
 
 
 def max_step_fraction(coarse_ratio: float) -> float:
-    """The longest step that promises cover, as a fraction of the distance to the center of the
-    nearest far node.
+    """The longest step for which the promises of a sum hold, as a fraction of the distance to the
+    center of the nearest far node.
 
     coarse_ratio: far nodes are farther away than this many times their radius.
     """
@@ -47,17 +47,18 @@ def max_step_fraction(coarse_ratio: float) -> float:
 
 
 def free_radius_fraction(coarse_ratio: float) -> float:
-    """The radius of the ball around x that counts as free of a far node's sources, as a fraction of
-    the distance to the center of the node.
+    """The radius of a ball around x that is free of the sources of a far node, as a fraction of the
+    distance from x to the center of the node.
 
-    coarse_ratio: as for `max_step_fraction`.
+    coarse_ratio: far nodes are farther away than this many times their radius.
     """
     return max_step_fraction(coarse_ratio) / _TAYLOR_RADII[-1]
 
 
 def remainder_factor(q: float) -> float:
-    """The function phi(q) = (3 - 2 q)/(1 - q)^2 of `SourceSums.sample`, for 0 <= q < 1. It is
-    convex, and 3 at 0."""
+    """The function phi(q) = (3 - 2 q)/(1 - q)^2 for 0 <= q < 1. It is convex, and 3 at 0. At the
+    distance t from a point, Taylor's remainder of a dipole of area a at the distance rho is at most
+    a t^2 rho^-4 phi(t/rho)."""
     return (3 - 2 * q) / (1 - q) ** 2
 
 
@@ -71,7 +72,7 @@ def final_rounding(backend: Backend, size: float = 1.0) -> Real:
 def dipole_rounding(area: Real, inverse: Real, unit: Real) -> Real:
     """A bound of the rounding of the value of a dipole at the distance rho.
 
-    area: of the dipole.
+    area: the area of the dipole.
     inverse: 1/rho.
     unit: the rounding of a coordinate, at least the machine epsilon.
 
@@ -149,21 +150,25 @@ class SourceSums:
 
     @classmethod
     def from_state(cls, parts: tuple[Any, ...]) -> SourceSums:
-        """The sums whose `to_state` is this tuple."""
+        """The sums that `to_state` turned into this tuple.
+
+        parts: the attributes in the order of the constructor, the Hessian as a tuple of its
+            entries.
+        """
         total, gradient, hessian, *bounds = parts
         return cls(total, gradient, None if hessian is None else SymmetricMatrix(*hessian), *bounds)
 
     def to_state(self) -> tuple[Any, ...]:
-        """The attributes in the order of the constructor, as a tuple for the state of a loop; the
-        Hessian is a tuple of its entries. (Sums that were not requested are None, because Dr.Jit
-        records a loop twice if a part of its state never changes.)"""
+        """The attributes in the order of the constructor, as a tuple for the state of a recorded
+        loop. The Hessian becomes a tuple of its six entries. Sums that were not requested are None:
+        Dr.Jit would record the loop twice if they were numbers that never change."""
         hessian = None if self.hessian is None else self.hessian.components()
         bounds = self.truncation, self.gradient_truncation, self.hessian_truncation, self.rounding
         ends = self.singularity_distance, self.s4, self.s5, self.compensation
         return self.total, self.gradient, hessian, *bounds, *ends
 
     def select(self, mask: Mask, other: SourceSums) -> SourceSums:
-        """The sums `other` on the lanes where the mask holds, these sums on all others. The sums
+        """The sums `other` on the lanes where the mask holds, these sums on all other lanes. Both
         must be without Hessians."""
         pairs = zip(other.to_state(), self.to_state(), strict=True)
         return SourceSums(*(None if b is None else dr.select(mask, a, b) for a, b in pairs))
@@ -339,16 +344,17 @@ class SourceSums:
         self, v: Vec3, unit: Real, lengths: tuple[Real, ...], rates: tuple[Real, ...], active: Mask
     ) -> tuple[Real, ...]:
         """Rates K with |f(x + s v) - f(x)| <= K |s| for lengths |s| up to each of `lengths`: the
-        rates for some edges (see `trail_sums.line_rates`), plus those for the sources of these
-        sums. They are infinite on lanes that are not active.
+        given rates for some edges, plus those for the sources of these sums. They are infinite on
+        lanes that are not active.
 
         v: (3,) directions of the lines.
         unit: the rounding of a coordinate of their points.
-        rates: for the edges, one for each length.
+        lengths: the lengths, one for each rate.
+        rates: the rates of the edges, one for each length (`trail_sums.line_rates`).
 
         Proof. By these sources f changes by at most |s| |g . v| + s^2 (3 s4 + rise R s5) for |s| <=
-        R (see `sample`, also for the symbols). |g . v| is raised by the truncation and rounding
-        errors of the gradient g. For lengths above R the rate is infinite.
+        R, with the symbols and the proof of `sample`. |g . v| is raised by the truncation and
+        rounding errors of the gradient g. For lengths above R the rate is infinite.
         """
         slope = dr.abs(dr.dot(self.gradient, v)) + self.gradient_truncation
         slope = dr.fma(SLOPE_ROUNDINGS * unit, self.s4, slope)
@@ -363,14 +369,16 @@ class SourceSums:
         return tuple(sums)
 
     def remainder(self, b: float, r: Real) -> Real:
-        """3 s4 + rise r s5 of `sample`.
+        """The number K for which f changes, at a distance t <= r, by at most K t^2 more than its
+        linear part: K = 3 s4 + rise r s5, with the symbols of `sample`.
 
-        b: the largest t/rho.
+        b: the largest ratio of t to the distance rho of a source.
         r: b times the distance to the nearest singular point, or less.
         """
         return dr.fma(_chord_slope(b) * r, self.s5, 3 * self.s4)
 
 
 def _chord_slope(b: float) -> float:
-    """The slope (phi(b) - 3)/b of the chord of phi over [0, b]: see `SourceSums.sample`."""
+    """The slope (phi(b) - 3)/b of the chord over [0, b] of the function phi(q) = (3 - 2q)/(1 -
+    q)^2: with it, phi(q) <= 3 + slope q."""
     return (4 - 3 * b) / (1 - b) ** 2

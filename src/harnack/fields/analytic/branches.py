@@ -43,7 +43,7 @@ def complex_type(backend: Backend) -> Any:
 
 
 def complex_of(x: Real, y: Real) -> Complex:
-    """x + i y as a Dr.Jit complex number; x and y may differ from lane to lane."""
+    """The complex number x + i y from two Dr.Jit numbers, of the backend and precision of x."""
     return complex_type(backend_of(x))(x, y)
 
 
@@ -67,10 +67,10 @@ class BranchPoint:
     """A point of the plane where branches are not analytic, with a bound of the branches near it.
 
     location: the point.
-    power, constant, radius, value: all branches g obey |g - value| <= constant |z - location|^power
-        at all z within the radius of the point, power > 0. If the drawn part of g has a period,
-        this holds after a shift by whole periods. The power is None if no such bound is known, as
-        at poles and logarithms.
+    power, constant, radius, value: the numbers of the bound |g - value| <= constant |z -
+        location|^power, with power > 0. All branches g obey it at all z within the radius of the
+        point. If the drawn part of g has a period, they do so after a shift by whole periods. The
+        power is None if no such bound is known, as at poles and logarithms.
 
     Raises:
         TypeError, ValueError: a number is not finite (the radius may be infinite), or the power,
@@ -84,6 +84,7 @@ class BranchPoint:
     value: complex = 0.0
 
     def __post_init__(self) -> None:
+        """Check the numbers."""
         check_no_derivatives("a BranchPoint", vars(self))
         object.__setattr__(self, "location", _finite(self.location, "the place of a branch point"))
         object.__setattr__(self, "value", _finite(self.value, "the value at a branch point"))
@@ -100,8 +101,9 @@ class BranchPoint:
 class PreparedBranchPoint:
     """A `BranchPoint` whose numbers are kernel parameters of a backend.
 
-    at: the location of the point.
-    power, constant, radius, value: as for `BranchPoint`.
+    at: the point of the plane.
+    power, constant, radius, value: the bound |g - value| <= constant |z - at|^power of all branches
+        g at points z within the radius; the power is None if no such bound is known.
     """
 
     at: Complex
@@ -253,8 +255,11 @@ class Branches(abc.ABC):
         )
 
     def points_on(self, z: Complex) -> tuple[PreparedBranchPoint, ...]:
-        """The branch points as Dr.Jit numbers of the same types as the point z: kernel parameters
-        after `prepare`, else literals."""
+        """The branch points as Dr.Jit numbers of the types of z: kernel parameters if these
+        branches were prepared, else literals.
+
+        z: a point of the plane.
+        """
         if self._prepared:
             return self._prepared
         real, make_complex = cast("Any", type(z.real)), cast("Any", type(z))
@@ -269,11 +274,14 @@ class Branches(abc.ABC):
 
     @abc.abstractmethod
     def second_derivative_bound(self, part: PlaneRegion) -> Real:
-        """A bound of |g"|, for all branches g, on the region `part` of the plane; infinite if no
-        bound is known."""
+        """A bound of |g"|, for all branches g, on a region of the plane; infinite if no bound is
+        known.
+
+        part: the region.
+        """
 
     def move_off_singularities(self, z: Complex, rounding: Real) -> Complex:
-        """z, moved away from singular points, where derivatives are NaN.
+        """The point z, moved away from singular points, where derivatives are NaN.
 
         rounding: a bound of the rounding error of z, as a distance. If z is nearer to a singular
             point than this (plus 1e-12), it is replaced by a point at that distance; else it is
@@ -286,16 +294,17 @@ class Branches(abc.ABC):
         return z
 
     def clearance(self, z: Complex) -> Real:
-        """The distance from z to the nearest singular point; 2 if there are no singular points."""
+        """The distance from z to the nearest singular point; 2 if there are no singular points, as
+        it limits the size of the disks on which promises are made."""
         nearest = 0 * z.real + (dr.inf if self.branch_points else _CLEARANCE_WITHOUT_POINTS)
         for point in self.points_on(z):
             nearest = fmin(abs(z - point.at), nearest)
         return nearest
 
-    def max_abs(self, middle: complex, reach: float) -> float:
-        """A bound of |g|, for all branches g, on the disk about `middle` with the radius `reach`;
+    def max_abs(self, center: complex, radius: float) -> float:
+        """An upper bound of |g|, for all branches g, on the disk about `center` with this radius;
         infinite if no bound is known."""
-        del middle, reach
+        del center, radius
         return math.inf
 
     def value_rounding(self, z: Complex, branches: tuple[Branch, ...]) -> Real:
@@ -343,9 +352,9 @@ class PowerProduct(Branches):
 
     @property
     def branch_points(self) -> tuple[BranchPoint, ...]:
-        """The a_i whose exponent is no positive integer. For a positive exponent alpha the bound is
-        C |z - a_i|^alpha within half the distance to the nearest other a_j, C a bound of the other
-        factors."""
+        """The a_i whose exponent is no positive integer, as `BranchPoint`s. For an exponent alpha >
+        0 the bound is |g| <= C |z - a_i|^alpha within half the distance to the nearest other a_j,
+        where C bounds the product of all other factors there."""
         points: list[BranchPoint] = []
         for i, (a, alpha) in enumerate(zip(self.centers, self.exponents, strict=True)):
             if alpha > 0 and alpha.is_integer():
@@ -367,12 +376,14 @@ class PowerProduct(Branches):
         return replace(super().prepare(backend), _on=_uploaded(self.centers, backend))
 
     def _centers(self, z: Complex) -> tuple[Complex, ...]:
-        """The points a_i as Dr.Jit numbers of the type of z: kernel parameters after `prepare`,
-        else literals."""
+        """The points a_i as Dr.Jit numbers of the type of z: kernel parameters if these branches
+        were prepared, else literals."""
         return self._on or tuple(type(z)(a.real, a.imag) for a in self.centers)
 
     def move_off_singularities(self, z: Complex, rounding: Real) -> Complex:
-        """z, moved away from singular points and from the zeros of g.
+        """The point z, moved away from singular points and from the zeros of g.
+
+        rounding: a bound of the rounding error of z, as a distance.
 
         A zero a_i with a positive integer exponent is no singular point of g. But `evaluate`
         computes the logarithm of g, which is infinite there. A point at a zero is moved by a few
@@ -415,7 +426,11 @@ class PowerProduct(Branches):
         return tuple(branches)
 
     def second_derivative_bound(self, part: PlaneRegion) -> Real:
-        """The bound of the class docstring, each term computed from logarithms of distances."""
+        """A bound of |g"| on a region of the plane; the class docstring has the proof. Each term is
+        computed from logarithms of distances.
+
+        part: the region.
+        """
         log_nearest: list[Real] = []
         log_farthest: list[Real] = []
         for a in self._centers(part.disk()[0]):
@@ -437,14 +452,16 @@ class PowerProduct(Branches):
                 total = total + factor * dr.exp(sum(logs)) if logs else factor
         return total * _BOUND_MARGIN
 
-    def max_abs(self, middle: complex, reach: float) -> float:
-        """The product of bounds of all factors on the disk; infinite if it contains a pole."""
+    def max_abs(self, center: complex, radius: float) -> float:
+        """An upper bound of |g| on the disk about `center` with this radius: the product of bounds
+        of all factors |z - a_i|^alpha_i. It is infinite if the disk contains an a_i with a negative
+        exponent."""
         product = 1.0
         for a, alpha in zip(self.centers, self.exponents, strict=True):
-            distance = abs(a - middle)
-            if alpha < 0 and distance <= reach:
+            distance = abs(a - center)
+            if alpha < 0 and distance <= radius:
                 return math.inf
-            product *= (distance + math.copysign(reach, alpha)) ** alpha
+            product *= (distance + math.copysign(radius, alpha)) ** alpha
         return product
 
     def value_rounding(self, z: Complex, branches: tuple[Branch, ...]) -> Real:
@@ -486,11 +503,12 @@ class Logarithm(Branches):
         return replace(super().prepare(backend), _on=_uploaded(self.centers, backend))
 
     def _centers(self, z: Complex) -> tuple[Complex, ...]:
-        """The points a_i as Dr.Jit numbers of the type of z: kernel parameters after `prepare`,
-        else literals."""
+        """The points a_i as Dr.Jit numbers of the type of z: kernel parameters if these branches
+        were prepared, else literals."""
         return self._on or tuple(type(z)(a.real, a.imag) for a in self.centers)
 
     def evaluate(self, z: Complex) -> tuple[Branch, ...]:
+        """The branch at z, as a list of one: the values of log differ by periods only."""
         zero = type(z)(0 * z.real, 0 * z.real)
         value, first, second = zero, zero, zero
         for a, n in zip(self._centers(z), self.multiplicities, strict=True):
@@ -508,7 +526,8 @@ class Logarithm(Branches):
         return total * _BOUND_MARGIN
 
     def value_rounding(self, z: Complex, branches: tuple[Branch, ...]) -> Real:
-        """The rounding of the logarithms and of the angles, which are at most pi."""
+        """A bound of the rounding error of the value, as a multiple of the machine epsilon: that of
+        the logarithms and of the angles, which are at most pi."""
         del branches
         roundings = 0 * z.real
         for a, n in zip(self._centers(z), self.multiplicities, strict=True):
@@ -562,11 +581,11 @@ class ArcSine(Branches):
 
 @dataclass(frozen=True)
 class UserBranches(Branches):
-    """The branches of a user's function; see `RiemannSurface` for what the user gives.
+    """The branches of a user's function of a complex variable.
 
-    function: returns all branches at z, each as (g, g') or (g, g', g").
+    function: a function of z that returns all branches at z, each as (g, g') or (g, g', g").
     singular: the points where a branch is not analytic.
-    second_bound: second_bound(z, r) bounds |g"| on the disk of radius r about z.
+    second_bound: a function: second_bound(z, r) bounds |g"| on the disk of radius r about z.
     branch_count: the number of branches.
     shift: the period of the drawn part, or None.
 
@@ -601,11 +620,11 @@ class UserBranches(Branches):
         return tuple(branches)
 
     def second_derivative_bound(self, part: PlaneRegion) -> Real:
-        middle, radius = part.disk()
+        center, radius = part.disk()
         is_free = radius == radius
-        for point in self.points_on(middle):
-            is_free = is_free & (abs(middle - point.at) > radius)
-        bound = 0 * radius + self.second_bound(middle, radius)
+        for point in self.points_on(center):
+            is_free = is_free & (abs(center - point.at) > radius)
+        bound = 0 * radius + self.second_bound(center, radius)
         return dr.select(is_free & (bound >= 0), bound, dr.inf)
 
 

@@ -267,17 +267,18 @@ _KERNEL_ROUNDING = 1e-5
 
 @dataclass(frozen=True)
 class CosineSums:
-    """The coefficients and local bounds of a series on a backend, which evaluates it.
+    """The coefficients and local bounds of a cosine series on a backend. The object evaluates the
+    series.
 
     backend: the backend.
-    shape: (K_x, K_y, K_z).
+    shape: (K_x, K_y, K_z), the numbers of terms along the axes.
     lower: the lower corner of the box.
     rate: pi over the sides of the box, the change of the angles per length.
     rows: a record (i, a_i00, a_i01, ...) for each i, the highest i first.
-    rounding: bounds of the rounding errors of value and gradient, in units of u, without the error
-        that moves the point.
+    rounding: bounds of the rounding errors of value and gradient, as multiples of the unit roundoff
+        u, without the error that acts like a move of the point.
     curvature: a bound of the absolute directional second derivatives on the box.
-    cells: local bounds of them, finest grid first.
+    cells: bounds of the same on single cells, finest grid first.
 
     Evaluation. Sums over k are computed for each i and j, then sums over j for each i, and the sum
     over i last (sum factorization). This takes about 2 K^3 products, whereas a sum of terms would
@@ -331,12 +332,16 @@ class CosineSums:
         return (self.backend.Array3f(p) - self.lower) * self.rate
 
     def value(self, p: Vec3) -> tuple[Real, Vec3]:
-        """Value and gradient at points p."""
+        """The value and the gradient of the series at points p."""
         angles = self.angles(p)
         y, z = _waves(angles.y, self.shape[1]), _waves(angles.z, self.shape[2])
 
         def add(row: list[Real], state: tuple[Real, ...]) -> tuple[Real, ...]:
-            """The sums of value and gradient after the terms of one i are added."""
+            """The state after the terms of one i are added.
+
+            row: the record of i.
+            state: the sums so far of the value and of the three components of the gradient.
+            """
             b, by, bz = _sum_plane(row, y, z)
             s, c = sincos(row[0] * angles.x)
             f, gx, gy, gz = state
@@ -357,7 +362,11 @@ class CosineSums:
         y, z = _waves(angles.y, self.shape[1]), _waves(angles.z, self.shape[2])
 
         def add(row: list[Real], state: tuple[Real, ...]) -> tuple[Real, ...]:
-            """The sums xx, yy, zz, xy, xz, yz after the terms of one i are added."""
+            """The state after the terms of one i are added.
+
+            row: the record of i.
+            state: the sums xx, yy, zz, xy, xz, yz so far.
+            """
             b, by, bz, byy, byz, bzz = _sum_plane(row, y, z, second=True)
             s, c = sincos(row[0] * angles.x)
             d, e = -row[0] * s, -row[0] * row[0] * c
@@ -374,8 +383,8 @@ class CosineSums:
         )
 
     def curvatures(self, p: Vec3) -> tuple[TaylorRemainder, ...]:
-        """Bounds of second derivatives around p, the smallest ball first; the last one holds
-        everywhere."""
+        """Bounds of second derivatives on balls about p, as promises: on the smallest ball first;
+        the last bound holds everywhere on the box."""
         everywhere = TaylorRemainder(self.curvature + 0 * p.x, dr.inf)
         if not self.cells:
             return (everywhere,)
@@ -389,7 +398,8 @@ class _CellCurvatures:
 
     count: the number of cells along each side of the box.
     sides: the lengths of a cell's sides.
-    bounds: the bounds of the cells, as in `CellBounds`.
+    bounds: for each cell a bound that holds on the cell and all its neighbors; the index along x
+        runs fastest.
     """
 
     backend: Backend
@@ -404,11 +414,13 @@ class _CellCurvatures:
         return cls(backend, cells.count, _vector_parameters(backend, size / cells.count), bounds)
 
     def curvature(self, share: Vec3) -> TaylorRemainder:
-        """The bound of the cell that contains a point, on a ball about the point.
+        """A bound of second derivatives on a ball about a point, as a promise: the bound of the
+        cell that contains the point, which also holds on the cell's neighbors.
 
         share: the point, as fractions of the box from 0 to 1.
 
-        The radius is the distance from the point to the boundary of the cell's neighbors, or less.
+        The radius of the ball is at most the distance from the point to the boundary of the
+        neighbors.
         """
         position, index = share * float(self.count), self.backend.UInt32(0)
         radius: Real = dr.inf
@@ -443,13 +455,15 @@ def _sum_plane(
     *,
     second: bool = False,
 ) -> tuple[Any, ...]:
-    """The sum over j and k for one i, and its derivatives by the angles v and w.
+    """The sum S of a_ijk cos(j v) cos(k w) over j and k, for one i, and its derivatives by the
+    angles v and w.
 
     row: the record (i, a_i00, a_i01, ...).
-    y, z: cos(j v) and its derivative for each j, and the same for cos(k w).
+    y: for all j, the list of cos(j v) and the list of its derivatives by v.
+    z: for all k, the list of cos(k w) and the list of its derivatives by w.
     second: whether to compute second derivatives, too.
 
-    Returns the sum S, S_v and S_w; with `second` also S_vv, S_vw and S_ww.
+    Returns S, S_v and S_w; with `second` also S_vv, S_vw and S_ww.
     """
     (cos_y, slope_y), (cos_z, slope_z) = y, z
     count = len(cos_z)

@@ -95,6 +95,7 @@ class FourierSeries(Field):
     from coefficients."""
 
     def __init__(self, coefficients: Any, box: Box | tuple[Any, Any]) -> None:
+        """Check the arguments, and compute the bounds of the series."""
         a = as_real_array(coefficients, "coefficients").astype(np.float64)
         if a.ndim != 3 or 0 in a.shape:
             raise ValueError(f"coefficients must have shape (K_x, K_y, K_z), not {a.shape}")
@@ -209,12 +210,12 @@ class FourierSeries(Field):
         return SurfaceDisplacement(float(distances.mean()), float(distances.max()), len(points))
 
     def _near(self, level: float, rng: int) -> tuple[FloatArray, FloatArray]:
-        """Points (n, 3) of the surface, or next to it, and the differences (n,) between function
-        and series.
+        """Points (n, 3) of the surface, or next to it, and the differences (n,) between the fitted
+        function and the series there.
 
         level: the level of the surface.
-        rng: the seed of the random points, for a function; for a grid the points are those of the
-            grid.
+        rng: the seed of the random points, if a function was fitted. If a grid was fitted, the
+            points are those of the grid.
         """
         if not callable(self._source):
             grid = cast("FloatArray", self._source)
@@ -264,7 +265,8 @@ class FourierSeries(Field):
         )
 
     def _on(self, p: Vec3) -> CosineSums:
-        """The series on the backend of p; `prepare` makes this free."""
+        """The series on the backend of p. If the field is prepared for this backend, nothing is
+        uploaded."""
         return self._upload(backend_of(p)) if self._device is None else self._device
 
     def evaluate(self, p: Vec3) -> Sample:
@@ -395,9 +397,8 @@ def _values(function: Function, points: FloatArray) -> FloatArray:
 
 
 def _rounding(a: FloatArray, size: FloatArray) -> tuple[float, float]:
-    """Bounds of the rounding errors of value and gradient, in units of u: see `FourierSeries`.
-
-    The error that moves the point is left out.
+    """Bounds of the rounding errors of value and gradient, as multiples of the unit roundoff u;
+    `FourierSeries` has the proof. The error that acts like a move of the point is left out.
 
     a: the coefficients (K_x, K_y, K_z).
     size: (3,) the lengths of the box's sides.

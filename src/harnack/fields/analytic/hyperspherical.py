@@ -60,13 +60,14 @@ _SCALE_ERROR, _W_ERROR = 6.0, 13.0
 
 @dataclass(frozen=True)
 class _OrderTerm:
-    """The part S(y) C_n^k(w) of the function that belongs to one j, with bounds of its factors.
+    """The part S(y) C_n^k(w) of the function that belongs to one j, with bounds of its factors. S
+    is a sum of solid harmonics of degree j, C_n^k a Gegenbauer polynomial.
 
     j: the degree of S.
-    n, k: l - j and j + 1, the indices of the Gegenbauer polynomial C_n^k.
-    weights: (j, m) -> coefficient of the sum S of solid harmonics.
+    n, k: l - j and j + 1, the indices of C_n^k.
+    weights: (j, m) -> coefficient of the solid harmonic in S.
     value, gradient, hessian: bounds of |S|, of its gradient and of its second derivatives.
-    rounding: the rounding of S as it is evaluated.
+    rounding: bounds of the rounding of S as it is evaluated.
     """
 
     j: int
@@ -80,7 +81,10 @@ class _OrderTerm:
 
     @classmethod
     def of(cls, l: int, j: int, weights: Weights) -> _OrderTerm:  # noqa: E741
-        """The part with this j of a function of degree l; weights: those of S, N_lj included."""
+        """The part of a function of degree l that belongs to this j.
+
+        weights: (j, m) -> coefficient of the solid harmonic in S, the factor N_lj included.
+        """
         bounds = value_bound(weights), gradient_bound(weights), hessian_bound(weights)
         rounding = HarmonicRounding.of(weights, is_divided=True)
         return cls(j, l - j, j + 1, weights, *bounds, rounding)
@@ -149,6 +153,7 @@ class HypersphericalHarmonic(Field):
     is_global = True
 
     def __init__(self, l: int, j: int, m: int, *, domain: Volume | None = None) -> None:  # noqa: E741
+        """Check l, j and m, and set up the function with this single term."""
         l, j, m = integer(l, "the degree l"), integer(j, "j"), integer(m, "the order m")  # noqa: E741
         check_volume(domain, "domain")
         if not 0 <= l <= LARGEST_DEGREE:
@@ -223,9 +228,10 @@ class HypersphericalHarmonic(Field):
 
         Let s = 1/total, y = 2 s p and w = 1 - 2 s. f is a sum of S(y) C(w). Since S is homogeneous
         of degree j, grad f = 2 s (sum of C grad S + p S (2 s C' - j C)). The errors, to first order
-        in u, are those of y: `_SCALE_ERROR` of its size, the same for all coordinates, and two
-        roundings of each coordinate (`is_divided`); that of w: `_W_ERROR`; and those of S, grad S
-        and C by their recurrences.
+        in the unit roundoff u, come from y, from w, and from S, grad S and C. The error of y is
+        `_SCALE_ERROR` of its size, the same for all coordinates, and two roundings of each
+        coordinate (`is_divided`). The error of w is `_W_ERROR`. Those of S, grad S and C come from
+        their recurrences.
         """
         s = 1 / total
         y, w, size = 2 * s * p, 1 - 2 * s, dr.norm(p)
@@ -243,9 +249,9 @@ class HypersphericalHarmonic(Field):
             outer = outer + harmonic * radial
             # Rounding.
             upper, slope_max = term.value(rho, r), term.gradient(rho, r)
-            value_error = term.rounding.value(rho, r) + _SCALE_ERROR * term.j * upper
+            value_error = term.rounding.value_error(rho, r) + _SCALE_ERROR * term.j * upper
             slope_error = (
-                term.rounding.gradient(rho, r)
+                term.rounding.gradient_error(rho, r)
                 + (_SCALE_ERROR * max(term.j - 1, 0) + roundings) * slope_max
             )
             c_error = dr.fma(_W_ERROR, dr.abs(first), gegenbauer_rounding(term.n, term.k))
@@ -274,11 +280,17 @@ class HypersphericalHarmonic(Field):
         return dr.fma(inner, inner, 1) * (1 - _ROUNDING)
 
     def _radius(self, square: Real, fraction: float) -> Real:
-        """The radius fraction * sqrt(1 + |p|^2) of a ball about p; square: |p|^2."""
+        """The radius fraction * sqrt(1 + |p|^2) of a ball about p.
+
+        square: |p|^2.
+        """
         return fraction * dr.sqrt(1 + square)
 
     def _curvatures(self, square: Real) -> list[TaylorRemainder]:
-        """Bounds of the Hessian on two balls about p and on all of space; square: |p|^2."""
+        """Bounds of the Hessian on two balls about p and on all of space, as promises.
+
+        square: |p|^2.
+        """
         l = self.degree  # noqa: E741
         size = l * self._known.largest * (1 + _ROUNDING)
         promises: list[TaylorRemainder] = []

@@ -69,8 +69,8 @@ def gegenbauer(n: int, k: int, w: Any) -> Any:
 
 
 def _coefficients(i: int, k: int) -> tuple[float, float]:
-    """The coefficients (a, b) of the step C_i = a w C_(i-1) - b C_(i-2) of the recurrence, k
-    fixed."""
+    """The coefficients (a, b) of the step C_i = a w C_(i-1) - b C_(i-2) of the recurrence of
+    Gegenbauer polynomials C_i^k for fixed k."""
     return 2 * (i + k - 1) / i, (i + 2 * k - 2) / i
 
 
@@ -220,9 +220,8 @@ class HypersphereRange:
         return max(-self.low, self.high)
 
     def radius(self, level: float) -> float:
-        """The radius of a ball about the origin of space that contains all points with this level.
-
-        It is infinite if there is no such ball, and 0 if the level does not occur.
+        """The radius of a ball about the origin of space that contains all points with this level;
+        infinite if there is no such ball, and 0 if the level does not occur.
 
         Points at the angle a from the pole w = 1 have the distance cot(a/2) from the origin. If the
         level may occur in the first zone, write P = A cos(b) along a great circle from the pole,

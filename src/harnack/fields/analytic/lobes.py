@@ -110,7 +110,12 @@ class Lobes(Field):
         return field
 
     def _initialize(self, weights: Any, scale: Any, sign: LobeSign) -> None:
-        """Check the parameters, which are those of `combined`, and compute the range of Y."""
+        """Check the parameters, and compute the range of Y.
+
+        weights: {(l, m): c}, for the sum Y of c Y_lm.
+        scale: the length of a lobe in which Y reaches 1.
+        sign: "both", "positive" or "negative".
+        """
         self.weights = _checked(weights)
         scale = as_positive(scale, "the scale of lobes")
         if not is_one_of(sign, _SIGNS):
@@ -185,7 +190,8 @@ class Lobes(Field):
         return space_scaled(self._unscaled(p / self._size), self._size)
 
     def _unscaled(self, x: Vec3) -> Sample:
-        """The sample at points x, for lobes of scale 1."""
+        """The sample at points x for lobes of scale 1: value, gradient, bounds of their errors, and
+        promises of second derivatives."""
         r = safe_norm(x)
         at_origin = r <= float(dr.smallest(type(r))) ** 0.25  # f is 0 up to rounding
         u = dr.select(at_origin, type(x)(0, 0, 1), x / dr.select(at_origin, 1, r))
@@ -246,7 +252,11 @@ class Lobes(Field):
         slopes = SlopeRange.around(base.slope, sample.gradient_error)
 
         def enclosure(length: Real, sign: int, slope_range: SlopeRange) -> ParabolaEnclosure:
-            """The parabola on a length of the ray, forward (sign 1) or backward (-1)."""
+            """The enclosure of f between two parabolas, on a length of the ray.
+
+            length: the length, forward (sign 1) or backward (sign -1).
+            slope_range: the range of the derivative of f in that direction.
+            """
             length = dr.select(dr.isfinite(length), length, 4 * (safe_norm(p) + self._size))
             end = dr.fma(type(p)(sign * length), path.direction, p)
             farthest = fmax(safe_norm(p), safe_norm(end)) * ((1 + _ROUNDING) / self._size)
@@ -258,12 +268,13 @@ class Lobes(Field):
         return RaySample(sample, (*base.forward, forward), (*base.backward, backward), base.slope)
 
     def _second_derivatives(self, farthest: Real) -> tuple[Real, Real]:
-        """Bounds (lower, upper) of the second derivatives along any line, for scale 1: see `Lobes`.
+        """Bounds (lower, upper) of the second derivatives of f along any line, for scale 1; `Lobes`
+        has the proof.
 
-        farthest: they hold at distances up to this from the origin.
+        farthest: the bounds hold at points within this distance of the origin.
 
-        Symbols: [low, high] is the range of W, degree is N, `swing` bounds |2 c q T' + q^2 T"|, and
-        `power` is the largest second derivative of r^3 or r^4.
+        In the code [low, high] is the range of W, `degree` is N, `swing` bounds |2 c q T' + q^2
+        T"|, and `power` is the largest second derivative of r^3 or r^4.
         """
         low, high = self.value_range
         if self.part == "both":
@@ -293,9 +304,10 @@ class Lobes(Field):
         """
         unit = float(dr.epsilon(type(r)))
         max_value, degree = max(map(abs, self.value_range)), self.degree
-        error = unit * (self._rounding.value(rho, 1.0) + (8 * degree + 4) * max_value)
+        error = unit * (self._rounding.value_error(rho, 1.0) + (8 * degree + 4) * max_value)
         slope = unit * (
-            2 * self._rounding.gradient(rho, 1.0) + (8 * degree**2 + 16 * degree + 16) * max_value
+            2 * self._rounding.gradient_error(rho, 1.0)
+            + (8 * degree**2 + 16 * degree + 16) * max_value
         )
         if self.part == "both":
             high = dr.abs(y) + error
@@ -304,7 +316,7 @@ class Lobes(Field):
         return r * r * (error + 8 * unit * r), r * (slope + 2 * error + 24 * unit * r)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """The three rows of the Hessian of f; see `_of_power`.
+        """The three rows of the Hessian of f.
 
         At the origin its limit depends on the direction of approach; the result is the limit along
         z.
@@ -334,7 +346,7 @@ class Lobes(Field):
         return scale * rows[0], scale * rows[1], scale * rows[2]
 
     def _of_power(self, u: Vec3, n: int) -> tuple[Real, Vec3, tuple[Vec3, Vec3, Vec3]]:
-        """Value, gradient and Hessian of r^n Y(x/r) at unit vectors u.
+        """Value, gradient and Hessian of r^n Y(x/r) at x = u, for unit vectors u.
 
         The function is the sum of r^(n-l) P_l, where P_l is the solid harmonic part of degree l of
         Y. With k = n - l and P = P_l, whose gradient is g and Hessian H, the Hessian of r^k P at a

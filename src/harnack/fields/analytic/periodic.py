@@ -135,7 +135,8 @@ class ExtensionBounds:
         )
 
     def ball(self, f: Real, slope: Real) -> HarmonicBall:
-        """The promise at a point p: a ball of R^4 with bounds of the harmonic extension on it.
+        """The promise at a point p: a `HarmonicBall` of R^4 about p, with bounds on it of the
+        harmonic extension F of f to four dimensions.
 
         f: the value at p.
         slope: |grad f(p)|.
@@ -150,7 +151,8 @@ class ExtensionBounds:
         return HarmonicBall(real(r), lower, upper, dimension=4)
 
     def _max_descent(self, f: Real, rise: Real) -> Real:
-        """A bound of -F on the ball about p; with -f instead of f, a bound of F.
+        """A bound of -F on the ball about p, where F is the harmonic extension of f to four
+        dimensions. With -f instead of f, it is a bound of F.
 
         f: the value at p, without the constant term.
         rise: the number D, for which |f(y) - f(p)| <= D |y-p|/R.
@@ -213,6 +215,7 @@ class EigenfunctionSum(Field):
     is_cheap = True
 
     def __init__(self, terms: Iterable[Term], *, domain: Volume | None = None) -> None:
+        """Check the terms, and compute their bounds and the default domain."""
         self.terms = checked_terms(terms)
         self.waves = self._bounds()
         longest = 2 * math.pi / min(self.waves.wavenumbers)
@@ -246,8 +249,8 @@ class EigenfunctionSum(Field):
         return self.waves.largest_curvature
 
     def evaluate(self, p: Vec3) -> Sample:
-        """The sample at p: see `EigenfunctionSum` for its promises and for the bound of its
-        rounding."""
+        """The sample at p. Its promises are a bound of second derivatives, a local Lipschitz
+        constant, and bounds on a harmonic ball of R^4; `EigenfunctionSum` has the proofs."""
         value, components = evaluate_terms(self.terms, p)
         gradient = type(p)(*components)
         epsilon = float(dr.epsilon(type(value)))
@@ -386,7 +389,8 @@ class Gyroid(_CubicSurface):
 class SchwarzP(_CubicSurface):
     """cos X + cos Y + cos Z with (X, Y, Z) = 2 pi p/cell: Schwarz's primitive surface.
 
-    cell, domain: as for `Gyroid`.
+    cell: the edge length of the cubic cell of periodicity, 2 pi by default.
+    domain: the volume in which f is drawn, by default the ball of radius `cell` about the origin.
 
     |f| <= 3, and |grad f| <= sqrt 3 (2 pi/cell) since the derivatives by X, Y and Z are sines. Both
     bounds are attained.

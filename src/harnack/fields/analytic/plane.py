@@ -187,9 +187,8 @@ def _integer(value: Any) -> int:
 def _user_branches(
     function: Any, singular_points: Any, second_bound: Any, period: Any
 ) -> UserBranches:
-    """The branches of a user's function, after a test evaluation of all that the user gave.
-
-    The parameters are those of `RiemannSurface`.
+    """The `Branches` of a user's function, after a test evaluation of all functions that the user
+    gave. The parameters are those of `make_branches`.
 
     Raises:
         TypeError, ValueError: a parameter is missing or invalid, or a function returns something
@@ -315,6 +314,7 @@ class LevelCurves(Field):
         level: float = 0.0,
         domain: Volume | None = None,
     ) -> None:
+        """Check the arguments, and make the branches of the function."""
         if part not in ("imag", "real"):
             raise ValueError(f'part must be "real" or "imag", not {part!r}')
         self.part = part
@@ -342,7 +342,8 @@ class LevelCurves(Field):
         return field
 
     def evaluate(self, p: Vec3) -> Sample:
-        """The sample at p, with two promises for each of two disks: see `LevelCurves`."""
+        """The sample at p. It has two promises for each of two disks about p: a harmonic ball, and
+        a bound of second derivatives."""
         rounding, z, branch = self._at(p)
         slope_x, slope_y = derivatives(branch.first, self.part)
         vector = cast("Any", type(p))
@@ -421,6 +422,7 @@ class HeightField(Formula):
     domain: Volume | None = field(default_factory=_unit_box)
 
     def __post_init__(self) -> None:
+        """Check the function and the domain."""
         if not callable(self.function):
             raise TypeError(f"function must be callable with x, y, not {self.function!r}")
         check_volume(self.domain, "domain")

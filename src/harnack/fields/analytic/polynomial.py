@@ -102,10 +102,11 @@ class HarmonicPromises:
 
     @classmethod
     def of(cls, weights: Weights, known: BallRange, *, is_divided: bool) -> HarmonicPromises:
-        """The promises of the sum of solid harmonics with these weights, (l, m) -> coefficient.
+        """The promises of the sum of solid harmonics with these weights.
 
-        known: the ranges of its parts of each degree.
-        is_divided: whether points are divided by a size other than 1 before, which adds rounding.
+        weights: (l, m) -> coefficient.
+        known: proved ranges of the parts of each degree.
+        is_divided: whether points are divided by a size other than 1 first, which adds rounding.
         """
         inner, outer = _best_radius(known, 0.0), _best_radius(known, 1.0)
         order, axial, axis_share = order_on_axis(weights), None, 0.0
@@ -144,7 +145,11 @@ class HarmonicPromises:
         return HarmonicBall(radius, lower - margin, upper + margin)
 
     def curvatures(self, rho: Real, r: Real) -> list[TaylorRemainder]:
-        """Bounds of the Hessian on balls of different radii, the smallest ball first."""
+        """Bounds of the Hessian on balls of different radii about a point, as promises, the
+        smallest ball first.
+
+        rho, r: the distances of the point from the z axis and from the origin.
+        """
         radii = [dr.inf]  # where the Hessian is constant
         if self.degree > 2:
             scale = r / (self.degree - 2)
@@ -164,8 +169,8 @@ class HarmonicPromises:
         return dr.fma(constant, 1 + _ROUNDING + _SLOPE_SHARE, self._underflow(r))
 
     def lipschitz(self, rho: Real, r: Real) -> Lipschitz | None:
-        """A Lipschitz constant on a ball that has a smallest radius; None if the harmonic ball has
-        one, too."""
+        """A Lipschitz constant on a ball that has a smallest radius, as a promise; None if the
+        harmonic ball has a smallest radius, too."""
         if self.lowest_degree < 3:
             return None
         radius = fmax(r * (_WIDE / (self.degree - 2)), _FLOOR)
@@ -191,10 +196,10 @@ class HarmonicPromises:
         E R is a few u times the range; `enclosures.free_radius.condition_rounding` covers 16 u.
         """
         unit = float(dr.epsilon(type(r)))  # u, half the distance from 1 to the next number
-        error = dr.fma(self.rounding.value(rho, r), unit, self._underflow(r))
+        error = dr.fma(self.rounding.value_error(rho, r), unit, self._underflow(r))
         if self.degree < 2:
             return error
-        slope = unit * self.rounding.gradient(rho, r)
+        slope = unit * self.rounding.gradient_error(rho, r)
         return dr.fma(slope * (0.5 / _SLOPE_SHARE), slope / curvature.constant, error)
 
     def _radius(self, rho: Real, r: Real) -> Real:
@@ -233,7 +238,8 @@ def _best_radius(known: BallRange, distance: float) -> float:
 
 
 class _SolidHarmonics(Field):
-    """A sum of solid harmonics of p/size, for |p| <= size; see `HarmonicPromises`."""
+    """A sum of solid harmonics of p/size, for |p| <= size, as a field whose promises are
+    `HarmonicPromises`."""
 
     is_cheap = True
     over_relaxation = 1.6
@@ -262,7 +268,8 @@ class _SolidHarmonics(Field):
         return max(degree for degree, _ in self._weights)
 
     def evaluate(self, p: Vec3) -> Sample:
-        """The sample at p, computed at p/size and scaled back: see `HarmonicPromises`."""
+        """The sample at p. It is computed at p/size and scaled back to p; its promises are those of
+        `HarmonicPromises`."""
         s, size = self._local(p), self._size
         value, gradient = evaluate(self._weights, s.x, s.y, s.z)
         rho, r = dr.norm(type(s)(s.x, s.y, 0)), dr.norm(s)
@@ -280,8 +287,8 @@ class _SolidHarmonics(Field):
         return Sample(value, slope, promises, error, alternative_promises=tuple(alternatives))
 
     def _local(self, p: Vec3) -> Vec3:
-        """The point in the coordinates of the solid harmonics: axes rotated, divided by the
-        size."""
+        """The point p in the coordinates of the solid harmonics: with its axes rotated, and divided
+        by the size."""
         return type(p)(*_rotate_axes((p.x, p.y, p.z), self._axis + 1)) / self._size
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
@@ -319,6 +326,7 @@ class SphericalHarmonic(_SolidHarmonics):
     """
 
     def __init__(self, l: int, m: int, *, radius: float = 1.0) -> None:  # noqa: E741
+        """Check the arguments, and set up the sum with this single term."""
         l, m = degree_and_order((l, m))  # noqa: E741
         if not 0 <= l <= LARGEST_DEGREE:
             raise ValueError(f"the degree l must be 0 to {LARGEST_DEGREE}, not {l}")
@@ -351,6 +359,7 @@ class HarmonicPolynomial(_SolidHarmonics):
     def __init__(
         self, coefficients: Mapping[tuple[int, int, int], float], *, domain: Volume | None = None
     ) -> None:
+        """Check the arguments, and convert the monomials to solid harmonics."""
         self.coefficients = _checked(coefficients)
         domain = Ball() if domain is None else domain
         size = _enclosing_radius(domain)

@@ -66,8 +66,8 @@ class _BranchValue:
         return dr.fma(self.x, direction.x, dr.fma(self.y, direction.y, direction.z))
 
     def coincides_with(self, other: _BranchValue) -> Mask:
-        """Whether phi and its gradient equal those of the other branch, as they do for a branch and
-        itself.
+        """Whether phi and its gradient equal phi and the gradient of the branch `other`. For a
+        branch and itself they do.
 
         On a line of symmetry two branches agree in phi and in its derivative by x but not by y;
         they do not coincide, and f has a crease there.
@@ -164,6 +164,7 @@ class RiemannSurface(Field):
         height: float = 1.0,
         domain: Volume | None = None,
     ) -> None:
+        """Check the arguments, and make the branches of the function."""
         if part not in ("imag", "real"):
             raise ValueError(f'part must be "imag" or "real", not {part!r}')
         if as_finite(height, "height") == 0:
@@ -332,7 +333,8 @@ class RiemannSurface(Field):
         return dr.abs(self._height)
 
     def _rounding(self, p: Vec3) -> Real:
-        """A generous bound of the rounding error of a point of the plane, as a distance."""
+        """A generous bound of the rounding error of the projection of p to the plane, as a
+        distance."""
         return 4 * backend_of(p).machine_epsilon * max_norm(p)
 
     def _graphs(self, p: Vec3, branches: tuple[Branch, ...]) -> list[_BranchValue]:
@@ -387,11 +389,11 @@ class RiemannSurface(Field):
     def _nearest_branch(
         self, z: Complex, h: Real, graphs: list[_BranchValue], error: Real, rounding: Real
     ) -> _PointBranches:
-        """Find the nearest branch at a point, and the sign of f.
+        """The branches at a point, with the nearest branch and the sign of f.
 
         z, h: the projection of the point to the plane, and its height.
-        graphs: all branches at the point.
-        error, rounding: kept in the result, see `_PointBranches`.
+        graphs: phi and its gradient for each branch at the point.
+        error, rounding: bounds of the errors of phi and of z, which are stored in the result.
         """
         nearest, sign = graphs[0], type(graphs[0].phi)(1)
         if not self._is_single:
@@ -522,30 +524,34 @@ class RiemannSurface(Field):
         slope_error = dr.select(speed > 0, second * local.rounding, 0)
         second = dr.select(speed > 0, second * dr.square(speed) * _BOUND_MARGIN, 0)
 
-        def slopes(branch: _BranchValue, sign: Real) -> SlopeRange:
-            """The range of the derivative of sign * phi along the ray at the sample."""
+        def slope_range(branch: _BranchValue, sign: Real) -> SlopeRange:
+            """An interval that contains the derivative of sign * phi along the ray, at the point of
+            the sample. phi is the height of the point minus that of the branch; the derivative is
+            computed with rounding."""
             slope = branch.slope(d)
             size = dr.abs(branch.x * d.x) + dr.abs(branch.y * d.y) + dr.abs(d.z)
             return SlopeRange.around(sign * slope, 16 * epsilon * size + slope_error * speed)
 
         if self._is_single:
-            return ParabolaEnclosure(slopes(local.nearest, local.sign), -second, second, length)
+            return ParabolaEnclosure(
+                slope_range(local.nearest, local.sign), -second, second, length
+            )
         distance = dr.abs(local.nearest.phi)
         unit = type(distance)(1)
         samples = tuple(
             BranchSample(
-                slopes(branch, dr.mulsign(unit, branch.phi)),
+                slope_range(branch, dr.mulsign(unit, branch.phi)),
                 dr.abs(branch.phi) - distance - self._extra_rounding(branch, local),
             )
             for branch in local.branches
         )
         nearest = BranchSample(
-            slopes(local.nearest, dr.mulsign(unit, local.nearest.phi)), 0 * distance
+            slope_range(local.nearest, dr.mulsign(unit, local.nearest.phi)), 0 * distance
         )
         return NearestBranchEnclosure(samples, nearest, distance, local.value >= 0, second, length)
 
     @staticmethod
     def _extra_rounding(branch: _BranchValue, local: _PointBranches) -> Real:
-        """By how much more phi of a branch may change than phi of the nearest branch by the
-        rounding of z; at least 0."""
+        """By how much more phi of a branch may change by the rounding of z than phi of the nearest
+        branch; at least 0. phi is the height of the point minus that of the branch."""
         return fmax(branch.steepness - local.nearest.steepness, 0) * local.rounding

@@ -44,8 +44,8 @@ _SECOND_ORDER = 1.03
 
 @dataclass(frozen=True)
 class HarmonicRounding:
-    """Bounds of the rounding errors of value and gradient of a sum of solid harmonics, in units of
-    u.
+    """Bounds of the rounding errors of value and gradient of a sum of solid harmonics, as multiples
+    of the unit roundoff u.
 
     They hold at a point of the unit ball, and depend on its distances rho from the z axis and r
     from the origin.
@@ -113,13 +113,13 @@ class HarmonicRounding:
         a, b, c, d = (AxialBound.of(table) for table in tables)
         return cls((a, b), (c, d), underflow)
 
-    def value(self, rho: Real, r: Real) -> Real:
+    def value_error(self, rho: Real, r: Real) -> Real:
         """The bound for the value, in units of u, at distances rho from the z axis and r from the
         origin."""
         near, anywhere = self.value_bounds
         return fmin(near(rho, r), anywhere(rho, r))
 
-    def gradient(self, rho: Real, r: Real) -> Real:
+    def gradient_error(self, rho: Real, r: Real) -> Real:
         """The bound for the length of the gradient's error, in units of u, at distances rho from
         the z axis and r from the origin."""
         near, anywhere = self.gradient_bounds
@@ -181,7 +181,10 @@ def _slope_errors(l: int, m: int, sums: int, is_divided: bool) -> tuple[float, f
     """Two bounds for the error of the gradient of r^l Y_lm / `legendre_weight`, as a length.
 
     The first one is in units of u rho^(m-1) r^(l-m) (for m = 0: of u r^(l-1)), the second one in
-    units of u r^(l-1). Parameters as for `_value_errors`.
+    units of u r^(l-1).
+
+    sums: the number of additions in which the term takes part.
+    is_divided: whether the point was divided by a size.
 
     The errors in the order in which `solid_harmonics.evaluate` computes: 4u for weights,
     coefficients and products in each component, 2u for the two terms of the x- and y-components,
@@ -231,14 +234,15 @@ _LinearBound: TypeAlias = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class WaveRounding:
-    """Bounds of the rounding errors of a sum of waves, as functions of the point p, in units of u.
+    """Bounds of the rounding errors of a sum of waves at a point p, as multiples of the unit
+    roundoff u.
 
     move: (x, y, z). Rounding that is the same for all terms acts as if p were moved, in each
         coordinate by this number times the absolute value of the coordinate.
     value, gradient: the errors of value and gradient apart from this move, each as (constant, x, y,
         z) for constant + x |p_x| + y |p_y| + z |p_z|.
-    slopes, hessian: in the same form, the whole errors of gradient and Hessian, where no error
-        counts as a move of the point.
+    slopes, hessian: the whole errors of gradient and Hessian, in the same form; no error counts as
+        a move of the point there.
 
     A sine or cosine has an error of 2u (`backend.elementary.sincos`).
 
@@ -262,7 +266,8 @@ class WaveRounding:
 
     @classmethod
     def of(cls, terms: Sequence[Term]) -> WaveRounding:
-        """The bounds for the operations of `evaluate_terms` for the sum of these terms."""
+        """The bounds of the rounding errors that `evaluate_terms` makes when it sums these
+        terms."""
         common_frequencies = [_common_frequency(terms, axis) for axis in range(3)]
         value, gradient, total_slopes, second = ([0.0] * 4 for _ in range(4))
         sizes, slopes, seconds = 0.0, 0.0, 0.0
@@ -290,8 +295,10 @@ class WaveRounding:
     def errors(self, p: Vec3, gradient: Vec3) -> tuple[Real, Real]:
         """Bounds of the errors of value and gradient at p.
 
-        gradient: the computed gradient at p. The error of the gradient is that relative to the
-            exact gradient at the point moved by `move`.
+        gradient: the computed gradient at p.
+
+        The bound for the gradient is that of its difference from the exact gradient at the point
+        moved by `move`.
         """
         size = [dr.abs(p.x), dr.abs(p.y), dr.abs(p.z)]
         value, slope = self.value[0], self.gradient[0]
@@ -324,11 +331,8 @@ def _wave_vector(term: Term) -> tuple[float, ...]:
 
 
 def _common_frequency(terms: Sequence[Term], axis: int) -> float | None:
-    """The absolute frequency that all factors along an axis have; None if they differ or there are
-    none.
-
-    None also if a plane wave has a component along the axis.
-    """
+    """The absolute frequency of all factors along an axis; None if they differ, if there are none,
+    or if a plane wave has a component along the axis."""
     frequencies: set[float] = set()
     for term in terms:
         if isinstance(term, PlaneWave):
@@ -342,8 +346,8 @@ def _common_frequency(terms: Sequence[Term], axis: int) -> float | None:
 
 
 def _product_rounding(frequency: float) -> float:
-    """The error of frequency times coordinate in units of u, the frequency's rounding included: 0
-    for powers of two, else 2."""
+    """The error of frequency times coordinate as a multiple of u, the frequency's rounding
+    included: 0 if the frequency is a power of two, else 2."""
     return 0.0 if abs(math.frexp(frequency)[0]) == 0.5 else 2.0
 
 

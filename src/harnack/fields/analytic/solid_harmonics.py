@@ -62,12 +62,13 @@ def odd_factorial(m: int) -> float:
 
 
 def legendre_weight(l: int, m: int) -> float:  # noqa: E741
-    """N_lm (2m-1)!! for m >= 0: `Legendre` times this is N_lm Q_l^m."""
+    """The factor N_lm (2m-1)!! of the polynomial Q_l^m/(2m-1)!! in a solid harmonic, for m >= 0."""
     return normalization(l, m) * odd_factorial(m)
 
 
 class Legendre:
-    """The polynomials Q_l^m / (2m-1)!! at given z and r^2, each computed once.
+    """The polynomials Q_l^m / (2m-1)!! at given z and r^2. Q_l^m is r^(l-m) times the m-th
+    derivative of the Legendre polynomial P_l at z/r. Each is computed once.
 
     Without the division by (2m-1)!!, which is Q_m^m, values would leave the range of float32. The
     factors `legendre_weight` of a sum contain it.
@@ -101,13 +102,14 @@ def evaluate(weights: Weights, x: Any, y: Any, z: Any) -> tuple[Any, tuple[Any, 
 
     Returns the value and the three components of the gradient.
 
-    For m >= 0 let Q = Q_l^m. The derivative of Q by z at fixed r^2 is Q_l^(m+1), and by r^2 it is
-    -Q_(l-1)^(m+1)/2. So r^l Y_lm / N_lm = Q C_m has the derivatives
+    With Q = Q_l^m, C_m and S_m as in the module, r^l Y_lm / N_lm is Q C_m for the order m >= 0 and
+    Q S_m for the order -m. The derivative of Q by z at fixed r^2 is Q_l^(m+1), and by r^2 it is
+    -Q_(l-1)^(m+1)/2. So Q C_m has the derivatives
 
         d/dx = -x Q_(l-1)^(m+1) C_m + m Q C_(m-1),   d/dz = (l+m) Q_(l-1)^m C_m,
         d/dy = -y Q_(l-1)^(m+1) C_m - m Q S_(m-1),
 
-    and Q S_m, which belongs to the order -m,
+    and Q S_m the derivatives
 
         d/dx = -x Q_(l-1)^(m+1) S_m + m Q S_(m-1),   d/dz = (l+m) Q_(l-1)^m S_m,
         d/dy = -y Q_(l-1)^(m+1) S_m + m Q C_(m-1).
@@ -138,7 +140,8 @@ def evaluate(weights: Weights, x: Any, y: Any, z: Any) -> tuple[Any, tuple[Any, 
 def hessian(weights: Weights, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any, Any, Any, Any]:
     """The second derivatives xx, yy, zz, xy, xz, yz of the sum of c_lm r^l Y_lm at points.
 
-    weights, x, y, z: as for `evaluate`.
+    weights: the coefficients (l, m) -> c_lm.
+    x, y, z: the coordinates, numbers or arrays.
 
     The rules of `evaluate` are applied twice to Q B, where B is C_m or S_m. With Q' =
     Q_(l-1)^(m+1), Q" = Q_(l-2)^(m+2) and the derivatives B_x, B_xx, ... of B, for which B_yy =
@@ -171,26 +174,28 @@ def hessian(weights: Weights, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any, An
     return total[0], total[1], total[2], total[3], total[4], total[5]
 
 
-def unit_hessian(l: int, m: int, rho: Any, z: Any, b: float, drop: int) -> Any:  # noqa: E741
-    """The Hessians (n, 3, 3) of r^l Y_lm, divided by rho^drop, at n points of the unit sphere.
+def unit_hessian(l: int, m: int, rho: Any, z: Any, azimuth: float, removed_power: int) -> Any:  # noqa: E741
+    """The Hessians (n, 3, 3) of the real solid harmonic r^l Y_lm, divided by rho^removed_power, at
+    n points of the unit sphere on one meridian.
 
-    l, m: degree and order, m >= 0; either drop is 0, or m >= 2 + drop.
+    l, m: degree and order, m >= 0; either removed_power is 0, or m >= 2 + removed_power.
     rho, z: (n,) the distances of the points from the z axis, and their z.
-    b: the azimuth of all points, in radians.
-    drop: the power of rho. The division is done after differentiation, without dividing by rho.
+    azimuth: the azimuth of the meridian, in radians.
+    removed_power: how many factors rho are left out. For m >= 2 every entry of the Hessian contains
+        rho^(m-2). So the factors are left out of the formula, and the result is finite at rho = 0.
     """
 
     def power(n: int) -> Any:
-        """rho^n / rho^drop; 1 for n < drop, where it is multiplied by 0."""
-        return rho ** max(n - drop, 0)
+        """rho^(n - removed_power). If n < removed_power it is 1: the factor before it is 0 then."""
+        return rho ** max(n - removed_power, 0)
 
-    x, y = rho * math.cos(b), rho * math.sin(b)
+    x, y = rho * math.cos(azimuth), rho * math.sin(azimuth)
     basis = (
-        power(m) * math.cos(m * b),
-        m * power(m - 1) * math.cos((m - 1) * b),
-        -m * power(m - 1) * math.sin((m - 1) * b),
-        m * (m - 1) * power(m - 2) * math.cos((m - 2) * b),
-        -m * (m - 1) * power(m - 2) * math.sin((m - 2) * b),
+        power(m) * math.cos(m * azimuth),
+        m * power(m - 1) * math.cos((m - 1) * azimuth),
+        -m * power(m - 1) * math.sin((m - 1) * azimuth),
+        m * (m - 1) * power(m - 2) * math.cos((m - 2) * azimuth),
+        -m * (m - 1) * power(m - 2) * math.sin((m - 2) * azimuth),
     )
     sums = _hessian_sums([(l, 1.0)], m, Legendre(z, 1.0))
     xx, yy, zz, xy, xz, yz = (entry + 0.0 * z for entry in _hessian_of_sums(sums, basis, x, y))
@@ -198,10 +203,11 @@ def unit_hessian(l: int, m: int, rho: Any, z: Any, b: float, drop: int) -> Any: 
 
 
 def _hessian_of_sums(sums: Sequence[Any], basis: Sequence[Any], x: Any, y: Any) -> tuple[Any, ...]:
-    """The derivatives xx, yy, zz, xy, xz, yz of Q B, summed over l with weights: see `hessian`.
+    """The second derivatives xx, yy, zz, xy, xz, yz of the sum over l of c_l N_lm Q_l^m B, by the
+    formulas of `hessian`.
 
-    sums: the six sums of `_hessian_sums`.
-    basis: B, B_x, B_y, B_xx, B_xy, where B is C_m or S_m.
+    sums: the six sums over l that `_hessian_sums` returns.
+    basis: B, B_x, B_y, B_xx, B_xy, where B is C_m or S_m and indices are derivatives.
     """
     at_m, at_next, at_second, rate, rate_next, rate_twice = sums
     b, bx, by, bxx, bxy = basis
@@ -216,20 +222,20 @@ def _hessian_of_sums(sums: Sequence[Any], basis: Sequence[Any], x: Any, y: Any) 
 
 
 def _hessian_sums(
-    column: Sequence[tuple[int, float]], m: int, q: Legendre
+    degree_weights: Sequence[tuple[int, float]], m: int, q: Legendre
 ) -> tuple[Any, Any, Any, Any, Any, Any]:
     """The weighted sums over l that second derivatives need, for one order.
 
-    With c_l the weight of the degree l, the sums of c_l N_lm times Q_l^m, Q_(l-1)^(m+1),
+    With c_l the weight of the degree l, these are the sums of c_l N_lm times Q_l^m, Q_(l-1)^(m+1),
     Q_(l-2)^(m+2), (l+m) Q_(l-1)^m, (l+m) Q_(l-2)^(m+1) and (l+m) (l+m-1) Q_(l-2)^m.
 
     degree_weights: (l, c_l) for all degrees l of the order.
     m: the absolute value of the order.
-    q: the polynomials at the points.
+    q: the polynomials Q_l^m at the points.
     """
-    at_m, at_next, rate = _slope_sums(column, m, q)
+    at_m, at_next, rate = _slope_sums(degree_weights, m, q)
     at_second, rate_next, rate_twice = 0.0, 0.0, 0.0
-    for l, weight in column:  # noqa: E741
+    for l, weight in degree_weights:  # noqa: E741
         a = weight * legendre_weight(l, m)
         if l > m + 1:
             rate_twice = rate_twice + (a * (l + m) * (l + m - 1)) * q(l - 2, m)
@@ -240,14 +246,20 @@ def _hessian_sums(
     return at_m, at_next, at_second, rate, rate_next, rate_twice
 
 
-def _slope_sums(column: Sequence[tuple[int, float]], m: int, q: Legendre) -> tuple[Any, Any, Any]:
+def _slope_sums(
+    degree_weights: Sequence[tuple[int, float]], m: int, q: Legendre
+) -> tuple[Any, Any, Any]:
     """The weighted sums over l that values and gradients need, for one order.
 
-    With c_l the weight of the degree l, the sums of c_l N_lm times Q_l^m, Q_(l-1)^(m+1) and (l+m)
-    Q_(l-1)^m. Parameters as for `_hessian_sums`.
+    With c_l the weight of the degree l, these are the sums of c_l N_lm times Q_l^m, Q_(l-1)^(m+1)
+    and (l+m) Q_(l-1)^m.
+
+    degree_weights: (l, c_l) for all degrees l of the order.
+    m: the absolute value of the order.
+    q: the polynomials Q_l^m at the points.
     """
     at_m, at_next, rate = 0.0, 0.0, 0.0
-    for l, weight in column:  # noqa: E741
+    for l, weight in degree_weights:  # noqa: E741
         a = weight * legendre_weight(l, m)
         at_m = at_m + a * q(l, m)
         if l > m:

@@ -115,8 +115,11 @@ def order_on_axis(weights: Weights) -> int:
 
 
 def value_bound(weights: Weights) -> AxialBound:
-    """A bound of |f| for the sum f with these weights, as |r^l Y_lm| <= max(N |Q(cos a)|) rho^m
-    r^(l-m)."""
+    """A bound of |f| for the sum f of solid harmonics with these weights: |r^l Y_lm| <= max(N
+    |Q(cos a)|) rho^m r^(l-m), where the maximum is over all polar angles a.
+
+    weights: (l, m) -> coefficient.
+    """
     return _summed(weights, lambda l, m: (m, l, largest_value(l, m)))  # noqa: E741
 
 
@@ -156,8 +159,11 @@ def _summed(weights: Weights, bound_of: Callable[[int, int], tuple[int, int, flo
 
 
 def amplitudes(weights: Weights) -> dict[tuple[int, int], float]:
-    """(l, m >= 0) -> the amplitude of the harmonics of degree l and orders m and -m together: the
-    root of the sum of the squares of their weights."""
+    """For each (l, m) with m >= 0, the amplitude of the harmonics of degree l and orders m and -m
+    together: the root of the sum of the squares of their weights.
+
+    weights: (l, m) -> coefficient.
+    """
     sizes: dict[tuple[int, int], float] = {}
     for (l, m), weight in weights.items():  # noqa: E741
         sizes[l, abs(m)] = math.hypot(sizes.get((l, abs(m)), 0.0), weight)
@@ -187,7 +193,8 @@ def _proved_maximum(sampled: FloatArray, degree: int) -> float:
 
 @functools.cache
 def largest_value(l: int, m: int) -> float:  # noqa: E741
-    """A bound of N |Q(cos a)| over all polar angles a."""
+    """A bound of N |Q(cos a)| over all polar angles a, where Y_lm = N Q(cos a) sin(a)^m times cos
+    or sin of m times the azimuth."""
     z, _ = polar_samples()
     return legendre_weight(l, m) * _proved_maximum(
         np.broadcast_to(Legendre(z, 1.0)(l, m), z.shape), l
@@ -233,7 +240,7 @@ def largest_hessian(l: int, m: int) -> float:  # noqa: E741
     largest = 0.0
     for angle in np.pi * np.arange(_AZIMUTH_SAMPLES) / _AZIMUTH_SAMPLES:
         b = angle / max(m, 1)
-        hessians = unit_hessian(l, m, rho, z, float(b), drop=max(m - 2, 0))
+        hessians = unit_hessian(l, m, rho, z, float(b), removed_power=max(m - 2, 0))
         sizes = np.abs(np.linalg.eigvalsh(hessians)).max(axis=1)
         largest = max(largest, _proved_maximum(sizes, l))
         if m == 0:
@@ -350,9 +357,10 @@ class BallRange:
         return cls(constant, tuple(ends))
 
     def with_spheres(self, weights: Weights, largest: float) -> BallRange:
-        """The same bounds with ranges of f on six spheres up to the radius `largest`.
+        """The same bounds of f, with ranges of f on six spheres up to the radius `largest`.
 
-        weights: those of f. A polynomial with a single f_l besides f_0 is returned unchanged.
+        weights: (l, m) -> coefficient, those of f. A polynomial with a single f_l besides f_0 is
+            returned unchanged.
         """
         if len(self.ends) < 2:
             return self
@@ -385,7 +393,8 @@ class BallRange:
         return self._derivative(s, 2)
 
     def gradient(self, s: Real) -> Real:
-        """A bound of |grad f| on |y| <= s, from |grad f_l| <= l M |y|^(l-1): see `curvature`."""
+        """A bound of |grad f| on |y| <= s, from |grad f_l| <= l M |y|^(l-1), where M is the largest
+        |f_l| on the unit sphere. `curvature` has the proof."""
         return self._derivative(s, 1)
 
     def _derivative(self, s: Real, order: int) -> Real:
@@ -413,8 +422,11 @@ class BallRange:
 
 
 def _points(weights: Weights) -> tuple[FloatArray, float]:
-    """Sample points (3, n) of the unit sphere for sums with these weights, and the angle within
-    which each point of the sphere is near one of them."""
+    """Sample points of the unit sphere for sums with these weights, an array (3, n); and an angle:
+    each point of the sphere is within it of a sample point.
+
+    weights: (l, m) -> coefficient.
+    """
     covering = _RESOLUTION / max(1, max(degree for degree, _ in weights))
     return unit_sphere(covering), covering
 

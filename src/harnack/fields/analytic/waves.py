@@ -141,7 +141,8 @@ def checked_terms(terms: Iterable[Term]) -> tuple[Term, ...]:
 
 
 class _FactorEvaluator:
-    """Evaluates factors and their derivatives at a point p; computes each sine and cosine once."""
+    """The values of factors and of their derivatives at a point p. Each sine and cosine is computed
+    once."""
 
     def __init__(self, p: Vec3) -> None:
         self._p = p
@@ -183,8 +184,8 @@ def hessian_of_terms(terms: Sequence[Term], p: Vec3) -> list[list[Real]]:
     """The matrix of second derivatives of the sum of the terms at p, as three rows of three.
 
     For a plane wave with wave vector k it is -k k^T times the wave. For a product, differentiating
-    twice along one axis multiplies it by -frequency^2; along two axes, each differentiates its own
-    factor.
+    twice along one axis multiplies it by -frequency^2; differentiating along two axes replaces the
+    factor of each of them by its derivative.
     """
     evaluate_factor = _FactorEvaluator(p)
     upper = {(i, j): p[0] * 0.0 for i in range(3) for j in range(i, 3)}
@@ -286,11 +287,11 @@ class WaveBounds:
 
 
 def mean_wavelength(amplitudes: npt.ArrayLike, wavenumbers: npt.ArrayLike) -> float:
-    """2 pi over the root mean square of the wavenumbers, weighted by the absolute amplitudes.
+    """2 pi over the root mean square of the wavenumbers, weighted by the absolute amplitudes. For a
+    single wave it is its wavelength. For a sum it is the length of the waves that dominate its
+    shape, and not that of the shortest wave.
 
-    amplitudes, wavenumbers: arrays (n,). For a single wave it is the wave's length; for a sum, the
-        length
-    of the waves that dominate its shape, and not that of the shortest wave.
+    amplitudes, wavenumbers: arrays (n,).
     """
     sizes, numbers = np.abs(amplitudes), np.asarray(wavenumbers, np.float64)
     largest = float(numbers.max())
@@ -299,10 +300,10 @@ def mean_wavelength(amplitudes: npt.ArrayLike, wavenumbers: npt.ArrayLike) -> fl
 
 
 def _plane_waves(term: Term) -> list[tuple[tuple[float, ...], complex]]:
-    """The plane waves of a term: pairs (k, A) with term = sum of Re(A exp(i k . p)), A complex.
+    """The plane waves of a term, as pairs (k, A) with term = sum of Re(A exp(i k . p)) and complex
+    A. The first nonzero component of each k is positive (`_canonical`).
 
-    A product cos a cos b cos c is the mean of cos(a +- b +- c) over the signs. The wave vectors are
-    in the form of `_canonical`.
+    A product cos a cos b cos c is the mean of cos(a +- b +- c) over the signs.
     """
     if isinstance(term, PlaneWave):
         phasor = term.amplitude * complex(math.cos(term.phase), math.sin(term.phase))
@@ -324,10 +325,11 @@ def _plane_waves(term: Term) -> list[tuple[tuple[float, ...], complex]]:
 
 
 def _canonical(k: Sequence[float], amplitude: complex) -> tuple[tuple[float, ...], complex]:
-    """The wave vector k and the complex amplitude, in the form in which k and -k give the same
-    result.
+    """The wave vector and the complex amplitude of the same plane wave Re(amplitude exp(i k . p)),
+    with a wave vector whose first nonzero component is positive.
 
-    The first nonzero component of the returned vector is positive: cos(k.p + t) = cos(-k.p - t).
+    If k has to be negated for this, the amplitude is conjugated: cos(k.p + t) = cos(-k.p - t). So k
+    and -k give the same result.
     """
     leading = next((v for v in k if v != 0), 0.0)
     if leading < 0:

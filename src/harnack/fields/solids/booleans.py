@@ -45,8 +45,12 @@ def union(*solids: Solid) -> Solid:
 
 
 def intersection(*solids: Solid) -> Solid:
-    """The intersection of solids: all points that are in each of them. It raises the errors of
-    `union`."""
+    """The intersection of solids: all points that are in each of them.
+
+    Raises:
+        ValueError: no solids.
+        TypeError: an argument that is not a solid.
+    """
     return BooleanSolid(_flatten_operands(solids, is_union=False), is_union=False)
 
 
@@ -114,9 +118,14 @@ class BooleanSolid(Solid):
         return BooleanSolid(tuple(part.map_operands(change) for part in self.parts), self.is_union)
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
-        """See `Solid.sublevel_extent`. Points where the extreme value is on the side asked for lie
-        either in each operand's volume, or in at least one of them: in the first case the volumes
-        are intersected, in the second a box is put around them."""
+        """A volume that is proved to contain all points where f <= level or, if `above`, all points
+        where f >= level; None if no such volume is known.
+
+        The volumes of the operands (the solids that are combined) are put together. If the points
+        lie in each of these volumes, they lie in the intersection of the volumes. If they lie in at
+        least one of the volumes, they lie in a box around all volumes. Which case it is depends on
+        `is_union` and `above`.
+        """
         extents = [part.sublevel_extent(level, above=above) for part in self.parts]
         bounded = [part for part in extents if part is not None]
         if self.is_union == above:
@@ -173,9 +182,10 @@ class BooleanSolid(Solid):
         return rows
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """The largest derivative errors of the operands that may be the extreme one (for a union
-        the least, for an intersection the greatest). They are infinite where rounding leaves open
-        which operand is extreme, since derivatives jump there."""
+        """Two bounds at p: of the error of the gradient, as a length, and of the error of the
+        Hessian. Each is the largest error of the operands whose value may be the smallest (for a
+        union) or the largest (for an intersection). Both are infinite where rounding leaves open
+        which operand that is, since derivatives jump there."""
         size = max_norm(p)
         sign = -1.0 if self.is_union else 1.0
         total_error = value_error_bound(sample, safe_norm(sample.gradient), size)
@@ -213,11 +223,13 @@ class BooleanSolid(Solid):
     def _combine_enclosures(
         self, operands: list[tuple[Enclosure, ...]], deficits: list[tuple[Real, Real]]
     ) -> tuple[Enclosure, ...]:
-        """The enclosures of the combination from those of its operands; () if an operand has none.
+        """The enclosures of the combination's function along the ray, from those of its operands;
+        () if an operand has none.
 
-        operands: the enclosures of each operand.
-        deficits: for each operand, bounds (lower, upper) of how much it is below the greatest
-            operand. (For a union, operands are negated first.)
+        operands: the enclosures of each operand. For a union they are those of the negated
+            operands.
+        deficits: for each operand, bounds (lower, upper) of how much its value is below the
+            greatest value.
         """
         if not all(operands):
             return ()
@@ -236,12 +248,12 @@ class BooleanSolid(Solid):
     ) -> tuple[Sample, list[tuple[Real, Real]], Real]:
         """The sample of the combination from those of the operands.
 
-        samples: of the operands, at one point.
+        samples: the samples of the operands, at one point.
         size: a bound of the absolute values of the point's coordinates.
 
-        Returns the sample; for each operand, bounds (lower, upper) of how much it is below the
-        greatest operand; and the greatest value of an operand. For a union all this is about
-        negated operands, except that the least value itself is returned.
+        Returns the sample; for each operand, bounds (lower, upper) of how much its value is below
+        the greatest value; and the greatest value. For a union the bounds are about the negated
+        operands, and the last result is the least value of an operand.
 
         Proof of the errors. Let v_i be the values of the operands f_i, e_i bounds of their errors
         (all rounding included, `value_error_bound`), and v = v_k the greatest value. Then max f_i
@@ -250,8 +262,8 @@ class BooleanSolid(Solid):
         with a smaller error may exclude most of that range. Then the value is set to the middle of
         the remaining range. Otherwise a ray would hit, by the rounding of one operand, a surface
         that lies inside of another operand. The tracer subtracts the error of the combination from
-        its level gaps. If the error of an operand is larger, the excess is subtracted from the
-        bound of how much the operand is below.
+        the differences between f and the levels. If the error of an operand is larger, the excess
+        is subtracted from the bound of how much the operand is below.
         """
         sign = -1.0 if self.is_union else 1.0
         values = [sign * operand.value for operand in samples]
@@ -302,8 +314,9 @@ class BooleanSolid(Solid):
         )
 
     def _common_lipschitz(self, samples: list[Sample]) -> tuple[Lipschitz, ...]:
-        """The largest of the operands' Lipschitz constants on the smallest of their balls, as a
-        promise of the combination; () if an operand promises no constant."""
+        """A Lipschitz constant of the combination near the point, as a promise: the largest of the
+        operands' constants, on the smallest of their balls; () if an operand promises no
+        constant."""
         constant: Any = 0.0
         radius: Any = math.inf
         for sample in samples:
@@ -316,16 +329,16 @@ class BooleanSolid(Solid):
 
 
 def min_wavelength(parts: Iterable[Solid]) -> float | None:
-    """The smallest `Field.min_wavelength` of solids. Solids for which it is None are left out; None
-    if there are no others."""
+    """The smallest `Field.min_wavelength` of the solids `parts`. Solids for which it is None are
+    left out; None if no solid remains."""
     return min(
         (part.min_wavelength for part in parts if part.min_wavelength is not None), default=None
     )
 
 
 def lipschitz_of(sample: Sample) -> Lipschitz | None:
-    """A Lipschitz constant that a sample promises, or that follows from one of its promises; None
-    if there is neither."""
+    """A Lipschitz promise of a sample, or one that follows from another of its promises; None if
+    there is none."""
     implied = [promise.implied_lipschitz(sample.value) for promise in sample.all_promises]
     stated = (promise for promise in sample.all_promises if isinstance(promise, Lipschitz))
     return next(stated, None) or next((promise for promise in implied if promise is not None), None)
@@ -433,7 +446,8 @@ class OffsetSolid(SolidOfField):
         return self._shifted(self.field.evaluate(p))
 
     def _shifted(self, sample: Sample) -> Sample:
-        """The sample of f - distance from that of f. Its error includes the rounding of the
+        """The sample of f - distance at the same point, from the sample of f. Here f is the
+        function of the solid that is offset. The bound of the error includes the rounding of the
         difference."""
         size = dr.abs(sample.value) + abs(self.distance)
         return sample.map_promises(
@@ -452,15 +466,16 @@ class OffsetSolid(SolidOfField):
 
 @dataclass(frozen=True, eq=False)
 class BlendedSolid(FormulaSolid):
-    """The union or intersection of two solids with a fillet: see `arithmetic.norms.blend_union`.
+    """The union or intersection of two solids with a fillet (`arithmetic.norms.blend_union` has the
+    function and its proofs).
 
     parts: the two solids.
-    radius: how far the fillet extends along the surfaces, where the functions are distances.
+    radius: how far the fillet extends along the surfaces, if the functions are distances.
     power: the exponent p of the superellipse that the fillet is a part of.
     is_union: whether it is their union; else it is their intersection.
 
     Its Lipschitz constant is 2^(1/p) times the larger of the solids' constants. The fillet of a
-    union lies where both functions are at most the radius, so that it is within the union of the
+    union lies where both functions are at most the radius. So it lies within the union of the
     solids grown by the radius.
     """
 
@@ -491,9 +506,13 @@ class BlendedSolid(FormulaSolid):
         object.__setattr__(self, "domain", union(*self.parts).domain)
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
-        """See `Solid.sublevel_extent`. A fillet adds points to a union below a level, and takes
-        points from an intersection; so the volume is that of the combination without a fillet, at a
-        level shifted by `_min_operand_bound` if the fillet adds points."""
+        """A volume that is proved to contain all points where f <= level or, if `above`, all points
+        where f >= level; None if no such volume is known.
+
+        A fillet adds points to a union below a level, and takes points from an intersection. So the
+        volume is that of the combination without a fillet; if the fillet adds points, for a level
+        shifted by `_min_operand_bound`.
+        """
         sharp = union(*self.parts) if self.is_union else self.parts[0] & self.parts[1]
         if self.is_union:
             return (

@@ -102,8 +102,8 @@ class DeformedSolid(FormulaSolid):
         return tally_of(self.inner.formula).may_jump
 
     def promises(self, p: Vec3) -> tuple[Promise, ...]:
-        """The Lipschitz constant of the inner solid times that of the inverse map on a ball about
-        p."""
+        """A Lipschitz promise: the Lipschitz constant of the inner solid times that of the inverse
+        map on a ball about p; () if the inner solid has no constant."""
         constant = self.inner.lipschitz
         if constant is None:
             return ()
@@ -261,7 +261,8 @@ def _axis_last(p: tuple[Any, Any, Any], axis: str) -> tuple[Any, Any, Any]:
 
 
 def _axis_in_place(p: tuple[Any, Any, Any], axis: str) -> tuple[Any, Any, Any]:
-    """The coordinates in the order x, y, z, from the order of `_axis_last`: its inverse."""
+    """The coordinates in the order x, y, z, from coordinates in the order of `_axis_last`, in which
+    the coordinate along `axis` is the last."""
     k = AXES[axis]
     x, y, z = (p[(i - k - 1) % 3] for i in range(3))
     return x, y, z

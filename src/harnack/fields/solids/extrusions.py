@@ -104,8 +104,9 @@ class Extrusion(Solid):
         return {"edges": sum(map(len, self.loops))}
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
-        """See `Solid.sublevel_extent`. A box around the outline, grown by the level; for a twisted
-        or tapered solid, around the image of that box at any height."""
+        """A box that contains all points where f <= level: a box around the outline, grown by the
+        level. For a twisted or tapered solid it contains the images of that box at all heights.
+        None if `above`."""
         if above:
             return None
         points = np.concatenate(self.loops)
@@ -189,10 +190,10 @@ class Extrusion(Solid):
         return Sample(value, gradient, promises, error, gradient_error)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The ray sample. Without twist and taper its enclosure is an `ExtrusionEnclosure`.
-        Otherwise its enclosures follow from a Lipschitz constant along the ray, the speed of the
-        preimage. It has no enclosure looking back. If the caller asks for other kinds of
-        enclosures, those of the promises are used."""
+        """The ray sample. Without twist and taper its enclosure (the proof of bounds of f along the
+        ray) is an `ExtrusionEnclosure`. Otherwise its enclosures follow from a Lipschitz constant
+        along the ray, the speed of the preimage. It has no enclosure looking back. If the caller
+        asks for other kinds of enclosures, those of the promises are used."""
         del back
         p, d = path.point(t), path.direction
         if not self.is_straight:
@@ -223,7 +224,7 @@ class Extrusion(Solid):
         )
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        """f at jets of the coordinates, or at Dr.Jit numbers."""
+        """f at coordinates that are jets or Dr.Jit numbers."""
         if not is_jet(x, type(self).__name__):
             return self.differentiable_value(_vector(x, y, z))
         solid = _prepared_for(self, x.piece_length)
@@ -234,7 +235,7 @@ class Extrusion(Solid):
 
     def _preimage(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
         """The preimage of (x, y, z): the point that taper and twist map to it. Coordinates may be
-        of any kind."""
+        numbers of any arithmetic."""
         for deform in (cast("Any", self)._tapering, cast("Any", self)._turning):
             if deform is not None:
                 x, y, z = deform.preimage(x, y, z)
@@ -253,17 +254,21 @@ class Extrusion(Solid):
     def _min_gradient_norm(self, sample: Sample) -> Real:
         """A lower bound of |grad f|, from the Lipschitz constant c that a sample promises.
 
-        Proof. |grad f| is at least the smallest singular value of the derivative of the inverse
-        map, which is the product of those of its two factors. For the twist, the singular values
-        are s, 1 and 1/s, so the smallest is 1/s. For the taper, they are k and those of a 2 x 2
-        matrix of determinant k; if s is the larger of these two, s >= k and s >= 1, so the smallest
-        is at least k/s. c is at least the product of both s, and k is at least 1/max(1, taper).
+        Proof. f at p is the signed distance of an outline's extrusion, whose gradient is at least
+        `_MIN_GRADIENT` long, at the preimage of p. So |grad f| is at least `_MIN_GRADIENT` times
+        the smallest singular value of the derivative of the inverse map, and that is at least the
+        product of the smallest singular values for the twist and for the taper. For the twist, the
+        singular values are s, 1 and 1/s with s >= 1, so the smallest is 1/s. For the taper, they
+        are k and those of a 2 x 2 matrix of determinant k. Let q be the larger of these two; then q
+        >= k and q >= 1, so the smallest is at least k/q. As c is at least s q, and k at least
+        1/max(1, taper), k/(s q) is at least 1/(max(1, taper) c).
         """
         (promise,) = sample.promises
         return _MIN_GRADIENT / (max(1.0, self.taper) * cast("Lipschitz", promise).constant)
 
     def _preimage_lipschitz(self, p: Vec3) -> tuple[Real, Real]:
-        """A Lipschitz constant of `_preimage` on a ball about p, and the radius of that ball."""
+        """A Lipschitz constant of the inverse map (`_preimage`) on a ball about p, and the radius
+        of that ball."""
         taper, twist = cast("Any", self)._tapering, cast("Any", self)._turning
         constant, radius = 0 * p.x + 1, 0 * p.x + dr.inf
         if taper is not None:
@@ -330,8 +335,12 @@ class ExtrusionEnclosure(Enclosure):
     rate: Real
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """See `Enclosure`. The deficits are by how much the distances w and d are less than f at
-        the start, error included."""
+        """The length of the path on which f is proved to meet neither the level above nor the level
+        below.
+
+        In the code the deficits are by how much w and d are less than f at the start, error
+        included.
+        """
         inf = type(gaps.below)(dr.inf)
         end_distance = dr.abs(self.height) - self.half
         end_deficit, side_deficit = (
@@ -370,15 +379,15 @@ class ExtrusionEnclosure(Enclosure):
 def outline_distance_jet(nearest: Callable[[Real, Real], OutlineSample], x: Jet, y: Jet) -> Jet:
     """The jet of a signed distance d in the plane.
 
-    nearest: returns the sample of d at a point (u, v).
+    nearest: a function that returns the sample of d at a point (u, v).
     x, y: jets of the coordinates.
 
     Proof. d has the Lipschitz constant 1. So its derivative by any variable is at most the length
-    of the derivative of (x, y) by it, and its value at the start is known up to the error of the
-    coordinates there. On a piece d may have kinks, so that second derivatives have no bound. At a
-    point, the gradient and the second derivatives are those of the distance from the nearest edge
-    or vertex. Where coordinates are ranges that stand for a ball, and not numbers with their
-    rounding, another edge may be nearest, as on a piece.
+    of the derivative of (x, y) by that variable, and its value at the start is known up to the
+    error of the coordinates there. On a piece d may have kinks, so that second derivatives have no
+    bound. At a point, the gradient and the second derivatives are those of the distance from the
+    nearest edge or vertex. If coordinates are ranges that stand for a ball, and not numbers with
+    their rounding, another edge may be nearest, as on a piece.
     """
     starts = [jet_u if jet_u.jet_at_start is None else jet_u.jet_at_start for jet_u in (x, y)]
     zero = 0 * x.piece_length
@@ -392,8 +401,10 @@ def outline_distance_jet(nearest: Callable[[Real, Real], OutlineSample], x: Jet,
     value = value + Interval(-value_error, value_error)
 
     def lipschitz_range(i: int, jet_u: Jet, jet_v: Jet) -> Interval:
-        """The range of the distance's derivative by variable i that its Lipschitz constant proves,
-        from the jets of both coordinates."""
+        """The range of the derivative of d by variable i that the Lipschitz constant 1 of d proves.
+
+        jet_u, jet_v: the jets of the two coordinates.
+        """
         a, b = zero + jet_u.first_derivatives[i].max_abs, zero + jet_v.first_derivatives[i].max_abs
         limit = dr.sqrt(dr.fma(a, a, b * b)) * (1 + 1e-5)
         return Interval(-limit, limit)
@@ -443,8 +454,9 @@ def outline_distance_jet(nearest: Callable[[Real, Real], OutlineSample], x: Jet,
 class SolidOfRevolution(Solid):
     """The solid of revolution, about the z axis, of an outline in the half-plane (r, z), r >= 0.
 
-    loops: as for `Extrusion`, with points (r, z). Edges on the axis are inside of the solid, and no
-        part of its surface.
+    loops: the outline, an array (n, 2) of the vertices (r, z) of a closed loop, or several such
+        arrays (even-odd rule). Edges on the axis are inside of the solid, and no part of its
+        surface.
 
     f is the signed distance, with the Lipschitz constant 1. Proof. The nearest point of a surface
     of revolution lies in the half-plane of p, so f is the signed distance of (r, z) from the
@@ -452,8 +464,8 @@ class SolidOfRevolution(Solid):
     The point (r, z) departs from that line in r alone. r(s) is convex along the path, and lies
     above its tangent by e(s) = (c/r)^2 s^2/(r(s) + r + r' s) >= 0, where c/r is the component of
     the direction across the half-plane. As the distance has the constant 1, it is less by at most
-    e(s). A concave bound less a convex function is still concave, which is all that
-    `TangentEnclosure` needs.
+    e(s). A concave bound less a convex function is still concave, and `TangentEnclosure` needs no
+    more than that.
 
     Raises:
         ValueError: loops that enclose no area, or with points of r < 0.
@@ -503,7 +515,7 @@ class SolidOfRevolution(Solid):
 
         r: the distance of p from the axis.
         outward: x and y of the unit vector from the axis to p.
-        side: the sample of the distance from the outline.
+        side: the sample of the signed distance from the outline at (r, z).
         """
         epsilon = 2 * float(dr.epsilon(type(p.x)))
         radial, up = side.gradient

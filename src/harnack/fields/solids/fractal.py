@@ -102,8 +102,8 @@ def cell_noise(kind: Fade, t: Any, vectors: Any) -> tuple[Any, list[Any], list[A
     hessian: list[Any] = [0.0] * 6
 
     def weight(corner: tuple[int, ...], orders: list[int]) -> Any:
-        """A product of three factors, one for each axis: the weight of a corner, or a derivative of
-        it.
+        """The weight of a corner, a product of three factors, one for each axis; or a derivative of
+        that product.
 
         corner: 0 or 1 for each axis.
         orders: the order of the derivative along each axis, 0 to 2.
@@ -236,7 +236,7 @@ class FractalNoise(FormulaSolid):
         return None
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        """f at jets of the coordinates, or at Dr.Jit numbers."""
+        """f at coordinates that are jets or Dr.Jit numbers."""
         jets = [axis for axis in (x, y, z) if is_jet(axis, type(self).__name__)]
         if jets:
             coordinates = [
@@ -246,10 +246,12 @@ class FractalNoise(FormulaSolid):
         return self._octaves([x, y, z])[0][0]
 
     def _octaves(self, q: list[Real], *, each: bool = False) -> list[tuple[Any, Any, Any]]:
-        """A list of tuples (value, gradient (3,), Hessian (6,) as in `cell_noise`): a single tuple
-        for the sum of all octaves or, if `each`, one for each octave.
+        """The octaves of the noise at points, each as a tuple (value, gradient (3,), Hessian (6,));
+        the Hessian is its upper triangle, row by row.
 
         q: the coordinates x, y and z of the points.
+        each: if True, the list has one tuple for each octave; else a single tuple, the sum of all
+            octaves.
         """
         data = self._data(q[0])
         scale, amplitude = data["frequency"], data["amplitude"]
@@ -288,7 +290,10 @@ class FractalNoise(FormulaSolid):
         return [total]
 
     def _ranges(self, coordinates: list[Jet]) -> Jet:
-        """The jet of f from jets of the coordinates: the sum of the octaves' jets."""
+        """The jet of f from jets of the coordinates: the sum of the jets of all octaves.
+
+        coordinates: the jets, at a point or on a piece of a path.
+        """
         like = coordinates[0].backend_number()
         like = like if coordinates[0].jet_at_start is None else coordinates[0].piece_length
         starts = [
@@ -325,8 +330,14 @@ class FractalNoise(FormulaSolid):
 
 
 class Noise(FractalNoise):
-    """Gradient noise of a single octave: noise with random unit vectors at the points of a lattice
-    (Perlin 1985; Hart 1996, equation 52). For the parameters see `FractalNoise`."""
+    """Gradient noise of a single octave: a smooth function that is 0 at the points of a lattice and
+    has random unit vectors as its gradients there (Perlin 1985; Hart 1996, equation 52).
+
+    frequency: the number of lattice points per unit of length.
+    amplitude: the factor of the noise.
+    seed: an integer of 32 bits that chooses the noise.
+    fade: "quintic", with a continuous second derivative, or "cubic".
+    """
 
     def __init__(
         self,
@@ -341,14 +352,15 @@ class Noise(FractalNoise):
 
 @dataclass(frozen=True)
 class DisplacedSolid(FormulaSolid):
-    """A displaced solid: the points where f + noise <= 0, with f the function of a solid (Hart
-    1996, appendix F).
+    """A displaced solid: the points where f + noise <= 0, with f the function of another solid
+    (Hart 1996, appendix F).
 
-    solid: has the function f, which must be a formula.
-    noise: the displacement.
+    solid: the solid with the function f. It must be a `Formula`, whose f is computed from the
+        coordinates by arithmetic.
+    noise: the noise that is added to f.
 
-    Its Lipschitz constant is the sum of the constants of both. Its surface lies where |f| is at
-    most the noise's `max_abs`.
+    The Lipschitz constant of f + noise is the sum of the constants of f and of the noise. The
+    displaced surface lies where |f| is at most `max_abs` of the noise.
     """
 
     solid: Formula
@@ -387,7 +399,8 @@ class _Octave:
     """An octave of fractal noise, sampled at a point, with bounds that hold around it.
 
     center: the coordinates of the point.
-    value, gradient, hessian: of the octave at the point; the Hessian (6,) as in `cell_noise`.
+    value, gradient, hessian: those of the octave at the point; the Hessian (6,) is its upper
+        triangle, row by row.
     slope: a bound of the length of the gradient, everywhere.
     bend: a bound of all second derivatives, everywhere.
     error, slope_error: bounds of the rounding errors of value and gradient at the point.
@@ -433,9 +446,9 @@ class _Octave:
     def _derivatives(
         self, jets: list[Jet], distance: Real, value: Interval, *, is_point: bool
     ) -> Jet:
-        """The jet from jets of the coordinates and from the range of the value.
+        """The octave's jet, from jets of the coordinates and from the range of its value.
 
-        jets: of the coordinates, whose values lie within `distance` of the octave's point.
+        jets: the jets of the coordinates, whose values lie within `distance` of the octave's point.
         value: the range of the value.
         is_point: whether second derivatives are those of the Hessian; else they are bounded by
             `bend`.

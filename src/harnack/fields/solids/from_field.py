@@ -153,11 +153,13 @@ class SublevelSolid(SolidOfField):
 def bounded_side_extent(
     field: Field, levels: tuple[float, ...], is_inside: Callable[[float], bool]
 ) -> Volume | None:
-    """A volume that contains all points inside, if one is proved. Else the field's domain, outside
-    of which f is not defined, or None.
+    """A volume that contains all points inside a solid, if one is proved. Else the field's domain,
+    outside of which f is not defined, or None.
 
-    levels: of f, on which the surface of the solid lies.
-    is_inside: takes a value of f, and returns whether points with this value are inside.
+    field: the field with the values f.
+    levels: the values of f on the surface of the solid.
+    is_inside: a function that takes a value of f, and returns whether points with this value are
+        inside.
 
     Proof. The level sets lie in `Field.extent`, which is convex. If it has bounds, its complement
     is connected and meets no level. So a single point of the complement decides on which side of
@@ -218,8 +220,8 @@ def field_jet(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
     ) -> tuple[tuple[Interval, ...], tuple[Interval, ...]]:
         """The ranges of the first and of the second derivatives of f by the variables of the jets.
 
-        jets: of the coordinates.
-        distance: a bound of the distance of their points from q.
+        jets: the jets of the coordinates.
+        distance: a bound of the distance from q to the points of the box of these jets.
         """
         limit = dr.select(distance <= radius, bound, dr.inf)
         spread = limit * distance * (1 + 1e-5) + sample.gradient_error
@@ -352,8 +354,10 @@ class BandSolid(SolidOfField):
         return prepared
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
-        """See `Solid.sublevel_extent`. The points where |f - level| - half_width is at most a
-        number lie between two levels of f."""
+        """A volume that is proved to contain all points where |f - level| - half_width is at most
+        the number `level`; these points lie between two levels of f. If no such volume is known, or
+        if `above`, it is the field's domain, outside of which f is not defined; None if there is
+        none."""
         ends = tuple(self.level + sign * (self.half_width + level) for sign in (-1, 1))
         if above or (self.field.is_global and self.field.period is None):
             return self.domain
@@ -376,9 +380,9 @@ class BandSolid(SolidOfField):
         return x, y, z
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """The bounds of the field f. They are infinite where rounding leaves open whether f is
-        above or below the level (or, if f has a period, which multiple of it is nearest), since
-        derivatives jump there."""
+        """Two bounds at p, of the errors of the gradient and of the Hessian: those of the field f.
+        They are infinite where rounding leaves open whether f is above or below the level (or, if f
+        has a period, which multiple of it is nearest), since derivatives jump there."""
         inner_sample = self.field.evaluate(p)
         first_error, second_error = self.field.derivative_errors(p, inner_sample)
         error = value_error_bound(inner_sample, safe_norm(inner_sample.gradient), max_norm(p))
@@ -412,8 +416,8 @@ class BandSolid(SolidOfField):
         return abs(self.field.formula(x, y, z) - self.level) - self.half_width
 
     def _level_difference(self, value: Real) -> Real:
-        """f - level; for a field with a period, less the multiple of the period that brings it
-        closest to 0.
+        """f - level; if the field has a period, minus the multiple of the period that brings the
+        difference closest to 0.
 
         value: f.
         """
@@ -443,17 +447,18 @@ class BandSolid(SolidOfField):
 
 @dataclass(frozen=True)
 class FoldedEnclosure(Enclosure):
-    """An enclosure of |r| from an enclosure of r.
+    """An enclosure of |r| along a path from an enclosure of r.
 
     inner: the enclosure of r.
     offset: r at the start of the path.
     period: if not None, r is known up to multiples of the period, and `offset` is within half a
-        period of 0; |r| then stands for the distance of r from the nearest multiple.
+        period of 0. Then |r| stands for the distance of r from the nearest multiple.
 
-    Proof. |r| rises by g only where r reaches plus or minus |r| + g, or one of these plus a
-    multiple of the period. It falls by g only where r reaches plus or minus |r| - g, or one of
-    these plus a multiple of the period. The nearest of these numbers above and below r are the
-    levels of r. If |r| - g < 0, or |r| + g is more than half a period, |r| never takes this value.
+    Proof. |r| rises by g only where r reaches plus or minus |r| + g, or one of these two numbers
+    plus a multiple of the period. It falls by g only where r reaches plus or minus |r| - g, or one
+    of these two numbers plus a multiple of the period. The nearest of all these numbers above and
+    below r are the levels of r. If |r| - g < 0, or |r| + g is more than half a period, |r| never
+    takes this value.
     """
 
     inner: Enclosure
@@ -467,12 +472,14 @@ class FoldedEnclosure(Enclosure):
         return self.inner.is_free(self._inner_gaps(gaps), length)
 
     def _inner_gaps(self, gaps: LevelGaps) -> LevelGaps:
-        """The gaps of r: how far r must rise, and how far it must fall, for |r| to leave its own
-        gaps.
+        """The gaps of r: how far r must rise, and how far it must fall, for |r| to reach one of its
+        next levels.
 
-        Let s = |r| and P the period. |r| has reached an end of its gaps if it is A = s + gaps.above
-        or B = s - gaps.below. For r >= 0, upwards r first reaches A or P - B, and downwards B or
-        -A. For r < 0 this is mirrored.
+        gaps: the differences between |r| and its next level below and above.
+
+        Let s = |r| and P the period. |r| reaches a level if it is A = s + gaps.above or B = s -
+        gaps.below. For r >= 0, upwards r first reaches A or P - B, and downwards B or -A. For r < 0
+        this is mirrored.
         """
         size, inf = dr.abs(self.offset), type(self.offset)(dr.inf)
         has_below = gaps.below <= size * _ROUNDING_FACTOR

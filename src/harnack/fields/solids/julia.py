@@ -40,26 +40,33 @@ class Julia(Solid):
     fourth_coordinate: that of the slice shown. The point (x, y, z) of space is the quaternion q_0 =
         x + y i + z j + fourth_coordinate k.
 
-    f = 2^-N max(log(|q_N|/B), -1), with B = (1 + sqrt(1 + 4 |c|))/2. Where |q| > B, |q|^2 - |c| >
-    |q|, so an orbit that leaves the ball of radius B escapes. So f <= 0 on the filled Julia set,
-    for any N.
+    f = 2^-N max(log(|q_N|/B), -1), with the escape radius B = (1 + sqrt(1 + 4 |c|))/2. If |q| > B,
+    then |q^2 + c| >= |q|^2 - |c| > |q|: an orbit that leaves the ball of radius B never returns. So
+    no orbit of the filled Julia set leaves it, and f <= 0 on the set, for any N.
 
-    Proof of the Lipschitz constants. Consider a ball of radius r about a point. In it q_n changes
-    by at most e_n, where e_0 = r and e_(n+1) = 2 |q_n| e_n + e_n^2, since the squares of q and q +
-    d differ by d q + q d + d^2. The derivative of q_n in any direction is at most d_n, where d_0 =
-    1 and d_(n+1) = 2 (|q_n| + e_n) d_n. So g_n = d_n/(|q_n| - e_n) is a bound of the derivative of
-    log|q_n| in the ball. A second bound follows from a lower bound m_n of |q_n| in the ball:
-    |q_(n+1)| >= m_n^2 - |c|, and g_(n+1) <= 2 g_n/(1 - |c|/m_n^2), as |q q' + q' q| <= 2 |q| |q'|.
-    The smaller bound is used. 2^-N g_N is a Lipschitz constant of f in the ball. So is 2^-N d_N e/B
-    (here e is Euler's number), since f is constant where |q_N| < B/e. Constants are promised for a
-    few radii. The rounding of an iterate is another change of this kind: e_n with r = 0 bounds the
-    error of q_n. A ball with |q_n| - e_n > B for an n <= N contains no point of the solid. (The
-    usual estimate |z| log|z| / (2 |z'|) is not a bound of the distance.)
+    Proof of the Lipschitz constants. Consider all orbits that begin in a ball of radius r about a
+    point, and let q_n be that of the point itself. The n-th iterates of the ball are within e_n of
+    q_n, where e_0 = r and e_(n+1) = 2 |q_n| e_n + e_n^2, since the squares of q and q + d differ by
+    d q + q d + d^2. The derivative of an iterate by the starting point in any direction is at most
+    d_n, where d_0 = 1 and d_(n+1) = 2 (|q_n| + e_n) d_n. So g_n = d_n/(|q_n| - e_n) is a bound of
+    the derivative of the logarithm of the iterate's absolute value. A second bound is g_(n+1) <= 2
+    g_n/(1 - |c|/m_n^2), as |q q' + q' q| <= 2 |q| |q'|. Here m_n is a lower bound of the absolute
+    values of the n-th iterates: the larger of |q_n| - e_n and m_(n-1)^2 - |c|. The smaller bound of
+    the two is used. Then 2^-N g_N is a Lipschitz constant of f in the ball. So is 2^-N d_N
+    exp(1)/B, since f is constant where the N-th iterate is smaller than B/exp(1). The sample of a
+    point promises such constants for a few radii r. A ball with |q_n| - e_n > B for an n <= N
+    contains no point of the solid. (The usual estimate |z| log|z| / (2 |z'|) is not a bound of the
+    distance.)
 
-    Where |q_n| > R at an n < N, for a large number R, f = 2^-n log|q_n| - 2^-N log B with an error
-    of at most 2^-n 2 |c|/|q_n|^2: each later iterate q_j adds 2^-(j+1) log|1 + c/q_j^2|, and these
-    terms decrease. If m_n >= 2 B there, later m_j at least double, and the product of all factors
-    1/(1 - |c|/m_j^2) is at most exp(4 |c|/m_n^2).
+    Rounding. q_n is computed with rounding. So e_(n+1) is increased by a bound of the rounding of
+    one iteration, 8 machine epsilons times |q_n|^2 + |c|. For r = 0, e_n is then a bound of the
+    error of q_n.
+
+    Early end. The iteration ends at an n < N if |q_n| is above a large number. Then f is taken as
+    2^-n log|q_n| - 2^-N log B, with an error of at most 2^-n 2 |c|/|q_n|^2: each later iterate q_j
+    adds 2^-(j+1) log|1 + c/q_j^2|, and these terms decrease. If m_n >= 2 B, later m_j at least
+    double, and the product of all factors 1/(1 - |c|/m_j^2) from n on is at most exp(4 |c|/m_n^2).
+    So 2^-n g_n times this number is a Lipschitz constant.
     """
 
     c: Quaternion = (-0.2, 0.8, 0.0, 0.0)
@@ -106,8 +113,15 @@ class Julia(Solid):
         return prepared
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
-        """A ball about the origin. Proof. Where |q_0| = B (1 + t), t > 0, |q_n| >= B (1 + (2B)^n t)
-        by induction, for B^2 - |c| = B; so f <= level needs (2B)^N t <= exp(2^N level) - 1."""
+        """A ball about the origin that contains all points where f <= level. None if `above`, as
+        the points where f >= level are unbounded; and for a level so large that the ball's radius
+        may overflow.
+
+        Proof. Let |q_0| = B (1 + t), t > 0. As B^2 - |c| = B, induction gives |q_n| >= B (1 +
+        (2B)^n t). Where f <= level, |q_N| <= B exp(2^N max(level, 0)), so (2B)^N t <= exp(2^N
+        max(level, 0)) - 1. In the slice |q_0|^2 is the squared distance from the origin plus
+        fourth_coordinate^2.
+        """
         b, scaled = self.escape_radius, 2.0**self.iterations * level
         if above or scaled > 600.0:
             return None
@@ -145,13 +159,14 @@ class Julia(Solid):
         return getattr(self, name)
 
     def _orbit(self, p: Vec3, radii: tuple[Real, ...]) -> tuple[Any, ...]:
-        """f, its gradient, a bound of the error of f, and for each radius a bound of |grad f| on
-        the ball of that radius about p.
+        """f at p, its gradient, a bound of the error of f, and for each radius a bound of |grad f|
+        on the ball of that radius about p.
 
         radii: the first must be 0, so that the error of f is that of rounding alone.
 
         In the notation of `Julia`, `size` is |c|, b is B, and for each radius `change` holds e_n,
-        `slopes` d_n, `min_q` m_n and `rates` g_n.
+        `slopes` d_n, `min_q` m_n and `rates` g_n. `rounded` is the bound of the rounding of one
+        iteration.
         """
         c, size, b = self._parameter("_c"), self._parameter("_size"), self._parameter("_b")
         real = cast("Any", type(p.x))

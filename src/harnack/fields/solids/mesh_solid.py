@@ -4,9 +4,9 @@ the mesh.
 `ClosedSurface.of` returns the faces of a mesh that bound the solid, and refuses a mesh that bounds
 none.
 
-Whether a point is inside is decided by the crossings of a ray with the mesh. The normals of edges
-and vertices, weighted by angles, would be the usual way, but near triangles as thin as rounding
-they decide nothing. The ray decides there too, because the two triangles at an edge compare the
+Whether a point is inside is decided by the crossings of a ray with the mesh. The usual way would be
+the normals of edges and vertices, weighted by angles. But near triangles as thin as rounding these
+normals decide nothing. The ray decides there too, because the two triangles at an edge compare the
 edge with the ray by the same bits. It takes a thirtieth of the time of the search for the nearest
 triangle.
 """
@@ -79,8 +79,10 @@ _CLEAR_MULTIPLE = 8.0
 
 
 def solid_of_mesh(given: Any) -> MeshSolid:
-    """The solid that a mesh bounds. A mesh is anything with `vertices` and `faces`, a pair of
-    these, or the path of a surface file.
+    """The solid that a mesh bounds, as a `MeshSolid`.
+
+    given: anything with `vertices` and `faces`, a pair (vertices, faces), or the path of a surface
+        file.
 
     Raises:
         MeshError: the mesh bounds no solid; the message states the reason and a remedy.
@@ -172,7 +174,7 @@ class MeshSolid(Solid):
 
     @property
     def surface(self) -> ClosedSurface:
-        """The triangles of the mesh that bound the solid."""
+        """The triangles of the mesh that bound the solid, as a `ClosedSurface`."""
         return cast("Any", self)._surface
 
     def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
@@ -241,8 +243,8 @@ _SAMPLE_CACHE: ContextVar[dict[tuple[int, ...], tuple[Vec3, Sample]] | None] = C
 
 @contextmanager
 def share_samples() -> Generator[None]:
-    """Within this context, a mesh is sampled only once at the same Dr.Jit points. So a shell and a
-    lattice of the same mesh share one search for the nearest triangles.
+    """A context within which a mesh is sampled only once at the same Dr.Jit points. So a shell and
+    a lattice of the same mesh share one search for the nearest triangles.
 
     While loops are recorded, samples are not shared, as their values are defined inside the loop
     only.
@@ -265,8 +267,8 @@ def _data_on_backend(solid: Any, like: Any) -> _MeshData:
 class _MeshData(UnitFrame):
     """The triangles of a mesh on a backend, in unit coordinates.
 
-    rays: a tree of all faces, which form a closed mesh, for the crossings of rays.
-    near: a tree of the triangles that bound the solid, for closest points.
+    rays: a tree of all faces, which form a closed mesh, with which the crossings of rays are found.
+    near: a tree of the triangles that bound the solid, with which closest points are found.
     corners: a record of nine numbers for each triangle of `near`, its corners.
     low, high: the lowest and the highest corner of the box of `near`.
     """
@@ -302,11 +304,12 @@ class _MeshData(UnitFrame):
         return self._signed_sample(p, x, self._closest_triangle(x))
 
     def sample_with_feature(self, p: Vec3) -> tuple[Sample, Vec3, Mask, Mask]:
-        """The sample at p, and on what the closest point of the mesh lies.
+        """The sample at p, and whether the closest point of the mesh lies inside a triangle, on an
+        edge or at a vertex.
 
-        Returns the sample; a unit vector along the edge that is nearest to the closest point;
-        whether the closest point is on that edge and no vertex; and whether it is a vertex. Both
-        are False where the closest point is inside a triangle.
+        Returns the sample; a unit vector along the edge that is nearest to the closest point; a
+        mask, whether the closest point is on that edge and no vertex; and a mask, whether it is a
+        vertex. Both masks are False where the closest point is inside a triangle.
         """
         vector = self.backend.Array3f
         x = self.to_unit(p)
@@ -404,11 +407,11 @@ def mesh_distance_jet(solid: MeshSolid, x: Jet, y: Jet, z: Jet) -> Jet:
     x, y, z: jets of the coordinates, at a point or on a piece of a path.
 
     Proof. d has the Lipschitz constant 1. So its derivative by any variable is at most the length
-    of the derivative of (x, y, z) by it, and its value at the start is known up to the error of the
-    coordinates there. On a piece d may have kinks, so that second derivatives have no bound. At a
-    point they are those of the distance from the nearest face, edge or vertex. For a face they are
-    0. For a vertex they are 1/d across the gradient. For an edge they are 1/d across both the
-    gradient and the edge, and 0 along the edge.
+    of the derivative of (x, y, z) by that variable, and its value at the start is known up to the
+    error of the coordinates there. On a piece d may have kinks, so that second derivatives have no
+    bound. At a point they are those of the distance from the nearest face, edge or vertex. For a
+    face they are 0. For a vertex they are 1/d across the gradient. For an edge they are 1/d across
+    both the gradient and the edge, and 0 along the edge.
     """
     coordinates = (x, y, z)
     starts = [coord if coord.jet_at_start is None else coord.jet_at_start for coord in coordinates]
@@ -424,9 +427,9 @@ def mesh_distance_jet(solid: MeshSolid, x: Jet, y: Jet, z: Jet) -> Jet:
     value = Interval(sample.value, sample.value).widened(1e-6, 0.0) + Interval(-error, error)
 
     def speeds(jets: Any) -> list[Real]:
-        """For each variable, a bound of the length of the derivative of (x, y, z) by it.
+        """For each variable, a bound of the length of the derivative of (x, y, z) by that variable.
 
-        jets: of the coordinates.
+        jets: the jets of the coordinates.
         """
         return [
             dr.sqrt(sum(dr.square(zero + coord.first_derivatives[i].max_abs) for coord in jets))
@@ -453,7 +456,8 @@ def mesh_distance_jet(solid: MeshSolid, x: Jet, y: Jet, z: Jet) -> Jet:
         """The range of the component, along `direction`, of the derivative of (x, y, z) by variable
         i.
 
-        jets: of the coordinates.
+        direction: (3,) a vector.
+        jets: the jets of the coordinates.
         """
         total = Interval(0.0, 0.0)
         for coord, jet in zip(direction, jets, strict=True):
@@ -573,18 +577,20 @@ def _boundary_pieces(
     """The triangles between winding numbers below and above 1/2, and their area.
 
     unit: (n, 3) the vertices in unit coordinates.
-    faces, weights: as in `ClosedSurface`.
-    place: returns the text for a place near a triangle, for messages.
+    faces: (m, 3), indices of vertices.
+    weights: (m,) how many times each face is counted.
+    place: a function that returns the text for a place near a triangle, for messages.
 
     Faces are cut into pieces where they meet other faces. The result is the corners (k, 3, 3) of
     the pieces that bound the solid, or None if these are all faces, uncut. Pieces run
-    counter-clockwise as seen from outside. In the area, pieces that coincide count once. Where
-    several faces coincide, and more of them are turned one way than the other, each of these is a
+    counter-clockwise as seen from outside. In the area, pieces that coincide count once. If several
+    faces coincide, and more of them are turned one way than the opposite way, each of these is a
     piece of the boundary.
 
     Triangles thinner than `_THIN_HEIGHT` have no reliable normal, and so no reliable winding
-    numbers beside them. If the boundary is all faces, it includes them. Else their computed winding
-    numbers decide; a wrong decision moves the surface by no more than their height.
+    numbers beside them. If the boundary is all faces, it includes such triangles. Else their
+    computed winding numbers decide; a wrong decision moves the surface by no more than their
+    height.
 
     Raises:
         MeshError: the mesh is inside out, or faces lie on each other.
@@ -669,7 +675,7 @@ def _check_closed(vertices: FloatArray, welded: Welded) -> None:
     """Raise MeshError unless every edge occurs as often in one direction as in the other.
 
     vertices: (n, 3).
-    welded: the faces, and the edges at which this is not so.
+    welded: the faces, and the edges that occur more often in one direction.
     """
     faces, edges, edge_weights = welded.net.faces, welded.edges, welded.weights
     if not len(edges):

@@ -183,17 +183,19 @@ class OutlineEdges:
     def _add_edges_by_chains(
         self, chains: RecordTable, query: _OutlineQuery, state: tuple[Any, ...]
     ) -> tuple[Any, ...]:
-        """The state of `_OutlineQuery` with all edges added. For a chain that is too far away to
-        hold the nearest edge, its box takes the place of its edges.
+        """The state of a loop over the edges (see `_OutlineQuery`), with all edges added. If a
+        chain is too far away to hold the nearest edge, its box is added in place of its edges.
 
-        state: before any edge.
+        chains: the records of the chains.
+        state: the state before any edge.
         """
         (square,) = chains.for_each(query.chain_upper_bound, (query.x + dr.inf,), "outline chains")
         max_distance = dr.sqrt(square) * (1 + 1e-5) + query.error
         index = type(chains.iteration_count)(0)
 
         def visit_chain(i: Any, *state: Any) -> tuple[Any, ...]:
-            """The state with the edges or the box of chain i added."""
+            """The index of the next chain, and the state after the edges of chain i, or its box if
+            it is far away, were added."""
             record = chains.read_record(i)
             count, state = query.with_chain(record, max_distance, state)
             first, count = type(i)(record[6]), type(i)(count)
@@ -216,14 +218,16 @@ class OutlineEdges:
 
 @dataclass(frozen=True)
 class _OutlineQuery:
-    """Points of the plane and lines from them, for which the distance from an outline is wanted.
+    """Points of the plane at which the signed distance from an outline is wanted, and lines from
+    these points, on which it is to be bounded.
 
     The methods update the state of a loop over the edges. It consists of these parts: the distance
     from the nearest edge so far and its rounding error; x and y of the vector from the nearest
     point of that edge to the query point; x and y of the edge's unit normal; whether the nearest
     point lies inside the edge, so that it is no vertex; whether the ray towards +x has crossed an
-    odd number of edges; and, for each knot, the smallest value there of the tangents of the
-    distances from the edges, as functions of the position on the line (`TangentEnclosure`).
+    odd number of edges; and a lower bound of the distance at each knot, a position on the line. The
+    distance from an edge lies above its tangent at the start of the line, so the bound is the
+    smallest of all tangents at the knot.
 
     x, y: the points, relative to the outline's center.
     velocity: the direction of the lines, of length 1 at most; None without lines.
@@ -240,7 +244,7 @@ class _OutlineQuery:
     unit: float
 
     def with_edge(self, row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """The state with the edge of record `row` added."""
+        """The state of the loop after the edge of the record `row` was added."""
         nearest, error, away_x, away_y, normal_x, normal_y, on_edge, inside, *bounds = state
         from_x, from_y = self.x - row[0], self.y - row[1]
         edge_x, edge_y = row[2] - row[0], row[3] - row[1]
@@ -271,8 +275,8 @@ class _OutlineQuery:
         )
 
     def chain_upper_bound(self, row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """The smaller of the state, a squared distance, and of the square of a distance within
-        which the chain of record `row` must have a point."""
+        """The smaller of two squared distances: the state, and the square of a distance within
+        which the chain of the record `row` must have a point."""
         (min_square,) = state
         near_x, far_x = self._distances_from_ends(self.x, row[0], row[2])
         near_y, far_y = self._distances_from_ends(self.y, row[1], row[3])
@@ -289,9 +293,9 @@ class _OutlineQuery:
     def with_chain(
         self, row: list[Real], limit: Real, state: tuple[Any, ...]
     ) -> tuple[Real, tuple[Any, ...]]:
-        """The number of edges of the chain of record `row` that must be read: all if its box is
-        within the distance `limit`, else 0. And the state, to which the box was added in place of
-        the edges if it is farther away."""
+        """The number of edges that must be read of the chain of the record `row`: all if its box is
+        within the distance `limit`, else 0; and the state. If the box is farther away, it is added
+        to the state in place of the edges."""
         nearest, error, away_x, away_y, normal_x, normal_y, on_edge, inside, *bounds = state
         to_x, to_y = self.x - clamp(self.x, row[0], row[2]), self.y - clamp(self.y, row[1], row[3])
         distance = dr.sqrt(dr.fma(to_x, to_x, to_y * to_y))
@@ -322,7 +326,9 @@ class _OutlineQuery:
 
 
 def _chain_records(start: FloatArray, end: FloatArray, loop_index: IntArray) -> FloatArray:
-    """The records of chains of consecutive edges, as in `OutlineEdges`.
+    """The records of chains of consecutive edges: for each its box as (lowest x, lowest y, highest
+    x, highest y), y of its first and of its last vertex, the index of its first edge, and the
+    number of its edges.
 
     start, end: (n, 2) the ends of the edges.
     loop_index: (n,) an index that changes where the next edge belongs to another chain.

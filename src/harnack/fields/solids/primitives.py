@@ -90,9 +90,11 @@ class Sphere(FormulaSolid):
 
 
 def _box_of_radii(radii: tuple[float, float, float], level: float) -> Volume:
-    """A box that contains all points where m (g - 1) <= level, with m the smallest radius. Here g
-    is a norm. The surface g = 1 meets the axes at the radii, and lies in the box of half sides
-    `radii`."""
+    """A box that contains all points where f = m (g - 1) <= level, with m the smallest radius. g is
+    a norm: the set g <= 1 lies in the box whose half sides are the radii.
+
+    radii: the half sides (3,) of that box.
+    """
     a, b, c = radii
     size = 1.0 + level / min(radii)
     return box_around((size * a, size * b, size * c))
@@ -279,10 +281,10 @@ class Cuboid(FormulaSolid):
     """The box |x| <= a/2, |y| <= b/2, |z| <= c/2.
 
     sides: (a, b, c).
-    radius: with which the edges are rounded.
+    radius: the radius with which the edges are rounded; 0 for sharp edges.
 
-    f is the signed distance: that of the box smaller by the radius on each side
-    (`orthogonal_intersection`), less the radius.
+    f is the signed distance. It is the signed distance from the box that is smaller by the radius
+    on each side (`orthogonal_intersection`), minus the radius.
     """
 
     is_convex = True
@@ -293,6 +295,7 @@ class Cuboid(FormulaSolid):
     lipschitz = 1.0
 
     def __post_init__(self) -> None:
+        """Check the arguments."""
         sides = as_triple(self.sides, "the sides of a box", all_positive=True)
         set_frozen(self, "sides", sides)
         radius = as_finite(self.radius, "the radius of the edges of a box")
@@ -325,13 +328,15 @@ def lipschitz_of_norms(p: float, q: float) -> float:
     at most c^2 u^(2q-2) + v^(2q-2). For q >= 2 both powers are at most u^q and v^q, whose sum is 1;
     so the square is at most c^2, as c >= 1. For q < 2, Hoelder's inequality with the exponents
     q/(2q-2) and q/(2-q) gives (c^m + 1)^(2/m) with m = 2q/(2-q). All these bounds are attained.
-    (Hart's constant, 1996, equation 31, is right only for p = q < 2, or p >= 2 and q >= 2.)
+    The root is computed as c (1 + c^-m)^(1/m), as c^m overflows if q is just below 2. The result
+    has an error of a few roundings, for which callers have to increase it. (Hart's constant, 1996,
+    equation 31, is right only for p = q < 2, or p >= 2 and q >= 2.)
     """
     c = 2.0 ** max(0.0, 1.0 / p - 0.5)
     if q >= 2.0:
         return c
     m = 2.0 * q / (2.0 - q)
-    return (c**m + 1.0) ** (1.0 / m)
+    return c * (1.0 + c**-m) ** (1.0 / m)
 
 
 def _checked_powers(powers: Any, name: str) -> tuple[float, float]:
@@ -405,7 +410,8 @@ class Supertorus(_Powered):
     """The points with | (|(x, y)|_p - major, z) |_q <= minor, where |.|_p is the p-norm.
 
     powers: (p, q), each at least 1.
-    major, minor: as for `Torus`.
+    major: the radius of the central curve, in the p-norm.
+    minor: the radius of the tube around it, in the q-norm.
 
     The Lipschitz constant is that of the norms (`lipschitz_of_norms`), as subtracting `major`
     changes no gradient.

@@ -65,7 +65,8 @@ class SpaceMap(abc.ABC):
 
     @abc.abstractmethod
     def apply(self, solid: Solid) -> Solid:
-        """The image of a solid under the map. The solid is not a combination of other solids."""
+        """The image of a solid under the map. It is called only for solids that are not
+        combinations of other solids; a combination is mapped operand by operand."""
 
 
 def axis_index(axis: str) -> int:
@@ -97,7 +98,7 @@ def _with_source(prepare: Callable[[Any, Backend], Field]) -> Callable[[Any, Bac
 
     @functools.wraps(prepare)
     def remembering(self: Any, backend: Backend) -> Field:
-        """See `Field.prepare`."""
+        """The prepared solid, with the original in its attribute `_source`."""
         prepared = prepare(self, backend)
         if prepared is not self:
             object.__setattr__(prepared, "_source", vars(self).get("_source", self))
@@ -141,7 +142,7 @@ class Solid(Field):
             cls.prepare = _with_source(cls.prepare)  # type: ignore[method-assign]
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        """f at jets of the coordinates: see `Formula.formula`.
+        """f at coordinates that are jets or Dr.Jit numbers.
 
         Raises:
             TypeError: f has no formula.
@@ -154,8 +155,8 @@ class Solid(Field):
 
     @abc.abstractmethod
     def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
-        """The same combination of other operands: each operand is replaced by change(operand). A
-        solid that is not a combination is its own operand."""
+        """The same combination of other operands (the solids that are combined): each operand is
+        replaced by change(operand). A solid that is not a combination is its own operand."""
 
     # Combinations. Operands that are not solids are refused.
 
@@ -255,7 +256,7 @@ class Solid(Field):
 
     @functools.cached_property
     def _ray_count_variants(self) -> TransientCache[tuple[int, ...], Solid]:
-        """The combinations made by `_for_rays`, by the identities of their parts."""
+        """The combinations made by `_for_rays` so far, by the identities (`id`) of their parts."""
         return TransientCache()
 
     def _for_rays(
@@ -320,7 +321,8 @@ class Solid(Field):
         return self._apply_map(Taper(start, end, axis))
 
     def _apply_map(self, change: SpaceMap) -> Solid:
-        """The image of the solid under a map of space, which is applied to each operand."""
+        """The image of the solid under a map of space. In a combination of solids, the map is
+        applied to each operand."""
         return self.map_operands(change.apply)
 
 
@@ -334,7 +336,7 @@ class SolidOfField(Solid):
 
     def _copy_settings(self, *names: str) -> None:
         """Copy attributes of the inner field to this solid: its settings for the tracer, and the
-        attributes with these names."""
+        further attributes with these names."""
         settings = (
             "has_variable_accuracy",
             "coarsest_accuracy",

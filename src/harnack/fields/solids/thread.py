@@ -252,8 +252,13 @@ class OutsideCylinderEnclosure(Enclosure):
     constant: Real
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """See `Enclosure`: the smaller of the length to the cylinder grown by the level below, and
-        of the length up to which the Lipschitz constant excludes the level above."""
+        """The length of the path on which f is proved to meet neither the level below nor the level
+        above: the smaller of two lengths.
+
+        The points at which f is at most the level below lie in the cylinder whose radius is larger
+        by that level; the first length is the length up to this cylinder. The second length is the
+        gap to the level above, divided by the Lipschitz constant.
+        """
         level = self.value - gaps.below + self.error
         level_radius = self.radius + level
         excess = (self.r - level_radius) * (self.r + level_radius)

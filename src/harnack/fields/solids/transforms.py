@@ -88,8 +88,11 @@ class AffineMap(SpaceMap):
 
     @classmethod
     def rotation(cls, degrees: float, axis: str | Sequence[float]) -> AffineMap:
-        """The rotation about an axis through the origin, by Rodrigues' formula. For the parameters
-        see `Solid.rotated`."""
+        """The rotation by an angle in degrees about an axis through the origin, counter-clockwise
+        as seen from the end of the axis, by Rodrigues' formula.
+
+        axis: "x", "y", "z" or a vector (3,).
+        """
         if isinstance(axis, str):
             unit = np.eye(3)[axis_index(axis)]
         else:
@@ -140,8 +143,8 @@ class AffineMap(SpaceMap):
         return _length_factor(np.array(self.matrix))
 
     def volume(self, volume: Volume | None) -> Volume | None:
-        """A volume that contains the image of `volume` under the map; None for no volume or one
-        without bounds."""
+        """A volume that contains the image of `volume` under the map; None if `volume` is None or
+        has no bounds."""
         if volume is None:
             return None
         m, b = np.array(self.matrix), np.array(self.translation_vector)
@@ -232,9 +235,10 @@ class TransformedSolid(SolidOfField):
         return x, y, z
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """The errors of the gradient and of the Hessian. For a solid with a formula they follow
-        from the ranges of the formula. For another solid they are its own errors at the preimage of
-        p. These leave out the effect of the rounding of the preimage, which is not known."""
+        """Two bounds at p, of the errors of the gradient and of the Hessian. For a solid with a
+        formula they follow from the ranges of the formula. For any other solid they are the bounds
+        of the inner solid at the preimage of p, scaled. These leave out the effect of the rounding
+        of the preimage, which is not known."""
         del sample
         numbers = self.numbers
         local = type(p)(*numbers.local(p.x, p.y, p.z))
@@ -335,8 +339,9 @@ class _InverseMap:
         )
 
     def prepare(self, backend: Backend) -> _InverseMap:
-        """The numbers as kernel parameters. Entries that are 0 or 1 stay Python numbers, so that
-        their terms or products are left out, which saves most of the work."""
+        """The same map with the entries of its matrix and its vector as kernel parameters. Entries
+        that are 0 or 1 stay Python numbers: then their terms or products are left out of the
+        kernel, which saves most of the work."""
         prepared = with_device_numbers(self, backend)
         rows = tuple(
             tuple(a if a in (0.0, 1.0) else b for a, b in zip(old, new, strict=True))
@@ -349,7 +354,8 @@ class _InverseMap:
         return replace(prepared, rows=rows[:3], translation_vector=rows[3])
 
     def local(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
-        """The preimage M^-1 (p - b) of the point p = (x, y, z). Coordinates may be of any kind."""
+        """The preimage M^-1 (p - b) of the point p = (x, y, z). Coordinates may be numbers of any
+        arithmetic."""
         a, b, c = (
             coordinate if _is_literal(shift, 0.0) else coordinate - shift
             for coordinate, shift in zip((x, y, z), self.translation_vector, strict=True)
@@ -369,7 +375,7 @@ class _InverseMap:
 
 def _weighted_sum(weights: tuple[Any, ...], terms: tuple[Any, ...]) -> Any:
     """The sum of the terms times their weights. Terms whose weight is the Python number 0 are left
-    out; None if that leaves none."""
+    out; None if all terms are left out."""
     total: Any = None
     for weight, term in zip(weights, terms, strict=True):
         if _is_literal(weight, 0.0):

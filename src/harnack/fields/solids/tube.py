@@ -254,10 +254,10 @@ class Tube(Solid):
         self, p: Vec3, direction: Vec3 | None, knots: tuple[Real, ...]
     ) -> tuple[Sample, Real, tuple[Real, ...]]:
         """The sample at p; the distance D of p from the polyline; and, for each knot, a lower bound
-        of the distance at p + knot direction less D.
+        of the distance at p + knot direction minus D.
 
-        direction: unit vectors; None if there are no knots.
-        knots: increasing lengths; the last may be infinite.
+        direction: the unit vectors of lines from p; None if there are no knots.
+        knots: increasing lengths along these lines; the last may be infinite.
         """
         if not hasattr(self, "_records"):
             return self.prepare(backend_of(p))._sample_with_bounds(p, direction, knots)
@@ -266,11 +266,11 @@ class Tube(Solid):
         records: RecordTable = cast("Any", self)._records
 
         def add_segment(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """The state with the segment of record `row` added.
+            """The state of the loop over segments after the segment of the record `row` was added.
 
             The state consists of the distance from the nearest segment, the three components of the
-            vector from its nearest point to p, the largest rounding error of such a vector, and the
-            smallest tangent at each knot.
+            vector from its nearest point to p, the largest rounding error of such a vector, and for
+            each knot the smallest value there of the tangents of the distances from the segments.
             """
             nearest, x, y, z, max_rounding, *bounds = state
             from_start, segment = p - vector(*row[:3]), vector(*row[3:6])
@@ -316,9 +316,9 @@ class Tube(Solid):
 
 
 def _group_segments(records: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The records of segments, filled up with copies of the last to a multiple of `_GROUP_SIZE`;
-    and for each group of that many consecutive segments the center and the radius of a ball that
-    contains them, as a record.
+    """The records of segments in groups of `_GROUP_SIZE` consecutive segments; and for each group a
+    record of the center and the radius of a ball that contains its segments. The last group is
+    filled up with copies of the last segment.
 
     records: (n, 7), the start of each segment, the vector from its start to its end, and 1 /
         length^2.
@@ -341,15 +341,17 @@ def _add_segments_by_groups(
     add_segment: Callable[[list[Real], tuple[Any, ...]], tuple[Any, ...]],
     start: tuple[Any, ...],
 ) -> tuple[Any, ...]:
-    """The state of `Tube._sample_with_bounds` with all segments added. For a group that is too far
-    away to hold the nearest segment, the distance from its ball takes the place of the distances
-    from its segments.
+    """The state of the loop over segments of `Tube._sample_with_bounds`, with all segments added.
+    If a group is too far away to hold the nearest segment, the distance from its ball takes the
+    place of the distances from its segments.
 
     p: the points.
-    direction, knots: as in `Tube._sample_with_bounds`.
-    records: of the segments.
+    direction: the unit vectors of lines from p; None if there are no knots.
+    knots: increasing lengths along these lines.
+    records: the records of the segments.
     groups: records (center, radius) of the groups' balls.
-    add_segment: returns the state with another segment added.
+    add_segment: a function that takes a record and a state, and returns the state with that segment
+        added.
     start: the state before any segment.
 
     Proof. If a segment lies in a ball of radius r about c, its distance from p is at least |p - c|
@@ -362,7 +364,8 @@ def _add_segments_by_groups(
     epsilon = 2 * float(dr.epsilon(real))
 
     def add_ball_end(ball: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """The smaller of the state and of the largest distance of a point of the ball from p."""
+        """The smaller of two distances: the state, and the largest distance from p of a point of
+        the ball."""
         return (fmin(dr.norm(p - vector(*ball[:3])) + ball[3], state[0]),)
 
     (min_end,) = groups.for_each(add_ball_end, (real(dr.inf),), "tube groups")
@@ -459,8 +462,9 @@ class TangentEnclosure(Enclosure):
     lower_bounds: tuple[Real, ...]
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """See `Enclosure`: the smaller of the length up to which F does not rise to the level
-        above, and the length up to which its lower bound does not fall to the level below."""
+        """The length of the path on which F is proved to meet neither level: the smaller of the
+        length up to which F does not rise to the level above, and the length up to which its lower
+        bound does not fall to the level below."""
         half_slope = self.distance * self.slope
         product = gaps.above * (gaps.above + 2 * self.distance)
         root = dr.sqrt(fmax(dr.fma(half_slope, half_slope, product), 0))
@@ -581,17 +585,18 @@ class _TubeBuffers:
 
 
 class _Segment(Field):
-    """The field of one tube: the distance D from its segment, less its radius r. Each lane may have
-    another segment.
+    """The field of one tube: the distance D from its segment, less its radius r. The segment may
+    differ from lane to lane.
 
     boxes: the boxes of all tubes, for their center.
-    row: the record of the segment, as in `_TubeBuffers`.
+    row: the record of the segment: its start, the radius of its tube, the vector from start to end,
+        and 1 / length^2.
 
     D is convex, as the distance from a convex set, and its Lipschitz constant is 1. Its second
-    derivative along any line is at most 1/D (Hart 1996): that of the distance from a point or from
-    a line, across the gradient, is 1/D, and the distance from a segment is everywhere one of these
-    two. So on a ball of radius s < D about the point it is at most 1/(D - s). Here s = D/2, so that
-    the bound is 1/s.
+    derivative along any line is at most 1/D (Hart 1996). For the distance from a point or from a
+    line it is 1/D across the gradient, and the distance from a segment is everywhere one of these
+    two distances. So on a ball of radius s < D about the point it is at most 1/(D - s). Here s =
+    D/2, so that the bound is 1/s.
     """
 
     def __init__(self, boxes: PatchBoxes, row: list[Real]) -> None:
