@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -222,3 +223,29 @@ def test_a_promise_is_needed_and_half_a_range_is_enough() -> None:
     with pytest.raises(ValueError, match=r"Sample\.promises is empty.*Lipschitz"):
         hk.trace(Bell(lambda w: (), 1.0, 2.0), *RAY)
     assert hk.trace(Charge(), *RAY).is_hit.all()
+
+
+class Wrapped(hk.Field):
+    """A field that holds others in a list, and uploads nothing itself."""
+
+    period = 4 * math.pi
+
+    def __init__(self, inner: hk.Field) -> None:
+        self.inner = [inner]
+        self.default_level = inner.default_level
+
+    def evaluate(self, p: Any) -> Any:
+        return self.inner[0].evaluate(p)
+
+
+def test_a_field_that_holds_a_field_of_the_library_is_prepared_with_it() -> None:
+    """The process ended, as the inner field was uploaded while a kernel was recorded."""
+    angle = hk.SolidAngle(example_curves.wavy_polygon(12))
+    rng = np.random.default_rng(5)
+    o = rng.normal(loc=(0.0, 0.0, 2.5), size=(200, 3))
+    d = 0.5 * rng.normal(size=(200, 3)) - o
+    options = {"t_max": 10.0, "tolerance": 1e-4}
+    hits, expected = hk.trace(Wrapped(angle), o, d, **options), hk.trace(angle, o, d, **options)
+    np.testing.assert_array_equal(hits.status, expected.status)
+    assert hits.is_hit.sum() > 50
+    np.testing.assert_allclose(hits.t[hits.is_hit], expected.t[hits.is_hit], atol=1e-3)

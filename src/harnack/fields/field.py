@@ -8,6 +8,7 @@ One evaluation of a field gives its value, its gradient, and promises that hold 
 from __future__ import annotations
 
 import abc
+import copy
 import inspect
 import math
 from collections.abc import Callable
@@ -200,12 +201,21 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
 
     def prepare(self, backend: Backend) -> Field:
         """A field equal to this one whose data lie on the backend. Each function of the library
-        calls this method once.
+        calls this method once, before a kernel is recorded, in which nothing can be uploaded.
 
-        The default returns the field itself, which suits fields that hold only Python numbers.
+        The default suits fields that hold only Python numbers, and fields of your own that hold
+        other fields: it prepares those that are attributes, or entries of attributes that are lists
+        or tuples. It returns the field itself if there are none.
         """
-        del backend
-        return self
+        if type(self).__module__.startswith("harnack."):
+            return self
+        attributes = {name: _prepared(value, backend) for name, value in vars(self).items()}
+        if all(value is vars(self)[name] for name, value in attributes.items()):
+            return self
+        prepared = copy.copy(self)
+        for name, value in attributes.items():
+            object.__setattr__(prepared, name, value)  # also of frozen dataclasses
+        return prepared
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """A volume that is proved to contain every point of the level sets; None if no such volume
@@ -421,6 +431,15 @@ def validate_levels_in_range(
             raise ValueError(
                 f"no surface has level {level:g}: {name} stays within [{lower:.6g}, {upper:.6g}]"
             )
+
+
+def _prepared(value: Any, backend: Backend) -> Any:
+    """An attribute of a field with the fields in it prepared; the same object if there are none."""
+    if isinstance(value, Field):
+        return value.prepare(backend)
+    if type(value) in (list, tuple) and any(isinstance(entry, Field) for entry in value):
+        return type(value)(_prepared(entry, backend) for entry in value)
+    return value
 
 
 def check_is_field(value: Any) -> None:

@@ -203,19 +203,19 @@ class HypersphericalHarmonic(Field):
         self._orders = [
             _OrderTerm.of(l, j, sums) for j, sums in weights_by_order(l, weights).items()
         ]
-        self._known = HypersphereRange.of(l, weights)
+        self._range = HypersphereRange.of(l, weights)
 
     @property
     def value_range(self) -> tuple[float, float]:
         """The ends (low, high) of an interval that is proved to contain all values of f."""
-        return self._known.low, self._known.high
+        return self._range.low, self._range.high
 
     def evaluate(self, p: Vec3) -> Sample:
         """The sample at p, with bounds of the Hessian on several balls and a Lipschitz constant."""
         square = dr.squared_norm(p)
         value, gradient, error, gradient_error = self._values(p, 1 + square)
         promises = (*self._remainder_near_zero(p, square), *self._curvatures(square))
-        slope = self.degree * (self._known.high - self._known.low) * (1 + _ROUNDING)
+        slope = self.degree * (self._range.high - self._range.low) * (1 + _ROUNDING)
         lipschitz = Lipschitz(slope / self._min_square(square, _BIG), self._radius(square, _BIG))
         return Sample(
             value, gradient, promises, error, gradient_error, alternative_promises=(lipschitz,)
@@ -292,7 +292,7 @@ class HypersphericalHarmonic(Field):
         square: |p|^2.
         """
         l = self.degree  # noqa: E741
-        size = l * self._known.largest * (1 + _ROUNDING)
+        size = l * self._range.largest * (1 + _ROUNDING)
         promises: list[TaylorRemainder] = []
         for fraction in _BALL_RADII:
             lower = self._min_square(square, fraction)
@@ -341,7 +341,7 @@ class HypersphericalHarmonic(Field):
         square = 1 + dr.squared_norm(closest)
         position = dr.dot(p, path.direction)
         l, c = self.degree, dr.sqrt(square)  # noqa: E741
-        bounds = self._known
+        bounds = self._range
         limit = l * l * 0.5 * (bounds.high - bounds.low)
         second = fmin(bounds.largest * l * ((l - 1) / square + 1 / c), limit) * (1 + _ROUNDING)
         forward = SphereArcEnclosure(slopes, second, position, square)
@@ -417,7 +417,7 @@ class HypersphericalHarmonic(Field):
         unbounded."""
         if self.domain is not None:
             return self.domain
-        radius = max((self._known.radius(level) for level in levels), default=0.0)
+        radius = max((self._range.radius(level) for level in levels), default=0.0)
         return Ball(radius=radius) if 0 < radius < math.inf else None
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
@@ -432,5 +432,5 @@ class HypersphericalHarmonic(Field):
             "degree": self.degree,
             "harmonics": sum(len(term.weights) for term in self._orders),
             "range": self.value_range,
-            "value far away": self._known.pole,
+            "value far away": self._range.pole,
         }
