@@ -161,13 +161,13 @@ def render(
     if target is not None and picture_options.color_bar and target.suffix.lower() == ".exr":
         raise ValueError(f"{target}: EXR files hold the numbers; a color bar is drawn in .png")
     shorthand = shorthand_among(arguments)
-    if not _is_of_studio(surfaces):
+    if not _is_for_studio(surfaces):
         of_studio = {name: arguments[name] for name in STUDIO_OPTIONS}
         refuse_studio_options({**of_studio, **shorthand, "options": options})
     job = RenderJob(surfaces, picture_options, options, shorthand, register().variant())
     task = job.task
     if is_divided:
-        _check_can_be_sent(surfaces, task)
+        _check_can_be_divided(surfaces, task)
     with open_executor(client, checkpoint, chunks) as workers:
         is_local = workers.client is None and workers.checkpoint is None
         executor = LocalRenderExecutor(task) if is_local else ClusterRenderExecutor(workers, job)
@@ -187,10 +187,12 @@ def _render_job(
     *,
     alone: bool,
 ) -> tuple[Image, npt.NDArray[np.uint8], list[str] | None]:
-    """The numbers of a picture, its pixels, and the names of its channels if it has its own.
+    """The numbers of a picture (h, w) or (h, w, n), its pixels in 8-bit sRGB, and the names of its
+    channels, or None for the usual names.
 
-    color_by: the option as it was set, the title of a color bar.
-    alone: whether this process draws everything.
+    executor: calls the methods of the job's task.
+    color_by: the option as it was set; if it is a text, it is the title of the color bar.
+    alone: whether this process draws everything. Only then is the time estimated before.
     """
     mi, options, task, sensor = job.mi, job.options, job.task, job.scene.sensors()[0]
     if task is None:
@@ -226,8 +228,8 @@ def _render_job(
 def _with_time_estimate(
     job: RenderJob, task: PathRenderTask, progress: bool | Advance
 ) -> PathRenderTask:
-    """The task in bands after which a progress bar can move; prints the estimated time of a long
-    picture."""
+    """The task with as many light paths at a time as let a progress bar move every few seconds. If
+    the picture will take long, a line with the estimated time is printed to stderr."""
     estimate = estimate_time(
         job.mi, job.scene, task.sensor, task.tracer, spp=task.spp,
         features=task.features,
@@ -239,16 +241,25 @@ def _with_time_estimate(
     return replace(task, paths_a_band=estimate.paths_a_band)
 
 
-def _is_of_studio(surfaces: Any) -> bool:
+def _is_for_studio(surfaces: Any) -> bool:
+    """Whether the first argument of `render` is drawn in the studio: a field, a surface, or a list
+    of them. Otherwise it is a Mitsuba scene."""
     return isinstance(surfaces, Field | Surface | TracedSurface | list | tuple)
 
 
-def _check_can_be_sent(surfaces: Any, task: Any) -> None:
+def _check_can_be_divided(surfaces: Any, task: Any) -> None:
+    """Raise an error if a picture cannot be divided into parts that are drawn on a cluster or kept
+    in a checkpoint. ValueError: Mitsuba's own integrator draws the scene, in one piece. TypeError:
+    the scene is given as a loaded scene or a file, and only a dictionary can be sent.
+
+    surfaces: the first argument of `render`.
+    task: the task that draws the picture part by part; None if Mitsuba draws it.
+    """
     if task is None:
         raise ValueError(
             "client, checkpoint: Mitsuba draws this scene, by an integrator of its own"
         )
-    if not _is_of_studio(surfaces) and not isinstance(surfaces, Mapping):
+    if not _is_for_studio(surfaces) and not isinstance(surfaces, Mapping):
         raise TypeError(
             "client, checkpoint: a loaded scene cannot be sent, and the files of one may change or "
             "be elsewhere: give the scene as a dictionary"
@@ -258,8 +269,8 @@ def _check_can_be_sent(surfaces: Any, task: Any) -> None:
 def _render_by_mitsuba(
     mi: Any, scene: Any, options: RenderOptions
 ) -> tuple[Image, npt.NDArray[np.uint8], list[str]]:
-    """The numbers (h, w, n) of a scene without our surfaces, with all channels of its own
-    integrator, the pixels of the first of them, and the names of all."""
+    """The picture of a scene without our surfaces, drawn by the scene's own integrator: the numbers
+    (h, w, n) of all n channels, the pixels of the color channels, and the names of all channels."""
     for name, used in (("max_depth", options.max_depth is not None), ("denoise", options.denoise)):
         if used:
             raise ValueError(f"{name}: Mitsuba draws this scene, by an integrator of its own")
@@ -272,6 +283,8 @@ def _render_by_mitsuba(
 
 
 def _warn_of(lost: int, kind: str) -> None:
+    """Warn that rays ran out of steps, if there are any. lost: their number. kind: what to call
+    them."""
     if lost:
         warnings.warn(
             f"{lost} {kind} ran out of steps and are drawn magenta; raise max_steps", stacklevel=3
@@ -281,7 +294,12 @@ def _warn_of(lost: int, kind: str) -> None:
 def _composite_over_backdrop(
     mi: Any, sensor: Any, image: Image, stage: StudioScene | None, show: str
 ) -> tuple[Image, npt.NDArray[np.uint8]]:
-    """The numbers of a picture and its pixels. image: its light and the covered fraction."""
+    """The numbers of a picture and its pixels, with the backdrop behind the surfaces.
+
+    image: (h, w, 4) linear sRGB light and the covered fraction of each pixel.
+    stage: the studio; None for a Mitsuba scene, which is left as it is.
+    show: "path" or "shaded".
+    """
     if stage is None:
         has_alpha = mi.has_flag(sensor.film().flags(), mi.FilmFlags.Alpha)
         image = image if has_alpha else np.ascontiguousarray(image[..., :3])
