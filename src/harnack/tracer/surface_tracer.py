@@ -255,8 +255,9 @@ class SurfaceTracer:
         `volume`; None if nothing cuts it open.
     uses_ray_queue: whether rays are traced at once when a method is called, if samples are not
         cheap: by few lanes that share a queue of rays. Then no kernel may be being recorded.
-    known_branch_volume: for a field whose samples give f only modulo 1, a volume outside of which f
-        is the value nearest to 0. None for other fields.
+    known_branch_volume: for a field whose samples give f only modulo 1, a volume outside of which
+        no level and no number that differs from a level by an integer lies between f and 0. This
+        determines f from its value modulo 1. None for other fields.
     """
 
     backend: Backend
@@ -389,8 +390,8 @@ class SurfaceTracer:
             start, end, hysteresis = self._crossing_interval(
                 path, real(t_min), real(t_max), start, end
             )
-        # The ray begins in cells that contain no level up to empty_until. If the field has no jumps,
-        # it starts there.
+        # Up to empty_until the ray lies in cells that contain no level. If the field has no jumps,
+        # the ray starts there.
         occupied, empty_until = None if crosses else self.occupied, start
         if occupied is not None:
             is_nonempty = backend.Bool(active) & (start < end)
@@ -411,8 +412,8 @@ class SurfaceTracer:
             state = replace(state, active=state.active & ~in_uncertain_cell, status=status)
         tracker = None
         if self.known_branch_volume is not None and not crosses:
-            # Outside of the volume f is nearest to 0. A ray that starts inside needs f at its start:
-            # if that is not cheap, its first sample is made with the branch.
+            # Outside of the volume the branch is that of f = 0. A ray that starts inside needs f at
+            # its start: if that is not cheap, its first sample is made with the branch.
             tracker = BranchTracker(self.levels)
             entry, _ = self.known_branch_volume.clip(path.origin, path.direction, t_min, t_max)
             outside = (entry > t_min) & (start <= entry)
