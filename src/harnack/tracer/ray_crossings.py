@@ -1,8 +1,8 @@
-"""The function `crossings`, which gives the crossings of rays with a surface, and its result
+"""The function `crossings`, which gives all points at which rays cross a surface, and its result
 `RayCrossings`.
 
-`find_crossings` finds them one after the other while a kernel is recorded. `RayCrossings` is the
-result for users: NumPy arrays for NumPy rays, Dr.Jit arrays for Dr.Jit rays.
+`find_crossings` finds the crossings of each ray one after another while a kernel is recorded.
+`RayCrossings` is the result for users: NumPy arrays for NumPy rays, Dr.Jit arrays for Dr.Jit rays.
 """
 
 from __future__ import annotations
@@ -50,15 +50,19 @@ _HONORED = (
 
 @dataclass(frozen=True)
 class CrossingArrays:
-    """The first k crossings of n rays, as Dr.Jit arrays.
+    """The first k crossings of n rays, as Dr.Jit arrays. Crossing j of ray i is at i k + j in
+    arrays of n k entries.
 
-    t: (n k) ray parameters, with crossing j of ray i at i k + j; inf if a ray has fewer crossings.
-    gradient: (n k, 3) of f at the crossing, or the normal of the facet; 0 for no crossing.
-    sheet: (n k) index of the facet that was crossed, NO_FACET for none.
+    t: (n k) ray parameters; inf if a ray has fewer crossings.
+    gradient: (n k, 3) the gradient of f at the crossing, or the normal of the facet; 0 for no
+        crossing. A facet is a flat piece of surface at which f jumps.
+    sheet: (n k) the index of the facet that was crossed, NO_FACET for none.
     side: (n k) 1 if f rises through the level along the ray, -1 if it falls, 0 for no crossing.
-    count: (n) number of crossings, at most k.
-    end: (n) ray parameter up to which the ray was followed; inf if it was followed to its end.
-    evaluations, status: (n) as in `RayCrossings`.
+    count: (n) the number of crossings, at most k.
+    end: (n) the ray parameter up to which the ray was followed; inf if it was followed to its end.
+    evaluations: (n) the number of evaluations of f.
+    status: (n) a `RayStatus`: MISS if the ray has no further crossings, HIT if it has k,
+        OUT_OF_STEPS if the ray behind `end` is not known.
     """
 
     t: Real
@@ -73,11 +77,12 @@ class CrossingArrays:
 
 @dataclass(frozen=True)
 class _SearchState:
-    """The state of rays, and the number of crossings that they have found.
+    """The state of rays that look for crossings, and the number of crossings that each has found.
 
     march: the state of the march; None for a field with jumps.
-    sheets: the state of `JumpTracer`, which includes that of the march; None without jumps.
-    count: the number of crossings.
+    sheets: for a field with jumps, the state of `JumpTracer`, which includes the state of the
+        march; else None.
+    count: the number of crossings so far.
     """
 
     march: MarchState | None
@@ -86,16 +91,18 @@ class _SearchState:
 
     @property
     def active(self) -> Mask:
+        """Mask of the rays that go on."""
         return self.now.active
 
     @property
     def now(self) -> MarchState:
-        """The state of the march."""
+        """The state of the march, for all kinds of fields."""
         state = self.march if self.sheets is None else self.sheets.march
         assert state is not None
         return state
 
     def with_march(self, now: MarchState, count: Any) -> _SearchState:
+        """This state with another state of the march and another number of crossings."""
         if self.sheets is None:
             return _SearchState(now, None, count)
         return _SearchState(None, dataclasses.replace(self.sheets, march=now), count)
@@ -106,8 +113,9 @@ def find_crossings(
 ) -> CrossingArrays:
     """The first k crossings of rays o + t d, |d| = 1, for t_min <= t <= t_max.
 
-    `Hysteresis` states the guarantees and proves them: between two crossings the ray is a single
-    march, in which contacts may begin and end any number of times.
+    `Hysteresis`, the rule by which a crossing is counted, states the guarantees and proves them. A
+    ray is marched from one crossing to the next without a new start: what is known of f at a
+    crossing is used behind it, and the ray may reach and leave levels any number of times.
     """
     backend = prepared.backend
     real, vector, count = backend.Float, backend.Array3f, backend.UInt32
@@ -122,6 +130,9 @@ def find_crossings(
     tracer = JumpTracer(march, prepared.field, path, start, end)
 
     def advance(now: _SearchState) -> _SearchState:
+        """The state after each active ray has gone to its next crossing, to the next jump of f, or
+        to its end. A crossing is written to the arrays outside, in the next free place of its
+        ray."""
         next_state, facet = now, None
         if now.sheets is None:
             after = march.advance(prepared.field, path, end, now.now)
@@ -268,6 +279,7 @@ def crossings(
 
 
 def _check_count(max_crossings: Any) -> int:
+    """`max_crossings` as an int of at least 1; TypeError or ValueError otherwise."""
     try:
         k = operator.index(max_crossings)
     except TypeError:
@@ -283,7 +295,9 @@ def _check_count(max_crossings: Any) -> int:
 def trace_crossings(
     surface: TracedSurface, rays: RayBatch, k: int, *, differentiable: bool
 ) -> RayCrossings:
-    """The first k crossings as `RayCrossings` of Dr.Jit arrays."""
+    """The first k crossings of each ray as a `RayCrossings` of Dr.Jit arrays. differentiable:
+    whether t and positions are to carry derivatives, if rays, levels or field have derivatives
+    enabled."""
     backend, o, d = rays.backend, rays.origin, rays.direction
     prepared = surface.prepare(backend, crosses=True)
     with dr.suspend_grad():
@@ -314,20 +328,22 @@ def trace_crossings(
 
 
 def empty_crossings(backend: Backend) -> RayCrossings:
-    """The crossings of no rays."""
+    """The `RayCrossings` of no rays, as Dr.Jit arrays."""
     number, vector = dr.zeros(backend.Float, 0), dr.zeros(backend.Array3f, 0)
     count, side = dr.zeros(backend.UInt32, 0), dr.zeros(backend.Int32, 0)
     return RayCrossings(number, vector, vector, side, side, count, number, count, count)
 
 
 def crossings_to_numpy(hits: RayCrossings, n: int, k: int) -> RayCrossings:
-    """Crossings of n rays as NumPy arrays."""
+    """The crossings of n rays, k for each, as NumPy arrays of shapes (n, k, ...) and (n,)."""
 
     def each(array: Any) -> Any:
+        """An array of crossings as a NumPy array (n, k, ...)."""
         values = to_numpy(array)
         return values.reshape(n, k, *values.shape[1:])
 
     def of_ray(array: Any) -> Any:
+        """An array of rays as a NumPy array (n,)."""
         return np.broadcast_to(to_numpy(array), (n,)).copy()
 
     return RayCrossings(

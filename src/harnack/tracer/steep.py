@@ -163,8 +163,8 @@ class _SearchState:
     inner, least: a length between them, and the difference between f and the level there.
     """
 
-    sample_count: Any
-    side_sample_count: Any
+    count: Any
+    side_count: Any
     passed: Mask
     active: Mask
     low: Real
@@ -236,32 +236,30 @@ def beyond(
     direction, as rounding may have put p behind the level; and half of `reach` along each axis from
     the nearest point.
 
-    Ranges of f around p prove nothing, as they may contain numbers that f does not take. So do
-    ranges beside a jump. So f counts as the level up to rounding only if it is continuous on a box
-    that is many times as large as this rounding. If the level is not found, nothing is proved: the
-    ray goes on, and comes nearer if it meets the surface.
+    Ranges of f around p prove nothing, as they may contain numbers that f does not take. The same
+    holds for ranges beside a jump. So f counts as the level up to rounding only if it is continuous
+    on a box that is many times as large as this rounding. If the level is not found, nothing is
+    proved: the ray goes on, and comes nearer if it meets the surface.
     """
     epsilon = float(dr.epsilon(backend.Float))
     shortest = 4 * epsilon * reach
 
     def sample_once(now: _SearchState) -> _SearchState:
         """The state after one more sample q."""
-        is_first, is_far = now.sample_count < 3, (now.sample_count == 2) | (now.sample_count == 4)
-        is_search = now.sample_count >= _TRIAL_COUNT
-        is_side = is_search & (
-            (now.high - now.low <= shortest) | (now.sample_count >= _MAX_SAMPLES)
-        )
-        is_behind = is_side & (now.side_sample_count == 0)
+        is_first, is_far = now.count < 3, (now.count == 2) | (now.count == 4)
+        is_search = now.count >= _TRIAL_COUNT
+        is_side = is_search & ((now.high - now.low <= shortest) | (now.count >= _MAX_SAMPLES))
+        is_behind = is_side & (now.side_count == 0)
         direction = dr.select(is_first | (is_search & ~is_behind), ways[0][0], ways[1][0])
         slope = dr.abs(dr.select(is_first, ways[0][1], ways[1][1]))
-        factor = dr.select(now.sample_count == 0, backend.Float(1), 2)
+        factor = dr.select(now.count == 0, backend.Float(1), 2)
         distance = dr.select(is_far, reach, fmin(factor * gaps.nearest / slope, reach))
         behind, ahead = now.inner - now.low, now.high - now.inner
         section = now.inner + _GOLDEN_SECTION * dr.select(ahead >= behind, ahead, -behind)
         section = dr.select(is_behind, -reach, dr.select(is_side, now.inner, section))
         distance = dr.select(is_search, section, distance)
-        side = dr.select((now.side_sample_count & 1) == 0, 0.5 * reach, -0.5 * reach)
-        axis = (now.side_sample_count - 1) >> 1  # no axis if sides is 0: 0 - 1 is a large number
+        side = dr.select((now.side_count & 1) == 0, 0.5 * reach, -0.5 * reach)
+        axis = (now.side_count - 1) >> 1  # no axis if the count is 0: 0 - 1 is a large number
         offset = type(p)(*(dr.select(is_side & (axis == k), side, 0) for k in range(3)))
         q = dr.fma(type(p)(distance), direction, p) + offset
         # In coordinates in which q is rounded more coarsely than this, the box is q itself.
@@ -286,19 +284,19 @@ def beyond(
         gap = dr.select(dr.isfinite(nearest), nearest, dr.inf)
         now = _narrowed(now, distance, gap, is_search & ~is_side)
         passed |= now.passed
-        samples, side_sample_count = (
-            now.sample_count + 1,
-            now.side_sample_count + dr.select(is_side, 1, 0),
+        samples, side_count = (
+            now.count + 1,
+            now.side_count + dr.select(is_side, 1, 0),
         )
         active = (
             now.active
             & ~passed
-            & ((samples < _TRIAL_COUNT) | (searches & (side_sample_count < _SIDE_COUNT)))
+            & ((samples < _TRIAL_COUNT) | (searches & (side_count < _SIDE_COUNT)))
         )
         return replace(
             now,
-            sample_count=samples,
-            side_sample_count=side_sample_count,
+            count=samples,
+            side_count=side_count,
             passed=passed,
             active=active,
         )
@@ -308,7 +306,7 @@ def beyond(
         backend.Float(0), backend.Float(reach), backend.Float(0), backend.Float(gaps.nearest),
     )  # fmt: skip
     end = loop_while_active(begin, sample_once, "harnack beyond")
-    return end.passed, end.sample_count
+    return end.passed, end.count
 
 
 def _narrowed(now: _SearchState, length: Real, gap: Real, is_search: Mask) -> _SearchState:

@@ -1,4 +1,4 @@
-"""`Surface`: the level sets of a field, and the part of them that is meant."""
+"""`Surface`: the level sets of a field, or the boundary of a solid, and the volumes that cut it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ SIDES: tuple[Side, ...] = get_args(Side)
 
 
 class SurfaceKeywords(TypedDict, total=False):
-    """The keywords of `Surface`, which every verb takes beside a bare field."""
+    """The keywords of `Surface`. Every verb (`trace`, `render`, `mesh`, ...) takes them beside a
+    field that is given without a `Surface`."""
 
     level: Any
     clip: Volume | None
@@ -114,7 +115,7 @@ class Surface:
 
     @property
     def keywords(self) -> dict[str, Any]:
-        """The keyword arguments but for `level`."""
+        """The keyword arguments of this surface but for `level`, by name."""
         return {
             "clip": self.clip, "section": self.section, "side": self.side, "largest": self.largest,
         }  # fmt: skip
@@ -131,12 +132,15 @@ class Surface:
 
     @property
     def solid_range(self) -> tuple[float, float] | None:
-        """The values (low, high) of f on the closed solid; None for the level set itself."""
+        """The interval (low, high) of the values of f on the closed solid; None if the surface is
+        the level set itself."""
         return side_range(self.side, self.level_values)
 
 
 def side_range(side: Side | None, levels: Sequence[float]) -> tuple[float, float] | None:
-    """The values (low, high) of f on the closed solid on a side of levels; None for a level set."""
+    """The interval (low, high) of the values of f on the closed solid that `side` describes; one
+    end may be infinite. None if `side` means the level set itself. levels: one level, or two for
+    "between"."""
     if side is None or side == "surface":
         return None
     low = -math.inf if side == "below" else levels[0]
@@ -144,7 +148,8 @@ def side_range(side: Side | None, levels: Sequence[float]) -> tuple[float, float
 
 
 def intersection_of(volumes: Sequence[Volume | None]) -> Volume | None:
-    """The intersection of volumes; None, for all of space, if there are none."""
+    """The intersection of volumes. Entries that are None stand for all of space, and so does the
+    result None."""
     distinct = list(dict.fromkeys(volume for volume in volumes if volume is not None))
     if not distinct:
         return None
@@ -152,14 +157,16 @@ def intersection_of(volumes: Sequence[Volume | None]) -> Volume | None:
 
 
 def level_number(level: Any) -> float:
-    """A level as a Python number. Raises TypeError for a level that is no number."""
+    """A level, which may be a Dr.Jit number, as a Python float. Raises TypeError for a level that
+    is no number."""
     if dr.is_array_v(type(level)):
         return float(dr.detach(level)[0])
     return as_number(level, "level must be a number, or several, such as 0.5 or 2 * math.pi")
 
 
 def as_number(number: Any, message: str) -> float:
-    """A number as Python's; TypeError, which begins with `message`, for anything else."""
+    """A number as a Python float. Raises TypeError, with a text that begins with `message`, for
+    anything else."""
     check_no_derivatives("a level or setting that is no Dr.Jit number", number)
     try:
         return float("nothing" if isinstance(number, str | bool | np.bool_) else number)
@@ -168,6 +175,8 @@ def as_number(number: Any, message: str) -> float:
 
 
 def _check_side(side: Any, levels: Sequence[Any]) -> Side | None:
+    """The option `side`, checked. Raises ValueError if it is unknown, or if the number of levels
+    does not suit it."""
     if side is not None and not is_one_of(side, SIDES):
         names = ", ".join(f'"{name}"' for name in SIDES)
         raise ValueError(f"side must be one of {names}, not {side!r}{did_you_mean(side, SIDES)}")
@@ -186,6 +195,8 @@ def _check_side(side: Any, levels: Sequence[Any]) -> Side | None:
 
 
 def _in_order(levels: tuple[Any, ...], side: Side | None) -> tuple[Any, ...]:
+    """The levels unchanged. Raises ValueError if side is "between" and they are not in ascending
+    order."""
     if side == "between" and not level_number(levels[0]) < level_number(levels[1]):
         low, high = map(level_number, levels)
         raise ValueError(f'side="between" needs level=(low, high), low < high, not {(low, high)}')
