@@ -251,8 +251,8 @@ def estimate_time(
     path_count = pixels * spp
 
     def seconds(count: int) -> float:
-        # The golden ratio spreads any number of pixels evenly.
         """The time of a run of `count` paths."""
+        # The golden ratio spreads any number of pixels evenly.
         indices = (np.arange(count) * 0.6180339887498949 % 1 * pixels).astype(np.int64)
         pixel = upload_indices(mi, np.minimum(indices, pixels - 1))
         sample = dr.opaque(mi.UInt32, 0, count)

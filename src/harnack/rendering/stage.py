@@ -328,9 +328,9 @@ def stage_placement(points: FloatArray, turned: FloatArray | None = None) -> Pla
 
 
 def _sensor(mi: Any, pose: CameraPose, size: tuple[int, int]) -> dict[str, Any]:
-    # Rays begin near the stage, however far the camera is: their origins are rounded.
     """The dictionary of the camera for Mitsuba. Raises ValueError if it is too far away for single
     precision. size: (width, height) in pixels."""
+    # Rays begin near the stage, however far the camera is: their origins are rounded.
     distance = float(np.linalg.norm(pose.origin))
     if distance > _MAX_CAMERA_DISTANCE:
         raise ValueError(
