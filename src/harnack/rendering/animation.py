@@ -1,4 +1,5 @@
-"""Animations: `render` for each frame, with a single framing for all of them."""
+"""Films: each picture is drawn by `render`, and the camera is chosen such that all pictures fit
+together."""
 
 from __future__ import annotations
 
@@ -191,8 +192,8 @@ def _value_at(value: Any, s: float) -> Any:
 
 
 def _is_function_of_s(value: Any) -> bool:
-    """Whether an option is a function of one number. A function of three coordinates, by which a
-    surface is colored, is no function of s."""
+    """Whether an option is a function of s, the time in a film: whether it can be called with one
+    number. A function of three coordinates, by which a surface is colored, cannot."""
     if not callable(value) or isinstance(value, type):
         return False
     try:
@@ -309,6 +310,7 @@ def _gif(path: Path, fps: float) -> Generator[Callable[[Pixels], None]]:
     pictures: list[Any] = []
 
     def add(pixels: Pixels) -> None:
+        """Add a picture (h, w, 3 or 4) to the film."""
         opaque = Image.fromarray(np.ascontiguousarray(pixels[..., :3]))
         indexed = opaque.quantize(_CLEAR, method=Image.Quantize.MEDIANCUT)
         if pixels.shape[-1] == 4:  # a GIF has no partly transparent pixels
@@ -343,6 +345,7 @@ def _mp4(path: Path, size: tuple[int, int], fps: float) -> Generator[Callable[[P
         stream.options = {"crf": "16"}
 
         def add(pixels: Pixels) -> None:
+            """Add a picture (h, w, 3) to the film."""
             if pixels.shape[-1] == 4:
                 raise ValueError("films in .mp4 have no alpha: choose another backdrop, or a .gif")
             height, width = (side - side % 2 for side in pixels.shape[:2])

@@ -1,8 +1,9 @@
-"""Renders arbitrary output variables (AOVs): normals, evaluations, status, depth, and values of
-another function on the surface.
+"""Renders arbitrary output variables (AOVs): normals, numbers of evaluations, status of rays,
+depth, and values of another function on the surface.
 
-The numbers are exact, not averaged: those of a single ray through the middle of each pixel. So are
-the pictures, except those of values: at edges, the colors of several rays are averaged.
+The numbers of a pixel are those of the single ray through its middle; nothing is averaged. The
+pixels of pictures show these numbers, too, except for pictures of values: at edges, the colors of
+several rays are averaged.
 """
 
 from __future__ import annotations
@@ -108,7 +109,7 @@ class AovTask:
         function: Field | None = None,
         background: Color = _BACKGROUND,
     ) -> AovTask:
-        """The task for a loaded Mitsuba scene."""
+        """The task for a loaded Mitsuba scene. The parameters are the attributes of the class."""
         return cls(mi, HybridScene.of(mi, scene), sensor, placement, function, background)
 
     @property
@@ -269,12 +270,13 @@ def status_picture(view: AovBuffers) -> npt.NDArray[np.uint8]:
 
 
 def depth_picture(view: AovBuffers, scale: ColorScale) -> npt.NDArray[np.uint8]:
-    """Depths of hits as the colors of a scale."""
+    """The picture (h, w, 3) of the depths of hits in the colors of a scale."""
     return _of_surfaces(view, scale.colors(view.depth))
 
 
 def value_picture(view: AovBuffers, scale: ColorScale) -> npt.NDArray[np.uint8]:
-    """Values at hits as the colors of a scale, gray where there is no value; with isolines."""
+    """The picture (h, w, 3) of the values at hits in the colors of a scale; gray where a hit has no
+    value. Isolines have their own colors."""
     value = value_of(view)
     picture = np.where(np.isnan(value)[..., None], _UNKNOWN, scale.colors(value))
     return _of_surfaces(view, np.where(np.isnan(view.isoline_color), picture, view.isoline_color))

@@ -1,4 +1,4 @@
-"""A camera that frames the surfaces on the stage."""
+"""`Camera`, which chooses from where a picture is seen such that the surfaces fill it."""
 
 from __future__ import annotations
 
@@ -27,22 +27,24 @@ Point = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Camera:
-    """A view of the stage.
+    """From where a picture is seen. What is not set is chosen such that the surfaces fill the
+    picture.
 
-    azimuth, elevation: of the direction the camera looks from, in degrees; azimuth 0 is +x and
-        90 is +y, elevation 90 is straight from above. By default -50 and 28.
-    fov: the larger of the horizontal and vertical angle of view, in degrees. By default 26, or, of
-        a camera with a position or a distance, the angle that frames the surface from there.
-    zoom: 1 frames the surface tightly with a margin; more comes closer or, of a camera with a
-        position or a distance, makes the angle of view smaller.
-    box: a box to frame in place of the visible surfaces, in their coordinates; it stands on the
-        ground. The pictures of a film, in which surfaces change, then fit each other, and nothing
-        has to be traced to find the frame.
+    azimuth, elevation: the direction from the surfaces to the camera, in degrees; azimuth 0 is +x
+        and 90 is +y, elevation 90 is straight above. By default -50 and 28.
+    fov: the larger of the horizontal and vertical angle of view, in degrees. By default 26; for a
+        camera with a position or a distance, the angle at which the surfaces fill the picture.
+    zoom: with 1, the surfaces fill the picture up to a margin. With a larger number the camera
+        comes closer; if it has a position or a distance, the angle of view becomes smaller instead.
+    box: a box, in the coordinates of the surfaces, that fills the picture in place of the visible
+        surfaces; it stands on the ground. With the same box, pictures of surfaces that change fit
+        each other, and no rays are traced to find the frame.
     position: (x, y, z), where the camera stands, in the coordinates of the surfaces, in place of
         azimuth and elevation.
     target: (x, y, z), the point in the middle of the picture, in the same coordinates; by default
-        the middle of the framed box.
-    distance: from the target, in the same unit; by default the one that frames the surface.
+        the middle of what fills the picture.
+    distance: of the camera from the target, in the same unit; by default such that the surfaces
+        fill the picture.
     """
 
     azimuth: float | None = None
@@ -196,7 +198,8 @@ class Camera:
 
     @property
     def fov_or_default(self) -> float:
-        """The angle of view of a camera that chooses its distance, in degrees."""
+        """The angle of view that was set, in degrees, or else 26, that of a camera that chooses its
+        distance."""
         return _DEFAULT_FOV if self.fov is None else self.fov
 
     def _slopes(self, size: tuple[int, int]) -> tuple[float, float]:

@@ -183,7 +183,8 @@ class HybridScene:
         return hit
 
     def no_hit(self, si: Any) -> SurfaceHit:
-        """The `SurfaceHit` of rays that hit nothing. si: invalid interactions, one for each ray."""
+        """The `SurfaceHit` of rays that hit nothing. si: interactions that are not valid, one for
+        each ray."""
         return self._of_scene(si, self.mi.Bool(False))
 
     def _of_scene(self, si: Any, active: Mask) -> SurfaceHit:

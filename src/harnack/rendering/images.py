@@ -80,7 +80,7 @@ def _apply_shoulder(radiance: FloatArray) -> FloatArray:
 
 
 def linear_to_srgb(x: FloatArray) -> FloatArray:
-    """Linear sRGB in [0, 1] as sRGB."""
+    """Linear sRGB in [0, 1] as sRGB, by its transfer function."""
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
 
 
@@ -140,9 +140,9 @@ def exr_bytes(image: npt.NDArray[np.floating[Any]], names: Sequence[str] | None 
 
 
 class Picture(np.ndarray[Any, np.dtype[Any]]):
-    """The numbers of a picture, an array like any other, which notebooks show as an image.
+    """The array of numbers that `render` returns. Notebooks show it as an image.
 
-    Arrays that are computed from it are ordinary ones and have no image.
+    Arrays that are computed from it are ordinary arrays, which notebooks do not show as images.
     """
 
     _srgb: npt.NDArray[np.uint8] | None = None
@@ -173,10 +173,10 @@ class Picture(np.ndarray[Any, np.dtype[Any]]):
 
     @property
     def srgb(self) -> npt.NDArray[np.uint8]:
-        """The pixels that are shown: sRGB in bytes, (h, w, 3), or (h, w, 4) with alpha.
+        """The pixels that are shown: 8-bit sRGB, (h, w, 3), or (h, w, 4) with alpha.
 
         Raises:
-            AttributeError: this array was computed from that of a picture.
+            AttributeError: this array was computed from a picture and has no pixels.
         """
         if self._srgb is None:
             raise AttributeError(

@@ -70,7 +70,7 @@ class SobolSampler:
         return SobolSampler(self.mi, pixel, index, self.seed, _CAMERA + _VERTEX * uint(depth))
 
     def next_2d(self, active: Any = True) -> Any:
-        """Points in [0, 1)^2."""
+        """The next random point in [0, 1)^2 of each path."""
         del active
         uint, mi = self.mi.UInt32, self.mi
         key = _hashed(uint, self.pixel + _hashed(uint, self.dimension + _hashed(uint, self.seed)))
@@ -87,7 +87,7 @@ class SobolSampler:
         return mi.Point2f(*(dr.minimum(mi.Float(bits) * 2.0**-32, largest) for bits in pair))
 
     def next_1d(self, active: Any = True) -> Any:
-        """Numbers in [0, 1)."""
+        """The next random number in [0, 1) of each path."""
         return self.next_2d(active).x
 
 
@@ -128,7 +128,7 @@ class _Vertex:
 
     @classmethod
     def none(cls, mi: Any) -> _Vertex:
-        """No vertex: the path comes from the camera."""
+        """The vertex of paths that have none yet, as they come from the camera; it is not valid."""
         zero = dr.zeros(mi.SurfaceInteraction3f)
         return cls(zero.p, zero.n, zero.shape, mi.Bool(False))
 

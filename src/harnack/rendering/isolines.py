@@ -106,12 +106,14 @@ class Isolines:
         hk.render(field, "b.png", isolines=[hk.Isolines(other, [0, 1], color="white"), ...])
 
     function: the function: "x", "y" or "z", which gives contour lines of height; a `Field`; or a
-        Python function of x, y and z as `harnack.expression` takes it. All are in the coordinates
-        of the surface, wherever it stands. There are no lines where the field is not defined:
-        outside of its `domain`, unless it `is_global`.
-    levels: the values, or one; those of angle-valued fields count up to their period.
-    interval: in place of levels, lines at all whole multiples of it. It must divide the period of
-        an angle-valued field, which has 12 lines if neither is given.
+        Python function of x, y and z as `harnack.expression` takes it. Its coordinates are those of
+        the surface, wherever that is placed. There are no lines outside the `domain` of a field,
+        unless the field is defined everywhere (`is_global`).
+    levels: the value, or several, at which there are lines. For an angle-valued field they are
+        taken modulo its period.
+    interval: in place of levels: there are lines at all whole multiples of this number. It must
+        divide the period of an angle-valued field. Such a field has 12 lines if neither levels nor
+        interval is given.
     width: of the lines, along the surface, in the unit of its coordinates; by default 0.4 percent
         of the diagonal of the surface's box.
     color: a name of CSS, "#rrggbb", or three numbers of sRGB.
@@ -162,7 +164,8 @@ class Isolines:
         return period / count
 
     def prepare(self, backend: Backend, size: float) -> PreparedIsolines:
-        """The isolines on a backend. size: diagonal of the surface's box, for the default width."""
+        """The isolines on a backend. size: the diagonal of the surface's box, 0.4 percent of which
+        is the default width of a line."""
         width = _DEFAULT_WIDTH * size if self.width is None else self.width
         step, period = self._exact_interval(), self.function_field.period
         volume = padded_domain(self.function_field, size)

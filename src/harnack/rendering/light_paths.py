@@ -192,7 +192,8 @@ def as_rgb(mi: Any, radiance: Any, wavelengths: Any) -> Any:
 
 
 def mean_of_blocks(color: Any, spp: int) -> Any:
-    """The means over blocks of `spp` successive lanes."""
+    """The means of colors over blocks of `spp` successive lanes, which are the samples of one
+    pixel."""
     return type(color)(*(dr.block_sum(channel, spp) / spp for channel in color))
 
 

@@ -1,7 +1,8 @@
-"""Imports Mitsuba with a usable variant, loads its scene files, and computes refraction and
-absorption in transparent solids.
+"""Imports Mitsuba with a variant that can draw surfaces, loads scene files, and computes refraction
+and absorption in transparent solids.
 
-Scene files in XML are checked before Mitsuba reads them, and its errors are reworded.
+Scene files in XML are checked before Mitsuba reads them, and Mitsuba's error messages are
+shortened.
 """
 
 from __future__ import annotations
@@ -105,7 +106,7 @@ def load_scene_file(mi: Any, path: str | os.PathLike[str]) -> Any:
 
 
 def load_dict(mi: Any, description: Mapping[str, Any]) -> Any:
-    """The scene, or another object of Mitsuba's, that a dictionary describes.
+    """The scene, or another object of Mitsuba's, that a dictionary describes, loaded by Mitsuba.
 
     Raises:
         RuntimeError: Mitsuba cannot make it; the message says which entry is wrong.

@@ -283,18 +283,22 @@ def mitsuba_shape(
             ...
         })
 
-    bsdf: dictionary or BSDF object; gray diffuse, seen from both sides, if left out. Open
-        surfaces have two sides: wrap one-sided BSDFs as {"type": "twosided", ...}.
-    to_world: matrix (4, 4) or Mitsuba transform of moves, turns and one scale for all axes.
-    tint: of a solid of glass, the fractions of red, green and blue light that are left after one
+    bsdf: a dictionary or a BSDF object; by default gray diffuse, seen from both sides. An open
+        surface has two sides: wrap a one-sided BSDF as {"type": "twosided", ...}.
+    to_world: a matrix (4, 4) or a Mitsuba transform of translations, rotations and one scale for
+        all axes.
+    tint: for a solid of glass, the fractions of red, green and blue light that are left after one
         unit of length in it, in the world: (1, 1, 1) for clear glass (Beer and Lambert).
-    section_bsdf: of the faces at which `section` cuts an opaque solid; by default that of the rest.
-    isolines: `harnack.Isolines` to draw on it, or a list of them; later ones cover earlier ones.
-    options, keywords: as `render` takes them: level, clip, tolerance, side, ... Glass needs a
-        `side`.
+    section_bsdf: the BSDF of the faces at which `section` cuts an opaque solid; by default that of
+        the rest.
+    isolines: `harnack.Isolines` to draw on the surface, or a list of them; later ones cover earlier
+        ones.
+    options, keywords: a `TraceOptions`, and the options level, clip, section, side, tolerance, ...
+        as `render` takes them. Glass needs a `side`.
 
     Raises:
-        ValueError: the surface has no bounds and no `clip`, or `to_world` is no similarity.
+        ValueError: the surface has no bounds and no `clip`, or `to_world` does not scale all
+            lengths alike.
     """
     mi = register()
     if isinstance(surface, Surface | Field):

@@ -77,7 +77,8 @@ def _lined_class(variant: str) -> Any:
             self.m_flags = flags
 
         def _select_bsdf(self, call: Callable[[Any, Mask], Any], si: Any, active: Mask) -> Any:
-            """The result of `call(bsdf, mask)` for the BSDF that is seen in each lane."""
+            """The result of `call(bsdf, mask)` on each lane, where bsdf is `base` or, on an
+            isoline, the BSDF of the isoline, and the mask holds the lanes of this BSDF."""
             line = si.prim_index
             result = call(self.base, active & (line == 0))
             for number, paint in enumerate(self.paints, start=1):

@@ -290,7 +290,7 @@ ShowMode = Literal["path", "shaded", "normal", "evaluations", "status", "depth",
 
 
 def options_of(verb: str) -> tuple[Option, ...]:
-    """The options that a verb honors."""
+    """The options (rows of `OPTIONS`) that a verb honors."""
     return tuple(option for option in OPTIONS if verb in option.verbs)
 
 

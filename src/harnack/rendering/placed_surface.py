@@ -1,4 +1,5 @@
-"""A level set placed in the world: translated, rotated or mirrored, scaled alike on all axes."""
+"""A level set placed in the world: it is translated, rotated or mirrored, and scaled by one
+factor."""
 
 from __future__ import annotations
 
@@ -70,19 +71,22 @@ class Placement:
         return matrix
 
     def apply(self, points: npt.ArrayLike) -> FloatArray:
-        """Points (n, 3) of the surface, in the world."""
+        """The points of the world, (n, 3), to which points (n, 3) of the surface's coordinates are
+        mapped."""
         local: FloatArray = np.asarray(points, dtype=np.float64)
         rotated: FloatArray = np.matmul(local, np.transpose(self.rotation))
         return self.scale * rotated + self.translation
 
     def apply_inverse(self, points: npt.ArrayLike) -> FloatArray:
-        """Points (n, 3) of the world, in the surface's coordinates."""
+        """The points of the surface's coordinates, (n, 3), that are mapped to points (n, 3) of the
+        world."""
         world: FloatArray = np.asarray(points, dtype=np.float64)
         local: FloatArray = np.matmul(world - self.translation, self.rotation)
         return local / self.scale
 
     def world_bounds(self, ends: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corner, (3,) each, of a box in the world that holds a box (2, 3)."""
+        """The lower and the upper corner, (3,) each, of a box in the world that contains a box of
+        the surface's coordinates. ends: (2, 3) the corners of that box."""
         corners = self.apply(list(itertools.product(*ends.T.tolist())))
         return corners.min(axis=0), corners.max(axis=0)
 
@@ -129,8 +133,11 @@ class PlacedSurface:
         cls, surface: TracedSurface, placement: Placement, backend: Backend,
         isolines: Sequence[Isolines] = (), size: float = 1.0,
     ) -> PlacedSurface:  # fmt: skip
-        """The surface on a backend. size: diagonal of the surface's box, for the default width of
-        isolines."""
+        """The surface on a backend, placed in the world.
+
+        isolines: lines to draw on it. size: the diagonal of the surface's box, for their default
+            width.
+        """
 
         def vector(numbers: FloatArray) -> Vec3:
             return backend.Array3f(*(dr.opaque(backend.Float, float(x)) for x in numbers))
@@ -210,7 +217,8 @@ class PlacedSurface:
         return near
 
     def occludes(self, o: Vec3, d: Vec3, t_max: Real, active: Mask) -> Mask:
-        """Whether rays of the world hit it; rays that are not proved to miss it count as hits."""
+        """Mask of rays o + t d, 0 <= t <= t_max, of the world that hit the surface. Rays that are
+        not proved to miss it count as hits."""
         o, d, t_max = self._local_ray(o, d, t_max)
         if self.solid is not None:
             return self.solid.occludes(o, d, t_max, active)

@@ -97,7 +97,8 @@ class RenderJob:
 
     @functools.cached_property
     def task(self) -> AovTask | PathRenderTask | ShadedTask | None:
-        """The task that draws the picture pixel by pixel; None for a scene that Mitsuba draws."""
+        """The task that draws the picture, and can draw it part by part; None for a scene that
+        Mitsuba's own integrator draws."""
         mi, options, stage = self.mi, self.options, self.stage
         scene = self.scene
         sensor = scene.sensors()[0]

@@ -203,11 +203,11 @@ def check_spp(spp: Any, *, source: str = "") -> int:
 
 
 def check_integer(name: str, number: Any) -> int:
-    """An integer of any sign.
+    """An option's value as an int. name: of the option.
 
     Raises:
         TypeError: it is no integer.
-        ValueError: a max_depth too large for the path tracer's counters.
+        ValueError: a max_depth that is too large for the path tracer's counters.
     """
     try:
         integer = _index(number)
@@ -234,7 +234,8 @@ def _index(number: Any) -> int:
 
 
 def check_camera(camera: Any) -> Camera:
-    """A `Camera`: the given one, one at a position (x, y, z), or the default for None."""
+    """The value of the option `camera` as a `Camera`: such an object, the (x, y, z) where a camera
+    stands, or None for the default camera."""
     if camera is None:
         return Camera()
     if isinstance(camera, Camera):

@@ -62,8 +62,9 @@ _COLOR_HELP = 'a name of CSS such as "steelblue", "#4682b4", or three numbers fr
 
 
 def parse_color(color: Any, name: str) -> Color:
-    """A color in sRGB, three numbers in [0, 1], as screens show them.
+    """A color in sRGB, as three numbers in [0, 1].
 
+    color: a name of CSS, "#rrggbb", or three numbers in [0, 1].
     name: of the colored thing, for messages.
 
     Raises:
@@ -127,9 +128,9 @@ _VIRIDIS = np.array(
 
 
 def viridis(x: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
-    """Colors (..., 3) in sRGB, in [0, 1], of numbers (...) in [0, 1]: dark blue to yellow.
+    """Colors (..., 3) in sRGB, in [0, 1], of numbers (...) in [0, 1], from dark blue to yellow.
 
-    Equal differences look equally large, and it reads well in gray and for the color-blind.
+    Equal differences of numbers look equally large, also in gray and for the color-blind.
     """
     x = np.clip(np.nan_to_num(x), 0.0, 1.0).astype(np.float64)
     colors = np.zeros((*x.shape, 3))
@@ -324,8 +325,8 @@ def require_pillow() -> tuple[Any, Any, Any]:
 
 
 def typeface_for(text: str, size: int) -> Any:
-    """A typeface with all letters of a text: Pillow's own, which has plain ASCII letters, or the
-    first of a list that is installed on this machine.
+    """A typeface of Pillow with all letters of a text. It is Pillow's own for plain ASCII letters;
+    otherwise the first one of a list that is installed on this machine and has the letters.
 
     Raises:
         ValueError: no typeface has all letters.

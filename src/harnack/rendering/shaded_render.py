@@ -223,7 +223,7 @@ class GBuffer:
         return cls(*(dr.zeros(kind, count) for kind in kinds))
 
     def to_numpy(self) -> dict[str, npt.NDArray[Any]]:
-        """The arrays as NumPy arrays, by name."""
+        """The arrays of this buffer as NumPy arrays, by name."""
         return {name: to_numpy(value) for name, value in vars(self).items()}
 
     @classmethod

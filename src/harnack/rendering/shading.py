@@ -282,7 +282,7 @@ class ShadowCaster(Protocol):
     def mi(self) -> Any: ...
 
     def occluded(self, ray: Any, active: Any) -> Any:
-        """Whether rays of Mitsuba's meet anything."""
+        """Mask of rays of Mitsuba's that hit an object."""
         ...
 
 

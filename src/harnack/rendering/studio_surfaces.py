@@ -1,4 +1,4 @@
-"""Turns the arguments of `render` into surfaces on the stage of the studio."""
+"""Turns the arguments of `render` into the objects that its studio shows."""
 
 from __future__ import annotations
 
@@ -232,8 +232,8 @@ def _surface(
     shorthand: Mapping[str, Any],
     is_clear: bool,
 ) -> TracedSurface:
-    """A surface with its options. A `Solid` is drawn as a solid where its inside can be seen: where
-    a section opens it, or it is clear."""
+    """A surface with the options of the call. A `Solid` is drawn as a solid if its inside can be
+    seen: if a section opens it, or its material is transparent."""
     if isinstance(element, TracedSurface):
         return element.with_call_cache(begins=True)
     honored = names_of("render", "surface", "trace")
@@ -243,10 +243,12 @@ def _surface(
 
 
 def with_visible_inside(surface: TracedSurface, *, is_clear: bool = False) -> TracedSurface:
-    """The surface, for a `Solid` whose inside can be seen as the boundary of the solid.
+    """The surface; a `Solid` whose inside can be seen becomes the boundary of the solid, with faces
+    where volumes cut it.
 
     Raises:
-        ValueError: a closed solid of a field that has none (`check_has_inside`).
+        ValueError: the boundary of a solid is requested for a field that has no closed solids
+            (`check_has_inside`).
     """
     is_seen = is_clear or surface.section is not None
     is_solid = isinstance(surface.field, Solid) and len(surface.levels) == 1

@@ -1,7 +1,8 @@
-"""First hits of rays with level sets and closed solids: refined positions, oriented normals.
+"""First hits of rays with level sets and with boundaries of solids: their positions, moved onto the
+surface, and normals that point to a known side.
 
-Everything here is in the surface's own coordinates and knows no Mitsuba;
-`hybrid_scene.surface_interaction` turns a hit into what a BSDF takes.
+All coordinates are those of the surface, and nothing here depends on Mitsuba.
+`hybrid_scene.surface_interaction` turns a hit into the interaction that a BSDF takes.
 """
 
 from __future__ import annotations
@@ -270,7 +271,8 @@ class CappedSolid:
 
     @classmethod
     def of(cls, surface: TracedSurface, prepared: SurfaceTracer) -> CappedSolid:
-        """The solid that `surface.side` describes."""
+        """The solid of a surface whose `side` describes one. prepared: the tracer of the surface.
+        Raises ValueError if the surface is a level set."""
         if surface.solid_range is None:
             raise ValueError("this surface is not the boundary of a solid: give it a side")
         finite = iter(prepared.levels.values)
@@ -278,7 +280,7 @@ class CappedSolid:
         return cls(prepared, low, high)
 
     def _contains(self, p: Vec3) -> Mask:
-        """Whether points of the volume belong to the solid."""
+        """Mask of points (3,) of the volume that belong to the solid."""
         f = self.prepared.sample(p).value
         return (f >= self.low) & (f <= self.high) & self.prepared.level_counts(p)
 
@@ -335,7 +337,8 @@ class CappedSolid:
         return dr.select(capped, cap_hit, hit)
 
     def occludes(self, o: Vec3, d: Vec3, t_max: Real, active: Mask) -> Mask:
-        """Whether rays hit the boundary; rays that are not proved to miss it count as hits."""
+        """Mask of rays o + t d, 0 <= t <= t_max, that hit the boundary of the solid. Rays that are
+        not proved to miss it count as hits."""
         start, end = self.prepared.clip(o, d, self.prepared.backend.Float(0), t_max)
         enters = active & (start < end)
         start = dr.select(enters, start, 0)

@@ -317,7 +317,8 @@ class _SearchedHits:
 
 @dataclass(frozen=True)
 class _SearchDistance:
-    """A length for each hit."""
+    """The distance from a hit within which the surface was found, as a record for
+    `compute_on_active`."""
 
     length: Real
 

@@ -50,25 +50,27 @@ class RayStatus(enum.IntEnum):
 class HitTolerance:
     """How close to a level a point must be to count as a hit.
 
-    distance: a length; a point is a hit if |f - level| <= distance * |grad f|. To first order this
+    distance: a length. A point is a hit if |f - level| <= distance * |grad f|. To first order this
         is its distance from the surface (paper, Sec. 3.1.2); the exceptions are below.
-    per_length: added to `distance` for each unit of t: half the angle of a pixel makes the
-        tolerance grow with the footprint of the pixel.
-    value: in units of f; a point is also a hit if |f - level| <= value, whatever the gradient.
+    per_length: added to `distance` for each unit of t. With half the angle of a pixel, the
+        tolerance grows with the size of the pixel on the surface.
+    value: in units of f. A point is also a hit if |f - level| <= value, whatever the gradient.
 
-    Where |grad f| may be unbounded, as beside a vertical tangent or a pole of a formula
-    (`Field.is_steep`), |f - level| / |grad f| is no distance. There a point is a hit only if f is
-    proved to take the level within the tolerance, by its slope ahead or by its values beyond, or up
-    to the rounding of the point. At creases |grad f| jumps but is bounded: a crease that stays off
-    the level counts as a hit where it comes as near to the level in value. So do spikes and steps
-    that are narrower than the tolerance, as those of tanh(1e6 x) - y and of
-    0.5 + exp(-(1e5 x)^2). For fields that are no formulas and have poles, such as clouds of
-    dipoles, rays that pass a pole within the tolerance count as hits of every level.
+    Steep fields. |grad f| may be unbounded, for example beside a vertical tangent or a pole of a
+    formula (`Field.is_steep`). Then |f - level| / |grad f| is no distance. A point is a hit there
+    only if f is proved to take the level within the tolerance, by its slope or by its values
+    nearby, or up to the rounding of the point.
 
-    If rounding leaves the distance to the level uncertain by more than the tolerance, then this
-    uncertainty is the tolerance: about 1e-6 of the size of coordinates in single precision, 1e-15
-    in double precision, and far more where grad f is 0 on the surface, as where two sheets of it
-    meet (`Hits.uncertainty` tells how much).
+    Creases and spikes. At creases |grad f| jumps but is bounded. A crease at which f comes as near
+    to the level in value counts as a hit, even if f does not take the level. So do spikes and steps
+    that are narrower than the tolerance, such as those of tanh(1e6 x) - y and of 0.5 + exp(-(1e5
+    x)^2). Some fields that are no formulas have poles, such as clouds of dipoles: rays that pass a
+    pole within the tolerance count as hits of every level.
+
+    Rounding. If rounding leaves the distance to the level uncertain by more than the tolerance,
+    this uncertainty takes the place of the tolerance. It is about 1e-6 of the size of coordinates
+    in single precision, and 1e-15 in double precision. It is far more where grad f is 0 on the
+    surface, for example where two sheets of the surface meet (`Hits.uncertainty` tells how much).
     """
 
     distance: float = 1e-4

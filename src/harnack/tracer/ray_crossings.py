@@ -188,28 +188,29 @@ def find_crossings(
 
 @dataclass(frozen=True)
 class RayCrossings:
-    """The first k crossings of n rays with the level set, in order.
+    """The first k crossings of n rays with the level set, in the order along each ray.
 
-    As NumPy arrays, or as tensors if the rays were; if they were Dr.Jit arrays, as Dr.Jit arrays,
-    in which (n, k) is flat: crossing j of ray i is at i k + j.
+    They are NumPy arrays; tensors if the rays were tensors; Dr.Jit arrays if the rays were Dr.Jit
+    arrays. The latter are flat: crossing j of ray i is at i k + j.
 
-    t: (n, k) ray parameter of the crossing, inf if a ray has fewer crossings. It lies between two
-        samples with f on different sides of the level: at the root of the cubic through their
-        values and slopes, or of a bisection if there is a crease between them.
-    position: (n, k, 3) point at t, NaN for no crossing.
-    normal: (n, k, 3) unit normal grad f/|grad f|, to the side of larger f; zero for no crossing.
-    primitive_index: (n, k) index of the facet, such as a triangle, that was crossed; -1 if no facet
-        was crossed.
+    t: (n, k) the ray parameter of the crossing, inf if a ray has fewer crossings. It lies between
+        two samples with f on different sides of the level: at the root of the cubic through their
+        values and slopes, or found by bisection if there is a crease between them.
+    position: (n, k, 3) the point at t, NaN for no crossing.
+    normal: (n, k, 3) the unit normal grad f/|grad f|, which points to the side of larger f; zero
+        for no crossing.
+    primitive_index: (n, k) the index of the facet that was crossed, a flat piece of surface at
+        which f jumps, such as a triangle; -1 if no facet was crossed.
     side: (n, k) integers: 1 if f rises through the level along the ray, -1 if it falls through it,
         0 for no crossing.
-    count: (n,) number of crossings, at most k.
-    traced_to: (n,) ray parameter up to which the ray was followed: inf if it was followed to its
-        end; else the point just behind the last crossing at which that was noticed, or the point at
-        which the ray ran out of steps.
-    status: (n,) a `RayStatus`, of the end of the ray. MISS: the ray is proved to have no other
-        crossings. HIT: there are k crossings, and the rest of the ray was not examined.
-        OUT_OF_STEPS: the ray behind `traced_to` is not known.
-    evaluations: (n,) number of evaluations of the field.
+    count: (n,) the number of crossings, at most k.
+    traced_to: (n,) the ray parameter up to which the ray was followed: inf if it was followed to
+        its end; else the point just behind the last crossing at which this crossing was noticed, or
+        the point at which the ray ran out of steps.
+    status: (n,) a `RayStatus`. MISS: the ray is proved to have no other crossings. HIT: there are k
+        crossings, and the rest of the ray was not examined. OUT_OF_STEPS: the ray behind
+        `traced_to` is not known.
+    evaluations: (n,) the number of evaluations of the field.
     """
 
     t: Any

@@ -73,7 +73,7 @@ class RayBatch:
 
     @property
     def arrays(self) -> tuple[Vec3, Vec3, Real, Real]:
-        """Origin, direction, t_min and t_max."""
+        """The arrays origin (3,), direction (3,), t_min and t_max."""
         return self.origin, self.direction, self.t_min, self.t_max
 
 

@@ -108,7 +108,7 @@ class Surface:
             )
 
     def replace(self, **changes: Any) -> Surface:
-        """This surface with other arguments, by their names in the constructor."""
+        """This surface with some arguments changed, which are named as in the constructor."""
         arguments: dict[str, Any] = {"field": self.field, "level": self.levels, **self.keywords}
         arguments |= changes
         return Surface(**arguments)
@@ -204,7 +204,7 @@ def _in_order(levels: tuple[Any, ...], side: Side | None) -> tuple[Any, ...]:
 
 
 def _as_levels(level: Any) -> tuple[Any, ...]:
-    """The levels, given as a number or several numbers, as a tuple."""
+    """The levels as a tuple. level: a number or several, which may be a tensor."""
     if is_tensor(level):
         numbers = tensor_to_array(level, "level")
         backend = backend_of(numbers)

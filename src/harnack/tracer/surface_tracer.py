@@ -195,7 +195,7 @@ class MarchResult:
 
     @property
     def at_jump(self) -> Mask:
-        """Mask of the rays that hit a facet."""
+        """Mask of the rays that hit a facet, a flat piece of surface at which f jumps."""
         return self.facet != NO_FACET
 
 
@@ -277,7 +277,7 @@ class SurfaceTracer:
     known_branch_volume: Volume | None = None
 
     def sample(self, p: Vec3) -> Sample:
-        """The field at p."""
+        """The sample of the field (value, gradient, error bounds) at points p (3,)."""
         return self.field.evaluate(p)
 
     def sample_with_branch(self, p: Vec3, value: Real) -> Sample:

@@ -108,7 +108,7 @@ class TraceOptions:
         return choose_enclosures(self.enclosures)
 
     def replace(self, **changes: Any) -> TraceOptions:
-        """These options with other values."""
+        """These options with some values changed, by name."""
         return replace(self, **changes)
 
 

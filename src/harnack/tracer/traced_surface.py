@@ -90,7 +90,7 @@ class TracedSurface:
 
     @classmethod
     def of(cls, surface: Surface, options: TraceOptions) -> TracedSurface:
-        """The surface with the options of a call.
+        """A surface with the options of a call, as a `TracedSurface`.
 
         Raises:
             ValueError, NotImplementedError: options that this surface cannot have.
@@ -109,7 +109,8 @@ class TracedSurface:
 
     @property
     def surface(self) -> Surface:
-        """The surface without the options."""
+        """The field with its levels, volumes and side as a `Surface`, without the options of
+        traces."""
         return Surface(
             self.field, self.levels, clip=self.clip, section=self.section, side=self.side,
             largest=self.largest,
@@ -117,7 +118,7 @@ class TracedSurface:
 
     @property
     def options(self) -> TraceOptions:
-        """The options without the surface."""
+        """The options of traces as a `TraceOptions`, without the surface."""
         return TraceOptions(
             tolerance=self.tolerance, enclosures=self.enclosures, max_steps=self.max_steps,
             over_relaxation=self.over_relaxation, require_crossing=self.require_crossing,
@@ -126,10 +127,12 @@ class TracedSurface:
     def validate_crossings(self, option: str) -> None:
         """Raise an error if crossings of this surface cannot be traced.
 
-        ValueError for several levels of a field with jumps, as a jump may cross more than one level
-        at once; NotImplementedError for a field with patches.
-
         option: the name of the verb or option that needs crossings, for the message.
+
+        Raises:
+            ValueError: the field has jumps and there are several levels; a jump may cross more than
+                one level at once.
+            NotImplementedError: the field is a union of patches, each with a function of its own.
         """
         if self.field.has_patches:
             raise NotImplementedError(
@@ -171,8 +174,8 @@ class TracedSurface:
         )
 
     def memoize(self, key: Any, compute: Callable[[], _T]) -> _T:
-        """The result of `compute()`, cached for this field, these levels and the key. Without a
-        cache (outside of a call of the library), `compute` is called each time."""
+        """The result of `compute()`. Within a call of the library it is cached for this field,
+        these levels and the key; otherwise `compute` is called each time."""
         if self._call_cache is None:
             return compute()
         full_key = key, id(self.field), self.level_values
@@ -194,8 +197,8 @@ class TracedSurface:
 
     @property
     def hit_tolerance(self) -> HitTolerance:
-        """The tolerance of hits: the one that was set, or one that follows the size of the
-        volume."""
+        """The tolerance of hits: the one that was set, or else 1e-4 of the longest side of the box
+        of the volume to which rays are clipped (1e-4 if this box is unbounded)."""
         return default_tolerance(self.volume) if self.tolerance is None else self.tolerance
 
     def for_rays(self, count: int) -> TracedSurface:
