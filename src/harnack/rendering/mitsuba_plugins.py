@@ -17,14 +17,15 @@ scenes that are put together in Python.
 </shape>
 <integrator type="harnack_path"/>                  max_depth, rr_depth, hide_emitters, clamp
 
-Mitsuba's own integrators ask Mitsuba's shapes alone, for which a proxy is two points: they would
-draw nothing, and say nothing. No method of a shape is called while they render, so `mitsuba.render`
-looks first and warns. `harnack.render` follows paths itself where the integrator asks for the same
-light, leaves scenes without our surfaces to Mitsuba, and refuses the rest.
+Mitsuba's own integrators trace rays to Mitsuba's shapes only. A level set is represented by a proxy
+mesh of two triangles, each of which is a single point, so they would draw nothing of it and say
+nothing. Mitsuba calls no method of a shape while it renders, so `mitsuba.render` is replaced by a
+function that checks the scene first and warns. `harnack.render` uses its own path tracer if the
+integrator asks for the same light, leaves scenes without level sets to Mitsuba, and raises an error
+for all other scenes.
 
-Mitsuba surfaces are zero-area proxy meshes with a path integrator that meets both worlds; finding
-a hit and describing it (`SurfaceInteraction`) are separate, since Mitsuba's next release lets
-Python define shapes.
+Finding a hit and describing it to Mitsuba (`SurfaceInteraction`) are separate, since Mitsuba's next
+release lets Python define shapes.
 """
 
 from __future__ import annotations
@@ -285,8 +286,8 @@ def mitsuba_shape(
 
     bsdf: a dictionary or a BSDF object; by default gray diffuse, seen from both sides. An open
         surface has two sides: wrap a one-sided BSDF as {"type": "twosided", ...}.
-    to_world: a matrix (4, 4) or a Mitsuba transform of translations, rotations and one scale for
-        all axes.
+    to_world: a matrix (4, 4) or a Mitsuba transform of translations, rotations, mirrors and one
+        scale for all axes.
     tint: for a solid of glass, the fractions of red, green and blue light that are left after one
         unit of length in it, in the world: (1, 1, 1) for clear glass (Beer and Lambert).
     section_bsdf: the BSDF of the faces at which `section` cuts an opaque solid; by default that of

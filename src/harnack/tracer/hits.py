@@ -124,35 +124,38 @@ def trace(
 ) -> Hits:
     """First hits of rays with a level set of a field. No hit is missed: every step is proved.
 
-    surface: a field, or a `Surface`: its levels, clip, section and largest component. `side` is
-        refused: the faces of a solid on its clip are no level set.
+    surface: a field; or a `Surface`, with its levels, clip, section and largest component. A
+        `Surface` with a `side` raises an error: the faces of a solid where its clip cuts it are no
+        level set.
     origins, directions: (n, 3) array-likes or Dr.Jit tensors (one of them may be (1, 3)), or Dr.Jit
         3-vectors. Directions need not have length 1; t counts multiples of the *unit* direction, so
         it is a length.
     t_min, t_max: (n,) or a number. With an infinite t_max, a ray that leaves the proved extent of
         the surface is a proved miss.
     options: a `TraceOptions`.
-    keywords: those of `Surface` beside a bare field, and of `TraceOptions` in place of `options`:
-        `trace(field, o, d, level=2.0, tolerance=1e-6)`.
+    keywords: the options of `Surface` beside a bare field, and the options of `TraceOptions` in
+        place of `options`: `trace(field, o, d, level=2.0, tolerance=1e-6)`.
 
-    Arrays of float64 are traced in double precision and give such arrays, others in single
-    precision, unless `precision` says otherwise. Crossing rays behind their first hit are for
-    `crossings`.
+    Arrays of float64 are traced in double precision and give such arrays, other arrays in single
+    precision, unless `precision` says otherwise. To find further crossings behind the first hit,
+    use `crossings`.
 
     With Dr.Jit rays, t and position carry derivatives with respect to rays, level, and vertices of
     a `SolidAngle`, if these have derivatives enabled (implicit differentiation at the hit). The
-    other results have no derivatives: in reverse mode, using theirs raises NotImplementedError; in
-    forward mode they are NaN. Fields of other numbers with derivatives enabled are refused.
+    other results have no derivatives: in reverse mode, using their derivatives raises
+    NotImplementedError; in forward mode they are NaN. Fields raise an error if other numbers of
+    theirs have derivatives enabled.
 
-    With `backend="webgpu"`, NumPy rays are traced in single precision by the package `wgpu`
-    (`pip install harnack[webgpu]`) with a translation of the kernel that Dr.Jit records. Rounding
-    is proved for Dr.Jit's own backends only; so at each call up to 4,096 of the rays are traced
-    there, too, and the device must agree.
+    With `backend="webgpu"`, NumPy rays are traced in single precision by the package `wgpu` (`pip
+    install harnack[webgpu]`) with a translation of the kernel that Dr.Jit records. Rounding is
+    proved for Dr.Jit's own backends only. So at each call up to 4,096 of the rays are traced by
+    Dr.Jit, too, and the results of the device must agree.
 
-    On processors, if there are at least 4,096 rays and neighbors have little to do with each other,
-    rays are traced by few lanes that share a queue, unless samples are cheap (`Field.is_cheap`).
-    This gives the same hits, bit by bit, in about half the time. Rays that start so far from a
-    `largest` component that rounding is more than a part of a cell are out of steps.
+    On processors, if there are at least 4,096 rays and successive rays differ much, rays are traced
+    by few lanes that share a queue, unless samples are cheap (`Field.is_cheap`). This gives the
+    same hits, bit by bit, in about half the time. If only the `largest` component is traced, a ray
+    is out of steps if it starts so far away that its coordinates are rounded by more than a small
+    part of a cell.
 
     Raises:
         TypeError, ValueError: shapes that do not match, NaN, directions of length zero, an empty or

@@ -237,25 +237,28 @@ def crossings(
     options: TraceOptions | None = None,
     **keywords: Unpack[TraceKeywords],
 ) -> RayCrossings:
-    """The first crossings of rays with a level set of a field, in order.
+    """The first crossings of rays with a level set of a field, in the order along each ray.
 
     If f goes farther than the tolerance to both sides of the level, the crossing is not missed, and
-    no crossing is counted twice. Touching a level without passing to its other side is no crossing,
-    and neither is starting on it. If levels are closer in value than four tolerances, a quarter of
-    their distance is the tolerance; rays run out of steps if that is below rounding. Otherwise the
-    tolerance is at least eight times the rounding error of f, in single precision about 1e-5 of the
-    size of the coordinates: if f goes less far than that to one side, the crossing may not count.
+    no crossing is counted twice. If a ray touches a level without passing to its other side, or
+    starts on it, that is no crossing. If levels are closer in value than four tolerances, a quarter
+    of their distance takes the place of the tolerance; rays run out of steps if that is below
+    rounding. Otherwise the tolerance is at least eight times the rounding error of f, in single
+    precision about 1e-5 of the size of the coordinates: if f goes less far than that to one side,
+    the crossing may not count.
 
-    surface, origins, directions, t_min, t_max, options, keywords: as in `trace`, but for `side`,
-        `largest`, `require_crossing` and `backend`, which crossings do not have. `max_steps` is for
-        the whole ray.
+    surface, origins, directions, t_min, t_max, options, keywords: the surface, the rays and the
+        options, as `trace` takes them. The options `side`, `largest`, `require_crossing` and
+        `backend` do not exist here. `max_steps` is for the whole ray.
     max_crossings: the number of crossings of each ray to return, at least 1.
 
-    With Dr.Jit rays, t and position carry derivatives as those of `trace` do.
+    With Dr.Jit rays, t and position carry derivatives with respect to rays, level, and vertices of
+    a `SolidAngle`, if these have derivatives enabled.
 
     Raises:
-        TypeError, ValueError: as `trace`; also for several levels of a field with jumps.
-        NotImplementedError: a field with patches.
+        TypeError, ValueError: wrong rays, levels or options, which `trace` lists; also several
+            levels of a field with jumps.
+        NotImplementedError: a union of patches, which has a function for each patch.
     """
     target, choices = surface_and_options("crossings", surface, options, keywords, _HONORED)
     traced = TracedSurface.of(target, choices).with_call_cache()

@@ -45,27 +45,29 @@ class Surface:
 
     Every verb takes a `Surface` in place of a field: `trace`, `crossings`, `render`, `animate`,
     `view`, `page`, `mesh`, `signed_distance`, `curvature`. Keywords of these verbs that are named
-    as here are shorthand: `trace(field, ..., level=2.0)` traces `Surface(field, 2.0)`.
+    as the parameters here are shorthand: `trace(field, ..., level=2.0)` traces `Surface(field,
+    2.0)`.
 
     field: the function f.
     level: a number or several, which may be Dr.Jit numbers; None for the field's default. For an
         angle-valued field levels are taken modulo its period. The attribute `levels` is a tuple.
-    clip: a volume. The surface is what lies in it and in the field's own domain.
-    section: another volume, which cuts the surface open: the faces of a solid on it may have a
-        material of their own.
+    clip: a volume. The surface is the part of the level set in this volume and in the field's own
+        domain.
+    section: another volume, which cuts the surface open. If a solid is cut, the faces of the cut
+        may have a material of their own.
     side: "surface" for the level set itself; "below", "above" or "between" for the boundary of the
-        closed solid on which f <= level, f >= level, or f is between two levels, with faces where
-        a volume cuts it. None is "below" for a `Solid` that is meshed, or whose inside a picture
-        shows, and else "surface".
-    largest: True for the largest connected component alone, as far as components are separated by
-        cells proved empty: 128 cells along the longest side of the box, or this number of them.
-        Largest is the component, of the part within domain and clip, with the largest sum of
-        projected areas along x, y and z. Meshes tell components apart by their triangles.
+        closed solid on which f <= level, f >= level, or f is between two levels, with faces where a
+        volume cuts it. None means "below" for a `Solid` that is meshed, or whose inside a picture
+        shows, and "surface" otherwise.
+    largest: True for the largest connected component alone. Components are told apart by cells that
+        are proved empty: 128 cells along the longest side of the box, or the given number. The
+        largest component, within domain and clip, is the one with the largest sum of projected
+        areas along x, y and z. Meshes tell components apart by their triangles.
 
     Raises:
         TypeError: `field` is no field, or another argument has a wrong type.
         ValueError: a level that is not finite or that the field cannot have; an unknown side, or a
-            number of levels that it does not have.
+            number of levels that does not suit the side.
     """
 
     field: Field
