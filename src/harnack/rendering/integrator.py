@@ -305,6 +305,7 @@ class PathTracer:
             if not count:
                 return results
             paths = gather_record(paths, rows)
+            # `rows` lists a single path twice; the second entry is not active.
             active = dr.arange(mi.UInt32, len(rows)) < dr.opaque(mi.UInt32, count)
             # No number is a literal, so that all vertices run the same kernels.
             dr.make_opaque(active, *array_leaves(paths))

@@ -175,8 +175,8 @@ def find_crossings(
         begin = _SearchState(None, tracer.begin(state), dr.zeros(count, n))
     walk = loop_while_active(begin, advance, "harnack crossings")
     final = walk.now
-    rays, none = dr.arange(count, n * k) // k, real(0)
-    roots = Contact(side, backend.Bool(False), t, gradient, none, before, behind, none)
+    rays, zero = dr.arange(count, n * k) // k, real(0)
+    roots = Contact(side, backend.Bool(False), t, gradient, zero, before, behind, zero)
     origins, directions = gather_vectors(backend, o, rays), gather_vectors(backend, d, rays)
     t, gradient, samples = prepared.refined_crossings(origins, directions, roots, dr.isfinite(t))
     evaluations = final.evaluations + dr.block_reduce(dr.ReduceOp.Add, samples, k)
@@ -317,8 +317,8 @@ def trace_crossings(
     if differentiable and needs_derivatives(prepared, o, d):
         with dr.suspend_grad():
             status = dr.select(is_found, backend.UInt32(int(RayStatus.HIT)), int(RayStatus.MISS))
-            none = dr.zeros(backend.Float, dr.width(t))
-            ends = MarchResult(t, none, found.gradient, none, none, status, found.sheet, found.side)
+            zero = dr.zeros(backend.Float, dr.width(t))
+            ends = MarchResult(t, zero, found.gradient, zero, zero, status, found.sheet, found.side)
         t, normal = attach_derivatives(prepared, o, d, ends, normal)
         normal = refuse_derivative(prepared, o, d, "normal", normal)
         end = refuse_derivative(prepared, o, d, "traced_to", end)
